@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What things are: frozen dataclasses of tensors, with no drawing, loading or logging."""
+
+from manyeyes.datatypes.boxes import LABELS, Boxes, wrap_angle
+from manyeyes.datatypes.errors import (
+    CheckpointError,
+    ConfigError,
+    ManyeyesError,
+    MissingExtraError,
+    RecordingError,
+    ShapeError,
+    WireError,
+)
+from manyeyes.datatypes.grid import BevGrid
+from manyeyes.datatypes.message import Message
+from manyeyes.datatypes.point_cloud import PointCloud
+from manyeyes.datatypes.snapshot import AgentFrame, Snapshot, Truth
+from manyeyes.datatypes.sparse_bev import Sites, SparseBev
+from manyeyes.datatypes.transform import Transform
+
+__all__ = [
+    "LABELS",
+    "AgentFrame",
+    "BevGrid",
+    "Boxes",
+    "CheckpointError",
+    "ConfigError",
+    "ManyeyesError",
+    "Message",
+    "MissingExtraError",
+    "PointCloud",
+    "RecordingError",
+    "ShapeError",
+    "Sites",
+    "Snapshot",
+    "SparseBev",
+    "Transform",
+    "Truth",
+    "WireError",
+    "wrap_angle",
+]

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Oriented boxes on the ground: what a detector finds and what truth holds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.transform import Transform
+
+LABELS = ("car", "van", "truck", "bus")
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """N boxes in one frame.
+
+    center: (N, 3) metres, the middle of the box; size: (N, 3) length, width, height; yaw: (N,) radians about +z,
+    0 along +x. score: (N,) in [0, 1]; label: (N,) int64, index into LABELS; id: (N,) int64, -1 when unknown.
+    sigma_xy: (N,) metres, sigma_yaw: (N,) radians and flip: (N,) in [0, 1] are the detector's own word on its
+    error and on the chance that the heading is off by pi; zero for truth.
+    """
+
+    center: Tensor
+    size: Tensor
+    yaw: Tensor
+    score: Tensor
+    label: Tensor
+    id: Tensor
+    sigma_xy: Tensor
+    sigma_yaw: Tensor
+    flip: Tensor
+
+    def __post_init__(self) -> None:
+        n = self.center.shape[0]
+        wanted = {"center": (n, 3), "size": (n, 3)}
+        for field in fields(self):
+            shape = tuple(getattr(self, field.name).shape)
+            if shape != wanted.get(field.name, (n,)):
+                raise ShapeError(f"Boxes.{field.name} needs shape {wanted.get(field.name, (n,))}; got {shape}.")
+
+    @classmethod
+    def of(
+        cls,
+        center: Tensor,
+        size: Tensor,
+        yaw: Tensor,
+        score: Tensor | None = None,
+        label: Tensor | None = None,
+        id: Tensor | None = None,
+    ) -> Boxes:
+        """Boxes with the rest at its default: score 1, label 0, id -1, no stated uncertainty."""
+        n, zeros = center.shape[0], torch.zeros(center.shape[0], dtype=center.dtype)
+        return cls(
+            center,
+            size,
+            yaw,
+            zeros + 1 if score is None else score,
+            torch.zeros(n, dtype=torch.int64) if label is None else label,
+            torch.full((n,), -1, dtype=torch.int64) if id is None else id,
+            zeros,
+            zeros,
+            zeros,
+        )
+
+    @classmethod
+    def empty(cls, dtype: torch.dtype = torch.float32) -> Boxes:
+        """No boxes."""
+        return cls.of(torch.zeros(0, 3, dtype=dtype), torch.zeros(0, 3, dtype=dtype), torch.zeros(0, dtype=dtype))
+
+    def __len__(self) -> int:
+        return self.center.shape[0]
+
+    def __getitem__(self, index: Tensor | slice) -> Boxes:
+        return Boxes(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    @classmethod
+    def cat(cls, many: list[Boxes]) -> Boxes:
+        """Several sets of one frame as one."""
+        return cls(*(torch.cat([getattr(b, f.name) for b in many]) for f in fields(cls))) if many else cls.empty()
+
+    def to(self, dtype: torch.dtype) -> Boxes:
+        """The same boxes in another floating-point type."""
+        return Boxes(*(v.to(dtype) if v.is_floating_point() else v for v in (getattr(self, f.name) for f in fields(self))))
+
+    def transform(self, target_from_source: Transform) -> Boxes:
+        """The same boxes in another frame; headings are projected onto the target's ground plane."""
+        ahead = torch.stack((self.yaw.cos(), self.yaw.sin(), torch.zeros_like(self.yaw)), -1)
+        ahead = ahead @ target_from_source.rotation.to(ahead.dtype).mT
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values |= {"center": target_from_source.apply(self.center), "yaw": torch.atan2(ahead[:, 1], ahead[:, 0])}
+        return Boxes(**values)
+
+    def bev(self) -> Tensor:
+        """(N, 5): x, y, length, width, yaw."""
+        return torch.cat((self.center[:, :2], self.size[:, :2], self.yaw[:, None]), -1)
+
+    def corners(self) -> Tensor:
+        """(N, 8, 3): front left, front right, rear right, rear left at the bottom, then the same at the top."""
+        unit = torch.tensor(
+            [[x, y, z] for z in (-0.5, 0.5) for x, y in ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))],
+            dtype=self.center.dtype,
+        )
+        local = unit * self.size[:, None, :]
+        c, s = self.yaw.cos()[:, None], self.yaw.sin()[:, None]
+        x, y = local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c
+        return torch.stack((x, y, local[..., 2]), -1) + self.center[:, None, :]
+
+    def contains(self, points: Tensor, margin_m: float = 0.0) -> Tensor:
+        """(N, P) bool: which of the points (P, 3) lie in each box, enlarged by margin_m on every side."""
+        delta = points[None] - self.center[:, None]
+        c, s = self.yaw.cos()[:, None], self.yaw.sin()[:, None]
+        local = torch.stack((delta[..., 0] * c + delta[..., 1] * s, delta[..., 1] * c - delta[..., 0] * s, delta[..., 2]), -1)
+        return (local.abs() <= self.size[:, None] / 2 + margin_m).all(-1)
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """Angles to [-pi, pi), radians."""
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every error that manyeyes raises on purpose; each text says what was expected, what came, and what to do."""
+
+
+class ManyeyesError(Exception):
+    """Base of all designed errors: the command line prints its one line and exits with 1."""
+
+
+class ShapeError(ManyeyesError, ValueError):
+    """A tensor whose shape or dtype does not fit the type it is given to."""
+
+
+class ConfigError(ManyeyesError, ValueError):
+    """A setting or preset that does not exist or does not fit; the text lists the known ones."""
+
+
+class RecordingError(ManyeyesError):
+    """A file of a recording that is missing, truncated or contradictory; the text names file and field."""
+
+
+class WireError(ManyeyesError):
+    """Bytes that are not a whole, matching message; the receiver drops them and counts them."""
+
+
+class CheckpointError(ManyeyesError):
+    """Weights that are missing, damaged or of another shape."""
+
+
+class MissingExtraError(ManyeyesError, ImportError):
+    """An optional dependency is not installed; the text is the pip line that installs it."""
+
+    def __init__(self, extra: str, purpose: str) -> None:
+        super().__init__(f"{purpose} needs the '{extra}' extra: pip install 'manyeyes[{extra}]'")

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One instant of a drive: what each agent knows, and, kept apart from it, the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes.boxes import Boxes
+from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.point_cloud import PointCloud
+from manyeyes.datatypes.transform import Transform
+
+
+@dataclass(frozen=True)
+class AgentFrame:
+    """One agent at one instant: all that it may use to perceive. No label is in it.
+
+    points: in the agent's own frame (x forward, y left, z up; z = 0 is the road under it, under a pole too).
+    world_from_agent: the *claimed* pose; pose_covariance: (3, 3) of x, y (m) and yaw (rad) in the world, what the
+    agent says of its error. sensor_height_m: height of the LiDAR above the road. speed_mps: own speed.
+    """
+
+    agent_id: int
+    timestamp_ns: int
+    points: PointCloud
+    world_from_agent: Transform
+    pose_covariance: Tensor
+    sensor_height_m: float = 1.9
+    speed_mps: float = 0.0
+    is_infrastructure: bool = False
+
+    def __post_init__(self) -> None:
+        if self.pose_covariance.shape != (3, 3):
+            raise ShapeError(f"AgentFrame.pose_covariance needs (3, 3); got {tuple(self.pose_covariance.shape)}.")
+
+    @classmethod
+    def of(cls, points: PointCloud, world_from_agent: Transform, agent_id: int = 0, timestamp_ns: int = 0) -> AgentFrame:
+        """A frame from a cloud and a pose that is believed to be exact."""
+        return cls(agent_id, timestamp_ns, points, world_from_agent, torch.zeros(3, 3, dtype=torch.float64))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What was really there at one instant; seen by evaluation and training only.
+
+    boxes: in the world frame, float64, ids set. seen: (agents, N) bool, whether an agent lists the box (its LiDAR met
+    it); row order is that of Snapshot.frames. world_from_agent: the true poses, batch shape (agents,).
+    """
+
+    boxes: Boxes
+    seen: Tensor
+    world_from_agent: Transform
+
+    def __post_init__(self) -> None:
+        agents = self.world_from_agent.translation.shape[0]
+        if self.seen.shape != (agents, len(self.boxes)):
+            raise ShapeError(f"Truth.seen needs ({agents}, {len(self.boxes)}); got {tuple(self.seen.shape)}.")
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All agents at one instant. scenario and index name it in its recording."""
+
+    scenario: str
+    index: int
+    frames: tuple[AgentFrame, ...]
+    truth: Truth | None = None

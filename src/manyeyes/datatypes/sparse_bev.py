@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Features on the occupied cells of a grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.grid import BevGrid
+
+
+@dataclass(frozen=True, eq=False)
+class Sites:
+    """Which cells of a batch of grids are occupied; compared by identity.
+
+    key: (N,) int64, strictly ascending, ``(batch * rows + row) * columns + column``. ``cache`` holds neighbour maps that
+    ``ops.sparse_conv`` built for this very set: a pruned or merged set is a new object and starts with none.
+    """
+
+    key: Tensor
+    grid: BevGrid
+    batch_size: int = 1
+    cache: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.key.dtype != torch.int64 or self.key.dim() != 1:
+            raise ShapeError(f"Sites.key needs int64 (N,); got {self.key.dtype} {tuple(self.key.shape)}.")
+        if self.key.numel():
+            rows, columns = self.grid.shape
+            ascending = bool((self.key[1:] > self.key[:-1]).all())
+            if not ascending or int(self.key[0]) < 0 or int(self.key[-1]) >= self.batch_size * rows * columns:
+                raise ShapeError("Sites.key must be strictly ascending and inside the grid; use ops.sparse_conv.coalesce.")
+
+    def __len__(self) -> int:
+        return self.key.shape[0]
+
+    @property
+    def batch(self) -> Tensor:
+        """(N,) int64: which grid of the batch each site belongs to."""
+        rows, columns = self.grid.shape
+        return self.key.div(rows * columns, rounding_mode="floor")
+
+    @property
+    def yx(self) -> Tensor:
+        """(N, 2) int64: row and column of each site."""
+        rows, columns = self.grid.shape
+        within = self.key.remainder(rows * columns)
+        return torch.stack((within.div(columns, rounding_mode="floor"), within.remainder(columns)), -1)
+
+    @property
+    def xy(self) -> Tensor:
+        """(N, 2) float32: metric centres in the agent's frame."""
+        return self.grid.centers(self.yx)
+
+
+@dataclass(frozen=True, eq=False)
+class SparseBev:
+    """features: (N, C), one row a site, in the order of ``sites``."""
+
+    features: Tensor
+    sites: Sites
+
+    def __post_init__(self) -> None:
+        if self.features.dim() != 2 or self.features.shape[0] != len(self.sites):
+            raise ShapeError(f"SparseBev needs features ({len(self.sites)}, C); got {tuple(self.features.shape)}.")
+
+    @property
+    def grid(self) -> BevGrid:
+        """The lattice that the sites lie on."""
+        return self.sites.grid
+
+    def with_features(self, features: Tensor) -> SparseBev:
+        """Other features on the same sites: neighbour maps are shared."""
+        return SparseBev(features, self.sites)
+
+    def keep(self, mask: Tensor) -> SparseBev:
+        """The sites where mask (N,) is true, as a new set."""
+        return SparseBev(self.features[mask], Sites(self.sites.key[mask], self.grid, self.sites.batch_size))
+
+    def dense(self) -> Tensor:
+        """(B, C, rows, columns), zero where no site is; for pictures, tests and dense rivals."""
+        rows, columns = self.grid.shape
+        out = self.features.new_zeros(self.sites.batch_size * rows * columns, self.features.shape[1])
+        out[self.sites.key] = self.features
+        return out.view(self.sites.batch_size, rows, columns, -1).permute(0, 3, 1, 2)
+
+    @classmethod
+    def from_cells(cls, features: Tensor, yx: Tensor, grid: BevGrid) -> SparseBev:
+        """One grid's cells (N, 2), each at most once, in any order."""
+        rows, columns = grid.shape
+        inside = (yx >= 0).all(-1) & (yx[:, 0] < rows) & (yx[:, 1] < columns)
+        if not bool(inside.all()):
+            raise ShapeError(f"{int((~inside).sum())} cells lie outside the grid of {rows} rows and {columns} columns.")
+        key, order = (yx[:, 0] * columns + yx[:, 1]).sort()
+        return cls(features[order], Sites(key, grid))

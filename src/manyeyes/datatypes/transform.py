@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Batched rigid motions, named target_from_source so that inner names cancel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes.errors import ShapeError
+
+
+@dataclass(frozen=True)
+class Transform:
+    """A rigid motion: ``p_target = rotation @ p_source + translation``.
+
+    rotation: (..., 3, 3), orthonormal; translation: (..., 3), metres. Poses are kept in float64, because world
+    coordinates reach kilometres; :meth:`apply` works in the dtype of the points it is given.
+    """
+
+    rotation: Tensor
+    translation: Tensor
+
+    def __post_init__(self) -> None:
+        if self.rotation.shape[-2:] != (3, 3) or self.translation.shape != self.rotation.shape[:-1]:
+            raise ShapeError(
+                "Transform needs rotation (..., 3, 3) and translation (..., 3); "
+                f"got {tuple(self.rotation.shape)} and {tuple(self.translation.shape)}."
+            )
+
+    @classmethod
+    def identity(cls, *batch: int, dtype: torch.dtype = torch.float64) -> Transform:
+        """The motion that changes nothing, batch shape as given."""
+        return cls(torch.eye(3, dtype=dtype).expand(*batch, 3, 3), torch.zeros(*batch, 3, dtype=dtype))
+
+    @classmethod
+    def from_matrix(cls, matrix: Tensor) -> Transform:
+        """From homogeneous matrices (..., 4, 4)."""
+        if matrix.shape[-2:] != (4, 4):
+            raise ShapeError(f"A rigid motion is a (..., 4, 4) matrix; got {tuple(matrix.shape)}.")
+        rotation = matrix[..., :3, :3]
+        eye = torch.eye(3, dtype=matrix.dtype)
+        if not bool(((rotation @ rotation.mT - eye).abs() < 1e-3).all()) or not bool((torch.det(rotation) > 0).all()):
+            raise ShapeError("The upper left 3x3 block is not a rotation (orthonormal, determinant +1).")
+        return cls(rotation, matrix[..., :3, 3])
+
+    @classmethod
+    def from_rpy(cls, translation: Tensor, roll: Tensor, pitch: Tensor, yaw: Tensor) -> Transform:
+        """From intrinsic z-y-x angles in radians, right-handed: R = Rz(yaw) Ry(pitch) Rx(roll). Angles are (...)."""
+        cr, sr, cp, sp, cy, sy = roll.cos(), roll.sin(), pitch.cos(), pitch.sin(), yaw.cos(), yaw.sin()
+        rows = (
+            torch.stack((cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr), -1),
+            torch.stack((sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr), -1),
+            torch.stack((-sp, cp * sr, cp * cr), -1),
+        )
+        return cls(torch.stack(rows, -2), translation)
+
+    @classmethod
+    def from_xyz_yaw(cls, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Transform:
+        """One upright pose, float64."""
+        zero = torch.zeros((), dtype=torch.float64)
+        return cls.from_rpy(torch.tensor([x, y, z], dtype=torch.float64), zero, zero, zero + yaw)
+
+    @property
+    def yaw(self) -> Tensor:
+        """Heading of the source's x axis in the target frame, (...), radians in (-pi, pi]."""
+        return torch.atan2(self.rotation[..., 1, 0], self.rotation[..., 0, 0])
+
+    def matrix(self) -> Tensor:
+        """Homogeneous form (..., 4, 4)."""
+        bottom = torch.zeros(*self.translation.shape[:-1], 1, 4, dtype=self.rotation.dtype)
+        bottom[..., 0, 3] = 1
+        return torch.cat((torch.cat((self.rotation, self.translation[..., None]), -1), bottom), -2)
+
+    def inverse(self) -> Transform:
+        """source_from_target."""
+        back = self.rotation.mT
+        return Transform(back, -(back @ self.translation[..., None])[..., 0])
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """a_from_b @ b_from_c = a_from_c, batches broadcast."""
+        moved = (self.rotation @ other.translation[..., None])[..., 0] + self.translation
+        rotation = self.rotation @ other.rotation
+        return Transform(rotation.expand(*moved.shape[:-1], 3, 3), moved)
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Points (..., N, 3) in the source frame to the target frame, dtype of the points."""
+        rotation, translation = self.rotation.to(points.dtype), self.translation.to(points.dtype)
+        return points @ rotation.mT + translation[..., None, :]
+
+    def __getitem__(self, index: int | slice | Tensor) -> Transform:
+        return Transform(self.rotation[index], self.translation[index])
+
+    @classmethod
+    def stack(cls, transforms: list[Transform] | tuple[Transform, ...]) -> Transform:
+        """Several motions of equal batch shape as one, new leading axis."""
+        return cls(torch.stack([t.rotation for t in transforms]), torch.stack([t.translation for t in transforms]))
