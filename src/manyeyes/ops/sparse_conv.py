@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Convolutions and pooling over occupied cells only, in plain PyTorch: exact, deterministic, on any device.
+
+A layer is one gather of neighbours and one matrix product, in blocks that stay in the CPU's cache. Its backward pass
+gathers too (by the transposed map), so that nothing is ever scattered and results do not depend on threads.
+Semantics: cross-correlation as in ``conv2d``; a bias is added to active rows alone; output keys are ascending.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
+from manyeyes.ops.sparse_index import NeighbourMap, Window, dilated_sites, distinct, neighbours, parent_sites
+from manyeyes.ops.voxelize import segment_max, segment_mean, segment_sum
+
+BLOCK_ROWS = 1024
+
+
+def coalesce(
+    features: Tensor, key: Tensor, grid: BevGrid, batch_size: int, reduce: Literal["sum", "mean", "max"] = "sum"
+) -> SparseBev:
+    """Rows (N, C) at keys (N,) in any order to a sparse map; rows of one cell are reduced (max starts at -inf)."""
+    rows, columns = grid.shape
+    size = batch_size * rows * columns
+    if key.numel() and (int(key.min()) < 0 or int(key.max()) >= size):
+        raise ShapeError(f"coalesce needs keys in [0, {size}); got {int(key.min())} … {int(key.max())}.")
+    found, row = distinct(key, size)
+    how = {"sum": segment_sum, "mean": segment_mean, "max": segment_max}
+    if reduce not in how:
+        raise ConfigError(f"coalesce reduces by one of {', '.join(how)}; got {reduce!r}.")
+    return SparseBev(how[reduce](features, row, found.shape[0]), Sites(found, grid, batch_size))
+
+
+def submanifold_conv(x: SparseBev, weight: Tensor, bias: Tensor | None = None, dilation: int = 1) -> SparseBev:
+    """A convolution on the same sites; weight (out, in, k, k), k odd, implied padding (k // 2) * dilation."""
+    kernel = _kernel(weight, x.features.shape[1], axis=1)
+    if kernel % 2 == 0:
+        raise ConfigError(f"submanifold_conv needs an odd kernel; got {kernel}.")
+    if kernel == 1:
+        return x.with_features(_affine(x.features, weight[:, :, 0, 0], bias))
+    return x.with_features(_conv(x.features, weight, bias, same_sites_map(x.sites, kernel, dilation)))
+
+
+def strided_conv(
+    x: SparseBev,
+    weight: Tensor,
+    bias: Tensor | None = None,
+    stride: int = 2,
+    padding: int = 1,
+    dilating: bool = False,
+) -> SparseBev:
+    """A convolution to a coarser grid; weight (out, in, k, k), k odd, padding k // 2.
+
+    dilating: every output that meets an active cell (spconv's SparseConv2d); otherwise only the parents
+    ``floor(i / stride)`` of active cells, a subset with the same values.
+    """
+    kernel = _kernel(weight, x.features.shape[1], axis=1)
+    sites, table = strided_map(x.sites, Window(kernel, stride, padding), dilating)
+    return SparseBev(_conv(x.features, weight, bias, table), sites)
+
+
+def inverse_conv(
+    x: SparseBev, weight: Tensor, target: Sites, bias: Tensor | None = None, stride: int = 2, padding: int = 1
+) -> SparseBev:
+    """Back to the finer sites ``target``: ``conv_transpose2d`` read there; weight (in, out, k, k)."""
+    kernel = _kernel(weight, x.features.shape[1], axis=0)
+    table = _pair_map(target, x.sites, _checked(target, Window(kernel, stride, padding)))
+    if target.grid.at(target.grid.stride * stride) != x.grid or target.batch_size != x.sites.batch_size:
+        raise ShapeError(
+            f"inverse_conv by {stride} needs a target on the grid before it; got {target.grid} from {x.grid}."
+        )
+    return SparseBev(_conv(x.features, weight.transpose(0, 1), bias, table, reverse=True), target)
+
+
+def max_pool(x: SparseBev, kernel: int = 3) -> SparseBev:
+    """The maximum over active neighbours (and the site itself), on the same sites; ties share the gradient equally."""
+    if kernel % 2 == 0:
+        raise ConfigError(f"max_pool needs an odd kernel; got {kernel}.")
+    return x.with_features(_pool(x.features, same_sites_map(x.sites, kernel)))
+
+
+def strided_max_pool(
+    x: SparseBev, kernel: int = 3, stride: int = 2, padding: int = 1, dilating: bool = False
+) -> SparseBev:
+    """The maximum over active cells under each output; sites as in :func:`strided_conv`."""
+    sites, table = strided_map(x.sites, Window(kernel, stride, padding), dilating)
+    return SparseBev(_pool(x.features, table), sites)
+
+
+def merge(levels: Sequence[SparseBev], reduce: Literal["sum", "mean", "max"] = "sum") -> SparseBev:
+    """Sites of coarser levels, indices times the ratio of strides, united with the first level's (CoSTr, Eq. 3)."""
+    fine = levels[0]
+    rows, columns = fine.grid.shape
+    keys = []
+    for level in levels:
+        if level.grid.at(fine.grid.stride) != fine.grid or level.grid.stride % fine.grid.stride:
+            raise ShapeError(f"merge needs levels on one ground, finest first; got {level.grid} after {fine.grid}.")
+        if level.sites.batch_size != fine.sites.batch_size or level.features.shape[1] != fine.features.shape[1]:
+            raise ShapeError("merge needs one batch size and one number of channels over all levels.")
+        yx = level.sites.yx * (level.grid.stride // fine.grid.stride)
+        keys.append((level.sites.batch * rows + yx[:, 0]) * columns + yx[:, 1])
+    features = torch.cat([level.features for level in levels])
+    return coalesce(features, torch.cat(keys), fine.grid, fine.sites.batch_size, reduce)
+
+
+def local_maxima(score: Tensor, sites: Sites, kernel: int = 3) -> Tensor:
+    """(N,) bool: sites that no active neighbour exceeds, nor equals with a lower key (one survivor a tied pair)."""
+    index = same_sites_map(sites, kernel).index.to(score.device)
+    around = torch.cat((score, score.new_full((1,), -torch.inf)))[index]
+    middle = index.shape[1] // 2
+    return (score[:, None] > around[:, :middle]).logical_or(index[:, :middle] == len(sites)).all(1) & (
+        score[:, None] >= around[:, middle:]
+    ).all(1)
+
+
+def same_sites_map(sites: Sites, kernel: int, dilation: int = 1) -> NeighbourMap:
+    """Neighbours of every site among the sites themselves; built once and kept in ``sites.cache``."""
+    name = ("same", kernel, dilation)
+    if name not in sites.cache:
+        window, shape = Window(kernel, 1, kernel // 2 * dilation, dilation), sites.grid.shape
+        index = neighbours(sites.key, shape, sites.key, shape, sites.batch_size, window)
+        sites.cache[name] = NeighbourMap(index, len(sites), is_symmetric=True)
+    return sites.cache[name]
+
+
+def strided_map(sites: Sites, window: Window, dilating: bool = False) -> tuple[Sites, NeighbourMap]:
+    """The coarser sites of a strided layer and what they meet; built once, so that equal layers share one set."""
+    name = ("strided", window, dilating)
+    if name not in sites.cache:
+        _checked(sites, window)
+        if not dilating and window.kernel // 2 < window.stride - 1:
+            raise ConfigError(f"A kernel of {window.kernel} does not reach all children at stride {window.stride}.")
+        shape, batch_size = sites.grid.shape, sites.batch_size
+        key = (
+            dilated_sites(sites.key, shape, batch_size, window)
+            if dilating
+            else parent_sites(sites.key, shape, batch_size, window.stride)
+        )
+        coarse = Sites(key, sites.grid.at(sites.grid.stride * window.stride), batch_size)
+        sites.cache[name] = (coarse, _pair_map(sites, coarse, window))
+    return sites.cache[name]
+
+
+def _pair_map(fine: Sites, coarse: Sites, window: Window) -> NeighbourMap:
+    """What the sites ``coarse`` meet among ``fine``; kept in the finer set, with the coarser that it names."""
+    name = ("pair", window, id(coarse))
+    if name not in fine.cache:
+        index = neighbours(coarse.key, coarse.grid.shape, fine.key, fine.grid.shape, fine.batch_size, window)
+        # Holding the coarser set keeps its id from being given to another one.
+        fine.cache[name] = (NeighbourMap(index, len(fine)), coarse)
+    return fine.cache[name][0]
+
+
+def _checked(sites: Sites, window: Window) -> Window:
+    if (
+        window.kernel % 2 == 0
+        or window.padding != window.kernel // 2
+        or window.out_shape(sites.grid.shape) != (sites.grid.at(sites.grid.stride * window.stride).shape)
+    ):
+        raise ConfigError(f"On a BevGrid the kernel is odd, the padding half of it, the stride 1 or 2; got {window}.")
+    return window
+
+
+def _kernel(weight: Tensor, channels: int, axis: int) -> int:
+    if weight.dim() != 4 or weight.shape[2] != weight.shape[3] or weight.shape[axis] != channels:
+        raise ShapeError(f"The weight needs {channels} at axis {axis} and a square kernel; got {tuple(weight.shape)}.")
+    return weight.shape[2]
+
+
+def _affine(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    out = x @ weight.to(x.dtype).T
+    return out if bias is None else out + bias.to(x.dtype)
+
+
+def _conv(x: Tensor, weight: Tensor, bias: Tensor | None, table: NeighbourMap, reverse: bool = False) -> Tensor:
+    """Rows (N_in, in) to (N_out, out); weight (out, in, k, k)."""
+    # (taps, in, out): one matrix for the gathered row of a site.
+    taps = weight.to(x.dtype).permute(2, 3, 1, 0).reshape(-1, weight.shape[1], weight.shape[0])
+    out: Tensor = _GatherProduct.apply(x, taps, table, reverse)  # pyright: ignore[reportAssignmentType]
+    return out if bias is None else out + bias.to(x.dtype)
+
+
+def _padded(x: Tensor, value: float = 0.0) -> Tensor:
+    return torch.cat((x, x.new_full((1, x.shape[1]), value)))
+
+
+def _block(x: Tensor) -> int:
+    return BLOCK_ROWS if x.device.type == "cpu" else 1 << 30
+
+
+def _gather_product(x: Tensor, index: Tensor, matrix: Tensor) -> Tensor:
+    """For every row of index (M, taps): the gathered rows of x (N, C) side by side, times matrix (taps * C, D)."""
+    rows, taps = index.shape
+    block, padded, out = _block(x), _padded(x), x.new_empty(rows, matrix.shape[1])
+    columns = x.new_empty(min(block, rows) * taps, x.shape[1])
+    for start in range(0, rows, block):
+        part = index[start : start + block]
+        gathered = torch.index_select(padded, 0, part.reshape(-1), out=columns[: part.numel()])
+        torch.mm(gathered.view(part.shape[0], -1), matrix, out=out[start : start + block])
+    return out
+
+
+def _gather_outer(x: Tensor, index: Tensor, dy: Tensor) -> Tensor:
+    """The sum over rows of (gathered rows of x)^T times dy (M, D): (taps * C, D)."""
+    rows, taps = index.shape
+    block, padded, out = _block(x), _padded(x), x.new_zeros(taps * x.shape[1], dy.shape[1])
+    columns = x.new_empty(min(block, rows) * taps, x.shape[1])
+    for start in range(0, rows, block):
+        part = index[start : start + block]
+        gathered = torch.index_select(padded, 0, part.reshape(-1), out=columns[: part.numel()])
+        out.addmm_(gathered.view(part.shape[0], -1).T, dy[start : start + block])
+    return out
+
+
+class _GatherProduct(torch.autograd.Function):
+    """Keeps the input alone for its backward pass; no column buffer outlives a block."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
+        ctx.save_for_backward(x, taps)
+        ctx.table, ctx.reverse = table, reverse
+        index = (table.back if reverse else table.index).to(x.device)
+        return _gather_product(x, index, taps.reshape(-1, taps.shape[2]))
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+        x, taps = ctx.saved_tensors
+        dy, table = grads[0].contiguous(), ctx.table
+        ahead, back = (table.back, table.index) if ctx.reverse else (table.index, table.back)
+        dx = dw = None
+        if ctx.needs_input_grad[0]:
+            dx = _gather_product(dy, back.to(x.device), taps.transpose(1, 2).reshape(-1, taps.shape[1]))
+        if ctx.needs_input_grad[1]:
+            dw = _gather_outer(x, ahead.to(x.device), dy).view_as(taps)
+        return dx, dw, None, None
+
+
+def _pool(x: Tensor, table: NeighbourMap) -> Tensor:
+    out: Tensor = _GatherMax.apply(x, table)  # pyright: ignore[reportAssignmentType]
+    return out
+
+
+class _GatherMax(torch.autograd.Function):
+    """The maximum over gathered rows; the gradient is shared equally among ties."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, table: NeighbourMap) -> Tensor:
+        index, padded, block = table.index.to(x.device), _padded(x, -torch.inf), _block(x)
+        parts = [padded[part].amax(1) for part in index.split(block)]
+        out = torch.cat(parts) if parts else x.new_empty(0, x.shape[1])
+        ctx.save_for_backward(x, out)
+        ctx.table = table
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        x, out = ctx.saved_tensors
+        index, back, block = ctx.table.index.to(x.device), ctx.table.back.to(x.device), _block(x)
+        padded, dx = _padded(x, -torch.inf), torch.empty_like(x)
+        ties = [(padded[p] == o[:, None]).sum(1) for p, o in zip(index.split(block), out.split(block), strict=True)]
+        share = _padded(grads[0] / torch.cat(ties)) if ties else _padded(grads[0])
+        top = _padded(out, torch.nan)
+        for start in range(0, x.shape[0], block):
+            part, rows = back[start : start + block], x[start : start + block]
+            dx[start : start + block] = (share[part] * (top[part] == rows[:, None])).sum(1)
+        return dx, None

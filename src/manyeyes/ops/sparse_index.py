@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Index work of sparse convolutions: which sites a layer has and which of them meet, as integers only.
+
+Sites are ``key = (batch * rows + row) * columns + column``, int64, ascending; shape is (rows, columns). A map is
+(outputs, kernel * kernel) int32; entry [o, t] is the row of the input under tap t of output o, and the number of inputs
+where there is none (the row of zeros that the caller appends). Taps run row by row, as in ``conv2d`` (no flip):
+output o meets input ``i = o * stride - padding + t * dilation``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Window(NamedTuple):
+    """Shape of a two-dimensional kernel, the same on both axes."""
+
+    kernel: int
+    stride: int = 1
+    padding: int = 0
+    dilation: int = 1
+
+    def out_shape(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """Rows and columns of the output of a convolution."""
+        rows, columns = (
+            (n + 2 * self.padding - self.dilation * (self.kernel - 1) - 1) // self.stride + 1 for n in shape
+        )
+        return max(rows, 0), max(columns, 0)
+
+
+@dataclass(eq=False)
+class NeighbourMap:
+    """index: (outputs, taps) int32, see the module; n_in: how many inputs there are."""
+
+    index: Tensor
+    n_in: int
+    is_symmetric: bool = False
+
+    @cached_property
+    def back(self) -> Tensor:
+        """(inputs, taps) int32: the output that meets an input by a tap; the number of outputs where there is none."""
+        if self.is_symmetric:
+            return self.index.flip(1)
+        n_out, taps = self.index.shape
+        # An input and a tap name at most one output, so that nothing is written twice except the spare row.
+        back = torch.full((self.n_in + 1, taps), n_out, dtype=torch.int32, device=self.index.device)
+        rows = torch.arange(n_out, dtype=torch.int32, device=self.index.device)
+        back.scatter_(0, self.index.long(), rows[:, None].expand(n_out, taps))
+        return back[: self.n_in].contiguous()
+
+
+def split(key: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Batch, row and column of keys, each (N,) int64."""
+    line = key.div(shape[1], rounding_mode="floor")
+    batch = line.div(shape[0], rounding_mode="floor")
+    return batch, line - batch * shape[0], key - line * shape[1]
+
+
+def distinct(key: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Ascending distinct keys (M,) of keys (N,) in [0, size), and the place (N,) int64 of each key among them."""
+    image = torch.zeros(size, dtype=torch.int32, device=key.device)
+    image[key] = 1
+    found = image.nonzero()[:, 0]
+    image[found] = torch.arange(found.shape[0], dtype=torch.int32, device=key.device)
+    return found, image[key].long()
+
+
+def dilated_sites(key: Tensor, shape: tuple[int, int], batch_size: int, window: Window) -> Tensor:
+    """Keys of every output that meets an active input: the active set of spconv's SparseConv2d."""
+    rows, columns = window.out_shape(shape)
+    batch, y, x = split(key, shape)
+    reach = torch.arange(window.kernel, device=key.device) * window.dilation
+    (oy, fits_y), (ox, fits_x) = (_outputs(v, reach, window, n) for v, n in ((y, rows), (x, columns)))
+    met = ((batch[:, None] * rows + oy)[:, :, None] * columns + ox[:, None, :])[fits_y[:, :, None] & fits_x[:, None, :]]
+    image = torch.zeros(batch_size * rows * columns, dtype=torch.bool, device=key.device)
+    image[met] = True
+    return image.nonzero()[:, 0]
+
+
+def _outputs(at: Tensor, reach: Tensor, window: Window, n_out: int) -> tuple[Tensor, Tensor]:
+    """Along one axis: output (N, kernel) that meets an input by each tap, and whether there is one."""
+    ahead = at[:, None] + window.padding - reach
+    # Divisibility and sign are tested before flooring, or negative places would round onto the first output.
+    out = ahead.div(window.stride, rounding_mode="floor")
+    return out, (ahead >= 0) & (out * window.stride == ahead) & (out < n_out)
+
+
+def parent_sites(key: Tensor, shape: tuple[int, int], batch_size: int, stride: int) -> Tensor:
+    """Keys of the cells ``floor(i / stride)`` of active cells i, on a grid of ceil(shape / stride)."""
+    rows, columns = -(-shape[0] // stride), -(-shape[1] // stride)
+    batch, y, x = split(key, shape)
+    y, x = y.div(stride, rounding_mode="floor"), x.div(stride, rounding_mode="floor")
+    return distinct((batch * rows + y) * columns + x, batch_size * rows * columns)[0]
+
+
+def neighbours(
+    out_key: Tensor,
+    out_shape: tuple[int, int],
+    in_key: Tensor,
+    in_shape: tuple[int, int],
+    batch_size: int,
+    window: Window,
+) -> Tensor:
+    """The map (outputs, kernel * kernel) int32 between two sets of sites.
+
+    An index image with a border that no tap leaves spares all bounds tests, and with them the ghost neighbours that
+    wrap from the last column to the next row.
+    """
+    kernel, stride, padding, dilation = window
+    reach = dilation * (kernel - 1)
+    low = max(padding, 0)
+    high = [max(0, (o - 1) * stride - padding + reach - (n - 1)) for o, n in zip(out_shape, in_shape, strict=True)]
+    rows, columns = low + in_shape[0] + high[0], low + in_shape[1] + high[1]
+    device, n_in = in_key.device, in_key.shape[0]
+    image = torch.full((batch_size * rows * columns,), n_in, dtype=torch.int32, device=device)
+    batch, y, x = split(in_key, in_shape)
+    image[(batch * rows + y + low) * columns + x + low] = torch.arange(n_in, dtype=torch.int32, device=device)
+    if out_key is not in_key or stride != 1:
+        batch, y, x = split(out_key, out_shape)
+    first = (batch * rows + y * stride - padding + low) * columns + x * stride - padding + low
+    step = torch.arange(kernel, device=device) * dilation
+    taps = (step[:, None] * columns + step).flatten()
+    return image[first[:, None] + taps]

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points to pillars, and reductions of points over their pillar; no caps, nothing padded, nothing dropped in range."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes import BevGrid, ConfigError, Sites
+from manyeyes.ops.sparse_index import distinct
+
+MOMENTS = (
+    "log1p_count",
+    "mean_dx",
+    "mean_dy",
+    "mean_z",
+    "min_z",
+    "max_z",
+    "std_z",
+    "std_x",
+    "std_y",
+    "cov_xy",
+    "mean_intensity",
+    "max_intensity",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Pillars:
+    """sites: the occupied pillars; inside: (P,) bool, points in range; row: (P_inside,) int64, their pillars."""
+
+    sites: Sites
+    inside: Tensor
+    row: Tensor
+
+
+def pillar_sites(xyz: Tensor, batch: Tensor, grid: BevGrid, batch_size: int) -> Pillars:
+    """The pillars that points (P, 3) of clouds batch (P,) fall into, ``floor((x - x_min) / pillar)`` in float64."""
+    if grid.stride != 1:
+        raise ConfigError(f"pillar_sites works at stride 1; got a grid of stride {grid.stride}: use grid.at(1).")
+    rows, columns = grid.shape
+    # float32 would put points of a border into one or the other pillar, depending on how the quotient is written.
+    x = ((xyz[:, 0].double() - grid.x_min) / grid.pillar).floor().long()
+    y = ((xyz[:, 1].double() - grid.y_min) / grid.pillar).floor().long()
+    z = xyz[:, 2].double()
+    inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows) & (z >= grid.z_min) & (z < grid.z_max)
+    key = ((batch * rows + y) * columns + x)[inside]
+    found, row = distinct(key, batch_size * rows * columns)
+    return Pillars(Sites(found, grid, batch_size), inside, row)
+
+
+def segment_sum(values: Tensor, row: Tensor, n: int) -> Tensor:
+    """(n, C): the sum of values (P, C) over segments row (P,) in [0, n)."""
+    return values.new_zeros(n, *values.shape[1:]).index_add(0, row, values)
+
+
+def segment_mean(values: Tensor, row: Tensor, n: int) -> Tensor:
+    """(n, C): the mean of values (P, C) over segments row (P,) in [0, n); zero where a segment is empty."""
+    count = torch.bincount(row, minlength=n).clamp_min(1).to(values.dtype)
+    return segment_sum(values, row, n) / count[:, None]
+
+
+def segment_max(values: Tensor, row: Tensor, n: int) -> Tensor:
+    """(n, C): the maximum of values (P, C) over segments row (P,) in [0, n), none empty; ties share the gradient."""
+    out: Tensor = _SegmentMax.apply(values, row, n)  # pyright: ignore[reportAssignmentType]
+    return out
+
+
+class _SegmentMax(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, row: Tensor, n: int) -> Tensor:
+        out = values.new_full((n, values.shape[1]), -torch.inf)
+        out.scatter_reduce_(0, row[:, None].expand_as(values), values, "amax")
+        ctx.save_for_backward(values, row, out)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        values, row, out = ctx.saved_tensors
+        tied = (values == out[row]).to(values.dtype)
+        share = grads[0] / segment_sum(tied, row, out.shape[0])
+        return tied * share[row], None, None
+
+
+@torch.no_grad()
+def pillar_moments(xyz: Tensor, intensity: Tensor, row: Tensor, sites: Sites) -> Tensor:
+    """(N, 12) statistics of the points (P, 3) in each pillar, in the order of ``MOMENTS``; offsets from its centre."""
+    n, count = len(sites), torch.bincount(row, minlength=len(sites)).to(xyz.dtype)[:, None]
+    local = torch.cat((xyz[:, :2] - sites.xy.to(xyz.dtype)[row], xyz[:, 2:], intensity[:, None]), 1)
+    mean = segment_sum(local, row, n) / count
+    off = local[:, :3] - mean[row, :3]
+    square = segment_sum(torch.cat((off * off, off[:, :1] * off[:, 1:2]), 1), row, n) / count
+    top = segment_max(torch.cat((-local[:, 2:3], local[:, 2:]), 1), row, n)
+    std = square[:, :3].sqrt()
+    columns = (
+        count.log1p(),
+        mean[:, :3],
+        -top[:, :1],
+        top[:, 1:2],
+        std[:, 2:3],
+        std[:, :2],
+        square[:, 3:],
+        mean[:, 3:],
+    )
+    return torch.cat((*columns, top[:, 2:3]), 1)
