@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every reader of a recording offers, and what can be said of any recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes import RecordingError, Snapshot
+
+
+class Recording(Protocol):
+    """Scenarios of consecutive snapshots; opening one reads no cloud."""
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """The names of all scenarios, in a fixed order."""
+        ...
+
+    def length(self, scenario: str) -> int:
+        """How many snapshots the scenario has."""
+        ...
+
+    def judged(self, scenario: str) -> range:
+        """The indices that evaluation counts; those before them are history."""
+        ...
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        """The ids of all agents of the scenario, the ego first."""
+        ...
+
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        """All agents at one instant."""
+        ...
+
+
+def judged_frames(recording: Recording) -> Iterator[tuple[str, int]]:
+    """Every (scenario, index) that evaluation counts, in order."""
+    for scenario in recording.scenarios:
+        for index in recording.judged(scenario):
+            yield scenario, index
+
+
+def require_index(recording: Recording, scenario: str, index: int) -> None:
+    """Refuse a scenario or index that the recording does not hold."""
+    if scenario not in recording.scenarios:
+        known = ", ".join(recording.scenarios[:8])
+        raise RecordingError(f"No scenario '{scenario}' in this recording; it holds {known}: choose one of them.")
+    if not 0 <= index < recording.length(scenario):
+        last = recording.length(scenario) - 1
+        raise RecordingError(f"Scenario '{scenario}' has no snapshot {index}; choose an index from 0 to {last}.")
+
+
+def points_in_listed_boxes(snapshot: Snapshot, margin_m: float = 0.1) -> Tensor:
+    """(agents, N) int64: how many of an agent's points lie in each true box that it lists; -1: not listed.
+
+    Boxes are moved into each agent's frame and enlarged by margin_m. A vehicle that is listed was met by the agent's
+    LiDAR, so a zero means that points, poses and boxes do not agree: a wrong sign in a reader shows at once.
+    """
+    if snapshot.truth is None:
+        raise RecordingError(f"Snapshot {snapshot.index} of '{snapshot.scenario}' has no truth; read one with labels.")
+    truth = snapshot.truth
+    counts = torch.full(truth.seen.shape, -1, dtype=torch.int64)
+    for row, frame in enumerate(snapshot.frames):
+        listed = truth.seen[row].nonzero()[:, 0]
+        boxes = truth.boxes[listed].transform(truth.world_from_agent[row].inverse())
+        points = frame.points.xyz.to(boxes.center.dtype)
+        reach = boxes.size.norm(dim=-1) / 2 + margin_m
+        for column, radius, one in zip(listed.tolist(), reach.tolist(), range(len(boxes))):
+            near = points[((points - boxes.center[one]).abs() <= radius).all(-1)]
+            counts[row, column] = boxes[one : one + 1].contains(near, margin_m).sum()
+    return counts
