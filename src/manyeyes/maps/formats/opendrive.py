@@ -201,7 +201,8 @@ class _Reader:
         s = record.line.stations(
             start, end, self.step_m, self.step_m / 2, np.array([*offsets, *record.lane_offset.start])
         )
-        middle = record.lane_offset(s)
+        # Where the lanes are renumbered, <laneOffset> jumps: the section's end takes the value from its own side.
+        middle = record.lane_offset(np.concatenate((s[:-1], [s[-1] - 1e-6])))
         if 0 in elements:
             self.border_marks(record, elements[0], index, s, middle, start)
         for side in (1, -1):
