@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The detector: see (one agent's cloud to tokens), fuse (tokens of all agents in the ego's frame), decode (boxes)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from manyeyes.datatypes import BevGrid, Boxes, PointCloud, SparseBev
+from manyeyes.models.box_head import BoxHead, DecodeConfig, RawBoxes, decode
+from manyeyes.models.encoder import EncoderConfig, SparseEncoder
+from manyeyes.models.fusion.gather import Tokens
+from manyeyes.models.fusion.maximum import MaximumFusion
+from manyeyes.models.fusion.self_attention import SelfAttentionFusion
+from manyeyes.models.pillars import PillarEncoder, PillarKind
+from manyeyes.models.pruning import FocalPrune, Pruned
+from manyeyes.models.transformer import AttentionConfig, WindowTransformer
+
+
+@dataclass(frozen=True)
+class DetectorConfig:
+    """grid: range and pillar size. prune_threshold: probability of lying near an object below which a cell is dropped."""
+
+    grid: BevGrid
+    pillars: PillarKind = "points"
+    pillar_channels: int = 32
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    dast: AttentionConfig = field(default_factory=AttentionConfig)
+    fusion: Literal["self_attention", "maximum"] = "self_attention"
+    fusion_attention: AttentionConfig = field(default_factory=AttentionConfig)
+    head_channels: int = 64
+    prune_threshold: float = 0.1
+    decode: DecodeConfig = field(default_factory=DecodeConfig)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a batch of agents made of their own clouds: tokens to keep or send, their worth (N,), and pruning's decisions."""
+
+    tokens: SparseBev
+    worth: Tensor
+    pruned: tuple[Pruned, ...]
+    sites_per_stride: tuple[int, ...]
+
+
+class Detector(nn.Module):
+    """CoSTr's path on sparse features: pillars, encoder with focal pruning, DAST, fusion, centre head."""
+
+    def __init__(self, config: DetectorConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.fingerprint = bytes(8)
+        self.pillars = PillarEncoder(config.grid, config.pillar_channels, config.pillars)
+        self.encoder = SparseEncoder(config.pillar_channels, config.encoder)
+        channels = self.encoder.out_channels
+        self.channels = channels
+        self.dast = WindowTransformer(channels, config.dast)
+        self.token_prune = FocalPrune(channels)
+        self.fusion = (
+            MaximumFusion(channels)
+            if config.fusion == "maximum"
+            else SelfAttentionFusion(channels, config.fusion_attention)
+        )
+        self.head = BoxHead(channels, config.head_channels)
+
+    @property
+    def token_grid(self) -> BevGrid:
+        """The lattice of the tokens."""
+        return self.config.grid.at(self.config.encoder.head_stride)
+
+    def see(self, clouds: list[PointCloud], prune_threshold: float | None = None) -> Seen:
+        """Clouds in their agents' frames to tokens on a batch of as many grids."""
+        threshold = self.config.prune_threshold if prune_threshold is None else prune_threshold
+        encoded = self.encoder(self.pillars(clouds), threshold)
+        tokens = encoded.tokens
+        tokens = tokens.with_features(self.dast(tokens.features, tokens.sites.xy, tokens.sites.batch, tokens.grid))
+        kept, decision = self.token_prune(tokens, threshold)
+        probability = torch.sigmoid(decision.logit.detach())
+        worth = probability if threshold <= 0 else probability[probability > threshold]
+        return Seen(kept, worth, (*encoded.pruned, decision), encoded.sites_per_stride)
+
+    def fuse(self, tokens: Tokens) -> RawBoxes:
+        """Tokens of all agents around each ego to raw boxes in the ego's frame."""
+        return self.head(self.fusion(tokens))
+
+    def detect(self, tokens: Tokens) -> list[Boxes]:
+        """Boxes of every ego in the batch, in its frame."""
+        return decode(self.fuse(tokens), self.config.decode)

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weights that ship with the package, by name; anything else is a path."""
+
+from __future__ import annotations
+
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from manyeyes.datatypes import CheckpointError
+from manyeyes.models import checkpoint
+from manyeyes.models.detector import Detector
+
+DEFAULT = "costr-small"
+
+
+def names() -> tuple[str, ...]:
+    """The shipped weights."""
+    folder = files("manyeyes.models") / "weights"
+    return (
+        tuple(sorted(Path(f.name).stem for f in folder.iterdir() if f.name.endswith(".safetensors")))
+        if folder.is_dir()
+        else ()
+    )
+
+
+def load(name_or_path: str | Path = DEFAULT) -> Detector:
+    """A detector in evaluation mode: a shipped name, or a .safetensors file of 'manyeyes train'."""
+    if str(name_or_path) in names():
+        with as_file(files("manyeyes.models") / "weights" / f"{name_or_path}.safetensors") as path:
+            return checkpoint.load(path)
+    path = Path(name_or_path)
+    if path.suffix != ".safetensors":
+        raise CheckpointError(
+            f"No weights are named {name_or_path!r}; shipped are {', '.join(names()) or 'none'}, or give a .safetensors file."
+        )
+    return checkpoint.load(path)

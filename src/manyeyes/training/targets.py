@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the detector should have said: centre heat, the box that each cell answers for, and where objects are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes import Boxes, Sites
+
+
+@dataclass(frozen=True)
+class TargetConfig:
+    """heat_sigma_m: spread of the heat around a centre, metres (the metric form of detection.md 4.1's warning).
+
+    reach_m: cells up to here from a box's centre also learn its shape, with a weight that falls off as a Gaussian of
+    shape_sigma_m. prune_margin_m: boxes are enlarged by at least this before asking whether a cell lies near one.
+    """
+
+    heat_sigma_m: float = 0.6
+    reach_m: float = 2.4
+    shape_sigma_m: float = 1.2
+    prune_margin_m: float = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Targets:
+    """For N sites and M boxes of all grids of a batch, concatenated.
+
+    heat: (N,), exactly 1 at one site a box, unique. box: (N,) int64, row of the box that the site learns, -1 for none.
+    weight: (N,), of its shape loss. boxes: the M boxes. positive: (N,) bool, heat is exactly 1.
+    """
+
+    heat: Tensor
+    box: Tensor
+    weight: Tensor
+    boxes: Boxes
+    positive: Tensor
+
+
+def assign(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Targets:
+    """Truth of each grid of the batch to its sites: the nearest site of a box is its centre, no site serves two boxes.
+
+    Pairs are taken from the nearest on (ties by site, then box), so that a box whose nearest site is taken gets the next one.
+    A box with no site within reach_m has no centre: nothing that was seen could stand for it.
+    """
+    n, batch, xy = len(sites), sites.batch, sites.xy
+    heat, weight = torch.zeros(n), torch.zeros(n)
+    box = torch.full((n,), -1, dtype=torch.int64)
+    positive, first = torch.zeros(n, dtype=torch.bool), 0
+    for b, boxes in enumerate(truth):
+        rows = (batch == b).nonzero()[:, 0]
+        if len(rows) and len(boxes):
+            distance = torch.cdist(xy[rows], boxes.center[:, :2].float())
+            nearest, which = distance.min(1)
+            near = nearest < config.reach_m
+            heat[rows] = torch.exp(-(nearest**2) / (2 * config.heat_sigma_m**2)).clamp_max(0.99)
+            box[rows[near]] = which[near] + first
+            weight[rows[near]] = torch.exp(-(nearest[near] ** 2) / (2 * config.shape_sigma_m**2))
+            for site, target in _unique_pairs(distance, config.reach_m):
+                heat[rows[site]], weight[rows[site]], positive[rows[site]] = 1.0, 1.0, True
+                box[rows[site]] = first + target
+        first += len(boxes)
+    return Targets(heat, box, weight, Boxes.cat(truth), positive)
+
+
+def _unique_pairs(distance: Tensor, reach_m: float) -> list[tuple[int, int]]:
+    site, target = (distance < reach_m).nonzero(as_tuple=True)
+    order = distance[site, target].sort(stable=True).indices
+    taken_sites: set[int] = set()
+    taken_boxes: set[int] = set()
+    pairs = []
+    for s, t in zip(site[order].tolist(), target[order].tolist()):
+        if s not in taken_sites and t not in taken_boxes:
+            taken_sites.add(s)
+            taken_boxes.add(t)
+            pairs.append((s, t))
+    return pairs
+
+
+def near_objects(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Tensor:
+    """(N,) bool: whether a cell's centre lies in a box enlarged by max(margin, half a cell) on every side (section 4.2)."""
+    margin = max(config.prune_margin_m, sites.grid.cell / 2)
+    batch, xy = sites.batch, sites.xy
+    near = torch.zeros(len(sites), dtype=torch.bool)
+    for b, boxes in enumerate(truth):
+        rows = (batch == b).nonzero()[:, 0]
+        if len(rows) and len(boxes):
+            delta = xy[rows][:, None] - boxes.center[None, :, :2].float()
+            c, s = boxes.yaw.float().cos(), boxes.yaw.float().sin()
+            along, across = delta[..., 0] * c + delta[..., 1] * s, delta[..., 1] * c - delta[..., 0] * s
+            half = boxes.size[:, :2].float() / 2 + margin
+            near[rows] = ((along.abs() <= half[:, 0]) & (across.abs() <= half[:, 1])).any(1)
+    return near
