@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Argoverse 2 sensor logs: two sweeps of one vehicle, read as two agents with a true relative pose.
+
+A real pair of clouds that nobody simulated. Layout: ``<log>/sensors/lidar/<ns>.feather``, ``annotations.feather`` and
+``city_SE3_egovehicle.feather``. AV2's ego frame has its origin at the middle of the rear axle, 0.33 m above the road
+(median over a Pittsburgh log's 2,706 poses and its map's ground height); the agent's frame here is that one moved down.
+The world is the log's city frame.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from manyeyes.datasets.recording import require_index
+from manyeyes.datatypes import (
+    LABELS,
+    AgentFrame,
+    Boxes,
+    MissingExtraError,
+    PointCloud,
+    RecordingError,
+    Snapshot,
+    Transform,
+    Truth,
+)
+
+_AXLE_HEIGHT_M = 0.33
+_LIDAR_ABOVE_AXLE_M = 1.64
+_REMEDY = "copy or download the file again"
+# Box ids start here, so that none is the id of an agent (0 and 1).
+_FIRST_BOX_ID = 100
+_LABEL_OF_CATEGORY = (
+    ("REGULAR_VEHICLE", "car"),
+    ("LARGE_VEHICLE", "truck"),
+    ("BOX_TRUCK", "truck"),
+    ("TRUCK", "truck"),
+    ("TRUCK_CAB", "truck"),
+    ("VEHICULAR_TRAILER", "truck"),
+    ("BUS", "bus"),
+    ("SCHOOL_BUS", "bus"),
+    ("ARTICULATED_BUS", "bus"),
+)
+
+
+@dataclass(frozen=True)
+class Annotations:
+    """All labelled objects of one sweep, of every category.
+
+    boxes: (N), float64, in AV2's ego frame; the label counts where is_vehicle (N,) is true. category: AV2's names.
+    interior_points: (N,) int64, AV2's own count of the sweep's points inside each box.
+    """
+
+    boxes: Boxes
+    category: tuple[str, ...]
+    is_vehicle: Tensor
+    interior_points: Tensor
+
+
+class Argoverse2Recording:
+    """Logs under a root (or one log): snapshot i shows sweep i as agent 0, the ego, and sweep i + gap as agent 1.
+
+    True boxes are the vehicles at the ego's time, and those that only the later sweep has; an agent has seen those that
+    hold a point of its sweep. Logs without enough sweeps are named in ``problems``.
+    """
+
+    def __init__(self, root: Path | str, gap: int = 1) -> None:
+        self.root = Path(root)
+        self._gap = gap
+        if not self.root.is_dir():
+            raise RecordingError(f"{self.root}: no such folder, expected Argoverse 2 logs; check the path.")
+        with os.scandir(self.root) as entries:
+            below = sorted(self.root / e.name for e in entries if e.is_dir() and not e.name.startswith("."))
+        folders = [self.root] if (self.root / "city_SE3_egovehicle.feather").is_file() else below
+        self._folders: dict[str, Path] = {}
+        self._sweeps: dict[str, tuple[int, ...]] = {}
+        problems = []
+        for folder in folders:
+            sweeps = tuple(sorted(int(p.stem) for p in folder.glob("sensors/lidar/*.feather") if p.stem.isdecimal()))
+            if len(sweeps) > gap:
+                self._folders[folder.name], self._sweeps[folder.name] = folder, sweeps
+            else:
+                problems.append(f"{folder}: {len(sweeps)} sweeps in sensors/lidar, expected more than {gap}; left out")
+        self.problems = tuple(problems)
+        if not self._folders:
+            first = problems[0] if problems else "it is empty"
+            raise RecordingError(f"{self.root}: no usable Argoverse 2 log ({first}); check the path or the download.")
+        self._tables: dict[tuple[Path, tuple[str, ...]], tuple[np.ndarray, ...]] = {}
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """The names of all usable logs, sorted."""
+        return tuple(self._folders)
+
+    def length(self, scenario: str) -> int:
+        """How many pairs of sweeps the log has."""
+        return len(self.sweeps(scenario)) - self._gap
+
+    def judged(self, scenario: str) -> range:
+        """All of them."""
+        return range(self.length(scenario))
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        """Always 0 and 1."""
+        self.sweeps(scenario)
+        return (0, 1)
+
+    def sweeps(self, scenario: str) -> tuple[int, ...]:
+        """Time stamps of the log's sweeps, nanoseconds, ascending."""
+        if scenario not in self._sweeps:
+            require_index(self, scenario, 0)
+        return self._sweeps[scenario]
+
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        """Two sweeps as two agents; without truth where the log has no annotations."""
+        require_index(self, scenario, index)
+        sweeps = self._sweeps[scenario]
+        pair = (sweeps[index], sweeps[index + self._gap])
+        frames = tuple(self._frame(scenario, i, time) for i, time in enumerate(pair))
+        labelled = (self._folders[scenario] / "annotations.feather").is_file()
+        return Snapshot(scenario, index, frames, self._truth(scenario, pair, frames) if labelled else None)
+
+    def points(self, scenario: str, timestamp_ns: int) -> PointCloud:
+        """One sweep in AV2's own ego frame."""
+        path = self._folders[scenario] / "sensors" / "lidar" / f"{timestamp_ns}.feather"
+        x, y, z, intensity, offset_ns = _columns(path, ("x", "y", "z", "intensity", "offset_ns"))
+        xyz = np.stack((x, y, z), -1).astype(np.float32)
+        bad = int((~np.isfinite(xyz).all(-1)).sum())
+        if bad:
+            raise RecordingError(f"{path}: {bad} of {len(xyz)} points are NaN or infinite, expected none; {_REMEDY}.")
+        brightness = torch.from_numpy(intensity.astype(np.float32) / np.float32(255))
+        return PointCloud.of(torch.from_numpy(xyz), brightness, torch.from_numpy(offset_ns * 1e-9))
+
+    def annotations(self, scenario: str, timestamp_ns: int) -> Annotations:
+        """All labelled objects of one sweep, in AV2's own ego frame."""
+        path = self._folders[scenario] / "annotations.feather"
+        names = ("tx_m", "ty_m", "tz_m", "length_m", "width_m", "height_m", "qw", "qx", "qy", "qz")
+        time, track, category, interior = self._table(
+            path, ("timestamp_ns", "track_uuid", "category", "num_interior_pts")
+        )
+        here = time == timestamp_ns
+        values = torch.from_numpy(np.stack([c[here] for c in self._table(path, names)], -1).astype(np.float64))
+        rotation = _rotation(values[:, 6:])
+        labels = dict(_LABEL_OF_CATEGORY)
+        found = tuple(str(c) for c in category[here])
+        return Annotations(
+            boxes=Boxes.of(
+                values[:, :3],
+                values[:, 3:6],
+                torch.atan2(rotation[:, 1, 0], rotation[:, 0, 0]),
+                label=torch.tensor([LABELS.index(labels.get(c, "car")) for c in found], dtype=torch.int64),
+                id=torch.from_numpy(np.searchsorted(np.unique(track), track[here]) + _FIRST_BOX_ID),
+            ),
+            category=found,
+            is_vehicle=torch.tensor([c in labels for c in found], dtype=torch.bool),
+            interior_points=torch.from_numpy(interior[here].astype(np.int64)),
+        )
+
+    def _frame(self, scenario: str, agent: int, timestamp_ns: int) -> AgentFrame:
+        cloud = self.points(scenario, timestamp_ns)
+        ego_from_agent = Transform.from_xyz_yaw(0, 0, -_AXLE_HEIGHT_M)
+        return AgentFrame(
+            agent_id=agent,
+            timestamp_ns=timestamp_ns,
+            points=cloud.transform(ego_from_agent.inverse()),
+            world_from_agent=self._city_from_ego(scenario, timestamp_ns) @ ego_from_agent,
+            pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
+            sensor_height_m=_AXLE_HEIGHT_M + _LIDAR_ABOVE_AXLE_M,
+            speed_mps=self._speed(scenario, timestamp_ns),
+        )
+
+    def _poses(self, scenario: str) -> tuple[np.ndarray, ...]:
+        names = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+        return self._table(self._folders[scenario] / "city_SE3_egovehicle.feather", names)
+
+    def _city_from_ego(self, scenario: str, timestamp_ns: int) -> Transform:
+        time, *parts = self._poses(scenario)
+        row = np.flatnonzero(time == timestamp_ns)
+        if not len(row):
+            path = self._folders[scenario] / "city_SE3_egovehicle.feather"
+            raise RecordingError(f"{path}: no pose at the sweep's time {timestamp_ns}; {_REMEDY}.")
+        values = torch.tensor([float(p[row[0]]) for p in parts], dtype=torch.float64)
+        return Transform(_rotation(values[:4]), values[4:])
+
+    def _speed(self, scenario: str, timestamp_ns: int) -> float:
+        """Metres per second between the poses 50 ms before and after, or as near as the log goes."""
+        time, *parts = self._poses(scenario)
+        order = np.argsort(time)
+        span = np.clip((timestamp_ns - 50_000_000, timestamp_ns + 50_000_000), time.min(), time.max())
+        place = [np.interp(span - time.min(), time[order] - time.min(), p[order]) for p in parts[4:]]
+        elapsed = float(span[1] - span[0]) * 1e-9
+        return float(np.linalg.norm(np.diff(place))) / elapsed if elapsed > 0 else 0.0
+
+    def _truth(self, scenario: str, pair: tuple[int, int], frames: tuple[AgentFrame, ...]) -> Truth:
+        """Vehicles in the city frame: the ego's copy of a track where it has one, in the order of ids."""
+        boxes, met = [], []
+        for time in pair:
+            labelled = self.annotations(scenario, time)
+            boxes.append(labelled.boxes[labelled.is_vehicle].transform(self._city_from_ego(scenario, time)))
+            met.append(labelled.boxes.id[labelled.is_vehicle & (labelled.interior_points > 0)])
+        both = Boxes.cat(boxes)
+        _, first = np.unique(both.id.numpy(), return_index=True)
+        union = both[torch.from_numpy(first)]
+        seen = torch.stack([torch.isin(union.id, ids) for ids in met])
+        return Truth(union, seen, Transform.stack([f.world_from_agent for f in frames]))
+
+    def _table(self, path: Path, names: tuple[str, ...]) -> tuple[np.ndarray, ...]:
+        """Columns that belong to the whole log; kept in memory."""
+        if (path, names) not in self._tables:
+            self._tables[path, names] = _columns(path, names)
+        return self._tables[path, names]
+
+
+def _rotation(quaternion: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4) as w, x, y, z."""
+    w, x, y, z = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = (
+        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
+        torch.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1),
+        torch.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
+    )
+    return torch.stack(rows, -2)
+
+
+def _columns(path: Path, names: tuple[str, ...]) -> tuple[np.ndarray, ...]:
+    """Named columns of a feather file as arrays."""
+    try:
+        from pyarrow import ArrowException, feather
+    except ImportError:
+        raise MissingExtraError("av2", "Reading Argoverse 2") from None
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such file, expected a feather table; download it.")
+    try:
+        table = feather.read_table(path, memory_map=False)
+    except (ArrowException, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise RecordingError(f"{path}: expected a feather table, found something else ({reason}); {_REMEDY}.") from None
+    missing = [n for n in names if n not in table.column_names]
+    if missing:
+        found = ", ".join(table.column_names)
+        raise RecordingError(f"{path}: expected the columns {', '.join(missing)}, found {found}; {_REMEDY}.")
+    return tuple(table[n].to_numpy() for n in names)
