@@ -8,14 +8,23 @@ Semantics: cross-correlation as in ``conv2d``; a bias is added to active rows al
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
-from manyeyes.ops.sparse_index import NeighbourMap, Window, dilated_sites, distinct, neighbours, parent_sites
+from manyeyes.ops.sparse_index import (
+    Gather,
+    NeighbourMap,
+    Window,
+    dilated_sites,
+    distinct,
+    neighbours,
+    parent_sites,
+    split,
+)
 from manyeyes.ops.voxelize import segment_max, segment_mean, segment_sum
 
 BLOCK_ROWS = 1024
@@ -151,8 +160,10 @@ def _pair_map(fine: Sites, coarse: Sites, window: Window) -> NeighbourMap:
     name = ("pair", window, id(coarse))
     if name not in fine.cache:
         index = neighbours(coarse.key, coarse.grid.shape, fine.key, fine.grid.shape, fine.batch_size, window)
+        _, y, x = split(fine.key, fine.grid.shape)
+        phase = None if window.stride == 1 else y % window.stride * window.stride + x % window.stride
         # Holding the coarser set keeps its id from being given to another one.
-        fine.cache[name] = (NeighbourMap(index, len(fine)), coarse)
+        fine.cache[name] = (NeighbourMap(index, len(fine), phase), coarse)
     return fine.cache[name][0]
 
 
@@ -181,40 +192,8 @@ def _conv(x: Tensor, weight: Tensor, bias: Tensor | None, table: NeighbourMap, r
     """Rows (N_in, in) to (N_out, out); weight (out, in, k, k)."""
     # (taps, in, out): one matrix for the gathered row of a site.
     taps = weight.to(x.dtype).permute(2, 3, 1, 0).reshape(-1, weight.shape[1], weight.shape[0])
-    out: Tensor = _GatherProduct.apply(x, taps, table, reverse)  # pyright: ignore[reportAssignmentType]
+    out: Tensor = _GatherProduct.apply(x, taps, table.on(x.device), reverse)  # pyright: ignore[reportAssignmentType]
     return out if bias is None else out + bias.to(x.dtype)
-
-
-def _padded(x: Tensor, value: float = 0.0) -> Tensor:
-    return torch.cat((x, x.new_full((1, x.shape[1]), value)))
-
-
-def _block(x: Tensor) -> int:
-    return BLOCK_ROWS if x.device.type == "cpu" else 1 << 30
-
-
-def _gather_product(x: Tensor, index: Tensor, matrix: Tensor) -> Tensor:
-    """For every row of index (M, taps): the gathered rows of x (N, C) side by side, times matrix (taps * C, D)."""
-    rows, taps = index.shape
-    block, padded, out = _block(x), _padded(x), x.new_empty(rows, matrix.shape[1])
-    columns = x.new_empty(min(block, rows) * taps, x.shape[1])
-    for start in range(0, rows, block):
-        part = index[start : start + block]
-        gathered = torch.index_select(padded, 0, part.reshape(-1), out=columns[: part.numel()])
-        torch.mm(gathered.view(part.shape[0], -1), matrix, out=out[start : start + block])
-    return out
-
-
-def _gather_outer(x: Tensor, index: Tensor, dy: Tensor) -> Tensor:
-    """The sum over rows of (gathered rows of x)^T times dy (M, D): (taps * C, D)."""
-    rows, taps = index.shape
-    block, padded, out = _block(x), _padded(x), x.new_zeros(taps * x.shape[1], dy.shape[1])
-    columns = x.new_empty(min(block, rows) * taps, x.shape[1])
-    for start in range(0, rows, block):
-        part = index[start : start + block]
-        gathered = torch.index_select(padded, 0, part.reshape(-1), out=columns[: part.numel()])
-        out.addmm_(gathered.view(part.shape[0], -1).T, dy[start : start + block])
-    return out
 
 
 class _GatherProduct(torch.autograd.Function):
@@ -224,24 +203,71 @@ class _GatherProduct(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
         ctx.save_for_backward(x, taps)
         ctx.table, ctx.reverse = table, reverse
-        index = (table.back if reverse else table.index).to(x.device)
-        return _gather_product(x, index, taps.reshape(-1, taps.shape[2]))
+        if reverse:
+            return _gather_product(x, table.behind, taps, table.n_in)
+        return _gather_product(x, table.ahead, taps, table.index.shape[0])
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         x, taps = ctx.saved_tensors
         dy, table = grads[0].contiguous(), ctx.table
-        ahead, back = (table.back, table.index) if ctx.reverse else (table.index, table.back)
+        there, back = (table.behind, table.ahead) if ctx.reverse else (table.ahead, table.behind)
         dx = dw = None
         if ctx.needs_input_grad[0]:
-            dx = _gather_product(dy, back.to(x.device), taps.transpose(1, 2).reshape(-1, taps.shape[1]))
+            dx = _gather_product(dy, back, taps.transpose(1, 2), x.shape[0])
         if ctx.needs_input_grad[1]:
-            dw = _gather_outer(x, ahead.to(x.device), dy).view_as(taps)
+            dw = _gather_outer(x, there, dy, taps.shape)
         return dx, dw, None, None
 
 
+def _gather_product(x: Tensor, gathers: tuple[Gather, ...], taps: Tensor, rows: int) -> Tensor:
+    """(rows, D): the gathered rows of x (N, C), each times the matrix (C, D) of its tap, summed over taps."""
+    padded, out = _padded(x), x.new_empty(rows, taps.shape[2])
+    for gather in gathers:
+        chosen = taps if gather.taps is None else taps.index_select(0, gather.taps)
+        matrix = chosen.reshape(-1, taps.shape[2])
+        part = out if gather.rows is None else x.new_empty(gather.index.shape[0], taps.shape[2])
+        for block, columns in _blocks(padded, gather.index):
+            torch.mm(columns, matrix, out=part[block])
+        if gather.rows is not None:
+            out.index_copy_(0, gather.rows, part)
+    return out
+
+
+def _gather_outer(x: Tensor, gathers: tuple[Gather, ...], dy: Tensor, shape: torch.Size) -> Tensor:
+    """(taps, C, D): for each tap the sum over rows of gathered rows of x (N, C), transposed, times dy (rows, D)."""
+    padded, out = _padded(x), x.new_zeros(shape)
+    for gather in gathers:
+        rows = dy if gather.rows is None else dy.index_select(0, gather.rows)
+        part = x.new_zeros(gather.index.shape[1] * shape[1], shape[2])
+        for block, columns in _blocks(padded, gather.index):
+            part.addmm_(columns.T, rows[block])
+        part = part.view(-1, *shape[1:])
+        out = part if gather.taps is None else out.index_add_(0, gather.taps, part)
+    return out
+
+
+def _blocks(padded: Tensor, index: Tensor) -> Iterator[tuple[slice, Tensor]]:
+    """Block by block, gathered rows side by side (rows, taps * C), in one buffer that is written anew each time."""
+    rows, taps = index.shape
+    size = _block_rows(padded)
+    buffer = padded.new_empty(min(size, rows) * taps, padded.shape[1])
+    for start in range(0, rows, size):
+        part = index[start : start + size]
+        columns = torch.index_select(padded, 0, part.reshape(-1), out=buffer[: part.numel()])
+        yield slice(start, start + size), columns.view(part.shape[0], taps * padded.shape[1])
+
+
+def _block_rows(x: Tensor) -> int:
+    return BLOCK_ROWS if x.device.type == "cpu" else 1 << 30
+
+
+def _padded(x: Tensor, value: float = 0.0) -> Tensor:
+    return torch.cat((x, x.new_full((1, x.shape[1]), value)))
+
+
 def _pool(x: Tensor, table: NeighbourMap) -> Tensor:
-    out: Tensor = _GatherMax.apply(x, table)  # pyright: ignore[reportAssignmentType]
+    out: Tensor = _GatherMax.apply(x, table.on(x.device))  # pyright: ignore[reportAssignmentType]
     return out
 
 
@@ -250,9 +276,10 @@ class _GatherMax(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, table: NeighbourMap) -> Tensor:
-        index, padded, block = table.index.to(x.device), _padded(x, -torch.inf), _block(x)
-        parts = [padded[part].amax(1) for part in index.split(block)]
-        out = torch.cat(parts) if parts else x.new_empty(0, x.shape[1])
+        padded, out = _padded(x, -torch.inf), x.new_full((table.index.shape[0], x.shape[1]), -torch.inf)
+        for rows, index in _row_blocks(table.index, x):
+            for tap in index:
+                torch.maximum(out[rows], padded.index_select(0, tap), out=out[rows])
         ctx.save_for_backward(x, out)
         ctx.table = table
         return out
@@ -260,12 +287,19 @@ class _GatherMax(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
         x, out = ctx.saved_tensors
-        index, back, block = ctx.table.index.to(x.device), ctx.table.back.to(x.device), _block(x)
-        padded, dx = _padded(x, -torch.inf), torch.empty_like(x)
-        ties = [(padded[p] == o[:, None]).sum(1) for p, o in zip(index.split(block), out.split(block), strict=True)]
-        share = _padded(grads[0] / torch.cat(ties)) if ties else _padded(grads[0])
-        top = _padded(out, torch.nan)
-        for start in range(0, x.shape[0], block):
-            part, rows = back[start : start + block], x[start : start + block]
-            dx[start : start + block] = (share[part] * (top[part] == rows[:, None])).sum(1)
+        padded, ties, dx = _padded(x, -torch.inf), torch.zeros_like(out), torch.zeros_like(x)
+        for rows, index in _row_blocks(ctx.table.index, x):
+            for tap in index:
+                ties[rows] += padded.index_select(0, tap).eq_(out[rows])
+        share, top = _padded(grads[0] / ties), _padded(out, torch.nan)
+        for rows, index in _row_blocks(ctx.table.back, x):
+            for tap in index:
+                dx[rows].addcmul_(share.index_select(0, tap), top.index_select(0, tap).eq_(x[rows]))
         return dx, None
+
+
+def _row_blocks(index: Tensor, x: Tensor) -> Iterator[tuple[slice, Tensor]]:
+    """Slices of rows with their part of the map, tap by tap: (taps, rows)."""
+    size = _block_rows(x)
+    for start in range(0, index.shape[0], size):
+        yield slice(start, start + size), index[start : start + size].T.contiguous()

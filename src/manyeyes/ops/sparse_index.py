@@ -9,8 +9,9 @@ output o meets input ``i = o * stride - padding + t * dilation``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -33,13 +34,32 @@ class Window(NamedTuple):
         return max(rows, 0), max(columns, 0)
 
 
+@dataclass(frozen=True, eq=False)
+class Gather:
+    """index: (M, taps) int32, what the outputs rows (M,) meet by the taps (taps,); None stands for all, in order."""
+
+    index: Tensor
+    rows: Tensor | None = None
+    taps: Tensor | None = None
+
+
 @dataclass(eq=False)
 class NeighbourMap:
-    """index: (outputs, taps) int32, see the module; n_in: how many inputs there are."""
+    """index: (outputs, taps) int32, see the module; n_in: how many inputs there are.
+
+    phase: (n_in,), the place of each input within its stride; inputs of one phase meet outputs by the same few taps.
+    """
 
     index: Tensor
     n_in: int
+    phase: Tensor | None = None
     is_symmetric: bool = False
+    moved: dict[torch.device, NeighbourMap] = field(default_factory=dict, repr=False)
+
+    @property
+    def ahead(self) -> tuple[Gather, ...]:
+        """What every output meets."""
+        return (Gather(self.index),)
 
     @cached_property
     def back(self) -> Tensor:
@@ -52,6 +72,28 @@ class NeighbourMap:
         rows = torch.arange(n_out, dtype=torch.int32, device=self.index.device)
         back.scatter_(0, self.index.long(), rows[:, None].expand(n_out, taps))
         return back[: self.n_in].contiguous()
+
+    @cached_property
+    def behind(self) -> tuple[Gather, ...]:
+        """What every input meets, by phase: at stride 2 and kernel 3 these are 1, 2, 2 and 4 taps instead of 9."""
+        if self.phase is None:
+            return (Gather(self.back),)
+        gathers = []
+        for phase in torch.unique(self.phase).tolist():
+            rows = (self.phase == phase).nonzero()[:, 0]
+            index = self.back.index_select(0, rows)
+            taps = (index < self.index.shape[0]).any(0).nonzero()[:, 0]
+            gathers.append(Gather(index.index_select(1, taps), rows, taps))
+        return tuple(gathers)
+
+    def on(self, device: torch.device) -> NeighbourMap:
+        """The same map on another device; kept."""
+        if device == self.index.device:
+            return self
+        if device not in self.moved:
+            phase = None if self.phase is None else self.phase.to(device)
+            self.moved[device] = NeighbourMap(self.index.to(device), self.n_in, phase, self.is_symmetric)
+        return self.moved[device]
 
 
 def split(key: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
@@ -67,27 +109,23 @@ def distinct(key: Tensor, size: int) -> tuple[Tensor, Tensor]:
     image[key] = 1
     found = image.nonzero()[:, 0]
     image[found] = torch.arange(found.shape[0], dtype=torch.int32, device=key.device)
-    return found, image[key].long()
+    return found, image.index_select(0, key).long()
 
 
 def dilated_sites(key: Tensor, shape: tuple[int, int], batch_size: int, window: Window) -> Tensor:
     """Keys of every output that meets an active input: the active set of spconv's SparseConv2d."""
-    rows, columns = window.out_shape(shape)
+    kernel, stride, padding, dilation = window
+    out = window.out_shape(shape)
+    reach = [(n - 1) * stride + 1 for n in out]
+    size = [max(p, padding + n) for p, n in zip((r + dilation * (kernel - 1) for r in reach), shape, strict=True)]
+    active = torch.zeros(batch_size, *size, dtype=torch.bool, device=key.device)
     batch, y, x = split(key, shape)
-    reach = torch.arange(window.kernel, device=key.device) * window.dilation
-    (oy, fits_y), (ox, fits_x) = (_outputs(v, reach, window, n) for v, n in ((y, rows), (x, columns)))
-    met = ((batch[:, None] * rows + oy)[:, :, None] * columns + ox[:, None, :])[fits_y[:, :, None] & fits_x[:, None, :]]
-    image = torch.zeros(batch_size * rows * columns, dtype=torch.bool, device=key.device)
-    image[met] = True
-    return image.nonzero()[:, 0]
-
-
-def _outputs(at: Tensor, reach: Tensor, window: Window, n_out: int) -> tuple[Tensor, Tensor]:
-    """Along one axis: output (N, kernel) that meets an input by each tap, and whether there is one."""
-    ahead = at[:, None] + window.padding - reach
-    # Divisibility and sign are tested before flooring, or negative places would round onto the first output.
-    out = ahead.div(window.stride, rounding_mode="floor")
-    return out, (ahead >= 0) & (out * window.stride == ahead) & (out < n_out)
+    active.view(-1)[(batch * size[0] + y + padding) * size[1] + x + padding] = True
+    met = torch.zeros(batch_size, *out, dtype=torch.bool, device=key.device)
+    steps = range(0, kernel * dilation, dilation)
+    for ty, tx in product(steps, steps):
+        met |= active[:, ty : ty + reach[0] : stride, tx : tx + reach[1] : stride]
+    return met.flatten().nonzero()[:, 0]
 
 
 def parent_sites(key: Tensor, shape: tuple[int, int], batch_size: int, stride: int) -> Tensor:
@@ -113,16 +151,16 @@ def neighbours(
     """
     kernel, stride, padding, dilation = window
     reach = dilation * (kernel - 1)
-    low = max(padding, 0)
-    high = [max(0, (o - 1) * stride - padding + reach - (n - 1)) for o, n in zip(out_shape, in_shape, strict=True)]
-    rows, columns = low + in_shape[0] + high[0], low + in_shape[1] + high[1]
+    rows, columns = (
+        padding + max(n, (o - 1) * stride - padding + reach + 1) for o, n in zip(out_shape, in_shape, strict=True)
+    )
     device, n_in = in_key.device, in_key.shape[0]
     image = torch.full((batch_size * rows * columns,), n_in, dtype=torch.int32, device=device)
     batch, y, x = split(in_key, in_shape)
-    image[(batch * rows + y + low) * columns + x + low] = torch.arange(n_in, dtype=torch.int32, device=device)
+    image[(batch * rows + y + padding) * columns + x + padding] = torch.arange(n_in, dtype=torch.int32, device=device)
     if out_key is not in_key or stride != 1:
         batch, y, x = split(out_key, out_shape)
-    first = (batch * rows + y * stride - padding + low) * columns + x * stride - padding + low
+    first = (batch * rows + y * stride) * columns + x * stride
     step = torch.arange(kernel, device=device) * dilation
     taps = (step[:, None] * columns + step).flatten()
-    return image[first[:, None] + taps]
+    return image.index_select(0, (first[:, None] + taps).flatten()).view(first.shape[0], kernel * kernel)

@@ -6,6 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numba
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -72,17 +74,58 @@ def segment_max(values: Tensor, row: Tensor, n: int) -> Tensor:
 class _SegmentMax(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, row: Tensor, n: int) -> Tensor:
-        out = values.new_full((n, values.shape[1]), -torch.inf)
-        out.scatter_reduce_(0, row[:, None].expand_as(values), values, "amax")
+        values, out = values.contiguous(), values.new_full((n, values.shape[1]), -torch.inf)
+        if _in_numba(values):
+            _raise_to_max(values.detach().numpy(), row.numpy(), out.numpy())
+        else:
+            out.scatter_reduce_(0, row[:, None].expand_as(values), values, "amax")
         ctx.save_for_backward(values, row, out)
         return out
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
         values, row, out = ctx.saved_tensors
+        if _in_numba(values):
+            spread = torch.empty_like(values)
+            share = grads[0].clone(memory_format=torch.contiguous_format)
+            _share_among_ties(values.numpy(), row.numpy(), out.numpy(), share.numpy(), spread.numpy())
+            return spread, None, None
         tied = (values == out[row]).to(values.dtype)
         share = grads[0] / segment_sum(tied, row, out.shape[0])
         return tied * share[row], None, None
+
+
+def _in_numba(values: Tensor) -> bool:
+    return values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64)
+
+
+@numba.njit(cache=True, nogil=True)
+def _raise_to_max(values: np.ndarray, row: np.ndarray, out: np.ndarray) -> None:
+    for p in range(values.shape[0]):
+        r = row[p]
+        for c in range(values.shape[1]):
+            v = values[p, c]
+            # The second test lets NaN through, as torch does.
+            if v > out[r, c] or v != v:
+                out[r, c] = v
+
+
+@numba.njit(cache=True, nogil=True)
+def _share_among_ties(
+    values: np.ndarray, row: np.ndarray, out: np.ndarray, share: np.ndarray, spread: np.ndarray
+) -> None:
+    ties = np.zeros_like(out)
+    for p in range(values.shape[0]):
+        r = row[p]
+        for c in range(values.shape[1]):
+            ties[r, c] += values[p, c] == out[r, c]
+    for r in range(out.shape[0]):
+        for c in range(out.shape[1]):
+            share[r, c] /= max(ties[r, c], 1)
+    for p in range(values.shape[0]):
+        r = row[p]
+        for c in range(values.shape[1]):
+            spread[p, c] = share[r, c] if values[p, c] == out[r, c] else 0.0
 
 
 @torch.no_grad()
