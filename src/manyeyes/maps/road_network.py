@@ -151,7 +151,7 @@ class RoadNetwork:
         drivable = [lane for lane in self.lanes if lane.is_drivable]
         return Surface.of_strips([lane.left for lane in drivable], [lane.right for lane in drivable])
 
-    def height(self, xy: Array, near_z: float | None = None) -> Array:
+    def height(self, xy: Array, near_z: Array | float | None = None) -> Array:
         """(N,) road height under points (N, 2); off the road, that of the nearest lane.
 
         Where roads cross on two levels: the one nearest to near_z, the highest when near_z is None.

@@ -53,20 +53,20 @@ class Surface:
         first, member = _fill_buckets(triangles, low[0], low[1], columns, rows)
         return cls(triangles, owner, float(low[0]), float(low[1]), columns, rows, first, member)
 
-    def height(self, xy: Array, near_z: float | None = None) -> Array:
+    def height(self, xy: Array, near_z: Array | float | None = None) -> Array:
         """(N,) z at points (N, 2): of the triangle above or below, else of the nearest triangle's nearest point.
 
-        Where several cover a point, the one nearest to near_z; the highest when near_z is None.
+        Where several cover a point, the one nearest to near_z (one for all, or (N,)); the highest when near_z is None.
         """
-        return self._query(xy, np.inf if near_z is None else near_z)[0]
+        return self._query(xy, near_z)[0]
 
     def distance(self, xy: Array) -> Array:
         """(N,) metres from points (N, 2) to the surface in plan; 0 on it, inf when there is none."""
-        return self._query(xy, np.inf)[1]
+        return self._query(xy, None)[1]
 
-    def owner_at(self, xy: Array, near_z: float | None = None) -> NDArray[np.int64]:
+    def owner_at(self, xy: Array, near_z: Array | float | None = None) -> NDArray[np.int64]:
         """(N,) the strip of the triangle that :meth:`height` reads; -1 when there is none."""
-        index = self._query(xy, np.inf if near_z is None else near_z)[2]
+        index = self._query(xy, near_z)[2]
         return np.where(index >= 0, self.owner[np.maximum(index, 0)], -1) if len(self.owner) else index
 
     def spread(self, xy: Array) -> Array:
@@ -74,9 +74,11 @@ class Surface:
         lattice = (self.x0, self.y0, self.columns, self.rows)
         return _spread(np.ascontiguousarray(xy, np.float64), self.triangles, *lattice, self.first, self.member)
 
-    def _query(self, xy: Array, near_z: float) -> tuple[Array, Array, NDArray[np.int64]]:
+    def _query(self, xy: Array, near_z: Array | float | None) -> tuple[Array, Array, NDArray[np.int64]]:
+        points = np.ascontiguousarray(xy, np.float64)
+        wanted = np.array(np.broadcast_to(np.inf if near_z is None else near_z, len(points)), np.float64)
         lattice = (self.x0, self.y0, self.columns, self.rows)
-        return _query(np.ascontiguousarray(xy, np.float64), near_z, self.triangles, *lattice, self.first, self.member)
+        return _query(points, wanted, self.triangles, *lattice, self.first, self.member)
 
 
 @numba.njit(cache=True)
@@ -153,7 +155,8 @@ def _query(xy, near_z, triangles, x0, y0, columns, rows, first, member):  # prag
                             t = member[m]
                             inside, z = _plane_z(triangles[t], x, y)
                             if inside:
-                                better = z > height[i] if near_z == np.inf else abs(z - near_z) < abs(height[i] - near_z)
+                                near = near_z[i]
+                                better = z > height[i] if near == np.inf else abs(z - near) < abs(height[i] - near)
                                 if best > 0.0 or better:
                                     best, height[i], index[i] = 0.0, z, t
                             elif best > 0.0:

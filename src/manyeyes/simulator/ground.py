@@ -81,7 +81,9 @@ def build_ground(
     Where roads cross on two levels, the one nearest to the height at the centre is taken; see :func:`is_multilevel`.
     """
     if half_size_m <= cell_m or cell_m <= 0 or surface_cell_m <= 0:
-        raise ConfigError(f"build_ground needs half_size_m > cell_m > 0 and a positive surface cell; got {half_size_m}, {cell_m}.")
+        raise ConfigError(
+            f"build_ground needs half_size_m > cell_m > 0 and a positive surface cell; got {half_size_m}, {cell_m}."
+        )
     center = np.asarray(center_xy, np.float64).reshape(2)
     x0, y0 = (center - half_size_m).tolist()
     nodes = int(np.ceil(2 * half_size_m / cell_m)) + 1
@@ -149,7 +151,9 @@ def _painted_strips(mark: RoadMark, cell: float) -> list[tuple[Array, Array]]:
     for start in np.arange(0.0, station[-1], mark.dash_m + mark.gap_m):
         end = min(start + mark.dash_m, station[-1])
         s = np.concatenate(([start], station[(station > start) & (station < end)], [end]))
-        strips.append(tuple(np.stack([np.interp(s, station, edge[:, k]) for k in (0, 1)], -1) for edge in (left, right)))
+        strips.append(
+            tuple(np.stack([np.interp(s, station, edge[:, k]) for k in (0, 1)], -1) for edge in (left, right))
+        )
     return strips
 
 

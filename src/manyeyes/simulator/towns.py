@@ -67,7 +67,9 @@ def find_town(name: str, path: Path | str | None = None) -> Path | bytes:
             return found
         looked.append(str(place))
     if name not in TOWNS:
-        raise ConfigError(f"Unknown town '{name}'; known: {', '.join(TOWNS)}, {GENERATED}<seed>. Looked in: {'; '.join(looked)}.")
+        raise ConfigError(
+            f"Unknown town '{name}'; known: {', '.join(TOWNS)}, {GENERATED}<seed>. Looked in: {'; '.join(looked)}."
+        )
     raise ConfigError(
         f"The roads of {name} are in none of: {'; '.join(looked) or 'no place'}. Give a path, set MANYEYES_TOWNS or CARLA_ROOT, or "
         f"`pip download --no-deps py123d==0.7.0 -d DIR` and give DIR; '{GENERATED}1' needs no file."

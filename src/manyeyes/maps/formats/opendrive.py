@@ -62,7 +62,9 @@ def read_opendrive(source: Path | str | bytes, name: str | None = None, step_m: 
         try:
             data = Path(source).read_bytes()
         except OSError as error:
-            raise OpenDriveError(f"{label}: cannot be read ({error.strerror}); give the path of an .xodr file.") from error
+            raise OpenDriveError(
+                f"{label}: cannot be read ({error.strerror}); give the path of an .xodr file."
+            ) from error
     try:
         data = gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
         root = ET.fromstring(data)

@@ -73,9 +73,7 @@ def _touch_junctions(root: ET.Element, last: dict[str, int], touch) -> None:
                 touch(own, far, other, other_far)
 
 
-def _with_links(
-    lanes: Sequence[Lane], touching: set[tuple[_End, _End]], left_hand: Set[str]
-) -> tuple[Lane, ...]:
+def _with_links(lanes: Sequence[Lane], touching: set[tuple[_End, _End]], left_hand: Set[str]) -> tuple[Lane, ...]:
     """Touching ends as predecessors and successors by travel, neighbours from the order within the section."""
     along_s = [(lane.lane_id < 0) != (lane.road_id in left_hand) for lane in lanes]
     before: list[set[int]] = [set() for _ in lanes]

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Traffic on a road network by SUMO, one child process a simulation, the same for the same seed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import LABELS, ConfigError, MissingExtraError
+from manyeyes.maps.road_network import RoadNetwork
+from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.simulator.parking import parked_cars
+from manyeyes.simulator.towns import run_sumo_tool
+from manyeyes.simulator.vehicles import VehicleStates, draw_vehicles
+
+Array = NDArray[np.float64]
+
+_WORKER = Path(__file__).with_name("sumo_worker.py")
+# Coordinates stay OpenDRIVE's; crossings of roads become junctions as the file has them; signals stand where the file has some.
+_NETCONVERT = (
+    "--offset.disable-normalization", "true",
+    "--opendrive.import-all-lanes", "false",
+    "--tls.guess-signals", "true",
+    "--tls.guess", "true",
+    "--junctions.join", "false",
+    "--no-turnarounds", "true",
+    "--default.lanewidth", "3.5",
+)  # fmt: skip
+_TRUCK_SPEED_MPS = 22.0
+_LATERAL_SIGMA_M, _LATERAL_LIMIT_M = 0.12, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """What motor traffic can use of a SUMO net: names, lengths in m, lanes, limits in m/s and, per edge, which follow it."""
+
+    name: tuple[str, ...]
+    length: Array
+    lanes: NDArray[np.int64]
+    limit: Array
+    following: tuple[tuple[int, ...], ...]
+
+
+def simulate_traffic(
+    network: RoadNetwork,
+    seed: int,
+    steps: int,
+    step_s: float = 0.1,
+    vehicles_per_lane_km: float = 9.0,
+    count: int | None = None,
+    warmup_s: float = 60.0,
+) -> tuple[VehicleStates, ...]:
+    """Moving and waiting vehicles of the whole network, one VehicleStates a step, after warmup_s of driving.
+
+    Each vehicle walks the net at random, far enough not to arrive before the end. count overrides vehicles_per_lane_km.
+    """
+    if steps < 1 or step_s <= 0 or warmup_s < 0:
+        raise ConfigError(
+            f"simulate_traffic needs steps >= 1, step_s > 0, warmup_s >= 0; got {steps}, {step_s}, {warmup_s}."
+        )
+    net = sumo_net(network)
+    edges = _read_edges(net)
+    wanted = round(vehicles_per_lane_km * float((edges.length * edges.lanes).sum()) / 1000) if count is None else count
+    random = keyed_generator(seed, "traffic", network.name)
+    kind, size = draw_vehicles(random, wanted)
+    with tempfile.TemporaryDirectory(prefix="manyeyes-sumo-") as folder:
+        routes = Path(folder) / "routes.rou.xml"
+        _write_routes(routes, edges, kind, size, random, duration_s=warmup_s + steps * step_s)
+        arguments = [
+            "--net-file", str(net), "--route-files", str(routes), "--step-length", repr(step_s),
+            "--seed", str(int(random.integers(2**31 - 1))), "--lanechange.duration", "2.5",
+            "--time-to-teleport", "-1", "--collision.action", "none", "--no-step-log", "true",
+            "--no-warnings", "true", "--duration-log.disable", "true", "--default.action-step-length", repr(step_s),
+        ]  # fmt: skip
+        output = Path(folder) / "states.npz"
+        job = {"arguments": arguments, "warmup_steps": round(warmup_s / step_s), "steps": steps, "output": str(output)}
+        _run_worker(Path(folder) / "job.json", job)
+        with np.load(output) as states:
+            step, vehicle, state = states["step"], states["vehicle"], states["state"]
+    aside = np.clip(random.normal(0.0, _LATERAL_SIGMA_M, wanted), -_LATERAL_LIMIT_M, _LATERAL_LIMIT_M)
+    everything = _to_states(network, vehicle, state, kind, size, aside)
+    return tuple(everything[step == k] for k in range(steps))
+
+
+def sumo_net(network: RoadNetwork) -> Path:
+    """The network converted for SUMO, made once and kept in the cache folder by the content's hash."""
+    version = _sumo_version()
+    key = hashlib.blake2b(network.xodr, digest_size=12)
+    key.update(repr((version, _NETCONVERT)).encode())
+    folder = cache_folder()
+    net = folder / f"{key.hexdigest()}.net.xml"
+    if net.is_file():
+        return net
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="netconvert-", dir=folder) as temporary:
+        xodr, made = Path(temporary) / "roads.xodr", Path(temporary) / "roads.net.xml"
+        xodr.write_bytes(network.xodr)
+        run_sumo_tool("netconvert", "--opendrive-files", str(xodr), "--output-file", str(made), *_NETCONVERT)
+        os.replace(made, net)
+    return net
+
+
+def cache_folder() -> Path:
+    """Where converted networks are kept: $MANYEYES_CACHE, else the user's cache folder."""
+    if os.environ.get("MANYEYES_CACHE"):
+        return Path(os.environ["MANYEYES_CACHE"]) / "sumo"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "manyeyes" / "sumo"
+
+
+def _sumo_version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("eclipse-sumo")
+    except PackageNotFoundError as error:
+        raise MissingExtraError("sim", "traffic") from error
+
+
+def _read_edges(net: Path) -> _Edges:
+    """Edges that cars may use and what follows each, in the file's order."""
+    root = ET.parse(net).getroot()
+    name, length, lanes, limit = [], [], [], []
+    for edge in root.findall("edge"):
+        if edge.get("function") is not None:
+            continue
+        usable = [lane for lane in edge.findall("lane") if _admits_cars(lane)]
+        if usable:
+            name.append(edge.get("id", ""))
+            length.append(float(usable[0].get("length", "0")))
+            lanes.append(len(usable))
+            limit.append(float(usable[0].get("speed", "13.9")))
+    if not name:
+        raise ConfigError(f"{net.name}: SUMO found no edge that cars may use; the roads have no drivable lanes.")
+    place = {edge: k for k, edge in enumerate(name)}
+    following: list[set[int]] = [set() for _ in name]
+    for connection in root.findall("connection"):
+        one, two = place.get(connection.get("from", "")), place.get(connection.get("to", ""))
+        if one is not None and two is not None:
+            following[one].add(two)
+    ordered = tuple(tuple(sorted(after)) for after in following)
+    return _Edges(tuple(name), np.array(length), np.array(lanes, np.int64), np.array(limit), ordered)
+
+
+def _admits_cars(lane: ET.Element) -> bool:
+    allow, disallow = lane.get("allow"), lane.get("disallow")
+    if allow is not None:
+        return "passenger" in allow.split() or allow == "all"
+    return disallow is None or not ({"all", "passenger"} & set(disallow.split()))
+
+
+def _write_routes(
+    path: Path,
+    edges: _Edges,
+    kind: NDArray[np.int64],
+    size: Array,
+    random: np.random.Generator,
+    duration_s: float,
+) -> None:
+    """A type, a route and a vehicle for each of N; all start within the first seconds, anywhere on their first edge."""
+    weights = edges.length * edges.lanes
+    start = random.choice(len(edges.name), len(kind), p=weights / weights.sum())
+    eager = np.clip(random.normal(1.0, 0.12, len(kind)), 0.7, 1.35)
+    depart = np.sort(random.random(len(kind)) * min(5.0, duration_s / 2))
+    root = ET.Element("routes")
+    for n in range(len(kind)):
+        label = LABELS[kind[n]]
+        heavy = label in ("truck", "bus")
+        length, width, height = (f"{v:.3f}" for v in size[n])
+        ET.SubElement(
+            root, "vType", id=f"t{n}", length=length, width=width, height=height, speedFactor=f"{eager[n]:.3f}",
+            vClass={"van": "delivery", "truck": "truck", "bus": "bus"}.get(label, "passenger"),
+            accel="1.2" if heavy else "2.4", decel="4.0" if heavy else "4.5", minGap="2.5", sigma="0.4",
+            maxSpeed=f"{_TRUCK_SPEED_MPS if heavy else 50.0}",
+        )  # fmt: skip
+        vehicle = ET.SubElement(
+            root, "vehicle", id=str(n), type=f"t{n}", depart=f"{depart[n]:.2f}", departLane="best",
+            departPos="random_free", departSpeed="max",
+        )  # fmt: skip
+        ET.SubElement(vehicle, "route", edges=" ".join(_walk(edges, int(start[n]), random, duration_s * eager[n])))
+    ET.ElementTree(root).write(path, encoding="utf-8")
+
+
+def _walk(edges: _Edges, start: int, random: np.random.Generator, seconds: float) -> list[str]:
+    """Edges from start, each drawn among those that follow, until driving them at the limit takes longer than ``seconds``."""
+    here, route, left = start, [start], seconds + 20.0
+    while left > 0 and edges.following[here]:
+        here = int(random.choice(edges.following[here]))
+        route.append(here)
+        left -= edges.length[here] / edges.limit[here]
+    return [edges.name[k] for k in route]
+
+
+def _run_worker(path: Path, job: dict[str, object]) -> None:
+    """The simulation in a child process; its last line of complaint becomes the error."""
+    path.write_text(json.dumps(job))
+    done = subprocess.run([sys.executable, str(_WORKER), str(path)], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        if "libsumo is not installed" in done.stderr:
+            raise MissingExtraError("sim", "traffic")
+        lines = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+        raise ConfigError(f"SUMO failed with {done.returncode}: {lines[-1][:300] if lines else 'it said nothing'}")
+
+
+def _to_states(
+    network: RoadNetwork,
+    vehicle: NDArray[np.int64],
+    state: Array,
+    kind: NDArray[np.int64],
+    size: Array,
+    aside: Array,
+) -> VehicleStates:
+    """SUMO's front bumpers and compass angles as footprints on the road.
+
+    aside: (vehicles,) metres left of the lane's middle that each keeps. Wheels stand at 0.3 lengths before and behind
+    the middle; their heights give pitch and z.
+    """
+    size, kind, aside = size[vehicle], kind[vehicle], aside[vehicle]
+    yaw = np.pi / 2 - np.radians(state[:, 3])
+    yaw = np.mod(yaw + np.pi, 2 * np.pi) - np.pi
+    ahead = np.stack((np.cos(yaw), np.sin(yaw)), -1)
+    left = np.stack((-ahead[:, 1], ahead[:, 0]), -1)
+    middle = state[:, :2] - ahead * size[:, :1] / 2 + left * aside[:, None]
+    base = size[:, :1] * 0.3
+    surface = network.drivable_surface
+    front = surface.height(middle + ahead * base, state[:, 2])
+    rear = surface.height(middle - ahead * base, state[:, 2])
+    position = np.concatenate((middle, (front + rear)[:, None] / 2), -1)
+    pitch = -np.arctan2(front - rear, 2 * base[:, 0])
+    return VehicleStates(vehicle, kind, position, yaw, pitch, state[:, 4], size)
+
+
+__all__ = ["VehicleStates", "cache_folder", "parked_cars", "simulate_traffic", "sumo_net"]
