@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.evaluation.bootstrap import (
+    mean_interval,
+    paired_difference,
+    resamples,
+    resolved,
+    scenario_interval,
+    weighted_recall,
+)
+from manyeyes.evaluation.detection import PROTOCOLS, FrameMatch, ap_of_matches
+
+MANYEYES = PROTOCOLS["manyeyes"]
+
+
+def frames(scenarios=6, per=3, seed=0, skill=0.7, n_gt=8):
+    """Random matched frames: a hit has a higher score on average; harder scenarios have fewer hits."""
+    g = np.random.default_rng(seed)
+    out = []
+    for s in range(scenarios):
+        for f in range(per):
+            tp = g.random(10) < skill - 0.05 * s
+            tp &= np.cumsum(tp) <= n_gt
+            score = np.clip(g.normal(0.4 + 0.3 * tp, 0.15), 0.06, 0.99) + 1e-9 * g.random(10)
+            order = np.argsort(-score, kind="stable")
+            row = np.where(tp[order], np.arange(10), -1)
+            out.append(FrameMatch(f"s{s}", f, torch.from_numpy(score[order]), torch.from_numpy(row), n_gt))
+    return out
+
+
+def slow_draws(matches, weights, protocol):
+    """The slow twin: writes every resample out in full and computes its AP."""
+    names = sorted({m.scenario for m in matches})
+    for row in weights:
+        copies = [
+            replace(m, scenario=f"{m.scenario}/{k}")
+            for name, times in zip(names, row, strict=True)
+            for k in range(times)
+            for m in matches
+            if m.scenario == name
+        ]
+        yield ap_of_matches(copies, protocol).ap
+
+
+@pytest.mark.parametrize("protocol", [MANYEYES, replace(MANYEYES, drop_first_segment=True)])
+def test_interval_equals_the_slow_twin(protocol):
+    matches = frames()
+    got = scenario_interval(matches, n=200, seed=3, level=0.9, protocol=protocol)
+    draws = np.array(list(slow_draws(matches, resamples(6, 200, 3), protocol)))
+    low, high = np.quantile(draws, [0.05, 0.95])
+    assert got.value == pytest.approx(ap_of_matches(matches, protocol).ap, abs=1e-12)
+    assert (got.low, got.high) == (pytest.approx(low, abs=1e-9), pytest.approx(high, abs=1e-9))
+    assert got.low < got.value < got.high and got.scenarios == 6
+
+
+def test_the_order_of_frames_changes_nothing():
+    matches = frames()
+    assert scenario_interval(matches[::-1], n=50) == scenario_interval(matches, n=50)
+    assert scenario_interval(matches, n=50, seed=1) != scenario_interval(matches, n=50, seed=2)
+
+
+def test_more_scenarios_give_a_narrower_interval():
+    few, many = frames(scenarios=5), [replace(m, scenario=f"{m.scenario}/{k}") for k in range(10) for m in frames(5)]
+    a, b = scenario_interval(few), scenario_interval(many)
+    assert b.value == pytest.approx(a.value, abs=1e-12)
+    assert (b.high - b.low) < 0.5 * (a.high - a.low)
+
+
+def test_pairing_cancels_what_makes_a_scenario_hard():
+    a = frames(scenarios=6, per=10, seed=1)
+    worse = [replace(m, truth_row=torch.where(m.truth_row == m.truth_row.max(), -1, m.truth_row)) for m in a]
+    got = paired_difference(a, worse)
+    alone_a, alone_b = scenario_interval(a), scenario_interval(worse)
+    assert got.value == pytest.approx(alone_a.value - alone_b.value)
+    assert 0 < got.low < got.value < got.high
+    assert got.high - got.low < 0.6 * (alone_a.high - alone_a.low)
+    same = paired_difference(a, a)
+    assert (same.value, same.low, same.high) == (0, 0, 0)
+
+
+def test_a_pair_must_be_a_pair():
+    a = frames(scenarios=3)
+    with pytest.raises(ConfigError, match="s2 are on one only"):
+        paired_difference(a, [m for m in a if m.scenario != "s2"])
+    with pytest.raises(ConfigError, match="scenario s0 differs"):
+        paired_difference(a, [replace(a[0], n_gt=99), *a[1:]])
+
+
+def test_coverage_of_the_interval():
+    """A 90 % interval over scenarios holds the truth about nine times of ten; one over frames would not."""
+    generator = np.random.default_rng(0)
+    inside = 0
+    for trial in range(200):
+        values = generator.normal(size=30)
+        got = mean_interval(values.tolist(), n=300, seed=trial, level=0.9)
+        inside += got.low <= 0 <= got.high
+    assert 0.82 < inside / 200 < 0.95
+
+
+def test_recall_and_empty_input():
+    matches = frames(scenarios=4)
+    got = scenario_interval(matches, n=20, statistic=weighted_recall)
+    assert got.value == pytest.approx(ap_of_matches(matches, MANYEYES).recall)
+    empty = scenario_interval([], n=10)
+    assert math.isnan(empty.value) and math.isnan(empty.low) and empty.scenarios == 0
+    no_truth = [replace(m, n_gt=0, truth_row=torch.full((10,), -1)) for m in matches]
+    assert math.isnan(scenario_interval(no_truth, n=10).value)
+
+
+def test_scenarios_without_detections_or_without_truth():
+    matches = frames(scenarios=4)
+    silent = FrameMatch("silent", 0, torch.zeros(0).double(), torch.zeros(0).long(), 8)
+    got = scenario_interval([*matches, silent], n=100)
+    assert got.value == pytest.approx(ap_of_matches([*matches, silent], MANYEYES).ap)
+    assert got.value < scenario_interval(matches, n=10).value
+
+
+def test_resamples_are_multinomial_and_pure():
+    counts = resamples(7, 2000, 5)
+    assert counts.shape == (2000, 7) and (counts.sum(1) == 7).all()
+    assert np.abs(counts.mean(0) - 1).max() < 0.1 and counts.max() >= 4
+    assert np.array_equal(counts, resamples(7, 2000, 5))
+
+
+def test_the_verdict():
+    assert resolved(0.12, 0.13, 0.2) == "reached"
+    assert resolved(0.12, 0.12, 0.2) == "reached"
+    assert resolved(0.12, 0.05, 0.11) == "missed"
+    assert resolved(0.12, 0.05, 0.12) == "not resolved"
+    assert resolved(0.12, math.nan, math.nan) == "not resolved"
