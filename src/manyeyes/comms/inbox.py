@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an agent has heard: packets in, the newest message of each other agent out. Bad bytes are counted, never raised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+from manyeyes.comms.wire import Assembly, Fragment, PacketError, Reason, TokenRows, decode_packet
+from manyeyes.datatypes import Message
+
+DropReason = Reason | Literal["wrong_model", "duplicate", "expired", "full"]
+
+_CLOCK_SLACK_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """How many packets were not taken, by reason.
+
+    garbage: not a packet, or cut. version: of another wire version. checksum: bytes were changed. implausible: values
+    that cannot be (NaN, cells outside the grid, captured over 1 s after arrival). contradiction: another packet of the
+    same message says otherwise. wrong_model: tokens of other weights. duplicate: a copy. expired: too old, or older
+    than what this agent has since said. full: no room for more agents or more bytes of this agent.
+    """
+
+    garbage: int = 0
+    version: int = 0
+    checksum: int = 0
+    implausible: int = 0
+    contradiction: int = 0
+    wrong_model: int = 0
+    duplicate: int = 0
+    expired: int = 0
+    full: int = 0
+
+    @property
+    def total(self) -> int:
+        """Packets not taken, for whatever reason."""
+        return sum(getattr(self, f.name) for f in fields(self))
+
+    def plus(self, reason: DropReason) -> Dropped:
+        """One more packet of that reason."""
+        return replace(self, **{reason: getattr(self, reason) + 1})
+
+
+@dataclass(frozen=True)
+class Reception:
+    """One agent's newest message as far as it came. last_arrival_ns is None where no arrival time was given."""
+
+    message: Message
+    received_packets: int
+    expected_packets: int
+    last_arrival_ns: int | None
+
+    @property
+    def complete(self) -> bool:
+        """Every packet of the message came and was of use."""
+        return self.received_packets == self.expected_packets
+
+    def age_ns(self, now_ns: int) -> int:
+        """Age of information: now less the time of capture."""
+        return now_ns - self.message.timestamp_ns
+
+
+@dataclass
+class _Held:
+    assembly: Assembly
+    packet_bytes: int
+    last_arrival_ns: int | None
+
+
+class Inbox:
+    """The newest message of each sender, complete or not.
+
+    fingerprint: tokens of other weights are refused, other sections of the same message are not; None takes all.
+    expire_ns: a message captured longer ago than this is neither taken nor given; None keeps it until a newer one comes.
+    At most max_agents senders of max_agent_bytes of packets each are held: a flood of ids cannot exhaust the memory.
+    Beyond it the sender heard of least recently (by capture) gives way to a newer one.
+    """
+
+    def __init__(
+        self,
+        fingerprint: bytes | None = None,
+        expire_ns: int | None = None,
+        max_agents: int = 64,
+        max_agent_bytes: int = 4 << 20,
+    ) -> None:
+        self._fingerprint = fingerprint
+        self._expire_ns = expire_ns
+        self._max_agents = max_agents
+        self._max_agent_bytes = max_agent_bytes
+        self._held: dict[int, _Held] = {}
+        self._dropped = Dropped()
+
+    @property
+    def dropped(self) -> Dropped:
+        """Packets not taken so far, by reason."""
+        return self._dropped
+
+    def push(self, packet: bytes, arrival_ns: int | None = None) -> None:
+        """Take one packet; whatever is wrong with it is counted and never raised."""
+        try:
+            fragment = decode_packet(packet)
+            refusal = self._refusal(fragment, arrival_ns) or self._store(fragment, arrival_ns)
+        except PacketError as error:
+            refusal = error.reason
+        if refusal is not None:
+            self._dropped = self._dropped.plus(refusal)
+
+    def receptions(self, now_ns: int | None = None) -> tuple[Reception, ...]:
+        """The newest message of each agent with how much of it came, by agent id. Those expired by now_ns are let go."""
+        if now_ns is not None:
+            self._held = {
+                k: v for k, v in self._held.items() if not self._is_old(v.assembly.header.timestamp_ns, now_ns)
+            }
+        return tuple(
+            Reception(
+                message=held.assembly.message(),
+                received_packets=len(held.assembly.fragments),
+                expected_packets=held.assembly.header.packets,
+                last_arrival_ns=held.last_arrival_ns,
+            )
+            for _, held in sorted(self._held.items())
+        )
+
+    def messages(self, now_ns: int | None = None) -> tuple[Message, ...]:
+        """The newest message of each agent, as far as it came, by agent id."""
+        return tuple(reception.message for reception in self.receptions(now_ns))
+
+    def _is_old(self, timestamp_ns: int, now_ns: int) -> bool:
+        return self._expire_ns is not None and now_ns - timestamp_ns > self._expire_ns
+
+    def _refusal(self, fragment: Fragment, arrival_ns: int | None) -> DropReason | None:
+        """Why a proper packet is not wanted, judged by itself."""
+        stamp = fragment.header.timestamp_ns
+        if arrival_ns is not None:
+            if self._is_old(stamp, arrival_ns):
+                return "expired"
+            # A stamp from the future would otherwise silence its agent id until that time has come.
+            if stamp - arrival_ns > _CLOCK_SLACK_NS:
+                return "implausible"
+        others = self._fingerprint is not None and fragment.header.fingerprint != self._fingerprint
+        return "wrong_model" if others and isinstance(fragment.body, TokenRows) else None
+
+    def _store(self, fragment: Fragment, arrival_ns: int | None) -> DropReason | None:
+        """Put a packet with its message; the reason where there is no place for it."""
+        agent, stamp, size = fragment.header.agent_id, fragment.header.timestamp_ns, len(fragment.packet)
+        held = self._held.get(agent)
+        if held is not None and stamp < held.assembly.header.timestamp_ns:
+            return "expired"
+        if held is None or stamp > held.assembly.header.timestamp_ns:
+            if held is None and not self._make_room(stamp):
+                return "full"
+            self._held[agent] = _Held(Assembly(fragment), size, arrival_ns)
+            return None
+        if held.packet_bytes + size > self._max_agent_bytes:
+            return "full"
+        if not held.assembly.add(fragment):
+            return "duplicate"
+        held.packet_bytes += size
+        if arrival_ns is not None:
+            held.last_arrival_ns = max(arrival_ns, held.last_arrival_ns or arrival_ns)
+        return None
+
+    def _make_room(self, stamp: int) -> bool:
+        """True where a new agent whose message is of that time may be held; the stalest agent gives way."""
+        if len(self._held) < self._max_agents:
+            return True
+        stalest = min(self._held, key=lambda agent: (self._held[agent].assembly.header.timestamp_ns, agent))
+        if self._held[stalest].assembly.header.timestamp_ns >= stamp:
+            return False
+        del self._held[stalest]
+        return True

@@ -1,0 +1,391 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wire format: round trips, sizes, order of importance, and every kind of damage."""
+
+import math
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from manyeyes.comms import wire
+from manyeyes.datatypes import (
+    LABELS,
+    BevGrid,
+    Boxes,
+    ConfigError,
+    Message,
+    PointCloud,
+    Sites,
+    SparseBev,
+    Transform,
+    WireError,
+)
+
+torch.set_num_threads(1)
+QUICK = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+GRID = BevGrid(-140.8, -38.4, -3.0, 140.8, 38.4, 1.0, 0.4, 8)
+
+
+def random_tokens(generator: torch.Generator, count: int, channels: int, grid: BevGrid = GRID) -> SparseBev:
+    rows, columns = grid.shape
+    key = torch.randperm(rows * columns, generator=generator)[:count].sort().values
+    scale = torch.logspace(-3, 3, channels)
+    return SparseBev(torch.randn(len(key), channels, generator=generator) * scale, Sites(key, grid))
+
+
+def random_boxes(generator: torch.Generator, count: int) -> Boxes:
+    def uniform(low: float, high: float) -> torch.Tensor:
+        return low + (high - low) * torch.rand(count, generator=generator)
+
+    center = torch.stack((uniform(-320, 320), uniform(-320, 320), uniform(0, 2)), -1)
+    size = torch.stack((uniform(1, 20), uniform(0.5, 3), uniform(1, 4)), -1)
+    score = uniform(0, 1).sort(descending=True).values
+    label = torch.randint(0, len(LABELS), (count,), generator=generator)
+    ids = torch.randint(-1, 255, (count,), generator=generator)
+    sigmas = (uniform(0.011, 19), uniform(0.0011, 3.1), uniform(0, 1))
+    return Boxes(center, size, uniform(-math.pi, math.pi), score, label, ids, *sigmas)
+
+
+def random_message(seed: int, tokens: int | None = 40, objects: int | None = 5, points: int | None = 50) -> Message:
+    g = torch.Generator().manual_seed(seed)
+    root = torch.randn(3, 3, generator=g, dtype=torch.float64) * torch.tensor([[0.3], [0.2], [0.01]])
+    angles = torch.rand(3, generator=g, dtype=torch.float64) * 6 - 3
+    position = torch.randn(3, generator=g, dtype=torch.float64) * 1e4
+    xyz = torch.rand(points or 0, 3, generator=g) * 600 - 300
+    return Message(
+        agent_id=int(torch.randint(-(2**31), 2**31, (), generator=g)),
+        timestamp_ns=int(torch.randint(0, 2**62, (), generator=g)),
+        world_from_agent=Transform.from_rpy(position, *angles),
+        pose_covariance=root @ root.mT,
+        fingerprint=bytes(torch.randint(0, 256, (8,), generator=g).tolist()),
+        is_infrastructure=bool(torch.rand((), generator=g) < 0.5),
+        tokens=None if tokens is None else random_tokens(g, tokens, 8),
+        token_score=None if tokens is None else torch.rand(tokens, generator=g),
+        objects=None if objects is None else random_boxes(g, objects),
+        points=None if points is None else PointCloud.of(xyz, torch.rand(points, generator=g)),
+    )
+
+
+def through(message: Message, **options) -> Message:
+    return wire.assemble(wire.decode_packet(p) for p in wire.encode(message, **options))
+
+
+sizes = st.one_of(st.none(), st.integers(0, 300))
+
+
+@QUICK
+@given(st.integers(0, 10**6), sizes, sizes, sizes, st.sampled_from(wire.PRECISIONS), st.integers(300, 3000))
+def test_round_trip(seed, tokens, objects, points, precision, mtu):
+    message = random_message(seed, tokens, objects, points)
+    packets = wire.encode(message, precision=precision, mtu=mtu)
+    assert all(len(p) <= mtu for p in packets)
+    back = wire.assemble(wire.decode_packet(p) for p in packets)
+
+    assert (back.agent_id, back.timestamp_ns) == (message.agent_id, message.timestamp_ns)
+    assert (back.fingerprint, back.is_infrastructure) == (message.fingerprint, message.is_infrastructure)
+    assert torch.equal(back.world_from_agent.translation, message.world_from_agent.translation)
+    assert (back.world_from_agent.rotation - message.world_from_agent.rotation).abs().max() < 2e-9
+    sigma = message.pose_covariance.diagonal().sqrt()
+    assert ((back.pose_covariance - message.pose_covariance).abs() <= 2e-3 * sigma[:, None] * sigma).all()
+    assert torch.linalg.eigvalsh(back.pose_covariance).min() > -1e-15
+    for name in ("tokens", "objects", "points"):
+        assert (getattr(back, name) is None) == (getattr(message, name) is None)
+    if message.tokens is not None:
+        check_tokens(back.tokens, message.tokens, precision)
+    if message.objects is not None:
+        check_objects(back.objects, message.objects)
+    if message.points is not None:
+        assert ((back.points.xyz - message.points.xyz).abs() <= 0.005 + 1e-4).all()
+        assert ((back.points.intensity - message.points.intensity).abs() <= 0.5 / 255 + 1e-6).all()
+
+
+def check_tokens(got: SparseBev, sent: SparseBev, precision: wire.Precision) -> None:
+    assert got.grid == sent.grid
+    assert torch.equal(got.sites.key, sent.sites.key)
+    error = (got.features - sent.features).abs()
+    if precision == "float32":
+        assert torch.equal(got.features, sent.features)
+    elif precision == "float16":
+        assert (error <= sent.features.abs() * 2**-11 + 2**-24).all()
+    elif len(sent.sites):
+        # A channel's step follows its peak in the packet, at most 9.1 % above; so the whole message's peak is a bound.
+        assert (error <= sent.features.abs().amax(0) * 2**0.125 / 127 / 2 * 1.001 + 2**-16).all()
+
+
+def check_objects(got: Boxes, sent: Boxes) -> None:
+    assert torch.equal(got.label, sent.label)
+    assert torch.equal(got.id, sent.id)
+    assert ((got.center - sent.center)[:, :2].abs() <= 0.005 + 1e-4).all()
+    assert ((got.size - sent.size)[:, :2].abs() <= 0.05 + 1e-5).all()
+    turn = torch.remainder(got.yaw - sent.yaw + math.pi, 2 * math.pi) - math.pi
+    assert (turn.abs() <= math.radians(0.005) + 1e-5).all()
+    assert ((got.score - sent.score).abs() <= 0.5 / 255 + 1e-6).all()
+    assert ((got.flip - sent.flip).abs() <= 0.5 / 31 + 1e-6).all()
+    assert ((got.sigma_xy / sent.sigma_xy).log().abs() <= math.log(20 / 0.01) / 254 / 2 + 1e-5).all()
+    assert ((got.sigma_yaw / sent.sigma_yaw).log().abs() <= math.log(3.2 / 0.001) / 254 / 2 + 1e-5).all()
+    assert torch.equal(got.size[:, 2], torch.tensor(wire.LABEL_HEIGHTS)[sent.label])
+    assert torch.equal(got.center[:, 2], got.size[:, 2] / 2)
+
+
+def test_golden_bytes():
+    """The format of version 1, byte for byte: if this fails, either undo the change or raise wire.VERSION."""
+    grid = BevGrid(-1.6, -0.8, -3, 1.6, 0.8, 1, 0.4, 2)
+    message = Message(
+        agent_id=-7,
+        timestamp_ns=1_234_567_890_123_456_789,
+        world_from_agent=Transform.from_xyz_yaw(100.25, -200.5, 0.125, 1.0),
+        pose_covariance=torch.diag(torch.tensor([0.25, 0.0625, 0.0], dtype=torch.float64)),
+        fingerprint=b"weights!",
+        is_infrastructure=True,
+        tokens=SparseBev(torch.tensor([[1.0, -2.0], [0.5, 4.0]]), Sites(torch.tensor([1, 6]), grid)),
+        token_score=torch.tensor([0.1, 0.9]),
+        objects=Boxes.of(torch.tensor([[1.0, -2.0, 0.8]]), torch.tensor([[4.5, 1.8, 1.6]]), torch.tensor([math.pi])),
+        points=PointCloud.of(torch.tensor([[0.01, -0.02, 300.0]]), torch.tensor([1.0])),
+    )
+    packets = wire.encode(message, precision="float16")
+    assert [p.hex() for p in packets] == GOLDEN
+    assert len(packets[0]) == wire.HEADER_BYTES + 13
+    assert len(packets[2]) == wire.HEADER_BYTES + 7
+
+
+GOLDEN = [
+    (
+        "4d4501065f0000000300f9ffffff1581e97df4102211000000000010594000000000001069c0000000000000c03f00000000"
+        "00000000f008c9560038000000340000000000007765696768747321640038ffb0b92d12ff000000ffd2ac09c8"
+    ),
+    (
+        "4d450105700001000300f9ffffff1581e97df4102211000000000010594000000000001069c0000000000000c03f00000000"
+        "00000000f008c956003800000034000000000000776569676874732160ffb0ffd4fea0005000640090010201020002000104"
+        "003c00c000380044c9964408"
+    ),
+    (
+        "4d450107590002000300f9ffffff1581e97df4102211000000000010594000000000001069c0000000000000c03f00000000"
+        "00000000f008c95600380000003400000000000077656967687473210100feff3075ff9a9f5b1d"
+    ),
+]
+
+
+def test_25_objects_are_325_bytes_and_a_header():
+    (packet,) = wire.encode(random_message(1, None, 25, None))
+    assert wire.HEADER_BYTES <= 90
+    assert len(packet) == 325 + wire.HEADER_BYTES
+
+
+def test_a_message_without_sections_is_one_header():
+    message = random_message(2, None, None, None)
+    (packet,) = wire.encode(message)
+    assert len(packet) == wire.HEADER_BYTES
+    back = through(message)
+    assert back.tokens is None and back.objects is None and back.points is None
+
+
+def test_most_important_first_and_any_prefix_is_a_message():
+    message = random_message(3, 300, 5, None)
+    packets = wire.encode(message, precision="float32")
+    assert len(packets) > 5
+    scores = dict(zip(message.tokens.sites.key.tolist(), message.token_score.tolist()))
+    lowest_so_far = 1.0
+    for packet in packets[1:]:
+        got = [scores[k] for k in wire.decode_packet(packet).body.key.tolist()]
+        assert max(got) <= lowest_so_far
+        lowest_so_far = min(got)
+    for cut in (1, 2, len(packets) - 1):
+        back = wire.assemble(map(wire.decode_packet, packets[:cut]))
+        assert len(back.objects) == 5
+        kept = {} if back.tokens is None else set(back.tokens.sites.key.tolist())
+        best = sorted(scores, key=lambda k: -scores[k])[: len(kept)]
+        assert set(best) == set(kept)
+
+
+def test_a_lost_packet_of_points_thins_the_cloud_evenly():
+    azimuth = torch.linspace(-3.1, 3.1, 2000)
+    cloud = PointCloud.of(torch.stack((azimuth.cos() * 50, azimuth.sin() * 50, azimuth * 0), -1))
+    packets = wire.encode(replace(random_message(4, None, None, None), points=cloud))
+    back = wire.assemble(map(wire.decode_packet, packets[:-1])).points
+    angle = torch.atan2(back.xyz[:, 1], back.xyz[:, 0])
+    assert len(back) < 2000
+    assert angle.diff().max() < 3 * 6.2 / 2000
+
+
+@QUICK
+@given(st.integers(0, 10**6), st.randoms(use_true_random=False))
+def test_order_and_copies_do_not_matter(seed, random):
+    packets = wire.encode(random_message(seed, 120, 150, 300), precision="float32", mtu=600)
+    shuffled = packets + random.choices(packets, k=3)
+    random.shuffle(shuffled)
+    assert same(wire.assemble(map(wire.decode_packet, shuffled)), wire.assemble(map(wire.decode_packet, packets)))
+
+
+def same(a: Message, b: Message) -> bool:
+    """Equal to the bit: what a message is made of is what its own bytes say."""
+    return wire.encode(a, precision="float32", mtu=60000) == wire.encode(b, precision="float32", mtu=60000)
+
+
+@QUICK
+@given(st.binary(max_size=300))
+def test_garbage_is_refused(data):
+    with pytest.raises(wire.PacketError):
+        wire.decode_packet(data)
+    with pytest.raises(wire.PacketError):
+        wire.decode_packet(b"ME\x01" + data)
+
+
+@QUICK
+@given(st.integers(0, 10**6), st.data())
+def test_every_flipped_bit_and_every_cut_is_noticed(seed, data):
+    packet = data.draw(st.sampled_from(wire.encode(random_message(seed, 10, 3, 10))))
+    bit = data.draw(st.integers(0, len(packet) * 8 - 1))
+    damaged = bytearray(packet)
+    damaged[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(wire.PacketError):
+        wire.decode_packet(bytes(damaged))
+    with pytest.raises(wire.PacketError):
+        wire.decode_packet(packet[: data.draw(st.integers(0, len(packet) - 1))])
+    with pytest.raises(wire.PacketError):
+        wire.decode_packet(packet + b"\0")
+
+
+def forge(packet: bytes, at: int, data: bytes) -> bytes:
+    """The packet with other bytes and a checksum that fits them: a faulty sender, not a faulty channel."""
+    changed = packet[:at] + data + packet[at + len(data) : -4]
+    return changed + zlib.crc32(changed).to_bytes(4, "little")
+
+
+@QUICK
+@given(st.integers(0, 1000), st.data())
+def test_a_faulty_sender_never_crashes_the_reader(seed, data):
+    packet = data.draw(st.sampled_from(wire.encode(random_message(seed, 10, 3, 10))))
+    at = data.draw(st.integers(10, len(packet) - 5))
+    forged = forge(packet, at, data.draw(st.binary(min_size=1, max_size=min(8, len(packet) - 4 - at))))
+    try:
+        message = wire.assemble([wire.decode_packet(forged)])
+    except wire.PacketError:
+        return
+    assert torch.isfinite(message.world_from_agent.rotation).all()
+    if message.tokens is not None:
+        assert torch.isfinite(message.tokens.features).all()
+    if message.objects is not None:
+        assert (message.objects.label < len(LABELS)).all()
+
+
+@pytest.mark.parametrize(
+    ("at", "data", "reason"),
+    [
+        (0, b"XX", "garbage"),
+        (2, b"\x02", "version"),
+        (4, b"\x01\x00", "garbage"),
+        (3, b"\xe1", "garbage"),
+        (6, b"\xff\xff", "garbage"),
+        (22, b"\x00\x00\x00\x00\x00\x00\xf8\x7f", "implausible"),
+        (22, b"\x00\x00\x00\x00\x00\x00\xf0\x7f", "implausible"),
+        (46, b"\xff\xff\xff\x7f\xff\xff\xff\x7f\xff\xff\xff\x7f", "implausible"),
+        (58, b"\x00\x7e", "implausible"),
+        (78 + 6, b"\x00\x80", "implausible"),
+        (78 + 15, b"\x03", "garbage"),
+        (78 + 15, b"\xf1", "garbage"),
+        (78 + 16, b"\x00\x00", "garbage"),
+        (78 + 18, b"\xff\xff", "garbage"),
+        (78 + 20, b"\xc0\x10", "implausible"),
+        (78 + 20, b"\x80\x00", "garbage"),
+        (78 + 22, b"\x00\x7c", "implausible"),
+    ],
+)
+def test_what_a_faulty_sender_is_told(at, data, reason):
+    """Cell 2000 of the 24 x 88 grid takes two bytes, cell 2112 is the first outside: 0xc0 0x10."""
+    tokens = SparseBev(torch.ones(1, 3), Sites(torch.tensor([2000]), GRID))
+    (packet,) = wire.encode(replace(random_message(5, None, None, None), tokens=tokens))
+    wire.decode_packet(forge(packet, 0, b""))
+    with pytest.raises(wire.PacketError) as caught:
+        wire.decode_packet(forge(packet, at, data))
+    assert caught.value.reason == reason
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("row", "value"), [("label_flip", 7), ("size", (0, 10)), ("yaw", 18000), ("yaw", -18001)])
+def test_implausible_objects_are_refused(row, value):
+    (packet,) = wire.encode(random_message(6, None, 1, None))
+    rows = np.frombuffer(packet[78:-4], wire._OBJECT).copy()
+    rows[row] = value
+    with pytest.raises(wire.PacketError) as caught:
+        wire.decode_packet(forge(packet, 78, rows.tobytes()))
+    assert caught.value.reason == "implausible"
+
+
+def test_contradictions_are_refused():
+    one, other = random_message(7, 60, None, None), random_message(8, 60, None, None)
+    first = wire.encode(one, mtu=400)
+    assert len(first) > 2
+    changed = wire.encode(replace(one, tokens=one.tokens.with_features(one.tokens.features + 1)), mtu=400)
+    turned = wire.encode(replace(one, world_from_agent=other.world_from_agent), mtu=400)
+    reordered = wire.encode(replace(one, token_score=-one.token_score), mtu=400)
+    for intruder in (changed[0], turned[1], reordered[-1], wire.encode(one, mtu=400, precision="int8")[1]):
+        with pytest.raises(wire.PacketError) as caught:
+            wire.assemble(map(wire.decode_packet, [first[0], intruder]))
+        assert caught.value.reason == "contradiction"
+    with pytest.raises(WireError, match="at least one"):
+        wire.assemble([])
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"agent_id": 2**31}, "int32"),
+        ({"fingerprint": b"short"}, "8 bytes"),
+        ({"pose_covariance": torch.tensor([[1.0, 2, 0], [2, 1, 0], [0, 0, 1]])}, "semidefinite"),
+        ({"pose_covariance": torch.full((3, 3), math.nan)}, "finite"),
+        ({"world_from_agent": Transform.from_xyz_yaw(math.inf, 0)}, "finite pose"),
+        ({"token_score": torch.full((40,), math.nan)}, "without NaN"),
+        ({"objects": Boxes.of(torch.full((1, 3), math.nan), torch.ones(1, 3), torch.zeros(1))}, "NaN or infinite"),
+        ({"objects": Boxes.of(torch.full((1, 3), 328.0), torch.ones(1, 3), torch.zeros(1))}, "crop them"),
+        ({"points": PointCloud.of(torch.full((1, 3), -400.0))}, "crop them"),
+        (
+            {"tokens": SparseBev(torch.full((1, 2), math.inf), Sites(torch.tensor([0]), GRID)), "token_score": None},
+            "finite",
+        ),
+        ({"tokens": SparseBev(torch.full((1, 2), 1e6), Sites(torch.tensor([0]), GRID)), "token_score": None}, "65504"),
+        (
+            {"tokens": SparseBev(torch.ones(1, 900), Sites(torch.tensor([0]), GRID)), "token_score": None},
+            "does not fit",
+        ),
+        (
+            {
+                "tokens": SparseBev(torch.ones(1, 2), Sites(torch.tensor([0]), replace(GRID, x_max=140.8001))),
+                "token_score": None,
+            },
+            "whole centimetres",
+        ),
+        ({"tokens": SparseBev(torch.ones(1, 2), Sites(torch.tensor([0]), GRID, 2)), "token_score": None}, "batch of 2"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_the_sender(change, match):
+    with pytest.raises(WireError, match=match):
+        wire.encode(replace(random_message(9), **change))
+
+
+def test_unknown_settings_are_refused():
+    with pytest.raises(ConfigError, match="float32, float16, int8"):
+        wire.encode(random_message(9), precision="float8")
+    with pytest.raises(ConfigError, match="mtu"):
+        wire.encode(random_message(9), mtu=80)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-9, math.pi / 2, math.pi, -math.pi, 3.0])
+def test_rotations_at_the_seams_of_the_quaternion(turn):
+    zero = torch.zeros((), dtype=torch.float64)
+    for angles in ((turn, 0, 0), (0, turn, 0), (0, 0, turn), (turn, turn, turn)):
+        pose = Transform.from_rpy(torch.zeros(3, dtype=torch.float64), *(zero + a for a in angles))
+        back = through(replace(random_message(10, None, None, None), world_from_agent=pose))
+        assert (back.world_from_agent.rotation - pose.rotation).abs().max() < 2e-9
+
+
+def test_sizes_and_ids_outside_their_range_saturate_or_wrap():
+    boxes = Boxes.of(torch.zeros(3, 3), torch.tensor([[40.0, 0.0, 1], [4, 2, 1], [4, 2, 1]]), torch.zeros(3))
+    boxes = replace(boxes, id=torch.tensor([300, -1, 254]))
+    back = through(replace(random_message(11, None, None, None), objects=boxes)).objects
+    assert back.size[0, :2].tolist() == pytest.approx([25.5, 0.1])
+    assert back.id.tolist() == [45, -1, 254]
+    assert back.sigma_xy.tolist() == [0, 0, 0]
