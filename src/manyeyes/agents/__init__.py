@@ -1,1 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
+"""One agent's whole step, and many agents on one recording."""

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One agent's whole step: share(own observation) to bytes, perceive(own observation, inbox) to boxes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from manyeyes.agents.collaboration import Collaboration, Intermediate
+from manyeyes.agents.eyes import Eyes
+from manyeyes.comms import wire
+from manyeyes.comms.inbox import Inbox, Reception
+from manyeyes.comms.select import within_budget
+from manyeyes.comms.wire import Precision
+from manyeyes.datatypes import AgentFrame, Boxes
+from manyeyes.models.detector import Detector
+
+OWN_BODY_M = (2.6, 1.3)
+
+
+@dataclass(frozen=True)
+class Perception:
+    """boxes: in the agent's own frame, best first. heard: the messages that took part, by agent id."""
+
+    boxes: Boxes
+    heard: tuple[Reception, ...]
+
+
+class Agent:
+    """A detector, a way to collaborate, and a limit in bytes for each message.
+
+    Nothing but the bytes of share passes between two agents; frames carry no labels, so truth cannot leak by type.
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        collaboration: Collaboration | None = None,
+        precision: Precision = "float16",
+        budget_bytes: int | None = 1 << 17,
+        eyes: Eyes | None = None,
+    ) -> None:
+        self.eyes = eyes or Eyes(detector)
+        self.collaboration = collaboration or Intermediate()
+        self.precision: Precision = precision
+        self.budget_bytes = budget_bytes
+
+    def share(self, frame: AgentFrame) -> list[bytes]:
+        """The packets that this frame is worth to others, most important first; none if there is nothing to say."""
+        message = self.collaboration.say(self.eyes, frame)
+        if message is None:
+            return []
+        if message.tokens is not None and message.token_score is not None:
+            tokens, score = within_budget(message.tokens, message.token_score, self.budget_bytes, self.precision)
+            message = replace(message, tokens=tokens, token_score=score)
+        return wire.encode(message, precision=self.precision)
+
+    def perceive(self, frame: AgentFrame, inbox: Inbox | Iterable[bytes] = (), now_ns: int | None = None) -> Perception:
+        """Boxes around the agent from its own frame and whatever of others' messages has come.
+
+        inbox: an Inbox that packets were pushed into, or plain packets. now_ns: when the ego stops waiting; messages that
+        the inbox holds too old by then are left out.
+        """
+        if not isinstance(inbox, Inbox):
+            packets, inbox = inbox, Inbox(self.eyes.detector.fingerprint)
+            for packet in packets:
+                inbox.push(packet)
+        heard = tuple(r for r in inbox.receptions(now_ns) if r.message.agent_id != frame.agent_id)
+        boxes = self.collaboration.hear(self.eyes, frame, [r.message for r in heard])
+        return Perception(_others(boxes, frame), heard)
+
+
+def _others(boxes: Boxes, frame: AgentFrame) -> Boxes:
+    """Without the box that others see where the agent itself stands."""
+    if frame.is_infrastructure:
+        return boxes
+    return boxes[(boxes.center[:, 0].abs() > OWN_BODY_M[0]) | (boxes.center[:, 1].abs() > OWN_BODY_M[1])]

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ways to collaborate: what an agent says, and what it makes of what it hears. One a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from manyeyes.agents.collaboration.alone import Alone
+from manyeyes.agents.collaboration.early import Early
+from manyeyes.agents.collaboration.intermediate import Intermediate
+from manyeyes.agents.collaboration.late import Late
+from manyeyes.agents.eyes import Eyes
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message
+
+__all__ = ["METHODS", "Alone", "Collaboration", "Early", "Intermediate", "Late", "method"]
+
+
+class Collaboration(Protocol):
+    """The two halves of one way to collaborate."""
+
+    @property
+    def name(self) -> str:
+        """How tables call it."""
+        ...
+
+    def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
+        """The message of this frame, before selection and encoding; None says nothing."""
+        ...
+
+    def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
+        """Boxes in the agent's frame, from its own cloud and what the others said."""
+        ...
+
+
+METHODS: dict[str, Collaboration] = {m.name: m for m in (Alone(), Late(), Intermediate(), Early())}
+
+
+def method(name: str) -> Collaboration:
+    """The method of that name."""
+    if name not in METHODS:
+        raise ConfigError(f"There is no method {name!r}; known are {', '.join(METHODS)}.")
+    return METHODS[name]

@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Early fusion: every agent sends its points; the ego looks at them all as one cloud. The bound, at any price in bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from manyeyes.agents.collaboration.heading import ego_from_sender, header
+from manyeyes.agents.eyes import Eyes
+from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud
+
+
+@dataclass(frozen=True)
+class Early:
+    """All points of every agent, quantised by the wire to a centimetre."""
+
+    name: str = "early"
+
+    def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
+        """The whole cloud."""
+        return replace(header(frame, eyes.detector.fingerprint), points=frame.points)
+
+    def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
+        """Boxes of the merged cloud."""
+        heard = [m.points.transform(ego_from_sender(frame, m)) for m in messages if m.points is not None]
+        return eyes.own(eyes.see_cloud(PointCloud.cat([frame.points, *heard])).tokens)

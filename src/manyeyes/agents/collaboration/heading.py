@@ -1,0 +1,23 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The head of every message: who, when, from where."""
+
+from __future__ import annotations
+
+from manyeyes.datatypes import AgentFrame, Message, Transform
+
+
+def header(frame: AgentFrame, fingerprint: bytes) -> Message:
+    """A message of this frame with no section yet."""
+    return Message(
+        agent_id=frame.agent_id,
+        timestamp_ns=frame.timestamp_ns,
+        world_from_agent=frame.world_from_agent,
+        pose_covariance=frame.pose_covariance,
+        fingerprint=fingerprint,
+        is_infrastructure=frame.is_infrastructure,
+    )
+
+
+def ego_from_sender(frame: AgentFrame, message: Message) -> Transform:
+    """From the sender's frame when it looked to the ego's now, by the claimed poses of both."""
+    return frame.world_from_agent.inverse() @ message.world_from_agent

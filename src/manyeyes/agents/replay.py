@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording played through agents on a channel: share, bytes, deliver, perceive; the same two functions as live."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from manyeyes.agents.agent import Agent, Perception
+from manyeyes.agents.collaboration import method
+from manyeyes.agents.eyes import Eyes
+from manyeyes.comms.bus import LocalBus
+from manyeyes.comms.channel import Channel, channel_preset
+from manyeyes.comms.inbox import Inbox
+from manyeyes.comms.wire import Precision
+from manyeyes.datasets.recording import Recording
+from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
+from manyeyes.models.detector import Detector
+
+EXPIRE_NS = 500_000_000
+
+
+@dataclass(frozen=True)
+class ReplayConfig:
+    """How a recording is played.
+
+    wait_s: how long after its own sweep an ego waits for messages before it perceives; whatever came by then takes part,
+    the newest of each sender. all_egos: every agent is judged as ego, not the first alone. history: snapshots played before
+    the first judged one, so that messages are under way. reach_m: radios farther apart do not hear each other (true poses).
+    """
+
+    channel: str = "ideal"
+    precision: Precision = "float16"
+    budget_bytes: int | None = 1 << 17
+    wait_s: float = 0.0
+    all_egos: bool = False
+    history: int = 0
+    reach_m: float = 70.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Sent:
+    """What one agent put on the air at one instant. seconds: the time that share took."""
+
+    agent_id: int
+    bytes: int
+    packets: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """One ego at one instant, with one method. ages_s: at the time of perceiving, of every message that took part."""
+
+    method: str
+    snapshot: Snapshot
+    ego: int
+    perception: Perception
+    sent: tuple[Sent, ...]
+    ages_s: tuple[float, ...]
+    perceive_seconds: float
+
+    @property
+    def boxes(self) -> Boxes:
+        """What the ego perceived, in its frame."""
+        return self.perception.boxes
+
+
+@dataclass
+class Team:
+    """All agents of one scenario with one method, their inboxes and the air between them."""
+
+    method: str
+    detector: Detector
+    config: ReplayConfig
+    eyes: dict[int, Eyes] = field(default_factory=dict)
+    _agents: dict[int, Agent] = field(default_factory=dict)
+    _inboxes: dict[int, Inbox] = field(default_factory=dict)
+    _bus: LocalBus = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._bus = LocalBus(Channel(channel_preset(self.config.channel), self.config.seed))
+
+    def step(self, snapshot: Snapshot) -> Iterator[Step]:
+        """Everybody shares; whoever is judged waits, hears and perceives."""
+        places = _places(snapshot)
+        sent = tuple(self._share(frame, places[frame.agent_id]) for frame in snapshot.frames)
+        egos = range(len(snapshot.frames)) if self.config.all_egos else range(1)
+        for ego, frame in enumerate(snapshot.frames):
+            until = frame.timestamp_ns + round(self.config.wait_s * 1e9)
+            agent, inbox = self._at(frame)
+            here = places[frame.agent_id]
+            for delivery in self._bus.deliver(frame.agent_id, here, until):
+                if math.dist(here, places.get(delivery.sender, here)) <= self.config.reach_m:
+                    inbox.push(delivery.packet, delivery.arrival_ns)
+            if ego in egos:
+                began = time.perf_counter()
+                perception = agent.perceive(frame, inbox, until)
+                took = time.perf_counter() - began
+                ages = tuple(heard.age_ns(until) / 1e9 for heard in perception.heard)
+                yield Step(self.method, snapshot, ego, perception, sent, ages, took)
+
+    def _share(self, frame: AgentFrame, place: tuple[float, float]) -> Sent:
+        agent, _ = self._at(frame)
+        began = time.perf_counter()
+        packets = agent.share(frame)
+        took = time.perf_counter() - began
+        self._bus.publish(frame.agent_id, place, packets, frame.timestamp_ns)
+        return Sent(frame.agent_id, sum(map(len, packets)), len(packets), took)
+
+    def _at(self, frame: AgentFrame) -> tuple[Agent, Inbox]:
+        who = frame.agent_id
+        if who not in self._agents:
+            eyes = self.eyes.setdefault(who, Eyes(self.detector))
+            self._agents[who] = Agent(
+                self.detector, method(self.method), self.config.precision, self.config.budget_bytes, eyes
+            )
+            self._inboxes[who] = Inbox(self.detector.fingerprint, EXPIRE_NS)
+        return self._agents[who], self._inboxes[who]
+
+
+def _places(snapshot: Snapshot) -> dict[int, tuple[float, float]]:
+    """Where each antenna really is, as far as the recording knows: radio waves do not care for claims."""
+    poses = (
+        snapshot.truth.world_from_agent
+        if snapshot.truth
+        else Transform.stack([f.world_from_agent for f in snapshot.frames])
+    )
+    return {frame.agent_id: (xyz[0], xyz[1]) for frame, xyz in zip(snapshot.frames, poses.translation.tolist())}
+
+
+def replay(
+    recording: Recording,
+    scenario: str,
+    detector: Detector,
+    methods: Sequence[str],
+    config: ReplayConfig,
+    disturb: Callable[[Snapshot], Snapshot] = lambda snapshot: snapshot,
+    share_eyes: bool = False,
+) -> Iterator[Step]:
+    """Every judged snapshot of one scenario through each method in turn.
+
+    disturb: what happens to claimed poses before anybody sees them. share_eyes: the methods look at a cloud once between
+    them; their boxes are the same, their times are then not to be compared.
+    """
+    eyes: dict[int, Eyes] = {}
+    teams = [Team(name, detector, config, eyes if share_eyes else {}) for name in methods]
+    judged = recording.judged(scenario)
+    for index in range(max(0, judged.start - config.history), judged.stop):
+        snapshot = disturb(recording.snapshot(scenario, index))
+        for team in teams:
+            for step in team.step(snapshot):
+                if index in judged:
+                    yield step
