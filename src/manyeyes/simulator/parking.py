@@ -114,7 +114,8 @@ def _without_conflicts(network: RoadNetwork, cars: VehicleStates) -> VehicleStat
         return cars
     rim = cars.corners(0.1)
     rim = np.concatenate((rim, (rim + np.roll(rim, -1, 1)) / 2, cars.position[:, None, :2]), 1)
-    clear = (network.drivable_surface.distance(rim.reshape(-1, 2)).reshape(rim.shape[:2]) > 0.05).all(1)
+    gap = network.drivable_surface.distance(rim.reshape(-1, 2)).reshape(rim.shape[:2])
+    clear = np.asarray(gap.min(1) > 0.05)
     for crossing in network.crossings:
         middle, reach = crossing.polygon[:, :2].mean(0), np.ptp(crossing.polygon[:, :2], axis=0).max() / 2
         near = np.linalg.norm(cars.position[:, :2] - middle, axis=1) < reach + 20.0

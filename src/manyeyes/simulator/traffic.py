@@ -106,7 +106,7 @@ def sumo_net(network: RoadNetwork) -> Path:
         xodr, made = Path(temporary) / "roads.xodr", Path(temporary) / "roads.net.xml"
         xodr.write_bytes(network.xodr)
         run_sumo_tool("netconvert", "--opendrive-files", str(xodr), "--output-file", str(made), *_NETCONVERT)
-        os.replace(made, net)
+        made.replace(net)
     return net
 
 

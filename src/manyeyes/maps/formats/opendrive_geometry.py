@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -152,7 +153,7 @@ class ReferenceLine:
             breaks[-1] = end
         starts = np.array([p.s for p in self.pieces])
         parts = []
-        for low, high in zip(breaks[:-1], breaks[1:]):
+        for low, high in itertools.pairwise(breaks):
             piece = self.pieces[max(int(np.searchsorted(starts, (low + high) / 2, side="right")) - 1, 0)]
             step = tight_step_m if piece.tightest_radius_m < 25.0 else step_m
             parts.append(np.linspace(low, high, max(1, int(np.ceil((high - low) / step))) + 1)[:-1])
