@@ -6,7 +6,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 import typing
 from pathlib import Path
 from typing import Any
@@ -57,7 +56,7 @@ def save(model: Detector, path: Path, card: dict[str, Any], half: bool = False) 
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     save_file(state, partial, {"format": FORMAT, "config": config_to_json(model.config), "card": json.dumps(card)})
-    os.replace(partial, path)
+    partial.replace(path)
 
 
 def load(path: Path) -> Detector:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -161,7 +160,7 @@ class Run:
             "optimiser": self.optimiser.state_dict(),
         }
         torch.save(state, partial)
-        os.replace(partial, self.state_path)
+        partial.replace(self.state_path)
 
     def _resume(self) -> None:
         try:
@@ -228,7 +227,7 @@ def _trim_log(path: Path, step: int) -> None:
         kept = [line for line in path.read_text().splitlines() if line and json.loads(line)["step"] <= step]
         partial = path.with_suffix(".partial")
         partial.write_text("".join(line + "\n" for line in kept))
-        os.replace(partial, path)
+        partial.replace(path)
 
 
 def _groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
