@@ -1,4 +1,70 @@
 # SPDX-License-Identifier: Apache-2.0
 """manyeyes: many agents, each with its own eyes and few bytes to say what it sees."""
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from manyeyes.agents.agent import Agent, Perception
+    from manyeyes.comms.inbox import Inbox
+    from manyeyes.datasets.argoverse2 import Argoverse2Recording
+    from manyeyes.datasets.opv2v import Opv2vRecording
+    from manyeyes.datatypes import (
+        AgentFrame,
+        BevGrid,
+        Boxes,
+        ManyeyesError,
+        Message,
+        PointCloud,
+        Snapshot,
+        SparseBev,
+        Transform,
+    )
+    from manyeyes.models.zoo import load as load_detector
+
+_HOME = {
+    "Agent": "manyeyes.agents.agent",
+    "AgentFrame": "manyeyes.datatypes",
+    "Argoverse2Recording": "manyeyes.datasets.argoverse2",
+    "BevGrid": "manyeyes.datatypes",
+    "Boxes": "manyeyes.datatypes",
+    "Inbox": "manyeyes.comms.inbox",
+    "ManyeyesError": "manyeyes.datatypes",
+    "Message": "manyeyes.datatypes",
+    "Opv2vRecording": "manyeyes.datasets.opv2v",
+    "Perception": "manyeyes.agents.agent",
+    "PointCloud": "manyeyes.datatypes",
+    "Snapshot": "manyeyes.datatypes",
+    "SparseBev": "manyeyes.datatypes",
+    "Transform": "manyeyes.datatypes",
+    "load_detector": "manyeyes.models.zoo",
+}
+
+__all__ = [
+    "Agent",
+    "AgentFrame",
+    "Argoverse2Recording",
+    "BevGrid",
+    "Boxes",
+    "Inbox",
+    "ManyeyesError",
+    "Message",
+    "Opv2vRecording",
+    "Perception",
+    "PointCloud",
+    "Snapshot",
+    "SparseBev",
+    "Transform",
+    "load_detector",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Names are loaded when they are first used: importing manyeyes alone costs milliseconds."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'manyeyes' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), "load" if name == "load_detector" else name)

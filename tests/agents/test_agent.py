@@ -33,10 +33,14 @@ def make_scene(agents: int) -> Sample:
     surface.scatter_(2, face, surface.gather(2, face).sign() * 0.5)
     local = surface * boxes.size[:, None]
     c, s = yaw.cos()[:, None], yaw.sin()[:, None]
-    moved = torch.stack((local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c, local[..., 2]), -1)
+    moved = torch.stack(
+        (local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c, local[..., 2]), -1
+    )
     ground = torch.cat(((torch.rand(1500, 2, generator=rng) - 0.5) * 50, torch.zeros(1500, 1)), 1)
     points = torch.cat(((moved + center[:, None]).flatten(0, 1), ground))
-    poses = [Transform.identity(), Transform.from_xyz_yaw(6, -3, 0, 0.7), Transform.from_xyz_yaw(-9, 4, 0.2, -2.0)][:agents]
+    poses = [Transform.identity(), Transform.from_xyz_yaw(6, -3, 0, 0.7), Transform.from_xyz_yaw(-9, 4, 0.2, -2.0)][
+        :agents
+    ]
     clouds = tuple(PointCloud.of(pose.inverse().apply(points)) for pose in poses)
     return Sample(clouds, tuple(poses), tuple(boxes.transform(pose.inverse()) for pose in poses), boxes)
 
@@ -58,7 +62,9 @@ def detector() -> Detector:
 
 def frames_of(sample: Sample, world: Transform | None = None) -> list[AgentFrame]:
     world = world or Transform.identity()
-    return [AgentFrame.of(c, world @ t, agent_id=i) for i, (c, t) in enumerate(zip(sample.clouds, sample.ego_from_agent))]
+    return [
+        AgentFrame.of(c, world @ t, agent_id=i) for i, (c, t) in enumerate(zip(sample.clouds, sample.ego_from_agent))
+    ]
 
 
 class RecordingEyes(Eyes):
