@@ -1,2 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bytes between agents: what to send, how it is written, what the air does to it, what is taken in."""
+
+from manyeyes.comms.bus import LocalBus
+from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, Delivery, Send, channel_preset
+from manyeyes.comms.codec import PacketError
+from manyeyes.comms.inbox import Dropped, Inbox, Reception
+from manyeyes.comms.select import within_budget
+from manyeyes.comms.wire import Fragment, assemble, decode_packet, encode
+
+__all__ = [
+    "CHANNELS",
+    "Channel",
+    "ChannelPreset",
+    "Delivery",
+    "Dropped",
+    "Fragment",
+    "Inbox",
+    "LocalBus",
+    "PacketError",
+    "Reception",
+    "Send",
+    "assemble",
+    "channel_preset",
+    "decode_packet",
+    "encode",
+    "within_budget",
+]

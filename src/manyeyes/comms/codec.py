@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers and tables to bytes and back: varints, sets of cells, quantised features, logarithmic codes. No weights.
 
-All functions work on whole numpy arrays; whatever is not a proper encoding raises :class:`WireError`.
+All functions work on whole numpy arrays; what is not a proper encoding is a :class:`PacketError`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import WireError
+
+Reason = Literal["garbage", "version", "checksum", "implausible", "contradiction"]
 
 DELTA, BITMAP = 0, 1
 """How a set of cells is written: gaps between sorted keys, or one bit a cell over the span of keys."""
@@ -20,6 +23,14 @@ _VARINT_BYTES = 5
 _VARINT_LIMITS = 1 << 7 * np.arange(1, _VARINT_BYTES)
 _STEPS_PER_OCTAVE = 8
 _FIRST_OCTAVE = -16
+
+
+class PacketError(WireError):
+    """A packet that is refused; ``reason`` says of what kind the fault is."""
+
+    def __init__(self, reason: Reason, text: str) -> None:
+        super().__init__(text)
+        self.reason: Reason = reason
 
 
 def varint_sizes(values: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -45,11 +56,11 @@ def unpack_varints(data: bytes, count: int) -> tuple[NDArray[np.int64], int]:
     raw = np.frombuffer(data, np.uint8, count=min(len(data), count * _VARINT_BYTES))
     ends = np.flatnonzero(raw < 128)[:count]
     if ends.size < count:
-        raise WireError(f"Expected {count} varints; the bytes end after {ends.size}.")
+        raise PacketError("garbage", f"Expected {count} varints; the bytes end after {ends.size}.")
     starts = np.concatenate(([0], ends[:-1] + 1))
     sizes = ends - starts + 1
     if int(sizes.max()) > _VARINT_BYTES or bool(((sizes > 1) & (raw[ends] == 0)).any()):
-        raise WireError(f"A varint has at most {_VARINT_BYTES} bytes and no padding.")
+        raise PacketError("garbage", f"A varint has at most {_VARINT_BYTES} bytes and no padding.")
     used = int(ends[-1]) + 1
     shift = 7 * (np.arange(used) - np.repeat(starts, sizes))
     digits = (raw[:used] & 127).astype(np.int64) << shift
@@ -102,11 +113,11 @@ def unpack_cells(layout: int, data: bytes, count: int) -> tuple[NDArray[np.int64
     (first, span), used = unpack_varints(data, 2)
     end = used + int(span)
     if end > len(data):
-        raise WireError(f"A bitmap of {int(span)} bytes was announced; {len(data) - used} are there.")
+        raise PacketError("garbage", f"A bitmap of {int(span)} bytes was announced; {len(data) - used} are there.")
     bits = np.unpackbits(np.frombuffer(data, np.uint8, count=int(span), offset=used), bitorder="little")
     key = np.flatnonzero(bits).astype(np.int64) + first
     if key.size != count:
-        raise WireError(f"A bitmap for {count} cells was announced; it marks {key.size}.")
+        raise PacketError("garbage", f"A bitmap for {count} cells was announced; it marks {key.size}.")
     return key, end
 
 
@@ -136,7 +147,8 @@ def quantise_int8(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArr
 
 def dequantise_int8(code: NDArray[np.uint8], steps: NDArray[np.int8]) -> NDArray[np.float32]:
     """Features (N, C) float32 from scale codes (C,) and steps (N, C)."""
-    return steps.astype(np.float32) * (SCALES[code] / np.float32(127))
+    step = (SCALES[code] / np.float32(127)).astype(np.float32)
+    return steps.astype(np.float32) * step
 
 
 def log_codes(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:

@@ -6,7 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
-from manyeyes.comms.wire import Assembly, Fragment, PacketError, Reason, TokenRows, decode_packet
+from manyeyes.comms.codec import PacketError, Reason
+from manyeyes.comms.sections import TokenRows
+from manyeyes.comms.wire import Assembly, Fragment, decode_packet
 from manyeyes.datatypes import Message
 
 DropReason = Reason | Literal["wrong_model", "duplicate", "expired", "full"]

@@ -6,7 +6,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from manyeyes.comms.wire import DEFAULT_MTU, Precision, check_precision, packet_counts, token_order
+from manyeyes.comms.sections import Precision, check_precision, packet_counts, token_order
+from manyeyes.comms.wire import DEFAULT_MTU, HEADER_BYTES
 from manyeyes.datatypes import SparseBev
 
 
@@ -28,7 +29,7 @@ def within_budget(
     if budget_bytes is None:
         return bev, score
     key = bev.sites.key.cpu().numpy()[order]
-    kept = sum(packet_counts(key, bev.features.shape[1], precision, mtu, budget_bytes))
+    kept = sum(packet_counts(key, bev.features.shape[1], precision, mtu - HEADER_BYTES, HEADER_BYTES, budget_bytes))
     mask = torch.zeros(len(order), dtype=torch.bool)
     mask[torch.from_numpy(order[:kept])] = True
     mask = mask.to(score.device)
