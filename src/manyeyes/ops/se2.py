@@ -144,7 +144,7 @@ def solve(initial: Tensor, edges: Edges, fixed: Tensor, huber: float | None = No
             moved = torch.where(fixed[:, None], poses, compose(poses, exp(step.view(-1, 3))))
             moved_cost = _cost(moved, edges, huber)
             # No damped step lowers the cost any more: rounding, or a cost that overflows.
-            done = float(step.abs().max()) < 1e-10 or damping > 1e12
+            done = float(step.abs().max()) < 1e-7 or damping > 1e12
             if moved_cost <= cost or done:
                 break
             damping *= 10
