@@ -16,8 +16,9 @@ from manyeyes.apps.viewer.animation import save_animation, stack
 from manyeyes.apps.viewer.birds_eye import AGENTS, FOUND, TRUE, draw, save_png, scene_of, view_of
 from manyeyes.apps.viewer.canvas import View, splat
 from manyeyes.apps.viewer.report import Picture, Report, render, save_report
-from manyeyes.apps.viewer.table import HEADINGS, Interval, Row, cells, markdown, terminal
+from manyeyes.apps.viewer.table import HEADINGS, Row, cells, markdown, terminal
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.evaluation.bootstrap import Interval
 
 GRID = BevGrid(-40.0, -20.0, -3.0, 40.0, 20.0, 1.0)
 
@@ -150,18 +151,22 @@ def test_an_animation_of_nothing_or_of_another_format_is_refused(tmp_path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
+def interval(value: float, low: float = math.nan, high: float = math.nan) -> Interval:
+    return Interval(value, low, high, 0.95, 1 if math.isnan(low) else 8)
+
+
 ROWS = (
-    Row("alone", Interval(0.612, 0.55, 0.66), Interval(0.4), 0.0, None, None, 41.0),
-    Row("intermediate", Interval(0.812, 0.75, 0.86), Interval(0.66), 2.0**15, 104.2, 45.0, 53.0),
+    Row("alone", interval(0.612, 0.55, 0.66), interval(0.4), 0.0, None, None, 41.0),
+    Row("intermediate", interval(0.812, 0.75, 0.86), interval(0.66), 2.0**15, 104.2, 45.0, 53.0),
     Row("early"),
 )
 
 
 def test_a_row_reads_as_numbers_and_what_is_absent_reads_not_run() -> None:
-    assert cells(ROWS[0]) == ("alone", "0.612 [0.550, 0.660]", "0.400", "0", "-", "-", "not run", "41.0")
+    assert cells(ROWS[0]) == ("alone", "0.612 [0.550, 0.660]", "0.400", "0", "-", "-", "-", "41.0")
     assert cells(ROWS[1])[3:6] == ("32,768", "15.00", "104")
     assert cells(ROWS[2]) == ("early", *["not run"] * 7)
-    assert cells(Row("x", Interval(float("nan"))))[1] == "no object"
+    assert cells(Row("x", interval(math.nan)))[1] == "no object"
 
 
 def test_the_markdown_table_is_aligned_and_complete() -> None:
@@ -186,6 +191,7 @@ def make_report(tmp_path) -> Report:
         "A <drive>",
         "Two agents & a box.",
         ROWS,
+        (),
         (Picture(picture, "all of it", wide=True), Picture(picture, "intermediate"), Picture(picture, "late")),
         (("Frames", "3"),),
         ("make demo",),

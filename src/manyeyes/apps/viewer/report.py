@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from manyeyes.apps.viewer.table import HEADINGS, Row, cells
+from manyeyes.apps.viewer.table import DIFFERENCE_HEADINGS, HEADINGS, NOT_RUN, Row, cells, difference_cells
 from manyeyes.datatypes import ConfigError
+from manyeyes.evaluation.comparison import Difference
 
 MIME = {".png": "image/png", ".gif": "image/gif", ".webp": "image/webp", ".svg": "image/svg+xml"}
 
@@ -74,6 +75,7 @@ class Report:
     title: str
     lead: str
     rows: tuple[Row, ...] = ()
+    differences: tuple[Difference, ...] = ()
     pictures: tuple[Picture, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
     commands: tuple[str, ...] = ()
@@ -91,9 +93,11 @@ def render(report: Report) -> str:
         columns = "".join(f"<dt>{_text(name)}</dt><dd>{_text(what)}</dd>" for name, what in COLUMNS)
         parts += [
             "<h2>Results</h2>",
-            _table(report.rows),
+            _table(HEADINGS, [cells(row) for row in report.rows]),
             f"<details><summary>What the columns mean</summary><dl>{columns}</dl></details>",
         ]
+    if report.differences:
+        parts += [_table(DIFFERENCE_HEADINGS, [difference_cells(d) for d in report.differences])]
     parts += [f"<p>{_text(note)}</p>" for note in report.notes]
     wide, pairs = [p for p in report.pictures if p.wide], [p for p in report.pictures if not p.wide]
     if wide:
@@ -127,16 +131,14 @@ def _text(value: str) -> str:
     return html.escape(value, quote=True)
 
 
-def _table(rows: Sequence[Row]) -> str:
-    head = "".join(f"<th>{_text(h)}</th>" for h in HEADINGS)
-    lines = []
-    for row in rows:
-        values = "".join(
-            f'<td class="absent">{_text(c)}</td>' if c in ("-", "not run") else f"<td>{_text(c)}</td>"
-            for c in cells(row)
-        )
-        lines.append(f"<tr>{values}</tr>")
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+def _table(headings: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{_text(heading)}</th>" for heading in headings)
+    body = "".join(f"<tr>{''.join(_cell(c) for c in line)}</tr>" for line in lines)
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _cell(text: str) -> str:
+    return f'<td class="absent">{_text(text)}</td>' if text in ("-", NOT_RUN) else f"<td>{_text(text)}</td>"
 
 
 def _figure(picture: Picture) -> str:

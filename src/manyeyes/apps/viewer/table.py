@@ -10,16 +10,11 @@ from dataclasses import dataclass
 from rich import box
 from rich.table import Table
 
+from manyeyes.evaluation.benchmark import MethodResult
+from manyeyes.evaluation.bootstrap import Interval
+from manyeyes.evaluation.comparison import Difference
+
 NOT_RUN = "not run"
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A value and its 95 % interval; low and high are None where there is one scenario only."""
-
-    value: float
-    low: float | None = None
-    high: float | None = None
 
 
 @dataclass(frozen=True)
@@ -45,6 +40,19 @@ class Row:
         return math.log2(self.bytes_per_message) if self.bytes_per_message else None
 
 
+def row_of(result: MethodResult) -> Row:
+    """The row of a measured method. Who says nothing has sent 0 bytes."""
+    return Row(
+        result.method,
+        result.intervals[0],
+        result.intervals[1],
+        result.communication.bytes_per_message if result.communication.messages else 0.0,
+        result.age_ms,
+        result.share_ms,
+        result.perceive_ms,
+    )
+
+
 HEADINGS = ("method", "AP@0.5", "AP@0.7", "bytes/message", "AB log2", "age ms", "share ms", "perceive ms")
 
 
@@ -57,7 +65,7 @@ def cells(row: Row) -> tuple[str, ...]:
         _number(row.bytes_per_message, 0),
         "-" if row.bytes_per_message == 0 else _number(row.log2_bytes, 2),
         "-" if row.bytes_per_message == 0 else _number(row.age_ms, 0),
-        _number(row.share_ms, 1),
+        "-" if row.bytes_per_message == 0 else _number(row.share_ms, 1),
         _number(row.perceive_ms, 1),
     )
 
@@ -76,8 +84,38 @@ def terminal(rows: Sequence[Row], title: str = "") -> Table:
 
 def markdown(rows: Sequence[Row]) -> str:
     """The table for a document, aligned."""
-    body = [HEADINGS, *(cells(row) for row in rows)]
-    widths = [max(len(line[i]) for line in body) for i in range(len(HEADINGS))]
+    return markdown_lines([HEADINGS, *(cells(row) for row in rows)])
+
+
+def differences_terminal(differences: Sequence[Difference]) -> Table:
+    """Paired differences for a terminal."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for heading in DIFFERENCE_HEADINGS:
+        table.add_column(heading, justify="left" if heading in ("paired difference", "verdict") else "right")
+    for difference in differences:
+        table.add_row(*difference_cells(difference))
+    return table
+
+
+DIFFERENCE_HEADINGS = ("paired difference", "AP at IoU", "value, 95 % interval", "bar", "verdict")
+
+
+def difference_cells(difference: Difference) -> tuple[str, ...]:
+    """A paired difference as text, in the order of DIFFERENCE_HEADINGS."""
+    value = difference.interval
+    spread = f" [{value.low:+.3f}, {value.high:+.3f}]" if value.scenarios > 1 else ""
+    return (
+        f"{difference.method} - {difference.rival}",
+        f"{difference.iou:g}",
+        f"{value.value:+.3f}{spread}",
+        "" if difference.bar is None else f"{difference.bar:.2f}",
+        difference.verdict or "",
+    )
+
+
+def markdown_lines(body: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, aligned; the first line is the heading, the first column stands to the left."""
+    widths = [max(len(line[i]) for line in body) for i in range(len(body[0]))]
     text = [
         "| " + " | ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths))) + " |"
         for line in body
@@ -96,10 +134,10 @@ def _interval(value: Interval | None) -> str:
         return NOT_RUN
     if math.isnan(value.value):
         return "no object"
-    if value.low is None or value.high is None:
+    if value.scenarios < 2:
         return f"{value.value:.3f}"
     return f"{value.value:.3f} [{value.low:.3f}, {value.high:.3f}]"
 
 
 def _number(value: float | None, digits: int) -> str:
-    return NOT_RUN if value is None else f"{value:,.{digits}f}"
+    return NOT_RUN if value is None or math.isnan(value) else f"{value:,.{digits}f}"

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes a drive that the shipped weights never saw, lets every agent share bytes and perceive, and judges the result.
+
+Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. What is found is
+compared for ego alone, late, intermediate and early fusion on the same channel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from manyeyes.apps.playing import Playing, excerpt, weights_name
+from manyeyes.datatypes import ConfigError
+
+PRESET = "demo"
+ALL_FRAMES = 100_000
+
+
+@dataclass(frozen=True)
+class Options:
+    """Where the drive goes and how it is played."""
+
+    out: Path = Path("out/demo")
+    """Folder for the recording, pictures, animation, report and JSON."""
+    seed: int = 0
+    """Another seed, another drive."""
+    towns: Path | None = None
+    """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
+    frames: int = ALL_FRAMES
+    """At most so many judged frames."""
+    animate: bool = True
+    """Draw the animation of the drive."""
+    playing: Playing = field(default_factory=lambda: Playing(channel="its-g5-27"))
+    """How agents collaborate."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    from rich.console import Console
+
+    from manyeyes.apps.showcase import Showing, bars, play
+    from manyeyes.datasets.opv2v import Opv2vRecording
+    from manyeyes.models import zoo
+    from manyeyes.simulator.presets import simulate
+
+    console = Console()
+    replay = options.playing.replay_config(options.seed)
+    detector = zoo.load(options.playing.weights)
+    folder = options.out / "recording" / f"seed-{options.seed}"
+    with bars(console) as progress:
+        task = progress.add_task("Simulating", total=1)
+        simulate(PRESET, folder, options.seed, 1, lambda at: progress.update(task, completed=at.done), options.towns)
+    drive = excerpt(Opv2vRecording(folder, "test"), None, options.frames)
+    town = drive.scenario.rpartition("_")[0]
+    if len(drive.judged(drive.scenario)) == 0:
+        raise ConfigError(f"{folder}: the drive has no judged frame; remove the folder and run the demo again.")
+    showing = Showing(
+        out=options.out,
+        title="manyeyes demo: one drive, four ways to collaborate",
+        lead=f"Simulated in {town}, which the shipped weights never saw. All that passes between agents is bytes.",
+        methods=options.playing.methods,
+        replay=replay,
+        weights=weights_name(options.playing.weights),
+        animate=options.animate,
+        facts=(("Town", town),),
+        commands=(
+            f"manyeyes demo --seed {options.seed}",
+            f"manyeyes run {folder} --split test",
+            f"manyeyes view {folder} --split test --out drive.gif",
+        ),
+    )
+    _, report = play(drive, detector, showing, console)
+    console.print(f"\nPictures, animation and JSON are in {options.out}; open {report}", highlight=False)

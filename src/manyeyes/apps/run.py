@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replays your own recording in OPV2V's layout with every method: table, pictures, animation, report, JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from manyeyes.apps.playing import Playing, excerpt, weights_name
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which drive, and how it is played."""
+
+    recording: tyro.conf.Positional[Path]
+    """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout."""
+    split: str | None = None
+    """Which split of a dataset: a folder inside it, such as test."""
+    scenario: str | None = None
+    """Which scenario; the first by default."""
+    frames: int = 60
+    """At most so many judged frames."""
+    frame: int | None = None
+    """Index of the instant that is pictured; the middle one by default."""
+    out: Path = Path("out/run")
+    """Folder for pictures, animation, report and JSON."""
+    seed: int = 0
+    """Of the channel's losses and jitter."""
+    animate: bool = True
+    """Draw the animation of the drive."""
+    playing: Playing = field(default_factory=Playing)
+    """How agents collaborate."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    from rich.console import Console
+
+    from manyeyes.apps.showcase import Showing, play
+    from manyeyes.datasets.opv2v import Opv2vRecording
+    from manyeyes.models import zoo
+
+    console = Console()
+    replay = options.playing.replay_config(options.seed)
+    recording = Opv2vRecording(options.recording, options.split)
+    for problem in recording.problems:
+        console.print(f"note: {problem}", highlight=False, markup=False)
+    drive = excerpt(recording, options.scenario, options.frames)
+    split = f" --split {options.split}" if options.split else ""
+    showing = Showing(
+        out=options.out,
+        title=f"{options.recording.name}: {drive.scenario}",
+        lead="A recording, replayed: every agent shares bytes and perceives, as it would on the road.",
+        methods=options.playing.methods,
+        replay=replay,
+        weights=weights_name(options.playing.weights),
+        frame=options.frame,
+        animate=options.animate,
+        commands=(f"manyeyes run {options.recording}{split} --scenario {drive.scenario}",),
+    )
+    _, report = play(drive, zoo.load(options.playing.weights), showing, console)
+    console.print(f"\nPictures, animation and JSON are in {options.out}; open {report}", highlight=False)

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plays one drive with every method and shows it: table, pictures of one instant, animation, report, JSON."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from manyeyes.agents.replay import ReplayConfig, Step, replay
+from manyeyes.apps import provenance
+from manyeyes.apps.outcome import Outcome, outcome_of, show
+from manyeyes.apps.playing import Excerpt
+from manyeyes.apps.viewer.animation import save_animation, stack
+from manyeyes.apps.viewer.birds_eye import draw, save_png, scene_of
+from manyeyes.apps.viewer.report import Picture, Report, save_report
+from manyeyes.apps.viewer.table import markdown
+from manyeyes.datatypes import BevGrid, ConfigError
+from manyeyes.evaluation.comparison import Tally
+from manyeyes.evaluation.detection import Protocol, protocol_named
+from manyeyes.models.detector import Detector
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+WIDTH, FILM_WIDTH, FILM_FRAME_MS = 1280, 800, 200
+TITLES = {
+    "alone": "Ego alone",
+    "late": "Late fusion: boxes are shared",
+    "intermediate": "Intermediate fusion: tokens are shared",
+    "early": "Early fusion: all points are shared",
+}
+
+
+@dataclass(frozen=True)
+class Showing:
+    """What is shown and where it goes. frame: index of the pictured instant, None: the middle one."""
+
+    out: Path
+    title: str
+    lead: str
+    methods: tuple[str, ...]
+    replay: ReplayConfig
+    weights: str
+    score_min: float = 0.2
+    frame: int | None = None
+    animate: bool = True
+    facts: tuple[tuple[str, str], ...] = ()
+    commands: tuple[str, ...] = ()
+
+
+@dataclass
+class _Film:
+    """Pictures of the drive, the methods that matter most above each other."""
+
+    methods: tuple[str, ...]
+    pending: dict[str, Image] = field(default_factory=dict)
+    images: list[Image] = field(default_factory=list)
+
+    def add(self, method: str, image: Image) -> None:
+        """One method's picture; the last method's completes an instant."""
+        self.pending[method] = image
+        if len(self.pending) == len(self.methods):
+            self.images.append(stack([self.pending[name] for name in self.methods]))
+            self.pending = {}
+
+
+def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console) -> tuple[Outcome, Path]:
+    """Plays the drive and writes everything under showing.out; the outcome and the report's path."""
+    judged = drive.judged(drive.scenario)
+    instant = judged[len(judged) // 2] if showing.frame is None else showing.frame
+    if instant not in judged:
+        known = f"{judged.start} to {judged[-1]}"
+        raise ConfigError(f"Frame {instant} of {drive.scenario} is not judged; choose one of {known}.")
+    grid, protocol = detector.config.grid, judging(detector)
+    tallies = {name: Tally(name, protocol) for name in showing.methods}
+    film = _Film(_filmed(showing.methods) if showing.animate else ())
+    kept: list[Step] = []
+    with bars(console) as progress:
+        task = progress.add_task("Playing", total=len(judged) * len(showing.methods))
+        for step in replay(drive, drive.scenario, detector, showing.methods, showing.replay):
+            tallies[step.method].add(step)
+            if step.snapshot.index == instant:
+                kept.append(step)
+            if step.method in film.methods:
+                film.add(step.method, _picture(step, grid, _caption_of(step), showing.score_min, FILM_WIDTH))
+            progress.advance(task)
+    outcome = outcome_of([tally.result() for tally in tallies.values()], protocol)
+    show(console, outcome, showing.title)
+    pictures = _film_picture(film, showing.out) + _still_pictures(kept, outcome, grid, showing)
+    config = {"showing": showing, "detector": detector.config}
+    origin = provenance.write_json(showing.out / "results.json", outcome, config, showing.replay.seed)
+    write_text(showing.out / "results.md", markdown(outcome.rows))
+    report = Report(
+        title=showing.title,
+        lead=showing.lead,
+        rows=outcome.rows,
+        differences=outcome.differences,
+        pictures=pictures,
+        facts=_facts(drive, detector, showing),
+        commands=showing.commands,
+        notes=_notes(outcome, protocol),
+        provenance=origin,
+    )
+    save_report(report, showing.out / "report.html")
+    return outcome, showing.out / "report.html"
+
+
+def judging(detector: Detector) -> Protocol:
+    """The project's own protocol over the range that the detector sees."""
+    grid = detector.config.grid
+    return protocol_named("manyeyes").within((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
+
+
+def bars(console: Console) -> Progress:
+    """Progress bars, on the same console as everything else."""
+    columns = TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    return Progress(*columns, console=console)
+
+
+def _filmed(methods: Sequence[str]) -> tuple[str, ...]:
+    """The two methods whose difference is the point, or as many of them as were run."""
+    wanted = tuple(name for name in ("alone", "intermediate") if name in methods)
+    return wanted or tuple(methods[:1])
+
+
+def _picture(step: Step, grid: BevGrid, caption: str, score_min: float, width: int) -> Image:
+    title = TITLES.get(step.method, step.method)
+    return draw(scene_of(step.snapshot, step.boxes, step.ego), grid, title, caption, width, score_min)
+
+
+def _caption_of(step: Step) -> str:
+    """What one instant cost."""
+    ego = step.snapshot.frames[step.ego].agent_id
+    sent = [s.bytes for s in step.sent if s.packets and s.agent_id != ego]
+    moment = f"frame {step.snapshot.index}"
+    if not sent:
+        return f"{moment} · nothing is sent"
+    age = f" · {1e3 * sum(step.ages_s) / len(step.ages_s):.0f} ms old" if step.ages_s else " · nothing has arrived"
+    return f"{moment} · {len(sent)} messages of {sum(sent) / len(sent) / 1e3:,.1f} kB{age}"
+
+
+def _film_picture(film: _Film, out: Path) -> tuple[Picture, ...]:
+    if not film.images:
+        return ()
+    save_animation(film.images, out / "drive.gif", FILM_FRAME_MS)
+    names = ", below it ".join(TITLES.get(name, name).split(":")[0].lower() for name in film.methods)
+    return (Picture(out / "drive.gif", f"The drive at half speed: {names}.", wide=True),)
+
+
+def _still_pictures(steps: Sequence[Step], outcome: Outcome, grid: BevGrid, showing: Showing) -> tuple[Picture, ...]:
+    """One bird's-eye picture a method, of the same instant."""
+    rows = {row.method: row for row in outcome.rows}
+    out = []
+    for step in steps:
+        ap = rows[step.method].ap50
+        caption = f"{_caption_of(step)} · AP@0.5 of the drive {ap.value:.3f}" if ap else _caption_of(step)
+        path = showing.out / f"{step.method}.png"
+        save_png(_picture(step, grid, caption, showing.score_min, WIDTH), path)
+        out.append(Picture(path, f"{TITLES.get(step.method, step.method)}; {caption}"))
+    return tuple(out)
+
+
+def _facts(drive: Excerpt, detector: Detector, showing: Showing) -> tuple[tuple[str, str], ...]:
+    return (
+        *showing.facts,
+        ("Scenario", drive.scenario),
+        ("Judged frames", str(len(drive.judged(drive.scenario)))),
+        ("Agents", str(len(drive.agents(drive.scenario)))),
+        ("Channel", showing.replay.channel),
+        ("The ego waits", f"{1e3 * showing.replay.wait_s:.0f} ms"),
+        ("Weights", f"{showing.weights} · {detector.fingerprint.hex()}"),
+    )
+
+
+def _notes(outcome: Outcome, protocol: Protocol) -> tuple[str, ...]:
+    x0, y0, _, x1, y1, _ = protocol.gt_range
+    place = f"x from {x0:g} to {x1:g} m, y from {y0:g} to {y1:g} m around the ego"
+    text = (
+        f"Judged are the vehicles that any agent's LiDAR met, {place}. This is one drive: its numbers show what "
+        "happened here, and resolve no difference between methods; 'manyeyes evaluate' does, over many."
+    )
+    return (text, *outcome.checks)
+
+
+def write_text(path: Path, text: str) -> None:
+    """A text file, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trains a detector on a recording; goes on where a stopped run was. Several processes: torchrun -m manyeyes.apps.cli train."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which recording, which settings, where to."""
+
+    data: Path
+    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario."""
+    split: str | None = "train"
+    """Which split of a dataset: a folder inside it."""
+    preset: str = "costr-small"
+    """Settings by name; an unknown name lists the known ones."""
+    out: Path = Path("runs/costr-small")
+    """Folder of the run: weights.safetensors, log.jsonl, loss.png, last.pt to go on from, train.json."""
+    seed: int = 0
+    """Of weights, samples and augmentation."""
+    steps: int | None = None
+    """Steps of the optimiser, instead of the preset's."""
+    batch: int | None = None
+    """Samples a step over all processes, instead of the preset's."""
+    learning_rate: float | None = None
+    """Instead of the preset's."""
+    threads: int = 1
+    """Threads of torch in each process; the result is the same only for the same number."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    import torch
+    import torch.distributed as dist
+    from rich.console import Console
+
+    from manyeyes.datasets.opv2v import Opv2vRecording
+    from manyeyes.datatypes import ConfigError
+    from manyeyes.training.presets import TRAINING_PRESETS
+
+    if options.preset not in TRAINING_PRESETS:
+        raise ConfigError(f"No training preset {options.preset!r}; choose one of {', '.join(TRAINING_PRESETS)}.")
+    asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
+    config = replace(TRAINING_PRESETS[options.preset], **{k: v for k, v in asked.items() if v is not None})
+    torch.set_num_threads(options.threads)
+    recording = Opv2vRecording(options.data, options.split)
+    several = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    if several:
+        dist.init_process_group("gloo")
+    try:
+        _train(options, config, recording, Console(quiet=several and dist.get_rank() > 0))
+    finally:
+        if several:
+            dist.destroy_process_group()
+
+
+def _train(options: Options, config: Any, recording: Any, console: Any) -> None:
+    from manyeyes.apps import provenance
+    from manyeyes.apps.showcase import bars
+    from manyeyes.apps.viewer.loss_curve import save_loss_curve
+    from manyeyes.training.loop import Progress, train
+
+    origin = provenance.provenance({"options": options, "training": config}, options.seed)
+    card = {"command": origin["command"], "versions": origin["versions"], "git_commit": origin["git_commit"]}
+    last: list[Progress] = []
+    with bars(console) as progress:
+        task = progress.add_task("Training", total=None)
+
+        def report(at: Progress) -> None:
+            progress.update(task, total=at.steps, completed=at.step, description=f"loss {at.loss:.3f}")
+            last[:] = [at]
+
+        weights = train(config, recording, options.out, options.seed, card, report)
+    if console.quiet:
+        return
+    save_loss_curve(options.out / "log.jsonl", options.out / "loss.png")
+    result = {
+        "weights": weights.name,
+        "loss": last[0].loss if last else None,
+        "seconds": last[0].seconds if last else None,
+    }
+    provenance.write_json(options.out / "train.json", result, {"options": options, "training": config}, options.seed)
+    console.print(f"{weights}; the loss over steps is in {options.out / 'loss.png'}", highlight=False)
