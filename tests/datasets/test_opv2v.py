@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -407,6 +407,14 @@ def test_numbers_written_as_words_of_yaml_1_1_are_numbers(scenario: Path) -> Non
     assert Opv2vRecording(scenario).snapshot("drive", 0).frames[1].speed_mps == pytest.approx(1.0)
 
 
+def test_an_agent_that_lists_itself_is_not_believed(scenario: Path) -> None:
+    edit(scenario / "641" / "00068.yaml", lambda c: c["vehicles"].update({641: c["vehicles"][700]}))
+    truth = Opv2vRecording(scenario).snapshot("drive", 0).truth
+    assert truth is not None and truth.boxes.id.tolist()[0] == 641
+    assert truth.seen[:, 0].tolist() == [True, False, True]  # 1045 and the pole list it, 641 does not
+    assert truth.boxes.center[0, :2].tolist() == pytest.approx([100.4, -50.3])
+
+
 @pytest.mark.parametrize("pose", [None, "sensor"])
 def test_the_height_of_a_pole_is_found_in_its_cloud_where_no_pose_tells(scenario: Path, pose: str | None) -> None:
     for stem in ("00068", "00070"):
@@ -422,38 +430,6 @@ def test_the_height_of_a_pole_is_found_in_its_cloud_where_no_pose_tells(scenario
     assert Opv2vRecording(scenario).snapshot("drive", 1).frames[2].sensor_height_m == pytest.approx(4.3, abs=1e-4)
     write_ascii(scenario / "-1" / "00068.pcd", scan(-1)[:50])
     assert Opv2vRecording(scenario).snapshot("drive", 1).frames[2].sensor_height_m == 1.9
-
-
-@dataclass(frozen=True)
-class Size:
-    """A CARLA vehicle and what it is."""
-
-    lwh: tuple[float, float, float]
-    label: str
-
-
-@pytest.mark.parametrize(
-    "vehicle",
-    [
-        Size((4.90, 2.06, 1.49), "car"),  # Lincoln MKZ
-        Size((5.36, 2.03, 1.41), "car"),  # Chevrolet Impala
-        Size((3.81, 1.97, 1.92), "car"),  # Jeep Wrangler
-        Size((4.44, 2.03, 2.04), "van"),  # Volkswagen T2
-        Size((5.92, 1.99, 2.56), "van"),  # Mercedes Sprinter
-        Size((5.20, 2.61, 2.47), "truck"),  # delivery truck
-        Size((8.47, 2.89, 3.83), "truck"),  # fire engine
-        Size((10.27, 3.94, 4.25), "bus"),  # Mitsubishi Fuso Rosa
-    ],
-    ids=lambda v: f"{v.label} {v.lwh[0]}",
-)
-def test_labels_by_size(vehicle: Size) -> None:
-    assert opv2v_yaml.LABELS[opv2v_yaml._label({}, np.array(vehicle.lwh))] == vehicle.label
-
-
-def test_labels_by_name_come_before_size() -> None:
-    size = np.array([4.5, 1.9, 1.5])
-    assert opv2v_yaml.LABELS[opv2v_yaml._label({"obj_type": "Truck"}, size)] == "truck"
-    assert opv2v_yaml.LABELS[opv2v_yaml._label({"bp_id": "vehicle.mercedes.sprinter"}, size)] == "van"
 
 
 def drive_frame(index: int = 0, agents: tuple[int, ...] = (1, 10, 9, -2)) -> Snapshot:
