@@ -317,6 +317,10 @@ def test_a_pruned_or_merged_set_starts_without_maps():
     down = strided_conv(x, w)
     assert same_sites_map(x.sites, 3) is same_sites_map(x.with_features(x.features + 1).sites, 3)
     assert strided_conv(x, w).sites is down.sites
+    inverse_conv(down, w, x.sites)
+    assert len([name for name in x.sites.cache if name[0] == "pair"]) == 1
+    dilated = submanifold_conv(x, w, dilation=2)
+    assert_near(dilated.features, read(conv2d(x.dense(), w, padding=2, dilation=2), x.sites))
     keep = torch.rand(len(x.sites), generator=torch.Generator().manual_seed(9)) < 0.5
     pruned = x.keep(keep)
     assert not pruned.sites.cache and x.sites.cache

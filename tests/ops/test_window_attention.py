@@ -221,6 +221,9 @@ def test_cost_counters_by_hand():
     ids = torch.tensor([0, 1, 1, 2, 2, 2, 2, 2])
     cost = attention_cost(plan_windows(ids, ids), side=8, cells=100)
     assert (cost.exact, cost.padded, cost.bound, cost.dense) == (1 + 4 + 25, 4 + 4 + 25, 64 * 8, 6400)
+    # One query each; five keys in one window, one in the other: many keys must not pad the few.
+    cost = attention_cost(plan_windows(torch.tensor([0, 1]), torch.tensor([0, 0, 0, 0, 0, 1])), side=8)
+    assert (cost.exact, cost.padded) == (6, 6)
 
 
 def test_plan_is_the_same_for_the_same_tokens():
