@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 GRASS, ASPHALT, PAINT, SIDEWALK, CROSSING = 0, 1, 2, 3, 4
 _STRIPE_M = 0.5
+_GAP_M = 2.5
 _LEVEL_GAP_M = 1.5
 
 
@@ -109,7 +110,7 @@ def is_multilevel(network: RoadNetwork, center_xy: ArrayLike, radius_m: float, s
 
 
 def _paint_surface(surface: NDArray[np.uint8], network: RoadNetwork, x0: float, y0: float, cell: float) -> None:
-    """Walkways, then what is paved over them, then lines, then the stripes of crossings."""
+    """Walkways, then what is paved over them, the gaps that the file leaves within, lines, and the stripes of crossings."""
     size = surface.shape[0] * cell
     low, high = np.array([x0, y0]), np.array([x0, y0]) + size
 
@@ -117,10 +118,11 @@ def _paint_surface(surface: NDArray[np.uint8], network: RoadNetwork, x0: float, 
         flat = points[:, :2]
         return bool((flat.min(0) <= high).all() and (flat.max(0) >= low).all())
 
-    for kinds, value in ((WALKABLE, SIDEWALK), (PAVED, ASPHALT)):
+    for kinds, value in (((*WALKABLE, "border"), SIDEWALK), ((*PAVED, "none"), ASPHALT)):
         for lane in network.lanes:
             if lane.kind in kinds and (reaches(lane.left) or reaches(lane.right)):
                 _fill_strip(surface, lane.left, lane.right, x0, y0, cell, value)
+    _close_gaps(surface, round(_GAP_M / cell))
     for mark in network.marks:
         if mark.is_paint and reaches(mark.line):
             for left, right in _painted_strips(mark, cell):
@@ -132,6 +134,29 @@ def _paint_surface(surface: NDArray[np.uint8], network: RoadNetwork, x0: float, 
             along = edges[np.argmax(np.linalg.norm(edges, axis=1))]
             along = along / max(np.linalg.norm(along), 1e-9)
             _fill_stripes(surface, polygon, along, x0, y0, cell, _STRIPE_M, CROSSING)
+
+
+def _close_gaps(surface: NDArray[np.uint8], reach: int) -> None:
+    """Grass to asphalt where it is narrower than 2 reach cells between roads: the corners of junctions, ends of parking lanes."""
+    lane = surface != GRASS
+    pad = np.pad(lane, reach)
+    closed = ~_widen(~_widen(pad, reach), reach)[reach:-reach, reach:-reach]
+    surface[closed & ~lane] = ASPHALT
+
+
+def _widen(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Cells with a true one at most ``reach`` rows and columns away."""
+    for axis in (0, 1):
+        total = np.cumsum(mask, axis=axis, dtype=np.int32)
+        total = np.pad(total, [(reach + 1, reach) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
+        n = mask.shape[axis]
+        low, high = (np.take(total, range(k, k + n), axis) for k in (0, 2 * reach + 1))
+        first = np.take(mask, [0], axis).astype(np.int32)
+        # The edge padding repeats the first cumulative value, which already counts the first cell.
+        inside = np.arange(n) <= reach
+        low = low - np.where(inside[:, None] if axis == 0 else inside[None], first, 0)
+        mask = high > low
+    return mask
 
 
 def _painted_strips(mark: RoadMark, cell: float) -> list[tuple[Array, Array]]:

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 class CrossingSite:
     """A place where roads meet. center: (3,) metres, on the road; radius_m reaches the farthest corner of its lanes.
 
-    approaches: ids of the drivable lanes that lead into it. arms: how many roads meet, counted by the directions
-    from which their traffic comes. is_multilevel: whether roads pass over each other within 60 m.
+    approaches: ids of the drivable lanes that lead into it. arms: how many roads meet, counted by the directions in which
+    their lanes begin and end. is_multilevel: whether roads pass over each other within 60 m.
     """
 
     junction_id: str
@@ -35,8 +35,11 @@ def crossing_sites(network: RoadNetwork, min_arms: int = 3, single_level: bool =
     """Junctions with at least min_arms arms, largest first; without those near a bridge unless single_level is false."""
     sites = []
     for junction in network.junctions:
-        lanes = [network.lanes[k] for k in junction.incoming]
-        arms = _count_arms(np.array([np.arctan2(*(junction.center - lane.center[-1])[[1, 0]]) for lane in lanes]))
+        inside = set(junction.lanes)
+        leaving = {k for own in junction.lanes for k in network.lanes[own].successors if k not in inside}
+        mouths = [network.lanes[k].center[-1] for k in junction.incoming]
+        mouths += [network.lanes[k].center[0] for k in sorted(leaving) if network.lanes[k].is_drivable]
+        arms = _count_arms(np.array([np.arctan2(*(mouth - junction.center)[[1, 0]]) for mouth in mouths]))
         if arms < min_arms:
             continue
         center = junction.center.copy()

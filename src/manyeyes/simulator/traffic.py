@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from manyeyes.maps.road_network import RoadNetwork
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.simulator.parking import parked_cars
 from manyeyes.simulator.towns import run_sumo_tool
-from manyeyes.simulator.vehicles import VehicleStates, draw_vehicles
+from manyeyes.simulator.vehicles import VehicleStates, draw_vehicles, overlaps
 
 Array = NDArray[np.float64]
 
@@ -32,11 +32,21 @@ _NETCONVERT = (
     "--opendrive.import-all-lanes", "false",
     "--tls.guess-signals", "true",
     "--tls.guess", "true",
+    "--tls.default-type", "actuated",
     "--junctions.join", "false",
     "--no-turnarounds", "true",
     "--default.lanewidth", "3.5",
+    "--junctions.internal-link-detail", "16",
+    "--junctions.limit-turn-speed", "3",
 )  # fmt: skip
+# Part of the cache's key: raise it when _for_traffic changes.
+_CONVERSION = 1
+_FASTEST_MPS = 16.7
 _TRUCK_SPEED_MPS = 22.0
+_TRAIL_S = 20.0
+_TOUCH_MARGIN_M = 0.02
+# Way between the front bumper and the rear axle, in lengths.
+_REAR_AXLE = 0.8
 _LATERAL_SIGMA_M, _LATERAL_LIMIT_M = 0.12, 0.3
 
 
@@ -78,25 +88,32 @@ def simulate_traffic(
         _write_routes(routes, edges, kind, size, random, duration_s=warmup_s + steps * step_s)
         arguments = [
             "--net-file", str(net), "--route-files", str(routes), "--step-length", repr(step_s),
-            "--seed", str(int(random.integers(2**31 - 1))), "--lanechange.duration", "2.5",
+            "--seed", str(int(random.integers(2**31 - 1))), "--lanechange.duration", "3",
             "--time-to-teleport", "-1", "--collision.action", "none", "--no-step-log", "true",
             "--no-warnings", "true", "--duration-log.disable", "true", "--default.action-step-length", repr(step_s),
         ]  # fmt: skip
         output = Path(folder) / "states.npz"
-        job = {"arguments": arguments, "warmup_steps": round(warmup_s / step_s), "steps": steps, "output": str(output)}
+        before = min(round(_TRAIL_S / step_s), round(warmup_s / step_s))
+        skipped = round(warmup_s / step_s) - before
+        job = {"arguments": arguments, "warmup_steps": skipped, "steps": steps + before, "output": str(output)}
         _run_worker(Path(folder) / "job.json", job)
         with np.load(output) as states:
             step, vehicle, state = states["step"], states["vehicle"], states["state"]
+    heading = _headings(vehicle, state, size[:, 0])
     aside = np.clip(random.normal(0.0, _LATERAL_SIGMA_M, wanted), -_LATERAL_LIMIT_M, _LATERAL_LIMIT_M)
-    everything = _to_states(network, vehicle, state, kind, size, aside)
-    return tuple(everything[step == k] for k in range(steps))
+    shown = step >= before
+    everything = _to_states(network, vehicle[shown], state[shown], heading[shown], kind, size, aside)
+    everything = replace(everything, speed=_speeds(step, vehicle, state, step_s)[shown])
+    frames = tuple(everything[step[shown] == before + k] for k in range(steps))
+    touching = np.unique(np.concatenate([_touching(frame) for frame in frames]))
+    return tuple(frame[~np.isin(frame.id, touching)] for frame in frames)
 
 
 def sumo_net(network: RoadNetwork) -> Path:
     """The network converted for SUMO, made once and kept in the cache folder by the content's hash."""
     version = _sumo_version()
     key = hashlib.blake2b(network.xodr, digest_size=12)
-    key.update(repr((version, _NETCONVERT)).encode())
+    key.update(repr((version, _NETCONVERT, _CONVERSION)).encode())
     folder = cache_folder()
     net = folder / f"{key.hexdigest()}.net.xml"
     if net.is_file():
@@ -104,10 +121,30 @@ def sumo_net(network: RoadNetwork) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="netconvert-", dir=folder) as temporary:
         xodr, made = Path(temporary) / "roads.xodr", Path(temporary) / "roads.net.xml"
-        xodr.write_bytes(network.xodr)
+        xodr.write_bytes(_for_traffic(network.xodr))
         run_sumo_tool("netconvert", "--opendrive-files", str(xodr), "--output-file", str(made), *_NETCONVERT)
         made.replace(net)
     return net
+
+
+def _for_traffic(xodr: bytes) -> bytes:
+    """The same roads as SUMO shall drive them: parking and two-way turning lanes closed, and each lane's speed limit stated.
+
+    SUMO would drive on parking lanes and take 50 km/h for every road. The CARLA towns allow up to 105 km/h into their
+    crossings, so that limits are cut at 60 km/h.
+    """
+    root = ET.fromstring(xodr)
+    for road in root.findall("road"):
+        speed = road.find("type/speed")
+        unit = {"mph": 0.44704, "km/h": 1 / 3.6}.get(speed.get("unit", "m/s"), 1.0) if speed is not None else 1.0
+        stated = (speed.get("max") if speed is not None else None) or ""
+        for lane in road.iter("lane"):
+            if lane.get("type") in ("parking", "bidirectional"):
+                lane.set("type", "none")
+            elif lane.get("type") == "driving" and lane.find("speed") is None and stated.replace(".", "", 1).isdigit():
+                limit = min(float(stated) * unit, _FASTEST_MPS)
+                ET.SubElement(lane, "speed", sOffset="0", max=f"{limit:.2f}", unit="m/s")
+    return ET.tostring(root)
 
 
 def cache_folder() -> Path:
@@ -147,8 +184,20 @@ def _read_edges(net: Path) -> _Edges:
         one, two = place.get(connection.get("from", "")), place.get(connection.get("to", ""))
         if one is not None and two is not None:
             following[one].add(two)
-    ordered = tuple(tuple(sorted(after)) for after in following)
+    ordered = tuple(tuple(sorted(after)) for after in _without_dead_ends(following))
     return _Edges(tuple(name), np.array(length), np.array(lanes, np.int64), np.array(limit), ordered)
+
+
+def _without_dead_ends(following: list[set[int]]) -> list[set[int]]:
+    """The same without ways that end, so that nobody vanishes on the road; unchanged where every way ends."""
+    kept, lost = [set(after) for after in following], set()
+    while True:
+        ends = {k for k, after in enumerate(kept) if not after} - lost
+        if not ends:
+            return kept if len(lost) < len(kept) else following
+        lost |= ends
+        for after in kept:
+            after -= ends
 
 
 def _admits_cars(lane: ET.Element) -> bool:
@@ -167,7 +216,8 @@ def _write_routes(
     duration_s: float,
 ) -> None:
     """A type, a route and a vehicle for each of N; all start within the first seconds, anywhere on their first edge."""
-    weights = edges.length * edges.lanes
+    weights = edges.length * edges.lanes * np.array([bool(after) for after in edges.following])
+    weights = weights if weights.any() else edges.length
     start = random.choice(len(edges.name), len(kind), p=weights / weights.sum())
     eager = np.clip(random.normal(1.0, 0.12, len(kind)), 0.7, 1.35)
     depart = np.sort(random.random(len(kind)) * min(5.0, duration_s / 2))
@@ -180,7 +230,7 @@ def _write_routes(
             root, "vType", id=f"t{n}", length=length, width=width, height=height, speedFactor=f"{eager[n]:.3f}",
             vClass={"van": "delivery", "truck": "truck", "bus": "bus"}.get(label, "passenger"),
             accel="1.2" if heavy else "2.4", decel="4.0" if heavy else "4.5", minGap="2.5", sigma="0.4",
-            maxSpeed=f"{_TRUCK_SPEED_MPS if heavy else 50.0}",
+            maxSpeed=f"{_TRUCK_SPEED_MPS if heavy else 50.0}", lcMaxSpeedLatStanding="0", lcMaxSpeedLatFactor="0.25",
         )  # fmt: skip
         vehicle = ET.SubElement(
             root, "vehicle", id=str(n), type=f"t{n}", depart=f"{depart[n]:.2f}", departLane="best",
@@ -211,22 +261,68 @@ def _run_worker(path: Path, job: dict[str, object]) -> None:
         raise ConfigError(f"SUMO failed with {done.returncode}: {lines[-1][:300] if lines else 'it said nothing'}")
 
 
+def _headings(vehicle: NDArray[np.int64], state: Array, length: Array) -> Array:
+    """(rows,) headings in radians: from where the front bumper was one wheelbase of way ago to where it is now.
+
+    SUMO's own angle swings a whole bus by the direction of its bumper while it changes lanes; following the bumper's
+    track keeps the rear on it. Before the record began the track goes straight back along SUMO's angle.
+    """
+    heading = np.empty(len(vehicle))
+    order = np.argsort(vehicle, kind="stable")
+    names, first = np.unique(vehicle[order], return_index=True)
+    for name, rows in zip(names, np.split(order, first[1:])):
+        front = state[rows, :2]
+        reach = _REAR_AXLE * length[name]
+        initial = np.pi / 2 - np.radians(state[rows[0], 3])
+        start = front[0] - reach * np.array([np.cos(initial), np.sin(initial)])
+        track = np.concatenate((start[None], front))
+        way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(track, axis=0), axis=1))))
+        rear = np.stack([np.interp(way[1:] - reach, way, track[:, k]) for k in (0, 1)], -1)
+        delta = front - rear
+        heading[rows] = np.arctan2(delta[:, 1], delta[:, 0])
+    return heading
+
+
+def _speeds(step: NDArray[np.int64], vehicle: NDArray[np.int64], state: Array, step_s: float) -> Array:
+    """(rows,) way of the front bumper since the step before over its time; SUMO's speed where there is no such step.
+
+    They differ where the lanes of one edge have unequal lengths: SUMO moves along all of them as if along their mean.
+    """
+    order = np.lexsort((step, vehicle))
+    follows = (np.diff(vehicle[order]) == 0) & (np.diff(step[order]) == 1)
+    way = np.linalg.norm(np.diff(state[order, :2], axis=0), axis=1) / step_s
+    speed = state[:, 4].copy()
+    speed[order[1:]] = np.where(follows, way, speed[order[1:]])
+    return speed
+
+
+def _touching(frame: VehicleStates) -> NDArray[np.int64]:
+    """Ids of vehicles that overlap one with a smaller id: SUMO lets corners touch where tracks meet at an angle."""
+    corners, found = frame.corners(_TOUCH_MARGIN_M), []
+    reach = np.linalg.norm(frame.size[:, :2], axis=1) / 2
+    for n in range(1, len(frame)):
+        near = np.linalg.norm(frame.position[:n, :2] - frame.position[n, :2], axis=1) < reach[:n] + reach[n]
+        close = near & (np.abs(frame.position[:n, 2] - frame.position[n, 2]) < 2.0)
+        if close.any() and overlaps(corners[n], corners[:n][close]).any():
+            found.append(frame.id[n])
+    return np.array(found, np.int64)
+
+
 def _to_states(
     network: RoadNetwork,
     vehicle: NDArray[np.int64],
     state: Array,
+    yaw: Array,
     kind: NDArray[np.int64],
     size: Array,
     aside: Array,
 ) -> VehicleStates:
-    """SUMO's front bumpers and compass angles as footprints on the road.
+    """SUMO's front bumpers as footprints on the road.
 
     aside: (vehicles,) metres left of the lane's middle that each keeps. Wheels stand at 0.3 lengths before and behind
     the middle; their heights give pitch and z.
     """
     size, kind, aside = size[vehicle], kind[vehicle], aside[vehicle]
-    yaw = np.pi / 2 - np.radians(state[:, 3])
-    yaw = np.mod(yaw + np.pi, 2 * np.pi) - np.pi
     ahead = np.stack((np.cos(yaw), np.sin(yaw)), -1)
     left = np.stack((-ahead[:, 1], ahead[:, 0]), -1)
     middle = state[:, :2] - ahead * size[:, :1] / 2 + left * aside[:, None]
