@@ -31,6 +31,8 @@ class Options:
     """At most so many judged frames."""
     animate: bool = True
     """Draw the animation of the drive."""
+    score_min: float = 0.2
+    """Detections below this score are not drawn; they count all the same."""
     playing: Playing = field(default_factory=lambda: Playing(channel="its-g5-27"))
     """How agents collaborate."""
 
@@ -63,6 +65,7 @@ def main(options: Options) -> None:
         replay=replay,
         weights=weights_name(options.playing.weights),
         animate=options.animate,
+        score_min=options.score_min,
         facts=(("Town", town),),
         commands=(
             f"manyeyes demo --seed {options.seed}",

@@ -55,6 +55,11 @@ class Outcome:
     differences: tuple[Difference, ...]
     checks: tuple[str, ...]
 
+    @property
+    def several(self) -> bool:
+        """Whether there are scenarios enough to compare over; one drive resolves nothing."""
+        return any(number.precision[0].ap.scenarios > 1 for number in self.numbers)
+
 
 def outcome_of(results: Sequence[MethodResult], protocol: Protocol) -> Outcome:
     """The outcome of measured methods."""
@@ -74,6 +79,8 @@ def outcome_of(results: Sequence[MethodResult], protocol: Protocol) -> Outcome:
 def show(console: Console, outcome: Outcome, title: str) -> None:
     """Table, differences and checks in the terminal."""
     console.print(terminal(outcome.rows, title))
+    if not outcome.several:
+        return
     if outcome.differences:
         console.print()
         console.print(differences_terminal(outcome.differences))

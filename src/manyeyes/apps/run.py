@@ -31,6 +31,8 @@ class Options:
     """Of the channel's losses and jitter."""
     animate: bool = True
     """Draw the animation of the drive."""
+    score_min: float = 0.2
+    """Detections below this score are not drawn; they count all the same."""
     playing: Playing = field(default_factory=Playing)
     """How agents collaborate."""
 
@@ -59,6 +61,7 @@ def main(options: Options) -> None:
         weights=weights_name(options.playing.weights),
         frame=options.frame,
         animate=options.animate,
+        score_min=options.score_min,
         commands=(f"manyeyes run {options.recording}{split} --scenario {drive.scenario}",),
     )
     _, report = play(drive, zoo.load(options.playing.weights), showing, console)

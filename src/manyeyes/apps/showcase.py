@@ -100,11 +100,10 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
         title=showing.title,
         lead=showing.lead,
         rows=outcome.rows,
-        differences=outcome.differences,
         pictures=pictures,
         facts=_facts(drive, detector, showing),
         commands=showing.commands,
-        notes=_notes(outcome, protocol),
+        notes=_notes(protocol),
         provenance=origin,
     )
     save_report(report, showing.out / "report.html")
@@ -178,14 +177,14 @@ def _facts(drive: Excerpt, detector: Detector, showing: Showing) -> tuple[tuple[
     )
 
 
-def _notes(outcome: Outcome, protocol: Protocol) -> tuple[str, ...]:
+def _notes(protocol: Protocol) -> tuple[str, ...]:
     x0, y0, _, x1, y1, _ = protocol.gt_range
     place = f"x from {x0:g} to {x1:g} m, y from {y0:g} to {y1:g} m around the ego"
     text = (
         f"Judged are the vehicles that any agent's LiDAR met, {place}. This is one drive: its numbers show what "
         "happened here, and resolve no difference between methods; 'manyeyes evaluate' does, over many."
     )
-    return (text, *outcome.checks)
+    return (text,)
 
 
 def write_text(path: Path, text: str) -> None:

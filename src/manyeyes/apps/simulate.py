@@ -14,8 +14,8 @@ class Options:
 
     preset: str = "towns-small"
     """Which set of scenarios; an unknown name lists the known ones."""
-    out: Path = Path("data/towns-small")
-    """Folder for the splits and the manifest; a run that was stopped goes on there."""
+    out: Path | None = None
+    """Folder for the splits and the manifest, data/PRESET by default; a run that was stopped goes on there."""
     seed: int = 0
     """Another seed, other scenes."""
     workers: int = os.cpu_count() or 1
@@ -36,6 +36,7 @@ def main(options: Options) -> None:
     from manyeyes.simulator.record import Progress
 
     preset = simulation_preset(options.preset)
+    out = options.out or Path("data") / options.preset
     total = sum(part.count for part in preset.splits)
     console = Console()
     with bars(console) as progress:
@@ -44,12 +45,12 @@ def main(options: Options) -> None:
         def report(at: Progress) -> None:
             progress.update(task, completed=at.done)
 
-        manifest = simulate(options.preset, options.out, options.seed, options.workers, report, options.towns)
+        manifest = simulate(options.preset, out, options.seed, options.workers, report, options.towns)
     held = json.loads(manifest.read_text(encoding="utf-8"))["scenarios"]
     provenance.write_json(
-        options.out / "simulate.json",
+        out / "simulate.json",
         {"scenarios": len(held), "frames": sum(entry["frames"] for entry in held), "manifest": manifest.name},
         {"options": options, "preset": preset},
         options.seed,
     )
-    console.print(f"{len(held)} scenarios in {options.out}; {manifest} lists counts and hashes", highlight=False)
+    console.print(f"{len(held)} scenarios in {out}; {manifest} lists counts and hashes", highlight=False)

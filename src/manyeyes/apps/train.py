@@ -19,8 +19,8 @@ class Options:
     """Which split of a dataset: a folder inside it."""
     preset: str = "costr-small"
     """Settings by name; an unknown name lists the known ones."""
-    out: Path = Path("runs/costr-small")
-    """Folder of the run: weights.safetensors, log.jsonl, loss.png, last.pt to go on from, train.json."""
+    out: Path | None = None
+    """Folder of the run, runs/PRESET by default: weights.safetensors, log.jsonl, loss.png, train.json, last.pt to go on from."""
     seed: int = 0
     """Of weights, samples and augmentation."""
     steps: int | None = None
@@ -65,6 +65,7 @@ def _train(options: Options, config: Any, recording: Any, console: Any) -> None:
     from manyeyes.apps.viewer.loss_curve import save_loss_curve
     from manyeyes.training.loop import Progress, train
 
+    out = options.out or Path("runs") / options.preset
     origin = provenance.provenance({"options": options, "training": config}, options.seed)
     card = {"command": origin["command"], "versions": origin["versions"], "git_commit": origin["git_commit"]}
     last: list[Progress] = []
@@ -75,14 +76,14 @@ def _train(options: Options, config: Any, recording: Any, console: Any) -> None:
             progress.update(task, total=at.steps, completed=at.step, description=f"loss {at.loss:.3f}")
             last[:] = [at]
 
-        weights = train(config, recording, options.out, options.seed, card, report)
+        weights = train(config, recording, out, options.seed, card, report)
     if console.quiet:
         return
-    save_loss_curve(options.out / "log.jsonl", options.out / "loss.png")
+    save_loss_curve(out / "log.jsonl", out / "loss.png")
     result = {
         "weights": weights.name,
         "loss": last[0].loss if last else None,
         "seconds": last[0].seconds if last else None,
     }
-    provenance.write_json(options.out / "train.json", result, {"options": options, "training": config}, options.seed)
-    console.print(f"{weights}; the loss over steps is in {options.out / 'loss.png'}", highlight=False)
+    provenance.write_json(out / "train.json", result, {"options": options, "training": config}, options.seed)
+    console.print(f"{weights}; the loss over steps is in {out / 'loss.png'}", highlight=False)

@@ -44,7 +44,7 @@ class Options:
     detect: str | None = None
     """Also draw what one method finds: alone, late, intermediate or early."""
     score_min: float = 0.2
-    """Detections below this score are left out."""
+    """Detections below this score are not drawn."""
     playing: Playing = field(default_factory=Playing)
     """How agents collaborate, with --detect."""
 

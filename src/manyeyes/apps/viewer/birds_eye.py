@@ -78,8 +78,10 @@ def scene_of(snapshot: Snapshot, detections: Boxes, ego: int = 0) -> Scene:
         agents.append(SceneAgent(frame.agent_id, index == ego, frame.is_infrastructure, ego_from_agent, cloud))
     if snapshot.truth is None:
         return Scene(tuple(agents), Boxes.empty(), torch.zeros(0, dtype=torch.bool), detections)
-    true_boxes = snapshot.truth.boxes.transform(snapshot.truth.world_from_agent[ego].inverse())
-    return Scene(tuple(agents), true_boxes, snapshot.truth.seen.any(0), detections)
+    # Nobody is asked to find itself: its marker stands for the ego's own body.
+    others = snapshot.truth.boxes.id != snapshot.frames[ego].agent_id
+    true_boxes = snapshot.truth.boxes[others].transform(snapshot.truth.world_from_agent[ego].inverse())
+    return Scene(tuple(agents), true_boxes, snapshot.truth.seen.any(0)[others], detections)
 
 
 def view_of(grid: BevGrid, width: int = 1280, margin_m: float = 4.0) -> View:
@@ -174,15 +176,20 @@ def _agent(pen: Pen, view: View, agent: SceneAgent, colour: Colour) -> None:
 
 
 def _frame(pen: Pen, view: View, scene: Scene, title: str, caption: str) -> None:
-    """Title and caption above, legend and scale bar below."""
+    """Title, caption and scale bar above, legend below; what reached out of the window is covered."""
     width, height = view.size
+    for top, bottom in ((0, HEADER), (height - FOOTER, height)):
+        pen.polygon(np.array([[0, top], [width, top], [width, bottom], [0, bottom]]), PAPER)
     pen.text((16, 10), title, INK, 18)
     pen.text((16, 35), caption, (84, 110, 122), 13)
     y = height - FOOTER / 2
     x = 16.0
-    for colour, text in ((TRUE, "true, seen"), (UNSEEN, "true, met by no agent"), (FOUND, "detection, score in %")):
-        if colour is not FOUND and not len(scene.truth):
-            continue
+    kinds = (
+        (TRUE, "true, seen", bool(scene.seen.any())),
+        (UNSEEN, "true, met by no agent", not bool(scene.seen.all())),
+        (FOUND, "detection, score in %", len(scene.detections) > 0),
+    )
+    for colour, text in ((colour, text) for colour, text, present in kinds if present):
         pen.polygon(np.array([[x, y - 5], [x + 18, y - 5], [x + 18, y + 5], [x, y + 5]]), None, colour, 1.8)
         pen.text((x + 25, y), text, INK, 12, "lm")
         x += 25 + pen.width(text, 12) + 20
@@ -192,6 +199,6 @@ def _frame(pen: Pen, view: View, scene: Scene, title: str, caption: str) -> None
         x += 15 + pen.width(agent.name, 12) + 18
     metres = 10 if view.x_max - view.x_min < 120 else 20
     end = width - 16.0
-    start = end - metres * view.scale
+    start, y = end - metres * view.scale, 22.0
     pen.line(np.array([[start, y - 4], [start, y + 4], [start, y], [end, y], [end, y - 4], [end, y + 4]]), INK, 1.5)
     pen.text((start - 8, y), f"{metres} m", INK, 12, "rm")

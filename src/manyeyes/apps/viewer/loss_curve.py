@@ -35,10 +35,13 @@ def save_loss_curve(log: Path, path: Path) -> None:
         (line,) = axes.plot(steps[width - 1 :], smooth, lw=2 if main else 1, label=name, zorder=3 if main else 2)
         if main:
             axes.plot(steps, values, lw=0.5, alpha=0.25, color=line.get_color(), zorder=1)
-    axes.set(xlabel="step", ylabel="loss", yscale="log")
+    # Terms that are negative log-likelihoods may fall below zero.
+    positive = all(line[key] > 0 for line in lines for key in line if key not in _NOT_TERMS)
+    axes.set(xlabel="step", ylabel="loss")
+    axes.set_yscale("log" if positive else "symlog", **({} if positive else {"linthresh": 0.1}))
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, ncols=2, fontsize=9)
+    figure.legend(frameon=False, fontsize=9, loc="outside right center")
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     figure.savefig(temporary, format="png", dpi=140)
     temporary.replace(path)

@@ -31,7 +31,7 @@ p { margin: 0 0 12px; max-width: 78ch; }
 .facts { display: flex; flex-wrap: wrap; gap: 10px; margin: 20px 0 0; padding: 0; list-style: none; }
 .facts li { background: var(--wash); border: 1px solid var(--line); border-radius: 8px; padding: 8px 14px; }
 .facts b { display: block; font-size: 12px; font-weight: 500; color: var(--soft); }
-.wide { overflow-x: auto; }
+.wide { overflow-x: auto; margin-bottom: 12px; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { text-align: right; padding: 8px 12px; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th { font-size: 12.5px; font-weight: 600; color: var(--soft); }
