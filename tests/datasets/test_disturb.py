@@ -102,6 +102,19 @@ def test_only_the_claim_changes():
     assert (moved(before, nothing) == 0).all() and (nothing.frames[1].pose_covariance == 0).all()
 
 
+def test_yaw_turns_about_the_worlds_vertical_even_for_a_pitched_agent():
+    angle = torch.tensor([0.05, -0.2, 1.0], dtype=torch.float64)
+    pitched = Transform.from_rpy(torch.zeros(3, dtype=torch.float64), *angle)
+    before = snapshot()
+    before = replace(before, frames=(before.frames[0], replace(before.frames[1], world_from_agent=pitched)))
+    noise = PoseNoise("collaborators_iid", 0.0, 0.1)
+    got = noise.apply(before, 0).frames[1].world_from_agent
+    expected = Transform.from_rpy(
+        torch.zeros(3, dtype=torch.float64), angle[0], angle[1], angle[2] + noise.offset("town", 0, -1)[3]
+    )
+    torch.testing.assert_close(got.rotation, expected.rotation)
+
+
 def test_moments_of_the_noise():
     noise = PoseNoise("collaborators_iid", 0.5, 0.1)
     draws = torch.stack([noise.offset("s", f, 1) for f in range(2000)])

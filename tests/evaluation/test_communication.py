@@ -42,6 +42,7 @@ def test_two_egos_of_one_frame_are_two_ego_frames():
 def test_frames_in_which_nobody_spoke():
     got = summarise([MessageRecord("a", 0, 1, 100)], ego_frames=4)
     assert got.bytes_per_ego_frame == 25 and got.bytes_per_message == 100
+    assert got.ab_mean_of_log2 == pytest.approx(math.log2(100)) and got.empty_messages == 0
     nothing = summarise([], ego_frames=4)
     assert nothing.bytes_per_ego_frame == 0 and nothing.megabits_per_s == 0
     assert math.isnan(nothing.bytes_per_message) and math.isnan(nothing.ab_log2_of_mean)

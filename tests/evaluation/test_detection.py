@@ -11,6 +11,7 @@ from manyeyes.evaluation.detection import (
     PROTOCOLS,
     FrameResult,
     average_precision,
+    average_precisions,
     ego_truth,
     kept_detections,
     match_frame,
@@ -49,6 +50,15 @@ def test_three_frames_by_hand_sorted_and_concatenated():
     assert got.ap == got.ap_global
     assert average_precision(three_frames(), 0.5, replace(MANYEYES, sort="concatenated")).ap == got.ap_legacy
     assert [m.tp.tolist() for m in got.frames] == [[True, False], [False, True], [True]]
+
+
+def test_several_thresholds_at_once():
+    frames = list(random_frames(5))
+    together = average_precisions(frames, (0.3, 0.5, 0.7), MANYEYES)
+    assert [r.ap_global for r in together] == [
+        average_precision(frames, t, MANYEYES).ap_global for t in (0.3, 0.5, 0.7)
+    ]
+    assert together[0].ap_global > together[2].ap_global
 
 
 def test_frames_may_come_in_any_order():
@@ -255,8 +265,8 @@ def crossing(order=(0, 1, 2), move=None, claimed_error=0.0):
         PointCloud.of(p.inverse().apply(center[[3, 4, 4, 4, 4]]).float())
         for p in (Transform.from_xyz_yaw(a[1], 0, 0, a[2]) for a in agents)
     ]
-    wrong = Transform.from_xyz_yaw(claimed_error, 0)
-    frames = [replace(AgentFrame.of(points[k], wrong @ poses[k], agents[k][0])) for k in order]
+    wrong = [Transform.from_xyz_yaw((k + 1) * claimed_error, 0) for k in range(3)]
+    frames = [AgentFrame.of(points[k], wrong[k] @ poses[k], agents[k][0]) for k in order]
     truth = Truth(boxes.transform(move), seen[list(order)], Transform.stack([poses[k] for k in order]))
     return Snapshot("crossing", 0, tuple(frames), truth)
 
@@ -285,11 +295,18 @@ def test_truth_does_not_depend_on_the_order_of_agents(order):
     assert torch.equal(one.center, other.center) and torch.equal(one.id, other.id)
 
 
-def test_truth_does_not_depend_on_where_the_world_is_nor_on_claimed_poses():
+def test_truth_does_not_depend_on_where_the_world_is():
     one = ego_truth(crossing(), 1, MANYEYES)
-    other = ego_truth(crossing(move=Transform.from_xyz_yaw(3000, -500, 7, 2.2), claimed_error=30.0), 1, MANYEYES)
+    other = ego_truth(crossing(move=Transform.from_xyz_yaw(3000, -500, 7, 2.2)), 1, MANYEYES)
     assert torch.equal(one.id, other.id)
     torch.testing.assert_close(one.center, other.center, atol=1e-9, rtol=0)
+
+
+def test_who_is_in_range_is_decided_by_true_poses():
+    """Agent 12 is 80 m away and claims 50 m; agent 11 is 60 m away and claims 90 m."""
+    for error in (-15.0, 30.0):
+        one, other = ego_truth(crossing(), 0, MANYEYES), ego_truth(crossing(claimed_error=error), 0, MANYEYES)
+        assert torch.equal(one.id, other.id) and torch.equal(one.center, other.center)
 
 
 def test_truth_respects_range_and_points():

@@ -96,6 +96,8 @@ def box(*values):
         ((0, 0, 0, 0, 0), (0, 0, 0, 0, 0), 0.0),
         ((0, 0, -4, 2, 0), (0, 0, 4, 2, 0), 0.0),
         ((math.nan, 0, 4, 2, 0), (0, 0, 4, 2, 0), 0.0),
+        ((0, 0, 4, 2, math.nan), (0, 0, 4, 2, 0), 0.0),
+        ((0, 0, math.inf, 2, 0), (0, 0, 4, 2, 0), 0.0),
     ],
 )
 def test_named_cases_both_ways_with_finite_gradients(a, b, expected):

@@ -37,7 +37,7 @@ def test_global_generators_are_left_alone():
 
 def test_golden_numbers():
     """Recordings, noise and weights are made from these: a change of the stream must be deliberate."""
-    assert keyed_uniform((3,), 7, "golden").tolist() == pytest.approx(GOLDEN_UNIFORM, abs=1e-15)
+    assert keyed_uniform((3,), 7, "golden").tolist() == GOLDEN_UNIFORM
     assert keyed_normal((3,), 7, "golden").tolist() == pytest.approx(GOLDEN_NORMAL, abs=1e-12)
 
 

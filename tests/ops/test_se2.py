@@ -179,6 +179,18 @@ def test_huber_resists_a_lying_edge():
     torch.testing.assert_close(clean.poses, solve(truth, edges, anchored(6)).poses)
 
 
+def test_the_robust_cost_grows_linearly_beyond_its_bound():
+    """One edge, off by 3 standard deviations: 9 / 2 plain, (2 * 3 * 1 - 1) / 2 with a bound of 1."""
+    at = torch.zeros(2, 3, dtype=F64)
+    edge = Edges(
+        torch.tensor([0]), torch.tensor([1]), torch.tensor([[1.5, 0, 0]], dtype=F64), 4 * torch.eye(3, dtype=F64)[None]
+    )
+    everything = torch.ones(2).bool()
+    assert solve(at, edge, everything).cost == pytest.approx(4.5)
+    assert solve(at, edge, everything, huber=1.0).cost == pytest.approx(2.5)
+    assert solve(at, edge, everything, huber=4.0).cost == pytest.approx(4.5)
+
+
 def test_the_answer_moves_with_the_world():
     truth, edges = graph(noise=0.2, seed=6)
     world = torch.tensor([2500.0, -900.0, 2.0], dtype=F64)

@@ -299,6 +299,14 @@ def average_precision(frames: Sequence[FrameResult | FrameOverlap], iou: float, 
     return ap_of_matches([match_frame(frame, iou, protocol) for frame in frames], protocol)
 
 
+def average_precisions(
+    frames: Sequence[FrameResult | FrameOverlap], ious: Sequence[float], protocol: Protocol
+) -> tuple[ApResult, ...]:
+    """AP of the frames at each IoU threshold; boxes are filtered and overlapped once."""
+    ready = [overlap_frame(frame, protocol) if isinstance(frame, FrameResult) else frame for frame in frames]
+    return tuple(average_precision(ready, iou, protocol) for iou in ious)
+
+
 def ap_of_matches(matches: Sequence[FrameMatch], protocol: Protocol) -> ApResult:
     """AP of frames that are already matched."""
     matches = in_dataset_order(matches)

@@ -25,8 +25,7 @@ def fit_se2(source: Tensor, target: Tensor, weight: Tensor | None = None) -> Ten
     p, q = source - p_mean, target - q_mean
     sine = (weight * (p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])).sum(-1)
     cosine = (weight * (p * q).sum(-1)).sum(-1)
-    known = (sine != 0) | (cosine != 0)
-    yaw = torch.atan2(torch.where(known, sine, 0.0), torch.where(known, cosine, 1.0))
+    yaw = torch.atan2(sine, cosine)
     c, s = yaw.cos(), yaw.sin()
     x, y = p_mean[..., 0, 0], p_mean[..., 0, 1]
     turned = torch.stack((c * x - s * y, s * x + c * y), -1)
