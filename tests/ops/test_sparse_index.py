@@ -78,26 +78,27 @@ def test_back_holds_each_meeting_once_and_from_the_other_side():
     key = keys(shape)
     found = parent_sites(key, shape, BATCH, 2)
     index = neighbours(found, window.out_shape(shape), key, shape, BATCH, window)
-    _, y, x = split(key, shape)
-    table = NeighbourMap(index, len(key), phase=y % 2 * 2 + x % 2)
+    table = NeighbourMap(index, len(key))
     wanted = {(o, t, i) for o, row in enumerate(index.tolist()) for t, i in enumerate(row) if i < len(key)}
     back = {(o, t, i) for i, row in enumerate(table.back.tolist()) for t, o in enumerate(row) if o < len(found)}
     assert back == wanted
-    by_phase = {
-        (o, int(gather.taps[t]), int(gather.rows[r]))
-        for gather in table.behind
-        for r, row in enumerate(gather.index.tolist())
-        for t, o in enumerate(row)
-        if o < len(found)
-    }
-    assert by_phase == wanted
-    assert sorted(gather.index.shape[1] for gather in table.behind) == [1, 2, 2, 4]
+    for reverse in (False, True):
+        pairs = [
+            (t, *ends) for t, *rows in table.pairs(reverse) for ends in zip(*(r.tolist() for r in rows), strict=True)
+        ]
+        assert len(pairs) == len(wanted)
+        assert {(t, b, a) if reverse else (t, a, b) for t, a, b in pairs} == {(t, i, o) for o, t, i in wanted}
+        assert all(len(s.unique()) == len(s) and len(e.unique()) == len(e) for _, s, e in table.pairs(reverse))
 
 
 def test_a_map_of_one_set_is_its_own_transpose_flipped():
     shape, key = (9, 10), keys((9, 10))
     index = neighbours(key, shape, key, shape, BATCH, Window(5, 1, 4, 2))
-    assert torch.equal(NeighbourMap(index, len(key), is_symmetric=True).back, NeighbourMap(index, len(key)).back)
+    symmetric, plain = NeighbourMap(index, len(key), is_symmetric=True), NeighbourMap(index, len(key))
+    assert torch.equal(symmetric.back, plain.back)
+    middle = plain.pairs()[12]
+    assert middle.tap == 12 and torch.equal(middle.source, middle.target) and len(middle.source) == len(key)
+    assert [pairs.tap for pairs in symmetric.pairs()] == [t for t in range(25) if t != 12]
 
 
 def test_distinct_is_unique_with_its_inverse():

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convolutions and pooling over occupied cells only, in plain PyTorch: exact, deterministic, on any device.
 
-A layer is one gather of neighbours and one matrix product, in blocks that stay in the CPU's cache. Its backward pass
-gathers too (by the transposed map), so that nothing is ever scattered and results do not depend on threads.
+A layer gathers, tap by tap, the rows that a tap meets, multiplies them by its matrix and adds them where they lead, in
+blocks that stay in the CPU's cache: only pairs that exist are multiplied (six of nine on a street). A tap leads to a
+row once at most, so that results do not depend on threads. Backward does the same with the pairs turned round.
 Semantics: cross-correlation as in ``conv2d``; a bias is added to active rows alone; output keys are ascending.
 """
 
@@ -16,14 +17,12 @@ from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
 from manyeyes.ops.sparse_index import (
-    Gather,
     NeighbourMap,
     Window,
     dilated_sites,
     distinct,
     neighbours,
     parent_sites,
-    split,
 )
 from manyeyes.ops.voxelize import segment_max, segment_mean, segment_sum
 
@@ -160,10 +159,8 @@ def _pair_map(fine: Sites, coarse: Sites, window: Window) -> NeighbourMap:
     name = ("pair", window, id(coarse))
     if name not in fine.cache:
         index = neighbours(coarse.key, coarse.grid.shape, fine.key, fine.grid.shape, fine.batch_size, window)
-        _, y, x = split(fine.key, fine.grid.shape)
-        phase = None if window.stride == 1 else y % window.stride * window.stride + x % window.stride
         # Holding the coarser set keeps its id from being given to another one.
-        fine.cache[name] = (NeighbourMap(index, len(fine), phase), coarse)
+        fine.cache[name] = (NeighbourMap(index, len(fine)), coarse)
     return fine.cache[name][0]
 
 
@@ -190,72 +187,62 @@ def _affine(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 def _conv(x: Tensor, weight: Tensor, bias: Tensor | None, table: NeighbourMap, reverse: bool = False) -> Tensor:
     """Rows (N_in, in) to (N_out, out); weight (out, in, k, k)."""
-    # (taps, in, out): one matrix for the gathered row of a site.
+    # (taps, in, out): one matrix for each tap.
     taps = weight.to(x.dtype).permute(2, 3, 1, 0).reshape(-1, weight.shape[1], weight.shape[0])
-    out: Tensor = _GatherProduct.apply(x, taps, table.on(x.device), reverse)  # pyright: ignore[reportAssignmentType]
+    out: Tensor = _PairProduct.apply(x, taps, table.on(x.device), reverse)  # pyright: ignore[reportAssignmentType]
     return out if bias is None else out + bias.to(x.dtype)
 
 
-class _GatherProduct(torch.autograd.Function):
-    """Keeps the input alone for its backward pass; no column buffer outlives a block."""
+class _PairProduct(torch.autograd.Function):
+    """Keeps the input alone for its backward pass; no gathered row outlives a block."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
         ctx.save_for_backward(x, taps)
         ctx.table, ctx.reverse = table, reverse
-        if reverse:
-            return _gather_product(x, table.behind, taps, table.n_in)
-        return _gather_product(x, table.ahead, taps, table.index.shape[0])
+        return _pair_product(x, taps, table, reverse)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
         x, taps = ctx.saved_tensors
-        dy, table = grads[0].contiguous(), ctx.table
-        there, back = (table.behind, table.ahead) if ctx.reverse else (table.ahead, table.behind)
+        dy, table, reverse = grads[0].contiguous(), ctx.table, ctx.reverse
         dx = dw = None
         if ctx.needs_input_grad[0]:
-            dx = _gather_product(dy, back, taps.transpose(1, 2), x.shape[0])
+            dx = _pair_product(dy, taps.transpose(1, 2), table, not reverse)
         if ctx.needs_input_grad[1]:
-            dw = _gather_outer(x, there, dy, taps.shape)
+            dw = _pair_outer(x, dy, table, reverse)
         return dx, dw, None, None
 
 
-def _gather_product(x: Tensor, gathers: tuple[Gather, ...], taps: Tensor, rows: int) -> Tensor:
-    """(rows, D): the gathered rows of x (N, C), each times the matrix (C, D) of its tap, summed over taps."""
-    padded, out = _padded(x), x.new_empty(rows, taps.shape[2])
-    for gather in gathers:
-        chosen = taps if gather.taps is None else taps.index_select(0, gather.taps)
-        matrix = chosen.reshape(-1, taps.shape[2])
-        part = out if gather.rows is None else x.new_empty(gather.index.shape[0], taps.shape[2])
-        for block, columns in _blocks(padded, gather.index):
-            torch.mm(columns, matrix, out=part[block])
-        if gather.rows is not None:
-            out.index_copy_(0, gather.rows, part)
+def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
+    """(rows, D): for each pair of a tap its row of x (N, C) times the matrix (C, D) of the tap, summed where it leads."""
+    # Every site meets itself by the middle tap: no gathering there.
+    out = x @ taps[taps.shape[0] // 2] if table.is_symmetric else x.new_zeros(table.rows(reverse), taps.shape[2])
+    size = min(_block_rows(x), table.longest)
+    gathered, product = x.new_empty(size, x.shape[1]), x.new_empty(size, taps.shape[2])
+    for tap, source, target in table.pairs(reverse):
+        for start in range(0, len(source), size):
+            part = source[start : start + size]
+            rows = torch.index_select(x, 0, part, out=gathered[: len(part)])
+            # A tap leads to a row once at most, so that no sum depends on the order of the pairs.
+            out.index_add_(0, target[start : start + size], torch.mm(rows, taps[tap], out=product[: len(part)]))
     return out
 
 
-def _gather_outer(x: Tensor, gathers: tuple[Gather, ...], dy: Tensor, shape: torch.Size) -> Tensor:
-    """(taps, C, D): for each tap the sum over rows of gathered rows of x (N, C), transposed, times dy (rows, D)."""
-    padded, out = _padded(x), x.new_zeros(shape)
-    for gather in gathers:
-        rows = dy if gather.rows is None else dy.index_select(0, gather.rows)
-        part = x.new_zeros(gather.index.shape[1] * shape[1], shape[2])
-        for block, columns in _blocks(padded, gather.index):
-            part.addmm_(columns.T, rows[block])
-        part = part.view(-1, *shape[1:])
-        out = part if gather.taps is None else out.index_add_(0, gather.taps, part)
-    return out
-
-
-def _blocks(padded: Tensor, index: Tensor) -> Iterator[tuple[slice, Tensor]]:
-    """Block by block, gathered rows side by side (rows, taps * C), in one buffer that is written anew each time."""
-    rows, taps = index.shape
-    size = _block_rows(padded)
-    buffer = padded.new_empty(min(size, rows) * taps, padded.shape[1])
-    for start in range(0, rows, size):
-        part = index[start : start + size]
-        columns = torch.index_select(padded, 0, part.reshape(-1), out=buffer[: part.numel()])
-        yield slice(start, start + size), columns.view(part.shape[0], taps * padded.shape[1])
+def _pair_outer(x: Tensor, dy: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
+    """(taps, C, D): for each tap the sum over its pairs of the row of x (N, C), transposed, times the row of dy (M, D)."""
+    dw = x.new_zeros(table.index.shape[1], x.shape[1], dy.shape[1])
+    if table.is_symmetric:
+        torch.mm(x.T, dy, out=dw[dw.shape[0] // 2])
+    size = min(_block_rows(x), table.longest)
+    ahead, behind = x.new_empty(size, x.shape[1]), x.new_empty(size, dy.shape[1])
+    for tap, source, target in table.pairs(reverse):
+        for start in range(0, len(source), size):
+            part = source[start : start + size]
+            rows = torch.index_select(x, 0, part, out=ahead[: len(part)])
+            others = torch.index_select(dy, 0, target[start : start + size], out=behind[: len(part)])
+            dw[tap].addmm_(rows.T, others)
+    return dw
 
 
 def _block_rows(x: Tensor) -> int:

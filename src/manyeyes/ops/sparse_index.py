@@ -34,32 +34,29 @@ class Window(NamedTuple):
         return max(rows, 0), max(columns, 0)
 
 
-@dataclass(frozen=True, eq=False)
-class Gather:
-    """index: (M, taps) int32, what the outputs rows (M,) meet by the taps (taps,); None stands for all, in order."""
+class Pairs(NamedTuple):
+    """By one tap, rows source (P,) int64 lead to rows target (P,) int64; no row stands twice on either side."""
 
-    index: Tensor
-    rows: Tensor | None = None
-    taps: Tensor | None = None
+    tap: int
+    source: Tensor
+    target: Tensor
 
 
 @dataclass(eq=False)
 class NeighbourMap:
     """index: (outputs, taps) int32, see the module; n_in: how many inputs there are.
 
-    phase: (n_in,), the place of each input within its stride; inputs of one phase meet outputs by the same few taps.
+    is_symmetric: inputs and outputs are one set, so that the middle tap leads from each row to itself.
     """
 
     index: Tensor
     n_in: int
-    phase: Tensor | None = None
     is_symmetric: bool = False
     moved: dict[torch.device, NeighbourMap] = field(default_factory=dict, repr=False)
 
-    @property
-    def ahead(self) -> tuple[Gather, ...]:
-        """What every output meets."""
-        return (Gather(self.index),)
+    def rows(self, reverse: bool) -> int:
+        """How many rows pairs lead to: outputs, or inputs when they are turned round."""
+        return self.n_in if reverse else self.index.shape[0]
 
     @cached_property
     def back(self) -> Tensor:
@@ -74,25 +71,32 @@ class NeighbourMap:
         return back[: self.n_in].contiguous()
 
     @cached_property
-    def behind(self) -> tuple[Gather, ...]:
-        """What every input meets, by phase: at stride 2 and kernel 3 these are 1, 2, 2 and 4 taps instead of 9."""
-        if self.phase is None:
-            return (Gather(self.back),)
-        gathers = []
-        for phase in torch.unique(self.phase).tolist():
-            rows = (self.phase == phase).nonzero()[:, 0]
-            index = self.back.index_select(0, rows)
-            taps = (index < self.index.shape[0]).any(0).nonzero()[:, 0]
-            gathers.append(Gather(index.index_select(1, taps), rows, taps))
-        return tuple(gathers)
+    def _ahead(self) -> tuple[Pairs, ...]:
+        """Tap by tap, which input leads to which output; without the middle tap where that is the row itself."""
+        by_tap = self.index.T.contiguous()
+        met = by_tap < self.n_in
+        if self.is_symmetric:
+            met[met.shape[0] // 2] = False
+        counts = met.sum(1).tolist()
+        target = met.nonzero()[:, 1].split(counts)
+        source = by_tap[met].long().split(counts)
+        return tuple(Pairs(tap, s, t) for tap, (s, t) in enumerate(zip(source, target)) if len(s))
+
+    @property
+    def longest(self) -> int:
+        """The most pairs that one tap has; at least 1."""
+        return max((len(pairs.source) for pairs in self._ahead), default=1)
+
+    def pairs(self, reverse: bool = False) -> tuple[Pairs, ...]:
+        """The pairs of every tap that has any, from inputs to outputs, or turned round."""
+        return tuple(Pairs(p.tap, p.target, p.source) for p in self._ahead) if reverse else self._ahead
 
     def on(self, device: torch.device) -> NeighbourMap:
         """The same map on another device; kept."""
         if device == self.index.device:
             return self
         if device not in self.moved:
-            phase = None if self.phase is None else self.phase.to(device)
-            self.moved[device] = NeighbourMap(self.index.to(device), self.n_in, phase, self.is_symmetric)
+            self.moved[device] = NeighbourMap(self.index.to(device), self.n_in, self.is_symmetric)
         return self.moved[device]
 
 
