@@ -27,9 +27,22 @@ class ActiveNorm(nn.BatchNorm1d):
         return super().forward(input)
 
 
-def conv_weight(a: int, b: int, kernel: int) -> nn.Parameter:
-    """A (a, b, kernel, kernel) kernel with He initialisation over its b * kernel^2 inputs."""
-    return nn.Parameter(torch.randn(a, b, kernel, kernel) * math.sqrt(2.0 / (b * kernel * kernel)))
+def fold_norm(weight: Tensor, norm: ActiveNorm) -> tuple[Tensor, Tensor]:
+    """A linear weight (outputs, ...) with the running statistics of the norm after it folded in, and the bias (outputs,)."""
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    return weight * scale.view(-1, *(1,) * (weight.dim() - 1)), norm.bias - norm.running_mean * scale
+
+
+def conv_weight(outputs: int, inputs: int, kernel: int) -> nn.Parameter:
+    """An (outputs, inputs, kernel, kernel) kernel with He initialisation over its inputs * kernel^2 inputs."""
+    return _tap_by_tap(torch.randn(outputs, inputs, kernel, kernel) * math.sqrt(2.0 / (inputs * kernel * kernel)))
+
+
+def _tap_by_tap(weight: Tensor) -> nn.Parameter:
+    """The same (outputs, inputs, k, k), laid out in memory as the matrices that the product reads: no copy at each call."""
+    return nn.Parameter(weight.permute(2, 3, 1, 0).contiguous().permute(3, 2, 0, 1))
 
 
 class SubmanifoldLayer(nn.Module):
@@ -64,7 +77,8 @@ class UpLayer(nn.Module):
 
     def __init__(self, inputs: int, lateral: int, outputs: int) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.randn(inputs, outputs, 3, 3) * math.sqrt(2.0 / (inputs * 9 / 4)))
+        weight = torch.randn(inputs, outputs, 3, 3) * math.sqrt(2.0 / (inputs * 9 / 4))
+        self.weight = nn.Parameter(_tap_by_tap(weight.transpose(0, 1)).data.transpose(0, 1))
         self.norm, self.lateral = ActiveNorm(outputs), nn.Linear(lateral, outputs, bias=False)
 
     def forward(self, coarse: SparseBev, fine: SparseBev) -> SparseBev:

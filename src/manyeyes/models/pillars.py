@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
-from manyeyes.models.layers import ActiveNorm
+from manyeyes.models.layers import ActiveNorm, fold_norm
+from manyeyes.ops.segment_affine import affine_segment_max
 from manyeyes.ops.voxelize import Pillars, pillar_moments, pillar_sites, segment_max, segment_mean
 
 PillarKind = Literal["points", "moments"]
@@ -29,8 +30,20 @@ class PointPillars(nn.Module):
         mean = segment_mean(xyz, row, len(sites))
         grid = sites.grid
         centre = torch.cat((sites.xy, sites.xy.new_full((len(sites), 1), (grid.z_min + grid.z_max) / 2)), -1)
+        if not self.training and not torch.is_grad_enabled():
+            return self._infer(xyz, intensity, row, mean, centre)
         inputs = torch.cat((xyz, intensity[:, None], xyz - mean[row], xyz - centre[row]), -1)
         return segment_max(torch.relu(self.norm(self.linear(inputs))), row, len(sites))
+
+    def _infer(self, xyz: Tensor, intensity: Tensor, row: Tensor, mean: Tensor, centre: Tensor) -> Tensor:
+        """The same numbers with the norm folded in: within a pillar only four of the ten inputs differ from point to point."""
+        weight, bias = fold_norm(self.linear.weight, self.norm)
+        place, bright, to_mean, to_centre = weight.split((3, 1, 3, 3), 1)
+        varying = torch.cat((place + to_mean + to_centre, bright), 1)
+        points = torch.cat((xyz, intensity[:, None]), 1)
+        origin = torch.cat((centre, centre.new_zeros(len(centre), 1)), 1)
+        top = affine_segment_max(points, origin, varying, row)
+        return torch.relu_(top + centre @ place.T + (centre - mean) @ to_mean.T + bias)
 
 
 class MomentPillars(nn.Module):
