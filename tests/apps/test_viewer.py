@@ -41,7 +41,7 @@ def snapshot(ego_points: torch.Tensor | None = None) -> Snapshot:
     far = torch.tensor([[500.0, 500.0, 1.0]])
     clouds = [
         PointCloud.of(far if ego_points is None else ego_points),
-        PointCloud.of(torch.tensor([[3.0, 2.0, 1.0]] * 40)),
+        PointCloud.of(torch.tensor([[3.0, 2.0, 1.0]] * 4)),
     ]
     frames = tuple(
         AgentFrame(i, 0, cloud, pose, torch.zeros(3, 3), is_infrastructure=i == 1)
@@ -94,6 +94,13 @@ def test_points_of_another_agent_are_moved_by_its_pose_and_have_its_colour() -> 
     image = draw(scene_of(snapshot(), Boxes.empty()), GRID)
     assert near(image, 17, 8, AGENTS[1])
     assert not near(image, 23, 8, AGENTS[1]) and not near(image, 17, 12, AGENTS[1])
+
+
+def test_points_that_the_ego_never_heard_of_are_pale() -> None:
+    image = draw(scene_of(snapshot(), Boxes.empty(), unheard=[0, 1]), GRID)
+    assert not near(image, 17, 8, AGENTS[1])
+    column, row = view_of(GRID, 1280).pixels(np.array([17.0, 8.0]))
+    assert 255 > np.asarray(image)[int(row), int(column)].min() > AGENTS[1][0], "pale, but there"
 
 
 def test_a_box_that_no_agent_met_is_not_drawn_as_seen() -> None:

@@ -14,7 +14,6 @@ from manyeyes.apps.playing import Playing, excerpt, weights_name
 from manyeyes.datatypes import ConfigError
 
 PRESET = "demo"
-ALL_FRAMES = 100_000
 
 
 @dataclass(frozen=True)
@@ -27,8 +26,8 @@ class Options:
     """Another seed, another drive."""
     towns: Path | None = None
     """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
-    frames: int = ALL_FRAMES
-    """At most so many judged frames."""
+    frames: int | None = None
+    """At most so many judged frames, instead of all."""
     animate: bool = True
     """Draw the animation of the drive."""
     score_min: float = 0.2
@@ -45,14 +44,19 @@ def main(options: Options) -> None:
     from manyeyes.datasets.opv2v import Opv2vRecording
     from manyeyes.models import zoo
     from manyeyes.simulator.presets import simulate
+    from manyeyes.simulator.record import Progress
 
     console = Console()
     replay = options.playing.replay_config(options.seed)
     detector = zoo.load(options.playing.weights)
     folder = options.out / "recording" / f"seed-{options.seed}"
     with bars(console) as progress:
-        task = progress.add_task("Simulating", total=1)
-        simulate(PRESET, folder, options.seed, 1, lambda at: progress.update(task, completed=at.done), options.towns)
+        task = progress.add_task("Simulating", total=None)
+
+        def report_scene(at: Progress) -> None:
+            progress.update(task, total=at.total, completed=at.done)
+
+        simulate(PRESET, folder, options.seed, 1, report_scene, options.towns)
     drive = excerpt(Opv2vRecording(folder, "test"), None, options.frames)
     town = drive.scenario.rpartition("_")[0]
     if len(drive.judged(drive.scenario)) == 0:

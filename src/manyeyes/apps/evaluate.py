@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -38,7 +39,7 @@ class Options:
     """Judge every agent as ego, not only the first."""
     seed: int = 0
     """Of losses, jitter and pose errors."""
-    workers: int = 1
+    workers: int = os.cpu_count() or 1
     """How many processes share the scenarios; results do not depend on it."""
     timed_frames: int = 10
     """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""

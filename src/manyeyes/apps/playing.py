@@ -61,11 +61,11 @@ class Playing:
 
 @dataclass(frozen=True)
 class Excerpt:
-    """One scenario of a recording, at most so many judged frames of it."""
+    """One scenario of a recording, at most so many judged frames of it, all for None."""
 
     recording: Recording
     scenario: str
-    frames: int
+    frames: int | None
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -89,13 +89,13 @@ class Excerpt:
         return self.recording.snapshot(scenario, index)
 
 
-def excerpt(recording: Recording, scenario: str | None, frames: int) -> Excerpt:
+def excerpt(recording: Recording, scenario: str | None, frames: int | None = None) -> Excerpt:
     """The named scenario, or the first; a name that is not there lists those that are."""
     names = recording.scenarios
     if scenario is not None and scenario not in names:
         more = f" and {len(names) - 8} more" if len(names) > 8 else ""
         raise ConfigError(f"There is no scenario {scenario!r} in the recording; it has {', '.join(names[:8])}{more}.")
-    if frames < 1:
+    if frames is not None and frames < 1:
         raise ConfigError(f"--frames is at least 1; got {frames}.")
     return Excerpt(recording, scenario or names[0], frames)
 

@@ -130,7 +130,10 @@ def _filmed(methods: Sequence[str]) -> tuple[str, ...]:
 
 def _picture(step: Step, grid: BevGrid, caption: str, score_min: float, width: int) -> Image:
     title = TITLES.get(step.method, step.method)
-    return draw(scene_of(step.snapshot, step.boxes, step.ego), grid, title, caption, width, score_min)
+    heard = {reception.message.agent_id for reception in step.perception.heard}
+    unheard = {frame.agent_id for frame in step.snapshot.frames} - heard
+    scene = scene_of(step.snapshot, step.boxes, step.ego, unheard)
+    return draw(scene, grid, title, caption, width, score_min)
 
 
 def _caption_of(step: Step) -> str:

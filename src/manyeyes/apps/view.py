@@ -59,7 +59,7 @@ def main(options: Options) -> None:
 
     if options.out.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"--out ends in {', '.join(SUFFIXES)}; got {options.out.name}.")
-    drive = excerpt(Opv2vRecording(options.recording, options.split), options.scenario, 1 << 30)
+    drive = excerpt(Opv2vRecording(options.recording, options.split), options.scenario)
     single = options.out.suffix.lower() == ".png"
     first = drive.judged(drive.scenario).start if options.frame is None else options.frame
     last = min(drive.length(drive.scenario), first + (1 if single else options.frames))

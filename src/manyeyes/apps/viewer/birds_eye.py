@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,19 +39,23 @@ AGENTS: tuple[Colour, ...] = (
     (121, 85, 72),
 )
 GROUND_M = 0.3
-GROUND_INK, POINT_INK = 0.12, 0.9
+GROUND_INK, POINT_INK, UNHEARD = 0.12, 0.9, 0.2
 HEADER, FOOTER = 58, 44
 
 
 @dataclass(frozen=True)
 class SceneAgent:
-    """One agent as the picture shows it; cloud and ego_from_agent are in the ego's frame."""
+    """One agent as the picture shows it; cloud and ego_from_agent are in the ego's frame.
+
+    heard: whether the ego had anything of it; points that it never heard of are pale.
+    """
 
     agent_id: int
     is_ego: bool
     is_infrastructure: bool
     ego_from_agent: Transform
     cloud: PointCloud
+    heard: bool = True
 
     @property
     def name(self) -> str:
@@ -68,14 +73,18 @@ class Scene:
     detections: Boxes
 
 
-def scene_of(snapshot: Snapshot, detections: Boxes, ego: int = 0) -> Scene:
-    """A snapshot as the frame number ``ego`` of it saw it; detections are in that frame already."""
+def scene_of(snapshot: Snapshot, detections: Boxes, ego: int = 0, unheard: Collection[int] = ()) -> Scene:
+    """A snapshot as the frame number ``ego`` of it saw it; detections are in that frame already.
+
+    unheard: ids of agents of which the ego had nothing.
+    """
     ego_from_world = snapshot.frames[ego].world_from_agent.inverse()
     agents = []
     for index, frame in enumerate(snapshot.frames):
         ego_from_agent = ego_from_world @ frame.world_from_agent
         cloud = frame.points.transform(ego_from_agent)
-        agents.append(SceneAgent(frame.agent_id, index == ego, frame.is_infrastructure, ego_from_agent, cloud))
+        heard = index == ego or frame.agent_id not in unheard
+        agents.append(SceneAgent(frame.agent_id, index == ego, frame.is_infrastructure, ego_from_agent, cloud, heard))
     if snapshot.truth is None:
         return Scene(tuple(agents), Boxes.empty(), torch.zeros(0, dtype=torch.bool), detections)
     # Nobody is asked to find itself: its marker stands for the ego's own body.
@@ -106,7 +115,7 @@ def draw(
     for index, agent in enumerate(scene.agents):
         xyz = agent.cloud.xyz.numpy()
         ink = np.where(xyz[:, 2] > GROUND_M, POINT_INK, GROUND_INK)
-        layers.append((xyz[:, :2], ink, _colour(index)))
+        layers.append((xyz[:, :2], ink if agent.heard else ink * UNHEARD, _colour(index)))
     pen = Pen(splat(view, layers, PAPER))
     edges = np.array(
         [[grid.x_min, grid.y_min], [grid.x_max, grid.y_min], [grid.x_max, grid.y_max], [grid.x_min, grid.y_max]]
