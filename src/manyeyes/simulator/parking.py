@@ -30,7 +30,7 @@ def parked_cars(
     stands on a drivable lane, near a junction or a crossing, or on a road faster than 20 m/s.
     """
     center = np.asarray(center_xy, np.float64).reshape(2)
-    candidates = [_in_spaces(network, seed, center, radius_m, density)]
+    candidates = [_in_spaces(network, seed, density)]
     for lane in network.lanes:
         if _has_kerb(network, lane) and np.linalg.norm(lane.center[:, :2] - center, axis=1).min() < radius_m + 10.0:
             candidates.append(_along(network, lane, seed, density))
@@ -84,13 +84,15 @@ def _along(network: RoadNetwork, lane: Lane, seed: int, density: float) -> Vehic
     return _states(lane.id * 1000 + np.arange(len(places)), kind, at, yaw, pitch, size)[taken]
 
 
-def _in_spaces(network: RoadNetwork, seed: int, center: Array, radius_m: float, density: float) -> VehicleStates:
-    """Cars in the file's marked spaces, along the longer edge of each."""
+def _in_spaces(network: RoadNetwork, seed: int, density: float) -> VehicleStates:
+    """Cars in the file's marked spaces outside junctions, along the longer edge of each."""
     if not network.parking:
         return VehicleStates.empty()
     random = keyed_generator(seed, "parked", "spaces")
     n = len(network.parking)
-    taken = random.random(n) < min(1.0, 1.4 * density)
+    inside = {road.id for road in network.roads if road.junction_id is not None}
+    free = np.array([space.road_id not in inside for space in network.parking])
+    taken = free & (random.random(n) < min(1.0, 1.4 * density))
     kind, size = draw_vehicles(random, n, (1.0, 0.0, 0.0, 0.0))
     corners = np.stack([space.polygon[:4] for space in network.parking])
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1]
