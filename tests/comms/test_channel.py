@@ -166,6 +166,16 @@ def test_who_publishes_first_at_one_instant_makes_no_difference():
     assert len(results[0]) > 10
 
 
+def test_asking_at_the_instant_of_sending_settles_nothing():
+    early, late = LocalBus(Channel(SLOW)), LocalBus(Channel(SLOW))
+    early.publish(2, HERE, packets(2), 0)
+    assert early.deliver(9, HERE, 0) == []
+    early.publish(1, HERE, packets(2), 0)
+    for agent in (1, 2):
+        late.publish(agent, HERE, packets(2), 0)
+    assert early.deliver(9, HERE, 50 * MS) == late.deliver(9, HERE, 50 * MS)
+
+
 @QUICK
 @given(st.lists(st.integers(0, 60), min_size=1, max_size=12), st.integers(0, 1000))
 def test_how_often_one_asks_makes_no_difference(instants, seed):

@@ -202,7 +202,7 @@ class Medium:
         What begins at until_ns exactly cannot have arrived by then, and is left open because others may still offer at
         that instant; a medium of infinite rate has no queue and settles it too.
         """
-        self._offered.sort(key=lambda item: (item[0].sent_ns, item[0].agent_id, item[1]))
+        self._offered.sort(key=lambda item: item[0].sent_ns)
         has_queue = not math.isinf(self.preset.rate_bps)
         out: list[OnAir] = []
         while self._waiting or self._offered:
