@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import itertools
 from dataclasses import fields
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manyeyes.datatypes import LABELS, ConfigError, ShapeError
+from manyeyes.datatypes import LABELS, ConfigError, MissingExtraError, ShapeError
 from manyeyes.simulator import traffic
 from manyeyes.simulator.parking import parked_cars
 from manyeyes.simulator.towns import load_town
@@ -195,3 +196,21 @@ def test_traffic_follows_the_hills_of_town03(monkeypatch: pytest.MonkeyPatch, tm
     near = np.concatenate([lane.center[:, :2] for lane in parking])
     distance = np.linalg.norm(states.position[:, None, :2] - near[None], axis=-1).min(1)
     assert (distance > 1.0).all()
+
+
+def test_missing_sumo_names_the_extra(town, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    def absent(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(importlib.metadata, "version", absent)
+        with pytest.raises(MissingExtraError, match=r"pip install 'manyeyes\[sim\]'"):
+            traffic.sumo_net(town)
+    script = tmp_path / "worker.py"
+    monkeypatch.setattr(traffic, "_WORKER", script)
+    script.write_text("import sys; sys.exit('libsumo is not installed')")
+    with pytest.raises(MissingExtraError, match="'sim' extra"):
+        traffic._run_worker(tmp_path / "job.json", {})
+    script.write_text("print('x'); raise ValueError('no net')")
+    with pytest.raises(ConfigError, match="SUMO failed with 1: ValueError: no net"):
+        traffic._run_worker(tmp_path / "job.json", {})
