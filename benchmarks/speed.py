@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sparse detector against a dense PointPillars with attention fusion, at equal widths and OPV2V's full range.
+
+Five agents: each shares (cloud to bytes), then one of them perceives (its own features and four messages to boxes after
+NMS). Both are timed in turn in one process, with random weights, and both judge as many candidate boxes. Widths and
+layers a stage are equal (strides 2, 4, 8); the sparse one has two more layers each at strides 16 and 32, the merge, the way
+up to its head's stride and window attention on top. The dense one's bytes are its float32 maps (the
+copy is counted, no codec) and it never warps a map; the sparse one's are whole packets within 2^17 bytes a message.
+With one thread the process's own time is counted, with more the wall clock; bars are judged on five shares and one
+perceive. The default head stride, 4, is the shipped model's; the dense heads work at stride 2.
+
+python benchmarks/speed.py [--quick] [--rounds 5] [--threads 1] [--data ROOT] [--out benchmarks/results/speed.json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+import time
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from statistics import median
+
+import torch
+from dense_pointpillars import DenseConfig, DensePointPillars
+from street import street
+from torch import Tensor
+
+from manyeyes.agents.agent import Agent
+from manyeyes.agents.eyes import Eyes
+from manyeyes.apps.provenance import write_json
+from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, Sites, Snapshot, SparseBev
+from manyeyes.models import zoo
+from manyeyes.models.box_head import DecodeConfig
+from manyeyes.models.detector import Detector, DetectorConfig
+from manyeyes.models.encoder import STRIDES, EncoderConfig
+from manyeyes.models.fusion.gather import gather
+from manyeyes.models.layers import ActiveNorm
+from manyeyes.models.presets import OPV2V_GRID
+from manyeyes.models.pruning import FocalPrune, Pruned
+from manyeyes.models.transformer import AttentionConfig
+from manyeyes.training.targets import TargetConfig, near_objects
+
+CANDIDATES = 200
+PRUNED_AT = (2, 4, 8)
+
+
+@dataclass(frozen=True)
+class Widths:
+    """A backbone: channels and layers after the strided one at strides 2, 4, 8, and channels of the dense way up."""
+
+    channels: tuple[int, int, int]
+    extra_layers: tuple[int, int, int]
+    pillar_channels: int
+    up: int
+    bar_unpruned: float
+    bar_pruned: float
+
+
+WIDE = Widths((64, 128, 256), (3, 5, 8), 64, 128, 3.0, 6.0)
+SMALL = Widths((32, 64, 128), (2, 2, 2), 32, 64, 1.8, 3.0)
+
+
+def dense_rival(widths: Widths) -> DensePointPillars:
+    return DensePointPillars(
+        DenseConfig(OPV2V_GRID, widths.pillar_channels, widths.channels, widths.extra_layers, widths.up)
+    )
+
+
+def sparse_config(widths: Widths, head_stride: int) -> DetectorConfig:
+    a, b, c = widths.channels
+    encoder = EncoderConfig(
+        channels=(widths.pillar_channels, a, b, c, c, c),
+        layers=(0, *widths.extra_layers, 2, 2),
+        prune_strides=PRUNED_AT,
+        head_stride=head_stride,
+    )
+    return DetectorConfig(
+        grid=OPV2V_GRID,
+        pillars="points",
+        pillar_channels=widths.pillar_channels,
+        encoder=encoder,
+        dast=AttentionConfig(),
+        head_channels=b,
+    )
+
+
+class GivenPrune(FocalPrune):
+    """Scores cells as always, then keeps those it was told to: random weights prune as a trained model does."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels)
+        self.kept: Tensor | None = None
+
+    def forward(self, x: SparseBev, threshold: float) -> tuple[SparseBev, Pruned]:
+        probability = torch.sigmoid(self.score(x.features)[:, 0])
+        if self.kept is None:
+            return x, Pruned(x.sites, torch.full_like(probability, 9.0))
+        mask = self.kept[x.sites.key]
+        return x.keep(mask), Pruned(x.sites, mask * 18.0 - 9.0)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Which cells one agent's pruning leaves: flat masks over the grid at each stride that prunes, and over the tokens'."""
+
+    levels: tuple[Tensor, ...]
+    tokens: Tensor
+
+
+def random_detector(config: DetectorConfig, frames: list[AgentFrame]) -> Detector:
+    """Random weights whose activations are of order one, and a threshold that lets so many candidates through."""
+    torch.manual_seed(0)
+    model = Detector(config)
+    for name, layer in list(model.encoder.prune.items()):
+        model.encoder.prune[name] = GivenPrune(layer.score.in_features)
+    model.token_prune = GivenPrune(model.channels)
+    norms = [m for m in model.modules() if isinstance(m, ActiveNorm)]
+    momenta = [m.momentum for m in norms]
+    for norm in norms:
+        norm.momentum = None  # pyright: ignore[reportAttributeAccessIssue]
+    eyes = Eyes(model.train())
+    with torch.inference_mode():
+        eyes.own(eyes.see(frames[0]).tokens)
+    for norm, momentum in zip(norms, momenta):
+        norm.momentum = momentum
+    return model.eval().requires_grad_(False)
+
+
+def set_kept(model: Detector, kept: Kept | None) -> None:
+    prunes = [*model.encoder.prune.values(), model.token_prune]
+    masks = [*kept.levels, kept.tokens] if kept else [None] * len(prunes)
+    for layer, mask in zip(prunes, masks):
+        layer.kept = mask  # pyright: ignore[reportAttributeAccessIssue, reportArgumentType]
+
+
+@dataclass(frozen=True)
+class Times:
+    """Milliseconds: five shares and one perceive, one share (mean of the five), one perceive."""
+
+    together: float
+    share: float
+    perceive: float
+
+
+class Sparse:
+    """The sparse detector as an agent runs it; kept: what pruning leaves of each agent's cells, None for all."""
+
+    def __init__(self, model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -> None:
+        self.model, self.frames, self.kept = model, frames, kept
+        self.sites, self.message_bytes = self._look()
+
+    def _look(self) -> tuple[tuple[int, ...], float]:
+        counts, sizes = [], []
+        for i, frame in enumerate(self.frames):
+            set_kept(self.model, self.kept[i] if self.kept else None)
+            agent = Agent(self.model)
+            sizes.append(sum(map(len, agent.share(frame))))
+            seen = agent.eyes.see(frame)
+            counts.append((*seen.sites_per_stride, len(seen.pruned[-1].sites), len(seen.tokens.sites)))
+        return tuple(sum(c) for c in zip(*counts)), median(sizes)
+
+    def once(self) -> Times:
+        agent, packets, began = Agent(self.model), [], _clock()
+        for i, frame in enumerate(self.frames):
+            set_kept(self.model, self.kept[i] if self.kept else None)
+            packets.append(agent.share(frame))
+        shared = _clock()
+        agent.perceive(self.frames[0], (p for message in packets[1:] for p in message))
+        ended = _clock()
+        return _times(began, shared, ended, len(self.frames))
+
+
+class Dense:
+    """The rival; as the sparse agent, it remembers its own maps between share and perceive."""
+
+    def __init__(self, model: DensePointPillars, frames: list[AgentFrame]) -> None:
+        self.model, self.frames = model, frames
+        self.message_bytes = sum(map(len, model.share(frames[0].points)))
+
+    def once(self) -> Times:
+        began, messages = _clock(), []
+        own = self.model.see(self.frames[0].points)
+        messages.append(self.model.pack(own))
+        messages += [self.model.share(frame.points) for frame in self.frames[1:]]
+        shared = _clock()
+        self.model.perceive(own, messages[1:], CANDIDATES)
+        return _times(began, shared, _clock(), len(self.frames))
+
+
+def _clock() -> float:
+    """Seconds. With one thread the process's own time, so that other work on the machine hits neither side."""
+    return time.process_time() if torch.get_num_threads() == 1 else time.perf_counter()
+
+
+def _times(began: float, shared: float, ended: float, agents: int) -> Times:
+    return Times(1e3 * (ended - began), 1e3 * (shared - began) / agents, 1e3 * (ended - shared))
+
+
+def aim_threshold(model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -> None:
+    """Set the score threshold so that CANDIDATES cells, or all if fewer, pass it in the ego's frame."""
+    parts = []
+    for i, frame in enumerate(frames):
+        set_kept(model, kept[i] if kept else None)
+        seen = model.see([frame.points]).tokens
+        motion = frames[0].world_from_agent.inverse() @ frame.world_from_agent if i else None
+        parts.append((0, seen.features, seen.sites.xy, motion))
+    raw = model.fuse(gather(parts, model.token_grid, 1))
+    power = DecodeConfig().overlap_power
+    best = (torch.sigmoid(raw.heat) ** (1 - power) * torch.sigmoid(raw.overlap) ** power).sort(descending=True).values
+    threshold = float(best[CANDIDATES]) if len(best) > CANDIDATES else 0.0
+    model.config = replace(model.config, decode=DecodeConfig(score_threshold=threshold))
+
+
+def kept_by_model(model: Detector, frames: list[AgentFrame], head_stride: int) -> list[Kept]:
+    """The cells that trained weights keep of each agent's cloud at their own threshold, over OPV2V's whole range.
+
+    The weights see no absolute position, so they run on any extent; their own limits of height stay.
+    """
+    config = model.config
+    grid = replace(OPV2V_GRID, z_min=config.grid.z_min, z_max=config.grid.z_max)
+    wide = Detector(replace(config, grid=grid))
+    wide.load_state_dict(model.state_dict())
+    wide.eval().requires_grad_(False)
+    kept = []
+    for frame in frames:
+        pruned = wide.see([frame.points]).pruned
+        masks = [_mask(p.sites, torch.sigmoid(p.logit) > config.prune_threshold) for p in pruned]
+        kept.append(Kept(tuple(masks[:-1]), _restride(masks[-1], wide.token_grid, head_stride)))
+    return kept
+
+
+def kept_by_truth(snapshot: Snapshot, head_stride: int, share_of_rest: float = 0.1) -> list[Kept]:
+    """Emulated: the cells near a listed box, as pruning is taught, and a tenth of all others."""
+    assert snapshot.truth is not None
+    random = torch.Generator().manual_seed(0)
+
+    def mask(stride: int, boxes: Boxes) -> Tensor:
+        grid = OPV2V_GRID.at(stride)
+        every = Sites(torch.arange(grid.shape[0] * grid.shape[1]), grid)
+        rest = torch.rand(len(every), generator=random) < share_of_rest
+        return near_objects(every, [boxes], TargetConfig()) | rest
+
+    kept = []
+    for i, frame in enumerate(snapshot.frames):
+        boxes = snapshot.truth.boxes[snapshot.truth.seen[i]].transform(frame.world_from_agent.inverse())
+        kept.append(Kept(tuple(mask(s, boxes) for s in PRUNED_AT), mask(head_stride, boxes)))
+    return kept
+
+
+def _mask(sites: Sites, chosen: Tensor) -> Tensor:
+    rows, columns = sites.grid.shape
+    mask = torch.zeros(rows * columns, dtype=torch.bool)
+    mask[sites.key[chosen]] = True
+    return mask
+
+
+def _restride(mask: Tensor, grid: BevGrid, stride: int) -> Tensor:
+    """A mask over the cells of one stride to those of another: parents of what is marked, or all children of it."""
+    ratio = max(1, stride // grid.stride)
+    image = mask.view(1, 1, *grid.shape).float()
+    image = torch.nn.functional.max_pool2d(image, ratio, ceil_mode=True)
+    finer = max(1, grid.stride // stride)
+    return (image.repeat_interleave(finer, 2).repeat_interleave(finer, 3) > 0).flatten()
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table."""
+
+    widths: str
+    contender: str
+    times: Times
+    ratio: Times | None
+    bar: float | None
+    message_bytes: float
+    sites: tuple[int, ...]
+
+
+def compare(widths: Widths, snapshot: Snapshot, kept: list[Kept], head_stride: int, rounds: int) -> list[Row]:
+    """Medians of all contenders, run in turn."""
+    frames = list(snapshot.frames)
+    dense = Dense(dense_rival(widths), frames)
+    contenders: list[Dense | Sparse] = [dense]
+    for cells in (None, kept):
+        model = random_detector(sparse_config(widths, head_stride), frames)
+        aim_threshold(model, frames, cells)
+        contenders.append(Sparse(model, frames, cells))
+    spent: list[list[Times]] = [[] for _ in contenders]
+    for i in range(rounds + 1):
+        for contender, times in zip(contenders, spent):
+            took = contender.once()
+            if i:
+                times.append(took)
+    best = [Times(*(median(getattr(t, f.name) for t in times) for f in fields(Times))) for times in spent]
+    name = "/".join(map(str, widths.channels))
+    rows = [Row(name, "dense", best[0], None, None, dense.message_bytes, ())]
+    for label, bar, sparse, times in zip(
+        ("unpruned", "pruned"), (widths.bar_unpruned, widths.bar_pruned), contenders[1:], best[1:]
+    ):
+        ratio = Times(*(getattr(best[0], f.name) / getattr(times, f.name) for f in fields(Times)))
+        assert isinstance(sparse, Sparse)
+        rows.append(Row(name, f"sparse, {label}", times, ratio, bar, sparse.message_bytes, sparse.sites))
+    return rows
+
+
+def show(rows: list[Row]) -> None:
+    print(
+        f"{'widths':<11} {'contender':<17} {'5 share + 1 perceive':>21} {'one share':>17} {'one perceive':>17} {'bytes':>9}"
+    )
+    for row in rows:
+        cells = []
+        for field in fields(Times):
+            ms = f"{getattr(row.times, field.name):.1f} ms"
+            cells.append(ms if row.ratio is None else f"{ms} {getattr(row.ratio, field.name):>5.1f}x")
+        bar = (
+            ""
+            if row.bar is None or row.ratio is None
+            else f"  bar {row.bar}x {'met' if row.ratio.together >= row.bar else 'MISSED'}"
+        )
+        print(
+            f"{row.widths:<11} {row.contender:<17} {cells[0]:>21} {cells[1]:>17} {cells[2]:>17} {row.message_bytes:>9.0f}{bar}"
+        )
+    for row in rows:
+        if row.sites:
+            levels = ", ".join(f"{s}x {n}" for s, n in zip(STRIDES, row.sites))
+            print(
+                f"sites, {row.widths}, {row.contender}: {levels}; tokens {row.sites[-2]}, of which sent or fused {row.sites[-1]}"
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="one round after the warm-up")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--head-stride", type=int, default=4)
+    parser.add_argument("--only", choices=("wide", "small"))
+    parser.add_argument("--out", type=Path)
+    wanted = parser.parse_args()
+    torch.set_num_threads(wanted.threads)
+    snapshot = street()
+    load = os.getloadavg()[0]
+    with torch.inference_mode():
+        if zoo.DEFAULT in zoo.names():
+            source = f"kept as the shipped {zoo.DEFAULT} does"
+            kept = kept_by_model(zoo.load(), list(snapshot.frames), wanted.head_stride)
+        else:
+            source = "pruning emulated from truth: cells near a listed box and a tenth of the rest"
+            kept = kept_by_truth(snapshot, wanted.head_stride)
+        points = [len(frame.points) for frame in snapshot.frames]
+        print(
+            f"torch {torch.__version__}, {wanted.threads} thread(s), load {load:.1f}, clouds of {points} points; {source}"
+        )
+        rows: list[Row] = []
+        for name, widths in (("wide", WIDE), ("small", SMALL)):
+            if wanted.only in (None, name):
+                rows += compare(widths, snapshot, kept, wanted.head_stride, 1 if wanted.quick else wanted.rounds)
+    show(rows)
+    if wanted.out:
+        settings = {
+            "threads": wanted.threads,
+            "load": load,
+            "head_stride": wanted.head_stride,
+            "points": points,
+            "pruning": source,
+        }
+        command = shlex.join(["python", *sys.argv])
+        write_json(wanted.out, {"command": command, "settings": settings, "rows": rows}, settings, seed=0)
+
+
+if __name__ == "__main__":
+    main()
