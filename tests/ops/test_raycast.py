@@ -4,7 +4,6 @@ import pytest
 
 from manyeyes.datatypes import ShapeError
 from manyeyes.ops.raycast import (
-    BOX,
     CYLINDER,
     ELLIPSOID,
     GROUND,
@@ -49,7 +48,9 @@ def crowd(seed: int, count: int = 40) -> Primitives:
     rng = np.random.default_rng(seed)
     many = []
     for i in range(count):
-        place = np.append(rng.uniform(4, 45) * np.array([np.cos(t := rng.uniform(0, 7)), np.sin(t)]), rng.uniform(-1, 3))
+        place = np.append(
+            rng.uniform(4, 45) * np.array([np.cos(t := rng.uniform(0, 7)), np.sin(t)]), rng.uniform(-1, 3)
+        )
         kind = int(rng.integers(3))
         half = rng.uniform(0.2, 3, 3)
         if kind == CYLINDER:
@@ -96,7 +97,9 @@ def test_flat_ground_is_exact_and_carries_its_class() -> None:
     expected = (reach > 0) & (reach < 39.9) & (BEAMS < 0)
     assert (hits.primitive[:, expected] == GROUND).all()
     assert (hits.primitive[:, ~expected & (reach > 40.1)] == NOTHING).all()
-    np.testing.assert_allclose(hits.range_m[:, expected], np.broadcast_to(reach[expected], (360, expected.sum())), atol=2e-3)
+    np.testing.assert_allclose(
+        hits.range_m[:, expected], np.broadcast_to(reach[expected], (360, expected.sum())), atol=2e-3
+    )
     x = hits.range_m * np.cos(BEAMS) * np.cos(circle(360))[:, None]
     ground = hits.primitive == GROUND
     sure = ground & (np.abs(x) > 0.02) & (np.abs(x - 2.5) > 0.02)

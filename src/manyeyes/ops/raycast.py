@@ -239,7 +239,9 @@ def _height(field, x_min, y_min, cell, x, y):
     row = min(max((y - y_min) / cell, 0.0), field.shape[0] - 1.001)
     j, i = int(column), int(row)
     u, v = column - j, row - i
-    return (field[i, j] * (1 - u) + field[i, j + 1] * u) * (1 - v) + (field[i + 1, j] * (1 - u) + field[i + 1, j + 1] * u) * v
+    return (field[i, j] * (1 - u) + field[i, j + 1] * u) * (1 - v) + (
+        field[i + 1, j] * (1 - u) + field[i + 1, j + 1] * u
+    ) * v
 
 
 @njit(cache=True)
@@ -294,7 +296,24 @@ def _walk_ground(field, x_min, y_min, cell, origin, rotation, rays, max_range, d
 
 
 @njit(cache=True)
-def _cast(kind, center, rotation, half, density, origin, sensor, el, azimuth, rays, per_turn, max_range, seed, depth, owner, cosine):
+def _cast(
+    kind,
+    center,
+    rotation,
+    half,
+    density,
+    origin,
+    sensor,
+    el,
+    azimuth,
+    rays,
+    per_turn,
+    max_range,
+    seed,
+    depth,
+    owner,
+    cosine,
+):
     """All primitives, nearest first."""
     n = kind.shape[0]
     o, q, bounds, near = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 5)), np.empty(n)
@@ -304,7 +323,9 @@ def _cast(kind, center, rotation, half, density, origin, sensor, el, azimuth, ra
             for c in range(3):
                 o[i, r] += rotation[i, c, r] * (origin[c] - center[i, c])
                 q[i, r, c] = (
-                    rotation[i, 0, r] * sensor[0, c] + rotation[i, 1, r] * sensor[1, c] + rotation[i, 2, r] * sensor[2, c]
+                    rotation[i, 0, r] * sensor[0, c]
+                    + rotation[i, 1, r] * sensor[1, c]
+                    + rotation[i, 2, r] * sensor[2, c]
                 )
         _interval(o[i], q[i], half[i], bounds[i])
         near[i] = bounds[i, 4]
@@ -381,9 +402,7 @@ def cast_reference(
     """The slow twin of :func:`cast`: every ray against every primitive by slabs and quadrics; the ground in 2 cm steps."""
     del per_turn
     ce, se = np.cos(elevation)[None], np.sin(elevation)[None]
-    sensor = np.stack(
-        [ce * np.cos(azimuth)[:, None], ce * np.sin(azimuth)[:, None], se + 0 * azimuth[:, None]], -1
-    )
+    sensor = np.stack([ce * np.cos(azimuth)[:, None], ce * np.sin(azimuth)[:, None], se + 0 * azimuth[:, None]], -1)
     ray = sensor @ rotation.T
     depth, owner = np.full(ray.shape[:2], np.inf), np.full(ray.shape[:2], NOTHING, np.int32)
     cosine, surface = np.zeros(ray.shape[:2]), np.zeros(ray.shape[:2], np.uint8)
@@ -403,7 +422,9 @@ def cast_reference(
         below = np.flatnonzero(path[:, 2] <= _reference_height(ground, path[:, 0], path[:, 1]))
         if below.size:
             depth[index], owner[index] = t[below[0]], GROUND
-            column, row = np.floor((path[below[0], :2] - (ground.x_min, ground.y_min)) / ground.surface_cell).astype(int)
+            column, row = np.floor((path[below[0], :2] - (ground.x_min, ground.y_min)) / ground.surface_cell).astype(
+                int
+            )
             if 0 <= row < ground.surface.shape[0] and 0 <= column < ground.surface.shape[1]:
                 surface[index] = ground.surface[row, column]
     owner[depth > max_range], depth[depth > max_range] = NOTHING, np.inf

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Named sets of scenarios: which towns train, validate and test, and how many scenes of what kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.simulator.record import Job, Progress, record
+from manyeyes.simulator.scenario import ScenarioSpec
+from manyeyes.simulator.towns import TOWN_SPLIT, assert_disjoint_split, find_town
+
+
+@dataclass(frozen=True)
+class SplitPreset:
+    """Scenes of one split: count of them, in turn over the towns."""
+
+    split: str
+    towns: tuple[str, ...]
+    count: int
+
+
+@dataclass(frozen=True)
+class SimulationPreset:
+    """What a recording holds.
+
+    vehicles: least and most connected vehicles of a scene. roadside_chance: of a unit on a pole, which always takes part
+    where there is one vehicle only. stand_in: generated roads where a town is not found; None makes that an error.
+    """
+
+    splits: tuple[SplitPreset, ...]
+    frames: int = 16
+    history_frames: int = 6
+    vehicles: tuple[int, int] = (1, 4)
+    roadside_chance: float = 0.7
+    lidar: str = "opv2v"
+    roadside_lidar: str = "opv2v-roadside"
+    min_vehicles: int = 16
+    stand_in: str | None = None
+
+    def __post_init__(self) -> None:
+        assert_disjoint_split({part.split: part.towns for part in self.splits})
+
+
+def _towns(train: int, validate: int, test: int) -> tuple[SplitPreset, ...]:
+    return (
+        SplitPreset("train", TOWN_SPLIT["train"], train),
+        SplitPreset("validate", TOWN_SPLIT["val"], validate),
+        SplitPreset("test", TOWN_SPLIT["test"], test),
+    )
+
+
+SIMULATION_PRESETS: dict[str, SimulationPreset] = {
+    "towns-small": SimulationPreset(_towns(110, 22, 84)),
+    "towns-large": SimulationPreset(_towns(600, 60, 200)),
+    "tiny": SimulationPreset(
+        (
+            SplitPreset("train", ("generated-1",), 2),
+            SplitPreset("validate", ("generated-2",), 1),
+            SplitPreset("test", ("generated-3",), 1),
+        ),
+        frames=3,
+        history_frames=1,
+        min_vehicles=4,
+    ),
+    "demo": SimulationPreset(
+        (SplitPreset("test", ("Town10HD",), 1),),
+        frames=56,
+        vehicles=(3, 3),
+        roadside_chance=1.0,
+        stand_in="generated-5",
+    ),
+}
+
+
+def simulation_preset(name: str) -> SimulationPreset:
+    """A preset by its name in SIMULATION_PRESETS."""
+    if name not in SIMULATION_PRESETS:
+        raise ConfigError(f"No simulation preset '{name}'; choose one of {', '.join(SIMULATION_PRESETS)}.")
+    return SIMULATION_PRESETS[name]
+
+
+def _town(name: str, towns: str | None, stand_in: str | None) -> str:
+    """The town, or its stand-in where its roads are not found."""
+    if stand_in is None:
+        return name
+    try:
+        find_town(name, towns)
+    except ConfigError:
+        return stand_in
+    return name
+
+
+def jobs_of(preset: SimulationPreset, seed: int, towns: str | None = None) -> list[Job]:
+    """The scenarios of a preset; each depends on seed, split and its number alone."""
+    jobs = []
+    for part in preset.splits:
+        for index in range(part.count):
+            random = keyed_generator(seed, "preset", part.split, index)
+            town = _town(part.towns[index % len(part.towns)], towns, preset.stand_in)
+            vehicles = int(random.integers(preset.vehicles[0], preset.vehicles[1] + 1))
+            spec = ScenarioSpec(
+                town=town,
+                seed=int(random.integers(1, 2**30)),
+                name=f"{town.lower()}_{index:04d}",
+                vehicles=vehicles,
+                frames=preset.frames,
+                history_frames=preset.history_frames,
+                roadside_chance=1.0 if vehicles == 1 else preset.roadside_chance,
+                lidar=preset.lidar,
+                roadside_lidar=preset.roadside_lidar,
+                density=round(float(random.uniform(3.5, 7.0)), 3),
+                min_vehicles=preset.min_vehicles,
+                clutter=round(float(random.uniform(0.4, 1.0)), 3),
+            )
+            jobs.append(Job(part.split, spec, towns))
+    return sorted(jobs, key=lambda job: (job.split != "train", job.split != "validate", job.spec.town, job.spec.name))
+
+
+def simulate(
+    preset: str,
+    out: Path | str,
+    seed: int = 0,
+    workers: int = 1,
+    progress: Callable[[Progress], None] | None = None,
+    towns: Path | str | None = None,
+) -> Path:
+    """Make a preset's recording under a folder; the path of its manifest. towns: where roads are looked for first."""
+    place = None if towns is None else str(towns)
+    jobs = jobs_of(simulation_preset(preset), seed, place)
+    return record(jobs, out, workers, progress, {"preset": preset, "seed": seed})
