@@ -91,7 +91,7 @@ def test_two_runs_say_the_same_but_for_time(data, weights, tmp_path) -> None:
 
 
 def test_evaluate_judges_pairs_over_scenarios(data, weights, tmp_path, capsys) -> None:
-    words = ("--methods", "alone", "intermediate", "--out", tmp_path)
+    words = ("--methods", "alone", "intermediate", "--workers", 1, "--out", tmp_path)
     assert run("evaluate", "--data", data, "--split", "test", "--weights", weights, *words) == 0
     said = capsys.readouterr().out
     assert "intermediate - alone" in said and "at most 131,072: reached" in said
