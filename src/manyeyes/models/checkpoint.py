@@ -35,24 +35,31 @@ def _build(kind: Any, value: Any) -> Any:
         return tuple(value) if isinstance(value, list) else value
     hints = typing.get_type_hints(kind)
     known = {f.name for f in dataclasses.fields(kind)}
-    if set(value) != known:
-        raise ConfigError(f"{kind.__name__} has fields {sorted(known)}; the stored configuration has {sorted(value)}.")
+    if not isinstance(value, dict) or set(value) != known:
+        raise ConfigError(
+            f"{getattr(kind, '__name__', kind)} has fields {sorted(known)}; the stored configuration has "
+            f"{sorted(value) if isinstance(value, dict) else value!r}."
+        )
     return kind(**{name: _build(hints[name], item) for name, item in value.items()})  # pyright: ignore[reportCallIssue]
 
 
 def fingerprint(model: Detector) -> bytes:
     """8 bytes that name a configuration and its weights; tokens are only understood by the weights that made them."""
     digest = hashlib.blake2b(config_to_json(model.config).encode(), digest_size=8)
-    for name, value in sorted(model.state_dict().items()):
+    for name, value in sorted(_tensors(model).items()):
         digest.update(name.encode())
         digest.update(value.detach().float().contiguous().numpy().tobytes())
     return digest.digest()
 
 
+def _tensors(model: Detector) -> dict[str, torch.Tensor]:
+    """Everything that changes what the model says: how many batches a norm has seen does not."""
+    return {k: v for k, v in model.state_dict().items() if not k.endswith("num_batches_tracked")}
+
+
 def save(model: Detector, path: Path, card: dict[str, Any], half: bool = False) -> None:
     """Write weights, configuration and a model card (command, seed, time, result) to one file, atomically."""
-    state = {k: v.half() if half and v.is_floating_point() else v for k, v in model.state_dict().items()}
-    state = {k: v.contiguous() for k, v in state.items() if not k.endswith("num_batches_tracked")}
+    state = {k: (v.half() if half and v.is_floating_point() else v).contiguous() for k, v in _tensors(model).items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     save_file(state, partial, {"format": FORMAT, "config": config_to_json(model.config), "card": json.dumps(card)})
@@ -62,8 +69,16 @@ def save(model: Detector, path: Path, card: dict[str, Any], half: bool = False) 
 def load(path: Path) -> Detector:
     """A detector in evaluation mode, from its own file alone."""
     state, metadata = _read(path)
-    model = Detector(config_from_json(DetectorConfig, metadata["config"]))
-    expected = {k: v for k, v in model.state_dict().items() if not k.endswith("num_batches_tracked")}
+    try:
+        model = Detector(config_from_json(DetectorConfig, metadata["config"]))
+    except json.JSONDecodeError as error:
+        raise CheckpointError(f"{path}: its configuration is not JSON ({error}); copy or train it again.") from error
+    except (ConfigError, TypeError) as error:
+        raise CheckpointError(
+            f"{path}: its configuration is not one of this version of manyeyes: {error} "
+            "Use the version that wrote it, or train again."
+        ) from error
+    expected = _tensors(model)
     for name in sorted(set(expected) | set(state)):
         if name not in state or name not in expected or state[name].shape != expected[name].shape:
             here = tuple(state[name].shape) if name in state else "nothing"
@@ -72,6 +87,8 @@ def load(path: Path) -> Detector:
                 f"{path}: tensor {name} is {here} in the file and {there} in the model that its configuration builds; "
                 "use the weights with the version of manyeyes that wrote them, or train again."
             )
+        if not bool(torch.isfinite(state[name]).all()):
+            raise CheckpointError(f"{path}: tensor {name} has NaN or infinite values; train again from an older save.")
     model.load_state_dict({k: v.float() for k, v in state.items()}, strict=False)
     model.eval().requires_grad_(False)
     model.fingerprint = fingerprint(model)

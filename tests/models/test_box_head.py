@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From boxes to what the head should say and back, at every head stride; decoding of odd batches."""
+
+import math
+
+import pytest
+import torch
+
+from manyeyes.datatypes import LABELS, BevGrid, Boxes, Sites, SparseBev
+from manyeyes.models.box_head import TYPICAL_SIZE, WIDTHS, BoxHead, DecodeConfig, RawBoxes, decode
+from manyeyes.ops.box_iou import pairwise_iou
+from manyeyes.training.targets import TargetConfig, assign
+
+GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0)
+
+
+def every_site(stride: int, batch_size: int = 1) -> Sites:
+    grid = GRID.at(stride)
+    return Sites(torch.arange(batch_size * grid.shape[0] * grid.shape[1]), grid, batch_size)
+
+
+def some_boxes(n: int = 6, seed: int = 0) -> Boxes:
+    random = torch.Generator().manual_seed(seed)
+    angle = torch.arange(n) * 2 * math.pi / n
+    center = torch.stack((angle.cos() * 17, angle.sin() * 17, torch.rand(n, generator=random) + 0.5), 1)
+    size = torch.tensor(TYPICAL_SIZE) * (0.8 + 0.6 * torch.rand(n, 3, generator=random))
+    yaw = torch.rand(n, generator=random) * 2 * math.pi - math.pi
+    return Boxes.of(center, size, yaw, label=torch.arange(n) % len(LABELS))
+
+
+def encode(boxes: Boxes, sites: Sites) -> RawBoxes:
+    """The raw boxes that a perfect head would say: the inverse of decode."""
+    targets = assign(sites, [boxes], TargetConfig(reach_m=sites.grid.cell * 1.5))
+    n, at, truth = len(sites), targets.positive.nonzero()[:, 0], boxes[targets.box[targets.positive]]
+    values = [torch.zeros(n, w) for w in WIDTHS]
+    values[0][:] = -20.0
+    values[0][at] = 20.0
+    values[1][at] = (truth.center[:, :2] - sites.xy[at]) / sites.grid.cell
+    values[2][at] = truth.center[:, 2:]
+    values[3][at] = (truth.size / torch.tensor(TYPICAL_SIZE)).log()
+    values[4][at] = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1)
+    values[5][at] = torch.where(truth.yaw.cos() > 0, 8.0, -8.0)[:, None]
+    values[6][at, truth.label] = 5.0
+    values[7][at] = math.log(0.25)
+    values[9][:] = 20.0
+    heat, offset, z, log_size, axis, direction, kind, *rest = values
+    return RawBoxes(sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction[:, 0], kind, *(v[:, 0] for v in rest))
+
+
+@pytest.mark.parametrize("stride", (2, 4, 8))
+def test_decode_inverts_encode(stride):
+    boxes = some_boxes()
+    (found,) = decode(encode(boxes, every_site(stride)), DecodeConfig())
+    assert len(found) == len(boxes)
+    order = torch.cdist(boxes.center[:, :2], found.center[:, :2]).argmin(1)
+    found = found[order]
+    assert torch.allclose(found.center, boxes.center, atol=1e-5)
+    assert torch.allclose(found.size, boxes.size, atol=1e-5)
+    turn = found.yaw - boxes.yaw
+    assert torch.allclose(torch.atan2(turn.sin(), turn.cos()), torch.zeros(len(boxes)), atol=1e-5)
+    assert torch.equal(found.label, boxes.label)
+    assert torch.allclose(found.sigma_xy, torch.full((len(boxes),), 0.25))
+    assert (found.flip < 1e-3).all() and (found.score > 0.99).all()
+
+
+def test_a_centre_half_a_cell_away_would_be_seen():
+    # What the field often gets wrong: (o + 0.5) * stride * pillar. Were the grid to say so, boxes would move by 1.4 m.
+    sites = every_site(8)
+    wrong = GRID.x_min + (sites.yx[:, 1] + 0.5) * 8 * GRID.pillar
+    assert torch.allclose(wrong - sites.xy[:, 0], torch.full((len(sites),), 1.4), atol=1e-4)
+
+
+def test_the_opposite_heading_is_the_same_rectangle_and_says_so():
+    boxes = some_boxes()
+    raw = encode(boxes, every_site(4))
+    turned = RawBoxes(**{**vars(raw), "direction": -raw.direction * 0.1})
+    (found,), (back,) = decode(raw, DecodeConfig()), decode(turned, DecodeConfig())
+    overlap = pairwise_iou(found.bev().double(), back.bev().double())
+    assert torch.allclose(overlap.max(1).values, torch.ones(len(found)).double(), atol=1e-5)
+    twin = back.yaw[overlap.argmax(1)] - found.yaw
+    assert torch.allclose(twin.cos(), -torch.ones(len(found)), atol=1e-5)
+    doubt = 1 - 1 / (1 + math.exp(-0.8))
+    assert torch.allclose(back.flip, torch.full((len(found),), doubt), atol=1e-5)
+
+
+def test_grids_of_a_batch_may_hold_no_few_and_too_many_boxes():
+    sites = every_site(8, batch_size=3)
+    per_grid = len(sites) // 3
+    heat = torch.full((len(sites),), -20.0)
+    heat[per_grid : per_grid + 2] = 4.0
+    heat[2 * per_grid :] = 4.0
+    zeros = [torch.zeros(len(sites), w).squeeze(1) for w in WIDTHS[1:]]
+    raw = RawBoxes(sites, heat, *zeros)
+    # Two cells of a row are 3.2 m apart: cars of 4.5 m on them share 1.3 of 7.7 m, an IoU of 0.169.
+    none, few, many = decode(raw, DecodeConfig(nms_iou=0.18, max_boxes=50))
+    assert (len(none), len(few), len(many)) == (0, 2, 50)
+    assert len(decode(raw, DecodeConfig(nms_iou=0.16))[1]) == 1
+
+
+def test_no_sites_no_boxes():
+    head = BoxHead(8, 16).eval()
+    raw = head(SparseBev(torch.zeros(0, 8), Sites(torch.zeros(0, dtype=torch.int64), GRID.at(4), 2)))
+    assert [len(b) for b in decode(raw, DecodeConfig())] == [0, 0]
+
+
+def test_scores_fall_and_mix_heat_with_overlap():
+    sites = every_site(8)
+    raw = encode(some_boxes(), sites)
+    heat = torch.where(raw.heat > 0, torch.linspace(0.1, 2.0, len(sites)), raw.heat)
+    raw = RawBoxes(**{**vars(raw), "heat": heat, "overlap": torch.zeros(len(sites))})
+    (found,) = decode(raw, DecodeConfig(overlap_power=0.5))
+    assert (found.score[:-1] >= found.score[1:]).all()
+    best = torch.sigmoid(heat[raw.heat > 0]).max()
+    assert float(found.score[0]) == pytest.approx(float((best * 0.5) ** 0.5), abs=1e-6)
+
+
+def test_a_fresh_head_expects_few_boxes():
+    torch.manual_seed(0)
+    head = BoxHead(8, 16).eval()
+    with torch.no_grad():
+        raw = head(SparseBev(torch.randn(64, 8), Sites(torch.arange(64), GRID.at(8))))
+    assert 0.05 < float(torch.sigmoid(raw.heat).mean()) < 0.2
