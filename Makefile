@@ -48,7 +48,7 @@ format: $(STAMP)
 	@$(BIN)/ruff check --fix .
 
 bench: $(STAMP)
-	@set -e; for script in $(sort $(wildcard benchmarks/*.py)); do echo "== $$script"; $(BIN)/python $$script; done
+	@set -e; for script in $(sort $(shell grep -l __main__ benchmarks/*.py)); do echo "== $$script"; $(BIN)/python $$script; done
 
 clean:
 	@rm -rf $(VENV) out dist .ruff_cache .hypothesis .import_linter_cache

@@ -78,4 +78,6 @@ def main(options: Options) -> None:
         ),
     )
     _, report = play(drive, detector, showing, console)
-    console.print(f"\nPictures, animation and JSON are in {options.out}; open {report}", highlight=False)
+    console.print(
+        f"\nPictures, animation and JSON are in {options.out}; open {report}", highlight=False, soft_wrap=True
+    )

@@ -74,7 +74,7 @@ def main(options: Options) -> None:
     open_recording = partial(Opv2vRecording, options.data, options.split)
     recording = open_recording()
     for problem in recording.problems:
-        console.print(f"note: {problem}", highlight=False, markup=False)
+        console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
     with bars(console) as progress:
         task = progress.add_task("Judging", total=len(recording.scenarios))
         results = benchmark(
@@ -92,7 +92,9 @@ def main(options: Options) -> None:
     if outcome.differences:
         text += "\n" + markdown_lines([DIFFERENCE_HEADINGS, *map(difference_cells, outcome.differences)])
     write_text(options.out / "results.md", text)
-    console.print(f"\nNumbers, configuration and versions are in {options.out / 'results.json'}", highlight=False)
+    console.print(
+        f"\nNumbers, configuration and versions are in {options.out / 'results.json'}", highlight=False, soft_wrap=True
+    )
 
 
 def _timed(

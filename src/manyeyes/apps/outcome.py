@@ -85,7 +85,7 @@ def show(console: Console, outcome: Outcome, title: str) -> None:
         console.print()
         console.print(differences_terminal(outcome.differences))
     for check in outcome.checks:
-        console.print(check, highlight=False)
+        console.print(check, highlight=False, soft_wrap=True)
 
 
 def _checks(rows: Sequence[Row]) -> tuple[str, ...]:

@@ -49,7 +49,7 @@ def main(options: Options) -> None:
     replay = options.playing.replay_config(options.seed)
     recording = Opv2vRecording(options.recording, options.split)
     for problem in recording.problems:
-        console.print(f"note: {problem}", highlight=False, markup=False)
+        console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
     drive = excerpt(recording, options.scenario, options.frames)
     split = f" --split {options.split}" if options.split else ""
     showing = Showing(
@@ -65,4 +65,6 @@ def main(options: Options) -> None:
         commands=(f"manyeyes run {options.recording}{split} --scenario {drive.scenario}",),
     )
     _, report = play(drive, zoo.load(options.playing.weights), showing, console)
-    console.print(f"\nPictures, animation and JSON are in {options.out}; open {report}", highlight=False)
+    console.print(
+        f"\nPictures, animation and JSON are in {options.out}; open {report}", highlight=False, soft_wrap=True
+    )

@@ -53,4 +53,6 @@ def main(options: Options) -> None:
         {"options": options, "preset": preset},
         options.seed,
     )
-    console.print(f"{len(held)} scenarios in {out}; {manifest} lists counts and hashes", highlight=False)
+    console.print(
+        f"{len(held)} scenarios in {out}; {manifest} lists counts and hashes", highlight=False, soft_wrap=True
+    )

@@ -86,4 +86,4 @@ def _train(options: Options, config: Any, recording: Any, console: Any) -> None:
         "seconds": last[0].seconds if last else None,
     }
     provenance.write_json(out / "train.json", result, {"options": options, "training": config}, options.seed)
-    console.print(f"{weights}; the loss over steps is in {out / 'loss.png'}", highlight=False)
+    console.print(f"{weights}; the loss over steps is in {out / 'loss.png'}", highlight=False, soft_wrap=True)

@@ -69,7 +69,7 @@ def main(options: Options) -> None:
         save_png(images[0], options.out)
     else:
         save_animation(images, options.out)
-    console.print(f"{options.out}: {drive.scenario}, frames {first} to {last - 1}", highlight=False)
+    console.print(f"{options.out}: {drive.scenario}, frames {first} to {last - 1}", highlight=False, soft_wrap=True)
 
 
 def _images(options: Options, drive: Excerpt, indices: range) -> list[Image]:
