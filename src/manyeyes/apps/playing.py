@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 ALL_METHODS = ("alone", "late", "intermediate", "early")
 PERIOD_MS = 100.0
-IDEAL_WAIT_MS = 1.0
+IDEAL_WAIT_MS = 0.0
 HISTORY = 2
 
 
@@ -30,7 +30,7 @@ class Playing:
     channel: str = "ideal"
     """The air between agents: ideal, its-g5, its-g5-27, lte-v2x, nr-sidelink, cellular."""
     wait_ms: float | None = None
-    """How long an ego waits for messages after its own sweep; by default 1 on the ideal channel, else one period, 100."""
+    """How long an ego waits for messages after its own sweep; by default 0 on the ideal channel, else one period, 100."""
     budget_bytes: int = 1 << 17
     """The most that a message of tokens may weigh."""
     precision: Literal["float32", "float16", "int8"] = "float16"
