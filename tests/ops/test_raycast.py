@@ -4,6 +4,7 @@ import pytest
 
 from manyeyes.datatypes import ShapeError
 from manyeyes.ops.raycast import (
+    BOX,
     CYLINDER,
     ELLIPSOID,
     GROUND,
@@ -129,6 +130,5 @@ def test_foliage_lets_some_rays_through_and_the_seed_decides_which() -> None:
 
 def test_wrong_shapes_are_named() -> None:
     with pytest.raises(ShapeError, match=r"Primitives.half needs shape \(1, 3\)"):
-        Primitives(
-            np.zeros(1, np.uint8), np.zeros((1, 3)), np.zeros((1, 3, 3)), np.zeros((1, 2)), np.zeros(1), np.zeros(1, np.int64), np.zeros(1)
-        )  # fmt: skip
+        one = solid(BOX, (0, 0, 0), (1, 1, 1))
+        Primitives(one.kind, one.center, one.rotation, one.half[:, :2], one.density, one.instance, one.reflectivity)

@@ -201,8 +201,8 @@ def _draw(index, kind, half, density, o, q, bounds, first, per_turn, el, azimuth
     beam_hi = np.searchsorted(el, bounds[3] + 1e-9)
     if beam_hi <= beam_lo:
         return
-    k_lo = int(math.ceil((bounds[0] - first) / step - 1e-9))
-    k_hi = min(int(math.floor((bounds[1] - first) / step + 1e-9)), k_lo + per_turn - 1)
+    k_lo = math.ceil((bounds[0] - first) / step - 1e-9)
+    k_hi = min(math.floor((bounds[1] - first) / step + 1e-9), k_lo + per_turn - 1)
     beams = el.shape[0]
     for k in range(k_lo, k_hi + 1):
         a = k % per_turn
@@ -354,7 +354,7 @@ def _finish(origin, rotation, rays, max_range, x_min, y_min, cell, surface_map, 
                 z = sin_el[b] * t
                 wx = origin[0] + rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
                 wy = origin[1] + rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
-                j, i = int(math.floor((wx - x_min) / cell)), int(math.floor((wy - y_min) / cell))
+                j, i = math.floor((wx - x_min) / cell), math.floor((wy - y_min) / cell)
                 if 0 <= i < rows and 0 <= j < columns:
                     surface[a, b] = surface_map[i, j]
 
@@ -417,7 +417,7 @@ def cast_reference(
         closer = t < depth
         depth[closer], owner[closer], cosine[closer] = t[closer], i, face[closer]
     for index in np.ndindex(*depth.shape):
-        t = np.arange(0.3, min(depth[index], max_range), 0.02)
+        t = np.arange(0.3, min(float(depth[index]), max_range), 0.02)
         path = origin + t[:, None] * ray[index]
         below = np.flatnonzero(path[:, 2] <= _reference_height(ground, path[:, 0], path[:, 1]))
         if below.size:

@@ -132,7 +132,7 @@ class Plot:
 
     def footprint(self, center: Array, half: tuple[float, float], yaw: float) -> Array:
         """Points (P, 2) that fill an oriented rectangle no coarser than a cell."""
-        nx, ny = (max(2, int(math.ceil(2 * h / self.cell)) + 1) for h in half)
+        nx, ny = (max(2, math.ceil(2 * h / self.cell) + 1) for h in half)
         u, v = np.meshgrid(np.linspace(-half[0], half[0], nx), np.linspace(-half[1], half[1], ny))
         c, s = math.cos(yaw), math.sin(yaw)
         return np.stack((center[0] + u * c - v * s, center[1] + u * s + v * c), -1).reshape(-1, 2)
@@ -188,7 +188,8 @@ class _Heap:
 def _band(plot: Plot, middle: Array, radius: float, low: float, high: float, to: Array) -> Array:
     """(N, 2) centres of the cells around the middle whose distance ``to`` is within low … high."""
     row, column = np.nonzero((to >= low) & (to <= high))
-    xy = np.stack((plot.ground.x_min + (column + 0.5) * plot.cell, plot.ground.y_min + (row + 0.5) * plot.cell), -1)
+    x, y = plot.ground.x_min + (column + 0.5) * plot.cell, plot.ground.y_min + (row + 0.5) * plot.cell
+    xy = np.stack((x, y), -1).astype(np.float64)
     return xy[np.hypot(*(xy - middle).T) < radius]
 
 

@@ -11,7 +11,7 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.simulator.record import Job, Progress, record
 from manyeyes.simulator.scenario import ScenarioSpec
-from manyeyes.simulator.towns import TOWN_SPLIT, assert_disjoint_split, find_town
+from manyeyes.simulator.towns import GENERATED, TOWN_SPLIT, assert_disjoint_split, find_town
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def jobs_of(preset: SimulationPreset, seed: int, towns: str | None = None) -> li
                 min_vehicles=preset.min_vehicles,
                 clutter=round(float(random.uniform(0.4, 1.0)), 3),
             )
-            jobs.append(Job(part.split, spec, towns))
+            jobs.append(Job(part.split, spec, None if town.startswith(GENERATED) else towns))
     return sorted(jobs, key=lambda job: (job.split != "train", job.split != "validate", job.spec.town, job.spec.name))
 
 

@@ -36,8 +36,9 @@ class ScenarioSpec:
     """What is asked of a scenario; the rest follows from the seed.
 
     vehicles: connected vehicles, each at least min_gap_m from the others and within low_m … high_m of the crossing at the
-    first frame. density: of the traffic, in units of 9 vehicles per kilometre of lane. roadside_chance: how often a unit on a pole takes part. frames: at rate_hz, the first history_frames of
-    which are not judged. min_vehicles: within 60 m of the crossing, or another crossing is drawn.
+    first frame. frames: at rate_hz, the first history_frames of which are not judged. roadside_chance: how often a unit
+    on a pole takes part. density: of the traffic, in units of 9 vehicles per kilometre of lane. min_vehicles: within
+    60 m of the crossing, or another one is drawn. clutter: times the numbers of ClutterSpec.
     """
 
     town: str

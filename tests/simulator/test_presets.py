@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+from pathlib import Path
+
+import pytest
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.simulator.presets import SIMULATION_PRESETS, SimulationPreset, SplitPreset, jobs_of, simulation_preset
+
+
+def test_no_town_is_on_two_sides() -> None:
+    for preset in SIMULATION_PRESETS.values():
+        sides = [set(part.towns) for part in preset.splits]
+        assert sum(map(len, sides)) == len(set().union(*sides))
+    with pytest.raises(ConfigError, match="Town01 is in 'train' and in 'test'"):
+        SimulationPreset((SplitPreset("train", ("Town01",), 1), SplitPreset("test", ("Town01",), 1)))
+
+
+def test_the_benchmark_has_the_scenes_it_promises() -> None:
+    jobs = jobs_of(simulation_preset("towns-small"), 0)
+    counts = {split: sum(job.split == split for job in jobs) for split in ("train", "validate", "test")}
+    assert counts == {"train": 110, "validate": 22, "test": 84}
+    towns = {job.split: set() for job in jobs}
+    for job in jobs:
+        towns[job.split].add(job.spec.town)
+        assert job.spec.frames - job.spec.history_frames == 10
+        assert job.spec.history_frames == 6
+        assert job.spec.vehicles + (job.spec.roadside_chance == 1.0) >= 2
+    assert towns["validate"] == {"Town07"}
+    assert towns["test"] == {"Town05", "Town10HD"}
+    assert len({(job.split, job.spec.name) for job in jobs}) == len(jobs)
+
+
+def test_the_seed_decides() -> None:
+    preset = simulation_preset("towns-small")
+    assert jobs_of(preset, 3) == jobs_of(preset, 3)
+    assert jobs_of(preset, 3) != jobs_of(preset, 4)
+
+
+def test_the_demo_runs_without_any_town(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere(name: str, path: str | None) -> Path:
+        raise ConfigError(f"no {name} in {path}")
+
+    monkeypatch.setattr("manyeyes.simulator.presets.find_town", nowhere)
+    (job,) = jobs_of(simulation_preset("demo"), 0, str(tmp_path))
+    assert job.spec.town.startswith("generated-")
+    assert job.towns is None  # generated roads are in no folder
+    assert job.spec.vehicles == 3
+    assert job.spec.roadside_chance == 1.0
+
+
+def test_an_unknown_preset_lists_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="No simulation preset 'town'; choose one of towns-small"):
+        simulation_preset("town")

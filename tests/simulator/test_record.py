@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("libsumo", reason="scenarios need the sim extra")
+
+from manyeyes.datasets.opv2v import Opv2vRecording
+from manyeyes.datasets.recording import points_in_listed_boxes
+from manyeyes.datatypes import ConfigError
+from manyeyes.simulator.record import Job, Progress, record
+from manyeyes.simulator.scenario import ScenarioSpec, make_scenario
+from manyeyes.simulator.towns import load_town
+
+SPEC = ScenarioSpec(
+    "generated-1", 7, "one", vehicles=1, frames=2, history_frames=1, roadside_chance=1.0, min_vehicles=6
+)
+JOBS = [Job("train", SPEC), Job("train", replace(SPEC, name="two", seed=8))]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(JOBS, tmp_path_factory.mktemp("one"), workers=1).parent
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
+    seen: list[Progress] = []
+    record(JOBS, tmp_path, workers=2, progress=seen.append)
+    assert files(tmp_path) == files(made)
+    assert [p.done for p in seen] == [1, 2]
+
+
+def test_the_reader_returns_the_simulators_own_truth(made: Path) -> None:
+    recording = Opv2vRecording(made, "train", strict=True, use_cache=False)
+    assert recording.scenarios == ("one", "two")
+    assert list(recording.judged("one")) == [1]
+    scenario = make_scenario(SPEC, load_town("generated-1"))
+    read, true = recording.snapshot("one", 1), scenario.snapshot(1)
+    assert read.truth is not None
+    assert true.truth is not None
+    listed = true.truth.seen.any(0)
+    order = true.truth.boxes.id[listed].argsort()
+    torch.testing.assert_close(read.truth.boxes.center, true.truth.boxes.center[listed][order], atol=1e-9, rtol=0)
+    assert torch.equal(read.truth.boxes.label, true.truth.boxes.label[listed][order])
+    for one, two in zip(read.frames, true.frames):
+        torch.testing.assert_close(one.points.xyz, two.points.xyz, atol=1e-4, rtol=0)
+        torch.testing.assert_close(one.points.intensity, two.points.intensity, atol=0.003, rtol=0)
+    assert int((points_in_listed_boxes(read) == 0).sum()) == 0
+
+
+def test_the_manifest_counts_and_hashes_what_is_there(made: Path) -> None:
+    content = json.loads((made / "manifest.json").read_text())
+    assert [s["name"] for s in content["scenarios"]] == ["one", "two"]
+    for entry in content["scenarios"]:
+        folder = made / "train" / entry["name"]
+        inside = {n: d for n, d in files(folder).items() if n != "scenario.json"}
+        lines = [f"{hashlib.sha256(data).hexdigest()}  {name}" for name, data in inside.items()]
+        assert entry["sha256"] == hashlib.sha256("\n".join(lines).encode()).hexdigest()
+        assert entry["bytes"] == sum(map(len, inside.values()))
+        assert entry["files"] == len(inside) == 2 * 2 * 2 + 1
+        assert 40_000 < entry["returns"] < 60_000
+        assert entry["moving"] >= 0.5
+
+
+def test_finished_scenarios_are_kept_and_half_written_ones_redone(made: Path) -> None:
+    before = files(made)
+    kept = (made / "train" / "one" / "scenario.json").stat().st_mtime_ns
+    (made / "train" / "two").rename(made / "train" / "two.partial")
+    (made / "train" / "two.partial" / "scenario.json").unlink()
+    record(JOBS, made, workers=1)
+    assert files(made) == before
+    assert (made / "train" / "one" / "scenario.json").stat().st_mtime_ns == kept
+
+
+def test_misuse_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="workers >= 1"):
+        record(JOBS, tmp_path, workers=0)
+    with pytest.raises(ConfigError, match="one name"):
+        record([JOBS[0], JOBS[0]], tmp_path)

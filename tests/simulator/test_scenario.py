@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import pytest
+import torch
+
+pytest.importorskip("libsumo", reason="scenarios need the sim extra")
+
+from manyeyes.datasets.recording import points_in_listed_boxes
+from manyeyes.datatypes import ConfigError, PointCloud, Snapshot
+from manyeyes.simulator.scenario import RSU_ID, NoSceneError, Scenario, ScenarioSpec, make_scenario
+from manyeyes.simulator.towns import load_town
+
+SPEC = ScenarioSpec(
+    "generated-1", 7, "one", vehicles=2, frames=3, history_frames=1, roadside_chance=1.0, min_vehicles=6
+)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return make_scenario(SPEC, load_town("generated-1"))
+
+
+@pytest.fixture(scope="module")
+def snapshot(scenario: Scenario) -> Snapshot:
+    return scenario.snapshot(1)
+
+
+def test_points_lie_in_the_boxes_that_agents_list(snapshot: Snapshot) -> None:
+    counts = points_in_listed_boxes(snapshot)
+    assert int((counts > 0).sum()) > 8
+    assert int((counts == 0).sum()) == 0
+    mirrored = []
+    for frame in snapshot.frames:
+        flip = frame.points.xyz * torch.tensor([1.0, -1.0, 1.0])
+        mirrored.append(replace(frame, points=PointCloud(flip, frame.points.intensity, frame.points.time_s)))
+    assert int((points_in_listed_boxes(replace(snapshot, frames=tuple(mirrored))) == 0).sum()) > 5
+
+
+def test_agents_are_vehicles_and_a_unit_on_a_pole_that_list_others(scenario: Scenario, snapshot: Snapshot) -> None:
+    ids = [frame.agent_id for frame in snapshot.frames]
+    assert ids == [*scenario.agents, RSU_ID]
+    assert snapshot.truth is not None
+    for row, frame in enumerate(snapshot.frames):
+        own = snapshot.truth.boxes.id == frame.agent_id
+        assert int(own.sum()) == (frame.agent_id > 0)
+        assert not bool(snapshot.truth.seen[row][own].any())
+        assert frame.timestamp_ns == 100_000_000
+    pole = snapshot.frames[-1]
+    assert pole.is_infrastructure
+    assert 4.5 <= pole.sensor_height_m <= 6.0
+    assert torch.equal(pole.world_from_agent.rotation[2], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+
+
+def test_the_road_under_each_agent_is_at_zero(snapshot: Snapshot) -> None:
+    for frame in snapshot.frames:
+        xyz = frame.points.xyz
+        near = (xyz[:, :2].norm(dim=1) < 15) & (xyz[:, 2].abs() < 0.3)
+        assert abs(float(xyz[near, 2].median())) < 0.03
+
+
+def test_half_of_the_vehicles_move_and_positions_change(scenario: Scenario) -> None:
+    assert scenario.moving_share >= 0.5
+    first, last = scenario.states[0], scenario.states[-1]
+    both = sorted(set(first.id.tolist()) & set(last.id.tolist()))
+    assert len(both) > 10
+    moved = [abs(first.position[first.id == i] - last.position[last.id == i]).max() for i in both]
+    assert max(moved) > 1.0
+
+
+def test_the_same_seed_gives_the_same_points(snapshot: Snapshot) -> None:
+    again = make_scenario(SPEC, load_town("generated-1")).snapshot(1)
+    for one, two in zip(snapshot.frames, again.frames):
+        assert torch.equal(one.points.xyz, two.points.xyz)
+        assert torch.equal(one.points.intensity, two.points.intensity)
+
+
+def test_what_cannot_be_had_is_named() -> None:
+    with pytest.raises(NoSceneError, match="no crossing in generated-1 has 5000 vehicles"):
+        make_scenario(replace(SPEC, min_vehicles=5000), load_town("generated-1"))
+    with pytest.raises(ConfigError, match="frames > history_frames"):
+        replace(SPEC, frames=1)
