@@ -85,7 +85,9 @@ class Boxes:
 
     def to(self, dtype: torch.dtype) -> Boxes:
         """The same boxes in another floating-point type."""
-        return Boxes(*(v.to(dtype) if v.is_floating_point() else v for v in (getattr(self, f.name) for f in fields(self))))
+        return Boxes(
+            *(v.to(dtype) if v.is_floating_point() else v for v in (getattr(self, f.name) for f in fields(self)))
+        )
 
     def transform(self, target_from_source: Transform) -> Boxes:
         """The same boxes in another frame; headings are projected onto the target's ground plane."""
@@ -114,7 +116,9 @@ class Boxes:
         """(N, P) bool: which of the points (P, 3) lie in each box, enlarged by margin_m on every side."""
         delta = points[None] - self.center[:, None]
         c, s = self.yaw.cos()[:, None], self.yaw.sin()[:, None]
-        local = torch.stack((delta[..., 0] * c + delta[..., 1] * s, delta[..., 1] * c - delta[..., 0] * s, delta[..., 2]), -1)
+        local = torch.stack(
+            (delta[..., 0] * c + delta[..., 1] * s, delta[..., 1] * c - delta[..., 0] * s, delta[..., 2]), -1
+        )
         return (local.abs() <= self.size[:, None] / 2 + margin_m).all(-1)
 
 

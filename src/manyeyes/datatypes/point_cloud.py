@@ -38,7 +38,9 @@ class PointCloud:
         xyz = xyz.to(torch.float32)
         if not bool(torch.isfinite(xyz).all()):
             bad = int((~torch.isfinite(xyz).all(-1)).sum())
-            raise ShapeError(f"{bad} of {xyz.shape[0]} points are NaN or infinite; drop them before building a PointCloud.")
+            raise ShapeError(
+                f"{bad} of {xyz.shape[0]} points are NaN or infinite; drop them before building a PointCloud."
+            )
         zeros = torch.zeros(xyz.shape[0])
         return cls(xyz, zeros if intensity is None else intensity.float(), zeros if time_s is None else time_s.float())
 

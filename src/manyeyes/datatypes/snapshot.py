@@ -37,7 +37,9 @@ class AgentFrame:
             raise ShapeError(f"AgentFrame.pose_covariance needs (3, 3); got {tuple(self.pose_covariance.shape)}.")
 
     @classmethod
-    def of(cls, points: PointCloud, world_from_agent: Transform, agent_id: int = 0, timestamp_ns: int = 0) -> AgentFrame:
+    def of(
+        cls, points: PointCloud, world_from_agent: Transform, agent_id: int = 0, timestamp_ns: int = 0
+    ) -> AgentFrame:
         """A frame from a cloud and a pose that is believed to be exact."""
         return cls(agent_id, timestamp_ns, points, world_from_agent, torch.zeros(3, 3, dtype=torch.float64))
 

@@ -33,7 +33,9 @@ class Sites:
             rows, columns = self.grid.shape
             ascending = bool((self.key[1:] > self.key[:-1]).all())
             if not ascending or int(self.key[0]) < 0 or int(self.key[-1]) >= self.batch_size * rows * columns:
-                raise ShapeError("Sites.key must be strictly ascending and inside the grid; use ops.sparse_conv.coalesce.")
+                raise ShapeError(
+                    "Sites.key must be strictly ascending and inside the grid; use ops.sparse_conv.coalesce."
+                )
 
     def __len__(self) -> int:
         return self.key.shape[0]

@@ -115,7 +115,7 @@ class Run:
         loss = terms.total(config.loss)
         if not bool(torch.isfinite(loss)):
             raise ConfigError(
-                f"The loss is {float(loss)} at step {self.step}; lower the learning rate, or resume from an older save."
+                f"The loss is {float(loss.detach())} at step {self.step}; lower the learning rate, or resume from an older save."
             )
         loss.backward()
         self._share_gradients()
@@ -124,7 +124,7 @@ class Run:
         self._average()
         self.step += 1
         self.seconds += time.monotonic() - began
-        return Progress(self.step, self.steps, float(loss), terms, rate, self.seconds)
+        return Progress(self.step, self.steps, float(loss.detach()), terms, rate, self.seconds)
 
     def _share_gradients(self) -> None:
         """The mean over processes of gradients and of running statistics: one flat exchange each."""
@@ -217,17 +217,24 @@ def train(
 
 
 def _log_line(progress: Progress) -> dict[str, float]:
-    terms = {name: round(float(value), 5) for name, value in vars(progress.terms).items()}
+    terms = {name: round(float(value.detach()), 5) for name, value in vars(progress.terms).items()}
     return {"step": progress.step, "loss": round(progress.loss, 5), **terms, "lr": progress.learning_rate}
 
 
 def _trim_log(path: Path, step: int) -> None:
-    """Drop the lines that a killed run wrote after its last save: they will be written again."""
+    """Drop the lines that a killed run wrote after its last save, the last of them perhaps cut: they will be written again."""
     if path.exists():
-        kept = [line for line in path.read_text().splitlines() if line and json.loads(line)["step"] <= step]
+        kept = [line for line in path.read_text().splitlines() if 0 < _step_of(line) <= step]
         partial = path.with_suffix(".partial")
         partial.write_text("".join(line + "\n" for line in kept))
-        partial.replace(path)
+        os.replace(partial, path)
+
+
+def _step_of(line: str) -> int:
+    try:
+        return int(json.loads(line)["step"])
+    except (json.JSONDecodeError, KeyError, TypeError):
+        return 0
 
 
 def _groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real LiDAR: two sweeps of one Argoverse 2 log as two agents; the second's bytes, and both clouds in one picture."""
+
+import sys
+from pathlib import Path
+
+from manyeyes import Agent, Argoverse2Recording, load_detector
+from manyeyes.apps.viewer.birds_eye import draw, save_png, scene_of
+
+root = Path(sys.argv[1] if len(sys.argv) > 1 else "../shared/data/av2")
+if not root.is_dir():
+    sys.exit(f"{root}: no Argoverse 2 logs here; give their folder.")
+recording = Argoverse2Recording(root)
+snapshot = recording.snapshot(recording.scenarios[0], 0)
+detector = load_detector()
+first, second = snapshot.frames
+packets = Agent(detector).share(second)
+perception = Agent(detector).perceive(first, packets)
+print(f"{sum(map(len, packets))} bytes from {len(second.points)} real points, {len(perception.boxes)} boxes")
+picture = Path(sys.argv[2] if len(sys.argv) > 2 else "two_real_sweeps.png")
+save_png(draw(scene_of(snapshot, perception.boxes), detector.config.grid, "Two real sweeps as two agents"), picture)
+print(picture)

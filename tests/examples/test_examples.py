@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every numbered example runs as a newcomer would run it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+SHARED = REPOSITORY.parent / "shared" / "data"
+
+
+def run(example: str, *arguments: str) -> str:
+    done = subprocess.run(
+        [sys.executable, str(REPOSITORY / "examples" / example), *arguments],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_every_example_is_run_here() -> None:
+    tested = Path(__file__).read_text()
+    examples = sorted(p.name for p in (REPOSITORY / "examples").glob("[0-9]*.py"))
+    assert examples
+    assert [name for name in examples if f'run("{name}"' not in tested] == []
+
+
+def test_01_bytes_between_two_agents() -> None:
+    out = run("01_bytes_between_two_agents.py")
+    assert "from 1 agent" in out
+    assert int(out.split()[0]) > 80
+
+
+@pytest.mark.slow
+def test_02_judge_a_drive(tmp_path: Path) -> None:
+    pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
+    out = run("02_judge_a_drive.py", str(tmp_path / "drive"))
+    assert [line.split()[0] for line in out.strip().splitlines()] == ["alone", "late", "intermediate", "early"]
+
+
+@pytest.mark.skipif(not (SHARED / "av2").is_dir(), reason="../shared/data/av2 is not beside this repository")
+def test_03_two_real_sweeps(tmp_path: Path) -> None:
+    picture = tmp_path / "pair.png"
+    out = run("03_two_real_sweeps.py", str(SHARED / "av2"), str(picture))
+    assert "99466 real points" in out
+    assert picture.stat().st_size > 50_000
