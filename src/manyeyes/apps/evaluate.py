@@ -15,7 +15,7 @@ from manyeyes.apps.playing import Playing, excerpt, weights_name
 if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.recording import Recording
-    from manyeyes.evaluation.benchmark import MethodResult
+    from manyeyes.evaluation.tally import MethodResult
     from manyeyes.models.detector import Detector
 
 

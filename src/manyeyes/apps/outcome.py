@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from rich.console import Console
 
 from manyeyes.apps.viewer.table import Row, differences_terminal, row_of, terminal
-from manyeyes.evaluation.benchmark import IOUS, MethodResult
 from manyeyes.evaluation.bootstrap import Interval
 from manyeyes.evaluation.communication import Communication
 from manyeyes.evaluation.comparison import Difference, differences
 from manyeyes.evaluation.detection import Protocol
+from manyeyes.evaluation.tally import IOUS, MethodResult
 
 LARGEST_MESSAGE = 1 << 17
 ALONE_BETWEEN = (0.50, 0.85)

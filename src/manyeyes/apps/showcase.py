@@ -21,8 +21,8 @@ from manyeyes.apps.viewer.birds_eye import draw, save_png, scene_of
 from manyeyes.apps.viewer.report import Picture, Report, save_report
 from manyeyes.apps.viewer.table import markdown
 from manyeyes.datatypes import BevGrid, ConfigError
-from manyeyes.evaluation.comparison import Tally
 from manyeyes.evaluation.detection import Protocol, protocol_named
+from manyeyes.evaluation.tally import Tally
 from manyeyes.models.detector import Detector
 
 if TYPE_CHECKING:

@@ -227,7 +227,7 @@ def _trim_log(path: Path, step: int) -> None:
         kept = [line for line in path.read_text().splitlines() if 0 < _step_of(line) <= step]
         partial = path.with_suffix(".partial")
         partial.write_text("".join(line + "\n" for line in kept))
-        os.replace(partial, path)
+        partial.replace(path)
 
 
 def _step_of(line: str) -> int:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from rich import box
 from rich.table import Table
 
-from manyeyes.evaluation.benchmark import MethodResult
 from manyeyes.evaluation.bootstrap import Interval
 from manyeyes.evaluation.comparison import Difference
+from manyeyes.evaluation.tally import MethodResult
 
 NOT_RUN = "not run"
 

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording made of nothing but arithmetic: cars whose sides return points, seen by every agent alike."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.ops.keyed_random import keyed_uniform
+
+
+@dataclass(frozen=True)
+class ToyRecording:
+    """scenarios of `frames` snapshots each; agents stand on a circle around the world's origin and look their own ways."""
+
+    agents_n: int = 3
+    frames: int = 2
+    scenarios: tuple[str, ...] = ("toy_0", "toy_1")
+    cars: int = 6
+    radius_m: float = 18.0
+    points_per_car: int = 60
+    ground_points: int = 300
+
+    def length(self, scenario: str) -> int:
+        return self.frames
+
+    def judged(self, scenario: str) -> range:
+        return range(self.frames)
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        return tuple(range(self.agents_n))
+
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        key = (scenario, index)
+        u = keyed_uniform((self.cars, 5), "toy cars", *key)
+        angle = (torch.arange(self.cars) + 0.3 * u[:, 0]) * 2 * math.pi / self.cars
+        center = torch.stack((angle.cos(), angle.sin(), angle * 0), 1) * self.radius_m * (0.5 + 0.5 * u[:, 1:2])
+        size = torch.tensor([4.4, 1.9, 1.6], dtype=torch.float64) * (0.9 + 0.2 * u[:, 2:3])
+        center[:, 2] = size[:, 2] / 2 + 1.0
+        boxes = Boxes.of(center, size, 2 * math.pi * u[:, 3], id=torch.arange(self.cars) + 100)
+        poses = [self._pose(i, key) for i in range(self.agents_n)]
+        frames = tuple(
+            AgentFrame.of(self._cloud(boxes, pose, i, key), pose, agent_id=i) for i, pose in enumerate(poses)
+        )
+        seen = torch.ones(self.agents_n, self.cars, dtype=torch.bool)
+        return Snapshot(scenario, index, frames, Truth(boxes, seen, Transform.stack(poses)))
+
+    def _pose(self, agent: int, key: tuple[str, int]) -> Transform:
+        u = keyed_uniform((3,), "toy pose", agent, *key).tolist()
+        return Transform.from_xyz_yaw(6 * u[0] - 3, 6 * u[1] - 3, 1.0, 2 * math.pi * u[2])
+
+    def _cloud(self, boxes: Boxes, pose: Transform, agent: int, key: tuple[str, int]) -> PointCloud:
+        """Points on the sides of all cars, a centimetre within, and on the ground under them, in the agent's frame."""
+        n, p = len(boxes), self.points_per_car
+        u = keyed_uniform((n, p, 3), "toy points", agent, *key)
+        local = u - 0.5
+        side = torch.arange(p) % 2
+        local[..., 0] = torch.where(side == 0, local[..., 0].sign() * 0.5, local[..., 0])
+        local[..., 1] = torch.where(side == 1, local[..., 1].sign() * 0.5, local[..., 1])
+        local = local * (boxes.size[:, None] - 0.02)
+        c, s = boxes.yaw.cos()[:, None], boxes.yaw.sin()[:, None]
+        turned = torch.stack(
+            (local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c, local[..., 2]), -1
+        )
+        ground = (keyed_uniform((self.ground_points, 3), "toy ground", agent, *key) - 0.5) * 50
+        ground[:, 2] = 0.95
+        world = torch.cat(((turned + boxes.center[:, None]).flatten(0, 1), ground))
+        return PointCloud.of(pose.inverse().apply(world))
+
+
+@pytest.fixture
+def toy() -> type[ToyRecording]:
+    return ToyRecording

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The training loop: resumes bit by bit, shares a batch between processes, logs, and runs the paper's preset."""
+
+import dataclasses
+import itertools
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from manyeyes.datatypes import CheckpointError, ConfigError
+from manyeyes.models import checkpoint
+from manyeyes.models.presets import COSTR_OPV2V, COSTR_TINY
+from manyeyes.training.loop import Run, TrainConfig, learning_rate, prune_threshold, train
+from manyeyes.training.samples import AugmentConfig
+
+TINY = TrainConfig(COSTR_TINY, steps=6, batch=2, warm_up=2, save_every=2, augment=AugmentConfig(max_agents=2))
+
+
+def small(toy):
+    return toy(agents_n=2, points_per_car=20, ground_points=60)
+
+
+def same_state(a: torch.nn.Module, b: torch.nn.Module) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
+
+
+def test_a_run_that_was_killed_ends_as_if_it_had_not_been(toy, tmp_path):
+    whole = Run(TINY, small(toy), tmp_path / "whole", seed=3)
+    for _ in range(6):
+        whole.advance()
+    broken = Run(TINY, small(toy), tmp_path / "broken", seed=3)
+    for _ in range(4):
+        broken.advance()
+        if broken.step == 2:
+            broken.save()
+    resumed = Run(TINY, small(toy), tmp_path / "broken", seed=3)
+    assert resumed.step == 2 and not same_state(resumed.model, broken.model)
+    last = [resumed.advance() for _ in range(4)][-1]
+    assert last.step == 6
+    assert same_state(resumed.model, whole.model) and same_state(resumed.average, whole.average)
+    for mine, theirs in zip(resumed.optimiser.state.values(), whole.optimiser.state.values(), strict=True):
+        assert torch.equal(mine["exp_avg"], theirs["exp_avg"]) and torch.equal(mine["exp_avg_sq"], theirs["exp_avg_sq"])
+
+
+def test_train_writes_weights_a_log_and_goes_on_where_it_stopped(toy, tmp_path):
+    heard = []
+    weights = train(TINY, small(toy), tmp_path, seed=1, card={"command": "x"}, report=heard.append)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6] == [p.step for p in heard]
+    assert all(math.isfinite(line["loss"]) for line in lines)
+    card = checkpoint.read_card(weights)
+    assert card["seed"] == 1 and card["steps"] == 6 and card["command"] == "x"
+    assert card["config"]["detector"]["head_channels"] == 32
+    # A run that is over trains no more; lines after the last save are dropped and written again.
+    with (tmp_path / "log.jsonl").open("a") as log:
+        log.write(json.dumps({"step": 7, "loss": 0.0}) + "\n")
+    before = weights.read_bytes()
+    train(TINY, small(toy), tmp_path, seed=1, card={"command": "x"})
+    assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [
+        1,
+        2,
+        3,
+        4,
+        5,
+        6,
+    ]
+    assert checkpoint.load(weights).fingerprint and len(before) == weights.stat().st_size
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_a_log_line_cut_by_a_kill_is_dropped(toy, tmp_path):
+    train(dataclasses.replace(TINY, steps=2), small(toy), tmp_path, seed=1)
+    with (tmp_path / "log.jsonl").open("a") as log:
+        log.write('{"step": 3, "lo')
+    train(dataclasses.replace(TINY, steps=2), small(toy), tmp_path, seed=1)
+    assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [1, 2]
+
+
+def test_the_shipped_weights_are_the_average(toy, tmp_path):
+    train(dataclasses.replace(TINY, steps=3), small(toy), tmp_path, seed=1)
+    state = torch.load(tmp_path / "last.pt", weights_only=True)
+    loaded = checkpoint.load(tmp_path / "weights.safetensors").state_dict()
+    assert torch.equal(loaded["head.out.weight"], state["average"]["head.out.weight"])
+    assert not torch.equal(loaded["head.out.weight"], state["model"]["head.out.weight"])
+
+
+def test_a_folder_of_another_run_or_a_cut_state_is_refused(toy, tmp_path):
+    run = Run(TINY, small(toy), tmp_path, seed=3)
+    run.save()
+    for config, seed in ((TINY, 4), (dataclasses.replace(TINY, learning_rate=1.0), 3)):
+        with pytest.raises(CheckpointError, match=r"last\.pt: belongs to a run of another configuration or seed"):
+            Run(config, small(toy), tmp_path, seed)
+    path = tmp_path / "last.pt"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(CheckpointError, match=r"last\.pt: not a whole training state"):
+        Run(TINY, small(toy), tmp_path, 3)
+
+
+def test_a_loss_that_is_no_number_stops_the_run_and_names_the_step(toy, tmp_path):
+    run = Run(TINY, small(toy), tmp_path, seed=3)
+    with torch.no_grad():
+        run.model.head.out.bias.fill_(torch.nan)
+    with pytest.raises(ConfigError, match="The loss is nan at step 0"):
+        run.advance()
+
+
+def test_schedules():
+    config = dataclasses.replace(TINY, learning_rate=1.0, warm_up=10, prune_from=0.1, prune_full=0.3)
+    rates = [learning_rate(config, step, 100) for step in range(101)]
+    assert rates[0] == pytest.approx(0.1) and max(rates) == rates[9] and rates[100] == pytest.approx(0.0, abs=1e-9)
+    assert all(a > b for a, b in itertools.pairwise(rates[9:]))
+    thresholds = [prune_threshold(config, step, 100) for step in (0, 10, 20, 30, 99)]
+    assert thresholds == pytest.approx([0, 0, 0.05, 0.1, 0.1])
+
+
+def test_the_same_seed_is_the_same_run_and_another_is_not(toy, tmp_path):
+    runs = [Run(TINY, small(toy), tmp_path / str(i), seed) for i, seed in enumerate((5, 5, 6))]
+    for run in runs:
+        run.advance()
+    assert same_state(runs[0].model, runs[1].model) and not same_state(runs[0].model, runs[2].model)
+
+
+PROCESS = """
+import datetime, json, pathlib, runpy, sys
+import torch, torch.distributed as dist
+torch.set_num_threads(1)
+here, port, rank, world, out = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), pathlib.Path(sys.argv[5])
+toy = runpy.run_path(here)["ToyRecording"]
+from manyeyes.models.presets import COSTR_TINY
+from manyeyes.training.loop import Run, TrainConfig
+from manyeyes.training.samples import AugmentConfig
+if world > 1:
+    dist.init_process_group(
+        "gloo", f"tcp://127.0.0.1:{port}", datetime.timedelta(seconds=60), world_size=world, rank=rank
+    )
+# One frame of one agent without augmentation: all samples of the batch are alike.
+alike = dict(scenarios=("toy_0",), frames=1, agents_n=1, points_per_car=20, ground_points=60)
+config = TrainConfig(COSTR_TINY, steps=6, batch=4, warm_up=2, augment=AugmentConfig.none())
+run = Run(config, toy(**alike), out / "alike", 0)
+first = run.advance()
+state = {k: v for k, v in run.model.state_dict().items() if "running" not in k and "tracked" not in k}
+varied = Run(config, toy(frames=4, points_per_car=20, ground_points=60), out / "varied", 0)
+drawn, real = [], varied.stream.draw
+object.__setattr__(varied.stream, "draw", lambda n: drawn.append(n) or real(n))
+losses = [varied.advance().loss for _ in range(2)]
+torch.save({"loss": first.loss, "state": state, "drawn": drawn, "losses": losses, "varied": varied.model.state_dict()},
+           out / f"{world}_{rank}.pt")
+"""
+
+
+def processes(worlds: tuple[int, ...], folder: Path) -> list[dict]:
+    """What every process of every world found, all of them started at once."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "OMP_NUM_THREADS": "1"}
+    started = []
+    for world in worlds:
+        with socket.socket() as s:
+            s.bind(("127.0.0.1", 0))
+            port = s.getsockname()[1]
+        for rank in range(world):
+            arguments = [str(Path(__file__).with_name("conftest.py")), *map(str, (port, rank, world, folder))]
+            started.append(subprocess.Popen([sys.executable, "-c", PROCESS, *arguments], env=environment))
+    assert [p.wait(120) for p in started] == [0] * len(started)
+    return [torch.load(folder / f"{world}_{rank}.pt", weights_only=True) for world in worlds for rank in range(world)]
+
+
+def test_two_processes_are_one_with_their_batch(tmp_path):
+    """Equal where it can be equal: each process normalises by its own samples (batch statistics, number of boxes), so one
+    process of four samples and two of two agree to rounding only when those agree, here because all samples are alike."""
+    one, first, second = processes((1, 2), tmp_path)
+    assert first["loss"] == pytest.approx(one["loss"], rel=1e-5) and second["loss"] == pytest.approx(
+        one["loss"], rel=1e-5
+    )
+    # The first step of AdamW is the sign of the gradient: where that is all rounding, weights may differ by two steps.
+    differ = [(first["state"][k] - v).abs().flatten() for k, v in one["state"].items()]
+    assert float((torch.cat(differ) > 1e-6).float().mean()) < 0.02
+    assert all(torch.equal(v, second["state"][k]) for k, v in first["state"].items())
+    # Different samples: no sample is drawn twice or left out, losses differ, weights and statistics stay the same.
+    assert (one["drawn"], first["drawn"], second["drawn"]) == ([*range(8)], [0, 1, 4, 5], [2, 3, 6, 7])
+    assert first["losses"] != second["losses"]
+    for name, value in first["varied"].items():
+        assert torch.equal(value, second["varied"][name]), name
+
+
+def test_a_batch_that_cannot_be_shared_is_refused(toy, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.distributed.get_rank", lambda: 0)
+    monkeypatch.setattr("torch.distributed.get_world_size", lambda: 4)
+    with pytest.raises(ConfigError, match="batch of 2 samples cannot be shared by 4"):
+        Run(TINY, small(toy), tmp_path, seed=0)
+
+
+def test_the_papers_preset_takes_a_step_and_resumes(toy, tmp_path):
+    config = TrainConfig(COSTR_OPV2V, steps=2, batch=1, augment=AugmentConfig(max_agents=2))
+    run = Run(config, small(toy), tmp_path, seed=0)
+    first = run.advance()
+    run.save()
+    assert math.isfinite(first.loss) and run.model.token_grid.stride == 8
+    resumed = Run(config, small(toy), tmp_path, seed=0)
+    assert resumed.step == 1 and math.isfinite(resumed.advance().loss)

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Losses against loops and closed forms, and finite where there is nothing to learn from."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from manyeyes.datatypes import BevGrid, Boxes, Sites
+from manyeyes.models.box_head import WIDTHS, RawBoxes
+from manyeyes.models.pruning import Pruned
+from manyeyes.training.losses import LossConfig, _gaussian_nll, centre_focal, head_terms, prune_focal
+from manyeyes.training.targets import TargetConfig, assign
+
+GRID = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0).at(4)
+SITES = Sites(torch.arange(GRID.shape[0] * GRID.shape[1]), GRID)
+
+
+def raw(seed: int = 0) -> RawBoxes:
+    random = torch.Generator().manual_seed(seed)
+    values = [torch.randn(len(SITES), w, generator=random).squeeze(1).requires_grad_() for w in WIDTHS]
+    return RawBoxes(SITES, *values)
+
+
+def one_box(yaw: float = 0.4) -> Boxes:
+    return Boxes.of(torch.tensor([[1.3, -2.2, 0.8]]), torch.tensor([[4.5, 1.9, 1.6]]), torch.tensor([yaw]))
+
+
+def test_centre_focal_by_a_loop():
+    random = torch.Generator().manual_seed(0)
+    logit, heat = torch.randn(30, generator=random) * 3, torch.rand(30, generator=random) * 0.98
+    positive = torch.zeros(30, dtype=torch.bool)
+    positive[[3, 17]] = True
+    heat[positive] = 1.0
+    total = 0.0
+    for s, y, is_centre in zip(logit.tolist(), heat.tolist(), positive.tolist()):
+        p = min(max(1 / (1 + math.exp(-s)), 1e-4), 1 - 1e-4)
+        total -= (1 - p) ** 2 * math.log(p) if is_centre else (1 - y) ** 4 * p**2 * math.log(1 - p)
+    assert float(centre_focal(logit, heat, positive)) == pytest.approx(total / 2, rel=1e-5)
+
+
+def test_prune_focal_by_a_loop():
+    logit = torch.tensor([-2.0, 0.3, 1.5, -0.4])
+    near = torch.tensor([False, True, False, True])
+    total = 0.0
+    for s, y in zip(logit.tolist(), near.tolist()):
+        p = 1 / (1 + math.exp(-s))
+        pt, alpha = (p, 0.25) if y else (1 - p, 0.75)
+        total -= alpha * (1 - pt) ** 2 * math.log(pt)
+    got = prune_focal(Pruned(Sites(torch.arange(4), GRID), logit), near)
+    assert float(got) == pytest.approx(total / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("scale", (1.0, 1e4))
+def test_without_a_box_every_term_is_finite_and_gradients_flow(scale):
+    some = raw()
+    some = dataclasses.replace(some, heat=(some.heat * scale).detach().requires_grad_())
+    targets = assign(SITES, [Boxes.empty()], TargetConfig())
+    prune = prune_focal(Pruned(SITES, some.heat), torch.zeros(len(SITES), dtype=torch.bool))
+    terms = head_terms(some, targets, prune)
+    total = terms.total(LossConfig())
+    total.backward()
+    assert bool(torch.isfinite(total)) and some.heat.grad is not None and bool(torch.isfinite(some.heat.grad).all())
+    assert not any(float(getattr(terms, n).detach()) for n in ("shape", "direction", "kind", "sigma", "overlap"))
+    assert float(terms.heat.detach()) > 0
+
+
+def test_no_sites_at_all():
+    none = Sites(torch.zeros(0, dtype=torch.int64), GRID)
+    empty = RawBoxes(none, *(torch.zeros(0, w).squeeze(1).requires_grad_() for w in WIDTHS))
+    terms = head_terms(empty, assign(none, [one_box()], TargetConfig()), torch.zeros(()))
+    assert float(terms.total(LossConfig()).detach()) == 0.0
+
+
+def test_the_stated_sigma_is_best_where_it_is_the_true_one():
+    random = torch.Generator().manual_seed(0)
+    errors = torch.randn(20000, 2, generator=random) * 0.37
+    log_sigma = torch.linspace(-3, 1, 401)
+    nll = torch.stack([_gaussian_nll(errors, s.expand(20000)).mean() for s in log_sigma])
+    assert float(log_sigma[nll.argmin()].exp()) == pytest.approx(0.37, rel=0.03)
+    wild = _gaussian_nll(torch.full((1, 2), 1e3), torch.tensor([-1e3]))
+    assert bool(torch.isfinite(wild).all())
+
+
+def perfect(truth: Boxes) -> RawBoxes:
+    """Every site says exactly the one box."""
+    n = len(SITES)
+    values = [torch.zeros(n, w) for w in WIDTHS]
+    values[1] = (truth.center[:, :2] - SITES.xy) / GRID.cell
+    values[2] = truth.center[:, 2:].expand(n, 1)
+    values[4] = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1).expand(n, 2)
+    # The axis lies in (-pi/2, pi/2]; a heading outside it is the axis' opposite.
+    values[5] = torch.where(truth.yaw.cos() > 0, 30.0, -30.0).expand(n, 1)
+    values[6][:, 0] = 30.0
+    values[7] = values[8] = torch.full((n, 1), -5.0)
+    values[9] = torch.full((n, 1), 30.0)
+    return RawBoxes(SITES, *(v.squeeze(1) for v in values))
+
+
+@pytest.mark.parametrize("yaw", (0.4, -1.5, 2.8, -2.9, math.pi / 2 - 1e-3))
+def test_a_perfect_answer_costs_nothing_and_its_opposite_only_direction(yaw):
+    truth = one_box(yaw)
+    targets = assign(SITES, [truth], TargetConfig())
+    terms = head_terms(perfect(truth), targets, torch.zeros(()))
+    for name in ("shape", "direction", "kind", "overlap"):
+        assert float(getattr(terms, name)) == pytest.approx(0.0, abs=2e-3), name
+    assert float(terms.sigma) == pytest.approx(-10.0, abs=0.1)
+    backward = dataclasses.replace(perfect(truth), direction=-perfect(truth).direction)
+    worse = head_terms(backward, targets, torch.zeros(()))
+    assert float(worse.direction) > 20 and float(worse.shape) == float(terms.shape)
+
+
+def test_the_term_for_sigma_never_moves_the_box():
+    some = raw()
+    terms = head_terms(some, assign(SITES, [one_box()], TargetConfig()), torch.zeros(()))
+    terms.sigma.backward()
+    assert some.offset.grad is None and some.axis.grad is None
+    assert some.log_sigma_xy.grad is not None and bool(some.log_sigma_xy.grad.any())
+
+
+def test_the_total_is_the_weighted_sum():
+    terms = head_terms(raw(), assign(SITES, [one_box()], TargetConfig()), torch.tensor(2.0))
+    weights = LossConfig(heat=2.0, shape=0.0, direction=0.0, kind=0.0, sigma=0.0, overlap=0.0, prune=0.5)
+    assert float(terms.total(weights).detach()) == pytest.approx(2 * float(terms.heat.detach()) + 1.0, rel=1e-6)

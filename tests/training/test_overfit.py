@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""H7: the smallest preset learns one frame of two agents by heart."""
+
+import torch
+
+from manyeyes.evaluation.detection import PROTOCOLS, FrameResult, average_precision
+from manyeyes.models.box_head import DecodeConfig, decode
+from manyeyes.models.presets import COSTR_TINY
+from manyeyes.training.loop import Run, TrainConfig
+from manyeyes.training.samples import AugmentConfig
+from manyeyes.training.step import forward
+
+
+def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):
+    recording = toy(agents_n=2, scenarios=("toy_0",), frames=1, ground_points=100)
+    schedule = {"steps": 150, "batch": 1, "learning_rate": 8e-3, "warm_up": 10, "ema": 0.9}
+    run = Run(TrainConfig(COSTR_TINY, augment=AugmentConfig.none(), **schedule), recording, tmp_path, seed=0)
+    losses = [run.advance() for _ in range(run.steps)]
+    assert float(losses[-1].terms.heat) < 0.01 * float(losses[0].terms.heat)
+    sample = run.stream.draw(0)
+    with torch.no_grad():
+        _, raw = forward(run.average.eval(), [sample])
+    together = decode(raw, DecodeConfig())[0]
+    frame = FrameResult("toy_0", 0, together, sample.union)
+    for iou in (0.5, 0.7):
+        assert average_precision([frame], iou, PROTOCOLS["manyeyes"]).ap == 1.0
+    best = together[:6]
+    nearest = torch.cdist(best.center[:, :2], sample.union.center[:, :2].float()).argmin(1)
+    truth = sample.union[nearest]
+    assert sorted(nearest.tolist()) == [*range(6)] and float(best.score.min()) > 0.5
+    # The heading too, and not only the axis, is right; and the detector knows how well it knows the place.
+    assert bool(((best.yaw - truth.yaw.float()).cos() > 0.97).all()) and float(best.flip.max()) < 0.5
+    error = (best.center[:, :2] - truth.center[:, :2].float()).norm(dim=1)
+    assert float(error.max()) < 0.4 and float(best.sigma_xy.max()) < 0.5
