@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -127,53 +128,58 @@ def test_the_same_seed_is_the_same_run_and_another_is_not(toy, tmp_path):
     assert same_state(runs[0].model, runs[1].model) and not same_state(runs[0].model, runs[2].model)
 
 
-PROCESS = """
-import datetime, json, pathlib, runpy, sys
-import torch, torch.distributed as dist
-torch.set_num_threads(1)
-here, port, rank, world, out = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), pathlib.Path(sys.argv[5])
-toy = runpy.run_path(here)["ToyRecording"]
+MEASURE = """
+import torch
 from manyeyes.models.presets import COSTR_TINY
 from manyeyes.training.loop import Run, TrainConfig
 from manyeyes.training.samples import AugmentConfig
-if world > 1:
-    dist.init_process_group(
-        "gloo", f"tcp://127.0.0.1:{port}", datetime.timedelta(seconds=60), world_size=world, rank=rank
-    )
-# One frame of one agent without augmentation: all samples of the batch are alike.
-alike = dict(scenarios=("toy_0",), frames=1, agents_n=1, points_per_car=20, ground_points=60)
-config = TrainConfig(COSTR_TINY, steps=6, batch=4, warm_up=2, augment=AugmentConfig.none())
-run = Run(config, toy(**alike), out / "alike", 0)
-first = run.advance()
-state = {k: v for k, v in run.model.state_dict().items() if "running" not in k and "tracked" not in k}
-varied = Run(config, toy(frames=4, points_per_car=20, ground_points=60), out / "varied", 0)
-drawn, real = [], varied.stream.draw
-object.__setattr__(varied.stream, "draw", lambda n: drawn.append(n) or real(n))
-losses = [varied.advance().loss for _ in range(2)]
-torch.save({"loss": first.loss, "state": state, "drawn": drawn, "losses": losses, "varied": varied.model.state_dict()},
-           out / f"{world}_{rank}.pt")
+
+def measure(toy, out):
+    # One frame of one agent without augmentation: all samples of the batch are alike.
+    alike = toy(scenarios=("toy_0",), frames=1, agents_n=1, points_per_car=20, ground_points=60)
+    config = TrainConfig(COSTR_TINY, steps=6, batch=4, warm_up=2, augment=AugmentConfig.none())
+    run = Run(config, alike, out / "alike", 0)
+    first = run.advance()
+    state = {k: v for k, v in run.model.state_dict().items() if "running" not in k and "tracked" not in k}
+    varied = Run(config, toy(frames=4, points_per_car=20, ground_points=60), out / "varied", 0)
+    drawn, real = [], varied.stream.draw
+    object.__setattr__(varied.stream, "draw", lambda n: drawn.append(n) or real(n))
+    losses = [varied.advance().loss for _ in range(2)]
+    return dict(loss=first.loss, state=state, drawn=drawn, losses=losses, varied=varied.model.state_dict())
+"""
+
+PROCESS = """
+import datetime, pathlib, runpy, sys
+import torch.distributed as dist
+torch.set_num_threads(1)
+here, port, rank, out = sys.argv[1], sys.argv[2], int(sys.argv[3]), pathlib.Path(sys.argv[4])
+dist.init_process_group("gloo", f"tcp://127.0.0.1:{port}", datetime.timedelta(seconds=60), world_size=2, rank=rank)
+torch.save(measure(runpy.run_path(here)["ToyRecording"], out), out / f"{rank}.pt")
+dist.destroy_process_group()
 """
 
 
-def processes(worlds: tuple[int, ...], folder: Path) -> list[dict]:
-    """What every process of every world found, all of them started at once."""
+def two_processes(folder: Path) -> list[dict]:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        port = s.getsockname()[1]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "OMP_NUM_THREADS": "1"}
-    started = []
-    for world in worlds:
-        with socket.socket() as s:
-            s.bind(("127.0.0.1", 0))
-            port = s.getsockname()[1]
-        for rank in range(world):
-            arguments = [str(Path(__file__).with_name("conftest.py")), *map(str, (port, rank, world, folder))]
-            started.append(subprocess.Popen([sys.executable, "-c", PROCESS, *arguments], env=environment))
-    assert [p.wait(120) for p in started] == [0] * len(started)
-    return [torch.load(folder / f"{world}_{rank}.pt", weights_only=True) for world in worlds for rank in range(world)]
+    arguments = [str(Path(__file__).with_name("conftest.py")), str(port)]
+    started = [
+        subprocess.Popen([sys.executable, "-c", MEASURE + PROCESS, *arguments, str(rank), str(folder)], env=environment)
+        for rank in range(2)
+    ]
+    assert [p.wait(120) for p in started] == [0, 0]
+    return [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(2)]
 
 
-def test_two_processes_are_one_with_their_batch(tmp_path):
+def test_two_processes_are_one_with_their_batch(toy, tmp_path):
     """Equal where it can be equal: each process normalises by its own samples (batch statistics, number of boxes), so one
     process of four samples and two of two agree to rounding only when those agree, here because all samples are alike."""
-    one, first, second = processes((1, 2), tmp_path)
+    first, second = two_processes(tmp_path)
+    names: dict[str, Any] = {}
+    exec(MEASURE, names)
+    one = names["measure"](toy, tmp_path)
     assert first["loss"] == pytest.approx(one["loss"], rel=1e-5) and second["loss"] == pytest.approx(
         one["loss"], rel=1e-5
     )

@@ -16,7 +16,8 @@ def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):
     schedule = {"steps": 150, "batch": 1, "learning_rate": 8e-3, "warm_up": 10, "ema": 0.9}
     run = Run(TrainConfig(COSTR_TINY, augment=AugmentConfig.none(), **schedule), recording, tmp_path, seed=0)
     losses = [run.advance() for _ in range(run.steps)]
-    assert float(losses[-1].terms.heat) < 0.01 * float(losses[0].terms.heat)
+    heats = [float(progress.terms.heat.detach()) for progress in (losses[0], losses[-1])]
+    assert heats[1] < 0.01 * heats[0]
     sample = run.stream.draw(0)
     with torch.no_grad():
         _, raw = forward(run.average.eval(), [sample])
@@ -27,7 +28,8 @@ def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):
     best = together[:6]
     nearest = torch.cdist(best.center[:, :2], sample.union.center[:, :2].float()).argmin(1)
     truth = sample.union[nearest]
-    assert sorted(nearest.tolist()) == [*range(6)] and float(best.score.min()) > 0.5
+    assert sorted(nearest.tolist()) == [*range(6)]
+    assert float(best.score.min()) > 0.3 and not (together.score[6:] > 0.5 * best.score.min()).any()
     # The heading too, and not only the axis, is right; and the detector knows how well it knows the place.
     assert bool(((best.yaw - truth.yaw.float()).cos() > 0.97).all()) and float(best.flip.max()) < 0.5
     error = (best.center[:, :2] - truth.center[:, :2].float()).norm(dim=1)
