@@ -3,12 +3,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
+from torch import Tensor
 
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, SparseBev
-from manyeyes.models.box_head import decode
-from manyeyes.models.detector import Detector, Seen
+from manyeyes.models.box_head import RawBoxes, decode
+from manyeyes.models.detector import Detector
 from manyeyes.models.fusion.gather import Tokens, own_tokens
+
+
+@dataclass(frozen=True)
+class Sight:
+    """One agent's own view: what it can tell others (N, C + PROPOSAL), the worth (N,) of each token, and its own boxes."""
+
+    told: SparseBev
+    worth: Tensor
+    boxes: Boxes
 
 
 class Eyes:
@@ -17,27 +29,29 @@ class Eyes:
     def __init__(self, detector: Detector, remember: int = 8) -> None:
         self.detector = detector
         self._remember = remember
-        self._seen: list[tuple[AgentFrame, Seen]] = []
+        self._seen: list[tuple[AgentFrame, Sight]] = []
 
-    def see(self, frame: AgentFrame) -> Seen:
-        """Tokens of the frame's own cloud, in the agent's frame."""
-        for known, seen in self._seen:
+    def see(self, frame: AgentFrame) -> Sight:
+        """The agent's own view of its frame."""
+        for known, sight in self._seen:
             if known is frame:
-                return seen
-        seen = self.see_cloud(frame.points)
-        self._seen = [*self._seen, (frame, seen)][-self._remember :]
-        return seen
+                return sight
+        sight = self.see_cloud(frame.points)
+        self._seen = [*self._seen, (frame, sight)][-self._remember :]
+        return sight
 
-    def see_cloud(self, cloud: PointCloud) -> Seen:
-        """Tokens of any cloud in an agent's frame; not remembered."""
+    def see_cloud(self, cloud: PointCloud) -> Sight:
+        """The view of any cloud in an agent's frame; not remembered."""
         with torch.inference_mode():
-            return self.detector.see([cloud])
+            seen = self.detector.see([cloud])
+        raw = self.fuse(own_tokens(seen.tokens))
+        return Sight(self.detector.tell(seen.tokens, raw), seen.worth, self.decode(raw))
 
-    def own(self, bev: SparseBev) -> Boxes:
-        """What these tokens alone say."""
-        return self.detect(own_tokens(bev))
+    def fuse(self, tokens: Tokens) -> RawBoxes:
+        """Raw boxes around one ego."""
+        with torch.inference_mode():
+            return self.detector.fuse(tokens)
 
-    def detect(self, tokens: Tokens) -> Boxes:
+    def decode(self, raw: RawBoxes) -> Boxes:
         """Boxes around one ego, in its frame, best first."""
-        with torch.inference_mode():
-            return decode(self.detector.fuse(tokens), self.detector.config.decode)[0]
+        return decode(raw, self.detector.config.decode)[0]

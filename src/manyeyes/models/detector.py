@@ -9,13 +9,14 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from manyeyes.datatypes import BevGrid, Boxes, PointCloud, SparseBev
-from manyeyes.models.box_head import BoxHead, DecodeConfig, RawBoxes, decode
+from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
+from manyeyes.models.box_head import BoxHead, DecodeConfig, RawBoxes
 from manyeyes.models.encoder import EncoderConfig, SparseEncoder
 from manyeyes.models.fusion.gather import Tokens
 from manyeyes.models.fusion.maximum import MaximumFusion
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
 from manyeyes.models.pillars import PillarEncoder, PillarKind
+from manyeyes.models.proposal import propose
 from manyeyes.models.pruning import FocalPrune, Pruned
 from manyeyes.models.transformer import AttentionConfig, WindowTransformer
 
@@ -82,10 +83,10 @@ class Detector(nn.Module):
         worth = probability if threshold <= 0 else probability[probability > threshold]
         return Seen(kept, worth, (*encoded.pruned, decision), encoded.sites_per_stride)
 
+    def tell(self, tokens: SparseBev, raw: RawBoxes) -> SparseBev:
+        """What is sent: features (N, C) and, behind them, the proposals of raw, the agent's own view of these tokens."""
+        return tokens.with_features(torch.cat((tokens.features, propose(raw)), 1))
+
     def fuse(self, tokens: Tokens) -> RawBoxes:
         """Tokens of all agents around each ego to raw boxes in the ego's frame."""
         return self.head(self.fusion(tokens))
-
-    def detect(self, tokens: Tokens) -> list[Boxes]:
-        """Boxes of every ego in the batch, in its frame."""
-        return decode(self.fuse(tokens), self.config.decode)

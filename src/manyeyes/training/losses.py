@@ -40,6 +40,10 @@ class LossTerms:
     overlap: Tensor
     prune: Tensor
 
+    def mean(self, other: LossTerms) -> LossTerms:
+        """Half of each."""
+        return LossTerms(*((getattr(self, f.name) + getattr(other, f.name)) / 2 for f in fields(self)))
+
     def total(self, config: LossConfig) -> Tensor:
         """The weighted sum."""
         return torch.stack([getattr(self, f.name) * getattr(config, f.name) for f in fields(self)]).sum()

@@ -8,7 +8,16 @@ from manyeyes.training.loop import TrainConfig
 from manyeyes.training.samples import AugmentConfig
 
 TRAINING_PRESETS: dict[str, TrainConfig] = {
-    "costr-small": TrainConfig(COSTR_SMALL, steps=6500, batch=4, learning_rate=1.5e-3, warm_up=200, save_every=100),
+    "costr-small": TrainConfig(
+        COSTR_SMALL,
+        steps=4800,
+        batch=4,
+        learning_rate=1.5e-3,
+        warm_up=200,
+        save_every=100,
+        prune_from=0.01,
+        prune_full=0.06,
+    ),
     "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
     "costr-tiny": TrainConfig(
         COSTR_TINY, steps=60, batch=2, learning_rate=3e-3, warm_up=5, save_every=20, augment=AugmentConfig(max_agents=3)

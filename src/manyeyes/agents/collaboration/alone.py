@@ -22,4 +22,4 @@ class Alone:
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """What the agent's own cloud shows."""
-        return eyes.own(eyes.see(frame).tokens)
+        return eyes.see(frame).boxes

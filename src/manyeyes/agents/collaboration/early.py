@@ -24,4 +24,4 @@ class Early:
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the merged cloud."""
         heard = [m.points.transform(ego_from_sender(frame, m)) for m in messages if m.points is not None]
-        return eyes.own(eyes.see_cloud(PointCloud.cat([frame.points, *heard])).tokens)
+        return eyes.see_cloud(PointCloud.cat([frame.points, *heard])).boxes

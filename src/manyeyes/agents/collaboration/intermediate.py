@@ -21,16 +21,16 @@ class Intermediate:
     name: str = "intermediate"
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
-        """The tokens that pruning kept, and their worth, by which a budget chooses."""
+        """The tokens that pruning kept with what the agent makes of them, and their worth, by which a budget chooses."""
         seen = eyes.see(frame)
-        return replace(header(frame, eyes.detector.fingerprint), tokens=seen.tokens, token_score=seen.worth)
+        return replace(header(frame, eyes.detector.fingerprint), tokens=seen.told, token_score=seen.worth)
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the fused tokens."""
-        own = eyes.see(frame).tokens
+        own = eyes.see(frame).told
         parts: list[tuple[int, Tensor, Tensor, Transform | None]] = [(0, own.features, own.sites.xy, None)]
         for message in messages:
             if message.tokens is not None and message.tokens.grid == own.grid:
                 there = message.tokens
                 parts.append((0, there.features, there.sites.xy, ego_from_sender(frame, message)))
-        return eyes.detect(gather(parts, own.grid, 1))
+        return eyes.decode(eyes.fuse(gather(parts, own.grid, 1)))

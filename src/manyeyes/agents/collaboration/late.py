@@ -22,7 +22,7 @@ class Late:
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
         """The boxes of the agent's own cloud."""
-        found = eyes.own(eyes.see(frame).tokens)
+        found = eyes.see(frame).boxes
         return replace(header(frame, eyes.detector.fingerprint), objects=found[found.score > self.say_above])
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
@@ -32,5 +32,5 @@ class Late:
             for m in messages
             if m.objects is not None
         ]
-        boxes = Boxes.cat([eyes.own(eyes.see(frame).tokens), *heard])
+        boxes = Boxes.cat([eyes.see(frame).boxes, *heard])
         return boxes[rotated_nms(boxes.bev().double(), boxes.score, self.nms_iou)]

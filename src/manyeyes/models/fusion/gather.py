@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, SparseBev, Transform
+from manyeyes.models.proposal import PROPOSAL, move_proposal
 from manyeyes.ops.sparse_conv import coalesce
 
 CUES = 3
@@ -21,12 +22,14 @@ class Tokens:
 
     features: (N, C); xy: (N, 2) metres in the ego's frame; ego: (N,) int64, which ego of the batch; cue: (N, CUES) how the
     sender's frame differs from the ego's there (height in metres, sine and cosine - 1 of the relative yaw): zero for its own.
+    proposal: (N, PROPOSAL) in the ego's axes, from the token's own place, zero where nobody has proposed anything yet.
     """
 
     features: Tensor
     xy: Tensor
     ego: Tensor
     cue: Tensor
+    proposal: Tensor
     grid: BevGrid
     batch_size: int
 
@@ -44,45 +47,34 @@ def rotate_vectors(features: Tensor, yaw: Tensor) -> Tensor:
 
 
 def gather(parts: Iterable[tuple[int, Tensor, Tensor, Transform | None]], grid: BevGrid, batch_size: int) -> Tokens:
-    """parts: (ego, features (n, C), xy (n, 2) in the sender's frame, ego_from_sender or None for the ego's own).
+    """parts: (ego, told (n, C + PROPOSAL), xy (n, 2) in the sender's frame, ego_from_sender or None for the ego's own).
 
     Tokens that fall outside the ego's range are dropped. grid: the lattice of the tokens, for all agents alike.
     """
-    features, places, egos, cues = [], [], [], []
-    for ego, feature, xy, ego_from_sender in parts:
+    columns: list[tuple[Tensor, ...]] = []
+    for ego, told, xy, ego_from_sender in parts:
+        feature, proposal = told[:, :-PROPOSAL], told[:, -PROPOSAL:]
         cue = feature.new_zeros(feature.shape[0], CUES)
         if ego_from_sender is not None:
             yaw = ego_from_sender.yaw
             moved = ego_from_sender.apply(torch.cat((xy, xy.new_zeros(xy.shape[0], 1)), 1).double())
+            height = moved[:, 2].to(feature.dtype)
             turn = torch.stack((yaw.sin(), yaw.cos() - 1)).to(feature.dtype).expand(feature.shape[0], 2)
-            cue = torch.cat((moved[:, 2:].to(feature.dtype), turn), 1)
-            feature, xy = rotate_vectors(feature, yaw), moved[:, :2].float()
+            cue = torch.cat((height[:, None], turn), 1)
+            feature, proposal = rotate_vectors(feature, yaw), move_proposal(proposal, yaw, height)
+            xy = moved[:, :2].float()
             near = grid.inside(xy)
-            feature, xy, cue = feature[near], xy[near], cue[near]
-        features.append(feature)
-        places.append(xy)
-        cues.append(cue)
-        egos.append(torch.full((feature.shape[0],), ego, dtype=torch.int64))
-    return Tokens(torch.cat(features), torch.cat(places), torch.cat(egos), torch.cat(cues), grid, batch_size)
+            feature, xy, cue, proposal = feature[near], xy[near], cue[near], proposal[near]
+        columns.append((feature, xy, torch.full((feature.shape[0],), ego, dtype=torch.int64), cue, proposal))
+    features, places, egos, cues, proposals = (torch.cat(column) for column in zip(*columns))
+    return Tokens(features, places, egos, cues, proposals, grid, batch_size)
 
 
 def own_tokens(bev: SparseBev) -> Tokens:
-    """Every grid of a batch as an ego that hears nobody."""
+    """Every grid of a batch as an ego that hears nobody and has not looked yet: features (N, C), no proposals."""
     sites = bev.sites
-    cue = bev.features.new_zeros(len(sites), CUES)
-    return Tokens(bev.features, sites.xy, sites.batch, cue, sites.grid, sites.batch_size)
-
-
-def join(first: Tokens, second: Tokens) -> Tokens:
-    """Two batches of egos as one; the second's egos are numbered on from the first's."""
-    return Tokens(
-        torch.cat((first.features, second.features)),
-        torch.cat((first.xy, second.xy)),
-        torch.cat((first.ego, second.ego + first.batch_size)),
-        torch.cat((first.cue, second.cue)),
-        first.grid,
-        first.batch_size + second.batch_size,
-    )
+    cue, proposal = bev.features.new_zeros(len(sites), CUES), bev.features.new_zeros(len(sites), PROPOSAL)
+    return Tokens(bev.features, sites.xy, sites.batch, cue, proposal, sites.grid, sites.batch_size)
 
 
 def lattice_offset(tokens: Tokens) -> tuple[Tensor, Tensor]:

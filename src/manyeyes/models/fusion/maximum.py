@@ -8,19 +8,27 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import SparseBev
 from manyeyes.models.fusion.gather import CUES, Tokens, lattice_offset, to_lattice
+from manyeyes.models.proposal import PROPOSAL
 
 
 class Placement(nn.Module):
-    """Tells a feature how it was moved: offset to the cell it lands on, height and turn of its sender. Starts at zero."""
+    """Tells a feature where it landed: offset to its cell, height and turn of its sender, and what the sender proposed there.
+
+    The proposal's box is measured from the cell that the token lands on. Ends in zeros, so that fusion starts as if without.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.embed = nn.Linear(CUES + 2, channels, bias=False)
-        nn.init.zeros_(self.embed.weight)
+        self.inner = nn.Linear(CUES + 2 + PROPOSAL, 2 * channels)
+        self.outer = nn.Linear(2 * channels, channels, bias=False)
+        nn.init.zeros_(self.outer.weight)
 
     def forward(self, features: Tensor, tokens: Tokens, offset: Tensor) -> Tensor:
         """(N, C) to (N, C)."""
-        return features + self.embed(torch.cat((tokens.cue, offset), 1))
+        proposed = (tokens.proposal != 0).any(1, keepdim=True)
+        shift = torch.nn.functional.pad(offset * proposed, (1, PROPOSAL - 3))
+        words = torch.cat((tokens.cue, offset, tokens.proposal + shift), 1)
+        return features + self.outer(torch.relu(self.inner(words)))
 
 
 class MaximumFusion(nn.Module):
