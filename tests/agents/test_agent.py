@@ -140,13 +140,15 @@ def test_an_agent_does_not_hear_itself_nor_report_its_own_body(detector: Detecto
 
 
 def test_late_fusion_keeps_one_box_of_two_that_overlap(detector: Detector) -> None:
-    """The same cloud at the same place from two agents: late fusion ends with the ego's own boxes, not with doubles."""
+    """What another says of the very same boxes adds none; the same boxes far aside add all."""
     frame = frames_of(make_scene(1))[0]
-    twin = replace(frame, agent_id=9)
-    late = method("late")
-    both = Agent(detector, late).perceive(frame, Agent(detector, late).share(twin)).boxes
-    alone = Agent(detector, method("alone")).perceive(frame).boxes
-    assert len(both) == len(alone) > 0
+    eyes, late = Eyes(detector), method("late")
+    said = late.say(eyes, frame)
+    assert said is not None and said.objects is not None
+    own = eyes.see(frame).boxes
+    assert len(late.hear(eyes, frame, [said])) == len(own) > 0
+    far = replace(said, world_from_agent=Transform.from_xyz_yaw(0.0, 200.0))
+    assert len(late.hear(eyes, frame, [far])) == len(own) + len(said.objects)
 
 
 def test_an_unknown_method_lists_the_known() -> None:
