@@ -10,6 +10,7 @@ import math
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import WireError
@@ -40,51 +41,94 @@ def varint_sizes(values: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def pack_varints(values: NDArray[np.int64]) -> bytes:
     """Little-endian base-128 of values (N,) in [0, 2^35): seven bits a byte, the top bit says that more follow."""
-    if values.size and (int(values.min()) < 0 or int(values.max()) >> 7 * _VARINT_BYTES):
+    out = np.empty(len(values) * _VARINT_BYTES, np.uint8)
+    used = _write_varints(np.ascontiguousarray(values, np.int64), out)
+    if used < 0:
         raise WireError("A varint holds values from 0 to 2^35 - 1; send a smaller grid.")
-    sizes = varint_sizes(values)
-    place = np.arange(_VARINT_BYTES)
-    digits = (values[:, None] >> (7 * place)) & 127
-    digits |= (place < sizes[:, None] - 1) * 128
-    return digits[place < sizes[:, None]].astype(np.uint8).tobytes()
+    return out[:used].tobytes()
+
+
+@njit(cache=True)
+def _write_varints(values, out):  # pragma: no cover
+    """Bytes written to out; -1 where a value does not fit."""
+    at = 0
+    for value in values:
+        if value < 0 or value >> 35:
+            return -1
+        while value >> 7:
+            out[at] = value & 127 | 128
+            value >>= 7
+            at += 1
+        out[at] = value
+        at += 1
+    return at
 
 
 def unpack_varints(data: bytes, count: int) -> tuple[NDArray[np.int64], int]:
     """The first ``count`` varints of data, and how many bytes they took. Padded (non-shortest) forms are refused."""
-    if count == 0:
-        return np.zeros(0, np.int64), 0
-    raw = np.frombuffer(data, np.uint8, count=min(len(data), count * _VARINT_BYTES))
-    ends = np.flatnonzero(raw < 128)[:count]
-    if ends.size < count:
-        raise PacketError("garbage", f"Expected {count} varints; the bytes end after {ends.size}.")
-    starts = np.concatenate(([0], ends[:-1] + 1))
-    sizes = ends - starts + 1
-    if int(sizes.max()) > _VARINT_BYTES or bool(((sizes > 1) & (raw[ends] == 0)).any()):
+    values = np.zeros(count, np.int64)
+    used, whole = _read_varints(np.frombuffer(data, np.uint8), values)
+    if whole < count and used >= 0:
+        raise PacketError("garbage", f"Expected {count} varints; the bytes end after {whole}.")
+    if used < 0:
         raise PacketError("garbage", f"A varint has at most {_VARINT_BYTES} bytes and no padding.")
-    used = int(ends[-1]) + 1
-    shift = 7 * (np.arange(used) - np.repeat(starts, sizes))
-    digits = (raw[:used] & 127).astype(np.int64) << shift
-    return np.add.reduceat(digits, starts), used
+    return values, used
+
+
+@njit(cache=True)
+def _read_varints(raw, values):  # pragma: no cover
+    """Bytes read, -1 where one is too long or padded, and how many values are whole."""
+    at = 0
+    for i in range(values.shape[0]):
+        value, shift = 0, 0
+        while True:
+            if at == raw.shape[0]:
+                return at, i
+            byte = np.int64(raw[at])
+            at += 1
+            value |= (byte & 127) << shift
+            shift += 7
+            if byte < 128:
+                break
+            if shift == 35:
+                return -1, i
+        if byte == 0 and shift > 7:
+            return -1, i
+        values[i] = value
+    return at, values.shape[0]
 
 
 def _gaps(key: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.concatenate((key[:1], np.diff(key) - 1))
 
 
+@njit(cache=True)
+def _sizes(key):  # pragma: no cover
+    """Bytes of sorted keys as gaps and as a bitmap."""
+    gaps, before = 0, -1
+    for k in key:
+        gaps += _varint_bytes(k - before - 1)
+        before = k
+    span = (key[-1] - key[0]) // 8 + 1
+    return gaps, _varint_bytes(key[0]) + _varint_bytes(span) + span
+
+
+@njit(cache=True)
+def _varint_bytes(value):  # pragma: no cover
+    size = 1
+    while value >> 7:
+        value >>= 7
+        size += 1
+    return size
+
+
 def _span_bytes(key: NDArray[np.int64]) -> int:
     return int(key[-1] - key[0]) // 8 + 1
 
 
-def _bitmap_size(key: NDArray[np.int64]) -> int:
-    span = _span_bytes(key)
-    return int(varint_sizes(np.array([key[0], span], np.int64)).sum()) + span
-
-
 def cells_size(key: NDArray[np.int64]) -> int:
     """Bytes of :func:`pack_cells` for sorted keys (N,); a further key lowers it by at most one byte (a shorter start)."""
-    if not key.size:
-        return 0
-    return min(int(varint_sizes(_gaps(key)).sum()), _bitmap_size(key))
+    return min(_sizes(key)) if key.size else 0
 
 
 def pack_cells(key: NDArray[np.int64]) -> tuple[int, bytes]:
@@ -95,9 +139,9 @@ def pack_cells(key: NDArray[np.int64]) -> tuple[int, bytes]:
     """
     if not key.size:
         return DELTA, b""
-    gaps = _gaps(key)
-    if int(varint_sizes(gaps).sum()) <= _bitmap_size(key):
-        return DELTA, pack_varints(gaps)
+    as_gaps, as_bitmap = _sizes(key)
+    if as_gaps <= as_bitmap:
+        return DELTA, pack_varints(_gaps(key))
     span = _span_bytes(key)
     bits = np.zeros(span * 8, np.uint8)
     bits[key - key[0]] = 1
