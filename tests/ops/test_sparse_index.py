@@ -101,6 +101,24 @@ def test_a_map_of_one_set_is_its_own_transpose_flipped():
     assert [pairs.tap for pairs in symmetric.pairs()] == [t for t in range(25) if t != 12]
 
 
+@pytest.mark.parametrize("symmetric", (False, True))
+def test_compiled_loops_find_what_whole_tensors_find(monkeypatch, symmetric):
+    shape, window = (11, 10), Window(3, 1, 1) if symmetric else Window(3, 2, 1)
+
+    def found() -> list[torch.Tensor]:
+        key = keys(shape)
+        out = key if symmetric else parent_sites(key, shape, BATCH, 2)
+        index = neighbours(out, window.out_shape(shape), key, shape, BATCH, window)
+        pairs = NeighbourMap(index, len(key), is_symmetric=symmetric).pairs()
+        return [out, index, *(t for tap, *ends in pairs for t in (torch.tensor(tap), *ends))]
+
+    loops = found()
+    monkeypatch.setattr("manyeyes.ops.sparse_index._in_loops", lambda key: False)
+    tensors = found()
+    assert len(loops) == len(tensors) > 10
+    assert all(a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(loops, tensors, strict=True))
+
+
 def test_distinct_is_unique_with_its_inverse():
     key = torch.randint(0, 50, (200,), generator=torch.Generator().manual_seed(0))
     found, row = distinct(key, 50)

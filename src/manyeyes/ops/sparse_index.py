@@ -14,7 +14,9 @@ from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 
 
@@ -73,13 +75,18 @@ class NeighbourMap:
     @cached_property
     def _ahead(self) -> tuple[Pairs, ...]:
         """Tap by tap, which input leads to which output; without the middle tap where that is the row itself."""
-        by_tap = self.index.T.contiguous()
-        met = by_tap < self.n_in
-        if self.is_symmetric:
-            met[met.shape[0] // 2] = False
-        counts = met.sum(1).tolist()
-        target = met.nonzero()[:, 1].split(counts)
-        source = by_tap[met].long().split(counts)
+        middle = self.index.shape[1] // 2 if self.is_symmetric else -1
+        if _in_loops(self.index):
+            counts = np.empty(self.index.shape[1], np.int64)
+            flat = torch.from_numpy(_pairs_by_tap(self.index.numpy(), self.n_in, middle, counts))
+            source, target = (rows.split(counts.tolist()) for rows in flat)
+        else:
+            by_tap = self.index.T.contiguous()
+            met = by_tap < self.n_in
+            if self.is_symmetric:
+                met[middle] = False
+            sizes = met.sum(1).tolist()
+            source, target = by_tap[met].long().split(sizes), met.nonzero()[:, 1].split(sizes)
         return tuple(Pairs(tap, s, t) for tap, (s, t) in enumerate(zip(source, target)) if len(s))
 
     @property
@@ -135,6 +142,10 @@ def dilated_sites(key: Tensor, shape: tuple[int, int], batch_size: int, window: 
 def parent_sites(key: Tensor, shape: tuple[int, int], batch_size: int, stride: int) -> Tensor:
     """Keys of the cells ``floor(i / stride)`` of active cells i, on a grid of ceil(shape / stride)."""
     rows, columns = -(-shape[0] // stride), -(-shape[1] // stride)
+    if _in_loops(key):
+        marked = np.zeros(batch_size * rows * columns, np.bool_)
+        _mark_parents(key.numpy(), shape[0], shape[1], rows, columns, stride, marked)
+        return torch.from_numpy(np.flatnonzero(marked))
     batch, y, x = split(key, shape)
     y, x = y.div(stride, rounding_mode="floor"), x.div(stride, rounding_mode="floor")
     return distinct((batch * rows + y) * columns + x, batch_size * rows * columns)[0]
@@ -159,6 +170,12 @@ def neighbours(
         padding + max(n, (o - 1) * stride - padding + reach + 1) for o, n in zip(out_shape, in_shape, strict=True)
     )
     device, n_in = in_key.device, in_key.shape[0]
+    if _in_loops(in_key):
+        index = np.empty((out_key.shape[0], kernel * kernel), np.int32)
+        image = np.full(batch_size * rows * columns, n_in, np.int32)
+        _place(in_key.numpy(), in_shape[0], in_shape[1], rows, columns, padding, image)
+        _look_up(out_key.numpy(), out_shape[0], out_shape[1], rows, columns, stride, kernel, dilation, image, index)
+        return torch.from_numpy(index)
     image = torch.full((batch_size * rows * columns,), n_in, dtype=torch.int32, device=device)
     batch, y, x = split(in_key, in_shape)
     image[(batch * rows + y + padding) * columns + x + padding] = torch.arange(n_in, dtype=torch.int32, device=device)
@@ -168,3 +185,53 @@ def neighbours(
     step = torch.arange(kernel, device=device) * dilation
     taps = (step[:, None] * columns + step).flatten()
     return image.index_select(0, (first[:, None] + taps).flatten()).view(first.shape[0], kernel * kernel)
+
+
+def _in_loops(key: Tensor) -> bool:
+    """On the CPU the integers are walked in compiled loops, elsewhere by whole tensors; a test holds one against the other."""
+    return key.device.type == "cpu"
+
+
+@njit(cache=True)
+def _mark_parents(key, in_rows, in_columns, rows, columns, stride, marked):  # pragma: no cover
+    for k in key:
+        line = k // in_columns
+        batch = line // in_rows
+        marked[(batch * rows + (line - batch * in_rows) // stride) * columns + (k - line * in_columns) // stride] = True
+
+
+@njit(cache=True)
+def _place(key, in_rows, in_columns, rows, columns, padding, image):  # pragma: no cover
+    for i in range(key.shape[0]):
+        line = key[i] // in_columns
+        batch = line // in_rows
+        y, x = line - batch * in_rows + padding, key[i] - line * in_columns + padding
+        image[(batch * rows + y) * columns + x] = i
+
+
+@njit(cache=True)
+def _look_up(key, out_rows, out_columns, rows, columns, stride, kernel, dilation, image, index):  # pragma: no cover
+    for o in range(key.shape[0]):
+        line = key[o] // out_columns
+        batch = line // out_rows
+        first = (batch * rows + (line - batch * out_rows) * stride) * columns + (key[o] - line * out_columns) * stride
+        for ty in range(kernel):
+            for tx in range(kernel):
+                index[o, ty * kernel + tx] = image[first + (ty * columns + tx) * dilation]
+
+
+@njit(cache=True)
+def _pairs_by_tap(index, n_in, middle, counts):  # pragma: no cover
+    """Rows source, target (2, P) int64, tap by tap; counts (taps,) is filled."""
+    counts[:] = 0
+    for o in range(index.shape[0]):
+        for t in range(index.shape[1]):
+            counts[t] += t != middle and index[o, t] < n_in
+    place = np.cumsum(counts) - counts
+    pairs = np.empty((2, counts.sum()), np.int64)
+    for o in range(index.shape[0]):
+        for t in range(index.shape[1]):
+            if t != middle and index[o, t] < n_in:
+                pairs[0, place[t]], pairs[1, place[t]] = index[o, t], o
+                place[t] += 1
+    return pairs
