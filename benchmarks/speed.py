@@ -123,7 +123,7 @@ def random_detector(config: DetectorConfig, frames: list[AgentFrame]) -> Detecto
         norm.momentum = None  # pyright: ignore[reportAttributeAccessIssue]
     eyes = Eyes(model.train())
     with torch.inference_mode():
-        eyes.own(eyes.see(frames[0]).tokens)
+        eyes.see_cloud(frames[0].points)
     for norm, momentum in zip(norms, momenta):
         norm.momentum = momentum
     return model.eval().requires_grad_(False)
@@ -158,7 +158,7 @@ class Sparse:
             set_kept(self.model, self.kept[i] if self.kept else None)
             agent = Agent(self.model)
             sizes.append(sum(map(len, agent.share(frame))))
-            seen = agent.eyes.see(frame)
+            seen = self.model.see([frame.points])
             counts.append((*seen.sites_per_stride, len(seen.pruned[-1].sites), len(seen.tokens.sites)))
         return tuple(sum(c) for c in zip(*counts)), median(sizes)
 
@@ -201,13 +201,13 @@ def _times(began: float, shared: float, ended: float, agents: int) -> Times:
 
 def aim_threshold(model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -> None:
     """Set the score threshold so that CANDIDATES cells, or all if fewer, pass it in the ego's frame."""
-    parts = []
+    parts, eyes = [], Eyes(model)
     for i, frame in enumerate(frames):
         set_kept(model, kept[i] if kept else None)
-        seen = model.see([frame.points]).tokens
+        told = eyes.see_cloud(frame.points).told
         motion = frames[0].world_from_agent.inverse() @ frame.world_from_agent if i else None
-        parts.append((0, seen.features, seen.sites.xy, motion))
-    raw = model.fuse(gather(parts, model.token_grid, 1))
+        parts.append((0, told.features, told.sites.xy, motion))
+    raw = eyes.fuse(gather(parts, model.token_grid, 1))
     power = DecodeConfig().overlap_power
     best = (torch.sigmoid(raw.heat) ** (1 - power) * torch.sigmoid(raw.overlap) ** power).sort(descending=True).values
     threshold = float(best[CANDIDATES]) if len(best) > CANDIDATES else 0.0
