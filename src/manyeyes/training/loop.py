@@ -189,7 +189,7 @@ def train(
 ) -> Path:
     """Train, or go on where the run in folder stopped; returns the file of averaged weights.
 
-    Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors.
+    Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
     """
     run = Run(config, recording, folder, seed)
     folder.mkdir(parents=True, exist_ok=True)
@@ -212,7 +212,7 @@ def train(
             "config": asdict(config),
             **(card or {}),
         }
-        checkpoint.save(run.average, weights, about)
+        checkpoint.save(run.average, weights, about, half=True)
     return weights
 
 
