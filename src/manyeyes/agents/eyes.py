@@ -4,23 +4,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, SparseBev
-from manyeyes.models.box_head import RawBoxes, decode
+from manyeyes.models.box_head import DecodeConfig, RawBoxes, decode
 from manyeyes.models.detector import Detector
 from manyeyes.models.fusion.gather import Tokens, own_tokens
 
 
 @dataclass(frozen=True)
 class Sight:
-    """One agent's own view: what it can tell others (N, C + PROPOSAL), the worth (N,) of each token, and its own boxes."""
+    """One agent's own view: what it can tell others (N, C + PROPOSAL), the worth (N,) of each token, and its raw boxes."""
 
     told: SparseBev
     worth: Tensor
-    boxes: Boxes
+    raw: RawBoxes
+    config: DecodeConfig
+
+    @cached_property
+    def boxes(self) -> Boxes:
+        """The agent's own boxes, in its frame, best first; decoded when first asked for, since not everybody sends them."""
+        return decode(self.raw, self.config)[0]
 
 
 class Eyes:
@@ -45,7 +52,7 @@ class Eyes:
         with torch.inference_mode():
             seen = self.detector.see([cloud])
         raw = self.fuse(own_tokens(seen.tokens))
-        return Sight(self.detector.tell(seen.tokens, raw), seen.worth, self.decode(raw))
+        return Sight(self.detector.tell(seen.tokens, raw), seen.worth, raw, self.detector.config.decode)
 
     def fuse(self, tokens: Tokens) -> RawBoxes:
         """Raw boxes around one ego."""
