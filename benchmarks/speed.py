@@ -3,13 +3,14 @@
 
 Five agents: each shares (cloud to bytes), then one of them perceives (its own features and four messages to boxes after
 NMS). Both are timed in turn in one process, with random weights, and both judge as many candidate boxes. Widths and
-layers a stage are equal (strides 2, 4, 8); the sparse one has two more layers each at strides 16 and 32, the merge, the way
-up to its head's stride and window attention on top. The dense one's bytes are its float32 maps (the
-copy is counted, no codec) and it never warps a map; the sparse one's are whole packets within 2^17 bytes a message.
-With one thread the process's own time is counted, with more the wall clock; bars are judged on five shares and one
-perceive. The default head stride, 4, is the shipped model's; the dense heads work at stride 2.
+layers a stage are equal (strides 2, 4, 8); the sparse one has two more layers each at strides 16 and 32, the merge, the
+way up to its head's stride, window attention, and the look that each agent takes by itself before it tells. The dense
+one's bytes are its float32 maps (the copy is counted, no codec) and it never warps a map; the sparse one's are whole
+packets within 2^17 bytes a message. With one thread the process's own time is counted, with more the wall clock; bars
+are judged on five shares and one perceive. The default head stride, 4, is the shipped model's; the dense heads work at
+stride 2.
 
-python benchmarks/speed.py [--quick] [--rounds 5] [--threads 1] [--data ROOT] [--out benchmarks/results/speed.json]
+python benchmarks/speed.py [--quick] [--rounds 5] [--threads 1] [--head-stride 4] [--out benchmarks/results/speed.json]
 """
 
 from __future__ import annotations
