@@ -14,7 +14,7 @@ from manyeyes.models.layers import SubmanifoldLayer
 from manyeyes.ops.nms import rotated_nms
 
 TYPICAL_SIZE = (4.5, 1.9, 1.6)
-WIDTHS = (1, 2, 1, 3, 2, 1, len(LABELS), 1, 1, 1)
+WIDTHS = (1, 2, 1, 3, 2, 2, len(LABELS), 1, 1, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,8 @@ class RawBoxes:
 
     heat: (N,) logit that a box is centred here. offset: (N, 2), x and y from the cell's centre, in cells. z: (N,) metres.
     log_size: (N, 3) of size / TYPICAL_SIZE. axis: (N, 2), cosine and sine of twice the yaw: the body's axis modulo pi.
-    direction: (N,) logit that the heading is the axis' own and not its opposite. kind: (N, labels) logits.
+    direction: (N, 2): its product with a unit vector along the axis is the logit that the vehicle faces that way; turning the
+    vector by pi turns the sign, so there is no seam. kind: (N, labels) logits.
     log_sigma_xy, log_sigma_yaw: (N,), m and rad. overlap: (N,) logit of the IoU that the box will have.
     """
 
@@ -57,12 +58,21 @@ def axis_yaw(axis: Tensor) -> Tensor:
     return torch.atan2(axis[:, 1], axis[:, 0]) / 2
 
 
+def facing(raw: RawBoxes) -> Tensor:
+    """(N,) logit that the vehicle faces along axis_yaw and not along its opposite; no gradient to the axis."""
+    yaw = axis_yaw(raw.axis).detach()
+    return raw.direction[:, 0] * yaw.cos() + raw.direction[:, 1] * yaw.sin()
+
+
 class BoxHead(nn.Module):
     """Two submanifold layers and one linear map to all quantities of RawBoxes."""
 
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
-        self.shared = nn.Sequential(SubmanifoldLayer(inputs, channels), SubmanifoldLayer(channels, channels))
+        self.shared = nn.Sequential(
+            SubmanifoldLayer(inputs, channels, norm=nn.LayerNorm),
+            SubmanifoldLayer(channels, channels, norm=nn.LayerNorm),
+        )
         self.out = nn.Linear(channels, sum(WIDTHS))
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
@@ -74,7 +84,7 @@ class BoxHead(nn.Module):
         parts = self.out(self.shared(x).features).split(WIDTHS, 1)
         heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap = parts
         return RawBoxes(
-            x.sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction[:, 0], kind,
+            x.sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind,
             sigma_xy[:, 0], sigma_yaw[:, 0], overlap[:, 0],
         )  # fmt: skip
 
@@ -105,7 +115,7 @@ def decode(raw: RawBoxes, config: DecodeConfig) -> list[Boxes]:
 def _boxes(raw: RawBoxes, rows: Tensor, score: Tensor) -> Boxes:
     cell = raw.sites.grid.cell
     xy = raw.sites.xy[rows] + raw.offset[rows] * cell
-    right = torch.sigmoid(raw.direction[rows])
+    right = torch.sigmoid(facing(raw))[rows]
     yaw = axis_yaw(raw.axis[rows]) + math.pi * (right < 0.5)
     return Boxes(
         center=torch.cat((xy, raw.z[rows, None]), 1).detach(),

@@ -21,6 +21,7 @@ class EncoderConfig:
 
     prune_strides: levels with a focal pruning layer. head_stride: stride of the tokens that are fused, sent and decoded;
     8 is the paper's letter, 4 the default. dilating: spconv's strided active set instead of parents only.
+    token_channels: tokens are projected to so many channels before attention; None keeps those of their stride.
     """
 
     channels: tuple[int, ...] = (32, 64, 128, 128, 128, 128)
@@ -28,6 +29,7 @@ class EncoderConfig:
     prune_strides: tuple[int, ...] = (4, 8)
     head_stride: int = 4
     dilating: bool = False
+    token_channels: int | None = None
 
     def __post_init__(self) -> None:
         if len(self.channels) != 6 or len(self.layers) != 6:
@@ -67,7 +69,10 @@ class SparseEncoder(nn.Module):
         self.post_merge = SubmanifoldLayer(width[8], width[8])
         ups = [s for s in (4, 2) if s >= config.head_stride]
         self.up = nn.ModuleDict({str(s): UpLayer(width[2 * s], width[s], width[s]) for s in ups})
-        self.out_channels = width[config.head_stride]
+        self.out_channels = config.token_channels or width[config.head_stride]
+        self.project = (
+            nn.Identity() if config.token_channels is None else nn.Linear(width[config.head_stride], self.out_channels)
+        )
 
     def forward(self, x: SparseBev, prune_threshold: float) -> Encoded:
         """prune_threshold: probability below which a cell is dropped; 0 drops none."""
@@ -82,4 +87,5 @@ class SparseEncoder(nn.Module):
         tokens = self.post_merge(merge([levels[8], levels[16], levels[32]]))
         for stride, up in self.up.items():
             tokens = up(tokens, levels[int(stride)])
+        tokens = tokens.with_features(self.project(tokens.features))
         return Encoded(tokens, tuple(pruned), tuple(len(levels[s].sites) for s in STRIDES))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -46,11 +47,16 @@ def _tap_by_tap(weight: Tensor) -> nn.Parameter:
 
 
 class SubmanifoldLayer(nn.Module):
-    """Submanifold convolution, norm, optional skip, ReLU: the sites stay as they are."""
+    """Submanifold convolution, norm, optional skip, ReLU: the sites stay as they are.
 
-    def __init__(self, inputs: int, outputs: int, kernel: int = 3) -> None:
+    norm: ActiveNorm, or LayerNorm where the same weights meet sets of different statistics (one agent, many agents).
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, kernel: int = 3, norm: Callable[[int], nn.Module] = ActiveNorm
+    ) -> None:
         super().__init__()
-        self.weight, self.norm = conv_weight(outputs, inputs, kernel), ActiveNorm(outputs)
+        self.weight, self.norm = conv_weight(outputs, inputs, kernel), norm(outputs)
         self.skip = inputs == outputs
 
     def forward(self, x: SparseBev) -> SparseBev:

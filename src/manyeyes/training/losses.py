@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from manyeyes.models.box_head import TYPICAL_SIZE, RawBoxes, axis_yaw
+from manyeyes.models.box_head import TYPICAL_SIZE, RawBoxes, axis_yaw, facing
 from manyeyes.models.pruning import Pruned
 from manyeyes.ops.box_iou import aligned_iou
 from manyeyes.training.targets import Targets
@@ -21,7 +21,7 @@ class LossConfig:
 
     heat: float = 1.0
     shape: float = 0.5
-    direction: float = 0.1
+    direction: float = 0.3
     kind: float = 0.1
     sigma: float = 0.05
     overlap: float = 0.3
@@ -92,7 +92,7 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor) -> LossTerms:
     yaw = axis_yaw(some.axis).detach()
     turn = truth.yaw - yaw
     ahead = (turn.cos() > 0).float()
-    direction = functional.binary_cross_entropy_with_logits(some.direction, ahead, reduction="none")
+    direction = functional.binary_cross_entropy_with_logits(facing(some), ahead, reduction="none")
     kind = functional.cross_entropy(some.kind, truth.label, reduction="none")
     sigma = _gaussian_nll(((some.offset - offset) * some.sites.grid.cell).detach(), some.log_sigma_xy)
     axis_error = torch.atan2((2 * turn).sin(), (2 * turn).cos())[:, None] / 2

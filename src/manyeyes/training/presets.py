@@ -10,7 +10,7 @@ from manyeyes.training.samples import AugmentConfig
 TRAINING_PRESETS: dict[str, TrainConfig] = {
     "costr-small": TrainConfig(
         COSTR_SMALL,
-        steps=4800,
+        steps=3600,
         batch=4,
         learning_rate=1.5e-3,
         warm_up=200,
