@@ -39,12 +39,12 @@ def encode(boxes: Boxes, sites: Sites) -> RawBoxes:
     values[2][at] = truth.center[:, 2:]
     values[3][at] = (truth.size / torch.tensor(TYPICAL_SIZE)).log()
     values[4][at] = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1)
-    values[5][at] = torch.where(truth.yaw.cos() > 0, 8.0, -8.0)[:, None]
+    values[5][at] = 8.0 * torch.stack((truth.yaw.cos(), truth.yaw.sin()), 1)
     values[6][at, truth.label] = 5.0
     values[7][at] = math.log(0.25)
     values[9][:] = 20.0
     heat, offset, z, log_size, axis, direction, kind, *rest = values
-    return RawBoxes(sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction[:, 0], kind, *(v[:, 0] for v in rest))
+    return RawBoxes(sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind, *(v[:, 0] for v in rest))
 
 
 @pytest.mark.parametrize("stride", (2, 4, 8))
@@ -81,6 +81,19 @@ def test_the_opposite_heading_is_the_same_rectangle_and_says_so():
     assert torch.allclose(twin.cos(), -torch.ones(len(found)), atol=1e-5)
     doubt = 1 - 1 / (1 + math.exp(-0.8))
     assert torch.allclose(back.flip, torch.full((len(found),), doubt), atol=1e-5)
+
+
+def test_traffic_across_the_way_has_a_heading_without_a_seam():
+    """A hair of error in the axis at ±90 degrees turns its representative by pi; the heading stays."""
+    for yaw in (math.pi / 2 - 1e-3, math.pi / 2 + 1e-3, -math.pi / 2 - 1e-3, -math.pi / 2 + 1e-3):
+        box = Boxes.of(torch.tensor([[3.0, 4.0, 0.8]]), torch.tensor([[4.5, 1.9, 1.6]]), torch.tensor([yaw]))
+        raw = encode(box, every_site(4))
+        for error in (-4e-3, 4e-3):
+            c, s = math.cos(error), math.sin(error)
+            off = torch.stack((raw.axis[:, 0] * c - raw.axis[:, 1] * s, raw.axis[:, 0] * s + raw.axis[:, 1] * c), 1)
+            (found,) = decode(RawBoxes(**{**vars(raw), "axis": off}), DecodeConfig())
+            assert math.cos(float(found.yaw[0]) - yaw) > 0.999
+            assert float(found.flip[0]) < 1e-3
 
 
 def test_grids_of_a_batch_may_hold_no_few_and_too_many_boxes():

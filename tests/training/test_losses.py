@@ -90,8 +90,7 @@ def perfect(truth: Boxes) -> RawBoxes:
     values[1] = (truth.center[:, :2] - SITES.xy) / GRID.cell
     values[2] = truth.center[:, 2:].expand(n, 1)
     values[4] = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1).expand(n, 2)
-    # The axis lies in (-pi/2, pi/2]; a heading outside it is the axis' opposite.
-    values[5] = torch.where(truth.yaw.cos() > 0, 30.0, -30.0).expand(n, 1)
+    values[5] = (30.0 * torch.stack((truth.yaw.cos(), truth.yaw.sin()), 1)).expand(n, 2)
     values[6][:, 0] = 30.0
     values[7] = values[8] = torch.full((n, 1), -5.0)
     values[9] = torch.full((n, 1), 30.0)
