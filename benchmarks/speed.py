@@ -37,6 +37,7 @@ from manyeyes.models import zoo
 from manyeyes.models.box_head import DecodeConfig
 from manyeyes.models.detector import Detector, DetectorConfig
 from manyeyes.models.encoder import STRIDES, EncoderConfig
+from manyeyes.models.folded import folded
 from manyeyes.models.fusion.gather import gather
 from manyeyes.models.layers import ActiveNorm
 from manyeyes.models.presets import OPV2V_GRID
@@ -56,12 +57,13 @@ class Widths:
     extra_layers: tuple[int, int, int]
     pillar_channels: int
     up: int
+    tokens: int
     bar_unpruned: float
     bar_pruned: float
 
 
-WIDE = Widths((64, 128, 256), (3, 5, 8), 64, 128, 3.0, 6.0)
-SMALL = Widths((32, 64, 128), (2, 2, 2), 32, 64, 1.8, 3.0)
+WIDE = Widths((64, 128, 256), (3, 5, 8), 64, 128, 128, 3.0, 6.0)
+SMALL = Widths((32, 64, 128), (2, 2, 2), 32, 64, 64, 1.8, 3.0)
 
 
 def dense_rival(widths: Widths) -> DensePointPillars:
@@ -77,6 +79,7 @@ def sparse_config(widths: Widths, head_stride: int) -> DetectorConfig:
         layers=(0, *widths.extra_layers, 2, 2),
         prune_strides=PRUNED_AT,
         head_stride=head_stride,
+        token_channels=widths.tokens,
     )
     return DetectorConfig(
         grid=OPV2V_GRID,
@@ -84,7 +87,7 @@ def sparse_config(widths: Widths, head_stride: int) -> DetectorConfig:
         pillar_channels=widths.pillar_channels,
         encoder=encoder,
         dast=AttentionConfig(),
-        head_channels=b,
+        head_channels=64,
     )
 
 
@@ -127,7 +130,7 @@ def random_detector(config: DetectorConfig, frames: list[AgentFrame]) -> Detecto
         eyes.see_cloud(frames[0].points)
     for norm, momentum in zip(norms, momenta):
         norm.momentum = momentum
-    return model.eval().requires_grad_(False)
+    return folded(model)
 
 
 def set_kept(model: Detector, kept: Kept | None) -> None:

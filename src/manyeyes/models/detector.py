@@ -77,7 +77,8 @@ class Detector(nn.Module):
         threshold = self.config.prune_threshold if prune_threshold is None else prune_threshold
         encoded = self.encoder(self.pillars(clouds), threshold)
         tokens = encoded.tokens
-        tokens = tokens.with_features(self.dast(tokens.features, tokens.sites.xy, tokens.sites.batch, tokens.grid))
+        sites = tokens.sites
+        tokens = tokens.with_features(self.dast(tokens.features, sites.xy, sites.batch, sites.grid, sites.cache))
         kept, decision = self.token_prune(tokens, threshold)
         probability = torch.sigmoid(decision.logit.detach())
         worth = probability if threshold <= 0 else probability[probability > threshold]

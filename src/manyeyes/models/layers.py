@@ -46,11 +46,20 @@ def _tap_by_tap(weight: Tensor) -> nn.Parameter:
     return nn.Parameter(weight.permute(2, 3, 1, 0).contiguous().permute(3, 2, 0, 1))
 
 
+def _rectified(y: Tensor, skip: Tensor | None) -> Tensor:
+    """ReLU of y, a tensor that nobody else holds, plus skip; in its place where no gradient needs it."""
+    if torch.is_grad_enabled():
+        return torch.relu(y if skip is None else y + skip)
+    return torch.relu_(y if skip is None else y.add_(skip))
+
+
 class SubmanifoldLayer(nn.Module):
     """Submanifold convolution, norm, optional skip, ReLU: the sites stay as they are.
 
     norm: ActiveNorm, or LayerNorm where the same weights meet sets of different statistics (one agent, many agents).
     """
+
+    bias: Tensor | None
 
     def __init__(
         self, inputs: int, outputs: int, kernel: int = 3, norm: Callable[[int], nn.Module] = ActiveNorm
@@ -58,37 +67,65 @@ class SubmanifoldLayer(nn.Module):
         super().__init__()
         self.weight, self.norm = conv_weight(outputs, inputs, kernel), norm(outputs)
         self.skip = inputs == outputs
+        self.register_buffer("bias", None, persistent=False)
 
     def forward(self, x: SparseBev) -> SparseBev:
         """(N, inputs) to (N, outputs) on the same sites."""
-        y = self.norm(submanifold_conv(x, self.weight).features)
-        return x.with_features(torch.relu(y + x.features if self.skip else y))
+        y = self.norm(submanifold_conv(x, self.weight, self.bias).features)
+        return x.with_features(_rectified(y, x.features if self.skip else None))
+
+    def fold(self) -> None:
+        """Take the norm's running statistics into the weight, for good; a LayerNorm has none and stays."""
+        if isinstance(self.norm, ActiveNorm):
+            weight, self.bias = fold_norm(self.weight.detach(), self.norm)
+            self.weight, self.norm = nn.Parameter(weight, requires_grad=False), nn.Identity()
 
 
 class DownLayer(nn.Module):
     """3x3 convolution of stride 2, norm, ReLU; ``dilating`` chooses spconv's active set, else parents of active cells."""
 
+    bias: Tensor | None
+
     def __init__(self, inputs: int, outputs: int, dilating: bool) -> None:
         super().__init__()
-        self.weight, self.norm, self.dilating = conv_weight(outputs, inputs, 3), ActiveNorm(outputs), dilating
+        self.weight, self.dilating = conv_weight(outputs, inputs, 3), dilating
+        self.norm: nn.Module = ActiveNorm(outputs)
+        self.register_buffer("bias", None, persistent=False)
 
     def forward(self, x: SparseBev) -> SparseBev:
         """Features at twice the stride."""
-        y = strided_conv(x, self.weight, stride=2, padding=1, dilating=self.dilating)
-        return y.with_features(torch.relu(self.norm(y.features)))
+        y = strided_conv(x, self.weight, self.bias, stride=2, padding=1, dilating=self.dilating)
+        return y.with_features(_rectified(self.norm(y.features), None))
+
+    def fold(self) -> None:
+        """Take the norm's running statistics into the weight, for good."""
+        if isinstance(self.norm, ActiveNorm):
+            weight, self.bias = fold_norm(self.weight.detach(), self.norm)
+            self.weight, self.norm = nn.Parameter(weight, requires_grad=False), nn.Identity()
 
 
 class UpLayer(nn.Module):
     """Inverse convolution back to a finer set of sites, norm, added to a projection of what was there, ReLU."""
 
+    bias: Tensor | None
+
     def __init__(self, inputs: int, lateral: int, outputs: int) -> None:
         super().__init__()
         weight = torch.randn(inputs, outputs, 3, 3) * math.sqrt(2.0 / (inputs * 9 / 4))
         self.weight = nn.Parameter(_tap_by_tap(weight.transpose(0, 1)).data.transpose(0, 1))
-        self.norm, self.lateral = ActiveNorm(outputs), nn.Linear(lateral, outputs, bias=False)
+        self.norm: nn.Module = ActiveNorm(outputs)
+        self.lateral = nn.Linear(lateral, outputs, bias=False)
+        self.register_buffer("bias", None, persistent=False)
 
     def forward(self, coarse: SparseBev, fine: SparseBev) -> SparseBev:
         """Coarse features on the sites of ``fine``."""
         sites: Sites = fine.sites
-        y = inverse_conv(coarse, self.weight, sites, stride=2, padding=1)
+        y = inverse_conv(coarse, self.weight, sites, self.bias, stride=2, padding=1)
         return fine.with_features(torch.relu(self.norm(y.features + self.lateral(fine.features))))
+
+    def fold(self) -> None:
+        """Take the norm's running statistics into both weights, for good."""
+        if isinstance(self.norm, ActiveNorm):
+            weight, self.bias = fold_norm(self.weight.detach().transpose(0, 1), self.norm)
+            self.lateral.weight = nn.Parameter(fold_norm(self.lateral.weight.detach(), self.norm)[0], False)
+            self.weight, self.norm = nn.Parameter(weight.transpose(0, 1), requires_grad=False), nn.Identity()

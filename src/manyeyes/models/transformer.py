@@ -5,10 +5,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from typing import Any
+
+import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
+from manyeyes.ops.window_loops import attend_in_windows, window_runs
+
+LOOPS_UP_TO = 48
+"""Mean number of keys a query up to which compiled loops beat padded batches on one core."""
 
 
 @dataclass(frozen=True)
@@ -41,23 +48,42 @@ class WindowBlock(nn.Module):
         hidden = channels * config.expansion
         self.ffn = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels))
 
-    def forward(self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid) -> Tensor:
-        """features (N, C) of tokens at xy (N, 2), metres, in grids batch (N,), to (N, C)."""
-        edge = self.window * grid.cell
-        origin, shift = (grid.x_min, grid.y_min), edge / 2 if self.shifted else 0.0
-        ids = window_ids(xy, batch, origin, edge, shift)
-        position = sincos_encoding(window_offsets(xy, origin, edge, grid.cell, shift), features.shape[1])
+    def forward(
+        self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
+    ) -> Tensor:
+        """features (N, C) of tokens at xy (N, 2), metres, in grids batch (N,), to (N, C).
+
+        cache: of the sites that xy and batch belong to, where they belong to any: their windows are found once.
+        """
+        cache = {} if cache is None else cache
+        name = ("windows", self.window, self.shifted)
+        if name not in cache:
+            edge = self.window * grid.cell
+            origin, shift = (grid.x_min, grid.y_min), edge / 2 if self.shifted else 0.0
+            offsets = window_offsets(xy, origin, edge, grid.cell, shift)
+            cache[name] = window_ids(xy, batch, origin, edge, shift), offsets
+        ids, offsets = cache[name]
+        place = (*name, features.shape[1])
+        if place not in cache:
+            cache[place] = sincos_encoding(offsets, features.shape[1])
         normed = self.norm(features)
-        placed = normed + position
+        placed = normed + cache[place]
 
         def split(x: Tensor) -> Tensor:
             return x.view(x.shape[0], self.heads, x.shape[1] // self.heads)
 
-        attended = window_attention(
-            split(self.query(placed)), split(self.key(placed)), split(self.value(normed)), plan_windows(ids, ids)
-        )
+        attended = _attend(split(self.query(placed)), split(self.key(placed)), split(self.value(normed)), ids)
         features = features + self.out(attended.flatten(1))
         return features + self.ffn(self.norm_ffn(features))
+
+
+def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:
+    """Attention of (N, heads, C / heads) within windows ids (N,)."""
+    if not torch.is_grad_enabled() and query.device.type == "cpu" and query.dtype == torch.float32:
+        runs = window_runs(ids)
+        if runs.pairs <= LOOPS_UP_TO * len(ids):
+            return attend_in_windows(query, key, value, runs)
+    return window_attention(query, key, value, plan_windows(ids, ids))
 
 
 class WindowTransformer(nn.Module):
@@ -67,8 +93,10 @@ class WindowTransformer(nn.Module):
         super().__init__()
         self.blocks = nn.ModuleList(WindowBlock(channels, config, shifted=bool(i % 2)) for i in range(config.blocks))
 
-    def forward(self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid) -> Tensor:
+    def forward(
+        self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
+    ) -> Tensor:
         """(N, C) to (N, C); see WindowBlock."""
         for block in self.blocks:
-            features = block(features, xy, batch, grid)
+            features = block(features, xy, batch, grid, cache)
         return features

@@ -181,15 +181,17 @@ def _kernel(weight: Tensor, channels: int, axis: int) -> int:
 
 
 def _affine(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    out = x @ weight.to(x.dtype).T
-    return out if bias is None else out + bias.to(x.dtype)
+    return torch.nn.functional.linear(x, weight.to(x.dtype), None if bias is None else bias.to(x.dtype))
 
 
 def _conv(x: Tensor, weight: Tensor, bias: Tensor | None, table: NeighbourMap, reverse: bool = False) -> Tensor:
     """Rows (N_in, in) to (N_out, out); weight (out, in, k, k)."""
     # (taps, in, out): one matrix for each tap.
     taps = weight.to(x.dtype).permute(2, 3, 1, 0).reshape(-1, weight.shape[1], weight.shape[0])
-    out: Tensor = _PairProduct.apply(x, taps, table.on(x.device), reverse)  # pyright: ignore[reportAssignmentType]
+    table = table.on(x.device)
+    if not torch.is_grad_enabled():
+        return _pair_product(x, taps, table, reverse, bias)
+    out: Tensor = _PairProduct.apply(x, taps, table, reverse)  # pyright: ignore[reportAssignmentType]
     return out if bias is None else out + bias.to(x.dtype)
 
 
@@ -214,18 +216,23 @@ class _PairProduct(torch.autograd.Function):
         return dx, dw, None, None
 
 
-def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
+def _pair_product(
+    x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, bias: Tensor | None = None
+) -> Tensor:
     """(rows, D): for each pair of a tap its row of x (N, C) times the matrix (C, D) of the tap, summed where it leads."""
+    bias = x.new_zeros(taps.shape[2]) if bias is None else bias.to(x.dtype)
     # Every site meets itself by the middle tap: no gathering there.
-    out = x @ taps[taps.shape[0] // 2] if table.is_symmetric else x.new_zeros(table.rows(reverse), taps.shape[2])
-    size = min(_block_rows(x), table.longest)
-    gathered, product = x.new_empty(size, x.shape[1]), x.new_empty(size, taps.shape[2])
-    for tap, source, target in table.pairs(reverse):
-        for start in range(0, len(source), size):
-            part = source[start : start + size]
-            rows = torch.index_select(x, 0, part, out=gathered[: len(part)])
-            # A tap leads to a row once at most, so that no sum depends on the order of the pairs.
-            out.index_add_(0, target[start : start + size], torch.mm(rows, taps[tap], out=product[: len(part)]))
+    out = (
+        torch.addmm(bias, x, taps[taps.shape[0] // 2])
+        if table.is_symmetric
+        else bias.expand(table.rows(reverse), -1).contiguous()
+    )
+    matrices, (longest, blocks) = taps.unbind(), table.blocks(_block_rows(x), reverse)
+    gathered, product = x.new_empty(longest, x.shape[1]), x.new_empty(longest, taps.shape[2])
+    for tap, source, target, size in blocks:
+        rows = torch.index_select(x, 0, source, out=gathered[:size])
+        # A tap leads to a row once at most, so that no sum depends on the order of the pairs.
+        out.index_add_(0, target, torch.mm(rows, matrices[tap], out=product[:size]))
     return out
 
 
@@ -234,14 +241,12 @@ def _pair_outer(x: Tensor, dy: Tensor, table: NeighbourMap, reverse: bool) -> Te
     dw = x.new_zeros(table.index.shape[1], x.shape[1], dy.shape[1])
     if table.is_symmetric:
         torch.mm(x.T, dy, out=dw[dw.shape[0] // 2])
-    size = min(_block_rows(x), table.longest)
-    ahead, behind = x.new_empty(size, x.shape[1]), x.new_empty(size, dy.shape[1])
-    for tap, source, target in table.pairs(reverse):
-        for start in range(0, len(source), size):
-            part = source[start : start + size]
-            rows = torch.index_select(x, 0, part, out=ahead[: len(part)])
-            others = torch.index_select(dy, 0, target[start : start + size], out=behind[: len(part)])
-            dw[tap].addmm_(rows.T, others)
+    longest, blocks = table.blocks(_block_rows(x), reverse)
+    ahead, behind = x.new_empty(longest, x.shape[1]), x.new_empty(longest, dy.shape[1])
+    for tap, source, target, size in blocks:
+        rows = torch.index_select(x, 0, source, out=ahead[:size])
+        others = torch.index_select(dy, 0, target, out=behind[:size])
+        dw[tap].addmm_(rows.T, others)
     return dw
 
 

@@ -44,6 +44,15 @@ class Pairs(NamedTuple):
     target: Tensor
 
 
+class Block(NamedTuple):
+    """Some consecutive pairs of one tap, and how many."""
+
+    tap: int
+    source: Tensor
+    target: Tensor
+    size: int
+
+
 @dataclass(eq=False)
 class NeighbourMap:
     """index: (outputs, taps) int32, see the module; n_in: how many inputs there are.
@@ -55,6 +64,7 @@ class NeighbourMap:
     n_in: int
     is_symmetric: bool = False
     moved: dict[torch.device, NeighbourMap] = field(default_factory=dict, repr=False)
+    cut: dict[tuple[int, bool], tuple[int, tuple[Block, ...]]] = field(default_factory=dict, repr=False)
 
     def rows(self, reverse: bool) -> int:
         """How many rows pairs lead to: outputs, or inputs when they are turned round."""
@@ -89,10 +99,16 @@ class NeighbourMap:
             source, target = by_tap[met].long().split(sizes), met.nonzero()[:, 1].split(sizes)
         return tuple(Pairs(tap, s, t) for tap, (s, t) in enumerate(zip(source, target)) if len(s))
 
-    @property
-    def longest(self) -> int:
-        """The most pairs that one tap has; at least 1."""
-        return max((len(pairs.source) for pairs in self._ahead), default=1)
+    def blocks(self, rows: int, reverse: bool = False) -> tuple[int, tuple[Block, ...]]:
+        """The pairs of every tap in blocks of so many rows at most, and the longest block's rows; cut once and kept."""
+        if (rows, reverse) not in self.cut:
+            found = tuple(
+                Block(tap, s, t, s.shape[0])
+                for tap, source, target in self.pairs(reverse)
+                for s, t in zip(source.split(rows), target.split(rows))
+            )
+            self.cut[rows, reverse] = max((block.size for block in found), default=0), found
+        return self.cut[rows, reverse]
 
     def pairs(self, reverse: bool = False) -> tuple[Pairs, ...]:
         """The pairs of every tap that has any, from inputs to outputs, or turned round."""

@@ -22,5 +22,6 @@ class SelfAttentionFusion(nn.Module):
         """Tokens of all agents to one feature a cell."""
         key, offset = lattice_offset(tokens)
         placed = self.placement(tokens.features, tokens, offset)
-        attended = self.transformer(placed, tokens.xy, tokens.ego, tokens.grid)
+        cache = None if tokens.sites is None else tokens.sites.cache
+        attended = self.transformer(placed, tokens.xy, tokens.ego, tokens.grid, cache)
         return to_lattice(attended, key, tokens, "mean")
