@@ -53,5 +53,3 @@ def test_no_norm_is_left_in_the_encoder_and_the_head_keeps_its_own() -> None:
     assert [m for m in copied.head.modules() if isinstance(m, torch.nn.LayerNorm)]
     assert copied.fingerprint == model.fingerprint
     assert copied.config == model.config
-
-

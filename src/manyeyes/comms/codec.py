@@ -131,6 +131,37 @@ def cells_size(key: NDArray[np.int64]) -> int:
     return min(_sizes(key)) if key.size else 0
 
 
+@njit(cache=True)
+def counts_in_room(key, each, fixed, capacity, header, left):  # pragma: no cover
+    """How many keys (N,), in the order given, each body takes: its cells, each bytes a cell, and fixed bytes.
+
+    A body has at most capacity bytes and, where left is not negative, all bodies with their headers at most left.
+    """
+    widest = 0
+    for k in key:
+        widest = max(widest, _varint_bytes(k))
+    counts, bodies, at = np.empty(key.shape[0], np.int64), 0, 0
+    while at < key.shape[0]:
+        room = max(0, (capacity if left < 0 else min(capacity, left - header)) - fixed)
+        most = min(key.shape[0] - at, 65535)
+        low, high = min(most, room // (each + widest)), min(most, room // each)
+        while low < high:
+            middle = (low + high + 1) // 2
+            size = middle * each + min(_sizes(np.sort(key[at : at + middle])))
+            if size <= room:
+                low = middle
+            else:
+                high = middle - 1
+        if low == 0:
+            break
+        if left >= 0:
+            left -= header + fixed + low * each + min(_sizes(np.sort(key[at : at + low])))
+        counts[bodies] = low
+        bodies += 1
+        at += low
+    return counts[:bodies]
+
+
 def pack_cells(key: NDArray[np.int64]) -> tuple[int, bytes]:
     """Strictly ascending keys (N,) in the shorter of two forms: (DELTA or BITMAP, bytes).
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -158,24 +159,8 @@ def packet_counts(
             f"One cell of {channels} channels as {precision} does not fit a body of {capacity} bytes: lower the "
             "precision or raise the mtu."
         )
-    widest = int(codec.varint_sizes(key.max())) if len(key) else 0
-    counts: list[int] = []
-    at, left = 0, budget_bytes
-    while at < len(key):
-        room = max(0, (capacity if left is None else min(capacity, left - header_bytes)) - fixed)
-        most = min(len(key) - at, 65535)
-        low, high = min(most, room // (each + widest)), min(most, room // each)
-        while low < high:
-            middle = (low + high + 1) // 2
-            size = middle * each + codec.cells_size(np.sort(key[at : at + middle]))
-            low, high = (middle, high) if size <= room else (low, middle - 1)
-        if low == 0:
-            break
-        counts.append(low)
-        if left is not None:
-            left -= header_bytes + fixed + low * each + codec.cells_size(np.sort(key[at : at + low]))
-        at += low
-    return counts
+    left = -1 if budget_bytes is None else max(0, budget_bytes)
+    return codec.counts_in_room(np.ascontiguousarray(key, np.int64), each, fixed, capacity, header_bytes, left).tolist()
 
 
 def _grid_fields(grid: BevGrid) -> tuple[int, ...]:
@@ -196,6 +181,7 @@ def _grid_fields(grid: BevGrid) -> tuple[int, ...]:
     return fields
 
 
+@lru_cache(maxsize=64)
 def _grid(fields: tuple[int, ...]) -> BevGrid:
     # A correctly rounded quotient gives back the very float that 140.8 is in the source of both sides.
     return BevGrid(*(v / 100 for v in fields[:6]), pillar=fields[6] / 1000, stride=fields[7])

@@ -244,7 +244,7 @@ def decode_packet(packet: bytes) -> Fragment:
         raise PacketError("garbage", f"Contradictory header: flags {flags:#04x}, packet {number} of {count}.")
     pose = (*rest[:3], *_quaternion(flags >> 3 & 3, rest[3:6]))
     factor = tuple(rest[6:12])
-    if not all(abs(v) <= _FARTHEST_M for v in pose[:3]) or not np.isfinite(factor).all():
+    if not all(abs(v) <= _FARTHEST_M for v in pose[:3]) or not all(map(math.isfinite, factor)):
         raise PacketError("implausible", f"Agent {agent_id} claims the position {pose[:3]} with the errors {factor}.")
     header = Header(agent_id, timestamp_ns, count, bool(flags & 4), rest[12], pose, factor)
     return Fragment(header, number, sections.read_body(flags & 3, packet[_HEADER.size : -_CRC.size]), packet)

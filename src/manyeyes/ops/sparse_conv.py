@@ -216,9 +216,7 @@ class _PairProduct(torch.autograd.Function):
         return dx, dw, None, None
 
 
-def _pair_product(
-    x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, bias: Tensor | None = None
-) -> Tensor:
+def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, bias: Tensor | None = None) -> Tensor:
     """(rows, D): for each pair of a tap its row of x (N, C) times the matrix (C, D) of the tap, summed where it leads."""
     bias = x.new_zeros(taps.shape[2]) if bias is None else bias.to(x.dtype)
     # Every site meets itself by the middle tap: no gathering there.
