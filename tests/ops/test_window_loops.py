@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Attention in compiled loops against the padded twin: any order of tokens, windows of one token and of many."""
+
+import pytest
+import torch
+
+from manyeyes.ops.keyed_random import keyed_torch_generator
+from manyeyes.ops.window_attention import window_attention
+from manyeyes.ops.window_loops import attend_in_windows, window_runs
+
+
+@pytest.mark.parametrize(("tokens", "windows", "width"), [(1, 1, 4), (40, 40, 8), (150, 3, 16), (300, 60, 32)])
+def test_loops_equal_the_padded_twin(tokens: int, windows: int, width: int) -> None:
+    random = keyed_torch_generator("loops", tokens)
+    window = torch.randint(windows, (tokens,), generator=random) * 7 - 3
+    q, k, v = (torch.randn(tokens, 2, width, generator=random) * 2 for _ in range(3))
+    ours = attend_in_windows(q, k, v, window_runs(window))
+    assert torch.allclose(ours, window_attention(q, k, v, window, window), atol=1e-5)
+
+
+def test_scores_of_any_size_do_not_overflow() -> None:
+    q = torch.full((5, 1, 4), 90.0)
+    out = attend_in_windows(q, q, torch.arange(20.0).view(5, 1, 4), window_runs(torch.zeros(5, dtype=torch.int64)))
+    assert torch.allclose(out[3, 0], torch.arange(4.0) + 8)
+
+
+def test_no_token_gives_no_row() -> None:
+    none = torch.zeros(0, 2, 8)
+    assert attend_in_windows(none, none, none, window_runs(torch.zeros(0, dtype=torch.int64))).shape == (0, 2, 8)
+
+
+def test_pairs_are_counted() -> None:
+    runs = window_runs(torch.tensor([5, -1, 5, 5]))
+    assert runs.pairs == 10
+    assert runs.start.tolist() == [0, 1, 4]
