@@ -120,6 +120,7 @@ def random_detector(config: DetectorConfig, frames: list[AgentFrame]) -> Detecto
     torch.manual_seed(0)
     model = Detector(config)
     for name, layer in list(model.encoder.prune.items()):
+        assert isinstance(layer, FocalPrune)
         model.encoder.prune[name] = GivenPrune(layer.score.in_features)
     model.token_prune = GivenPrune(model.channels)
     norms = [m for m in model.modules() if isinstance(m, ActiveNorm)]
@@ -318,7 +319,8 @@ def _stride_name(stride: int | None) -> str:
 
 def show(rows: list[Row]) -> None:
     print(
-        f"{'widths':<11} {'head stride':<16} {'contender':<17} {'5 share + 1 perceive':>21} {'one share':>17} {'one perceive':>17} {'bytes':>9}"
+        f"{'widths':<11} {'head stride':<16} {'contender':<17} "
+        f"{'5 share + 1 perceive':>21} {'one share':>17} {'one perceive':>17} {'bytes':>9}"
     )
     for row in rows:
         cells = []
@@ -331,13 +333,15 @@ def show(rows: list[Row]) -> None:
             else f"  bar {row.bar}x {'met' if row.ratio.together >= row.bar else 'MISSED'}"
         )
         print(
-            f"{row.widths:<11} {_stride_name(row.head_stride):<16} {row.contender:<17} {cells[0]:>21} {cells[1]:>17} {cells[2]:>17} {row.message_bytes:>9.0f}{bar}"
+            f"{row.widths:<11} {_stride_name(row.head_stride):<16} {row.contender:<17} "
+            f"{cells[0]:>21} {cells[1]:>17} {cells[2]:>17} {row.message_bytes:>9.0f}{bar}"
         )
     for row in rows:
         if row.sites:
             levels = ", ".join(f"{s}x {n}" for s, n in zip(STRIDES, row.sites))
             print(
-                f"sites, {row.widths}, head stride {row.head_stride}, {row.contender}: {levels}; tokens {row.sites[-2]}, of which sent or fused {row.sites[-1]}"
+                f"sites, {row.widths}, head stride {row.head_stride}, {row.contender}: {levels}; "
+                f"tokens {row.sites[-2]}, of which sent or fused {row.sites[-1]}"
             )
 
 

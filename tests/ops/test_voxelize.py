@@ -179,3 +179,18 @@ def test_no_points_give_no_pillars():
         values = none.clone().requires_grad_()
         fast(values, pillars.row, 0).sum().backward()
         assert values.grad is not None and values.grad.shape == (0, 3)
+
+
+def test_compiled_loops_place_points_as_whole_tensors_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = BevGrid(-4.0, -2.0, -1.0, 4.0, 2.0, 1.0)
+    random = torch.Generator().manual_seed(5)
+    xyz = (torch.rand(4000, 3, generator=random) - 0.5) * torch.tensor([10.0, 5.0, 3.0])
+    xyz[:2000, :2] = (xyz[:2000, :2] / 0.4).round() * 0.4
+    batch = torch.arange(4000) // 2000
+    ours = pillar_sites(xyz, batch, grid, 2)
+    monkeypatch.setattr("manyeyes.ops.voxelize._in_numba", lambda values: False)
+    theirs = pillar_sites(xyz, batch, grid, 2)
+    assert 0 < int(ours.inside.sum()) < 4000
+    assert torch.equal(ours.inside, theirs.inside)
+    assert torch.equal(ours.sites.key, theirs.sites.key)
+    assert torch.equal(ours.row, theirs.row)

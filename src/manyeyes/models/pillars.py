@@ -76,5 +76,6 @@ class PillarEncoder(nn.Module):
         cloud = PointCloud.cat(clouds)
         batch = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor([len(c) for c in clouds]))
         pillars = pillar_sites(cloud.xyz, batch, self.grid, len(clouds))
-        features = self.net(cloud.xyz[pillars.inside], cloud.intensity[pillars.inside], pillars)
+        kept = pillars.inside.nonzero()[:, 0]
+        features = self.net(cloud.xyz.index_select(0, kept), cloud.intensity.index_select(0, kept), pillars)
         return SparseBev(features, pillars.sites)

@@ -44,6 +44,12 @@ def pillar_sites(xyz: Tensor, batch: Tensor, grid: BevGrid, batch_size: int) -> 
     if grid.stride != 1:
         raise ConfigError(f"pillar_sites works at stride 1; got a grid of stride {grid.stride}: use grid.at(1).")
     rows, columns = grid.shape
+    if _in_numba(xyz):
+        inside, key = np.empty(xyz.shape[0], np.bool_), np.empty(xyz.shape[0], np.int64)
+        limits = (grid.x_min, grid.y_min, grid.z_min, grid.z_max, grid.pillar)
+        kept = _point_keys(xyz.detach().numpy(), batch.numpy(), limits, rows, columns, inside, key)
+        found, row = distinct(torch.from_numpy(key[:kept]), batch_size * rows * columns)
+        return Pillars(Sites(found, grid, batch_size), torch.from_numpy(inside), row)
     # float32 would put points of a border into one or the other pillar, depending on how the quotient is written.
     x = ((xyz[:, 0].double() - grid.x_min) / grid.pillar).floor().long()
     y = ((xyz[:, 1].double() - grid.y_min) / grid.pillar).floor().long()
@@ -52,6 +58,30 @@ def pillar_sites(xyz: Tensor, batch: Tensor, grid: BevGrid, batch_size: int) -> 
     key = ((batch * rows + y) * columns + x)[inside]
     found, row = distinct(key, batch_size * rows * columns)
     return Pillars(Sites(found, grid, batch_size), inside, row)
+
+
+@numba.njit(cache=True, nogil=True)
+def _point_keys(
+    xyz: np.ndarray,
+    batch: np.ndarray,
+    limits: tuple[float, float, float, float, float],
+    rows: int,
+    columns: int,
+    inside: np.ndarray,
+    key: np.ndarray,
+) -> int:  # pragma: no cover
+    """Which points lie in range, and the keys of those, one after another; how many there are."""
+    x_min, y_min, z_min, z_max, pillar = limits
+    kept = 0
+    for p in range(xyz.shape[0]):
+        x = np.floor((np.float64(xyz[p, 0]) - x_min) / pillar)
+        y = np.floor((np.float64(xyz[p, 1]) - y_min) / pillar)
+        z = np.float64(xyz[p, 2])
+        inside[p] = x >= 0 and x < columns and y >= 0 and y < rows and z >= z_min and z < z_max
+        if inside[p]:
+            key[kept] = (batch[p] * rows + np.int64(y)) * columns + np.int64(x)
+            kept += 1
+    return kept
 
 
 def segment_sum(values: Tensor, row: Tensor, n: int) -> Tensor:
