@@ -84,6 +84,17 @@ def test_a_log_line_cut_by_a_kill_is_dropped(toy, tmp_path):
     assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [1, 2]
 
 
+def test_a_second_stage_begins_where_the_first_ended(toy, tmp_path):
+    first = train(dataclasses.replace(TINY, steps=2), small(toy), tmp_path / "first", seed=1)
+    kept = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, prune_threshold=0.01))
+    second = Run(kept, small(toy), tmp_path / "second", 2, first)
+    for name, value in checkpoint.load(first).state_dict().items():
+        assert torch.equal(second.model.state_dict()[name], value), name
+    wider = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, head_channels=48))
+    with pytest.raises(CheckpointError, match="differs in shape"):
+        Run(wider, small(toy), tmp_path / "third", 2, first)
+
+
 def test_the_shipped_weights_are_the_average(toy, tmp_path):
     train(dataclasses.replace(TINY, steps=3), small(toy), tmp_path, seed=1)
     state = torch.load(tmp_path / "last.pt", weights_only=True)

@@ -29,6 +29,8 @@ class Options:
     """Samples a step over all processes, instead of the preset's."""
     learning_rate: float | None = None
     """Instead of the preset's."""
+    weights: Path | None = None
+    """Weights to begin from instead of random ones, such as those of the stage before."""
     threads: int = 1
     """Threads of torch in each process; the result is the same only for the same number."""
 
@@ -76,7 +78,7 @@ def _train(options: Options, config: Any, recording: Any, console: Any) -> None:
             progress.update(task, total=at.steps, completed=at.step, description=f"loss {at.loss:.3f}")
             last[:] = [at]
 
-        weights = train(config, recording, out, options.seed, card, report)
+        weights = train(config, recording, out, options.seed, card, report, options.weights)
     if console.quiet:
         return
     save_loss_curve(out / "log.jsonl", out / "loss.png")

@@ -9,6 +9,7 @@ from pathlib import Path
 from manyeyes.datatypes import CheckpointError
 from manyeyes.models import checkpoint
 from manyeyes.models.detector import Detector
+from manyeyes.models.folded import folded
 
 DEFAULT = "costr-small"
 
@@ -24,13 +25,16 @@ def names() -> tuple[str, ...]:
 
 
 def load(name_or_path: str | Path = DEFAULT) -> Detector:
-    """A detector in evaluation mode: a shipped name, or a .safetensors file of 'manyeyes train'."""
+    """A detector for inference, norms folded in: a shipped name, or a .safetensors file of 'manyeyes train'.
+
+    To train on from a file, or to look at its weights as they are, use checkpoint.load.
+    """
     if str(name_or_path) in names():
         with as_file(files("manyeyes.models") / "weights" / f"{name_or_path}.safetensors") as path:
-            return checkpoint.load(path)
+            return folded(checkpoint.load(path))
     path = Path(name_or_path)
     if path.suffix != ".safetensors":
         raise CheckpointError(
             f"No weights are named {name_or_path!r}; shipped are {', '.join(names()) or 'none'}, or give a .safetensors file."
         )
-    return checkpoint.load(path)
+    return folded(checkpoint.load(path))

@@ -79,7 +79,9 @@ def prune_threshold(config: TrainConfig, step: int, steps: int) -> float:
 class Run:
     """Model, optimiser and average of one training run, in a folder from which it resumes."""
 
-    def __init__(self, config: TrainConfig, recording: Recording, folder: Path, seed: int) -> None:
+    def __init__(
+        self, config: TrainConfig, recording: Recording, folder: Path, seed: int, start: Path | None = None
+    ) -> None:
         self.config, self.folder, self.seed = config, folder, seed
         self.rank, self.world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
         if config.batch % self.world:
@@ -89,6 +91,8 @@ class Run:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.model = Detector(config.detector)
+        if start is not None:
+            _load_weights(self.model, start)
         self.average = copy.deepcopy(self.model).requires_grad_(False)
         self.optimiser = torch.optim.AdamW(_groups(self.model, config.weight_decay), lr=config.learning_rate)
         self.step, self.seconds = 0, 0.0
@@ -186,12 +190,15 @@ def train(
     seed: int = 0,
     card: dict[str, Any] | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
+    start: Path | None = None,
 ) -> Path:
     """Train, or go on where the run in folder stopped; returns the file of averaged weights.
 
+    start: a file of weights to begin from instead of random ones; its settings may differ where they shape no tensor.
+
     Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
     """
-    run = Run(config, recording, folder, seed)
+    run = Run(config, recording, folder, seed, start)
     folder.mkdir(parents=True, exist_ok=True)
     if run.rank == 0:
         _trim_log(folder / "log.jsonl", run.step)
@@ -214,6 +221,16 @@ def train(
         }
         checkpoint.save(run.average, weights, about, half=True)
     return weights
+
+
+def _load_weights(model: Detector, start: Path) -> None:
+    state, own = checkpoint.load(start).state_dict(), model.state_dict()
+    odd = sorted(k for k in own if k not in state or state[k].shape != own[k].shape)
+    if odd:
+        raise CheckpointError(
+            f"{start}: cannot start this preset, tensor {odd[0]} differs in shape; start from weights of its own kind."
+        )
+    model.load_state_dict(state)
 
 
 def _log_line(progress: Progress) -> dict[str, float]:

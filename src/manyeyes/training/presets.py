@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from manyeyes.models.presets import COSTR_OPV2V, COSTR_SMALL, COSTR_TINY
 from manyeyes.training.loop import TrainConfig
 from manyeyes.training.samples import AugmentConfig
@@ -18,9 +20,20 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
         prune_from=0.01,
         prune_full=0.06,
     ),
+    "costr-small-2": TrainConfig(
+        replace(COSTR_SMALL, prune_threshold=0.02),
+        steps=900,
+        batch=4,
+        learning_rate=4e-4,
+        warm_up=50,
+        save_every=100,
+        prune_from=0.0,
+        prune_full=0.001,
+    ),
     "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
     "costr-tiny": TrainConfig(
         COSTR_TINY, steps=60, batch=2, learning_rate=3e-3, warm_up=5, save_every=20, augment=AugmentConfig(max_agents=3)
     ),
 }
-"""costr-small: what ships. costr-opv2v: the paper's 80 + 10 epochs. costr-tiny: tests and examples."""
+"""costr-small and then, from its weights, costr-small-2, which keeps more cells: what ships. costr-opv2v: the paper's 80 + 10
+epochs. costr-tiny: tests and examples."""

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Late and intermediate fusion with the same budget of settings, on the validation town; prints AP of each.
+
+Both are given every pair of (NMS IoU, power of the predicted IoU in the score). What the test table uses is chosen here.
+Usage: python benchmarks/tuning.py --data data/towns-small --weights costr-small
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import math
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from manyeyes import Agent, Opv2vRecording, load_detector
+from manyeyes.agents.collaboration import Collaboration, Intermediate, Late
+from manyeyes.agents.eyes import Eyes, Sight
+from manyeyes.datatypes import AgentFrame, Boxes, Snapshot
+from manyeyes.evaluation.detection import FrameResult, average_precisions, ego_truth, protocol_named
+from manyeyes.models.box_head import DecodeConfig, RawBoxes, decode
+
+REACH_M = 70.0
+SETTINGS = tuple(itertools.product((0.05, 0.15, 0.30), (0.2, 0.4, 0.6)))
+
+
+class DecodedOtherwise(Eyes):
+    """What other eyes saw, decoded with another setting."""
+
+    def __init__(self, eyes: Eyes, setting: DecodeConfig) -> None:
+        super().__init__(eyes.detector)
+        self._eyes, self._setting = eyes, setting
+
+    def see(self, frame: AgentFrame) -> Sight:
+        return replace(self._eyes.see(frame), config=self._setting)
+
+    def decode(self, raw: RawBoxes) -> Boxes:
+        return decode(raw, self._setting)[0]
+
+
+def heard_by_first(snapshot: Snapshot) -> list[AgentFrame]:
+    """The other agents within reach of the ego."""
+    places = [f.world_from_agent.translation[:2].tolist() for f in snapshot.frames]
+    return [f for f, place in zip(snapshot.frames[1:], places[1:]) if math.dist(place, places[0]) <= REACH_M]
+
+
+def perceive(way: Collaboration, eyes: Eyes, snapshot: Snapshot) -> Boxes:
+    """What the first agent finds with this way to collaborate, through bytes."""
+    packets = [p for frame in heard_by_first(snapshot) for p in Agent(eyes.detector, way, eyes=eyes).share(frame)]
+    return Agent(eyes.detector, way, eyes=eyes).perceive(snapshot.frames[0], packets).boxes
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("data/towns-small"))
+    parser.add_argument("--split", default="validate")
+    parser.add_argument("--weights", default="costr-small")
+    parser.add_argument("--every", type=int, default=3, help="judged frames between two that are looked at")
+    parser.add_argument("--out", type=Path, default=None)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    if not options.data.is_dir():
+        print(f"not run: {options.data} is absent; make it with 'manyeyes simulate --preset towns-small'")
+        return
+    detector, recording = load_detector(options.weights), Opv2vRecording(options.data, options.split)
+    grid, base = detector.config.grid, detector.config.decode
+    box = (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
+    protocol = protocol_named("manyeyes").within(box)
+    found: dict[tuple[str, float, float], list[FrameResult]] = defaultdict(list)
+    for scenario in recording.scenarios:
+        for index in recording.judged(scenario)[:: options.every]:
+            snapshot, eyes = recording.snapshot(scenario, index), Eyes(detector)
+            truth = ego_truth(snapshot, 0, protocol)
+            for nms_iou, power in SETTINGS:
+                otherwise = DecodedOtherwise(eyes, replace(base, nms_iou=nms_iou, overlap_power=power))
+                for way in (Late(nms_iou=nms_iou), Intermediate()):
+                    boxes = perceive(way, otherwise, snapshot)
+                    found[way.name, nms_iou, power].append(FrameResult(scenario, index, boxes, truth))
+    rows = []
+    for (name, nms_iou, power), results in sorted(found.items()):
+        at = [ap.ap for ap in average_precisions(results, (0.5, 0.7), protocol)]
+        rows.append({"method": name, "nms_iou": nms_iou, "overlap_power": power, "ap50": at[0], "ap70": at[1]})
+        print(f"{name:13} NMS {nms_iou:.2f}  power {power:.1f}  AP@0.5 {at[0]:.4f}  AP@0.7 {at[1]:.4f}")
+    if options.out is not None:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        partial = options.out.with_suffix(".partial")
+        partial.write_text(
+            json.dumps({"split": options.split, "weights": str(options.weights), "rows": rows}, indent=1)
+        )
+        partial.replace(options.out)
+
+
+if __name__ == "__main__":
+    main()
