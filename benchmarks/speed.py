@@ -18,6 +18,7 @@ python benchmarks/speed.py [--quick] [--rounds 5] [--threads 1] [--head-stride 8
 from __future__ import annotations
 
 import argparse
+import copy
 import os
 import shlex
 import sys
@@ -227,9 +228,8 @@ def kept_by_model(model: Detector, frames: list[AgentFrame], head_stride: int) -
     """
     config = model.config
     grid = replace(OPV2V_GRID, z_min=config.grid.z_min, z_max=config.grid.z_max)
-    wide = Detector(replace(config, grid=grid))
-    wide.load_state_dict(model.state_dict())
-    wide.eval().requires_grad_(False)
+    wide = copy.deepcopy(model)
+    wide.config, wide.pillars.grid = replace(config, grid=grid), grid.at(1)
     kept = []
     for frame in frames:
         pruned = wide.see([frame.points]).pruned

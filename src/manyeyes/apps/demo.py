@@ -30,7 +30,7 @@ class Options:
     """At most so many judged frames, instead of all."""
     animate: bool = True
     """Draw the animation of the drive."""
-    score_min: float = 0.2
+    score_min: float = 0.4
     """Detections below this score are not drawn; they count all the same."""
     playing: Playing = field(default_factory=lambda: Playing(channel="its-g5-27"))
     """How agents collaborate."""

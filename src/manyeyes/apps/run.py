@@ -31,7 +31,7 @@ class Options:
     """Of the channel's losses and jitter."""
     animate: bool = True
     """Draw the animation of the drive."""
-    score_min: float = 0.2
+    score_min: float = 0.4
     """Detections below this score are not drawn; they count all the same."""
     playing: Playing = field(default_factory=Playing)
     """How agents collaborate."""

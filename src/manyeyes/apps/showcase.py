@@ -47,7 +47,7 @@ class Showing:
     methods: tuple[str, ...]
     replay: ReplayConfig
     weights: str
-    score_min: float = 0.2
+    score_min: float = 0.4
     frame: int | None = None
     animate: bool = True
     facts: tuple[tuple[str, str], ...] = ()

@@ -43,7 +43,7 @@ class Options:
     """Of the picture, pixels."""
     detect: str | None = None
     """Also draw what one method finds: alone, late, intermediate or early."""
-    score_min: float = 0.2
+    score_min: float = 0.4
     """Detections below this score are not drawn."""
     playing: Playing = field(default_factory=Playing)
     """How agents collaborate, with --detect."""
