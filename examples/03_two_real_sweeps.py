@@ -18,5 +18,8 @@ packets = Agent(detector).share(second)
 perception = Agent(detector).perceive(first, packets)
 print(f"{sum(map(len, packets))} bytes from {len(second.points)} real points, {len(perception.boxes)} boxes")
 picture = Path(sys.argv[2] if len(sys.argv) > 2 else "two_real_sweeps.png")
-save_png(draw(scene_of(snapshot, perception.boxes), detector.config.grid, "Two real sweeps as two agents"), picture)
+save_png(
+    draw(scene_of(snapshot, perception.boxes), detector.config.grid, "Two real sweeps as two agents", score_min=0.6),
+    picture,
+)
 print(picture)
