@@ -171,10 +171,12 @@ def test_damaged_lzf_is_refused(packed: bytes) -> None:
     assert lzf_decompress(packed, 3) is None
 
 
-def test_random_lzf_bytes_never_crash() -> None:
+def test_random_lzf_bytes_are_refused_or_give_the_size_asked_for() -> None:
     rng = np.random.default_rng(0)
     for _ in range(500):
-        lzf_decompress(rng.integers(0, 256, int(rng.integers(0, 60)), np.uint8).tobytes(), int(rng.integers(1, 200)))
+        size = int(rng.integers(1, 200))
+        out = lzf_decompress(rng.integers(0, 256, int(rng.integers(0, 60)), np.uint8).tobytes(), size)
+        assert out is None or len(out) == size
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])

@@ -57,7 +57,6 @@ class Detector(nn.Module):
         self.pillars = PillarEncoder(config.grid, config.pillar_channels, config.pillars)
         self.encoder = SparseEncoder(config.pillar_channels, config.encoder)
         channels = self.encoder.out_channels
-        self.channels = channels
         self.dast = WindowTransformer(channels, config.dast)
         self.token_prune = FocalPrune(channels)
         self.fusion = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -89,9 +90,8 @@ def lattice_offset(tokens: Tokens) -> tuple[Tensor, Tensor]:
     return key, (tokens.xy - tokens.grid.centers(yx)) / tokens.grid.cell
 
 
-def to_lattice(features: Tensor, key: Tensor, tokens: Tokens, reduce: str) -> SparseBev:
+def to_lattice(features: Tensor, key: Tensor, tokens: Tokens, reduce: Literal["mean", "max"]) -> SparseBev:
     """Tokens on their nearest cells, one feature a cell."""
-    assert reduce in ("mean", "max")
     if tokens.sites is not None:
         return SparseBev(features, tokens.sites)
-    return coalesce(features, key, tokens.grid, tokens.batch_size, reduce=reduce)  # pyright: ignore[reportArgumentType]
+    return coalesce(features, key, tokens.grid, tokens.batch_size, reduce=reduce)
