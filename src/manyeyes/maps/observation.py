@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one agent saw of the map, once: elements in its own frame, its claimed pose, what it could see; and its file form.
+
+The file form is documented in docs/observation.md: Parquet, one row an observation.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import struct
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import ManyeyesError
+from manyeyes.datatypes.map_element import CROSSING, MapElements, Polygons, frozen
+
+Floats = NDArray[np.float64]
+
+FORMAT_VERSION = 1
+_MOST_SIGMA_M = 1000.0
+
+
+class ObservationError(ManyeyesError, ValueError):
+    """An observation that cannot be trusted; the text names the field, what was expected and what came."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The local metric frame of a map: transverse Mercator on WGS 84 about an origin, scale 1, x east, y north, metres.
+
+    latitude, longitude: degrees, EPSG:4326, of the point that is x = y = 0.
+    """
+
+    latitude: float = 0.0
+    longitude: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (abs(self.latitude) <= 90.0 and abs(self.longitude) <= 180.0):
+            raise ObservationError(
+                f"Frame needs latitude in [-90, 90] and longitude in [-180, 180] degrees; got {self.latitude}, {self.longitude}."
+            )
+
+    @property
+    def proj(self) -> str:
+        """The frame as a PROJ string."""
+        return (
+            f"+proj=tmerc +lat_0={self.latitude!r} +lon_0={self.longitude!r} +k=1 +x_0=0 +y_0=0 "
+            "+datum=WGS84 +units=m +no_defs +type=crs"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One agent's map elements, once.
+
+    agent: a pseudonym. pass_id: one drive of that agent. time_ns: of the look, nanoseconds since 1970, UTC.
+    pose: (3,) x, y (m), yaw (rad) of the agent in the map's frame, as claimed. covariance: (3, 3) of that pose, m and rad.
+    view: (K, 2) metres, the polygon that the agent could see, an open ring in the agent's frame; occluders: what hid parts
+    of it, same frame. elements: in the agent's frame. model: what made them. trusted: a surveyed pole, whose one word counts.
+    """
+
+    agent: str
+    pass_id: str
+    time_ns: int
+    pose: Floats
+    covariance: Floats
+    view: Floats
+    elements: MapElements
+    model: str = ""
+    trusted: bool = False
+    occluders: Polygons = field(default_factory=Polygons.of)
+
+    def __post_init__(self) -> None:
+        for name in ("pose", "covariance", "view"):
+            object.__setattr__(self, name, frozen(getattr(self, name), np.float64))
+        _check(self)
+
+    @cached_property
+    def id(self) -> str:
+        """BLAKE2b-128 of the canonical bytes, in hexadecimal: equal content, equal id, on any machine."""
+        return hashlib.blake2b(self.canonical_bytes(), digest_size=16).hexdigest()
+
+    def canonical_bytes(self) -> bytes:
+        """Every field in the order of the class, numbers little-endian, lengths before contents, no negative zero."""
+        e = self.elements
+        out = [b"manyeyes.observation", struct.pack("<I", FORMAT_VERSION)]
+        for text in (self.agent, self.pass_id, self.model):
+            raw = text.encode()
+            out.append(struct.pack("<I", len(raw)) + raw)
+        out.append(struct.pack("<q?", self.time_ns, self.trusted))
+        for array in (
+            self.pose,
+            self.covariance,
+            self.view,
+            self.occluders.points,
+            e.points,
+            e.score,
+            e.sigma,
+            e.style,
+        ):
+            out.append(struct.pack("<I", array.size) + (array + 0.0).astype("<f8", copy=False).tobytes())
+        for array in (self.occluders.first, e.kind, e.first):
+            out.append(struct.pack("<I", array.size) + array.astype("<i8", copy=False).tobytes())
+        return b"".join(out)
+
+    def in_map(self, pose: Floats | None = None) -> MapElements:
+        """The elements in the map's frame, at the claimed pose or at another (3,)."""
+        x, y, yaw = (float(v) for v in (self.pose if pose is None else pose))
+        return self.elements.transform(x, y, yaw)
+
+
+def _check(o: Observation) -> None:
+    """Raise ObservationError for the first field that cannot be used."""
+    _require(bool(o.agent), "agent", "a non-empty pseudonym", "none")
+    _require(
+        isinstance(o.time_ns, int) and 0 <= o.time_ns < 2**63, "time_ns", "whole nanoseconds since 1970", o.time_ns
+    )
+    for name, shape in (("pose", (3,)), ("covariance", (3, 3))):
+        value = getattr(o, name)
+        _require(value.shape == shape, name, f"shape {shape}", value.shape)
+        _require_finite(name, value)
+    _require(_is_covariance(o.covariance), "covariance", "a symmetric, positive definite matrix", o.covariance)
+    _require(
+        o.view.ndim == 2 and o.view.shape[1] == 2 and len(o.view) >= 3, "view", "a ring (K, 2), K >= 3", o.view.shape
+    )
+    _require_finite("view", o.view)
+    _require(is_simple_ring(o.view), "view", "a ring that does not cross itself", "one that does")
+    _require_finite("occluders", o.occluders.points)
+    if len(o.occluders):
+        least = int(np.diff(o.occluders.first).min())
+        _require(least >= 3, "occluders", "rings of 3 points or more", least)
+    if len(o.elements):
+        _check_elements(o.elements)
+
+
+def _check_elements(e: MapElements) -> None:
+    """Raise ObservationError for the first column of the elements that cannot be used."""
+    _require_finite("points", e.points)
+    _require_within("score", e.score, 1.0)
+    _require_within("sigma", e.sigma, _MOST_SIGMA_M)
+    _require_within("style", e.style, 1.0)
+    _require(bool((np.abs(e.style.sum(1) - 1.0) < 1e-6).all()), "style", "probabilities that sum to 1", "others")
+    counts = e.counts
+    _require(not (counts < 2 + e.closed).any(), "points", "2 points a line and 3 a crossing, or more", counts)
+    bad = int(_first_crossed_ring(e.kind, e.first, e.points, CROSSING))
+    _require(bad < 0, "points", "crossings whose ring does not cross itself", f"element {bad}, whose ring does")
+
+
+def _require(holds: bool, name: str, expected: str, came: object) -> None:
+    if not holds:
+        text = " ".join(str(came).split())
+        raise ObservationError(f"Observation.{name}: expected {expected}; got {text}. Mend it where it is made.")
+
+
+def _require_finite(name: str, values: Floats) -> None:
+    if not np.isfinite(values).all():
+        _require(False, name, "finite numbers", "NaN or infinity")
+
+
+def _require_within(name: str, values: Floats, most: float) -> None:
+    """Every value in [0, most]; NaN is not."""
+    inside = (values >= 0.0) & (values <= most)
+    if not inside.all():
+        _require(False, name, f"values in [0, {most:g}]", values[~inside].flat[0])
+
+
+def _is_covariance(m: Floats) -> bool:
+    """Whether m (3, 3) is symmetric and all its leading minors are positive (Sylvester), relative to its scale."""
+    if not np.allclose(m, m.T, rtol=1e-9, atol=1e-12):
+        return False
+    (a, b, c), (_, d, e), (_, _, f) = m.tolist()
+    if a <= 0 or d <= 0 or f <= 0:
+        return False
+    # As correlations, so that units (m, rad) do not decide.
+    r, s, t = b / math.sqrt(a * d), c / math.sqrt(a * f), e / math.sqrt(d * f)
+    return 1 - r * r > 1e-12 and 1 + 2 * r * s * t - r * r - s * s - t * t > 1e-12
+
+
+def is_simple_ring(ring: Floats) -> bool:
+    """Whether no two edges of the open ring (K, 2) cross; edges that only touch at a shared end do not."""
+    return not _ring_crosses(ring)
+
+
+@numba.njit(cache=True)
+def _ring_crosses(ring: Floats) -> bool:  # pragma: no cover - compiled
+    n = len(ring)
+    for i in range(n):
+        ax, ay = ring[i]
+        bx, by = ring[(i + 1) % n]
+        for j in range(i + 2, n):
+            if i == 0 and j == n - 1:
+                continue
+            cx, cy = ring[j]
+            dx, dy = ring[(j + 1) % n]
+            one = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+            two = (bx - ax) * (dy - ay) - (by - ay) * (dx - ax)
+            three = (dx - cx) * (ay - cy) - (dy - cy) * (ax - cx)
+            four = (dx - cx) * (by - cy) - (dy - cy) * (bx - cx)
+            if one * two < 0 and three * four < 0:
+                return True
+    return False
+
+
+@numba.njit(cache=True)
+def _first_crossed_ring(kind, first, points, ring_kind):  # pragma: no cover - compiled
+    for i in range(len(kind)):
+        if kind[i] == ring_kind and _ring_crosses(points[first[i] : first[i + 1]]):
+            return i
+    return -1
