@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The part of the truth that was there to be seen: the union of all views, after GlobalMapNet's protocol (2024).
+
+Views are placed by the *true* poses: an agent saw what it saw, wherever it believes that it was. Open lines are cut at the
+border of the area and keep parts of at least 2 m; a crossing is kept whole when at least half of its area lies inside, since
+half a crossing is no truth that any map should be held against.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import MissingExtraError
+from manyeyes.datatypes.map_element import CROSSING, MapElements
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
+
+Floats = NDArray[np.float64]
+SHORTEST_PART_M, CROSSING_SHARE = 2.0, 0.5
+
+
+def observed_area(views: Sequence[Floats], poses: Floats) -> BaseGeometry:
+    """The union of field-of-view polygons (K, 2), agents' frames, at true poses (N, 3) of x, y, yaw."""
+    shapely = _shapely()
+    placed = []
+    for view, (x, y, yaw) in zip(views, np.asarray(poses, dtype=np.float64)):
+        c, s = np.cos(yaw), np.sin(yaw)
+        placed.append(shapely.polygons(np.asarray(view) @ np.array([[c, s], [-s, c]]) + [x, y]))
+    return shapely.union_all(placed)
+
+
+def clip(elements: MapElements, area: BaseGeometry) -> MapElements:
+    """The elements inside an area; scores and styles are kept."""
+    shapely = _shapely()
+    shapely.prepare(area)
+    rows: list[int] = []
+    parts: list[Floats] = []
+    for row in range(len(elements)):
+        points = elements.polyline(row)
+        if elements.kind[row] == CROSSING:
+            ring = shapely.polygons(points)
+            if ring.is_valid and shapely.area(shapely.intersection(ring, area)) >= CROSSING_SHARE * shapely.area(ring):
+                rows.append(row)
+                parts.append(points)
+            continue
+        line = shapely.linestrings(points)
+        if shapely.covers(area, line):
+            rows.append(row)
+            parts.append(points)
+            continue
+        inside = shapely.line_merge(shapely.intersection(line, area))
+        for piece in shapely.get_parts(inside):
+            if piece.geom_type == "LineString" and piece.length >= SHORTEST_PART_M:
+                rows.append(row)
+                parts.append(shapely.get_coordinates(piece))
+    return with_geometry(elements, rows, parts)
+
+
+def with_geometry(elements: MapElements, rows: Sequence[int], parts: Sequence[Floats]) -> MapElements:
+    """Elements like those at the rows, each with another geometry (n, 2); sigma is the mean of the old points'."""
+    index = np.asarray(rows, dtype=np.int64)
+    mean = np.add.reduceat(elements.sigma, elements.first[:-1]) / elements.counts if len(elements) else np.zeros(0)
+    sigma = np.repeat(mean[index], [len(part) for part in parts]) if len(parts) else np.zeros(0)
+    return MapElements.of(parts, elements.kind[index], elements.score[index], sigma, elements.style[index])
+
+
+def _shapely() -> Any:
+    try:
+        import shapely
+    except ImportError as error:
+        raise MissingExtraError("map", "cutting the truth to what was observed") from error
+    return shapely
