@@ -86,3 +86,34 @@ def test_log_codes_by_hand():
     codes = codec.log_codes(np.array([0.0, 1e-9, 0.01, 20.0, 1e9]), 0.01, 20.0)
     assert codes.tolist() == [0, 1, 1, 255, 255]
     assert codec.log_values(codes, 0.01, 20.0) == pytest.approx([0, 0.01, 0.01, 20, 20])
+
+
+def test_runs_are_packed_as_if_each_were_alone():
+    dense, sparse, none = np.arange(700, 900), np.array([3, 5000, 2**24 - 1]), np.zeros(0, np.int64)
+    runs = [sparse, dense, none, dense + 1]
+    packed = codec.pack_cell_runs(np.concatenate(runs), [len(run) for run in runs])
+    assert packed == [codec.pack_cells(run) for run in runs]
+    assert [layout for layout, _ in packed] == [codec.DELTA, codec.BITMAP, codec.DELTA, codec.BITMAP]
+    with pytest.raises(WireError, match="smaller grid"):
+        codec.pack_cell_runs(np.array([1, 2**35]), [1, 1])
+
+
+def test_runs_are_quantised_as_if_each_were_alone():
+    values = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32) * np.array([[0, 1, 1000]], np.float32)
+    codes, steps = codec.quantise_int8_runs(values, [4, 5])
+    for run, rows in enumerate((slice(0, 4), slice(4, 9))):
+        code, step = codec.quantise_int8(values[rows])
+        assert np.array_equal(codes[run], code)
+        assert np.array_equal(steps[rows], step)
+
+
+@pytest.mark.parametrize("dtype", ["<f2", "<f4"])
+def test_floats_that_are_not_finite_are_found_at_any_place(dtype):
+    for at in (0, 3):
+        for bad in (np.inf, -np.inf, np.nan, np.finfo(dtype).max, -0.0):
+            values = np.linspace(-2, 2, 7).astype(dtype)
+            for place in range(7):
+                changed = values.copy()
+                changed[place] = bad
+                data = b"\xff\x7f\xff"[:at] + changed.tobytes()
+                assert codec.are_finite(data, at, values.itemsize) == np.isfinite(bad)

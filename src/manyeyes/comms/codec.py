@@ -55,24 +55,34 @@ def _write_varints(values, out):  # pragma: no cover
     for value in values:
         if value < 0 or value >> 35:
             return -1
-        while value >> 7:
-            out[at] = value & 127 | 128
-            value >>= 7
-            at += 1
-        out[at] = value
-        at += 1
+        at = _write_varint(value, out, at)
     return at
+
+
+@njit(cache=True)
+def _write_varint(value, out, at):  # pragma: no cover
+    """The place in out after the value that was written from at on."""
+    while value >> 7:
+        out[at] = value & 127 | 128
+        value >>= 7
+        at += 1
+    out[at] = value
+    return at + 1
 
 
 def unpack_varints(data: bytes, count: int) -> tuple[NDArray[np.int64], int]:
     """The first ``count`` varints of data, and how many bytes they took. Padded (non-shortest) forms are refused."""
     values = np.zeros(count, np.int64)
     used, whole = _read_varints(np.frombuffer(data, np.uint8), values)
-    if whole < count and used >= 0:
-        raise PacketError("garbage", f"Expected {count} varints; the bytes end after {whole}.")
+    _check_varints(used, whole, count)
+    return values, used
+
+
+def _check_varints(used: int, whole: int, count: int) -> None:
     if used < 0:
         raise PacketError("garbage", f"A varint has at most {_VARINT_BYTES} bytes and no padding.")
-    return values, used
+    if whole < count:
+        raise PacketError("garbage", f"Expected {count} varints; the bytes end after {whole}.")
 
 
 @njit(cache=True)
@@ -98,10 +108,6 @@ def _read_varints(raw, values):  # pragma: no cover
     return at, values.shape[0]
 
 
-def _gaps(key: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.concatenate((key[:1], np.diff(key) - 1))
-
-
 @njit(cache=True)
 def _sizes(key):  # pragma: no cover
     """Bytes of sorted keys as gaps and as a bitmap."""
@@ -120,10 +126,6 @@ def _varint_bytes(value):  # pragma: no cover
         value >>= 7
         size += 1
     return size
-
-
-def _span_bytes(key: NDArray[np.int64]) -> int:
-    return int(key[-1] - key[0]) // 8 + 1
 
 
 def cells_size(key: NDArray[np.int64]) -> int:
@@ -168,32 +170,102 @@ def pack_cells(key: NDArray[np.int64]) -> tuple[int, bytes]:
     DELTA: varints of the first key and of each further gap less one. BITMAP: varints of the first key and of the
     number of bytes that follow, then one bit a key from the first to the last, lowest bit first.
     """
-    if not key.size:
-        return DELTA, b""
-    as_gaps, as_bitmap = _sizes(key)
-    if as_gaps <= as_bitmap:
-        return DELTA, pack_varints(_gaps(key))
-    span = _span_bytes(key)
-    bits = np.zeros(span * 8, np.uint8)
-    bits[key - key[0]] = 1
-    head = pack_varints(np.array([key[0], span], np.int64))
-    return BITMAP, head + np.packbits(bits, bitorder="little").tobytes()
+    return pack_cell_runs(key, [len(key)])[0]
+
+
+def pack_cell_runs(key: NDArray[np.int64], counts: list[int]) -> list[tuple[int, bytes]]:
+    """:func:`pack_cells` of each run of keys (N,), which ascend within a run; counts: how many keys each run has."""
+    if key.size and (int(key.min()) < 0 or int(key.max()) >> 7 * _VARINT_BYTES):
+        raise WireError("A varint holds values from 0 to 2^35 - 1; send a smaller grid.")
+    out = np.empty(len(key) * _VARINT_BYTES, np.uint8)
+    layouts, ends = np.empty(len(counts), np.uint8), np.empty(len(counts), np.int64)
+    _write_cell_runs(np.ascontiguousarray(key, np.int64), np.array(counts, np.int64), out, layouts, ends)
+    data, stops = out.tobytes(), ends.tolist()
+    return [(layout, data[a:b]) for layout, a, b in zip(layouts.tolist(), [0, *stops], stops)]
+
+
+@njit(cache=True)
+def _write_cell_runs(key, counts, out, layouts, ends):  # pragma: no cover
+    """Fills out with the bytes of all runs, layouts with their forms and ends with where each ends."""
+    at, first = 0, 0
+    for run in range(counts.shape[0]):
+        cells = key[first : first + counts[run]]
+        first += counts[run]
+        layouts[run] = DELTA
+        if cells.shape[0]:
+            as_gaps, as_bitmap = _sizes(cells)
+            if as_gaps <= as_bitmap:
+                before = -1
+                for k in cells:
+                    at = _write_varint(k - before - 1, out, at)
+                    before = k
+            else:
+                layouts[run] = BITMAP
+                span = (cells[-1] - cells[0]) // 8 + 1
+                at = _write_varint(span, out, _write_varint(cells[0], out, at))
+                out[at : at + span] = 0
+                for k in cells:
+                    bit = k - cells[0]
+                    out[at + bit // 8] |= 1 << bit % 8
+                at += span
+        ends[run] = at
 
 
 def unpack_cells(layout: int, data: bytes, count: int) -> tuple[NDArray[np.int64], int]:
     """The inverse of :func:`pack_cells`: ascending keys (count,) and how many bytes of data they took."""
+    key, raw = np.empty(count, np.int64), np.frombuffer(data, np.uint8)
     if layout == DELTA:
-        gaps, used = unpack_varints(data, count)
-        return np.cumsum(gaps + 1) - 1, used
+        used, whole = _read_varints(raw, key)
+        _check_varints(used, whole, count)
+        _add_up_gaps(key)
+        return key, used
     (first, span), used = unpack_varints(data, 2)
     end = used + int(span)
     if end > len(data):
         raise PacketError("garbage", f"A bitmap of {int(span)} bytes was announced; {len(data) - used} are there.")
-    bits = np.unpackbits(np.frombuffer(data, np.uint8, count=int(span), offset=used), bitorder="little")
-    key = np.flatnonzero(bits).astype(np.int64) + first
-    if key.size != count:
-        raise PacketError("garbage", f"A bitmap for {count} cells was announced; it marks {key.size}.")
+    marked = _read_bitmap(raw[used:end], first, key)
+    if marked != count:
+        raise PacketError("garbage", f"A bitmap for {count} cells was announced; it marks {marked}.")
     return key, end
+
+
+@njit(cache=True)
+def _add_up_gaps(key):  # pragma: no cover
+    before = -1
+    for i in range(key.shape[0]):
+        before += key[i] + 1
+        key[i] = before
+
+
+@njit(cache=True)
+def _read_bitmap(raw, first, key):  # pragma: no cover
+    """How many bits are set; as many of their keys as there is room for."""
+    marked = 0
+    for i in range(raw.shape[0]):
+        byte = raw[i]
+        for bit in range(8):
+            if byte >> bit & 1:
+                if marked < key.shape[0]:
+                    key[marked] = first + 8 * i + bit
+                marked += 1
+    return marked
+
+
+def are_finite(data: bytes, at: int, size: int) -> bool:
+    """Whether the little-endian floats of size bytes, 2 or 4, that data holds from at on are neither NaN nor infinite."""
+    return bool(_are_finite(np.frombuffer(data, np.uint8), at, size))
+
+
+@njit(cache=True)
+def _are_finite(raw, at, size):  # pragma: no cover
+    bad = False
+    if size == 2:
+        for i in range((raw.shape[0] - at) // 2):
+            bad |= raw[at + 2 * i + 1] & 0x7C == 0x7C
+    else:
+        for i in range((raw.shape[0] - at) // 4):
+            bad |= (raw[at + 4 * i + 3] & 0x7F == 0x7F) and raw[at + 4 * i + 2] & 0x80 == 0x80
+    return not bad
 
 
 def _scales() -> NDArray[np.float32]:
@@ -211,17 +283,28 @@ def quantise_int8(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArr
 
     One byte a channel instead of a float: the step is at most 9 % coarser than the ideal one.
     """
-    peak = np.abs(values).max(0) if len(values) else np.zeros(values.shape[1], np.float32)
+    codes, steps = quantise_int8_runs(values, [len(values)])
+    return codes[0], steps
+
+
+def quantise_int8_runs(values: NDArray[np.float32], counts: list[int]) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:
+    """:func:`quantise_int8` of each run of rows (N, C): codes (runs, C), steps (N, C). counts: the rows of each run.
+
+    A run is empty only where it is the only one.
+    """
+    peak = np.zeros((len(counts), values.shape[1]), np.float32)
+    if len(values):
+        peak = np.maximum.reduceat(np.abs(values), np.cumsum([0, *counts[:-1]]))
     code = np.searchsorted(SCALES, peak)
     if code.size and int(code.max()) > 255:
         raise WireError(f"int8 features reach {SCALES[-1]:.0f}; got {float(peak.max()):g}; send float32.")
-    step = SCALES[code] / np.float32(127)
+    step = np.repeat(SCALES[code] / np.float32(127), counts, axis=0)
     quantised = np.rint(np.divide(values, step, out=np.zeros_like(values), where=step > 0))
     return code.astype(np.uint8), np.clip(quantised, -127, 127).astype(np.int8)
 
 
 def dequantise_int8(code: NDArray[np.uint8], steps: NDArray[np.int8]) -> NDArray[np.float32]:
-    """Features (N, C) float32 from scale codes (C,) and steps (N, C)."""
+    """Features (N, C) float32 from scale codes (C,), or (N, C) of each row, and steps (N, C)."""
     step = (SCALES[code] / np.float32(127)).astype(np.float32)
     return steps.astype(np.float32) * step
 

@@ -67,6 +67,7 @@ import struct
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -82,9 +83,11 @@ VERSION = 1
 DEFAULT_MTU = 1398
 
 _MAGIC = b"ME"
-_HEADER = struct.Struct("<2sBBHHHiq3d3i6e8s")
+_START = struct.Struct("<2sBBHHH")
+_COMMON = struct.Struct("<iq3d3i6e8s")
 _CRC = struct.Struct("<I")
-HEADER_BYTES = _HEADER.size + _CRC.size
+_BODY_AT = _START.size + _COMMON.size
+HEADER_BYTES = _BODY_AT + _CRC.size
 _QUATERNION_UNIT = 2.0**31 / math.sqrt(0.5)
 _FARTHEST_M = 1e8
 
@@ -132,12 +135,11 @@ def encode(message: Message, *, precision: Precision = "float16", mtu: int = DEF
             f"A message has at most 65535 packets; this one needs {len(bodies)}: send less or raise the mtu."
         )
     common = _common_fields(message)
-    packets = []
+    rest, count, packets = _COMMON.pack(*common.rest), len(bodies), []
     for number, (kind, body) in enumerate(bodies):
-        head = _HEADER.pack(
-            _MAGIC, VERSION, common.flags | kind, HEADER_BYTES + len(body), number, len(bodies), *common.rest
-        )
-        packets.append(head + body + _CRC.pack(zlib.crc32(body, zlib.crc32(head))))
+        start = _START.pack(_MAGIC, VERSION, common.flags | kind, HEADER_BYTES + len(body), number, count)
+        packet = b"".join((start, rest, body))
+        packets.append(packet + _CRC.pack(zlib.crc32(packet)))
     return packets
 
 
@@ -232,22 +234,32 @@ def decode_packet(packet: bytes) -> Fragment:
         )
     if len(packet) < HEADER_BYTES:
         raise PacketError("garbage", f"Truncated packet: {len(packet)} bytes, a header alone has {HEADER_BYTES}.")
-    _, _, flags, length, number, count, agent_id, timestamp_ns, *rest = _HEADER.unpack_from(packet)
+    _, _, flags, length, number, count = _START.unpack_from(packet)
     if length != len(packet):
         raise PacketError("garbage", f"Truncated or padded packet: it announces {length} bytes and has {len(packet)}.")
     checksum = zlib.crc32(memoryview(packet)[: -_CRC.size])
+    common = packet[_START.size : _BODY_AT]
     if _CRC.unpack_from(packet, length - _CRC.size)[0] != checksum:
+        agent_id = _COMMON.unpack(common)[0]
         raise PacketError(
             "checksum", f"The checksum of a packet said to be of agent {agent_id} does not match its bytes."
         )
     if flags >> 5 or number >= count:
         raise PacketError("garbage", f"Contradictory header: flags {flags:#04x}, packet {number} of {count}.")
-    pose = (*rest[:3], *_quaternion(flags >> 3 & 3, rest[3:6]))
+    header = _header(common, flags >> 2, count)
+    return Fragment(header, number, sections.read_body(flags & 3, packet[_BODY_AT : -_CRC.size]), packet)
+
+
+# The packets of a message come one after another, and what they say alike is read once.
+@lru_cache(maxsize=64)
+def _header(common: bytes, flags: int, count: int) -> Header:
+    """The fields from the agent id to the fingerprint, checked; flags without the kind of body."""
+    agent_id, timestamp_ns, *rest = _COMMON.unpack(common)
+    pose = (*rest[:3], *_quaternion(flags >> 1, rest[3:6]))
     factor = tuple(rest[6:12])
     if not all(abs(v) <= _FARTHEST_M for v in pose[:3]) or not all(map(math.isfinite, factor)):
         raise PacketError("implausible", f"Agent {agent_id} claims the position {pose[:3]} with the errors {factor}.")
-    header = Header(agent_id, timestamp_ns, count, bool(flags & 4), rest[12], pose, factor)
-    return Fragment(header, number, sections.read_body(flags & 3, packet[_HEADER.size : -_CRC.size]), packet)
+    return Header(agent_id, timestamp_ns, count, bool(flags & 1), rest[12], pose, factor)
 
 
 def _quaternion(largest: int, codes: list[int]) -> list[float]:
@@ -277,10 +289,10 @@ class Assembly:
         if held is not None and held.packet == fragment.packet:
             return False
         name = f"packet {fragment.number} of agent {head.agent_id} at {head.timestamp_ns} ns"
-        if fragment.header != head or held is not None:
+        if (fragment.header is not head and fragment.header != head) or held is not None:
             raise PacketError("contradiction", f"A second {name} differs from the first; both cannot be true.")
         if isinstance(fragment.body, TokenRows):
-            form = (fragment.body.grid, fragment.body.precision, fragment.body.features.shape[1])
+            form = (fragment.body.grid, fragment.body.precision, fragment.body.values.shape[1])
             cells = fragment.body.key.tolist()
             if (self._form or form) != form or not self._cells.isdisjoint(cells):
                 raise PacketError("contradiction", f"The cells in {name} do not go with those of the other packets.")
