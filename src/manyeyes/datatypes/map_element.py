@@ -31,7 +31,7 @@ def frozen(values: ArrayLike, dtype: type[np.generic]) -> NDArray:
 
 def check_offsets(name: str, first: Ints, total: int) -> None:
     """Raise ShapeError unless first (N+1,) starts at 0, never falls and ends at total."""
-    if first.ndim != 1 or len(first) == 0 or first[0] != 0 or first[-1] != total or (np.diff(first) < 0).any():
+    if first.ndim != 1 or len(first) == 0 or first[0] != 0 or first[-1] != total or (first[1:] < first[:-1]).any():
         raise ShapeError(
             f"{name}.first needs offsets (N+1,) that start at 0, never fall and end at {total}; "
             f"got shape {first.shape} from {first[:1].tolist()} to {first[-1:].tolist()}."
@@ -149,7 +149,7 @@ class MapElements:
     @property
     def counts(self) -> Ints:
         """(N,) points of each element."""
-        return np.diff(self.first)
+        return self.first[1:] - self.first[:-1]
 
     @property
     def closed(self) -> NDArray[np.bool_]:

@@ -171,13 +171,13 @@ def _require_within(name: str, values: Floats, most: float) -> None:
 
 def _is_covariance(m: Floats) -> bool:
     """Whether m (3, 3) is symmetric and all its leading minors are positive (Sylvester), relative to its scale."""
-    if not np.allclose(m, m.T, rtol=1e-9, atol=1e-12):
+    (a, b, c), (d, e, f), (g, h, i) = m.tolist()
+    if a <= 0 or e <= 0 or i <= 0:
         return False
-    (a, b, c), (_, d, e), (_, _, f) = m.tolist()
-    if a <= 0 or d <= 0 or f <= 0:
+    if any(abs(one - two) > 1e-12 + 1e-9 * abs(one) for one, two in ((b, d), (c, g), (f, h))):
         return False
     # As correlations, so that units (m, rad) do not decide.
-    r, s, t = b / math.sqrt(a * d), c / math.sqrt(a * f), e / math.sqrt(d * f)
+    r, s, t = b / math.sqrt(a * e), c / math.sqrt(a * i), f / math.sqrt(e * i)
     return 1 - r * r > 1e-12 and 1 + 2 * r * s * t - r * r - s * s - t * t > 1e-12
 
 

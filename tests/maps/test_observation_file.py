@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Observations as files: the documented example, round trips, and what is put aside with its reason."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manyeyes.datatypes.map_element import MapElements, Polygons
+from manyeyes.maps.observation import Frame, Observation, ObservationError
+from manyeyes.maps.observation_file import (
+    METADATA_KEY,
+    metadata,
+    observation_table,
+    observations_of,
+    read_observations,
+    write_observations,
+)
+
+pa = pytest.importorskip("pyarrow", reason="the 'map' extra is not installed")
+pq = pytest.importorskip("pyarrow.parquet")
+
+FRAME = Frame(49.0, 8.4)
+VIEW = np.array([[0.0, -15.0], [60.0, -15.0], [60.0, 15.0], [0.0, 15.0]])
+ELEMENTS = MapElements.of(
+    [[[0, 0], [30, 0.25]], [[10, -5], [14, -5], [14, 5], [10, 5]]], [0, 2], score=[0.5, 0.75], style=[1, 3]
+)
+
+
+def crowd(count: int) -> list[Observation]:
+    rng = np.random.default_rng(3)
+    return [
+        Observation(
+            agent=f"car-{k % 3}",
+            pass_id=f"p{k}",
+            time_ns=k,
+            pose=rng.normal(size=3),
+            covariance=np.diag([0.5, 0.4, 1e-4]),
+            view=VIEW,
+            elements=ELEMENTS.with_points(ELEMENTS.points + rng.normal(0, 0.01, ELEMENTS.points.shape))
+            if k % 4
+            else MapElements.empty(),
+            model="net",
+            trusted=k == 2,
+            occluders=Polygons.of([VIEW * 0.1, VIEW[:3] * 0.2]) if k % 2 else Polygons.of(),
+        )
+        for k in range(count)
+    ]
+
+
+def test_the_documented_example_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).resolve().parents[2] / "docs" / "observation.md").read_text()
+    names: dict = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)
+    (seen,) = names["reading"].observations
+    assert names["reading"].frame == FRAME and not names["reading"].quarantined
+    assert seen.agent == "car-17" and seen.elements.kind.tolist() == [0, 2]
+    assert seen.elements.sigma.tolist() == [0.12, 0.3, 0.12, 0.12, 0.12, 0.12]
+    assert seen.elements.style.tolist() == [[0.1, 0.9, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    assert seen.covariance[2, 2] == 0.0002 and seen.covariance[0, 1] == 0.0
+    assert np.allclose(seen.in_map().polyline(0)[0], [120.5 - 1.75, -40.25], atol=1e-4)
+
+
+def test_what_was_written_is_read_back_bit_by_bit(tmp_path: Path) -> None:
+    many = crowd(7)
+    many[3] = replace(many[3], covariance=np.array([[0.5, 0.1, 0.01], [0.1, 0.6, 0.02], [0.01, 0.02, 0.3]]))
+    write_observations(tmp_path / "a.parquet", many, FRAME)
+    reading = read_observations(tmp_path / "a.parquet")
+    assert [o.id for o in reading.observations] == [o.id for o in many]
+    assert reading.frame == FRAME and reading.quarantined == ()
+    assert [p.name for p in tmp_path.iterdir()] == ["a.parquet"]
+
+
+def test_no_observations_are_a_file_too(tmp_path: Path) -> None:
+    write_observations(tmp_path / "a.parquet", [], FRAME)
+    assert read_observations(tmp_path).observations == ()
+
+
+def test_a_table_cut_out_of_another_gives_its_own_rows() -> None:
+    many = crowd(6)
+    rows = list(observations_of(observation_table(many, FRAME).slice(2, 3)))
+    assert [o.id for _, o in rows if isinstance(o, Observation)] == [o.id for o in many[2:5]]
+
+
+def rewritten(table, row: int, change) -> object:
+    rows = table.to_pylist()
+    change(rows[row])
+    return pa.Table.from_pylist(rows, schema=table.schema)
+
+
+def _nan(row: dict) -> None:
+    row["elements"][0]["points"][0]["x"] = math.nan
+
+
+def _no_point(row: dict) -> None:
+    row["elements"][0]["points"][1]["y"] = None
+
+
+def _bow_tie(row: dict) -> None:
+    corners = row["elements"][1]["points"]
+    corners[1], corners[2] = corners[2], corners[1]
+
+
+def _kind(row: dict) -> None:
+    row["elements"][1]["kind"] = "tree"
+
+
+def _score(row: dict) -> None:
+    row["elements"][1]["score"] = 1.5
+
+
+def _style(row: dict) -> None:
+    row["elements"][1]["style"] = [1.0]
+
+
+def _covariance(row: dict) -> None:
+    row["covariance"] = [1.0, 0.0]
+
+
+def _agent(row: dict) -> None:
+    row["agent"] = None
+
+
+def _view(row: dict) -> None:
+    row["view"] = None
+
+
+def _moved(row: dict) -> None:
+    row["elements"][0]["points"][0]["x"] += 0.001
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_nan, "points: expected finite"),
+        (_no_point, "points: expected finite"),
+        (_bow_tie, "cross"),
+        (_kind, "kind: expected one of divider, boundary, crossing, stop_line; got tree"),
+        (_score, "score: expected values in .0, 1.; got 1.5"),
+        (_style, "style"),
+        (_covariance, "covariance: expected 6 numbers"),
+        (_agent, "agent"),
+        (_view, "view"),
+        (_moved, "id: expected [0-9a-f]{32}, as its content says"),
+    ],
+)
+def test_a_bad_row_is_put_aside_with_its_reason_and_the_rest_is_read(tmp_path: Path, change, said: str) -> None:
+    many = crowd(6)
+    pq.write_table(rewritten(observation_table(many, FRAME), 3, change), tmp_path / "a.parquet")
+    reading = read_observations(tmp_path)
+    assert [o.id for o in reading.observations] == [o.id for o in many if o is not many[3]]
+    (aside,) = reading.quarantined
+    assert (aside.row, aside.count) == (3, 1) and aside.file.endswith("a.parquet")
+    assert re.search(said, aside.reason)
+
+
+def stated(change: dict) -> dict[bytes, str]:
+    return {METADATA_KEY: json.dumps(metadata(FRAME) | change)}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"version": 2}, "version 2. Read a newer version"),
+        ({"version": "1"}, "version '1'"),
+        ({"crs": "EPSG:25832"}, "crs: expected .* got 'EPSG:25832'.*Reproject"),
+        ({"origin": {"crs": "EPSG:4258", "latitude": 49.0, "longitude": 8.4}}, "EPSG:4258"),
+        ({"origin": {"crs": "EPSG:4326", "latitude": 49.1, "longitude": 8.4}}, "origin: expected latitude 49.0"),
+        ({"origin": {}}, "expected metadata"),
+        ({"format": "release"}, "got 'release'"),
+    ],
+)
+def test_a_file_of_another_kind_version_or_frame_is_put_aside_whole(tmp_path: Path, change: dict, said: str) -> None:
+    many = crowd(4)
+    write_observations(tmp_path / "a.parquet", many[:2], FRAME)
+    pq.write_table(observation_table(many[2:], FRAME).replace_schema_metadata(stated(change)), tmp_path / "b.parquet")
+    reading = read_observations(tmp_path)
+    assert [o.id for o in reading.observations] == [o.id for o in many[:2]]
+    (aside,) = reading.quarantined
+    assert aside.row == -1 and re.search(said, aside.reason)
+
+
+def test_files_without_our_metadata_or_columns_are_put_aside(tmp_path: Path) -> None:
+    table = observation_table(crowd(2), FRAME)
+    write_observations(tmp_path / "a.parquet", crowd(2), FRAME)
+    pq.write_table(table.replace_schema_metadata({}), tmp_path / "b.parquet")
+    pq.write_table(table.drop_columns(["yaw", "view"]), tmp_path / "c.parquet")
+    reasons = [q.reason for q in read_observations(tmp_path).quarantined]
+    assert "expected metadata 'manyeyes'" in reasons[0] and "yaw, view missing" in reasons[1]
+
+
+def test_a_cut_or_damaged_file_is_put_aside_and_never_read_wrong(tmp_path: Path) -> None:
+    many = crowd(8)
+    write_observations(tmp_path / "a.parquet", many, FRAME)
+    whole = (tmp_path / "a.parquet").read_bytes()
+    (tmp_path / "b.parquet").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "c.parquet").write_bytes(b"")
+    for k, place in enumerate(range(100, len(whole) // 2, 97)):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0x10
+        (tmp_path / f"d{k}.parquet").write_bytes(damaged)
+    reading = read_observations(tmp_path)
+    good = {o.id for o in many}
+    assert {o.id for o in reading.observations} <= good
+    files = {Path(q.file).name for q in reading.quarantined}
+    assert {"b.parquet", "c.parquet"} <= files and any(name.startswith("d") for name in files)
+    assert all("\n" not in q.reason for q in reading.quarantined)
+
+
+def test_nothing_to_read_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ObservationError, match="found none"):
+        read_observations(tmp_path)
+    (tmp_path / "a.parquet").write_bytes(b"no")
+    with pytest.raises(ObservationError, match="no file could be read"):
+        read_observations(tmp_path)
+
+
+def test_the_frame_asked_for_is_the_frame_required(tmp_path: Path) -> None:
+    write_observations(tmp_path / "a.parquet", crowd(1), FRAME)
+    reading = read_observations(tmp_path, Frame(48.0, 8.4))
+    assert reading.observations == () and "latitude 48.0" in reading.quarantined[0].reason
