@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from manyeyes.apps.viewer.map_page import Disagreement, MapPage, lonlat, render, save_map_page
+from manyeyes.apps.viewer.map_page import MapPage, lonlat, render, save_map_page
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
+from manyeyes.evaluation.disagreement import Disagreement
 
 SURE, UNSURE, MISSED = (12, 44, 132), (215, 48, 31), (243, 132, 186)
 

@@ -143,7 +143,7 @@ def judge(
     """All numbers of a map (elements with scores) against the truth, both in one metric frame."""
     for name in ways:
         way_named(name)
-    return MapQuality(tuple(_judge_kind(k, _lines(predicted, k), _lines(truth, k), ways) for k in kinds))
+    return MapQuality(tuple(_judge_kind(k, lines_of_kind(predicted, k), lines_of_kind(truth, k), ways) for k in kinds))
 
 
 def _judge_kind(kind: str, mine: Lines, theirs: Lines, ways: Sequence[str]) -> KindQuality:
@@ -183,7 +183,7 @@ def _judge_kind(kind: str, mine: Lines, theirs: Lines, ways: Sequence[str]) -> K
     )
 
 
-def _lines(elements: MapElements, kind: str) -> Lines:
+def lines_of_kind(elements: MapElements, kind: str) -> Lines:
     """The elements of one kind that have length, rings closed."""
     parts, scores = [], []
     for row in np.flatnonzero(elements.kind == KINDS.index(kind)):

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import KINDS, MapElements
+from manyeyes.evaluation.disagreement import Disagreement
 from manyeyes.maps.transverse_mercator import degrees_from_metres
 
 Floats = NDArray[np.float64]
@@ -28,18 +29,6 @@ _DEGREES = 7
 KIND_COLOURS = {"divider": "#e07b00", "boundary": "#2e7d32", "crossing": "#1565c0", "stop_line": "#8e24aa"}
 CONFIDENCE_STOPS = ((0.0, "#d7301f"), (0.5, "#fdae61"), (0.8, "#41b6c4"), (1.0, "#0c2c84"))
 DISAGREEMENT_COLOURS = {"invented": "#d50000", "missed": "#ff6fae", "unexplained": "#9e9d24"}
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """Pieces of lines (each (n, 2) metres, map frame) on which sources disagree.
-
-    invented: fused and not true. missed: true, observed, and not fused. unexplained: observed and not fused.
-    """
-
-    invented: Sequence[Floats] = ()
-    missed: Sequence[Floats] = ()
-    unexplained: Sequence[Floats] = ()
 
 
 @dataclass(frozen=True)
