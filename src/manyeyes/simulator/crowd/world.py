@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A true map that changes: elements that are removed, moved or painted anew at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes.map_element import MapElements
+
+Indices = NDArray[np.int64]
+
+NEVER_NS = 2**63 - 1
+
+
+@dataclass(frozen=True)
+class Change:
+    """What happens to one true element (its index in Place.truth) at a time.
+
+    remove: it is gone from then on. add: it was not there before. move: it lies shift_m (x, y metres) elsewhere from then on.
+    """
+
+    element: int
+    at_ns: int
+    what: Literal["remove", "add", "move"]
+    shift_m: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """N versions of elements. name: (N,) the true element each is a version of; born, died: (N,) nanoseconds, half-open."""
+
+    elements: MapElements
+    name: Indices
+    born: Indices
+    died: Indices
+
+    @classmethod
+    def of(cls, truth: MapElements, changes: Sequence[Change] = ()) -> World:
+        """A truth and what becomes of it, in the order of time."""
+        name = list(range(len(truth)))
+        born, died = [0] * len(truth), [NEVER_NS] * len(truth)
+        moved: list[MapElements] = []
+        latest = list(range(len(truth)))
+        for change in sorted(changes, key=lambda c: (c.at_ns, c.element)):
+            if not 0 <= change.element < len(truth):
+                raise ConfigError(f"Change.element: expected 0 to {len(truth) - 1}; got {change.element}.")
+            now = latest[change.element]
+            if change.what == "remove":
+                died[now] = change.at_ns
+            elif change.what == "add":
+                born[now] = change.at_ns
+            else:
+                died[now] = change.at_ns
+                latest[change.element] = len(name)
+                name.append(change.element)
+                born.append(change.at_ns)
+                died.append(NEVER_NS)
+                before = (truth if now < len(truth) else moved[now - len(truth)]).take([now if now < len(truth) else 0])
+                moved.append(before.transform(*change.shift_m, 0.0))
+        return cls(MapElements.cat([truth, *moved]), np.array(name, np.int64), _times(born), _times(died))
+
+    def rows_at(self, time_ns: int) -> Indices:
+        """Rows of the versions that exist at a time."""
+        return np.flatnonzero((self.born <= time_ns) & (time_ns < self.died))
+
+    def at(self, time_ns: int) -> MapElements:
+        """The true map at a time."""
+        return self.elements.take(self.rows_at(time_ns))
+
+    @property
+    def epochs(self) -> Indices:
+        """(E,) times from which on the world is another, ascending, the first 0."""
+        times = np.unique(np.concatenate(([0], self.born, self.died)))
+        return times[times < NEVER_NS]
+
+
+def _times(values: Sequence[int]) -> Indices:
+    return np.array(values, np.int64)
