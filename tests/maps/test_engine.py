@@ -7,7 +7,7 @@ import time
 import pytest
 
 from manyeyes.datatypes import ConfigError, MissingExtraError
-from manyeyes.maps.engine import Dask, Inline, ProcessPool, Ray, map_blocks, named_executor
+from manyeyes.maps.engine import Inline, ProcessPool, map_blocks, named_executor
 
 
 def _square_late(value: int) -> tuple[int, int]:
@@ -22,36 +22,42 @@ def _fails_at_three(value: int) -> int:
     return value
 
 
+def _run(executor, fn, blocks, progress=None):
+    with executor.open() as runner:
+        return map_blocks(fn, blocks, runner, progress)
+
+
 def test_a_process_pool_gives_the_inline_list_in_block_order_and_reports_every_block():
     seen: list[tuple[int, int]] = []
-    results = map_blocks(
-        _square_late, range(9), ProcessPool(2, ahead=1), lambda done, total: seen.append((done, total))
-    )
-    assert [square for square, _ in results] == [square for square, _ in map_blocks(_square_late, range(9), Inline())]
+    with ProcessPool(2, ahead=1).open() as runner:
+        results = map_blocks(_square_late, range(9), runner, lambda done, total: seen.append((done, total)))
+        again = map_blocks(_square_late, range(3), runner)
+        with pytest.raises(ValueError, match="block three"):
+            map_blocks(_fails_at_three, range(6), runner)
+    assert [square for square, _ in results] == [square for square, _ in _run(Inline(), _square_late, range(9))]
     assert os.getpid() not in {pid for _, pid in results}
+    assert {pid for _, pid in again} <= {pid for _, pid in results}
     assert seen == [(k, 9) for k in range(1, 10)]
 
 
-@pytest.mark.parametrize("executor", [Inline(), ProcessPool(2)])
-def test_an_exception_of_a_block_reaches_the_caller(executor):
+def test_an_exception_of_a_block_reaches_the_caller_inline():
     with pytest.raises(ValueError, match="block three"):
-        map_blocks(_fails_at_three, range(6), executor)
+        _run(Inline(), _fails_at_three, range(6))
 
 
-@pytest.mark.parametrize("executor", [Inline(), ProcessPool(2)])
-def test_no_blocks_give_an_empty_list(executor):
-    assert map_blocks(_square_late, [], executor) == []
+def test_without_a_runner_a_pool_of_its_own_runs_the_blocks():
+    assert map_blocks(_fails_at_three, [5]) == [5]
+    assert map_blocks(_fails_at_three, []) == []
 
 
-def test_dask_gives_the_inline_list():
-    pytest.importorskip("dask.distributed", reason="the dask extra is not installed")
-    results = map_blocks(_square_late, range(9), Dask(workers=2))
-    assert [square for square, _ in results] == [k * k for k in range(9)]
-
-
-def test_ray_gives_the_inline_list():
-    pytest.importorskip("ray", reason="the ray extra is not installed")
-    results = map_blocks(_square_late, range(9), Ray(workers=2))
+@pytest.mark.parametrize("name", ["dask", "ray"])
+def test_a_cluster_gives_the_inline_list(name):
+    module = {"dask": "dask.distributed", "ray": "ray"}[name]
+    pytest.importorskip(module, reason=f"the {name} extra is not installed")
+    with named_executor(name, workers=2).open() as runner:
+        results = map_blocks(_square_late, range(9), runner)
+        with pytest.raises(ValueError, match="block three"):
+            map_blocks(_fails_at_three, range(6), runner)
     assert [square for square, _ in results] == [k * k for k in range(9)]
 
 
@@ -68,7 +74,7 @@ def test_an_absent_engine_names_its_extra(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     for name in ("dask", "ray"):
         with pytest.raises(MissingExtraError, match=rf"manyeyes\[{name}\]"):
-            map_blocks(_fails_at_three, [1], named_executor(name))
+            _run(named_executor(name), _fails_at_three, [1])
 
 
 def test_an_unknown_executor_lists_the_known_ones():
