@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -181,6 +181,10 @@ class VectorMap:
         """The ids of the observations that element i came from, in hexadecimal."""
         rows = self.sources[self.sources_first[i] : self.sources_first[i + 1]]
         return [row.tobytes().hex() for row in self.observations[rows]]
+
+    def with_state(self, state: ArrayLike) -> VectorMap:
+        """The same map with other states (N,)."""
+        return replace(self, state=np.asarray(state))
 
     def published(self) -> VectorMap:
         """Only what is published."""

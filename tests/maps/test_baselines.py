@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rivals, each on a case worked by hand, and what they share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, MapElements, Polygons
+from manyeyes.maps.baselines import chamfer_nms, union
+from manyeyes.maps.baselines.rules import CLAMP, HIT, MISS, Rules, pool
+from manyeyes.maps.observation import Frame, Observation
+from manyeyes.maps.vector_map import CANDIDATE, PUBLISHED, VectorMap
+
+VIEW = np.array([[-10.0, -20.0], [60.0, -20.0], [60.0, 20.0], [-10.0, 20.0]])
+SQUARE = [[20.0, -4.0], [24.0, -4.0], [24.0, 4.0], [20.0, 4.0]]
+
+
+def line(y: float, x0: float = 0.0, x1: float = 40.0, n: int = 9) -> list[list[float]]:
+    return [[float(x), y] for x in np.linspace(x0, x1, n)]
+
+
+def seen(
+    k: int, lines: list, kinds: int | list[int] = DIVIDER, score: float | list[float] = 0.8, view: np.ndarray = VIEW
+) -> Observation:
+    elements = MapElements.of(lines, kinds, score=score)
+    return Observation(f"car-{k}", "p", k, np.zeros(3), np.diag([0.25, 0.25, 1e-4]), view, elements)
+
+
+def lines_in(made: VectorMap, kind: int = DIVIDER) -> list[np.ndarray]:
+    return [made.elements.polyline(i) for i in np.flatnonzero(made.elements.kind == kind)]
+
+
+RIVALS = [union, chamfer_nms]
+
+
+@pytest.mark.parametrize("rival", RIVALS, ids=lambda r: r.__name__.split(".")[-1])
+def test_neither_order_nor_repetition_of_observations_changes_a_map(rival) -> None:
+    many = [
+        seen(k, [line(0.1 * k), line(3.5 - 0.05 * k), SQUARE], [DIVIDER, BOUNDARY, CROSSING], 0.5 + 0.05 * k)
+        for k in range(5)
+    ]
+    first = rival.fuse(many)
+    again = rival.fuse([*many[::-1], many[2]])
+    assert first.quantised_hash() == again.quantised_hash() and len(first)
+    assert np.array_equal(first.elements.score, again.elements.score)
+
+
+@pytest.mark.parametrize("rival", RIVALS, ids=lambda r: r.__name__.split(".")[-1])
+def test_nothing_seen_is_an_empty_map_in_the_frame(rival) -> None:
+    assert (
+        len(rival.fuse([], frame=Frame(49.0, 8.0))) == 0
+        and rival.fuse([], frame=Frame(49.0, 8.0)).frame.latitude == 49.0
+    )
+    assert len(rival.fuse([seen(0, [])])) == 0
+
+
+@pytest.mark.parametrize("rival", RIVALS, ids=lambda r: r.__name__.split(".")[-1])
+def test_one_observation_is_mapped_at_its_pose_with_its_style_and_source(rival) -> None:
+    one = replace(seen(0, [line(2.0), SQUARE], [DIVIDER, CROSSING]), pose=np.array([100.0, 50.0, math.pi / 2]))
+    one = replace(one, elements=replace(one.elements, style=np.eye(4)[[DASHED, 3]]))
+    made = rival.fuse([one])
+    (divider,), (crossing,) = lines_in(made), lines_in(made, CROSSING)
+    ends = sorted([divider[0].tolist(), divider[-1].tolist()], key=lambda p: p[1])
+    assert np.allclose(ends, [[98, 50], [98, 90]], atol=0.15)
+    assert np.allclose(crossing.mean(0), [100, 72], atol=0.1)
+    assert made.elements.style[0, DASHED] == 1.0 and made.sources_of(0) == [one.id]
+
+
+def test_the_pre_filter_drops_weak_and_short_elements_and_a_repeated_observation() -> None:
+    many = [
+        seen(0, [line(0), line(1, 0, 3.9), line(2)], DIVIDER, [0.9, 0.9, 0.29]),
+        seen(1, [line(0, 0, 3), SQUARE], [3, 2]),
+    ]
+    kept = pool([*many, many[0]], Rules())
+    assert kept.elements.kind.tolist() == [0, 3, 2] and kept.observation.tolist() == [0, 1, 1]
+
+
+def test_scores_follow_who_saw_who_missed_and_how_long() -> None:
+    far = VIEW + (500.0, 0.0)
+    many = [seen(0, [line(0.0)]), seen(1, []), seen(2, []), seen(3, [], view=far)]
+    made = union.fuse(many)
+    assert made.log_odds[0] == pytest.approx(HIT + 2 * MISS, abs=1e-9)
+    assert made.elements.score[0] == pytest.approx(0.8 / (1 + math.exp(-(HIT + 2 * MISS) / 4)), abs=1e-9)
+    short = union.fuse([seen(0, [line(0.0, 0, 10)])])
+    assert short.elements.score[0] == pytest.approx(0.8 * 0.5 / (1 + math.exp(-HIT / 4)), abs=1e-9)
+    assert union.fuse([seen(0, [line(0.0)]), *(seen(k, []) for k in range(1, 30))]).log_odds[0] == -CLAMP
+
+
+def test_an_occluder_excuses_who_did_not_see() -> None:
+    wall = Polygons.of([[[1.0, -30.0], [1.5, -30.0], [1.5, 30.0], [1.0, 30.0]]])
+    hidden = replace(seen(1, []), occluders=wall)
+    assert union.fuse([seen(0, [line(0.0, 5, 45)]), hidden]).log_odds[0] == pytest.approx(HIT, abs=1e-9)
+
+
+def test_what_too_few_saw_is_a_candidate() -> None:
+    rules = Rules(least_observations=2)
+    many = [seen(0, [line(0.0), line(9.0)]), seen(1, [line(0.2)])]
+    made = chamfer_nms.fuse(many, chamfer_nms.Config(rules=rules))
+    assert made.state.tolist() == [PUBLISHED, CANDIDATE] and made.supporters.tolist() == [2, 1]
+    made = chamfer_nms.fuse(many, chamfer_nms.Config(rules=Rules(publish=2.0)))
+    assert made.state.tolist() == [PUBLISHED, CANDIDATE]
+
+
+def test_union_keeps_everything() -> None:
+    made = union.fuse([seen(0, [line(0.0), SQUARE], [0, 2]), seen(1, [line(0.2), line(0.2, 0, 5)])])
+    assert len(made) == 4 and made.state.tolist() == [PUBLISHED, CANDIDATE, PUBLISHED, PUBLISHED]
+
+
+def test_nms_keeps_the_best_of_lines_on_each_other_and_all_others() -> None:
+    many = [
+        seen(0, [line(0.0), line(3.5)], DIVIDER, [0.6, 0.9]),
+        seen(1, [line(0.6), line(0.3)], [DIVIDER, BOUNDARY], [0.8, 0.7]),
+        seen(2, [line(1.1), line(0.0, 0, 20)], DIVIDER, [0.7, 0.5]),
+    ]
+    made = chamfer_nms.fuse(many)
+    # 0.8 at 0.6 m takes 0.6 at 0.0 and 0.7 at 1.1; half the line is 5 m away by Chamfer and stays.
+    assert [round(float(line[0, 1]), 6) for line in lines_in(made)] == [0.0, 0.6, 3.5]
+    assert len(lines_in(made, BOUNDARY)) == 1
+    assert sorted(made.supporters[made.elements.kind == DIVIDER].tolist()) == [1, 1, 3]
