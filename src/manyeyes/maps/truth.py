@@ -79,12 +79,12 @@ def map_truth(network: RoadNetwork, policy: TruthPolicy = TruthPolicy()) -> MapE
     dividers = _outside(_middles(paint), junction_region(network, policy.merge_m))
     dividers = chain(merge(dividers, policy), policy)
     if policy.boundary == "pavement":
-        edges = [_Line(ring, _style("none")) for ring in _pavement_rings(network, policy)]
+        edges = _pavement_rings(network, policy)
     else:
         edges = [_Line(mark.line[:, :2], _style("none")) for mark in network.marks if mark.kind == "curb"]
-        edges = _beside_lanes(_without_map_ends(edges, network), network, policy)
+    edges = _beside_lanes(_without_map_ends(edges, network), network, policy)
     boundaries = chain(merge(edges, policy), policy)
-    boundaries = [piece for line in boundaries for piece in _pieces(line, region)]
+    boundaries = [piece for line in boundaries for piece in _pieces(line, region, policy.min_line_m)]
     stops = [_Line(mark.line[:, :2], _style("none")) for mark in network.marks if mark.kind == "stop"]
     found: list[tuple[str, _Line]] = []
     found += [("divider", line) for line in dividers if line.length_m >= policy.min_line_m]
@@ -102,8 +102,11 @@ def junction_region(network: RoadNetwork, margin_m: float) -> BaseGeometry:
     return shapely.simplify(shapely.buffer(ground, margin_m - 0.05, join_style="mitre"), 0.05)
 
 
-def cut_elements(elements: MapElements, region: BaseGeometry, min_line_m: float = 0.0) -> MapElements:
-    """The elements with lines cut where they enter or leave the region; crossings stay whole, pieces keep score and style."""
+def cut_elements(elements: MapElements, region: BaseGeometry, min_line_m: float = 5.0) -> MapElements:
+    """The elements with lines cut where they enter or leave the region; crossings stay whole, pieces keep score and style.
+
+    A cut that would leave a piece shorter than min_line_m is not made.
+    """
     shapely = _shapely()
     if not len(elements):
         return elements
@@ -113,13 +116,11 @@ def cut_elements(elements: MapElements, region: BaseGeometry, min_line_m: float 
         line = elements.polyline(k)
         ring = elements.kind[k] == CROSSING
         sigma = elements.sigma[elements.first[k] : elements.first[k + 1]]
-        for part in [line] if ring else _split(line, region):
-            if ring or np.linalg.norm(np.diff(part, axis=0), axis=1).sum() >= min_line_m:
-                parts.append(part)
-                source.append(k)
-                # The nearest own point's sigma: cuts add points, they do not move any.
-                apart = np.linalg.norm(part[:, None] - line, axis=2)
-                sigmas.append(sigma[apart.argmin(1)])
+        for part in [line] if ring else _split(line, region, min_line_m):
+            parts.append(part)
+            source.append(k)
+            # The nearest own point's sigma: cuts add points, they do not move any.
+            sigmas.append(sigma[np.linalg.norm(part[:, None] - line, axis=2).argmin(1)])
     own = np.array(source, np.int64)
     sigma = np.concatenate(sigmas) if sigmas else np.zeros(0)
     return MapElements.of(parts, elements.kind[own], elements.score[own], sigma, elements.style[own])
@@ -140,16 +141,16 @@ def merge(lines: Sequence[_Line], policy: TruthPolicy) -> list[_Line]:
         covered = np.zeros(0, bool)
         points = line.points
         if len(near):
-            points = _dense(line.points, _STEP_M)
+            points = _dense(line.points, _STEP_M / 2)
             covered = np.zeros(len(points), bool)
             for other in near.tolist():
-                covered |= _runs_along(points, ranked[other].points, shapes[other], policy)
+                covered |= _runs_along(points, shapes[other], policy)
         kept += [_Line(part, line.style) for part in _runs(points, ~covered)] if covered.any() else [line]
     return [line for line in kept if line.length_m >= 2 * _STEP_M]
 
 
-def _runs_along(points: Array, line: Array, shape: BaseGeometry, policy: TruthPolicy) -> NDArray[np.bool_]:
-    """(M,) whether each point lies within merge_m of a line and has its direction."""
+def _runs_along(points: Array, shape: BaseGeometry, policy: TruthPolicy) -> NDArray[np.bool_]:
+    """(M,) whether each point lies within merge_m beside a line, not beyond its ends, and has its direction."""
     shapely = _shapely()
     probe = shapely.points(points)
     close = shapely.distance(probe, shape) <= policy.merge_m
@@ -159,7 +160,8 @@ def _runs_along(points: Array, line: Array, shape: BaseGeometry, policy: TruthPo
         behind = shapely.get_coordinates(shapely.line_interpolate_point(shape, np.maximum(along - 0.25, 0.0)))
         step = np.gradient(points, axis=0)[close]
         turn = np.abs(_angle(step) - _angle(ahead - behind)) % np.pi
-        close[close] = np.minimum(turn, np.pi - turn) <= policy.merge_heading_rad
+        beside = (along > 1e-6) & (along < shape.length - 1e-6)
+        close[close] = beside & (np.minimum(turn, np.pi - turn) <= policy.merge_heading_rad)
     return close
 
 
@@ -230,8 +232,8 @@ def _middles(marks: Sequence[RoadMark]) -> list[_Line]:
     return lines
 
 
-def _pavement_rings(network: RoadNetwork, policy: TruthPolicy) -> list[Array]:
-    """The outline of the union of all paved lanes and shoulders, without where the network ends."""
+def _pavement_rings(network: RoadNetwork, policy: TruthPolicy) -> list[_Line]:
+    """The outline of the union of all paved lanes and shoulders."""
     shapely = _shapely()
     paved = [lane for lane in network.lanes if lane.kind in ROADWAY and lane.width_m.max() > 0.05]
     strips = shapely.buffer(_grounds(paved), 0.1, join_style="mitre")
@@ -241,9 +243,8 @@ def _pavement_rings(network: RoadNetwork, policy: TruthPolicy) -> list[Array]:
         if part.area < policy.min_island_m2:
             continue
         islands = [ring for ring in part.interiors if shapely.Polygon(ring).area >= policy.min_island_m2]
-        found += [shapely.get_coordinates(ring) for ring in (part.exterior, *islands)]
-    lines = _without_map_ends([_Line(ring, _style("none")) for ring in found], network)
-    return [line.points for line in lines]
+        found += [_Line(shapely.get_coordinates(ring), _style("none")) for ring in (part.exterior, *islands)]
+    return found
 
 
 def _without_map_ends(lines: Sequence[_Line], network: RoadNetwork) -> list[_Line]:
@@ -338,19 +339,28 @@ def _outside(lines: Sequence[_Line], region: BaseGeometry, within: BaseGeometry 
     return kept
 
 
-def _pieces(line: _Line, region: BaseGeometry) -> list[_Line]:
-    return [_Line(part, line.style) for part in _split(line.points, region)]
+def _pieces(line: _Line, region: BaseGeometry, least_m: float) -> list[_Line]:
+    return [_Line(part, line.style) for part in _split(line.points, region, least_m)]
 
 
-def _split(points: Array, region: BaseGeometry) -> list[Array]:
-    """The stretches of a line outside and inside a region, in the line's order."""
+def _split(points: Array, region: BaseGeometry, least_m: float) -> list[Array]:
+    """The stretches of a line outside and inside a region, in the line's order, none cut shorter than least_m."""
     shapely = _shapely()
     shape = shapely.LineString(points)
     if not region.intersects(shape) or region.contains(shape):
         return [points]
-    cuts = shapely.get_parts(shapely.intersection(shape, region.boundary))
-    along = np.array([shape.project(shapely.Point(c)) for c in shapely.get_coordinates(cuts)], np.float64)
-    return _cut_along(points, np.unique(along.round(6)))
+    cuts = shapely.get_coordinates(shapely.intersection(shape, region.boundary))
+    along = np.array([shape.project(shapely.Point(c)) for c in cuts], np.float64)
+    if len(along) and np.linalg.norm(points[0] - points[-1]) < 0.01:
+        # A closed line begins at a cut, not where its file happened to begin.
+        before, *after = _cut_along(points, along.min(keepdims=True))
+        points = np.concatenate((*after, before[1:])) if after else before
+        along = np.mod(along - along.min(), shape.length)
+    kept = [0.0]
+    for s in np.unique(along.round(6)).tolist():
+        if s - kept[-1] >= least_m and shape.length - s >= least_m:
+            kept.append(s)
+    return _cut_along(points, np.array(kept[1:]))
 
 
 def _cut_along(points: Array, along: Array) -> list[Array]:
