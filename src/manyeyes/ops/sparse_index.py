@@ -83,36 +83,50 @@ class NeighbourMap:
         return back[: self.n_in].contiguous()
 
     @cached_property
-    def _ahead(self) -> tuple[Pairs, ...]:
-        """Tap by tap, which input leads to which output; without the middle tap where that is the row itself."""
-        middle = self.index.shape[1] // 2 if self.is_symmetric else -1
+    def _met(self) -> tuple[Tensor, Tensor, list[int]]:
+        """Tap by tap, which input (P,) leads to which output (P,), and how many pairs each tap has.
+
+        Where the map is symmetric, taps before the middle alone: those behind it have the same pairs turned round.
+        """
+        taps = self.index.shape[1] // 2 if self.is_symmetric else self.index.shape[1]
         if _in_loops(self.index):
-            counts = np.empty(self.index.shape[1], np.int64)
-            flat = torch.from_numpy(_pairs_by_tap(self.index.numpy(), self.n_in, middle, counts))
-            source, target = (rows.split(counts.tolist()) for rows in flat)
-        else:
-            by_tap = self.index.T.contiguous()
-            met = by_tap < self.n_in
-            if self.is_symmetric:
-                met[middle] = False
-            sizes = met.sum(1).tolist()
-            source, target = by_tap[met].long().split(sizes), met.nonzero()[:, 1].split(sizes)
-        return tuple(Pairs(tap, s, t) for tap, (s, t) in enumerate(zip(source, target)) if len(s))
+            counts = np.zeros(taps, np.int64)
+            source, target = map(torch.from_numpy, _pairs_by_tap(self.index.numpy(), self.n_in, counts))
+            return source, target, counts.tolist()
+        by_tap = self.index[:, :taps].T.contiguous()
+        met = by_tap < self.n_in
+        return by_tap[met].long(), met.nonzero()[:, 1], met.sum(1).tolist()
+
+    def _cut(self, rows: int) -> list[Block]:
+        """The pairs of every tap, from inputs to outputs, in blocks of so many rows at most, as views."""
+        source, target, counts = self._met
+        sizes = [(tap, min(rows, n - at)) for tap, n in enumerate(counts) for at in range(0, n, rows)]
+        lengths = [size for _, size in sizes]
+        parts = zip(sizes, source.split(lengths), target.split(lengths))
+        blocks = [Block(tap, some, others, size) for (tap, size), some, others in parts]
+        if self.is_symmetric:
+            last = self.index.shape[1] - 1
+            turned = (Block(last - b.tap, b.target, b.source, b.size) for b in blocks)
+            # Within a tap inputs ascend as outputs do: the blocks of a tap turned round stand in the same order.
+            blocks += sorted(turned, key=lambda block: block.tap)
+        return blocks
 
     def blocks(self, rows: int, reverse: bool = False) -> tuple[int, tuple[Block, ...]]:
         """The pairs of every tap in blocks of so many rows at most, and the longest block's rows; cut once and kept."""
         if (rows, reverse) not in self.cut:
-            found = tuple(
-                Block(tap, s, t, s.shape[0])
-                for tap, source, target in self.pairs(reverse)
-                for s, t in zip(source.split(rows), target.split(rows))
-            )
-            self.cut[rows, reverse] = max((block.size for block in found), default=0), found
+            found = self._cut(rows)
+            if reverse:
+                found = [Block(b.tap, b.target, b.source, b.size) for b in found]
+            self.cut[rows, reverse] = max((block.size for block in found), default=0), tuple(found)
         return self.cut[rows, reverse]
 
     def pairs(self, reverse: bool = False) -> tuple[Pairs, ...]:
-        """The pairs of every tap that has any, from inputs to outputs, or turned round."""
-        return tuple(Pairs(p.tap, p.target, p.source) for p in self._ahead) if reverse else self._ahead
+        """The pairs of every tap that has any, from inputs to outputs, or turned round.
+
+        A symmetric map has none by its middle tap, which leads from each row to itself.
+        """
+        whole = self.blocks(max(1, self.index.shape[0]), reverse)[1]
+        return tuple(Pairs(b.tap, b.source, b.target) for b in whole)
 
     def on(self, device: torch.device) -> NeighbourMap:
         """The same map on another device; kept."""
@@ -237,17 +251,15 @@ def _look_up(key, out_rows, out_columns, rows, columns, stride, kernel, dilation
 
 
 @njit(cache=True)
-def _pairs_by_tap(index, n_in, middle, counts):  # pragma: no cover
-    """Rows source, target (2, P) int64, tap by tap; counts (taps,) is filled."""
-    counts[:] = 0
+def _pairs_by_tap(index, n_in, counts):  # pragma: no cover
+    """Rows source and target, (P,) int64 each, of the first taps, tap by tap; counts (taps,), zeros, is filled."""
     for o in range(index.shape[0]):
-        for t in range(index.shape[1]):
-            counts[t] += t != middle and index[o, t] < n_in
-    place = np.cumsum(counts) - counts
-    pairs = np.empty((2, counts.sum()), np.int64)
-    for o in range(index.shape[0]):
-        for t in range(index.shape[1]):
-            if t != middle and index[o, t] < n_in:
-                pairs[0, place[t]], pairs[1, place[t]] = index[o, t], o
-                place[t] += 1
-    return pairs
+        for t in range(counts.shape[0]):
+            counts[t] += index[o, t] < n_in
+    # One place to spare: writing always and moving on only past a pair costs no branch that is guessed wrong.
+    source, target, at = np.empty(counts.sum() + 1, np.int64), np.empty(counts.sum() + 1, np.int64), 0
+    for t in range(counts.shape[0]):
+        for o in range(index.shape[0]):
+            source[at], target[at] = index[o, t], o
+            at += index[o, t] < n_in
+    return source[:at], target[:at]
