@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, MapElements, Polygons
-from manyeyes.maps.baselines import chamfer_nms, union
+from manyeyes.maps.baselines import chamfer_nms, crowdmap_literal, polymerge, union
 from manyeyes.maps.baselines.rules import CLAMP, HIT, MISS, Rules, pool
 from manyeyes.maps.observation import Frame, Observation
 from manyeyes.maps.vector_map import CANDIDATE, PUBLISHED, VectorMap
@@ -34,7 +34,7 @@ def lines_in(made: VectorMap, kind: int = DIVIDER) -> list[np.ndarray]:
     return [made.elements.polyline(i) for i in np.flatnonzero(made.elements.kind == kind)]
 
 
-RIVALS = [union, chamfer_nms]
+RIVALS = [union, chamfer_nms, crowdmap_literal, polymerge]
 
 
 @pytest.mark.parametrize("rival", RIVALS, ids=lambda r: r.__name__.split(".")[-1])
@@ -121,3 +121,39 @@ def test_nms_keeps_the_best_of_lines_on_each_other_and_all_others() -> None:
     assert [round(float(line[0, 1]), 6) for line in lines_in(made)] == [0.0, 0.6, 3.5]
     assert len(lines_in(made, BOUNDARY)) == 1
     assert sorted(made.supporters[made.elements.kind == DIVIDER].tolist()) == [1, 1, 3]
+
+
+def test_the_literal_pipeline_keeps_the_most_confident_or_takes_the_mean_after_registration() -> None:
+    turned = [[x, y + 0.4 + 0.01 * x] for x, y in line(0.0)]
+    many = [seen(0, [line(0.0)], score=0.9), seen(1, [turned]), seen(2, [line(0.3)], score=0.7), seen(3, [line(3.5)])]
+    made = crowdmap_literal.fuse(many)
+    assert [len(made), made.supporters.tolist()] == [2, [3, 1]]
+    assert made.elements.polyline(0).tolist() == line(0.0)
+    mean = crowdmap_literal.fuse(many, crowdmap_literal.Config(merge="mean"))
+    # Registered onto it, the others lie on the anchor: the mean is the anchor, not the middle of the offsets.
+    assert np.abs(mean.elements.polyline(0)[:, 1]).max() < 0.05 and len(mean.elements.polyline(0)) == 50
+
+
+def test_the_literal_pipeline_has_no_edge_between_a_line_and_its_part() -> None:
+    made = crowdmap_literal.fuse([seen(0, [line(0.0)]), seen(1, [line(0.0, 0, 15)])])
+    assert len(made) == 2
+
+
+def test_lines_fold_into_middles_where_they_face_and_lengthen_each_other_beyond() -> None:
+    whole = polymerge.fold(np.array(line(0.0, 0, 10, 3)), np.array(line(1.0, 8, 20, 4)[::-1]))
+    # At 5 m nothing faces the line; 8 and 10 face each other; 12 and on are beyond.
+    assert whole.tolist() == [[0, 0], [5, 0], [8, 0.5], [10, 0.5], [12, 1], [16, 1], [20, 1]]
+
+
+def test_polymerge_chains_lines_that_touch_and_keeps_others_apart() -> None:
+    many = [seen(0, [line(0.0, 0, 20)]), seen(1, [line(0.5, 10, 40)]), seen(2, [line(3.5)])]
+    first, second = lines_in(polymerge.fuse(many))
+    assert sorted((first[0, 0], first[-1, 0])) == [0.0, 40.0] and second[0, 1] == 3.5
+    bridge = seen(3, [[[5.0, 0.0], [20.0, 3.5]]])
+    assert len(lines_in(polymerge.fuse([*many, bridge]))) == 1
+
+
+def test_polymerge_draws_crossings_and_takes_what_most_agree_on() -> None:
+    rings = [np.array(SQUARE) + (dx, 0.0) for dx in (-0.5, 0.0, 0.5)]
+    (ring,) = lines_in(polymerge.fuse([seen(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING)
+    assert np.allclose(ring.min(0), [20.0, -4.0], atol=0.15) and np.allclose(ring.max(0), [24.0, 4.0], atol=0.15)

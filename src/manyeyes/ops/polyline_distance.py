@@ -25,7 +25,12 @@ def chamfer(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> 
 
 def directed(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> tuple[Floats, Floats]:
     """(K,) the mean and (K,) the greatest distance from the points of a's line to the segments of b's."""
-    return _directed(*_columns(a, a_first, b, b_first), frozen(pairs, np.int64))
+    return _directed(*_columns(a, a_first, b, b_first), frozen(pairs, np.int64))[:2]
+
+
+def nearest(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> Floats:
+    """(K,) the least distance from a point of a's line to a segment of b's."""
+    return _directed(*_columns(a, a_first, b, b_first), frozen(pairs, np.int64))[2]
 
 
 def frechet(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints, either_way: bool = True) -> Floats:
@@ -63,7 +68,7 @@ def _chamfer(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
 
 @numba.njit(cache=True)
 def _directed(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
-    mean, most = np.empty(len(pairs)), np.zeros(len(pairs))
+    mean, most, least = np.empty(len(pairs)), np.zeros(len(pairs)), np.full(len(pairs), np.inf)
     for k in range(len(pairs)):
         i, j = pairs[k]
         total = 0.0
@@ -79,8 +84,9 @@ def _directed(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
                 best = min(best, (ex - share * dx) ** 2 + (ey - share * dy) ** 2)
             total += np.sqrt(best)
             most[k] = max(most[k], np.sqrt(best))
+            least[k] = min(least[k], np.sqrt(best))
         mean[k] = total / max(a_first[i + 1] - a_first[i], 1)
-    return mean, most
+    return mean, most, least
 
 
 @numba.njit(cache=True)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rigid coherent point drift in the plane (Myronenko and Song, IEEE TPAMI 32(12), 2010, Fig. 2), with or without scale."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes.map_element import frozen
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CpdConfig:
+    """scaled: whether a scale is estimated too; the paper's registration is without. outlier: w, the share of uniform noise.
+
+    sigma_m: start of the annealed sigma, metres; None: from the spread of both sets, as published. tolerance: of the change of
+    sigma squared, square metres, at which it ends; iterations: at most. max_shift_m: a result that moves the mean of the
+    points farther is refused (no motion); None: any.
+    """
+
+    scaled: bool = False
+    outlier: float = 0.0
+    sigma_m: float | None = None
+    tolerance: float = 1e-5
+    iterations: int = 100
+    max_shift_m: float | None = None
+
+
+@dataclass(frozen=True)
+class Drift:
+    """y to ``scale * y @ rotation.T + shift``; iterations: how many it took."""
+
+    scale: float
+    rotation: Floats
+    shift: Floats
+    iterations: int
+
+    def apply(self, points: Floats) -> Floats:
+        """(K, 2) points moved."""
+        return self.scale * points @ self.rotation.T + self.shift
+
+
+def register(target: Floats, source: Floats, config: CpdConfig = CpdConfig()) -> Drift:
+    """The motion that brings source (M, 2) onto target (N, 2)."""
+    # About the target's mean: far from the origin the squares would lose what is looked for.
+    centre = target.mean(0)
+    x, y = frozen(target - centre, np.float64), frozen(source - centre, np.float64)
+    start = -1.0 if config.sigma_m is None else config.sigma_m**2
+    scale, angle, u, v, count = _drift(x, y, config.scaled, config.outlier, start, config.tolerance, config.iterations)
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = np.array([[c, -s], [s, c]])
+    found = Drift(scale, rotation, np.array([u, v]) + centre - scale * rotation @ centre, count)
+    moved = found.apply(source).mean(0) - source.mean(0)
+    if config.max_shift_m is not None and np.hypot(*moved) > config.max_shift_m:
+        return Drift(1.0, np.eye(2), np.zeros(2), count)
+    return found
+
+
+@numba.njit(cache=True)
+def _drift(x, y, scaled, outlier, start, tolerance, most):  # pragma: no cover - compiled
+    n, m = len(x), len(y)
+    scale, c, s, u, v = 1.0, 1.0, 0.0, 0.0, 0.0
+    variance = start
+    if variance < 0.0:
+        variance = 0.0
+        for i in range(n):
+            for j in range(m):
+                variance += (x[i, 0] - y[j, 0]) ** 2 + (x[i, 1] - y[j, 1]) ** 2
+        variance /= 2.0 * n * m
+    weight = np.empty(m)
+    count = 0
+    while count < most and variance > 1e-12:
+        count += 1
+        uniform = 2.0 * np.pi * variance * outlier / (1.0 - outlier) * m / n
+        # Sums over the posterior p(j | i): of itself, of x, of y, of their products.
+        total, sx, sy, tx, ty = 0.0, 0.0, 0.0, 0.0, 0.0
+        xx, yy, cross_c, cross_s = 0.0, 0.0, 0.0, 0.0
+        for i in range(n):
+            least = np.inf
+            for j in range(m):
+                dx = x[i, 0] - scale * (c * y[j, 0] - s * y[j, 1]) - u
+                dy = x[i, 1] - scale * (s * y[j, 0] + c * y[j, 1]) - v
+                weight[j] = (dx * dx + dy * dy) / (2.0 * variance)
+                least = min(least, weight[j])
+            # Relative to the nearest, so that nothing underflows; what is e^40 times less likely is nothing.
+            below = uniform * np.exp(min(least, 700.0)) if uniform > 0.0 else 0.0
+            mass, mx, my, mm = 0.0, 0.0, 0.0, 0.0
+            for j in range(m):
+                if weight[j] - least < 40.0:
+                    w = np.exp(least - weight[j])
+                    mass += w
+                    mx += w * y[j, 0]
+                    my += w * y[j, 1]
+                    mm += w * (y[j, 0] ** 2 + y[j, 1] ** 2)
+            below += mass
+            p, mx, my = mass / below, mx / below, my / below
+            total += p
+            sx += p * x[i, 0]
+            sy += p * x[i, 1]
+            tx += mx
+            ty += my
+            xx += p * (x[i, 0] ** 2 + x[i, 1] ** 2)
+            yy += mm / below
+            cross_c += x[i, 0] * mx + x[i, 1] * my
+            cross_s += x[i, 1] * mx - x[i, 0] * my
+        if total <= 1e-12:
+            break
+        sx, sy, tx, ty = sx / total, sy / total, tx / total, ty / total
+        xx -= total * (sx * sx + sy * sy)
+        yy -= total * (tx * tx + ty * ty)
+        cross_c -= total * (sx * tx + sy * ty)
+        cross_s -= total * (sy * tx - sx * ty)
+        # In the plane the best rotation is an angle: the SVD of the paper in closed form.
+        length = np.hypot(cross_c, cross_s)
+        c, s = (cross_c / length, cross_s / length) if length > 0.0 else (1.0, 0.0)
+        scale = length / yy if scaled and yy > 0.0 else 1.0
+        u, v = sx - scale * (c * tx - s * ty), sy - scale * (s * tx + c * ty)
+        before = variance
+        variance = max((xx + scale * scale * yy - 2.0 * scale * length) / (2.0 * total), 0.0)
+        if abs(before - variance) < tolerance:
+            break
+    return scale, np.arctan2(s, c), u, v, count
