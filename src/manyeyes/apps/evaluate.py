@@ -24,9 +24,9 @@ class Options:
     """Which recording, which methods, whose rules."""
 
     data: Path
-    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario."""
+    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario; or a root in DAIR-V2X's layout."""
     split: str | None = None
-    """Which split of a dataset: a folder inside it, such as test."""
+    """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
     out: Path = Path("out/evaluate")
     """Folder for results.json and results.md."""
     protocol: str = "manyeyes"
@@ -53,10 +53,10 @@ def main(options: Options) -> None:
 
     from manyeyes.apps import provenance
     from manyeyes.apps.outcome import outcome_of, show
+    from manyeyes.apps.recordings import open_recording, with_patience
     from manyeyes.apps.showcase import bars, write_text
     from manyeyes.apps.viewer.table import DIFFERENCE_HEADINGS, difference_cells, markdown, markdown_lines
     from manyeyes.datasets.disturb import PoseNoise
-    from manyeyes.datasets.opv2v import Opv2vRecording
     from manyeyes.evaluation.benchmark import BenchmarkConfig, benchmark, judging_protocol
     from manyeyes.models import zoo
 
@@ -71,15 +71,14 @@ def main(options: Options) -> None:
         noise=noise if disturbed else None,
     )
     protocol, detector = judging_protocol(config), zoo.load(config.weights)
-    open_recording = partial(Opv2vRecording, options.data, options.split)
-    recording = open_recording()
+    opener = partial(open_recording, options.data, options.split)
+    recording = opener()
+    config = replace(config, replay=with_patience(config.replay, options.playing, recording))
     for problem in recording.problems:
         console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
     with bars(console) as progress:
         task = progress.add_task("Judging", total=len(recording.scenarios))
-        results = benchmark(
-            open_recording, config, options.workers, lambda done, total: progress.update(task, completed=done)
-        )
+        results = benchmark(opener, config, options.workers, lambda done, total: progress.update(task, completed=done))
     timed = [_timed(r, recording, detector, config.replay, options.timed_frames) for r in results]
     outcome = outcome_of(timed, protocol)
     where = f"{options.data.name}{f'/{options.split}' if options.split else ''}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replays your own recording in OPV2V's layout with every method: table, pictures, animation, report, JSON."""
+"""Replays your own recording, in OPV2V's or DAIR-V2X's layout, with every method: table, pictures, animation, report, JSON."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Options:
     """Which drive, and how it is played."""
 
     recording: tyro.conf.Positional[Path]
-    """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout."""
+    """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout; or a root in DAIR-V2X's."""
     split: str | None = None
-    """Which split of a dataset: a folder inside it, such as test."""
+    """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
     scenario: str | None = None
     """Which scenario; the first by default."""
     frames: int = 60
@@ -41,13 +41,13 @@ def main(options: Options) -> None:
     """The verb."""
     from rich.console import Console
 
+    from manyeyes.apps.recordings import open_recording, with_patience
     from manyeyes.apps.showcase import Showing, play
-    from manyeyes.datasets.opv2v import Opv2vRecording
     from manyeyes.models import zoo
 
     console = Console()
     replay = options.playing.replay_config(options.seed)
-    recording = Opv2vRecording(options.recording, options.split)
+    recording = open_recording(options.recording, options.split)
     for problem in recording.problems:
         console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
     drive = excerpt(recording, options.scenario, options.frames)
@@ -57,7 +57,7 @@ def main(options: Options) -> None:
         title=f"{options.recording.name}: {drive.scenario}",
         lead="A recording, replayed: every agent shares bytes and perceives, as it would on the road.",
         methods=options.playing.methods,
-        replay=replay,
+        replay=with_patience(replay, options.playing, recording),
         weights=weights_name(options.playing.weights),
         frame=options.frame,
         animate=options.animate,

@@ -26,9 +26,9 @@ class Options:
     """What to draw."""
 
     recording: tyro.conf.Positional[Path]
-    """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout."""
+    """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout; or a root in DAIR-V2X's."""
     split: str | None = None
-    """Which split of a dataset: a folder inside it, such as test."""
+    """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
     scenario: str | None = None
     """Which scenario; the first by default."""
     frame: int | None = None
@@ -53,13 +53,13 @@ def main(options: Options) -> None:
     """The verb."""
     from rich.console import Console
 
+    from manyeyes.apps.recordings import open_recording
     from manyeyes.apps.viewer.animation import save_animation
     from manyeyes.apps.viewer.birds_eye import save_png
-    from manyeyes.datasets.opv2v import Opv2vRecording
 
     if options.out.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"--out ends in {', '.join(SUFFIXES)}; got {options.out.name}.")
-    drive = excerpt(Opv2vRecording(options.recording, options.split), options.scenario)
+    drive = excerpt(open_recording(options.recording, options.split), options.scenario)
     single = options.out.suffix.lower() == ".png"
     first = drive.judged(drive.scenario).start if options.frame is None else options.frame
     last = min(drive.length(drive.scenario), first + (1 if single else options.frames))
@@ -79,7 +79,7 @@ def _images(options: Options, drive: Excerpt, indices: range) -> list[Image]:
     grid = BevGrid(-options.reach_m[0], -options.reach_m[1], -5.0, *options.reach_m, 6.0)
     found = [Boxes.empty()] * len(snapshots)
     if options.detect is not None:
-        grid, found = _detections(options, snapshots)
+        grid, found = _detections(options, drive, snapshots)
     images = []
     for snapshot, boxes in zip(snapshots, found):
         caption = f"frame {snapshot.index} · {len(snapshot.frames)} agents"
@@ -89,15 +89,16 @@ def _images(options: Options, drive: Excerpt, indices: range) -> list[Image]:
     return images
 
 
-def _detections(options: Options, snapshots: list[Snapshot]) -> tuple[BevGrid, list[Boxes]]:
+def _detections(options: Options, drive: Excerpt, snapshots: list[Snapshot]) -> tuple[BevGrid, list[Boxes]]:
     """The detector's range, and what the ego finds at each instant."""
     from dataclasses import replace
 
     from manyeyes.agents.replay import Team
+    from manyeyes.apps.recordings import with_patience
     from manyeyes.models import zoo
 
     playing = replace(options.playing, methods=(str(options.detect),))
-    config: ReplayConfig = playing.replay_config(0)
+    config: ReplayConfig = with_patience(playing.replay_config(0), playing, drive.recording)
     detector = zoo.load(playing.weights)
     team = Team(playing.methods[0], detector, config)
     return detector.config.grid, [step.boxes for snapshot in snapshots for step in team.step(snapshot)]

@@ -21,6 +21,7 @@ import torch
 
 from manyeyes.datasets.cache import ArrayCache, default_cache_folder
 from manyeyes.datasets.carla import carla_from_transform, mirror_points, transform_from_carla
+from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, height_above_ground
 from manyeyes.datasets.opv2v_yaml import (
     AgentRecord,
     Protocol,
@@ -35,8 +36,6 @@ from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, RecordingError, Sn
 
 _AGENT = re.compile(r"-?\d+")
 _KMH = 3.6
-_DEFAULT_HEIGHT_M = 1.9
-_PLAUSIBLE_HEIGHT_M = (0.3, 20.0)
 _KEPT_RECORDS = 20_000
 
 
@@ -163,7 +162,7 @@ class Opv2vRecording:
         if stated is not None:
             return stated
         if agent.folder not in self._heights:
-            self._heights[agent.folder] = _height_above_ground(self._cloud(agent, min(agent.stems)).xyz)
+            self._heights[agent.folder] = height_above_ground(self._cloud(agent, min(agent.stems)).xyz)
         return self._heights[agent.folder]
 
 
@@ -173,18 +172,8 @@ def _stated_height(record: AgentRecord, world_from_lidar: Transform) -> float | 
     offset = world_from_lidar.translation - transform_from_carla(record.ego_pose).translation
     # Along the LiDAR's axis, not the world's: exact on a slope, with the LiDAR mounted before or behind the middle.
     height = float(offset @ world_from_lidar.rotation[:, 2])
-    low, high = _PLAUSIBLE_HEIGHT_M
+    low, high = PLAUSIBLE_HEIGHT_M
     return height if low <= height <= high and float(offset.norm()) <= high else None
-
-
-def _height_above_ground(xyz: np.ndarray) -> float:
-    """The height that puts the road at z = 0: the lowest twentieth of what is below the sensor within 25 m."""
-    low, high = _PLAUSIBLE_HEIGHT_M
-    near = xyz[(np.hypot(xyz[:, 0], xyz[:, 1]) < 25) & (xyz[:, 2] < -low), 2]
-    if len(near) < 100:
-        return _DEFAULT_HEIGHT_M
-    height = -float(np.percentile(near, 5))
-    return height if low <= height <= high else _DEFAULT_HEIGHT_M
 
 
 def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> Truth:

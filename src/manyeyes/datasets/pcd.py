@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point Cloud Data files, version 0.7: ascii, binary and binary_compressed in, binary out.
+"""Point Cloud Data files, version 0.7: ascii, binary and binary_compressed in, the last two out.
 
 Points are given in the file's own frame: which axes and which hand that is, the reader of the recording knows.
 """
@@ -16,6 +16,7 @@ from manyeyes.datasets.cache import ArrayCache, write_whole
 from manyeyes.datatypes import RecordingError
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
+_LETTERS = {kind: letter for letter, kind in _KINDS.items()}
 _ENCODINGS = ("ascii", "binary", "binary_compressed")
 _REMEDY = "copy or download the file again"
 
@@ -99,6 +100,29 @@ def write_pcd(path: Path, xyz: np.ndarray, intensity: np.ndarray) -> None:
         f"COUNT 1 1 1 1\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA binary\n"
     )
     write_whole(path, header.encode(), record.tobytes())
+
+
+def write_table(path: Path, table: PcdTable) -> None:
+    """Write every field (N,) in its own type, one field after the other, as ``DATA binary_compressed``."""
+    from manyeyes.datasets.lzf import lzf_compress
+
+    columns = [np.ascontiguousarray(c, c.dtype.newbyteorder("<")) for c in table.columns]
+    sizes = {c.shape for c in columns}
+    if len(sizes) != 1 or len(next(iter(sizes))) != 1 or len(columns) != len(table.names):
+        raise RecordingError(
+            f"{path}: expected one column (N,) for each of {' '.join(table.names)}; got shapes "
+            f"{', '.join(str(c.shape) for c in columns)}: give columns of one length."
+        )
+    plain = b"".join(c.tobytes() for c in columns)
+    packed = lzf_compress(plain) if plain else b""
+    n = len(columns[0])
+    header = (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {' '.join(table.names)}\n"
+        f"SIZE {' '.join(str(c.dtype.itemsize) for c in columns)}\n"
+        f"TYPE {' '.join(_LETTERS[c.dtype.kind] for c in columns)}\nCOUNT {' '.join('1' for _ in columns)}\n"
+        f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA binary_compressed\n"
+    )
+    write_whole(path, header.encode(), np.array([len(packed), len(plain)], "<u4").tobytes(), packed)
 
 
 def _read(path: Path) -> tuple[_Header, PcdTable]:

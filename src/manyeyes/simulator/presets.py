@@ -6,9 +6,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.simulator.dair import record_dair
 from manyeyes.simulator.record import Job, Progress, record
 from manyeyes.simulator.scenario import ScenarioSpec
 from manyeyes.simulator.towns import GENERATED, TOWN_SPLIT, assert_disjoint_split, find_town
@@ -29,6 +31,7 @@ class SimulationPreset:
 
     vehicles: least and most connected vehicles of a scene. roadside_chance: of a unit on a pole, which always takes part
     where there is one vehicle only. stand_in: generated roads where a town is not found; None makes that an error.
+    layout: of the files; dair takes one vehicle and the unit, and judges every pair.
     """
 
     splits: tuple[SplitPreset, ...]
@@ -40,6 +43,7 @@ class SimulationPreset:
     roadside_lidar: str = "opv2v-roadside"
     min_vehicles: int = 16
     stand_in: str | None = None
+    layout: Literal["opv2v", "dair"] = "opv2v"
 
     def __post_init__(self) -> None:
         assert_disjoint_split({part.split: part.towns for part in self.splits})
@@ -72,6 +76,22 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
         vehicles=(3, 3),
         roadside_chance=1.0,
         stand_in="generated-5",
+    ),
+    # The split's names are DAIR-V2X's own. Generated roads: it needs no file.
+    "dair-crossing": SimulationPreset(
+        (
+            SplitPreset("train", ("generated-1", "generated-4", "generated-6", "generated-7"), 24),
+            SplitPreset("val", ("generated-2", "generated-8"), 8),
+            SplitPreset("test", ("generated-3", "generated-9"), 8),
+        ),
+        frames=10,
+        history_frames=0,
+        vehicles=(1, 1),
+        roadside_chance=1.0,
+        lidar="dair-vehicle",
+        roadside_lidar="dair-infrastructure",
+        min_vehicles=8,
+        layout="dair",
     ),
 }
 
@@ -131,4 +151,5 @@ def simulate(
     """Make a preset's recording under a folder; the path of its manifest. towns: where roads are looked for first."""
     place = None if towns is None else str(towns)
     jobs = jobs_of(simulation_preset(preset), seed, place)
-    return record(jobs, out, workers, progress, {"preset": preset, "seed": seed})
+    write = record_dair if simulation_preset(preset).layout == "dair" else record
+    return write(jobs, out, workers, progress, {"preset": preset, "seed": seed})

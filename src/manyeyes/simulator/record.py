@@ -9,12 +9,13 @@ import multiprocessing
 import os
 import platform
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -29,6 +30,7 @@ MANIFEST = "manifest.json"
 _ENTRY = "scenario.json"
 _STEP_S = 0.05
 _ATTEMPTS = 40
+JobT = TypeVar("JobT")
 
 
 @dataclass(frozen=True)
@@ -93,29 +95,31 @@ def record(
         raise ConfigError("Two scenarios of one split have one name; give each its own.")
     root.mkdir(parents=True, exist_ok=True)
     entries: dict[tuple[str, str], Entry] = {}
-    for count, (job, entry) in enumerate(_run(jobs, root, workers), 1):
+    for count, (job, entry) in enumerate(run_jobs(record_scenario, jobs, root, workers), 1):
         entries[job.split, job.spec.name] = entry
         if progress is not None:
             progress(Progress(count, len(jobs), f"{job.split}/{job.spec.name}"))
     content = {
         "format": "OPV2V",
         "settings": settings or {},
-        "versions": _versions(),
+        "versions": versions(),
         "scenarios": [asdict(entries[name]) for name in names],
     }
-    _write_json(root / MANIFEST, content)
+    write_json(root / MANIFEST, content)
     return root / MANIFEST
 
 
-def _run(jobs: list[Job], root: Path, workers: int) -> Iterator[tuple[Job, Entry]]:
-    """Finished jobs, in whatever order."""
+def run_jobs(
+    work: Callable[[JobT, Path], Entry], jobs: Sequence[JobT], root: Path, workers: int
+) -> Iterator[tuple[JobT, Entry]]:
+    """Finished jobs, in whatever order; work is a function of its module, for it is sent to other processes."""
     if workers == 1:
         for job in jobs:
-            yield job, record_scenario(job, root)
+            yield job, work(job, root)
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, max(1, len(jobs))), context, _start_worker) as pool:
-        running: dict[Future[Entry], Job] = {pool.submit(record_scenario, job, root): job for job in jobs}
+        running: dict[Future[Entry], JobT] = {pool.submit(work, job, root): job for job in jobs}
         try:
             while running:
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -144,11 +148,10 @@ def record_scenario(job: Job, root: Path) -> Entry:
     for stale in (folder, folder.with_name(f"{folder.name}.partial")):
         if stale.exists():
             shutil.rmtree(stale)
-    scenario = _first_scene(job)
+    scenario = first_scene(job.spec, job.towns)
     partial = folder.with_name(f"{folder.name}.partial")
     points = _write(scenario, partial)
     files = sorted(p for p in partial.rglob("*") if p.is_file())
-    lines = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(partial).as_posix()}" for p in files]
     agents = (*scenario.agents, *((-1,) if scenario.roadside is not None else ()))
     entry = Entry(
         split=job.split,
@@ -164,23 +167,33 @@ def record_scenario(job: Job, root: Path) -> Entry:
         returns=points // (len(agents) * len(scenario)),
         files=len(files),
         bytes=sum(p.stat().st_size for p in files),
-        sha256=hashlib.sha256("\n".join(lines).encode()).hexdigest(),
+        sha256=digest_of(files, partial),
     )
-    _write_json(partial / _ENTRY, {"spec": asdict(job.spec), "entry": asdict(entry)})
+    write_json(partial / _ENTRY, {"spec": asdict(job.spec), "entry": asdict(entry)})
     partial.rename(folder)
     return entry
 
 
-def _first_scene(job: Job) -> Scenario:
-    """The scenario of the first of the seeds s, s + 1, … whose traffic offers one."""
-    network = _network(job.spec.town, job.towns)
+def digest_of(files: list[Path], folder: Path) -> str:
+    """What Entry.sha256 is, of files below a folder."""
+    lines = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(folder).as_posix()}" for p in files]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def first_scene(spec: ScenarioSpec, towns: str | None, roadside: bool = False) -> Scenario:
+    """The scenario of the first of the seeds s, s + 1, … whose traffic offers one; roadside: with a unit on a pole."""
+    network = _network(spec.town, towns)
     reason = ""
     for attempt in range(_ATTEMPTS):
         try:
-            return make_scenario(replace(job.spec, seed=job.spec.seed + attempt), network)
+            scenario = make_scenario(replace(spec, seed=spec.seed + attempt), network)
         except NoSceneError as error:
             reason = str(error)
-    raise NoSceneError(f"{job.spec.name}: none of {_ATTEMPTS} seeds gives a scene in {job.spec.town}; last: {reason}")
+            continue
+        if scenario.roadside is not None or not roadside:
+            return scenario
+        reason = f"seed {spec.seed + attempt} has no place for a pole"
+    raise NoSceneError(f"{spec.name}: none of {_ATTEMPTS} seeds gives a scene in {spec.town}; last: {reason}")
 
 
 def _write(scenario: Scenario, folder: Path) -> int:
@@ -219,7 +232,8 @@ def _kept(folder: Path, spec: ScenarioSpec) -> Entry | None:
         raise RecordingError(f"{path}: expected what a recording run writes; {error}: remove the folder.") from error
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Of Python and of the packages that a recording depends on."""
     found = {"python": platform.python_version()}
     for package in ("manyeyes", "numpy", "numba", "torch", "libsumo"):
         try:
@@ -229,7 +243,8 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _write_json(path: Path, content: object) -> None:
+def write_json(path: Path, content: object) -> None:
+    """Write a file whole or not at all."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_text(json.dumps(content, indent=1) + "\n")
     temporary.replace(path)

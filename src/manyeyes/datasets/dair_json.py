@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What DAIR-V2X's JSON files say: numbers that may be strings, calibrations, labels of one side and of both.
+
+Lengths are metres and angles radians on disk. Vehicles are ``Car``, ``Van``, ``Truck`` and ``Bus``, in any case of
+letters; everything else is left out, and so is a box without size, as in the official reader.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from manyeyes.datatypes import LABELS, Boxes, RecordingError, Transform
+
+REMEDY = "copy or download the file again"
+# Published calibrations are rounded; a mirrored or sheared one is farther off than this.
+_NOT_A_ROTATION = 0.02
+
+
+def load_json(path: Path) -> Any:
+    """The content of a JSON file."""
+    try:
+        return json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: no such file, expected JSON; {REMEDY}.") from None
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}), expected JSON; {REMEDY}.") from None
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise RecordingError(f"{path}: expected JSON, found something else ({reason}); {REMEDY}.") from None
+
+
+def load_list(path: Path) -> list[Mapping[str, Any]]:
+    """The objects of a JSON file that holds a list of them."""
+    content = load_json(path)
+    if not isinstance(content, list) or not all(isinstance(entry, Mapping) for entry in content):
+        found = type(content).__name__ if not isinstance(content, list) else "other things in it"
+        raise RecordingError(f"{path}: expected a list of JSON objects, found {found}; {REMEDY}.")
+    return content
+
+
+def field_of(path: Path, content: Any, key: str, where: str = "") -> Any:
+    """The value of a key that has to be there."""
+    if not isinstance(content, Mapping) or key not in content:
+        raise RecordingError(f"{path}: expected the key '{_name(where, key)}', found none; {REMEDY}.")
+    return content[key]
+
+
+def text_of(path: Path, content: Any, key: str, where: str = "") -> str:
+    """A value that has to be a text with something in it."""
+    found = field_of(path, content, key, where)
+    if not isinstance(found, str) or not found:
+        raise RecordingError(f"{path}: expected a text at '{_name(where, key)}', found {found!r}; {REMEDY}.")
+    return found
+
+
+def number_of(path: Path, content: Any, key: str, where: str = "", blank: float | None = None) -> float:
+    """A finite number, written as such or as a string; blank: what an empty string stands for, None: an error."""
+    found = field_of(path, content, key, where)
+    if found == "" and blank is not None:
+        return blank
+    value = _number(found)
+    if value is None:
+        raise RecordingError(f"{path}: expected a number at '{_name(where, key)}', found {found!r}; {REMEDY}.")
+    return value
+
+
+def _name(where: str, key: str) -> str:
+    return f"{where}.{key}" if where else key
+
+
+def _number(found: object) -> float | None:
+    if isinstance(found, bool) or not isinstance(found, (int, float, str)):
+        return None
+    try:
+        value = float(found)
+    except (ValueError, OverflowError):
+        return None
+    return value if np.isfinite(value) else None
+
+
+def _array(path: Path, found: object, shape: tuple[int, ...], name: str) -> np.ndarray:
+    """An array of the shape, from nested lists of numbers or strings in any nesting of as many."""
+    values = _flat(found)
+    if values is None or len(values) != int(np.prod(shape)):
+        what = " x ".join(map(str, shape))
+        shown = repr(found)
+        shown = shown if len(shown) <= 80 else f"{shown[:77]}..."
+        raise RecordingError(f"{path}: expected {what} finite numbers at '{name}', found {shown}; {REMEDY}.")
+    return np.asarray(values, np.float64).reshape(shape)
+
+
+def _flat(found: object) -> list[float] | None:
+    if isinstance(found, Sequence) and not isinstance(found, str):
+        parts = [_flat(entry) for entry in found]
+        return None if any(part is None for part in parts) else [v for part in parts for v in part or ()]
+    value = _number(found)
+    return None if value is None else [value]
+
+
+def read_calibration(path: Path) -> Transform:
+    """target_from_source of ``{rotation, translation}``, or of such a thing under ``transform``; float64.
+
+    The rotation is replaced by the nearest true one, because published matrices are rounded.
+    """
+    return _motion(path, load_json(path))
+
+
+def _motion(path: Path, content: Any) -> Transform:
+    inner = content.get("transform", content) if isinstance(content, Mapping) else content
+    where = "transform" if inner is not content else ""
+    rotation = _array(path, field_of(path, inner, "rotation", where), (3, 3), _name(where, "rotation"))
+    translation = _array(path, field_of(path, inner, "translation", where), (3,), _name(where, "translation"))
+    left, scale, right = np.linalg.svd(rotation)
+    if np.abs(scale - 1).max() > _NOT_A_ROTATION or np.linalg.det(rotation) < 0:
+        raise RecordingError(
+            f"{path}: '{_name(where, 'rotation')}' is no rotation (singular values {np.round(scale, 3).tolist()}, "
+            f"determinant {np.linalg.det(rotation):.3f}), expected an orthonormal, right-handed matrix; {REMEDY}."
+        )
+    return Transform(torch.from_numpy(left @ right), torch.from_numpy(translation))
+
+
+def read_infrastructure_calibration(path: Path) -> tuple[Transform, tuple[float, float]]:
+    """world_from_virtuallidar, and its ``relative_error``: metres along the world's x and y, 0 where it is blank."""
+    content = load_json(path)
+    error = content.get("relative_error") if isinstance(content, Mapping) else None
+    return _motion(path, content), offset_of(path, error or None, "relative_error") or (0.0, 0.0)
+
+
+def offset_of(path: Path, found: Any, where: str) -> tuple[float, float] | None:
+    """``{delta_x, delta_y}`` in metres; None where there is none, or where an empty string stands for it."""
+    if found is None or found == "":
+        return None
+    return number_of(path, found, "delta_x", where, 0.0), number_of(path, found, "delta_y", where, 0.0)
+
+
+def read_side_labels(path: Path) -> Boxes:
+    """Vehicles that one side lists, in its LiDAR's frame, float64: ``3d_location`` is the middle, ``rotation`` the yaw."""
+    places: list[list[float]] = []
+    kept: list[tuple[int, int]] = []
+    for row, entry, label in _vehicles(path):
+        size = _size(path, entry, row)
+        if min(size) <= 0:
+            continue
+        location = field_of(path, entry, "3d_location", f"[{row}]")
+        middle = [number_of(path, location, axis, f"[{row}].3d_location") for axis in "xyz"]
+        places.append([*middle, *size, number_of(path, entry, "rotation", f"[{row}]")])
+        kept.append((label, _track(path, entry, row)))
+    table = torch.tensor(places, dtype=torch.float64).reshape(-1, 7)
+    return _boxes(table[:, :3], table[:, 3:6], table[:, 6], kept)
+
+
+def read_world_labels(path: Path) -> Boxes:
+    """Vehicles of a cooperative label in the world frame, float64, by ``world_8_points`` alone.
+
+    The corners run front left, front right, rear right, rear left at the bottom, then the same at the top; ``rotation``,
+    ``3d_location`` and ``3d_dimensions`` of these files are not those of the world.
+    """
+    corners: list[np.ndarray] = []
+    kept: list[tuple[int, int]] = []
+    for row, entry, label in _vehicles(path):
+        where = f"[{row}].world_8_points"
+        found = _array(path, field_of(path, entry, "world_8_points", f"[{row}]"), (8, 3), where)
+        if not np.ptp(found, axis=0).any():
+            continue
+        corners.append(found)
+        kept.append((label, _track(path, entry, row)))
+        _check_corners(path, found, where)
+    table = torch.from_numpy(np.stack(corners)) if corners else torch.zeros(0, 8, 3, dtype=torch.float64)
+    ahead, aside, up = _axes(table)
+    size = torch.stack((ahead.norm(dim=-1), aside.norm(dim=-1), up.norm(dim=-1)), -1)
+    return _boxes(table.mean(1), size, torch.atan2(ahead[:, 1], ahead[:, 0]), kept)
+
+
+def _axes(corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Edges (N, 3) of boxes' corners (N, 8, 3): from rear to front, from right to left, from bottom to top."""
+
+    def edge(to: list[int], start: list[int]) -> torch.Tensor:
+        return corners[:, to].mean(1) - corners[:, start].mean(1)
+
+    return edge([0, 1, 4, 5], [2, 3, 6, 7]), edge([0, 3, 4, 7], [1, 2, 5, 6]), edge([4, 5, 6, 7], [0, 1, 2, 3])
+
+
+def _check_corners(path: Path, corners: np.ndarray, where: str) -> None:
+    """Refuse corners in another order: they would give a mirrored, tilted or upturned box without a word."""
+    ahead, aside, up = (axis[0].numpy() for axis in _axes(torch.from_numpy(corners[None])))
+    volume = float(np.linalg.det(np.stack((ahead, aside, up))))
+    full = float(np.linalg.norm(ahead) * np.linalg.norm(aside) * np.linalg.norm(up))
+    if up[2] <= 0 or volume < 0.9 * full:
+        raise RecordingError(
+            f"{path}: expected at '{where}' the corners front left, front right, rear right, rear left at the bottom, "
+            f"then at the top; found edges ahead {np.round(ahead, 2).tolist()}, to the left {np.round(aside, 2).tolist()}, "
+            f"up {np.round(up, 2).tolist()}; {REMEDY}."
+        )
+
+
+def _vehicles(path: Path) -> list[tuple[int, Mapping[str, Any], int]]:
+    """Row, entry and index into LABELS of every vehicle in a label file."""
+    found = []
+    for row, entry in enumerate(load_list(path)):
+        name = text_of(path, entry, "type", f"[{row}]").lower()
+        if name in LABELS:
+            found.append((row, entry, LABELS.index(name)))
+    return found
+
+
+def _size(path: Path, entry: Mapping[str, Any], row: int) -> list[float]:
+    sizes = field_of(path, entry, "3d_dimensions", f"[{row}]")
+    return [number_of(path, sizes, axis, f"[{row}].3d_dimensions") for axis in "lwh"]
+
+
+def _track(path: Path, entry: Mapping[str, Any], row: int) -> int:
+    """``track_id`` (V2X-Seq), or -1 where there is none."""
+    if entry.get("track_id") in (None, ""):
+        return -1
+    value = number_of(path, entry, "track_id", f"[{row}]")
+    if value < 0 or value != int(value):
+        raise RecordingError(
+            f"{path}: expected a whole number >= 0 at '[{row}].track_id', found {entry['track_id']!r}; {REMEDY}."
+        )
+    return int(value)
+
+
+def _boxes(center: torch.Tensor, size: torch.Tensor, yaw: torch.Tensor, kept: list[tuple[int, int]]) -> Boxes:
+    """Ids are track_id + 1 where all have one and none has it twice, else rows from 1: id 0 is the ego's own body."""
+    tracks = [track for _, track in kept]
+    whole = min(tracks, default=0) >= 0 and len(set(tracks)) == len(tracks)
+    ids = [t + 1 for t in tracks] if whole else list(range(1, len(kept) + 1))
+    label = torch.tensor([label for label, _ in kept], dtype=torch.int64)
+    return Boxes.of(center, size, yaw, label=label, id=torch.tensor(ids, dtype=torch.int64))

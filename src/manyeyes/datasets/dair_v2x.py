@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""DAIR-V2X-C and V2X-Seq, read: one vehicle (agent 0, the ego) and one infrastructure (agent -1) at a crossing.
+
+The format is right-handed, in metres and radians, and points lie in the LiDAR's frame (the infrastructure's is a virtual
+one, upright, looking along x). What comes out lies in the agent's frame, whose z = 0 is the road. The two sweeps of a
+pair have their own time stamps. The format has neither the height of a LiDAR (found in the cloud, unless the index has our
+``lidar_height_m``), nor a speed (found from the poses), nor an agent's word on its own error (reads as zero).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from manyeyes.datasets.dair_index import Index, Pair, SideFrame, Sides, dair_root, read_index, split_ids
+from manyeyes.datasets.dair_json import (
+    read_calibration,
+    read_infrastructure_calibration,
+    read_side_labels,
+    read_world_labels,
+)
+from manyeyes.datasets.ground_height import height_above_ground
+from manyeyes.datasets.pcd import PcdCloud, read_pcd
+from manyeyes.datasets.recording import require_index
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, RecordingError, Snapshot, Transform, Truth
+from manyeyes.ops.box_iou import pairwise_iou
+
+VEHICLE_ID, INFRASTRUCTURE_ID = 0, -1
+# CoAlign's threshold for two sides' labels of one vehicle; two vehicles do not overlap at all (detection.md 1.7).
+_SAME_IOU = 0.05
+_POLE_REACH_M = 40.0
+_KEPT_POSES = 20_000
+
+Labels = Literal["cooperative", "sides"]
+
+
+class DairRecording:
+    """Pairs under a root in DAIR-V2X's layout; the drives (``batch_id``, ``sequence_id``) are the scenarios.
+
+    split: of the official cooperative-split-data.json, looked for in the root unless split_file is given. labels: the truth
+    is the cooperative label, or the union of what the two sides list. label_folder: where the cooperative labels lie, such
+    as ``label_world_backup`` of the complemented release. delay_frames: the infrastructure's sweep is so many sweeps older.
+    native_pose_error: the infrastructure claims the pose of its calibration, without the correction by hand that the truth
+    keeps. A pair that lacks a file is left out and named in ``problems``, one line a kind; with strict it is an error.
+    """
+
+    def __init__(
+        self,
+        root: Path | str,
+        split: str | None = None,
+        *,
+        split_file: Path | str | None = None,
+        labels: Labels = "cooperative",
+        label_folder: str = "label_world",
+        delay_frames: int = 0,
+        native_pose_error: bool = False,
+        strict: bool = False,
+        drop_nan: bool = False,
+    ) -> None:
+        found = dair_root(Path(root))
+        if found is None:
+            raise RecordingError(
+                f"{root}: expected a folder with vehicle-side and infrastructure-side; check the path."
+            )
+        if delay_frames < 0 or labels not in ("cooperative", "sides"):
+            raise ConfigError(
+                f"DairRecording needs labels 'cooperative' or 'sides' and delay_frames >= 0; got {labels!r}, {delay_frames}."
+            )
+        self.root = found
+        self.split = split
+        self._labels = labels
+        self._native_pose_error = native_pose_error
+        self._drop_nan = drop_nan
+        self._sides = Sides(found)
+        ids = None if split is None else split_ids(found, split, Path(split_file) if split_file else None)
+        self._index: Index = read_index(found, self._sides, ids, delay_frames, label_folder)
+        self.problems = self._index.problems
+        if not self._index.pairs or (strict and self.problems):
+            more = f" and {len(self.problems) - 1} more" if len(self.problems) > 1 else ""
+            first = f"{self.problems[0]}{more}" if self.problems else "no pair is listed"
+            raise RecordingError(f"{found}: expected whole pairs of sweeps; {first}. Download what is missing.")
+        self._heights: dict[tuple[str, bool], float] = {}
+        self._poses: dict[tuple[Path, ...], Transform] = {}
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """The names of all drives that have a usable pair, numbers in their order."""
+        return tuple(self._index.pairs)
+
+    def length(self, scenario: str) -> int:
+        """How many pairs the drive has."""
+        return len(self._pairs(scenario))
+
+    def judged(self, scenario: str) -> range:
+        """All of them."""
+        return range(self.length(scenario))
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        """The vehicle and the infrastructure, always 0 and -1."""
+        self._pairs(scenario)
+        return (VEHICLE_ID, INFRASTRUCTURE_ID)
+
+    def pair(self, scenario: str, index: int) -> Pair:
+        """Which files a snapshot comes from."""
+        require_index(self, scenario, index)
+        return self._index.pairs[scenario][index]
+
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        """Both agents, each at its own time; the truth is that of the vehicle's time, None without a label."""
+        pair = self.pair(scenario, index)
+        poses = self.lidar_poses(pair)
+        claims = poses
+        if self._native_pose_error and pair.offset is not None:
+            claims = (poses[0], self._uncorrected(pair))
+        sides = (pair.vehicle, pair.infrastructure)
+        heights = [self._height(scenario, side, pole) for side, pole in zip(sides, (False, True))]
+        frames = tuple(
+            self._frame(id, side, height, claim)
+            for id, side, height, claim in zip(self.agents(scenario), sides, heights, claims)
+        )
+        true = [pose @ Transform.from_xyz_yaw(0, 0, -height) for pose, height in zip(poses, heights)]
+        return Snapshot(scenario, index, frames, self._truth(pair, poses, Transform.stack(true)))
+
+    def lidar_poses(self, pair: Pair) -> tuple[Transform, Transform]:
+        """World from the vehicle's LiDAR and from the infrastructure's virtual one, as far as the recording knows."""
+        vehicle = self._vehicle_pose(pair.vehicle)
+        if not all(path.is_file() for path in pair.infrastructure.motions):
+            return vehicle, vehicle @ read_calibration(pair.i2v)  # which holds the correction
+        unit = self._uncorrected(pair)
+        if pair.offset is None:
+            return vehicle, unit
+        shift = torch.tensor([*pair.offset, 0.0], dtype=torch.float64)
+        if not pair.offset_in_world:
+            shift = vehicle.rotation @ shift
+        return vehicle, Transform(unit.rotation, unit.translation + shift)
+
+    def side_boxes(self, scenario: str, index: int) -> tuple[Boxes, Boxes]:
+        """What the vehicle lists and what the infrastructure lists, in the world frame, by the labels of each side."""
+        pair = self.pair(scenario, index)
+        return self._listed(pair, self.lidar_poses(pair))
+
+    def _pairs(self, scenario: str) -> tuple[Pair, ...]:
+        if scenario not in self._index.pairs:
+            require_index(self, scenario, 0)
+        return self._index.pairs[scenario]
+
+    def _frame(self, agent: int, side: SideFrame, height: float, world_from_lidar: Transform) -> AgentFrame:
+        cloud = self._cloud(side)
+        xyz = cloud.xyz.copy()
+        xyz[:, 2] += np.float32(height)
+        time_s = None
+        if cloud.time_s is not None:
+            relative = cloud.time_s - side.timestamp_ns * 1e-9
+            # Points carry seconds since 1970; whatever is not within a second of the sweep counts by another clock.
+            time_s = torch.from_numpy(np.where(np.abs(relative) < 1, relative, 0.0).astype(np.float32))
+        return AgentFrame(
+            agent_id=agent,
+            timestamp_ns=side.timestamp_ns,
+            points=PointCloud.of(torch.from_numpy(xyz), torch.from_numpy(cloud.intensity), time_s),
+            world_from_agent=world_from_lidar @ Transform.from_xyz_yaw(0, 0, -height),
+            pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
+            sensor_height_m=height,
+            speed_mps=self._speed(side) if agent == VEHICLE_ID else 0.0,
+            is_infrastructure=agent == INFRASTRUCTURE_ID,
+        )
+
+    def _cloud(self, side: SideFrame) -> PcdCloud:
+        """The sweep without points at the sensor itself, which are no returns."""
+        cloud = read_pcd(side.cloud, self._drop_nan)
+        met = cloud.xyz.any(axis=1)
+        return PcdCloud(cloud.xyz[met], cloud.intensity[met], None if cloud.time_s is None else cloud.time_s[met])
+
+    def _height(self, scenario: str, side: SideFrame, pole: bool) -> float:
+        """Metres from the road up to the LiDAR: stated, or found in the drive's first cloud so that it stays the same."""
+        if side.height_m is not None:
+            return side.height_m
+        if (scenario, pole) not in self._heights:
+            first = self._index.pairs[scenario][0]
+            cloud = self._cloud(first.infrastructure if pole else first.vehicle)
+            # A pole's LiDAR does not see the road below it, and looks one way only.
+            self._heights[scenario, pole] = (
+                height_above_ground(cloud.xyz, _POLE_REACH_M) if pole else height_above_ground(cloud.xyz)
+            )
+        return self._heights[scenario, pole]
+
+    def _vehicle_pose(self, side: SideFrame) -> Transform:
+        if side.motions not in self._poses:
+            if len(self._poses) >= _KEPT_POSES:
+                self._poses.clear()
+            novatel, lidar = side.motions
+            self._poses[side.motions] = read_calibration(novatel) @ read_calibration(lidar)
+        return self._poses[side.motions]
+
+    def _uncorrected(self, pair: Pair) -> Transform:
+        """World from virtual LiDAR by its own calibration; ``relative_error`` counts where the pair states no offset."""
+        if not all(path.is_file() for path in pair.infrastructure.motions):
+            return self._vehicle_pose(pair.vehicle) @ read_calibration(pair.i2v)
+        pose, (x, y) = read_infrastructure_calibration(pair.infrastructure.motions[0])
+        if pair.offset is not None:
+            return pose
+        return Transform(pose.rotation, pose.translation + torch.tensor([x, y, 0.0], dtype=torch.float64))
+
+    def _speed(self, side: SideFrame) -> float:
+        """From the sweep before, m/s; 0 where there is none within half a second."""
+        before = self._sides.vehicle.before(side, 1)
+        if before is None or not all(path.is_file() for path in before.motions):
+            return 0.0
+        seconds = (side.timestamp_ns - before.timestamp_ns) * 1e-9
+        moved = self._vehicle_pose(side).translation - self._vehicle_pose(before).translation
+        return float(moved.norm()) / seconds if 0 < seconds <= 0.5 else 0.0
+
+    def _listed(self, pair: Pair, poses: tuple[Transform, Transform]) -> tuple[Boxes, Boxes]:
+        vehicle, unit = (read_side_labels(side.label) for side in (pair.vehicle, pair.infrastructure))
+        return vehicle.transform(poses[0]), unit.transform(poses[1])
+
+    def _truth(self, pair: Pair, poses: tuple[Transform, Transform], world_from_agent: Transform) -> Truth | None:
+        have_sides = pair.vehicle.label.is_file() and pair.infrastructure.label.is_file()
+        if (self._labels == "cooperative" and pair.label is None) or (self._labels == "sides" and not have_sides):
+            return None
+        listed = self._listed(pair, poses) if have_sides else (Boxes.empty(torch.float64), Boxes.empty(torch.float64))
+        if self._labels == "sides":
+            boxes = _union(*listed)
+        elif pair.offset_in_world and pair.label is not None:
+            boxes = read_world_labels(pair.label)
+        else:
+            assert pair.label is not None
+            boxes = read_side_labels(pair.label).transform(poses[0])  # V2X-Seq: in the vehicle's LiDAR frame
+        seen = torch.stack([_partner(boxes, side) >= 0 for side in listed])
+        # A label that neither side lists is in the truth all the same: it was given for the ego.
+        seen[0] |= ~seen.any(0)
+        return Truth(_own_body_marked(boxes, poses[0]), seen, world_from_agent)
+
+
+def _partner(boxes: Boxes, others: Boxes) -> Tensor:
+    """(N,) int64: the row of others that is the same vehicle, -1 for none; greatest overlaps first, each row once."""
+    partner = torch.full((len(boxes),), -1, dtype=torch.int64)
+    if not len(boxes) or not len(others):
+        return partner
+    iou = pairwise_iou(boxes.bev(), others.bev())
+    order = torch.argsort(iou.flatten(), descending=True, stable=True)
+    taken = torch.zeros(len(others), dtype=torch.bool)
+    for at in order[iou.flatten()[order] > _SAME_IOU].tolist():
+        row, column = divmod(at, len(others))
+        if partner[row] < 0 and not taken[column]:
+            partner[row] = column
+            taken[column] = True
+    return partner
+
+
+def _union(vehicle: Boxes, unit: Boxes) -> Boxes:
+    """Both lists, each vehicle once, as the vehicle's side has it; ids are rows from 1."""
+    both = Boxes.cat([vehicle, unit[_partner(unit, vehicle) < 0]])
+    id = torch.arange(1, len(both) + 1)
+    return Boxes.of(both.center, both.size, both.yaw, label=both.label, id=id)
+
+
+def _own_body_marked(boxes: Boxes, world_from_lidar: Transform) -> Boxes:
+    """The box around the vehicle's own LiDAR gets the vehicle's id, so that nobody is asked to detect himself."""
+    local = boxes.transform(world_from_lidar.inverse())
+    around = Boxes.of(local.center * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64), local.size, local.yaw)
+    own = (
+        around.contains(torch.zeros(1, 3, dtype=torch.float64))[:, 0]
+        if len(boxes)
+        else torch.zeros(0, dtype=torch.bool)
+    )
+    id = torch.where(own, torch.full_like(boxes.id, VEHICLE_ID), boxes.id)
+    return Boxes.of(boxes.center, boxes.size, boxes.yaw, label=boxes.label, id=id)
