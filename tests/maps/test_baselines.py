@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, MapElements, Polygons
-from manyeyes.maps.baselines import chamfer_nms, crowdmap_literal, polymerge, union
+from manyeyes.maps.baselines import (
+    chamfer_nms,
+    crowdmap_literal,
+    frechet_clustering,
+    global_map_builder,
+    polymerge,
+    union,
+)
+from manyeyes.maps.baselines.assignment import assign
 from manyeyes.maps.baselines.rules import CLAMP, HIT, MISS, Rules, pool
 from manyeyes.maps.observation import Frame, Observation
 from manyeyes.maps.vector_map import CANDIDATE, PUBLISHED, VectorMap
@@ -34,7 +42,7 @@ def lines_in(made: VectorMap, kind: int = DIVIDER) -> list[np.ndarray]:
     return [made.elements.polyline(i) for i in np.flatnonzero(made.elements.kind == kind)]
 
 
-RIVALS = [union, chamfer_nms, crowdmap_literal, polymerge]
+RIVALS = [union, chamfer_nms, crowdmap_literal, polymerge, frechet_clustering, global_map_builder]
 
 
 @pytest.mark.parametrize("rival", RIVALS, ids=lambda r: r.__name__.split(".")[-1])
@@ -157,3 +165,58 @@ def test_polymerge_draws_crossings_and_takes_what_most_agree_on() -> None:
     rings = [np.array(SQUARE) + (dx, 0.0) for dx in (-0.5, 0.0, 0.5)]
     (ring,) = lines_in(polymerge.fuse([seen(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING)
     assert np.allclose(ring.min(0), [20.0, -4.0], atol=0.15) and np.allclose(ring.max(0), [24.0, 4.0], atol=0.15)
+
+
+def test_frechet_clusters_are_means_of_what_runs_together_from_end_to_end() -> None:
+    many = [seen(0, [line(0.0)]), seen(1, [line(0.6)[::-1]]), seen(2, [line(0.9)]), seen(3, [line(0.3, 0, 20)])]
+    made = frechet_clustering.fuse(many)
+    assert made.supporters.tolist() == [1, 3]
+    assert np.allclose(made.elements.polyline(1)[:, 1], 0.5) and len(made.elements.polyline(1)) == 20
+    medoid = frechet_clustering.fuse(many, frechet_clustering.Config(take="medoid"))
+    assert sorted(round(float(line[0, 1]), 6) for line in lines_in(medoid)) == [0.3, 0.6]
+
+
+def test_single_linkage_chains_where_average_linkage_does_not() -> None:
+    many = [seen(k, [line(1.5 * k)]) for k in range(4)]
+    assert len(frechet_clustering.fuse(many, frechet_clustering.Config(linkage="single"))) == 1
+    assert len(frechet_clustering.fuse(many)) == 2
+
+
+def test_frechet_clusters_of_rings_do_not_mind_where_and_which_way_a_ring_begins() -> None:
+    rings = [SQUARE, SQUARE[2:] + SQUARE[:2], [[x + 0.5, y] for x, y in SQUARE][::-1]]
+    (ring,) = lines_in(frechet_clustering.fuse([seen(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING)
+    assert np.allclose(ring.mean(0), [22 + 0.5 / 3, 0.0], atol=0.02)
+
+
+def test_the_builder_replaces_what_the_newest_covers() -> None:
+    old, new = np.array(line(0.0, 0, 40, 2)), np.array(line(0.5, 10, 50, 2)[::-1])
+    assert global_map_builder.replaced(old, new, 0.01).tolist() == [[0, 0], [10, 0.5], [50, 0.5]]
+    inner = global_map_builder.replaced(old, np.array(line(0.5, 10, 20, 2)), 0.01)
+    assert inner.tolist() == [[0, 0], [10, 0.5], [20, 0.5], [40, 0]]
+
+
+def test_the_builder_matches_one_to_one_adds_the_rest_and_suppresses_what_lies_on_others() -> None:
+    many = [
+        seen(0, [line(0.0), line(3.5)], score=0.6),
+        seen(1, [line(0.8), line(4.0), line(9.0)]),
+        seen(2, [line(0.5, 0, 20), line(10.5, 0, 40)], score=0.9),
+    ]
+    made = global_map_builder.fuse(many)
+    assert made.supporters.tolist() == [3, 2, 1]
+    first = lines_in(made)[0]
+    assert (first[0].tolist(), first[-1].tolist()) == ([0.0, 0.5], [40.0, 0.8])
+    # 10.5 matches nothing (1.5 m from 9.0) and, more confident, suppresses it: their buffers overlap.
+    assert lines_in(made)[2][0, 1] == 10.5
+
+
+def test_the_cheapest_assignment_agrees_with_scipy() -> None:
+    optimize = pytest.importorskip("scipy.optimize")
+    rng = np.random.default_rng(1)
+    for shape in ((1, 1), (4, 4), (3, 7), (9, 5), (12, 12), (0, 3), (3, 0)):
+        cost = rng.uniform(0, 9, shape)
+        cost[cost > 6] = 1e4
+        got = assign(cost)
+        rows = np.flatnonzero(got >= 0)
+        assert len(rows) == min(shape) == len(set(got[rows].tolist()))
+        want = cost[optimize.linear_sum_assignment(cost)].sum() if min(shape) else 0.0
+        assert cost[rows, got[rows]].sum() == pytest.approx(want, abs=1e-9)
