@@ -32,7 +32,9 @@ from manyeyes.ops.box_iou import pairwise_iou
 VEHICLE_ID, INFRASTRUCTURE_ID = 0, -1
 # CoAlign's threshold for two sides' labels of one vehicle; two vehicles do not overlap at all (detection.md 1.7).
 _SAME_IOU = 0.05
-_POLE_REACH_M = 40.0
+# Where the road is looked for: near, because a vehicle's LiDAR is tilted by a degree; farther, because a pole's does not see
+# the road below it.
+_VEHICLE_REACH_M, _POLE_REACH_M = 15.0, 40.0
 _KEPT_POSES = 20_000
 
 Labels = Literal["cooperative", "sides"]
@@ -181,10 +183,8 @@ class DairRecording:
         if (scenario, pole) not in self._heights:
             first = self._index.pairs[scenario][0]
             cloud = self._cloud(first.infrastructure if pole else first.vehicle)
-            # A pole's LiDAR does not see the road below it, and looks one way only.
-            self._heights[scenario, pole] = (
-                height_above_ground(cloud.xyz, _POLE_REACH_M) if pole else height_above_ground(cloud.xyz)
-            )
+            reach = _POLE_REACH_M if pole else _VEHICLE_REACH_M
+            self._heights[scenario, pole] = height_above_ground(cloud.xyz, reach)
         return self._heights[scenario, pole]
 
     def _vehicle_pose(self, side: SideFrame) -> Transform:
