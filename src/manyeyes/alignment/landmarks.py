@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Landmarks: what an agent's decoded boxes say that another agent can recognise; no identity and no truth is in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import Boxes, ConfigError, ShapeError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+SIZES_M = (0.2, 30.0)
+
+
+@dataclass(frozen=True)
+class DetectorError:
+    """Errors of a detector that states none of its own: one standard deviation an axis (m), of the heading modulo pi (rad), and the
+    chance that the heading is off by pi. Spec: specs/pose.md 4.2, whose boxes are off by 0.25 m and 2.5 degrees, 3 % turned."""
+
+    sigma_xy_m: float = 0.25
+    sigma_yaw_rad: float = 0.044
+    flip: float = 0.03
+
+    def __post_init__(self) -> None:
+        if not (self.sigma_xy_m > 0 and self.sigma_yaw_rad > 0 and 0 <= self.flip <= 0.5):
+            raise ConfigError(
+                "DetectorError needs sigma_xy_m > 0, sigma_yaw_rad > 0 and flip in [0, 0.5]; "
+                f"got {self.sigma_xy_m}, {self.sigma_yaw_rad}, {self.flip}."
+            )
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """N objects on the ground in one agent's frame (x forward, y left).
+
+    xy: (N, 2) metres. yaw: (N,) radians, sure modulo pi only; flip: (N,) in [0, 0.5], the chance that it is off by pi.
+    size: (N, 2) length and width (m). score: (N,) in [0, 1]. sigma_xy: (N,) one standard deviation an axis (m); sigma_yaw: (N,) of
+    the yaw modulo pi (rad). instant: (N,) int64, which frame a landmark was seen in, 0 for the current one and counting
+    back: objects move, so only landmarks of one instant can be the same object (specs/pose.md 4.8).
+    """
+
+    xy: Floats
+    yaw: Floats
+    size: Floats
+    score: Floats
+    sigma_xy: Floats
+    sigma_yaw: Floats
+    flip: Floats
+    instant: Ints
+
+    def __post_init__(self) -> None:
+        n = len(self.xy)
+        wanted = {"xy": (n, 2), "size": (n, 2)}
+        for field in fields(self):
+            shape = getattr(self, field.name).shape
+            if shape != wanted.get(field.name, (n,)):
+                raise ShapeError(f"Landmarks.{field.name} needs shape {wanted.get(field.name, (n,))}; got {shape}.")
+
+    @classmethod
+    def of_boxes(cls, boxes: Boxes, error: DetectorError | None = None) -> Landmarks:
+        """What decoded boxes say; a box that states no error of its own (sigma 0) gets the detector's."""
+        error = error or DetectorError()
+        columns = (
+            boxes.center[:, :2],
+            boxes.yaw,
+            boxes.size[:, :2],
+            boxes.score,
+            boxes.sigma_xy,
+            boxes.sigma_yaw,
+            boxes.flip,
+        )
+        xy, yaw, size, score, sigma_xy, sigma_yaw, flip = (c.detach().cpu().double().numpy() for c in columns)
+        stated = sigma_xy > 0
+        return cls(
+            xy,
+            yaw,
+            size,
+            score,
+            np.where(stated, sigma_xy, error.sigma_xy_m),
+            np.where(sigma_yaw > 0, sigma_yaw, error.sigma_yaw_rad),
+            np.where(stated, flip, error.flip),
+            np.zeros(len(xy), np.int64),
+        )
+
+    @classmethod
+    def empty(cls) -> Landmarks:
+        """None."""
+        zero = np.zeros(0)
+        return cls(np.zeros((0, 2)), zero, np.zeros((0, 2)), zero, zero, zero, zero, np.zeros(0, np.int64))
+
+    @classmethod
+    def cat(cls, many: Sequence[Landmarks]) -> Landmarks:
+        """Several sets of one frame as one."""
+        return cls(*(np.concatenate([getattr(m, f.name) for m in many]) for f in fields(cls))) if many else cls.empty()
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def __getitem__(self, index: slice | Ints | NDArray[np.bool_]) -> Landmarks:
+        return Landmarks(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    def moved(self, pose: Floats) -> Landmarks:
+        """The same landmarks in another frame, pose (3,) = target_from_source as x, y (m), yaw (rad)."""
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        x, y = self.xy[:, 0], self.xy[:, 1]
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values |= {"xy": np.stack((c * x - s * y + pose[0], s * x + c * y + pose[1]), 1), "yaw": self.yaw + pose[2]}
+        return Landmarks(**values)
+
+    def usable(self, reach_m: float, at_most: int) -> Ints:
+        """Rows that can be matched, in an order that does not depend on the order given.
+
+        Numbers are finite, sizes those of a vehicle, the place within ``reach_m`` of the middle of all; where more than
+        ``at_most`` remain, those of the highest score.
+        """
+        numbers = np.column_stack((self.xy, self.yaw, self.size, self.score, self.sigma_xy, self.sigma_yaw, self.flip))
+        good = np.isfinite(numbers).all(1) & (np.abs(self.xy) < 1e7).all(1) & (self.sigma_xy > 0) & (self.sigma_yaw > 0)
+        good &= ((self.size > SIZES_M[0]) & (self.size < SIZES_M[1])).all(1)
+        rows = np.flatnonzero(good)
+        if len(rows):
+            xy = self.xy[rows]
+            rows = rows[np.hypot(*(xy - np.median(xy, 0)).T) <= reach_m]
+        order = np.lexsort((*numbers[rows].T, -self.score[rows], self.instant[rows]))
+        return rows[order] if len(rows) <= at_most else rows[order[self._best(rows[order], at_most)]]
+
+    def _best(self, rows: Ints, at_most: int) -> Ints:
+        """Places in rows of the highest scores, in the order of rows."""
+        return np.sort(np.argsort(-self.score[rows], kind="stable")[:at_most])

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The default corrector's hypotheses: every pose that the objects of two agents suggest, best first, whatever is claimed.
+
+Pairs of objects vote (vote_loops), the best supported poses are refined on one-to-one pairs, and each is given a
+log-likelihood ratio: how much likelier the agreement is if the pairs are the same objects than if they met by chance. A
+pair gains log(area / 2 pi s^2) less half its squared misfit, ``area`` being the ground on which a chance neighbour would
+have to fall, and log 2p for a heading that agrees, p its chance. Design and the measured reasons for it: specs/pose.md
+4.2-4.4. The answer does not depend on the order of landmarks nor on which agent is called ego.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.alignment import vote_loops as loops
+from manyeyes.alignment.estimate import PoseClaim
+from manyeyes.alignment.landmarks import Landmarks
+from manyeyes.datatypes import ConfigError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class VoteConfig:
+    """How poses are found.
+
+    reach_m: landmarks farther than this from the middle of all are left out; landmarks: at most so many, those of highest score.
+    shortest_m, longest_m: lengths of edges; edges: at most so many an agent, the shortest. hypotheses: at most so many, those
+    that agree best. Together the caps bound the time. edge_gate: how many standard deviations edges may differ. size_gate_m:
+    difference of widths (twice that and a tenth of it for lengths). tau_m, turn_rad: reach of the coarse support. refined: how
+    many of the best are refined. pair_gate: largest squared misfit of a pair (3 degrees of freedom; 14.16 is p = 0.003). area_m2:
+    see the module, fitted on simulated crossings. apart_m, apart_rad: answers that differ by less are one.
+    """
+
+    reach_m: float = 300.0
+    landmarks: int = 200
+    shortest_m: float = 3.0
+    longest_m: float = 150.0
+    edges: int = 6000
+    hypotheses: int = 8000
+    edge_gate: float = 3.5
+    size_gate_m: float = 0.5
+    tau_m: float = 1.5
+    turn_rad: float = 0.26
+    refined: int = 32
+    pair_gate: float = 14.16
+    area_m2: float = 330.0
+    apart_m: float = 2.0
+    apart_rad: float = 0.105
+
+    def __post_init__(self) -> None:
+        if min(self.landmarks, self.edges, self.hypotheses, self.refined) < 1 or not self.shortest_m < self.longest_m:
+            raise ConfigError("VoteConfig needs caps of at least 1 and shortest_m < longest_m.")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One pose (3,) ego_from_other that objects suggest: its covariance (3, 3) in the ego's axes, pairs (P, 2) of rows, the
+    log-likelihood ratio, and the squared misfit of all pairs with its degrees of freedom."""
+
+    pose: Floats
+    covariance: Floats
+    pairs: Ints
+    score: float
+    misfit: float
+    freedom: int
+
+
+def candidates(
+    ego: Landmarks, other: Landmarks, config: VoteConfig, claimed: PoseClaim | None = None
+) -> list[Candidate]:
+    """Distinct poses ego_from_other, the likeliest first. A claim is one more hypothesis; it has no say in the score."""
+    rows_e, rows_o = (x.usable(config.reach_m, config.landmarks) for x in (ego, other))
+    if not len(rows_e) or not len(rows_o):
+        return []
+    a, b = ego[rows_e], other[rows_o]
+    start = None if claimed is None else claimed.pose
+    # From the smaller set to the larger, so that exchanging the agents gives the inverse to the last digit but rounding.
+    swapped = _rank(a) < _rank(b)
+    if swapped:
+        found = _search(b, a, config, None if start is None else _inverse(start))
+    else:
+        found = _search(a, b, config, start)
+    out = []
+    for pose, information, pairs, misfit, score in found:
+        freedom = 3 * len(pairs) - 3
+        total = float(misfit.sum())
+        covariance: Floats = np.linalg.inv(information) * max(1.0, total / freedom if freedom else 1.0)
+        if swapped:
+            pose, covariance, pairs = *_inverted(pose, covariance), pairs[:, ::-1]
+        rows = np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1)
+        out.append(Candidate(pose, (covariance + covariance.T) / 2, rows[np.lexsort(rows.T)], score, total, freedom))
+    return out
+
+
+_Found = tuple[Floats, Floats, Ints, Floats, float]
+
+
+def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None) -> list[_Found]:
+    """Distinct refined poses a_from_b, best first."""
+    numbers_a, numbers_b = _numbers(a), _numbers(b)
+    may = loops.compatible(a.size, b.size, a.instant, b.instant, config.size_gate_m)
+    poses = _hypotheses(a, b, may, config)
+    grid = loops.grid_of(numbers_a[0], config.tau_m)
+    support = loops.support(poses, numbers_a, numbers_b, may, grid, config.tau_m, config.turn_rad)
+    # Equal support is ordered by the pose itself, never by where it stands in a list.
+    order = np.lexsort((*poses.T, -np.round(support, 9)))
+    middle = b.xy.mean(0)
+    best = poses[loops.distinct(poses, order, middle, config.refined, config.apart_m / 2, config.apart_rad / 2)]
+    if start is not None:
+        best = np.concatenate((best, start[None]))
+    found = []
+    for pose in best:
+        pose, information, pairs, misfit = loops.refine(pose, numbers_a, numbers_b, may, 1.0, config.pair_gate, 14)
+        if len(pairs):
+            found.append((pose, information, pairs, misfit, _score(a, b, pose, pairs, misfit, config)))
+    found.sort(key=lambda f: (-f[4], *f[0]))
+    return _merged(found, b, config)
+
+
+def _numbers(x: Landmarks) -> tuple[Floats, Floats, Floats, Floats]:
+    return tuple(np.ascontiguousarray(v) for v in (x.xy, x.yaw, x.sigma_xy, x.sigma_yaw))  # type: ignore[return-value]
+
+
+def _hypotheses(a: Landmarks, b: Landmarks, may: NDArray[np.bool_], config: VoteConfig) -> Floats:
+    most = 100 * config.hypotheses
+    poses, misfit = loops.match_edges(
+        _numbers(a), _numbers(b), _edges(a, config), _edges(b, config), may, config.edge_gate, most
+    )
+    if len(poses) > config.hypotheses:
+        poses = poses[np.lexsort((*poses.T, misfit))[: config.hypotheses]]
+    return poses
+
+
+def _edges(x: Landmarks, config: VoteConfig) -> tuple[Ints, Floats]:
+    """Ends and shapes of the edges, by length."""
+    ends, shape = loops.edge_table(np.ascontiguousarray(x.xy), x.yaw, config.shortest_m, config.longest_m)
+    order = np.argsort(shape[:, 0], kind="stable")[: config.edges]
+    return ends[order], shape[order]
+
+
+def _score(a: Landmarks, b: Landmarks, pose: Floats, pairs: Ints, misfit: Floats, config: VoteConfig) -> float:
+    """Log-likelihood ratio of the pairs; a pair that is likelier to have met by chance takes nothing away but its heading."""
+    i, k = pairs.T
+    gain = np.log(config.area_m2 / (2 * np.pi * (a.sigma_xy[i] ** 2 + b.sigma_xy[k] ** 2))) - misfit / 2
+    flip_a, flip_b = np.clip(a.flip[i], 0.01, 0.5), np.clip(b.flip[k], 0.01, 0.5)
+    agree = (1 - flip_a) * (1 - flip_b) + flip_a * flip_b
+    same = np.cos(a.yaw[i] - b.yaw[k] - pose[2]) > 0
+    return float((np.maximum(gain, 0.0) + np.log(2 * np.where(same, agree, 1 - agree))).sum())
+
+
+def _merged(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[_Found]:
+    """The found poses, best first, without those that say the same as a better one where that one's objects are."""
+    poses = np.array([f[0] for f in found]).reshape(-1, 3)
+    kept, gone = [], np.zeros(len(found), bool)
+    for n, one in enumerate(found):
+        if gone[n]:
+            continue
+        kept.append(one)
+        apart = placed(poses, b.xy[one[2][:, 1]].mean(0)) - placed(one[0][None], b.xy[one[2][:, 1]].mean(0))
+        turn = np.abs(np.remainder(poses[:, 2] - one[0][2] + np.pi, 2 * np.pi) - np.pi)
+        gone |= (turn < config.apart_rad) & (np.hypot(apart[:, 0], apart[:, 1]) < config.apart_m)
+    return kept
+
+
+def placed(poses: Floats, point: Floats) -> Floats:
+    """(N, 2) where poses (N, 3) put a point (2,)."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return poses[:, :2] + np.stack((c * point[0] - s * point[1], s * point[0] + c * point[1]), 1)
+
+
+def _rank(x: Landmarks) -> tuple[float, ...]:
+    """A number of a set that does not depend on its frame or order."""
+    return (len(x), *np.round(np.sort(x.size, 0).sum(0), 9), round(float(x.score.sum()), 9))
+
+
+def _inverse(pose: Floats) -> Floats:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
+
+
+def _inverted(pose: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """The inverse pose and its covariance."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    back = _inverse(pose)
+    by = np.array([[-c, -s, back[1]], [s, -c, -back[0]], [0.0, 0.0, -1.0]])
+    return back, by @ covariance @ by.T
