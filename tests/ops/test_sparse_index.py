@@ -99,6 +99,12 @@ def test_a_map_of_one_set_is_its_own_transpose_flipped():
     middle = plain.pairs()[12]
     assert middle.tap == 12 and torch.equal(middle.source, middle.target) and len(middle.source) == len(key)
     assert [pairs.tap for pairs in symmetric.pairs()] == [t for t in range(25) if t != 12]
+    for reverse, rows in ((False, 7), (True, 7), (False, 1000)):
+        longest, blocks = symmetric.blocks(rows, reverse)
+        others = [block for block in plain.blocks(rows, reverse)[1] if block.tap != 12]
+        assert longest == max(block.size for block in others) <= rows
+        assert [(b.tap, b.size) for b in blocks] == [(b.tap, b.size) for b in others]
+        assert all(torch.equal(a.source, b.source) and torch.equal(a.target, b.target) for a, b in zip(blocks, others))
 
 
 @pytest.mark.parametrize("symmetric", (False, True))
@@ -119,11 +125,13 @@ def test_compiled_loops_find_what_whole_tensors_find(monkeypatch, symmetric):
     assert all(a.dtype == b.dtype and torch.equal(a, b) for a, b in zip(loops, tensors, strict=True))
 
 
-def test_distinct_is_unique_with_its_inverse():
+def test_distinct_is_unique_with_its_inverse(monkeypatch):
     key = torch.randint(0, 50, (200,), generator=torch.Generator().manual_seed(0))
     found, row = distinct(key, 50)
     wanted, inverse = key.unique(return_inverse=True)
     assert torch.equal(found, wanted) and torch.equal(row, inverse)
+    monkeypatch.setattr("manyeyes.ops.sparse_index._in_loops", lambda key: False)
+    assert all(torch.equal(a, b) for a, b in zip(distinct(key, 50), (wanted, inverse)))
 
 
 def test_no_sites_give_empty_maps():

@@ -194,3 +194,13 @@ def test_compiled_loops_place_points_as_whole_tensors_do(monkeypatch: pytest.Mon
     assert torch.equal(ours.inside, theirs.inside)
     assert torch.equal(ours.sites.key, theirs.sites.key)
     assert torch.equal(ours.row, theirs.row)
+
+
+@pytest.mark.parametrize("dtype", (torch.float32, torch.float64))
+def test_a_mean_without_gradient_has_the_bits_of_one_with(dtype: torch.dtype) -> None:
+    random = torch.Generator().manual_seed(3)
+    values, row = torch.randn(500, 3, generator=random, dtype=dtype), torch.randint(0, 40, (500,), generator=random)
+    plain, graph = segment_mean(values, row, 42), segment_mean(values.requires_grad_(), row, 42)
+    assert graph.requires_grad and not plain.requires_grad
+    assert torch.equal(plain, graph.detach())
+    assert not plain[40:].any()

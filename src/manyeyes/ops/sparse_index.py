@@ -146,6 +146,9 @@ def split(key: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
 
 def distinct(key: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Ascending distinct keys (M,) of keys (N,) in [0, size), and the place (N,) int64 of each key among them."""
+    if _in_loops(key):
+        found, row = _distinct(key.numpy(), np.zeros(size, np.int32))
+        return torch.from_numpy(found), torch.from_numpy(row)
     image = torch.zeros(size, dtype=torch.int32, device=key.device)
     image[key] = 1
     found = image.nonzero()[:, 0]
@@ -220,6 +223,22 @@ def neighbours(
 def _in_loops(key: Tensor) -> bool:
     """On the CPU the integers are walked in compiled loops, elsewhere by whole tensors; a test holds one against the other."""
     return key.device.type == "cpu"
+
+
+@njit(cache=True, nogil=True)
+def _distinct(key, image):  # pragma: no cover
+    """Ascending distinct keys and the place of each key among them; image: zeros for every key there may be."""
+    for k in key:
+        image[k] = 1
+    found, n = np.empty(min(key.shape[0], image.shape[0]), np.int64), 0
+    for k in range(image.shape[0]):
+        if image[k]:
+            found[n], image[k] = k, n
+            n += 1
+    row = np.empty(key.shape[0], np.int64)
+    for i in range(key.shape[0]):
+        row[i] = image[key[i]]
+    return found[:n], row
 
 
 @njit(cache=True)

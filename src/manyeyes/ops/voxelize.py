@@ -91,8 +91,25 @@ def segment_sum(values: Tensor, row: Tensor, n: int) -> Tensor:
 
 def segment_mean(values: Tensor, row: Tensor, n: int) -> Tensor:
     """(n, C): the mean of values (P, C) over segments row (P,) in [0, n); zero where a segment is empty."""
+    if _in_numba(values) and values.dim() == 2 and not (torch.is_grad_enabled() and values.requires_grad):
+        return torch.from_numpy(_means(values.numpy(), row.numpy(), n))
     count = torch.bincount(row, minlength=n).clamp_min(1).to(values.dtype)
     return segment_sum(values, row, n) / count[:, None]
+
+
+@numba.njit(cache=True, nogil=True)
+def _means(values: np.ndarray, row: np.ndarray, n: int) -> np.ndarray:  # pragma: no cover
+    """Sums in the order of the points, then the quotients, as by tensors."""
+    out, count = np.zeros((n, values.shape[1]), values.dtype), np.zeros(n, values.dtype)
+    for p in range(values.shape[0]):
+        r = row[p]
+        count[r] += 1
+        for c in range(values.shape[1]):
+            out[r, c] += values[p, c]
+    for r in range(n):
+        for c in range(values.shape[1]):
+            out[r, c] /= max(count[r], 1)
+    return out
 
 
 def segment_max(values: Tensor, row: Tensor, n: int) -> Tensor:
