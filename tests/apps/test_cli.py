@@ -23,12 +23,16 @@ def test_help_lists_every_verb_and_imports_nothing_heavy() -> None:
     assert all(f"  {verb} " in done.stdout for verb in cli.VERBS)
 
 
-@pytest.mark.parametrize("verb", cli.VERBS)
+EVERY_VERB = [verb for verb in cli.VERBS if verb not in cli.GROUPS]
+EVERY_VERB += [f"{group} {verb}" for group, verbs in cli.GROUPS.items() for verb in verbs]
+
+
+@pytest.mark.parametrize("verb", EVERY_VERB)
 def test_every_verb_has_options_with_help(verb, capsys) -> None:
-    module = importlib.import_module(f"manyeyes.apps.{verb}")
+    module = importlib.import_module(f"manyeyes.apps.{verb.replace(' ', '_')}")
     assert module.__doc__ and callable(module.main)
     with pytest.raises(SystemExit) as stop:
-        cli.main([verb, "--help"])
+        cli.main([*verb.split(), "--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
     assert f"manyeyes {verb}" in text
@@ -43,8 +47,16 @@ def test_an_unknown_verb_says_which_are_known(capsys) -> None:
     assert cli.main(["demmo"]) == 2
     assert capsys.readouterr().err == (
         "manyeyes: there is no verb 'demmo'; did you mean demo? Known verbs: "
-        "demo, simulate, train, evaluate, run, view, doctor.\n"
+        "demo, simulate, train, evaluate, run, view, map, doctor.\n"
     )
+
+
+def test_a_group_lists_its_verbs_and_knows_no_other(capsys) -> None:
+    assert cli.main(["map"]) == 0
+    said = capsys.readouterr().out
+    assert all(f"  {verb} " in said for verb in cli.GROUPS["map"]) and "usage: manyeyes map VERB" in said
+    assert cli.main(["map", "fuze"]) == 2
+    assert "did you mean fuse? Known verbs: simulate, import, fuse" in capsys.readouterr().err
 
 
 def test_wrong_arguments_exit_with_2(capsys) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from manyeyes import __version__
 
@@ -17,19 +17,36 @@ VERBS = {
     "evaluate": "judge methods on a split: AP with intervals, bytes, paired differences",
     "run": "replay your own OPV2V-format recording as demo does",
     "view": "draw a frame of a recording, or animate a drive",
+    "map": "one map from many drives: simulate, fuse, evaluate, diff, export, view, import",
     "doctor": "print what a bug report needs",
+}
+GROUPS = {
+    "map": {
+        "simulate": "send a crowd through a place: observations and truth from a seed",
+        "import": "result files of MapTR or StreamMapNet with their poses become observations",
+        "fuse": "one map of a folder of observations",
+        "evaluate": "judge a map against the truth, or methods in a study",
+        "diff": "what changed from one map to another",
+        "export": "GeoJSON, GeoPackage, Lanelet2, Argoverse 2, nuScenes, PMTiles",
+        "view": "a web page (.html) that needs no internet, or a picture (.png)",
+    },
 }
 INTERRUPTED = 130
 
 
-def help_text() -> str:
-    """What ``manyeyes --help`` prints."""
-    width = max(map(len, VERBS)) + 2
-    verbs = "\n".join(f"  {verb.ljust(width)}{what}" for verb, what in VERBS.items())
+def help_text(group: str = "") -> str:
+    """What ``manyeyes --help`` prints, or the help of a group of verbs."""
+    table, prog = (GROUPS[group], f"manyeyes {group}") if group else (VERBS, "manyeyes")
+    width = max(map(len, table)) + 2
+    verbs = "\n".join(f"  {verb.ljust(width)}{what}" for verb, what in table.items())
+    about = (
+        f"manyeyes {group}: {VERBS[group]}."
+        if group
+        else "manyeyes: many agents, each with its own eyes and few bytes to say what it sees."
+    )
     return (
-        "manyeyes: many agents, each with its own eyes and few bytes to say what it sees.\n\n"
-        f"usage: manyeyes VERB [options]\n\n{verbs}\n\n"
-        "manyeyes VERB --help lists the options of a verb; manyeyes --version prints the version.\n"
+        f"{about}\n\nusage: {prog} VERB [options]\n\n{verbs}\n\n"
+        f"{prog} VERB --help lists the options of a verb; manyeyes --version prints the version.\n"
     )
 
 
@@ -42,11 +59,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words[0] in ("-V", "--version"):
         sys.stdout.write(f"manyeyes {__version__}\n")
         return 0
-    if words[0] not in VERBS:
-        close = difflib.get_close_matches(words[0], VERBS, 1)
-        hint = f"did you mean {close[0]}? " if close else ""
-        return _fail(f"there is no verb {words[0]!r}; {hint}Known verbs: {', '.join(VERBS)}.", 2)
-    return _run(words[0], words[1:])
+    if words[0] in GROUPS:
+        return _group(words[0], words[1:])
+    return _run(words[0], words[1:]) if words[0] in VERBS else _unknown(words[0], VERBS)
+
+
+def _group(group: str, words: Sequence[str]) -> int:
+    """A verb of a group, such as ``map fuse``, lives in the module ``map_fuse``."""
+    if not words or words[0] in ("-h", "--help", "help"):
+        sys.stdout.write(help_text(group))
+        return 0
+    known = GROUPS[group]
+    return _run(f"{group} {words[0]}", words[1:]) if words[0] in known else _unknown(words[0], known)
+
+
+def _unknown(word: str, known: Iterable[str]) -> int:
+    close = difflib.get_close_matches(word, known, 1)
+    hint = f"did you mean {close[0]}? " if close else ""
+    return _fail(f"there is no verb {word!r}; {hint}Known verbs: {', '.join(known)}.", 2)
 
 
 def _run(verb: str, words: Sequence[str]) -> int:
@@ -55,7 +85,7 @@ def _run(verb: str, words: Sequence[str]) -> int:
 
         from manyeyes.datatypes.errors import ManyeyesError
 
-        module = importlib.import_module(f"manyeyes.apps.{verb}")
+        module = importlib.import_module(f"manyeyes.apps.{verb.replace(' ', '_')}")
     except KeyboardInterrupt:
         return _fail("stopped.", INTERRUPTED)
     try:

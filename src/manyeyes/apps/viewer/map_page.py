@@ -11,7 +11,7 @@ import html
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import KINDS, MapElements
-from manyeyes.evaluation.disagreement import Disagreement
+from manyeyes.evaluation.disagreement import Disagreement, disagreement
+from manyeyes.evaluation.map_difference import MapChange
 from manyeyes.maps.transverse_mercator import degrees_from_metres
+from manyeyes.maps.vector_map import VectorMap
 
 Floats = NDArray[np.float64]
 _DEGREES = 7
@@ -29,13 +31,22 @@ _DEGREES = 7
 KIND_COLOURS = {"divider": "#e07b00", "boundary": "#2e7d32", "crossing": "#1565c0", "stop_line": "#8e24aa"}
 CONFIDENCE_STOPS = ((0.0, "#d7301f"), (0.5, "#fdae61"), (0.8, "#41b6c4"), (1.0, "#0c2c84"))
 DISAGREEMENT_COLOURS = {"invented": "#d50000", "missed": "#ff6fae", "unexplained": "#9e9d24"}
+LAYERS = {"truth": "Truth", "observed": "Observations", "fused": "Fused map", "disagreement": "Disagreement"}
+CHANGE_NAMES = (
+    ("truth", "Old map"),
+    ("fused", "New map"),
+    ("disagreement", "Changes"),
+    ("invented", "new"),
+    ("missed", "gone"),
+)
 
 
 @dataclass(frozen=True)
 class MapPage:
     """What the page shows; elements in the map's metric frame, whose origin lies at (latitude, longitude) degrees.
 
-    about: one line of text a fused element, shown when it is clicked. facts: (name, value) pairs under the title.
+    about: one line of text a fused element, shown when it is clicked. facts: (name, value) pairs under the title. names: other
+    words for layers and disagreements, as (the page's own, the shown) pairs.
     """
 
     title: str
@@ -46,6 +57,37 @@ class MapPage:
     disagreement: Disagreement = Disagreement()
     about: Sequence[str] = ()
     facts: Sequence[tuple[str, str]] = ()
+    names: Sequence[tuple[str, str]] = ()
+
+
+def page_of(
+    title: str, made: VectorMap, truth: MapElements | None, observed: MapElements | None, observations: int
+) -> MapPage:
+    """The page of what a map publishes."""
+    shown = made.published()
+    elements = shown.elements
+    facts = [("Elements", str(len(shown))), ("Length", f"{elements.lengths().sum() / 1000:.2f} km")]
+    facts += [("Observations", str(observations))] if observations else []
+    about = [
+        f"{KINDS[int(elements.kind[k])].replace('_', ' ')}, confidence {elements.score[k]:.2f}, {int(shown.supporters[k])} "
+        f"observations by {int(shown.agents[k])} agents, id {shown.id[k].tobytes().hex()[:12]}"
+        for k in range(len(shown))
+    ]
+    origin = (made.frame.latitude, made.frame.longitude)
+    odd = disagreement(elements, truth, observed)
+    return MapPage(title, elements, origin, truth, observed, odd, about, facts)
+
+
+def page_of_change(title: str, old: VectorMap, new: VectorMap, change: MapChange) -> MapPage:
+    """The page of a difference: the new map, the old one as its background, what is new and what is gone."""
+    page = page_of(title, new, old.published().elements, None, 0)
+    facts = [
+        (c.kind.replace("_", " "), f"+{c.new_m:.0f} m, -{c.gone_m:.0f} m")
+        for c in change.kinds
+        if c.new_m + c.gone_m > 0
+    ]
+    odd = Disagreement(invented=change.new, missed=change.gone)
+    return replace(page, disagreement=odd, facts=facts, names=CHANGE_NAMES)
 
 
 def lonlat(points: Floats, origin: tuple[float, float]) -> Floats:
@@ -61,12 +103,14 @@ def render(page: MapPage) -> str:
         "fused": _features(page.fused, page.origin, page.about),
         "disagreement": _pieces(page.disagreement, page.origin),
     }
+    names = dict(page.names)
     data = {
         "layers": layers,
         "bounds": _bounds(page),
         "kinds": KIND_COLOURS,
         "confidence": CONFIDENCE_STOPS,
         "disagreement": DISAGREEMENT_COLOURS,
+        "titles": {name: names.get(name, title) for name, title in LAYERS.items()},
     }
     facts = "".join(f"<li><b>{_text(n)}</b>{_text(v)}</li>" for n, v in page.facts)
     return "\n".join(
@@ -76,7 +120,7 @@ def render(page: MapPage) -> str:
             f"<title>{_text(page.title)}</title>",
             f"<style>{_file('vendor/maplibre-gl.css')}</style><style>{_file('web/map_page.css')}</style></head><body>",
             f'<div id="map"></div><div id="panel"><h1>{_text(page.title)}</h1><ul class="facts">{facts}</ul>',
-            f'<div id="layers"></div>{_legend()}</div>',
+            f'<div id="layers"></div>{_legend(names)}</div>',
             f'<script type="application/json" id="data">{_json(data)}</script>',
             f"<script>{_file('vendor/maplibre-gl.js')}</script>",
             f"<script>{_file('web/map_page.js')}</script></body></html>\n",
@@ -128,12 +172,14 @@ def _bounds(page: MapPage) -> list[list[float]]:
     return lonlat(np.stack((points.min(0), points.max(0))), page.origin).tolist()
 
 
-def _legend() -> str:
+def _legend(names: dict[str, str]) -> str:
     stops = ", ".join(f"{colour} {100 * at:g}%" for at, colour in CONFIDENCE_STOPS)
     kinds = "".join(
         f'<span><i style="background:{c}"></i>{k.replace("_", " ")}</span>' for k, c in KIND_COLOURS.items()
     )
-    odd = "".join(f'<span><i style="background:{c}"></i>{k}</span>' for k, c in DISAGREEMENT_COLOURS.items())
+    odd = "".join(
+        f'<span><i style="background:{c}"></i>{names.get(k, k)}</span>' for k, c in DISAGREEMENT_COLOURS.items()
+    )
     return (
         f'<div class="legend"><b>Confidence of fused elements</b><div class="bar" style="background:linear-gradient(90deg, '
         f'{stops})"></div><div class="ends"><span>0</span><span>1</span></div><b>Truth and observations</b>'

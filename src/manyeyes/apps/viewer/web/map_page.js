@@ -4,11 +4,11 @@ const byKind = ["match", ["get", "kind"], ...Object.entries(held.kinds).flat(), 
 const byScore = ["interpolate", ["linear"], ["get", "score"], ...held.confidence.flat()];
 const byWhat = ["match", ["get", "what"], ...Object.entries(held.disagreement).flat(), "#000"];
 const LAYERS = [
-  { id: "truth", title: "Truth", shown: true, paint: { "line-color": byKind, "line-width": 5, "line-opacity": 0.25 } },
-  { id: "observed", title: "Observations", shown: false,
+  { id: "truth", shown: true, paint: { "line-color": byKind, "line-width": 5, "line-opacity": 0.25 } },
+  { id: "observed", shown: false,
     paint: { "line-color": byKind, "line-width": 1, "line-opacity": 0.35 } },
-  { id: "fused", title: "Fused map", shown: true, paint: { "line-color": byScore, "line-width": 2.4 } },
-  { id: "disagreement", title: "Disagreement", shown: false,
+  { id: "fused", shown: true, paint: { "line-color": byScore, "line-width": 2.4 } },
+  { id: "disagreement", shown: false,
     paint: { "line-color": byWhat, "line-width": 4, "line-opacity": 0.8 } },
 ];
 const map = new maplibregl.Map({
@@ -30,7 +30,7 @@ map.on("load", () => {
     const label = document.createElement("label");
     const box = Object.assign(document.createElement("input"), { type: "checkbox", checked: layer.shown, name: layer.id });
     box.addEventListener("change", () => map.setLayoutProperty(layer.id, "visibility", box.checked ? "visible" : "none"));
-    label.append(box, ` ${layer.title} (${data.features.length})`);
+    label.append(box, ` ${held.titles[layer.id]} (${data.features.length})`);
     document.getElementById("layers").append(label);
   }
   const asked = new URLSearchParams(location.hash.slice(1)).get("show");

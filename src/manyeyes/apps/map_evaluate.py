@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Judges a map against the truth, or runs a study: methods side by side over places, counts and seeds, against bars.
+
+Studies: fusion (four places that nothing was tuned on), noise (pose errors of 0 to 1.5 m), table3 (the CrowdMap paper's Table 3
+as a study), malicious (do liars move what honest agents saw), tuning (all methods with the same budget, on other places).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from manyeyes.datatypes import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+STUDIES = ("fusion", "noise", "table3", "malicious", "tuning")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is judged."""
+
+    vector_map: tyro.conf.Positional[Path | None] = None
+    """The map's folder, of 'map fuse'; or nothing, with --study."""
+    truth: Path | None = None
+    """A map's folder with the truth; 'truth' beside the map is found by itself."""
+    study: str | None = None
+    """fusion, noise, table3, malicious or tuning."""
+    places: tuple[str, ...] = ()
+    """Only these places of a study."""
+    counts: tuple[int, ...] = ()
+    """Only these counts of observations of the study 'fusion'."""
+    seeds: int = 3
+    """How many seeds of a study."""
+    methods: tuple[str, ...] = ()
+    """Only these methods of a study."""
+    oracles: bool = False
+    """Add the oracle rows to a study: truth cut again, true poses, known association."""
+    workers: int = 2
+    """Processes that share a study; results do not depend on it."""
+    out: Path = Path("out/map-study")
+    """Folder for a study: cells are kept there, and a study that was stopped goes on."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    from rich.console import Console
+
+    if options.study is not None and options.study not in STUDIES:
+        raise ConfigError(f"No study is called {options.study!r}; known: {', '.join(STUDIES)}.")
+    if (options.study is None) == (options.vector_map is None):
+        raise ConfigError(f"Give a map's folder, or --study with one of {', '.join(STUDIES)}.")
+    console = Console()
+    if options.vector_map is not None:
+        _judge_one(options, options.vector_map, console)
+        return
+    from manyeyes.apps.map_studies import study
+
+    study(options, console)
+
+
+def _judge_one(options: Options, path: Path, console: Console) -> None:
+    from manyeyes.apps import provenance
+    from manyeyes.apps.map_folder import MapFolder, read_vector_map
+    from manyeyes.apps.viewer.map_table import kinds_terminal
+    from manyeyes.evaluation.map_cells import judge_maps
+
+    truth_folder = options.truth or path.parent / "truth"
+    if not truth_folder.is_dir():
+        raise ConfigError(f"{truth_folder}: no truth there; name one with --truth.")
+    made, truth = read_vector_map(path).published().elements, read_vector_map(truth_folder).elements
+    cut = MapFolder(truth_folder.parent).cut()
+    ap, kinds = judge_maps(cut(made) if cut else made, truth)
+    console.print(kinds_terminal(ap, kinds, f"{path} against {truth_folder}"))
+    out = path / "quality.json"
+    provenance.write_json(out, {"ap": ap, "kinds": kinds}, options, None)
+    console.print(f"All numbers are in {out}", highlight=False, soft_wrap=True)

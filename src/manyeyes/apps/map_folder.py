@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What 'map simulate' leaves behind and the other verbs find: observations, truth in view, and where maps are cut."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from manyeyes.datatypes import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from manyeyes.evaluation.map_trial import Cut, Scene
+    from manyeyes.maps.observation import Frame, Observation
+    from manyeyes.maps.observation_file import Reading
+    from manyeyes.maps.vector_map import VectorMap
+
+ROWS_A_FILE = 5000
+LINES, CROSSINGS = "lines.parquet", "crossings.parquet"
+
+
+@dataclass(frozen=True)
+class MapFolder:
+    """observations/*.parquet, truth (a map), cut.json (ground of junctions and area)."""
+
+    path: Path
+
+    def write(self, scene: Scene) -> None:
+        """A scene, each file whole or not at all."""
+        import shapely
+
+        from manyeyes.maps.vector_map import VectorMap
+        from manyeyes.maps.whole_file import write_whole
+
+        self.write_observations(scene.observations, scene.place.frame)
+        write_vector_map(VectorMap.of(scene.truth, scene.place.frame), self.path / "truth")
+        cut = {"junctions": shapely.to_wkt(scene.place.junctions, 3), "area": scene.place.area}
+        write_whole(self.path / "cut.json", (json.dumps(cut) + "\n").encode())
+
+    def write_observations(self, observations: Sequence[Observation], frame: Frame) -> None:
+        """The observations, instead of those that were there."""
+        from manyeyes.maps.observation_file import write_observations
+
+        held = self.path / "observations"
+        held.mkdir(parents=True, exist_ok=True)
+        for old in sorted(held.glob("part-*.parquet")):
+            old.unlink()
+        for part, start in enumerate(range(0, len(observations), ROWS_A_FILE)):
+            write_observations(held / f"part-{part:05d}.parquet", observations[start : start + ROWS_A_FILE], frame)
+
+    def cut(self) -> Cut | None:
+        """The cut that maps get before they are judged; None where the folder says none."""
+        import shapely
+
+        from manyeyes.evaluation.map_trial import Cut
+
+        file = self.path / "cut.json"
+        if not file.is_file():
+            return None
+        try:
+            held = json.loads(file.read_text(encoding="utf-8"))
+            x0, y0, x1, y1 = (float(v) for v in held["area"])
+            return Cut(shapely.from_wkt(held["junctions"]), (x0, y0, x1, y1))
+        except (ValueError, KeyError, TypeError, shapely.errors.ShapelyError) as error:
+            raise ConfigError(
+                f"{file}: expected junctions (WKT) and area of four numbers; {error}. Simulate again."
+            ) from error
+
+
+def observations_in(path: Path, console: Console) -> Reading:
+    """The observations of a file, a folder of files, or a simulated folder; what was put aside is said, one line each."""
+    from manyeyes.maps.observation_file import read_observations
+
+    reading = read_observations(path / "observations" if (path / "observations").is_dir() else path)
+    say_put_aside(reading, console)
+    if not reading.observations:
+        raise ConfigError(f"{path} holds no usable observation; 'manyeyes map simulate' makes some.")
+    return reading
+
+
+def say_put_aside(reading: Reading, console: Console) -> None:
+    """What could not be used, and why, one line each."""
+    for bad in reading.quarantined:
+        where = f"{bad.file} row {bad.row}" if bad.row >= 0 else bad.file
+        many = f" ({bad.count} rows)" if bad.count > 1 else ""
+        console.print(f"put aside: {where}{many}: {bad.reason}", highlight=False, markup=False, soft_wrap=True)
+
+
+def write_vector_map(made: VectorMap, folder: Path) -> None:
+    """A map as a folder of two GeoParquet files: GeoArrow columns hold lines or polygons, not both."""
+    from manyeyes.maps.formats.geoparquet import write_map
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write_map(made, folder / LINES, folder / CROSSINGS)
+
+
+def read_vector_map(folder: Path) -> VectorMap:
+    """The map of a folder that 'map fuse' wrote."""
+    from manyeyes.maps.formats.geoparquet import read_map
+
+    files = [folder / LINES, folder / CROSSINGS]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise ConfigError(f"{folder}: expected a map's folder with {LINES} and {CROSSINGS}; {missing[0]} is missing.")
+    return read_map(*files)

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ways to make a map of observations that studies compare, by name, with the settings that tuning found.
+
+A method is told the observations and the frame, nothing else. Oracles, which are told more, are named in map_oracle.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes.map_element import MapElements
+from manyeyes.evaluation.map_oracle import ORACLES, oracle
+from manyeyes.evaluation.map_trial import Scene
+from manyeyes.maps.fuse import FuseConfig, fuse
+from manyeyes.maps.observation import Frame, Observation
+from manyeyes.maps.vector_map import VectorMap
+
+OURS = "manyeyes"
+RIVALS = (
+    "union",
+    "chamfer_nms",
+    "crowdmap_literal",
+    "polymerge",
+    "frechet_clustering",
+    "heatmap_buffer",
+    "global_map_builder",
+)
+METHODS = (OURS, *RIVALS)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Configurations by method's name; a method that is not listed runs with its defaults."""
+
+    chosen: tuple[tuple[str, Any], ...] = ()
+    ours: FuseConfig = field(default_factory=FuseConfig)
+
+    def of(self, method: str) -> Any:
+        """The configuration of a method; None: its defaults."""
+        if method == OURS or method in ORACLES:
+            return self.ours
+        return dict(self.chosen).get(method)
+
+
+def tuned() -> Settings:
+    """The settings that studies use: what ``manyeyes map evaluate --study tuning`` found for each method."""
+    return Settings()
+
+
+def check_method(method: str) -> None:
+    """ConfigError for a method that is not known."""
+    if method not in METHODS and method not in ORACLES:
+        raise ConfigError(f"No method is called {method!r}; known: {', '.join((*METHODS, *ORACLES))}.")
+
+
+def map_of(
+    method: str, observations: Sequence[Observation], settings: Settings, frame: Frame | None = None
+) -> VectorMap:
+    """The map that a method makes of observations."""
+    if method == OURS:
+        return fuse(observations, settings.ours, frame)
+    if method not in RIVALS:
+        raise ConfigError(f"{method!r} is told more than observations; known: {', '.join(METHODS)}.")
+    rival, config = importlib.import_module(f"manyeyes.maps.baselines.{method}"), settings.of(method)
+    return rival.fuse(observations, rival.Config() if config is None else config, frame)
+
+
+def make_map(method: str, scene: Scene, settings: Settings) -> MapElements:
+    """The published elements of a method's map of a scene."""
+    if method in ORACLES:
+        return oracle(method, scene, settings.ours)
+    return map_of(method, scene.observations, settings, scene.place.frame).published().elements
