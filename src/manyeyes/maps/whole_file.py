@@ -14,19 +14,21 @@ UNFINISHED = ".unfinished"
 
 
 @contextmanager
-def replacing(path: Path, keep_suffix: bool = False) -> Iterator[Path]:
+def replacing(path: Path, keep_suffix: bool = False, durable: bool = True) -> Iterator[Path]:
     """A temporary path beside ``path`` that takes its place when the block ends well, and vanishes when it does not.
 
     keep_suffix is for libraries that go by a file's ending; else no pattern such as ``*.parquet`` meets the temporary file.
-    The bytes are on the disk before the name is: after a loss of power the file is the old one or the new one.
+    Durable: the bytes are on the disk before the name is, so that after a loss of power, too, the file is the old one or the new.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}{path.suffix if keep_suffix else ''}")
     try:
         yield temporary
-        _to_disk(temporary)
+        if durable:
+            _to_disk(temporary)
         temporary.replace(path)
-        _to_disk(path.parent)
+        if durable:
+            _to_disk(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -60,10 +60,14 @@ def geometries(shapely: Any, elements: MapElements) -> NDArray[np.object_]:
     return out
 
 
-def map_tables(vector_map: VectorMap) -> tuple[pa.Table, pa.Table]:
-    """The map as two Arrow tables, lines and crossings, with GeoParquet metadata; nothing is lost."""
-    closed = vector_map.elements.closed
-    return _table(vector_map, np.flatnonzero(~closed), False), _table(vector_map, np.flatnonzero(closed), True)
+def map_tables(vector_map: VectorMap, rows: NDArray[np.int64] | None = None) -> tuple[pa.Table, pa.Table]:
+    """The map, or these rows of it, as two Arrow tables, lines and crossings, with GeoParquet metadata; nothing is lost.
+
+    Rows keep their relations to rows that are left out, by id: those may stand in another file.
+    """
+    rows = np.arange(len(vector_map)) if rows is None else rows
+    closed = vector_map.elements.closed[rows]
+    return _table(vector_map, rows[~closed], False), _table(vector_map, rows[closed], True)
 
 
 def map_of_tables(tables: list[pa.Table], frame: Frame) -> VectorMap:
@@ -74,9 +78,9 @@ def map_of_tables(tables: list[pa.Table], frame: Frame) -> VectorMap:
     return _assemble(parts, frame)
 
 
-def write_map(vector_map: VectorMap, lines: Path, crossings: Path) -> None:
-    """Write the lossless form: one file of lines, one of crossings (empty ones too)."""
-    for table, path in zip(map_tables(vector_map), (lines, crossings)):
+def write_map(vector_map: VectorMap, lines: Path, crossings: Path, rows: NDArray[np.int64] | None = None) -> None:
+    """Write the lossless form of a map or of some rows: one file of lines, one of crossings (empty ones too)."""
+    for table, path in zip(map_tables(vector_map, rows), (lines, crossings)):
         _write(table, path)
 
 
@@ -153,13 +157,11 @@ def _table(m: VectorMap, rows: NDArray[np.int64], closed: bool) -> pa.Table:
     _, places = rows_of(m.elements.first, rows)
     stations = m.stations.take(places)
     per_point = [e.sigma, *(getattr(stations, f.name) for f in fields(Stations))]
-    ids = np.array(hex_ids(m.id), dtype=np.str_)
     first, sources = rows_of(m.sources_first, rows)
-    observed = hex_ids(m.observations)
     columns: dict[str, pa.Array] = {
         "geometry": _geoarrow(pyarrow, e, closed),
         "bbox": _bbox(pyarrow, e.bounds()),
-        "id": pyarrow.array(ids[rows].tolist(), pyarrow.string()),
+        "id": pyarrow.array(hex_ids(m.id[rows]), pyarrow.string()),
         "kind": pyarrow.array([KINDS[k] for k in e.kind.tolist()], pyarrow.string()),
         "state": pyarrow.array([STATES[k] for k in m.state[rows].tolist()], pyarrow.string()),
         "score": pyarrow.array(e.score),
@@ -168,9 +170,9 @@ def _table(m: VectorMap, rows: NDArray[np.int64], closed: bool) -> pa.Table:
     columns |= {name: pyarrow.array(getattr(m, name)[rows]) for name in _ROW_COLUMNS}
     columns |= {_AT_POINT + n: _lists(pyarrow, e.first, v) for n, v in zip(_POINT_COLUMNS, per_point)}
     for name in _PAIR_COLUMNS:
-        columns[name] = _related(pyarrow, getattr(m.topology, name), rows, len(m), ids)
+        columns[name] = _related(pyarrow, getattr(m.topology, name), rows, m.id)
     columns["branch"] = _branches(pyarrow, m.topology, rows, len(m))
-    named = pyarrow.array([observed[k] for k in m.sources[sources].tolist()], pyarrow.string())
+    named = pyarrow.array(hex_ids(m.observations[m.sources[sources]]), pyarrow.string())
     columns["sources"] = pyarrow.ListArray.from_arrays(pyarrow.array(first, pyarrow.int32()), named)
     geo = _geo("polygon" if closed else "linestring", ["Polygon" if closed else "LineString"], e, m.frame)
     metadata = {
@@ -213,14 +215,12 @@ def _lists(pyarrow: Any, first: NDArray[np.int64], values: NDArray) -> pa.Array:
     return pyarrow.ListArray.from_arrays(pyarrow.array(first, pyarrow.int32()), pyarrow.array(values))
 
 
-def _related(
-    pyarrow: Any, pairs: NDArray[np.int64], rows: NDArray[np.int64], total: int, ids: NDArray[np.str_]
-) -> pa.Array:
+def _related(pyarrow: Any, pairs: NDArray[np.int64], rows: NDArray[np.int64], ids: NDArray[np.uint8]) -> pa.Array:
     """Per row the ids of its partners, in the order of the pairs."""
     order = np.argsort(pairs[:, 0], kind="stable")
-    first = np.searchsorted(pairs[order, 0], np.arange(total + 1))
+    first = np.searchsorted(pairs[order, 0], np.arange(len(ids) + 1))
     chosen, places = rows_of(first, rows)
-    values = pyarrow.array(ids[pairs[order[places], 1]].tolist(), pyarrow.string())
+    values = pyarrow.array(hex_ids(ids[pairs[order[places], 1]]), pyarrow.string())
     return pyarrow.ListArray.from_arrays(pyarrow.array(chosen, pyarrow.int32()), values)
 
 

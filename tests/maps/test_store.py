@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A store keeps every observation once, every release whole, and knows what changed; a writer may be killed at any moment."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manyeyes.datatypes.map_element import DIVIDER, MapElements
+from manyeyes.maps.changes import apply_delta, delta_between, home_tiles, with_ids_of
+from manyeyes.maps.formats.attributes import hex_ids
+from manyeyes.maps.observation import Frame, Observation
+from manyeyes.maps.observation_file import write_observations
+from manyeyes.maps.observation_log import StoreError, locked, read_standing
+from manyeyes.maps.store import MapStore, watermark_of
+from manyeyes.maps.vector_map import VectorMap
+
+pytest.importorskip("pyarrow", reason="the map extra is not installed")
+pytest.importorskip("shapely", reason="the map extra is not installed")
+
+FRAME = Frame(48.137, 11.575)
+MARK = watermark_of((), np.zeros(0, np.int64))
+
+
+def _observation(k: int, x: float | None = None) -> Observation:
+    line = MapElements.of([np.array([[0.0, 1.0], [20.0, 1.0]])], DIVIDER)
+    view = np.array([[-30.0, -15.0], [30.0, -15.0], [30.0, 15.0], [-30.0, 15.0]])
+    pose = np.array([40.0 * k if x is None else x, 5.0 * k, 0.0])
+    return Observation(f"agent{k}", "pass", k, pose, np.diag((0.5, 0.5, 1e-4)), view, line)
+
+
+def _lines(*ys: float, x: float = 0.0) -> VectorMap:
+    return VectorMap.of(
+        MapElements.of([np.stack((np.arange(x, x + 31), np.full(31, y)), 1) for y in ys], DIVIDER), FRAME
+    )
+
+
+def test_the_log_keeps_each_observation_once_and_gives_back_what_was_put_in(tmp_path):
+    store = MapStore.create(tmp_path / "s", FRAME)
+    many = [_observation(k) for k in range(300)]
+    with store.writing() as log:
+        assert log.append(many[:200]) == (200, 0)
+        assert log.append(many[150:]) == (100, 50)
+        assert log.append(many[:10]) == (0, 10)
+        standing = log.standing()
+    assert len(list((tmp_path / "s/log").iterdir())) == 2
+    assert standing.ids == tuple(sorted(o.id for o in many))
+    rows = np.flatnonzero(standing.xy[:, 0] > 7000)
+    got = read_standing(tmp_path / "s/log", standing, rows)
+    want = sorted((o for o in many if o.pose[0] > 7000), key=lambda o: o.id)
+    assert [o.id for o in got] == [o.id for o in want] and len(want) == 124
+    assert standing.reach_m[0] == pytest.approx(np.hypot(30, 15))
+
+
+def test_a_retracted_observation_counts_no_more_and_does_not_come_back(tmp_path):
+    store = MapStore.create(tmp_path, FRAME)
+    many = [_observation(k) for k in range(5)]
+    with store.writing() as log:
+        log.append(many)
+        log.retract([many[2].id], "asked for by its driver")
+        assert log.append([many[2]]) == (0, 1)
+        assert set(log.standing().ids) == {o.id for o in many} - {many[2].id}
+        with pytest.raises(StoreError, match=r"no observation 00+"):
+            log.retract(["00" * 16], "unknown")
+
+
+def test_ingest_puts_aside_what_cannot_be_used_with_its_reason_and_keeps_the_rest(tmp_path):
+    good = [_observation(k) for k in range(4)]
+    (tmp_path / "in").mkdir()
+    write_observations(tmp_path / "in/a.parquet", good, FRAME)
+    write_observations(tmp_path / "in/b.parquet", [_observation(9)], Frame(10.0, 10.0))
+    (tmp_path / "in/c.parquet").write_bytes((tmp_path / "in/a.parquet").read_bytes()[:500])
+    store = MapStore.create(tmp_path / "s", FRAME)
+    with store.writing() as log:
+        done = log.ingest(tmp_path / "in")
+        rows = log.catalogue.quarantined()
+    assert (done.added, len(done.quarantined)) == (4, 2)
+    reasons = {Path(file).name: reason for file, _, _, reason in rows}
+    assert "origin" in reasons["b.parquet"] and "whole Parquet file" in reasons["c.parquet"]
+
+
+def test_the_index_is_made_again_from_the_log(tmp_path):
+    store = MapStore.create(tmp_path, FRAME)
+    with store.writing() as log:
+        log.append([_observation(k) for k in range(5)])
+        log.retract([_observation(3).id], "test")
+        before = log.standing()
+    for path in tmp_path.glob("catalogue.sqlite*"):
+        path.unlink()
+    with MapStore(tmp_path).writing() as log:
+        after = log.standing()
+    assert after.ids == before.ids and len(after) == 4
+    np.testing.assert_array_equal(after.xy, before.xy)
+    np.testing.assert_array_equal(after.row_group, before.row_group)
+
+
+def test_a_release_is_read_back_and_says_what_it_was_made_of(two_lanes, tmp_path):
+    store = MapStore.create(tmp_path, FRAME)
+    first = VectorMap.cat([two_lanes(), two_lanes(1000.0, -700.0)])
+    mark = watermark_of(["ab" * 16], np.array([7]))
+    manifest = store.publish(first, "union", "tau=1", mark)
+    assert (manifest.number, manifest.parent, manifest.elements, manifest.watermark) == (1, 0, 10, mark)
+    assert (manifest.algorithm, manifest.settings) == ("union", "tau=1")
+    assert [(t.x, t.y, t.elements) for t in manifest.tiles] == [(0, -1, 2), (0, 0, 3), (3, -3, 5)]
+    assert MapStore(tmp_path).manifest() == manifest
+    got = store.read()
+    assert got.quantised_hash() == first.quantised_hash() == manifest.content
+    # Neighbours in another tile are still known, as relations are stored by id.
+    assert {tuple(p) for p in got.topology.right.tolist()} and len(got.topology.right) == len(first.topology.right)
+    near = store.read(area=(900.0, -800.0, 1100.0, -600.0))
+    assert sorted(hex_ids(near.id)) == sorted(hex_ids(first.id[5:]))
+
+
+def test_equal_tiles_are_stored_once_for_all_releases(two_lanes, tmp_path):
+    store = MapStore.create(tmp_path, FRAME)
+    far = two_lanes(1000.0, -700.0)
+    store.publish(VectorMap.cat([two_lanes(), far]), "a", "", MARK)
+    count = len(list((tmp_path / "tiles").rglob("*.parquet")))
+    one, two = store.manifest(), store.publish(VectorMap.cat([two_lanes(y=0.3), far]), "a", "", MARK)
+    assert one.tiles[-1] == two.tiles[-1]
+    assert {t.x for t in two.tiles if t not in one.tiles} == {0}
+    assert len(list((tmp_path / "tiles").rglob("*.parquet"))) > count
+    assert store.read(1).quantised_hash() == one.content != two.content == store.read().quantised_hash()
+
+
+def test_a_delta_turns_the_parent_into_the_release_and_counts_by_tile(tmp_path):
+    store = MapStore.create(tmp_path, FRAME)
+    store.publish(_lines(10, 20, 30), "a", "", MARK)
+    store.publish(VectorMap.cat([_lines(10, 20.5), _lines(300, x=600.0)]), "a", "", MARK)
+    delta = store.delta(2)
+    # The line that moved by half a metre keeps its id; the one at 30 m is gone; one is new, two tiles on.
+    before, after = store.read(1), store.read(2)
+    assert len(delta.added) == len(delta.modified) == len(delta.deleted) == 1
+    assert delta.modified[0] in hex_ids(before.id)
+    assert delta.by_tile() == [((0, 0), 0, 1, 1), ((2, 1), 1, 0, 0)]
+    made = apply_delta(before, delta)
+    assert made.quantised_hash() == after.quantised_hash() and hex_ids(made.id) == hex_ids(after.id)
+    assert len(store.delta(1).added) == 3
+
+
+def test_ids_go_to_the_largest_overlap_and_only_once():
+    before, after = _lines(10, 20), _lines(10.4, 10.8, 20.2)
+    got = with_ids_of(after, before)
+    assert hex_ids(got.id)[2] == hex_ids(before.id)[1]
+    inherited = [name for name in hex_ids(got.id)[:2] if name == hex_ids(before.id)[0]]
+    assert len(inherited) == 1
+    other_kind = replace(before, elements=replace(before.elements, kind=np.array([1, 1])))
+    assert hex_ids(with_ids_of(after, other_kind).id) == hex_ids(after.id)
+    assert len(delta_between(after, after).changed) == 0
+
+
+def test_an_element_lives_in_the_tile_of_its_lesser_end_whichever_way_it_runs(two_lanes):
+    m = _lines(10, x=250.0)
+    back = replace(m, elements=m.elements.with_points(m.elements.points[::-1]))
+    assert home_tiles(m).tolist() == home_tiles(back).tolist() == [[0, 0]]
+    assert home_tiles(two_lanes(250.0, 0.0)).tolist()[3] == [1, -1]
+
+
+def test_damage_is_named(two_lanes, tmp_path):
+    store = MapStore.create(tmp_path, FRAME)
+    with pytest.raises(StoreError, match="no release yet"):
+        store.manifest()
+    store.publish(two_lanes(), "a", "", MARK)
+    with pytest.raises(StoreError, match="no release 3; there are 1"):
+        store.read(3)
+    with pytest.raises(StoreError, match="choose another folder"):
+        MapStore.create(tmp_path, Frame(1.0, 1.0))
+    with pytest.raises(StoreError, match=r"store\.json"):
+        MapStore(tmp_path / "nowhere")
+    path = next((tmp_path / "tiles").rglob("*.lines.parquet"))
+    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    with pytest.raises(StoreError, match="missing or damaged"):
+        store.read()
+    for version in (99,):
+        file = tmp_path / "releases/000001.json"
+        file.write_text(json.dumps({**json.loads(file.read_text()), "version": version}))
+        with pytest.raises(StoreError, match="version 99"):
+            store.manifest()
+
+
+def test_two_writers_do_not_meet(tmp_path):
+    store = MapStore.create(tmp_path, FRAME)
+    with locked(tmp_path / "lock"), pytest.raises(StoreError, match="another program"), store.writing():
+        pass
+    with store.writing():
+        pass
+
+
+@pytest.mark.parametrize(("first", "step", "timed"), [(1, 9, 4)])
+def test_a_writer_killed_at_any_moment_leaves_a_whole_release_and_a_whole_log(tmp_path, first, step, timed):
+    script = Path(__file__).with_name("killed_writer.py")
+    command = [sys.executable, str(script), str(tmp_path), str(step), str(timed)]
+    report = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    killed = [case for case in report["cases"] if case["killed"]]
+    assert len(killed) >= 8
+    assert report["want"]["release"] == 2 and report["want"]["unfinished"] == []
+    releases, seconds = set(), set()
+    for case in report["cases"]:
+        seen = json.loads(case["seen"])
+        assert seen["whole"] and seen["first"] and seen["second"] in (0, 40), case
+        releases.add(seen["release"])
+        seconds.add(seen["second"])
+        # A writer that comes after finishes the work, and nothing tells that another had died.
+        assert json.loads(case["end"]) == report["want"], case
+    assert seconds == {0, 40} and 1 in releases
