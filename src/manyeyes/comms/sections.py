@@ -43,13 +43,14 @@ _SIGMA_XY, _SIGMA_YAW = (0.01, 20.0), (0.001, 3.2)
 
 @dataclass(frozen=True, eq=False)
 class TokenRows:
-    """Some cells of a grid: key (n,) ascending; values (n, C) as they stand in the packet; scales: codes (C,) if int8."""
+    """Some cells of a grid: key (n,) ascending; scales and values: the bytes of C codes (none but for int8) and n rows of C."""
 
     grid: BevGrid
     precision: Precision
+    channels: int
     key: NDArray[np.int64]
-    values: NDArray[Any]
-    scales: NDArray[np.uint8] | None
+    scales: bytes
+    values: bytes
 
     @property
     def features(self) -> NDArray[np.float32]:
@@ -277,19 +278,15 @@ def _read_tokens(body: bytes) -> TokenRows:
             "implausible", f"Cells lie outside a grid of {rows} rows and {columns} columns (or it is huge)."
         )
     precision, at = PRECISIONS[form & 3], _GRID.size + used
-    scales = None
-    dtype = _FEATURE_TYPES[precision]
-    scale_bytes = channels if precision == "int8" else 0
-    if len(body) != at + scale_bytes + count * channels * dtype.itemsize:
+    size = _FEATURE_TYPES[precision].itemsize
+    end = at + (channels if precision == "int8" else 0)
+    if len(body) != end + count * channels * size:
         raise PacketError(
             "garbage", f"{count} cells of {channels} channels as {precision} do not fill {len(body)} bytes."
         )
-    if precision == "int8":
-        scales = np.frombuffer(body, np.uint8, channels, at)
-    elif not codec.are_finite(body, at, dtype.itemsize):
+    if size > 1 and not codec.are_finite(body, at, size):
         raise PacketError("implausible", "Features are NaN or infinite.")
-    values = np.frombuffer(body, dtype, offset=at + scale_bytes).reshape(count, channels)
-    return TokenRows(grid, precision, key, values, scales)
+    return TokenRows(grid, precision, channels, key, body[at:end], body[end:])
 
 
 def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
@@ -304,11 +301,13 @@ def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
 
 def _features(parts: list[TokenRows]) -> NDArray[np.float32]:
     """(n, C) float32 of the rows of several packets of one form."""
-    dtype = _FEATURE_TYPES[parts[0].precision].newbyteorder("=")
-    values = np.concatenate([p.values for p in parts], dtype=dtype)
-    codes = [p.scales for p in parts if p.scales is not None]
-    if codes:
-        return codec.dequantise_int8(np.repeat(np.stack(codes), [len(p.key) for p in parts], axis=0), values)
+    dtype, channels = _FEATURE_TYPES[parts[0].precision], parts[0].channels
+    # A copy that may be written to, in the machine's own order of bytes.
+    values = np.frombuffer(b"".join(p.values for p in parts), dtype).astype(dtype.newbyteorder("="))
+    values = values.reshape(-1, channels)
+    if parts[0].precision == "int8":
+        codes = np.frombuffer(b"".join(p.scales for p in parts), np.uint8).reshape(-1, channels)
+        return codec.dequantise_int8(np.repeat(codes, [len(p.key) for p in parts], axis=0), values)
     return torch.from_numpy(values).float().numpy()
 
 

@@ -288,18 +288,22 @@ class Assembly:
         head, held = self.header, self.fragments.get(fragment.number)
         if held is not None and held.packet == fragment.packet:
             return False
-        name = f"packet {fragment.number} of agent {head.agent_id} at {head.timestamp_ns} ns"
         if (fragment.header is not head and fragment.header != head) or held is not None:
+            name = self._name(fragment)
             raise PacketError("contradiction", f"A second {name} differs from the first; both cannot be true.")
         if isinstance(fragment.body, TokenRows):
-            form = (fragment.body.grid, fragment.body.precision, fragment.body.values.shape[1])
+            form = (fragment.body.grid, fragment.body.precision, fragment.body.channels)
             cells = fragment.body.key.tolist()
             if (self._form or form) != form or not self._cells.isdisjoint(cells):
+                name = self._name(fragment)
                 raise PacketError("contradiction", f"The cells in {name} do not go with those of the other packets.")
             self._form = form
             self._cells.update(cells)
         self.fragments[fragment.number] = fragment
         return True
+
+    def _name(self, fragment: Fragment) -> str:
+        return f"packet {fragment.number} of agent {self.header.agent_id} at {self.header.timestamp_ns} ns"
 
     def message(self) -> Message:
         """What has come so far, as a message; sections of which no packet came are None."""
