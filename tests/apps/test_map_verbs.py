@@ -87,6 +87,18 @@ def test_export_writes_a_file_that_others_read(folder, tmp_path) -> None:
     assert len(json.loads((tmp_path / "all.geojson").read_text())["features"]) >= len(held["features"])
 
 
+def test_a_store_takes_observations_in_and_other_verbs_read_its_last_release(folder, tmp_path, capsys) -> None:
+    store = tmp_path / "city"
+    assert run("map", "fuse", folder, "--store", store, "--executor", "inline") == 0
+    assert "release 1 after 24 new observations, 0 known, 0 put aside" in capsys.readouterr().out
+    assert run("map", "fuse", folder, "--store", store, "--executor", "inline") == 0
+    assert "release 2 after 0 new observations, 24 known" in capsys.readouterr().out
+    assert read_vector_map(store).quantised_hash() == read_vector_map(folder / "map").quantised_hash()
+    assert run("map", "diff", folder / "map", store) == 0
+    assert run("map", "fuse", folder, "--store", store, "--method", "union") == 1
+    assert "without --store" in capsys.readouterr().err
+
+
 def test_import_reads_results_of_a_model(tmp_path, capsys) -> None:
     vectors = [[[0.0, 0.0], [10.0, 0.0]], [[0.0, 3.5], [10.0, 3.5]]]
     results = {"meta": {}, "results": {t: {"vectors": vectors, "scores": [0.9, 0.05], "labels": [1, 2]} for t in "abc"}}

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from manyeyes.evaluation.map_trial import Cut, Scene
     from manyeyes.maps.observation import Frame, Observation
-    from manyeyes.maps.observation_file import Reading
+    from manyeyes.maps.observation_file import Quarantined, Reading
     from manyeyes.maps.vector_map import VectorMap
 
 ROWS_A_FILE = 5000
@@ -71,20 +71,25 @@ class MapFolder:
             ) from error
 
 
+def observation_files(path: Path) -> Path:
+    """Where observations lie: the folder of that name in a folder that has one, else the path itself."""
+    return path / "observations" if (path / "observations").is_dir() else path
+
+
 def observations_in(path: Path, console: Console) -> Reading:
     """The observations of a file, a folder of files, or a simulated folder; what was put aside is said, one line each."""
     from manyeyes.maps.observation_file import read_observations
 
-    reading = read_observations(path / "observations" if (path / "observations").is_dir() else path)
-    say_put_aside(reading, console)
+    reading = read_observations(observation_files(path))
+    say_put_aside(reading.quarantined, console)
     if not reading.observations:
         raise ConfigError(f"{path} holds no usable observation; 'manyeyes map simulate' makes some.")
     return reading
 
 
-def say_put_aside(reading: Reading, console: Console) -> None:
+def say_put_aside(quarantined: Sequence[Quarantined], console: Console) -> None:
     """What could not be used, and why, one line each."""
-    for bad in reading.quarantined:
+    for bad in quarantined:
         where = f"{bad.file} row {bad.row}" if bad.row >= 0 else bad.file
         many = f" ({bad.count} rows)" if bad.count > 1 else ""
         console.print(f"put aside: {where}{many}: {bad.reason}", highlight=False, markup=False, soft_wrap=True)
@@ -99,11 +104,18 @@ def write_vector_map(made: VectorMap, folder: Path) -> None:
 
 
 def read_vector_map(folder: Path) -> VectorMap:
-    """The map of a folder that 'map fuse' wrote."""
+    """The map of a folder that 'map fuse' wrote: a map's own, or a store, whose last release is meant."""
     from manyeyes.maps.formats.geoparquet import read_map
+
+    if (folder / "store.json").is_file():
+        from manyeyes.maps.store import MapStore
+
+        return MapStore(folder).read()
 
     files = [folder / LINES, folder / CROSSINGS]
     missing = [file.name for file in files if not file.is_file()]
     if missing:
-        raise ConfigError(f"{folder}: expected a map's folder with {LINES} and {CROSSINGS}; {missing[0]} is missing.")
+        raise ConfigError(
+            f"{folder}: expected a store, or a map's folder with {LINES} and {CROSSINGS}; {missing[0]} is missing."
+        )
     return read_map(*files)

@@ -5,8 +5,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
+
+from manyeyes.datatypes import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import TaskID
 
 
 @dataclass(frozen=True)
@@ -19,6 +26,12 @@ class Options:
     """Folder for the map, two GeoParquet files; 'map' beside the observations by default."""
     method: str = "manyeyes"
     """manyeyes, or a rival: union, chamfer_nms, crowdmap_literal, polymerge, frechet_clustering, heatmap_buffer, ..."""
+    store: Path | None = None
+    """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release."""
+    executor: str = "process"
+    """What fuses a store's tiles: inline, process, dask or ray."""
+    workers: int | None = None
+    """How many processes; one a core by default. The map does not depend on it."""
 
 
 def main(options: Options) -> None:
@@ -33,6 +46,9 @@ def main(options: Options) -> None:
 
     check_method(options.method)
     console = Console()
+    if options.store is not None:
+        _into_store(options, options.store, console)
+        return
     reading = observations_in(options.observations, console)
     base = options.observations if options.observations.is_dir() else options.observations.parent
     out = options.out or base / ("map" if options.method == "manyeyes" else options.method)
@@ -53,6 +69,40 @@ def main(options: Options) -> None:
     provenance.write_json(out / "fuse.json", payload, {"options": options, "settings": Settings()}, None)
     console.print(
         f"{out}: {published} published elements of {len(made)} from {len(reading.observations)} observations in {seconds:.1f} s",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _into_store(options: Options, folder: Path, console: Console) -> None:
+    """Takes the observations into a store's log and publishes a release, tile by tile."""
+    from manyeyes.apps.map_folder import observation_files, say_put_aside
+    from manyeyes.apps.showcase import bars
+    from manyeyes.maps.engine import named_executor
+    from manyeyes.maps.observation_file import read_observations
+    from manyeyes.maps.store import MapStore
+
+    if options.method != "manyeyes":
+        raise ConfigError(f"A store is fused by manyeyes' own method; fuse without --store for {options.method}.")
+    executor, source = named_executor(options.executor, options.workers), observation_files(options.observations)
+    there = (folder / "store.json").exists()
+    store = MapStore(folder) if there else MapStore.create(folder, read_observations(source).frame)
+    with store.writing() as log:
+        done = log.ingest(source)
+    say_put_aside(done.quarantined, console)
+    with bars(console) as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def report(step: str, finished: int, total: int) -> None:
+            task = tasks.get(step)
+            if task is None:
+                task = tasks[step] = progress.add_task(step, total=total)
+            progress.update(task, completed=finished, total=total)
+
+        manifest = store.fuse(executor=executor, progress=report)
+    console.print(
+        f"{folder}: release {manifest.number} after {done.added} new observations, {done.known} known, "
+        f"{len(done.quarantined)} put aside",
         highlight=False,
         soft_wrap=True,
     )

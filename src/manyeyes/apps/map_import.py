@@ -68,7 +68,7 @@ def main(options: Options) -> None:
         table = read_nuscenes_poses(options.nuscenes, options.location, options.axes)
     asked = ResultOptions(options.axes, options.range_x, options.range_y, options.least_score, model=options.model)
     reading = read_model_results(options.results, table, asked)
-    say_put_aside(reading, console)
+    say_put_aside(reading.quarantined, console)
     if not reading.observations:
         raise ConfigError(f"{options.results}: no sample could be used; the reasons stand above.")
     MapFolder(options.out).write_observations(reading.observations, reading.frame)
