@@ -253,6 +253,8 @@ def test_poles_are_trusted_and_stand_still(cross):
     pole = crowd.roles == ROLES.index("pole")
     assert pole.sum() >= 8
     assert [o.trusted for o in crowd.observations] == pole.tolist()
+    where = {(o.agent, *o.pose.tolist()) for o, p in zip(crowd.observations, pole) if p}
+    assert len(where) == len({agent for agent, *_ in where}) == 1
     off = np.linalg.norm((poses(crowd) - crowd.true_poses)[pole], axis=1)
     assert off.max() == 0.0
     assert np.mean([len(o.elements) for o, p in zip(crowd.observations, pole) if p]) > 3

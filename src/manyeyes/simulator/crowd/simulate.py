@@ -59,9 +59,10 @@ class Crowd:
 
 @dataclass(frozen=True)
 class _Pass:
-    """One drive: who, its place in the order of passes, its role, its true poses (K, 3) and its key."""
+    """One drive: who (number and pseudonym), its place among passes, its role, its true poses (K, 3) and its key."""
 
     agent: int
+    name: str
     number: int
     role: int
     poses: Array
@@ -120,15 +121,15 @@ def _passes(place: Place, config: CrowdConfig, seed: int) -> Iterator[_Pass]:
         agent = number // config.passes_per_agent
         key = _key(seed, agent, number)
         role = _role(agent, config, offsets)
-        as_pole = len(poles) and unit(key, _PASS, 0, 8) < config.pole_share
-        if as_pole:
-            role, path = POLE, None
-            drawn = np.repeat(poles[[int(unit(key, _PASS, 0, 9) * len(poles))]], config.per_pass, axis=0)
+        name = f"s{seed}-a{agent:05d}"
+        if len(poles) and unit(key, _PASS, 0, 8) < config.pole_share:
+            site = int(unit(key, _PASS, 0, 9) * len(poles))
+            role, name = POLE, f"s{seed}-pole{site:03d}"
+            drawn = np.repeat(poles[[site]], config.per_pass, axis=0)
         else:
-            path = _path(place, config, key, share)
-            drawn = _looks(path, place.area, config, key)
+            drawn = _looks(_path(place, config, key, share), place.area, config, key)
         if len(drawn):
-            yield _Pass(agent, number, role, drawn, key)
+            yield _Pass(agent, name, number, role, drawn, key)
         number += 1
 
 
@@ -241,10 +242,9 @@ class _Looker:
                 [noise.x_min, noise.y_max],
             ]
         )
-        agent = f"s{self.seed}-a{drive.agent:05d}"
         observation = Observation(
-            agent=agent,
-            pass_id=f"{agent}-p{drive.number:05d}",
+            agent=drive.name,
+            pass_id=f"{drive.name}-p{drive.number:05d}",
             time_ns=time,
             pose=claimed,
             covariance=covariance,
