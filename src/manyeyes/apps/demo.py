@@ -2,16 +2,22 @@
 """Makes a drive that the shipped weights never saw, lets every agent share bytes and perceive, and judges the result.
 
 Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. What is found is
-compared for ego alone, late, intermediate and early fusion on the same channel.
+compared for ego alone, late, intermediate and early fusion on the same channel. At the end a crowd maps a crossroads.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from manyeyes.apps.playing import Playing, excerpt, weights_name
 from manyeyes.datatypes import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from manyeyes.apps.viewer.report import Chapter
 
 PRESET = "demo"
 
@@ -61,6 +67,7 @@ def main(options: Options) -> None:
     town = drive.scenario.rpartition("_")[0]
     if len(drive.judged(drive.scenario)) == 0:
         raise ConfigError(f"{folder}: the drive has no judged frame; remove the folder and run the demo again.")
+    chapters, said = _small_map(options.out / "map", options.seed, console)
     showing = Showing(
         out=options.out,
         title="manyeyes demo: one drive, four ways to collaborate",
@@ -75,9 +82,26 @@ def main(options: Options) -> None:
             f"manyeyes demo --seed {options.seed}",
             f"manyeyes run {folder} --split test",
             f"manyeyes view {folder} --split test --out drive.gif",
+            f"manyeyes map fuse {options.out / 'map'}",
         ),
+        chapters=chapters,
     )
     _, report = play(drive, detector, showing, console)
+    console.print(f"\n{said}", highlight=False, soft_wrap=True)
     console.print(
         f"\nPictures, animation and JSON are in {options.out}; open {report}", highlight=False, soft_wrap=True
     )
+
+
+def _small_map(out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
+    """The map part, or why there is none: it needs an extra of its own."""
+    from manyeyes.datatypes import MissingExtraError
+
+    try:
+        from manyeyes.apps.map_demo import sentence, small_map
+
+        with console.status("Mapping a crossroads"):
+            numbers, chapter = small_map(out, seed)
+    except MissingExtraError as error:
+        return (), f"No map: {error}"
+    return (chapter,), sentence(numbers)

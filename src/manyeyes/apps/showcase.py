@@ -18,7 +18,7 @@ from manyeyes.apps.outcome import Outcome, outcome_of, show
 from manyeyes.apps.playing import Excerpt
 from manyeyes.apps.viewer.animation import save_animation, stack
 from manyeyes.apps.viewer.birds_eye import draw, save_png, scene_of
-from manyeyes.apps.viewer.report import Picture, Report, save_report
+from manyeyes.apps.viewer.report import Chapter, Picture, Report, save_report
 from manyeyes.apps.viewer.table import markdown
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.evaluation.detection import Protocol, protocol_named
@@ -52,6 +52,7 @@ class Showing:
     animate: bool = True
     facts: tuple[tuple[str, str], ...] = ()
     commands: tuple[str, ...] = ()
+    chapters: tuple[Chapter, ...] = ()
 
 
 @dataclass
@@ -104,6 +105,7 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
         facts=_facts(drive, detector, showing),
         commands=showing.commands,
         notes=_notes(protocol),
+        chapters=showing.chapters,
         provenance=origin,
     )
     save_report(report, showing.out / "report.html")

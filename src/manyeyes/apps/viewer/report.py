@@ -69,6 +69,15 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Chapter:
+    """A part of a report of its own: heading, text, pictures."""
+
+    title: str
+    text: str
+    pictures: tuple[Picture, ...] = ()
+
+
+@dataclass(frozen=True)
 class Report:
     """All that the page shows. facts: short (name, value) pairs; provenance: what write_json wrote beside it."""
 
@@ -80,6 +89,7 @@ class Report:
     facts: tuple[tuple[str, str], ...] = ()
     commands: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    chapters: tuple[Chapter, ...] = ()
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
@@ -104,6 +114,8 @@ def render(report: Report) -> str:
         parts += ["<h2>The drive</h2>", *(_figure(p) for p in wide)]
     if pairs:
         parts += ["<h2>One instant, from above</h2>", f'<div class="pair">{"".join(_figure(p) for p in pairs)}</div>']
+    for chapter in report.chapters:
+        parts += [f"<h2>{_text(chapter.title)}</h2>", f"<p>{_text(chapter.text)}</p>", *map(_figure, chapter.pictures)]
     if report.commands:
         parts += ["<h2>Again, on your machine</h2>", f"<pre>{_text(chr(10).join(report.commands))}</pre>"]
     if report.provenance:

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One map from many drives: sixty wrong local maps of a crossroads become one, judged against the truth and drawn.
+
+python examples/06_one_map_from_many_drives.py out/crossroads.html
+"""
+
+import sys
+from pathlib import Path
+
+from manyeyes.apps.viewer.map_page import page_of, save_map_page
+from manyeyes.datatypes.map_element import MapElements
+from manyeyes.evaluation.map_quality import judge
+from manyeyes.maps.fuse import fuse
+from manyeyes.maps.observation_file import read_observations, write_observations
+from manyeyes.simulator.crowd.place import place
+from manyeyes.simulator.crowd.simulate import simulate_crowd
+
+page = Path(sys.argv[1] if len(sys.argv) > 1 else "out/crossroads.html")
+page.parent.mkdir(parents=True, exist_ok=True)
+
+# A crowd drives through a crossroads; each look is one Observation with a claimed pose, a view and some map elements.
+where = place("cross", size_m=160.0)
+crowd = simulate_crowd(where, 60, seed=1)
+
+# Yours would come from a file, as docs/observation.md describes it: one row an observation.
+file = page.with_name("observations.parquet")
+write_observations(file, crowd.observations, where.frame)
+observations = read_observations(file).observations
+
+made = fuse(observations, frame=where.frame).published()
+union = MapElements.cat([observation.in_map() for observation in observations])
+truth = where.in_area()
+for name, elements in (("fused", made.elements), ("union", union)):
+    quality = judge(where.in_area(elements), truth)
+    divider = quality.length("divider")
+    print(
+        f"{name}: {len(elements)} elements, mAP {quality.mean_ap():.2f}, dividers: precision {divider.precision:.2f}, "
+        f"recall {divider.recall:.2f}, duplication {quality.of('divider').duplication:.2f}"
+    )
+
+save_map_page(page_of("Crossroads", made, truth, union, len(observations)), page)
+print(f"{page} shows it")
