@@ -321,3 +321,18 @@ def test_truth_respects_range_and_points():
 def test_a_snapshot_without_truth_is_refused():
     with pytest.raises(RecordingError, match="crossing #0 has no truth"):
         ego_truth(replace(crossing(), truth=None), 0, MANYEYES)
+
+
+def test_ranges_on_dair_differ_where_their_sources_do() -> None:
+    ranges = {
+        name: PROTOCOLS[name].gt_range for name in ("dair", "coalign", "heal-dair", "costr-dair", "costr-dair-centred")
+    }
+    assert ranges["dair"] == (0.0, -39.68, -3.0, 100.0, 39.68, 1.0)
+    assert ranges["coalign"] == (-100.8, -40.0, -3.5, 100.8, 40.0, 1.5)
+    assert ranges["heal-dair"] == (-102.4, -51.2, -3.5, 102.4, 51.2, 1.5)
+    for name in ("costr-dair", "costr-dair-centred"):
+        x0, y0, _, x1, y1, _ = ranges[name]
+        assert (x1 - x0, y1 - y0) == (102.4, 102.4) and PROTOCOLS[name].sort == "concatenated"
+    assert ranges["costr-dair"][0] == 0.0
+    assert PROTOCOLS["sparsealign-dair"].com_range_m == 200.0
+    assert PROTOCOLS["sparsealign-dair"].min_points_in_gt == PROTOCOLS["sparsealign"].min_points_in_gt == 4

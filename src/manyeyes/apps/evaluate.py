@@ -30,7 +30,7 @@ class Options:
     out: Path = Path("out/evaluate")
     """Folder for results.json and results.md."""
     protocol: str = "manyeyes"
-    """Rules of the AP: manyeyes, opencood, coalign, sparsealign, dair."""
+    """Rules of the AP: manyeyes, opencood, coalign, sparsealign; on DAIR-V2X also dair, heal-dair, costr-dair, sparsealign-dair."""
     noise_xy_m: float = 0.0
     """Standard deviation of errors of collaborators' claimed positions."""
     noise_yaw_deg: float = 0.0

@@ -96,9 +96,11 @@ class DairWriter:
             _motion(world_from_lidar.inverse() @ world_from_virtual),
         )
         self._json(vehicle / "label" / "lidar" / f"{stem}.json", _side_labels(_listed(snapshot, row), world_from_lidar))
-        listed = _side_labels(_listed(unit, pole), world_from_virtual)
-        self._json(infrastructure / "label" / "virtuallidar" / f"{stem}.json", [_as_strings(entry) for entry in listed])
-        everything = snapshot.truth.boxes[snapshot.truth.seen.any(0)].to(torch.float64)
+        listed = _listed(unit, pole)
+        labels = [_as_strings(entry) for entry in _side_labels(listed, world_from_virtual)]
+        self._json(infrastructure / "label" / "virtuallidar" / f"{stem}.json", labels)
+        either = snapshot.truth.seen[row] | torch.isin(snapshot.truth.boxes.id, listed.id)
+        everything = snapshot.truth.boxes[either].to(torch.float64)
         self._json(
             self.root / "cooperative" / "label_world" / f"{stem}.json", _world_labels(everything, world_from_virtual)
         )

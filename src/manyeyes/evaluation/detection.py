@@ -29,7 +29,10 @@ keep theirs. Without any truth, AP and recall are NaN, not 0; without any detect
 The primary protocol ``manyeyes`` judges by box centres in the plane on both sides. The others reproduce published
 code, whose rules differ; where a source does not say (score thresholds of ``sparsealign`` and ``dair``, NMS of
 ``dair``), OpenCOOD's value stands in. Their z ranges are those of a LiDAR frame, hence ``z_origin_m``. Their cap of
-100 truth boxes a frame is not reproduced. ``coalign`` is CoAlign's setting for DAIR-V2X.
+100 truth boxes a frame is not reproduced. ``coalign`` is CoAlign's setting for DAIR-V2X, and ``dair`` that of its authors.
+By the same rules as CoAlign, other ranges on DAIR-V2X: ``heal-dair`` (HEAL), ``sparsealign-dair`` (SparseAlign's rules and its
+test range), and CoSTr's 102.4 m × 102.4 m, which the paper does not place: ``costr-dair`` ahead of the vehicle, where the original
+labels are, ``costr-dair-centred`` around it; both by the legacy AP, which its numbers suggest (detection.md 1.7, inferred).
 """
 
 from __future__ import annotations
@@ -94,30 +97,34 @@ _OPENCOOD = Protocol(
     z_origin_m=1.9,
 )
 
+_COALIGN = replace(
+    _OPENCOOD,
+    name="coalign",
+    sort="global",
+    gt_range=(-100.8, -40.0, -3.5, 100.8, 40.0, 1.5),
+    gt_range_mode="corners_xy",
+    pred_range_mode="corners",
+    com_range_m=100.0,
+)
+
+_SPARSEALIGN = Protocol(
+    name="sparsealign",
+    score_threshold=0.20,
+    nms_iou=0.01,
+    nms_pre=500,
+    gt_range_mode="center",
+    pred_range_mode="center",
+    z_origin_m=1.9,
+    min_points_in_gt=4,
+)
+
 PROTOCOLS: dict[str, Protocol] = {
     p.name: p
     for p in (
         Protocol(name="manyeyes"),
         _OPENCOOD,
-        replace(
-            _OPENCOOD,
-            name="coalign",
-            sort="global",
-            gt_range=(-100.8, -40.0, -3.5, 100.8, 40.0, 1.5),
-            gt_range_mode="corners_xy",
-            pred_range_mode="corners",
-            com_range_m=100.0,
-        ),
-        Protocol(
-            name="sparsealign",
-            score_threshold=0.20,
-            nms_iou=0.01,
-            nms_pre=500,
-            gt_range_mode="center",
-            pred_range_mode="center",
-            z_origin_m=1.9,
-            min_points_in_gt=4,
-        ),
+        _COALIGN,
+        _SPARSEALIGN,
         Protocol(
             name="dair",
             score_threshold=0.20,
@@ -128,6 +135,14 @@ PROTOCOLS: dict[str, Protocol] = {
             com_range_m=math.inf,
             matching="truth_first",
             drop_first_segment=True,
+        ),
+        replace(_COALIGN, name="heal-dair", gt_range=(-102.4, -51.2, -3.5, 102.4, 51.2, 1.5)),
+        replace(_COALIGN, name="costr-dair", sort="concatenated", gt_range=(0.0, -51.2, -3.5, 102.4, 51.2, 1.5)),
+        replace(
+            _COALIGN, name="costr-dair-centred", sort="concatenated", gt_range=(-51.2, -51.2, -3.5, 51.2, 51.2, 1.5)
+        ),
+        replace(
+            _SPARSEALIGN, name="sparsealign-dair", gt_range=(-100.0, -40.0, -3.0, 100.0, 40.0, 1.0), com_range_m=200.0
         ),
     )
 }

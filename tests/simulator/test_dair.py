@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated crossing in DAIR-V2X's layout: the simulator's truth comes back, and a wrong reader does not hide."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("libsumo", reason="scenarios need the sim extra")
+
+from manyeyes.datasets import dair_json, dair_v2x
+from manyeyes.datasets.dair_v2x import DairRecording
+from manyeyes.datasets.pcd import PcdCloud, read_table
+from manyeyes.datatypes import ConfigError, Transform
+from manyeyes.simulator import dair
+from manyeyes.simulator.dair import record_dair
+from manyeyes.simulator.presets import jobs_of, simulation_preset
+from manyeyes.simulator.record import Job, Progress, first_scene
+from manyeyes.simulator.scenario import Scenario, ScenarioSpec
+
+SPEC = ScenarioSpec(
+    town="generated-1",
+    seed=7,
+    name="one",
+    vehicles=1,
+    frames=2,
+    history_frames=0,
+    roadside_chance=1.0,
+    lidar="dair-vehicle",
+    roadside_lidar="dair-infrastructure",
+    min_vehicles=6,
+)
+JOBS = [Job("train", SPEC), Job("val", replace(SPEC, name="two", frames=1))]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def scenes_made_once() -> Iterator[None]:
+    """Making a scene takes seconds; every test of this process shares them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(dair, "first_scene", remembered)
+        yield
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, scenes_made_once: None) -> Path:
+    return record_dair(JOBS, tmp_path_factory.mktemp("dair"), workers=1).parent
+
+
+@lru_cache
+def remembered(spec: ScenarioSpec, towns: str | None, roadside: bool) -> Scenario:
+    return first_scene(spec, towns, roadside)
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def unmet(recording: DairRecording) -> int:
+    """How many vehicles that a side lists hold none of its points."""
+    count = 0
+    for frame, boxes in zip(recording.snapshot("0", 1).frames, recording.side_boxes("0", 1)):
+        local = boxes.transform(frame.world_from_agent.inverse())
+        count += int((local.contains(frame.points.xyz.double(), 0.1).sum(1) == 0).sum())
+    return count
+
+
+def test_the_simulators_own_truth_comes_back(made: Path) -> None:
+    recording = DairRecording(made, strict=True)
+    assert recording.scenarios == ("0", "1")
+    assert DairRecording(made, "train").scenarios == ("0",) and DairRecording(made, "val").length("1") == 1
+    scenario = dair.first_scene(replace(SPEC, frames=10, rate_hz=50.0), None, roadside=True)
+    read = recording.snapshot("0", 1)
+    assert read.truth is not None
+    vehicle = scenario.snapshot(9)
+    lag = (read.frames[0].timestamp_ns - read.frames[1].timestamp_ns) // 20_000_000
+    assert lag in (0, 1)
+    unit = scenario.snapshot(9 - lag)
+    for one, two in zip(read.frames, (vehicle.frames[0], unit.frames[1])):
+        assert one.timestamp_ns == two.timestamp_ns
+        torch.testing.assert_close(one.points.xyz, two.points.xyz, atol=1e-4, rtol=0)
+        torch.testing.assert_close(one.points.intensity, two.points.intensity, atol=0.003, rtol=0)
+        torch.testing.assert_close(one.world_from_agent.matrix(), two.world_from_agent.matrix(), atol=1e-9, rtol=0)
+    assert read.frames[0].speed_mps == pytest.approx(vehicle.frames[0].speed_mps, abs=0.5)
+    true, earlier = vehicle.truth, unit.truth
+    assert true is not None and earlier is not None
+    by_pole = torch.isin(true.boxes.id, earlier.boxes.id[earlier.seen[1]])
+    either = true.seen[0] | by_pole
+    own = true.boxes.id[either] == scenario.agents[0]
+    assert torch.equal(read.truth.boxes.id, torch.where(own, 0, true.boxes.id[either]))
+    assert torch.equal(read.truth.boxes.label, true.boxes.label[either])
+    torch.testing.assert_close(read.truth.boxes.corners(), true.boxes[either].corners(), atol=1e-9, rtol=0)
+    assert torch.equal(read.truth.seen, torch.stack([true.seen[0], by_pole])[:, either])
+
+
+def test_a_mirrored_or_transposed_reader_shows(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert unmet(DairRecording(made)) == 0
+    read_pcd, motion = dair_v2x.read_pcd, dair_json._motion
+
+    def mirrored(path: Path, drop_nan: bool = False) -> PcdCloud:
+        found = read_pcd(path, drop_nan)
+        return PcdCloud(found.xyz * np.float32([1, -1, 1]), found.intensity, found.time_s)
+
+    def transposed(path: Path, content: object) -> Transform:
+        found = motion(path, content)
+        return Transform(found.rotation.mT, found.translation)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(dair_v2x, "read_pcd", mirrored)
+        assert unmet(DairRecording(made)) > 5
+    # Points and labels of one side turn together: it is the two sides that no longer agree.
+    whole = DairRecording(made).snapshot("0", 1).truth
+    assert whole is not None
+    with monkeypatch.context() as patch:
+        patch.setattr(dair_json, "_motion", transposed)
+        truth = DairRecording(made).snapshot("0", 1).truth
+        assert truth is not None
+        assert int((truth.seen & whole.seen).sum()) < int(whole.seen.sum()) // 2
+
+
+def test_the_sensors_are_those_of_dair(made: Path) -> None:
+    vehicle = read_table(made / "vehicle-side/velodyne/000000.pcd")
+    pole = read_table(made / "infrastructure-side/velodyne/000000.pcd")
+    assert vehicle.names == ("x", "y", "z", "intensity", "timestamp") and pole.names == ("x", "y", "z", "intensity")
+    x, y, z = (c.astype(np.float64) for c in vehicle.columns[:3])
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    assert len(np.unique(np.rint(elevation / (23 / 39)))) == 40, "forty beams"
+    assert float(pole.columns[0].min()) >= 0, "it looks one way"
+    assert float(pole.columns[3].min()) >= 0 and float(pole.columns[3].max()) <= 1
+    assert vehicle.columns[3].max() > 100
+
+
+def test_the_manifest_counts_and_hashes_what_is_there(made: Path) -> None:
+    content = json.loads((made / "manifest.json").read_text())
+    assert content["format"] == "DAIR-V2X"
+    assert [(s["batch"], s["name"], s["split"], s["frames"]) for s in content["scenarios"]] == [
+        (0, "one", "train", 2),
+        (1, "two", "val", 1),
+    ]
+    stems = {0: ("000000", "000001"), 1: ("000002",)}
+    for entry in content["scenarios"]:
+        inside = {n: d for n, d in files(made).items() if Path(n).stem in stems[entry["batch"]] and "batches" not in n}
+        lines = [f"{hashlib.sha256(data).hexdigest()}  {name}" for name, data in inside.items()]
+        assert entry["sha256"] == hashlib.sha256("\n".join(lines).encode()).hexdigest()
+        assert entry["files"] == len(inside) == 9 * entry["frames"]
+        assert entry["bytes"] == sum(map(len, inside.values()))
+
+
+def test_finished_drives_are_kept_and_lost_ones_made_again(made: Path) -> None:
+    before = files(made)
+    kept = (made / "batches/000000.json").stat().st_mtime_ns
+    (made / "batches/000001.json").unlink()
+    (made / "vehicle-side/velodyne/000002.pcd").unlink()
+    seen: list[Progress] = []
+    record_dair(JOBS, made, workers=1, progress=seen.append)
+    assert files(made) == before
+    assert (made / "batches/000000.json").stat().st_mtime_ns == kept
+    assert [p.name for p in seen] == ["train/one", "val/two"]
+
+
+@pytest.mark.slow
+def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
+    record_dair(JOBS, tmp_path, workers=2)
+    assert files(tmp_path) == files(made)
+
+
+def test_the_preset_is_one_vehicle_and_a_pole() -> None:
+    jobs = jobs_of(simulation_preset("dair-crossing"), 0)
+    assert {job.split: sum(j.split == job.split for j in jobs) for job in jobs} == {"train": 24, "val": 8, "test": 8}
+    for job in jobs:
+        assert (job.spec.vehicles, job.spec.roadside_chance) == (1, 1.0)
+        assert (job.spec.lidar, job.spec.roadside_lidar) == ("dair-vehicle", "dair-infrastructure")
+        assert job.spec.history_frames == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "workers", "says"),
+    [(lambda s: s, 0, "workers >= 1"), (lambda s: replace(s, vehicles=2), 1, "one vehicle a drive")],
+)
+def test_misuse_is_named(
+    tmp_path: Path, change: Callable[[ScenarioSpec], ScenarioSpec], workers: int, says: str
+) -> None:
+    with pytest.raises(ConfigError, match=says):
+        record_dair([Job("train", change(SPEC))], tmp_path, workers=workers)
