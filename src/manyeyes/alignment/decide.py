@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The default corrector: whether the best vote is believed, and what becomes of the claimed pose.
 
-A vote is accepted by how much likelier it is than chance and than the best distinct other vote, at limits calibrated on
-pairs of agents that share no object (calibrate). A claimed pose makes votes near it likelier, by the logarithm of its
-density against that of a pose that may be anywhere; a wrong claim takes nothing away. Then the claim is tested against
-the vote: squared Mahalanobis distance, chi^2 with 3 degrees of freedom. Where they agree the two are fused by their
-information; a doubtful claim is inflated first; a refuted one is not used. Spec: specs/pose.md 4.3, 4.4, which replaces
-FeaKM's "use the calculated pose if it differs significantly".
+A vote is accepted by how much likelier it is than chance and than the best distinct other vote, at limits calibrated
+on pairs of agents that share no object (calibrate). A claimed pose makes votes near it likelier, by the logarithm of
+its density against that of a pose that may be anywhere; a wrong claim takes nothing away. Then the claim is tested
+against the vote: squared Mahalanobis distance, chi^2 with 3 degrees of freedom. Where they agree the two are fused by
+their information; a doubtful claim is inflated first; a refuted one is not used. Spec: specs/pose.md 4.3, 4.4, which
+replaces FeaKM's "use the calculated pose if it differs significantly".
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ DOUBTFUL, REFUTED = 7.815, 16.266
 class Acceptance:
     """When a vote is believed.
 
-    least_score: log-likelihood ratio against chance that it needs; least_margin: and against the best distinct other vote.
-    least_pairs: and how many pairs, where no claim supports it. rival_pairs: a runner-up that would be believed if it were
-    alone must be so many (mean) pairs behind: a queue that slips by one place loses only one. anywhere: volume (m^2 rad)
-    of poses that an unknown pose may take, 100 m around with any yaw.
+    least_score: log-likelihood ratio against chance that it needs; least_margin: and against the best distinct other
+    vote. least_pairs: and how many pairs, where no claim supports it. rival_pairs: a runner-up that would be believed
+    if it were alone must be so many (mean) pairs behind: a queue that slips by one place loses only one. anywhere:
+    volume (m^2 rad) of poses that an unknown pose may take, 100 m around with any yaw.
     """
 
     least_score: float = 25.0
@@ -71,7 +71,9 @@ def correct(
 
 @dataclass(frozen=True)
 class Ranked:
-    """The best vote, its score with what the claim adds, by how much that exceeds the runner-up's, and the runner-up's pairs."""
+    """The best vote, its score with what the claim adds, by how much that exceeds the runner-up's, and the
+    runner-up's pairs.
+    """
 
     best: Candidate
     score: float
@@ -124,7 +126,9 @@ def decide(found: list[Candidate], claimed: PoseClaim | None, accept: Acceptance
 
 
 def fused(pose: Floats, covariance: Floats, other: Floats, other_covariance: Floats) -> tuple[Floats, Floats]:
-    """Two independent estimates (3,), (3, 3) of one pose as one, weighted by information; either covariance may be zero."""
+    """Two independent estimates (3,), (3, 3) of one pose as one, weighted by information; either covariance may be
+    zero.
+    """
     gain = np.linalg.solve(covariance + other_covariance, covariance).T
     moved = pose + gain @ difference(other, pose)
     rest = np.eye(3) - gain

@@ -21,8 +21,9 @@ Ints = NDArray[np.int64]
 class PoseStatus(Enum):
     """What came of comparing what two agents see with what one claims.
 
-    OK: objects and claim agree. CORRECTED: objects give the pose; nothing was claimed, or what was claimed is doubtful. CONFLICT:
-    objects give a pose that the claim contradicts. AMBIGUOUS: objects fit in more than one way. NO_MATCH: objects give no pose.
+    OK: objects and claim agree. CORRECTED: objects give the pose; nothing was claimed, or what was claimed is
+    doubtful. CONFLICT: objects give a pose that the claim contradicts. AMBIGUOUS: objects fit in more than one way.
+    NO_MATCH: objects give no pose.
     """
 
     OK = "ok"
@@ -39,7 +40,9 @@ class PoseStatus(Enum):
 
 @dataclass(frozen=True)
 class PoseClaim:
-    """ego_from_other as claimed; covariance: (3, 3) of x, y (m) and yaw (rad) in the ego's axes, what is said of its error."""
+    """ego_from_other as claimed; covariance: (3, 3) of x, y (m) and yaw (rad) in the ego's axes, what is said of its
+    error.
+    """
 
     ego_from_other: Transform
     covariance: Floats
@@ -72,11 +75,12 @@ class PoseClaim:
 class PoseEstimate:
     """A corrector's answer about ego_from_other.
 
-    ego_from_other: what to use, None where nothing is known; x, y and yaw are corrected, height and tilt are those of the claim.
-    covariance: (3, 3) of x, y (m), yaw (rad) in the ego's axes. inliers: pairs that agree with it; runner_up: pairs that agree
-    with the best *distinct* other answer; margin: by how much the answer is likelier than that one (log-likelihood). pairs:
-    (inliers, 2) rows of ego's and other's landmarks. measured, measured_covariance: (3,), (3, 3) what objects alone say, where
-    they say one thing. distance: squared Mahalanobis distance of that from the claim (3 degrees of freedom), NaN without both.
+    ego_from_other: what to use, None where nothing is known; x, y and yaw are corrected, height and tilt are those of
+    the claim. covariance: (3, 3) of x, y (m), yaw (rad) in the ego's axes. inliers: pairs that agree with it;
+    runner_up: pairs that agree with the best *distinct* other answer; margin: by how much the answer is likelier than
+    that one (log-likelihood). pairs: (inliers, 2) rows of ego's and other's landmarks. measured, measured_covariance:
+    (3,), (3, 3) what objects alone say, where they say one thing. distance: squared Mahalanobis distance of that from
+    the claim (3 degrees of freedom), NaN without both.
     """
 
     ego_from_other: Transform | None

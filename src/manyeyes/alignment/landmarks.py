@@ -19,8 +19,10 @@ SIZES_M = (0.2, 30.0)
 
 @dataclass(frozen=True)
 class DetectorError:
-    """Errors of a detector that states none of its own: one standard deviation an axis (m), of the heading modulo pi (rad), and the
-    chance that the heading is off by pi. Spec: specs/pose.md 4.2, whose boxes are off by 0.25 m and 2.5 degrees, 3 % turned."""
+    """Errors of a detector that states none of its own: one standard deviation an axis (m), of the heading modulo pi
+    (rad), and the chance that the heading is off by pi. Spec: specs/pose.md 4.2, whose boxes are off by 0.25 m and
+    2.5 degrees, 3 % turned.
+    """
 
     sigma_xy_m: float = 0.25
     sigma_yaw_rad: float = 0.044
@@ -38,10 +40,11 @@ class DetectorError:
 class Landmarks:
     """N objects on the ground in one agent's frame (x forward, y left).
 
-    xy: (N, 2) metres. yaw: (N,) radians, sure modulo pi only; flip: (N,) in [0, 0.5], the chance that it is off by pi.
-    size: (N, 2) length and width (m). score: (N,) in [0, 1]. sigma_xy: (N,) one standard deviation an axis (m); sigma_yaw: (N,) of
-    the yaw modulo pi (rad). instant: (N,) int64, which frame a landmark was seen in, 0 for the current one and counting
-    back: objects move, so only landmarks of one instant can be the same object (specs/pose.md 4.8).
+    xy: (N, 2) metres. yaw: (N,) radians, sure modulo pi only; flip: (N,) in [0, 0.5], the chance that it is off by
+    pi. size: (N, 2) length and width (m). score: (N,) in [0, 1]. sigma_xy: (N,) one standard deviation an axis (m);
+    sigma_yaw: (N,) of the yaw modulo pi (rad). instant: (N,) int64, which frame a landmark was seen in, 0 for the
+    current one and counting back: objects move, so only landmarks of one instant can be the same object
+    (specs/pose.md 4.8).
     """
 
     xy: Floats
@@ -115,8 +118,8 @@ class Landmarks:
     def usable(self, reach_m: float, at_most: int) -> Ints:
         """Rows that can be matched, in an order that does not depend on the order given.
 
-        Numbers are finite, sizes those of a vehicle, the place within ``reach_m`` of the middle of all; where more than
-        ``at_most`` remain, those of the highest score.
+        Numbers are finite, sizes those of a vehicle, the place within ``reach_m`` of the middle of all; where more
+        than ``at_most`` remain, those of the highest score.
         """
         numbers = np.column_stack((self.xy, self.yaw, self.size, self.score, self.sigma_xy, self.sigma_yaw, self.flip))
         good = np.isfinite(numbers).all(1) & (np.abs(self.xy) < 1e7).all(1) & (self.sigma_xy > 0) & (self.sigma_yaw > 0)

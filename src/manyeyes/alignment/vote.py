@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default corrector's hypotheses: every pose that the objects of two agents suggest, best first, whatever is claimed.
+"""The default corrector's hypotheses: every pose that the objects of two agents suggest, best first, whatever is
+claimed.
 
 Pairs of objects vote (vote_loops), the best supported poses are refined on one-to-one pairs, and each is given a
-log-likelihood ratio: how much likelier the agreement is if the pairs are the same objects than if they met by chance. A
-pair gains log(area / 2 pi s^2) less half its squared misfit, ``area`` being the ground on which a chance neighbour would
-have to fall, and log 2p for a heading that agrees, p its chance. Design and the measured reasons for it: specs/pose.md
-4.2-4.4. The answer does not depend on the order of landmarks nor on which agent is called ego.
+log-likelihood ratio: how much likelier the agreement is if the pairs are the same objects than if they met by chance.
+A pair gains log(area / 2 pi s^2) less half its squared misfit, ``area`` being the ground on which a chance neighbour
+would have to fall, and log 2p for a heading that agrees, p its chance. Design and the measured reasons for it:
+specs/pose.md 4.2-4.4. The answer does not depend on the order of landmarks nor on which agent is called ego.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ Ints = NDArray[np.int64]
 class VoteConfig:
     """How poses are found.
 
-    reach_m: landmarks farther than this from the middle of all are left out; landmarks: at most so many, those of highest score.
-    shortest_m, longest_m: lengths of edges; edges: at most so many an agent, the shortest. hypotheses: at most so many, those
-    that agree best. Together the caps bound the time. edge_gate: how many standard deviations edges may differ. size_gate_m:
-    difference of widths (twice that and a tenth of it for lengths). tau_m, turn_rad: reach of the coarse support. refined: how
-    many of the best are refined. pair_gate: largest squared misfit of a pair (3 degrees of freedom; 14.16 is p = 0.003). area_m2:
-    see the module, fitted on simulated crossings. apart_m, apart_rad: answers that differ by less are one.
+    reach_m: landmarks farther than this from the middle of all are left out; landmarks: at most so many, those of
+    highest score. shortest_m, longest_m: lengths of edges; edges: at most so many an agent, the shortest. hypotheses:
+    at most so many, those that agree best. Together the caps bound the time. edge_gate: how many standard deviations
+    edges may differ. size_gate_m: difference of widths (twice that and a tenth of it for lengths). tau_m, turn_rad:
+    reach of the coarse support. refined: how many of the best are refined. pair_gate: largest squared misfit of a
+    pair (3 degrees of freedom; 14.16 is p = 0.003). area_m2: see the module, fitted on simulated crossings. apart_m,
+    apart_rad: answers that differ by less are one.
     """
 
     reach_m: float = 300.0
@@ -59,8 +61,9 @@ class VoteConfig:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One pose (3,) ego_from_other that objects suggest: its covariance (3, 3) in the ego's axes, pairs (P, 2) of rows, the
-    log-likelihood ratio, and the squared misfit of all pairs with its degrees of freedom."""
+    """One pose (3,) ego_from_other that objects suggest: its covariance (3, 3) in the ego's axes, pairs (P, 2) of
+    rows, the log-likelihood ratio, and the squared misfit of all pairs with its degrees of freedom.
+    """
 
     pose: Floats
     covariance: Floats
@@ -144,7 +147,9 @@ def _edges(x: Landmarks, config: VoteConfig) -> tuple[Ints, Floats]:
 
 
 def _score(a: Landmarks, b: Landmarks, pose: Floats, pairs: Ints, misfit: Floats, config: VoteConfig) -> float:
-    """Log-likelihood ratio of the pairs; a pair that is likelier to have met by chance takes nothing away but its heading."""
+    """Log-likelihood ratio of the pairs; a pair that is likelier to have met by chance takes nothing away but its
+    heading.
+    """
     i, k = pairs.T
     gain = np.log(config.area_m2 / (2 * np.pi * (a.sigma_xy[i] ** 2 + b.sigma_xy[k] ** 2))) - misfit / 2
     flip_a, flip_b = np.clip(a.flip[i], 0.01, 0.5), np.clip(b.flip[k], 0.01, 0.5)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compiled loops of the vote: hypotheses from matching edges, their support, and refinement on one-to-one pairs.
 
-An edge joins two landmarks of one agent. Its length and its angles to the two headings (modulo pi) are the same in every
-frame, and two matched edges give the relative pose with a yaw as exact as the edge is long; a single pair of objects
-(specs/pose.md 4.2) gives a yaw only as exact as a detected heading, which at 50 m is off by two metres.
+An edge joins two landmarks of one agent. Its length and its angles to the two headings (modulo pi) are the same in
+every frame, and two matched edges give the relative pose with a yaw as exact as the edge is long; a single pair of
+objects (specs/pose.md 4.2) gives a yaw only as exact as a detected heading, which at 50 m is off by two metres.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ def edge_table(xy, yaw, shortest, longest):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def compatible(size_a, size_b, instant_a, instant_b, gate):  # pragma: no cover - compiled
-    """(N, M) bool: landmarks that may be one object: of one instant, widths within ``gate`` (m), lengths within about twice."""
+    """(N, M) bool: landmarks that may be one object: of one instant, widths within ``gate`` (m), lengths within about
+    twice.
+    """
     ok = np.empty((len(size_a), len(size_b)), np.bool_)
     for i in range(len(size_a)):
         for j in range(len(size_b)):
@@ -59,7 +61,8 @@ def compatible(size_a, size_b, instant_a, instant_b, gate):  # pragma: no cover 
 def match_edges(a, b, edges_a, edges_b, may, gate, at_most):  # pragma: no cover - compiled
     """Poses (H, 3) a_from_b of edges that agree within ``gate`` standard deviations, and their misfit (H,).
 
-    a, b: xy, yaw, sigma_xy, sigma_yaw. edges: ends and shapes sorted by length. may: (N, M) pairs that may be one object.
+    a, b: xy, yaw, sigma_xy, sigma_yaw. edges: ends and shapes sorted by length. may: (N, M) pairs that may be one
+    object.
     """
     xy_a, _, sxy_a, syaw_a = a
     xy_b, _, sxy_b, syaw_b = b
@@ -110,7 +113,9 @@ def match_edges(a, b, edges_a, edges_b, may, gate, at_most):  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def grid_of(xy, cell):  # pragma: no cover - compiled
-    """Rows of points by square cells: (order, start, x0, y0, columns, rows, cell); cells grow where there would be too many."""
+    """Rows of points by square cells: (order, start, x0, y0, columns, rows, cell); cells grow where there would be
+    too many.
+    """
     x0, y0, x1, y1 = xy[:, 0].min(), xy[:, 1].min(), xy[:, 0].max(), xy[:, 1].max()
     cell = max(cell, max(x1 - x0, y1 - y0) / 1000.0)
     nx, ny = int((x1 - x0) / cell) + 1, int((y1 - y0) / cell) + 1
@@ -157,7 +162,9 @@ def support(poses, a, b, may, grid, tau, turn):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def distinct(poses, order, middle, at_most, apart, turn):  # pragma: no cover - compiled
-    """Rows of poses, best first, of which no two agree within ``apart`` metres at the middle (2,) of b and ``turn`` radians."""
+    """Rows of poses, best first, of which no two agree within ``apart`` metres at the middle (2,) of b and ``turn``
+    radians.
+    """
     chosen = np.empty(at_most, np.int64)
     place = np.empty((at_most, 2))
     count = 0
@@ -181,7 +188,9 @@ def distinct(poses, order, middle, at_most, apart, turn):  # pragma: no cover - 
 
 @njit(cache=True, nogil=True)
 def pair_up(pose, a, b, may, slack, gate):  # pragma: no cover - compiled
-    """One-to-one pairs (P, 2), nearest first, and their squared misfits (P,) in standard deviations (3 numbers a pair)."""
+    """One-to-one pairs (P, 2), nearest first, and their squared misfits (P,) in standard deviations (3 numbers a
+    pair).
+    """
     xy_a, yaw_a, sxy_a, syaw_a = a
     xy_b, yaw_b, sxy_b, syaw_b = b
     c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -253,7 +262,9 @@ def fit(pose, pairs, a, b, rounds):  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def refine(pose, a, b, may, slack, gate, rounds):  # pragma: no cover - compiled
-    """Pairs and fit in turn until the pairs stay: pose, information, pairs, misfits; wide at first, then as exact as stated."""
+    """Pairs and fit in turn until the pairs stay: pose, information, pairs, misfits; wide at first, then as exact as
+    stated.
+    """
     information = np.zeros((3, 3))
     before = np.full((1, 2), -1, np.int64)
     for round_ in range(rounds):

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pose correction on simulated scenes of landmarks: the default corrector and its rivals, by common objects, noise
+and density.
+
+Tables: ``success``: share of frames whose best guess is within 1 m and 1 degree, by common objects and by what is
+claimed (sparse traffic). ``answers``: when to answer, on DAIR-V2X's counts of common objects in dense traffic, with
+one frame and with five, and on agents that share nothing. ``rivals``: success at 1 m and 1 degree, all frames,
+against the noise of the claim. ``displacement``: of common objects after fusion with a good claim, over that of the
+claim alone. ``speed``: processor time of one call.
+
+python benchmarks/pose.py [--scenes 300] [--nulls 1000] [--out benchmarks/results/pose.json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from manyeyes.alignment.accumulate import Sighting, accumulated
+from manyeyes.alignment.decide import Acceptance, CorrectorConfig, correct
+from manyeyes.alignment.estimate import Corrector
+from manyeyes.alignment.landmarks import Landmarks
+from manyeyes.alignment.rivals import coalign, feaco, fpv_rcnn, given, icp, mash, v2x_reg, vips
+from manyeyes.alignment.rivals.v2x_reg import V2xRegConfig
+from manyeyes.apps.provenance import write_json
+from manyeyes.evaluation.pose import ClaimNoise, PoseFrame, PoseScore, judged, score
+from manyeyes.simulator.landmarks import BoxError, LandmarkScene, LandmarkSpec, make_landmark_scene
+
+NOISY = BoxError(0.45, np.radians(4.0), 0.10, 0.3)
+GUESS = CorrectorConfig(accept=Acceptance(-1e9, 0.0, 1, 0.0))
+RIVALS: dict[str, Corrector] = {
+    "vote": correct,
+    "given": given.correct,
+    "coalign": coalign.correct,
+    "fpv_rcnn": fpv_rcnn.correct,
+    "feaco": feaco.correct,
+    "icp": icp.correct,
+    "vips": vips.correct,
+    "v2x_reg oDist": v2x_reg.correct,
+    "v2x_reg oIoU": partial(v2x_reg.correct, config=V2xRegConfig("oIoU")),
+    "mash": mash.correct,
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One setting: what the scenes were, what was claimed, the method, and its numbers."""
+
+    table: str
+    method: str
+    common: int | None
+    ego_extra: int
+    other_extra: int
+    instants: int
+    noisy: bool
+    disjoint: bool
+    claim: str
+    sigma: float
+    score: PoseScore
+    mean_ms: float
+    p95_ms: float
+
+
+def landmarks(scene: LandmarkScene) -> tuple[Landmarks, Landmarks]:
+    """What both agents see, all instants in their frames of now."""
+    both = ((scene.ego, scene.ego_from_then), (scene.other, scene.other_from_then))
+    one, two = (
+        accumulated([Sighting(Landmarks.of_boxes(b), n, then[n]) for n, b in enumerate(boxes)]) for boxes, then in both
+    )
+    return one, two
+
+
+def run(
+    table: str, method: str, corrector: Corrector, spec: LandmarkSpec, noise: ClaimNoise, scenes: int, seed: int
+) -> Row:
+    """A method on scenes 0, 1, ... of a seed."""
+    frames: list[PoseFrame] = []
+    spent = []
+    for n in range(scenes):
+        scene = make_landmark_scene(spec, seed, n)
+        ego, other = landmarks(scene)
+        claimed = noise.claim(scene.ego_from_other, n)
+        begin = time.process_time()
+        said = corrector(ego, other, claimed)
+        spent.append(1e3 * (time.process_time() - begin))
+        frames.append(judged(said, scene.ego_from_other, scene.common_xy))
+    return Row(
+        table,
+        method,
+        spec.common,
+        spec.ego_extra,
+        spec.other_extra,
+        spec.instants,
+        spec.error == NOISY,
+        spec.disjoint,
+        noise.kind,
+        noise.sigma_m,
+        score(frames),
+        float(np.mean(spent[1:] or spent)),
+        float(np.percentile(spent[1:] or spent, 95)),
+    )
+
+
+def rows(scenes: int, nulls: int) -> Iterator[Row]:
+    """All tables."""
+    none = ClaimNoise("none")
+    guess = partial(correct, config=GUESS)
+    for common in (3, 4, 5, 6, 8):
+        spec = LandmarkSpec(common, 8, 10)
+        yield run("success", "vote", guess, spec, none, scenes, 0)
+        for kind, sigma in (("gaussian", 0.0), ("gaussian", 2.0), ("gaussian", 4.0), ("unknown", 0.0)):
+            yield run("success", "vote", guess, spec, ClaimNoise(kind, sigma, sigma), scenes, 0)
+    yield run("answers", "vote", correct, LandmarkSpec(0, 22, 28, disjoint=True), none, nulls, 1)
+    yield run("answers", "vote", correct, LandmarkSpec(0, 22, 28), none, nulls // 2, 2)
+    yield run("answers", "vote", correct, LandmarkSpec(), none, nulls // 2, 3)
+    yield run("answers", "vote", correct, LandmarkSpec(0, 22, 28, NOISY, disjoint=True), none, nulls // 2, 1)
+    yield run("answers", "vote", correct, LandmarkSpec(error=NOISY), none, nulls // 2, 3)
+    yield run("answers", "vote", correct, LandmarkSpec(0, 22, 28, disjoint=True, instants=5), none, nulls // 5, 1)
+    yield run("answers", "vote", correct, LandmarkSpec(instants=5), none, nulls // 5, 3)
+    for sigma in (0.1, 0.2, 0.5):
+        for method in ("given", "vote"):
+            spec, noise = LandmarkSpec(), ClaimNoise("gaussian", sigma, sigma)
+            yield run("displacement", method, RIVALS[method], spec, noise, scenes, 4)
+    for sigma in (0.0, 0.4, 0.8, 1.2, 2.0):
+        for method, corrector in RIVALS.items():
+            spec, noise = LandmarkSpec(6, 8, 10), ClaimNoise("gaussian", sigma, sigma)
+            yield run("rivals", method, corrector, spec, noise, scenes // 5, 5)
+    yield run("speed", "vote", correct, LandmarkSpec(8, 32, 32), none, 40, 6)
+
+
+def line(row: Row) -> str:
+    """A row as text."""
+    s = row.score
+    return (
+        f"{row.table:12} {row.method:14} K={row.common!s:4} +{row.ego_extra}/{row.other_extra} x{row.instants}"
+        f"{' noisy' if row.noisy else ''}{' strangers' if row.disjoint else ''} {row.claim} {row.sigma:g}: "
+        f"success {s.success[0]:.3f}/{s.success[1]:.3f}/{s.success[2]:.3f} coverage {s.coverage:.3f} precision {s.precision:.3f} "
+        f"null {s.null_accepts:.4f} OD {s.displacement:.3f} NEES {s.nees:.2f} inside {s.inside:.3f} "
+        f"{row.mean_ms:.1f} ms (p95 {row.p95_ms:.1f})"
+    )
+
+
+def main() -> None:
+    """The benchmark."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--scenes", type=int, default=300)
+    parser.add_argument("--nulls", type=int, default=1000)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/pose.json"))
+    options = parser.parse_args()
+    done = []
+    for row in rows(options.scenes, options.nulls):
+        sys.stdout.write(line(row) + "\n")
+        sys.stdout.flush()
+        done.append(row)
+    command = f"python benchmarks/pose.py {shlex.join(sys.argv[1:])}".strip()
+    write_json(options.out, {"rows": [asdict(r) for r in done]}, {"command": command}, 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from manyeyes.alignment.estimate import PoseClaim, PoseStatus, unanswered
+from manyeyes.alignment.watchman import Health, WatchState, watch
+from manyeyes.datatypes import ConfigError, Transform
+
+SPREAD = np.diag([0.15**2, 0.15**2, 0.003**2])
+CLAIM = PoseClaim.of(Transform.from_xyz_yaw(20.0, -5.0, 0.0, 1.0), 0.5, 0.01)
+
+
+def measured(offset):
+    seen = replace(
+        unanswered(CLAIM, PoseStatus.OK), measured=CLAIM.pose + offset, measured_covariance=SPREAD, inliers=6
+    )
+    return seen
+
+
+def run(offsets, every_s=0.1):
+    state, reports = WatchState.new(), []
+    for n, offset in enumerate(offsets):
+        state, report = watch(state, measured(offset), CLAIM, n * every_s)
+        reports.append(report)
+    return reports
+
+
+def noise(n, seed):
+    return np.random.default_rng(seed).standard_normal((n, 3)) * np.sqrt(np.diag(SPREAD))
+
+
+def test_a_sound_agent_with_a_constant_error_of_its_claim_is_left_alone():
+    for seed in range(30):
+        bias = np.random.default_rng(1000 + seed).standard_normal(3) * [0.4, 0.4, 0.008]
+        assert {r.health for r in run(noise(40, seed) + bias)} == {Health.SOUND}
+
+
+def test_an_offset_of_five_sigma_is_flagged_in_its_first_frame():
+    flagged = [run(noise(1, s) + [0.0, 2.61, 0.0])[0].health is Health.OFFSET for s in range(200)]
+    assert np.mean(flagged) >= 0.8
+    # A few frames later hardly any is missed, though each single frame might be forgiven.
+    later = [run(noise(10, s) + [0.0, 2.61, 0.0])[-1].health is Health.OFFSET for s in range(100)]
+    assert np.mean(later) >= 0.98
+
+
+@pytest.mark.parametrize("every_s, share", [(1.0, 1.0), (0.5, 1.0)])
+def test_a_drift_of_a_tenth_of_a_metre_a_second_is_named_within_thirty_frames(every_s, share):
+    named = []
+    for seed in range(30):
+        time = np.arange(30) * every_s
+        reports = run(noise(30, seed) + time[:, None] * [0.1, 0.0, 0.0], every_s)
+        named.append(any(r.health is Health.DRIFTING for r in reports))
+        assert reports[-1].drift[0] == pytest.approx(0.1, abs=0.03)
+    assert np.mean(named) >= share
+
+
+def test_frames_without_a_pose_change_nothing():
+    state, report = watch(WatchState.new(), unanswered(CLAIM), CLAIM, 0.0)
+    assert report.health is Health.UNKNOWN and report.frames == 0
+    state, _ = watch(state, measured(np.zeros(3)), CLAIM, 1.0)
+    again, report = watch(state, unanswered(CLAIM), CLAIM, 2.0)
+    assert again is state and report.health is Health.SOUND and report.frames == 1
+
+
+def test_memory_is_bounded_and_time_must_grow():
+    state = WatchState.new()
+    for n in range(50):
+        state, report = watch(state, measured(np.zeros(3)), CLAIM, float(n))
+    assert report.frames == 30 and state.time[0] == 20.0
+    with pytest.raises(ConfigError, match="growing times"):
+        watch(state, measured(np.zeros(3)), CLAIM, 49.0)
