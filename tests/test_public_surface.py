@@ -16,6 +16,7 @@ def test_the_public_names_are_these() -> None:
         "Argoverse2Recording",
         "BevGrid",
         "Boxes",
+        "DairRecording",
         "Inbox",
         "ManyeyesError",
         "Message",

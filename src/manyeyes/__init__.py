@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from manyeyes.agents.agent import Agent, Perception
     from manyeyes.comms.inbox import Inbox
     from manyeyes.datasets.argoverse2 import Argoverse2Recording
+    from manyeyes.datasets.dair_v2x import DairRecording
     from manyeyes.datasets.opv2v import Opv2vRecording
     from manyeyes.datatypes import (
         AgentFrame,
@@ -32,6 +33,7 @@ _HOME = {
     "Argoverse2Recording": "manyeyes.datasets.argoverse2",
     "BevGrid": "manyeyes.datatypes",
     "Boxes": "manyeyes.datatypes",
+    "DairRecording": "manyeyes.datasets.dair_v2x",
     "Inbox": "manyeyes.comms.inbox",
     "ManyeyesError": "manyeyes.datatypes",
     "Message": "manyeyes.datatypes",
@@ -50,6 +52,7 @@ __all__ = [
     "Argoverse2Recording",
     "BevGrid",
     "Boxes",
+    "DairRecording",
     "Inbox",
     "ManyeyesError",
     "Message",

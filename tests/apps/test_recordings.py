@@ -2,6 +2,7 @@
 """The verbs on a recording in DAIR-V2X's layout, which they know by its folders."""
 
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from PIL import Image
 
 from manyeyes.apps import cli
 from manyeyes.apps.playing import Playing
-from manyeyes.apps.recordings import open_recording, with_patience
+from manyeyes.apps.recordings import open_recording, suited_to
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.dair_writer import DairWriter, write_dair_index
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
@@ -75,9 +76,11 @@ def test_the_layout_is_known_by_its_folders(data: Path, tmp_path: Path) -> None:
 def test_an_ego_waits_for_the_later_sweep_of_a_pair(data: Path, tmp_path: Path) -> None:
     recording = open_recording(data)
     for playing, wait_s in ((Playing(), 0.05), (Playing(channel="its-g5"), 0.05), (Playing(wait_ms=7.0), 0.007)):
-        assert with_patience(playing.replay_config(0), playing, recording).wait_s == wait_s
+        config = suited_to(playing.replay_config(0), playing, recording)
+        assert (config.wait_s, config.reach_m) == (wait_s, math.inf)
     Opv2vWriter(tmp_path / "drive").write(street(0))
-    assert with_patience(Playing().replay_config(0), Playing(), open_recording(tmp_path)).wait_s == 0.0
+    config = Playing().replay_config(0)
+    assert suited_to(config, Playing(), open_recording(tmp_path)) == config
 
 
 def test_evaluate_judges_pairs_and_hears_the_pole(data: Path, weights: Path, tmp_path: Path) -> None:

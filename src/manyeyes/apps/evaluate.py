@@ -53,7 +53,7 @@ def main(options: Options) -> None:
 
     from manyeyes.apps import provenance
     from manyeyes.apps.outcome import outcome_of, show
-    from manyeyes.apps.recordings import open_recording, with_patience
+    from manyeyes.apps.recordings import open_recording, suited_to
     from manyeyes.apps.showcase import bars, write_text
     from manyeyes.apps.viewer.table import DIFFERENCE_HEADINGS, difference_cells, markdown, markdown_lines
     from manyeyes.datasets.disturb import PoseNoise
@@ -73,7 +73,7 @@ def main(options: Options) -> None:
     protocol, detector = judging_protocol(config), zoo.load(config.weights)
     opener = partial(open_recording, options.data, options.split)
     recording = opener()
-    config = replace(config, replay=with_patience(config.replay, options.playing, recording))
+    config = replace(config, replay=suited_to(config.replay, options.playing, recording))
     for problem in recording.problems:
         console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
     with bars(console) as progress:

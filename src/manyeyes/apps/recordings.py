@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opens a recording by what its folder holds, and says how long an ego waits where sweeps are not simultaneous."""
+"""Opens a recording by what its folder holds, and suits the replay to it."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,12 +26,12 @@ def open_recording(root: Path, split: str | None = None) -> Opv2vRecording | Dai
     return Opv2vRecording(root, split) if dair_root(root) is None else DairRecording(root, split)
 
 
-def with_patience(config: ReplayConfig, playing: Playing, recording: Recording) -> ReplayConfig:
-    """The configuration with the wait that suits the recording, unless the user chose one.
+def suited_to(config: ReplayConfig, playing: Playing, recording: Recording) -> ReplayConfig:
+    """The configuration with the wait and the reach that suit the recording; a wait that the user chose stays.
 
     The two sweeps of a DAIR-V2X pair are some ten milliseconds apart, either way: an ego that does not wait would never
-    hear an infrastructure whose sweep is the later one.
+    hear an infrastructure whose sweep is the later one. And its pairs collaborate at any distance, by its own protocol.
     """
-    if playing.wait_ms is None and isinstance(recording, DairRecording):
-        return replace(config, wait_s=PAIRS_WAIT_S)
-    return config
+    if not isinstance(recording, DairRecording):
+        return config
+    return replace(config, reach_m=math.inf, wait_s=config.wait_s if playing.wait_ms is not None else PAIRS_WAIT_S)

@@ -41,7 +41,7 @@ def main(options: Options) -> None:
     """The verb."""
     from rich.console import Console
 
-    from manyeyes.apps.recordings import open_recording, with_patience
+    from manyeyes.apps.recordings import open_recording, suited_to
     from manyeyes.apps.showcase import Showing, play
     from manyeyes.models import zoo
 
@@ -57,7 +57,7 @@ def main(options: Options) -> None:
         title=f"{options.recording.name}: {drive.scenario}",
         lead="A recording, replayed: every agent shares bytes and perceives, as it would on the road.",
         methods=options.playing.methods,
-        replay=with_patience(replay, options.playing, recording),
+        replay=suited_to(replay, options.playing, recording),
         weights=weights_name(options.playing.weights),
         frame=options.frame,
         animate=options.animate,

@@ -14,7 +14,7 @@ class Options:
     """Which recording, which settings, where to."""
 
     data: Path
-    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario."""
+    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario; or a root in DAIR-V2X's layout."""
     split: str | None = "train"
     """Which split of a dataset: a folder inside it."""
     preset: str = "costr-small"
@@ -41,7 +41,7 @@ def main(options: Options) -> None:
     import torch.distributed as dist
     from rich.console import Console
 
-    from manyeyes.datasets.opv2v import Opv2vRecording
+    from manyeyes.apps.recordings import open_recording
     from manyeyes.datatypes import ConfigError
     from manyeyes.training.presets import TRAINING_PRESETS
 
@@ -50,7 +50,7 @@ def main(options: Options) -> None:
     asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
     config = replace(TRAINING_PRESETS[options.preset], **{k: v for k, v in asked.items() if v is not None})
     torch.set_num_threads(options.threads)
-    recording = Opv2vRecording(options.data, options.split)
+    recording = open_recording(options.data, options.split)
     several = int(os.environ.get("WORLD_SIZE", "1")) > 1
     if several:
         dist.init_process_group("gloo")

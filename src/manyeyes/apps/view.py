@@ -94,11 +94,11 @@ def _detections(options: Options, drive: Excerpt, snapshots: list[Snapshot]) -> 
     from dataclasses import replace
 
     from manyeyes.agents.replay import Team
-    from manyeyes.apps.recordings import with_patience
+    from manyeyes.apps.recordings import suited_to
     from manyeyes.models import zoo
 
     playing = replace(options.playing, methods=(str(options.detect),))
-    config: ReplayConfig = with_patience(playing.replay_config(0), playing, drive.recording)
+    config: ReplayConfig = suited_to(playing.replay_config(0), playing, drive.recording)
     detector = zoo.load(playing.weights)
     team = Team(playing.methods[0], detector, config)
-    return detector.config.grid, [step.boxes for snapshot in snapshots for step in team.step(snapshot)]
+    return detector.config.range, [step.boxes for snapshot in snapshots for step in team.step(snapshot)]

@@ -93,6 +93,21 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
         min_vehicles=8,
         layout="dair",
     ),
+    "dair-tiny": SimulationPreset(
+        (
+            SplitPreset("train", ("generated-1",), 2),
+            SplitPreset("val", ("generated-2",), 1),
+            SplitPreset("test", ("generated-3",), 1),
+        ),
+        frames=3,
+        history_frames=0,
+        vehicles=(1, 1),
+        roadside_chance=1.0,
+        lidar="dair-vehicle",
+        roadside_lidar="dair-infrastructure",
+        min_vehicles=4,
+        layout="dair",
+    ),
 }
 
 
