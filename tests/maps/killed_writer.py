@@ -78,12 +78,12 @@ def in_fork(work, kill_after_s: float | None = None) -> tuple[str, bool]:
 
 
 def dying_write(folder: Path, at: int) -> None:
-    """Write the second batch and release, and die at the ``at``-th operation on a file."""
+    """Write the second batch and release, and die at the ``at``-th operation on a file or folder of the store."""
     count = 0
 
-    def watch(event: str, _: tuple) -> None:
+    def watch(event: str, about: tuple) -> None:
         nonlocal count
-        if event in _WATCHED:
+        if event in _WATCHED and str(about[0]).startswith(str(folder)):
             count += 1
             if count == at:
                 os.kill(os.getpid(), signal.SIGKILL)

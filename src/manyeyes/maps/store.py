@@ -37,7 +37,7 @@ from manyeyes.maps.observation import Frame
 from manyeyes.maps.observation_log import TILE_M, ObservationLog, StoreError, locked
 from manyeyes.maps.tiles import ALGORITHM, StepProgress, TileConfig, fuse_tiles
 from manyeyes.maps.vector_map import VectorMap
-from manyeyes.maps.whole_file import remove_unfinished, write_whole
+from manyeyes.maps.whole_file import remove_unfinished, rename_whole, write_whole
 
 STORE_VERSION = 1
 
@@ -244,7 +244,7 @@ class MapStore:
         for kind, draft in zip(("lines", "crossings"), drafts):
             digest = _hash(draft.read_bytes())
             path = folder / f"{digest}.{kind}.parquet"
-            draft.replace(path)
+            rename_whole(draft, path)
             names.append(_below(path, self.folder / "tiles"))
             hashes.append(digest)
         return TileEntry(x, y, len(rows), (names[0], names[1]), (hashes[0], hashes[1]))

@@ -39,6 +39,12 @@ def write_whole(path: Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
+def rename_whole(draft: Path, path: Path) -> None:
+    """Give a finished, flushed file its final name, and flush the name."""
+    draft.replace(path)
+    _to_disk(path.parent)
+
+
 def remove_unfinished(folder: Path) -> list[Path]:
     """Delete what writers that were killed left in a folder and below it; the caller holds the folder's lock."""
     left = sorted(folder.rglob(f".*{UNFINISHED}*"))

@@ -1,0 +1,328 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the fusion of maps costs, in four questions.
+
+literal  our fusion against the paper's literal pipeline with pycpd, per observation, in turn in one process (bar: 50 times)
+stream   one observation of about 25 elements taken into a map of 100,000 elements (bar: 10 ms)
+city     a growing city, 10^4, 10^5, 10^6 observed elements, from the log to a release (bar at 10^6, two cores: 20 min, 8 GB)
+engines  10^5 observed elements inline, over processes, Dask and Ray: the map must be identical
+
+Observations are simulated before the clock starts. Besides wall time the processors' own time is given, which a busy
+machine does not change; memory is the largest sum of resident memory over this process and its workers, looked at four times
+a second, shared pages counted for each.
+
+python benchmarks/map_fusion.py literal|stream|city|engines [--elements 10000 ...] [--workers 2] [--out FILE.json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import psutil
+import torch
+
+from manyeyes.apps.provenance import write_json
+from manyeyes.datatypes.map_element import DIVIDER, MapElements
+from manyeyes.maps.baselines import crowdmap_literal
+from manyeyes.maps.engine import named_executor
+from manyeyes.maps.fuse import fuse
+from manyeyes.maps.observation import Frame, Observation
+from manyeyes.maps.store import MapStore
+from manyeyes.maps.stream import StreamingMap
+from manyeyes.maps.tiles import TileConfig
+from manyeyes.maps.vector_map import VectorMap
+from manyeyes.simulator.crowd import CROWDS, CrowdConfig, place, simulate_crowd
+
+CITY = replace(CROWDS["local"], range_x=(-45.0, 45.0), range_y=(-25.0, 25.0))
+LITERAL_BAR, STREAM_BAR_MS, CITY_BAR_S, CITY_BAR_GB = 50.0, 10.0, 1200.0, 8.0
+
+
+@dataclass(frozen=True)
+class Literal:
+    """Seconds of processor time per observation, medians over the rounds, and how many times ours is faster."""
+
+    observations: int
+    elements: float
+    ours_s: float
+    literal_s: float
+    times: float
+    met: bool
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Milliseconds of processor time of one observation, median and largest, after some that only compile."""
+
+    map_elements: int
+    elements: float
+    median_ms: float
+    most_ms: float
+    met: bool
+
+
+@dataclass(frozen=True)
+class City:
+    """One size: observations, observed elements, seconds to ingest and to fuse and publish, processor time, peak memory."""
+
+    executor: str
+    observations: int
+    elements: int
+    map_elements: int
+    map_hash: str
+    ingest_s: float
+    fuse_s: float
+    fuse_cpu_s: float
+    peak_gb: float
+    load: float
+
+
+class _Registered:
+    """What pycpd found, with the interface of the project's own registration."""
+
+    def __init__(self, moved: np.ndarray) -> None:
+        self.moved = moved
+
+    def apply(self, _: np.ndarray) -> np.ndarray:
+        """The moved points."""
+        return self.moved
+
+
+def with_pycpd(anchor: np.ndarray, other: np.ndarray, _: object) -> _Registered:
+    """Rigid registration by pycpd with its defaults."""
+    from pycpd import RigidRegistration
+
+    return _Registered(RigidRegistration(X=anchor, Y=other).register()[0])
+
+
+def literal(count: int, rounds: int, config: CrowdConfig) -> Literal:
+    """Both pipelines on one crowd of a crossroads, in turn."""
+    crowd = simulate_crowd(place("cross"), count, config)
+    many = crowd.observations
+    fuse(many[:20]), crowdmap_literal.fuse(many[:5])
+    own = crowdmap_literal.register
+    ours, theirs = [], []
+    for _ in range(rounds):
+        ours.append(_cpu(lambda: fuse(many)) / count)
+        crowdmap_literal.register = with_pycpd
+        theirs.append(_cpu(lambda: crowdmap_literal.fuse(many)) / count)
+        crowdmap_literal.register = own
+    times = median(theirs) / median(ours)
+    return Literal(count, _mean_elements(many), median(ours), median(theirs), times, times >= LITERAL_BAR)
+
+
+def large_map(elements: int, frame: Frame) -> VectorMap:
+    """Lines of 20 stations on a lattice of streets: three side by side each 30 m, as many as asked for."""
+    side = int(np.ceil(np.sqrt(elements / 3)))
+    k = np.arange(elements)
+    row, column = np.divmod(k // 3, side)
+    start = np.stack((column * 30.0, row * 30.0 + (k % 3) * 3.5), 1) - side * 15.0
+    points = start[:, None] + np.stack((np.linspace(0.0, 20.0, 20), np.zeros(20)), 1)
+    made = MapElements(
+        np.full(elements, DIVIDER), np.arange(elements + 1) * 20, points.reshape(-1, 2), np.full(elements, 0.9),
+        np.full(elements * 20, 0.1), np.tile((1.0, 0.0, 0.0, 0.0), (elements, 1)),
+    )  # fmt: skip
+    return VectorMap.of(made, frame, log_odds=4.0)
+
+
+def stream(elements: int, rounds: int) -> Stream:
+    """Observations of a large map's lines, moved by half a metre, one after the other."""
+    base = large_map(elements, Frame())
+    live = StreamingMap(base)
+    spent, counts = [], []
+    view = np.array([[-60.0, -50.0], [60.0, -50.0], [60.0, 50.0], [-60.0, 50.0]])
+    middles = base.elements.points[base.elements.first[:-1]] + (10.0, 0.0)
+    for k in range(rounds + 5):
+        # A number that has no factor in common with the rows of the lattice walks all over the map.
+        at = middles[(k * 7919) % elements]
+        near = np.flatnonzero(np.hypot(*(middles - at).T) < 60.0)[:25]
+        seen = base.elements.take(near).transform(-float(at[0]), -float(at[1]) + 0.5, 0.0)
+        pose, covariance = np.array([at[0], at[1], 0.0]), np.diag((0.5, 0.5, 2e-4))
+        observation = Observation(f"agent{k}", "pass", 1000 + k, pose, covariance, view, seen)
+        assert observation.id
+        began = time.process_time()
+        live.assimilate(observation)
+        spent.append(1e3 * (time.process_time() - began))
+        counts.append(len(near))
+    spent = spent[5:]
+    return Stream(elements, float(np.mean(counts)), median(spent), max(spent), median(spent) < STREAM_BAR_MS)
+
+
+def city(elements: int, engine: str, workers: int, crowd: Sequence[Observation], frame: Frame) -> City:
+    """Ingest, fuse, publish."""
+    with tempfile.TemporaryDirectory() as folder:
+        store = MapStore.create(Path(folder) / "city", frame)
+        load = os.getloadavg()[0]
+        with _peak() as peak:
+            began = time.perf_counter()
+            with store.writing() as log:
+                log.append(crowd)
+            ingested = time.perf_counter()
+            cpu = _all_cpu()
+            made = store.fuse(None, TileConfig(), named_executor(engine, workers), _say)
+            cpu = _all_cpu() - cpu
+            ended = time.perf_counter()
+        return City(
+            engine,
+            len(crowd),
+            elements,
+            made.elements,
+            made.content,
+            ingested - began,
+            ended - ingested,
+            cpu,
+            peak[0],
+            load,
+        )
+
+
+def city_crowd(elements: int, seed: int) -> tuple[tuple[Observation, ...], Frame]:
+    """Observations of a lattice of streets that grows with their number, until they hold so many elements."""
+    side = max(2, round(np.sqrt(elements / 2500)))
+    where = place(f"grid-{side}", None)
+    probe = simulate_crowd(where, 40, CITY, seed)
+    count = int(np.ceil(elements / max(_mean_elements(probe.observations), 1.0)))
+    return simulate_crowd(
+        where, count, CITY, seed, progress=lambda k, n: _say("simulate", k, n)
+    ).observations, where.frame
+
+
+def _mean_elements(many: Sequence[Observation]) -> float:
+    return float(np.mean([len(o.elements) for o in many]))
+
+
+def _cpu(work: Callable[[], object]) -> float:
+    began = time.process_time()
+    work()
+    return time.process_time() - began
+
+
+def _say(name: str, done: int, total: int) -> None:
+    if sys.stderr.isatty():
+        print(f"\r{name} {done}/{total}   ", end="", file=sys.stderr, flush=True)
+
+
+def _family() -> list[psutil.Process]:
+    own = psutil.Process()
+    return [own, *own.children(recursive=True)]
+
+
+def _all_cpu() -> float:
+    """Seconds that this process and its workers, those that ended too, have spent on processors."""
+    total = 0.0
+    for process in _family():
+        try:
+            times = process.cpu_times()
+        except psutil.NoSuchProcess:
+            continue
+        total += times.user + times.system + times.children_user + times.children_system
+    return total
+
+
+@contextmanager
+def _peak() -> Iterator[list[float]]:
+    """The largest resident memory in GB, once the block has ended."""
+    most, ended = [0.0], threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(0.25):
+            total = 0
+            for process in _family():
+                try:
+                    total += process.memory_info().rss
+                except psutil.NoSuchProcess:
+                    continue
+            most[0] = max(most[0], total / 1e9)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield most
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _cities(sizes: Sequence[int], engines: Sequence[str], workers: int, seed: int) -> list[City]:
+    rows = []
+    for size in sizes:
+        crowd, frame = city_crowd(size, seed)
+        seen = sum(len(o.elements) for o in crowd)
+        for engine in engines:
+            row = city(seen, engine, workers, crowd, frame)
+            rows.append(row)
+            print(
+                f"{engine}: {row.observations} observations, {row.elements} elements -> {row.map_elements}, {row.map_hash}: "
+                f"ingest {row.ingest_s:.1f} s, fuse and publish {row.fuse_s:.1f} s ({row.fuse_cpu_s:.1f} s of processors), "
+                f"{row.peak_gb:.2f} GB, load before {row.load:.1f}",
+                flush=True,
+            )
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("literal", "stream", "city", "engines"))
+    parser.add_argument("--elements", type=int, nargs="+")
+    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--engines", nargs="+", default=["inline", "process", "dask", "ray"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path)
+    wanted = parser.parse_args()
+    torch.set_num_threads(1)
+    rows: list[object] = []
+    if wanted.what == "literal":
+        row = literal(wanted.count, wanted.rounds, CITY)
+        print(
+            f"{row.observations} observations of {row.elements:.1f} elements: ours {1e3 * row.ours_s:.1f} ms, literal with pycpd "
+            f"{1e3 * row.literal_s:.0f} ms an observation: {row.times:.0f} times; bar {LITERAL_BAR:.0f} {_met(row.met)}"
+        )
+        rows = [row]
+    elif wanted.what == "stream":
+        for size in wanted.elements or [100_000]:
+            live = stream(size, wanted.rounds * 20)
+            print(
+                f"map of {live.map_elements} elements, observation of {live.elements:.1f}: {live.median_ms:.2f} ms (most "
+                f"{live.most_ms:.2f}); bar {STREAM_BAR_MS:.0f} ms {_met(live.met)}"
+            )
+            rows.append(live)
+    elif wanted.what == "city":
+        cities = _cities(wanted.elements or [10_000, 100_000, 1_000_000], ["process"], wanted.workers, wanted.seed)
+        for one in cities:
+            if one.elements >= 990_000:
+                print(
+                    f"bar {CITY_BAR_S:.0f} s, {CITY_BAR_GB:.0f} GB {_met(one.fuse_s <= CITY_BAR_S and one.peak_gb <= CITY_BAR_GB)}"
+                )
+        rows = list(cities)
+    else:
+        cities = _cities(wanted.elements or [100_000], wanted.engines, wanted.workers, wanted.seed)
+        print("identical" if len({one.map_hash for one in cities}) == 1 else "MAPS DIFFER")
+        rows = list(cities)
+    if wanted.out:
+        settings = {"what": wanted.what, "workers": wanted.workers, "load": os.getloadavg()[0]}
+        write_json(
+            wanted.out,
+            {"command": shlex.join(["python", *sys.argv]), "settings": settings, "rows": rows},
+            settings,
+            wanted.seed,
+        )
+
+
+def _met(met: bool) -> str:
+    return "met" if met else "MISSED"
+
+
+if __name__ == "__main__":
+    main()
