@@ -44,6 +44,11 @@ def test_an_answer_by_hand():
     assert not found.right(5.0) and found.right(5.01)
 
 
+def test_an_answer_that_states_no_error_has_no_nees():
+    said = replace(unanswered(ClaimNoise().claim(TRUTH, 0)), status=PoseStatus.OK, inliers=4)
+    assert math.isnan(judged(said, TRUTH, PLACES).nees)
+
+
 def test_displacement_by_hand():
     assert displacement(TRUTH + [3.0, 4.0, 0.0], TRUTH, PLACES) == pytest.approx(5.0)
     # Both places are 10 m from the other agent: turned by 0.1 rad about it, each moves by the chord.

@@ -85,7 +85,9 @@ def judged(estimate: PoseEstimate, truth: Floats, common_xy: Floats) -> PoseFram
         return PoseFrame(estimate.status, len(common_xy), math.inf, math.inf, math.nan, math.nan, -math.inf)
     error = difference(pose, truth)
     answered = estimate.status.answered
-    nees = float(error @ np.linalg.solve(estimate.covariance, error)) if answered and estimate.inliers else math.nan
+    # A claim that states no error at all leaves nothing to measure its error by.
+    stated = answered and estimate.inliers > 0 and np.linalg.eigvalsh(estimate.covariance).min() > 1e-14
+    nees = float(error @ np.linalg.solve(estimate.covariance, error)) if stated else math.nan
     return PoseFrame(
         estimate.status,
         len(common_xy),
