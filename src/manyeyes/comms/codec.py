@@ -215,9 +215,8 @@ def unpack_cells(layout: int, data: bytes, count: int) -> tuple[NDArray[np.int64
     """The inverse of :func:`pack_cells`: ascending keys (count,) and how many bytes of data they took."""
     key, raw = np.empty(count, np.int64), np.frombuffer(data, np.uint8)
     if layout == DELTA:
-        used, whole = _read_varints(raw, key)
+        used, whole = _read_gaps(raw, key)
         _check_varints(used, whole, count)
-        _add_up_gaps(key)
         return key, used
     (first, span), used = unpack_varints(data, 2)
     end = used + int(span)
@@ -230,11 +229,14 @@ def unpack_cells(layout: int, data: bytes, count: int) -> tuple[NDArray[np.int64
 
 
 @njit(cache=True)
-def _add_up_gaps(key):  # pragma: no cover
+def _read_gaps(raw, key):  # pragma: no cover
+    """As :func:`_read_varints`, and the gaps added up to keys."""
+    used, whole = _read_varints(raw, key)
     before = -1
     for i in range(key.shape[0]):
         before += key[i] + 1
         key[i] = before
+    return used, whole
 
 
 @njit(cache=True)

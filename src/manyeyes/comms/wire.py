@@ -225,7 +225,7 @@ def _cholesky(covariance: NDArray[np.float64]) -> list[float]:
 
 def decode_packet(packet: bytes) -> Fragment:
     """One packet, checked from its first to its last byte; every fault is a :class:`PacketError` with a reason."""
-    packet = bytes(memoryview(packet))
+    packet = packet if type(packet) is bytes else bytes(memoryview(packet))
     if len(packet) < 3 or packet[:2] != _MAGIC:
         raise PacketError("garbage", f"Not a manyeyes packet: expected the bytes {_MAGIC!r}, got {packet[:2]!r}.")
     if packet[2] != VERSION:
@@ -237,9 +237,8 @@ def decode_packet(packet: bytes) -> Fragment:
     _, _, flags, length, number, count = _START.unpack_from(packet)
     if length != len(packet):
         raise PacketError("garbage", f"Truncated or padded packet: it announces {length} bytes and has {len(packet)}.")
-    checksum = zlib.crc32(memoryview(packet)[: -_CRC.size])
     common = packet[_START.size : _BODY_AT]
-    if _CRC.unpack_from(packet, length - _CRC.size)[0] != checksum:
+    if _CRC.unpack_from(packet, length - _CRC.size)[0] != zlib.crc32(memoryview(packet)[: -_CRC.size]):
         agent_id = _COMMON.unpack(common)[0]
         raise PacketError(
             "checksum", f"The checksum of a packet said to be of agent {agent_id} does not match its bytes."
