@@ -49,6 +49,17 @@ class Noise(NamedTuple):
     style_error: float
 
 
+class Room(NamedTuple):
+    """Where a look is written: points (MOST, n, 2), columns (MOST, 4) and style (MOST, S).
+
+    columns: kind, score, sigma, and the name of the true element, -1 for one that is not there.
+    """
+
+    points: Array
+    columns: Array
+    style: Array
+
+
 class Scenery(NamedTuple):
     """The true map, ready to be looked at.
 
@@ -281,13 +292,18 @@ def _emit_false(line, noise, key, element, run, out):
 
 
 @numba.njit(cache=True)
-def look(scene, noise, pose, shadows, key, points, columns, style):
-    """Fill points (MOST, n, 2), columns (MOST, 4) and style (MOST, S) with what is seen from a pose; how many elements.
+def _reach(noise):
+    """The farthest that is in view."""
+    return np.hypot(max(abs(noise.x_min), abs(noise.x_max)), max(abs(noise.y_min), abs(noise.y_max)))
 
-    pose: x, y, yaw (3,) of the agent, true. shadows: (Q, 4, 2) hidden quadrilaterals in its frame. columns: kind, score, sigma,
-    and the name of the true element, -1 for one that is not there.
+
+@numba.njit(cache=True)
+def look(scene, noise, pose, shadows, key, room):
+    """Fill a room with what is seen from a pose; how many elements that is.
+
+    pose: x, y, yaw (3,) of the agent, true. shadows: (Q, 4, 2) hidden quadrilaterals in its frame.
     """
-    reach = np.hypot(max(abs(noise.x_min), abs(noise.x_max)), max(abs(noise.y_min), abs(noise.y_max)))
+    reach = _reach(noise)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     found = 0
     for e in range(len(scene.kind)):
@@ -306,7 +322,7 @@ def look(scene, noise, pose, shadows, key, points, columns, style):
             dx, dy = scene.points[i, 0] - pose[0], scene.points[i, 1] - pose[1]
             local[i - a, 0], local[i - a, 1] = c * dx + s * dy, c * dy - s * dx
         if scene.kind[e] == CROSSING:
-            found = _see_crossing(scene, e, local, noise, shadows, key, reach, points, columns, style, found)
+            found = _see_crossing(scene, e, local, noise, shadows, key, room, found)
             continue
         start, run = -1, 0
         for i in range(len(local) + 1):
@@ -319,14 +335,16 @@ def look(scene, noise, pose, shadows, key, points, columns, style):
                 start = i
             elif not seen and start >= 0:
                 if found < MOST - 6:
-                    found = _see_line(scene, e, run, local[start:i], noise, key, reach, points, columns, style, found)
+                    found = _see_line(scene, e, run, local[start:i], noise, key, room, found)
                 start, run = -1, run + 1
     return found
 
 
 @numba.njit(cache=True)
-def _see_crossing(scene, e, local, noise, shadows, key, reach, points, columns, style, found):
+def _see_crossing(scene, e, local, noise, shadows, key, room, found):
     """One crossing: said when at least half of it and 4 m² are in sight; how many elements there are now."""
+    points, columns, style = room
+    reach = _reach(noise)
     ring, area = _clip_ring(local, noise)
     name = scene.name[e]
     if area < 4.0 or unit(key, name, 0, _CONFUSE) < noise.confusion / 2:
@@ -351,8 +369,10 @@ def _see_crossing(scene, e, local, noise, shadows, key, reach, points, columns, 
 
 
 @numba.njit(cache=True)
-def _see_line(scene, e, run, line, noise, key, reach, points, columns, style, found):
+def _see_line(scene, e, run, line, noise, key, room, found):
     """One visible stretch of a line, whole or in two parts, and perhaps a false one beside it; how many elements now."""
+    points, columns, style = room
+    reach = _reach(noise)
     name, kind = scene.name[e], scene.kind[e]
     least = 3 if kind == STOP_LINE else 8
     if len(line) < least:
@@ -414,4 +434,4 @@ def _say_style(true, noise, key, element, run, out):
     out[said] = 0.85
 
 
-__all__ = ["MOST", "Noise", "Scenery", "look", "normal", "scenery", "unit"]
+__all__ = ["MOST", "Noise", "Room", "Scenery", "look", "normal", "scenery", "unit"]

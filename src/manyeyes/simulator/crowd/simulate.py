@@ -20,7 +20,7 @@ from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.crowd.config import CROWDS, CrowdConfig
 from manyeyes.simulator.crowd.place import Place
 from manyeyes.simulator.crowd.routes import along
-from manyeyes.simulator.crowd.sight import MOST, Noise, Scenery, look, normal, scenery, unit
+from manyeyes.simulator.crowd.sight import MOST, Noise, Room, Scenery, look, normal, scenery, unit
 from manyeyes.simulator.crowd.world import Change, World
 
 Array = NDArray[np.float64]
@@ -199,9 +199,7 @@ class _Looker:
         self.scenes = [_scene(world, int(time)) for time in world.epochs]
         self.noise = self._noise(config.range_x, config.range_y)
         self.pole_noise = self._noise((0.0, config.pole_range), (-15.0, 15.0))
-        self.points = np.empty((MOST, config.points, 2))
-        self.columns = np.empty((MOST, 4))
-        self.style = np.empty((MOST, len(STYLES)))
+        self.room = Room(np.empty((MOST, config.points, 2)), np.empty((MOST, 4)), np.empty((MOST, len(STYLES))))
 
     def _noise(self, x: tuple[float, float], y: tuple[float, float]) -> Noise:
         c = self.config
@@ -229,7 +227,7 @@ class _Looker:
         time += int(k * np.mean(config.spacing) / _SPEED_MPS * 1e9)
         epoch = 0 if drive.role == STALE else int(np.searchsorted(self.epochs, time, side="right")) - 1
         shadows = _shadows(key, config, noise)
-        found = look(self.scenes[epoch], noise, pose, shadows, key, self.points, self.columns, self.style)
+        found = look(self.scenes[epoch], noise, pose, shadows, key, self.room)
         claimed, covariance = self._claim(drive, key, pose)
         elements = self._elements(found)
         if drive.role == MALICIOUS:
@@ -254,17 +252,17 @@ class _Looker:
             trusted=drive.role == POLE,
             occluders=Polygons.of(list(shadows)),
         )
-        return observation, self.columns[:found, 3].astype(np.int64)
+        return observation, self.room.columns[:found, 3].astype(np.int64)
 
     def _elements(self, found: int) -> MapElements:
         count = self.config.points
         return MapElements(
-            kind=self.columns[:found, 0].astype(np.int64),
+            kind=self.room.columns[:found, 0].astype(np.int64),
             first=np.arange(found + 1, dtype=np.int64) * count,
-            points=self.points[:found].reshape(-1, 2).copy(),
-            score=self.columns[:found, 1].copy(),
-            sigma=np.repeat(np.maximum(self.columns[:found, 2], 0.01), count),
-            style=self.style[:found].copy(),
+            points=self.room.points[:found].reshape(-1, 2).copy(),
+            score=self.room.columns[:found, 1].copy(),
+            sigma=np.repeat(np.maximum(self.room.columns[:found, 2], 0.01), count),
+            style=self.room.style[:found].copy(),
         )
 
     def _claim(self, drive: _Pass, key: np.uint64, pose: Array) -> tuple[Array, Array]:
