@@ -158,8 +158,8 @@ def read_side_labels(path: Path) -> Boxes:
 def read_world_labels(path: Path) -> Boxes:
     """Vehicles of a cooperative label in the world frame, float64, by ``world_8_points`` alone.
 
-    The corners run front left, front right, rear right, rear left at the bottom, then the same at the top; ``rotation``,
-    ``3d_location`` and ``3d_dimensions`` of these files are not those of the world.
+    The corners run front left, front right, rear right, rear left at the bottom, then the same at the top. ``rotation`` is
+    not the yaw in the world, and the format's own description calls all but type and corners unusable.
     """
     corners: list[np.ndarray] = []
     kept: list[tuple[int, int]] = []
