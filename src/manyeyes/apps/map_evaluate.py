@@ -25,7 +25,7 @@ STUDIES = ("fusion", "noise", "table3", "malicious", "tuning")
 class Options:
     """What is judged."""
 
-    vector_map: tyro.conf.Positional[Path | None] = None
+    folder: tyro.conf.Positional[Path | None] = None
     """The map's folder, of 'map fuse'; or nothing, with --study."""
     truth: Path | None = None
     """A map's folder with the truth; 'truth' beside the map is found by itself."""
@@ -53,11 +53,11 @@ def main(options: Options) -> None:
 
     if options.study is not None and options.study not in STUDIES:
         raise ConfigError(f"No study is called {options.study!r}; known: {', '.join(STUDIES)}.")
-    if (options.study is None) == (options.vector_map is None):
+    if (options.study is None) == (options.folder is None):
         raise ConfigError(f"Give a map's folder, or --study with one of {', '.join(STUDIES)}.")
     console = Console()
-    if options.vector_map is not None:
-        _judge_one(options, options.vector_map, console)
+    if options.folder is not None:
+        _judge_one(options, options.folder, console)
         return
     from manyeyes.apps.map_studies import study
 
@@ -69,14 +69,28 @@ def _judge_one(options: Options, path: Path, console: Console) -> None:
     from manyeyes.apps.map_folder import MapFolder, read_vector_map
     from manyeyes.apps.viewer.map_table import kinds_terminal
     from manyeyes.evaluation.map_cells import judge_maps
+    from manyeyes.evaluation.map_interval import Sureness, ap_interval, f_interval
 
     truth_folder = options.truth or path.parent / "truth"
     if not truth_folder.is_dir():
         raise ConfigError(f"{truth_folder}: no truth there; name one with --truth.")
     made, truth = read_vector_map(path).published().elements, read_vector_map(truth_folder).elements
     cut = MapFolder(truth_folder.parent).cut()
-    ap, kinds = judge_maps(cut(made) if cut else made, truth)
+    judged = cut(made) if cut else made
+    ap, kinds = judge_maps(judged, truth)
     console.print(kinds_terminal(ap, kinds, f"{path} against {truth_folder}"))
+    sure = tuple(
+        Sureness(row.kind, ap_interval(judged, truth, row.kind), f_interval(judged, truth, row.kind))
+        for row in kinds
+        if row.n_truth
+    )
+    for s in sure:
+        console.print(
+            f"{s.kind}: AP exact {s.ap.value:.3f} [{s.ap.low:.3f}, {s.ap.high:.3f}], "
+            f"F@0.5 m {s.f.value:.3f} [{s.f.low:.3f}, {s.f.high:.3f}] over {s.ap.scenarios} squares of 64 m",
+            highlight=False,
+            soft_wrap=True,
+        )
     out = path / "quality.json"
-    provenance.write_json(out, {"ap": ap, "kinds": kinds}, options, None)
+    provenance.write_json(out, {"ap": ap, "kinds": kinds, "intervals": sure}, options, None)
     console.print(f"All numbers are in {out}", highlight=False, soft_wrap=True)

@@ -13,9 +13,9 @@ import tyro
 class Options:
     """What is written, and as what."""
 
-    vector_map: tyro.conf.Positional[Path]
+    folder: tyro.conf.Positional[Path]
     """The map's folder, of 'map fuse'."""
-    out: tyro.conf.Positional[Path]
+    file: tyro.conf.Positional[Path]
     """The file; .geojson, .gpkg, .parquet, .osm and .pmtiles name their format, .json needs --format."""
     format: str | None = None
     """geojson, geopackage, geoparquet, lanelet2, argoverse2, nuscenes or pmtiles, where the file's ending does not say it."""
@@ -32,8 +32,8 @@ def main(options: Options) -> None:
     from manyeyes.apps.map_folder import read_vector_map
     from manyeyes.maps.export import export_map
 
-    made = read_vector_map(options.vector_map)
+    made = read_vector_map(options.folder)
     chosen = made if options.everything else made.published()
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    export_map(chosen, options.out, options.format, options.simplify)
-    Console().print(f"{options.out}: {len(chosen)} elements", highlight=False, soft_wrap=True)
+    options.file.parent.mkdir(parents=True, exist_ok=True)
+    export_map(chosen, options.file, options.format, options.simplify)
+    Console().print(f"{options.file}: {len(chosen)} elements", highlight=False, soft_wrap=True)

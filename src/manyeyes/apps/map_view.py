@@ -15,7 +15,7 @@ from manyeyes.datatypes import ConfigError
 class Options:
     """What to draw."""
 
-    vector_map: tyro.conf.Positional[Path]
+    folder: tyro.conf.Positional[Path]
     """The map's folder, of 'map fuse'."""
     truth: Path | None = None
     """A map's folder to hold it against; 'truth' beside the map is found by itself."""
@@ -36,18 +36,18 @@ def main(options: Options) -> None:
     from manyeyes.apps.viewer.map_page import page_of, save_map_page
     from manyeyes.datatypes.map_element import MapElements
 
-    out = options.out or options.vector_map / "map.html"
+    out = options.out or options.folder / "map.html"
     if out.suffix.lower() not in (".html", ".png"):
         raise ConfigError(f"--out ends in .html or .png; got {out.name}.")
     console = Console()
-    beside = options.vector_map.parent
-    made = read_vector_map(options.vector_map)
+    beside = options.folder.parent
+    made = read_vector_map(options.folder)
     truth_folder = options.truth or _if_there(beside / "truth")
-    truth = read_vector_map(truth_folder).elements if truth_folder and truth_folder != options.vector_map else None
+    truth = read_vector_map(truth_folder).elements if truth_folder and truth_folder != options.folder else None
     seen_in = options.observations or _if_there(beside / "observations")
     seen = observations_in(seen_in, console).observations if seen_in else ()
     observed = MapElements.cat([o.in_map() for o in seen[: options.most]]) if seen else None
-    title = options.vector_map.stem
+    title = options.folder.stem
     if out.suffix.lower() == ".png":
         save_figure([Panel(title, made.published().elements, truth)], out, columns=1, width_in=10.0)
     else:

@@ -159,7 +159,7 @@ def _judge_kind(kind: str, mine: Lines, theirs: Lines, ways: Sequence[str]) -> K
             precision.append(Precision(name, thresholds, at, sum(at) / len(at), int((hits[-1] >= 0).sum())))
         if name == "exact" and kind != "crossing":
             frechet = _order(mine, theirs, match(table, order, THRESHOLDS["narrow"][-1]))
-    there, back = _pieces(mine), _pieces(theirs)
+    there, back = pieces_of(mine), pieces_of(theirs)
     near_truth = nearest_line(there.middle, theirs.points, theirs.first, LATERAL_WITHIN_M)
     near_mine = nearest_line(back.middle, mine.points, mine.first, max(LENGTH_WITHIN_M))
     lateral = _quantiles(near_truth.distance, there.length, (0.5, 0.95))
@@ -195,7 +195,7 @@ def lines_of_kind(elements: MapElements, kind: str) -> Lines:
 
 
 @dataclass(frozen=True)
-class _Pieces:
+class Pieces:
     """Lines in short pieces: middle (P, 2), length (P,), owner (P,) row of the line."""
 
     middle: Floats
@@ -203,7 +203,7 @@ class _Pieces:
     owner: NDArray[np.int64]
 
 
-def _pieces(lines: Lines) -> _Pieces:
+def pieces_of(lines: Lines) -> Pieces:
     """Every segment in equal pieces of at most PIECE_M."""
     start = np.delete(np.arange(len(lines.points)), lines.first[1:] - 1) if len(lines) else np.zeros(0, dtype=np.int64)
     owner = np.repeat(np.arange(len(lines)), np.diff(lines.first) - 1)
@@ -213,7 +213,7 @@ def _pieces(lines: Lines) -> _Pieces:
     segment = np.repeat(np.arange(len(start)), count)
     within = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count, count)
     share = ((within + 0.5) / count[segment])[:, None]
-    return _Pieces(lines.points[start[segment]] + share * step[segment], (length / count)[segment], owner[segment])
+    return Pieces(lines.points[start[segment]] + share * step[segment], (length / count)[segment], owner[segment])
 
 
 def _length_score(within_m: float, there: Floats, mine: Floats, back: Floats, theirs: Floats) -> LengthScore:
@@ -240,7 +240,7 @@ def _quantiles(distance: Floats, weight: Floats, levels: Sequence[float]) -> lis
     return [float(values[min(np.searchsorted(mass, level * mass[-1]), len(values) - 1)]) for level in levels]
 
 
-def _fragmentation(pieces: _Pieces, nearest: NDArray[np.int64], n_truth: int) -> float:
+def _fragmentation(pieces: Pieces, nearest: NDArray[np.int64], n_truth: int) -> float:
     """The mean number of predicted elements on those true ones that have any."""
     near = nearest >= 0
     if n_truth == 0 or not near.any():

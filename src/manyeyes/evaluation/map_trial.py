@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -88,8 +88,9 @@ class Scene:
         return Cut(self.place.junctions, self.place.area)
 
 
+@lru_cache(maxsize=2)
 def carry_out(trial: Trial) -> Scene:
-    """The trial's crowd, driven."""
+    """The trial's crowd, driven; the last two are kept, as a study asks for one trial with many settings in turn."""
     return Scene(trial, simulate_crowd(place(trial.place, trial.size_m), trial.count, trial.crowd, trial.seed))
 
 
