@@ -40,7 +40,9 @@ class AlignConfig:
     along_m, heading_rad: how far along and how turned a neighbour may be. sigma_m: what lines of other observations
     scatter. correlation: points of one line that count as one. damping: share of a step taken. prior_scale: corrections
     beyond about so many standard deviations stop pulling back. frozen_above: posterior over prior variance above which
-    a direction stays as claimed. most: observations that count in a cell of 8 m, class and heading.
+    a direction stays as claimed. most: observations that count in a cell of 8 m, class and heading. gauge_m: within
+    which distance what all were moved alike is taken back; gauge_scale: standard deviations beyond which a correction
+    has little say in that; agent_scale: beyond which an agent's mean correction makes its lines weigh little.
     """
 
     spacing_m: float = 1.0
@@ -54,6 +56,9 @@ class AlignConfig:
     prior_scale: float = 3.0
     frozen_above: float = 0.8
     most: int = 32
+    gauge_m: float = 250.0
+    gauge_scale: float = 1.0
+    agent_scale: float = 2.0
     gross: GrossConfig = field(default_factory=GrossConfig)
 
 
@@ -64,11 +69,14 @@ class Alignment:
     start: (O, 3) after the gross search, the claimed pose where it moved nothing. scale: (O,) metres, how far the lines
     of the observation's agent lie from others' (robust). observability: (O, 3) from 0 (only the prior speaks) to 1,
     ascending, of the three directions of the pose. residual: (O,) and matched (O,): weighted square residual (m²) and
-    number of points with neighbours.
+    number of points with neighbours. offset: (O, 2) metres moved more than those around. faith: (O,) in (0, 1], how
+    well the claims of the observation's agent and others' fit. claim: (O, 2, 2) covariance of the claimed place. voice:
+    (O,) how much that claim counts for where all stand, 0 if the search moved it. fixed: (O,) 1 for surveyed poles.
     """
 
     ids: tuple[str, ...]
     agents: tuple[str, ...]
+    claim: Floats
     start: Floats
     pose: Floats
     covariance: Floats
@@ -76,6 +84,10 @@ class Alignment:
     observability: Floats
     residual: Floats
     matched: Floats
+    offset: Floats
+    faith: Floats
+    voice: Floats
+    fixed: Floats
 
     def rows(self, ids: Sequence[str]) -> Ints:
         """Where these ids stand."""
@@ -91,21 +103,22 @@ class Alignment:
         )
 
 
-_COLUMNS = ("start", "pose", "covariance", "scale", "observability", "residual", "matched")
+_STATE = ("claim", "start", "pose", "covariance", "scale", "observability", "residual", "matched")
+_COLUMNS = (*_STATE, "offset", "faith", "voice", "fixed")
 
 
 def solve_poses(observations: Sequence[Observation], config: AlignConfig = AlignConfig()) -> Alignment:
     """The corrected pose of each observation; a pure function of the set."""
     sightings = gather(observations, config.spacing_m)
     home = np.arange(len(sightings))
-    state = search(sightings, home, config)
+    state = merge([search(sightings, home, config)], config)
     for number in range(len(config.gates_m)):
-        state = merge([sweep(sightings, state, number, home, config)])
+        state = merge([sweep(sightings, state, number, home, config)], config)
     return state
 
 
 def overlapping(
-    observations: Sequence[Observation], home: Sequence[Observation], margin_m: float = 12.0
+    observations: Sequence[Observation], home: Sequence[Observation], margin_m: float = 45.0
 ) -> list[Observation]:
     """Those of the observations that any sweep of the home observations reads, themselves included, ids ascending."""
     if not len(home):
@@ -128,6 +141,7 @@ def claimed(sightings: Sightings) -> Alignment:
     start = Alignment(
         sightings.ids,
         tuple(sightings.agents[a] for a in sightings.agent.tolist()),
+        np.array(sightings.covariance)[:, :2, :2],
         pose,
         pose,
         np.array(sightings.covariance),
@@ -135,6 +149,10 @@ def claimed(sightings: Sightings) -> Alignment:
         np.zeros((count, 3)),
         np.zeros(count),
         np.zeros(count),
+        np.zeros((count, 2)),
+        np.ones(count),
+        looks_weight(sightings, pose, np.zeros(count), np.ones(count)),
+        np.asarray(sightings.trusted).astype(np.float64),
     )
     return start.take(np.array(sorted(range(count), key=lambda k: sightings.ids[k]), np.int64))
 
@@ -148,7 +166,8 @@ def search(sightings: Sightings, home: Ints, config: AlignConfig = AlignConfig()
     place = state.rows([sightings.ids[k] for k in home.tolist()])
     moved = np.empty_like(found)
     moved[place] = found
-    return replace(state, start=moved, pose=moved)
+    still = (moved == state.pose).all(1)
+    return replace(state, start=moved, pose=moved, voice=np.where(still, state.voice, 0.0))
 
 
 def sweep(
@@ -156,28 +175,30 @@ def sweep(
 ) -> Alignment:
     """The home observations after one more sweep; ``state`` holds all of the sightings after the sweep before."""
     rows = state.rows(sightings.ids)
-    start, pose, scale = state.start[rows], state.pose[rows], state.scale[rows]
+    start, pose = state.start[rows], state.pose[rows]
     keep = np.flatnonzero(bounded(sightings, start, config.most))
     xy, tangent = sightings.world(pose)
-    weight = looks_weight(sightings, start, scale)
+    weight = looks_weight(sightings, start, state.scale[rows], state.faith[rows])
     grid = build_grid(xy[keep, 0], xy[keep, 1], sightings.kind[keep], 2.5)
     order = keep[grid.order]
     far = np.asarray(sightings.observation)[order]
     gate, kernel = config.gates_m[number], config.kernels_m[number]
-    sums = _sweep(
+    sums = normal_equations(
         home,
         (sightings.first, xy, tangent, sightings.kind, sightings.sigma),
         (grid.keys, grid.start, xy[order], tangent[order], far, weight[far]),
         (gate, kernel, config.along_m, np.cos(config.heading_rad), config.sigma_m, config.correlation),
     )
-    moved = _step(sightings, home, start, pose, sums, config)
+    moved = step_poses(sightings, home, start, pose, sums, config)
     part = state.take(rows[home])
     part = replace(part, **moved)
     return part.take(np.array(sorted(range(len(part.ids)), key=lambda k: part.ids[k]), np.int64))
 
 
-def merge(parts: Sequence[Alignment]) -> Alignment:
-    """Home observations of all tiles as one, ids ascending, with each agent's scale from all its residuals."""
+def merge(parts: Sequence[Alignment], config: AlignConfig = AlignConfig()) -> Alignment:
+    """Home observations of all tiles as one, ids ascending, with each agent's scale and faith from all its residuals
+    and offsets.
+    """
     ids = [name for part in parts for name in part.ids]
     agents = [name for part in parts for name in part.agents]
     order = np.array(sorted(range(len(ids)), key=lambda k: ids[k]), np.int64)
@@ -191,7 +212,15 @@ def merge(parts: Sequence[Alignment]) -> Alignment:
     matched = np.bincount(agent, whole.matched, len(names))
     # Two points of prior knowledge keep an agent that nobody else saw at the usual scatter.
     variance = (residual + 20.0 * 0.04) / (matched + 20.0)
-    return replace(whole, scale=np.sqrt(variance)[agent])
+    common = _common_error(whole, config)
+    offset = (whole.pose - whole.start)[:, :2] - common
+    pose = whole.pose.copy()
+    pose[:, :2] -= np.where(whole.fixed[:, None] > 0, 0.0, common)
+    mean = np.stack([np.bincount(agent, offset[:, k], len(names)) for k in (0, 1)], 1)
+    mean = mean / np.bincount(agent, minlength=len(names))[:, None]
+    away = (mean**2).sum(1)[agent] / (np.trace(whole.claim, axis1=1, axis2=2) / 2)
+    faith = (config.agent_scale**2 / (config.agent_scale**2 + away)) ** 2
+    return replace(whole, pose=pose, offset=offset, scale=np.sqrt(variance)[agent], faith=faith)
 
 
 def bounded(sightings: Sightings, pose: Floats, most: int) -> NDArray[np.bool_]:
@@ -209,14 +238,72 @@ def bounded(sightings: Sightings, pose: Floats, most: int) -> NDArray[np.bool_]:
     return bound_observations(key, np.asarray(sightings.observation), np.asarray(sightings.agent), rank, most)
 
 
-def looks_weight(sightings: Sightings, start: Floats, scale: Floats, radius_m: float = 30.0) -> Floats:
+def _common_error(whole: Alignment, config: AlignConfig) -> Floats:
+    """(O, 2) metres by which the observations around each one were moved alike, which nothing but chance explains.
+
+    Lines tell where observations stand to each other; where all of them stand is told by their claims alone, whose
+    errors have no common direction. So the mode of the corrections around is an error of all, and is taken back. It is
+    a mode, not a mean: a fifth of agents who lie alike do not move it far. Each correction counts in the directions
+    that lines told; one that the gross search moved does not.
+    """
+    told = np.eye(2) - whole.covariance[:, :2, :2] @ np.linalg.inv(whole.claim)
+    told = (told + told.transpose(0, 2, 1)) / 2
+    grid = build_grid(whole.start[:, 0], whole.start[:, 1], np.zeros(len(told), np.int64), config.gauge_m)
+    return _modes(
+        whole.start,
+        whole.pose[:, :2] - whole.start[:, :2],
+        told,
+        whole.voice * whole.faith,
+        np.sqrt(np.trace(whole.claim, axis1=1, axis2=2) / 2),
+        (grid.keys, grid.start, grid.order),
+        (config.gauge_m, config.gauge_scale),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _modes(place, correction, told, weight, sigma, grid, numbers):  # pragma: no cover - compiled
+    keys, start, order = grid
+    radius, scale = numbers
+    out = np.zeros((len(place), 2))
+    for o in range(len(place)):
+        ix, iy = int(np.floor(place[o, 0] / radius)), int(np.floor(place[o, 1] / radius))
+        x, y = 0.0, 0.0
+        for turn in range(6):
+            # The scale narrows from where everything counts.
+            c2 = (scale * max(1.0, 4.0 - turn)) ** 2
+            # One quiet observation more, so that the mode of few is not a rumour.
+            xx, xy, yy, bx, by = 1.0, 0.0, 1.0, 0.0, 0.0
+            for dx in range(-1, 2):
+                low, high = span(keys, start, 0, ix + dx, iy - 1, iy + 1)
+                for k in range(low, high):
+                    q = order[k]
+                    far = ((place[q, 0] - place[o, 0]) ** 2 + (place[q, 1] - place[o, 1]) ** 2) / radius**2
+                    if far >= 1.0 or weight[q] <= 0.0:
+                        continue
+                    t = told[q]
+                    ex, ey = correction[q, 0] - x, correction[q, 1] - y
+                    m2 = (ex * (t[0, 0] * ex + t[0, 1] * ey) + ey * (t[0, 1] * ex + t[1, 1] * ey)) / sigma[q] ** 2
+                    g = c2 / (c2 + max(0.0, m2))
+                    w = weight[q] * (1.0 - far) ** 2 * g * g
+                    xx += w * t[0, 0]
+                    xy += w * t[0, 1]
+                    yy += w * t[1, 1]
+                    bx += w * (t[0, 0] * correction[q, 0] + t[0, 1] * correction[q, 1])
+                    by += w * (t[0, 1] * correction[q, 0] + t[1, 1] * correction[q, 1])
+            determinant = xx * yy - xy * xy
+            x, y = (yy * bx - xy * by) / determinant, (xx * by - xy * bx) / determinant
+        out[o, 0], out[o, 1] = x, y
+    return out
+
+
+def looks_weight(sightings: Sightings, start: Floats, scale: Floats, faith: Floats, radius_m: float = 30.0) -> Floats:
     """(O,) how much an observation's lines weigh for others: surveyed poles much, agents with odd lines and repeated
     looks little.
     """
     grid = build_grid(start[:, 0], start[:, 1], np.zeros(len(start), np.int64), radius_m)
     looks = _same_agent(start, np.asarray(sightings.agent), grid.keys, grid.start, grid.order, radius_m)
     usual = 1.0 / (1.0 + (scale / 0.2) ** 4)
-    return np.where(sightings.trusted, 50.0, 2.0 * usual / looks)
+    return np.where(sightings.trusted, 50.0, 2.0 * usual * faith / looks)
 
 
 @njit(cache=True, nogil=True)
@@ -238,7 +325,7 @@ def _same_agent(pose, agent, keys, start, order, radius):  # pragma: no cover - 
 
 
 @njit(cache=True, nogil=True)
-def _sweep(home, own, others, numbers):  # pragma: no cover - compiled
+def normal_equations(home, own, others, numbers):  # pragma: no cover - compiled
     """Normal equations of each home observation: (H, 11) pivot x, y; information xx, xy, xt, yy, yt, tt; right side is
     last of (H, 14): then x, y, t of the gradient, residual sum, vote sum, points.
     """
@@ -299,7 +386,7 @@ def _sweep(home, own, others, numbers):  # pragma: no cover - compiled
     return out
 
 
-def _step(
+def step_poses(
     sightings: Sightings, home: Ints, start: Floats, pose: Floats, sums: Floats, config: AlignConfig
 ) -> dict[str, Floats]:
     """The columns of an Alignment that a sweep changes, for the home rows."""

@@ -54,12 +54,13 @@ def cell_key(kind: Ints, x: Floats, y: Floats, cell_m: float) -> Ints:
 def span(keys: Ints, start: Ints, kind: int, ix: int, iy0: int, iy1: int) -> tuple[int, int]:
     """The range in a grid's order of the points of cells (ix, iy0..iy1) of a kind."""
     base = (kind << 60) | ((ix + 536870912) << 30)
-    low = _lower_bound(keys, base | (iy0 + 536870912))
-    return start[low], start[_lower_bound(keys, (base | (iy1 + 536870912)) + 1)]
+    low = lower_bound(keys, base | (iy0 + 536870912))
+    return start[low], start[lower_bound(keys, (base | (iy1 + 536870912)) + 1)]
 
 
 @njit(cache=True, nogil=True)
-def _lower_bound(keys: Ints, key: int) -> int:
+def lower_bound(keys: Ints, key: int) -> int:
+    """The first place in ascending keys whose key is at least this one."""
     low, high = 0, len(keys)
     while low < high:
         middle = (low + high) >> 1

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from manyeyes.maps.associate import build_grid, span
+from manyeyes.maps.associate import build_grid, lower_bound, span
 from manyeyes.maps.sightings import Sightings, is_line, sight
 
 Floats = NDArray[np.float64]
@@ -206,14 +206,16 @@ def _witness(stations, others, index, who, sights, style, numbers, least, decay)
     stamp = np.zeros((who[4], 4), np.int64)
     for k in range(count):
         n = _collect(k, stations, others, numbers, (mass, offset, pull, nearest, element, aside_of, touched))
+        # Sums over observations go in their order, whatever order the grid gave.
+        touched[:n].sort()
         shift[k], sigma[k] = _agree(n, touched, aside_of, mass, offset, pull, numbers)
         for t in range(n):
             o = touched[t]
             if aside_of[o] == 1 and abs(offset[o] / mass[o] - shift[k]) > numbers[8]:
                 aside_of[o] = 2
         # Only now is it known which of them are at the place that they agree on.
-        hits = np.sort(touched[:n])
-        for o in hits:
+        for t in range(n):
+            o = touched[t]
             if aside_of[o] == 1:
                 if filled == len(sources):
                     bigger = np.empty(2 * filled, np.int64)
@@ -299,14 +301,14 @@ def _agree(n, touched, aside_of, mass, offset, pull, numbers):  # pragma: no cov
     """Where across the station the observations agree, and its sigma: reweighted means, one contribution an
     observation.
     """
-    order = np.sort(touched[:n])
     kernel, floor = numbers[11], numbers[12]
     place, spread = 0.0, 1.0
     for turn in range(4):
         total, aside, information = 0.0, 0.0, 0.0
         # The kernel narrows from the gate's width, so that the start, which may lie between two lines, decides little.
         c2 = (kernel * (2.0 if turn == 0 else 1.0)) ** 2
-        for o in order:
+        for i in range(n):
+            o = touched[i]
             if aside_of[o] == 1:
                 d = offset[o] / mass[o]
                 g = c2 / (c2 + (d - place) ** 2)
@@ -348,7 +350,7 @@ def fold_looks(
         else:
             o = of[q]
             q += 1
-            seen = 0.0 if aside_of[o] == 2 else _visibility(places, o, who[0], sights, numbers[6])
+            seen = 0.0 if aside_of[o] == 2 else visibility(places, o, who[0], sights, numbers[6])
         coverage += seen
         if seen <= 0.0 or not (started or found):
             continue
@@ -392,14 +394,14 @@ def fold_looks(
 def _cell_of(places, index):  # pragma: no cover - compiled
     keys, start, _ = index
     key = ((int(np.floor(places[0, 0] / 32.0)) + 536870912) << 30) | (int(np.floor(places[0, 1] / 32.0)) + 536870912)
-    cell = np.searchsorted(keys, key)
+    cell = lower_bound(keys, key)
     if cell < len(keys) and keys[cell] == key:
         return start[cell], start[cell + 1]
     return 0, 0
 
 
 @njit(cache=True, nogil=True)
-def _visibility(places, o, pose, sights, margin):  # pragma: no cover - compiled
+def visibility(places, o, pose, sights, margin):  # pragma: no cover - compiled
     """Mean visibility of the places from observation o; what is seen by less than half says nothing."""
     c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
     total = 0.0

@@ -23,6 +23,7 @@ from manyeyes.maps.linking import LinkConfig, link, smooth
 from manyeyes.maps.observation import Frame, Observation
 from manyeyes.maps.sightings import gather
 from manyeyes.maps.stations import Area, Evidence, StationConfig, StationTable, find_stations, with_style
+from manyeyes.maps.topology import topology_of
 from manyeyes.maps.vector_map import CANDIDATE, PUBLISHED, RETIRED, Stations, Topology, VectorMap, content_ids
 
 Floats = NDArray[np.float64]
@@ -138,7 +139,7 @@ def _as_map(parts: _Parts, evidence: Evidence, frame: Frame) -> VectorMap:
         parts.points,
         parts.score.clip(0.0, 1.0),
         evidence.sigma[row],
-        style.reshape(count, -1),
+        style,
     )
     sources_first, sources = _sources(owner, row, count, evidence)
     stations = Stations(
@@ -160,11 +161,17 @@ def _as_map(parts: _Parts, evidence: Evidence, frame: Frame) -> VectorMap:
         t_first=t_first,
         t_last=t_last,
         stations=stations,
-        topology=Topology.none(),
+        topology=_topology(elements, state),
         observations=evidence.observations,
         sources_first=sources_first,
         sources=sources,
     )
+
+
+def _topology(elements: MapElements, state: Ints) -> Topology:
+    """Relations among the elements that are not retired."""
+    alive = np.flatnonzero(state != RETIRED)
+    return topology_of(elements.take(alive)).renumbered(alive)
 
 
 def _sources(owner: Ints, row: Ints, count: int, evidence: Evidence) -> tuple[Ints, Ints]:

@@ -48,7 +48,7 @@ def gross_search(sightings: Sightings, keep: NDArray[np.bool_], home: Ints, conf
     chosen = np.flatnonzero(keep)
     grid = build_grid(xy[chosen, 0], xy[chosen, 1], sightings.kind[chosen], 8.0)
     rows = chosen[grid.order]
-    moves = _search(
+    moves = best_moves(
         home,
         np.asarray(sightings.pose),
         np.asarray(sightings.trusted),
@@ -65,6 +65,11 @@ def gross_search(sightings: Sightings, keep: NDArray[np.bool_], home: Ints, conf
         (config.reach_m, config.cell_m, config.gain, config.least_m, config.price),
         config.stride,
     )
+    return moved_by(sightings, home, moves)
+
+
+def moved_by(sightings: Sightings, home: Ints, moves: Floats) -> Floats:
+    """Claimed poses (H, 3) moved by moves (H, 3) of their own frames."""
     start = np.asarray(sightings.pose)[home]
     c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
     x, y = moves[:, 0], moves[:, 1]
@@ -72,7 +77,10 @@ def gross_search(sightings: Sightings, keep: NDArray[np.bool_], home: Ints, conf
 
 
 @njit(cache=True, nogil=True)
-def _search(home, pose, trusted, own, others, agent, yaws, numbers, stride):  # pragma: no cover - compiled
+def best_moves(home, pose, trusted, own, others, agent, yaws, numbers, stride):  # pragma: no cover - compiled
+    """The move (H, 3) of each home observation's own frame that fits it best to the points of others, all zero for
+    none.
+    """
     first, xy, tangent, kind = own
     reach, cell, gain, least, price = numbers
     moves = np.zeros((len(home), 3))

@@ -253,8 +253,10 @@ def smooth(xy, first, members, weight, scale):  # pragma: no cover - compiled
                     power *= d
             out[a + i, 0], out[a + i, 1] = xy[members[a + i], 0], xy[members[a + i], 1]
             if high - low >= 5:
-                system = np.array([[s[0], s[1], s[2]], [s[1], s[2], s[3]], [s[2], s[3], s[4]]])
-                if abs(np.linalg.det(system)) > 1e-9:
-                    out[a + i, 0] = np.linalg.solve(system, tx)[0]
-                    out[a + i, 1] = np.linalg.solve(system, ty)[0]
+                # The parabola's value here is the first unknown of three equations: Cramer's rule.
+                c0, c1, c2 = s[2] * s[4] - s[3] * s[3], s[2] * s[3] - s[1] * s[4], s[1] * s[3] - s[2] * s[2]
+                determinant = s[0] * c0 + s[1] * c1 + s[2] * c2
+                if determinant > 1e-9 * s[0] * s[2] * s[4]:
+                    out[a + i, 0] = (tx[0] * c0 + tx[1] * c1 + tx[2] * c2) / determinant
+                    out[a + i, 1] = (ty[0] * c0 + ty[1] * c1 + ty[2] * c2) / determinant
     return out

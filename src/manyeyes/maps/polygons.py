@@ -78,7 +78,9 @@ def find_crossings(
     hull_first, hulls = _hulls(first, points)
     area = _areas(hull_first, hulls)
     usable = area > 0.5
-    label = _groups(hull_first, hulls, area, usable, rank[owner], config.overlap, config.most)
+    label = _groups(
+        hull_first, hulls, area, usable, np.argsort(rank[owner], kind="stable"), config.overlap, config.most
+    )
     count = int(label.max(initial=-1)) + 1
     reach = _own_reach(first, points, owner, pose, sights(sightings), config.cut_m)
     rings = [
@@ -114,13 +116,30 @@ def _placed(sightings: Sightings, rows: Ints, owner: Ints, pose: Floats) -> tupl
     return np.asarray(elements.first), np.stack((c * x - s * y + at[:, 0], s * x + c * y + at[:, 1]), 1)
 
 
+def hulls_of(ring: Floats) -> Floats:
+    """The convex hull (K, 2) of one ring, anticlockwise."""
+    return _hulls(np.array([0, len(ring)]), np.ascontiguousarray(ring))[1]
+
+
+def overlap_of(one: Floats, two: Floats) -> float:
+    """The share of the smaller of two convex anticlockwise rings that they have in common."""
+    if min(len(one), len(two)) < 3:
+        return 0.0
+    return float(_common(one, two)) / max(1e-9, min(float(_area(one)), float(_area(two))))
+
+
 @njit(cache=True, nogil=True)
 def _hulls(first, points):  # pragma: no cover - compiled
     """Convex hulls, anticlockwise, of rings: offsets and points (Andrew's monotone chain)."""
     out_first, out, filled = np.zeros(len(first), np.int64), np.empty((len(points) + len(first), 2)), 0
     for r in range(len(first) - 1):
         ring = points[first[r] : first[r + 1]]
-        order = np.argsort(ring[:, 0] + 0.0, kind="mergesort")
+        order = np.arange(len(ring))
+        for i in range(1, len(ring)):
+            j = i
+            while j > 0 and (ring[order[j], 0], ring[order[j], 1]) < (ring[order[j - 1], 0], ring[order[j - 1], 1]):
+                order[j], order[j - 1] = order[j - 1], order[j]
+                j -= 1
         hull, n = np.empty((2 * len(ring) + 2, 2)), 0
         for turn in range(2):
             base = n
@@ -193,7 +212,7 @@ def _half_plane(ring, px, py, nx, ny):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _groups(first, points, area, usable, rank, overlap, most):  # pragma: no cover - compiled
+def _groups(first, points, area, usable, walk, overlap, most):  # pragma: no cover - compiled
     """(R,) the group of each ring, -1 for those that are too many or too small; groups numbered by their best ring.
 
     Rings whose boxes touch form a block; a block's best ``most`` rings are joined by average linkage while the best
@@ -207,14 +226,13 @@ def _groups(first, points, area, usable, rank, overlap, most):  # pragma: no cov
         for axis in range(2):
             low[r, axis] = points[first[r] : first[r + 1], axis].min() if first[r + 1] > first[r] else 0.0
             high[r, axis] = points[first[r] : first[r + 1], axis].max() if first[r + 1] > first[r] else 0.0
-    walk = np.argsort(rank, kind="mergesort")
     groups = 0
     stack = np.empty(count, np.int64)
     for seed in walk:
         if block[seed] >= 0 or not usable[seed]:
             continue
         block[seed], stack[0], n = seed, seed, 1
-        members = [seed]
+        members = 1
         while n > 0:
             n -= 1
             r = stack[n]
@@ -222,9 +240,12 @@ def _groups(first, points, area, usable, rank, overlap, most):  # pragma: no cov
                 if block[q] < 0 and usable[q] and _touch(low, high, q, r):
                     block[q], stack[n] = seed, q
                     n += 1
-                    members.append(q)
-        chosen = np.array(members)
-        chosen = chosen[np.argsort(rank[chosen] * count + chosen, kind="mergesort")][:most]
+                    members += 1
+        chosen, n = np.empty(min(members, most), np.int64), 0
+        for r in walk:
+            if block[r] == seed and n < len(chosen):
+                chosen[n] = r
+                n += 1
         groups = _average_linkage(chosen, first, points, area, overlap, label, groups)
     return label
 
@@ -334,7 +355,12 @@ def _shape(members, hull_first, hulls, first, points, cut, weight, rectangle):  
 @njit(cache=True, nogil=True)
 def _median(value, weight):  # pragma: no cover - compiled
     """The weighted median, between the two middle values where the halves balance."""
-    order = np.argsort(value, kind="mergesort")
+    order = np.arange(len(value))
+    for i in range(1, len(order)):
+        j = i
+        while j > 0 and value[order[j]] < value[order[j - 1]]:
+            order[j], order[j - 1] = order[j - 1], order[j]
+            j -= 1
     half, total = 0.5 * weight.sum(), 0.0
     for i in range(len(order)):
         total += weight[order[i]]
@@ -353,8 +379,7 @@ def _evidence(fused, rings, index, who, seen, style, numbers, least, decay, over
     odds, coverage = np.zeros(count), np.zeros(count)
     support, agents, state = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
     t_first, t_last, votes = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, style.shape[1]))
-    first, found = np.zeros(count + 1, np.int64), [np.int64(0)]
-    found.pop()
+    first, found, filled = np.zeros(count + 1, np.int64), np.empty(max(16, len(area)), np.int64), 0
     aside_of, book, stamp = np.zeros(observations, np.int64), np.zeros((who[4], 4)), np.zeros((who[4], 4), np.int64)
     for k in range(count):
         ring = xy[start[k] : start[k + 1]]
@@ -378,15 +403,22 @@ def _evidence(fused, rings, index, who, seen, style, numbers, least, decay, over
                 aside_of[owner[r]] = 1
             elif share > 0.05 and aside_of[owner[r]] == 0:
                 aside_of[owner[r]] = 2
-        hits = np.flatnonzero(aside_of == 1)
+        begin = filled
+        for o in range(observations):
+            if aside_of[o] == 1:
+                if filled == len(found):
+                    bigger = np.empty(2 * filled, np.int64)
+                    bigger[:filled] = found
+                    found = bigger
+                found[filled] = o
+                filled += 1
+        hits = found[begin:filled]
         odds[k], coverage[k], agents[k], state[k] = fold_looks(
             places, k, hits, aside_of, index, who, seen, numbers, least, decay, book, stamp
         )
-        for o in hits:
-            found.append(o)
         support[k] = len(hits)
         if len(hits) > 0:
             t_first[k], t_last[k] = who[2][hits[0]], who[2][hits[-1]]
-        first[k + 1] = len(found)
+        first[k + 1] = filled
         aside_of[:] = 0
-    return odds, coverage, support, agents, state, t_first, t_last, votes, first, np.array(found, np.int64)
+    return odds, coverage, support, agents, state, t_first, t_last, votes, first, found[:filled].copy()

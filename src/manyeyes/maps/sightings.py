@@ -79,6 +79,14 @@ class Sightings:
             np.stack((c * u - s * v, s * u + c * v), 1),
         )
 
+    def world_view(self, pose: Floats) -> Floats:
+        """Corners (Q, 2) of all views in the map's frame when the agents stand at pose (O, 3)."""
+        owner = np.repeat(np.repeat(np.arange(len(self)), np.diff(self.view.of)), np.diff(self.view.first))
+        at = pose[owner]
+        c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
+        x, y = self.view.xy[:, 0], self.view.xy[:, 1]
+        return np.stack((c * x - s * y + at[:, 0], s * x + c * y + at[:, 1]), 1)
+
 
 def gather(observations: Sequence[Observation], spacing_m: float) -> Sightings:
     """Observations as columns, whatever their order and however often each is given.

@@ -141,7 +141,7 @@ def find_stations(
     """
     rows = alignment.rows(sightings.ids)
     pose, covariance = alignment.pose[rows], alignment.covariance[rows]
-    weight = looks_weight(sightings, alignment.start[rows], alignment.scale[rows])
+    weight = looks_weight(sightings, alignment.start[rows], alignment.scale[rows], alignment.faith[rows])
     lines = _lines(sightings, pose, covariance, weight, area, config)
     rank = np.argsort(np.argsort(np.array(sightings.ids)))
     crossings = find_crossings(sightings, pose, weight, rank, config.polygon, config.evidence)

@@ -1,0 +1,520 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map that takes in one observation at a time, for latency; the fold over all observations stays the canonical map.
+
+An observation is aligned to the map as to one more neighbour (stages 1 and 2 of specs/maps.md 3.4, the map standing
+still), then each station it could see gains or loses log-odds and is drawn a little across towards what was seen, and
+what no station explains becomes candidate stations. What that costs against the fold is told by :func:`drift`.
+Differences on purpose: earlier observations are not moved again, what an agent said of a station before the one
+observation last heard is forgotten when its daily sum is capped, and crossings keep their shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, rows_of
+from manyeyes.maps.align import AlignConfig, normal_equations, step_poses
+from manyeyes.maps.associate import PointGrid, build_grid, span
+from manyeyes.maps.evidence import sights as sights_of
+from manyeyes.maps.evidence import visibility, witnesses
+from manyeyes.maps.fuse import FuseConfig, assemble
+from manyeyes.maps.gross import best_moves, moved_by
+from manyeyes.maps.observation import Observation
+from manyeyes.maps.polygons import hulls_of, overlap_of
+from manyeyes.maps.sightings import DAY_NS, Sightings, gather, is_line
+from manyeyes.maps.stations import Evidence, StationTable
+from manyeyes.maps.vector_map import PUBLISHED, RETIRED, VectorMap
+from manyeyes.ops.nearest_line import nearest_line
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_STILL = -1  # the observation that the map's own points belong to: none
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """fuse: of the fold. gates_m, kernels_m: of the steps to the map. fold_in: candidates that wait before the grid is
+    built anew.
+    """
+
+    fuse: FuseConfig = field(default_factory=FuseConfig)
+    gates_m: tuple[float, ...] = (2.0, 1.3, 0.8, 0.8)
+    kernels_m: tuple[float, ...] = (0.8, 0.5, 0.35, 0.35)
+    fold_in: int = 20000
+
+
+@dataclass(frozen=True, eq=False)
+class Assimilated:
+    """What one observation did: its pose (3,) and covariance (3, 3), stations it confirmed, missed and began."""
+
+    pose: Floats
+    covariance: Floats
+    confirmed: int
+    missed: int
+    begun: int
+
+
+class StreamingMap:
+    """A map in memory that observations are added to; holds its own copy of everything."""
+
+    def __init__(self, start: VectorMap, config: StreamConfig = StreamConfig()) -> None:
+        self.config, self.frame = config, start.frame
+        lines = np.flatnonzero(is_line(start.elements.kind) & (start.state != RETIRED))
+        rings = np.flatnonzero(~is_line(start.elements.kind) & (start.state != RETIRED))
+        self._rings = _Rows.of(start, rings)
+        self._ring_points = [np.array(start.elements.polyline(int(k))) for k in rings]
+        rows = _Rows.of_points(start, lines)
+        xy, tangent = _points_of(start.elements.take(lines))
+        order = _order(xy, rows.kind)
+        self._main = _Ground.of(xy[order], tangent[order], rows.take(order))
+        self._new = _Ground.of(np.zeros((0, 2)), np.zeros((0, 2)), rows.take(order[:0]))
+        self._known = [row.tobytes() for row in start.observations]
+        self._origin = np.repeat(lines, start.elements.counts[lines])[order]
+        self._start = start
+        self._heard: list[tuple[Ints, bool, int]] = []
+        self._ids = {name: k for k, name in enumerate(self._known)}
+
+    def assimilate(self, observation: Observation) -> Assimilated:
+        """Add one observation; one that the map holds already changes nothing."""
+        raw = bytes.fromhex(observation.id)
+        s = gather([observation], self.config.fuse.align.spacing_m)
+        if raw in self._ids:
+            return Assimilated(np.array(observation.pose), np.array(observation.covariance), 0, 0, 0)
+        pose, covariance = self._align(s)
+        self._ids[raw] = len(self._known)
+        self._known.append(raw)
+        xy, tangent = s.world(pose)
+        weight = 0.04 / (s.sigma**2 + 0.1**2 + covariance[0, 0, 0] / 2 + covariance[0, 1, 1] / 2)
+        confirmed, missed, explained = 0, 0, np.zeros(len(xy), bool)
+        for ground in (self._main, self._new):
+            hits, misses, near = ground.update(s, pose, xy, tangent, weight, self.config)
+            self._heard.append((hits, ground is self._main, len(self._known) - 1))
+            confirmed, missed, explained = confirmed + len(hits), missed + misses, explained | near
+        confirmed, missed = self._cross(s, pose, confirmed, missed)
+        fresh = np.flatnonzero(~explained & is_line(s.kind))
+        self._begin(s, xy[fresh], tangent[fresh], fresh)
+        if len(self._new) > self.config.fold_in:
+            self._fold_in()
+        return Assimilated(pose[0], covariance[0], confirmed, missed, len(fresh))
+
+    def map(self) -> VectorMap:
+        """The map as it stands, linked to lines."""
+        self._fold_in()
+        ground, count = self._main, len(self._main)
+        listed: list[list[int]] = [[] for _ in range(count)]
+        first, sources = self._start.sources_first, self._start.sources
+        for k, origin in enumerate(self._origin.tolist()):
+            if origin >= 0:
+                listed[k] = sources[first[origin] : first[origin + 1]].tolist()
+        for rows, _, number in self._heard:
+            for k in rows.tolist():
+                listed[k].append(number)
+        ring_rows = np.flatnonzero(~is_line(self._start.elements.kind) & (self._start.state != RETIRED))
+        of_rings = [sources[first[k] : first[k + 1]].tolist() for k in ring_rows.tolist()]
+        of_rings += [[] for _ in range(len(self._ring_points) - len(of_rings))]
+        ids = np.frombuffer(b"".join(self._known), np.uint8).reshape(-1, 16)
+        starts = np.concatenate(([0], np.cumsum([len(r) for r in self._ring_points], dtype=np.int64))).astype(np.int64)
+        ring_xy = np.concatenate(self._ring_points) if self._ring_points else np.zeros((0, 2))
+        line, ring = ground.rows.evidence(listed, ids), self._rings.evidence(of_rings, ids)
+        alive = np.flatnonzero((line.log_odds > 0.0) | (line.state != 0))
+        table = StationTable(ground.xy[alive], ground.tangent[alive], line.take(alive), starts, ring_xy, ring)
+        return assemble(StationTable.cat([table]), self.config.fuse, self.frame)
+
+    def _align(self, s: Sightings) -> tuple[Floats, Floats]:
+        """Pose (1, 3) and covariance (1, 3, 3) of the one observation against the map."""
+        config, ground, home = self.config.fuse.align, self._main, np.zeros(1, np.int64)
+        one = replace(config, gates_m=self.config.gates_m, kernels_m=self.config.kernels_m, damping=1.0)
+        pose, covariance = np.array(s.pose), np.array(s.covariance)
+        if not len(ground) or not len(s.xy):
+            return pose, covariance
+        wide = (ground.wide.keys, ground.wide.start, *ground.wide_points)
+        pose = moved_by(s, home, best_moves(*_search_arguments(s, home, wide, config)))
+        begin = pose
+        for gate, kernel in zip(one.gates_m, one.kernels_m):
+            xy, tangent = s.world(pose)
+            sums = normal_equations(
+                home,
+                (s.first, xy, tangent, s.kind, s.sigma),
+                (ground.grid.keys, ground.grid.start, ground.xy, ground.tangent, ground.owner, ground.weight),
+                (gate, kernel, one.along_m, float(np.cos(one.heading_rad)), one.sigma_m, one.correlation),
+            )
+            moved = step_poses(s, home, begin, pose, sums, one)
+            pose, covariance = moved["pose"], moved["covariance"]
+        return pose, covariance
+
+    def _cross(self, s: Sightings, pose: Floats, confirmed: int, missed: int) -> tuple[int, int]:
+        """Evidence for crossings: overlapped by one of the observation's, or in clear view without."""
+        config, rows = self.config.fuse.stations, np.flatnonzero(np.asarray(s.elements.kind) == CROSSING)
+        moved = s.elements.transform(*(float(v) for v in pose[0]))
+        mine = [hulls_of(np.asarray(moved.polyline(int(k)))) for k in rows]
+        used = [False] * len(mine)
+        reach = float(s.reach_m[0]) + 5.0
+        for k, ring in enumerate(self._ring_points):
+            middle = ring.mean(0)
+            if np.hypot(*(middle - pose[0, :2])) > reach:
+                continue
+            shares = [overlap_of(hull, hulls_of(ring)) for hull in mine]
+            best = max(shares, default=0.0)
+            if best >= config.polygon.overlap:
+                used = [u or share >= config.polygon.overlap for u, share in zip(used, shares)]
+                self._rings.change(np.array([k]), config.evidence.hit, s, True, self.config)
+                confirmed += 1
+            elif best <= 0.05:
+                places = np.concatenate((middle[None], (ring + middle) / 2))
+                seen = visibility(places, 0, np.ascontiguousarray(pose), sights_of(s), config.evidence.margin_m)
+                if seen > 0.0:
+                    self._rings.change(np.array([k]), config.evidence.miss * seen, s, False, self.config)
+                    missed += 1
+        for hull, known in zip(mine, used):
+            if not known and len(hull) >= 3:
+                self._ring_points.append(hull)
+                self._rings = self._rings.grown(1, np.array([CROSSING]), s, self.config)
+        return confirmed, missed
+
+    def _begin(self, s: Sightings, xy: Floats, tangent: Floats, points: Ints) -> None:
+        """New candidates from points that no station explains."""
+        if not len(xy):
+            return
+        rows = self._new.rows.grown(len(xy), s.kind[points], s, self.config)
+        # Candidates keep their order of arrival in ``order``; the grid sorts them.
+        joined = _Ground.of(np.concatenate((self._new.xy, xy)), np.concatenate((self._new.tangent, tangent)), rows)
+        begun = np.arange(len(self._new), len(joined))
+        self._heard.append((begun, False, len(self._known) - 1))
+        self._settle_new(joined)
+
+    def _settle_new(self, joined: _Ground) -> None:
+        """Sort the candidates by their grid and renumber what was heard of them."""
+        order = joined.grid.order
+        place = np.empty(len(order), np.int64)
+        place[order] = np.arange(len(order))
+        self._heard = [(rows if main else place[rows], main, k) for rows, main, k in self._heard]
+        self._new = _Ground.of(joined.xy[order], joined.tangent[order], joined.rows.take(order))
+
+    def _fold_in(self) -> None:
+        """Make candidates part of the main ground."""
+        if not len(self._new):
+            return
+        both = _Rows.cat(self._main.rows, self._new.rows)
+        xy = np.concatenate((self._main.xy, self._new.xy))
+        tangent = np.concatenate((self._main.tangent, self._new.tangent))
+        order = _order(xy, both.kind)
+        place = np.empty(len(order), np.int64)
+        place[order] = np.arange(len(order))
+        shift = len(self._main)
+        self._heard = [(place[rows if main else rows + shift], True, k) for rows, main, k in self._heard]
+        self._origin = np.concatenate((self._origin, np.full(len(self._new), -1, np.int64)))[order]
+        self._main = _Ground.of(xy[order], tangent[order], both.take(order))
+        self._new = _Ground.of(np.zeros((0, 2)), np.zeros((0, 2)), both.take(order[:0]))
+
+
+@dataclass(eq=False)
+class _Rows:
+    """Evidence columns that change; row by row with stations or rings."""
+
+    kind: Ints
+    sigma: Floats
+    log_odds: Floats
+    support: Ints
+    agents: Ints
+    state: Ints
+    t_first: Ints
+    t_last: Ints
+    style: Floats
+    last_agent: Ints
+    day: Ints
+    day_sum: Floats
+
+    @classmethod
+    def of(cls, m: VectorMap, rows: Ints) -> _Rows:
+        """Of the elements ``rows``, one row each."""
+        columns = (m.log_odds, m.supporters, m.agents, m.state, m.t_first, m.t_last)
+        sigma = np.array([m.elements.sigma[m.elements.first[k]] for k in rows.tolist()])
+        return cls._of(m.elements.kind[rows], sigma, tuple(c[rows] for c in columns), m.elements.style[rows])
+
+    @classmethod
+    def of_points(cls, m: VectorMap, rows: Ints) -> _Rows:
+        """Of the points of the elements ``rows``."""
+        _, points = rows_of(m.elements.first, rows)
+        owner = m.elements.owner[points]
+        t = m.stations
+        columns = (t.log_odds, t.support, t.agents, m.state[m.elements.owner], t.t_first, t.t_last)
+        return cls._of(
+            m.elements.kind[owner], t.sigma[points], tuple(c[points] for c in columns), m.elements.style[owner]
+        )
+
+    @classmethod
+    def _of(cls, kind: Ints, sigma: Floats, columns: tuple[NDArray, ...], style: Floats) -> _Rows:
+        count = len(kind)
+        log_odds, support, agents, state, first, last = (np.array(c) for c in columns)
+        return cls(
+            kind=np.array(kind),
+            sigma=np.array(sigma),
+            log_odds=log_odds,
+            support=support,
+            agents=agents,
+            state=state,
+            t_first=first,
+            t_last=last,
+            style=np.array(style),
+            last_agent=np.full(count, -1, np.int64),
+            day=np.zeros(count, np.int64),
+            day_sum=np.zeros(count),
+        )
+
+    @classmethod
+    def cat(cls, one: _Rows, two: _Rows) -> _Rows:
+        """Both, in order."""
+        return cls(*(np.concatenate((getattr(one, n), getattr(two, n))) for n in cls.__dataclass_fields__))
+
+    def take(self, order: Ints) -> _Rows:
+        """The chosen rows, in the order given."""
+        return _Rows(*(getattr(self, n)[order] for n in self.__dataclass_fields__))
+
+    def grown(self, count: int, kind: Ints, s: Sightings, config: StreamConfig) -> _Rows:
+        """With ``count`` rows begun by an observation."""
+        evidence, time = config.fuse.stations.evidence, int(s.time_ns[0])
+        odds = min(evidence.hit, evidence.daily)
+        state = PUBLISHED if bool(s.trusted[0]) and odds >= evidence.publish else 0
+        one = np.ones(count, np.int64)
+        begun = _Rows(
+            np.asarray(kind, np.int64),
+            np.full(count, 0.3),
+            np.full(count, odds),
+            one,
+            one.copy(),
+            one * state,
+            one * time,
+            one * time,
+            np.full((count, len(STYLES)), 1.0 / len(STYLES)),
+            np.full(count, _agent_number(s)),
+            one * (time // DAY_NS),
+            np.full(count, odds),
+        )
+        return _Rows.cat(self, begun)
+
+    def change(self, rows: Ints, amount: float | Floats, s: Sightings, hit: bool, config: StreamConfig) -> None:
+        """Add to the log-odds of rows: decayed since they were last heard of, capped by agent and day, clamped; then
+        their state.
+        """
+        evidence, time = config.fuse.stations.evidence, int(s.time_ns[0])
+        decay = np.array(evidence.decay_s)[self.kind[rows]]
+        age = np.maximum(0.0, (time - self.t_last[rows]) * 1e-9)
+        odds = self.log_odds[rows] * np.exp(-age / decay)
+        same = (self.last_agent[rows] == _agent_number(s)) & (self.day[rows] == time // DAY_NS)
+        before = np.where(same, self.day_sum[rows], 0.0)
+        after = before + amount
+        if not bool(s.trusted[0]):
+            after = np.clip(after, -evidence.daily, evidence.daily)
+        odds = np.clip(odds + after - before, -evidence.clamp, evidence.clamp)
+        self.log_odds[rows], self.day_sum[rows] = odds, after
+        self.agents[rows] += hit & ~same
+        self.support[rows] += hit
+        self.last_agent[rows], self.day[rows] = _agent_number(s), time // DAY_NS
+        if hit:
+            self.t_last[rows] = np.maximum(self.t_last[rows], time)
+        enough = (self.agents[rows] >= evidence.publish_agents) | bool(s.trusted[0])
+        state = np.where((odds >= evidence.publish) & enough & hit, PUBLISHED, self.state[rows])
+        self.state[rows] = np.where(odds <= evidence.retire, RETIRED, state)
+
+    def evidence(self, listed: Sequence[Sequence[int]], ids: NDArray[np.uint8]) -> Evidence:
+        """As the fold's table; ``listed``: the observations (rows of ids) of each row."""
+        known, place = np.unique(ids, axis=0, return_inverse=True)
+        sources = [np.unique(place.reshape(-1)[np.array(one, np.int64)]) for one in listed]
+        return Evidence(
+            kind=self.kind,
+            sigma=self.sigma,
+            log_odds=self.log_odds,
+            coverage=self.support.astype(np.float64),
+            support=self.support,
+            agents=self.agents,
+            state=self.state,
+            t_first=self.t_first,
+            t_last=self.t_last,
+            style=self.style,
+            first=np.concatenate(([0], np.cumsum([len(one) for one in sources]))).astype(np.int64),
+            sources=np.concatenate(sources) if sources else np.zeros(0, np.int64),
+            observations=known,
+        )
+
+
+@dataclass(eq=False)
+class _Ground:
+    """Stations in the order of their grid, so that the compiled loops read them in place."""
+
+    xy: Floats
+    tangent: Floats
+    rows: _Rows
+    grid: PointGrid
+    wide: PointGrid
+    wide_points: tuple[Floats, Floats, Ints]
+    owner: Ints
+    weight: Floats
+
+    @classmethod
+    def of(cls, xy: Floats, tangent: Floats, rows: _Rows) -> _Ground:
+        xy, tangent = np.ascontiguousarray(xy), np.ascontiguousarray(tangent)
+        grid = build_grid(xy[:, 0], xy[:, 1], rows.kind, 2.5)
+        wide = build_grid(xy[:, 0], xy[:, 1], rows.kind, 8.0)
+        order = wide.order
+        nobody = np.full(len(xy), _STILL, np.int64)
+        weight = np.minimum(4.0, rows.support.astype(np.float64))
+        return cls(xy, tangent, rows, grid, wide, (xy[order], tangent[order], nobody), nobody, weight)
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def update(
+        self, s: Sightings, pose: Floats, xy: Floats, tangent: Floats, weight: Floats, config: StreamConfig
+    ) -> tuple[Ints, int, NDArray[np.bool_]]:
+        """Evidence of one observation: rows confirmed, how many missed, and which of its points (P,) some station
+        explains.
+        """
+        evidence = config.fuse.stations.evidence
+        if not len(self) or not len(xy):
+            return np.zeros(0, np.int64), 0, np.zeros(len(xy), bool)
+        lines = np.flatnonzero(is_line(s.kind))
+        fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind[lines], 2.5)
+        order = lines[fine.order]
+        corner = s.world_view(pose)
+        near, place, mass, seen, explained = _compare(
+            (self.grid.keys, self.grid.start, self.xy, self.tangent),
+            (fine.keys, fine.start, xy[order], tangent[order], weight[order]),
+            (corner.min(0), corner.max(0)),
+            witnesses(s, pose)[0],
+            sights_of(s),
+            evidence.numbers,
+            len(KINDS),
+        )
+        hit = mass > 0.0
+        rows = near[hit]
+        gain = mass[hit] / (mass[hit] + 1.0 / np.maximum(self.rows.sigma[rows], 0.02) ** 2 * 0.04)
+        self.rows.change(rows, evidence.hit, s, True, config)
+        normal = np.stack((-self.tangent[rows, 1], self.tangent[rows, 0]), 1)
+        self.xy[rows] += (gain * place[hit])[:, None] * normal
+        self.rows.sigma[rows] = np.maximum(evidence.bias_m, self.rows.sigma[rows] * np.sqrt(1.0 - gain))
+        lost = (mass < 0.0) & (seen > 0.0)
+        self.rows.change(near[lost], evidence.miss * seen[lost], s, False, config)
+        whole = np.zeros(len(xy), bool)
+        whole[order] = explained
+        return rows, int(lost.sum()), whole
+
+
+@njit(cache=True, nogil=True)
+def _compare(ground, points, box, pose, sights, numbers, kinds):  # pragma: no cover - compiled
+    """Stations in the box of a view: rows, place across of what was seen there, its weight (0: a little aside, -1:
+    nothing) and visibility; and which points (P,), in their grid's order, have a station.
+    """
+    keys, start, xy, tangent = ground
+    pkeys, pstart, pxy, ptangent, pweight = points
+    reach, across, wide, cosine = numbers[7], numbers[8], numbers[9], numbers[10]
+    low, high = box
+    explained = np.zeros(len(pxy), np.bool_)
+    size, n = 1024, 0
+    rows, place, mass, seen = np.empty(size, np.int64), np.empty(size), np.empty(size), np.empty(size)
+    spot = np.empty((1, 2))
+    for kind in range(kinds):
+        if kind == 2:
+            continue
+        for ix in range(int(np.floor((low[0] - 2.0) / 2.5)), int(np.floor((high[0] + 2.0) / 2.5)) + 1):
+            first, last = span(
+                keys, start, kind, ix, int(np.floor((low[1] - 2.0) / 2.5)), int(np.floor((high[1] + 2.0) / 2.5))
+            )
+            for k in range(first, last):
+                x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
+                total, offset, heavy, beside = 0.0, 0.0, 0.0, False
+                jx, jy = int(np.floor(x / 2.5)), int(np.floor(y / 2.5))
+                for dx in range(-1, 2):
+                    a, b = span(pkeys, pstart, kind, jx + dx, jy - 1, jy + 1)
+                    for q in range(a, b):
+                        ex, ey = pxy[q, 0] - x, pxy[q, 1] - y
+                        dot = u * ptangent[q, 0] + v * ptangent[q, 1]
+                        if abs(dot) < cosine or ex * ex + ey * ey > reach * reach + wide * wide:
+                            continue
+                        sign = 1.0 if dot > 0.0 else -1.0
+                        norm = np.sqrt(2.0 + 2.0 * abs(dot))
+                        mx, my = (u + sign * ptangent[q, 0]) / norm, (v + sign * ptangent[q, 1]) / norm
+                        along, aside = abs(ex * mx + ey * my), ey * mx - ex * my
+                        if along > reach or abs(aside) > wide:
+                            continue
+                        beside = True
+                        explained[q] = explained[q] or abs(aside) <= across
+                        if abs(aside) <= across:
+                            w = (1.0 - along / reach) ** 2 + 1e-9
+                            total += w
+                            offset += w * aside
+                            heavy += w * pweight[q]
+                spot[0, 0], spot[0, 1] = x, y
+                visible = visibility(spot, 0, pose, sights, numbers[6]) if not beside else 1.0
+                if total <= 0.0 and (beside or visible <= 0.0):
+                    continue
+                if n == size:
+                    size *= 2
+                    rows, place = _longer(rows, size), _longer(place, size)
+                    mass, seen = _longer(mass, size), _longer(seen, size)
+                rows[n], seen[n] = k, visible
+                place[n], mass[n] = (offset / total, heavy / total) if total > 0.0 else (0.0, -1.0)
+                n += 1
+    return rows[:n].copy(), place[:n].copy(), mass[:n].copy(), seen[:n].copy(), explained
+
+
+@njit(cache=True, nogil=True)
+def _longer(values, size):  # pragma: no cover - compiled
+    out = np.empty(size, values.dtype)
+    out[: len(values)] = values
+    return out
+
+
+def drift(one: VectorMap, two: VectorMap, within_m: float = 0.5) -> float:
+    """F-score of two maps' published lines: harmonic mean of the shares of points of each within a distance of the
+    other's kind.
+    """
+    shares = []
+    for a, b in ((one.published(), two.published()), (two.published(), one.published())):
+        close, total = 0, 0
+        kind = a.elements.kind[a.elements.owner]
+        for k in np.flatnonzero(is_line(np.arange(len(KINDS)))).tolist():
+            others = b.elements.take(np.flatnonzero(b.elements.kind == k))
+            points = a.elements.points[kind == k]
+            away = nearest_line(points, others.points, others.first, within_m).distance
+            close, total = close + int((away <= within_m).sum()), total + len(points)
+        shares.append(close / total if total else 1.0)
+    return 2 * shares[0] * shares[1] / (shares[0] + shares[1]) if sum(shares) > 0 else 0.0
+
+
+def _search_arguments(s: Sightings, home: Ints, others: tuple, config: AlignConfig) -> tuple:
+    gross = config.gross
+    return (
+        home,
+        np.asarray(s.pose),
+        np.asarray(s.trusted),
+        (s.first, s.xy, s.tangent, s.kind),
+        others,
+        np.asarray(s.agent),
+        np.array(gross.yaws),
+        (gross.reach_m, gross.cell_m, gross.gain, gross.least_m, gross.price),
+        gross.stride,
+    )
+
+
+def _points_of(elements: MapElements) -> tuple[Floats, Floats]:
+    """Points and unit tangents (P, 2): the chord over both neighbours."""
+    points = np.array(elements.points)
+    index = np.arange(len(points))
+    first, last = elements.first[:-1][elements.owner], elements.first[1:][elements.owner] - 1
+    step = points[np.minimum(index + 1, last)] - points[np.maximum(index - 1, first)]
+    return points, step / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-12)[:, None]
+
+
+def _order(xy: Floats, kind: Ints) -> Ints:
+    return build_grid(xy[:, 0], xy[:, 1], kind, 2.5).order
+
+
+def _agent_number(s: Sightings) -> int:
+    """A number for the agent's name that is the same in every process."""
+    return int.from_bytes(s.agents[int(s.agent[0])].encode()[-7:], "little")

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The laws and cases of the fusion: specs/maps.md 3.5 and 8 (a) to (l), on straight roads small enough to work out by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, SOLID, MapElements, Polygons
+from manyeyes.maps.align import merge, overlapping, search, solve_poses, sweep
+from manyeyes.maps.fuse import FuseConfig, assemble, fuse, fuse_aligned
+from manyeyes.maps.observation import Observation
+from manyeyes.maps.sightings import gather
+from manyeyes.maps.stations import StationTable, find_stations
+from manyeyes.maps.vector_map import PUBLISHED, RETIRED
+from manyeyes.ops.nearest_line import nearest_line
+
+HALF_X, HALF_Y = 30.0, 15.0
+VIEW = np.array([[-HALF_X, -HALF_Y], [HALF_X, -HALF_Y], [HALF_X, HALF_Y], [-HALF_X, HALF_Y]])
+CLAIM = np.diag([0.4**2, 0.4**2, np.radians(0.5) ** 2])
+HOUR = 3_600_000_000_000
+
+
+def road(length=100.0, sides=(-5.25, -1.75, 1.75, 5.25)):
+    """Straight lines along x, boundaries outside and dividers inside."""
+    lines = [np.array([[0.0, y], [length, y]]) for y in sides]
+    return [(BOUNDARY if y in (sides[0], sides[-1]) else DIVIDER, line) for y, line in zip(sides, lines)]
+
+
+def look(world, at, agent="a", hour=0, error=(0.0, 0.0, 0.0), noise=0.0, seed=0, style=NO_STYLE, **more):
+    """What an agent at true pose ``at`` sees of world lines, when its claimed pose is off by ``error``."""
+    rng = np.random.default_rng(seed)
+    x, y, yaw = at
+    back = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    lines, kinds = [], []
+    for kind, line in world:
+        own = (np.asarray(line) - (x, y)) @ back
+        if kind == CROSSING:
+            inside = (np.abs(own) <= (HALF_X, HALF_Y)).all(1)
+            pieces = [own] if inside.all() else []
+        else:
+            pieces = _inside(own)
+        for piece in pieces:
+            lines.append(piece + rng.normal(0.0, noise, piece.shape) if noise else piece)
+            kinds.append(kind)
+    elements = MapElements.of(lines, kinds, 0.9, style=style)
+    pose = np.array(at) + error
+    fields = {"covariance": CLAIM, "view": VIEW, **more}
+    return Observation(
+        agent, agent + "-1", 1_700_000_000_000_000_000 + int(hour * HOUR), pose, elements=elements, **fields
+    )
+
+
+def _inside(line):
+    """The piece of a straight line inside the view, with a point about every 3 m."""
+    share = np.linspace(0.0, 1.0, 401)[:, None]
+    points = line[0] + share * (line[1] - line[0])
+    points = points[(np.abs(points) <= (HALF_X, HALF_Y)).all(1)]
+    if len(points) < 2 or np.linalg.norm(points[-1] - points[0]) < 2.0:
+        return []
+    count = max(2, int(np.linalg.norm(points[-1] - points[0]) / 3.0) + 1)
+    return [points[0] + np.linspace(0.0, 1.0, count)[:, None] * (points[-1] - points[0])]
+
+
+def crowd(world, count=12, sigma=0.4, noise=0.1, seed=1, length=100.0):
+    """Looks along a road by as many agents, with errors of pose and points."""
+    rng = np.random.default_rng(seed)
+    return [
+        look(
+            world,
+            (rng.uniform(10.0, length - 10.0), rng.choice([-1.5, 1.5]), rng.choice([0.0, np.pi])),
+            agent=f"agent{k}",
+            hour=k,
+            error=(*rng.normal(0.0, sigma, 2), rng.normal(0.0, np.radians(0.4))),
+            noise=noise,
+            seed=seed * 1000 + k,
+        )
+        for k in range(count)
+    ]
+
+
+def lines_of(fused, kind, state=PUBLISHED):
+    rows = np.flatnonzero((fused.elements.kind == kind) & (fused.state == state))
+    return [fused.elements.polyline(int(k)) for k in rows]
+
+
+def furthest(a, b):
+    """The largest distance from a point of elements ``a`` to the lines of ``b``."""
+    first, points = b.first, b.points
+    return nearest_line(a.points, points, first, 50.0).distance.max(initial=0.0)
+
+
+def test_a_copies_of_an_observation_are_that_observation():
+    one = look(road(), (30.0, 1.5, 0.0))
+    once, often = fuse([one]), fuse([one] * 5)
+    assert once.quantised_hash(0.1) == often.quantised_hash(0.1)
+    assert (once.id == often.id).all() and once.observations.tobytes().hex() == one.id
+    assert len(once) == 4
+    seen = one.in_map()
+    assert furthest(once.elements, seen) < 1e-3 and abs(once.elements.lengths() - 59.9).max() < 1.0
+
+
+def test_b_order_does_not_matter():
+    observations = crowd(road())
+    turned = [observations[k] for k in np.random.default_rng(0).permutation(len(observations))]
+    a, b = fuse(observations), fuse(turned)
+    assert a.quantised_hash(0.1) == b.quantised_hash(0.1) and (a.sources == b.sources).all()
+
+
+@pytest.mark.parametrize("pieces", [2, 3, 5])
+def test_c_a_line_seen_in_pieces_is_one_line(pieces):
+    cuts = np.linspace(0.0, 50.0, pieces + 1)
+    whole = road(50.0)
+    world = [(kind, np.array([[a + 0.5, line[0, 1]], [b - 0.5, line[0, 1]]]))
+             for kind, line in whole for a, b in pairwise(cuts)]  # fmt: skip
+    fused = fuse([look(world, (25.0 + k, 0.0, 0.0), f"agent{k}", k) for k in range(4)])
+    assert len(lines_of(fused, DIVIDER)) == 2 and len(lines_of(fused, BOUNDARY)) == 2
+    assert abs(fused.elements.lengths() - 49.0).max() < 1.0
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_d_seven_parallel_lines_stay_seven_whatever_common_offset_each_agent_has(seed):
+    sides = [3.5 * k for k in range(-3, 4)]
+    world, rng = road(sides=sides), np.random.default_rng(seed)
+    claim = np.diag([0.5**2, 0.7**2, 1e-4])
+    errors = rng.uniform(-1.0, 1.0, 10)
+    seen = [
+        look(world, (30.0 + 4 * k, 0.0, 0.0), f"agent{k}", k, (0.0, errors[k], 0.0), 0.1, k, covariance=claim)
+        for k in range(10)
+    ]
+    fused = fuse(seen).published()
+    assert len(fused) == 7
+    across = np.sort([fused.elements.polyline(k)[:, 1].mean() for k in range(7)])
+    assert np.abs(np.diff(across) - 3.5).max() < 0.1
+
+
+def test_e_lines_that_cross_stay_two():
+    world = [(DIVIDER, np.array([[0.0, 0.0], [50.0, 0.0]])), (DIVIDER, np.array([[25.0, -14.0], [25.0, 14.0]]))]
+    fused = fuse([look(world, (25.0 + k, 0.5, 0.0), f"agent{k}", k, noise=0.1, seed=k) for k in range(5)])
+    lengths = np.sort([np.linalg.norm(line[-1] - line[0]) for line in lines_of(fused, DIVIDER)])
+    assert len(lengths) == 2 and abs(lengths[0] - 28.0) < 1.5 and abs(lengths[1] - 50.0) < 1.5
+
+
+def test_f_dashes_are_one_dashed_line():
+    dashes = [(DIVIDER, np.array([[a, 0.0], [a + 6.0, 0.0]])) for a in (0.0, 15.0, 30.0, 45.0)]
+    seen = [look(dashes, (25.0 + k, 0.5, 0.0), f"agent{k}", k, style=DASHED) for k in range(4)]
+    fused = fuse(seen).published()
+    assert len(fused) == 1 and abs(fused.elements.lengths()[0] - 51.0) < 1.0
+    assert fused.elements.style[0].argmax() == DASHED
+    solid = fuse([look(road(), (25.0 + k, 0.5, 0.0), f"agent{k}", k, style=SOLID) for k in range(4)])
+    assert (solid.elements.style.argmax(1) == SOLID).all()
+
+
+def test_g_one_outlier_agent_of_ten_moves_nothing():
+    world = [*road(), (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))]
+    honest = [look(world, (35.0 + 2 * k, 0.0, 0.0), f"agent{k}", k, noise=0.1, seed=k) for k in range(9)]
+    wrong = look(world, (42.0, 0.0, 0.0), "outlier", 3, (0.0, 3.0, 0.0), 0.1, 77)
+    before, after = fuse(honest).published(), fuse([*honest, wrong]).published()
+    assert len(before) == len(after) == 5
+    assert furthest(before.elements, after.elements) < 0.1
+    pose = solve_poses([*honest, wrong])
+    assert abs(pose.pose[pose.rows([wrong.id])[0], 1]) < 0.2
+
+
+def _crossing_seen_then(count, missed, occluders=None):
+    ring = (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))
+    before = [look([*road(), ring], (30.0, 0.0, 0.0), f"agent{k}", k) for k in range(count)]
+    more = {} if occluders is None else {"occluders": Polygons.of(occluders)}
+    after = [look(road(), (30.0, 0.0, 0.0), f"later{k}", count + k, **more) for k in range(missed)]
+    fused = fuse([*before, *after])
+    return int(fused.state[np.flatnonzero(fused.elements.kind == CROSSING)[0]])
+
+
+@pytest.mark.parametrize("missed, state", [(0, PUBLISHED), (6, PUBLISHED), (9, RETIRED)])
+def test_h_a_removed_crossing_retires_after_eight_clear_misses(missed, state):
+    assert _crossing_seen_then(8, missed) == state
+
+
+def test_h_a_crossing_behind_a_lorry_never_retires():
+    lorry = np.array([[6.0, -9.0], [8.0, -9.0], [8.0, 9.0], [6.0, 9.0]])
+    assert _crossing_seen_then(8, 14, [lorry]) == PUBLISHED
+    assert _crossing_seen_then(8, 14, [lorry - (30.0, 0.0)]) == RETIRED
+
+
+def test_i_a_moved_divider_switches_and_is_never_averaged():
+    def world(y):
+        return [(BOUNDARY, np.array([[0.0, s], [60.0, s]])) for s in (-6.0, 6.0)] + [
+            (DIVIDER, np.array([[0.0, y], [60.0, y]]))
+        ]
+
+    old = [look(world(0.0), (30.0, 0.5, 0.0), f"old{k}", k, noise=0.05, seed=k) for k in range(8)]
+    new = [look(world(1.5), (30.0, 0.5, 0.0), f"new{k}", 10 + k, noise=0.05, seed=100 + k) for k in range(12)]
+    at = []
+    for count in (0, 2, 4, 8, 12):
+        lines = lines_of(fuse([*old, *new[:count]]), DIVIDER)
+        across = [float(line[:, 1].mean()) for line in lines]
+        assert all(min(abs(y), abs(y - 1.5)) < 0.15 for y in across), across
+        assert all(np.ptp(line[:, 1]) < 0.5 for line in lines)
+        at.append(sorted(round(y / 1.5) for y in across))
+    # Two agents' word is not enough against eight; then for a while both may stand; then the old one has gone.
+    assert at[0] == [0] and 0 in at[1] and at[-1] == [1]
+
+
+def test_j_areas_that_are_cut_give_the_map_of_one():
+    observations, config = crowd(road(), 16), FuseConfig()
+    whole = fuse(observations, config)
+    tiles = [[o for o in observations if (o.pose[0] >= 50.0) == side] for side in (False, True)]
+    near = [gather(overlapping(observations, home), 1.0) for home in tiles]
+    rows = [np.array([s.ids.index(o.id) for o in home]) for s, home in zip(near, tiles)]
+    state = merge([search(s, r) for s, r in zip(near, rows)])
+    for number in range(len(config.align.gates_m)):
+        state = merge([sweep(s, state.take(state.rows(s.ids)), number, r) for s, r in zip(near, rows)])
+    assert (state.pose == solve_poses(observations).pose).all()
+    sightings = gather(observations, config.align.spacing_m)
+    areas = [(-100.0, -100.0, 47.3, 100.0), (47.3, -100.0, 200.0, 1.1), (47.3, 1.1, 200.0, 100.0)]
+    tables = [find_stations(sightings, state, area, config.stations) for area in areas]
+    assert min(len(t) for t in tables) > 20
+    assert assemble(StationTable.cat(tables), config).quantised_hash(0.1) == whole.quantised_hash(0.1)
+
+
+def test_k_an_observation_taken_out_was_never_there():
+    observations = crowd(road())
+    fresh = fuse(observations[:-1])
+    fuse(observations)
+    again = fuse(observations[:-1][::-1])
+    assert again.quantised_hash(0.1) == fresh.quantised_hash(0.1)
+    assert observations[-1].id not in {row.tobytes().hex() for row in again.observations}
+
+
+@pytest.mark.parametrize("motion", [(0.3, 0.4, 0.0), (130.0, -70.0, 0.7), (-40.0, 15.0, 2.5)])
+def test_l_the_map_moves_with_the_world(motion):
+    x, y, yaw = motion
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    world = [*road(), (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))]
+    observations = crowd(world, 10)
+    moved = [
+        replace(o, pose=turn @ o.pose + (x, y, yaw), covariance=turn @ np.asarray(o.covariance) @ turn.T)
+        for o in observations
+    ]
+    here, there = fuse(observations), fuse(moved)
+    expected = here.elements.transform(x, y, yaw)
+    assert sorted(here.elements.kind) == sorted(there.elements.kind)
+    assert furthest(expected, there.elements) < 0.01 and furthest(there.elements, expected) < 0.01
+
+
+def test_liars_who_agree_move_no_station_that_honest_agents_saw():
+    world = [*road(), (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))]
+    honest = crowd(world, 40)
+    for offset in (1.0, 2.0, 4.0):
+        liars = [replace(o, agent=f"liar{k}", elements=o.elements.with_points(o.elements.points + (0.0, offset)))
+                 for k, o in enumerate(crowd(world, 10, seed=5))]  # fmt: skip
+        liars = [replace(o, pose=(o.pose[0], o.pose[1], o.pose[2])) for o in liars if np.cos(o.pose[2]) > 0]
+        before, after = fuse(honest).published(), fuse([*honest, *liars]).published()
+        assert furthest(before.elements, after.elements) < 0.1, offset
+
+
+def test_bends_do_not_shrink():
+    angle = np.linspace(0.0, np.pi / 2, 40)
+    bend = (BOUNDARY, 9.0 * np.stack((np.cos(angle), np.sin(angle)), 1))
+    seen = []
+    for k in range(6):
+        o = look([], (0.0, 0.0, 0.0), f"agent{k}", k)
+        rng = np.random.default_rng(k)
+        seen.append(replace(o, elements=MapElements.of([bend[1] + rng.normal(0, 0.05, bend[1].shape)], [BOUNDARY])))
+    line = lines_of(fuse(seen), BOUNDARY)
+    assert len(line) == 1 and abs(np.hypot(*line[0].T) - 9.0).max() < 0.1
+
+
+def test_a_trusted_pole_publishes_alone_and_does_not_move():
+    pole = look(road(), (30.0, 0.0, 0.0), "pole", trusted=True)
+    car = look(road(), (35.0, 0.0, 0.0), "car", 1, (0.0, 0.8, 0.0))
+    pose = solve_poses([pole, car])
+    assert (pose.pose[pose.rows([pole.id])[0]] == pole.pose).all()
+    assert abs(pose.pose[pose.rows([car.id])[0], 1]) < 0.1
+    assert len(fuse([pole, replace(pole, time_ns=pole.time_ns + HOUR)]).published()) == 4
+    assert len(fuse([car]).published()) == 0
+
+
+def test_nothing_gives_nothing():
+    assert len(fuse([])) == 0
+    assert len(fuse([look([], (0.0, 0.0, 0.0))])) == 0
+
+
+@settings(max_examples=6, deadline=None)
+@given(st.randoms(use_true_random=False), st.lists(st.integers(0, 9), max_size=12))
+def test_the_map_is_a_function_of_the_set(random, again):
+    observations = crowd(road(), 10)
+    chosen = [observations[k] for k in range(10) if random.random() < 0.7]
+    more = chosen + [observations[k] for k in again if observations[k] in chosen]
+    random.shuffle(more)
+    assert fuse(more).quantised_hash(0.1) == fuse(chosen).quantised_hash(0.1)
+
+
+@settings(max_examples=4, deadline=None)
+@given(st.floats(-2.0, 2.0), st.integers(2, 5))
+def test_gauge_is_the_mean_of_the_claims(error, count):
+    """Two groups that claim to stand error apart meet in the middle: nobody's word is the law."""
+    seen = [
+        look(road(), (30.0 + k, 0.0, 0.0), f"agent{k}", k, (0.0, error / 4 * (-1) ** k, 0.0)) for k in range(2 * count)
+    ]
+    line = lines_of(fuse_aligned(seen, solve_poses(seen)), DIVIDER)
+    across = sorted(float(one[:, 1].mean()) for one in line)
+    assert len(across) == 2 and abs(across[0] + 1.75) < 0.06 and abs(across[1] - 1.75) < 0.06
