@@ -218,14 +218,16 @@ def unpack_cells(layout: int, data: bytes, count: int) -> tuple[NDArray[np.int64
         used, whole = _read_gaps(raw, key)
         _check_varints(used, whole, count)
         return key, used
-    (first, span), used = unpack_varints(data, 2)
-    end = used + int(span)
-    if end > len(data):
-        raise PacketError("garbage", f"A bitmap of {int(span)} bytes was announced; {len(data) - used} are there.")
-    marked = _read_bitmap(raw[used:end], first, key)
+    head = np.empty(2, np.int64)
+    used, whole = _read_varints(raw, head)
+    _check_varints(used, whole, 2)
+    first, span = head.tolist()
+    if used + span > len(data):
+        raise PacketError("garbage", f"A bitmap of {span} bytes was announced; {len(data) - used} are there.")
+    marked = _read_bitmap(raw, used, used + span, first, key)
     if marked != count:
         raise PacketError("garbage", f"A bitmap for {count} cells was announced; it marks {marked}.")
-    return key, end
+    return key, used + span
 
 
 @njit(cache=True)
@@ -240,11 +242,11 @@ def _read_gaps(raw, key):  # pragma: no cover
 
 
 @njit(cache=True)
-def _read_bitmap(raw, first, key):  # pragma: no cover
-    """How many bits are set; as many of their keys as there is room for."""
+def _read_bitmap(raw, start, end, first, key):  # pragma: no cover
+    """How many bits are set from start to end; as many of their keys as there is room for."""
     marked = 0
-    for i in range(raw.shape[0]):
-        byte = raw[i]
+    for i in range(end - start):
+        byte = raw[start + i]
         for bit in range(8):
             if byte >> bit & 1:
                 if marked < key.shape[0]:
