@@ -167,10 +167,10 @@ def _tables(
         return []
     homes = [b for b in blocks if b.home]
     steps = [_Step(b, None, -1) for b in homes]
-    state = merge(each(steps, "search", _pose_step, Alignment))
+    state = merge(each(steps, "search", _pose_step, Alignment), config.align)
     for number in range(len(config.align.gates_m)):
         steps = [_Step(b, _part(state, b), number) for b in homes]
-        state = merge(each(steps, f"sweep {number + 1}", _pose_step, Alignment))
+        state = merge(each(steps, f"sweep {number + 1}", _pose_step, Alignment), config.align)
     return each([_Step(b, _part(state, b), None) for b in blocks], "stations", _station_step, StationTable)
 
 
