@@ -12,6 +12,7 @@ from manyeyes.datatypes.errors import (
     WireError,
 )
 from manyeyes.datatypes.grid import BevGrid
+from manyeyes.datatypes.map_element import KINDS, STYLES, MapElements, Polygons
 from manyeyes.datatypes.message import Message
 from manyeyes.datatypes.point_cloud import PointCloud
 from manyeyes.datatypes.snapshot import AgentFrame, Snapshot, Truth
@@ -19,16 +20,20 @@ from manyeyes.datatypes.sparse_bev import Sites, SparseBev
 from manyeyes.datatypes.transform import Transform
 
 __all__ = [
+    "KINDS",
     "LABELS",
+    "STYLES",
     "AgentFrame",
     "BevGrid",
     "Boxes",
     "CheckpointError",
     "ConfigError",
     "ManyeyesError",
+    "MapElements",
     "Message",
     "MissingExtraError",
     "PointCloud",
+    "Polygons",
     "RecordingError",
     "ShapeError",
     "Sites",
