@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every executor gives the list that a loop gives, and a block's exception reaches the caller."""
+"""A pool gives the list that a loop gives, and a block's exception reaches the caller; clusters: see test_tiles.py."""
 
 import os
 import time
@@ -48,17 +48,6 @@ def test_an_exception_of_a_block_reaches_the_caller_inline():
 def test_without_a_runner_a_pool_of_its_own_runs_the_blocks():
     assert map_blocks(_fails_at_three, [5]) == [5]
     assert map_blocks(_fails_at_three, []) == []
-
-
-@pytest.mark.parametrize("name", ["dask", "ray"])
-def test_a_cluster_gives_the_inline_list(name):
-    module = {"dask": "dask.distributed", "ray": "ray"}[name]
-    pytest.importorskip(module, reason=f"the {name} extra is not installed")
-    with named_executor(name, workers=2).open() as runner:
-        results = map_blocks(_square_late, range(9), runner)
-        with pytest.raises(ValueError, match="block three"):
-            map_blocks(_fails_at_three, range(6), runner)
-    assert [square for square, _ in results] == [k * k for k in range(9)]
 
 
 def test_an_absent_engine_names_its_extra(monkeypatch):
