@@ -8,7 +8,7 @@ one frame and with five, and on agents that share nothing. ``rivals``: success a
 against the noise of the claim. ``displacement``: of common objects after fusion with a good claim, over that of the
 claim alone. ``speed``: processor time of one call.
 
-python benchmarks/pose.py [--scenes 300] [--nulls 1000] [--out benchmarks/results/pose.json]
+python benchmarks/pose.py [--tables success answers ...] [--scenes 300] [--nulls 1000] [--out benchmarks/results/pose.json]
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -28,26 +28,13 @@ from manyeyes.alignment.accumulate import Sighting, accumulated
 from manyeyes.alignment.decide import Acceptance, CorrectorConfig, correct
 from manyeyes.alignment.estimate import Corrector
 from manyeyes.alignment.landmarks import Landmarks
-from manyeyes.alignment.rivals import coalign, feaco, fpv_rcnn, given, icp, mash, v2x_reg, vips
-from manyeyes.alignment.rivals.v2x_reg import V2xRegConfig
+from manyeyes.alignment.rivals.table import CORRECTORS
 from manyeyes.apps.provenance import write_json
 from manyeyes.evaluation.pose import ClaimNoise, PoseFrame, PoseScore, judged, score
 from manyeyes.simulator.landmarks import BoxError, LandmarkScene, LandmarkSpec, make_landmark_scene
 
 NOISY = BoxError(0.45, np.radians(4.0), 0.10, 0.3)
 GUESS = CorrectorConfig(accept=Acceptance(-1e9, 0.0, 1, 0.0))
-RIVALS: dict[str, Corrector] = {
-    "vote": correct,
-    "given": given.correct,
-    "coalign": coalign.correct,
-    "fpv_rcnn": fpv_rcnn.correct,
-    "feaco": feaco.correct,
-    "icp": icp.correct,
-    "vips": vips.correct,
-    "v2x_reg oDist": v2x_reg.correct,
-    "v2x_reg oIoU": partial(v2x_reg.correct, config=V2xRegConfig("oIoU")),
-    "mash": mash.correct,
-}
 
 
 @dataclass(frozen=True)
@@ -78,15 +65,20 @@ def landmarks(scene: LandmarkScene) -> tuple[Landmarks, Landmarks]:
     return one, two
 
 
+@lru_cache(maxsize=4)
+def prepared(spec: LandmarkSpec, scenes: int, seed: int) -> list[tuple[LandmarkScene, Landmarks, Landmarks]]:
+    """Scenes 0, 1, ... of a seed, and what both agents see: the same for every method and noise."""
+    made = [make_landmark_scene(spec, seed, n) for n in range(scenes)]
+    return [(scene, *landmarks(scene)) for scene in made]
+
+
 def run(
     table: str, method: str, corrector: Corrector, spec: LandmarkSpec, noise: ClaimNoise, scenes: int, seed: int
 ) -> Row:
     """A method on scenes 0, 1, ... of a seed."""
     frames: list[PoseFrame] = []
     spent = []
-    for n in range(scenes):
-        scene = make_landmark_scene(spec, seed, n)
-        ego, other = landmarks(scene)
+    for n, (scene, ego, other) in enumerate(prepared(spec, scenes, seed)):
         claimed = noise.claim(scene.ego_from_other, n)
         begin = time.process_time()
         said = corrector(ego, other, claimed)
@@ -109,31 +101,51 @@ def run(
     )
 
 
-def rows(scenes: int, nulls: int) -> Iterator[Row]:
-    """All tables."""
-    none = ClaimNoise("none")
-    guess = partial(correct, config=GUESS)
+def success(scenes: int, nulls: int) -> Iterator[Row]:
+    """Best guesses, whether or not they would be answered."""
     for common in (3, 4, 5, 6, 8):
-        spec = LandmarkSpec(common, 8, 10)
-        yield run("success", "vote", guess, spec, none, scenes, 0)
-        for kind, sigma in (("gaussian", 0.0), ("gaussian", 2.0), ("gaussian", 4.0), ("unknown", 0.0)):
+        spec, guess = LandmarkSpec(common, 8, 10), partial(correct, config=GUESS)
+        for kind, sigma in (("none", 0.0), ("gaussian", 1.0), ("gaussian", 4.0), ("unknown", 0.0)):
             yield run("success", "vote", guess, spec, ClaimNoise(kind, sigma, sigma), scenes, 0)
-    yield run("answers", "vote", correct, LandmarkSpec(0, 22, 28, disjoint=True), none, nulls, 1)
-    yield run("answers", "vote", correct, LandmarkSpec(0, 22, 28), none, nulls // 2, 2)
-    yield run("answers", "vote", correct, LandmarkSpec(), none, nulls // 2, 3)
-    yield run("answers", "vote", correct, LandmarkSpec(0, 22, 28, NOISY, disjoint=True), none, nulls // 2, 1)
-    yield run("answers", "vote", correct, LandmarkSpec(error=NOISY), none, nulls // 2, 3)
-    yield run("answers", "vote", correct, LandmarkSpec(0, 22, 28, disjoint=True, instants=5), none, nulls // 5, 1)
-    yield run("answers", "vote", correct, LandmarkSpec(instants=5), none, nulls // 5, 3)
+
+
+def answers(scenes: int, nulls: int) -> Iterator[Row]:
+    """When to answer; agents that share nothing stand at one crossing or at two."""
+    none = ClaimNoise("none")
+    for error in (BoxError(), NOISY):
+        for spec, share in (
+            (LandmarkSpec(0, 22, 28, error, disjoint=True), 1),
+            (LandmarkSpec(error=error), 2),
+            (LandmarkSpec(0, 22, 28, error), 2),
+            (LandmarkSpec(0, 22, 28, error, disjoint=True, instants=5), 5),
+            (LandmarkSpec(error=error, instants=5), 5),
+        ):
+            yield run("answers", "vote", correct, spec, none, nulls // share, 1)
+
+
+def displacement(scenes: int, nulls: int) -> Iterator[Row]:
+    """Objects in common after fusion with a good claim."""
     for sigma in (0.1, 0.2, 0.5):
         for method in ("given", "vote"):
-            spec, noise = LandmarkSpec(), ClaimNoise("gaussian", sigma, sigma)
-            yield run("displacement", method, RIVALS[method], spec, noise, scenes, 4)
+            noise = ClaimNoise("gaussian", sigma, sigma)
+            yield run("displacement", method, CORRECTORS[method], LandmarkSpec(), noise, scenes, 4)
+
+
+def rivals(scenes: int, nulls: int) -> Iterator[Row]:
+    """Everybody, against the noise of the claim."""
     for sigma in (0.0, 0.4, 0.8, 1.2, 2.0):
-        for method, corrector in RIVALS.items():
-            spec, noise = LandmarkSpec(6, 8, 10), ClaimNoise("gaussian", sigma, sigma)
-            yield run("rivals", method, corrector, spec, noise, scenes // 5, 5)
-    yield run("speed", "vote", correct, LandmarkSpec(8, 32, 32), none, 40, 6)
+        for method, corrector in CORRECTORS.items():
+            noise = ClaimNoise("gaussian", sigma, sigma)
+            yield run("rivals", method, corrector, LandmarkSpec(6, 8, 10), noise, scenes // 2, 5)
+
+
+def speed(scenes: int, nulls: int) -> Iterator[Row]:
+    """40 by 40 and 200 by 200 objects."""
+    for extra, count in ((32, 40), (192, 5)):
+        yield run("speed", "vote", correct, LandmarkSpec(8, extra, extra), ClaimNoise("none"), count, 6)
+
+
+TABLES = {f.__name__: f for f in (success, answers, displacement, rivals, speed)}
 
 
 def line(row: Row) -> str:
@@ -154,12 +166,14 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=300)
     parser.add_argument("--nulls", type=int, default=1000)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/pose.json"))
+    parser.add_argument("--tables", nargs="+", choices=list(TABLES), default=list(TABLES))
     options = parser.parse_args()
     done = []
-    for row in rows(options.scenes, options.nulls):
-        sys.stdout.write(line(row) + "\n")
-        sys.stdout.flush()
-        done.append(row)
+    for table in options.tables:
+        for row in TABLES[table](options.scenes, options.nulls):
+            sys.stdout.write(line(row) + "\n")
+            sys.stdout.flush()
+            done.append(row)
     command = f"python benchmarks/pose.py {shlex.join(sys.argv[1:])}".strip()
     write_json(options.out, {"rows": [asdict(r) for r in done]}, {"command": command}, 0)
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.alignment.landmarks import Landmarks
-from manyeyes.datatypes import ConfigError, ShapeError, Transform
+from manyeyes.datatypes import AgentFrame, ConfigError, ShapeError, Transform
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -64,6 +64,17 @@ class PoseClaim:
     def of(cls, ego_from_other: Transform, sigma_xy_m: float, sigma_yaw_rad: float) -> PoseClaim:
         """A claim whose errors in x, y and yaw are independent."""
         return cls(ego_from_other, np.diag([sigma_xy_m**2, sigma_xy_m**2, sigma_yaw_rad**2]))
+
+    @classmethod
+    def between(cls, ego: AgentFrame, other: AgentFrame) -> PoseClaim:
+        """What two agents' claimed poses say together: errors of both, and the ego's yaw error at the other's distance."""
+        ego_from_other = ego.world_from_agent.inverse() @ other.world_from_agent
+        x, y, _ = planar(ego_from_other)
+        c, s = float(ego.world_from_agent.yaw.cos()), float(ego.world_from_agent.yaw.sin())
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]]) @ turn
+        parts = [(lever, ego.pose_covariance), (turn, other.pose_covariance)]
+        return cls(ego_from_other, sum((by @ c.double().numpy() @ by.T for by, c in parts), np.zeros((3, 3))))
 
     @property
     def pose(self) -> Floats:

@@ -92,7 +92,8 @@ def candidates(
     for pose, information, pairs, misfit, score in found:
         freedom = 3 * len(pairs) - 3
         total = float(misfit.sum())
-        covariance: Floats = np.linalg.inv(information) * max(1.0, total / freedom if freedom else 1.0)
+        inflated = max(1.0, total / freedom if freedom else 1.0)
+        covariance = np.asarray(np.linalg.inv(information) * inflated, np.float64)
         if swapped:
             pose, covariance, pairs = *_inverted(pose, covariance), pairs[:, ::-1]
         rows = np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1)

@@ -17,6 +17,7 @@ VERBS = {
     "evaluate": "judge methods on a split: AP with intervals, bytes, paired differences",
     "run": "replay your own OPV2V-format recording as demo does",
     "view": "draw a frame of a recording, or animate a drive",
+    "align": "where agents are, from what they detect: claimed and corrected poses judged",
     "map": "one map from many drives: simulate, fuse, evaluate, diff, export, view, import",
     "doctor": "print what a bug report needs",
 }

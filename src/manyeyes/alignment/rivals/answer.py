@@ -26,7 +26,7 @@ def answered(ego: Landmarks, other: Landmarks, pose: Floats, pairs: Ints, claime
     """The pose (3,) in place of what was claimed, with the covariance that its pairs (P, 2) give by their stated
     errors.
     """
-    covariance = np.linalg.inv(information(ego, other, pose, pairs))
+    covariance = np.asarray(np.linalg.inv(information(ego, other, pose, pairs)), np.float64)
     distance = float("nan") if claimed is None else mahalanobis(pose, covariance, claimed)
     return PoseEstimate(
         upright(pose, claimed),
