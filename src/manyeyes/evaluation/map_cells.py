@@ -10,11 +10,12 @@ import math
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from manyeyes.datatypes.map_element import KINDS, MapElements
-from manyeyes.evaluation.map_methods import Settings, make_map
+from manyeyes.evaluation.map_methods import RIVALS, Settings, make_map
 from manyeyes.evaluation.map_quality import THRESHOLDS, MapQuality, judge
 from manyeyes.evaluation.map_trial import Scene, Trial, carry_out
 from manyeyes.maps.whole_file import write_whole
@@ -87,11 +88,28 @@ class Unit:
 
 
 def cell_path(unit: Unit, method: str) -> Path:
-    """The file of a cell; its name holds a digest of the trial and the method's configuration."""
-    said = repr((unit.trial, method, unit.settings.of(method)))
+    """The file of a cell; its name holds a digest of the trial, the method's configuration and the code that they run."""
+    said = repr((unit.trial, method, unit.settings.of(method), code_digest(method in RIVALS)))
     digest = hashlib.blake2b(said.encode(), digest_size=6).hexdigest()
     trial = unit.trial
     return unit.folder / f"{trial.place}-{trial.window}-{trial.count:04d}-{trial.seed}-{method}-{digest}.json"
+
+
+@lru_cache(maxsize=2)
+def code_digest(rival: bool) -> str:
+    """A hash of the sources that a cell's numbers follow from: a change of them makes cells anew, a change of others does not."""
+    package = Path(__file__).resolve().parents[1]
+    patterns = [
+        "evaluation/map_quality.py",
+        "evaluation/map_matching.py",
+        "evaluation/map_trial.py",
+        "evaluation/observed.py",
+    ]
+    patterns += ["simulator/crowd/*.py", "ops/nearest_line.py", "ops/polyline*.py", "maps/truth.py"]
+    patterns += ["maps/baselines/*.py", "maps/sightings.py"] if rival else ["maps/*.py", "evaluation/map_oracle.py"]
+    files = sorted({file for pattern in patterns for file in package.glob(pattern)})
+    said = b"".join(file.relative_to(package).as_posix().encode() + file.read_bytes() for file in files)
+    return hashlib.blake2b(said, digest_size=8).hexdigest()
 
 
 def run_unit(unit: Unit) -> list[Cell]:

@@ -25,8 +25,8 @@ from manyeyes.maps.fuse import FuseConfig
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.crowd.config import CROWDS
 
-BUDGET, SEED = 12, 1000
-PLACES, COUNTS = ("Town02", "Town07", "cross"), (20, 60)
+BUDGET, SEED = 8, 1000
+PLACES, COUNTS = ("Town07", "cross"), (20, 60)
 
 Choices = dict[str, tuple[Any, ...]]
 _GATES = (0.5, 0.75, 1.0, 1.5, 2.0)
