@@ -186,6 +186,27 @@ def test_single_linkage_chains_where_average_linkage_does_not() -> None:
     assert len(frechet_clustering.fuse(many)) == 2
 
 
+def test_complete_linkage_joins_nothing_that_has_two_members_too_far_apart() -> None:
+    many = [seen(k, [line(y)]) for k, y in enumerate((0.0, 0.9, 2.2))]
+    # The mean of 1.3 and 2.2 is within the gate of 1.75; the greater is not.
+    assert len(frechet_clustering.fuse(many)) == 1
+    assert len(frechet_clustering.fuse(many, frechet_clustering.Config(linkage="complete"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("rival", "change"),
+    [
+        (frechet_clustering, {"linkage": "ward"}),
+        (frechet_clustering, {"take": "best"}),
+        (crowdmap_literal, {"merge": "sum"}),
+        (heatmap_buffer, {"walks": "none"}),
+    ],
+)
+def test_an_unknown_choice_is_refused(rival, change: dict) -> None:
+    with pytest.raises(ConfigError, match=r"expected .*; got"):
+        rival.Config(**change)
+
+
 def test_frechet_clusters_of_rings_do_not_mind_where_and_which_way_a_ring_begins() -> None:
     rings = [SQUARE, SQUARE[2:] + SQUARE[:2], [[x + 0.5, y] for x, y in SQUARE][::-1]]
     (ring,) = lines_in(frechet_clustering.fuse([seen(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING)

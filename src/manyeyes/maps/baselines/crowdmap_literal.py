@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING
 from manyeyes.maps.baselines.chamfer_nms import overlaps
 from manyeyes.maps.baselines.cpd import CpdConfig, register
@@ -39,6 +40,10 @@ class Config:
     cpd: CpdConfig = field(default_factory=CpdConfig)
     merge: Literal["keep", "mean"] = "keep"
     rules: Rules = field(default_factory=Rules)
+
+    def __post_init__(self) -> None:
+        if self.merge not in ("keep", "mean"):
+            raise ConfigError(f"crowdmap_literal.merge: expected keep or mean; got {self.merge!r}. Choose one of them.")
 
 
 def fuse(observations: Sequence[Observation], config: Config = Config(), frame: Frame | None = None) -> VectorMap:

@@ -3,8 +3,8 @@
 
 The paper names "FDC" and cites a review of distances (Besse et al., IEEE T-ITS 17(11), 2016) that has no such algorithm; this is
 the reading of specs/maps.md section 4. Distances are discrete Frechet on equally spaced samples, the lesser of both directions
-(rings: from the sample nearest to the other's first). Clusters join by single or average linkage up to ``gate_m``; what comes
-out is the cluster's medoid, or the mean of its samples brought into one direction.
+(rings: from the sample nearest to the other's first). Clusters join by single, average or complete linkage up to ``gate_m``; what
+comes out is the cluster's medoid, or the mean of its samples brought into one direction.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING
 from manyeyes.maps.baselines.rules import Floats, Ints, Merged, Pool, Rules, as_map, pool
 from manyeyes.maps.lane_links import components
@@ -33,23 +34,30 @@ class Config:
 
     gate_m: float = 1.75
     samples: int = 20
-    linkage: Literal["single", "average"] = "average"
+    linkage: Literal["single", "average", "complete"] = "average"
     take: Literal["mean", "medoid"] = "mean"
     rules: Rules = field(default_factory=Rules)
+
+    def __post_init__(self) -> None:
+        if self.linkage not in ("single", "average", "complete") or self.take not in ("mean", "medoid"):
+            raise ConfigError(
+                "frechet_clustering.Config: expected linkage single, average or complete and take mean or medoid; "
+                f"got {self.linkage!r} and {self.take!r}. Choose of those."
+            )
 
 
 def fuse(observations: Sequence[Observation], config: Config = Config(), frame: Frame | None = None) -> VectorMap:
     """The map of clusters."""
     seen = pool(observations, config.rules)
     line = _samples(seen, config.samples)
-    # A Frechet distance is never below the gap between two boxes along an axis.
-    pairs = near_pairs(seen.elements.bounds(), config.gate_m)
+    # A Frechet distance is never below the gap between two boxes along an axis; means may hold distances beyond the gate.
+    pairs = near_pairs(seen.elements.bounds(), 2 * config.gate_m)
     pairs = pairs[seen.elements.kind[pairs[:, 0]] == seen.elements.kind[pairs[:, 1]]]
     gap = distances(line, pairs, seen.elements.kind == CROSSING)
     close = gap <= config.gate_m
     label = components(len(line), pairs[close])
-    if config.linkage == "average":
-        label = _average(label, pairs, gap, config.gate_m)
+    if config.linkage != "single":
+        label = _linked(label, pairs, gap, config)
     merged = []
     for rows, inner in _members(label, pairs):
         kind = int(seen.elements.kind[rows[0]])
@@ -109,8 +117,9 @@ def _members(label: Ints, pairs: Ints) -> Iterator[tuple[Ints, Ints]]:
         yield rows, within[first[k] : last[k]]
 
 
-def _average(label: Ints, pairs: Ints, gap: Floats, gate_m: float) -> Ints:
-    """(N,) the labels after average linkage within each component; distances beyond what was measured count as twice the gate."""
+def _linked(label: Ints, pairs: Ints, gap: Floats, config: Config) -> Ints:
+    """(N,) labels after average or complete linkage within each component; what was not measured counts as twice the gate."""
+    gate_m = config.gate_m
     out = label.copy()
     for rows, inner in _members(label, pairs):
         if len(rows) < 3:
@@ -126,8 +135,11 @@ def _average(label: Ints, pairs: Ints, gap: Floats, gate_m: float) -> Ints:
             if not apart[i, j] <= gate_m:
                 break
             i, j = min(i, j), max(i, j)
-            mean = (size[i] * apart[i] + size[j] * apart[j]) / (size[i] + size[j])
-            apart[i], apart[:, i] = mean, mean
+            if config.linkage == "complete":
+                joint = np.maximum(apart[i], apart[j])
+            else:
+                joint = (size[i] * apart[i] + size[j] * apart[j]) / (size[i] + size[j])
+            apart[i], apart[:, i] = joint, joint
             apart[i, i] = apart[j] = apart[:, j] = np.inf
             size[i] += size[j]
             own[own == j] = i

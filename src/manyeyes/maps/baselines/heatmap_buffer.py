@@ -45,6 +45,10 @@ class Config:
     walks: Literal["longest", "all"] = "all"
     rules: Rules = field(default_factory=Rules)
 
+    def __post_init__(self) -> None:
+        if self.walks not in ("longest", "all"):
+            raise ConfigError(f"heatmap_buffer.walks: expected longest or all; got {self.walks!r}. Choose one of them.")
+
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
