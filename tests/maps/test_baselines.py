@@ -187,8 +187,8 @@ def test_single_linkage_chains_where_average_linkage_does_not() -> None:
 
 
 def test_complete_linkage_joins_nothing_that_has_two_members_too_far_apart() -> None:
-    many = [seen(k, [line(y)]) for k, y in enumerate((0.0, 0.9, 2.2))]
-    # The mean of 1.3 and 2.2 is within the gate of 1.75; the greater is not.
+    many = [seen(k, [line(y)]) for k, y in enumerate((0.0, 0.9, 2.1))]
+    # The mean of 1.2 and 2.1 is within the gate of 1.75; the greater is not.
     assert len(frechet_clustering.fuse(many)) == 1
     assert len(frechet_clustering.fuse(many, frechet_clustering.Config(linkage="complete"))) == 2
 
