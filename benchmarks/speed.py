@@ -123,7 +123,7 @@ def random_detector(config: DetectorConfig, frames: list[AgentFrame]) -> Detecto
     for name, layer in list(model.encoder.prune.items()):
         assert isinstance(layer, FocalPrune)
         model.encoder.prune[name] = GivenPrune(layer.score.in_features)
-    model.token_prune = GivenPrune(model.channels)
+    model.token_prune = GivenPrune(model.encoder.out_channels)
     norms = [m for m in model.modules() if isinstance(m, ActiveNorm)]
     momenta = [m.momentum for m in norms]
     for norm in norms:

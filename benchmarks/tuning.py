@@ -25,7 +25,7 @@ from manyeyes.evaluation.detection import FrameResult, average_precisions, ego_t
 from manyeyes.models.box_head import DecodeConfig, RawBoxes, decode
 
 REACH_M = 70.0
-SETTINGS = tuple(itertools.product((0.05, 0.15, 0.30), (0.2, 0.4, 0.6)))
+SETTINGS = tuple(itertools.product((0.05, 0.15, 0.30), (0.4, 0.6, 0.8)))
 
 
 class DecodedOtherwise(Eyes):
@@ -67,7 +67,7 @@ def main() -> None:
         print(f"not run: {options.data} is absent; make it with 'manyeyes simulate --preset towns-small'")
         return
     detector, recording = load_detector(options.weights), Opv2vRecording(options.data, options.split)
-    grid, base = detector.config.grid, detector.config.decode
+    grid, base = detector.config.range, detector.config.decode
     box = (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
     protocol = protocol_named("manyeyes").within(box)
     found: dict[tuple[str, float, float], list[FrameResult]] = defaultdict(list)

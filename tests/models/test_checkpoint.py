@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from manyeyes.datatypes import CheckpointError, ConfigError, PointCloud
+from manyeyes.datatypes import BevGrid, CheckpointError, ConfigError, PointCloud
 from manyeyes.models import checkpoint, zoo
 from manyeyes.models.checkpoint import FORMAT, config_from_json, config_to_json, fingerprint
 from manyeyes.models.detector import Detector, DetectorConfig
@@ -159,3 +159,15 @@ def test_shipped_weights_load_and_see(name):
     loaded = zoo.load(name)
     assert len(loaded.see([cloud()]).tokens.features) >= 0
     assert checkpoint.read_card(Path(zoo.__file__).parent / "weights" / f"{name}.safetensors")
+
+
+def test_a_configuration_with_an_option_comes_back_and_an_older_one_gets_its_default():
+    area = BevGrid(-10.0, -5.0, -3.0, 10.0, 5.0, 3.0)
+    config = DetectorConfig(BevGrid(-10.0, -10.0, -3.0, 10.0, 10.0, 3.0), answers=area)
+    text = config_to_json(config)
+    assert config_from_json(DetectorConfig, text) == config and config.range == area
+    older = {k: v for k, v in json.loads(text).items() if k != "answers"}
+    read = config_from_json(DetectorConfig, json.dumps(older))
+    assert read.answers is None and read.range == read.grid
+    with pytest.raises(ConfigError):
+        config_from_json(DetectorConfig, json.dumps({k: v for k, v in older.items() if k != "grid"}))

@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes import BevGrid, Boxes, SparseBev, Transform
-from manyeyes.models.box_head import TYPICAL_SIZE, axis_yaw
-from manyeyes.models.fusion.gather import CUES, Tokens, gather, own_tokens, rotate_vectors, to_lattice
+from manyeyes.datatypes import BevGrid, Boxes, Sites, SparseBev, Transform
+from manyeyes.models.box_head import RAW, TYPICAL_SIZE, RawBoxes, RefineHead, axis_yaw, facing
+from manyeyes.models.fusion.gather import CUES, Tokens, gather, rotate_vectors
 from manyeyes.models.fusion.maximum import MaximumFusion, Placement
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
+from manyeyes.models.fusion.settle import VOTING_HEAT, settle
 from manyeyes.models.proposal import PROPOSAL
 from manyeyes.models.transformer import AttentionConfig
 
@@ -27,6 +28,8 @@ def fusion(name: str, random_placement: bool = True) -> torch.nn.Module:
     model = MaximumFusion(CHANNELS) if name == "maximum" else SelfAttentionFusion(CHANNELS, AttentionConfig(heads=2))
     if random_placement:
         torch.nn.init.normal_(model.placement.outer.weight, std=0.3)
+    else:
+        torch.nn.init.zeros_(model.settle.outer.weight)
     return model.eval().requires_grad_(False)
 
 
@@ -37,6 +40,13 @@ def told(seed: int, n: int = 60) -> SparseBev:
     key = torch.randperm(rows * columns, generator=random)[:n]
     yx = torch.stack((key // columns, key % columns), 1)
     return SparseBev.from_cells(torch.randn(n, CHANNELS + PROPOSAL, generator=random), yx, GRID)
+
+
+def silent(x: SparseBev) -> SparseBev:
+    """The same tokens, none of which believes in an object: they stay where they are."""
+    features = x.features.clone()
+    features[:, CHANNELS] = -9.0
+    return x.with_features(features)
 
 
 def pose(seed: int) -> Transform:
@@ -63,8 +73,9 @@ def tokens_of(agents: list[int], world: Transform | None = None) -> Tokens:
 def test_who_speaks_first_does_not_matter(name):
     model = fusion(name)
     a, b = model(tokens_of([0, 1, 2, 3])), model(tokens_of([0, 3, 1, 2]))
-    assert torch.equal(a.sites.key, b.sites.key)
-    assert torch.allclose(a.features, b.features, atol=1e-5)
+    assert torch.equal(a.bev.sites.key, b.bev.sites.key)
+    assert torch.allclose(a.bev.features, b.bev.features, atol=1e-5)
+    assert torch.allclose(a.given, b.given, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", FUSIONS)
@@ -72,9 +83,9 @@ def test_who_speaks_first_does_not_matter(name):
 def test_every_agent_adds_what_it_has(name, agents):
     tokens = tokens_of(list(range(agents)))
     out = fusion(name)(tokens)
-    cells = GRID.cells(tokens.xy)
-    assert len(out.sites) == len(torch.unique(cells, dim=0)) > 40 * agents**0.5
-    assert bool(torch.isfinite(out.features).all())
+    key, _ = settle(tokens)
+    assert torch.equal(out.bev.sites.key, torch.unique(key)) and len(out.given) > 35 * agents**0.5
+    assert bool(torch.isfinite(out.bev.features).all()) and bool(torch.isfinite(out.given).all())
 
 
 @pytest.mark.parametrize("name", FUSIONS)
@@ -83,8 +94,8 @@ def test_an_agent_without_tokens_changes_nothing(name):
     own = told(0)
     alone = [(0, own.features, own.sites.xy, None)]
     with_silent = gather([*alone, (0, none.features, none.sites.xy, pose(3))], GRID, 1)
-    assert torch.allclose(model(with_silent).features, model(gather(alone, GRID, 1)).features, atol=1e-6)
-    assert len(model(gather([(0, none.features, none.sites.xy, None)], GRID, 1)).sites) == 0
+    assert torch.allclose(model(with_silent).bev.features, model(gather(alone, GRID, 1)).bev.features, atol=1e-6)
+    assert len(model(gather([(0, none.features, none.sites.xy, None)], GRID, 1)).bev.sites) == 0
 
 
 @pytest.mark.parametrize("name", FUSIONS)
@@ -92,15 +103,16 @@ def test_moving_the_whole_world_changes_nothing(name):
     model = fusion(name)
     world = Transform.from_xyz_yaw(4321.0, -987.0, 12.0, 2.5)
     here, there = model(tokens_of([0, 1, 2])), model(tokens_of([0, 1, 2], world))
-    assert torch.equal(here.sites.key, there.sites.key)
-    assert torch.allclose(here.features, there.features, atol=1e-4)
+    assert torch.equal(here.bev.sites.key, there.bev.sites.key)
+    assert torch.allclose(here.bev.features, there.bev.features, atol=1e-4)
+    assert torch.allclose(here.given, there.given, atol=1e-3)
 
 
 def test_maximum_of_a_neighbour_shifted_by_whole_cells_is_the_dense_maximum():
-    model, mine, theirs = fusion("maximum", random_placement=False), told(0), told(1)
+    model, mine, theirs = fusion("maximum", random_placement=False), silent(told(0)), silent(told(1))
     shift = Transform.from_xyz_yaw(3 * GRID.cell, -2 * GRID.cell)
     parts = [(0, mine.features, mine.sites.xy, None), (0, theirs.features, theirs.sites.xy, shift)]
-    out = model(gather(parts, GRID, 1))
+    out = model(gather(parts, GRID, 1)).bev
 
     def dense(x: SparseBev) -> Tensor:
         image = torch.full((CHANNELS, *GRID.shape), -torch.inf)
@@ -120,15 +132,13 @@ def test_a_neighbour_beyond_the_range_is_not_heard():
 
 
 @pytest.mark.parametrize("name", FUSIONS)
-def test_zero_placement_is_the_literal_paper_and_starts_so(name):
+def test_a_fresh_placement_says_nothing_and_a_trained_one_does(name):
     fresh, trained = fusion(name, random_placement=False), fusion(name)
     assert not fresh.placement.outer.weight.any()
     tokens = tokens_of([0, 1])
-    assert torch.equal(fresh(tokens).features, fresh(dataclasses.replace(tokens, cue=tokens.cue * 0)).features)
-    for field in ("cue", "proposal"):
-        blind = dataclasses.replace(tokens, **{field: torch.zeros_like(getattr(tokens, field))})
-        assert torch.equal(fresh(tokens).features, fresh(blind).features)
-        assert not torch.allclose(trained(tokens).features, trained(blind).features, atol=1e-3)
+    blind = dataclasses.replace(tokens, cue=tokens.cue * 0)
+    assert torch.equal(fresh(tokens).bev.features, fresh(blind).bev.features)
+    assert not torch.allclose(trained(tokens).bev.features, trained(blind).bev.features, atol=1e-3)
     zeros = torch.zeros(len(tokens.xy), 2)
     assert torch.equal(Placement(CHANNELS)(tokens.features, tokens, zeros), tokens.features)
 
@@ -173,33 +183,81 @@ def test_egos_of_a_batch_do_not_hear_each_other(name):
     model = fusion(name)
     together = model(gather([*parts_of([0, 1]), *parts_of([2, 3], ego=1)], GRID, 2))
     for b, alone in enumerate((model(tokens_of([0, 1])), model(tokens_of([2, 3])))):
-        rows = together.sites.batch == b
-        assert torch.equal(together.sites.yx[rows], alone.sites.yx)
-        assert torch.allclose(together.features[rows], alone.features, atol=1e-5)
+        rows = together.bev.sites.batch == b
+        assert torch.equal(together.bev.sites.yx[rows], alone.bev.sites.yx)
+        assert torch.allclose(together.bev.features[rows], alone.bev.features, atol=1e-5)
+        assert torch.allclose(together.given[rows], alone.given, atol=1e-5)
 
 
-def test_own_tokens_are_the_grids_of_a_batch_and_propose_nothing():
-    own = told(0)
-    seen = own.with_features(own.features[:, :CHANNELS])
-    tokens = own_tokens(seen)
-    assert tokens.batch_size == 1 and not tokens.cue.any() and not tokens.proposal.any()
-    assert torch.equal(to_lattice(tokens.features, own.sites.key, tokens, "mean").features, seen.features)
+def boxes_of(proposal: Tensor, xy: Tensor) -> Boxes:
+    size = proposal[:, RAW.log_size].exp() * torch.tensor(TYPICAL_SIZE)
+    center = torch.cat((xy + proposal[:, RAW.offset] * GRID.cell, proposal[:, RAW.z]), 1)
+    return Boxes.of(center, size, axis_yaw(proposal[:, RAW.axis]))
 
 
 def test_a_proposed_box_moves_as_the_box_itself():
     own, motion = told(0), Transform.from_xyz_yaw(2.0, -1.0, 0.5, 2.1)
-
-    def boxes(proposal: Tensor, xy: Tensor) -> Boxes:
-        size = torch.cat((proposal[:, 4:6], torch.zeros(len(xy), 1)), 1).exp() * torch.tensor(TYPICAL_SIZE)
-        center = torch.cat((xy + proposal[:, 1:3] * GRID.cell, proposal[:, 3:4]), 1)
-        return Boxes.of(center, size, axis_yaw(proposal[:, 6:8]))
-
     moved = gather([(0, own.features, own.sites.xy, motion)], GRID, 1)
-    before = boxes(own.features[:, CHANNELS:], own.sites.xy)
+    before = boxes_of(own.features[:, CHANNELS:], own.sites.xy)
     at = motion.apply(torch.cat((own.sites.xy, torch.zeros(len(own.sites), 1)), 1).double())
     wanted = before[GRID.inside(at)].transform(motion)
-    got = boxes(moved.proposal, moved.xy)
+    got = boxes_of(moved.proposal, moved.xy)
     assert len(got) == len(wanted) > 30
     assert torch.allclose(got.center, wanted.center, atol=1e-4) and torch.equal(got.size, wanted.size)
     assert torch.allclose((2 * (got.yaw - wanted.yaw)).cos(), torch.ones(len(got)), atol=1e-5)
-    assert torch.equal(moved.proposal[:, 0], own.features[GRID.inside(at), CHANNELS])
+    for same in (RAW.heat, RAW.kind, RAW.overlap):
+        assert torch.equal(moved.proposal[:, same], own.features[GRID.inside(at)][:, CHANNELS:][:, same])
+
+
+def test_which_way_a_proposal_faces_turns_with_it():
+    proposal, xy = torch.zeros(1, CHANNELS + PROPOSAL), torch.zeros(1, 2)
+    box = proposal[:, CHANNELS:]
+    box[:, RAW.axis] = torch.tensor([[math.cos(2 * 1.2), math.sin(2 * 1.2)]])
+    box[:, RAW.direction] = 5 * torch.tensor([[math.cos(1.2), math.sin(1.2)]])
+    for turn in (0.3, 1.0, 2.5, -2.0):
+        moved = gather([(0, proposal, xy, Transform.from_xyz_yaw(0.0, 0.0, 0.0, turn))], GRID, 1)
+        raw = RawBoxes.of(moved.proposal, Sites(torch.tensor([0]), GRID, 1))
+        yaw = float(axis_yaw(raw.axis)) + math.pi * (float(facing(raw)) < 0)
+        assert math.cos(yaw - 1.2 - turn) == pytest.approx(1.0, abs=1e-5)
+
+
+def one_object(*said: tuple[float, float, float, float]) -> Tokens:
+    """Tokens at (x, y) of as many agents, each saying with a heat that there is a box at (centre, y)."""
+    parts = []
+    for x, y, centre, heat in said:
+        row = torch.zeros(1, CHANNELS + PROPOSAL)
+        box = row[:, CHANNELS:]
+        box[:, RAW.heat] = heat
+        box[:, RAW.offset] = torch.tensor([[centre - x, 0.0]]) / GRID.cell
+        box[:, RAW.axis] = torch.tensor([[1.0, 0.0]])
+        parts.append((0, row, torch.tensor([[x, y]]), None))
+    return gather(parts, GRID, 1)
+
+
+@pytest.mark.parametrize("name", FUSIONS)
+def test_tokens_of_one_object_meet_on_its_centre_and_the_surer_counts_more(name):
+    # Cells are 1.6 m wide with centres at 0.2 + 1.6 k: the tokens lie in two cells, both mean the cell of x = 0.2.
+    tokens = one_object((0.2, 0.2, 0.5, 2.0), (1.8, 0.2, 0.8, 0.0))
+    out = fusion(name, random_placement=False)(tokens)
+    assert len(out.bev.sites) == 1
+    assert out.bev.sites.xy[0].tolist() == pytest.approx([0.2, 0.2], abs=1e-5)
+    share = math.exp(2.0) / (math.exp(2.0) + 1.0)
+    box = boxes_of(out.given, out.bev.sites.xy)
+    assert float(box.center[0, 0]) == pytest.approx(0.5 * share + 0.8 * (1 - share), abs=1e-5)
+    assert float(out.given[0, 0]) == pytest.approx(2.0 * share, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", FUSIONS)
+def test_a_token_that_does_not_believe_stays_where_it_is(name):
+    tokens = one_object((0.2, 0.2, 0.5, 2.0), (1.8, 0.2, 0.8, VOTING_HEAT - 0.1))
+    assert len(fusion(name)(tokens).bev.sites) == 2
+
+
+@pytest.mark.parametrize("name", FUSIONS)
+def test_an_untrained_second_look_changes_nothing_and_a_trained_one_does(name):
+    fused = fusion(name)(tokens_of([0, 1, 2]))
+    torch.manual_seed(1)
+    head = RefineHead(CHANNELS, 8).eval().requires_grad_(False)
+    assert torch.equal(head(fused.bev, fused.given).columns(), fused.given)
+    torch.nn.init.normal_(head.out.weight)
+    assert not torch.allclose(head(fused.bev, fused.given).columns(), fused.given, atol=1e-2)

@@ -62,7 +62,7 @@ def test_without_a_box_every_term_is_finite_and_gradients_flow(scale):
     total = terms.total(LossConfig())
     total.backward()
     assert bool(torch.isfinite(total)) and some.heat.grad is not None and bool(torch.isfinite(some.heat.grad).all())
-    assert not any(float(getattr(terms, n).detach()) for n in ("shape", "direction", "kind", "sigma", "overlap"))
+    assert not any(float(getattr(terms, n).detach()) for n in ("shape", "direction", "kind", "sigma", "overlap", "iou"))
     assert float(terms.heat.detach()) > 0
 
 
@@ -102,7 +102,7 @@ def test_a_perfect_answer_costs_nothing_and_its_opposite_only_direction(yaw):
     truth = one_box(yaw)
     targets = assign(SITES, [truth], TargetConfig())
     terms = head_terms(perfect(truth), targets, torch.zeros(()))
-    for name in ("shape", "direction", "kind", "overlap"):
+    for name in ("shape", "direction", "kind", "overlap", "iou"):
         assert float(getattr(terms, name)) == pytest.approx(0.0, abs=2e-3), name
     assert float(terms.sigma) == pytest.approx(-10.0, abs=0.1)
     backward = dataclasses.replace(perfect(truth), direction=-perfect(truth).direction)
@@ -118,7 +118,20 @@ def test_the_term_for_sigma_never_moves_the_box():
     assert some.log_sigma_xy.grad is not None and bool(some.log_sigma_xy.grad.any())
 
 
+def test_the_iou_itself_pulls_a_box_that_nearly_fits_to_its_place():
+    truth = one_box()
+    aside = perfect(truth)
+    offset = (aside.offset + torch.tensor([0.1, -0.1])).requires_grad_()
+    targets = assign(SITES, [truth], TargetConfig())
+    before = head_terms(dataclasses.replace(aside, offset=offset), targets, torch.zeros(())).iou
+    before.backward()
+    assert offset.grad is not None and float(before.detach()) > 0.05
+    step = 0.5 * offset.grad / offset.grad.norm()
+    after = dataclasses.replace(aside, offset=(offset - step).detach())
+    assert float(head_terms(after, targets, torch.zeros(())).iou) < float(before.detach())
+
+
 def test_the_total_is_the_weighted_sum():
     terms = head_terms(raw(), assign(SITES, [one_box()], TargetConfig()), torch.tensor(2.0))
-    weights = LossConfig(heat=2.0, shape=0.0, direction=0.0, kind=0.0, sigma=0.0, overlap=0.0, prune=0.5)
+    weights = LossConfig(heat=2.0, shape=0.0, direction=0.0, kind=0.0, sigma=0.0, overlap=0.0, iou=0.0, prune=0.5)
     assert float(terms.total(weights).detach()) == pytest.approx(2 * float(terms.heat.detach()) + 1.0, rel=1e-6)

@@ -12,7 +12,7 @@ from torch import Tensor
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, SparseBev
 from manyeyes.models.box_head import DecodeConfig, RawBoxes, decode
 from manyeyes.models.detector import Detector
-from manyeyes.models.fusion.gather import Tokens, own_tokens
+from manyeyes.models.fusion.gather import Tokens
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Eyes:
         """The view of any cloud in an agent's frame; not remembered."""
         with torch.inference_mode():
             seen = self.detector.see([cloud])
-        raw = self.fuse(own_tokens(seen.tokens))
+            raw = self.detector.look(seen.tokens)
         return Sight(self.detector.tell(seen.tokens, raw), seen.worth, raw, self.detector.config.decode)
 
     def fuse(self, tokens: Tokens) -> RawBoxes:

@@ -78,7 +78,7 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
     if instant not in judged:
         known = f"{judged.start} to {judged[-1]}"
         raise ConfigError(f"Frame {instant} of {drive.scenario} is not judged; choose one of {known}.")
-    grid, protocol = detector.config.grid, judging(detector)
+    grid, protocol = detector.config.range, judging(detector)
     tallies = {name: Tally(name, protocol) for name in showing.methods}
     film = _Film(_filmed(showing.methods) if showing.animate else ())
     kept: list[Step] = []
@@ -114,7 +114,7 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
 
 def judging(detector: Detector) -> Protocol:
     """The project's own protocol over the range that the detector sees."""
-    grid = detector.config.grid
+    grid = detector.config.range
     return protocol_named("manyeyes").within((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
 
 

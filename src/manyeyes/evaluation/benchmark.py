@@ -31,8 +31,8 @@ class BenchmarkConfig:
 
 
 def judging_protocol(config: BenchmarkConfig) -> Protocol:
-    """The named protocol; our own one judges over the range that the detector sees."""
-    protocol, grid = protocol_named(config.protocol), zoo.load(config.weights).config.grid
+    """The named protocol; our own one judges over the range that the detector answers for."""
+    protocol, grid = protocol_named(config.protocol), zoo.load(config.weights).config.range
     if config.protocol != "manyeyes":
         return protocol
     return protocol.within((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))

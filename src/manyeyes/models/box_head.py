@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,21 @@ from manyeyes.models.layers import SubmanifoldLayer
 from manyeyes.ops.nms import rotated_nms
 
 TYPICAL_SIZE = (4.5, 1.9, 1.6)
+
+
+class Columns:
+    """Where each quantity of RawBoxes stands in a row of numbers."""
+
+    def __init__(self) -> None:
+        ends = list(accumulate(WIDTHS, initial=0))
+        spans = [slice(a, b) for a, b in pairwise(ends)]
+        self.heat, self.offset, self.z, self.log_size, self.axis, self.direction = spans[:6]
+        self.kind, self.log_sigma_xy, self.log_sigma_yaw, self.overlap = spans[6:]
+        self.total = ends[-1]
+
+
 WIDTHS = (1, 2, 1, 3, 2, 2, len(LABELS), 1, 1, 1)
+RAW = Columns()
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +54,21 @@ class RawBoxes:
     log_sigma_xy: Tensor
     log_sigma_yaw: Tensor
     overlap: Tensor
+
+    @classmethod
+    def of(cls, columns: Tensor, sites: Sites) -> RawBoxes:
+        """From rows (N, RAW.total)."""
+        heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap = columns.split(WIDTHS, 1)
+        return cls(
+            sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind,
+            sigma_xy[:, 0], sigma_yaw[:, 0], overlap[:, 0],
+        )  # fmt: skip
+
+    def columns(self) -> Tensor:
+        """(N, RAW.total): all quantities side by side."""
+        values = (self.heat, self.offset, self.z, self.log_size, self.axis, self.direction, self.kind)
+        values = (*values, self.log_sigma_xy, self.log_sigma_yaw, self.overlap)
+        return torch.cat([v[:, None] if v.dim() == 1 else v for v in values], 1)
 
     def bev(self) -> Tensor:
         """(N, 5): x, y, length, width, yaw (of the axis) of every site's box, differentiable."""
@@ -73,20 +103,33 @@ class BoxHead(nn.Module):
             SubmanifoldLayer(inputs, channels, norm=nn.LayerNorm),
             SubmanifoldLayer(channels, channels, norm=nn.LayerNorm),
         )
-        self.out = nn.Linear(channels, sum(WIDTHS))
+        self.out = nn.Linear(channels, RAW.total)
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
         with torch.no_grad():
             self.out.bias[0] = -2.19
 
     def forward(self, x: SparseBev) -> RawBoxes:
-        """Fused features to raw boxes, one a site."""
-        parts = self.out(self.shared(x).features).split(WIDTHS, 1)
-        heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap = parts
-        return RawBoxes(
-            x.sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind,
-            sigma_xy[:, 0], sigma_yaw[:, 0], overlap[:, 0],
-        )  # fmt: skip
+        """Features to raw boxes, one a site."""
+        return RawBoxes.of(self.out(self.shared(x).features), x.sites)
+
+
+class RefineHead(nn.Module):
+    """A centre head that is given boxes and says what to add to them; nothing, before it has learned."""
+
+    def __init__(self, inputs: int, channels: int) -> None:
+        super().__init__()
+        self.shared = nn.Sequential(
+            SubmanifoldLayer(inputs, channels, norm=nn.LayerNorm),
+            SubmanifoldLayer(channels, channels, norm=nn.LayerNorm),
+        )
+        self.out = nn.Linear(channels, RAW.total)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, x: SparseBev, given: Tensor) -> RawBoxes:
+        """Features, and the boxes (N, RAW.total) given of the same sites, to better boxes."""
+        return RawBoxes.of(given + self.out(self.shared(x).features), x.sites)
 
 
 @dataclass(frozen=True)

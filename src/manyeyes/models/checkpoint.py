@@ -26,16 +26,20 @@ def config_to_json(config: Any) -> str:
 
 
 def config_from_json(kind: type, text: str) -> Any:
-    """The inverse of config_to_json; an unknown or missing field is an error."""
+    """The inverse of config_to_json; an unknown field is an error, and so is a missing one that has no default."""
     return _build(kind, json.loads(text))
 
 
 def _build(kind: Any, value: Any) -> Any:
+    if value is None:
+        return None
+    kind = next((k for k in typing.get_args(kind) if dataclasses.is_dataclass(k)), kind)
     if not dataclasses.is_dataclass(kind):
         return tuple(value) if isinstance(value, list) else value
     hints = typing.get_type_hints(kind)
     known = {f.name for f in dataclasses.fields(kind)}
-    if not isinstance(value, dict) or set(value) != known:
+    needed = {f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING}
+    if not isinstance(value, dict) or not needed <= set(value) <= known:
         raise ConfigError(
             f"{getattr(kind, '__name__', kind)} has fields {sorted(known)}; the stored configuration has "
             f"{sorted(value) if isinstance(value, dict) else value!r}."

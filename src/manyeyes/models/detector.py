@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The detector: see (one agent's cloud to tokens), fuse (tokens of all agents in the ego's frame), decode (boxes)."""
+"""The detector: see (one agent's cloud to tokens), look (its own boxes), fuse (tokens of all agents to boxes around the ego)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
-from manyeyes.models.box_head import BoxHead, DecodeConfig, RawBoxes
+from manyeyes.models.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead
 from manyeyes.models.encoder import EncoderConfig, SparseEncoder
 from manyeyes.models.fusion.gather import Tokens
 from manyeyes.models.fusion.maximum import MaximumFusion
@@ -23,7 +23,9 @@ from manyeyes.models.transformer import AttentionConfig, WindowTransformer
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """grid: range and pillar size. prune_threshold: probability of lying near an object below which a cell is dropped."""
+    """grid: what an agent sees and tells, and the pillar size. prune_threshold: probability of lying near an object below which
+    a cell is dropped. answers: the range in which its boxes are asked for, where that is less than it sees; None: all of it.
+    """
 
     grid: BevGrid
     pillars: PillarKind = "points"
@@ -35,6 +37,12 @@ class DetectorConfig:
     head_channels: int = 64
     prune_threshold: float = 0.1
     decode: DecodeConfig = field(default_factory=DecodeConfig)
+    answers: BevGrid | None = None
+
+    @property
+    def range(self) -> BevGrid:
+        """Where boxes are asked for."""
+        return self.answers or self.grid
 
 
 @dataclass(frozen=True)
@@ -48,7 +56,7 @@ class Seen:
 
 
 class Detector(nn.Module):
-    """CoSTr's path on sparse features: pillars, encoder with focal pruning, DAST, fusion, centre head."""
+    """CoSTr's path on sparse features: pillars, encoder with focal pruning, DAST, a centre head; fusion and a second look."""
 
     def __init__(self, config: DetectorConfig) -> None:
         super().__init__()
@@ -65,6 +73,7 @@ class Detector(nn.Module):
             else SelfAttentionFusion(channels, config.fusion_attention)
         )
         self.head = BoxHead(channels, config.head_channels)
+        self.refine = RefineHead(channels, config.head_channels)
 
     @property
     def token_grid(self) -> BevGrid:
@@ -83,10 +92,15 @@ class Detector(nn.Module):
         worth = probability if threshold <= 0 else probability[probability > threshold]
         return Seen(kept, worth, (*encoded.pruned, decision), encoded.sites_per_stride)
 
+    def look(self, tokens: SparseBev) -> RawBoxes:
+        """What each agent makes of its own tokens, in its own frame."""
+        return self.head(tokens)
+
     def tell(self, tokens: SparseBev, raw: RawBoxes) -> SparseBev:
         """What is sent: features (N, C) and, behind them, the proposals of raw, the agent's own view of these tokens."""
         return tokens.with_features(torch.cat((tokens.features, propose(raw)), 1))
 
     def fuse(self, tokens: Tokens) -> RawBoxes:
-        """Tokens of all agents around each ego to raw boxes in the ego's frame."""
-        return self.head(self.fusion(tokens))
+        """Tokens of all agents around each ego, its own among them, to raw boxes in the ego's frame."""
+        fused = self.fusion(tokens)
+        return self.refine(fused.bev, fused.given)

@@ -17,7 +17,7 @@ from manyeyes.training.targets import Targets
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the terms."""
+    """Weights of the terms. iou: of 1 - IoU itself, for boxes that nearly fit already; off at the start, where none do."""
 
     heat: float = 1.0
     shape: float = 0.5
@@ -25,6 +25,7 @@ class LossConfig:
     kind: float = 0.1
     sigma: float = 0.05
     overlap: float = 0.3
+    iou: float = 0.0
     prune: float = 0.2
 
 
@@ -38,6 +39,7 @@ class LossTerms:
     kind: Tensor
     sigma: Tensor
     overlap: Tensor
+    iou: Tensor
     prune: Tensor
 
     def mean(self, other: LossTerms) -> LossTerms:
@@ -73,7 +75,7 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor) -> LossTerms:
     rows = (targets.box >= 0).nonzero()[:, 0]
     if not len(rows):
         zero = raw.heat.sum() * 0
-        return LossTerms(heat, zero, zero, zero, zero, zero, prune)
+        return LossTerms(heat, zero, zero, zero, zero, zero, zero, prune)
     some, truth, weight = (
         raw.rows(targets.box >= 0),
         targets.boxes[targets.box[rows]].to(torch.float32),
@@ -97,9 +99,11 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor) -> LossTerms:
     sigma = _gaussian_nll(((some.offset - offset) * some.sites.grid.cell).detach(), some.log_sigma_xy)
     axis_error = torch.atan2((2 * turn).sin(), (2 * turn).cos())[:, None] / 2
     sigma = sigma + _gaussian_nll(axis_error, some.log_sigma_yaw)
-    iou = aligned_iou(some.bev().detach(), truth.bev())
-    overlap = functional.binary_cross_entropy_with_logits(some.overlap, iou.clamp(0, 1).float(), reduction="none")
-    return LossTerms(heat, mean(shape), mean(direction), mean(kind), mean(sigma), mean(overlap), prune)
+    iou = aligned_iou(some.bev(), truth.bev())
+    overlap = functional.binary_cross_entropy_with_logits(
+        some.overlap, iou.detach().clamp(0, 1).float(), reduction="none"
+    )
+    return LossTerms(heat, mean(shape), mean(direction), mean(kind), mean(sigma), mean(overlap), mean(1 - iou), prune)
 
 
 def _gaussian_nll(error: Tensor, log_sigma: Tensor) -> Tensor:

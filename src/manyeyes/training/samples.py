@@ -20,7 +20,7 @@ class AugmentConfig:
 
     scale: everything is enlarged by a uniform factor within 1 ± scale; flip: mirrored left to right half of the time.
     thin: share of points dropped, uniform up to this. early_share: samples whose clouds are merged into the ego's, as early
-    fusion does. max_agents: at most so many, ego included, a random number of them.
+    fusion does. max_agents: at most so many, ego included, a random number of them; from 99 on all that there are.
     """
 
     turn_rad: float = math.pi / 4

@@ -10,7 +10,7 @@ import torch
 from manyeyes.datatypes import Boxes
 from manyeyes.models.box_head import RawBoxes
 from manyeyes.models.detector import Detector, Seen
-from manyeyes.models.fusion.gather import gather, own_tokens
+from manyeyes.models.fusion.gather import gather
 from manyeyes.training.losses import LossTerms, head_terms, prune_focal
 from manyeyes.training.samples import Sample
 from manyeyes.training.targets import TargetConfig, assign, near_objects
@@ -31,7 +31,7 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
     The tokens take the very path that they take as bytes: seen in the sender's frame, moved metrically, fused, decoded.
     """
     seen = model.see([cloud for sample in samples for cloud in sample.clouds], prune_threshold)
-    alone = model.fuse(own_tokens(seen.tokens))
+    alone = model.look(seen.tokens)
     told, sites = model.tell(seen.tokens, alone), seen.tokens.sites
     parts, agent = [], 0
     batch, xy = sites.batch, sites.xy

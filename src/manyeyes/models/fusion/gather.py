@@ -5,14 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes import BevGrid, Sites, SparseBev, Transform
+from manyeyes.datatypes import BevGrid, Transform
 from manyeyes.models.proposal import PROPOSAL, move_proposal
-from manyeyes.ops.sparse_conv import coalesce
 
 CUES = 3
 
@@ -23,8 +21,7 @@ class Tokens:
 
     features: (N, C); xy: (N, 2) metres in the ego's frame; ego: (N,) int64, which ego of the batch; cue: (N, CUES) how the
     sender's frame differs from the ego's there (height in metres, sine and cosine - 1 of the relative yaw): zero for its own.
-    proposal: (N, PROPOSAL) in the ego's axes, from the token's own place, zero where nobody has proposed anything yet.
-    sites: the tokens' cells where it is known that they lie on the centres, one a cell and in order; else None.
+    proposal: (N, PROPOSAL) in the ego's axes, from the token's own place.
     """
 
     features: Tensor
@@ -34,7 +31,6 @@ class Tokens:
     proposal: Tensor
     grid: BevGrid
     batch_size: int
-    sites: Sites | None = None
 
 
 def rotate_vectors(features: Tensor, yaw: Tensor) -> Tensor:
@@ -71,27 +67,3 @@ def gather(parts: Iterable[tuple[int, Tensor, Tensor, Transform | None]], grid: 
         columns.append((feature, xy, torch.full((feature.shape[0],), ego, dtype=torch.int64), cue, proposal))
     features, places, egos, cues, proposals = (torch.cat(column) for column in zip(*columns))
     return Tokens(features, places, egos, cues, proposals, grid, batch_size)
-
-
-def own_tokens(bev: SparseBev) -> Tokens:
-    """Every grid of a batch as an ego that hears nobody and has not looked yet: features (N, C), no proposals."""
-    sites = bev.sites
-    cue, proposal = bev.features.new_zeros(len(sites), CUES), bev.features.new_zeros(len(sites), PROPOSAL)
-    return Tokens(bev.features, sites.xy, sites.batch, cue, proposal, sites.grid, sites.batch_size, sites)
-
-
-def lattice_offset(tokens: Tokens) -> tuple[Tensor, Tensor]:
-    """Key (N,) of the nearest cell and the token's offset (N, 2) from that cell's centre, in cells."""
-    if tokens.sites is not None:
-        return tokens.sites.key, tokens.xy.new_zeros(len(tokens.sites), 2)
-    rows, columns = tokens.grid.shape
-    yx = tokens.grid.cells(tokens.xy)
-    key = (tokens.ego * rows + yx[:, 0]) * columns + yx[:, 1]
-    return key, (tokens.xy - tokens.grid.centers(yx)) / tokens.grid.cell
-
-
-def to_lattice(features: Tensor, key: Tensor, tokens: Tokens, reduce: Literal["mean", "max"]) -> SparseBev:
-    """Tokens on their nearest cells, one feature a cell."""
-    if tokens.sites is not None:
-        return SparseBev(features, tokens.sites)
-    return coalesce(features, key, tokens.grid, tokens.batch_size, reduce=reduce)

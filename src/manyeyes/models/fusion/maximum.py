@@ -6,15 +6,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from manyeyes.datatypes import SparseBev
-from manyeyes.models.fusion.gather import CUES, Tokens, lattice_offset, to_lattice
+from manyeyes.models.fusion.gather import CUES, Tokens
+from manyeyes.models.fusion.settle import WORD_SCALE, Fused, Settle, settle
 from manyeyes.models.proposal import PROPOSAL
 
 
 class Placement(nn.Module):
-    """Tells a feature where it landed: offset to its cell, height and turn of its sender, and what the sender proposed there.
+    """Tells a feature where it landed: its place in its cell, height and turn of its sender, and what the sender proposed.
 
-    The proposal's box is measured from the cell that the token lands on. Ends in zeros, so that fusion starts as if without.
+    Ends in zeros, so that fusion starts as if without.
     """
 
     def __init__(self, channels: int) -> None:
@@ -23,22 +23,20 @@ class Placement(nn.Module):
         self.outer = nn.Linear(2 * channels, channels, bias=False)
         nn.init.zeros_(self.outer.weight)
 
-    def forward(self, features: Tensor, tokens: Tokens, offset: Tensor) -> Tensor:
-        """(N, C) to (N, C)."""
-        proposed = (tokens.proposal != 0).any(1, keepdim=True)
-        shift = torch.nn.functional.pad(offset * proposed, (1, PROPOSAL - 3))
-        words = torch.cat((tokens.cue, offset, tokens.proposal + shift), 1)
+    def forward(self, features: Tensor, tokens: Tokens, place: Tensor) -> Tensor:
+        """(N, C) to (N, C); place (N, 2) from the cell's centre, in cells."""
+        words = torch.cat((tokens.cue, place, tokens.proposal * WORD_SCALE), 1)
         return features + self.outer(torch.relu(self.inner(words)))
 
 
 class MaximumFusion(nn.Module):
-    """Every agent's feature on its nearest cell; the maximum of each channel."""
+    """Every agent's feature on the cell where it settles; the maximum of each channel."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.placement = Placement(channels)
+        self.placement, self.settle = Placement(channels), Settle(channels, "max")
 
-    def forward(self, tokens: Tokens) -> SparseBev:
-        """Tokens of all agents to one feature a cell."""
-        key, offset = lattice_offset(tokens)
-        return to_lattice(self.placement(tokens.features, tokens, offset), key, tokens, "max")
+    def forward(self, tokens: Tokens) -> Fused:
+        """Tokens of all agents to one feature and one box a cell."""
+        key, place = settle(tokens)
+        return self.settle(self.placement(tokens.features, tokens, place), tokens, key, place)

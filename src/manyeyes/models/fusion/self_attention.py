@@ -5,23 +5,23 @@ from __future__ import annotations
 
 from torch import nn
 
-from manyeyes.datatypes import SparseBev
-from manyeyes.models.fusion.gather import Tokens, lattice_offset, to_lattice
+from manyeyes.models.fusion.gather import Tokens
 from manyeyes.models.fusion.maximum import Placement
+from manyeyes.models.fusion.settle import Fused, Settle, settle
 from manyeyes.models.transformer import AttentionConfig, WindowTransformer
 
 
 class SelfAttentionFusion(nn.Module):
-    """Tokens attend to each other where they are, then settle on the nearest cell; their mean where they meet."""
+    """Tokens attend to each other where they are, then settle, and those that meet become one by trust."""
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
         self.placement, self.transformer = Placement(channels), WindowTransformer(channels, config)
+        self.settle = Settle(channels, "trust")
 
-    def forward(self, tokens: Tokens) -> SparseBev:
-        """Tokens of all agents to one feature a cell."""
-        key, offset = lattice_offset(tokens)
-        placed = self.placement(tokens.features, tokens, offset)
-        cache = None if tokens.sites is None else tokens.sites.cache
-        attended = self.transformer(placed, tokens.xy, tokens.ego, tokens.grid, cache)
-        return to_lattice(attended, key, tokens, "mean")
+    def forward(self, tokens: Tokens) -> Fused:
+        """Tokens of all agents to one feature and one box a cell."""
+        key, place = settle(tokens)
+        placed = self.placement(tokens.features, tokens, place)
+        attended = self.transformer(placed, tokens.xy, tokens.ego, tokens.grid)
+        return self.settle(attended, tokens, key, place)
