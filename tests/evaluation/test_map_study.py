@@ -14,11 +14,21 @@ from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.evaluation import map_cells
 from manyeyes.evaluation.map_cells import ApRow, Cell, KindRow, Unit, cell_path, read_cell, run_unit
 from manyeyes.evaluation.map_malice import displacement, malice_units
-from manyeyes.evaluation.map_methods import METHODS, OURS, Settings, check_method, map_of, tuned
+from manyeyes.evaluation.map_methods import (
+    METHODS,
+    OURS,
+    TUNED,
+    Settings,
+    check_method,
+    configured,
+    defaults,
+    map_of,
+    tuned,
+)
 from manyeyes.evaluation.map_oracle import associated, halves
 from manyeyes.evaluation.map_study import StudyConfig, best_rival, difference, lines, smaller, trials, verdicts
 from manyeyes.evaluation.map_trial import Trial, at_poses, carry_out
-from manyeyes.evaluation.map_tuning import CHOICES, configured, defaults, drawn
+from manyeyes.evaluation.map_tuning import CHOICES, drawn
 from manyeyes.maps.engine import Inline
 from manyeyes.maps.fuse import FuseConfig
 from manyeyes.maps.vector_map import VectorMap
@@ -116,7 +126,7 @@ def test_a_kept_cell_is_read_back_and_not_made_again(scene, tmp_path, monkeypatc
     path.write_text(path.read_text()[:-40])
     assert read_cell(path) is None
     other = replace(
-        unit, settings=Settings(chosen=(("union", configured(defaults("union"), [("rules.min_score", 0.5)])),))
+        unit, settings=Settings(chosen=(("union", configured(defaults("union"), (("rules.min_score", 0.5),))),))
     )
     assert cell_path(other, "union") != path and cell_path(other, "oracle-cuts") == cell_path(unit, "oracle-cuts")
 
@@ -166,9 +176,12 @@ def test_every_method_is_tuned_over_fields_that_it_has_with_defaults_first() -> 
         draws = [configured(config, drawn(method, k)) for k in range(6)]
         assert draws[0] == config and len({repr(d) for d in draws}) > 3
         assert {name for name, _ in drawn(method, 1)} == set(CHOICES[method]), "a choice names no field"
-    changed = configured(FuseConfig(), [("stations.evidence.publish", 9.0)])
+    changed = configured(FuseConfig(), (("stations.evidence.publish", 9.0),))
     assert changed.stations.evidence.publish == 9.0 and changed.align == FuseConfig().align
     assert tuned().ours.stations.evidence.publish_agents == 1
+    assert tuned().of("polymerge").share == 0.3 and tuned().of("union") is None
+    for method, changes in TUNED.items():
+        assert all(value in CHOICES[method][name] for name, value in changes), "tuning never drew this"
 
 
 def test_an_executor_changes_nothing_in_the_order_of_cells(scene, tmp_path, monkeypatch) -> None:

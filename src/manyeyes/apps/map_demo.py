@@ -45,9 +45,8 @@ def small_map(out: Path, seed: int = 0) -> tuple[SmallMap, Chapter]:
     MapFolder(out).write(scene)
     write_vector_map(made, out / "map")
     observed = MapElements.cat([o.in_map() for o in scene.observations])
-    save_map_page(
-        page_of("One map from many drives", made, scene.truth, observed, len(scene.observations)), out / "map.html"
-    )
+    page = page_of("One map from many drives", made, scene.truth, observed, len(scene.observations), shown)
+    save_map_page(page, out / "map.html")
     save_figure(
         _two_observations(scene, solve_poses(scene.observations, settings.ours.align)), out / "misalignment.png"
     )

@@ -31,7 +31,7 @@ def main(options: Options) -> None:
     """The verb."""
     from rich.console import Console
 
-    from manyeyes.apps.map_folder import observations_in, read_vector_map
+    from manyeyes.apps.map_folder import MapFolder, observations_in, read_vector_map
     from manyeyes.apps.viewer.map_figures import Panel, save_figure
     from manyeyes.apps.viewer.map_page import page_of, save_map_page
     from manyeyes.datatypes.map_element import MapElements
@@ -51,7 +51,9 @@ def main(options: Options) -> None:
     if out.suffix.lower() == ".png":
         save_figure([Panel(title, made.published().elements, truth)], out, columns=1, width_in=10.0)
     else:
-        save_map_page(page_of(title, made, truth, observed, len(seen)), out)
+        cut = MapFolder(truth_folder.parent).cut() if truth_folder and truth is not None else None
+        judged = cut(made.published().elements) if cut else None
+        save_map_page(page_of(title, made, truth, observed, len(seen), judged), out)
     console.print(f"{out}: {len(made.published())} published elements", highlight=False, soft_wrap=True)
 
 

@@ -46,13 +46,37 @@ class Settings:
         return dict(self.chosen).get(method)
 
 
-def tuned() -> Settings:
-    """The settings that studies use. Ours: one agent's word publishes, as it does for every rival; the score says how sure it is.
+Changes = tuple[tuple[str, Any], ...]
+# What ``manyeyes map evaluate --study tuning`` found, as changes of the defaults; a method that is not here stays with its own.
+# Ours: one agent's word publishes, as it does for every rival, since average precision ranks: a line that one agent saw costs
+# nothing behind those that many saw.
+TUNED: dict[str, Changes] = {
+    OURS: (("stations.evidence.publish", 1.5), ("stations.evidence.publish_agents", 1)),
+    "chamfer_nms": (("gate_m", 0.75), ("rules.min_score", 0.2)),
+    "polymerge": (("gate_m", 0.75), ("share", 0.3), ("rules.min_score", 0.5)),
+    "heatmap_buffer": (("buffer_m", 0.5), ("share", 0.3), ("simplify_m", 0.1), ("rules.min_score", 0.0)),
+    "crowdmap_literal": (("gate_m", 0.75), ("accept_m", 1.0), ("rules.min_score", 0.2)),
+}
 
-    Average precision ranks, so a line that one agent saw costs nothing behind those that many saw, and finds what else is missed.
-    """
-    evidence = replace(FuseConfig().stations.evidence, publish=1.5, publish_agents=1)
-    return Settings(ours=replace(FuseConfig(), stations=replace(FuseConfig().stations, evidence=evidence)))
+
+def tuned() -> Settings:
+    """The settings that studies use."""
+    chosen = {method: configured(defaults(method), changes) for method, changes in TUNED.items()}
+    ours = chosen.pop(OURS)
+    return Settings(tuple(sorted(chosen.items())), ours)
+
+
+def defaults(method: str) -> Any:
+    """A method's configuration as it comes."""
+    return FuseConfig() if method == OURS else importlib.import_module(f"manyeyes.maps.baselines.{method}").Config()
+
+
+def configured(config: Any, changed: Changes) -> Any:
+    """A configuration with fields replaced; a dotted name goes into the part of that name."""
+    for name, value in changed:
+        head, _, rest = name.partition(".")
+        config = replace(config, **{head: configured(getattr(config, head), ((rest, value),)) if rest else value})
+    return config
 
 
 def check_method(method: str) -> None:

@@ -9,19 +9,17 @@ counts, one seed that no study uses; of equal ones the first stays. Fields that 
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from manyeyes.evaluation.map_cells import Unit, run_unit
-from manyeyes.evaluation.map_methods import OURS, Settings
+from manyeyes.evaluation.map_methods import OURS, Settings, configured, defaults
 from manyeyes.evaluation.map_trial import Trial
 from manyeyes.maps.engine import Executor, map_blocks
-from manyeyes.maps.fuse import FuseConfig
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.crowd.config import CROWDS
 
@@ -89,19 +87,6 @@ def drawn(method: str, number: int) -> tuple[tuple[str, Any], ...]:
     known = [item for item in CHOICES[method].items() if _has(defaults(method), item[0])]
     unit = keyed_uniform((len(known),), SEED, "map-tuning", method, number).numpy()
     return tuple((name, values[int(u * len(values))]) for (name, values), u in zip(known, unit))
-
-
-def defaults(method: str) -> Any:
-    """A method's configuration as it comes."""
-    return FuseConfig() if method == OURS else importlib.import_module(f"manyeyes.maps.baselines.{method}").Config()
-
-
-def configured(config: Any, changed: Sequence[tuple[str, Any]]) -> Any:
-    """A configuration with fields replaced; a dotted name goes into the part of that name."""
-    for name, value in changed:
-        head, _, rest = name.partition(".")
-        config = replace(config, **{head: configured(getattr(config, head), [(rest, value)]) if rest else value})
-    return config
 
 
 def settings_with(method: str, config: Any) -> Settings:

@@ -61,9 +61,14 @@ class MapPage:
 
 
 def page_of(
-    title: str, made: VectorMap, truth: MapElements | None, observed: MapElements | None, observations: int
+    title: str,
+    made: VectorMap,
+    truth: MapElements | None,
+    observed: MapElements | None,
+    observations: int,
+    judged: MapElements | None = None,
 ) -> MapPage:
-    """The page of what a map publishes."""
+    """The page of what a map publishes. judged: what of it the truth can speak about, where that is not all."""
     shown = made.published()
     elements = shown.elements
     facts = [("Elements", str(len(shown))), ("Length", f"{elements.lengths().sum() / 1000:.2f} km")]
@@ -75,6 +80,8 @@ def page_of(
     ]
     origin = (made.frame.latitude, made.frame.longitude)
     odd = disagreement(elements, truth, observed)
+    if judged is not None and truth is not None:
+        odd = replace(odd, invented=disagreement(judged, truth).invented)
     return MapPage(title, elements, origin, truth, observed, odd, about, facts)
 
 
