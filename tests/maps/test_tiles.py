@@ -76,7 +76,8 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
         "search", *(f"sweep {k + 1}" for k in range(steps)), "stations",
     ]  # fmt: skip
     before = {p.name: p.stat().st_mtime_ns for p in work.iterdir()}
-    results = sorted(p for p in work.iterdir() if not p.name.endswith(".sightings.npz"))
+    results = sorted(work.iterdir())
+    assert len(results) == 4 * (steps + 2) and not list(work.glob("*.sightings.npz"))
     results[0].write_bytes(results[0].read_bytes()[:100])
     results[1].unlink()
     assert _tiled(store, work, 256.0).quantised_hash() == whole.quantised_hash()

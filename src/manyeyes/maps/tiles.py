@@ -122,8 +122,13 @@ def fuse_tiles(
     """The map of the log's observations that ``standing`` lists; ``log`` and ``work`` are folders that all workers see."""
     config = config or FuseConfig()
     blocks = make_blocks(log, standing, work, config, tiles)
+    used: set[str] = set()
     with (executor or ProcessPool()).open() as runner:
-        tables = _tables(blocks, config, runner, progress)
+        tables = _tables(blocks, config, runner, progress, used)
+    # Steps that this map did not need are those of maps before it; sightings are large and quickly made again.
+    for path in sorted(work.glob("*.npz")):
+        if path.name not in used:
+            path.unlink()
     return assemble(StationTable.cat(tables), config, frame) if tables else VectorMap.empty(frame)
 
 
@@ -154,13 +159,14 @@ def make_blocks(log: Path, standing: Standing, work: Path, config: FuseConfig, t
 
 
 def _tables(
-    blocks: Sequence[Block], config: FuseConfig, runner: Runner, progress: StepProgress | None
+    blocks: Sequence[Block], config: FuseConfig, runner: Runner, progress: StepProgress | None, used: set[str]
 ) -> list[StationTable]:
-    """Stations of all blocks: search, sweeps with a barrier after each, stations."""
+    """Stations of all blocks: search, sweeps with a barrier after each, stations; ``used`` gets the names of all results."""
 
     def each(steps: Sequence[_Step], name: str, fn: Callable[[_Step], None], kind: type[T]) -> list[T]:
         told = None if progress is None else partial(progress, name)
         map_blocks(fn, steps, runner, told)
+        used.update(step.path.name for step in steps)
         return [_result(step, fn, kind) for step in steps]
 
     if not blocks:
@@ -214,7 +220,7 @@ def _station_step(step: _Step) -> None:
 
 
 def _sightings(block: Block) -> Sightings:
-    """The block's observations as columns, kept in the work folder for the next step."""
+    """The block's observations as columns, kept in the work folder for the next step of this fusion."""
     path = block.work / f"{block.key}.sightings.npz"
     found = load_columns(path, Sightings)
     if found is None:
