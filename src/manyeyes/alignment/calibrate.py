@@ -11,6 +11,8 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 
+import numpy as np
+
 from manyeyes.alignment.decide import Acceptance, CorrectorConfig, rank
 from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.alignment.vote import candidates
@@ -41,7 +43,8 @@ def calibrated(
 
 def _accepted_from(ego: Landmarks, other: Landmarks, config: CorrectorConfig) -> float:
     """The least_score above which this scene gets no answer; minus infinity where other limits already refuse it."""
+    more = config.accept.per_instant * max(len(np.unique(ego.instant)) - 1, 0)
     ranked = rank(candidates(ego, other, config.vote), None, config.accept.anywhere)
     if ranked is None or ranked.margin < config.accept.least_margin:
         return -math.inf
-    return ranked.score if len(ranked.best.pairs) >= config.accept.least_pairs else -math.inf
+    return ranked.score - more if len(ranked.best.pairs) >= config.accept.least_pairs else -math.inf

@@ -38,10 +38,11 @@ class Acceptance:
     volume (m^2 rad) of poses that an unknown pose may take, 100 m around with any yaw.
     """
 
-    least_score: float = 25.0
+    least_score: float = 24.0
     least_margin: float = 3.0
     least_pairs: int = 3
     rival_pairs: float = 2.0
+    per_instant: float = 4.0
     anywhere: float = 2.0e5
 
     def __post_init__(self) -> None:
@@ -66,7 +67,8 @@ def correct(
 ) -> PoseEstimate:
     """Where the other agent is, from the objects that both see and from what is claimed, if anything is."""
     config = config or CorrectorConfig()
-    return decide(candidates(ego, other, config.vote, claimed), claimed, config.accept)
+    instants = len(np.unique(ego.instant))
+    return decide(candidates(ego, other, config.vote, claimed), claimed, config.accept, instants)
 
 
 @dataclass(frozen=True)
@@ -94,16 +96,17 @@ def rank(found: list[Candidate], claimed: PoseClaim | None, anywhere: float) -> 
     return Ranked(found[first], scores[first], margin, max(len(found[n].pairs) for n in order[1:]))
 
 
-def decide(found: list[Candidate], claimed: PoseClaim | None, accept: Acceptance) -> PoseEstimate:
-    """The answer that votes, likeliest first, and a claim give together."""
+def decide(found: list[Candidate], claimed: PoseClaim | None, accept: Acceptance, instants: int = 1) -> PoseEstimate:
+    """The answer that votes, likeliest first, from so many instants, and a claim give together."""
+    least = accept.least_score + accept.per_instant * max(instants - 1, 0)
     ranked = rank(found, claimed, accept.anywhere)
     if ranked is None:
         return unanswered(claimed)
     best = ranked.best
     known = _bonus(best, claimed, accept.anywhere) > 0
-    if ranked.score < accept.least_score or len(best.pairs) < (1 if known else accept.least_pairs):
+    if ranked.score < least or len(best.pairs) < (1 if known else accept.least_pairs):
         return replace(unanswered(claimed), inliers=len(best.pairs), runner_up=ranked.runner_up, margin=ranked.margin)
-    rival = ranked.score - ranked.margin >= accept.least_score
+    rival = ranked.score - ranked.margin >= least
     wanted = accept.rival_pairs * best.score / len(best.pairs) if rival else accept.least_margin
     if ranked.margin < max(wanted, accept.least_margin):
         said = unanswered(claimed, PoseStatus.AMBIGUOUS)

@@ -53,6 +53,7 @@ class VoteConfig:
     area_m2: float = 330.0
     apart_m: float = 2.0
     apart_rad: float = 0.105
+    still_m: float = 1.5
 
     def __post_init__(self) -> None:
         if min(self.landmarks, self.edges, self.hypotheses, self.refined) < 1 or not self.shortest_m < self.longest_m:
@@ -156,7 +157,23 @@ def _score(a: Landmarks, b: Landmarks, pose: Floats, pairs: Ints, misfit: Floats
     flip_a, flip_b = np.clip(a.flip[i], 0.01, 0.5), np.clip(b.flip[k], 0.01, 0.5)
     agree = (1 - flip_a) * (1 - flip_b) + flip_a * flip_b
     same = np.cos(a.yaw[i] - b.yaw[k] - pose[2]) > 0
-    return float((np.maximum(gain, 0.0) + np.log(2 * np.where(same, agree, 1 - agree))).sum())
+    gain = np.maximum(gain, 0.0) + np.log(2 * np.where(same, agree, 1 - agree))
+    return float(gain[_once(a.xy[i], a.instant[i], gain, config.still_m)].sum())
+
+
+def _once(xy: Floats, instant: Ints, gain: Floats, still_m: float) -> NDArray[np.bool_]:
+    """(P,) which pairs count: of those at one place in several instants the best, since what stands still is no new
+    evidence.
+    """
+    if not instant.any():
+        return np.ones(len(gain), bool)
+    order = np.lexsort((instant, xy[:, 1], xy[:, 0], -gain))
+    near = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1)) < still_m
+    near &= instant[:, None] != instant[None]
+    counts = np.zeros(len(gain), bool)
+    for p in order:
+        counts[p] = not (near[p] & counts).any()
+    return counts
 
 
 def _merged(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[_Found]:
