@@ -23,6 +23,7 @@ def test_two_streets_by_hand() -> None:
     assert got.distance.tolist() == pytest.approx([1.0, 1.0, 5.0, np.inf])
     assert got.line.tolist() == [0, 1, 0, -1]
     assert got.heading[:2].tolist() == pytest.approx([0.0, np.pi / 2])
+    assert got.across.tolist() == pytest.approx([1.0, -1.0, 4.0, np.inf]), "3 m beyond the end and 4 m beside it"
 
 
 def test_nothing_to_look_at_and_nothing_to_ask() -> None:
@@ -42,3 +43,4 @@ def test_the_grid_finds_what_the_slow_twin_finds(seed: int, reach: float) -> Non
     np.testing.assert_allclose(fast.distance, slow.distance, atol=1e-12)
     np.testing.assert_array_equal(fast.line, slow.line)
     np.testing.assert_allclose(fast.heading, slow.heading, atol=1e-12)
+    np.testing.assert_allclose(fast.across, slow.across, atol=1e-9)

@@ -3,8 +3,8 @@
 
 A crowd of 200 in which a share of agents is malicious (their elements are moved by 1 to 4 m, each its own way or all the same
 way) is fused twice: with and without the malicious agents' observations. Judged are the stations of published lines of the
-honest map that five or more agents saw: how far each lies from the published lines of its kind in the map of all. Beyond
-``lost_m`` a station is lost, which counts as moved.
+honest map that five or more agents saw: how far across the nearest published line of its kind in the map of all each lies (along a
+line there is no place to be moved from). Where no such line is within 2 m the station is lost, which counts as moved.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from manyeyes.ops.nearest_line import nearest_line
 from manyeyes.simulator.crowd.config import CROWDS
 from manyeyes.simulator.crowd.simulate import MALICIOUS
 
-COUNT, SHARE, AGENTS, BAR_M, LOST_M = 200, 0.2, 5, 0.1, 5.0
+COUNT, SHARE, AGENTS, BAR_M, LOST_M = 200, 0.2, 5, 0.1, 2.0
 OFFSETS_M = (1.0, 2.0, 3.0, 4.0)
 MANNERS = ("independent", "colluding")
 
 
 @dataclass(frozen=True)
 class Malice:
-    """One crowd with liars. stations: judged; lost: farther than lost_m from everything; moved: beyond the bar, lost included."""
+    """One crowd with liars. stations: judged; lost: with no line near; moved: beyond the bar, lost included."""
 
     place: str
     seed: int
@@ -104,12 +104,12 @@ def malice(unit: MaliceUnit) -> Malice:
 
 
 def displacement(alone: VectorMap, together: VectorMap, agents: int = AGENTS) -> np.ndarray:
-    """(S,) metres from each well-seen station of one map to the lines of its kind in another; inf where there is none near."""
+    """(S,) metres across the nearest line of its kind in another map, of each well-seen station; inf where there is none near."""
     before, after = alone.published(), together.published()
     kind = before.elements.kind[before.elements.owner]
     out = []
     for code, name in enumerate(KINDS):
         chosen = (kind == code) & (before.stations.agents >= agents)
         lines = lines_of_kind(after.elements, name)
-        out.append(nearest_line(before.elements.points[chosen], lines.points, lines.first, LOST_M).distance)
+        out.append(np.abs(nearest_line(before.elements.points[chosen], lines.points, lines.first, LOST_M).across))
     return np.concatenate(out)

@@ -19,11 +19,15 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Nearest:
-    """For each query: distance (Q,) metres, inf beyond reach; line (Q,) its row, -1 beyond; heading (Q,) of its segment."""
+    """For each query: distance (Q,) metres, inf beyond reach; line (Q,) its row, -1 beyond; heading (Q,) of its segment.
+
+    across: (Q,) metres from the straight line through that segment, left positive: beside a line's end, less than distance.
+    """
 
     distance: Floats
     line: Ints
     heading: Floats
+    across: Floats
 
 
 def nearest_line(queries: Floats, points: Floats, first: Ints, reach_m: float) -> Nearest:
@@ -34,7 +38,7 @@ def nearest_line(queries: Floats, points: Floats, first: Ints, reach_m: float) -
     line, start = segments_of(first)
     if len(queries) == 0 or len(start) == 0:
         nothing = np.full(len(queries), np.inf)
-        return Nearest(nothing, np.full(len(queries), -1, dtype=np.int64), np.zeros(len(queries)))
+        return Nearest(nothing, np.full(len(queries), -1, dtype=np.int64), np.zeros(len(queries)), nothing)
     origin = points.min(0) - reach_m
     # A cell of the reach keeps the lists short; a segment is entered in every cell that its box, grown by the reach, meets.
     size = max(reach_m, 1.0)
@@ -46,20 +50,24 @@ def nearest_line(queries: Floats, points: Floats, first: Ints, reach_m: float) -
 
 def nearest_line_slow(queries: Floats, points: Floats, first: Ints, reach_m: float) -> Nearest:
     """The slow twin of :func:`nearest_line`."""
-    distance, owner, heading = [], [], []
+    distance, owner, heading, across = [], [], [], []
     line, start = segments_of(first)
     for query in np.asarray(queries, dtype=np.float64).reshape(-1, 2):
-        best = (np.inf, -1, 0.0)
+        best = (np.inf, -1, 0.0, np.inf)
         for row, s in zip(line, start):
             a, d = points[s], points[s + 1] - points[s]
             t = min(1.0, max(0.0, float((query - a) @ d) / float(d @ d))) if d @ d > 0 else 0.0
             away = float(np.hypot(*(query - a - t * d)))
             if away <= reach_m and away < best[0]:
-                best = (away, int(row), float(np.arctan2(d[1], d[0])))
+                beside = (
+                    float(d[0] * (query - a)[1] - d[1] * (query - a)[0]) / float(np.hypot(*d)) if d @ d > 0 else away
+                )
+                best = (away, int(row), float(np.arctan2(d[1], d[0])), beside)
         distance.append(best[0])
         owner.append(best[1])
         heading.append(best[2])
-    return Nearest(np.array(distance), np.array(owner, dtype=np.int64), np.array(heading))
+        across.append(best[3])
+    return Nearest(np.array(distance), np.array(owner, dtype=np.int64), np.array(heading), np.array(across))
 
 
 def segments_of(first: Ints) -> tuple[Ints, Ints]:
@@ -103,12 +111,13 @@ def _enter(points: Floats, start: Ints, place: Floats, shape: Ints, reach: float
 def _look_up(
     queries: Floats, points: Floats, start: Ints, line: Ints, place: Floats, shape: Ints, offset: Ints, held: Ints,
     reach: float,
-) -> tuple[Floats, Ints, Floats]:  # fmt: skip
-    """Distance, line and heading of each query's nearest segment in its own cell."""
+) -> tuple[Floats, Ints, Floats, Floats]:  # fmt: skip
+    """Distance, line, heading and offset across of each query's nearest segment in its own cell."""
     size, columns, rows = place[2], shape[0], shape[1]
     distance = np.full(len(queries), np.inf)
     owner = np.full(len(queries), -1, dtype=np.int64)
     heading = np.zeros(len(queries))
+    across = np.full(len(queries), np.inf)
     for q in range(len(queries)):
         x, y = queries[q, 0], queries[q, 1]
         column, row = np.floor((x - place[0]) / size), np.floor((y - place[1]) / size)
@@ -126,4 +135,6 @@ def _look_up(
             if away < best and away <= reach:
                 best = away
                 distance[q], owner[q], heading[q] = away, line[held[h]], np.arctan2(dy, dx)
-    return distance, owner, heading
+                beside = dx * (y - points[s, 1]) - dy * (x - points[s, 0])
+                across[q] = beside / np.sqrt(square) if square > 0 else away
+    return distance, owner, heading, across
