@@ -189,7 +189,7 @@ def sweep(
         (grid.keys, grid.start, xy[order], tangent[order], far, weight[far]),
         (gate, kernel, config.along_m, np.cos(config.heading_rad), config.sigma_m, config.correlation),
     )
-    moved = step_poses(sightings, home, start, pose, sums, config)
+    moved = step_poses(sightings, home, (start, pose), sums, config)
     part = state.take(rows[home])
     part = replace(part, **moved)
     return part.take(np.array(sorted(range(len(part.ids)), key=lambda k: part.ids[k]), np.int64))
@@ -212,14 +212,12 @@ def merge(parts: Sequence[Alignment], config: AlignConfig = AlignConfig()) -> Al
     matched = np.bincount(agent, whole.matched, len(names))
     # Two points of prior knowledge keep an agent that nobody else saw at the usual scatter.
     variance = (residual + 20.0 * 0.04) / (matched + 20.0)
-    common = _common_error(whole, config)
+    told = _told(whole)
+    common = _common_error(whole, told, config)
     offset = (whole.pose - whole.start)[:, :2] - common
     pose = whole.pose.copy()
     pose[:, :2] -= np.where(whole.fixed[:, None] > 0, 0.0, common)
-    mean = np.stack([np.bincount(agent, offset[:, k], len(names)) for k in (0, 1)], 1)
-    mean = mean / np.bincount(agent, minlength=len(names))[:, None]
-    away = (mean**2).sum(1)[agent] / (np.trace(whole.claim, axis1=1, axis2=2) / 2)
-    faith = (config.agent_scale**2 / (config.agent_scale**2 + away)) ** 2
+    faith = _faith(offset, told, np.trace(whole.claim, axis1=1, axis2=2) / 2, agent, config.agent_scale)
     return replace(whole, pose=pose, offset=offset, scale=np.sqrt(variance)[agent], faith=faith)
 
 
@@ -238,7 +236,29 @@ def bounded(sightings: Sightings, pose: Floats, most: int) -> NDArray[np.bool_]:
     return bound_observations(key, np.asarray(sightings.observation), np.asarray(sightings.agent), rank, most)
 
 
-def _common_error(whole: Alignment, config: AlignConfig) -> Floats:
+def _told(whole: Alignment) -> Floats:
+    """(O, 2, 2) from 0 (the lines tell nothing of the place in that direction) to the identity."""
+    told = np.eye(2) - whole.covariance[:, :2, :2] @ np.linalg.inv(whole.claim)
+    return (told + told.transpose(0, 2, 1)) / 2
+
+
+def _faith(offset: Floats, told: Floats, variance: Floats, agent: Ints, scale: float) -> Floats:
+    """(O,) in (0, 1]: small for agents whose claims are off alike, in the directions that lines told, by more than
+    ``scale`` sigmas.
+
+    The mean over an agent's observations tells more than any one of them: its noise averages out, its lie does not.
+    """
+    count = int(agent.max(initial=-1)) + 1
+    weight, pull, usual = np.zeros((count, 2, 2)), np.zeros((count, 2)), np.zeros(count)
+    np.add.at(weight, agent, told)
+    np.add.at(pull, agent, _apply(told, offset))
+    np.add.at(usual, agent, variance)
+    mean = np.linalg.solve(weight + 0.1 * np.eye(2), pull[:, :, None])[:, :, 0]
+    away = np.einsum("ai,aij,aj->a", mean, weight, mean).clip(0.0) / np.maximum(usual, 1e-12)
+    return ((scale**2 / (scale**2 + away)) ** 2)[agent]
+
+
+def _common_error(whole: Alignment, told: Floats, config: AlignConfig) -> Floats:
     """(O, 2) metres by which the observations around each one were moved alike, which nothing but chance explains.
 
     Lines tell where observations stand to each other; where all of them stand is told by their claims alone, whose
@@ -246,8 +266,6 @@ def _common_error(whole: Alignment, config: AlignConfig) -> Floats:
     a mode, not a mean: a fifth of agents who lie alike do not move it far. Each correction counts in the directions
     that lines told; one that the gross search moved does not.
     """
-    told = np.eye(2) - whole.covariance[:, :2, :2] @ np.linalg.inv(whole.claim)
-    told = (told + told.transpose(0, 2, 1)) / 2
     grid = build_grid(whole.start[:, 0], whole.start[:, 1], np.zeros(len(told), np.int64), config.gauge_m)
     return _modes(
         whole.start,
@@ -387,9 +405,10 @@ def normal_equations(home, own, others, numbers):  # pragma: no cover - compiled
 
 
 def step_poses(
-    sightings: Sightings, home: Ints, start: Floats, pose: Floats, sums: Floats, config: AlignConfig
+    sightings: Sightings, home: Ints, at: tuple[Floats, Floats], sums: Floats, config: AlignConfig
 ) -> dict[str, Floats]:
     """The columns of an Alignment that a sweep changes, for the home rows."""
+    start, pose = at
     prior = np.asarray(sightings.covariance)[home]
     pivot, now, begin = sums[:, :2], pose[home], start[home]
     jacobian = np.tile(np.eye(3), (len(home), 1, 1))

@@ -69,6 +69,7 @@ class StreamingMap:
         rings = np.flatnonzero(~is_line(start.elements.kind) & (start.state != RETIRED))
         self._rings = _Rows.of(start, rings)
         self._ring_points = [np.array(start.elements.polyline(int(k))) for k in rings]
+        self._middles = np.array([ring.mean(0) for ring in self._ring_points]).reshape(-1, 2)
         rows = _Rows.of_points(start, lines)
         xy, tangent = _points_of(start.elements.take(lines))
         order = _order(xy, rows.kind)
@@ -144,7 +145,7 @@ class StreamingMap:
                 (ground.grid.keys, ground.grid.start, ground.xy, ground.tangent, ground.owner, ground.weight),
                 (gate, kernel, one.along_m, float(np.cos(one.heading_rad)), one.sigma_m, one.correlation),
             )
-            moved = step_poses(s, home, begin, pose, sums, one)
+            moved = step_poses(s, home, (begin, pose), sums, one)
             pose, covariance = moved["pose"], moved["covariance"]
         return pose, covariance
 
@@ -155,10 +156,8 @@ class StreamingMap:
         mine = [hulls_of(np.asarray(moved.polyline(int(k)))) for k in rows]
         used = [False] * len(mine)
         reach = float(s.reach_m[0]) + 5.0
-        for k, ring in enumerate(self._ring_points):
-            middle = ring.mean(0)
-            if np.hypot(*(middle - pose[0, :2])) > reach:
-                continue
+        for k in np.flatnonzero(np.hypot(*(self._middles - pose[0, :2]).T) <= reach).tolist():
+            ring, middle = self._ring_points[k], self._middles[k]
             shares = [overlap_of(hull, hulls_of(ring)) for hull in mine]
             best = max(shares, default=0.0)
             if best >= config.polygon.overlap:
@@ -174,6 +173,7 @@ class StreamingMap:
         for hull, known in zip(mine, used):
             if not known and len(hull) >= 3:
                 self._ring_points.append(hull)
+                self._middles = np.concatenate((self._middles, hull.mean(0)[None]))
                 self._rings = self._rings.grown(1, np.array([CROSSING]), s, self.config)
         return confirmed, missed
 
