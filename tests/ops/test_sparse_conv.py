@@ -397,6 +397,32 @@ def test_blocks_do_not_change_the_result(monkeypatch):
         assert_near(got, wanted)
 
 
+@pytest.mark.parametrize("inputs, outputs", [(4, 4), (8, 3), (32, 64), (64, 130), (12, 64)])
+@pytest.mark.parametrize("layer", ["submanifold", "strided", "dilating"])
+def test_compiled_loops_and_blocks_give_the_same(monkeypatch, layer, inputs, outputs):
+    x, w = scene(0.5), weights(outputs, inputs, 3, 3)
+    generator = torch.Generator().manual_seed(5)
+    x = x.with_features(torch.randn(len(x.features), inputs, generator=generator))
+    w = w.float()
+    b = torch.randn(outputs, generator=generator)
+
+    def run() -> Tensor:
+        with torch.inference_mode():
+            if layer == "submanifold":
+                return submanifold_conv(x, w, b).features
+            return strided_conv(x, w, b, dilating=layer == "dilating").features
+
+    in_loops = run()
+    monkeypatch.setattr("manyeyes.ops.sparse_conv.LOOPS_UP_TO", 0)
+    in_blocks = run()
+    assert in_loops.shape == in_blocks.shape and len(in_loops) > 5
+    assert torch.allclose(in_loops, in_blocks, atol=1e-5) and float(in_blocks.abs().max()) > 0.1
+    monkeypatch.setattr("manyeyes.ops.sparse_conv.add_products", lambda *_: None)
+    assert torch.equal(run(), in_blocks)
+    monkeypatch.setattr("manyeyes.ops.sparse_conv.LOOPS_UP_TO", 1 << 30)
+    assert not torch.allclose(run(), in_blocks, atol=1e-2)
+
+
 def test_wrong_arguments_are_named():
     x = scene(0.3)
     with pytest.raises(ConfigError, match="odd kernel; got 2"):

@@ -13,9 +13,6 @@ from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
 from manyeyes.ops.window_loops import attend_in_windows, window_runs
 
-LOOPS_UP_TO = 48
-"""Mean number of keys a query up to which compiled loops beat padded batches on one core."""
-
 
 @dataclass(frozen=True)
 class AttentionConfig:
@@ -79,9 +76,7 @@ class WindowBlock(nn.Module):
 def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:
     """Attention of (N, heads, C / heads) within windows ids (N,)."""
     if not torch.is_grad_enabled() and query.device.type == "cpu" and query.dtype == torch.float32:
-        runs = window_runs(ids)
-        if runs.pairs <= LOOPS_UP_TO * len(ids):
-            return attend_in_windows(query, key, value, runs)
+        return attend_in_windows(query, key, value, window_runs(ids))
     return window_attention(query, key, value, plan_windows(ids, ids))
 
 

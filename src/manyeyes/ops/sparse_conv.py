@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
+from manyeyes.ops.pair_loops import add_products
 from manyeyes.ops.sparse_index import (
     NeighbourMap,
     Window,
@@ -27,6 +28,8 @@ from manyeyes.ops.sparse_index import (
 from manyeyes.ops.voxelize import segment_max, segment_mean, segment_sum
 
 BLOCK_ROWS = 1024
+LOOPS_UP_TO = 128 * 128
+"""Channels in times channels out up to which compiled loops beat the products of blocks on one core."""
 
 
 def coalesce(
@@ -225,6 +228,11 @@ def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, b
         if table.is_symmetric
         else bias.expand(table.rows(reverse), -1).contiguous()
     )
+    if _in_loops(x, taps):
+        rows, flat, matrices = x.contiguous().view(-1).numpy(), out.view(-1).numpy(), taps.contiguous().flatten(1)
+        for tap, source, target in table.pairs(reverse):
+            add_products(rows, matrices[tap].numpy(), source.numpy(), target.numpy(), flat, x.shape[1], out.shape[1])
+        return out
     matrices, (longest, blocks) = taps.unbind(), table.blocks(_block_rows(x), reverse)
     gathered, product = x.new_empty(longest, x.shape[1]), x.new_empty(longest, taps.shape[2])
     for tap, source, target, size in blocks:
@@ -232,6 +240,12 @@ def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, b
         # A tap leads to a row once at most, so that no sum depends on the order of the pairs.
         out.index_add_(0, target, torch.mm(rows, matrices[tap], out=product[:size]))
     return out
+
+
+def _in_loops(x: Tensor, taps: Tensor) -> bool:
+    """Inference on the CPU with few channels: compiled loops do without the copies, which there cost as much as the products."""
+    plain = x.device.type == "cpu" and x.dtype == taps.dtype == torch.float32 and x.shape[1] % 4 == 0
+    return plain and not torch.is_grad_enabled() and taps.shape[1] * taps.shape[2] <= LOOPS_UP_TO
 
 
 def _pair_outer(x: Tensor, dy: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
