@@ -324,7 +324,7 @@ def _cities(sizes: Sequence[int], engines: Sequence[str], workers: int, seed: in
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("literal", "stream", "city", "engines"))
+    parser.add_argument("what", nargs="?", default="stream", choices=("literal", "stream", "city", "engines"))
     parser.add_argument("--elements", type=int, nargs="+")
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--rounds", type=int, default=3)
