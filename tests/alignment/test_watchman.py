@@ -34,12 +34,17 @@ def noise(n, seed):
 def test_a_sound_agent_with_a_constant_error_of_its_claim_is_left_alone():
     for seed in range(30):
         bias = np.random.default_rng(1000 + seed).standard_normal(3) * [0.4, 0.4, 0.008]
-        assert {r.health for r in run(noise(40, seed) + bias)} == {Health.SOUND}
+        health = [r.health for r in run(noise(40, seed) + bias)]
+        assert {Health.OFFSET, Health.DRIFTING}.isdisjoint(health) and health.count(Health.SOUND) >= 30
 
 
 def test_an_offset_of_five_sigma_is_flagged_in_its_first_frame():
-    flagged = [run(noise(1, s) + [0.0, 2.61, 0.0])[0].health is Health.OFFSET for s in range(200)]
-    assert np.mean(flagged) >= 0.8
+    # 2.61 m are five times what the claim's 0.5 m and the measurement's 0.15 m are together.
+    health = [run(noise(1, s) + [0.0, 2.61, 0.0])[0].health for s in range(200)]
+    assert np.mean([h in (Health.OFFSET, Health.DOUBTFUL) for h in health]) >= 0.98
+    assert np.mean([h is Health.OFFSET for h in health]) >= 0.95
+    honest = [run(noise(1, s) * 3.5)[0].health for s in range(200)]
+    assert np.mean([h is Health.OFFSET for h in honest]) <= 0.005
     # A few frames later hardly any is missed, though each single frame might be forgiven.
     later = [run(noise(10, s) + [0.0, 2.61, 0.0])[-1].health is Health.OFFSET for s in range(100)]
     assert np.mean(later) >= 0.98

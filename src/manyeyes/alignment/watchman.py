@@ -16,7 +16,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.alignment.decide import REFUTED
+from manyeyes.alignment.decide import DOUBTFUL, REFUTED
 from manyeyes.alignment.estimate import PoseClaim, PoseEstimate, difference
 from manyeyes.datatypes import ConfigError
 
@@ -24,30 +24,32 @@ Floats = NDArray[np.float64]
 
 
 class Health(Enum):
-    """UNKNOWN: objects have not yet said enough. SOUND: objects and claim agree. OFFSET: the claim is off. DRIFTING:
-    it moves off.
+    """UNKNOWN: objects have not yet said enough. SOUND: objects and claim agree. DOUBTFUL: in this frame they agree
+    badly, as one honest frame in twenty does. OFFSET: the claim is off. DRIFTING: it moves off.
     """
 
     UNKNOWN = "unknown"
     SOUND = "sound"
+    DOUBTFUL = "doubtful"
     OFFSET = "offset"
     DRIFTING = "drifting"
 
 
 @dataclass(frozen=True)
 class WatchConfig:
-    """frames: how many measured frames are remembered. least: how many a drift needs. single, drift: limits of the
-    tests, squared and in standard deviations: 16.27 is p = 0.001 of one frame; 4.5 of a slope keeps false names below
-    one in ten thousand windows of three slopes.
+    """frames: how many measured frames are remembered. least: how many a drift needs. single, doubtful, drift: limits
+    of the tests, squared and in standard deviations: 16.27 is p = 0.001 of one frame; 4.5 of a slope keeps false
+    names below one in ten thousand windows of three slopes.
     """
 
     frames: int = 30
     least: int = 8
     single: float = REFUTED
+    doubtful: float = DOUBTFUL
     drift: float = 4.5
 
     def __post_init__(self) -> None:
-        if not 3 <= self.least <= self.frames or min(self.single, self.drift) <= 0:
+        if not 3 <= self.least <= self.frames or min(self.single, self.doubtful, self.drift) <= 0:
             raise ConfigError("WatchConfig needs 3 <= least <= frames and limits above 0.")
 
 
@@ -115,7 +117,7 @@ def _report(state: WatchState, config: WatchConfig) -> Report:
     joint = np.linalg.inv(weight.sum(0))
     mean = joint @ np.einsum("nab,nb->a", weight, state.innovation)
     lasting = _distance(mean, joint + state.claimed.mean(0))
-    health = Health.SOUND
+    health = Health.DOUBTFUL if now > config.doubtful else Health.SOUND
     if max(now, lasting) > config.single:
         health = Health.OFFSET
     if sigmas > config.drift:
