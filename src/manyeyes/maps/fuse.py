@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from manyeyes.datatypes.map_element import MapElements, rows_of
+from manyeyes.datatypes.map_element import DASHED, MapElements, rows_of
 from manyeyes.maps.align import AlignConfig, Alignment, solve_poses
 from manyeyes.maps.linking import LinkConfig, link, smooth
 from manyeyes.maps.observation import Frame, Observation
@@ -41,7 +41,7 @@ class FuseConfig:
     align: AlignConfig = field(default_factory=AlignConfig)
     stations: StationConfig = field(default_factory=StationConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
-    least_m: tuple[float, float, float, float] = (8.0, 8.0, 0.0, 2.0)
+    least_m: tuple[float, float, float, float] = (4.0, 4.0, 0.0, 2.0)
     full_score_m: tuple[float, float, float, float] = (20.0, 20.0, 0.0, 3.0)
 
 
@@ -95,7 +95,8 @@ def _lines(table: StationTable, chosen: NDArray[np.bool_], config: FuseConfig) -
     rows = np.flatnonzero(chosen)
     xy, kind = table.xy[rows], table.line.kind[rows]
     weight = 1.0 / table.line.sigma[rows] ** 2
-    first, members = link(xy, table.tangent[rows], kind, table.line.log_odds[rows], config.link)
+    dashed = table.line.style[rows].argmax(1) == DASHED
+    first, members = link(xy, table.tangent[rows], kind, table.line.log_odds[rows], dashed, config.link)
     points = smooth(xy, first, members, weight, config.link.smooth)
     first, order = _canonical(first, points)
     points, members = points[order], members[order]

@@ -19,11 +19,13 @@ from manyeyes.maps.associate import build_grid, span
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """gap_m: largest gap between linked stations; join_m: between ends of lines in the second round.
+    """gap_m: largest gap between linked stations; join_m: between ends of lines in the second round; dashed_m: between
+    ends of dashed lines.
 
     lateral_m, lateral_slope: largest lateral gap at no gap, and how it grows. heading_rad, heading_slope: largest turn
     and its growth a metre of gap. lateral_cost: metres of gap that a metre of lateral gap costs. smooth: Gaussian
@@ -31,7 +33,8 @@ class LinkConfig:
     """
 
     gap_m: float = 6.0
-    join_m: float = 12.0
+    join_m: float = 8.0
+    dashed_m: float = 12.0
     lateral_m: float = 0.25
     lateral_slope: float = 0.08
     heading_rad: float = 0.26
@@ -41,7 +44,7 @@ class LinkConfig:
 
 
 def link(
-    xy: Floats, tangent: Floats, kind: Ints, strength: Floats, config: LinkConfig = LinkConfig()
+    xy: Floats, tangent: Floats, kind: Ints, strength: Floats, dashed: Flags, config: LinkConfig = LinkConfig()
 ) -> tuple[Ints, Ints]:
     """Stations (K,) as chains: offsets (L + 1,) and station rows in order along each chain; every station is in one
     chain.
@@ -50,8 +53,9 @@ def link(
     """
     pair = _links(xy, tangent, kind, config.gap_m, config)
     first, members = _follow(pair, strength)
-    for reach in (config.join_m,):
+    for reach, may in ((config.join_m, np.ones(len(xy), bool)), (config.dashed_m, dashed)):
         ends = np.unique(np.concatenate((members[first[:-1]], members[first[1:] - 1])))
+        ends = ends[may[ends]]
         pair = _join(pair, ends, xy, tangent, kind, reach, config, (first, members))
         first, members = _follow(pair, strength)
     return first, members
