@@ -54,11 +54,11 @@ def test_03_two_real_sweeps(tmp_path: Path) -> None:
     assert picture.stat().st_size > 50_000
 
 
-def test_06_one_map_from_many_drives(tmp_path: Path) -> None:
+def test_04_one_map_from_many_drives(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="the 'map' extra is not installed")
     pytest.importorskip("shapely", reason="the 'map' extra is not installed")
     page = tmp_path / "crossroads.html"
-    fused, union, last = run("06_one_map_from_many_drives.py", str(page)).strip().splitlines()
+    fused, union, last = run("04_one_map_from_many_drives.py", str(page)).strip().splitlines()
     assert fused.startswith("fused: ") and union.startswith("union: ") and last.endswith("shows it")
     assert float(fused.split("mAP ")[1][:4]) > float(union.split("mAP ")[1][:4])
     assert page.stat().st_size > 1_000_000

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One map from many drives: sixty wrong local maps of a crossroads become one, judged against the truth and drawn.
 
-python examples/06_one_map_from_many_drives.py out/crossroads.html
+python examples/04_one_map_from_many_drives.py out/crossroads.html
 """
 
 import sys
