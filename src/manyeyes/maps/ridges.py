@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ridges: points of many noisy lines slide sideways to where most lines agree, and are thinned to one a metre.
+"""Ridges: points of many noisy lines slide sideways to where most lines agree, and are thinned to about one a metre.
 
 Stages 3 and 4 of specs/maps.md 3.4: mean shift confined to the normal (subspace-constrained mean shift; Ozertem and
 Erdogmus, "Locally defined principal curves and surfaces", JMLR 2011). Distances go along the mean normal of the two
@@ -36,7 +36,7 @@ class RidgeConfig:
     across_sigma_m: float = 0.45
     heading_rad: float = 0.35
     rounds: int = 4
-    spacing_m: float = 1.0
+    spacing_m: float = 0.7
     twin_m: float = 0.5
 
 
