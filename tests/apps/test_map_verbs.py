@@ -130,7 +130,7 @@ def spoil_cut(folder: Path) -> Path:
         (("evaluate",), ("--study",)),
         (("evaluate", "--study", "moon"), ("moon", "table3")),
         (("evaluate", "--study", "fusion", "--methods", "guess"), ("guess", "union")),
-        (("evaluate", "{here}"), ("{here}", "truth")),
+        (("evaluate", "{here}"), ("truth", "--truth")),
         (("view", "{here}"), ("{here}", "lines.parquet")),
         (("view", "{here}", "--out", "x.jpg"), ("x.jpg", ".html")),
         (("diff", "{here}", "{here}", "--out", "x.txt"), ("x.txt", ".json")),
