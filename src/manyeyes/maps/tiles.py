@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -37,7 +37,7 @@ T = TypeVar("T")
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
-#: Part of every hash of a step: raised whenever a step's result changes for equal inputs.
+#: What releases name as their origin.
 ALGORITHM = "manyeyes.fuse/1"
 
 #: Called as steps go on: (name of the step, blocks done, blocks in all).
@@ -80,10 +80,8 @@ class Block:
 
     @property
     def key(self) -> str:
-        """Hash of what the block is about: its observations, its home, its area, the settings."""
-        text = "|".join(
-            (ALGORITHM, repr(self.config), repr(self.area), ",".join(self.home), ",".join(self.standing.ids))
-        )
+        """Hash of what the block is about: its observations, its home, its area, the settings, the code of the steps."""
+        text = "|".join((_code(), repr(self.config), repr(self.area), ",".join(self.home), ",".join(self.standing.ids)))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
@@ -178,6 +176,15 @@ def _tables(
         steps = [_Step(b, _part(state, b), number) for b in homes]
         state = merge(each(steps, f"sweep {number + 1}", _pose_step, Alignment), config.align)
     return each([_Step(b, _part(state, b), None) for b in blocks], "stations", _station_step, StationTable)
+
+
+@cache
+def _code() -> str:
+    """Hash of this package's sources: results of other code are not taken for those of this one."""
+    digest = hashlib.blake2b(ALGORITHM.encode(), digest_size=16)
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _part(state: Alignment, block: Block) -> Alignment:
