@@ -202,8 +202,7 @@ def make_report(tmp_path) -> Report:
         (Picture(picture, "all of it", wide=True), Picture(picture, "intermediate"), Picture(picture, "late")),
         (("Frames", "3"),),
         ("make demo",),
-        (),
-        {"seed": 7},
+        provenance={"seed": 7},
     )
 
 
