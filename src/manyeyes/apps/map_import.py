@@ -28,9 +28,9 @@ class Options:
     """Which of nuScenes' locations; a map has one frame."""
     axes: Literal["vehicle", "lidar"] = "vehicle"
     """Of the points: vehicle (x forward, y left) or lidar (x right, y forward: MapTR on nuScenes)."""
-    range_x: tuple[float, float] = (-15.0, 15.0)
+    range_x: tuple[float, float] = (-30.0, 30.0)
     """The model's view ahead of the vehicle, metres."""
-    range_y: tuple[float, float] = (-30.0, 30.0)
+    range_y: tuple[float, float] = (-15.0, 15.0)
     """The model's view to the left of the vehicle, metres."""
     least_score: float = 0.1
     """Elements below this score are left out."""
