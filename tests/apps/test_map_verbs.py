@@ -112,7 +112,7 @@ def test_import_reads_results_of_a_model(tmp_path, capsys) -> None:
     assert run(*words, "--origin", 49.0, 8.4, "--out", tmp_path / "in") == 0
     said = capsys.readouterr().out
     assert "2 observations of 2 elements" in said and "'c' has no pose" in said
-    view = read_observations(tmp_path / "in").observations[0].view
+    view = read_observations(tmp_path / "in" / "observations").observations[0].view
     assert (np.ptp(view[:, 0]), np.ptp(view[:, 1])) == (60.0, 30.0), "the models look farther ahead than to the sides"
     assert run("map", "fuse", tmp_path / "in") == 0
     assert run(*words, "--out", tmp_path / "in") == 1
