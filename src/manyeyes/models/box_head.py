@@ -94,15 +94,18 @@ def facing(raw: RawBoxes) -> Tensor:
     return raw.direction[:, 0] * yaw.cos() + raw.direction[:, 1] * yaw.sin()
 
 
+def _trunk(inputs: int, channels: int) -> nn.Sequential:
+    return nn.Sequential(
+        SubmanifoldLayer(inputs, channels, norm=nn.LayerNorm), SubmanifoldLayer(channels, channels, norm=nn.LayerNorm)
+    )
+
+
 class BoxHead(nn.Module):
     """Two submanifold layers and one linear map to all quantities of RawBoxes."""
 
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
-        self.shared = nn.Sequential(
-            SubmanifoldLayer(inputs, channels, norm=nn.LayerNorm),
-            SubmanifoldLayer(channels, channels, norm=nn.LayerNorm),
-        )
+        self.shared = _trunk(inputs, channels)
         self.out = nn.Linear(channels, RAW.total)
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
@@ -119,10 +122,7 @@ class RefineHead(nn.Module):
 
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
-        self.shared = nn.Sequential(
-            SubmanifoldLayer(inputs, channels, norm=nn.LayerNorm),
-            SubmanifoldLayer(channels, channels, norm=nn.LayerNorm),
-        )
+        self.shared = _trunk(inputs, channels)
         self.out = nn.Linear(channels, RAW.total)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
