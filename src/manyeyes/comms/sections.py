@@ -329,6 +329,7 @@ def merge_objects(parts: list[NDArray[Any]]) -> Boxes | None:
         sigma_xy=torch.from_numpy(codec.log_values(rows["sigma_xy"], *_SIGMA_XY)),
         sigma_yaw=torch.from_numpy(codec.log_values(rows["sigma_yaw"], *_SIGMA_YAW)),
         flip=torch.from_numpy((rows["label_flip"] >> 3).astype(np.float32) / 31),
+        velocity=torch.zeros(len(rows), 2),
     )
 
 

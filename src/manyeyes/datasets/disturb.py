@@ -82,6 +82,7 @@ class PoseNoise:
         return replace(
             frame,
             world_from_agent=Transform(turn.to(pose.rotation.dtype) @ pose.rotation, pose.translation + offset[:3]),
+            odometry=frame.odometry or pose,
             pose_covariance=frame.pose_covariance + variance.diag().to(frame.pose_covariance.dtype),
         )
 

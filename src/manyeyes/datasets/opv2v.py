@@ -189,7 +189,8 @@ def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> Truth:
     center = column("location") + column("center")
     center[:, 1] *= -1
     yaw = -column("angle")[:, 1] * (math.pi / 180)
-    boxes = Boxes.of(center, 2 * column("extent"), yaw, label=column("label"), id=torch.from_numpy(id[first]))
+    velocity = torch.stack((yaw.cos(), yaw.sin()), 1) * (column("speed") / _KMH)[:, None]
+    boxes = Boxes.of(center, 2 * column("extent"), yaw, None, column("label"), torch.from_numpy(id[first]), velocity)
     return Truth(boxes, torch.from_numpy(seen), Transform.stack([f.world_from_agent for f in frames]))
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -22,7 +22,8 @@ class Boxes:
     center: (N, 3) metres, the middle of the box; size: (N, 3) length, width, height; yaw: (N,) radians about +z,
     0 along +x. score: (N,) in [0, 1]; label: (N,) int64, index into LABELS; id: (N,) int64, -1 when unknown.
     sigma_xy: (N,) metres, sigma_yaw: (N,) radians and flip: (N,) in [0, 1] are the detector's own word on its
-    error and on the chance that the heading is off by pi; zero for truth.
+    error and on the chance that the heading is off by pi; zero for truth. velocity: (N, 2) m/s over the ground along the
+    frame's x and y, zero where nobody knows it.
     """
 
     center: Tensor
@@ -34,10 +35,11 @@ class Boxes:
     sigma_xy: Tensor
     sigma_yaw: Tensor
     flip: Tensor
+    velocity: Tensor
 
     def __post_init__(self) -> None:
         n = self.center.shape[0]
-        wanted = {"center": (n, 3), "size": (n, 3)}
+        wanted = {"center": (n, 3), "size": (n, 3), "velocity": (n, 2)}
         for field in fields(self):
             shape = tuple(getattr(self, field.name).shape)
             if shape != wanted.get(field.name, (n,)):
@@ -52,6 +54,7 @@ class Boxes:
         score: Tensor | None = None,
         label: Tensor | None = None,
         id: Tensor | None = None,
+        velocity: Tensor | None = None,
     ) -> Boxes:
         """Boxes with the rest at its default: score 1, label 0, id -1, no stated uncertainty."""
         n, zeros = center.shape[0], torch.zeros(center.shape[0], dtype=center.dtype)
@@ -65,6 +68,7 @@ class Boxes:
             zeros,
             zeros,
             zeros,
+            torch.zeros(n, 2, dtype=center.dtype) if velocity is None else velocity,
         )
 
     @classmethod
@@ -90,12 +94,19 @@ class Boxes:
         )
 
     def transform(self, target_from_source: Transform) -> Boxes:
-        """The same boxes in another frame; headings are projected onto the target's ground plane."""
-        ahead = torch.stack((self.yaw.cos(), self.yaw.sin(), torch.zeros_like(self.yaw)), -1)
-        ahead = ahead @ target_from_source.rotation.to(ahead.dtype).mT
+        """The same boxes in another frame; headings and velocities are projected onto the target's ground plane."""
+        turn = target_from_source.rotation.to(self.yaw.dtype).mT
+        ahead = torch.stack((self.yaw.cos(), self.yaw.sin(), torch.zeros_like(self.yaw)), -1) @ turn
+        velocity = (self.velocity.to(turn.dtype) @ turn[:2])[:, :2]
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values |= {"center": target_from_source.apply(self.center), "yaw": torch.atan2(ahead[:, 1], ahead[:, 0])}
-        return Boxes(**values)
+        return Boxes(**(values | {"velocity": velocity}))
+
+    def after(self, seconds: float) -> Boxes:
+        """Where the boxes are so much later, if each keeps its velocity."""
+        center = self.center.clone()
+        center[:, :2] += self.velocity * seconds
+        return replace(self, center=center)
 
     def bev(self) -> Tensor:
         """(N, 5): x, y, length, width, yaw."""

@@ -20,7 +20,8 @@ class AgentFrame:
 
     points: in the agent's own frame (x forward, y left, z up; z = 0 is the road under it, under a pole too).
     world_from_agent: the *claimed* pose; pose_covariance: (3, 3) of x, y (m) and yaw (rad) in the world, what the
-    agent says of its error. sensor_height_m: height of the LiDAR above the road. speed_mps: own speed.
+    agent says of its error. sensor_height_m: height of the LiDAR above the road. speed_mps: own speed. odometry: the pose in a
+    frame of the agent's own that drifts but never jumps, for motion since the frames before; by default the claimed pose.
     """
 
     agent_id: int
@@ -31,6 +32,7 @@ class AgentFrame:
     sensor_height_m: float = 1.9
     speed_mps: float = 0.0
     is_infrastructure: bool = False
+    odometry: Transform | None = None
 
     def __post_init__(self) -> None:
         if self.pose_covariance.shape != (3, 3):
@@ -42,6 +44,11 @@ class AgentFrame:
     ) -> AgentFrame:
         """A frame from a cloud and a pose that is believed to be exact."""
         return cls(agent_id, timestamp_ns, points, world_from_agent, torch.zeros(3, 3, dtype=torch.float64))
+
+    def from_earlier(self, earlier: AgentFrame) -> Transform:
+        """From the agent's own frame of an earlier instant to this one, by its odometry."""
+        now, then = self.odometry or self.world_from_agent, earlier.odometry or earlier.world_from_agent
+        return now.inverse() @ then
 
 
 @dataclass(frozen=True)

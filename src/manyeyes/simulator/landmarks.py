@@ -227,4 +227,5 @@ def _boxes(
         sigma,
         torch.full((n,), error.sigma_yaw_rad, dtype=torch.float64),
         torch.full((n,), error.flip, dtype=torch.float64),
+        torch.zeros(n, 2, dtype=torch.float64),
     )

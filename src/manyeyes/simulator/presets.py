@@ -18,11 +18,15 @@ from manyeyes.simulator.towns import GENERATED, TOWN_SPLIT, assert_disjoint_spli
 
 @dataclass(frozen=True)
 class SplitPreset:
-    """Scenes of one split: count of them, in turn over the towns."""
+    """Scenes of one split: count of them, in turn over the towns.
+
+    beams: which of the sensors "<lidar><beams>" all agents of a scene carry, in turn over the scenes; () is the preset's own.
+    """
 
     split: str
     towns: tuple[str, ...]
     count: int
+    beams: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -51,9 +55,9 @@ class SimulationPreset:
 
 def _towns(train: int, validate: int, test: int) -> tuple[SplitPreset, ...]:
     return (
-        SplitPreset("train", TOWN_SPLIT["train"], train),
-        SplitPreset("validate", TOWN_SPLIT["val"], validate),
-        SplitPreset("test", TOWN_SPLIT["test"], test),
+        SplitPreset("train", TOWN_SPLIT["train"], train, ("-16", "-16", "-32", "-16", "", "-16", "-16", "-32")),
+        SplitPreset("validate", TOWN_SPLIT["val"], validate, ("-16",)),
+        SplitPreset("test", TOWN_SPLIT["test"], test, ("-16",)),
     )
 
 
@@ -71,7 +75,7 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
         min_vehicles=4,
     ),
     "demo": SimulationPreset(
-        (SplitPreset("test", ("Town10HD",), 1),),
+        (SplitPreset("test", ("Town10HD",), 1, ("-16",)),),
         frames=56,
         vehicles=(3, 3),
         roadside_chance=1.0,
@@ -136,6 +140,7 @@ def jobs_of(preset: SimulationPreset, seed: int, towns: str | None = None) -> li
         for index in range(part.count):
             random = keyed_generator(seed, "preset", part.split, index)
             town = _town(part.towns[index % len(part.towns)], towns, preset.stand_in)
+            beams = part.beams[index % len(part.beams)] if part.beams else ""
             vehicles = int(random.integers(preset.vehicles[0], preset.vehicles[1] + 1))
             spec = ScenarioSpec(
                 town=town,
@@ -145,8 +150,8 @@ def jobs_of(preset: SimulationPreset, seed: int, towns: str | None = None) -> li
                 frames=preset.frames,
                 history_frames=preset.history_frames,
                 roadside_chance=1.0 if vehicles == 1 else preset.roadside_chance,
-                lidar=preset.lidar,
-                roadside_lidar=preset.roadside_lidar,
+                lidar=preset.lidar + beams,
+                roadside_lidar=preset.roadside_lidar + beams,
                 density=round(float(random.uniform(3.5, 7.0)), 3),
                 min_vehicles=preset.min_vehicles,
                 clutter=round(float(random.uniform(0.4, 1.0)), 3),
