@@ -12,7 +12,7 @@ from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.collaboration import method
 from manyeyes.agents.eyes import Eyes
 from manyeyes.comms.bus import LocalBus
-from manyeyes.comms.channel import Channel, channel_preset
+from manyeyes.comms.channel import Channel, ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
 from manyeyes.comms.wire import Precision
 from manyeyes.datasets.recording import Recording
@@ -26,12 +26,13 @@ EXPIRE_NS = 500_000_000
 class ReplayConfig:
     """How a recording is played.
 
-    wait_s: how long after its own sweep an ego waits for messages before it perceives; whatever came by then takes part,
-    the newest of each sender. all_egos: every agent is judged as ego, not the first alone. history: snapshots played before
-    the first judged one, so that messages are under way. reach_m: radios farther apart do not hear each other (true poses).
+    channel: a preset by name, or any other radio. wait_s: how long after its own sweep an ego waits for messages before it
+    perceives; whatever came by then takes part, the newest of each sender. all_egos: every agent is judged as ego, not the
+    first alone. history: snapshots played before the first judged one, so that messages are under way. reach_m: radios
+    farther apart do not hear each other (true poses).
     """
 
-    channel: str = "ideal"
+    channel: str | ChannelPreset = "ideal"
     precision: Precision = "float16"
     budget_bytes: int | None = 1 << 17
     wait_s: float = 0.0
@@ -39,6 +40,11 @@ class ReplayConfig:
     history: int = 0
     reach_m: float = 70.0
     seed: int = 0
+
+    @property
+    def radio(self) -> ChannelPreset:
+        """The channel itself."""
+        return self.channel if isinstance(self.channel, ChannelPreset) else channel_preset(self.channel)
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,7 @@ class Team:
     _bus: LocalBus = field(init=False)
 
     def __post_init__(self) -> None:
-        self._bus = LocalBus(Channel(channel_preset(self.config.channel), self.config.seed))
+        self._bus = LocalBus(Channel(self.config.radio, self.config.seed))
 
     def step(self, snapshot: Snapshot) -> Iterator[Step]:
         """Everybody shares; whoever is judged waits, hears and perceives."""

@@ -176,7 +176,7 @@ def _facts(drive: Excerpt, detector: Detector, showing: Showing) -> tuple[tuple[
         ("Scenario", drive.scenario),
         ("Judged frames", str(len(drive.judged(drive.scenario)))),
         ("Agents", str(len(drive.agents(drive.scenario)))),
-        ("Channel", showing.replay.channel),
+        ("Channel", showing.replay.radio.name),
         ("The ego waits", f"{1e3 * showing.replay.wait_s:.0f} ms"),
         ("Weights", f"{showing.weights} · {detector.fingerprint.hex()}"),
     )
