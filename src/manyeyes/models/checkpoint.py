@@ -7,17 +7,23 @@ import dataclasses
 import hashlib
 import json
 import typing
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import nn
 
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models.detector import Detector, DetectorConfig
 
 FORMAT = "manyeyes-detector-1"
+"""Of a detector's file; models of other kinds have formats of their own."""
+
+Config = TypeVar("Config")
+Model = TypeVar("Model", bound=nn.Module)
 
 
 def config_to_json(config: Any) -> str:
@@ -33,7 +39,7 @@ def config_from_json(kind: type, text: str) -> Any:
 def _build(kind: Any, value: Any) -> Any:
     if value is None:
         return None
-    kind = next((k for k in typing.get_args(kind) if dataclasses.is_dataclass(k)), kind)
+    kind = _alternative(kind, value)
     if not dataclasses.is_dataclass(kind):
         return tuple(value) if isinstance(value, list) else value
     hints = typing.get_type_hints(kind)
@@ -47,7 +53,14 @@ def _build(kind: Any, value: Any) -> Any:
     return kind(**{name: _build(hints[name], item) for name, item in value.items()})  # pyright: ignore[reportCallIssue]
 
 
-def fingerprint(model: Detector) -> bytes:
+def _alternative(kind: Any, value: Any) -> Any:
+    """Of a union of dataclasses the one whose fields are all that the value names, else the first."""
+    kinds = [k for k in typing.get_args(kind) if dataclasses.is_dataclass(k)]
+    named = set(value) if isinstance(value, dict) else set()
+    return next((k for k in kinds if named == {f.name for f in dataclasses.fields(k)}), kinds[0] if kinds else kind)
+
+
+def fingerprint(model: nn.Module) -> bytes:
     """8 bytes that name a configuration and its weights; tokens are only understood by the weights that made them."""
     digest = hashlib.blake2b(config_to_json(model.config).encode(), digest_size=8)
     for name, value in sorted(_tensors(model).items()):
@@ -56,25 +69,32 @@ def fingerprint(model: Detector) -> bytes:
     return digest.digest()
 
 
-def _tensors(model: Detector) -> dict[str, torch.Tensor]:
+def _tensors(model: nn.Module) -> dict[str, torch.Tensor]:
     """Everything that changes what the model says: how many batches a norm has seen does not."""
     return {k: v for k, v in model.state_dict().items() if not k.endswith("num_batches_tracked")}
 
 
-def save(model: Detector, path: Path, card: dict[str, Any], half: bool = False) -> None:
-    """Write weights, configuration and a model card (command, seed, time, result) to one file, atomically."""
+def save(model: nn.Module, path: Path, card: dict[str, Any], half: bool = False, format: str = FORMAT) -> None:
+    """Write weights, the model's config and a model card (command, seed, time, result) to one file, atomically."""
     state = {k: (v.half() if half and v.is_floating_point() else v).contiguous() for k, v in _tensors(model).items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
-    save_file(state, partial, {"format": FORMAT, "config": config_to_json(model.config), "card": json.dumps(card)})
+    save_file(state, partial, {"format": format, "config": config_to_json(model.config), "card": json.dumps(card)})
     partial.replace(path)
 
 
 def load(path: Path) -> Detector:
     """A detector in evaluation mode, from its own file alone."""
-    state, metadata = _read(path)
+    model = load_as(path, FORMAT, DetectorConfig, Detector)
+    model.fingerprint = fingerprint(model)
+    return model
+
+
+def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config], Model]) -> Model:
+    """A model in evaluation mode, built from the configuration in its own file; build: from a configuration of that kind."""
+    state, metadata = _read(path, format)
     try:
-        model = Detector(config_from_json(DetectorConfig, metadata["config"]))
+        model = build(config_from_json(kind, metadata["config"]))
     except json.JSONDecodeError as error:
         raise CheckpointError(f"{path}: its configuration is not JSON ({error}); copy or train it again.") from error
     except (ConfigError, TypeError) as error:
@@ -95,16 +115,15 @@ def load(path: Path) -> Detector:
             raise CheckpointError(f"{path}: tensor {name} has NaN or infinite values; train again from an older save.")
     model.load_state_dict({k: v.float() for k, v in state.items()}, strict=False)
     model.eval().requires_grad_(False)
-    model.fingerprint = fingerprint(model)
     return model
 
 
-def read_card(path: Path) -> dict[str, Any]:
+def read_card(path: Path, format: str = FORMAT) -> dict[str, Any]:
     """The model card inside a file of weights."""
-    return json.loads(_read(path)[1]["card"])
+    return json.loads(_read(path, format)[1]["card"])
 
 
-def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+def _read(path: Path, format: str = FORMAT) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file of weights; give a .safetensors file that 'manyeyes train' wrote.")
     try:
@@ -113,8 +132,8 @@ def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise CheckpointError(f"{path}: not a whole safetensors file ({error}); copy or train it again.") from error
-    if metadata.get("format") != FORMAT or "config" not in metadata:
+    if metadata.get("format") != format or "config" not in metadata:
         raise CheckpointError(
-            f"{path}: format is {metadata.get('format')!r}, not {FORMAT!r}; 'manyeyes train' writes such files."
+            f"{path}: format is {metadata.get('format')!r}, not {format!r}; 'manyeyes train' writes such files."
         )
     return state, metadata
