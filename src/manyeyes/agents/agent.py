@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from manyeyes.agents.collaboration import Collaboration, Intermediate
 from manyeyes.agents.eyes import Eyes
+from manyeyes.agents.memory import Memory
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox, Reception
 from manyeyes.comms.select import within_budget
@@ -40,7 +41,7 @@ class Agent:
         budget_bytes: int | None = 1 << 17,
         eyes: Eyes | None = None,
     ) -> None:
-        self.eyes = eyes or Eyes(detector)
+        self.eyes, self.memory = eyes or Eyes(detector), Memory()
         self.collaboration = collaboration or Intermediate()
         self.precision: Precision = precision
         self.budget_bytes = budget_bytes
@@ -66,7 +67,7 @@ class Agent:
             for packet in packets:
                 inbox.push(packet)
         heard = tuple(r for r in inbox.receptions(now_ns) if r.message.agent_id != frame.agent_id)
-        boxes = self.collaboration.hear(self.eyes, frame, [r.message for r in heard])
+        boxes = self.collaboration.hear(self.eyes, frame, self.memory.complete(heard))
         return Perception(_others(boxes, frame), heard)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a detector made of an agent's own cloud, remembered so that sharing and perceiving see it once."""
+"""What a detector made of an agent's own sweeps, remembered: sharing and perceiving see each once, and later ones look back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from torch import Tensor
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, SparseBev
 from manyeyes.models.box_head import DecodeConfig, RawBoxes, decode
 from manyeyes.models.detector import Detector
-from manyeyes.models.fusion.gather import Tokens
+from manyeyes.models.fusion.gather import Part, Tokens
+
+LONGEST_GAP_NS = 250_000_000
+"""A sweep that lies farther back than this, or one of another agent or scenario, says nothing of the motion since."""
+FASTEST_M = 30.0
+"""An agent that moved farther between two sweeps did not drive there: another scenario has begun."""
 
 
 @dataclass(frozen=True)
@@ -31,34 +36,72 @@ class Sight:
 
 
 class Eyes:
-    """A detector and the last few frames that it saw. Frames are told apart by identity."""
+    """A detector and the last few frames that it saw, of one agent. Frames are told apart by identity.
+
+    remember: how many. They are forgotten where time goes back, stands still, or jumps: a scenario has ended.
+    """
 
     def __init__(self, detector: Detector, remember: int = 8) -> None:
         self.detector = detector
         self._remember = remember
         self._seen: list[tuple[AgentFrame, Sight]] = []
+        self._merged: tuple[AgentFrame, PointCloud] | None = None
 
     def see(self, frame: AgentFrame) -> Sight:
-        """The agent's own view of its frame."""
+        """The agent's own view of its frame, with the sweep before it where there is one."""
         for known, sight in self._seen:
             if known is frame:
                 return sight
-        sight = self.see_cloud(frame.points)
+        if self._seen and not follows(frame, self._seen[-1][0]):
+            self._seen = []
+        earlier = None
+        if self._seen:
+            before = self._seen[-1][0]
+            earlier = before.points.transform(frame.from_earlier(before))
+        sight = self.see_cloud(frame.points, earlier)
         self._seen = [*self._seen, (frame, sight)][-self._remember :]
         return sight
 
-    def see_cloud(self, cloud: PointCloud) -> Sight:
-        """The view of any cloud in an agent's frame; not remembered."""
-        with torch.inference_mode():
-            seen = self.detector.see([cloud])
-            raw = self.detector.look(seen.tokens)
-        return Sight(self.detector.tell(seen.tokens, raw), seen.worth, raw, self.detector.config.decode)
+    def past(self, frame: AgentFrame, instants: int = 2) -> list[Part]:
+        """What the agent itself told at its last instants before this frame, newest first, for the ego 0."""
+        at = next((i for i, (known, _) in enumerate(self._seen) if known is frame), 0)
+        parts = []
+        for before, sight in self._seen[max(0, at - instants) : at][::-1]:
+            age_s = (frame.timestamp_ns - before.timestamp_ns) / 1e9
+            parts.append(
+                Part(0, sight.told.features, sight.told.sites.xy, frame.from_earlier(before), age_s)
+            )
+        return parts
 
-    def fuse(self, tokens: Tokens) -> RawBoxes:
+    def earlier_merged(self, frame: AgentFrame, merged: PointCloud) -> PointCloud | None:
+        """What was merged around the agent at its last instant, moved to this one; what is merged now is kept for the next."""
+        last, self._merged = self._merged, (frame, merged)
+        if last is None or not follows(frame, last[0]):
+            return None
+        return last[1].transform(frame.from_earlier(last[0]))
+
+    def see_cloud(self, cloud: PointCloud, earlier: PointCloud | None = None) -> Sight:
+        """The view of any cloud in an agent's frame, and of the one before it in the same frame; not remembered."""
+        with torch.inference_mode():
+            before = PointCloud.of(torch.zeros(0, 3)) if earlier is None else earlier
+            seen = self.detector.see([cloud], [before])
+            raw = self.detector.look(seen.tokens)
+            told = self.detector.tell(seen.tokens, raw)
+            return Sight(told, torch.sigmoid(self.detector.choose(told)), raw, self.detector.config.decode)
+
+    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
         """Raw boxes around one ego."""
         with torch.inference_mode():
-            return self.detector.fuse(tokens)
+            return self.detector.fuse(tokens, past)
 
     def decode(self, raw: RawBoxes) -> Boxes:
         """Boxes around one ego, in its frame, best first."""
         return decode(raw, self.detector.config.decode)[0]
+
+
+def follows(frame: AgentFrame, before: AgentFrame) -> bool:
+    """Whether one frame is the continuation of another: the same agent, a little later, about there."""
+    gap = frame.timestamp_ns - before.timestamp_ns
+    if frame.agent_id != before.agent_id or not 0 < gap <= LONGEST_GAP_NS:
+        return False
+    return float(frame.from_earlier(before).translation.norm()) <= FASTEST_M

@@ -15,6 +15,8 @@ from manyeyes.models.layers import SubmanifoldLayer
 from manyeyes.ops.nms import rotated_nms
 
 TYPICAL_SIZE = (4.5, 1.9, 1.6)
+SPEED_UNIT = 10.0
+"""Metres per second in one unit of RawBoxes.velocity."""
 
 
 class Columns:
@@ -24,11 +26,11 @@ class Columns:
         ends = list(accumulate(WIDTHS, initial=0))
         spans = [slice(a, b) for a, b in pairwise(ends)]
         self.heat, self.offset, self.z, self.log_size, self.axis, self.direction = spans[:6]
-        self.kind, self.log_sigma_xy, self.log_sigma_yaw, self.overlap = spans[6:]
+        self.kind, self.log_sigma_xy, self.log_sigma_yaw, self.overlap, self.velocity = spans[6:]
         self.total = ends[-1]
 
 
-WIDTHS = (1, 2, 1, 3, 2, 2, len(LABELS), 1, 1, 1)
+WIDTHS = (1, 2, 1, 3, 2, 2, len(LABELS), 1, 1, 1, 2)
 RAW = Columns()
 
 
@@ -41,6 +43,7 @@ class RawBoxes:
     direction: (N, 2): its product with a unit vector along the axis is the logit that the vehicle faces that way; turning the
     vector by pi turns the sign, so there is no seam. kind: (N, labels) logits.
     log_sigma_xy, log_sigma_yaw: (N,), m and rad. overlap: (N,) logit of the IoU that the box will have.
+    velocity: (N, 2) over the ground along x and y, in SPEED_UNIT.
     """
 
     sites: Sites
@@ -54,20 +57,21 @@ class RawBoxes:
     log_sigma_xy: Tensor
     log_sigma_yaw: Tensor
     overlap: Tensor
+    velocity: Tensor
 
     @classmethod
     def of(cls, columns: Tensor, sites: Sites) -> RawBoxes:
         """From rows (N, RAW.total)."""
-        heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap = columns.split(WIDTHS, 1)
+        heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap, velocity = columns.split(WIDTHS, 1)
         return cls(
             sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind,
-            sigma_xy[:, 0], sigma_yaw[:, 0], overlap[:, 0],
+            sigma_xy[:, 0], sigma_yaw[:, 0], overlap[:, 0], velocity,
         )  # fmt: skip
 
     def columns(self) -> Tensor:
         """(N, RAW.total): all quantities side by side."""
         values = (self.heat, self.offset, self.z, self.log_size, self.axis, self.direction, self.kind)
-        values = (*values, self.log_sigma_xy, self.log_sigma_yaw, self.overlap)
+        values = (*values, self.log_sigma_xy, self.log_sigma_yaw, self.overlap, self.velocity)
         return torch.cat([v[:, None] if v.dim() == 1 else v for v in values], 1)
 
     def bev(self) -> Tensor:
@@ -79,8 +83,7 @@ class RawBoxes:
     def rows(self, mask: Tensor) -> RawBoxes:
         """Some of the sites."""
         sites = Sites(self.sites.key[mask], self.sites.grid, self.sites.batch_size)
-        values = (self.heat, self.offset, self.z, self.log_size, self.axis, self.direction, self.kind)
-        return RawBoxes(sites, *(v[mask] for v in (*values, self.log_sigma_xy, self.log_sigma_yaw, self.overlap)))
+        return RawBoxes.of(self.columns()[mask], sites)
 
 
 def axis_yaw(axis: Tensor) -> Tensor:
@@ -170,4 +173,5 @@ def _boxes(raw: RawBoxes, rows: Tensor, score: Tensor) -> Boxes:
         sigma_xy=raw.log_sigma_xy[rows].exp().detach(),
         sigma_yaw=raw.log_sigma_yaw[rows].exp().detach(),
         flip=torch.minimum(right, 1 - right).detach(),
+        velocity=raw.velocity[rows].detach() * SPEED_UNIT,
     )

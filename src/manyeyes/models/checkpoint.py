@@ -118,6 +118,11 @@ def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config
     return model
 
 
+def read_state(path: Path) -> dict[str, torch.Tensor]:
+    """The tensors of a file of weights by name, as they are stored."""
+    return _read(path)[0]
+
+
 def read_card(path: Path, format: str = FORMAT) -> dict[str, Any]:
     """The model card inside a file of weights."""
     return json.loads(_read(path, format)[1]["card"])

@@ -12,19 +12,21 @@ from torch import Tensor, nn
 from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
 from manyeyes.models.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead
 from manyeyes.models.encoder import EncoderConfig, SparseEncoder
+from manyeyes.models.fusion.flow_aware import FlowAwareFusion
 from manyeyes.models.fusion.gather import Tokens
 from manyeyes.models.fusion.maximum import MaximumFusion
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
 from manyeyes.models.pillars import PillarEncoder, PillarKind
 from manyeyes.models.proposal import propose
 from manyeyes.models.pruning import FocalPrune, Pruned
+from manyeyes.models.selector import Selector
 from manyeyes.models.transformer import AttentionConfig, WindowTransformer
 
 
 @dataclass(frozen=True)
 class DetectorConfig:
     """grid: what an agent sees and tells, and the pillar size. prune_threshold: probability of lying near an object below which
-    a cell is dropped. answers: the range in which its boxes are asked for, where that is less than it sees; None: all of it.
+    a cell is dropped. sweeps: how many an agent looks at together, its last one or two. answers: the range in which its boxes are asked for, where that is less than it sees; None: all of it.
     """
 
     grid: BevGrid
@@ -32,12 +34,13 @@ class DetectorConfig:
     pillar_channels: int = 32
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     dast: AttentionConfig = field(default_factory=AttentionConfig)
-    fusion: Literal["self_attention", "maximum"] = "self_attention"
+    fusion: Literal["flow_aware", "self_attention", "maximum"] = "self_attention"
     fusion_attention: AttentionConfig = field(default_factory=AttentionConfig)
     head_channels: int = 64
     prune_threshold: float = 0.1
     decode: DecodeConfig = field(default_factory=DecodeConfig)
     answers: BevGrid | None = None
+    sweeps: Literal[1, 2] = 1
 
     @property
     def range(self) -> BevGrid:
@@ -47,10 +50,9 @@ class DetectorConfig:
 
 @dataclass(frozen=True)
 class Seen:
-    """What a batch of agents made of their own clouds: tokens to keep or send, their worth (N,), and pruning's decisions."""
+    """What a batch of agents made of their own clouds: tokens to keep or send, and pruning's decisions."""
 
     tokens: SparseBev
-    worth: Tensor
     pruned: tuple[Pruned, ...]
     sites_per_stride: tuple[int, ...]
 
@@ -62,16 +64,13 @@ class Detector(nn.Module):
         super().__init__()
         self.config = config
         self.fingerprint = bytes(8)
-        self.pillars = PillarEncoder(config.grid, config.pillar_channels, config.pillars)
+        self.pillars = PillarEncoder(config.grid, config.pillar_channels, config.pillars, config.sweeps)
         self.encoder = SparseEncoder(config.pillar_channels, config.encoder)
         channels = self.encoder.out_channels
         self.dast = WindowTransformer(channels, config.dast)
         self.token_prune = FocalPrune(channels)
-        self.fusion = (
-            MaximumFusion(channels)
-            if config.fusion == "maximum"
-            else SelfAttentionFusion(channels, config.fusion_attention)
-        )
+        self.selector = Selector(channels)
+        self.fusion = _fusion(channels, config)
         self.head = BoxHead(channels, config.head_channels)
         self.refine = RefineHead(channels, config.head_channels)
 
@@ -80,17 +79,20 @@ class Detector(nn.Module):
         """The lattice of the tokens."""
         return self.config.grid.at(self.config.encoder.head_stride)
 
-    def see(self, clouds: list[PointCloud], prune_threshold: float | None = None) -> Seen:
-        """Clouds in their agents' frames to tokens on a batch of as many grids."""
+    def see(
+        self,
+        clouds: list[PointCloud],
+        earlier: list[PointCloud] | None = None,
+        prune_threshold: float | None = None,
+    ) -> Seen:
+        """Clouds in their agents' frames to tokens on a batch of as many grids. earlier: the sweeps before, in the same frames."""
         threshold = self.config.prune_threshold if prune_threshold is None else prune_threshold
-        encoded = self.encoder(self.pillars(clouds), threshold)
+        encoded = self.encoder(self.pillars(clouds, earlier), threshold)
         tokens = encoded.tokens
         sites = tokens.sites
         tokens = tokens.with_features(self.dast(tokens.features, sites.xy, sites.batch, sites.grid, sites.cache))
         kept, decision = self.token_prune(tokens, threshold)
-        probability = torch.sigmoid(decision.logit.detach())
-        worth = probability if threshold <= 0 else probability[probability > threshold]
-        return Seen(kept, worth, (*encoded.pruned, decision), encoded.sites_per_stride)
+        return Seen(kept, (*encoded.pruned, decision), encoded.sites_per_stride)
 
     def look(self, tokens: SparseBev) -> RawBoxes:
         """What each agent makes of its own tokens, in its own frame."""
@@ -100,7 +102,21 @@ class Detector(nn.Module):
         """What is sent: features (N, C) and, behind them, the proposals of raw, the agent's own view of these tokens."""
         return tokens.with_features(torch.cat((tokens.features, propose(raw)), 1))
 
-    def fuse(self, tokens: Tokens) -> RawBoxes:
-        """Tokens of all agents around each ego, its own among them, to raw boxes in the ego's frame."""
-        fused = self.fusion(tokens)
+    def choose(self, told: SparseBev) -> Tensor:
+        """(N,) logits of how much each token is worth to others; a budget sends the highest."""
+        return self.selector(told)
+
+    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
+        """Tokens of all agents around each ego, its own among them, to raw boxes in the ego's frame.
+
+        past: what the ego itself told at its last instants, moved into its frame of now.
+        """
+        fused = self.fusion(tokens, past)
         return self.refine(fused.bev, fused.given)
+
+
+def _fusion(channels: int, config: DetectorConfig) -> FlowAwareFusion | SelfAttentionFusion | MaximumFusion:
+    if config.fusion == "maximum":
+        return MaximumFusion(channels)
+    kind = FlowAwareFusion if config.fusion == "flow_aware" else SelfAttentionFusion
+    return kind(channels, config.fusion_attention)

@@ -18,64 +18,82 @@ MOMENTS = 12
 
 
 class PointPillars(nn.Module):
-    """Per-point linear layer and maximum over each pillar (PointPillars, Lang et al. 2019, eq. in section 2.1)."""
+    """Per-point linear layer and maximum over each pillar (PointPillars, Lang et al. 2019, eq. in section 2.1).
 
-    def __init__(self, channels: int) -> None:
+    With two sweeps a point's age, in sweeps, is an input more.
+    """
+
+    def __init__(self, channels: int, sweeps: int = 1) -> None:
         super().__init__()
-        self.linear, self.norm = nn.Linear(10, channels, bias=False), ActiveNorm(channels)
+        self.sweeps = sweeps
+        self.linear, self.norm = nn.Linear(9 + sweeps, channels, bias=False), ActiveNorm(channels)
 
-    def forward(self, xyz: Tensor, intensity: Tensor, pillars: Pillars) -> Tensor:
-        """Kept points (P, 3) and (P,) to pillar features (N, channels)."""
+    def forward(self, xyz: Tensor, bright: Tensor, old: Tensor, pillars: Pillars) -> Tensor:
+        """Kept points (P, 3), their intensities (P,) and whether they are of the sweep before (P,) to (N, channels)."""
+        intensity = torch.stack((bright, old.to(bright.dtype)), 1)[:, : self.sweeps]
         sites, row = pillars.sites, pillars.row
         mean = segment_mean(xyz, row, len(sites))
         grid = sites.grid
         centre = torch.cat((sites.xy, sites.xy.new_full((len(sites), 1), (grid.z_min + grid.z_max) / 2)), -1)
         if not self.training and not torch.is_grad_enabled():
             return self._infer(xyz, intensity, row, mean, centre)
-        inputs = torch.cat((xyz, intensity[:, None], xyz - mean[row], xyz - centre[row]), -1)
+        inputs = torch.cat((xyz, intensity[:, :1], xyz - mean[row], xyz - centre[row], intensity[:, 1:]), -1)
         return segment_max(torch.relu(self.norm(self.linear(inputs))), row, len(sites))
 
     def _infer(self, xyz: Tensor, intensity: Tensor, row: Tensor, mean: Tensor, centre: Tensor) -> Tensor:
         """The same numbers with the norm folded in: within a pillar only four of the ten inputs differ from point to point."""
         weight, bias = fold_norm(self.linear.weight, self.norm)
-        place, bright, to_mean, to_centre = weight.split((3, 1, 3, 3), 1)
-        varying = torch.cat((place + to_mean + to_centre, bright), 1)
-        points = torch.cat((xyz, intensity[:, None]), 1)
-        origin = torch.cat((centre, centre.new_zeros(len(centre), 1)), 1)
+        place, bright, to_mean, to_centre, age = weight.split((3, 1, 3, 3, self.sweeps - 1), 1)
+        varying = torch.cat((place + to_mean + to_centre, bright, age), 1)
+        points = torch.cat((xyz, intensity), 1)
+        origin = torch.cat((centre, centre.new_zeros(len(centre), self.sweeps)), 1)
         top = affine_segment_max(points, origin, varying, row)
         return torch.relu_(top + centre @ place.T + (centre - mean) @ to_mean.T + bias)
 
 
 class MomentPillars(nn.Module):
-    """A two-layer perceptron on twelve statistics of each pillar: no gradient through points, so training it costs less."""
+    """A two-layer perceptron on twelve statistics of each pillar: no gradient through points, so training it costs less.
 
-    def __init__(self, channels: int) -> None:
+    With two sweeps there are twelve of each.
+    """
+
+    def __init__(self, channels: int, sweeps: int = 1) -> None:
         super().__init__()
-        self.scale = ActiveNorm(MOMENTS)
+        self.sweeps = sweeps
+        self.scale = ActiveNorm(MOMENTS * sweeps)
         self.layers = nn.Sequential(
-            nn.Linear(MOMENTS, 2 * channels), nn.ReLU(), nn.Linear(2 * channels, channels, bias=False)
+            nn.Linear(MOMENTS * sweeps, 2 * channels), nn.ReLU(), nn.Linear(2 * channels, channels, bias=False)
         )
         self.norm = ActiveNorm(channels)
 
-    def forward(self, xyz: Tensor, intensity: Tensor, pillars: Pillars) -> Tensor:
-        """Kept points (P, 3) and (P,) to pillar features (N, channels)."""
-        moments = pillar_moments(xyz, intensity, pillars.row, pillars.sites)
+    def forward(self, xyz: Tensor, bright: Tensor, old: Tensor, pillars: Pillars) -> Tensor:
+        """Kept points (P, 3), their intensities (P,) and whether they are of the sweep before (P,) to (N, channels)."""
+        sweeps = (~old, old) if self.sweeps == 2 else (slice(None),)
+        moments = torch.cat([pillar_moments(xyz[s], bright[s], pillars.row[s], pillars.sites) for s in sweeps], 1)
         return torch.relu(self.norm(self.layers(self.scale(moments))))
 
 
 class PillarEncoder(nn.Module):
-    """Clouds of a batch of agents to features at stride 1."""
+    """Clouds of a batch of agents, and with two sweeps those before them, to features at stride 1."""
 
-    def __init__(self, grid: BevGrid, channels: int, kind: PillarKind) -> None:
+    def __init__(self, grid: BevGrid, channels: int, kind: PillarKind, sweeps: int = 1) -> None:
         super().__init__()
-        self.grid = grid.at(1)
-        self.net = PointPillars(channels) if kind == "points" else MomentPillars(channels)
+        self.grid, self.sweeps = grid.at(1), sweeps
+        self.net = PointPillars(channels, sweeps) if kind == "points" else MomentPillars(channels, sweeps)
 
-    def forward(self, clouds: list[PointCloud]) -> SparseBev:
-        """One cloud an agent, each in that agent's frame, to (N, channels) on a batch of as many grids."""
-        cloud = PointCloud.cat(clouds)
-        batch = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor([len(c) for c in clouds]))
+    def forward(self, clouds: list[PointCloud], earlier: list[PointCloud] | None = None) -> SparseBev:
+        """One cloud an agent, each in that agent's frame, to (N, channels) on a batch of as many grids.
+
+        earlier: the sweep before each, moved into the same frame; left out where the net looks at one sweep only.
+        """
+        before = earlier if earlier is not None and self.sweeps == 2 else []
+        many = [*clouds, *before]
+        cloud, lengths = PointCloud.cat(many), torch.tensor([len(c) for c in many])
+        agents = torch.arange(len(clouds))
+        batch = torch.repeat_interleave(torch.cat((agents, agents[: len(before)])), lengths)
+        old = torch.arange(len(cloud)) >= int(lengths[: len(clouds)].sum())
         pillars = pillar_sites(cloud.xyz, batch, self.grid, len(clouds))
         kept = pillars.inside.nonzero()[:, 0]
-        features = self.net(cloud.xyz.index_select(0, kept), cloud.intensity.index_select(0, kept), pillars)
+        xyz, bright = cloud.xyz.index_select(0, kept), cloud.intensity.index_select(0, kept)
+        features = self.net(xyz, bright, old.index_select(0, kept), pillars)
         return SparseBev(features, pillars.sites)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from manyeyes.models.box_head import RAW, RawBoxes
+from manyeyes.models.box_head import RAW, SPEED_UNIT, RawBoxes
 
 PROPOSAL = RAW.total
 """Columns of a proposal: those of RawBoxes, in its order."""
@@ -32,6 +32,11 @@ def proposed_heat(proposal: Tensor) -> Tensor:
     return proposal[:, RAW.heat][:, 0]
 
 
+def proposed_velocity(proposal: Tensor) -> Tensor:
+    """(N, 2): of the object, metres per second."""
+    return proposal[:, RAW.velocity] * SPEED_UNIT
+
+
 def reset_origin(proposal: Tensor, shift: Tensor) -> Tensor:
     """The same boxes, measured from places that lie (N, 2) cells before the tokens' own."""
     moved = proposal.clone()
@@ -49,4 +54,5 @@ def move_proposal(proposal: Tensor, yaw: Tensor, height: Tensor) -> Tensor:
     moved[:, RAW.z] += height[:, None]
     moved[:, RAW.axis] = proposal[:, RAW.axis] @ twice
     moved[:, RAW.direction] = proposal[:, RAW.direction] @ once
+    moved[:, RAW.velocity] = proposal[:, RAW.velocity] @ once
     return moved

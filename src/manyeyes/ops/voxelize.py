@@ -177,16 +177,21 @@ def _share_among_ties(
 
 @torch.no_grad()
 def pillar_moments(xyz: Tensor, intensity: Tensor, row: Tensor, sites: Sites) -> Tensor:
-    """(N, 12) statistics of the points (P, 3) in each pillar, in the order of ``MOMENTS``; offsets from its centre."""
-    n, count = len(sites), torch.bincount(row, minlength=len(sites)).to(xyz.dtype)[:, None]
+    """(N, 12) statistics of the points (P, 3) in each pillar, in the order of ``MOMENTS``; offsets from its centre.
+
+    A pillar without points has zeros.
+    """
+    n, points = len(sites), torch.bincount(row, minlength=len(sites)).to(xyz.dtype)[:, None]
+    count = points.clamp_min(1)
     local = torch.cat((xyz[:, :2] - sites.xy.to(xyz.dtype)[row], xyz[:, 2:], intensity[:, None]), 1)
     mean = segment_sum(local, row, n) / count
     off = local[:, :3] - mean[row, :3]
     square = segment_sum(torch.cat((off * off, off[:, :1] * off[:, 1:2]), 1), row, n) / count
-    top = segment_max(torch.cat((-local[:, 2:3], local[:, 2:]), 1), row, n)
+    top = segment_max(torch.cat((-local[:, 2:3], local[:, 2:]), 1), row, n) if len(xyz) else local.new_zeros(n, 3)
+    top = torch.where(points > 0, top, 0)
     std = square[:, :3].sqrt()
     columns = (
-        count.log1p(),
+        points.log1p(),
         mean[:, :3],
         -top[:, :1],
         top[:, 1:2],

@@ -22,7 +22,7 @@ from manyeyes.models import checkpoint
 from manyeyes.models.checkpoint import config_to_json
 from manyeyes.models.detector import Detector, DetectorConfig
 from manyeyes.training.losses import LossConfig, LossTerms
-from manyeyes.training.samples import AugmentConfig, SampleStream, epoch_length
+from manyeyes.training.samples import AugmentConfig, RoadConfig, SampleStream, epoch_length
 from manyeyes.training.step import loss_terms
 from manyeyes.training.targets import TargetConfig
 
@@ -48,6 +48,7 @@ class TrainConfig:
     prune_full: float = 0.10
     save_every: int = 200
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    road: RoadConfig = field(default_factory=RoadConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)
     loss: LossConfig = field(default_factory=LossConfig)
 
@@ -87,7 +88,7 @@ class Run:
         if config.batch % self.world:
             raise ConfigError(f"A batch of {config.batch} samples cannot be shared by {self.world} processes evenly.")
         self.steps = config.steps or math.ceil(config.epochs * epoch_length(recording) / config.batch)
-        self.stream = SampleStream(recording, config.detector.grid, config.augment, seed)
+        self.stream = SampleStream(recording, config.detector.grid, config.augment, seed, config.road)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.model = Detector(config.detector)
@@ -115,7 +116,8 @@ class Run:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.optimiser.zero_grad(set_to_none=True)
-        terms = loss_terms(self.model, samples, config.targets, prune_threshold(config, self.step, self.steps))
+        threshold = prune_threshold(config, self.step, self.steps)
+        terms = loss_terms(self.model, samples, config.targets, threshold, config.loss.together)
         loss = terms.total(config.loss)
         if not bool(torch.isfinite(loss)):
             raise ConfigError(
@@ -224,13 +226,25 @@ def train(
 
 
 def _load_weights(model: Detector, start: Path) -> None:
-    state, own = checkpoint.load(start).state_dict(), model.state_dict()
-    odd = sorted(k for k in own if k not in state or state[k].shape != own[k].shape)
+    """Begin from a file. Where the model has grown, by a part or by rows and columns at their ends, what is new starts as if
+    it were not there: a new part as it is built, new rows and columns of a matrix at zero."""
+    state, own = checkpoint.read_state(start), model.state_dict()
+    begun = {name: _grown(value, state[name]) for name, value in own.items() if name in state}
+    odd = sorted([*(name for name, value in begun.items() if value is None), *(set(state) - set(own))])
     if odd:
         raise CheckpointError(
-            f"{start}: cannot start this preset, tensor {odd[0]} differs in shape; start from weights of its own kind."
+            f"{start}: cannot start this preset, tensor {odd[0]} does not fit; start from weights of its own kind."
         )
-    model.load_state_dict(state)
+    model.load_state_dict(begun, strict=False)
+
+
+def _grown(new: Tensor, old: Tensor) -> Tensor | None:
+    """The old values at the start of the new tensor, None where they do not fit into it."""
+    if new.dim() != old.dim() or any(n < o for n, o in zip(new.shape, old.shape)):
+        return None
+    grown = torch.zeros_like(new) if new.dim() > 1 else new.clone()
+    grown[tuple(slice(0, o) for o in old.shape)] = old.to(new.dtype)
+    return grown
 
 
 def _log_line(progress: Progress) -> dict[str, float]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from manyeyes.models.box_head import TYPICAL_SIZE, RawBoxes, axis_yaw, facing
+from manyeyes.models.box_head import SPEED_UNIT, TYPICAL_SIZE, RawBoxes, axis_yaw, facing
 from manyeyes.models.pruning import Pruned
 from manyeyes.ops.box_iou import aligned_iou
 from manyeyes.training.targets import Targets
@@ -17,7 +17,11 @@ from manyeyes.training.targets import Targets
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the terms. iou: of 1 - IoU itself, for boxes that nearly fit already; off at the start, where none do."""
+    """Weights of the terms. iou: of 1 - IoU itself, for boxes that nearly fit already; off at the start, where none do.
+
+    kept, information: of the selector's L1 and InfoNCE (CoSTr Eq. 12). together: the share of what egos make of all that they
+    hear, the rest is what agents make of their own view.
+    """
 
     heat: float = 1.0
     shape: float = 0.5
@@ -26,7 +30,11 @@ class LossConfig:
     sigma: float = 0.05
     overlap: float = 0.3
     iou: float = 0.0
+    velocity: float = 1.0
     prune: float = 0.2
+    kept: float = 0.02
+    information: float = 0.01
+    together: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -40,11 +48,15 @@ class LossTerms:
     sigma: Tensor
     overlap: Tensor
     iou: Tensor
+    velocity: Tensor
     prune: Tensor
+    kept: Tensor
+    information: Tensor
 
-    def mean(self, other: LossTerms) -> LossTerms:
-        """Half of each."""
-        return LossTerms(*((getattr(self, f.name) + getattr(other, f.name)) / 2 for f in fields(self)))
+    def mixed(self, other: LossTerms, share: float) -> LossTerms:
+        """So much of the other, the rest of this."""
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return LossTerms(*((1 - share) * mine + share * theirs for mine, theirs in pairs))
 
     def total(self, config: LossConfig) -> Tensor:
         """The weighted sum."""
@@ -69,13 +81,13 @@ def prune_focal(pruned: Pruned, near: Tensor, alpha: float = 0.25, gamma: float 
     return (share * (1 - right) ** gamma * entropy).sum() / near.sum().clamp_min(1)
 
 
-def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor) -> LossTerms:
+def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, kept: Tensor, information: Tensor) -> LossTerms:
     """All terms of one batch; every one is finite and zero where there is nothing to learn from."""
     heat = centre_focal(raw.heat, targets.heat, targets.positive)
     rows = (targets.box >= 0).nonzero()[:, 0]
     if not len(rows):
         zero = raw.heat.sum() * 0
-        return LossTerms(heat, zero, zero, zero, zero, zero, zero, prune)
+        return LossTerms(heat, *(zero,) * 7, prune, kept, information)
     some, truth, weight = (
         raw.rows(targets.box >= 0),
         targets.boxes[targets.box[rows]].to(torch.float32),
@@ -103,7 +115,9 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor) -> LossTerms:
     overlap = functional.binary_cross_entropy_with_logits(
         some.overlap, iou.detach().clamp(0, 1).float(), reduction="none"
     )
-    return LossTerms(heat, mean(shape), mean(direction), mean(kind), mean(sigma), mean(overlap), mean(1 - iou), prune)
+    speed = (some.velocity - truth.velocity / SPEED_UNIT).abs().sum(1)
+    rest = (mean(sigma), mean(overlap), mean(1 - iou), mean(speed), prune, kept, information)
+    return LossTerms(heat, mean(shape), mean(direction), mean(kind), *rest)
 
 
 def _gaussian_nll(error: Tensor, log_sigma: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from manyeyes.models.presets import COSTR_OPV2V, COSTR_SMALL, COSTR_TINY, SMALL_AROUND, SMALL_GRID
 from manyeyes.training.loop import TrainConfig
 from manyeyes.training.losses import LossConfig
-from manyeyes.training.samples import AugmentConfig
+from manyeyes.training.samples import AugmentConfig, RoadConfig
 
 TRAINING_PRESETS: dict[str, TrainConfig] = {
     "costr-small": TrainConfig(
@@ -32,6 +32,19 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
         prune_full=0.001,
         augment=AugmentConfig(max_agents=99),
         loss=LossConfig(iou=0.5),
+    ),
+    "costr-small-3": TrainConfig(
+        replace(COSTR_SMALL, grid=SMALL_AROUND, answers=SMALL_GRID, prune_threshold=0.08),
+        steps=5200,
+        batch=4,
+        learning_rate=1e-3,
+        warm_up=100,
+        save_every=100,
+        prune_from=0.0,
+        prune_full=0.02,
+        augment=AugmentConfig(thin=0.1),
+        road=RoadConfig(past=2, late_share=0.4, astray_share=0.5, lost_share=0.25, few_share=0.4),
+        loss=LossConfig(iou=0.5, together=0.6),
     ),
     "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
     "costr-tiny": TrainConfig(

@@ -3,26 +3,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
-from manyeyes.datatypes import Boxes
+from manyeyes.datatypes import Boxes, SparseBev
 from manyeyes.models.box_head import RawBoxes
 from manyeyes.models.detector import Detector, Seen
-from manyeyes.models.fusion.gather import gather
+from manyeyes.models.fusion.gather import Part, Tokens, gather
+from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.training.information import information_terms
 from manyeyes.training.losses import LossTerms, head_terms, prune_focal
-from manyeyes.training.samples import Sample
+from manyeyes.training.samples import Sample, View
 from manyeyes.training.targets import TargetConfig, assign, near_objects
+
+PACKET_TOKENS = 8
+"""How many tokens are lost together: what a packet of 1,398 bytes holds of float16 features, about."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one batch of samples gave: every agent's own view (alone), and every ego's with all it hears (together)."""
+    """What one batch of samples gave: every agent's own view (alone), and every ego's with all it hears (together).
+
+    told: what each view tells, on a batch of grids. mask: (N,) in (0, 1), how much of it the selector would keep.
+    """
 
     seen: Seen
     alone: RawBoxes
     together: RawBoxes
+    told: SparseBev
+    mask: Tensor
 
 
 def forward(model: Detector, samples: list[Sample], prune_threshold: float | None = None) -> Outcome:
@@ -30,26 +41,82 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
 
     The tokens take the very path that they take as bytes: seen in the sender's frame, moved metrically, fused, decoded.
     """
-    seen = model.see([cloud for sample in samples for cloud in sample.clouds], prune_threshold)
+    views = [view for sample in samples for view in sample.views]
+    seen = model.see([v.now for v in views], [v.earlier for v in views], prune_threshold)
     alone = model.look(seen.tokens)
-    told, sites = model.tell(seen.tokens, alone), seen.tokens.sites
-    parts, agent = [], 0
-    batch, xy = sites.batch, sites.xy
+    told = model.tell(seen.tokens, alone)
+    score = model.choose(told)
+    mask = torch.sigmoid(score)
+    parts, number = [], 0
+    batch, xy = told.sites.batch, told.sites.xy
     for ego, sample in enumerate(samples):
-        for i, motion in enumerate(sample.ego_from_agent):
-            rows = batch == agent
-            parts.append((ego, told.features[rows], xy[rows], motion if i else None))
-            agent += 1
-    return Outcome(seen, alone, model.fuse(gather(parts, told.grid, len(samples))))
+        for i, view in enumerate(sample.views):
+            rows = (batch == number).nonzero()[:, 0]
+            part = _part(ego, view, told.features, xy)
+            if not i:
+                part = replace(part, ego_from_sender=None, told=told.features[rows], xy=xy[rows])
+            else:
+                rows = _arriving(rows, score.detach(), view, (*sample.key, i))
+                kept = None if view.keep is None else 1 + mask[rows] - mask[rows].detach()
+                part = replace(part, told=told.features[rows], xy=xy[rows], kept=kept)
+            parts.append(part)
+            number += 1
+    past = _remembered(model, samples, prune_threshold)
+    return Outcome(seen, alone, model.fuse(gather(parts, told.grid, len(samples)), past), told, mask)
+
+
+def _part(ego: int, view: View, told: Tensor, xy: Tensor) -> Part:
+    return Part(ego, told, xy, view.ego_from_view, view.age_s, view.doubt_xy_m, view.doubt_yaw_rad)
+
+
+def _arriving(rows: Tensor, score: Tensor, view: View, key: tuple[int | str, ...]) -> Tensor:
+    """The rows of a view's tokens that a budget sends and the air does not lose, packet by packet."""
+    if view.keep is None and not view.lost:
+        return rows
+    rng = keyed_generator("arriving", *key)
+    if view.keep is not None:
+        # Near ties are drawn by chance, so that what is just left out is tried too.
+        noise = torch.from_numpy(rng.gumbel(size=len(rows))).float()
+        order = (score[rows] + 0.5 * noise).sort(descending=True, stable=True).indices
+        rows = rows[order[: view.keep]]
+    packet = torch.arange(len(rows)) // PACKET_TOKENS
+    luck = torch.from_numpy(rng.random(int(packet[-1]) + 1 if len(rows) else 0))
+    return rows[luck[packet] >= view.lost].sort().values
+
+
+@torch.no_grad()
+def _remembered(model: Detector, samples: list[Sample], prune_threshold: float | None) -> Tokens | None:
+    """What every ego told at its last instants, as its memory holds it: no gradient reaches the past."""
+    views = [(ego, view) for ego, sample in enumerate(samples) for view in sample.past]
+    if not views:
+        return None
+    seen = model.see([v.now for _, v in views], [v.earlier for _, v in views], prune_threshold)
+    told = model.tell(seen.tokens, model.look(seen.tokens))
+    batch, xy = told.sites.batch, told.sites.xy
+    parts = []
+    for number, (ego, view) in enumerate(views):
+        rows = batch == number
+        parts.append(_part(ego, view, told.features[rows], xy[rows]))
+    return gather(parts, told.grid, len(samples))
 
 
 def loss_terms(
-    model: Detector, samples: list[Sample], targets: TargetConfig, prune_threshold: float | None = None
+    model: Detector,
+    samples: list[Sample],
+    targets: TargetConfig,
+    prune_threshold: float | None = None,
+    together: float = 0.5,
 ) -> LossTerms:
-    """Losses of one batch: egos against the union of what their agents list, each agent against its own list; halves each."""
+    """Losses of one batch: egos against the union of what their agents list, each agent against its own list.
+
+    together: the share of the former.
+    """
     out = forward(model, samples, prune_threshold)
-    listed: list[Boxes] = [boxes for sample in samples for boxes in sample.seen]
+    listed: list[Boxes] = [view.seen for sample in samples for view in sample.views]
     union = [sample.union for sample in samples]
     prune = torch.stack([prune_focal(p, near_objects(p.sites, listed, targets)) for p in out.seen.pruned]).mean()
-    alone = head_terms(out.alone, assign(out.alone.sites, listed, targets), prune)
-    return alone.mean(head_terms(out.together, assign(out.together.sites, union, targets), prune))
+    own = assign(out.alone.sites, listed, targets)
+    kept, information = information_terms(out.told, out.mask, own.heat)
+    alone = head_terms(out.alone, own, prune, kept, information)
+    fused = head_terms(out.together, assign(out.together.sites, union, targets), prune, kept, information)
+    return alone.mixed(fused, together)

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from manyeyes.agents.collaboration.alone import Alone
 from manyeyes.agents.collaboration.early import Early
-from manyeyes.agents.collaboration.intermediate import Intermediate
+from manyeyes.agents.collaboration.intermediate import Intermediate, at_random, confidence
 from manyeyes.agents.collaboration.late import Late
 from manyeyes.agents.eyes import Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message
@@ -33,7 +33,17 @@ class Collaboration(Protocol):
         ...
 
 
-METHODS: dict[str, Collaboration] = {m.name: m for m in (Alone(), Late(), Intermediate(), Early())}
+METHODS: dict[str, Collaboration] = {
+    m.name: m
+    for m in (
+        Alone(),
+        Late(),
+        Intermediate(),
+        Intermediate("confidence", confidence),
+        Intermediate("random", at_random),
+        Early(),
+    )
+}
 
 
 def method(name: str) -> Collaboration:

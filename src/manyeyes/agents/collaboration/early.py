@@ -13,7 +13,7 @@ from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud
 
 @dataclass(frozen=True)
 class Early:
-    """All points of every agent, quantised by the wire to a centimetre."""
+    """The points of every agent's last two sweeps, quantised by the wire to a centimetre."""
 
     name: str = "early"
 
@@ -22,6 +22,7 @@ class Early:
         return replace(header(frame, eyes.detector.fingerprint), points=frame.points)
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes of the merged cloud."""
+        """Boxes of the merged cloud and of the one merged before it."""
         heard = [m.points.transform(ego_from_sender(frame, m)) for m in messages if m.points is not None]
-        return eyes.see_cloud(PointCloud.cat([frame.points, *heard])).boxes
+        merged = PointCloud.cat([frame.points, *heard])
+        return eyes.see_cloud(merged, eyes.earlier_merged(frame, merged)).boxes

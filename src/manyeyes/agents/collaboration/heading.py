@@ -21,3 +21,8 @@ def header(frame: AgentFrame, fingerprint: bytes) -> Message:
 def ego_from_sender(frame: AgentFrame, message: Message) -> Transform:
     """From the sender's frame when it looked to the ego's now, by the claimed poses of both."""
     return frame.world_from_agent.inverse() @ message.world_from_agent
+
+
+def age_s(frame: AgentFrame, message: Message) -> float:
+    """How long before the ego's frame the sender looked, seconds."""
+    return (frame.timestamp_ns - message.timestamp_ns) / 1e9

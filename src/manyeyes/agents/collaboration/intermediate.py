@@ -3,34 +3,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
-from manyeyes.agents.collaboration.heading import ego_from_sender, header
-from manyeyes.agents.eyes import Eyes
-from manyeyes.datatypes import AgentFrame, Boxes, Message, Transform
-from manyeyes.models.fusion.gather import gather
+from manyeyes.agents.collaboration.heading import age_s, ego_from_sender, header
+from manyeyes.agents.eyes import Eyes, Sight
+from manyeyes.datatypes import AgentFrame, Boxes, Message
+from manyeyes.models.fusion.gather import Part, gather
+from manyeyes.models.proposal import PROPOSAL, proposed_heat
+from manyeyes.ops.keyed_random import keyed_uniform
+
+
+def learned(sight: Sight, frame: AgentFrame) -> Tensor:
+    """What the trained selector says (CoSTr section III-E)."""
+    return sight.worth
+
+
+def confidence(sight: Sight, frame: AgentFrame) -> Tensor:
+    """How sure the sender is that the token is the middle of an object: the rule of Where2comm, on tokens."""
+    return torch.sigmoid(proposed_heat(sight.told.features[:, -PROPOSAL:]))
+
+
+def at_random(sight: Sight, frame: AgentFrame) -> Tensor:
+    """A uniform draw for every token, keyed by sender and time."""
+    return keyed_uniform((len(sight.worth),), 0, "selection", frame.agent_id, frame.timestamp_ns).float()
 
 
 @dataclass(frozen=True)
 class Intermediate:
-    """Tokens of the weights that the ego carries itself; the inbox refuses others."""
+    """Tokens of the weights that the ego carries itself; the inbox refuses others. score: which of them a budget keeps first."""
 
     name: str = "intermediate"
+    score: Callable[[Sight, AgentFrame], Tensor] = learned
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
         """The tokens that pruning kept with what the agent makes of them, and their worth, by which a budget chooses."""
-        seen = eyes.see(frame)
-        return replace(header(frame, eyes.detector.fingerprint), tokens=seen.told, token_score=seen.worth)
+        sight = eyes.see(frame)
+        return replace(
+            header(frame, eyes.detector.fingerprint), tokens=sight.told, token_score=self.score(sight, frame)
+        )
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes of the fused tokens."""
+        """Boxes of the fused tokens, with the agent's own last two instants to look back at."""
         own = eyes.see(frame).told
-        parts: list[tuple[int, Tensor, Tensor, Transform | None]] = [(0, own.features, own.sites.xy, None)]
+        parts = [Part(0, own.features, own.sites.xy)]
         for message in messages:
             if message.tokens is not None and message.tokens.grid == own.grid:
-                there = message.tokens
-                parts.append((0, there.features, there.sites.xy, ego_from_sender(frame, message)))
-        return eyes.decode(eyes.fuse(gather(parts, own.grid, 1)))
+                parts.append(_part(frame, message, message.tokens.features, message.tokens.sites.xy))
+        past = eyes.past(frame)
+        return eyes.decode(eyes.fuse(gather(parts, own.grid, 1), gather(past, own.grid, 1) if past else None))
+
+
+def _part(frame: AgentFrame, message: Message, told: Tensor, xy: Tensor) -> Part:
+    """Both claims may be wrong: their variances add up."""
+    doubt = (frame.pose_covariance + message.pose_covariance).diagonal()
+    across = float((doubt[:2].mean()).clamp_min(0).sqrt())
+    turn = float(doubt[2].clamp_min(0).sqrt())
+    return Part(0, told, xy, ego_from_sender(frame, message), age_s(frame, message), across, turn)

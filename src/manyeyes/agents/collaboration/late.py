@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from manyeyes.agents.collaboration.heading import ego_from_sender, header
+from manyeyes.agents.collaboration.heading import age_s, ego_from_sender, header
 from manyeyes.agents.eyes import Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 from manyeyes.ops.nms import rotated_nms
@@ -14,21 +14,21 @@ from manyeyes.ops.nms import rotated_nms
 
 @dataclass(frozen=True)
 class Late:
-    """nms_iou: boxes of several agents that overlap more are one object; say_above: the lowest score worth its 13 bytes."""
+    """nms_iou: boxes of several agents that overlap more are one object; say_above: the lowest score worth its bytes."""
 
     name: str = "late"
     nms_iou: float = 0.15
     say_above: float = 0.05
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
-        """The boxes of the agent's own cloud."""
+        """The boxes of the agent's own sweeps."""
         found = eyes.see(frame).boxes
         return replace(header(frame, eyes.detector.fingerprint), objects=found[found.score > self.say_above])
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """All boxes in the ego's frame, after suppression by score."""
+        """All boxes in the ego's frame, each where its velocity has taken it by now, after suppression by score."""
         heard = [
-            m.objects.transform(ego_from_sender(frame, m)).to(frame.points.xyz.dtype)
+            m.objects.after(age_s(frame, m)).transform(ego_from_sender(frame, m)).to(frame.points.xyz.dtype)
             for m in messages
             if m.objects is not None
         ]

@@ -3,30 +3,11 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
-from manyeyes.models.fusion.gather import CUES, Tokens
-from manyeyes.models.fusion.settle import WORD_SCALE, Fused, Settle, settle
-from manyeyes.models.proposal import PROPOSAL
-
-
-class Placement(nn.Module):
-    """Tells a feature where it landed: its place in its cell, height and turn of its sender, and what the sender proposed.
-
-    Ends in zeros, so that fusion starts as if without.
-    """
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.inner = nn.Linear(CUES + 2 + PROPOSAL, 2 * channels)
-        self.outer = nn.Linear(2 * channels, channels, bias=False)
-        nn.init.zeros_(self.outer.weight)
-
-    def forward(self, features: Tensor, tokens: Tokens, place: Tensor) -> Tensor:
-        """(N, C) to (N, C); place (N, 2) from the cell's centre, in cells."""
-        words = torch.cat((tokens.cue, place, tokens.proposal * WORD_SCALE), 1)
-        return features + self.outer(torch.relu(self.inner(words)))
+from manyeyes.models.fusion.gather import Tokens
+from manyeyes.models.fusion.placement import Placement
+from manyeyes.models.fusion.settle import Fused, Settle, settle
 
 
 class MaximumFusion(nn.Module):
@@ -36,7 +17,7 @@ class MaximumFusion(nn.Module):
         super().__init__()
         self.placement, self.settle = Placement(channels), Settle(channels, "max")
 
-    def forward(self, tokens: Tokens) -> Fused:
-        """Tokens of all agents to one feature and one box a cell."""
+    def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+        """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
         key, place = settle(tokens)
         return self.settle(self.placement(tokens.features, tokens, place), tokens, key, place)

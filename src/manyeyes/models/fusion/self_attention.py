@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-attention over the tokens of all agents in windows of the ego's frame (CoSTr section III-D, without history)."""
+"""Self-attention over the tokens of all agents in windows of the ego's frame: DAST in FAST's place (CoSTr Table III)."""
 
 from __future__ import annotations
 
 from torch import nn
 
 from manyeyes.models.fusion.gather import Tokens
-from manyeyes.models.fusion.maximum import Placement
+from manyeyes.models.fusion.placement import Placement
 from manyeyes.models.fusion.settle import Fused, Settle, settle
 from manyeyes.models.transformer import AttentionConfig, WindowTransformer
 
@@ -19,8 +19,8 @@ class SelfAttentionFusion(nn.Module):
         self.placement, self.transformer = Placement(channels), WindowTransformer(channels, config)
         self.settle = Settle(channels, "trust")
 
-    def forward(self, tokens: Tokens) -> Fused:
-        """Tokens of all agents to one feature and one box a cell."""
+    def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+        """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
         key, place = settle(tokens)
         placed = self.placement(tokens.features, tokens, place)
         attended = self.transformer(placed, tokens.xy, tokens.ego, tokens.grid)

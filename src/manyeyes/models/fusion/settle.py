@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from manyeyes.datatypes import Sites, SparseBev
+from manyeyes.datatypes import BevGrid, Sites, SparseBev
 from manyeyes.models.box_head import RAW
 from manyeyes.models.fusion.gather import Tokens
 from manyeyes.models.proposal import PROPOSAL, proposed_heat, proposed_offset, reset_origin
@@ -18,6 +18,8 @@ from manyeyes.ops.voxelize import segment_max, segment_sum
 
 VOTING_HEAT = -3.0
 """Logit from which a token is taken at its word and settles where it says that its object is; others stay where they are."""
+DRIFT_MPS = 1.0
+"""How fast a remembered or delayed box is taken to become uncertain: what is left of a velocity's error."""
 REACH_CELLS = 2.0
 """A proposal that points farther, in cells, is not followed: at stride 4 heads learn centres up to 1.5 cells away."""
 
@@ -32,21 +34,30 @@ class Fused:
 
 def settle(tokens: Tokens) -> tuple[Tensor, Tensor]:
     """Key (N,) of the cell where each token comes to rest, and the token's own place (N, 2) from that cell's centre, in cells."""
-    offset = proposed_offset(tokens.proposal)
-    votes = (proposed_heat(tokens.proposal) > VOTING_HEAT) & (offset.abs().amax(1) <= REACH_CELLS)
-    goal = tokens.xy + offset * votes[:, None] * tokens.grid.cell
-    goal = torch.where(tokens.grid.inside(goal)[:, None], goal, tokens.xy)
+    key = resting_keys(tokens.xy, tokens.proposal, tokens.ego, tokens.grid)
     rows, columns = tokens.grid.shape
-    yx = tokens.grid.cells(goal)
-    key = (tokens.ego * rows + yx[:, 0]) * columns + yx[:, 1]
+    within = key.remainder(rows * columns)
+    yx = torch.stack((within.div(columns, rounding_mode="floor"), within.remainder(columns)), -1)
     return key, (tokens.xy - tokens.grid.centers(yx)) / tokens.grid.cell
+
+
+def resting_keys(xy: Tensor, proposal: Tensor, grid_of: Tensor, grid: BevGrid) -> Tensor:
+    """(N,) int64, ``(grid_of * rows + row) * columns + column`` of the cell where tokens at xy (N, 2) come to rest."""
+    offset = proposed_offset(proposal)
+    votes = (proposed_heat(proposal) > VOTING_HEAT) & (offset.abs().amax(1) <= REACH_CELLS)
+    goal = xy + offset * votes[:, None] * grid.cell
+    goal = torch.where(grid.inside(goal)[:, None], goal, xy)
+    rows, columns = grid.shape
+    yx = grid.cells(goal)
+    return (grid_of * rows + yx[:, 0]) * columns + yx[:, 1]
 
 
 class Settle(nn.Module):
     """Tokens of a cell become one: a mean by trust, or the maximum, of features; a mean by trust of their boxes.
 
     Trust is a softmax within the cell of what the tokens propose (heat, own word on overlap and error) and of their features;
-    it starts as heat plus overlap less log sigma, so that the first guess is a box averaged by what its senders claim. How many
+    it starts as heat plus overlap less log sigma, so that the first guess is a box averaged by what its senders claim; sigma
+    holds the doubt of the sender's place and what its box may have moved by since, beside the error of the box itself. How many
     tokens met, how sure they are together and how far apart their boxes lie is told to the feature: no mean could.
     """
 
@@ -54,7 +65,7 @@ class Settle(nn.Module):
         super().__init__()
         self.reduce = reduce
         self.word, self.inner_trust = nn.Linear(3, 1, bias=False), nn.Linear(channels, 1, bias=False)
-        self.inner = nn.Linear(PROPOSAL + 4, 2 * channels)
+        self.inner = nn.Linear(RAW.velocity.start + 4, 2 * channels)
         self.outer = nn.Linear(2 * channels, channels, bias=False)
         with torch.no_grad():
             self.word.weight.copy_(torch.tensor([[1.0, 1.0, -1.0]]))
@@ -66,15 +77,18 @@ class Settle(nn.Module):
         found, row = distinct(key, tokens.batch_size * rows * columns)
         n = found.shape[0]
         boxes = reset_origin(tokens.proposal, place)
-        words = torch.cat([boxes[:, c] for c in (RAW.heat, RAW.overlap, RAW.log_sigma_xy)], 1)
-        trust = (self.word(words) + self.inner_trust(features))[:, 0]
+        moved = DRIFT_MPS * 0.1 * tokens.age
+        blur = (boxes[:, RAW.log_sigma_xy].clamp(-5, 3).exp() ** 2 + (tokens.doubt**2 + moved**2)[:, None]).log() / 2
+        words = torch.cat((boxes[:, RAW.heat], boxes[:, RAW.overlap], blur), 1)
+        trust = (self.word(words) + self.inner_trust(features))[:, 0] + tokens.kept.log()
         share = _softmax(trust, row, n)[:, None]
         given = segment_sum(share * boxes, row, n)
         sure = torch.sigmoid(boxes[:, RAW.heat])
         away = (boxes[:, RAW.offset] - given[row][:, RAW.offset]) ** 2
         met = segment_sum(torch.cat((torch.ones_like(sure), sure), 1), row, n).log1p()
         apart = segment_sum(share * away, row, n).clamp_max(1)
-        told = torch.cat((given * WORD_SCALE, met, apart), 1)
+        told = torch.cat(((given * WORD_SCALE)[:, : RAW.velocity.start], met, apart), 1)
+        features = features * tokens.kept[:, None]
         merged = segment_max(features, row, n) if self.reduce == "max" else segment_sum(share * features, row, n)
         merged = merged + self.outer(torch.relu(self.inner(told)))
         return Fused(SparseBev(merged, Sites(found, tokens.grid, tokens.batch_size)), given)

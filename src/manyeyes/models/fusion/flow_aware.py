@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FAST: self-attention over the tokens of all agents, cross-attention to the ego's own past, merge (CoSTr section III-D)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from manyeyes.models.fusion.gather import Tokens
+from manyeyes.models.fusion.placement import Placement
+from manyeyes.models.fusion.settle import Fused, Settle, settle
+from manyeyes.models.transformer import AttentionConfig, WindowTransformer
+from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
+
+
+class PastAttention(nn.Module):
+    """Pre-norm attention of tokens to the past in their window, and a feed-forward net; both residual, both zero at the start.
+
+    A token whose window holds nothing of the past stays exactly as it is: no softmax is taken over an empty set.
+    """
+
+    def __init__(self, channels: int, config: AttentionConfig) -> None:
+        super().__init__()
+        self.heads, self.window = config.heads, config.window
+        self.norm, self.norm_past, self.norm_ffn = (nn.LayerNorm(channels) for _ in range(3))
+        self.query, self.key, self.value = (nn.Linear(channels, channels) for _ in range(3))
+        self.out = nn.Linear(channels, channels, bias=False)
+        hidden = channels * config.expansion
+        self.ffn = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels))
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.ffn[2].weight)
+        nn.init.zeros_(self.ffn[2].bias)
+
+    def forward(self, features: Tensor, tokens: Tokens, remembered: Tensor, past: Tokens) -> Tensor:
+        """features (N, C) of tokens and remembered (M, C) of the past, placed and timed, to (N, C)."""
+        edge, cell = self.window * tokens.grid.cell, tokens.grid.cell
+        origin = (tokens.grid.x_min, tokens.grid.y_min)
+        plan = plan_windows(*(window_ids(t.xy, t.ego, origin, edge) for t in (tokens, past)))
+        asked = (plan.query_place < plan.query_slot.shape[0]).nonzero()[:, 0]
+        if not len(asked):
+            return features
+        normed, known = self.norm(features), self.norm_past(remembered)
+        here, there = (
+            sincos_encoding(window_offsets(t.xy, origin, edge, cell), features.shape[1]) for t in (tokens, past)
+        )
+
+        def split(x: Tensor) -> Tensor:
+            return x.view(x.shape[0], self.heads, x.shape[1] // self.heads)
+
+        heads = split(self.query(normed + here)), split(self.key(known + there)), split(self.value(known))
+        some = (features + self.out(window_attention(*heads, plan).flatten(1)))[asked]
+        return features.index_copy(0, asked, some + self.ffn(self.norm_ffn(some)))
+
+
+class FlowAwareFusion(nn.Module):
+    """Tokens attend to each other where their objects should be by now, then to what the ego itself saw, then settle."""
+
+    def __init__(self, channels: int, config: AttentionConfig) -> None:
+        super().__init__()
+        self.placement, self.transformer = Placement(channels), WindowTransformer(channels, config)
+        self.past = PastAttention(channels, config)
+        self.settle = Settle(channels, "trust")
+
+    def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+        """Tokens of all agents, and those of the ego's own last instants, to one feature and one box a cell."""
+        key, place = settle(tokens)
+        attended = self.transformer(
+            self.placement(tokens.features, tokens, place), tokens.xy, tokens.ego, tokens.grid
+        )
+        if past is not None and len(past.features):
+            remembered = self.placement(past.features, past, settle(past)[1])
+            attended = self.past(attended, tokens, remembered, past)
+        return self.settle(attended, tokens, key, place)
