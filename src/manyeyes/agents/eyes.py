@@ -39,6 +39,7 @@ class Eyes:
     """A detector and the last few frames that it saw, of one agent. Frames are told apart by identity.
 
     remember: how many. They are forgotten where time goes back, stands still, or jumps: a scenario has ended.
+    perceived: the last frame in which the agent fused what it heard, and the fused tokens, where a method keeps them.
     """
 
     def __init__(self, detector: Detector, remember: int = 8) -> None:
@@ -46,6 +47,7 @@ class Eyes:
         self._remember = remember
         self._seen: list[tuple[AgentFrame, Sight]] = []
         self._merged: tuple[AgentFrame, PointCloud] | None = None
+        self.perceived: tuple[AgentFrame, SparseBev] | None = None
 
     def see(self, frame: AgentFrame) -> Sight:
         """The agent's own view of its frame, with the sweep before it where there is one."""
@@ -68,9 +70,7 @@ class Eyes:
         parts = []
         for before, sight in self._seen[max(0, at - instants) : at][::-1]:
             age_s = (frame.timestamp_ns - before.timestamp_ns) / 1e9
-            parts.append(
-                Part(0, sight.told.features, sight.told.sites.xy, frame.from_earlier(before), age_s)
-            )
+            parts.append(Part(0, sight.told.features, sight.told.sites.xy, frame.from_earlier(before), age_s))
         return parts
 
     def earlier_merged(self, frame: AgentFrame, merged: PointCloud) -> PointCloud | None:

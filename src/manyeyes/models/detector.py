@@ -16,6 +16,7 @@ from manyeyes.models.fusion.flow_aware import FlowAwareFusion
 from manyeyes.models.fusion.gather import Tokens
 from manyeyes.models.fusion.maximum import MaximumFusion
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
+from manyeyes.models.fusion.settle import Fused
 from manyeyes.models.pillars import PillarEncoder, PillarKind
 from manyeyes.models.proposal import propose
 from manyeyes.models.pruning import FocalPrune, Pruned
@@ -26,7 +27,8 @@ from manyeyes.models.transformer import AttentionConfig, WindowTransformer
 @dataclass(frozen=True)
 class DetectorConfig:
     """grid: what an agent sees and tells, and the pillar size. prune_threshold: probability of lying near an object below which
-    a cell is dropped. sweeps: how many an agent looks at together, its last one or two. answers: the range in which its boxes are asked for, where that is less than it sees; None: all of it.
+    a cell is dropped. answers: the range in which its boxes are asked for, where that is less than it sees; None: all of it.
+    sweeps: how many an agent looks at together, its last one or two.
     """
 
     grid: BevGrid
@@ -111,8 +113,12 @@ class Detector(nn.Module):
 
         past: what the ego itself told at its last instants, moved into its frame of now.
         """
-        fused = self.fusion(tokens, past)
+        fused = self.merge(tokens, past)
         return self.refine(fused.bev, fused.given)
+
+    def merge(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+        """The first half of fuse: one feature and one merged box a cell."""
+        return self.fusion(tokens, past)
 
 
 def _fusion(channels: int, config: DetectorConfig) -> FlowAwareFusion | SelfAttentionFusion | MaximumFusion:

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from manyeyes.agents.collaboration.alone import Alone
 from manyeyes.agents.collaboration.early import Early
+from manyeyes.agents.collaboration.fused import Fused
 from manyeyes.agents.collaboration.intermediate import Intermediate, at_random, confidence
 from manyeyes.agents.collaboration.late import Late
 from manyeyes.agents.eyes import Eyes
@@ -41,6 +42,7 @@ METHODS: dict[str, Collaboration] = {
         Intermediate(),
         Intermediate("confidence", confidence),
         Intermediate("random", at_random),
+        Fused(),
         Early(),
     )
 }

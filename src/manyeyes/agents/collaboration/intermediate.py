@@ -11,7 +11,7 @@ from torch import Tensor
 
 from manyeyes.agents.collaboration.heading import age_s, ego_from_sender, header
 from manyeyes.agents.eyes import Eyes, Sight
-from manyeyes.datatypes import AgentFrame, Boxes, Message
+from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
 from manyeyes.models.fusion.gather import Part, gather
 from manyeyes.models.proposal import PROPOSAL, proposed_heat
 from manyeyes.ops.keyed_random import keyed_uniform
@@ -49,12 +49,16 @@ class Intermediate:
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the fused tokens, with the agent's own last two instants to look back at."""
         own = eyes.see(frame).told
-        parts = [Part(0, own.features, own.sites.xy)]
-        for message in messages:
-            if message.tokens is not None and message.tokens.grid == own.grid:
-                parts.append(_part(frame, message, message.tokens.features, message.tokens.sites.xy))
         past = eyes.past(frame)
-        return eyes.decode(eyes.fuse(gather(parts, own.grid, 1), gather(past, own.grid, 1) if past else None))
+        tokens = gather(parts_of(frame, own, messages), own.grid, 1)
+        return eyes.decode(eyes.fuse(tokens, gather(past, own.grid, 1) if past else None))
+
+
+def parts_of(frame: AgentFrame, own: SparseBev, messages: Sequence[Message]) -> list[Part]:
+    """The ego's own tokens and those of every message on the same lattice."""
+    there = [(m, m.tokens) for m in messages if m.tokens is not None and m.tokens.grid == own.grid]
+    heard = [_part(frame, message, tokens.features, tokens.sites.xy) for message, tokens in there]
+    return [Part(0, own.features, own.sites.xy), *heard]
 
 
 def _part(frame: AgentFrame, message: Message, told: Tensor, xy: Tensor) -> Part:

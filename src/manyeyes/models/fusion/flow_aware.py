@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
 
 from manyeyes.models.fusion.gather import Tokens
@@ -26,16 +25,17 @@ class PastAttention(nn.Module):
         self.query, self.key, self.value = (nn.Linear(channels, channels) for _ in range(3))
         self.out = nn.Linear(channels, channels, bias=False)
         hidden = channels * config.expansion
-        self.ffn = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels))
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.ffn[2].weight)
-        nn.init.zeros_(self.ffn[2].bias)
+        last = nn.Linear(hidden, channels)
+        self.ffn = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), last)
+        for nothing in (self.out.weight, last.weight, last.bias):
+            nn.init.zeros_(nothing)
 
     def forward(self, features: Tensor, tokens: Tokens, remembered: Tensor, past: Tokens) -> Tensor:
         """features (N, C) of tokens and remembered (M, C) of the past, placed and timed, to (N, C)."""
         edge, cell = self.window * tokens.grid.cell, tokens.grid.cell
         origin = (tokens.grid.x_min, tokens.grid.y_min)
-        plan = plan_windows(*(window_ids(t.xy, t.ego, origin, edge) for t in (tokens, past)))
+        asking, known_in = (window_ids(t.xy, t.ego, origin, edge) for t in (tokens, past))
+        plan = plan_windows(asking, known_in)
         asked = (plan.query_place < plan.query_slot.shape[0]).nonzero()[:, 0]
         if not len(asked):
             return features
@@ -64,9 +64,7 @@ class FlowAwareFusion(nn.Module):
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
         """Tokens of all agents, and those of the ego's own last instants, to one feature and one box a cell."""
         key, place = settle(tokens)
-        attended = self.transformer(
-            self.placement(tokens.features, tokens, place), tokens.xy, tokens.ego, tokens.grid
-        )
+        attended = self.transformer(self.placement(tokens.features, tokens, place), tokens.xy, tokens.ego, tokens.grid)
         if past is not None and len(past.features):
             remembered = self.placement(past.features, past, settle(past)[1])
             attended = self.past(attended, tokens, remembered, past)
