@@ -21,6 +21,7 @@ class EncoderConfig:
 
     prune_strides: levels with a focal pruning layer. head_stride: stride of the tokens that are fused, sent and decoded;
     8 is the paper's letter, 4 the default. dilating: spconv's strided active set instead of parents only.
+    coarse: whether strides 16 and 32 take part (Eq. 3); without them the merge has stride 8 alone.
     token_channels: tokens are projected to so many channels before attention; None keeps those of their stride.
     """
 
@@ -30,6 +31,7 @@ class EncoderConfig:
     head_stride: int = 4
     dilating: bool = False
     token_channels: int | None = None
+    coarse: bool = True
 
     def __post_init__(self) -> None:
         if len(self.channels) != 6 or len(self.layers) != 6:
@@ -58,12 +60,14 @@ class SparseEncoder(nn.Module):
         super().__init__()
         self.config = config
         width = dict(zip(STRIDES, config.channels))
+        self.strides = STRIDES if config.coarse else STRIDES[:4]
         self.down = nn.ModuleList(
             [SubmanifoldLayer(inputs, width[1], kernel=1)]
-            + [DownLayer(width[s // 2], width[s], config.dilating) for s in STRIDES[1:]]
+            + [DownLayer(width[s // 2], width[s], config.dilating) for s in self.strides[1:]]
         )
         self.stages = nn.ModuleList(
-            nn.Sequential(*(SubmanifoldLayer(c, c) for _ in range(n))) for c, n in zip(config.channels, config.layers)
+            nn.Sequential(*(SubmanifoldLayer(c, c) for _ in range(n)))
+            for _, c, n in zip(self.strides, config.channels, config.layers)
         )
         self.prune = nn.ModuleDict({str(s): FocalPrune(width[s]) for s in config.prune_strides})
         self.post_merge = SubmanifoldLayer(width[8], width[8])
@@ -78,14 +82,14 @@ class SparseEncoder(nn.Module):
         """prune_threshold: probability below which a cell is dropped; 0 drops none."""
         levels: dict[int, SparseBev] = {}
         pruned: list[Pruned] = []
-        for stride, down, stage in zip(STRIDES, self.down, self.stages):
+        for stride, down, stage in zip(self.strides, self.down, self.stages):
             x = stage(down(x))
             if str(stride) in self.prune:
                 x, decision = self.prune[str(stride)](x, prune_threshold)
                 pruned.append(decision)
             levels[stride] = x
-        tokens = self.post_merge(merge([levels[8], levels[16], levels[32]]))
+        tokens = self.post_merge(merge([levels[s] for s in self.strides[3:]]))
         for stride, up in self.up.items():
             tokens = up(tokens, levels[int(stride)])
         tokens = tokens.with_features(self.project(tokens.features))
-        return Encoded(tokens, tuple(pruned), tuple(len(levels[s].sites) for s in STRIDES))
+        return Encoded(tokens, tuple(pruned), tuple(len(levels[s].sites) for s in self.strides))

@@ -227,13 +227,15 @@ def train(
 
 def _load_weights(model: Detector, start: Path) -> None:
     """Begin from a file. Where the model has grown, by a part or by rows and columns at their ends, what is new starts as if
-    it were not there: a new part as it is built, new rows and columns of a matrix at zero."""
+    it were not there: a new part as it is built, new rows and columns of a matrix at zero. Parts that the model lacks are left out,
+    as an ablation does."""
     state, own = checkpoint.read_state(start), model.state_dict()
     begun = {name: _grown(value, state[name]) for name, value in own.items() if name in state}
-    odd = sorted([*(name for name, value in begun.items() if value is None), *(set(state) - set(own))])
-    if odd:
+    odd = sorted(name for name, value in begun.items() if value is None)
+    if odd or not begun:
         raise CheckpointError(
-            f"{start}: cannot start this preset, tensor {odd[0]} does not fit; start from weights of its own kind."
+            f"{start}: cannot start this preset, tensor {(odd or sorted(state))[0]} does not fit; "
+            "start from weights of its own kind."
         )
     model.load_state_dict(begun, strict=False)
 

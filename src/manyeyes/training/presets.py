@@ -4,11 +4,37 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from manyeyes.models.presets import COSTR_OPV2V, COSTR_SMALL, COSTR_TINY, SMALL_AROUND, SMALL_GRID
 from manyeyes.training.loop import TrainConfig
 from manyeyes.training.losses import LossConfig
 from manyeyes.training.samples import AugmentConfig, RoadConfig
+
+_ROAD = TrainConfig(
+    replace(COSTR_SMALL, grid=SMALL_AROUND, answers=SMALL_GRID, prune_threshold=0.08),
+    steps=5200,
+    batch=4,
+    learning_rate=1e-3,
+    warm_up=100,
+    save_every=100,
+    prune_from=0.0,
+    prune_full=0.02,
+    augment=AugmentConfig(thin=0.1),
+    road=RoadConfig(past=2, late_share=0.4, astray_share=0.5, lost_share=0.25, few_share=0.4),
+    loss=LossConfig(iou=0.5, together=0.6),
+)
+_BRANCH = replace(_ROAD, steps=400, learning_rate=3e-4, warm_up=20, prune_full=0.001)
+
+
+def _branch(**changes: Any) -> TrainConfig:
+    """One row of CoSTr's Table III: the whole model trained on, with a part of it changed."""
+    return replace(_BRANCH, detector=replace(_BRANCH.detector, **changes))
+
+
+_FINE_ONLY = replace(COSTR_SMALL.encoder, coarse=False, prune_strides=())
+_NO_BLOCKS = replace(COSTR_SMALL.dast, blocks=0)
+_PLAIN = {"dast": _NO_BLOCKS, "fusion": "maximum"}
 
 TRAINING_PRESETS: dict[str, TrainConfig] = {
     "costr-small": TrainConfig(
@@ -33,23 +59,18 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
         augment=AugmentConfig(max_agents=99),
         loss=LossConfig(iou=0.5),
     ),
-    "costr-small-3": TrainConfig(
-        replace(COSTR_SMALL, grid=SMALL_AROUND, answers=SMALL_GRID, prune_threshold=0.08),
-        steps=5200,
-        batch=4,
-        learning_rate=1e-3,
-        warm_up=100,
-        save_every=100,
-        prune_from=0.0,
-        prune_full=0.02,
-        augment=AugmentConfig(thin=0.1),
-        road=RoadConfig(past=2, late_share=0.4, astray_share=0.5, lost_share=0.25, few_share=0.4),
-        loss=LossConfig(iou=0.5, together=0.6),
-    ),
+    "costr-small-3": _ROAD,
+    "branch-plain": _branch(**_PLAIN, encoder=_FINE_ONLY),
+    "branch-se": _branch(**_PLAIN),
+    "branch-se-dast": _branch(fusion="maximum"),
+    "branch-se-dast-dast": _branch(fusion="self_attention"),
+    "branch-se-fast": _branch(dast=_NO_BLOCKS),
+    "branch-se-dast-fast": _BRANCH,
     "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
     "costr-tiny": TrainConfig(
         COSTR_TINY, steps=60, batch=2, learning_rate=3e-3, warm_up=5, save_every=20, augment=AugmentConfig(max_agents=3)
     ),
 }
-"""costr-small and then, from its weights, costr-small-2 (what lies to the sides is seen as well, all agents at once, IoU itself in
-the loss): what ships. costr-opv2v: the paper's 80 + 10 epochs. costr-tiny: tests and examples."""
+"""costr-small and then, each from the weights before, costr-small-2 (what lies to the sides is seen as well, all agents at once,
+IoU itself in the loss) and costr-small-3 (past, delay, pose errors, loss, budgets): what ships. branch-*: rows of the ablation,
+each from what ships, with equal further steps. costr-opv2v: the paper's 80 + 10 epochs. costr-tiny: tests and examples."""
