@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FeaKM's net, whole: keypoints of views and matches between them, as published and mended behind one interface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from manyeyes.datatypes.keypoints import Keypoints
+from manyeyes.models import checkpoint
+from manyeyes.models.constellation import ConstellationConfig
+from manyeyes.models.keypoint_boxes import BoxKeypointNet, BoxKeypoints
+from manyeyes.models.keypoint_net import DenseKeypointNet, DenseKeypoints, View
+from manyeyes.models.matcher import Matcher, MatcherConfig, Points, mutual
+
+FORMAT = "manyeyes-feakm-1"
+
+
+@dataclass(frozen=True)
+class FeakmConfig:
+    """Where keypoints come from and how they are matched."""
+
+    keypoints: DenseKeypoints | BoxKeypoints
+    matcher: MatcherConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """pairs: (P, 2) rows of two sets of keypoints, no row twice on either side; probability: (P,)."""
+
+    pairs: Tensor
+    probability: Tensor
+
+
+class FeakmNet(nn.Module):
+    """describe is what each agent does at home; match is what the ego does with what it was sent."""
+
+    def __init__(self, config: FeakmConfig) -> None:
+        super().__init__()
+        self.config = config
+        kind = config.keypoints
+        self.keypoints = DenseKeypointNet(kind) if isinstance(kind, DenseKeypoints) else BoxKeypointNet(kind)
+        self.matcher = Matcher(config.matcher)
+
+    def describe(self, views: Sequence[View]) -> list[Keypoints]:
+        """Keypoints of views that are described together: one, as a sender does, or a pair, as FeaKM's code does."""
+        return self.keypoints(views)
+
+    @torch.no_grad()
+    def match(self, ego: Keypoints, other: Keypoints) -> Matches:
+        """Points that are one object, by what they look like and how they stand; no pose is given."""
+        if not len(ego) or not len(other):
+            return Matches(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0))
+        assignment = self.matcher(Points.of([ego]), Points.of([other]))[-1]
+        return Matches(*mutual(assignment, self.config.matcher.threshold)[0])
+
+
+FEAKM_PAPER = FeakmConfig(DenseKeypoints(), MatcherConfig())
+"""As published: 15 M parameters with its 128 input channels."""
+
+FEAKM_SMALL = FeakmConfig(
+    BoxKeypoints(),
+    MatcherConfig(
+        descriptor=32, width=128, layers=4, heads=4, unit_m=10.0, threshold=0.1, constellation=ConstellationConfig()
+    ),
+)
+"""Mended, and at most 2 M parameters."""
+
+FEAKM = {"feakm-paper": FEAKM_PAPER, "feakm": FEAKM_SMALL}
+
+
+def load(path: Path) -> FeakmNet:
+    """A net in evaluation mode, from its own file alone."""
+    return checkpoint.load_as(path, FORMAT, FeakmConfig, FeakmNet)
