@@ -67,8 +67,12 @@ class Progress:
 
 def learning_rate(config: TrainConfig, step: int, steps: int) -> float:
     """Linear warm-up, then a cosine to zero."""
-    warm = min(1.0, (step + 1) / max(1, config.warm_up))
-    return config.learning_rate * warm * 0.5 * (1 + math.cos(math.pi * step / steps))
+    return config.learning_rate * warm_cosine(config.warm_up, step, steps)
+
+
+def warm_cosine(warm_up: int, step: int, steps: int) -> float:
+    """A share of the peak: linear growth over warm_up steps, and a cosine to zero over all."""
+    return min(1.0, (step + 1) / max(1, warm_up)) * 0.5 * (1 + math.cos(math.pi * step / steps))
 
 
 def prune_threshold(config: TrainConfig, step: int, steps: int) -> float:
@@ -95,7 +99,7 @@ class Run:
         if start is not None:
             _load_weights(self.model, start)
         self.average = copy.deepcopy(self.model).requires_grad_(False)
-        self.optimiser = torch.optim.AdamW(_groups(self.model, config.weight_decay), lr=config.learning_rate)
+        self.optimiser = torch.optim.AdamW(parameter_groups(self.model, config.weight_decay), lr=config.learning_rate)
         self.step, self.seconds = 0, 0.0
         if self.state_path.exists():
             self._resume()
@@ -138,8 +142,8 @@ class Run:
             return
         for p in self.model.parameters():
             p.grad = torch.zeros_like(p) if p.grad is None else p.grad
-        _mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world)
-        _mean_in_place([b for b in self.model.buffers() if b.is_floating_point()], self.world)
+        mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world)
+        mean_in_place([b for b in self.model.buffers() if b.is_floating_point()], self.world)
 
     @torch.no_grad()
     def _average(self) -> None:
@@ -203,7 +207,7 @@ def train(
     run = Run(config, recording, folder, seed, start)
     folder.mkdir(parents=True, exist_ok=True)
     if run.rank == 0:
-        _trim_log(folder / "log.jsonl", run.step)
+        trim_log(folder / "log.jsonl", run.step)
     while run.step < run.steps:
         progress = run.advance()
         if run.rank == 0:
@@ -254,7 +258,7 @@ def _log_line(progress: Progress) -> dict[str, float]:
     return {"step": progress.step, "loss": round(progress.loss, 5), **terms, "lr": progress.learning_rate}
 
 
-def _trim_log(path: Path, step: int) -> None:
+def trim_log(path: Path, step: int) -> None:
     """Drop the lines that a killed run wrote after its last save, the last of them perhaps cut: they will be written again."""
     if path.exists():
         kept = [line for line in path.read_text().splitlines() if 0 < _step_of(line) <= step]
@@ -270,13 +274,15 @@ def _step_of(line: str) -> int:
         return 0
 
 
-def _groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
+def parameter_groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
+    """What an optimiser is given: matrices, whose weights decay, and the rest, whose do not."""
     matrices = [p for p in model.parameters() if p.dim() > 1]
     rest = [p for p in model.parameters() if p.dim() <= 1]
     return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
 
 
-def _mean_in_place(tensors: list[Tensor], world: int) -> None:
+def mean_in_place(tensors: list[Tensor], world: int) -> None:
+    """Each tensor becomes its mean over world processes, in one flat exchange."""
     flat = torch.cat([t.flatten() for t in tensors])
     dist.all_reduce(flat)
     flat /= world
