@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from manyeyes.datatypes import LABELS, BevGrid, Boxes, Sites, SparseBev
-from manyeyes.models.box_head import TYPICAL_SIZE, WIDTHS, BoxHead, DecodeConfig, RawBoxes, decode
+from manyeyes.models.box_head import SPEED_UNIT, TYPICAL_SIZE, WIDTHS, BoxHead, DecodeConfig, RawBoxes, decode
 from manyeyes.ops.box_iou import pairwise_iou
 from manyeyes.training.targets import TargetConfig, assign
 
@@ -25,7 +25,8 @@ def some_boxes(n: int = 6, seed: int = 0) -> Boxes:
     center = torch.stack((angle.cos() * 17, angle.sin() * 17, torch.rand(n, generator=random) + 0.5), 1)
     size = torch.tensor(TYPICAL_SIZE) * (0.8 + 0.6 * torch.rand(n, 3, generator=random))
     yaw = torch.rand(n, generator=random) * 2 * math.pi - math.pi
-    return Boxes.of(center, size, yaw, label=torch.arange(n) % len(LABELS))
+    velocity = 12 * torch.randn(n, 2, generator=random)
+    return Boxes.of(center, size, yaw, label=torch.arange(n) % len(LABELS), velocity=velocity)
 
 
 def encode(boxes: Boxes, sites: Sites) -> RawBoxes:
@@ -43,8 +44,8 @@ def encode(boxes: Boxes, sites: Sites) -> RawBoxes:
     values[6][at, truth.label] = 5.0
     values[7][at] = math.log(0.25)
     values[9][:] = 20.0
-    heat, offset, z, log_size, axis, direction, kind, *rest = values
-    return RawBoxes(sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind, *(v[:, 0] for v in rest))
+    values[10][at] = truth.velocity / SPEED_UNIT
+    return RawBoxes.of(torch.cat(values, 1), sites)
 
 
 @pytest.mark.parametrize("stride", (2, 4, 8))
@@ -59,6 +60,7 @@ def test_decode_inverts_encode(stride):
     turn = found.yaw - boxes.yaw
     assert torch.allclose(torch.atan2(turn.sin(), turn.cos()), torch.zeros(len(boxes)), atol=1e-5)
     assert torch.equal(found.label, boxes.label)
+    assert torch.allclose(found.velocity, boxes.velocity, atol=1e-4) and float(boxes.velocity.norm(dim=1).min()) > 1
     assert torch.allclose(found.sigma_xy, torch.full((len(boxes),), 0.25))
     assert (found.flip < 1e-3).all() and (found.score > 0.99).all()
 

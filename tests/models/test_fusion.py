@@ -9,25 +9,32 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, Boxes, Sites, SparseBev, Transform
-from manyeyes.models.box_head import RAW, TYPICAL_SIZE, RawBoxes, RefineHead, axis_yaw, facing
-from manyeyes.models.fusion.gather import CUES, Tokens, gather, rotate_vectors
-from manyeyes.models.fusion.maximum import MaximumFusion, Placement
+from manyeyes.models.box_head import RAW, SPEED_UNIT, TYPICAL_SIZE, RawBoxes, RefineHead, axis_yaw, facing
+from manyeyes.models.fusion.flow_aware import FlowAwareFusion
+from manyeyes.models.fusion.gather import CUES, Part, Tokens, gather, rotate_vectors
+from manyeyes.models.fusion.maximum import MaximumFusion
+from manyeyes.models.fusion.placement import Placement
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
 from manyeyes.models.fusion.settle import VOTING_HEAT, settle
-from manyeyes.models.proposal import PROPOSAL
+from manyeyes.models.proposal import PROPOSAL, proposed_velocity
 from manyeyes.models.transformer import AttentionConfig
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 16
-FUSIONS = ("maximum", "self_attention")
-Part = tuple[int, Tensor, Tensor, Transform | None]
+FUSIONS = ("maximum", "self_attention", "flow_aware")
 
 
 def fusion(name: str, random_placement: bool = True) -> torch.nn.Module:
     torch.manual_seed(0)
-    model = MaximumFusion(CHANNELS) if name == "maximum" else SelfAttentionFusion(CHANNELS, AttentionConfig(heads=2))
+    attention = AttentionConfig(heads=2)
+    model = {
+        "maximum": lambda: MaximumFusion(CHANNELS),
+        "self_attention": lambda: SelfAttentionFusion(CHANNELS, attention),
+        "flow_aware": lambda: FlowAwareFusion(CHANNELS, attention),
+    }[name]()
     if random_placement:
         torch.nn.init.normal_(model.placement.outer.weight, std=0.3)
+        torch.nn.init.normal_(model.placement.temporal.weight, std=0.3)
     else:
         torch.nn.init.zeros_(model.settle.outer.weight)
     return model.eval().requires_grad_(False)
@@ -61,7 +68,7 @@ def parts_of(agents: list[int], world: Transform | None = None, ego: int = 0) ->
     parts: list[Part] = []
     for i, (agent, at) in enumerate(zip(agents, poses)):
         own = told(agent)
-        parts.append((ego, own.features, own.sites.xy, poses[0].inverse() @ at if i else None))
+        parts.append(Part(ego, own.features, own.sites.xy, poses[0].inverse() @ at if i else None))
     return parts
 
 
@@ -92,10 +99,10 @@ def test_every_agent_adds_what_it_has(name, agents):
 def test_an_agent_without_tokens_changes_nothing(name):
     model, none = fusion(name), told(9, n=0)
     own = told(0)
-    alone = [(0, own.features, own.sites.xy, None)]
-    with_silent = gather([*alone, (0, none.features, none.sites.xy, pose(3))], GRID, 1)
+    alone = [Part(0, own.features, own.sites.xy)]
+    with_silent = gather([*alone, Part(0, none.features, none.sites.xy, pose(3))], GRID, 1)
     assert torch.allclose(model(with_silent).bev.features, model(gather(alone, GRID, 1)).bev.features, atol=1e-6)
-    assert len(model(gather([(0, none.features, none.sites.xy, None)], GRID, 1)).bev.sites) == 0
+    assert len(model(gather([Part(0, none.features, none.sites.xy)], GRID, 1)).bev.sites) == 0
 
 
 @pytest.mark.parametrize("name", FUSIONS)
@@ -111,7 +118,7 @@ def test_moving_the_whole_world_changes_nothing(name):
 def test_maximum_of_a_neighbour_shifted_by_whole_cells_is_the_dense_maximum():
     model, mine, theirs = fusion("maximum", random_placement=False), silent(told(0)), silent(told(1))
     shift = Transform.from_xyz_yaw(3 * GRID.cell, -2 * GRID.cell)
-    parts = [(0, mine.features, mine.sites.xy, None), (0, theirs.features, theirs.sites.xy, shift)]
+    parts = [Part(0, mine.features, mine.sites.xy), Part(0, theirs.features, theirs.sites.xy, shift)]
     out = model(gather(parts, GRID, 1)).bev
 
     def dense(x: SparseBev) -> Tensor:
@@ -127,7 +134,7 @@ def test_maximum_of_a_neighbour_shifted_by_whole_cells_is_the_dense_maximum():
 def test_a_neighbour_beyond_the_range_is_not_heard():
     own = told(0)
     far = Transform.from_xyz_yaw(200.0, 0.0)
-    parts = [(0, own.features, own.sites.xy, None), (0, own.features, own.sites.xy, far)]
+    parts = [Part(0, own.features, own.sites.xy), Part(0, own.features, own.sites.xy, far)]
     assert len(gather(parts, GRID, 1).features) == len(own.sites)
 
 
@@ -160,22 +167,25 @@ def test_a_direction_in_a_token_turns_as_the_thing_itself():
     features = own.features.clone()
     features[:, :2] = landmark - own.sites.xy
     ego_from_sender = Transform.from_xyz_yaw(2.0, -1.0, 0.5, 2.1)
-    moved = gather([(0, features, own.sites.xy, ego_from_sender)], GRID, 1)
+    moved = gather([Part(0, features, own.sites.xy, ego_from_sender)], GRID, 1)
     there = ego_from_sender.apply(torch.tensor([[5.0, 3.0, 0.0]]).double())[0, :2].float()
     assert len(moved.features) > 30
     assert torch.allclose(moved.xy + moved.features[:, :2], there.expand(len(moved.xy), 2), atol=1e-4)
 
 
-def test_cues_tell_height_and_turn_and_are_zero_for_the_ego():
-    own = told(0)
-    parts = [
-        (0, own.features, own.sites.xy, None),
-        (0, own.features, own.sites.xy, Transform.from_xyz_yaw(0, 0, 1.5, 0.3)),
-    ]
-    cue = gather(parts, GRID, 1).cue
-    assert cue.shape[1] == CUES and not cue[: len(own.sites)].any()
-    wanted = torch.tensor([1.5, math.sin(0.3), math.cos(0.3) - 1])
-    assert torch.allclose(cue[len(own.sites) :], wanted.expand(len(cue) - len(own.sites), 3), atol=1e-6)
+def test_cues_tell_height_turn_doubt_and_age_and_are_zero_for_the_ego():
+    own, motion = silent(told(0)), Transform.from_xyz_yaw(0, 0, 1.5, 0.3)
+    own.features[:, CHANNELS:][:, RAW.velocity] = 0.0
+    theirs = Part(0, own.features, own.sites.xy, motion, age_s=0.25, doubt_xy_m=0.3, doubt_yaw_rad=0.01)
+    tokens = gather([Part(0, own.features, own.sites.xy), theirs], GRID, 1)
+    cue, n = tokens.cue, len(own.sites)
+    assert cue.shape[1] == CUES and not cue[:n].any()
+    wanted = torch.tensor([1.5, math.sin(0.3), math.cos(0.3) - 1]).expand(len(cue) - n, 3)
+    assert torch.allclose(cue[n:, :3], wanted, atol=1e-6)
+    assert torch.equal(tokens.age[n:], torch.full((len(cue) - n,), 2.5))
+    # A claim's doubt in heading moves what is far from its sender more than what is near to it.
+    reach = tokens.xy[n:].norm(dim=1)
+    assert torch.allclose(tokens.doubt[n:], (0.3**2 + (0.01 * reach) ** 2).sqrt(), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", FUSIONS)
@@ -197,7 +207,7 @@ def boxes_of(proposal: Tensor, xy: Tensor) -> Boxes:
 
 def test_a_proposed_box_moves_as_the_box_itself():
     own, motion = told(0), Transform.from_xyz_yaw(2.0, -1.0, 0.5, 2.1)
-    moved = gather([(0, own.features, own.sites.xy, motion)], GRID, 1)
+    moved = gather([Part(0, own.features, own.sites.xy, motion)], GRID, 1)
     before = boxes_of(own.features[:, CHANNELS:], own.sites.xy)
     at = motion.apply(torch.cat((own.sites.xy, torch.zeros(len(own.sites), 1)), 1).double())
     wanted = before[GRID.inside(at)].transform(motion)
@@ -207,6 +217,9 @@ def test_a_proposed_box_moves_as_the_box_itself():
     assert torch.allclose((2 * (got.yaw - wanted.yaw)).cos(), torch.ones(len(got)), atol=1e-5)
     for same in (RAW.heat, RAW.kind, RAW.overlap):
         assert torch.equal(moved.proposal[:, same], own.features[GRID.inside(at)][:, CHANNELS:][:, same])
+    velocity = SPEED_UNIT * own.features[GRID.inside(at)][:, CHANNELS:][:, RAW.velocity]
+    turned = dataclasses.replace(wanted, velocity=velocity).transform(Transform.from_xyz_yaw(0, 0, 0, 2.1)).velocity
+    assert torch.allclose(proposed_velocity(moved.proposal), turned, atol=1e-4)
 
 
 def test_which_way_a_proposal_faces_turns_with_it():
@@ -215,7 +228,7 @@ def test_which_way_a_proposal_faces_turns_with_it():
     box[:, RAW.axis] = torch.tensor([[math.cos(2 * 1.2), math.sin(2 * 1.2)]])
     box[:, RAW.direction] = 5 * torch.tensor([[math.cos(1.2), math.sin(1.2)]])
     for turn in (0.3, 1.0, 2.5, -2.0):
-        moved = gather([(0, proposal, xy, Transform.from_xyz_yaw(0.0, 0.0, 0.0, turn))], GRID, 1)
+        moved = gather([Part(0, proposal, xy, Transform.from_xyz_yaw(0.0, 0.0, 0.0, turn))], GRID, 1)
         raw = RawBoxes.of(moved.proposal, Sites(torch.tensor([0]), GRID, 1))
         yaw = float(axis_yaw(raw.axis)) + math.pi * (float(facing(raw)) < 0)
         assert math.cos(yaw - 1.2 - turn) == pytest.approx(1.0, abs=1e-5)
@@ -230,7 +243,7 @@ def one_object(*said: tuple[float, float, float, float]) -> Tokens:
         box[:, RAW.heat] = heat
         box[:, RAW.offset] = torch.tensor([[centre - x, 0.0]]) / GRID.cell
         box[:, RAW.axis] = torch.tensor([[1.0, 0.0]])
-        parts.append((0, row, torch.tensor([[x, y]]), None))
+        parts.append(Part(0, row, torch.tensor([[x, y]]), None))
     return gather(parts, GRID, 1)
 
 

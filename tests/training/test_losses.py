@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, Boxes, Sites
-from manyeyes.models.box_head import WIDTHS, RawBoxes
+from manyeyes.models.box_head import SPEED_UNIT, WIDTHS, RawBoxes
 from manyeyes.models.pruning import Pruned
-from manyeyes.training.losses import LossConfig, _gaussian_nll, centre_focal, head_terms, prune_focal
-from manyeyes.training.targets import TargetConfig, assign
+from manyeyes.training.losses import LossConfig, LossTerms, _gaussian_nll, centre_focal, head_terms, prune_focal
+from manyeyes.training.targets import TargetConfig, Targets, assign
 
 GRID = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0).at(4)
 SITES = Sites(torch.arange(GRID.shape[0] * GRID.shape[1]), GRID)
@@ -24,7 +24,17 @@ def raw(seed: int = 0) -> RawBoxes:
 
 
 def one_box(yaw: float = 0.4) -> Boxes:
-    return Boxes.of(torch.tensor([[1.3, -2.2, 0.8]]), torch.tensor([[4.5, 1.9, 1.6]]), torch.tensor([yaw]))
+    place, size, velocity = (
+        torch.tensor([[1.3, -2.2, 0.8]]),
+        torch.tensor([[4.5, 1.9, 1.6]]),
+        torch.tensor([[6.0, -8.0]]),
+    )
+    return Boxes.of(place, size, torch.tensor([yaw]), velocity=velocity)
+
+
+def terms_of(some: RawBoxes, targets: Targets, prune: float = 0.0, kept: float = 0.0, told: float = 0.0) -> LossTerms:
+    """All terms, where nothing is pruned or selected unless said."""
+    return head_terms(some, targets, *map(torch.tensor, (prune, kept, told)))
 
 
 def test_centre_focal_by_a_loop():
@@ -58,18 +68,20 @@ def test_without_a_box_every_term_is_finite_and_gradients_flow(scale):
     some = dataclasses.replace(some, heat=(some.heat * scale).detach().requires_grad_())
     targets = assign(SITES, [Boxes.empty()], TargetConfig())
     prune = prune_focal(Pruned(SITES, some.heat), torch.zeros(len(SITES), dtype=torch.bool))
-    terms = head_terms(some, targets, prune)
+    terms = head_terms(some, targets, prune, torch.zeros(()), torch.zeros(()))
     total = terms.total(LossConfig())
     total.backward()
     assert bool(torch.isfinite(total)) and some.heat.grad is not None and bool(torch.isfinite(some.heat.grad).all())
-    assert not any(float(getattr(terms, n).detach()) for n in ("shape", "direction", "kind", "sigma", "overlap", "iou"))
+    assert not any(
+        float(getattr(terms, n).detach()) for n in ("shape", "direction", "kind", "sigma", "overlap", "iou", "velocity")
+    )
     assert float(terms.heat.detach()) > 0
 
 
 def test_no_sites_at_all():
     none = Sites(torch.zeros(0, dtype=torch.int64), GRID)
     empty = RawBoxes(none, *(torch.zeros(0, w).squeeze(1).requires_grad_() for w in WIDTHS))
-    terms = head_terms(empty, assign(none, [one_box()], TargetConfig()), torch.zeros(()))
+    terms = terms_of(empty, assign(none, [one_box()], TargetConfig()))
     assert float(terms.total(LossConfig()).detach()) == 0.0
 
 
@@ -94,6 +106,7 @@ def perfect(truth: Boxes) -> RawBoxes:
     values[6][:, 0] = 30.0
     values[7] = values[8] = torch.full((n, 1), -5.0)
     values[9] = torch.full((n, 1), 30.0)
+    values[10] = (truth.velocity / SPEED_UNIT).expand(n, 2)
     return RawBoxes(SITES, *(v.squeeze(1) for v in values))
 
 
@@ -101,20 +114,20 @@ def perfect(truth: Boxes) -> RawBoxes:
 def test_a_perfect_answer_costs_nothing_and_its_opposite_only_direction(yaw):
     truth = one_box(yaw)
     targets = assign(SITES, [truth], TargetConfig())
-    terms = head_terms(perfect(truth), targets, torch.zeros(()))
-    for name in ("shape", "direction", "kind", "overlap", "iou"):
+    terms = terms_of(perfect(truth), targets)
+    for name in ("shape", "direction", "kind", "overlap", "iou", "velocity"):
         assert float(getattr(terms, name)) == pytest.approx(0.0, abs=2e-3), name
     assert float(terms.sigma) == pytest.approx(-10.0, abs=0.1)
     backward = dataclasses.replace(perfect(truth), direction=-perfect(truth).direction)
-    worse = head_terms(backward, targets, torch.zeros(()))
+    worse = terms_of(backward, targets)
     assert float(worse.direction) > 20 and float(worse.shape) == float(terms.shape)
 
 
 def test_the_term_for_sigma_never_moves_the_box():
     some = raw()
-    terms = head_terms(some, assign(SITES, [one_box()], TargetConfig()), torch.zeros(()))
+    terms = terms_of(some, assign(SITES, [one_box()], TargetConfig()))
     terms.sigma.backward()
-    assert some.offset.grad is None and some.axis.grad is None
+    assert not any(g is not None and bool(g.any()) for g in (some.offset.grad, some.axis.grad))
     assert some.log_sigma_xy.grad is not None and bool(some.log_sigma_xy.grad.any())
 
 
@@ -123,15 +136,19 @@ def test_the_iou_itself_pulls_a_box_that_nearly_fits_to_its_place():
     aside = perfect(truth)
     offset = (aside.offset + torch.tensor([0.1, -0.1])).requires_grad_()
     targets = assign(SITES, [truth], TargetConfig())
-    before = head_terms(dataclasses.replace(aside, offset=offset), targets, torch.zeros(())).iou
+    before = terms_of(dataclasses.replace(aside, offset=offset), targets).iou
     before.backward()
     assert offset.grad is not None and float(before.detach()) > 0.05
     step = 0.5 * offset.grad / offset.grad.norm()
     after = dataclasses.replace(aside, offset=(offset - step).detach())
-    assert float(head_terms(after, targets, torch.zeros(())).iou) < float(before.detach())
+    assert float(terms_of(after, targets).iou) < float(before.detach())
 
 
 def test_the_total_is_the_weighted_sum():
-    terms = head_terms(raw(), assign(SITES, [one_box()], TargetConfig()), torch.tensor(2.0))
-    weights = LossConfig(heat=2.0, shape=0.0, direction=0.0, kind=0.0, sigma=0.0, overlap=0.0, iou=0.0, prune=0.5)
-    assert float(terms.total(weights).detach()) == pytest.approx(2 * float(terms.heat.detach()) + 1.0, rel=1e-6)
+    terms = terms_of(raw(), assign(SITES, [one_box()], TargetConfig()), 2.0, 3.0, 4.0)
+    weights = LossConfig(
+        heat=2.0, shape=0.0, direction=0.0, kind=0.0, sigma=0.0, overlap=0.0, iou=0.0, velocity=0.25, prune=0.5, kept=0.1,
+        information=0.01,
+    )  # fmt: skip
+    wanted = 2 * float(terms.heat.detach()) + 0.25 * float(terms.velocity.detach()) + 1.0 + 0.3 + 0.04
+    assert float(terms.total(weights).detach()) == pytest.approx(wanted, rel=1e-6)
