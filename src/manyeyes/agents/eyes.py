@@ -39,12 +39,16 @@ class Eyes:
     """A detector and the last few frames that it saw, of one agent. Frames are told apart by identity.
 
     remember: how many. They are forgotten where time goes back, stands still, or jumps: a scenario has ended.
-    perceived: the last frame in which the agent fused what it heard, and the fused tokens, where a method keeps them.
+    known: views by agent and time of capture, which are taken as they are and added to, so that several players of one recording
+    look at each sweep once between them. perceived: the last frame in which the agent fused what it heard, and the fused
+    tokens, where a method keeps them.
     """
 
-    def __init__(self, detector: Detector, remember: int = 8) -> None:
+    def __init__(
+        self, detector: Detector, remember: int = 8, known: dict[tuple[int, int], Sight] | None = None
+    ) -> None:
         self.detector = detector
-        self._remember = remember
+        self._remember, self._known = remember, known
         self._seen: list[tuple[AgentFrame, Sight]] = []
         self._merged: tuple[AgentFrame, PointCloud] | None = None
         self.perceived: tuple[AgentFrame, SparseBev] | None = None
@@ -56,11 +60,14 @@ class Eyes:
                 return sight
         if self._seen and not follows(frame, self._seen[-1][0]):
             self._seen = []
-        earlier = None
-        if self._seen:
-            before = self._seen[-1][0]
-            earlier = before.points.transform(frame.from_earlier(before))
-        sight = self.see_cloud(frame.points, earlier)
+        key = frame.agent_id, frame.timestamp_ns
+        sight = self._known.get(key) if self._known is not None else None
+        if sight is None:
+            before = self._seen[-1][0] if self._seen else None
+            earlier = None if before is None else before.points.transform(frame.from_earlier(before))
+            sight = self.see_cloud(frame.points, earlier)
+        if self._known is not None:
+            self._known[key] = sight
         self._seen = [*self._seen, (frame, sight)][-self._remember :]
         return sight
 

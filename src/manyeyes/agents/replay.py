@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.collaboration import method
-from manyeyes.agents.eyes import Eyes
+from manyeyes.agents.eyes import Eyes, Sight
 from manyeyes.comms.bus import LocalBus
 from manyeyes.comms.channel import Channel, ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
@@ -20,6 +20,9 @@ from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
 from manyeyes.models.detector import Detector
 
 EXPIRE_NS = 500_000_000
+
+Views = dict[tuple[int, int], Sight]
+"""What agents made of their sweeps, by agent and time of capture."""
 
 
 @dataclass(frozen=True)
@@ -77,12 +80,12 @@ class Step:
 
 @dataclass
 class Team:
-    """All agents of one scenario with one method, their inboxes and the air between them."""
+    """All agents of one scenario with one method, their inboxes and the air between them. known: views that need no second look."""
 
     method: str
     detector: Detector
     config: ReplayConfig
-    eyes: dict[int, Eyes] = field(default_factory=dict)
+    known: Views | None = None
     _agents: dict[int, Agent] = field(default_factory=dict)
     _inboxes: dict[int, Inbox] = field(default_factory=dict)
     _bus: LocalBus = field(init=False)
@@ -120,7 +123,7 @@ class Team:
     def _at(self, frame: AgentFrame) -> tuple[Agent, Inbox]:
         who = frame.agent_id
         if who not in self._agents:
-            eyes = self.eyes.setdefault(who, Eyes(self.detector))
+            eyes = Eyes(self.detector, known=self.known)
             self._agents[who] = Agent(
                 self.detector, method(self.method), self.config.precision, self.config.budget_bytes, eyes
             )
@@ -145,15 +148,15 @@ def replay(
     methods: Sequence[str],
     config: ReplayConfig,
     disturb: Callable[[Snapshot], Snapshot] = lambda snapshot: snapshot,
-    share_eyes: bool = False,
+    known: Views | None = None,
 ) -> Iterator[Step]:
     """Every judged snapshot of one scenario through each method in turn.
 
-    disturb: what happens to claimed poses before anybody sees them. share_eyes: the methods look at a cloud once between
-    them; their boxes are the same, their times are then not to be compared.
+    disturb: what happens to claimed poses before anybody sees them. known: what agents of this scenario and these weights made of
+    their sweeps, played from the same first snapshot on; it is added to, so that the methods look at a sweep once between them.
+    Their boxes are the same; their times are then not to be compared.
     """
-    eyes: dict[int, Eyes] = {}
-    teams = [Team(name, detector, config, eyes if share_eyes else {}) for name in methods]
+    teams = [Team(name, detector, config, known) for name in methods]
     judged = recording.judged(scenario)
     for index in range(max(0, judged.start - config.history), judged.stop):
         snapshot = disturb(recording.snapshot(scenario, index))
