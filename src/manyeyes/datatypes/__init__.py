@@ -2,6 +2,7 @@
 """What things are: frozen dataclasses of tensors, with no drawing, loading or logging."""
 
 from manyeyes.datatypes.boxes import LABELS, Boxes, wrap_angle
+from manyeyes.datatypes.camera import Camera, CameraImage
 from manyeyes.datatypes.errors import (
     CheckpointError,
     ConfigError,
@@ -26,6 +27,8 @@ __all__ = [
     "AgentFrame",
     "BevGrid",
     "Boxes",
+    "Camera",
+    "CameraImage",
     "CheckpointError",
     "ConfigError",
     "ManyeyesError",

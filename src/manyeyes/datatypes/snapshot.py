@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes.boxes import Boxes
+from manyeyes.datatypes.camera import CameraImage
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.point_cloud import PointCloud
 from manyeyes.datatypes.transform import Transform
@@ -22,6 +23,7 @@ class AgentFrame:
     world_from_agent: the *claimed* pose; pose_covariance: (3, 3) of x, y (m) and yaw (rad) in the world, what the
     agent says of its error. sensor_height_m: height of the LiDAR above the road. speed_mps: own speed. odometry: the pose in a
     frame of the agent's own that drifts but never jumps, for motion since the frames before; by default the claimed pose.
+    images: what its cameras took, where it has any and they were asked for.
     """
 
     agent_id: int
@@ -33,6 +35,7 @@ class AgentFrame:
     speed_mps: float = 0.0
     is_infrastructure: bool = False
     odometry: Transform | None = None
+    images: tuple[CameraImage, ...] = ()
 
     def __post_init__(self) -> None:
         if self.pose_covariance.shape != (3, 3):

@@ -101,7 +101,7 @@ class Hits:
 
 
 @njit(cache=True)
-def _uniform(seed: np.uint64, primitive: int, ray: int) -> float:
+def uniform_of(seed: np.uint64, primitive: int, ray: int) -> float:
     """A number in (0, 1] from a counter: the same for a ray and a primitive in whatever order they are met (SplitMix64)."""
     x = seed + np.uint64(_MIX_A) * np.uint64(primitive + 1) + np.uint64(_MIX_B) * np.uint64(ray + 1)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(_MIX_B)
@@ -145,7 +145,7 @@ def _interval(o, q, half, bounds):
 
 
 @njit(cache=True)
-def _hit_box(o, half, d0, d1, d2):
+def hit_box(o, half, d0, d1, d2):
     """Entry distance and cosine into a box from outside it; (inf, 0) when missed. At most three faces look at the sensor."""
     if abs(o[0]) > half[0] and o[0] * d0 < 0:
         t = ((half[0] if o[0] > 0 else -half[0]) - o[0]) / d0
@@ -163,7 +163,7 @@ def _hit_box(o, half, d0, d1, d2):
 
 
 @njit(cache=True)
-def _hit_cylinder(o, half, d0, d1, d2):
+def hit_cylinder(o, half, d0, d1, d2):
     """Entry distance and cosine into the side of a cylinder of radius half[0]."""
     a, b = d0 * d0 + d1 * d1, o[0] * d0 + o[1] * d1
     c = o[0] * o[0] + o[1] * o[1] - half[0] * half[0]
@@ -177,7 +177,7 @@ def _hit_cylinder(o, half, d0, d1, d2):
 
 
 @njit(cache=True)
-def _hit_ellipsoid(o, half, d0, d1, d2):
+def hit_ellipsoid(o, half, d0, d1, d2):
     """Entry and exit distance of an ellipsoid, (inf, inf) when missed; entry is 0 from within."""
     s0, s1, s2 = o[0] / half[0], o[1] / half[1], o[2] / half[2]
     e0, e1, e2 = d0 / half[0], d1 / half[1], d2 / half[2]
@@ -218,14 +218,14 @@ def _draw(index, kind, half, density, o, q, bounds, first, per_turn, el, azimuth
             d1 = cos_el[b] * u1 + sin_el[b] * q[1, 2]
             d2 = cos_el[b] * u2 + sin_el[b] * q[2, 2]
             if kind == BOX:
-                t, face = _hit_box(o, half, d0, d1, d2)
+                t, face = hit_box(o, half, d0, d1, d2)
             elif kind == CYLINDER:
-                t, face = _hit_cylinder(o, half, d0, d1, d2)
+                t, face = hit_cylinder(o, half, d0, d1, d2)
             else:
-                t, leave = _hit_ellipsoid(o, half, d0, d1, d2)
+                t, leave = hit_ellipsoid(o, half, d0, d1, d2)
                 face = 0.7
                 if density > 0 and t < math.inf:
-                    t += -math.log(_uniform(seed, index, a * beams + b)) / density
+                    t += -math.log(uniform_of(seed, index, a * beams + b)) / density
                     if t >= leave:
                         t = math.inf
             if t < depth[a, b]:
@@ -233,7 +233,7 @@ def _draw(index, kind, half, density, o, q, bounds, first, per_turn, el, azimuth
 
 
 @njit(cache=True)
-def _height(field, x_min, y_min, cell, x, y):
+def height_at(field, x_min, y_min, cell, x, y):
     """Bilinear height; the border value goes on outside."""
     column = min(max((x - x_min) / cell, 0.0), field.shape[1] - 1.001)
     row = min(max((y - y_min) / cell, 0.0), field.shape[0] - 1.001)
@@ -264,21 +264,27 @@ def _walk_ground(field, x_min, y_min, cell, origin, rotation, rays, max_range, d
             t, above = free, 1.0
             before_t, before = free, -1.0
             while t < limit:
-                above = origin[2] + t * d2 - _height(field, x_min, y_min, cell, origin[0] + t * d0, origin[1] + t * d1)
+                above = (
+                    origin[2] + t * d2 - height_at(field, x_min, y_min, cell, origin[0] + t * d0, origin[1] + t * d1)
+                )
                 if above <= 0:
                     break
                 before_t, before = t, above
                 t += max(0.4, 0.01 * t)
             if t >= limit and limit > before_t:
                 t = limit
-                above = origin[2] + t * d2 - _height(field, x_min, y_min, cell, origin[0] + t * d0, origin[1] + t * d1)
+                above = (
+                    origin[2] + t * d2 - height_at(field, x_min, y_min, cell, origin[0] + t * d0, origin[1] + t * d1)
+                )
             if above > 0 or before <= 0:
                 free = max(free, before_t)
                 continue
             low, high, f_low, f_high = before_t, t, before, above
             for _ in range(4):
                 t = low + (high - low) * f_low / (f_low - f_high)
-                above = origin[2] + t * d2 - _height(field, x_min, y_min, cell, origin[0] + t * d0, origin[1] + t * d1)
+                above = (
+                    origin[2] + t * d2 - height_at(field, x_min, y_min, cell, origin[0] + t * d0, origin[1] + t * d1)
+                )
                 if abs(above) < 2e-4:
                     break
                 if above > 0:
@@ -288,9 +294,9 @@ def _walk_ground(field, x_min, y_min, cell, origin, rotation, rays, max_range, d
             free = max(free, before_t)
             if t < depth[a, b] and t <= max_range:
                 x, y = origin[0] + t * d0, origin[1] + t * d1
-                here = _height(field, x_min, y_min, cell, x, y)
-                gx = (_height(field, x_min, y_min, cell, x + cell, y) - here) / cell
-                gy = (_height(field, x_min, y_min, cell, x, y + cell) - here) / cell
+                here = height_at(field, x_min, y_min, cell, x, y)
+                gx = (height_at(field, x_min, y_min, cell, x + cell, y) - here) / cell
+                gy = (height_at(field, x_min, y_min, cell, x, y + cell) - here) / cell
                 depth[a, b], owner[a, b] = t, GROUND
                 cosine[a, b] = abs(d2 - gx * d0 - gy * d1) / math.sqrt(1 + gx * gx + gy * gy)
 
@@ -409,9 +415,11 @@ def cast_reference(
     number = np.arange(depth.size).reshape(depth.shape)
     for i in range(len(primitives)):
         o, d = primitives.rotation[i].T @ (origin - primitives.center[i]), ray @ primitives.rotation[i]
-        t, leave, face = _reference_hit(int(primitives.kind[i]), o, d, primitives.half[i])
+        t, leave, face = reference_hit(int(primitives.kind[i]), o, d, primitives.half[i])
         if primitives.density[i] > 0:
-            draw = np.array([_uniform(np.uint64(seed % 2**64), i, int(k)) for k in number.ravel()]).reshape(depth.shape)
+            draw = np.array([uniform_of(np.uint64(seed % 2**64), i, int(k)) for k in number.ravel()]).reshape(
+                depth.shape
+            )
             inside = t - np.log(draw) / primitives.density[i]
             t = np.where(inside < leave, inside, np.inf)
         closer = t < depth
@@ -419,7 +427,7 @@ def cast_reference(
     for index in np.ndindex(*depth.shape):
         t = np.arange(0.3, min(float(depth[index]), max_range), 0.02)
         path = origin + t[:, None] * ray[index]
-        below = np.flatnonzero(path[:, 2] <= _reference_height(ground, path[:, 0], path[:, 1]))
+        below = np.flatnonzero(path[:, 2] <= reference_height(ground, path[:, 0], path[:, 1]))
         if below.size:
             depth[index], owner[index] = t[below[0]], GROUND
             column, row = np.floor((path[below[0], :2] - (ground.x_min, ground.y_min)) / ground.surface_cell).astype(
@@ -431,7 +439,8 @@ def cast_reference(
     return Hits(depth, owner, cosine, surface)
 
 
-def _reference_height(ground: HeightField, x: Array, y: Array) -> Array:
+def reference_height(ground: HeightField, x: Array, y: Array) -> Array:
+    """Bilinear heights at points, any shape; the border value goes on outside."""
     rows, columns = ground.height.shape
     u = np.clip((x - ground.x_min) / ground.cell, 0, columns - 1.001)
     v = np.clip((y - ground.y_min) / ground.cell, 0, rows - 1.001)
@@ -441,7 +450,7 @@ def _reference_height(ground: HeightField, x: Array, y: Array) -> Array:
     return sum(w * ground.height[c] for w, c in zip(weight, corner))  # pyright: ignore[reportReturnType]
 
 
-def _reference_hit(kind: int, o: Array, d: Array, half: Array) -> tuple[Array, Array, Array]:
+def reference_hit(kind: int, o: Array, d: Array, half: Array) -> tuple[Array, Array, Array]:
     """Entry distance, exit distance and cosine of rays o + t d (d: (..., 3)) into one primitive in its own frame."""
     with np.errstate(divide="ignore", invalid="ignore"):
         if kind == BOX:
