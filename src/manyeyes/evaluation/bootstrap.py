@@ -84,6 +84,49 @@ def weighted_recall(pool: Pooled, weights: np.ndarray) -> np.ndarray:
         return (weights @ hits) / (weights @ pool.n_gt)
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """A statistic of matched frames on all scenarios and on every resample of them, draws (R,); n_gt (S,) is their truth."""
+
+    names: tuple[str, ...]
+    n_gt: np.ndarray
+    value: float
+    draws: np.ndarray
+    level: float
+    same_truth: bool
+
+    def interval(self) -> Interval:
+        """The value and its interval."""
+        return _interval(self.value, self.draws, self.level, len(self.names))
+
+    def less(self, other: Drawn) -> Interval:
+        """This statistic minus the other on the same resamples, of the same scenarios with equal truth."""
+        if self.names != other.names:
+            odd = sorted(set(self.names) ^ set(other.names))
+            raise ConfigError(
+                f"A paired difference needs the same scenarios on both sides; {', '.join(odd[:5])} are on one only."
+            )
+        if self.same_truth and not np.array_equal(self.n_gt, other.n_gt):
+            odd = self.names[int(np.argmax(self.n_gt != other.n_gt))]
+            raise ConfigError(f"A paired difference needs the same truth on both sides; scenario {odd} differs.")
+        return _interval(self.value - other.value, self.draws - other.draws, self.level, len(self.names))
+
+
+def drawn(
+    matches: Sequence[FrameMatch],
+    n: int = 1000,
+    seed: int = 0,
+    level: float = 0.95,
+    protocol: Protocol = PROTOCOLS["manyeyes"],
+    statistic: Statistic = weighted_ap,
+) -> Drawn:
+    """The AP (or another statistic) of matched frames on n resamples, made once for any number of differences."""
+    pool = _pooled(matches, protocol)
+    value = float(statistic(pool, np.ones((1, len(pool.names)), dtype=np.int64))[0])
+    draws = statistic(pool, resamples(len(pool.names), n, seed))
+    return Drawn(pool.names, pool.n_gt, value, draws, level, protocol.count_frames_without_det)
+
+
 def scenario_interval(
     matches: Sequence[FrameMatch],
     n: int = 1000,
@@ -93,10 +136,7 @@ def scenario_interval(
     statistic: Statistic = weighted_ap,
 ) -> Interval:
     """The AP (or another statistic) of matched frames and its interval over scenarios."""
-    pool = _pooled(matches, protocol)
-    draws = statistic(pool, resamples(len(pool.names), n, seed))
-    value = float(statistic(pool, np.ones((1, len(pool.names)), dtype=np.int64))[0])
-    return _interval(value, draws, level, len(pool.names))
+    return drawn(matches, n, seed, level, protocol, statistic).interval()
 
 
 def paired_difference(
@@ -109,19 +149,8 @@ def paired_difference(
     statistic: Statistic = weighted_ap,
 ) -> Interval:
     """Statistic of a minus that of b, both on the same resampled scenarios, which must be the same with equal truth."""
-    first, second = _pooled(a, protocol), _pooled(b, protocol)
-    if first.names != second.names:
-        odd = sorted(set(first.names) ^ set(second.names))
-        raise ConfigError(
-            f"A paired difference needs the same scenarios on both sides; {', '.join(odd[:5])} are on one only."
-        )
-    if protocol.count_frames_without_det and not np.array_equal(first.n_gt, second.n_gt):
-        odd = first.names[int(np.argmax(first.n_gt != second.n_gt))]
-        raise ConfigError(f"A paired difference needs the same truth on both sides; scenario {odd} differs.")
-    weights = resamples(len(first.names), n, seed)
-    once = np.ones((1, len(first.names)), dtype=np.int64)
-    value = float((statistic(first, once) - statistic(second, once))[0])
-    return _interval(value, statistic(first, weights) - statistic(second, weights), level, len(first.names))
+    ours, theirs = (drawn(matches, n, seed, level, protocol, statistic) for matches in (a, b))
+    return ours.less(theirs)
 
 
 def mean_interval(values: Sequence[float], n: int = 1000, seed: int = 0, level: float = 0.95) -> Interval:

@@ -7,11 +7,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from torch import Tensor
+
 from manyeyes.agents.replay import Step
 from manyeyes.evaluation.bootstrap import Interval, paired_difference, scenario_interval
 from manyeyes.evaluation.communication import Communication, MessageRecord, summarise
 from manyeyes.evaluation.detection import (
     ApResult,
+    FrameMatch,
     FrameOverlap,
     FrameResult,
     Protocol,
@@ -45,12 +48,14 @@ class MethodResult:
 class Tally:
     """What one method did so far, in the little that judging needs: no cloud is kept.
 
-    Messages are those that other agents sent for an ego's frame, arrived or not. share_s counts calls that said something.
+    speeds: (G,) m/s of each frame's true boxes. Messages are those that other agents sent for an ego's frame, arrived or not.
+    share_s counts calls that said something.
     """
 
     method: str
     protocol: Protocol
     frames: list[FrameOverlap] = field(default_factory=list)
+    speeds: list[Tensor] = field(default_factory=list)
     messages: list[MessageRecord] = field(default_factory=list)
     ages_s: list[float] = field(default_factory=list)
     share_s: list[float] = field(default_factory=list)
@@ -62,6 +67,7 @@ class Tally:
         truth = ego_truth(snapshot, step.ego, self.protocol)
         result = FrameResult(snapshot.scenario, snapshot.index, step.boxes, truth)
         self.frames.append(overlap_frame(result, self.protocol))
+        self.speeds.append(truth.velocity.norm(dim=1))
         heard = (h.message for h in step.perception.heard)
         arrived = {m.agent_id: tuple(m.tokens.features.shape) for m in heard if m.tokens is not None}
         for sent in step.sent:
@@ -79,20 +85,33 @@ class Tally:
     def extend(self, other: Tally) -> None:
         """Count what another tally of this method counted."""
         self.frames += other.frames
+        self.speeds += other.speeds
         self.messages += other.messages
         self.ages_s += other.ages_s
         self.share_s += other.share_s
         self.perceive_s += other.perceive_s
 
+    def matches(self) -> tuple[tuple[FrameMatch, ...], ...]:
+        """The frames matched at each of IOUS, in the order they came in."""
+        return tuple(tuple(match_frame(frame, iou, self.protocol) for frame in self.frames) for iou in IOUS)
+
+    def communication(self) -> Communication:
+        """What was sent."""
+        return summarise(self.messages, len(self.frames))
+
+    def age_ms(self) -> float:
+        """The mean age of what took part, when it was used; NaN where nothing did."""
+        return _mean_ms(self.ages_s)
+
     def result(self) -> MethodResult:
         """The numbers of everything counted so far."""
-        matches = [[match_frame(frame, iou, self.protocol) for frame in self.frames] for iou in IOUS]
+        matches = self.matches()
         return MethodResult(
             self.method,
             tuple(ap_of_matches(m, self.protocol) for m in matches),
             tuple(scenario_interval(m, protocol=self.protocol) for m in matches),
-            summarise(self.messages, len(self.frames)),
-            _mean_ms(self.ages_s),
+            self.communication(),
+            self.age_ms(),
             _mean_ms(self.share_s),
             _mean_ms(self.perceive_s),
         )
