@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures to features at an eighth of their size: a residual network and a feature pyramid, both our own.
+
+Sources: He et al., CVPR 2016 (basic and bottleneck blocks); Lin et al., CVPR 2017 (top-down pyramid); Wu and He, ECCV 2018
+(group normalisation, so that what one agent makes of its picture never depends on whose pictures share the batch).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from manyeyes.datatypes import ConfigError
+
+FEATURE_STRIDE = 8
+"""Pixels of the picture a pixel of the features, along each axis; feature o is centred on pixel 8 o."""
+
+
+@dataclass(frozen=True)
+class ImageEncoderConfig:
+    """blocks: residual blocks at strides 4, 8, 16, …, two stages or more; width: channels of the first stage, doubled by each.
+
+    bottleneck: 1-3-1 blocks with four times the channels (ResNet-50 is (3, 4, 6, 3), 64, True); else 3-3 blocks
+    (ResNet-18 is (2, 2, 2, 2), 64, False). channels: of the pyramid and of what comes out.
+    """
+
+    blocks: tuple[int, ...] = (2, 2, 2, 2)
+    width: int = 64
+    bottleneck: bool = False
+    channels: int = 128
+
+    def __post_init__(self) -> None:
+        if len(self.blocks) < 2 or min(self.blocks) < 1:
+            raise ConfigError(
+                f"ImageEncoderConfig.blocks needs two or more stages of a block or more; got {self.blocks}."
+            )
+
+
+def group_norm(channels: int) -> nn.GroupNorm:
+    """Groups of 16 channels, or one group where there are fewer."""
+    return nn.GroupNorm(max(1, channels // 16), channels)
+
+
+def conv(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
+    """Convolution and group norm; sizes are divided by the stride, rounded up."""
+    return nn.Sequential(nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, bias=False), group_norm(outputs))
+
+
+class Residual(nn.Module):
+    """A residual block; the shortcut is projected where size or channels change."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1, bottleneck: bool = False) -> None:
+        super().__init__()
+        inner = outputs // 4 if bottleneck else outputs
+        layers = (
+            [conv(inputs, inner, 1), nn.ReLU(), conv(inner, inner, 3, stride), nn.ReLU(), conv(inner, outputs, 1)]
+            if bottleneck
+            else [conv(inputs, inner, 3, stride), nn.ReLU(), conv(inner, outputs, 3)]
+        )
+        self.inner = nn.Sequential(*layers)
+        self.shortcut = nn.Identity() if inputs == outputs and stride == 1 else conv(inputs, outputs, 1, stride)
+        last = layers[-1][1]
+        assert isinstance(last, nn.GroupNorm)
+        # Every block starts as its shortcut, which lets deep stacks learn from the first step (Goyal et al. 2017).
+        nn.init.zeros_(last.weight)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, inputs, h, w) to (N, outputs, ceil(h / stride), ceil(w / stride))."""
+        return torch.relu(self.shortcut(x) + self.inner(x))
+
+
+def finer(x: Tensor, size: tuple[int, int]) -> Tensor:
+    """(N, C, h, w) at twice the density, cut to size, bilinear: cell o comes to lie on cell 2 o, where strided layers took it."""
+    h, w = x.shape[-2:]
+    padded = F.pad(x, (0, 1, 0, 1), mode="replicate")
+    return F.interpolate(padded, (2 * h + 1, 2 * w + 1), mode="bilinear", align_corners=True)[..., : size[0], : size[1]]
+
+
+class Pyramid(nn.Module):
+    """Maps of falling size as one map of the size of the first: each level is told what the coarser ones saw."""
+
+    def __init__(self, inputs: tuple[int, ...], channels: int) -> None:
+        super().__init__()
+        self.lateral = nn.ModuleList(nn.Conv2d(c, channels, 1) for c in inputs)
+        self.smooth = conv(channels, channels, 3)
+
+    def forward(self, levels: list[Tensor]) -> Tensor:
+        """(N, inputs[i], h_i, w_i), finest first, to (N, channels, h_0, w_0)."""
+        laterals = [lateral(level) for lateral, level in zip(self.lateral, levels)]
+        down = laterals[-1]
+        for level in laterals[-2::-1]:
+            down = level + finer(down, level.shape[-2:])
+        return torch.relu(self.smooth(down))
+
+
+class ImageEncoder(nn.Module):
+    """Colour pictures to features of stride 8."""
+
+    def __init__(self, config: ImageEncoderConfig) -> None:
+        super().__init__()
+        grow = 4 if config.bottleneck else 1
+        self.stem = nn.Sequential(conv(3, config.width, 7, 2), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+        widths = [config.width * grow * 2**i for i in range(len(config.blocks))]
+        stages, inputs = [], config.width
+        for i, (count, width) in enumerate(zip(config.blocks, widths)):
+            blocks = [Residual(inputs, width, 2 if i else 1, config.bottleneck)]
+            blocks += [Residual(width, width, 1, config.bottleneck) for _ in range(count - 1)]
+            stages.append(nn.Sequential(*blocks))
+            inputs = width
+        self.stages = nn.ModuleList(stages)
+        self.pyramid = Pyramid(tuple(widths[1:]), config.channels)
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        """(V, 3, h, w) uint8, or floats in [0, 255], to (V, channels, ceil(h / 8), ceil(w / 8))."""
+        x = self.stem(rgb.to(torch.float32) / 64 - 2)
+        levels = []
+        for stage in self.stages:
+            x = stage(x)
+            levels.append(x)
+        return self.pyramid(levels[1:])

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From features of a tile to map elements: a fixed number of queries, each one element of a fixed number of points.
+
+Sources: MapTR (Liao et al., ICLR 2023): hierarchical queries, an instance's and a point's embedding added, and reference points
+refined layer by layer; MapTRv2 (IJCV 2024): self-attention among instances and within each in turn, and a second group of queries
+for one-to-many matching in training; Deformable DETR (ICLR 2021): attention to a few learned places. The two groups never
+attend to each other, which here is said by running the same layers on each.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from manyeyes.datatypes import BevGrid, ConfigError
+from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
+from manyeyes.ops.deformable import sample_weighted
+
+Group = Literal["one", "many"]
+
+
+@dataclass(frozen=True)
+class MapHeadConfig:
+    """kinds: of elements that are told apart, by name. elements, points: queries of one-to-one matching, and points of each;
+    many: queries of one-to-many matching, in training only. places: looked at by each of the heads, a point and layer.
+
+    keep, threshold: at most so many answers, by score over all elements and kinds, and those of at least that score.
+    """
+
+    kinds: tuple[str, ...] = ("divider", "boundary", "crossing")
+    elements: int = 50
+    points: int = 20
+    many: int = 0
+    channels: int = 128
+    feed: int = 256
+    layers: int = 3
+    heads: int = 8
+    places: int = 4
+    keep: int = 50
+    threshold: float = 0.05
+
+    def __post_init__(self) -> None:
+        if self.channels % self.heads or self.points < 2 or min(self.elements, self.layers, self.places) < 1:
+            raise ConfigError(f"MapHeadConfig needs channels divisible by heads and two points or more; got {self}.")
+        if not self.kinds or not set(self.kinds) <= set(KINDS) or len(set(self.kinds)) != len(self.kinds):
+            raise ConfigError(f"MapHeadConfig.kinds are some of {', '.join(KINDS)}; got {self.kinds}.")
+
+
+@dataclass(frozen=True, eq=False)
+class RawMap:
+    """What one layer says of B tiles: logit (B, I, kinds) and point (B, I, P, 2), x and y as shares of the tile, in (0, 1)."""
+
+    logit: Tensor
+    point: Tensor
+
+
+class _SelfAttention(nn.Module):
+    """Attention among the rows of each sequence; places are added to what is compared, not to what is told."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.compare, self.value = nn.Linear(channels, 2 * channels), nn.Linear(channels, channels)
+        self.out = nn.Linear(channels, channels)
+
+    def forward(self, x: Tensor, place: Tensor) -> Tensor:
+        """(..., L, C) to (..., L, C), place of a shape that broadcasts."""
+        query, key = self.compare(x + place).chunk(2, -1)
+        query, key, value = (t.unflatten(-1, (self.heads, -1)).transpose(-2, -3) for t in (query, key, self.value(x)))
+        mixed = F.scaled_dot_product_attention(query, key, value)
+        return self.out(mixed.transpose(-2, -3).flatten(-2))
+
+
+class DeformableAttention(nn.Module):
+    """Each query looks at a few places around its reference point, which it chooses itself (Deformable DETR, Eq. 2)."""
+
+    def __init__(self, channels: int, heads: int, places: int) -> None:
+        super().__init__()
+        self.heads, self.places = heads, places
+        self.value, self.out = nn.Linear(channels, channels), nn.Linear(channels, channels)
+        self.offset, self.weight = nn.Linear(channels, heads * places * 2), nn.Linear(channels, heads * places)
+        # Heads start by looking in as many directions, each place a cell farther.
+        angle = torch.arange(heads) * (2 * math.pi / heads)
+        ring = torch.stack((angle.cos(), angle.sin()), -1)
+        ring = ring / ring.abs().amax(-1, keepdim=True)
+        steps = ring[:, None] * torch.arange(1, places + 1)[:, None]
+        nn.init.zeros_(self.offset.weight)
+        nn.init.zeros_(self.weight.weight)
+        nn.init.zeros_(self.weight.bias)
+        with torch.no_grad():
+            self.offset.bias.copy_(steps.flatten())
+
+    def forward(self, query: Tensor, reference: Tensor, ground: Tensor) -> Tensor:
+        """query (B, Q, C), reference (B, Q, 2) as shares of the ground, ground (B, rows, columns, C), to (B, Q, C)."""
+        b, q, channels = query.shape
+        rows, columns = ground.shape[1:3]
+        values = self.value(ground).view(b, rows, columns, self.heads, channels // self.heads).permute(0, 3, 4, 1, 2)
+        offset = self.offset(query).view(b, q, self.heads, self.places, 2)
+        weight = self.weight(query).view(b, q, self.heads, self.places).softmax(-1)
+        at = reference[:, :, None, None] + offset / offset.new_tensor([columns, rows])
+        return self.out(sample_weighted(values, at, weight))
+
+
+class MapLayer(nn.Module):
+    """Among instances, within each, to the ground, and each by itself; a norm after each."""
+
+    def __init__(self, config: MapHeadConfig) -> None:
+        super().__init__()
+        c = config.channels
+        self.among, self.within = _SelfAttention(c, config.heads), _SelfAttention(c, config.heads)
+        self.look = DeformableAttention(c, config.heads, config.places)
+        self.feed = nn.Sequential(nn.Linear(c, config.feed), nn.ReLU(), nn.Linear(config.feed, c))
+        self.norms = nn.ModuleList(nn.LayerNorm(c) for _ in range(4))
+
+    def forward(self, x: Tensor, place: Tensor, reference: Tensor, ground: Tensor) -> Tensor:
+        """x (B, I, P, C), place (I, P, C), reference (B, I, P, 2), ground (B, rows, columns, C), to (B, I, P, C)."""
+        among = self.among(x.transpose(1, 2), place.transpose(0, 1)).transpose(1, 2)
+        x = self.norms[0](x + among)
+        x = self.norms[1](x + self.within(x, place))
+        look = self.look((x + place).flatten(1, 2), reference.flatten(1, 2), ground)
+        x = self.norms[2](x + look.view_as(x))
+        return self.norms[3](x + self.feed(x))
+
+
+class MapHead(nn.Module):
+    """Queries, layers, and after each layer kinds and points."""
+
+    def __init__(self, config: MapHeadConfig) -> None:
+        super().__init__()
+        self.config = config
+        c = config.channels
+        self.instance = nn.Parameter(torch.randn(config.elements + config.many, 2 * c))
+        self.point = nn.Parameter(torch.randn(config.points, 2 * c))
+        self.reference = nn.Linear(c, 2)
+        self.layers = nn.ModuleList(MapLayer(config) for _ in range(config.layers))
+        self.kinds = nn.ModuleList(_kind_branch(c, len(config.kinds)) for _ in range(config.layers))
+        self.moves = nn.ModuleList(_move_branch(c) for _ in range(config.layers))
+
+    def forward(self, ground: Tensor, group: Group = "one") -> tuple[RawMap, ...]:
+        """Features of B tiles (B, C, rows, columns) to one RawMap a layer, the last the best; group: which queries."""
+        ones = self.config.elements
+        instance = self.instance[:ones] if group == "one" else self.instance[ones:]
+        place, content = (instance[:, None] + self.point).chunk(2, -1)
+        b = ground.shape[0]
+        x = content.expand(b, *content.shape)
+        reference = self.reference(place).sigmoid().expand(b, *place.shape[:-1], 2)
+        ground = ground.permute(0, 2, 3, 1)
+        out = []
+        for layer, kind, move in zip(self.layers, self.kinds, self.moves):
+            x = layer(x, place, reference, ground)
+            point = torch.sigmoid(move(x) + torch.logit(reference, 1e-5))
+            out.append(RawMap(kind(x.mean(2)), point))
+            reference = point.detach()
+        return tuple(out)
+
+
+def _kind_branch(channels: int, kinds: int) -> nn.Sequential:
+    last = nn.Linear(channels, kinds)
+    # Few queries are elements: each starts at a probability of 0.01 (focal loss, Lin et al. 2017).
+    nn.init.constant_(last.bias, -math.log(99))
+    hidden = [part for _ in range(2) for part in (nn.Linear(channels, channels), nn.LayerNorm(channels), nn.ReLU())]
+    return nn.Sequential(*hidden, last)
+
+
+def _move_branch(channels: int) -> nn.Sequential:
+    last = nn.Linear(channels, 2)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels), nn.ReLU(), last)
+
+
+def decode(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[MapElements]:
+    """The elements of each tile, in its frame, metres, best first; a query may answer under two kinds, as in MapTR."""
+    score = raw.logit.detach().sigmoid()
+    low = np.array([tile.x_min, tile.y_min])
+    size = np.array([tile.x_max, tile.y_max]) - low
+    code = np.array([KINDS.index(kind) for kind in config.kinds])
+    out = []
+    for scores, points in zip(score, raw.point.detach().double()):
+        value, order = scores.flatten().sort(descending=True, stable=True)
+        kept = order[: config.keep][value[: config.keep] >= config.threshold]
+        query, kind = (kept // scores.shape[1]).numpy(), (kept % scores.shape[1]).numpy()
+        lines = points.numpy()[query] * size + low
+        out.append(MapElements.of(list(lines), code[kind], scores.flatten()[kept].double().numpy()))
+    return out
+
+
+def is_ring(kind: str) -> bool:
+    """Whether the last point of such an element joins its first."""
+    return KINDS.index(kind) == CROSSING

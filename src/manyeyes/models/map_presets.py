@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Map models by name and sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from manyeyes.datatypes import BevGrid, ConfigError
+from manyeyes.models.image_encoder import ImageEncoderConfig
+from manyeyes.models.lift import DepthBins
+from manyeyes.models.map_bev import BevConfig, Sensor
+from manyeyes.models.map_head import MapHeadConfig
+from manyeyes.models.mapper import MapperConfig
+
+FORMAT = "manyeyes-mapper-1"
+"""Of a mapper's file of weights."""
+
+
+def _tile(cell_m: float) -> BevGrid:
+    """CrowdMap's semi-global tile, 120 m along its road by 60 m."""
+    return BevGrid(-60.0, -30.0, -5.0, 60.0, 30.0, 5.0, pillar=cell_m)
+
+
+TOY = MapperConfig(
+    BevConfig(
+        BevGrid(-36.0, -36.0, -2.0, 36.0, 36.0, 4.0, pillar=0.6),
+        channels=32,
+        raster_width=12,
+        raster_blocks=(1, 1),
+        image=ImageEncoderConfig((1, 1), 12, channels=32),
+        image_size=(64, 112),
+        depth=DepthBins(1.0, 37.0, 19),
+    ),
+    _tile(1.5),
+    token_channels=16,
+    neck=(1, 1),
+    head=MapHeadConfig(elements=30, points=10, many=60, channels=64, feed=128, layers=2, heads=4),
+)
+"""For tests: seconds a step at most."""
+
+SMALL = MapperConfig(
+    BevConfig(
+        BevGrid(-38.4, -38.4, -2.0, 38.4, 38.4, 4.0, pillar=0.4),
+        channels=48,
+        raster_width=16,
+        image=ImageEncoderConfig((2, 2, 2), 24, channels=64),
+        image_size=(150, 200),
+        depth=DepthBins(1.0, 49.0, 33),
+    ),
+    _tile(0.8),
+    token_channels=32,
+    head=MapHeadConfig(elements=50, points=20, many=50, channels=128, feed=256, layers=3),
+)
+"""For two cores."""
+
+PAPER = MapperConfig(
+    BevConfig(
+        BevGrid(-51.2, -51.2, -2.0, 51.2, 51.2, 4.0, pillar=0.4),
+        channels=256,
+        raster_width=64,
+        raster_blocks=(2, 2, 2),
+        image=ImageEncoderConfig((3, 4, 6, 3), 64, True, 256),
+        image_size=(480, 640),
+        depth=DepthBins(1.0, 69.0, 69),
+    ),
+    _tile(0.6),
+    token_channels=128,
+    neck=(2, 2, 2),
+    head=MapHeadConfig(elements=100, points=20, many=300, channels=256, feed=512, layers=6),
+)
+"""ResNet-50, 120 m by 60 m, 100 queries of 20 points: CrowdMap section 3.1, and MapTRv2's decoder where it is silent. For GPUs."""
+
+MAPPERS = {"toy": TOY, "small": SMALL, "paper": PAPER}
+
+
+def mapper_config(name: str, sensors: tuple[Sensor, ...] = ("lidar",)) -> MapperConfig:
+    """A preset by its name in MAPPERS, for agents that carry these sensors."""
+    if name not in MAPPERS:
+        raise ConfigError(f"No map model is called {name!r}; choose one of {', '.join(MAPPERS)}.")
+    config = MAPPERS[name]
+    return replace(config, bev=replace(config.bev, sensors=sensors))

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of the ground moved between frames, and the maximum over those that saw a place.
+
+What nobody saw is not zero: a maximum against zero would clip every negative feature beside an agent's horizon. Here a place
+out of view is minus infinity, and one that nobody saw is a vector of its own. Source: CrowdMap section 2.2 (affine warp,
+bilinear, maxout); F-Cooper, Chen et al. 2019 (maxout); the mask is ours (specs: maps.md 1.4).
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from manyeyes.datatypes import BevGrid, ShapeError, Transform
+
+SEEN_SHARE = 0.5
+"""A place is seen where more than this share of the bilinear weight falls on seen cells."""
+
+
+def warp(
+    features: Tensor, seen: Tensor, source: BevGrid, target: BevGrid, target_from_source: Transform
+) -> tuple[Tensor, Tensor]:
+    """Features (N, C, h, w) on one grid to (N, C, H, W) on another, and which places (N, H, W) are seen there.
+
+    seen: (N, h, w) bool. target_from_source: N motions, of which the planar part counts: x, y and yaw. Each place is the mean of
+    the seen cells around it by their bilinear weights; unseen places are zero.
+    """
+    if features.shape[-2:] != source.shape or seen.shape != features.shape[:1] + features.shape[-2:]:
+        raise ShapeError(
+            f"warp needs features (N, C, {source.shape[0]}, {source.shape[1]}) and seen of the same cells; got "
+            f"{tuple(features.shape)} and {tuple(seen.shape)}."
+        )
+    at = _places(source, target, target_from_source).to(features)
+    share = seen[:, None].to(features.dtype)
+    both = torch.cat((features * share, share), 1)
+    moved = F.grid_sample(both, at, mode="bilinear", padding_mode="zeros", align_corners=False)
+    weight = moved[:, -1:]
+    visible = weight > SEEN_SHARE
+    return moved[:, :-1] / weight.clamp_min(SEEN_SHARE) * visible, visible[:, 0]
+
+
+def _places(source: BevGrid, target: BevGrid, target_from_source: Transform) -> Tensor:
+    """(N, H, W, 2) where the centres of target's cells lie in source, -1 and 1 being its outer borders; float64."""
+    rows, columns = target.shape
+    row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    xy = target.centers(torch.stack((row, column), -1).view(-1, 2)).double()
+    moved = xy - target_from_source.translation[:, None, :2].double()
+    yaw = target_from_source.yaw.double()
+    c, s = yaw.cos()[:, None], yaw.sin()[:, None]
+    x, y = moved[..., 0] * c + moved[..., 1] * s, moved[..., 1] * c - moved[..., 0] * s
+    size = torch.tensor([source.shape[1], source.shape[0]], dtype=torch.float64)
+    origin = torch.tensor([source.x_min, source.y_min], dtype=torch.float64)
+    cell = ((torch.stack((x, y), -1) - origin) / source.pillar - 0.5) / source.stride
+    return ((2 * cell + 1) / size - 1).view(-1, rows, columns, 2)
+
+
+def masked_max(features: Tensor, seen: Tensor, null: Tensor) -> Tensor:
+    """(B, C, H, W): the greatest of features (B, K, C, H, W) over those of K that see a place (B, K, H, W); else null (C,)."""
+    greatest = features.masked_fill(~seen[:, :, None], -torch.inf).amax(1)
+    return torch.where(seen.any(1)[:, None], greatest, null[:, None, None])

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The encoder of pictures: sizes, alignment of its levels, and that looks do not know of each other."""
+
+import pytest
+import torch
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.models.image_encoder import FEATURE_STRIDE, ImageEncoder, ImageEncoderConfig, Residual, finer
+
+TINY = ImageEncoderConfig((1, 1, 1), 8, channels=16)
+
+
+@pytest.mark.parametrize("size", [(64, 112), (75, 101)])
+@pytest.mark.parametrize("config", [TINY, ImageEncoderConfig((1, 1), 8, True, 16)])
+def test_features_are_an_eighth_rounded_up(config, size):
+    rgb = torch.randint(0, 256, (2, 3, *size), dtype=torch.uint8)
+    out = ImageEncoder(config)(rgb)
+    assert out.shape == (2, 16, -(-size[0] // FEATURE_STRIDE), -(-size[1] // FEATURE_STRIDE))
+    assert bool((out >= 0).all()) and float(out.detach().std()) > 0
+
+
+def test_one_picture_does_not_depend_on_the_others_of_its_batch():
+    net = ImageEncoder(TINY).train()
+    rgb = torch.rand(3, 3, 40, 56) * 255
+    assert torch.allclose(net(rgb)[1:2], net(rgb[1:2]), atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(8, 10), (7, 9)])
+def test_a_finer_map_keeps_every_cell_where_the_stride_took_it(size):
+    ramp = torch.arange(float(size[1])).expand(1, 1, *size) + 10 * torch.arange(float(size[0]))[:, None]
+    coarse = ramp[..., ::2, ::2]
+    fine = finer(coarse, size)
+    assert fine.shape == ramp.shape
+    # A ramp comes back exactly, but for a last cell beyond the last that was taken.
+    assert torch.allclose(fine[..., : size[0] - 1, : size[1] - 1], ramp[..., : size[0] - 1, : size[1] - 1], atol=1e-5)
+    if size[1] % 2:
+        assert torch.allclose(fine, ramp, atol=1e-5)
+
+
+def test_a_block_starts_as_its_shortcut():
+    x = torch.rand(1, 16, 5, 5)
+    assert torch.equal(Residual(16, 16, bottleneck=True)(x), x)
+
+
+def test_fifty_layers_have_their_published_width():
+    net = ImageEncoder(ImageEncoderConfig((3, 4, 6, 3), 64, True, 256))
+    body = sum(p.numel() for part in (net.stem, net.stages) for p in part.parameters())
+    # ResNet-50 without its classifier has 23,508,032 parameters (He et al. 2016); group norms have as many as batch norms.
+    assert body == 23_508_032
+
+
+def test_one_stage_is_refused():
+    with pytest.raises(ConfigError, match="two or more stages"):
+        ImageEncoderConfig((2,))
