@@ -87,7 +87,7 @@ def test_tokens_of_another_model_are_refused_and_the_objects_are_used():
 @given(st.lists(st.binary(max_size=200), max_size=20), st.randoms(use_true_random=False))
 def test_garbage_copies_and_order_change_nothing(noise, random):
     clean = [p for agent in (1, 2, 3) for p in packets_of(said(agent))]
-    mixed = clean + [b"ME\x01" + n for n in noise] + noise + random.choices(clean, k=5)
+    mixed = clean + [b"ME\x02" + n for n in noise] + noise + random.choices(clean, k=5)
     mixed += [clean[0][: random.randrange(len(clean[0]))], clean[1] + b"!"]
     random.shuffle(mixed)
     inbox = filled(mixed)
@@ -113,10 +113,10 @@ def test_each_reason_is_counted_under_its_name():
     packet = packets_of(said())[0]
     old = bytearray(packet)
     old[2] = 9
-    nan = packet[:22] + b"\0\0\0\0\0\0\xf8\x7f" + packet[30:-4]
-    nan += zlib.crc32(nan).to_bytes(4, "little")
+    far = packet[:20] + b"\0\0\0\0\0\x80" + packet[26:-4]
+    far += zlib.crc32(far).to_bytes(4, "little")
     moved = packets_of(replace(said(), world_from_agent=Transform.identity()))[1]
-    inbox = filled([packet, b"", bytes(old), packet[:-1] + b"?", nan, moved, packet])
+    inbox = filled([packet, b"", bytes(old), packet[:-1] + bytes([packet[-1] ^ 1]), far, moved, packet])
     wanted = {"garbage": 1, "version": 1, "checksum": 1, "implausible": 1, "contradiction": 1, "duplicate": 1}
     assert inbox.dropped == Dropped(**wanted)
     assert inbox.dropped.total == 6

@@ -4,6 +4,7 @@
 from manyeyes.comms.bus import LocalBus
 from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, Delivery, Send, channel_preset
 from manyeyes.comms.codec import PacketError
+from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.inbox import Dropped, Inbox, Reception
 from manyeyes.comms.select import within_budget
 from manyeyes.comms.wire import Fragment, assemble, decode_packet, encode
@@ -12,6 +13,7 @@ __all__ = [
     "CHANNELS",
     "Channel",
     "ChannelPreset",
+    "CodeTables",
     "Delivery",
     "Dropped",
     "Fragment",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import WireError
 
-Reason = Literal["garbage", "version", "checksum", "implausible", "contradiction"]
+Reason = Literal["garbage", "version", "checksum", "implausible", "contradiction", "wrong_model"]
 
 DELTA, BITMAP = 0, 1
 """How a set of cells is written: gaps between sorted keys, or one bit a cell over the span of keys."""

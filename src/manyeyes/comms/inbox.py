@@ -7,11 +7,12 @@ from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from manyeyes.comms.codec import PacketError, Reason
+from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.sections import TokenRows
 from manyeyes.comms.wire import Assembly, Fragment, decode_packet
 from manyeyes.datatypes import Message
 
-DropReason = Reason | Literal["wrong_model", "duplicate", "expired", "full"]
+DropReason = Reason | Literal["duplicate", "expired", "full"]
 
 _CLOCK_SLACK_NS = 1_000_000_000
 
@@ -78,7 +79,8 @@ class Inbox:
     fingerprint: tokens of other weights are refused, other sections of the same message are not; None takes all.
     expire_ns: a message captured longer ago than this is neither taken nor given; None keeps it until a newer one comes.
     At most max_agents senders of max_agent_bytes of packets each are held: a flood of ids cannot exhaust the memory.
-    Beyond it the sender heard of least recently (by capture) gives way to a newer one.
+    Beyond it the sender heard of least recently (by capture) gives way to a newer one. tables: of the codebook of these
+    weights; without them coded tokens cannot be read and are refused as of other weights.
     """
 
     def __init__(
@@ -87,11 +89,13 @@ class Inbox:
         expire_ns: int | None = None,
         max_agents: int = 64,
         max_agent_bytes: int = 4 << 20,
+        tables: CodeTables | None = None,
     ) -> None:
         self._fingerprint = fingerprint
         self._expire_ns = expire_ns
         self._max_agents = max_agents
         self._max_agent_bytes = max_agent_bytes
+        self._tables = tables
         self._held: dict[int, _Held] = {}
         self._dropped = Dropped()
 
@@ -103,7 +107,7 @@ class Inbox:
     def push(self, packet: bytes, arrival_ns: int | None = None) -> None:
         """Take one packet; whatever is wrong with it is counted and never raised."""
         try:
-            fragment = decode_packet(packet)
+            fragment = decode_packet(packet, self._tables)
             refusal = self._refusal(fragment, arrival_ns) or self._store(fragment, arrival_ns)
         except PacketError as error:
             refusal = error.reason

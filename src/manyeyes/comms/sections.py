@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bodies of packets: tokens, objects and points to rows of bytes and back, as :mod:`manyeyes.comms.wire` lays down."""
+"""The bodies of packets: tokens, objects, points, requests to bytes and back, as :mod:`manyeyes.comms.wire` lays down."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -16,34 +17,43 @@ from torch import Tensor
 
 from manyeyes.comms import codec
 from manyeyes.comms.codec import PacketError
+from manyeyes.comms.entropy import MOST_CELLS, CodeTables, coded_counts, pack_coded, unpack_coded
 from manyeyes.datatypes import LABELS, BevGrid, Boxes, ConfigError, PointCloud, Sites, SparseBev, WireError
+from manyeyes.datatypes.message import DESCRIPTOR, RequestMap
 
-Precision = Literal["float32", "float16", "int8"]
+Precision = Literal["float32", "float16", "int8", "codes"]
 
-PRECISIONS: tuple[Precision, ...] = ("float32", "float16", "int8")
+PRECISIONS: tuple[Precision, ...] = ("float32", "float16", "int8", "codes")
 # The middle of what drives in European cities.
 LABEL_HEIGHTS = (1.6, 2.3, 3.2, 3.2)
-NONE, TOKENS, OBJECTS, POINTS = range(4)
+NONE, TOKENS, OBJECTS, POINTS, REQUEST = range(5)
 
-_GRID = struct.Struct("<6hHBBHH")
-TOKENS_BYTES = _GRID.size
+_GRID = struct.Struct("<6hHB")
+_TOKENS = struct.Struct("<BHH")
+TOKENS_BYTES = _GRID.size + _TOKENS.size
 _OBJECT = np.dtype(
     [("xy", "<i2", 2), ("yaw", "<i2"), ("size", "u1", 2), ("score", "u1")]
     + [(name, "u1") for name in ("sigma_xy", "sigma_yaw", "label_flip", "id")]
 )
+_VELOCITY, _DESCRIPTOR = 1, 2
+_METRES_PER_S = 0.25
 _POINT = np.dtype([("xyz", "<i2", 3), ("intensity", "u1")])
 _FEATURE_TYPES: dict[Precision, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),
     "float16": np.dtype("<f2"),
     "int8": np.dtype("i1"),
+    "codes": np.dtype("u1"),
 }
+_CODED = 2
 _MOST_CELLS = 1 << 24
 _SIGMA_XY, _SIGMA_YAW = (0.01, 20.0), (0.001, 3.2)
 
 
 @dataclass(frozen=True, eq=False)
 class TokenRows:
-    """Some cells of a grid: key (n,) ascending; scales and values: the bytes of C codes (none but for int8) and n rows of C."""
+    """Some cells of a grid: key (n,) ascending; scales and values: the bytes of C scale codes (none but for int8) and n rows
+    of C.
+    """
 
     grid: BevGrid
     precision: Precision
@@ -53,8 +63,8 @@ class TokenRows:
     values: bytes
 
     @property
-    def features(self) -> NDArray[np.float32]:
-        """(n, C) float32: what the values stand for."""
+    def features(self) -> NDArray[Any]:
+        """(n, C) float32, what the values stand for; uint8 where they are codes."""
         return _features([self])
 
 
@@ -72,13 +82,7 @@ class PointRows:
     rows: NDArray[Any]
 
 
-Body = TokenRows | ObjectRows | PointRows | None
-
-
-def check_precision(precision: str) -> None:
-    """Raise ConfigError where precision is not one of PRECISIONS."""
-    if precision not in PRECISIONS:
-        raise ConfigError(f"precision is one of {', '.join(PRECISIONS)}; got {precision!r}.")
+Body = TokenRows | ObjectRows | PointRows | RequestMap | None
 
 
 def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int16]:
@@ -92,14 +96,25 @@ def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int
     return codes.astype(np.int16)
 
 
-def object_bodies(boxes: Boxes, capacity: int) -> list[bytes]:
-    """Bodies of whole objects, the highest score first; no objects are one empty body."""
-    boxes = boxes[boxes.score.argsort(descending=True, stable=True)]
+def _object_type(flags: int) -> np.dtype[Any]:
+    """The row of an object, with what the flags of its body add."""
+    velocity = [("velocity", "i1", 2)] if flags & _VELOCITY else []
+    return np.dtype(_OBJECT.descr + velocity + ([("descriptor", "i1", DESCRIPTOR)] if flags & _DESCRIPTOR else []))
+
+
+def object_bodies(boxes: Boxes, descriptors: Tensor | None, capacity: int) -> list[bytes]:
+    """Bodies of whole objects, the highest score first; no objects are one body without rows.
+
+    Velocities are sent where any of them is not 0, descriptors where there are any.
+    """
+    order = boxes.score.argsort(descending=True, stable=True)
+    boxes = boxes[order]
     values = torch.cat(
         [
             boxes.center,
             boxes.size,
             torch.stack((boxes.yaw, boxes.score, boxes.sigma_xy, boxes.sigma_yaw, boxes.flip), -1),
+            boxes.velocity,
         ],
         -1,
     )
@@ -112,7 +127,9 @@ def object_bodies(boxes: Boxes, capacity: int) -> list[bytes]:
             f"Message.objects.label is an index into {LABELS}; got {int(label.min())} to {int(label.max())}."
         )
     v = values.numpy()
-    rows = np.zeros(len(boxes), _OBJECT)
+    velocity = np.clip(np.rint(v[:, 11:] / _METRES_PER_S), -127, 127)
+    flags = (_VELOCITY if velocity.any() else 0) | (_DESCRIPTOR if descriptors is not None else 0)
+    rows = np.zeros(len(boxes), _object_type(flags))
     rows["xy"] = _centimetres(v[:, :2], "Objects")
     hundredths = np.rint(np.rad2deg(v[:, 6]) * 100)
     rows["yaw"] = np.mod(hundredths + 18000, 36000) - 18000
@@ -123,8 +140,21 @@ def object_bodies(boxes: Boxes, capacity: int) -> list[bytes]:
     rows["label_flip"] = label | np.rint(np.clip(v[:, 10], 0, 1) * 31).astype(np.int64) << 3
     ids = boxes.id.cpu().numpy()
     rows["id"] = np.where(ids < 0, 255, np.mod(ids, 255))
-    each = capacity // _OBJECT.itemsize
-    return [rows[i : i + each].tobytes() for i in range(0, max(len(rows), 1), each)]
+    if flags & _VELOCITY:
+        rows["velocity"] = velocity
+    if descriptors is not None:
+        rows["descriptor"] = _descriptor_codes(descriptors, len(boxes))[order.cpu().numpy()]
+    each, head = (capacity - 1) // rows.dtype.itemsize, bytes([flags])
+    return [head + rows[i : i + each].tobytes() for i in range(0, max(len(rows), 1), each)]
+
+
+def _descriptor_codes(descriptors: Tensor, count: int) -> NDArray[np.int8]:
+    values = descriptors.detach().double().cpu()
+    if tuple(values.shape) != (count, DESCRIPTOR) or not bool((values.abs() <= 1).all()):
+        raise WireError(
+            f"Message.descriptors needs ({count}, {DESCRIPTOR}) in [-1, 1], one an object; got {tuple(values.shape)}."
+        )
+    return np.rint(values.numpy() * 127).astype(np.int8)
 
 
 def point_bodies(cloud: PointCloud, capacity: int) -> list[bytes]:
@@ -147,19 +177,49 @@ def token_order(tokens: SparseBev, score: Tensor | None) -> NDArray[np.int64]:
     return score.detach().argsort(descending=True, stable=True).cpu().numpy()
 
 
+@dataclass(frozen=True)
+class Form:
+    """How tokens are written: precision, and the tables by which codes are, or None where their bytes are sent as they are."""
+
+    precision: Precision
+    tables: CodeTables | None = None
+
+    def __post_init__(self) -> None:
+        if self.precision not in PRECISIONS:
+            raise ConfigError(f"precision is one of {', '.join(PRECISIONS)}; got {self.precision!r}.")
+
+    def tables_of(self, tokens: SparseBev) -> CodeTables | None:
+        """The tables, where these tokens are to be coded by them; tokens of another kind than the form's are a WireError."""
+        codes = tokens.features.dtype == torch.uint8
+        if codes != (self.precision == "codes"):
+            raise WireError(
+                f"Tokens of {tokens.features.dtype} are not sent as {self.precision}: codes are uint8 rows of the model's "
+                "codebook, and only codes are."
+            )
+        if not codes or self.tables is None:
+            return None
+        if self.tables.width != tokens.features.shape[1]:
+            raise WireError(
+                f"The tables are of rows of {self.tables.width} bytes; these have {tokens.features.shape[1]}."
+            )
+        rows, columns = tokens.grid.shape
+        return self.tables if rows * columns <= MOST_CELLS else None
+
+
 def packet_counts(
-    key: NDArray[np.int64],
-    channels: int,
-    precision: Precision,
+    tokens: SparseBev,
+    order: NDArray[np.int64],
+    form: Form,
     capacity: int,
     header_bytes: int = 0,
     budget_bytes: int | None = None,
 ) -> list[int]:
-    """How many cells each tokens packet takes, in the order of key (N,): bodies of at most capacity bytes.
+    """How many cells each tokens packet takes, in that order (N,) of rows: bodies of at most capacity bytes.
 
     Bodies with header_bytes each take at most budget_bytes altogether. Each packet is filled before the next is begun,
     so a smaller budget keeps a prefix of what a larger one keeps.
     """
+    channels, precision, tables = tokens.features.shape[1], form.precision, form.tables_of(tokens)
     each = channels * _FEATURE_TYPES[precision].itemsize
     fixed = TOKENS_BYTES + (channels if precision == "int8" else 0)
     if channels < 1 or channels > 65535 or fixed + each + 5 > capacity:
@@ -167,8 +227,12 @@ def packet_counts(
             f"One cell of {channels} channels as {precision} does not fit a body of {capacity} bytes: lower the "
             "precision or raise the mtu."
         )
+    key = np.ascontiguousarray(tokens.sites.key.cpu().numpy()[order], np.int64)
     left = -1 if budget_bytes is None else max(0, budget_bytes)
-    return codec.counts_in_room(np.ascontiguousarray(key, np.int64), each, fixed, capacity, header_bytes, left).tolist()
+    if tables is None:
+        return codec.counts_in_room(key, each, fixed, capacity, header_bytes, left).tolist()
+    rows = tokens.features.cpu().numpy()[order]
+    return coded_counts(key, rows, tokens.grid.shape, tables, fixed, capacity, header_bytes, left).tolist()
 
 
 def _grid_fields(grid: BevGrid) -> tuple[int, ...]:
@@ -202,30 +266,53 @@ def _grid_and_cells(fields: tuple[int, ...]) -> tuple[BevGrid, int]:
     return grid, rows * columns
 
 
-def token_bodies(tokens: SparseBev, score: Tensor | None, precision: Precision, capacity: int) -> list[bytes]:
+def token_bodies(tokens: SparseBev, score: Tensor | None, form: Form, capacity: int) -> list[bytes]:
     """The bodies of the tokens packets, the cells of highest score in the first."""
     order = token_order(tokens, score)
-    key = tokens.sites.key.cpu().numpy()[order]
-    features = tokens.features.detach().float().cpu()
+    key, precision = tokens.sites.key.cpu().numpy()[order], form.precision
+    features = tokens.features.detach().cpu()
+    features = features if precision == "codes" else features.float()
     largest, peak = 65504 if precision == "float16" else math.inf, 0.0
-    if features.numel():
+    if features.numel() and precision != "codes":
         peak = float(features.abs().max())
     if not (math.isfinite(peak) and peak <= largest):
         raise WireError(f"Features sent as {precision} must be finite and at most {largest:g}; these are not.")
-    grid, channels = _grid_fields(tokens.grid), features.shape[1]
-    counts = packet_counts(key, channels, precision, capacity) or [0]
+    grid, channels = _GRID.pack(*_grid_fields(tokens.grid)), features.shape[1]
+    counts = packet_counts(tokens, order, form, capacity) or [0]
     # All bodies at once, each with its cells in ascending order.
     inner = np.argsort(np.repeat(np.arange(len(counts)) * _MOST_CELLS, counts) + key)
-    cells = codec.pack_cell_runs(key[inner], counts)
-    values, scales = _values(features.index_select(0, torch.from_numpy(order[inner])), precision, counts)
-    form = PRECISIONS.index(precision)
-    heads = [_GRID.pack(*grid, form | layout << 2, channels, 0)[:-2] for layout in (codec.DELTA, codec.BITMAP)]
+    key, features = key[inner], features.index_select(0, torch.from_numpy(order[inner]))
+    number, tables = PRECISIONS.index(precision), form.tables_of(tokens)
+
+    def head(layout: int, count: int) -> bytes:
+        return grid + _TOKENS.pack(number | layout << 2, channels, count)
+
+    if tables is not None:
+        rows, ends = features.numpy(), np.cumsum([0, *counts])
+        return [
+            head(_CODED, b - a) + pack_coded(key[a:b], rows[a:b], tokens.grid.shape, tables)
+            for a, b in pairwise(ends.tolist())
+        ]
+    cells = codec.pack_cell_runs(key, counts)
+    values, scales = _values(features, precision, counts)
     each, bodies, at = channels * _FEATURE_TYPES[precision].itemsize, [], 0
     for count, (layout, packed), scale in zip(counts, cells, scales):
         end = at + count * each
-        bodies.append(b"".join((heads[layout], count.to_bytes(2, "little"), packed, scale, values[at:end])))
+        bodies.append(b"".join((head(layout, count), packed, scale, values[at:end])))
         at = end
     return bodies
+
+
+def request_body(request: RequestMap, capacity: int) -> bytes:
+    """The body of the one packet of a request map."""
+    sure = request.sure.detach().double().cpu()
+    if not bool(((sure >= 0) & (sure <= 1)).all()):
+        raise WireError("Message.request.sure is from 0 to 1; this is not.")
+    if _GRID.size + sure.numel() > capacity:
+        raise WireError(
+            f"A request map fits one packet, {capacity - _GRID.size} cells; got {sure.numel()}: coarser, please."
+        )
+    return _GRID.pack(*_grid_fields(request.grid)) + np.rint(sure.numpy() * 255).astype(np.uint8).tobytes()
 
 
 def _values(features: Tensor, precision: Precision, counts: list[int]) -> tuple[bytes, list[bytes]]:
@@ -233,60 +320,100 @@ def _values(features: Tensor, precision: Precision, counts: list[int]) -> tuple[
     if precision == "int8":
         codes, steps = codec.quantise_int8_runs(features.numpy(), counts)
         return steps.tobytes(), [code.tobytes() for code in codes]
+    if precision == "codes":
+        return features.numpy().tobytes(), [b""] * len(counts)
     # Several times as fast here as numpy's conversion, to the same bits.
     rows = (features.half() if precision == "float16" else features).numpy()
     return rows.astype(_FEATURE_TYPES[precision], copy=False).tobytes(), [b""] * len(counts)
 
 
-def read_body(kind: int, body: bytes) -> TokenRows | ObjectRows | PointRows | None:
-    """The rows of a body, checked; whatever is wrong is a PacketError with a reason."""
+def read_body(kind: int, body: bytes, fingerprint: bytes, tables: CodeTables | None) -> Body:
+    """The rows of a body, checked; whatever is wrong is a PacketError with a reason.
+
+    tables: of the reader's weights; coded tokens can only be read by those that the packet's fingerprint names.
+    """
     if kind == TOKENS:
-        return _read_tokens(body)
-    if kind == NONE:
-        if body:
-            raise PacketError("garbage", f"A packet without a section has {len(body)} bytes of body.")
-        return None
-    dtype = _OBJECT if kind == OBJECTS else _POINT
+        return _read_tokens(body, fingerprint, tables)
+    if kind == OBJECTS:
+        return _read_objects(body)
+    if kind == REQUEST:
+        return _read_request(body)
+    if kind == POINTS:
+        return PointRows(_rows(body, _POINT))
+    if kind != NONE or body:
+        raise PacketError("garbage", f"A body of kind {kind} and {len(body)} bytes is not known.")
+    return None
+
+
+def _rows(body: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
     if len(body) % dtype.itemsize:
         raise PacketError("garbage", f"Rows of {dtype.itemsize} bytes do not fill a body of {len(body)}.")
-    rows = np.frombuffer(body, dtype)
-    if kind == POINTS:
-        return PointRows(rows)
+    return np.frombuffer(body, dtype)
+
+
+def _read_objects(body: bytes) -> ObjectRows:
+    if not body or body[0] & ~(_VELOCITY | _DESCRIPTOR):
+        raise PacketError("garbage", "A body of objects begins with its flags, of which two are known.")
+    rows = _rows(body[1:], _object_type(body[0]))
     good = (rows["label_flip"] & 7 < len(LABELS)) & (rows["size"] > 0).all(-1)
     good &= (rows["yaw"] >= -18000) & (rows["yaw"] < 18000)
+    for name in set(rows.dtype.names or ()) & {"velocity", "descriptor"}:
+        good &= (rows[name] > -128).all(-1)
     if not good.all():
         raise PacketError(
-            "implausible", f"{int((~good).sum())} objects have an unknown label, no size, or a yaw over 180°."
+            "implausible", f"{int((~good).sum())} objects have an unknown label, no size, or a number out of range."
         )
     return ObjectRows(rows)
 
 
-def _read_tokens(body: bytes) -> TokenRows:
+def _read_grid(body: bytes) -> tuple[BevGrid, int]:
+    """The grid that a body begins with, and its cells."""
     if len(body) < _GRID.size:
-        raise PacketError("garbage", f"A tokens body begins with {_GRID.size} bytes; got {len(body)}.")
-    *fields, form, channels, count = _GRID.unpack_from(body)
-    if form >> 3 or form & 3 >= len(PRECISIONS) or not channels:
-        raise PacketError("garbage", f"Unknown form of tokens: {form:#04x}, {channels} channels.")
+        raise PacketError("garbage", f"A grid has {_GRID.size} bytes; got {len(body)}.")
     try:
-        grid, cells = _grid_and_cells(tuple(fields))
+        grid, cells = _grid_and_cells(_GRID.unpack_from(body))
     except ConfigError as error:
         raise PacketError("implausible", str(error)) from error
-    key, used = codec.unpack_cells(form >> 2, body[_GRID.size :], count)
-    if cells > _MOST_CELLS or (count and int(key[-1]) >= cells):
-        rows, columns = grid.shape
-        raise PacketError(
-            "implausible", f"Cells lie outside a grid of {rows} rows and {columns} columns (or it is huge)."
-        )
-    precision, at = PRECISIONS[form & 3], _GRID.size + used
+    if cells > _MOST_CELLS:
+        raise PacketError("implausible", f"A grid of {cells} cells is huge.")
+    return grid, cells
+
+
+def _read_request(body: bytes) -> RequestMap:
+    grid, cells = _read_grid(body)
+    if len(body) != _GRID.size + cells:
+        raise PacketError("garbage", f"A request of {cells} cells does not fill a body of {len(body)} bytes.")
+    sure = np.frombuffer(body, np.uint8, offset=_GRID.size).astype(np.float32) / 255
+    return RequestMap(grid, torch.from_numpy(sure).view(grid.shape))
+
+
+def _read_tokens(body: bytes, fingerprint: bytes, tables: CodeTables | None) -> TokenRows:
+    if len(body) < TOKENS_BYTES:
+        raise PacketError("garbage", f"A tokens body begins with {TOKENS_BYTES} bytes; got {len(body)}.")
+    grid, cells = _read_grid(body)
+    form, channels, count = _TOKENS.unpack_from(body, _GRID.size)
+    precision, layout, data = PRECISIONS[form & 3], form >> 2, body[TOKENS_BYTES:]
+    if layout > (_CODED if precision == "codes" else codec.BITMAP) or not channels:
+        raise PacketError("garbage", f"Unknown form of tokens: {form:#04x}, {channels} channels.")
+    if layout == _CODED:
+        if tables is None or tables.fingerprint != fingerprint:
+            raise PacketError("wrong_model", "These tokens are coded by the tables of other weights.")
+        if tables.width != channels or cells > MOST_CELLS:
+            raise PacketError("implausible", f"Coded rows of {channels} bytes on {cells} cells are not of this model.")
+        key, rows = unpack_coded(data, count, grid.shape, tables)
+        return TokenRows(grid, precision, channels, key, b"", rows.tobytes())
+    key, used = codec.unpack_cells(layout, data, count)
+    if count and int(key[-1]) >= cells:
+        raise PacketError("implausible", f"Cells lie outside a grid of {grid.shape} rows and columns.")
     size = _FEATURE_TYPES[precision].itemsize
-    end = at + (channels if precision == "int8" else 0)
-    if len(body) != end + count * channels * size:
+    end = used + (channels if precision == "int8" else 0)
+    if len(data) != end + count * channels * size:
         raise PacketError(
             "garbage", f"{count} cells of {channels} channels as {precision} do not fill {len(body)} bytes."
         )
-    if size > 1 and not codec.are_finite(body, at, size):
+    if size > 1 and not codec.are_finite(data, used, size):
         raise PacketError("implausible", "Features are NaN or infinite.")
-    return TokenRows(grid, precision, channels, key, body[at:end], body[end:])
+    return TokenRows(grid, precision, channels, key, data[used:end], data[end:])
 
 
 def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
@@ -299,8 +426,8 @@ def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
     return SparseBev(features, Sites(torch.from_numpy(key[order]), parts[0].grid))
 
 
-def _features(parts: list[TokenRows]) -> NDArray[np.float32]:
-    """(n, C) float32 of the rows of several packets of one form."""
+def _features(parts: list[TokenRows]) -> NDArray[Any]:
+    """(n, C) float32, or uint8 of codes, of the rows of several packets of one form."""
     dtype, channels = _FEATURE_TYPES[parts[0].precision], parts[0].channels
     # A copy that may be written to, in the machine's own order of bytes.
     values = np.frombuffer(b"".join(p.values for p in parts), dtype).astype(dtype.newbyteorder("="))
@@ -308,6 +435,8 @@ def _features(parts: list[TokenRows]) -> NDArray[np.float32]:
     if parts[0].precision == "int8":
         codes = np.frombuffer(b"".join(p.scales for p in parts), np.uint8).reshape(-1, channels)
         return codec.dequantise_int8(np.repeat(codes, [len(p.key) for p in parts], axis=0), values)
+    if parts[0].precision == "codes":
+        return values
     return torch.from_numpy(values).float().numpy()
 
 
@@ -329,8 +458,21 @@ def merge_objects(parts: list[NDArray[Any]]) -> Boxes | None:
         sigma_xy=torch.from_numpy(codec.log_values(rows["sigma_xy"], *_SIGMA_XY)),
         sigma_yaw=torch.from_numpy(codec.log_values(rows["sigma_yaw"], *_SIGMA_YAW)),
         flip=torch.from_numpy((rows["label_flip"] >> 3).astype(np.float32) / 31),
-        velocity=torch.zeros(len(rows), 2),
+        velocity=torch.from_numpy(_numbers(rows, "velocity", 2) * np.float32(_METRES_PER_S)),
     )
+
+
+def merge_descriptors(parts: list[NDArray[Any]]) -> Tensor | None:
+    """(N, DESCRIPTOR) of the objects of several packets, in that order; None where they have none."""
+    if not parts or "descriptor" not in (parts[0].dtype.names or ()):
+        return None
+    return torch.from_numpy(_numbers(np.concatenate(parts), "descriptor", DESCRIPTOR) / np.float32(127))
+
+
+def _numbers(rows: NDArray[Any], name: str, width: int) -> NDArray[np.float32]:
+    """A column of small integers, zeros where the rows have none."""
+    known = name in (rows.dtype.names or ())
+    return rows[name].astype(np.float32) if known else np.zeros((len(rows), width), np.float32)
 
 
 def merge_points(parts: list[NDArray[Any]]) -> PointCloud | None:

@@ -6,7 +6,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from manyeyes.comms.sections import Precision, check_precision, packet_counts, token_order
+from manyeyes.comms.entropy import CodeTables
+from manyeyes.comms.sections import Form, Precision, packet_counts, token_order
 from manyeyes.comms.wire import DEFAULT_MTU, HEADER_BYTES
 from manyeyes.datatypes import SparseBev
 
@@ -17,6 +18,7 @@ def within_budget(
     budget_bytes: int | None,
     precision: Precision = "float16",
     mtu: int = DEFAULT_MTU,
+    tables: CodeTables | None = None,
 ) -> tuple[SparseBev, Tensor]:
     """The cells of highest score (N,), ties by key, whose packets together have at most budget_bytes; None is no limit.
 
@@ -24,12 +26,11 @@ def within_budget(
     never exceed the budget. A smaller budget keeps a subset. A budget that holds no cell keeps none: then the section
     is left out of the message (an empty section would still cost its header). Source: CoSTr Eq. 13 with real bytes.
     """
-    check_precision(precision)
+    form = Form(precision, tables)
     order = token_order(bev, score)
     if budget_bytes is None:
         return bev, score
-    key = bev.sites.key.cpu().numpy()[order]
-    kept = sum(packet_counts(key, bev.features.shape[1], precision, mtu - HEADER_BYTES, HEADER_BYTES, budget_bytes))
+    kept = sum(packet_counts(bev, order, form, mtu - HEADER_BYTES, HEADER_BYTES, budget_bytes))
     mask = torch.zeros(len(order), dtype=torch.bool)
     mask[torch.from_numpy(order[:kept])] = True
     mask = mask.to(score.device)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wire format, version 1: a message as packets that each decode alone, the most important first.
+"""Wire format, version 2: a message as packets that each decode alone, the most important first.
 
 This text is the specification. All numbers are little-endian. A packet is a header, one body and a checksum:
 
@@ -7,21 +7,22 @@ This text is the specification. All numbers are little-endian. A packet is a hea
 offset bytes type     meaning
 ====== ===== ======== =====================================================================================
 0      2     bytes    ``ME``
-2      1     u8       version, 1
-3      1     u8       flags: bits 0-1 kind of body (0 none, 1 tokens, 2 objects, 3 points), bit 2 sender is
-                      infrastructure, bits 3-4 which part of the quaternion (w, x, y, z) is left out, 5-7 zero
-4      2     u16      length of the whole packet in bytes, checksum included
-6      2     u16      number of this packet within its message, from 0
-8      2     u16      packets in the message, all kinds together
-10     4     i32      agent id
-14     8     i64      time of capture, nanoseconds
-22     24    3 x f64  claimed position x, y, z in the world, metres
-46     12    3 x i32  the other three parts of the unit quaternion of world_from_agent, times 2^31 / sqrt(1/2); the
+2      1     u8       version, 2
+3      1     u8       flags: bits 0-2 kind of body (0 none, 1 tokens, 2 objects, 3 points, 4 request), bit 3 sender
+                      is infrastructure, bits 4-5 which part of the quaternion (w, x, y, z) is left out, 6-7 zero
+4      2     u16      number of this packet within its message, from 0
+6      2     u16      packets in the message, all kinds together
+8      4     i32      agent id
+12     8     i64      time of capture, nanoseconds
+20     18    3 x i48  claimed position x, y, z in the world, 2^-20 m, within 100,000 km (error below 0.5 um)
+38     12    3 x i32  the other three parts of the unit quaternion of world_from_agent, times 2^31 / sqrt(1/2); the
                       part left out is the largest and is made positive (error below 1e-9 rad)
-58     12    6 x f16  lower Cholesky factor L of the pose covariance, rows (xx, yx yy, wx wy ww), metres and
-                      radians: the covariance is read as L L^T, never indefinite, within 0.2 %
-70     8     bytes    model fingerprint
-78     ...            body
+50     3     3 x u8   standard deviations of x and y, 0 or 1 mm to 10 km, and of yaw, 0 or 1e-5 to 10 rad: 0 is 0,
+                      codes 1 to 255 are equal ratios (within 3.3 %)
+53     3     3 x i8   lower factor L of their correlations (yx, wx wy), 1/127; the diagonal follows, since rows have
+                      length 1 (a longer row is shortened): the covariance is never indefinite
+56     8     bytes    model fingerprint
+64     ...            body
 end-4  4     u32      CRC-32 (zlib) of everything before it
 ====== ===== ======== =====================================================================================
 
@@ -31,15 +32,18 @@ Tokens (kind 1), some cells of one grid with their features:
 0      12    6 x i16  x_min, y_min, z_min, x_max, y_max, z_max of the grid, centimetres
 12     2     u16      pillar, millimetres
 14     1     u8       stride
-15     1     u8       bits 0-1 features (0 float32, 1 float16, 2 int8), bit 2 cells (0 gaps, 1 bitmap), 3-7 zero
-16     2     u16      channels C
+15     1     u8       bits 0-1 features (0 float32, 1 float16, 2 int8, 3 codes), bits 2-3 layout (0 cells as gaps,
+                      1 cells as a bitmap, 2 cells and codes as one coded stream), 4-7 zero
+16     2     u16      channels C; bytes of a row of codes
 18     2     u16      cells n; 0 only where the message's whole section is empty
-20     ...            cells, in ascending order of ``row * columns + column``, by ``codec.pack_cells``
+20     ...            layouts 0, 1: cells, in ascending order of ``row * columns + column``, by ``codec.pack_cells``
 ...    ...            int8 only: C scale codes u8 (``codec.SCALES``), a channel's step is scale / 127
-...    ...            features, n rows of C
+...    ...            layouts 0, 1: features, n rows of C
+20     ...            layout 2, codes only: both, by ``entropy.pack_coded`` and the tables of the model's codebook
 ====== ===== ======== =====================================================================================
 
-Objects (kind 2), 13 bytes each, in the sender's frame, highest score first:
+Objects (kind 2): one byte of flags (bit 0 velocities, bit 1 descriptors, 2-7 zero, the same in all packets), then 13 bytes
+each, in the sender's frame, highest score first:
 
 ====== ===== ======== =====================================================================================
 0      4     2 x i16  centre x, y, centimetres (to 327.67 m)
@@ -50,14 +54,19 @@ Objects (kind 2), 13 bytes each, in the sender's frame, highest score first:
 10     1     u8       sigma_yaw: 0 is 0; codes 1 to 255 are 0.001 to 3.2 rad in equal ratios
 11     1     u8       bits 0-2 label (index into LABELS), bits 3-7 probability that the heading is off by pi, 1/31
 12     1     u8       the sender's track id modulo 255; 255 is unknown
+13     2     2 x i8   with velocities: vx, vy over the ground, 0.25 m/s, -127 to 127; 127 means 31.75 m/s or more
+...    32    32 x i8  with descriptors: 1/127, -127 to 127
 ====== ===== ======== =====================================================================================
 
 Height is not sent: it is read as the mean of the label (``sections.LABEL_HEIGHTS``), and the object stands on the sender's
 ground plane, centre z = height / 2. Points (kind 3), 7 bytes each: x, y, z i16 centimetres, intensity u8 1/255; time
-within the sweep is not sent. Packet k of K points packets has every K-th point from k on, so a loss thins the cloud.
+within the sweep is not sent. Packet k of K points packets has every K-th point from k on, so a loss thins the cloud. A
+request (kind 4) is one packet: a grid as tokens begin with (15 bytes), then for each of its cells, row by row, u8 how sure the
+sender is of what it sees there, 1/255.
 
-Packets are numbered objects first, then tokens by falling score (ties by key), then points: a message that is cut after
-any packet still helps. A message without sections is one packet of kind 0. Empty sections are one packet with no rows.
+Packets are numbered objects first, then the request, then tokens by falling score (ties by key), then points: a message that
+is cut after any packet still helps. A message without sections is one packet of kind 0. Empty sections are one packet with no
+rows. There is no length: what was cut or padded fails the checksum.
 """
 
 from __future__ import annotations
@@ -75,26 +84,34 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.comms import sections
-from manyeyes.comms.codec import PacketError
-from manyeyes.comms.sections import Body, ObjectRows, PointRows, Precision, TokenRows
+from manyeyes.comms.codec import PacketError, log_codes, log_values
+from manyeyes.comms.entropy import CodeTables
+from manyeyes.comms.sections import Body, Form, ObjectRows, PointRows, Precision, TokenRows
 from manyeyes.datatypes import BevGrid, ConfigError, Message, Transform, WireError
+from manyeyes.datatypes.message import RequestMap
 
-VERSION = 1
+VERSION = 2
 DEFAULT_MTU = 1398
 
 _MAGIC = b"ME"
-_START = struct.Struct("<2sBBHHH")
-_COMMON = struct.Struct("<iq3d3i6e8s")
+_START = struct.Struct("<2sBBHH")
+_COMMON = struct.Struct("<iq18s3i3B3b8s")
 _CRC = struct.Struct("<I")
 _BODY_AT = _START.size + _COMMON.size
 HEADER_BYTES = _BODY_AT + _CRC.size
 _QUATERNION_UNIT = 2.0**31 / math.sqrt(0.5)
+_POSITION_UNITS = 1 << 20
+_POSITION_BYTES = 6
 _FARTHEST_M = 1e8
+_SIGMA_M, _SIGMA_RAD = (1e-3, 1e4), (1e-5, 10.0)
 
 
 @dataclass(frozen=True)
 class Header:
-    """What every packet of a message says alike, apart from its number. pose: position, and quaternion w, x, y, z."""
+    """What every packet of a message says alike, apart from its number.
+
+    pose: position, and quaternion w, x, y, z. spread: codes of three standard deviations, then of three entries of L.
+    """
 
     agent_id: int
     timestamp_ns: int
@@ -102,7 +119,7 @@ class Header:
     is_infrastructure: bool
     fingerprint: bytes
     pose: tuple[float, ...]
-    covariance_factor: tuple[float, ...]
+    spread: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,17 +132,33 @@ class Fragment:
     packet: bytes
 
 
-def encode(message: Message, *, precision: Precision = "float16", mtu: int = DEFAULT_MTU) -> list[bytes]:
-    """A message as packets of at most mtu bytes, the most important first; what does not fit the format is a WireError."""
-    sections.check_precision(precision)
+def encode(
+    message: Message,
+    *,
+    precision: Precision = "float16",
+    mtu: int = DEFAULT_MTU,
+    tables: CodeTables | None = None,
+) -> list[bytes]:
+    """A message as packets of at most mtu bytes, the most important first; what does not fit the format is a WireError.
+
+    tables: those of the weights that the message names; with them, codes are entropy-coded.
+    """
+    form = Form(precision, tables)
     if not HEADER_BYTES + sections.TOKENS_BYTES < mtu <= 65535:
         raise ConfigError(f"mtu is from {HEADER_BYTES + sections.TOKENS_BYTES + 1} to 65535 bytes; got {mtu}.")
     capacity = mtu - HEADER_BYTES
     bodies: list[tuple[int, bytes]] = []
     if message.objects is not None:
-        bodies += [(sections.OBJECTS, body) for body in sections.object_bodies(message.objects, capacity)]
+        rows = sections.object_bodies(message.objects, message.descriptors, capacity)
+        bodies += [(sections.OBJECTS, body) for body in rows]
+    if message.request is not None:
+        bodies.append((sections.REQUEST, sections.request_body(message.request, capacity)))
     if message.tokens is not None:
-        rows = sections.token_bodies(message.tokens, message.token_score, precision, capacity)
+        if tables is not None and tables.fingerprint != message.fingerprint:
+            raise WireError(
+                f"Tables of weights {tables.fingerprint.hex()} do not code tokens of {message.fingerprint.hex()}."
+            )
+        rows = sections.token_bodies(message.tokens, message.token_score, form, capacity)
         bodies += [(sections.TOKENS, body) for body in rows]
     if message.points is not None:
         bodies += [(sections.POINTS, body) for body in sections.point_bodies(message.points, capacity)]
@@ -137,7 +170,7 @@ def encode(message: Message, *, precision: Precision = "float16", mtu: int = DEF
     common = _common_fields(message)
     rest, count, packets = _COMMON.pack(*common.rest), len(bodies), []
     for number, (kind, body) in enumerate(bodies):
-        start = _START.pack(_MAGIC, VERSION, common.flags | kind, HEADER_BYTES + len(body), number, count)
+        start = _START.pack(_MAGIC, VERSION, common.flags | kind, number, count)
         packet = b"".join((start, rest, body))
         packets.append(packet + _CRC.pack(zlib.crc32(packet)))
     return packets
@@ -162,9 +195,12 @@ def _common_fields(message: Message) -> _Common:
     if position.shape != (3,) or not np.isfinite(rotation).all() or not (np.abs(position) <= _FARTHEST_M).all():
         raise WireError(f"Message.world_from_agent is one finite pose within {_FARTHEST_M:.0e} m; got {position}.")
     largest, parts = _smallest_three(rotation)
-    factor = _cholesky(message.pose_covariance.double().cpu().numpy())
-    flags = (4 if message.is_infrastructure else 0) | largest << 3
-    values = (message.agent_id, message.timestamp_ns, *position.tolist(), *parts, *factor, message.fingerprint)
+    spread = _spread(message.pose_covariance.double().cpu().numpy())
+    flags = (8 if message.is_infrastructure else 0) | largest << 4
+    place = b"".join(
+        round(v * _POSITION_UNITS).to_bytes(_POSITION_BYTES, "little", signed=True) for v in position.tolist()
+    )
+    values = (message.agent_id, message.timestamp_ns, place, *parts, *spread, message.fingerprint)
     return _Common(flags, values)
 
 
@@ -196,8 +232,8 @@ def _rotation(q: tuple[float, ...]) -> list[list[float]]:
     ]
 
 
-def _cholesky(covariance: NDArray[np.float64]) -> list[float]:
-    """Six entries of the lower factor of a positive semidefinite (3, 3); zero rows and columns are allowed."""
+def _spread(covariance: NDArray[np.float64]) -> list[int]:
+    """Codes of the standard deviations and of the factor of the correlations of a (3, 3), where zero rows are allowed."""
     if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
         raise WireError(f"Message.pose_covariance is a finite (3, 3); got {covariance.tolist()}.")
     sigma = np.sqrt(np.maximum(covariance.diagonal(), 0))
@@ -216,15 +252,31 @@ def _cholesky(covariance: NDArray[np.float64]) -> list[float]:
             good &= pivot > -1e-6 and bool((np.abs(column) < 1e-3).all())
     if not good:
         raise WireError(f"Message.pose_covariance is symmetric and positive semidefinite; got {covariance.tolist()}.")
-    lower *= sigma[:, None]
-    factor = lower[np.tril_indices(3)]
-    if (np.abs(factor) > 65504).any():
-        raise WireError(f"Message.pose_covariance is too large to send (over 65 km): {covariance.tolist()}.")
-    return factor.tolist()
+    if (sigma[:2] > _SIGMA_M[1]).any():
+        raise WireError(f"Message.pose_covariance is too large to send (over 10 km): {covariance.tolist()}.")
+    # Rows have length 1, but for rounding and for what nobody varies.
+    lower /= np.maximum(np.linalg.norm(lower, axis=1, keepdims=True), 1e-9)
+    codes = [*log_codes(sigma[:2], *_SIGMA_M), *log_codes(sigma[2:], *_SIGMA_RAD)]
+    return [int(v) for v in (*codes, *np.rint(lower[[1, 2, 2], [0, 0, 1]] * 127))]
 
 
-def decode_packet(packet: bytes) -> Fragment:
-    """One packet, checked from its first to its last byte; every fault is a :class:`PacketError` with a reason."""
+def _covariance(spread: tuple[int, ...]) -> NDArray[np.float64]:
+    """The inverse of _spread; any codes are some covariance."""
+    codes = np.array(spread[:3], np.uint8)
+    sigma = np.concatenate((log_values(codes[:2], *_SIGMA_M), log_values(codes[2:], *_SIGMA_RAD))).astype(np.float64)
+    lower = np.zeros((3, 3))
+    lower[[1, 2, 2], [0, 0, 1]] = np.array(spread[3:]) / 127
+    lower /= np.maximum(np.linalg.norm(lower, axis=1, keepdims=True), 1)
+    lower[range(3), range(3)] = np.sqrt(np.maximum(1 - np.square(lower).sum(1), 0))
+    factor = sigma[:, None] * lower
+    return factor @ factor.T
+
+
+def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
+    """One packet, checked from its first to its last byte; every fault is a :class:`PacketError` with a reason.
+
+    tables: of the reader's weights, by which coded tokens are read.
+    """
     packet = packet if type(packet) is bytes else bytes(memoryview(packet))
     if len(packet) < 3 or packet[:2] != _MAGIC:
         raise PacketError("garbage", f"Not a manyeyes packet: expected the bytes {_MAGIC!r}, got {packet[:2]!r}.")
@@ -234,31 +286,33 @@ def decode_packet(packet: bytes) -> Fragment:
         )
     if len(packet) < HEADER_BYTES:
         raise PacketError("garbage", f"Truncated packet: {len(packet)} bytes, a header alone has {HEADER_BYTES}.")
-    _, _, flags, length, number, count = _START.unpack_from(packet)
-    if length != len(packet):
-        raise PacketError("garbage", f"Truncated or padded packet: it announces {length} bytes and has {len(packet)}.")
+    _, _, flags, number, count = _START.unpack_from(packet)
     common = packet[_START.size : _BODY_AT]
-    if _CRC.unpack_from(packet, length - _CRC.size)[0] != zlib.crc32(memoryview(packet)[: -_CRC.size]):
+    if _CRC.unpack_from(packet, len(packet) - _CRC.size)[0] != zlib.crc32(memoryview(packet)[: -_CRC.size]):
         agent_id = _COMMON.unpack(common)[0]
         raise PacketError(
             "checksum", f"The checksum of a packet said to be of agent {agent_id} does not match its bytes."
         )
-    if flags >> 5 or number >= count:
+    if flags >> 6 or number >= count:
         raise PacketError("garbage", f"Contradictory header: flags {flags:#04x}, packet {number} of {count}.")
-    header = _header(common, flags >> 2, count)
-    return Fragment(header, number, sections.read_body(flags & 3, packet[_BODY_AT : -_CRC.size]), packet)
+    header = _header(common, flags >> 3, count)
+    body = sections.read_body(flags & 7, packet[_BODY_AT : -_CRC.size], header.fingerprint, tables)
+    return Fragment(header, number, body, packet)
 
 
 # The packets of a message come one after another, and what they say alike is read once.
 @lru_cache(maxsize=64)
 def _header(common: bytes, flags: int, count: int) -> Header:
     """The fields from the agent id to the fingerprint, checked; flags without the kind of body."""
-    agent_id, timestamp_ns, *rest = _COMMON.unpack(common)
-    pose = (*rest[:3], *_quaternion(flags >> 1, rest[3:6]))
-    factor = tuple(rest[6:12])
-    if not all(abs(v) <= _FARTHEST_M for v in pose[:3]) or not all(map(math.isfinite, factor)):
-        raise PacketError("implausible", f"Agent {agent_id} claims the position {pose[:3]} with the errors {factor}.")
-    return Header(agent_id, timestamp_ns, count, bool(flags & 1), rest[12], pose, factor)
+    agent_id, timestamp_ns, place, *rest = _COMMON.unpack(common)
+    position = tuple(
+        int.from_bytes(place[at : at + _POSITION_BYTES], "little", signed=True) / _POSITION_UNITS
+        for at in range(0, 3 * _POSITION_BYTES, _POSITION_BYTES)
+    )
+    if not all(abs(v) <= _FARTHEST_M for v in position):
+        raise PacketError("implausible", f"Agent {agent_id} claims the position {position}.")
+    pose = (*position, *_quaternion(flags >> 1, rest[:3]))
+    return Header(agent_id, timestamp_ns, count, bool(flags & 1), rest[9], pose, tuple(rest[3:9]))
 
 
 def _quaternion(largest: int, codes: list[int]) -> list[float]:
@@ -279,6 +333,8 @@ class Assembly:
         self.header = first.header
         self.fragments: dict[int, Fragment] = {}
         self._form: tuple[BevGrid, Precision, int] | None = None
+        self._objects: np.dtype[Any] | None = None
+        self._requested = False
         self._cells: set[int] = set()
         self.add(first)
 
@@ -298,6 +354,16 @@ class Assembly:
                 raise PacketError("contradiction", f"The cells in {name} do not go with those of the other packets.")
             self._form = form
             self._cells.update(cells)
+        if isinstance(fragment.body, ObjectRows):
+            if (self._objects or fragment.body.rows.dtype) != fragment.body.rows.dtype:
+                name = self._name(fragment)
+                raise PacketError("contradiction", f"The objects in {name} say other things than those before.")
+            self._objects = fragment.body.rows.dtype
+        if isinstance(fragment.body, RequestMap):
+            if self._requested:
+                name = self._name(fragment)
+                raise PacketError("contradiction", f"{name} is a second request; there is one a message.")
+            self._requested = True
         self.fragments[fragment.number] = fragment
         return True
 
@@ -308,8 +374,7 @@ class Assembly:
         """What has come so far, as a message; sections of which no packet came are None."""
         head = self.header
         bodies = [self.fragments[number].body for number in sorted(self.fragments)]
-        factor = torch.zeros(3, 3, dtype=torch.float64)
-        factor[tuple(torch.tril_indices(3, 3))] = torch.tensor(head.covariance_factor, dtype=torch.float64)
+        objects = [b.rows for b in bodies if isinstance(b, ObjectRows)]
         return Message(
             agent_id=head.agent_id,
             timestamp_ns=head.timestamp_ns,
@@ -317,12 +382,14 @@ class Assembly:
                 torch.tensor(_rotation(head.pose[3:]), dtype=torch.float64),
                 torch.tensor(head.pose[:3], dtype=torch.float64),
             ),
-            pose_covariance=factor @ factor.mT,
+            pose_covariance=torch.from_numpy(_covariance(head.spread)),
             fingerprint=head.fingerprint,
             is_infrastructure=head.is_infrastructure,
             tokens=sections.merge_tokens([b for b in bodies if isinstance(b, TokenRows)]),
-            objects=sections.merge_objects([b.rows for b in bodies if isinstance(b, ObjectRows)]),
+            objects=sections.merge_objects(objects),
+            descriptors=sections.merge_descriptors(objects),
             points=sections.merge_points([b.rows for b in bodies if isinstance(b, PointRows)]),
+            request=next((b for b in bodies if isinstance(b, RequestMap)), None),
         )
 
 

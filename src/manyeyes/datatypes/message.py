@@ -8,18 +8,40 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from manyeyes.datatypes.boxes import Boxes
+from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.grid import BevGrid
 from manyeyes.datatypes.point_cloud import PointCloud
 from manyeyes.datatypes.sparse_bev import SparseBev
 from manyeyes.datatypes.transform import Transform
 
+DESCRIPTOR = 32
+"""Numbers of an object's descriptor."""
+
+
+@dataclass(frozen=True, eq=False)
+class RequestMap:
+    """How sure an agent is of what it sees around itself: sure (rows, columns) in [0, 1], one value a cell of a coarse grid.
+
+    0 where it sees nothing: there others can help it most.
+    """
+
+    grid: BevGrid
+    sure: Tensor
+
+    def __post_init__(self) -> None:
+        if tuple(self.sure.shape) != self.grid.shape:
+            raise ShapeError(f"RequestMap.sure needs shape {self.grid.shape}; got {tuple(self.sure.shape)}.")
+
 
 @dataclass(frozen=True)
 class Message:
-    """Header and up to three sections; a section that is not sent is None.
+    """Header and up to four sections; a section that is not sent is None.
 
     world_from_agent: the claimed pose at timestamp_ns, the time of capture; pose_covariance: (3, 3), x, y, yaw.
     fingerprint: 8 bytes that name the weights which made the tokens; tokens of other weights are refused.
-    tokens: one grid, in the sender's frame. token_score: (N,), which cells matter most. objects and points: sender's frame.
+    tokens: one grid, in the sender's frame; features float, or uint8 rows of the weights' codebook. token_score: (N,), which
+    cells matter most. objects and points: sender's frame. descriptors: (objects, DESCRIPTOR) in [-1, 1], of each object, for
+    matching. request: what the sender would hear.
     """
 
     agent_id: int
@@ -32,3 +54,5 @@ class Message:
     token_score: Tensor | None = None
     objects: Boxes | None = None
     points: PointCloud | None = None
+    descriptors: Tensor | None = None
+    request: RequestMap | None = None

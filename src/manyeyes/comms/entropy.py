@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coded tokens in fewer bytes: cells and rows of one packet as one stream, each symbol at the length of its surprise.
+
+The stream is rANS (Duda, "Asymmetric numeral systems", 2013, section 3): a state of 24 bits at most, renormalised by
+bytes, frequencies that sum to 4,096. The decoder ends in the state that the encoder began with and has read every byte, or
+the stream is refused.
+
+Cells come first: for every cell of the grid in order of key, up to the last that is named, one bit, with a frequency that
+adapts within the packet to which of six neighbours known by then are named (context modelling as in JBIG, ITU-T T.82; all
+whole numbers, so both sides agree on any machine). Then, row by row, the bytes of each token by the tables of the codebook.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from manyeyes.comms.codec import PacketError
+from manyeyes.datatypes import ConfigError
+
+TOTAL_BITS = 12
+TOTAL = 1 << TOTAL_BITS
+_LOWEST = 1 << 16
+STATE_BYTES = 3
+MOST_CELLS = 1 << 18
+"""Of a grid whose cells are coded: a forged packet costs its reader milliseconds, not more."""
+
+_CONTEXTS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class CodeTables:
+    """frequencies: (W, 256), of each value of each byte of a row, none 0, summing to 4,096; they belong to the weights that
+    the fingerprint names.
+    """
+
+    fingerprint: bytes
+    frequencies: NDArray[np.integer]
+    starts: NDArray[np.int32] = field(init=False, repr=False)
+    values: NDArray[np.uint8] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        table = np.ascontiguousarray(self.frequencies, np.int32)
+        if table.ndim != 2 or table.shape[1] != 256 or (table < 1).any() or (table.sum(1) != TOTAL).any():
+            raise ConfigError(f"CodeTables needs (W, 256) frequencies from 1, a row summing to {TOTAL}.")
+        object.__setattr__(self, "frequencies", table)
+        object.__setattr__(self, "starts", (np.cumsum(table, 1) - table).astype(np.int32))
+        object.__setattr__(self, "values", np.stack([np.repeat(np.arange(256, dtype=np.uint8), row) for row in table]))
+
+    @property
+    def width(self) -> int:
+        """Bytes of a row."""
+        return self.frequencies.shape[0]
+
+
+def pack_coded(key: NDArray[np.int64], rows: NDArray[np.uint8], shape: tuple[int, int], tables: CodeTables) -> bytes:
+    """Ascending keys (n,) on a grid of shape (rows, columns), and their rows (n, W), as one stream."""
+    symbols = np.empty((_room(key, rows), 2), np.int32)
+    count = _symbols(key, rows, shape[0], shape[1], tables.starts, tables.frequencies, symbols)
+    out = np.empty(2 * count + STATE_BYTES, np.uint8)
+    used = _write(symbols[:count], out)
+    return out[len(out) - used :].tobytes()
+
+
+def _room(key: NDArray[np.int64], rows: NDArray[np.uint8]) -> int:
+    return (int(key[-1]) + 1 if key.size else 0) + rows.size
+
+
+def unpack_coded(
+    data: bytes, count: int, shape: tuple[int, int], tables: CodeTables
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """The inverse of :func:`pack_coded` for count cells: keys (count,) and rows (count, W)."""
+    key, rows = np.empty(count, np.int64), np.empty((count, tables.width), np.uint8)
+    raw = np.frombuffer(data, np.uint8)
+    if not _read(raw, shape[0], shape[1], tables.starts, tables.frequencies, tables.values, key, rows):
+        raise PacketError("garbage", f"{len(data)} bytes are not the stream of {count} cells and their rows.")
+    return key, rows
+
+
+def coded_counts(
+    key: NDArray[np.int64],
+    rows: NDArray[np.uint8],
+    shape: tuple[int, int],
+    tables: CodeTables,
+    fixed: int,
+    capacity: int,
+    header: int,
+    left: int,
+) -> NDArray[np.int64]:
+    """As ``codec.counts_in_room`` for coded tokens: how many of keys (N,) and rows (N, W), in the order given, each body takes."""
+    return _counts(
+        np.ascontiguousarray(key, np.int64), np.ascontiguousarray(rows), shape[0], shape[1],
+        tables.starts, tables.frequencies, fixed, capacity, header, left,
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def _counts(key, rows, height, width, starts, frequencies, fixed, capacity, header, left):  # pragma: no cover
+    counts, bodies, at = np.empty(key.shape[0], np.int64), 0, 0
+    top = 0
+    for k in key:
+        top = max(top, k)
+    symbols = np.empty((top + 1 + rows.size, 2), np.int32)
+    while at < key.shape[0]:
+        room = max(0, (capacity if left < 0 else min(capacity, left - header)) - fixed)
+        # The bounds do not depend on the room: with more of it the search never ends lower, so budgets are nested.
+        low, high, taken = 0, min(key.shape[0] - at, 65535), 0
+        while low < high:
+            middle = (low + high + 1) // 2
+            order = np.argsort(key[at : at + middle]) + at
+            used = _symbols(key[order], rows[order], height, width, starts, frequencies, symbols)
+            size = _size(symbols[:used])
+            if size <= room:
+                low, taken = middle, size
+            else:
+                high = middle - 1
+        if low == 0:
+            break
+        if left >= 0:
+            left -= header + fixed + taken
+        counts[bodies] = low
+        bodies += 1
+        at += low
+    return counts[:bodies]
+
+
+@njit(cache=True)
+def _context(named, at, row, column, height, width):  # pragma: no cover
+    """Which neighbours of a cell are named: left, above, above aside, two away."""
+    left = column > 0 and named[at - 1]
+    above = row > 0 and named[at - width]
+    aside = (row > 0 and column > 0 and named[at - width - 1]) or (
+        row > 0 and column + 1 < width and named[at - width + 1]
+    )
+    far = (column > 1 and named[at - 2]) or (row > 1 and named[at - 2 * width])
+    return left + 2 * above + 4 * aside + 8 * far
+
+
+@njit(cache=True)
+def _prior(count, cells):  # pragma: no cover
+    """Counts (contexts, 2) to begin with of cells that are not and that are named."""
+    seen = np.ones((_CONTEXTS, 2), np.int64)
+    seen[0, 0] = 2 * max(1, cells // max(1, count))
+    seen[1:, 0] = 2
+    return seen
+
+
+@njit(cache=True)
+def _chance(seen, context):  # pragma: no cover
+    """Frequency, 1 to 4,095, that a cell in this context is named."""
+    chance = TOTAL * seen[context, 1] // (seen[context, 0] + seen[context, 1])
+    return min(max(chance, 1), TOTAL - 1)
+
+
+@njit(cache=True)
+def _symbols(key, rows, height, width, starts, frequencies, out):  # pragma: no cover
+    """Fills out with (start, frequency) of everything to be written; how many there are."""
+    n, at = key.shape[0], 0
+    if n == 0:
+        return 0
+    named, seen = np.zeros(key[-1] + 1, np.bool_), _prior(n, height * width)
+    found, row, column = 0, 0, 0
+    for k in range(key[-1] + 1):
+        context = _context(named, k, row, column, height, width)
+        chance = _chance(seen, context)
+        if k == key[found]:
+            named[k] = True
+            found += 1
+            out[at, 0], out[at, 1] = 0, chance
+            seen[context, 1] += 2
+        else:
+            out[at, 0], out[at, 1] = chance, TOTAL - chance
+            seen[context, 0] += 2
+        at += 1
+        column += 1
+        if column == width:
+            row, column = row + 1, 0
+    for i in range(n):
+        for j in range(rows.shape[1]):
+            value = rows[i, j]
+            out[at, 0], out[at, 1] = starts[j, value], frequencies[j, value]
+            at += 1
+    return at
+
+
+@njit(cache=True)
+def _size(symbols):  # pragma: no cover
+    """Bytes that _write makes."""
+    state, size = np.int64(_LOWEST), STATE_BYTES
+    for i in range(symbols.shape[0] - 1, -1, -1):
+        start, frequency = np.int64(symbols[i, 0]), np.int64(symbols[i, 1])
+        while state >= frequency << TOTAL_BITS:
+            size += 1
+            state >>= 8
+        state = (state // frequency << TOTAL_BITS) + state % frequency + start
+    return size
+
+
+@njit(cache=True)
+def _write(symbols, out):  # pragma: no cover
+    """Fills the end of out, from back to front; how many bytes."""
+    state, at = np.int64(_LOWEST), out.shape[0]
+    for i in range(symbols.shape[0] - 1, -1, -1):
+        start, frequency = np.int64(symbols[i, 0]), np.int64(symbols[i, 1])
+        while state >= frequency << TOTAL_BITS:
+            at -= 1
+            out[at] = state & 255
+            state >>= 8
+        state = (state // frequency << TOTAL_BITS) + state % frequency + start
+    for _ in range(STATE_BYTES):
+        at -= 1
+        out[at] = state & 255
+        state >>= 8
+    return out.shape[0] - at
+
+
+@njit(cache=True)
+def _take(state, frequency, offset, raw, at):  # pragma: no cover
+    """State and place after a symbol; offset: how far the state lies above the symbol's start. Bytes beyond the end are 0."""
+    state = frequency * (state >> TOTAL_BITS) + offset
+    while state < _LOWEST and at <= raw.shape[0]:
+        state = state << 8 | (np.int64(raw[at]) if at < raw.shape[0] else 0)
+        at += 1
+    return state, at
+
+
+@njit(cache=True)
+def _read(raw, height, width, starts, frequencies, values, key, rows):  # pragma: no cover
+    """Fills key and rows; whether raw is the stream of just these."""
+    if raw.shape[0] < STATE_BYTES:
+        return False
+    state = np.int64(raw[0]) << 16 | np.int64(raw[1]) << 8 | np.int64(raw[2])
+    if state < _LOWEST:
+        return False
+    n, at = key.shape[0], STATE_BYTES
+    cells = height * width
+    named, seen = np.zeros(cells, np.bool_), _prior(n, cells)
+    found, row, column, k = 0, 0, 0, 0
+    while found < n:
+        if k == cells or at > raw.shape[0]:
+            return False
+        context = _context(named, k, row, column, height, width)
+        chance = _chance(seen, context)
+        slot = state & TOTAL - 1
+        if slot < chance:
+            state, at = _take(state, chance, slot, raw, at)
+            named[k] = True
+            key[found] = k
+            found += 1
+            seen[context, 1] += 2
+        else:
+            state, at = _take(state, TOTAL - chance, slot - chance, raw, at)
+            seen[context, 0] += 2
+        k += 1
+        column += 1
+        if column == width:
+            row, column = row + 1, 0
+    for i in range(n):
+        for j in range(rows.shape[1]):
+            if at > raw.shape[0]:
+                return False
+            slot = state & TOTAL - 1
+            value = values[j, slot]
+            rows[i, j] = value
+            state, at = _take(state, np.int64(frequencies[j, value]), slot - starts[j, value], raw, at)
+    return state == _LOWEST and at == raw.shape[0]
