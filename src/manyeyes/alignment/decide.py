@@ -145,9 +145,13 @@ def _joined(best: Candidate, claimed: PoseClaim | None) -> tuple[Floats, Floats,
     distance = mahalanobis(best.pose, best.covariance, claimed)
     if distance > REFUTED:
         return best.pose, best.covariance, PoseStatus.CONFLICT, distance
-    doubt = max(1.0, distance / DOUBTFUL)
-    pose, covariance = fused(best.pose, best.covariance, claimed.pose, claimed.covariance * doubt**2)
+    pose, covariance = fused(best.pose, best.covariance, claimed.pose, inflated(claimed, distance).covariance)
     return pose, covariance, PoseStatus.OK if distance <= DOUBTFUL else PoseStatus.CORRECTED, distance
+
+
+def inflated(claimed: PoseClaim, distance: float) -> PoseClaim:
+    """The claim with a wider covariance, where objects lie at a doubtful squared Mahalanobis distance from it."""
+    return replace(claimed, covariance=claimed.covariance * max(1.0, distance / DOUBTFUL) ** 2)
 
 
 def mahalanobis(pose: Floats, covariance: Floats, claimed: PoseClaim) -> float:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.alignment.landmarks import Landmarks
-from manyeyes.datatypes import AgentFrame, ConfigError, ShapeError, Transform
+from manyeyes.datatypes import AgentFrame, ConfigError, Message, ShapeError, Transform
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -66,7 +66,7 @@ class PoseClaim:
         return cls(ego_from_other, np.diag([sigma_xy_m**2, sigma_xy_m**2, sigma_yaw_rad**2]))
 
     @classmethod
-    def between(cls, ego: AgentFrame, other: AgentFrame) -> PoseClaim:
+    def between(cls, ego: AgentFrame | Message, other: AgentFrame | Message) -> PoseClaim:
         """What two agents' claimed poses say together: errors of both, and the ego's yaw error at the other's distance."""
         ego_from_other = ego.world_from_agent.inverse() @ other.world_from_agent
         x, y, _ = planar(ego_from_other)
