@@ -15,7 +15,10 @@ from manyeyes.ops.keyed_random import keyed_uniform
 
 @dataclass(frozen=True)
 class ToyRecording:
-    """scenarios of `frames` snapshots each; agents stand on a circle around the world's origin and look their own ways."""
+    """scenarios of `frames` snapshots at 10 Hz; cars drive ahead, up to `speed_mps`, and agents all to the world's north.
+
+    Agents are spread around the world's origin and look their own ways; every one of them sees every car whole.
+    """
 
     agents_n: int = 3
     frames: int = 2
@@ -24,6 +27,8 @@ class ToyRecording:
     radius_m: float = 18.0
     points_per_car: int = 60
     ground_points: int = 300
+    speed_mps: float = 10.0
+    agent_mps: float = 4.0
 
     def length(self, scenario: str) -> int:
         return self.frames
@@ -36,22 +41,26 @@ class ToyRecording:
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         key = (scenario, index)
-        u = keyed_uniform((self.cars, 5), "toy cars", *key)
+        u = keyed_uniform((self.cars, 5), "toy cars", scenario, 0)
         angle = (torch.arange(self.cars) + 0.3 * u[:, 0]) * 2 * math.pi / self.cars
         center = torch.stack((angle.cos(), angle.sin(), angle * 0), 1) * self.radius_m * (0.5 + 0.5 * u[:, 1:2])
         size = torch.tensor([4.4, 1.9, 1.6], dtype=torch.float64) * (0.9 + 0.2 * u[:, 2:3])
         center[:, 2] = size[:, 2] / 2 + 1.0
-        boxes = Boxes.of(center, size, 2 * math.pi * u[:, 3], id=torch.arange(self.cars) + 100)
-        poses = [self._pose(i, key) for i in range(self.agents_n)]
+        yaw = 2 * math.pi * u[:, 3]
+        velocity = self.speed_mps * u[:, 4:] * torch.stack((yaw.cos(), yaw.sin()), 1)
+        boxes = Boxes.of(center, size, yaw, id=torch.arange(self.cars) + 100, velocity=velocity).after(0.1 * index)
+        poses = [self._pose(i, scenario, index) for i in range(self.agents_n)]
         frames = tuple(
-            AgentFrame.of(self._cloud(boxes, pose, i, key), pose, agent_id=i) for i, pose in enumerate(poses)
+            AgentFrame.of(self._cloud(boxes, pose, i, key), pose, agent_id=i, timestamp_ns=index * 100_000_000)
+            for i, pose in enumerate(poses)
         )
         seen = torch.ones(self.agents_n, self.cars, dtype=torch.bool)
         return Snapshot(scenario, index, frames, Truth(boxes, seen, Transform.stack(poses)))
 
-    def _pose(self, agent: int, key: tuple[str, int]) -> Transform:
-        u = keyed_uniform((3,), "toy pose", agent, *key).tolist()
-        return Transform.from_xyz_yaw(6 * u[0] - 3, 6 * u[1] - 3, 1.0, 2 * math.pi * u[2])
+    def _pose(self, agent: int, scenario: str, index: int) -> Transform:
+        u = keyed_uniform((3,), "toy pose", agent, scenario, 0).tolist()
+        north = 0.1 * index * self.agent_mps
+        return Transform.from_xyz_yaw(6 * u[0] - 3, 6 * u[1] - 3 + north, 1.0, 2 * math.pi * u[2])
 
     def _cloud(self, boxes: Boxes, pose: Transform, agent: int, key: tuple[str, int]) -> PointCloud:
         """Points on the sides of all cars, a centimetre within, and on the ground under them, in the agent's frame."""
