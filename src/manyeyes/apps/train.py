@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains a detector on a recording; goes on where a stopped run was. Several processes: torchrun -m manyeyes.apps.cli train."""
+"""Trains a detector on a recording, or FeaKM on what a detector sees; goes on where a stopped run was.
+
+Several processes (detectors only): torchrun -m manyeyes.apps.cli train.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,8 @@ class Options:
     learning_rate: float | None = None
     """Instead of the preset's."""
     weights: Path | None = None
-    """Weights to begin from instead of random ones, such as those of the stage before."""
+    """Weights to begin from instead of random ones, such as those of the stage before; for feakm and feakm-paper the detector
+    whose view they match, a shipped one by default."""
     threads: int = 1
     """Threads of torch in each process; the result is the same only for the same number."""
 
@@ -41,12 +45,17 @@ def main(options: Options) -> None:
     import torch.distributed as dist
     from rich.console import Console
 
+    from manyeyes.apps import train_feakm
     from manyeyes.apps.recordings import open_recording
     from manyeyes.datatypes import ConfigError
+    from manyeyes.training.feakm import FEAKM_TRAINING
     from manyeyes.training.presets import TRAINING_PRESETS
 
+    if options.preset in FEAKM_TRAINING:
+        return train_feakm.main(options, Console())
     if options.preset not in TRAINING_PRESETS:
-        raise ConfigError(f"No training preset {options.preset!r}; choose one of {', '.join(TRAINING_PRESETS)}.")
+        known = ", ".join((*TRAINING_PRESETS, *FEAKM_TRAINING))
+        raise ConfigError(f"No training preset {options.preset!r}; choose one of {known}.")
     asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
     config = replace(TRAINING_PRESETS[options.preset], **{k: v for k, v in asked.items() if v is not None})
     torch.set_num_threads(options.threads)

@@ -22,10 +22,13 @@ FORMAT = "manyeyes-feakm-1"
 
 @dataclass(frozen=True)
 class FeakmConfig:
-    """Where keypoints come from and how they are matched."""
+    """Where keypoints come from and how they are matched. detector: fingerprint (hex) of the weights whose views it was taught
+    on; views of others mean nothing to it.
+    """
 
     keypoints: DenseKeypoints | BoxKeypoints
     matcher: MatcherConfig
+    detector: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +49,11 @@ class FeakmNet(nn.Module):
         self.keypoints = DenseKeypointNet(kind) if isinstance(kind, DenseKeypoints) else BoxKeypointNet(kind)
         self.matcher = Matcher(config.matcher)
 
-    def describe(self, views: Sequence[View]) -> list[Keypoints]:
-        """Keypoints of views that are described together: one, as a sender does, or a pair, as FeaKM's code does."""
-        return self.keypoints(views)
+    def describe(self, views: Sequence[View], together: int = 0) -> list[Keypoints]:
+        """Keypoints of views, described in groups of so many together (0: all): one, as a sender does, or a pair, as FeaKM's
+        code does; only as published does it make a difference.
+        """
+        return self.keypoints(views, together)
 
     @torch.no_grad()
     def match(self, ego: Keypoints, other: Keypoints) -> Matches:

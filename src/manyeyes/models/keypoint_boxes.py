@@ -53,8 +53,8 @@ class BoxKeypointNet(nn.Module):
         self.inner = nn.Linear(samples * (config.inputs + 1) + WORDS, config.width)
         self.net = nn.Sequential(nn.LayerNorm(config.width), nn.GELU(), nn.Linear(config.width, config.descriptor))
 
-    def forward(self, views: Sequence[View]) -> list[Keypoints]:
-        """The boxes that are sure enough, of each view by itself."""
+    def forward(self, views: Sequence[View], together: int = 0) -> list[Keypoints]:
+        """The boxes that are sure enough, of each view by itself, however many are given together."""
         return [self._points(view) for view in views]
 
     def _points(self, view: View) -> Keypoints:

@@ -90,11 +90,14 @@ class DenseKeypointNet(nn.Module):
             nn.Conv2d(d, d, 3, padding=1), nn.ReLU(), nn.BatchNorm2d(d), nn.Conv2d(d, d, 1), nn.BatchNorm2d(d)
         )
 
-    def forward(self, views: Sequence[View]) -> list[Keypoints]:
-        """Exactly `most` points of each view, the best first and then padding."""
-        features = torch.cat([v.tokens.dense() for v in views])
-        scale = features.abs().amax((0, 2, 3), keepdim=True).clamp_min(1e-6)
-        described = functional.normalize(self.head(self.trunk(features / scale)))
+    def forward(self, views: Sequence[View], together: int = 0) -> list[Keypoints]:
+        """Exactly `most` points of each view, the best first and then padding.
+
+        together: views are scaled by the largest value in groups of so many, one after the other; 0: all of them.
+        """
+        features = torch.cat([v.tokens.dense() for v in views]).unflatten(0, (-1, together or len(views)))
+        scale = features.abs().amax((1, 3, 4), keepdim=True).clamp_min(1e-6)
+        described = functional.normalize(self.head(self.trunk((features / scale).flatten(0, 1))))
         return [self._points(view, d) for view, d in zip(views, described)]
 
     def _points(self, view: View, described: Tensor) -> Keypoints:
