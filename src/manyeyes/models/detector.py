@@ -15,6 +15,7 @@ from manyeyes.models.encoder import EncoderConfig, SparseEncoder
 from manyeyes.models.fusion.flow_aware import FlowAwareFusion
 from manyeyes.models.fusion.gather import Tokens
 from manyeyes.models.fusion.maximum import MaximumFusion
+from manyeyes.models.fusion.multi_scale import MultiScaleFusion
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
 from manyeyes.models.fusion.settle import Fused
 from manyeyes.models.pillars import PillarEncoder, PillarKind
@@ -36,7 +37,7 @@ class DetectorConfig:
     pillar_channels: int = 32
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     dast: AttentionConfig = field(default_factory=AttentionConfig)
-    fusion: Literal["flow_aware", "self_attention", "maximum"] = "self_attention"
+    fusion: Literal["flow_aware", "self_attention", "maximum", "multi_scale"] = "self_attention"
     fusion_attention: AttentionConfig = field(default_factory=AttentionConfig)
     head_channels: int = 64
     prune_threshold: float = 0.1
@@ -121,8 +122,10 @@ class Detector(nn.Module):
         return self.fusion(tokens, past)
 
 
-def _fusion(channels: int, config: DetectorConfig) -> FlowAwareFusion | SelfAttentionFusion | MaximumFusion:
-    if config.fusion == "maximum":
-        return MaximumFusion(channels)
+def _fusion(
+    channels: int, config: DetectorConfig
+) -> FlowAwareFusion | SelfAttentionFusion | MaximumFusion | MultiScaleFusion:
+    if config.fusion in ("maximum", "multi_scale"):
+        return MaximumFusion(channels) if config.fusion == "maximum" else MultiScaleFusion(channels)
     kind = FlowAwareFusion if config.fusion == "flow_aware" else SelfAttentionFusion
     return kind(channels, config.fusion_attention)

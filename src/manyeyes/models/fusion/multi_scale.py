@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fusion at several scales (FeaKM section 4.3, Eq. 7): what a wrong pose pulls apart on fine cells still meets on coarse ones."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from manyeyes.datatypes import ConfigError, Sites, SparseBev
+from manyeyes.models.fusion.gather import Tokens
+from manyeyes.models.fusion.placement import Placement
+from manyeyes.models.fusion.settle import Fused, Settle, settle
+from manyeyes.models.layers import SubmanifoldLayer
+from manyeyes.ops.sparse_index import distinct
+from manyeyes.ops.voxelize import segment_max
+
+
+class MultiScaleFusion(nn.Module):
+    """The maximum over agents on cells of the tokens' stride, twice it, and so on; the scales side by side, projected.
+
+    Eq. 7a downsamples each agent's map and 7b fuses: here one maximum over a coarse cell does both, since the maximum over
+    agents of each agent's maximum is the maximum of all its tokens. Starts as MaximumFusion does: coarser scales weigh nothing.
+    """
+
+    def __init__(self, channels: int, levels: int = 3) -> None:
+        super().__init__()
+        if levels < 2:
+            raise ConfigError(f"MultiScaleFusion needs at least two levels; got {levels}. Maximum fusion has one.")
+        self.placement, self.settle = Placement(channels), Settle(channels, "max")
+        self.coarser = nn.ModuleList(Scale(channels, 2**level) for level in range(1, levels))
+        self.out = nn.Linear(levels * channels, channels, bias=False)
+        with torch.no_grad():
+            self.out.weight.copy_(torch.eye(channels, levels * channels))
+
+    def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+        """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
+        key, place = settle(tokens)
+        placed = self.placement(tokens.features, tokens, place)
+        fine = self.settle(placed, tokens, key, place)
+        row = torch.searchsorted(fine.bev.sites.key, key)
+        heard = placed * tokens.kept[:, None]
+        scales = [fine.bev.features, *(scale(heard, row, fine.bev.sites) for scale in self.coarser)]
+        return Fused(fine.bev.with_features(self.out(torch.cat(scales, 1))), fine.given)
+
+
+class Scale(nn.Module):
+    """One coarser scale: tokens of a cell times as wide become one, look around, and are told to the fine cells within."""
+
+    def __init__(self, channels: int, times: int) -> None:
+        super().__init__()
+        self.times = times
+        self.down = nn.Sequential(nn.Linear(channels, channels), nn.LayerNorm(channels), nn.ReLU())
+        self.around = SubmanifoldLayer(channels, channels, norm=nn.LayerNorm)
+
+    def forward(self, features: Tensor, row: Tensor, sites: Sites) -> Tensor:
+        """features: (N, C) of tokens that rest on fine sites row (N,); to (sites, C)."""
+        grid = sites.grid.at(sites.grid.stride * self.times)
+        rows, columns = grid.shape
+        yx = grid.cells(sites.xy)
+        key, parent = distinct((sites.batch * rows + yx[:, 0]) * columns + yx[:, 1], sites.batch_size * rows * columns)
+        merged = segment_max(self.down(features), parent[row], len(key))
+        coarse = self.around(SparseBev(merged, Sites(key, grid, sites.batch_size)))
+        return coarse.features[parent]
