@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -12,91 +11,107 @@ import torch
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.collaboration import METHODS, method
 from manyeyes.agents.eyes import Eyes
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Transform
+from manyeyes.comms.inbox import Inbox
+from manyeyes.datatypes import AgentFrame, ConfigError, Message, PointCloud, Transform
 from manyeyes.models.box_head import RawBoxes
 from manyeyes.models.detector import Detector
-from manyeyes.models.fusion.gather import Tokens
-from manyeyes.models.presets import COSTR_TINY
-from manyeyes.training.samples import Sample
-from manyeyes.training.step import forward, loss_terms
-from manyeyes.training.targets import TargetConfig
+from manyeyes.models.fusion.gather import Part, Tokens
+from manyeyes.training.samples import AugmentConfig, RoadConfig, Sample, make_sample
+from manyeyes.training.step import forward
 
-
-def make_scene(agents: int) -> Sample:
-    """Eight cars on a plane, their surfaces sampled, seen whole by every agent from its own place and heading."""
-    rng = torch.Generator().manual_seed(3)
-    center = torch.cat(((torch.rand(8, 2, generator=rng) - 0.5) * 36, torch.full((8, 1), 0.8)), 1)
-    yaw = (torch.rand(8, generator=rng) - 0.5) * 2 * math.pi
-    boxes = Boxes.of(center, torch.tensor([4.5, 1.9, 1.6]).repeat(8, 1), yaw, id=torch.arange(8))
-    surface = torch.rand(8, 120, 3, generator=rng) - 0.5
-    face = torch.randint(0, 3, (8, 120, 1), generator=rng)
-    surface.scatter_(2, face, surface.gather(2, face).sign() * 0.5)
-    local = surface * boxes.size[:, None]
-    c, s = yaw.cos()[:, None], yaw.sin()[:, None]
-    moved = torch.stack(
-        (local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c, local[..., 2]), -1
-    )
-    ground = torch.cat(((torch.rand(1500, 2, generator=rng) - 0.5) * 50, torch.zeros(1500, 1)), 1)
-    points = torch.cat(((moved + center[:, None]).flatten(0, 1), ground))
-    poses = [Transform.identity(), Transform.from_xyz_yaw(6, -3, 0, 0.7), Transform.from_xyz_yaw(-9, 4, 0.2, -2.0)][
-        :agents
-    ]
-    clouds = tuple(PointCloud.of(pose.inverse().apply(points)) for pose in poses)
-    return Sample(clouds, tuple(poses), tuple(boxes.transform(pose.inverse()) for pose in poses), boxes)
-
-
-@pytest.fixture(scope="module")
-def detector() -> Detector:
-    """Tiny weights whose norms have seen something; a low threshold so that there is much to compare."""
-    torch.manual_seed(0)
-    config = replace(COSTR_TINY, prune_threshold=0.08)
-    model = Detector(config)
-    with torch.no_grad():
-        for p in model.fusion.placement.outer.parameters():
-            p.normal_(std=0.1)
-        for _ in range(40):
-            loss_terms(model, [make_scene(3)], TargetConfig(), 0.0)
-    model.fingerprint = b"testtest"
-    return model.eval().requires_grad_(False)
-
-
-def frames_of(sample: Sample, world: Transform | None = None) -> list[AgentFrame]:
-    world = world or Transform.identity()
-    return [
-        AgentFrame.of(c, world @ t, agent_id=i) for i, (c, t) in enumerate(zip(sample.clouds, sample.ego_from_agent))
-    ]
+NOW = 5
 
 
 class RecordingEyes(Eyes):
-    """Keeps the raw boxes that the ego decoded last."""
+    """Keeps what the ego fused last; looks back at so many instants."""
 
     raw: RawBoxes
+    heard: Tokens
+    remembered: Tokens | None
 
-    def fuse(self, tokens: Tokens) -> RawBoxes:
-        self.raw = super().fuse(tokens)
+    def __init__(self, detector: Detector, instants: int) -> None:
+        super().__init__(detector)
+        self.instants = instants
+
+    def past(self, frame: AgentFrame, instants: int = 2) -> list[Part]:
+        return super().past(frame, self.instants)
+
+    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
+        self.heard, self.remembered = tokens, past
+        self.raw = super().fuse(tokens, past)
         return self.raw
 
 
-@pytest.mark.parametrize("agents", [1, 2, 3])
-def test_training_forward_equals_share_bytes_perceive(detector: Detector, agents: int) -> None:
+def told_by_bytes(drive, detector: Detector, sample: Sample, first: int) -> tuple[list[bytes], list[Message]]:
+    """Packets of the sample's collaborators, and what they say: each looked when, and claims to be where, its view has it."""
+    ego, packets, inbox = drive.frame(0, NOW).world_from_agent, [], Inbox(detector.fingerprint)
+    for view in sample.views[1:]:
+        then = NOW - round(view.age_s / 0.1)
+        (true,) = (f for f in drive.frames(then) if torch.equal(f.points.xyz, view.now.xyz))
+        sender = Agent(detector, precision="float32", budget_bytes=None)
+        if then > first:
+            sender.share(drive.frame(true.agent_id, then - 1))
+        sigma = torch.tensor([view.doubt_xy_m, view.doubt_xy_m, view.doubt_yaw_rad]).double()
+        claim = replace(true, odometry=true.world_from_agent, world_from_agent=ego @ view.ego_from_view)
+        packets += sender.share(replace(claim, pose_covariance=(sigma**2).diag()))
+    for packet in packets:
+        inbox.push(packet)
+    return packets, list(inbox.messages())
+
+
+def as_said(drive, sample: Sample, messages: list[Message]) -> Sample:
+    """The sample with the doubts that arrived: a standard deviation travels as a code of one byte."""
+    ego, views = drive.frame(0, NOW).world_from_agent, [sample.views[0]]
+    for view in sample.views[1:]:
+        place = (ego @ view.ego_from_view).translation
+        message = min(messages, key=lambda m: float(place.dist(m.world_from_agent.translation)))
+        sigma = message.pose_covariance.diagonal().sqrt().tolist()
+        assert sigma[0] == pytest.approx(view.doubt_xy_m, rel=0.1) and sigma[2] == pytest.approx(
+            view.doubt_yaw_rad, rel=0.1
+        )
+        views.append(replace(view, doubt_xy_m=sigma[0], doubt_yaw_rad=sigma[2]))
+    return replace(sample, views=tuple(views))
+
+
+ROADS = {
+    "one sweep": (3, 1, RoadConfig()),
+    "two sweeps": (3, 2, RoadConfig()),
+    "past": (2, 4, RoadConfig(past=2)),
+    "alone with a past": (1, 4, RoadConfig(past=2)),
+    "late": (3, 4, RoadConfig(late_share=1.0, late_frames=2)),
+    "astray": (2, 2, RoadConfig(astray_share=1.0)),
+    "all": (3, 4, RoadConfig(past=2, late_share=1.0, late_frames=2, astray_share=1.0)),
+}
+
+
+@pytest.mark.parametrize("name", ROADS)
+def test_training_forward_equals_share_bytes_perceive(drive, detector: Detector, name: str) -> None:
     """With float32 features, what training computes and what the bytes give agree within 1e-5, site by site."""
-    sample = make_scene(agents)
+    agents, moments, road = ROADS[name]
+    some, first = drive(agents), NOW + 1 - moments
+    seen = [some.snapshot(i) for i in range(first, NOW + 1)]
+    sample = make_sample(seen, 0, detector.config.grid, AugmentConfig.none(), ("same", 1), road)
+    packets, messages = told_by_bytes(some, detector, sample, first)
     with torch.no_grad():
-        trained = forward(detector, [sample]).together
-    frames = frames_of(sample, Transform.from_xyz_yaw(1234.5, -678.9, 3.0, 0.4))
-    eyes = RecordingEyes(detector)
-    packets = [p for f in frames[1:] for p in Agent(detector, precision="float32", budget_bytes=None).share(f)]
-    Agent(detector, precision="float32", eyes=eyes).perceive(frames[0], packets)
-    rows = trained.sites.batch == 0
-    assert int(rows.sum()) > 20
-    assert torch.equal(trained.sites.key[rows], eyes.raw.sites.key)
-    for name in ("heat", "offset", "z", "log_size", "axis", "direction", "log_sigma_xy", "overlap"):
-        a, b = getattr(trained, name)[rows], getattr(eyes.raw, name)
+        trained = forward(detector, [as_said(some, sample, messages)]).together
+    eyes = RecordingEyes(detector, road.past)
+    ego = Agent(detector, precision="float32", eyes=eyes)
+    for index in range(first, NOW):
+        ego.perceive(some.frame(0, index))
+    ego.perceive(some.frame(0, NOW), packets)
+    # The case is what its name says, and there is something to compare.
+    heard = eyes.heard
+    assert len(sample.views) == agents and len(sample.past) == road.past and len(trained.sites) > 20
+    assert bool(heard.age.any()) == bool(road.late_share) and bool(heard.doubt.any()) == bool(road.astray_share)
+    assert (eyes.remembered is not None and len(eyes.remembered.features) > 20) == bool(road.past)
+    assert torch.equal(trained.sites.key, eyes.raw.sites.key)
+    for name in (f.name for f in fields(RawBoxes) if f.name != "sites"):
+        a, b = getattr(trained, name), getattr(eyes.raw, name)
         assert torch.allclose(a, b, atol=1e-5), (name, float((a - b).abs().max()))
 
 
-def test_collaborators_change_what_the_ego_sees(detector: Detector) -> None:
-    frames = frames_of(make_scene(2))
+def test_collaborators_change_what_the_ego_sees(drive, detector: Detector) -> None:
+    frames = drive(2).frames()
     blind = replace(frames[0], points=PointCloud.of(torch.tensor([[1.0, 1.0, 0.0]])))
     packets = Agent(detector).share(frames[1])
     assert len(Agent(detector).perceive(blind, packets).boxes) > len(Agent(detector).perceive(blind).boxes)
@@ -111,8 +126,8 @@ def test_an_empty_cloud_and_an_empty_inbox_give_no_error(detector: Detector, nam
     assert len(found.boxes) == 0
 
 
-def test_a_message_never_exceeds_its_budget(detector: Detector) -> None:
-    frame = frames_of(make_scene(1))[0]
+def test_a_message_never_exceeds_its_budget(drive, detector: Detector) -> None:
+    frame = drive(1).frame(0, 3)
     free = sum(map(len, Agent(detector, budget_bytes=None).share(frame)))
     for budget in (0, 200, 1000, free // 2, free):
         sent = sum(map(len, Agent(detector, budget_bytes=budget).share(frame)))
@@ -120,8 +135,8 @@ def test_a_message_never_exceeds_its_budget(detector: Detector) -> None:
         assert sent <= max(budget, 200), (budget, sent)
 
 
-def test_tokens_of_other_weights_change_nothing(detector: Detector) -> None:
-    frames = frames_of(make_scene(2))
+def test_tokens_of_other_weights_change_nothing(drive, detector: Detector) -> None:
+    frames = drive(2).frames()
     packets = Agent(detector).share(frames[1])
     ego = Agent(detector)
     alone = ego.perceive(frames[0]).boxes
@@ -131,26 +146,26 @@ def test_tokens_of_other_weights_change_nothing(detector: Detector) -> None:
     assert torch.equal(alone.bev(), strange.boxes.bev())
 
 
-def test_an_agent_does_not_hear_itself_nor_report_its_own_body(detector: Detector) -> None:
-    frame = frames_of(make_scene(1))[0]
+def test_an_agent_does_not_hear_itself_nor_report_its_own_body(drive, detector: Detector) -> None:
+    frame = drive(1).frame(0, 3)
     agent = Agent(detector)
     assert agent.perceive(frame, agent.share(frame)).heard == ()
     boxes = agent.perceive(frame).boxes
     assert not bool(((boxes.center[:, 0].abs() <= 2.6) & (boxes.center[:, 1].abs() <= 1.3)).any())
 
 
-def test_late_fusion_keeps_one_box_of_two_that_overlap(detector: Detector) -> None:
+def test_late_fusion_keeps_one_box_of_two_that_overlap(drive, detector: Detector) -> None:
     """What another says of the very same boxes adds none; the same boxes far aside add all."""
-    frame = frames_of(make_scene(1))[0]
+    frame = drive(1).frame(0, 3)
     eyes, late = Eyes(detector), method("late")
     said = late.say(eyes, frame)
     assert said is not None and said.objects is not None
     own = eyes.see(frame).boxes
     assert len(late.hear(eyes, frame, [said])) == len(own) > 0
-    far = replace(said, world_from_agent=Transform.from_xyz_yaw(0.0, 200.0))
+    far = replace(said, world_from_agent=frame.world_from_agent @ Transform.from_xyz_yaw(0.0, 200.0))
     assert len(late.hear(eyes, frame, [far])) == len(own) + len(said.objects)
 
 
 def test_an_unknown_method_lists_the_known() -> None:
-    with pytest.raises(ConfigError, match="alone, late, intermediate, early"):
+    with pytest.raises(ConfigError, match=", ".join(METHODS)):
         method("telepathy")

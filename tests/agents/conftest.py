@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drive made of arithmetic: eight cars that keep their velocities and agents that drive among them, at 10 Hz."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.models.detector import Detector
+from manyeyes.models.layers import ActiveNorm
+from manyeyes.models.presets import COSTR_TINY
+from manyeyes.training.samples import AugmentConfig, RoadConfig, make_sample
+from manyeyes.training.step import forward
+
+TENTH_NS = 100_000_000
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Every agent sees every car whole and some ground; world: where all this is."""
+
+    agents: int = 3
+    speed_mps: float = 8.0
+    agent_mps: float = 5.0
+    world: Transform = Transform.from_xyz_yaw(1234.5, -678.9, 3.0, 0.4)
+
+    def cars(self, index: int) -> Boxes:
+        """In the frame that ``world`` places."""
+        rng = torch.Generator().manual_seed(3)
+        center = torch.cat(((torch.rand(8, 2, generator=rng) - 0.5) * 36, torch.full((8, 1), 0.8)), 1).double()
+        yaw = (torch.rand(8, generator=rng).double() - 0.5) * 2 * math.pi
+        velocity = self.speed_mps * torch.stack((yaw.cos(), yaw.sin()), 1)
+        size = torch.tensor([4.5, 1.9, 1.6]).double().repeat(8, 1)
+        return Boxes.of(center, size, yaw, id=torch.arange(8) + 100, velocity=velocity).after(0.1 * index)
+
+    def points(self, index: int) -> torch.Tensor:
+        """Surfaces of the cars, and ground, in the frame that ``world`` places."""
+        rng, boxes = torch.Generator().manual_seed(4 + index), self.cars(index)
+        surface = torch.rand(8, 120, 3, generator=rng).double() - 0.5
+        face = torch.randint(0, 3, (8, 120, 1), generator=rng)
+        surface.scatter_(2, face, surface.gather(2, face).sign() * 0.5)
+        local = surface * boxes.size[:, None]
+        c, s = boxes.yaw.cos()[:, None], boxes.yaw.sin()[:, None]
+        x, y = local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c
+        moved = torch.stack((x, y, local[..., 2]), -1) + boxes.center[:, None]
+        ground = torch.cat(((torch.rand(1500, 2, generator=rng) - 0.5) * 50, torch.zeros(1500, 1)), 1)
+        return torch.cat((moved.flatten(0, 1), ground.double()))
+
+    def frame(self, agent: int, index: int) -> AgentFrame:
+        """One agent's frame; its pose is believed to be exact."""
+        starts = ((0.0, 0.0, 0.0, 0.0), (6.0, -3.0, 0.0, 0.7), (-9.0, 4.0, 0.2, -2.0))
+        x, y, z, yaw = starts[agent]
+        ahead = 0.1 * index * self.agent_mps
+        pose = Transform.from_xyz_yaw(x + ahead * math.cos(yaw), y + ahead * math.sin(yaw), z, yaw)
+        cloud = PointCloud.of(pose.inverse().apply(self.points(index)))
+        return AgentFrame.of(cloud, self.world @ pose, agent_id=agent, timestamp_ns=index * TENTH_NS)
+
+    def frames(self, index: int = 3) -> list[AgentFrame]:
+        """All agents at one instant."""
+        return [self.frame(agent, index) for agent in range(self.agents)]
+
+    def snapshot(self, index: int) -> Snapshot:
+        """All agents and the truth, in the world."""
+        frames = tuple(self.frames(index))
+        boxes = self.cars(index).transform(self.world)
+        seen = torch.ones(self.agents, len(boxes), dtype=torch.bool)
+        truth = Truth(boxes, seen, Transform.stack([frame.world_from_agent for frame in frames]))
+        return Snapshot("drive", index, frames, truth)
+
+
+@pytest.fixture
+def drive() -> type[Drive]:
+    return Drive
+
+
+def tiny_detector() -> Detector:
+    """Tiny weights whose norms have seen something, that tell of places, ages and the past, and prune little."""
+    torch.manual_seed(0)
+    model = Detector(replace(COSTR_TINY, prune_threshold=0.08))
+    moments, road = [Drive().snapshot(i) for i in range(4)], RoadConfig(past=2, late_share=0.5, late_frames=2)
+    sample = make_sample(moments, 0, COSTR_TINY.grid, AugmentConfig.none(), ("norms",), road)
+    fusion = model.fusion
+    with torch.no_grad():
+        for linear in (fusion.placement.outer, fusion.placement.temporal, fusion.past.out, fusion.past.ffn[2]):
+            torch.nn.init.normal_(linear.weight, std=0.1)
+        for norm in (m for m in model.modules() if isinstance(m, ActiveNorm)):
+            norm.momentum = 0.5
+        for _ in range(5):
+            forward(model, [sample], 0.0)
+    model.fingerprint = b"testtest"
+    return model.eval().requires_grad_(False)
+
+
+@pytest.fixture(scope="session")
+def detector() -> Detector:
+    return tiny_detector()
