@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a receiver would hear: a coarse map of how sure it is, and what it makes of the worth of others' tokens.
+
+A receiver broadcasts one byte a window (``RequestMap``). A sender moves its tokens into each receiver's frame, by the poses that
+the messages claim, and lowers the score of what all of them see well: the largest need counts, since one message serves all.
+Compare Where2comm's request map (Hu et al., NeurIPS 2022, section 3.3), which is dense and as fine as the features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes import BevGrid, ConfigError, SparseBev, Transform
+from manyeyes.datatypes.message import Message, RequestMap
+
+
+def request_map(tokens: SparseBev, sure: Tensor, window: BevGrid) -> RequestMap:
+    """One agent's map over the coarse grid window: in each cell the least sure (N,) in [0, 1] of its tokens, 0 without any.
+
+    The least: where one of two vehicles is in doubt, help is wanted. sure: how certain the agent is of each token's object.
+    """
+    if sure.shape != (len(tokens.sites),) or not bool(((sure >= 0) & (sure <= 1)).all()):
+        raise ConfigError(f"sure needs ({len(tokens.sites)},) in [0, 1]; got {tuple(sure.shape)}.")
+    rows, columns = window.shape
+    yx = window.cells(tokens.sites.xy)
+    cell = yx[:, 0] * columns + yx[:, 1]
+    least = torch.full((rows * columns,), torch.inf).scatter_reduce(0, cell, sure.float(), "amin")
+    return RequestMap(window, torch.where(least.isinf(), 0.0, least).view(rows, columns))
+
+
+def need(xy: Tensor, world_from_sender: Transform, requests: Sequence[Message], least: float = 0.1) -> Tensor:
+    """(N,) in [least, 1]: what to multiply the positive scores of tokens at xy (N, 2), metres in the sender's frame, with.
+
+    requests: messages that have a request; without any, all is needed. To one receiver a token is worth 1 - sure of the window
+    where it falls, and nothing beyond its map; of several receivers the largest counts. ``least`` keeps an order among
+    tokens that nobody asks for: whoever does not broadcast a request may still hear them.
+    """
+    asked = [m for m in requests if m.request is not None]
+    if not asked:
+        return torch.ones(len(xy))
+    needs = torch.stack([_need_of(xy, world_from_sender, m.world_from_agent, m.request) for m in asked if m.request])
+    return needs.amax(0).clamp_min(least)
+
+
+def _need_of(xy: Tensor, world_from_sender: Transform, world_from_receiver: Transform, request: RequestMap) -> Tensor:
+    flat = torch.cat((xy, xy.new_zeros(len(xy), 1)), 1).double()
+    there = (world_from_receiver.inverse() @ world_from_sender).apply(flat)[:, :2]
+    yx = request.grid.cells(there)
+    wanted = 1 - request.sure[yx[:, 0], yx[:, 1]]
+    return torch.where(request.grid.inside(there), wanted, 0.0).float()
