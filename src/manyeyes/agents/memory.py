@@ -20,26 +20,38 @@ KEPT_NS = 500_000_000
 
 
 class Memory:
-    """The last message of each sender that said what its next one could not. It forgets what is older than keep_ns."""
+    """The last two messages of each sender: what the newer lacks, the older may have said. Older than keep_ns is forgotten."""
 
     def __init__(self, keep_ns: int = KEPT_NS) -> None:
         self._keep_ns = keep_ns
-        self._held: dict[int, Message] = {}
+        self._held: dict[int, tuple[Message, Message | None]] = {}
 
     def complete(self, heard: Sequence[Reception]) -> list[Message]:
-        """The messages heard, and behind each that lacks packets what its sender said before and does not say again."""
+        """The messages heard, and behind each that lacks packets what its sender said before and does not say again.
+
+        Heard again, whole or with more packets than before, a message is completed anew from the same one before it.
+        """
         messages = []
         for reception in heard:
-            message, older = reception.message, self._held.get(reception.message.agent_id)
-            messages.append(message)
-            rest = None
-            if older is not None and 0 < message.timestamp_ns - older.timestamp_ns <= self._keep_ns:
-                rest = None if reception.complete else _unsaid(older, message)
-            if rest is not None:
-                messages.append(rest)
-            if older is None or message.timestamp_ns != older.timestamp_ns or reception.complete:
-                self._held[message.agent_id] = message
+            message = reception.message
+            before = self._before(message)
+            self._held[message.agent_id] = message, before
+            rest = None if reception.complete or before is None else _unsaid(before, message)
+            messages += [message] if rest is None else [message, rest]
+        if heard:
+            latest = max(reception.message.timestamp_ns for reception in heard)
+            near = ((k, v) for k, v in self._held.items() if abs(latest - v[0].timestamp_ns) <= self._keep_ns)
+            self._held = dict(near)
         return messages
+
+    def _before(self, message: Message) -> Message | None:
+        """What its sender said last before it, if that is not too long ago; a time that goes back begins anew."""
+        newest, before = self._held.get(message.agent_id, (None, None))
+        if newest is None or message.timestamp_ns < newest.timestamp_ns:
+            return None
+        if newest.timestamp_ns < message.timestamp_ns:
+            before = newest
+        return None if before is None or message.timestamp_ns - before.timestamp_ns > self._keep_ns else before
 
 
 def _unsaid(older: Message, newer: Message) -> Message | None:
