@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, SOLID, MapElements, Polygons
 from manyeyes.maps.align import merge, overlapping, search, solve_poses, sweep
+from manyeyes.maps.evidence import EvidenceConfig
 from manyeyes.maps.fuse import FuseConfig, assemble, fuse, fuse_aligned
 from manyeyes.maps.observation import Observation
 from manyeyes.maps.sightings import gather
-from manyeyes.maps.stations import StationTable, find_stations
+from manyeyes.maps.stations import StationConfig, StationTable, find_stations
 from manyeyes.maps.vector_map import PUBLISHED, RETIRED
 from manyeyes.ops.nearest_line import nearest_line
 
@@ -185,6 +186,20 @@ def test_h_a_crossing_behind_a_lorry_never_retires():
     lorry = np.array([[6.0, -9.0], [8.0, -9.0], [8.0, 9.0], [6.0, 9.0]])
     assert _crossing_seen_then(8, 14, [lorry]) == PUBLISHED
     assert _crossing_seen_then(8, 14, [lorry - (30.0, 0.0)]) == RETIRED
+
+
+def test_what_many_looked_for_in_vain_needs_more_than_one_word():
+    ghost = (DIVIDER, np.array([[0.0, 0.0], [60.0, 0.0]]))
+    config = FuseConfig(stations=StationConfig(evidence=EvidenceConfig(publish=1.5, publish_agents=1)))
+    early = [look(road(60.0), (30.0, 0.5, 0.0), f"early{k}", k) for k in range(6)]
+    late = [look([*road(60.0), ghost], (30.0, 0.5, 0.0), f"late{k}", 10 + k) for k in range(3)]
+
+    def dividers(observations):
+        return len(lines_of(fuse(observations, config), DIVIDER))
+
+    assert dividers(late[:1]) == 3  # nobody looked before
+    assert dividers([*early, *late[:1]]) == 2
+    assert dividers([*early, *late]) == 3  # three agree: it is new
 
 
 def test_i_a_moved_divider_switches_and_is_never_averaged():

@@ -4,8 +4,8 @@
 Stages 4 and 7 of specs/maps.md 3.4. A station gains log(P_D / P_FA) for an observation that has a line there and loses
 visibility times log((1 - P_FA) / (1 - P_D)) for one that could see the place and has none; a line a little aside says
 neither. Each agent's sum of a day is capped, so that one busy or malicious agent cannot decide. It is published and
-retired with hysteresis. What was never seen before its first sighting is not held against it: until then nobody had the
-hypothesis.
+retired with hysteresis. Clear views of the place before the first sighting count against it too, but only down to
+``doubt``: what many looked for in vain and one saw is more likely false than new, and still a few who agree suffice.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ _DAY_S = 86400.0
 
 @dataclass(frozen=True)
 class EvidenceConfig:
-    """detection, false_alarm: P_D and P_FA. clamp: largest |log-odds|. daily: largest change one agent makes in a day.
+    """detection, false_alarm: P_D and P_FA. clamp: largest |log-odds|; doubt: before the first sighting. daily: largest
+    change one agent makes in a day.
 
     publish: log-odds at which a station is published, given publish_agents distinct agents or a surveyed pole. retire:
     at which it is retired, given retire_agents distinct agents that missed it. margin_m: of a view, within which a miss
@@ -40,6 +41,7 @@ class EvidenceConfig:
     detection: float = 0.7
     false_alarm: float = 0.15
     clamp: float = 6.0
+    doubt: float = 2.0
     daily: float = 2.0
     publish: float = 2.2
     publish_agents: int = 2
@@ -68,7 +70,8 @@ class EvidenceConfig:
     def numbers(self) -> Floats:
         """The numbers that the compiled loops read, in their order."""
         gates = (self.along_m, self.across_m, self.aside_m, float(np.cos(self.heading_rad)), self.kernel_m, self.bias_m)
-        return np.array((self.hit, self.miss, self.clamp, self.daily, self.publish, self.retire, self.margin_m, *gates))
+        sums = (self.hit, self.miss, self.clamp, self.daily, self.publish, self.retire, self.margin_m)
+        return np.array((*sums, *gates, self.doubt))
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,7 +341,7 @@ def fold_looks(
     low, high = _cell_of(places, index)
     of = index[2]
     odds, coverage, state, then, surveyed, started = 0.0, 0.0, 0, 0, False, False
-    seen_by, all_by, missed_by, next_hit, q = 0, 0, 0, 0, low
+    seen_by, all_by, missed_by, next_hit, q, floor = 0, 0, 0, 0, low, -numbers[13]
     era_seen, era_missed = 1, 1
     while next_hit < len(hits) or q < high:
         found = next_hit < len(hits) and (q >= high or hits[next_hit] <= of[q])
@@ -352,7 +355,7 @@ def fold_looks(
             q += 1
             seen = 0.0 if aside_of[o] == 2 else visibility(places, o, who[0], sights, numbers[6])
         coverage += seen
-        if seen <= 0.0 or not (started or found):
+        if seen <= 0.0:
             continue
         if started:
             odds *= np.exp(-(time_ns[o] - then) * 1e-9 / decay)
@@ -367,7 +370,9 @@ def fold_looks(
         if not trusted[o]:
             allowed = min(daily, max(-daily, book[a, 0] + change))
             change, book[a, 0] = allowed - book[a, 0], allowed
-        odds = min(clamp, max(-clamp, odds + change))
+        if found:
+            floor = -clamp
+        odds = min(clamp, max(floor, odds + change))
         if found:
             if stamp[a, 2] != era_seen:
                 stamp[a, 2] = era_seen
@@ -376,7 +381,7 @@ def fold_looks(
                 book[a, 1] = 1.0
                 all_by += 1
             surveyed = surveyed or trusted[o]
-        elif stamp[a, 3] != era_missed:
+        elif all_by > 0 and stamp[a, 3] != era_missed:
             stamp[a, 3] = era_missed
             missed_by += 1
         if odds >= publish and (seen_by >= least[0] or surveyed):

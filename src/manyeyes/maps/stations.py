@@ -57,7 +57,7 @@ class StationConfig:
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """What K stations or crossings share: columns as in evidence.Witness; ``sources`` count in observations (U, 16),
-    ascending.
+    each station's and the observations ascending.
     """
 
     kind: Ints
@@ -183,8 +183,10 @@ def _evidence_of(found: Witness | Crossings, kind: Ints, sightings: Sightings) -
     ids = np.frombuffer(bytes.fromhex("".join(sightings.ids)), np.uint8).reshape(-1, 16)
     known, place = np.unique(ids, axis=0, return_inverse=True)
     columns = {name: getattr(found, name) for name in names}
+    sources = place.reshape(-1)[found.sources]
+    owner = np.repeat(np.arange(len(kind)), np.diff(found.first))
     return Evidence(
-        kind=kind, first=found.first, sources=place.reshape(-1)[found.sources], observations=known, **columns
+        kind=kind, first=found.first, sources=sources[np.lexsort((sources, owner))], observations=known, **columns
     )
 
 
