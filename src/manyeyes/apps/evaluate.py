@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judges methods on a split: AP with 95 % intervals over scenarios, bytes, age, time, and paired differences with verdicts."""
+"""Judges methods on a split: AP with 95 % intervals over scenarios, bytes, age, time, and paired differences with verdicts.
+
+--study NAME runs a study instead: robustness (delay, errors of pose, lost packets), budget (AP against bytes), agents (one to
+five), ablation (branches of a training), system (every agent as ego, one budget for the channel), picture (one frame).
+"""
 
 from __future__ import annotations
 
@@ -45,6 +49,18 @@ class Options:
     """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""
     playing: Playing = field(default_factory=Playing)
     """How agents collaborate."""
+    every: int = 1
+    """Judge each so many-th frame of those that the recording judges."""
+    study: str | None = None
+    """robustness, budget, agents, ablation, system or picture; what is finished is kept under --out and not made again."""
+    budgets: tuple[int, ...] = ()
+    """Bytes: of a message in the study 'budget', of all messages of an instant in 'system'; by default the study's own."""
+    selectors: tuple[str, ...] = ()
+    """Methods that choose tokens, in the studies 'budget' and 'system'; by default intermediate, confidence, random."""
+    precisions: tuple[str, ...] = ()
+    """Ways to write tokens, in the study 'budget'; by default all."""
+    branches: tuple[str, ...] = ()
+    """Weights that the study 'ablation' compares, each as name=weights.safetensors."""
 
 
 def main(options: Options) -> None:
@@ -61,6 +77,11 @@ def main(options: Options) -> None:
     from manyeyes.models import zoo
 
     console = Console()
+    if options.study is not None:
+        from manyeyes.apps.studies import study
+
+        study(options, console)
+        return
     disturbed = options.noise_xy_m > 0 or options.noise_yaw_deg > 0
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
     config = BenchmarkConfig(
@@ -69,6 +90,7 @@ def main(options: Options) -> None:
         protocol=options.protocol,
         replay=options.playing.replay_config(options.seed, options.all_egos),
         noise=noise if disturbed else None,
+        every=options.every,
     )
     protocol, detector = judging_protocol(config), zoo.load(config.weights)
     opener = partial(open_recording, options.data, options.split)

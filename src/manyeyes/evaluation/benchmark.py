@@ -4,24 +4,27 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from itertools import islice
+from itertools import chain, groupby, islice
 from pathlib import Path
 
 import torch
 
-from manyeyes.agents.replay import ReplayConfig, Views, replay
+from manyeyes.agents.replay import ReplayConfig, Step, Views, replay
 from manyeyes.datasets.disturb import PoseNoise
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import Snapshot
 from manyeyes.evaluation.detection import Protocol, protocol_named
 from manyeyes.evaluation.tally import MethodResult, Tally
-from manyeyes.evaluation.views import EveryKth, NearestAgents
+from manyeyes.evaluation.views import EveryKth, KeptSnapshots, NearestAgents
 from manyeyes.models import zoo
 from manyeyes.models.detector import Detector
+
+TOGETHER = 8
+"""Conditions that are played side by side: more of them see each sweep once, fewer of them are lost when a study is stopped."""
 
 
 @dataclass(frozen=True)
@@ -67,31 +70,37 @@ def _load(weights: str, changed_ns: int) -> Detector:
     return zoo.load(weights)
 
 
-def run_scenario(open_recording: Callable[[], Recording], config: BenchmarkConfig, scenario: str) -> list[Tally]:
-    """All methods on one scenario; a function of its arguments alone."""
+def run_scenario(
+    open_recording: Callable[[], Recording], configs: Sequence[BenchmarkConfig], scenario: str
+) -> list[list[Tally]]:
+    """All methods of each configuration on one scenario; a function of its arguments alone.
+
+    The configurations have the same weights, view and history: each sweep is read and looked at once between them.
+    """
     torch.set_num_threads(1)
-    detector, protocol = loaded(config.weights), judging_protocol(config)
-    tallies = {name: Tally(name, protocol) for name in config.methods}
-    recording = config.view(open_recording())
+    first = configs[0]
+    detector, known = loaded(first.weights), {}
+    apart = 2 * first.every + first.replay.history + 1
+    recording = KeptSnapshots(first.view(open_recording()), apart)
+    tallies = [{name: Tally(name, judging_protocol(config)) for name in config.methods} for config in configs]
+    plays = [_instants(recording, scenario, detector, config, known) for config in configs]
+    for instants in zip(*plays):
+        for (_, steps), counts in zip(instants, tallies):
+            for step in steps:
+                counts[step.method].add(step)
+    return [list(counts.values()) for counts in tallies]
+
+
+def _instants(
+    recording: Recording, scenario: str, detector: Detector, config: BenchmarkConfig, known: Views
+) -> Iterator[tuple[int, Iterator[Step]]]:
+    """The steps of one configuration, judged snapshot by judged snapshot."""
     played = config.replay
     if config.channel_bytes is not None:
         played = replace(played, budget_bytes=config.channel_bytes // len(recording.agents(scenario)))
     disturb = partial(_disturb, config.noise)
-    known = _views_of((detector.fingerprint, scenario, max(0, recording.judged(scenario).start - played.history)))
-    for step in replay(recording, scenario, detector, config.methods, played, disturb, known):
-        tallies[step.method].add(step)
-    return list(tallies.values())
-
-
-MOST_VIEWS = 12_000
-"""Of all scenarios together, about 130 kB each, that a process keeps: conditions change what agents hear, never what they see."""
-_kept: dict[tuple[bytes, str, int], Views] = {}
-
-
-def _views_of(key: tuple[bytes, str, int]) -> Views:
-    while _kept and sum(map(len, _kept.values())) > MOST_VIEWS:
-        del _kept[next(iter(_kept))]
-    return _kept.setdefault(key, {})
+    steps = replay(recording, scenario, detector, config.methods, played, disturb, known)
+    return groupby(steps, lambda step: step.snapshot.index)
 
 
 def _disturb(noise: PoseNoise | None, snapshot: Snapshot) -> Snapshot:
@@ -104,43 +113,52 @@ def played(
     workers: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Generator[tuple[Tally, ...]]:
-    """The tallies of each configuration in turn, each as soon as its last scenario is played.
+    """The tallies of each configuration in turn, as soon as they are there.
 
-    open_recording must be picklable when workers > 1; results do not depend on workers. progress counts scenarios.
+    open_recording must be picklable when workers > 1; results do not depend on workers. progress counts scenarios played by
+    a configuration.
     """
-    recording = open_recording()
-    _kept.clear()
-    scenarios = [config.view(recording).scenarios for config in configs]
-    jobs = [(config, name) for config, names in zip(configs, scenarios) for name in names]
-    work, counts = partial(_job, open_recording), list(map(len, scenarios))
+    recording, groups = open_recording(), _together(configs)
+    jobs = [(group, name) for group in groups for name in group[0].view(recording).scenarios]
+    work, total = partial(_job, open_recording), sum(len(group) for group, _ in jobs)
+
+    def report(done: int) -> None:
+        progress(done, total)
+
     if workers == 1:
-        yield from _gathered(map(work, jobs), configs, counts, progress)
+        yield from _gathered(map(work, jobs), groups, jobs, report)
         return
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        yield from _gathered(pool.imap(work, jobs), configs, counts, progress)
+        yield from _gathered(pool.imap(work, jobs), groups, jobs, report)
 
 
-def _job(open_recording: Callable[[], Recording], job: tuple[BenchmarkConfig, str]) -> list[Tally]:
+def _together(configs: Sequence[BenchmarkConfig]) -> list[tuple[BenchmarkConfig, ...]]:
+    """Neighbours that can be played together, at most TOGETHER of them: what is finished is handed out group by group."""
+    alike = groupby(configs, lambda c: (c.weights, c.every, c.agents, c.replay.history))
+    runs = [tuple(run) for _, run in alike]
+    return [run[k : k + TOGETHER] for run in runs for k in range(0, len(run), TOGETHER)]
+
+
+def _job(open_recording: Callable[[], Recording], job: tuple[tuple[BenchmarkConfig, ...], str]) -> list[list[Tally]]:
     return run_scenario(open_recording, *job)
 
 
 def _gathered(
-    found: Iterable[list[Tally]],
-    configs: Sequence[BenchmarkConfig],
-    counts: Sequence[int],
-    progress: Callable[[int, int], None],
+    found: Iterable[list[list[Tally]]],
+    groups: Sequence[tuple[BenchmarkConfig, ...]],
+    jobs: Sequence[tuple[tuple[BenchmarkConfig, ...], str]],
+    progress: Callable[[int], None],
 ) -> Generator[tuple[Tally, ...]]:
-    """Tallies of scenarios, counts of them a configuration, added up."""
+    """The tallies of jobs, added up over the scenarios of each group."""
     results, done = iter(found), 0
-    for config, count in zip(configs, counts):
-        protocol = judging_protocol(config)
-        whole = tuple(Tally(name, protocol) for name in config.methods)
-        for tallies in islice(results, count):
-            for all_of_it, one in zip(whole, tallies):
+    for group in groups:
+        whole = [[Tally(name, judging_protocol(config)) for name in config.methods] for config in group]
+        for tallies in islice(results, sum(of is group for of, _ in jobs)):
+            for all_of_it, one in zip(chain(*whole), chain(*tallies)):
                 all_of_it.extend(one)
-            done += 1
-            progress(done, sum(counts))
-        yield whole
+            done += len(group)
+            progress(done)
+        yield from map(tuple, whole)
 
 
 def benchmark(

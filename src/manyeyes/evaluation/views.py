@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording seen with less: some of its judged frames, or some of its agents. Both are recordings themselves."""
+"""A recording seen with less: some of its judged frames, some of its agents, or each snapshot read once. All are recordings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 
@@ -43,6 +44,35 @@ class EveryKth:
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         """As in the recording."""
         return self.recording.snapshot(scenario, index)
+
+
+class KeptSnapshots:
+    """The last so many snapshots that were asked for are kept, for several who play a recording side by side."""
+
+    def __init__(self, recording: Recording, count: int) -> None:
+        self._recording = recording
+        self._read = lru_cache(maxsize=count)(recording.snapshot)
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """As in the recording."""
+        return self._recording.scenarios
+
+    def length(self, scenario: str) -> int:
+        """As in the recording."""
+        return self._recording.length(scenario)
+
+    def judged(self, scenario: str) -> range:
+        """As in the recording."""
+        return self._recording.judged(scenario)
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        """As in the recording."""
+        return self._recording.agents(scenario)
+
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        """As in the recording, and the same object while it is kept."""
+        return self._read(scenario, index)
 
 
 class NearestAgents:

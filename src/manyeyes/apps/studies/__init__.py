@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Studies of detection as commands: each a file, each writing JSON, Markdown and a picture."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from manyeyes.datatypes import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from manyeyes.apps.evaluate import Options
+
+STUDIES = {
+    "robustness": "delay, errors of pose, lost packets, one at a time and together (CoSTr, Table II)",
+    "budget": "AP against bytes a message, for each way to choose tokens and to write them (CoSTr, Fig. 3)",
+    "agents": "one agent to five",
+    "ablation": "branches of a training, side by side (CoSTr, Table III)",
+    "system": "every agent judged as ego, one budget for the channel (CoSTr, Eq. 2)",
+    "picture": "one frame under errors, methods side by side (CoSTr, Fig. 4)",
+}
+
+
+def check_study(name: str) -> None:
+    """Refuse a study that is not there."""
+    if name not in STUDIES:
+        raise ConfigError(f"No study is called {name!r}; known: {', '.join(STUDIES)}.")
+
+
+def study(options: Options, console: Console) -> None:
+    """Run the named study; cells that are kept are not made again."""
+    check_study(options.study or "")
+    importlib.import_module(f"manyeyes.apps.studies.{options.study}").run(options, console)

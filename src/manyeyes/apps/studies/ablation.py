@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Branches of a training side by side, perfect, late and displaced: CoSTr, Table III. Each part is to earn its place.
+
+The order is that of the command line; a branch is held against the one before it. What was trained, how long and from which
+seed stands in the model card of each file and is shown beside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from manyeyes.apps.studies.disturbance import PERFECT, Disturbance
+from manyeyes.apps.studies.running import OURS, PAPER, carry_out, publish, start
+from manyeyes.apps.viewer.curves import Curve, Panel
+from manyeyes.apps.viewer.study_table import Sheet, change, log2, number, value
+from manyeyes.datatypes import ConfigError
+from manyeyes.evaluation.bootstrap import Interval
+from manyeyes.evaluation.sweep import Condition, Sweep
+from manyeyes.models import checkpoint
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from manyeyes.apps.evaluate import Options
+
+UNDER = (PERFECT, Disturbance(delay_s=0.2), Disturbance(position_m=0.4))
+PAPER_TABLE = (
+    ("none", 0.875, 0.831, 0.762, 16.43),
+    ("SE", 0.897, 0.842, 0.790, 16.94),
+    ("SE, DAST", 0.919, 0.849, 0.883, 16.94),
+    ("SE, DAST, DAST in FAST's place", 0.933, 0.878, 0.911, 16.94),
+    ("SE, DAST, FAST", 0.946, 0.928, 0.926, 16.94),
+    ("SE, DAST, FAST, MI", 0.941, 0.924, 0.925, 14.71),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A branch. ap: at IoU 0.5 and 0.7 under each of UNDER; over_last: AP@0.5 over the branch before. card: of its weights."""
+
+    branch: str
+    ap: tuple[tuple[Interval, Interval], ...]
+    over_last: tuple[Interval, ...]
+    bytes_per_message: float
+    card: dict[str, Any]
+
+
+def run(options: Options, console: Console) -> None:
+    """The study."""
+    branches = branches_of(options.branches)
+    begun = start(options, console)
+    base = replace(begun.base, methods=(OURS,))
+    conditions = [
+        Condition(_name(branch, under), under.on(replace(base, weights=str(path))))
+        for branch, path in branches.items()
+        for under in UNDER
+    ]
+    cards = {branch: checkpoint.read_card(path) for branch, path in branches.items()}
+    done = carry_out(begun, conditions)
+    table = rows(done, cards)
+    sheets = [_sheet(table), _cards(table), _paper()]
+    payload: dict[str, object] = {"rows": table, "paper": {"note": PAPER, "rows": PAPER_TABLE}}
+    publish(begun, payload, sheets, panels(table), conditions, (PAPER.replace('column "paper"', "last table"),))
+
+
+def branches_of(words: Sequence[str]) -> dict[str, Path]:
+    """Names and files of ``name=weights.safetensors``."""
+    pairs = [word.partition("=") for word in words]
+    odd = [word for word, (name, _, path) in zip(words, pairs) if not name or not path]
+    names = [name for name, _, _ in pairs]
+    if odd or not words or len(set(names)) < len(names):
+        raise ConfigError(
+            "The study 'ablation' takes --branches name=weights.safetensors ..., each name once; "
+            f"got {' '.join(words) or 'none'}."
+        )
+    return {name: Path(path) for name, _, path in pairs}
+
+
+def _name(branch: str, under: Disturbance) -> str:
+    return f"{branch}: {under.name}"
+
+
+def rows(done: Sweep, cards: dict[str, dict[str, Any]]) -> tuple[Row, ...]:
+    """The table, in the order of the branches."""
+    out, last = [], ""
+    for branch, card in cards.items():
+        places = [(_name(branch, under), OURS) for under in UNDER]
+        before = [(_name(last, under), OURS) for under in UNDER] if last else []
+        out.append(
+            Row(
+                branch,
+                tuple((done.ap(place, 0), done.ap(place, 1)) for place in places),
+                tuple(done.less(place, other, 0) for place, other in zip(places, before)),
+                done.cells[places[0]].bytes_per_message,
+                card,
+            )
+        )
+        last = branch
+    return tuple(out)
+
+
+def _sheet(table: Sequence[Row]) -> Sheet:
+    names = [under.name for under in UNDER]
+    headings = (
+        "branch", *(f"AP@0.5 {n}" for n in names), *(f"AP@0.7 {n}" for n in names),
+        *(f"over the one before {n}" for n in names), "bytes/message", "AB log2",
+    )  # fmt: skip
+    lines = tuple(
+        (
+            row.branch,
+            *(value(half) for half, _ in row.ap),
+            *(value(seven) for _, seven in row.ap),
+            *(tuple(map(change, row.over_last)) or ("",) * len(UNDER)),
+            number(row.bytes_per_message),
+            log2(row.bytes_per_message),
+        )
+        for row in table
+    )
+    return Sheet("Branches", headings, lines)
+
+
+def _cards(table: Sequence[Row]) -> Sheet:
+    lines = tuple((row.branch, *(str(row.card.get(key, "")) for key in ("steps", "seed", "command"))) for row in table)
+    return Sheet("How they were trained", ("branch", "steps", "seed", "command"), lines)
+
+
+def _paper() -> Sheet:
+    lines = tuple((name, *(f"{v:.3f}" for v in ap), f"{ab:.2f}") for name, *ap, ab in PAPER_TABLE)
+    headings = ("parts", *(under.name for under in UNDER), "AB log2")
+    return Sheet("The paper's own table, AP@0.5: another data set, unknown protocol", headings, lines)
+
+
+def panels(table: Sequence[Row]) -> list[Panel]:
+    """AP@0.5 and AP@0.7 of the branches, a line a disturbance."""
+    x, ticks = tuple(map(float, range(len(table)))), tuple(row.branch for row in table)
+    return [
+        Panel(
+            f"AP@{iou}", "", f"AP@{iou}",
+            tuple(Curve(u.name, tuple(row.ap[k][which] for row in table), x) for k, u in enumerate(UNDER)),
+            ticks=ticks,
+        )
+        for which, iou in enumerate(("0.5", "0.7"))
+    ]  # fmt: skip
