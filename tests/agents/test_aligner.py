@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from manyeyes.agents.agent import Agent
 from manyeyes.agents.aligner import Aligner, Use, boxes_of
+from manyeyes.agents.collaboration import Late
 from manyeyes.agents.eyes import Eyes
 from manyeyes.alignment.estimate import PoseStatus
 from manyeyes.alignment.watchman import Health
@@ -42,7 +44,8 @@ def cars(count: int, seed: int) -> Boxes:
 class ToldEyes(Eyes):
     """An ego that sees given boxes and decodes as the detector does."""
 
-    def __init__(self, boxes: Boxes) -> None:
+    def __init__(self, boxes: Boxes, detector: Detector | None = None) -> None:
+        super().__init__(detector or Detector(COSTR_TINY))
         self.boxes = boxes
 
     def see(self, frame: AgentFrame) -> Any:
@@ -203,6 +206,25 @@ def test_a_message_heard_twice_says_nothing_new_and_a_new_drive_begins_anew() ->
     earlier = replace(message, timestamp_ns=0)
     anew = Aligner().align(frame(), eyes(world), [earlier], again.states)
     assert anew.verdicts[0].health.frames == 1 and anew.states[2].time.tolist() == [0.0]
+
+
+def test_an_agent_fuses_boxes_from_where_their_sender_is() -> None:
+    """share → bytes → perceive with late fusion: what only the other sees lies where it really is."""
+    known, hidden = cars(12, 13), cars(3, 14)
+    detector = Detector(COSTR_TINY).eval()
+    other = Agent(detector, Late(), eyes=ToldEyes(Boxes.cat([known, hidden]).transform(OTHERS[0].inverse()), detector))
+    claimed = said(known, OTHERS[0], off=(1.5, 1.0, 0.03), sigma=1.2)
+    packets = other.share(
+        replace(frame(), agent_id=2, world_from_agent=claimed.world_from_agent, pose_covariance=claimed.pose_covariance)
+    )
+    wanted = hidden.transform(EGO.inverse()).center[:, :2]
+    missed = {}
+    for aligner in (None, Aligner()):
+        ego = Agent(detector, Late(), eyes=ToldEyes(known.transform(EGO.inverse()), detector), aligner=aligner)
+        found = ego.perceive(frame(), packets)
+        missed[aligner is None] = float(torch.cdist(wanted, found.boxes.center[:, :2]).amin(1).max())
+        assert len(found.verdicts) == (aligner is not None) and len(found.heard) == 1
+    assert missed[False] < 0.1 and missed[True] > 1.0
 
 
 def test_nobody_heard_and_unknown_correctors() -> None:

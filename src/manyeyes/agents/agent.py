@@ -6,9 +6,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+from manyeyes.agents.aligner import Aligner, Verdict
 from manyeyes.agents.collaboration import Collaboration, Intermediate
 from manyeyes.agents.eyes import Eyes
 from manyeyes.agents.memory import Memory
+from manyeyes.alignment.watchman import WatchState
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox, Reception
 from manyeyes.comms.select import within_budget
@@ -21,16 +23,20 @@ OWN_BODY_M = (2.6, 1.3)
 
 @dataclass(frozen=True)
 class Perception:
-    """boxes: in the agent's own frame, best first. heard: the messages that took part, by agent id."""
+    """boxes: in the agent's own frame, best first. heard: the messages that took part, by agent id, from where they were
+    believed to come. verdicts: on every message that came, where the agent aligns them.
+    """
 
     boxes: Boxes
     heard: tuple[Reception, ...]
+    verdicts: tuple[Verdict, ...] = ()
 
 
 class Agent:
     """A detector, a way to collaborate, and a limit in bytes for each message.
 
     Nothing but the bytes of share passes between two agents; frames carry no labels, so truth cannot leak by type.
+    aligner: corrects where others say they are before anything is fused; None believes them.
     """
 
     def __init__(
@@ -40,8 +46,10 @@ class Agent:
         precision: Precision = "float16",
         budget_bytes: int | None = 1 << 17,
         eyes: Eyes | None = None,
+        aligner: Aligner | None = None,
     ) -> None:
         self.eyes, self.memory = eyes or Eyes(detector), Memory()
+        self.aligner, self._watched = aligner, dict[int, WatchState]()
         self.collaboration = collaboration or Intermediate()
         self.precision: Precision = precision
         self.budget_bytes = budget_bytes
@@ -67,8 +75,21 @@ class Agent:
             for packet in packets:
                 inbox.push(packet)
         heard = tuple(r for r in inbox.receptions(now_ns) if r.message.agent_id != frame.agent_id)
+        heard, verdicts = self._aligned(frame, heard)
         boxes = self.collaboration.hear(self.eyes, frame, self.memory.complete(heard))
-        return Perception(_others(boxes, frame), heard)
+        return Perception(_others(boxes, frame), heard, verdicts)
+
+    def _aligned(
+        self, frame: AgentFrame, heard: tuple[Reception, ...]
+    ) -> tuple[tuple[Reception, ...], tuple[Verdict, ...]]:
+        """What was heard from where it belongs, without what belongs nowhere."""
+        if self.aligner is None:
+            return heard, ()
+        aligned = self.aligner.align(frame, self.eyes, [r.message for r in heard], self._watched)
+        self._watched = dict(aligned.states)
+        said = {message.agent_id: message for message in aligned.messages}
+        kept = (replace(r, message=said[r.message.agent_id]) for r in heard if r.message.agent_id in said)
+        return tuple(kept), aligned.verdicts
 
 
 def _others(boxes: Boxes, frame: AgentFrame) -> Boxes:

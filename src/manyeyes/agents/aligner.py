@@ -32,6 +32,8 @@ from manyeyes.models.proposal import PROPOSAL
 
 Floats = NDArray[np.float64]
 
+FORGET_S = 60.0
+"""A sender that was silent for so long is judged anew."""
 EGO = 0
 """The ego's node in the graph; senders are 1, 2, ... in the order of their messages."""
 
@@ -95,14 +97,17 @@ class Aligner:
         self, frame: AgentFrame, eyes: Eyes, messages: Sequence[Message], states: Mapping[int, WatchState]
     ) -> Aligned:
         """The messages that came for a frame, put where they belong. states: of the frame before, by sender."""
+        now_s = frame.timestamp_ns * 1e-9
+        watched = {a: s for a, s in states.items() if not len(s.time) or abs(now_s - s.time[-1]) <= FORGET_S}
+        if not messages:
+            return Aligned((), (), watched)
         own = self._landmarks(eyes.see(frame).boxes, 0.0)
         marks = [self._landmarks(boxes_of(eyes, message), age_s(frame, message)) for message in messages]
         claims = [PoseClaim.between(frame, message) for message in messages]
         answers = [corrector(self.corrector)(own, theirs, claim) for theirs, claim in zip(marks, claims)]
-        watched = dict(states)
         health = []
         for message, claim, answer in zip(messages, claims, answers):
-            state, report = self._watched(states.get(message.agent_id), message, claim, answer)
+            state, report = self._watched(watched.get(message.agent_id), message, claim, answer)
             watched[message.agent_id] = state
             health.append(report)
         settled, contradicted = self._settled(messages, marks, claims, answers)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from manyeyes.agents.agent import Agent, Perception
+from manyeyes.agents.aligner import Aligner
 from manyeyes.agents.collaboration import method
 from manyeyes.agents.eyes import Eyes, Sight
 from manyeyes.comms.bus import LocalBus
@@ -32,7 +33,7 @@ class ReplayConfig:
     channel: a preset by name, or any other radio. wait_s: how long after its own sweep an ego waits for messages before it
     perceives; whatever came by then takes part, the newest of each sender. all_egos: every agent is judged as ego, not the
     first alone. history: snapshots played before the first judged one, so that messages are under way. reach_m: radios
-    farther apart do not hear each other (true poses).
+    farther apart do not hear each other (true poses). aligner: corrects where others say they are, None: nobody does.
     """
 
     channel: str | ChannelPreset = "ideal"
@@ -43,6 +44,7 @@ class ReplayConfig:
     history: int = 0
     reach_m: float = 70.0
     seed: int = 0
+    aligner: Aligner | None = None
 
     @property
     def radio(self) -> ChannelPreset:
@@ -124,8 +126,9 @@ class Team:
         who = frame.agent_id
         if who not in self._agents:
             eyes = Eyes(self.detector, known=self.known)
+            config = self.config
             self._agents[who] = Agent(
-                self.detector, method(self.method), self.config.precision, self.config.budget_bytes, eyes
+                self.detector, method(self.method), config.precision, config.budget_bytes, eyes, config.aligner
             )
             self._inboxes[who] = Inbox(self.detector.fingerprint, EXPIRE_NS)
         return self._agents[who], self._inboxes[who]

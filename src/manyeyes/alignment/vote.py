@@ -35,7 +35,9 @@ class VoteConfig:
     edges may differ. size_gate_m: difference of widths (twice that and a tenth of it for lengths). tau_m, turn_rad:
     reach of the coarse support. refined: how many of the best are refined. pair_gate: largest squared misfit of a
     pair (3 degrees of freedom; 14.16 is p = 0.003). area_m2: see the module, fitted on simulated crossings. apart_m,
-    apart_rad: answers that differ by less are one.
+    apart_rad: answers that differ by less are one. still_m: what moved less between instants counts once. trust: degrees
+    of freedom that stated errors are worth against those that the pairs show. shared: the part of a box's variance that
+    all boxes of one view have in common, which no number of pairs averages out.
     """
 
     reach_m: float = 300.0
@@ -54,10 +56,14 @@ class VoteConfig:
     apart_m: float = 2.0
     apart_rad: float = 0.105
     still_m: float = 1.5
+    trust: float = 10.0
+    shared: float = 0.0
 
     def __post_init__(self) -> None:
         if min(self.landmarks, self.edges, self.hypotheses, self.refined) < 1 or not self.shortest_m < self.longest_m:
             raise ConfigError("VoteConfig needs caps of at least 1 and shortest_m < longest_m.")
+        if not (self.trust > 0 and 0 <= self.shared < 1):
+            raise ConfigError("VoteConfig needs trust > 0 and shared in [0, 1).")
 
 
 @dataclass(frozen=True)
@@ -93,8 +99,7 @@ def candidates(
     for pose, information, pairs, misfit, score in found:
         freedom = 3 * len(pairs) - 3
         total = float(misfit.sum())
-        inflated = max(1.0, total / freedom if freedom else 1.0)
-        covariance = np.asarray(np.linalg.inv(information) * inflated, np.float64)
+        covariance = _covariance(information, len(pairs), total, freedom, config)
         if swapped:
             pose, covariance, pairs = *_inverted(pose, covariance), pairs[:, ::-1]
         rows = np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1)
@@ -194,6 +199,17 @@ def placed(poses: Floats, point: Floats) -> Floats:
     """(N, 2) where poses (N, 3) put a point (2,)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return poses[:, :2] + np.stack((c * point[0] - s * point[1], s * point[0] + c * point[1]), 1)
+
+
+def _covariance(information: Floats, pairs: int, misfit: float, freedom: int, config: VoteConfig) -> Floats:
+    """(3, 3): what the pairs' stated errors give, scaled by what they show (the mean of an inverse gamma prior on the
+    scale), and what all boxes of a view have in common.
+    """
+    scale = (config.trust + misfit) / (config.trust + freedom)
+    covariance = np.asarray(np.linalg.inv(information) * scale, np.float64)
+    # information[0, 0] sums the pairs' inverse variances along an axis.
+    covariance[[0, 1], [0, 1]] += config.shared * pairs / information[0, 0]
+    return covariance
 
 
 def _rank(x: Landmarks) -> tuple[float, ...]:
