@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
 from manyeyes.models.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead
+from manyeyes.models.codebook import Codebook, CodebookConfig
 from manyeyes.models.encoder import EncoderConfig, SparseEncoder
 from manyeyes.models.fusion.flow_aware import FlowAwareFusion
 from manyeyes.models.fusion.gather import Tokens
@@ -29,7 +30,8 @@ from manyeyes.models.transformer import AttentionConfig, WindowTransformer
 class DetectorConfig:
     """grid: what an agent sees and tells, and the pillar size. prune_threshold: probability of lying near an object below which
     a cell is dropped. answers: the range in which its boxes are asked for, where that is less than it sees; None: all of it.
-    sweeps: how many an agent looks at together, its last one or two.
+    sweeps: how many an agent looks at together, its last one or two. codebook: of the bytes that its tokens are sent as; None
+    where none was fitted.
     """
 
     grid: BevGrid
@@ -44,6 +46,7 @@ class DetectorConfig:
     decode: DecodeConfig = field(default_factory=DecodeConfig)
     answers: BevGrid | None = None
     sweeps: Literal[1, 2] = 1
+    codebook: CodebookConfig | None = None
 
     @property
     def range(self) -> BevGrid:
@@ -76,6 +79,7 @@ class Detector(nn.Module):
         self.fusion = _fusion(channels, config)
         self.head = BoxHead(channels, config.head_channels)
         self.refine = RefineHead(channels, config.head_channels)
+        self.codebook = None if config.codebook is None else Codebook(channels, config.codebook)
 
     @property
     def token_grid(self) -> BevGrid:
