@@ -34,7 +34,7 @@ TOY = MapperConfig(
     _tile(1.5),
     token_channels=16,
     neck=(1, 1),
-    head=MapHeadConfig(elements=30, points=10, many=60, channels=64, feed=128, layers=2, heads=4),
+    head=MapHeadConfig(elements=50, points=10, many=50, channels=64, feed=128, layers=2, heads=4),
 )
 """For tests: seconds a step at most."""
 

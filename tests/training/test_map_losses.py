@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Losses of the map head: hand-worked numbers, who answers for what, and that the order of points means nothing."""
+
+import itertools
+import math
+
+import pytest
+import torch
+
+from manyeyes.models.map_head import RawMap
+from manyeyes.training.map_losses import (
+    MapLossConfig,
+    focal,
+    head_terms,
+    ink_loss,
+    map_terms,
+    match,
+    turned_away,
+)
+from manyeyes.training.map_targets import MapTarget, orders_of
+
+CONFIG = MapLossConfig()
+
+
+def targets(points, ring, kind):
+    points, flags = torch.as_tensor(points, dtype=torch.float32), torch.tensor(ring)
+    return MapTarget(torch.tensor(kind), flags, orders_of(points, flags))
+
+
+def random_case(seed, elements=3, queries=5, points=6):
+    generator = torch.Generator().manual_seed(seed)
+    where = torch.rand(elements, points, 2, generator=generator)
+    ring = [i % 2 == 1 for i in range(elements)]
+    raw = RawMap(
+        torch.randn(1, queries, 3, generator=generator).requires_grad_(),
+        torch.rand(1, queries, points, 2, generator=generator).requires_grad_(),
+    )
+    return where, ring, raw
+
+
+def test_the_loss_does_not_know_from_which_end_a_line_or_where_a_ring_was_begun():
+    where, ring, raw = random_case(0)
+    kind = [0, 2, 1]
+    total = None
+    for line_back, turn, ring_back in itertools.product((False, True), range(6), (False, True)):
+        drawn = where.clone()
+        if line_back:
+            drawn[0] = drawn[0].flip(0)
+        drawn[1] = drawn[1].roll(turn, 0)
+        if ring_back:
+            drawn[1] = drawn[1].flip(0)
+        terms = map_terms([raw], [], torch.zeros(()), [targets(drawn, ring, kind)], CONFIG)
+        loss = terms.total(CONFIG)
+        grads = torch.autograd.grad(loss, (raw.logit, raw.point))
+        if total is None:
+            total = (loss, *grads)
+        # Identical, to the last bit: the same order of points is found, however they were given.
+        assert torch.equal(loss, total[0])
+        assert torch.equal(grads[0], total[1]) and torch.equal(grads[1], total[2])
+
+
+def test_the_match_is_the_best_of_all_assignments():
+    for seed in range(5):
+        where, ring, raw = random_case(seed, elements=3, queries=4)
+        target = targets(where, ring, [0, 2, 1])
+        found = match(raw.logit[0].detach(), raw.point[0].detach(), target, CONFIG)
+        logit, point = raw.logit[0].detach(), raw.point[0].detach()
+
+        def cost(query, element, logit=logit, point=point, target=target):
+            p = torch.sigmoid(logit[query, target.kind[element]])
+            said = -0.25 * (1 - p) ** 2 * p.log() + 0.75 * p**2 * (1 - p).log()
+            away = min(float((point[query] - order).abs().sum()) for order in target.orders[element])
+            return CONFIG.kind * float(said) + CONFIG.point * away
+
+        best = min(sum(cost(q, e) for e, q in enumerate(chosen)) for chosen in itertools.permutations(range(4), 3))
+        pairs = list(zip(found.query.tolist(), found.element.tolist()))
+        assert sorted(e for _, e in pairs) == [0, 1, 2]
+        assert sum(cost(q, e) for q, e in pairs) == pytest.approx(best, abs=1e-4)
+
+
+def test_a_perfect_answer_costs_nothing_but_doubt():
+    where, ring, _ = random_case(3)
+    kind = [0, 2, 1]
+    logit = torch.full((1, 4, 3), -12.0)
+    for query, k in ((2, 0), (0, 2), (3, 1)):
+        logit[0, query, k] = 12.0
+    point = torch.rand(1, 4, 6, 2)
+    point[0, 2], point[0, 0], point[0, 3] = where[0].flip(0), where[1].roll(3, 0), where[2]
+    terms = head_terms([RawMap(logit, point)], [targets(where, ring, kind)], CONFIG)
+    assert [float(t) for t in terms] == pytest.approx([0, 0, 0], abs=1e-5)
+
+
+def test_terms_by_hand():
+    # One line of three points from (0, 0) to (1, 0); one query, off by 0.1 in y at its end.
+    target = targets([[[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]]], [False], [0])
+    raw = RawMap(torch.zeros(1, 1, 1), torch.tensor([[[[1.0, 0.1], [0.5, 0.0], [0.0, 0.0]]]]))
+    kind, point, direction = head_terms([raw, raw], [target], CONFIG)
+    assert float(point) == pytest.approx(2 * 0.1)
+    assert float(direction) == pytest.approx(2 * (1 - 0.5 / math.hypot(0.5, 0.1)), abs=1e-5)
+    assert float(kind) == pytest.approx(2 * 0.25 * 0.25 * math.log(2))
+
+
+def test_only_a_ring_has_a_closing_edge():
+    # The last point lies off, so that the edge back to the first is turned by ninety degrees.
+    mine = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]])
+    theirs = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]]) + torch.tensor([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    assert turned_away(mine, theirs, torch.tensor([True])).tolist() == pytest.approx([0])
+    bent = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]])
+    line, ring = (float(turned_away(mine, bent, torch.tensor([flag]))) for flag in (False, True))
+    assert line == pytest.approx(1.0) and ring == pytest.approx(2 - math.cos(math.pi / 4), abs=1e-5)
+
+
+def test_focal_loss_is_its_formula():
+    logit = torch.tensor([-2.0, 0.3, 1.5], dtype=torch.float64)
+    p = logit.sigmoid()
+    torch.testing.assert_close(focal(logit, torch.ones_like(logit)), -0.25 * (1 - p) ** 2 * p.log())
+    torch.testing.assert_close(focal(logit, torch.zeros_like(logit)), -0.75 * p**2 * (1 - p).log())
+
+
+def test_a_tile_without_elements_teaches_silence_only():
+    raw = RawMap(torch.zeros(1, 4, 3, requires_grad=True), torch.rand(1, 4, 6, 2, requires_grad=True))
+    empty = MapTarget(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool), torch.zeros(0, 12, 6, 2))
+    kind, point, direction = head_terms([raw], [empty], CONFIG)
+    assert float(kind.detach()) > 0 and float(point) == 0 and float(direction) == 0
+    kind.backward()
+    assert raw.logit.grad is not None and bool((raw.logit.grad > 0).all())
+
+
+def test_of_the_many_queries_each_element_has_several():
+    where, ring, _ = random_case(1)
+    target = targets(where, ring, [0, 2, 1])
+    config = MapLossConfig(repeat=2)
+    logit = torch.full((1, 6, 3), -12.0)
+    point = torch.rand(1, 6, 6, 2)
+    for query in range(6):
+        logit[0, query, target.kind[query % 3]] = 12.0
+        point[0, query] = where[query % 3]
+    one, many = RawMap(logit[:, :3], point[:, :3]), RawMap(logit, point)
+    terms = map_terms([one], [many], torch.zeros(()), [target], config)
+    assert float(terms.many) == pytest.approx(0, abs=1e-4)
+    thrice = map_terms([one], [many], torch.zeros(()), [target], MapLossConfig(repeat=3))
+    assert float(thrice.total(CONFIG)) == pytest.approx(float(thrice.many), abs=1e-4)
+
+
+def test_ink_weighs_what_is_drawn_four_times():
+    logit = torch.zeros(2, 1)
+    on, off = (float(ink_loss(logit, torch.full((2, 1), v))) for v in (1.0, 0.0))
+    assert on == pytest.approx(4 * math.log(2)) and off == pytest.approx(math.log(2))

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of tiles: clouds, poses, truth and ink say the same thing before and after every augmentation; keyed; split by town."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, PointCloud, Snapshot, Transform
+from manyeyes.datatypes.camera import Camera, CameraImage
+from manyeyes.datatypes.map_element import CROSSING, DIVIDER, KINDS, MapElements
+from manyeyes.models.map_bev import BevConfig
+from manyeyes.models.map_head import MapHeadConfig
+from manyeyes.models.mapper import MapperConfig
+from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.training.map_samples import MapAugment, TileStream, inked, mirrored, mirrored_motion
+
+CONFIG = MapperConfig(
+    BevConfig(BevGrid(-12.0, -12.0, -2.0, 12.0, 12.0, 4.0, pillar=0.5)),
+    BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=1.0),
+    head=MapHeadConfig(channels=16, heads=4),
+)
+EXACT = MapAugment(1, 4, 0.0, 0.0, flip=False)
+MAPS = {
+    "Aton": MapElements.of([[[-50.0, 3.0], [50.0, 3.0]], [[2, -4], [6, -4], [6, 0], [2, 0]]], [DIVIDER, CROSSING]),
+    "Bton": MapElements.of([[[1000.0, -50.0], [1000.0, 50.0]]], DIVIDER),
+}
+
+
+class Drives:
+    """Agents on a line; the cloud of each is points on the painted line of its town, and one bright point of its own."""
+
+    scenarios = ("aton_0", "aton_1", "bton_0")
+
+    def length(self, scenario):
+        return 2
+
+    def judged(self, scenario):
+        return range(2)
+
+    def agents(self, scenario):
+        return (1, 2)
+
+    def snapshot(self, scenario, index):
+        rng = keyed_generator("drives", scenario, index)
+        frames = []
+        for agent in range(2):
+            if scenario.startswith("aton"):
+                pose = Transform.from_xyz_yaw(rng.uniform(-6, 6), 0, 1.0, rng.uniform(-3, 3))
+                line = np.stack((np.linspace(-10, 10, 40), np.full(40, 3.0), np.full(40, 1.0)), 1)
+            else:
+                pose = Transform.from_xyz_yaw(1001, rng.uniform(-6, 6), 1.0, rng.uniform(-3, 3))
+                line = np.stack((np.full(40, 1000.0), np.linspace(-10, 10, 40), np.full(40, 1.0)), 1)
+            frames.append(AgentFrame.of(PointCloud.of(pose.inverse().apply(torch.from_numpy(line))), pose, agent))
+        return Snapshot(scenario, index, tuple(frames))
+
+
+def stream(augment=EXACT, seed=0, **fields):
+    return TileStream(Drives(), MAPS, CONFIG, augment, seed, **fields)
+
+
+AUGMENTS = {
+    "none": EXACT,
+    "turn": dataclasses.replace(EXACT, turn_rad=0.5),
+    "shift": dataclasses.replace(EXACT, shift_m=4.0),
+    "all": MapAugment(1, 6, 0.5, 4.0, flip=True),
+}
+
+
+@pytest.mark.parametrize("name", AUGMENTS)
+def test_points_truth_and_ink_say_the_same(name):
+    for number in range(12):
+        sample = stream(AUGMENTS[name]).draw(number)
+        line = next(sample.truth.polyline(i) for i in range(len(sample.truth)) if sample.truth.kind[i] == DIVIDER)
+        along = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
+        for k, look in enumerate(sample.looks):
+            # Every point of the cloud lies on the painted line, in the tile and in the ink of the look.
+            there = sample.tile_from_look[k].apply(look.points.xyz.double())[:, :2].numpy() - line[0]
+            np.testing.assert_allclose(there[:, 0] * along[1] - there[:, 1] * along[0], 0, atol=1e-4)
+            near = look.points.xyz[CONFIG.bev.grid.inside(look.points.xyz[:, :2]), :2]
+            # A cell's border may fall either way: some point within half a step is on an inked cell.
+            yx = CONFIG.bev.token_grid.cells(near)
+            ink = torch.nn.functional.max_pool2d(sample.ink[k, :1].float(), 3, 1, 1)[0]
+            assert len(near) and bool((ink[yx[:, 0], yx[:, 1]] > 0).all())
+            assert 0.005 < float(sample.ink[k, 0].float().mean()) < 0.1
+
+
+def test_samples_are_keyed_and_their_looks_many():
+    augment = MapAugment(1, 6, 0.5, 4.0)
+    a, b = stream(augment).draw(5), stream(augment).draw(5)
+    assert torch.equal(a.tile_from_look.translation, b.tile_from_look.translation) and torch.equal(a.ink, b.ink)
+    assert not np.array_equal(a.truth.points, stream(augment, seed=1).draw(5).truth.points)
+    counts = {len(stream(augment).draw(number).looks) for number in range(30)}
+    assert counts == {1, 2, 3, 4, 5, 6}
+
+
+def test_errors_of_claimed_poses_move_looks_and_not_the_truth():
+    noisy = dataclasses.replace(EXACT, least=4, sigma_m=0.5, sigma_rad=0.02)
+    exact, moved = stream(dataclasses.replace(EXACT, least=4)).draw(3), stream(noisy).draw(3)
+    np.testing.assert_array_equal(exact.truth.points, moved.truth.points)
+    away = (exact.tile_from_look.translation - moved.tile_from_look.translation).norm(dim=1)
+    assert bool((away > 0).all()) and float(away.max()) < 3.0
+    assert torch.equal(exact.ink, moved.ink)
+
+
+def test_a_town_that_judges_may_not_teach():
+    assert stream(held_out=("Cton",)).towns == ("Aton", "Bton")
+    with pytest.raises(ConfigError, match="bton"):
+        stream(held_out=("Bton",))
+
+
+def test_ink_lies_on_the_cells_of_lines_and_fills_crossings():
+    grid = BevGrid(-4.0, -4.0, -1.0, 4.0, 4.0, 1.0, pillar=0.5, stride=2)
+    square = [[-1.4, -1.4], [1.4, -1.4], [1.4, 1.4], [-1.4, 1.4]]
+    elements = MapElements.of([[[-9.0, 0.1], [9.0, 0.1]], square], [DIVIDER, CROSSING])
+    ink = inked(elements, grid, ("crossing", "divider"))
+    row = int(grid.cells(torch.tensor([[0.0, 0.1]]))[0, 0])
+    assert ink[1].nonzero().tolist() == [[row, c] for c in range(8)]
+    rows, columns = ink[0].nonzero().unbind(1)
+    expected = grid.cells(torch.tensor([[-1.4, -1.4], [1.4, 1.4]]))
+    assert int(rows.min()) == int(expected[0, 0]) and int(columns.max()) == int(expected[1, 1])
+    assert int(ink[0].sum()) == (int(rows.max()) - int(rows.min()) + 1) ** 2
+    assert [KINDS[CROSSING], KINDS[DIVIDER]] == ["crossing", "divider"]
+
+
+def test_a_mirror_is_no_camera():
+    look = Drives().snapshot("aton_0", 0).frames[0]
+    flipped = mirrored(look)
+    assert torch.equal(flipped.points.xyz[:, 1], -look.points.xyz[:, 1])
+    camera = Camera(torch.eye(3, dtype=torch.float64), Transform.identity(), 2, 2)
+    photo = CameraImage(camera, torch.zeros(3, 2, 2, dtype=torch.uint8))
+    with pytest.raises(ConfigError, match="another camera"):
+        mirrored(dataclasses.replace(look, images=(photo,)))
+
+
+def test_a_mirrored_turn_is_a_turn_the_other_way():
+    back = mirrored_motion(Transform.from_xyz_yaw(1.0, 2.0, 3.0, 0.4))
+    assert float(back.yaw) == pytest.approx(-0.4) and back.translation.tolist() == [1.0, -2.0, 3.0]
+    assert math.isclose(float(torch.det(back.rotation)), 1.0)

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Targets of the map head: equal spacing, and all orders that draw one figure."""
+
+import numpy as np
+import pytest
+import torch
+
+from manyeyes.datatypes import BevGrid
+from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, STOP_LINE, MapElements
+from manyeyes.training.map_targets import evenly, orders_of, target_of
+
+TILE = BevGrid(-10.0, -5.0, -1.0, 10.0, 5.0, 1.0, pillar=1.0)
+SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+
+
+def test_a_line_has_equal_steps_and_both_its_ends():
+    bent = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 1.0]])
+    np.testing.assert_allclose(evenly(bent, 5, ring=False), [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]])
+
+
+def test_a_ring_has_no_point_twice_and_does_not_know_where_it_was_begun():
+    expected = [[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]]
+    for shift in range(4):
+        np.testing.assert_allclose(evenly(np.roll(SQUARE, shift, axis=0), 8, ring=True), expected)
+    back = evenly(SQUARE[::-1], 8, ring=True)
+    np.testing.assert_allclose(back, [expected[0], *expected[:0:-1]])
+
+
+def test_the_orders_of_a_line_are_two_and_of_a_ring_all_turns_both_ways():
+    points = torch.arange(5.0)[:, None].expand(2, 5, 2).contiguous()
+    orders = orders_of(points, torch.tensor([False, True]))
+    assert orders.shape == (2, 10, 5, 2)
+    lines = {tuple(order) for order in orders[0, ..., 0].tolist()}
+    assert lines == {(0, 1, 2, 3, 4), (4, 3, 2, 1, 0)}
+    rings = {tuple(order) for order in orders[1, ..., 0].tolist()}
+    turns = {tuple((s + k) % 5 for k in range(5)) for s in range(5)}
+    assert rings == turns | {tuple(reversed(turn)) for turn in turns} and len(rings) == 10
+
+
+@pytest.mark.parametrize("ring", [False, True])
+def test_the_set_of_orders_is_that_of_the_reversed_and_of_the_turned(ring):
+    points = torch.rand(1, 6, 2)
+    flag = torch.tensor([ring])
+    same = {tuple(o.flatten().tolist()) for o in orders_of(points, flag)[0]}
+    assert same == {tuple(o.flatten().tolist()) for o in orders_of(points.flip(1), flag)[0]}
+    turned = {tuple(o.flatten().tolist()) for o in orders_of(points.roll(2, 1), flag)[0]}
+    assert (same == turned) == ring
+
+
+def test_targets_are_shares_of_the_tile_and_only_of_kinds_that_are_asked_for():
+    truth = MapElements.of(
+        [[[-10.0, 0.0], [10.0, 0.0]], [[0.0, 0.0], [1.0, 1.0]], SQUARE, [[0.0, -5.0], [0.0, 5.0]]],
+        [DIVIDER, STOP_LINE, CROSSING, BOUNDARY],
+    )
+    target = target_of(truth, TILE, ("boundary", "divider", "crossing"), 4)
+    assert target.kind.tolist() == [1, 2, 0] and target.ring.tolist() == [False, True, False]
+    assert target.orders.shape == (3, 8, 4, 2)
+    torch.testing.assert_close(target.orders[0, 0, :, 0], torch.linspace(0, 1, 4))
+    torch.testing.assert_close(target.orders[2, 0, :, 1], torch.linspace(0, 1, 4))
+    assert float(target.orders[1, 0].min()) == 0.5 and target.repeated(3).kind.tolist() == [1, 2, 0] * 3
+
+
+def test_an_empty_tile_has_no_targets():
+    target = target_of(MapElements.empty(), TILE, ("divider",), 4)
+    assert len(target) == 0 and target.orders.shape == (0, 8, 4, 2)
