@@ -17,11 +17,17 @@ import torch
 
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
+from manyeyes.models.fusion.gather import Part, gather
 from manyeyes.models.presets import COSTR_OPV2V, COSTR_TINY
-from manyeyes.training.loop import Run, TrainConfig, learning_rate, prune_threshold, train
-from manyeyes.training.samples import AugmentConfig
+from manyeyes.training.loop import Run, TrainConfig, _grown, learning_rate, prune_threshold, train
+from manyeyes.training.samples import AugmentConfig, RoadConfig
 
 TINY = TrainConfig(COSTR_TINY, steps=6, batch=2, warm_up=2, save_every=2, augment=AugmentConfig(max_agents=2))
+ROAD = dataclasses.replace(
+    TINY,
+    augment=AugmentConfig(max_agents=99, early_share=0.0),
+    road=RoadConfig(2, late_share=0.5, late_frames=2, astray_share=0.5, lost_share=0.5, few_share=1.0, few=4),
+)
 
 
 def small(toy):
@@ -32,16 +38,18 @@ def same_state(a: torch.nn.Module, b: torch.nn.Module) -> bool:
     return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
 
 
-def test_a_run_that_was_killed_ends_as_if_it_had_not_been(toy, tmp_path):
-    whole = Run(TINY, small(toy), tmp_path / "whole", seed=3)
+@pytest.mark.parametrize("config", (TINY, ROAD), ids=("plain", "road"))
+def test_a_run_that_was_killed_ends_as_if_it_had_not_been(toy, tmp_path, config):
+    recording = dataclasses.replace(small(toy), frames=4)
+    whole = Run(config, recording, tmp_path / "whole", seed=3)
     for _ in range(6):
         whole.advance()
-    broken = Run(TINY, small(toy), tmp_path / "broken", seed=3)
+    broken = Run(config, recording, tmp_path / "broken", seed=3)
     for _ in range(4):
         broken.advance()
         if broken.step == 2:
             broken.save()
-    resumed = Run(TINY, small(toy), tmp_path / "broken", seed=3)
+    resumed = Run(config, recording, tmp_path / "broken", seed=3)
     assert resumed.step == 2 and not same_state(resumed.model, broken.model)
     last = [resumed.advance() for _ in range(4)][-1]
     assert last.step == 6
@@ -90,9 +98,43 @@ def test_a_second_stage_begins_where_the_first_ended(toy, tmp_path):
     second = Run(kept, small(toy), tmp_path / "second", 2, first)
     for name, value in checkpoint.load(first).state_dict().items():
         assert torch.equal(second.model.state_dict()[name], value), name
-    wider = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, head_channels=48))
-    with pytest.raises(CheckpointError, match="differs in shape"):
-        Run(wider, small(toy), tmp_path / "third", 2, first)
+    narrower = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, head_channels=24))
+    with pytest.raises(CheckpointError, match=r"head\.out\.weight does not fit"):
+        Run(narrower, small(toy), tmp_path / "third", 2, first)
+
+
+def test_a_tensor_grows_at_its_ends_by_zeros_and_a_vector_keeps_its_own():
+    old = torch.arange(6.0).view(2, 3) + 1
+    grown = _grown(torch.full((3, 4), 9.0), old)
+    assert grown is not None and grown.tolist() == [[1, 2, 3, 0], [4, 5, 6, 0], [0, 0, 0, 0]]
+    bias = _grown(torch.tensor([7.0, 8.0, 9.0]), torch.tensor([1.0, 2.0]))
+    assert bias is not None and bias.tolist() == [1, 2, 9]
+    assert _grown(torch.zeros(2, 2), old) is None and _grown(torch.zeros(6), old) is None
+    half = _grown(torch.zeros(2, 3), old.half())
+    assert half is not None and half.dtype == torch.float32 and torch.equal(half, old)
+
+
+def test_what_a_model_has_grown_by_starts_as_if_it_were_not_there(toy, tmp_path):
+    """From one sweep and plain self-attention to two sweeps and a past: the same boxes, before the first step."""
+    plain = dataclasses.replace(COSTR_TINY, sweeps=1, fusion="self_attention", prune_threshold=0.0)
+    first = train(dataclasses.replace(TINY, detector=plain, steps=2), small(toy), tmp_path / "first", seed=1)
+    grown = dataclasses.replace(plain, sweeps=2, fusion="flow_aware")
+    run = Run(dataclasses.replace(TINY, detector=grown), small(toy), tmp_path / "second", 2, first)
+    old, new = checkpoint.load(first), run.model.eval()
+    now, before = (toy().snapshot("toy_0", i).frames[0].points for i in (1, 0))
+    none = now[:0]
+    with torch.no_grad():
+        mine, theirs = (
+            m.tell(s, m.look(s)) for m, s in ((old, old.see([now]).tokens), (new, new.see([now], [none]).tokens))
+        )
+        past = new.see([before], [none]).tokens
+        looked_back = gather([Part(0, new.tell(past, new.look(past)).features, past.sites.xy)], old.token_grid, 1)
+        tokens = gather([Part(0, mine.features, mine.sites.xy)], old.token_grid, 1)
+        boxes = old.fuse(tokens), new.fuse(tokens, looked_back)
+    assert torch.equal(mine.sites.key, theirs.sites.key)
+    assert torch.allclose(mine.features, theirs.features, atol=1e-5)
+    assert len(looked_back.features) > 20 and torch.equal(boxes[0].sites.key, boxes[1].sites.key)
+    assert torch.allclose(boxes[0].columns(), boxes[1].columns(), atol=1e-6)
 
 
 def test_the_shipped_weights_are_the_average(toy, tmp_path):
