@@ -12,7 +12,9 @@ import torch
 from manyeyes.alignment.estimate import PoseClaim, PoseStatus, difference
 from manyeyes.alignment.feakm import ConsensusConfig, Feakm, RansacConfig, mended, published
 from manyeyes.alignment.landmarks import Landmarks
-from manyeyes.datatypes import BevGrid, Boxes, SparseBev, Transform
+from manyeyes.comms import wire
+from manyeyes.comms.inbox import Inbox
+from manyeyes.datatypes import BevGrid, Boxes, Message, SparseBev, Transform
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.feakm import FeakmConfig, FeakmNet, Matches
 from manyeyes.models.keypoint_boxes import BoxKeypoints
@@ -156,6 +158,34 @@ class Drawn:
 
     def match(self, ego: Keypoints, other: Keypoints) -> Matches:
         return Matches(self.pairs, torch.ones(len(self.pairs)))
+
+
+def test_a_pose_is_found_from_what_comes_as_bytes():
+    """25 objects with a descriptor each: 45 bytes an object and one header; places come back to a centimetre."""
+    n, rng = 25, torch.Generator().manual_seed(2)
+    seen = marks(n)
+    boxes = Boxes.of(
+        torch.from_numpy(np.column_stack((seen.xy, np.zeros(n)))).float(),
+        torch.tensor([4.5, 1.9, 1.6]).expand(n, 3),
+        torch.from_numpy(seen.yaw).float(),
+        torch.rand(n, generator=rng),
+    )
+    descriptor = torch.nn.functional.normalize(torch.randn(n, 32, generator=rng))
+    move = Transform.from_xyz_yaw(*map(float, (TRUTH[0], TRUTH[1], 0.0, TRUTH[2])))
+    ego = Keypoints(boxes.transform(move), descriptor)
+    message = Message(3, 0, Transform.identity(), torch.zeros(3, 3), objects=boxes, descriptors=descriptor)
+    packets = wire.encode(message)
+    assert len(packets) == 1 and 45 * n < len(packets[0]) <= 45 * n + 80
+    inbox = Inbox(bytes(8))
+    inbox.push(packets[0])
+    (heard,) = inbox.receptions()
+    other = Keypoints(heard.message.objects, heard.message.descriptors)
+    alike = (ego.descriptor @ other.descriptor.T).argmax(1)
+    net = FeakmNet(FeakmConfig(BoxKeypoints(4, 32, 8), MatcherConfig(32, 8, 1, 1)))
+    found = Feakm.of(Drawn(net, torch.stack((torch.arange(n), alike), 1)))(ego, other, None)
+    assert found.inliers == n
+    off = difference(found.pose, TRUTH)
+    assert np.hypot(off[0], off[1]) < 0.02 and abs(off[2]) < 1e-3
 
 
 def test_the_half_pixel():

@@ -21,17 +21,6 @@ def test_points_move_and_descriptors_stay():
     assert len(points[torch.tensor([2, 0])]) == 2 and torch.equal(points[torch.tensor([2, 0])].xy[0], points.xy[2])
 
 
-def test_a_byte_a_component_keeps_the_direction():
-    points = some()
-    codes = points.codes()
-    assert codes.dtype == torch.int8 and codes.shape == (4, 32)
-    back = Keypoints.of_codes(points.boxes, codes)
-    assert float((back.descriptor * points.descriptor).sum(1).min()) > 0.999
-    torch.testing.assert_close(back.descriptor.norm(dim=1), torch.ones(4))
-    nothing = Keypoints.of_codes(points.boxes, torch.zeros(4, 32, dtype=torch.int8))
-    assert not nothing.descriptor.any()
-
-
 def test_a_descriptor_too_few_is_refused():
     with pytest.raises(ShapeError, match=r"descriptors \(4, D\); got \(3, 32\)"):
         Keypoints(some().boxes, some().descriptor[:3])

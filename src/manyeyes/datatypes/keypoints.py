@@ -5,20 +5,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from manyeyes.datatypes.boxes import Boxes
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.transform import Transform
 
-CODES = 127
-"""Steps of an int8 descriptor from 0 to 1."""
-
 
 @dataclass(frozen=True)
 class Keypoints:
-    """N points in an agent's frame: what FeaKM sends of them is their places and descriptors (FeaKM section 4.2.1).
+    """N points in an agent's frame: what FeaKM sends of them is their places and descriptors (FeaKM section 4.2.1), here as
+    Message.objects and Message.descriptors.
 
     boxes: what stands at each point; a bare point has size 0, yaw 0 and an infinite sigma_yaw, for it has no heading.
     descriptor: (N, D), of length 1 (0 where there is nothing to describe).
@@ -45,13 +42,3 @@ class Keypoints:
     def transform(self, target_from_source: Transform) -> Keypoints:
         """The same points in another frame; descriptors stay as they are."""
         return Keypoints(self.boxes.transform(target_from_source), self.descriptor)
-
-    def codes(self) -> Tensor:
-        """(N, D) int8: the descriptors as they are sent, one byte a component."""
-        return (self.descriptor.detach() * CODES).round().clamp(-CODES, CODES).to(torch.int8)
-
-    @classmethod
-    def of_codes(cls, boxes: Boxes, codes: Tensor) -> Keypoints:
-        """Received points; codes: (N, D) int8."""
-        descriptor = codes.float()
-        return cls(boxes, descriptor / descriptor.norm(dim=1, keepdim=True).clamp_min(1))

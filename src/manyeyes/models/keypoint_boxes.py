@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from manyeyes.datatypes.keypoints import Keypoints
+from manyeyes.datatypes.message import DESCRIPTOR
 from manyeyes.models.box_head import TYPICAL_SIZE
 from manyeyes.models.fusion.gather import rotate_vectors
 from manyeyes.models.keypoint_net import View
@@ -34,7 +35,7 @@ class BoxKeypoints:
     """
 
     inputs: int = 64
-    descriptor: int = 32
+    descriptor: int = DESCRIPTOR
     width: int = 128
     score_min: float = 0.2
     most: int = 64
