@@ -2,6 +2,7 @@
 """Every study from end to end on a small recording, with weights that were never trained: what is written, kept and refused."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -9,10 +10,14 @@ import torch
 from PIL import Image
 
 from manyeyes.apps import cli
-from manyeyes.apps.studies import robustness
-from manyeyes.datasets.opv2v import Opv2vWriter
+from manyeyes.apps.studies import robustness, running
+from manyeyes.apps.studies.disturbance import HARD, PERFECT, Disturbance
+from manyeyes.apps.viewer.curves import Panel
+from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
 from manyeyes.evaluation import benchmark
+from manyeyes.evaluation.benchmark import BenchmarkConfig, run_scenario
+from manyeyes.evaluation.tally import Tally
 from manyeyes.models import checkpoint
 from manyeyes.models.detector import Detector
 from manyeyes.models.presets import COSTR_TINY
@@ -63,6 +68,19 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.fixture
+def panels(monkeypatch) -> list[Panel]:
+    """What is to be drawn, instead of drawing it."""
+    last: list[Panel] = []
+
+    def keep(drawn: list[Panel], path: Path) -> None:
+        last[:] = drawn
+        Image.new("RGB", (500, 10)).save(path)
+
+    monkeypatch.setattr(running, "save_curves", keep)
+    return last
+
+
 def evaluate(data: Path, weights: Path, out: Path, study: str, *words: object) -> dict:
     """The JSON that a study wrote."""
     common = ("--data", data, "--split", "test", "--weights", weights, "--workers", 1, "--out", out, "--study", study)
@@ -83,7 +101,7 @@ def few(monkeypatch) -> tuple:
     return kept
 
 
-def test_robustness_has_a_row_a_disturbance_and_method(data, weights, tmp_path, few) -> None:
+def test_robustness_has_a_row_a_disturbance_and_method(data, weights, tmp_path, few, panels) -> None:
     held = evaluate(data, weights, tmp_path, "robustness", "--methods", "alone", "late", "intermediate", "--every", 2)
     rows, origin = held["result"]["rows"], held["provenance"]
     assert {"command", "seed", "versions", "git_commit", "config"} <= set(origin)
@@ -100,9 +118,17 @@ def test_robustness_has_a_row_a_disturbance_and_method(data, weights, tmp_path, 
     claims = held["result"]["claims"]
     assert sum("intermediate - late" in c["what"] for c in claims) == 2 * len(few)
     assert [c["bar"] for c in claims[-3:]] == [-0.037, -0.044, -0.03]
+    assert [p.title for p in panels] == ["Delay", "Heading", "Position", "Lost packets", "Together"]
+    assert {c.label: c.x for c in panels[0].curves} == {
+        "alone": (),
+        "late": (0, 0.1, 0.4),
+        "intermediate": (0, 0.1, 0.4),
+    }
 
 
-def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(data, weights, tmp_path, monkeypatch, few) -> None:
+def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(
+    data, weights, tmp_path, monkeypatch, few, panels
+) -> None:
     monkeypatch.setattr(robustness, "ALL", few[:4])
     words = ("--methods", "alone", "late", "--every", 2)
     first = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
@@ -135,7 +161,7 @@ def test_budgets_are_kept_and_small_ones_say_less(data, weights, tmp_path) -> No
     assert {r["selector"] for r in held["beside"]} == {"alone", "late"}
 
 
-def test_agents_are_judged_on_the_scenarios_that_have_them(data, weights, tmp_path) -> None:
+def test_agents_are_judged_on_the_scenarios_that_have_them(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "alone", "late", "--every", 2)
     rows = evaluate(data, weights, tmp_path, "agents", *words)["result"]["rows"]
     assert [(r["agents"], r["method"], r["scenarios"]) for r in rows] == [
@@ -144,23 +170,28 @@ def test_agents_are_judged_on_the_scenarios_that_have_them(data, weights, tmp_pa
     assert rows[1]["bytes_per_message"] == 0 < rows[2]["bytes_per_message"]
     assert rows[1]["over_alone"]["value"] == 0 and rows[2]["over_one_fewer"]["scenarios"] == 2
     assert rows[3]["over_alone"]["scenarios"] == 1
+    assert [(p.ylabel, c.label, c.x) for p in panels for c in p.curves] == [
+        ("AP@0.5", "late", (1, 2, 3)), ("AP@0.5 over ego alone", "late", (1, 2, 3)),
+    ]  # fmt: skip
 
 
-def test_ablation_shows_each_branch_with_its_card(data, weights, tmp_path) -> None:
+def test_ablation_shows_each_branch_with_its_card(data, weights, tmp_path, panels) -> None:
     words = ("--every", 2, "--branches", f"first={weights}", f"again={weights}")
     rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
     assert [r["branch"] for r in rows] == ["first", "again"] and rows[0]["card"]["steps"] == 7
     assert [d["value"] for d in rows[1]["over_last"]] == [0, 0, 0] and rows[0]["over_last"] == []
     assert rows[0]["bytes_per_message"] > 0 and "| first" in (tmp_path / "ablation.md").read_text()
+    assert [p.ticks for p in panels] == 2 * [("first", "again")] and len(panels[0].curves) == 3
 
 
-def test_in_the_system_everybody_is_ego_and_the_channel_has_one_budget(data, weights, tmp_path) -> None:
+def test_in_the_system_everybody_is_ego_and_the_channel_has_one_budget(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "alone", "--selectors", "intermediate", "--budgets", 6000, "--every", 2)
     rows = evaluate(data, weights, tmp_path, "system", *words)["result"]["rows"]
     bound, alone = rows
     assert (bound["budget_bytes"], alone["budget_bytes"], alone["method"]) == (6000, None, "alone")
     assert 0 < bound["instant_bytes"] <= bound["most"] <= 6000
     assert bound["ego_frames"] == alone["ego_frames"] == 2 + 3
+    assert {c.label: len(c.x) for c in panels[0].curves} == {"intermediate": 1, "alone": 0}
 
 
 def test_the_picture_is_of_one_frame_with_the_most_agents(data, weights, tmp_path) -> None:
@@ -168,6 +199,26 @@ def test_the_picture_is_of_one_frame_with_the_most_agents(data, weights, tmp_pat
     assert (held["scenario"], held["frame"]) == ("b", 5)
     assert [r["method"] for r in held["rows"]] == ["alone", "late", "intermediate", "early"]
     assert all(r["true"] == 2 for r in held["rows"])
+
+
+def scores(tallies: list[Tally]) -> list[list[float]]:
+    """What each method found."""
+    return [[x for frame in tally.frames for x in frame.score.tolist()] for tally in tallies]
+
+
+def test_conditions_side_by_side_are_as_each_by_itself(data, weights) -> None:
+    opener = partial(Opv2vRecording, data, "test")
+    base = BenchmarkConfig(str(weights), ("late", "early"))
+    configs = [disturbance.on(base) for disturbance in (PERFECT, HARD, Disturbance(delay_s=0.1))]
+    together = [scores(tallies) for tallies in run_scenario(opener, configs, "b")]
+    apart = [scores(run_scenario(opener, [config], "b")[0]) for config in configs]
+    assert together == apart and together[0] != together[1] != together[2]
+
+
+def test_ego_alone_is_the_same_under_every_disturbance(data, weights) -> None:
+    base = BenchmarkConfig(str(weights), ("alone",))
+    calm, rough = run_scenario(partial(Opv2vRecording, data, "test"), [PERFECT.on(base), HARD.on(base)], "b")
+    assert scores(calm) == scores(rough) and len(scores(calm)[0]) > 0
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ from pathlib import Path
 import torch
 
 from manyeyes.agents.replay import ReplayConfig, Step, Views, replay
+from manyeyes.comms.budget import equal_share
 from manyeyes.datasets.disturb import PoseNoise
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import Snapshot
@@ -97,7 +99,7 @@ def _instants(
     """The steps of one configuration, judged snapshot by judged snapshot."""
     played = config.replay
     if config.channel_bytes is not None:
-        played = replace(played, budget_bytes=config.channel_bytes // len(recording.agents(scenario)))
+        played = replace(played, budget_bytes=equal_share(config.channel_bytes, len(recording.agents(scenario))))
     disturb = partial(_disturb, config.noise)
     steps = replay(recording, scenario, detector, config.methods, played, disturb, known)
     return groupby(steps, lambda step: step.snapshot.index)
@@ -139,12 +141,13 @@ def _together(configs: Sequence[BenchmarkConfig]) -> list[tuple[BenchmarkConfig,
     return [run[k : k + TOGETHER] for run in runs for k in range(0, len(run), TOGETHER)]
 
 
-def _job(open_recording: Callable[[], Recording], job: tuple[tuple[BenchmarkConfig, ...], str]) -> list[list[Tally]]:
-    return run_scenario(open_recording, *job)
+def _job(open_recording: Callable[[], Recording], job: tuple[tuple[BenchmarkConfig, ...], str]) -> bytes:
+    """As bytes: between processes, torch would hand over every tensor as an open file, and a study has more than may be open."""
+    return pickle.dumps(run_scenario(open_recording, *job))
 
 
 def _gathered(
-    found: Iterable[list[list[Tally]]],
+    found: Iterable[bytes],
     groups: Sequence[tuple[BenchmarkConfig, ...]],
     jobs: Sequence[tuple[tuple[BenchmarkConfig, ...], str]],
     progress: Callable[[int], None],
@@ -153,8 +156,8 @@ def _gathered(
     results, done = iter(found), 0
     for group in groups:
         whole = [[Tally(name, judging_protocol(config)) for name in config.methods] for config in group]
-        for tallies in islice(results, sum(of is group for of, _ in jobs)):
-            for all_of_it, one in zip(chain(*whole), chain(*tallies)):
+        for played_one in islice(results, sum(of is group for of, _ in jobs)):
+            for all_of_it, one in zip(chain(*whole), chain(*pickle.loads(played_one))):
                 all_of_it.extend(one)
             done += len(group)
             progress(done)

@@ -22,7 +22,7 @@ from manyeyes.evaluation.cell import Cell, Speeds, cell_of, read_cell, write_cel
 from manyeyes.evaluation.detection import Protocol
 
 SOURCES = (
-    "agents", "comms", "datasets", "datatypes", "models", "ops",
+    "agents", "alignment", "comms", "datasets", "datatypes", "models", "ops",
     "evaluation/benchmark.py", "evaluation/cell.py", "evaluation/communication.py", "evaluation/detection.py",
     "evaluation/tally.py", "evaluation/views.py",
 )  # fmt: skip
