@@ -16,19 +16,32 @@ from manyeyes.ops.window_loops import attend_in_windows, window_runs
 
 @dataclass(frozen=True)
 class AttentionConfig:
-    """window: edge S of a window in cells of the token grid; blocks alternate regular and shifted windows."""
+    """window: edge S of a window in cells of the token grid; blocks alternate regular and shifted windows.
+
+    levels: shares of S^2 up to which a window's number of tokens is Low, and Medium; above it is High (Eq. 5).
+    separate_weights: a block has weights for each level, the paper's letter; shared ones do not ask for the level.
+    """
 
     window: int = 8
     blocks: int = 2
     heads: int = 4
     expansion: int = 2
+    levels: tuple[float, float] = (0.125, 0.25)
+    separate_weights: bool = False
+
+    def __post_init__(self) -> None:
+        low, medium = self.levels
+        if not 0 <= low <= medium:
+            raise ConfigError(
+                f"AttentionConfig.levels are two ascending shares of a window's cells; got {self.levels}."
+            )
 
 
 class WindowBlock(nn.Module):
     """Pre-norm attention within a window and a feed-forward net, both residual (Eq. 6, 7).
 
     The relative position encoding (Eq. 4) enters queries and keys, measured from the middle of the window that is in force,
-    shifted or not. Weights are shared by all density levels (Eq. 5); padding buckets are an affair of ``ops`` alone.
+    shifted or not. Padding buckets are an affair of ``ops`` alone.
     """
 
     def __init__(self, channels: int, config: AttentionConfig, shifted: bool) -> None:
@@ -73,6 +86,42 @@ class WindowBlock(nn.Module):
         return features + self.ffn(self.norm_ffn(features))
 
 
+class RoutedBlock(nn.Module):
+    """Three blocks of attention, one for windows of Low, Medium and High density each (Eq. 5 to the letter).
+
+    All tokens of a window go through the weights of its level; one token more may send them all through others.
+    """
+
+    def __init__(self, channels: int, config: AttentionConfig, shifted: bool) -> None:
+        super().__init__()
+        self.config, self.shifted = config, shifted
+        self.levels = nn.ModuleList(WindowBlock(channels, config, shifted) for _ in range(3))
+
+    def forward(
+        self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
+    ) -> Tensor:
+        """(N, C) to (N, C); see WindowBlock. cache is not used: each level has tokens of its own."""
+        edge = self.config.window * grid.cell
+        ids = window_ids(xy, batch, (grid.x_min, grid.y_min), edge, edge / 2 if self.shifted else 0.0)
+        level = density_levels(ids, self.config.window**2, self.config.levels)
+        out = features
+        for number, block in enumerate(self.levels):
+            rows = (level == number).nonzero()[:, 0]
+            if len(rows):
+                out = out.index_copy(0, rows, block(features[rows], xy[rows], batch[rows], grid))
+        return out
+
+
+def density_levels(window: Tensor, cells: int, levels: tuple[float, float]) -> Tensor:
+    """(N,) int64: 0 Low, 1 Medium, 2 High, by how many tokens n_w the window (N,) of each holds (CoSTr Eq. 5).
+
+    Low: n_w / cells at most levels[0]; Medium: at most levels[1]; tokens at continuous places may be more than cells.
+    """
+    _, row, count = window.unique(return_inverse=True, return_counts=True)
+    share = count[row].double() / cells
+    return (share > levels[0]).long() + (share > levels[1]).long()
+
+
 def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:
     """Attention of (N, heads, C / heads) within windows ids (N,)."""
     if not torch.is_grad_enabled() and query.device.type == "cpu" and query.dtype == torch.float32:
@@ -85,7 +134,8 @@ class WindowTransformer(nn.Module):
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList(WindowBlock(channels, config, shifted=bool(i % 2)) for i in range(config.blocks))
+        block = RoutedBlock if config.separate_weights else WindowBlock
+        self.blocks = nn.ModuleList(block(channels, config, shifted=bool(i % 2)) for i in range(config.blocks))
 
     def forward(
         self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
