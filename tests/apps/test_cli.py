@@ -47,7 +47,7 @@ def test_an_unknown_verb_says_which_are_known(capsys) -> None:
     assert cli.main(["demmo"]) == 2
     assert capsys.readouterr().err == (
         "manyeyes: there is no verb 'demmo'; did you mean demo? Known verbs: "
-        "demo, simulate, train, evaluate, run, view, align, map, doctor.\n"
+        "demo, simulate, train, quantise, evaluate, run, view, align, map, doctor.\n"
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from manyeyes.agents.aligner import Aligner, Verdict
+from manyeyes.agents.coding import codebook_of, coded, readable, tables_of
 from manyeyes.agents.collaboration import Collaboration, Intermediate
 from manyeyes.agents.eyes import Eyes
 from manyeyes.agents.memory import Memory
@@ -53,16 +54,27 @@ class Agent:
         self.collaboration = collaboration or Intermediate()
         self.precision: Precision = precision
         self.budget_bytes = budget_bytes
+        self._tables = tables_of(detector)
+        if precision == "codes":
+            codebook_of(detector)
 
-    def share(self, frame: AgentFrame) -> list[bytes]:
-        """The packets that this frame is worth to others, most important first; none if there is nothing to say."""
+    def share(self, frame: AgentFrame, budget_bytes: int | None = None) -> list[bytes]:
+        """The packets that this frame is worth to others, most important first; none if there is nothing to say.
+
+        budget_bytes: less than the agent's own, where others need the channel too. A message of tokens is never longer, be
+        it that nothing is said; objects and points know no budget.
+        """
+        budget = min((b for b in (self.budget_bytes, budget_bytes) if b is not None), default=None)
         message = self.collaboration.say(self.eyes, frame)
         if message is None:
             return []
         if message.tokens is not None and message.token_score is not None:
-            tokens, score = within_budget(message.tokens, message.token_score, self.budget_bytes, self.precision)
+            tokens = coded(message.tokens, self.eyes.detector) if self.precision == "codes" else message.tokens
+            tokens, score = within_budget(tokens, message.token_score, budget, self.precision, tables=self._tables)
             message = replace(message, tokens=tokens, token_score=score)
-        return wire.encode(message, precision=self.precision)
+        packets = wire.encode(message, precision=self.precision, tables=self._tables)
+        too_long = budget is not None and message.tokens is not None and sum(map(len, packets)) > budget
+        return [] if too_long else packets
 
     def perceive(self, frame: AgentFrame, inbox: Inbox | Iterable[bytes] = (), now_ns: int | None = None) -> Perception:
         """Boxes around the agent from its own frame and whatever of others' messages has come.
@@ -71,10 +83,11 @@ class Agent:
         the inbox holds too old by then are left out.
         """
         if not isinstance(inbox, Inbox):
-            packets, inbox = inbox, Inbox(self.eyes.detector.fingerprint)
+            packets, inbox = inbox, Inbox(self.eyes.detector.fingerprint, tables=self._tables)
             for packet in packets:
                 inbox.push(packet)
-        heard = tuple(r for r in inbox.receptions(now_ns) if r.message.agent_id != frame.agent_id)
+        came = (r for r in inbox.receptions(now_ns) if r.message.agent_id != frame.agent_id)
+        heard = tuple(readable(r, self.eyes.detector) for r in came)
         heard, verdicts = self._aligned(frame, heard)
         boxes = self.collaboration.hear(self.eyes, frame, self.memory.complete(heard))
         return Perception(_others(boxes, frame), heard, verdicts)

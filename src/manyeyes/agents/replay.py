@@ -10,8 +10,10 @@ from dataclasses import dataclass, field
 
 from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.aligner import Aligner
+from manyeyes.agents.coding import tables_of
 from manyeyes.agents.collaboration import method
 from manyeyes.agents.eyes import Eyes, Sight
+from manyeyes.comms.budget import fair_shares
 from manyeyes.comms.bus import LocalBus
 from manyeyes.comms.channel import Channel, ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
@@ -33,12 +35,15 @@ class ReplayConfig:
     channel: a preset by name, or any other radio. wait_s: how long after its own sweep an ego waits for messages before it
     perceives; whatever came by then takes part, the newest of each sender. all_egos: every agent is judged as ego, not the
     first alone. history: snapshots played before the first judged one, so that messages are under way. reach_m: radios
-    farther apart do not hear each other (true poses). aligner: corrects where others say they are, None: nobody does.
+    farther apart do not hear each other (true poses). channel_bytes: what all agents together may send at an instant, shared as
+    ``comms.budget.fair_shares`` does by what each would say alone, as if scheduled by one who is told.
+    aligner: corrects where others say they are, None: nobody does.
     """
 
     channel: str | ChannelPreset = "ideal"
     precision: Precision = "float16"
     budget_bytes: int | None = 1 << 17
+    channel_bytes: int | None = None
     wait_s: float = 0.0
     all_egos: bool = False
     history: int = 0
@@ -98,7 +103,7 @@ class Team:
     def step(self, snapshot: Snapshot) -> Iterator[Step]:
         """Everybody shares; whoever is judged waits, hears and perceives."""
         places = _places(snapshot)
-        sent = tuple(self._share(frame, places[frame.agent_id]) for frame in snapshot.frames)
+        sent = self._share(snapshot.frames, places)
         egos = range(len(snapshot.frames)) if self.config.all_egos else range(1)
         for ego, frame in enumerate(snapshot.frames):
             until = frame.timestamp_ns + round(self.config.wait_s * 1e9)
@@ -114,13 +119,27 @@ class Team:
                 ages = tuple(heard.age_ns(until) / 1e9 for heard in perception.heard)
                 yield Step(self.method, snapshot, ego, perception, sent, ages, took)
 
-    def _share(self, frame: AgentFrame, place: tuple[float, float]) -> Sent:
+    def _share(self, frames: Sequence[AgentFrame], places: dict[int, tuple[float, float]]) -> tuple[Sent, ...]:
+        """What everybody says, handed to the bus: each packet is counted as it is handed over."""
+        said = [self._say(frame) for frame in frames]
+        if self.config.channel_bytes is not None:
+            wanted = [sum(map(len, packets)) for packets, _ in said]
+            shares = fair_shares(self.config.channel_bytes, wanted)
+            less = zip(frames, said, wanted, shares)
+            said = [spoken if share == want else self._say(frame, share) for frame, spoken, want, share in less]
+        for frame, (packets, _) in zip(frames, said):
+            self._bus.publish(frame.agent_id, places[frame.agent_id], packets, frame.timestamp_ns)
+        return tuple(
+            Sent(frame.agent_id, sum(map(len, packets)), len(packets), took)
+            for frame, (packets, took) in zip(frames, said)
+        )
+
+    def _say(self, frame: AgentFrame, budget_bytes: int | None = None) -> tuple[list[bytes], float]:
+        """An agent's packets, and the seconds that they took it."""
         agent, _ = self._at(frame)
         began = time.perf_counter()
-        packets = agent.share(frame)
-        took = time.perf_counter() - began
-        self._bus.publish(frame.agent_id, place, packets, frame.timestamp_ns)
-        return Sent(frame.agent_id, sum(map(len, packets)), len(packets), took)
+        packets = agent.share(frame, budget_bytes)
+        return packets, time.perf_counter() - began
 
     def _at(self, frame: AgentFrame) -> tuple[Agent, Inbox]:
         who = frame.agent_id
@@ -130,7 +149,7 @@ class Team:
             self._agents[who] = Agent(
                 self.detector, method(self.method), config.precision, config.budget_bytes, eyes, config.aligner
             )
-            self._inboxes[who] = Inbox(self.detector.fingerprint, EXPIRE_NS)
+            self._inboxes[who] = Inbox(self.detector.fingerprint, EXPIRE_NS, tables=tables_of(self.detector))
         return self._agents[who], self._inboxes[who]
 
 

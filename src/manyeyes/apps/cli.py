@@ -14,6 +14,7 @@ VERBS = {
     "demo": "make a drive, share bytes, perceive, judge: table, pictures, animation, report",
     "simulate": "make scenes from a seed, in OPV2V's layout",
     "train": "train a detector on a recording",
+    "quantise": "fit the codebook by which trained weights send few bytes",
     "evaluate": "judge methods on a split: AP with intervals, bytes, paired differences",
     "run": "replay your own OPV2V-format recording as demo does",
     "view": "draw a frame of a recording, or animate a drive",

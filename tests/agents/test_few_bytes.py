@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Few bytes on the whole path: codes from agent to agent, counted as they are handed to the bus, within shared budgets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+
+from manyeyes.agents.agent import Agent
+from manyeyes.agents.coding import coded, readable
+from manyeyes.agents.replay import ReplayConfig, replay
+from manyeyes.comms.bus import LocalBus
+from manyeyes.comms.inbox import Inbox
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.models.checkpoint import fingerprint
+from manyeyes.models.codebook import CodebookConfig
+from manyeyes.models.detector import Detector
+from manyeyes.models.presets import COSTR_TINY
+from manyeyes.training.codebook import with_codebook
+
+torch.set_num_threads(1)
+
+
+class Plane:
+    """Three agents on a plane with noise on it: enough for a detector that was never trained."""
+
+    scenarios = ("plane",)
+
+    def length(self, scenario: str) -> int:
+        return 2
+
+    def judged(self, scenario: str) -> range:
+        return range(2)
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        return (0, 1, 2)
+
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        poses = [Transform.from_xyz_yaw(8.0 * i, 3.0 * i, 0.0, 0.5 * i) for i in range(3)]
+        frames = []
+        for i, pose in enumerate(poses):
+            rng = torch.Generator().manual_seed(10 * index + i)
+            xyz = (torch.rand(400 * (i + 1), 3, generator=rng) - 0.5) * torch.tensor([40.0, 40.0, 1.5])
+            frames.append(AgentFrame.of(PointCloud.of(xyz), pose, agent_id=i, timestamp_ns=100_000_000 * index))
+        truth = Truth(Boxes.empty(torch.float64), torch.zeros(3, 0, dtype=torch.bool), Transform.stack(poses))
+        return Snapshot(scenario, index, tuple(frames), truth)
+
+
+@pytest.fixture(scope="module")
+def detector() -> Detector:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        plain = Detector(replace(COSTR_TINY, prune_threshold=0.05)).eval().requires_grad_(False)
+    plain.fingerprint = fingerprint(plain)
+    told = [Agent(plain).eyes.see(f).told.features for f in Plane().snapshot("plane", 0).frames]
+    return with_codebook(plain, torch.cat(told), 0, CodebookConfig(3, 64))
+
+
+@pytest.mark.parametrize("precision", ["float16", "codes"])
+@pytest.mark.parametrize("channel_bytes", [None, 2500])
+def test_the_bytes_of_a_table_are_those_handed_to_the_bus(detector, monkeypatch, precision, channel_bytes):
+    """Packet by packet: what a step reports of a sender is the number and the length of what the bus was given."""
+    handed: dict[tuple[int, int], list[int]] = {}
+    publish = LocalBus.publish
+
+    def counted(self, agent_id, position_xy, packets, now_ns):
+        handed[now_ns, agent_id] = [len(packet) for packet in packets]
+        publish(self, agent_id, position_xy, packets, now_ns)
+
+    monkeypatch.setattr(LocalBus, "publish", counted)
+    config = ReplayConfig(precision=precision, budget_bytes=4096, channel_bytes=channel_bytes)
+    steps = list(replay(Plane(), "plane", detector, ["intermediate"], config))
+    assert len(steps) == 2
+    for step in steps:
+        now = step.snapshot.frames[0].timestamp_ns
+        sizes = {s.agent_id: (s.bytes, s.packets) for s in step.sent}
+        assert sizes == {a: (sum(v), len(v)) for (t, a), v in handed.items() if t == now}
+        assert all(size <= 4096 for size, _ in sizes.values())
+        if channel_bytes is not None:
+            assert channel_bytes - 400 < sum(size for size, _ in sizes.values()) <= channel_bytes
+        assert len(step.perception.heard) == sum(1 for s in step.sent if s.packets and s.agent_id != 0)
+
+
+def test_codes_arrive_as_what_they_stand_for_in_a_tenth_of_the_bytes(detector):
+    """All of them: the receiver reads, cell by cell, what the sender's codebook makes of its tokens."""
+    frames = Plane().snapshot("plane", 0).frames
+    sender = Agent(detector, precision="codes", budget_bytes=None)
+    packets = sender.share(frames[1])
+    (heard,) = Agent(detector).perceive(frames[0], packets).heard
+    told = sender.eyes.see(frames[1]).told
+    assert torch.equal(heard.message.tokens.sites.key, told.sites.key)
+    book = detector.codebook
+    assert torch.equal(heard.message.tokens.features, book.read(book.write(told.features)))
+    whole = Agent(detector, precision="float32", budget_bytes=None).share(frames[1])
+    assert sum(map(len, packets)) < 0.12 * sum(map(len, whole))
+
+
+@pytest.mark.parametrize("precision", ["float16", "codes"])
+def test_a_message_of_tokens_never_exceeds_any_budget_and_a_smaller_one_keeps_a_part(detector, precision):
+    frame = Plane().snapshot("plane", 0).frames[2]
+    agent, kept = Agent(detector, precision=precision, budget_bytes=None), []
+    for budget in (0, 60, 90, 300, 1000, 1398, 4096):
+        packets = agent.share(frame, budget)
+        assert sum(map(len, packets)) <= budget
+        heard = Agent(detector).perceive(Plane().snapshot("plane", 0).frames[0], packets).heard
+        kept.append({k for r in heard for k in r.message.tokens.sites.key.tolist()})
+    assert all(a <= b for a, b in pairwise(kept)) and 0 < len(kept[-3]) < len(kept[-1])
+
+
+def test_codes_need_a_codebook_on_both_sides(detector):
+    plain = Detector(replace(detector.config, codebook=None)).eval()
+    with pytest.raises(ConfigError, match="manyeyes quantise"):
+        Agent(plain, precision="codes")
+    frames = Plane().snapshot("plane", 0).frames
+    with pytest.raises(ConfigError, match="manyeyes quantise"):
+        coded(Agent(plain).eyes.see(frames[0]).told, plain)
+    packets = Agent(detector, precision="codes").share(frames[1])
+    # Without the tables coded packets are of other weights; and rows of another width mean nothing here.
+    inbox = Inbox(detector.fingerprint)
+    for packet in packets:
+        inbox.push(packet)
+    assert inbox.dropped.wrong_model == len(packets)
+    inbox = Inbox(tables=Agent(detector)._tables)
+    inbox.push(packets[0])
+    assert readable(inbox.receptions()[0], plain).message.tokens is None
