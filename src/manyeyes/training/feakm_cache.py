@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from manyeyes.agents.eyes import Eyes
+from manyeyes.agents.eyes import Eyes, Sight
 from manyeyes.datasets.cache import write_whole
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import (
@@ -108,17 +108,17 @@ def build(recording: Recording, detector: Detector, root: Path, every: int = 3) 
         path = _file(folder, scenario, index)
         if not path.exists():
             eyes = {agent: Eyes(detector) for agent in recording.agents(scenario)}
-            if index:
-                _see(eyes, recording.snapshot(scenario, index - 1))
+            for before in range(max(0, index - 1), index):
+                _see(eyes, recording.snapshot(scenario, before))
             snapshot = recording.snapshot(scenario, index)
-            write_scene(path, Scene(_see(eyes, snapshot), _poses(snapshot)))
+            views = tuple(View.of(sight.told, sight.boxes) for sight in _see(eyes, snapshot))
+            write_scene(path, Scene(views, _poses(snapshot)))
         done.append((scenario, index))
         yield FeatureCache(folder, tuple(done))
 
 
-def _see(eyes: dict[int, Eyes], snapshot: Snapshot) -> tuple[View, ...]:
-    sights = [eyes[frame.agent_id].see(frame) for frame in snapshot.frames]
-    return tuple(View.of(sight.told, sight.boxes) for sight in sights)
+def _see(eyes: dict[int, Eyes], snapshot: Snapshot) -> list[Sight]:
+    return [eyes[frame.agent_id].see(frame) for frame in snapshot.frames]
 
 
 def _poses(snapshot: Snapshot) -> Transform:
