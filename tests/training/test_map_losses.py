@@ -121,7 +121,7 @@ def test_a_tile_without_elements_teaches_silence_only():
     raw = RawMap(torch.zeros(1, 4, 3, requires_grad=True), torch.rand(1, 4, 6, 2, requires_grad=True))
     empty = MapTarget(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool), torch.zeros(0, 12, 6, 2))
     kind, point, direction = head_terms([raw], [empty], CONFIG)
-    assert float(kind.detach()) > 0 and float(point) == 0 and float(direction) == 0
+    assert float(kind.detach()) > 0 and float(point.detach()) == 0 == float(direction.detach())
     kind.backward()
     assert raw.logit.grad is not None and bool((raw.logit.grad > 0).all())
 

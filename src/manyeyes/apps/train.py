@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains a detector on a recording, or FeaKM on what a detector sees; goes on where a stopped run was.
+"""Trains a detector or a map model on a recording, or FeaKM on what a detector sees; goes on where a stopped run was.
 
-Several processes (detectors only): torchrun -m manyeyes.apps.cli train.
+Several processes (not for FeaKM): torchrun -m manyeyes.apps.cli train.
 """
 
 from __future__ import annotations
@@ -45,16 +45,19 @@ def main(options: Options) -> None:
     import torch.distributed as dist
     from rich.console import Console
 
-    from manyeyes.apps import train_feakm
+    from manyeyes.apps import train_feakm, train_map
     from manyeyes.apps.recordings import open_recording
     from manyeyes.datatypes import ConfigError
     from manyeyes.training.feakm import FEAKM_TRAINING
+    from manyeyes.training.map_presets import MAP_TRAINING
     from manyeyes.training.presets import TRAINING_PRESETS
 
     if options.preset in FEAKM_TRAINING:
         return train_feakm.main(options, Console())
+    if options.preset in MAP_TRAINING:
+        return train_map.main(options)
     if options.preset not in TRAINING_PRESETS:
-        known = ", ".join((*TRAINING_PRESETS, *FEAKM_TRAINING))
+        known = ", ".join((*TRAINING_PRESETS, *FEAKM_TRAINING, *MAP_TRAINING))
         raise ConfigError(f"No training preset {options.preset!r}; choose one of {known}.")
     asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
     config = replace(TRAINING_PRESETS[options.preset], **{k: v for k, v in asked.items() if v is not None})

@@ -138,6 +138,8 @@ class MapHead(nn.Module):
         self.instance = nn.Parameter(torch.randn(config.elements + config.many, 2 * c))
         self.point = nn.Parameter(torch.randn(config.points, 2 * c))
         self.reference = nn.Linear(c, 2)
+        # Queries begin all over the tile, not in its middle.
+        nn.init.xavier_uniform_(self.reference.weight)
         self.layers = nn.ModuleList(MapLayer(config) for _ in range(config.layers))
         self.kinds = nn.ModuleList(_kind_branch(c, len(config.kinds)) for _ in range(config.layers))
         self.moves = nn.ModuleList(_move_branch(c) for _ in range(config.layers))

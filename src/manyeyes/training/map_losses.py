@@ -29,7 +29,7 @@ class MapLossConfig:
     point: float = 5.0
     direction: float = 0.005
     ink: float = 1.0
-    repeat: int = 6
+    repeat: int = 2
     many: float = 1.0
 
 
@@ -80,7 +80,8 @@ def head_terms(
     layers: Sequence[RawMap], targets: Sequence[MapTarget], config: MapLossConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(kind, point, direction) of one group of queries, each layer matched anew, summed over layers."""
-    wanted = max(1, sum(len(target) for target in targets))
+    queries = layers[0].logit.shape[1]
+    answers = max(1, sum(min(len(target), queries) for target in targets))
     kind = point = direction = layers[0].logit.new_zeros(())
     for raw in layers:
         hot = torch.zeros_like(raw.logit)
@@ -88,9 +89,9 @@ def head_terms(
             found = match(raw.logit[tile], raw.point[tile], target, config)
             hot[tile, found.query, target.kind[found.element]] = 1
             mine, ring = raw.point[tile, found.query], target.ring[found.element]
-            point = point + (mine - found.points).abs().sum() / wanted
-            direction = direction + turned_away(mine, found.points, ring).sum() / wanted
-        kind = kind + focal(raw.logit, hot).sum() / wanted
+            point = point + (mine - found.points).abs().sum() / answers
+            direction = direction + turned_away(mine, found.points, ring).sum() / answers
+        kind = kind + focal(raw.logit, hot).sum() / answers
     return kind, point, direction
 
 

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training settings of map models by name."""
+
+from __future__ import annotations
+
+import math
+
+from manyeyes.models.map_presets import mapper_config
+from manyeyes.training.map_loop import MapTrainConfig
+from manyeyes.training.map_losses import MapLossConfig
+from manyeyes.training.map_samples import MapAugment
+
+_NOISE = {"sigma_m": 0.2, "sigma_rad": math.radians(0.3)}
+
+MAP_TRAINING: dict[str, MapTrainConfig] = {
+    "map-toy": MapTrainConfig(
+        mapper_config("toy"), steps=60, batch=2, learning_rate=2e-3, warm_up=10, save_every=20, augment=MapAugment(1, 3)
+    ),
+    "map-small": MapTrainConfig(
+        mapper_config("small"), steps=1500, batch=4, learning_rate=1e-3, save_every=50, augment=MapAugment(**_NOISE)
+    ),
+    "map-small-camera": MapTrainConfig(
+        mapper_config("small", ("camera",)),
+        steps=1500,
+        batch=4,
+        learning_rate=1e-3,
+        save_every=50,
+        augment=MapAugment(flip=False, **_NOISE),
+    ),
+    "map-small-both": MapTrainConfig(
+        mapper_config("small", ("lidar", "camera")),
+        steps=1500,
+        batch=4,
+        learning_rate=1e-3,
+        save_every=50,
+        augment=MapAugment(flip=False, **_NOISE),
+    ),
+    "map-paper": MapTrainConfig(
+        mapper_config("paper", ("camera",)),
+        steps=60000,
+        batch=8,
+        learning_rate=6e-4,
+        warm_up=500,
+        save_every=500,
+        augment=MapAugment(least=10, flip=False),
+        loss=MapLossConfig(repeat=6),
+    ),
+}
+"""map-toy: tests. map-small: one to ten looks a tile, two cores; its two siblings need pictures in the recording. map-paper: the
+paper's ten pictures a tile and batch of eight; steps and rate are MapTRv2's, the paper gives none."""

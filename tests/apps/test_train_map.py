@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verb train on a map preset: from a simulated recording of generated towns to weights that draw tiles."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from manyeyes.apps import train
+from manyeyes.apps.train_map import true_maps
+from manyeyes.datasets.opv2v import Opv2vRecording
+from manyeyes.datatypes import ConfigError
+from manyeyes.models import checkpoint
+from manyeyes.models.map_presets import FORMAT
+from manyeyes.models.mapper import Mapper, MapperConfig
+from manyeyes.simulator.presets import simulate
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tiny")
+    simulate("tiny", folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_train_then_judge(recorded, tmp_path):
+    out = tmp_path / "run"
+    train.main(train.Options(recorded, preset="map-toy", out=out, steps=2, batch=1))
+    weights = out / "weights.safetensors"
+    model = checkpoint.load_as(weights, FORMAT, MapperConfig, Mapper)
+    assert model.config.tile.x_max == 60.0 and (out / "loss.png").exists() and (out / "train.json").exists()
+    card = checkpoint.read_card(weights, FORMAT)
+    assert card["towns"] == ["generated-1"] and "train" in card["command"]
+    table = subprocess.run(
+        [sys.executable, "benchmarks/map_tiles.py", "--weights", weights, "--data", recorded, "--looks", "1", "2"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert table.count("maptr_mAP") == 2
+    again = subprocess.run(
+        [sys.executable, "benchmarks/map_tiles.py", "--weights", weights, "--data", recorded, "--split", "train"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert again.returncode and "Split by place" in again.stderr
+
+
+@pytest.mark.slow
+def test_true_maps_are_those_of_the_scenarios_towns(recorded):
+    maps = true_maps(Opv2vRecording(recorded, "train"))
+    assert list(maps) == ["generated-1"] and len(maps["generated-1"]) > 10
+
+
+def test_an_unknown_preset_names_the_map_presets():
+    with pytest.raises(ConfigError, match="map-small"):
+        train.main(train.Options(Path("nowhere"), preset="map-large"))
