@@ -1,10 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.simulator.presets import SIMULATION_PRESETS, SimulationPreset, SplitPreset, jobs_of, simulation_preset
+from manyeyes.simulator.presets import (
+    SIMULATION_PRESETS,
+    SimulationPreset,
+    SplitPreset,
+    jobs_of,
+    simulation_preset,
+    with_cameras,
+)
 
 
 def test_no_town_is_on_two_sides() -> None:
@@ -34,6 +42,17 @@ def test_the_seed_decides() -> None:
     preset = simulation_preset("towns-small")
     assert jobs_of(preset, 3) == jobs_of(preset, 3)
     assert jobs_of(preset, 3) != jobs_of(preset, 4)
+
+
+def test_cameras_see_the_same_scenes() -> None:
+    preset = simulation_preset("tiny")
+    blind, seeing = jobs_of(preset, 3), jobs_of(with_cameras(preset), 3)
+    assert [replace(job.spec, cameras="none", roadside_cameras="none") for job in seeing] == [j.spec for j in blind]
+    assert {(job.spec.cameras, job.spec.roadside_cameras) for job in seeing} == {
+        ("opv2v-small", "dair-infrastructure-small")
+    }
+    with pytest.raises(ConfigError, match="in OPV2V's layout only"):
+        with_cameras(simulation_preset("dair-tiny"))
 
 
 def test_the_demo_runs_without_any_town(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

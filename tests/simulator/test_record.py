@@ -19,7 +19,10 @@ from manyeyes.simulator.towns import load_town
 SPEC = ScenarioSpec(
     "generated-1", 7, "one", vehicles=1, frames=2, history_frames=1, roadside_chance=1.0, min_vehicles=6
 )
-JOBS = [Job("train", SPEC), Job("train", replace(SPEC, name="two", seed=8))]
+JOBS = [
+    Job("train", SPEC),
+    Job("train", replace(SPEC, name="two", seed=8, roadside_cameras="dair-infrastructure-small")),
+]
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +57,19 @@ def test_the_reader_returns_the_simulators_own_truth(made: Path) -> None:
         torch.testing.assert_close(one.points.xyz, two.points.xyz, atol=1e-4, rtol=0)
         torch.testing.assert_close(one.points.intensity, two.points.intensity, atol=0.003, rtol=0)
     assert int((points_in_listed_boxes(read) == 0).sum()) == 0
+
+
+def test_pictures_lie_beside_the_clouds_as_they_were_taken(made: Path) -> None:
+    assert len(list((made / "train" / "two" / "-1").glob("*_camera0.png"))) == 2
+    assert not list((made / "train" / "one").rglob("*.png"))
+    read = Opv2vRecording(made, "train", strict=True, use_cache=False, images=True).snapshot("two", 0).frames[-1]
+    true = make_scenario(JOBS[1].spec, load_town("generated-1")).snapshot(0).frames[-1]
+    (one,), (two,) = read.images, true.images
+    assert torch.equal(one.rgb, two.rgb)
+    assert one.rgb.shape == (3, 270, 480)
+    torch.testing.assert_close(
+        one.camera.agent_from_camera.matrix(), two.camera.agent_from_camera.matrix(), atol=1e-9, rtol=0
+    )
 
 
 def test_the_manifest_counts_and_hashes_what_is_there(made: Path) -> None:

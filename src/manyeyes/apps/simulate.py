@@ -15,13 +15,15 @@ class Options:
     preset: str = "towns-small"
     """Which set of scenarios; an unknown name lists the known ones."""
     out: Path | None = None
-    """Folder for the splits and the manifest, data/PRESET by default; a run that was stopped goes on there."""
+    """Folder for the splits and the manifest, data/PRESET or data/PRESET-cameras; a run that was stopped goes on there."""
     seed: int = 0
     """Another seed, other scenes."""
     workers: int = os.cpu_count() or 1
     """How many processes share the work."""
     towns: Path | None = None
     """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
+    cameras: bool = False
+    """Pictures too: four cameras a vehicle and one a pole, beside the clouds."""
 
 
 def main(options: Options) -> None:
@@ -36,7 +38,7 @@ def main(options: Options) -> None:
     from manyeyes.simulator.record import Progress
 
     preset = simulation_preset(options.preset)
-    out = options.out or Path("data") / options.preset
+    out = options.out or Path("data") / f"{options.preset}{'-cameras' if options.cameras else ''}"
     total = sum(part.count for part in preset.splits)
     console = Console()
     with bars(console) as progress:
@@ -45,7 +47,7 @@ def main(options: Options) -> None:
         def report(at: Progress) -> None:
             progress.update(task, completed=at.done)
 
-        manifest = simulate(options.preset, out, options.seed, options.workers, report, options.towns)
+        manifest = simulate(options.preset, out, options.seed, options.workers, report, options.towns, options.cameras)
     held = json.loads(manifest.read_text(encoding="utf-8"))["scenarios"]
     provenance.write_json(
         out / "simulate.json",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OPV2V and V2XSet, read and written: ``<split>/<scenario>/<agent>/<stem>.{pcd,yaml}``.
+"""OPV2V and V2XSet, read and written: ``<split>/<scenario>/<agent>/<stem>.{pcd,yaml}``, and ``<stem>_camera0.png`` ….
 
 On disk everything is left-handed, in degrees and km/h, and points lie in the LiDAR's frame. What comes out is
 right-handed, in radians and m/s, and points lie in the agent's frame, whose z = 0 is the road. The format has neither
@@ -22,6 +22,7 @@ import torch
 from manyeyes.datasets.cache import ArrayCache, default_cache_folder
 from manyeyes.datasets.carla import carla_from_transform, mirror_points, transform_from_carla
 from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, height_above_ground
+from manyeyes.datasets.opv2v_camera import camera_yaml, missing_pictures, picture_path, read_images
 from manyeyes.datasets.opv2v_yaml import (
     AgentRecord,
     Protocol,
@@ -31,6 +32,7 @@ from manyeyes.datasets.opv2v_yaml import (
     write_record,
 )
 from manyeyes.datasets.pcd import PcdCloud, read_pcd, write_pcd
+from manyeyes.datasets.picture import write_png
 from manyeyes.datasets.recording import require_index
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, RecordingError, Snapshot, Transform, Truth
 
@@ -58,8 +60,8 @@ class Opv2vRecording:
 
     The ego is the first agent by string order, infrastructure comes last, and the ego's frames are the snapshots; an
     agent that lacks a frame is left out of that snapshot. What is missing stands in ``problems``, one line each; with
-    strict it is an error instead. Clouds are read when a snapshot is asked for. cache_folder: where parsed yaml and
-    ascii clouds are kept (default: the user's cache folder); None with ``use_cache=False``.
+    strict it is an error instead. Clouds are read when a snapshot is asked for; pictures too, with images=True.
+    cache_folder: where parsed yaml and ascii clouds are kept (default: the user's cache folder); None with ``use_cache=False``.
     """
 
     def __init__(
@@ -71,13 +73,15 @@ class Opv2vRecording:
         drop_nan: bool = False,
         use_cache: bool = True,
         cache_folder: Path | None = None,
+        images: bool = False,
     ) -> None:
         self.root = Path(root)
         self.split = split
+        self._with_images = images
         self._drop_nan = drop_nan
         self._cache = ArrayCache(cache_folder or default_cache_folder()) if use_cache else None
         problems: list[str] = []
-        found = (_scan(folder, problems) for folder in _scenario_folders(self.root, split))
+        found = (_scan(folder, problems, images) for folder in _scenario_folders(self.root, split))
         self._scenarios = {s.folder.name: s for s in found if s is not None}
         self.problems = tuple(problems)
         if not self._scenarios or (strict and problems):
@@ -141,15 +145,18 @@ class Opv2vRecording:
         height = self._sensor_height(agent, record, world_from_lidar)
         xyz = mirror_points(cloud.xyz)
         xyz[:, 2] += np.float32(height)
+        world_from_agent = world_from_lidar @ Transform.from_xyz_yaw(0, 0, -height)
+        yaml = agent.folder / f"{stem}.yaml"
         return AgentFrame(
             agent_id=agent.id,
             timestamp_ns=timestamp_ns,
             points=PointCloud.of(torch.from_numpy(xyz), torch.from_numpy(cloud.intensity)),
-            world_from_agent=world_from_lidar @ Transform.from_xyz_yaw(0, 0, -height),
+            world_from_agent=world_from_agent,
             pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
             sensor_height_m=height,
             speed_mps=record.speed_kmh / _KMH,
             is_infrastructure=record.is_infrastructure,
+            images=read_images(yaml, world_from_agent, self._cache) if self._with_images else (),
         )
 
     def _sensor_height(self, agent: _Agent, record: AgentRecord, world_from_lidar: Transform) -> float:
@@ -226,11 +233,11 @@ def _scenario_folders(root: Path, split: str | None) -> list[Path]:
     )
 
 
-def _scan(folder: Path, problems: list[str]) -> _Scenario | None:
+def _scan(folder: Path, problems: list[str], images: bool) -> _Scenario | None:
     """What a scenario's folder holds, by names alone; what is missing is added to problems."""
     names = [p for p in _subfolders(folder) if _AGENT.fullmatch(p.name)]
     ordered = [p for p in names if int(p.name) >= 0] + [p for p in names if int(p.name) < 0]
-    agents = [a for a in (_scan_agent(p, problems) for p in ordered) if a.stems]
+    agents = [a for a in (_scan_agent(p, problems, images) for p in ordered) if a.stems]
     if not agents:
         problems.append(f"{folder}: no agent with a whole frame, the scenario is left out")
         return None
@@ -249,8 +256,9 @@ def _scan(folder: Path, problems: list[str]) -> _Scenario | None:
     return _Scenario(folder, tuple(agents), stems)
 
 
-def _scan_agent(folder: Path, problems: list[str]) -> _Agent:
-    files = [p for p in folder.iterdir() if p.stem.isdecimal()]
+def _scan_agent(folder: Path, problems: list[str], images: bool) -> _Agent:
+    everything = list(folder.iterdir())
+    files = [p for p in everything if p.stem.isdecimal()]
     clouds = {p.stem for p in files if p.suffix == ".pcd"}
     records = {p.stem for p in files if p.suffix == ".yaml"}
     if not clouds and not records:
@@ -259,6 +267,8 @@ def _scan_agent(folder: Path, problems: list[str]) -> _Agent:
         if there:
             count = f"{len(there)} of {len(clouds | records)} frames"
             problems.append(f"{folder}: {count} lack their {suffix}, the first is {min(there, key=int)}; left out")
+    if images:
+        problems += [f"{folder}: {line}" for line in missing_pictures(everything, sorted(clouds & records, key=int))]
     return _Agent(int(folder.name), folder, frozenset(clouds & records))
 
 
@@ -293,9 +303,13 @@ class Opv2vWriter:
             xyz = mirror_points(frame.points.xyz.numpy())
             xyz[:, 2] -= np.float32(frame.sensor_height_m)
             write_pcd(folder / f"{stem}.pcd", xyz, frame.points.intensity.numpy())
-            record = _record_of(snapshot, row, box_speed_mps)
+            record, cameras = _record_of(snapshot, row, box_speed_mps), {}
+            true_pose = transform_from_carla(record.ego_pose), transform_from_carla(record.lidar_pose)
+            for number, image in enumerate(frame.images):
+                write_png(picture_path(folder, stem, number), image.rgb)
+                cameras |= camera_yaml(number, image.camera, *true_pose)
             # Last, so that a yaml without its cloud never comes of an interrupted run.
-            write_record(folder / f"{stem}.yaml", record, carla_from_transform(frame.world_from_agent))
+            write_record(folder / f"{stem}.yaml", record, carla_from_transform(frame.world_from_agent), cameras)
 
     def close(self, protocol: Mapping[str, Any]) -> None:
         """Write data_protocol.yaml; ``history_frames`` in it says how many first frames are not judged."""

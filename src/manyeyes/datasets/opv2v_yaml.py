@@ -176,12 +176,19 @@ def _label(vehicle: Mapping[Any, Any], size: np.ndarray) -> int:
     return LABELS.index("van" if height >= 2 else "car")
 
 
-def write_record(path: Path, record: AgentRecord, predicted_pose: Sequence[float]) -> None:
-    """Write one agent's yaml; predicted_pose is what the agent believes of its own place on the road.
+def write_record(
+    path: Path, record: AgentRecord, predicted_pose: Sequence[float], cameras: Mapping[str, Any] | None = None
+) -> None:
+    """Write one agent's yaml; predicted_pose is what the agent believes of its own place on the road, cameras its entries of them.
 
     The text is formed by hand, because PyYAML takes ten times as long as the rest of a frame.
     """
     lines = [f"RSU: {str(record.is_infrastructure).lower()}", f"ego_speed: {_number(record.speed_kmh)}"]
+    for key, camera in (cameras or {}).items():
+        lines.append(f"{key}:")
+        for name, values in camera.items():
+            lines.append(f"  {name}:")
+            lines += [f"  - {_flow(value)}" for value in values]
     for key, pose in (("lidar_pose", record.lidar_pose), ("plan_trajectory", ())):
         lines += _list(key, pose, "")
     for key, pose in (("predicted_ego_pos", predicted_pose), ("true_ego_pos", record.ego_pose)):
@@ -200,6 +207,10 @@ def _list(key: str, values: Sequence[float], indent: str) -> list[str]:
     if not values:
         return [f"{indent}{key}: []"]
     return [f"{indent}{key}:", *(f"{indent}- {_number(v)}" for v in values)]
+
+
+def _flow(value: float | Sequence[float]) -> str:
+    return _number(value) if isinstance(value, (int, float)) else f"[{', '.join(_number(v) for v in value)}]"
 
 
 def _number(value: float) -> str:

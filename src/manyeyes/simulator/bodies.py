@@ -14,6 +14,7 @@ from manyeyes.ops.raycast import BOX, Primitives
 
 Array = NDArray[np.float64]
 
+BODYWORK, CABIN, WINDSCREEN, TYRE, CARGO, CHASSIS = range(6)
 _RUBBER, _GLASS, _TARPAULIN = 0.06, 0.12, 0.45
 
 
@@ -21,12 +22,13 @@ _RUBBER, _GLASS, _TARPAULIN = 0.06, 0.12, 0.45
 class Body:
     """Boxes in the vehicle's frame (x forward, y left, origin on the road under its middle).
 
-    center and half: (P, 3) metres; reflectivity: (P,).
+    center and half: (P, 3) metres; reflectivity: (P,); part: (P,) uint8, BODYWORK … CHASSIS (a CABIN has windows all around).
     """
 
     center: Array
     half: Array
     reflectivity: Array
+    part: NDArray[np.uint8]
 
 
 def vehicle_body(kind: str, size: tuple[float, float, float], seed: int, id: int) -> Body:
@@ -39,15 +41,16 @@ def vehicle_body(kind: str, size: tuple[float, float, float], seed: int, id: int
     parts = {"car": _car, "van": _van, "truck": _truck, "bus": _bus}[kind](paint, vary)
     low, high = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
     scale = np.array(size)
-    return Body((low + high) / 2 * scale, (high - low) / 2 * scale, np.array([min(p[2], 0.95) for p in parts]))
+    bright, part = np.array([min(p[2], 0.95) for p in parts]), np.array([p[3] for p in parts], np.uint8)
+    return Body((low + high) / 2 * scale, (high - low) / 2 * scale, bright, part)
 
 
-# A part is (low corner, high corner, reflectivity) in fractions of length (-0.5 … 0.5), width (-0.5 … 0.5), height (0 … 1).
-_Part = tuple[tuple[float, float, float], tuple[float, float, float], float]
+# A part is (low corner, high corner, reflectivity, what it is) in fractions of length, width (-0.5 … 0.5) and height (0 … 1).
+_Part = tuple[tuple[float, float, float], tuple[float, float, float], float, int]
 
 
 def _axle(x: float, half_length: float, top: float) -> _Part:
-    return (x - half_length, -0.48, 0.0), (x + half_length, 0.48, top), _RUBBER
+    return (x - half_length, -0.48, 0.0), (x + half_length, 0.48, top), _RUBBER, TYRE
 
 
 def _car(paint: float, vary: Array) -> list[_Part]:
@@ -55,10 +58,10 @@ def _car(paint: float, vary: Array) -> list[_Part]:
     front, back = 0.16 + 0.04 * vary[2], -0.30 - 0.08 * vary[3]
     boot = min(hood + 0.06 + 0.04 * vary[4], 0.7)
     return [
-        ((-0.5, -0.5, sill), (0.5, 0.5, hood - 0.12), paint),
-        ((front, -0.46, hood - 0.12), (0.47, 0.46, hood), paint),
-        ((back, -0.43, hood - 0.12), (front, 0.43, 1.0), 0.5 * paint + 0.5 * _GLASS),
-        ((-0.49, -0.46, hood - 0.12), (back, 0.46, boot), paint),
+        ((-0.5, -0.5, sill), (0.5, 0.5, hood - 0.12), paint, BODYWORK),
+        ((front, -0.46, hood - 0.12), (0.47, 0.46, hood), paint, BODYWORK),
+        ((back, -0.43, hood - 0.12), (front, 0.43, 1.0), 0.5 * paint + 0.5 * _GLASS, CABIN),
+        ((-0.49, -0.46, hood - 0.12), (back, 0.46, boot), paint, BODYWORK),
         _axle(0.31, 0.07, 0.42),
         _axle(-0.29, 0.07, 0.42),
     ]
@@ -67,9 +70,9 @@ def _car(paint: float, vary: Array) -> list[_Part]:
 def _van(paint: float, vary: Array) -> list[_Part]:
     nose = 0.30 + 0.05 * vary[0]
     return [
-        ((-0.5, -0.5, 0.14), (nose, 0.5, 1.0), paint),
-        ((nose, -0.48, 0.14), (0.5, 0.48, 0.55 + 0.05 * vary[1]), paint),
-        ((nose, -0.45, 0.5), (nose + 0.09, 0.45, 0.86), _GLASS),
+        ((-0.5, -0.5, 0.14), (nose, 0.5, 1.0), paint, BODYWORK),
+        ((nose, -0.48, 0.14), (0.5, 0.48, 0.55 + 0.05 * vary[1]), paint, BODYWORK),
+        ((nose, -0.45, 0.5), (nose + 0.09, 0.45, 0.86), _GLASS, WINDSCREEN),
         _axle(0.31, 0.06, 0.32),
         _axle(-0.30, 0.06, 0.32),
     ]
@@ -78,9 +81,9 @@ def _van(paint: float, vary: Array) -> list[_Part]:
 def _truck(paint: float, vary: Array) -> list[_Part]:
     cab = 0.27 + 0.04 * vary[0]
     return [
-        ((cab, -0.48, 0.14), (0.5, 0.48, 0.72 + 0.08 * vary[1]), paint),
-        ((-0.5, -0.5, 0.30), (cab - 0.03, 0.5, 1.0), _TARPAULIN + 0.2 * vary[2]),
-        ((-0.47, -0.30, 0.18), (cab, 0.30, 0.30), 0.1),
+        ((cab, -0.48, 0.14), (0.5, 0.48, 0.72 + 0.08 * vary[1]), paint, BODYWORK),
+        ((-0.5, -0.5, 0.30), (cab - 0.03, 0.5, 1.0), _TARPAULIN + 0.2 * vary[2], CARGO),
+        ((-0.47, -0.30, 0.18), (cab, 0.30, 0.30), 0.1, CHASSIS),
         _axle(0.37, 0.055, 0.28),
         _axle(-0.28, 0.055, 0.28),
         _axle(-0.40, 0.055, 0.28),
@@ -90,9 +93,9 @@ def _truck(paint: float, vary: Array) -> list[_Part]:
 def _bus(paint: float, vary: Array) -> list[_Part]:
     floor, window = 0.10 + 0.02 * vary[0], 0.42 + 0.04 * vary[1]
     return [
-        ((-0.5, -0.5, floor), (0.5, 0.5, window), paint),
-        ((-0.498, -0.49, window), (0.495, 0.49, 0.90), 0.4 * paint + 0.6 * _GLASS),
-        ((-0.40, -0.44, 0.90), (0.35 + 0.05 * vary[2], 0.44, 1.0), paint),
+        ((-0.5, -0.5, floor), (0.5, 0.5, window), paint, BODYWORK),
+        ((-0.498, -0.49, window), (0.495, 0.49, 0.90), 0.4 * paint + 0.6 * _GLASS, CABIN),
+        ((-0.40, -0.44, 0.90), (0.35 + 0.05 * vary[2], 0.44, 1.0), paint, BODYWORK),
         _axle(0.28, 0.045, 0.25),
         _axle(-0.27, 0.045, 0.25),
     ]

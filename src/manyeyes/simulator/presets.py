@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -35,7 +35,7 @@ class SimulationPreset:
 
     vehicles: least and most connected vehicles of a scene. roadside_chance: of a unit on a pole, which always takes part
     where there is one vehicle only. stand_in: generated roads where a town is not found; None makes that an error.
-    layout: of the files; dair takes one vehicle and the unit, and judges every pair.
+    layout: of the files; dair takes one vehicle and the unit, and judges every pair. cameras, roadside_cameras: as in ScenarioSpec.
     """
 
     splits: tuple[SplitPreset, ...]
@@ -48,8 +48,12 @@ class SimulationPreset:
     min_vehicles: int = 16
     stand_in: str | None = None
     layout: Literal["opv2v", "dair"] = "opv2v"
+    cameras: str = "none"
+    roadside_cameras: str = "none"
 
     def __post_init__(self) -> None:
+        if self.layout == "dair" and {self.cameras, self.roadside_cameras} != {"none"}:
+            raise ConfigError("Pictures are written in OPV2V's layout only; choose a preset of it, or no cameras.")
         assert_disjoint_split({part.split: part.towns for part in self.splits})
 
 
@@ -122,6 +126,11 @@ def simulation_preset(name: str) -> SimulationPreset:
     return SIMULATION_PRESETS[name]
 
 
+def with_cameras(preset: SimulationPreset) -> SimulationPreset:
+    """The same scenes seen by four cameras a vehicle and one a pole too, on a quarter of their pixels or less."""
+    return replace(preset, cameras="opv2v-small", roadside_cameras="dair-infrastructure-small")
+
+
 def _town(name: str, towns: str | None, stand_in: str | None) -> str:
     """The town, or its stand-in where its roads are not found."""
     if stand_in is None:
@@ -155,6 +164,8 @@ def jobs_of(preset: SimulationPreset, seed: int, towns: str | None = None) -> li
                 density=round(float(random.uniform(3.5, 7.0)), 3),
                 min_vehicles=preset.min_vehicles,
                 clutter=round(float(random.uniform(0.4, 1.0)), 3),
+                cameras=preset.cameras,
+                roadside_cameras=preset.roadside_cameras,
             )
             jobs.append(Job(part.split, spec, None if town.startswith(GENERATED) else towns))
     return sorted(jobs, key=lambda job: (job.split != "train", job.split != "validate", job.spec.town, job.spec.name))
@@ -167,9 +178,11 @@ def simulate(
     workers: int = 1,
     progress: Callable[[Progress], None] | None = None,
     towns: Path | str | None = None,
+    cameras: bool = False,
 ) -> Path:
     """Make a preset's recording under a folder; the path of its manifest. towns: where roads are looked for first."""
     place = None if towns is None else str(towns)
-    jobs = jobs_of(simulation_preset(preset), seed, place)
-    write = record_dair if simulation_preset(preset).layout == "dair" else record
+    wanted = with_cameras(simulation_preset(preset)) if cameras else simulation_preset(preset)
+    jobs = jobs_of(wanted, seed, place)
+    write = record_dair if wanted.layout == "dair" else record
     return write(jobs, out, workers, progress, {"preset": preset, "seed": seed})

@@ -224,7 +224,7 @@ def _kept(folder: Path, spec: ScenarioSpec) -> Entry | None:
         return None
     try:
         content = json.loads(path.read_text())
-        if content["spec"] != json.loads(json.dumps(asdict(spec))):
+        if ScenarioSpec(**content["spec"]) != spec:
             return None
         entry = content["entry"]
         return Entry(**{**entry, "agents": tuple(entry["agents"])})

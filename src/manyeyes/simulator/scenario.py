@@ -15,9 +15,12 @@ from manyeyes.maps.road_network import Junction, RoadNetwork
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import HeightField, Primitives
 from manyeyes.simulator.bodies import Body, box_centers, place_bodies, rotation_of, vehicle_body
+from manyeyes.simulator.camera import CameraSpec, Stage, camera_rig, take
 from manyeyes.simulator.clutter import ClutterSpec, Plot, corner_places, place_clutter, pole
 from manyeyes.simulator.ground import Ground, build_ground, is_multilevel
 from manyeyes.simulator.lidar import LidarSpec, Scene, lidar_spec, scan
+from manyeyes.simulator.light import draw_light
+from manyeyes.simulator.look import Look, still_look, vehicle_look
 from manyeyes.simulator.parking import parked_cars
 from manyeyes.simulator.traffic import simulate_traffic
 from manyeyes.simulator.vehicles import VehicleStates
@@ -38,7 +41,8 @@ class ScenarioSpec:
     vehicles: connected vehicles, each at least min_gap_m from the others and within low_m … high_m of the crossing at the
     first frame. frames: at rate_hz, the first history_frames of which are not judged. roadside_chance: how often a unit
     on a pole takes part. density: of the traffic, in units of 9 vehicles per kilometre of lane. min_vehicles: within
-    60 m of the crossing, or another one is drawn. clutter: times the numbers of ClutterSpec.
+    60 m of the crossing, or another one is drawn. clutter: times the numbers of ClutterSpec. cameras, roadside_cameras:
+    names of CAMERA_RIGS, of each vehicle and of the unit, whose cameras are at its LiDAR's height.
     """
 
     town: str
@@ -57,6 +61,8 @@ class ScenarioSpec:
     min_gap_m: float = 9.0
     min_vehicles: int = 16
     clutter: float = 1.0
+    cameras: str = "none"
+    roadside_cameras: str = "none"
 
     def __post_init__(self) -> None:
         if not (1 <= self.vehicles <= 6 and self.frames > self.history_frames >= 0 and 0 <= self.low_m < self.high_m):
@@ -71,10 +77,11 @@ class NoSceneError(ConfigError):
 
 @dataclass(frozen=True, eq=False)
 class Roadside:
-    """A unit on a pole: its upright frame on the road under it, facing the crossing, and its sensor."""
+    """A unit on a pole: its upright frame on the road under it, facing the crossing, and its sensors."""
 
     world_from_agent: Transform
     lidar: LidarSpec
+    cameras: tuple[CameraSpec, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +110,9 @@ class Scenario:
     def snapshot(self, index: int) -> Snapshot:
         """What every agent senses at one instant, and the truth: claimed poses are the true ones."""
         states, spec = self.states[index], self.spec
-        moving = place_bodies(
-            [self.bodies[int(i)] for i in states.id], states.position, states.yaw, states.pitch, states.id
-        )
-        scene = Scene(Primitives.cat([self.still, moving]), self.ground)
-        boxes = true_boxes(states)
+        scene, boxes = self.scene(index), true_boxes(states)
+        rig = camera_rig(spec.cameras)
+        stage = self.stage(index) if {spec.cameras, spec.roadside_cameras} != {"none"} else None
         time_ns = round(index * 1e9 / spec.rate_hz)
         frames, seen = [], []
         for agent in self.agents:
@@ -115,15 +120,29 @@ class Scenario:
             pose = _pose(states, row)
             speed = float(states.speed[row])
             frame, mine = self._sense(scene, agent, pose, lidar_spec(spec.lidar), boxes, time_ns, speed)
-            frames.append(frame)
+            frames.append(_with_images(frame, stage, rig))
             seen.append(mine)
         if self.roadside is not None:
             unit = self.roadside
             frame, mine = self._sense(scene, RSU_ID, unit.world_from_agent, unit.lidar, boxes, time_ns, 0.0)
-            frames.append(frame)
+            frames.append(_with_images(frame, stage, unit.cameras))
             seen.append(mine)
         truth = Truth(boxes, torch.stack(seen), Transform.stack([f.world_from_agent for f in frames]))
         return Snapshot(spec.name, index, tuple(frames), truth)
+
+    def scene(self, index: int) -> Scene:
+        """All that rays can meet at one instant."""
+        states = self.states[index]
+        moving = place_bodies(
+            [self.bodies[int(i)] for i in states.id], states.position, states.yaw, states.pitch, states.id
+        )
+        return Scene(Primitives.cat([self.still, moving]), self.ground)
+
+    def stage(self, index: int) -> Stage:
+        """The scene at one instant as cameras see it."""
+        seed = self.spec.seed
+        look = Look.cat([still_look(self.still, seed), vehicle_look(self.states[index], self.bodies, seed)])
+        return Stage.of(self.scene(index), look, draw_light(seed, self.spec.name))
 
     def _sense(
         self, scene: Scene, agent: int, pose: Transform, lidar: LidarSpec, boxes: Boxes, time_ns: int, speed: float
@@ -142,6 +161,13 @@ class Scenario:
             is_infrastructure=agent < 0,
         )
         return frame, seen_boxes(points, instance, pose, boxes, agent)
+
+
+def _with_images(frame: AgentFrame, stage: Stage | None, rig: tuple[CameraSpec, ...]) -> AgentFrame:
+    if stage is None:
+        return frame
+    pictures = (take(stage, frame.world_from_agent, camera, own=frame.agent_id) for camera in rig)
+    return replace(frame, images=tuple(picture.image for picture in pictures))
 
 
 def true_boxes(states: VehicleStates) -> Boxes:
@@ -277,7 +303,7 @@ def _furnish(
         plot.keep_out(position[:2], (float(size[0]) / 2 + 0.5, float(size[1]) / 2 + 0.5), float(yaw))
     roadside, solids = None, []
     if random.random() < spec.roadside_chance:
-        roadside = _roadside(plot, middle, lidar_spec(spec.roadside_lidar), random)
+        roadside = _roadside(plot, middle, spec, random)
     if roadside is not None:
         xyz = roadside.world_from_agent.translation.numpy()
         plot.keep_out(xyz[:2], (1.0, 1.0), 0.0)
@@ -297,7 +323,7 @@ def _furnish(
     return Scenario(spec, network, field, Primitives.cat(solids), states, bodies, agents, roadside, middle)
 
 
-def _roadside(plot: Plot, middle: Array, lidar: LidarSpec, random: np.random.Generator) -> Roadside | None:
+def _roadside(plot: Plot, middle: Array, spec: ScenarioSpec, random: np.random.Generator) -> Roadside | None:
     """A pole beside the carriageway near the crossing, facing it, 4.5 to 6 m high; None where there is no place."""
     places = corner_places(plot, middle)
     if not len(places):
@@ -305,4 +331,6 @@ def _roadside(plot: Plot, middle: Array, lidar: LidarSpec, random: np.random.Gen
     xy = places[int(random.integers(min(len(places), 150)))]
     toward = middle - xy
     pose = Transform.from_xyz_yaw(float(xy[0]), float(xy[1]), float(plot.height(xy)), math.atan2(toward[1], toward[0]))
-    return Roadside(pose, replace(lidar, height_m=float(random.uniform(4.5, 6.0))))
+    height = float(random.uniform(4.5, 6.0))
+    cameras = tuple(replace(camera, z_m=height) for camera in camera_rig(spec.roadside_cameras))
+    return Roadside(pose, replace(lidar_spec(spec.roadside_lidar), height_m=height), cameras)
