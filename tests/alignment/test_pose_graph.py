@@ -73,6 +73,15 @@ def test_a_colluding_pair_is_isolated_by_those_who_agree():
     assert 4 not in found.pose
 
 
+@pytest.mark.parametrize("liar", [(0, 1), (0, 2), (1, 2)])
+def test_in_a_single_triangle_claims_tell_which_link_lies(liar):
+    listed = [link(i, j, np.array([3.0, 0.0, 0.1]) if (i, j) == liar else None) for i, j in ((0, 1), (0, 2), (1, 2))]
+    found = settle(0, listed, {1: claim(1), 2: claim(2)})
+    assert [(n.i, n.j) for n in found.refused] == [liar]
+    for agent in (1, 2):
+        np.testing.assert_allclose(difference(found.pose[agent], np.array(PLACES[agent], float)), 0, atol=0.05)
+
+
 def test_claims_place_whom_no_link_reaches_and_weigh_little_where_links_do():
     found = settle(0, [link(0, 1)], {1: claim(1, 5.0), 2: claim(2)})
     np.testing.assert_allclose(found.pose[2], PLACES[2], atol=1e-9)

@@ -138,6 +138,18 @@ def test_every_kind_makes_a_claim_but_none(kind):
     assert (claim is None) == (kind == "none")
 
 
+def test_an_offset_is_five_of_what_is_stated_in_any_direction():
+    found = np.array([ClaimNoise("offset", 0.4, 1.0).claim(TRUTH, "drive/7", n).pose - TRUTH for n in range(20)])
+    np.testing.assert_allclose(np.hypot(*found[:, :2].T), 2.0)
+    assert len(np.unique(np.sign(found[:, :2]), axis=0)) == 4 and np.abs(found[:, 2]).max() < 1e-12
+    assert ClaimNoise("offset", 0.4, 1.0).claim(TRUTH, 0).covariance[0, 0] == pytest.approx(0.16)
+
+
+def test_conflicts_are_counted_over_all_frames():
+    frames = [frame(), frame(PoseStatus.CONFLICT), frame(PoseStatus.NO_MATCH), frame(PoseStatus.OK)]
+    assert score(frames).conflicts == 0.25
+
+
 def test_an_unknown_kind_lists_the_known():
-    with pytest.raises(ConfigError, match="heavy, unknown, none"):
+    with pytest.raises(ConfigError, match="heavy, offset, unknown, none"):
         ClaimNoise("pink")

@@ -62,6 +62,12 @@ class CorrectorConfig:
     accept: Acceptance = Acceptance()
 
 
+DETECTED = CorrectorConfig(VoteConfig(shared=0.15))
+"""For what detectors find: boxes of one view err alike, each towards who sees but one side of a vehicle. Measured on 154
+pairs of agents of the validation towns: the mean NEES is 5.4 without it, 3.2 with it (3 is honest).
+"""
+
+
 def correct(
     ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: CorrectorConfig | None = None
 ) -> PoseEstimate:

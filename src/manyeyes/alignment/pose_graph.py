@@ -19,9 +19,9 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.alignment.decide import REFUTED
-from manyeyes.alignment.estimate import PoseClaim
-from manyeyes.datatypes import ConfigError
-from manyeyes.ops.se2 import Edges, compose, inverse, log, solve
+from manyeyes.alignment.estimate import PoseClaim, difference
+from manyeyes.datatypes import ConfigError, Transform
+from manyeyes.ops.se2 import Edges, between, compose, inverse, log, solve
 
 Floats = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ def settle(
     part.
     """
     ordered = sorted(links, key=lambda n: (n.i, n.j, *n.pose))
-    kept, refused = consistent(ordered, limit)
+    kept, refused = consistent(ordered, limit, [_doubt(ego, n, claims) for n in ordered])
     agents = sorted({ego, *claims, *(a for n in ordered for a in (n.i, n.j))})
     reached = _reached(ego, kept, claims)
     poses, covariance = _solve(ego, [a for a in agents if a in reached], kept, claims, huber)
@@ -72,9 +72,13 @@ def settle(
     return Settled(poses, covariance, tuple(kept), tuple(refused), isolated)
 
 
-def consistent(links: Sequence[Link], limit: float) -> tuple[list[Link], list[Link]]:
-    """The links without those that no triangle agrees with, and those: the link in most failing triangles goes first."""
+def consistent(links: Sequence[Link], limit: float, doubts: Sequence[float] = ()) -> tuple[list[Link], list[Link]]:
+    """The links without those that no triangle agrees with, and those: the link in most failing triangles goes first.
+
+    doubts: how badly each link agrees with what is claimed; it decides where triangles do not, as in a single one.
+    """
     kept, refused = list(links), []
+    doubt = list(doubts) or [0.0] * len(kept)
     while True:
         failing = [0.0] * len(kept)
         closing = [0] * len(kept)
@@ -87,14 +91,30 @@ def consistent(links: Sequence[Link], limit: float) -> tuple[list[Link], list[Li
         if not bad:
             break
         # A link that some triangle confirms is trusted before one that none does.
-        worst = max(bad, key=lambda n: (-closing[n], failing[n], -n))
+        worst = max(bad, key=lambda n: (-closing[n], round(failing[n], 9), doubt[n], -n))
         refused.append(kept.pop(worst))
+        doubt.pop(worst)
     # Whoever contradicted more than one other and is confirmed by no triangle is not believed for its last link either.
     confirmed = {a for n, count in enumerate(closing) if count for a in (kept[n].i, kept[n].j)}
     contradicted = [a for n in refused for a in (n.i, n.j)]
     alone = {a for a in contradicted if contradicted.count(a) > 1} - confirmed
     refused += [n for n in kept if {n.i, n.j} & alone]
     return [n for n in kept if not {n.i, n.j} & alone], refused
+
+
+def _doubt(ego: int, link: Link, claims: Mapping[int, PoseClaim]) -> float:
+    """Squared Mahalanobis distance of a link from what both its agents claim; 0 where one of them claims nothing."""
+    known = {**claims, ego: PoseClaim.of(Transform.identity(), 0.0, 0.0)}
+    if link.i not in known or link.j not in known:
+        return 0.0
+    one, two = known[link.i], known[link.j]
+    said = between(torch.from_numpy(one.pose), torch.from_numpy(two.pose)).numpy()
+    c, s = np.cos(one.pose[2]), np.sin(one.pose[2])
+    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    lever = np.array([[1.0, 0.0, -said[1]], [0.0, 1.0, said[0]], [0.0, 0.0, 1.0]]) @ turn
+    spread = link.covariance + lever @ one.covariance @ lever.T + turn @ two.covariance @ turn.T
+    delta = difference(link.pose, said)
+    return float(delta @ np.linalg.solve(spread, delta))
 
 
 def cycle_distance(one: Link, two: Link, three: Link) -> float:

@@ -3,9 +3,10 @@
 
 What is watched is the innovation: where objects put the agent less where it says it is, in its own claimed
 covariance's axes. One frame is a chi^2 test; a lasting offset that each frame alone would forgive is the mean of the
-last frames, again by chi^2; a drift is the slope of a line through them, which an offset that the claim's own error
-explains does not hide. Pure functions: the state is the caller's. Spec: specs/pose.md 4.4, its "infrastructure
-status"; FeaKM's paper asks for it and has none.
+last frames, again by chi^2; a drift is the slope of a line that begins at some frame and before it was level, which an
+offset that the claim's own error explains does not hide. What was seen before it tells where the line begins, so that a
+drift is named far sooner than its own frames alone would allow. Pure functions: the state is the caller's.
+Spec: specs/pose.md 4.4, its "infrastructure status"; FeaKM's paper asks for it and has none.
 """
 
 from __future__ import annotations
@@ -37,20 +38,22 @@ class Health(Enum):
 
 @dataclass(frozen=True)
 class WatchConfig:
-    """frames: how many measured frames are remembered. least: how many a drift needs. single, doubtful, drift: limits
-    of the tests, squared and in standard deviations: 16.27 is p = 0.001 of one frame; 4.5 of a slope keeps false
-    names below one in ten thousand windows of three slopes.
+    """frames: how many measured frames are remembered. lasting: of how many an offset is the mean. least: how many a drift
+    needs. single, doubtful, drift: limits of the tests, squared and in standard deviations: 16.27 is p = 0.001 of one
+    frame; 4.5 of a slope names fewer than one sound agent in twenty in half a minute at 10 Hz.
     """
 
-    frames: int = 30
-    least: int = 8
+    frames: int = 100
+    lasting: int = 30
+    least: int = 20
     single: float = REFUTED
     doubtful: float = DOUBTFUL
     drift: float = 4.5
 
     def __post_init__(self) -> None:
-        if not 3 <= self.least <= self.frames or min(self.single, self.doubtful, self.drift) <= 0:
-            raise ConfigError("WatchConfig needs 3 <= least <= frames and limits above 0.")
+        fits = 3 <= self.least <= self.frames and 1 <= self.lasting <= self.frames
+        if not fits or min(self.single, self.doubtful, self.drift) <= 0:
+            raise ConfigError("WatchConfig needs 3 <= least <= frames, 1 <= lasting <= frames and limits above 0.")
 
 
 @dataclass(frozen=True)
@@ -73,8 +76,7 @@ class WatchState:
 @dataclass(frozen=True)
 class Report:
     """health, and what it rests on: distance, squared, of the mean innovation; drift: metres per second, x and y, and
-    radians per second of yaw (3,); drift_sigmas: the largest of them in standard deviations; frames: measured frames
-    in memory.
+    radians per second of yaw (3,); drift_sigmas: its size in standard deviations; frames: measured frames in memory.
     """
 
     health: Health
@@ -110,13 +112,13 @@ def _report(state: WatchState, config: WatchConfig) -> Report:
     n = len(state.time)
     if not n:
         return Report(Health.UNKNOWN, float("nan"), np.zeros(3), 0.0, 0)
-    drift, sigmas = _slope(state) if n >= config.least else (np.zeros(3), 0.0)
+    drift, sigmas = _slope(state, config.least) if n >= config.least else (np.zeros(3), 0.0)
     now = _distance(state.innovation[-1], state.measured[-1] + state.claimed[-1])
     # The claim's error may be one for all frames, so that only the measurements average out.
-    weight = np.linalg.inv(state.measured)
+    weight = np.linalg.inv(state.measured[-config.lasting :])
     joint = np.linalg.inv(weight.sum(0))
-    mean = joint @ np.einsum("nab,nb->a", weight, state.innovation)
-    lasting = _distance(mean, joint + state.claimed.mean(0))
+    mean = joint @ np.einsum("nab,nb->a", weight, state.innovation[-config.lasting :])
+    lasting = _distance(mean, joint + state.claimed[-config.lasting :].mean(0))
     health = Health.DOUBTFUL if now > config.doubtful else Health.SOUND
     if max(now, lasting) > config.single:
         health = Health.OFFSET
@@ -125,19 +127,26 @@ def _report(state: WatchState, config: WatchConfig) -> Report:
     return Report(health, max(now, lasting), drift, sigmas, n)
 
 
-def _slope(state: WatchState) -> tuple[Floats, float]:
-    """Slope (3,) per second of the line through the innovations, and its size in standard deviations.
+def _slope(state: WatchState, least: int) -> tuple[Floats, float]:
+    """Slope (3,) per second of the line through the innovations that is level and then rises, for at least so many frames;
+    and its size in standard deviations: of the way over the ground, or of the turn, whichever is larger.
 
     The spread is the larger of what the measurements state and what the innovations show, so that a claim whose
     errors are drawn anew in each frame is not taken for one that moves.
     """
-    time = state.time - state.time.mean()
-    span = np.square(time).sum()
-    slope = time @ state.innovation / span
-    rest = state.innovation - state.innovation.mean(0) - time[:, None] * slope
-    shown = np.square(rest).sum(0) / (len(time) - 2)
+    n = len(state.time)
+    begins = state.time[: n - least + 1]
+    rising = np.maximum(state.time - begins[:, None], 0.0)
+    rising -= rising.mean(1, keepdims=True)
+    span = np.square(rising).sum(1, keepdims=True)
+    slope = rising @ state.innovation / span
+    whole = np.square(state.innovation - state.innovation.mean(0)).sum(0)
+    shown = (whole - np.square(slope) * span) / (n - 2)
     stated = np.diagonal(state.measured, axis1=1, axis2=2).mean(0)
-    return slope, float((np.abs(slope) / np.sqrt(np.maximum(shown, stated) / span)).max())
+    squared = np.square(slope) * span / np.maximum(shown, stated)
+    sigmas = np.sqrt(np.maximum(squared[:, 0] + squared[:, 1], squared[:, 2]))
+    best = int(sigmas.argmax())
+    return slope[best], float(sigmas[best])
 
 
 def _distance(delta: Floats, covariance: Floats) -> float:

@@ -9,7 +9,7 @@ the two agents share no object can only be answered by chance: *null accepts* is
 displacement* (OD) is the mean distance (m) by which the used pose misplaces the objects in common. *NEES* is e' C^-1 e
 of right answers, 3 if the covariance C is honest; *inside* is the share of them within the 95 % ellipsoid. The
 *risk-coverage curve* orders frames by an estimator's own confidence: risk is the share not right among the most
-confident; AURC is its mean over all coverages.
+confident; AURC is its mean over all coverages. *Conflicts* is the share of all frames that contradict the claim.
 """
 
 from __future__ import annotations
@@ -72,6 +72,7 @@ class PoseScore:
     nees: float
     inside: float
     aurc: float
+    conflicts: float
 
 
 def judged(estimate: PoseEstimate, truth: Floats, common_xy: Floats) -> PoseFrame:
@@ -133,6 +134,7 @@ def score(frames: Sequence[PoseFrame]) -> PoseScore:
         _mean(nees),
         _mean((nees <= WITHIN_95).astype(np.float64)),
         _mean(risk_coverage(frames)[1]),
+        _share(sum(f.status is PoseStatus.CONFLICT for f in frames), n),
     )
 
 
@@ -191,7 +193,8 @@ class ClaimNoise:
     kind: ``gaussian`` (of the other agent); ``gaussian_all`` (of both, in the world, so that the ego's yaw moves the
     other by its distance); ``laplace`` (scale sigma, so sqrt 2 as wide); ``bias`` (one offset a scene); ``walk``
     (each frame adds a tenth); ``latency`` (along the other's heading, sigma_m at most); ``heavy`` (one claim in ten
-    is ten times as far off); ``unknown`` (anywhere within 100 m, any yaw, and says so); ``none`` (no claim).
+    is ten times as far off); ``offset`` (five sigma_m off in any direction); ``unknown`` (anywhere within 100 m, any
+    yaw, and says so); ``none`` (no claim).
     """
 
     kind: str = "gaussian"
@@ -203,7 +206,7 @@ class ClaimNoise:
         if self.kind not in NOISE_KINDS:
             raise ConfigError(f"No noise of claims is called {self.kind!r}; known: {', '.join(NOISE_KINDS)}.")
 
-    def claim(self, truth: Floats, scene: int, frame: int = 0) -> PoseClaim | None:
+    def claim(self, truth: Floats, scene: int | str, frame: int = 0) -> PoseClaim | None:
         """ego_from_other as claimed in a frame of a scene, from the true one (3,); None where nothing is claimed."""
         if self.kind == "none":
             return None
@@ -217,7 +220,7 @@ class ClaimNoise:
         moved = truth + offset
         return PoseClaim(upright(moved, None), np.diag(variance))
 
-    def _offset(self, truth: Floats, sigma: Floats, scene: int, frame: int) -> tuple[Floats, Floats]:
+    def _offset(self, truth: Floats, sigma: Floats, scene: int | str, frame: int) -> tuple[Floats, Floats]:
         """What the claim is off by (3,), and the variances (3,) that it states."""
         unit = keyed_normal((6,), self.seed, "claim", scene, 0 if self.kind == "bias" else frame).numpy()
         if self.kind == "gaussian_all":
@@ -233,13 +236,16 @@ class ClaimNoise:
             late = keyed_uniform((1,), self.seed, "claim", self.kind, scene, frame).item() * self.sigma_m
             along = np.array([math.cos(truth[2]), math.sin(truth[2]), 0.0])
             return -late * along, np.array([sigma[0], sigma[1], max(sigma[2], 1e-3)]) ** 2
+        if self.kind == "offset":
+            angle = 2 * math.pi * keyed_uniform((1,), self.seed, "claim", self.kind, scene, frame).item()
+            return 5 * self.sigma_m * np.array([math.cos(angle), math.sin(angle), 0.0]), sigma**2
         if self.kind == "heavy":
             far = keyed_uniform((1,), self.seed, "claim", self.kind, scene, frame).item() < 0.1
             return sigma * unit[:3] * (10.0 if far else 1.0), sigma**2
         return sigma * unit[:3], sigma**2
 
 
-NOISE_KINDS = ("gaussian", "gaussian_all", "laplace", "bias", "walk", "latency", "heavy", "unknown", "none")
+NOISE_KINDS = ("gaussian", "gaussian_all", "laplace", "bias", "walk", "latency", "heavy", "offset", "unknown", "none")
 
 
 def _success(frames: Sequence[PoseFrame], limit: float) -> float:

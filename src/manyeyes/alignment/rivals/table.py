@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from functools import partial
 
-from manyeyes.alignment.decide import correct
+from manyeyes.alignment.decide import DETECTED, correct
 from manyeyes.alignment.estimate import Corrector
 from manyeyes.alignment.rivals import coalign, feaco, fpv_rcnn, given, icp, mash, v2x_reg, vips
 from manyeyes.alignment.rivals.v2x_reg import V2xRegConfig
 from manyeyes.datatypes import ConfigError
 
 CORRECTORS: dict[str, Corrector] = {
-    "vote": correct,
+    "vote": partial(correct, config=DETECTED),
     "given": given.correct,
     "coalign": coalign.correct,
     "fpv-rcnn": fpv_rcnn.correct,
