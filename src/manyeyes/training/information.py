@@ -3,10 +3,14 @@
 
 The letter of Eq. 10 compares an aggregate with itself and teaches nothing (detection.md 5.2 has the audit and the toy). Here the
 masked words of a window are compared with what its own task says matters there, by an un-normalised product: a mask that
-withholds what matters lowers the agreement, and no scale of the mask cancels.
+withholds what matters lowers the agreement, and no scale of the mask cancels. For study there are two more targets: what the
+receiver sees itself (the paper, repaired: it drops what only the sender sees), and the letter.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -19,6 +23,7 @@ from manyeyes.ops.window_attention import window_ids
 
 WINDOW_CELLS = 8
 TEMPERATURE = 0.1
+Target = Literal["own_task", "receiver", "literal"]
 
 
 def information_terms(told: SparseBev, mask: Tensor, matters: Tensor) -> tuple[Tensor, Tensor]:
@@ -44,8 +49,60 @@ def window_information(features: Tensor, mask: Tensor, matters: Tensor, row: Ten
     x = segment_sum(mask[:, None] * features, row, windows) / count.sqrt()
     y = segment_sum(matters[:, None] * features, row, windows).detach() / count.sqrt()
     some = (segment_sum(matters[:, None], row, windows)[:, 0] > 0.5).nonzero()[:, 0]
-    if len(some) < 2:
-        return mask.sum() * 0
+    return _info_nce(x, y, some) if len(some) >= 2 else mask.sum() * 0
+
+
+@dataclass(frozen=True, eq=False)
+class Meeting:
+    """Senders' and receivers' tokens in the receivers' windows, for the study targets.
+
+    sent (N, C) and had (M, C): unit features, the receivers' own turned axes; sent_mask (N,); sent_row (N,) and had_row (M,):
+    windows, numbered from 0.
+    """
+
+    sent: Tensor
+    sent_mask: Tensor
+    sent_row: Tensor
+    had: Tensor
+    had_row: Tensor
+
+
+def receiver_information(met: Meeting) -> Tensor:
+    """Symmetric InfoNCE, scalar, between what is sent of a window and what the receiver itself has there.
+
+    Windows that only one of them has cannot be compared and take no part: what only the sender sees is worth nothing here.
+    """
+    windows = _windows(met)
+    sent, had = (torch.bincount(row, minlength=windows) for row in (met.sent_row, met.had_row))
+    both = ((sent > 0) & (had > 0)).nonzero()[:, 0]
+    if len(both) < 2:
+        return met.sent_mask.sum() * 0
+    x = segment_sum(met.sent_mask[:, None] * met.sent, met.sent_row, windows)[both] / sent[both, None].sqrt()
+    y = segment_sum(met.had, met.had_row, windows)[both].detach() / had[both, None].sqrt()
+    return _info_nce(x, y, torch.arange(len(both)))
+
+
+def literal_information(met: Meeting) -> Tensor:
+    """Minus Eq. 11 of the joint aggregate of Eq. 10, scalar: each window's unit vector against itself and all others."""
+    windows = _windows(met)
+    if not windows:
+        return met.sent_mask.sum() * 0
+    joint = segment_sum(met.sent_mask[:, None] * met.sent, met.sent_row, windows)
+    z = functional.normalize(joint + segment_sum(met.had, met.had_row, windows).detach(), dim=1)
+    z = z[torch.unique(torch.cat((met.sent_row, met.had_row)))]
+    return functional.cross_entropy(z @ z.mT / TEMPERATURE, torch.arange(len(z)))
+
+
+STUDIED = {"receiver": receiver_information, "literal": literal_information}
+
+
+def _windows(met: Meeting) -> int:
+    rows = torch.cat((met.sent_row, met.had_row))
+    return int(rows.max()) + 1 if len(rows) else 0
+
+
+def _info_nce(x: Tensor, y: Tensor, some: Tensor) -> Tensor:
+    """Windows (W, C) of one side against those of the other; only some are asked for, all are negatives."""
     agree = x @ y.mT / TEMPERATURE
     right = functional.cross_entropy(agree[some], some)
     return (right + functional.cross_entropy(agree.mT[some], some)) / 2

@@ -12,6 +12,7 @@ from torch.nn import functional
 from manyeyes.models.box_head import SPEED_UNIT, TYPICAL_SIZE, RawBoxes, axis_yaw, facing
 from manyeyes.models.pruning import Pruned
 from manyeyes.ops.box_iou import aligned_iou
+from manyeyes.training.information import Target
 from manyeyes.training.targets import Targets
 
 
@@ -20,7 +21,8 @@ class LossConfig:
     """Weights of the terms. iou: of 1 - IoU itself, for boxes that nearly fit already; off at the start, where none do.
 
     kept, information: of the selector's L1 and InfoNCE (CoSTr Eq. 12). together: the share of what egos make of all that they
-    hear, the rest is what agents make of their own view.
+    hear, the rest is what agents make of their own view. target: what the information is measured against; own_task, but for
+    studies.
     """
 
     heat: float = 1.0
@@ -35,6 +37,7 @@ class LossConfig:
     kept: float = 0.02
     information: float = 0.01
     together: float = 0.5
+    target: Target = "own_task"
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, kept: Tensor, inf
     rows = (targets.box >= 0).nonzero()[:, 0]
     if not len(rows):
         zero = raw.heat.sum() * 0
-        return LossTerms(heat, *(zero,) * 7, prune, kept, information)
+        return LossTerms(heat, zero, zero, zero, zero, zero, zero, zero, prune, kept, information)
     some, truth, weight = (
         raw.rows(targets.box >= 0),
         targets.boxes[targets.box[rows]].to(torch.float32),

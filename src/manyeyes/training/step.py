@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from manyeyes.datatypes import Boxes, SparseBev
 from manyeyes.models.box_head import RawBoxes
 from manyeyes.models.detector import Detector, Seen
 from manyeyes.models.fusion.gather import Part, Tokens, gather
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.training.information import information_terms
+from manyeyes.ops.window_attention import window_ids
+from manyeyes.training.information import STUDIED, WINDOW_CELLS, Meeting, Target, information_terms
 from manyeyes.training.losses import LossTerms, head_terms, prune_focal
 from manyeyes.training.samples import Sample, View
 from manyeyes.training.targets import TargetConfig, assign, near_objects
@@ -42,9 +44,10 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
     The tokens take the very path that they take as bytes: seen in the sender's frame, moved metrically, fused, decoded.
     """
     views = [view for sample in samples for view in sample.views]
-    seen = model.see([v.now for v in views], [v.earlier for v in views], prune_threshold)
-    alone = model.look(seen.tokens)
-    told = model.tell(seen.tokens, alone)
+    with torch.set_grad_enabled(torch.is_grad_enabled() and any(p.requires_grad for p in model.encoder.parameters())):
+        seen = model.see([v.now for v in views], [v.earlier for v in views], prune_threshold)
+        alone = model.look(seen.tokens)
+        told = model.tell(seen.tokens, alone)
     score = model.choose(told)
     mask = torch.sigmoid(score)
     parts, number = [], 0
@@ -106,10 +109,11 @@ def loss_terms(
     targets: TargetConfig,
     prune_threshold: float | None = None,
     together: float = 0.5,
+    target: Target = "own_task",
 ) -> LossTerms:
     """Losses of one batch: egos against the union of what their agents list, each agent against its own list.
 
-    together: the share of the former.
+    together: the share of the former. target: what the selector's information is measured against.
     """
     out = forward(model, samples, prune_threshold)
     listed: list[Boxes] = [view.seen for sample in samples for view in sample.views]
@@ -117,6 +121,26 @@ def loss_terms(
     prune = torch.stack([prune_focal(p, near_objects(p.sites, listed, targets)) for p in out.seen.pruned]).mean()
     own = assign(out.alone.sites, listed, targets)
     kept, information = information_terms(out.told, out.mask, own.heat)
+    if target != "own_task":
+        information = STUDIED[target](meeting(out, samples))
     alone = head_terms(out.alone, own, prune, kept, information)
     fused = head_terms(out.together, assign(out.together.sites, union, targets), prune, kept, information)
     return alone.mixed(fused, together)
+
+
+def meeting(out: Outcome, samples: list[Sample]) -> Meeting:
+    """What collaborators tell and what their egos see themselves, in windows of the egos' frames; no gradient but the mask's."""
+    told, batch, xy = out.told, out.told.sites.batch, out.told.sites.xy
+    views = [(ego, i, view) for ego, sample in enumerate(samples) for i, view in enumerate(sample.views)]
+    sides: tuple[list[Part], list[Part]] = ([], [])
+    for number, (ego, i, view) in enumerate(views):
+        rows = batch == number
+        part = _part(ego, view, told.features[rows].detach(), xy[rows])
+        sides[i > 0].append(replace(part, kept=out.mask[rows]))
+    none = Part(0, told.features[:0].detach(), xy[:0], kept=out.mask[:0])
+    had, sent = (gather([none, *parts], told.grid, len(samples)) for parts in sides)
+    origin, edge = (told.grid.x_min, told.grid.y_min), WINDOW_CELLS * told.grid.cell
+    ids = torch.cat([window_ids(t.xy, t.ego, origin, edge) for t in (sent, had)])
+    row = ids.unique(return_inverse=True)[1]
+    unit = [functional.normalize(t.features, dim=1) for t in (sent, had)]
+    return Meeting(unit[0], sent.kept, row[: len(sent.xy)], unit[1], row[len(sent.xy) :])

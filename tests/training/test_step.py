@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What arrives of a message in training, and which gradients flow through it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from manyeyes.datatypes import BevGrid
+from manyeyes.models.detector import Detector
+from manyeyes.models.presets import COSTR_TINY
+from manyeyes.training.losses import LossConfig
+from manyeyes.training.samples import AugmentConfig, RoadConfig, Sample, View, make_sample
+from manyeyes.training.step import PACKET_TOKENS, _arriving, _remembered, forward, loss_terms, meeting
+from manyeyes.training.targets import TargetConfig
+
+GRID: BevGrid = COSTR_TINY.grid
+
+
+@pytest.fixture(scope="module")
+def detector() -> Detector:
+    torch.manual_seed(0)
+    return Detector(COSTR_TINY)
+
+
+@pytest.fixture
+def sample(toy) -> Sample:
+    recording = toy(agents_n=2, points_per_car=20, ground_points=60)
+    moments = [recording.snapshot("toy_0", i) for i in range(4)]
+    return make_sample(moments, 0, GRID, AugmentConfig.none(), ("step",), RoadConfig(past=2))
+
+
+def limited(sample: Sample, keep: int | None = None, lost: float = 0.0) -> Sample:
+    """The sample whose collaborator has that budget and those losses."""
+    return replace(sample, views=(sample.views[0], replace(sample.views[1], keep=keep, lost=lost)))
+
+
+def arriving(view: View, score: Tensor, number: int = 0) -> list[int]:
+    """Rows that arrive of a view whose tokens are the rows from 100 on."""
+    rows = torch.arange(100, 100 + len(score))
+    return _arriving(rows, torch.cat((torch.full((100,), 99.0), score)), view, ("test", number)).tolist()
+
+
+def test_a_budget_lets_the_best_through_and_near_ties_by_chance(sample):
+    view = replace(sample.views[1], keep=10)
+    score = torch.linspace(-10, 10, 40)[torch.randperm(40, generator=torch.Generator().manual_seed(0))]
+    best = set((100 + score.sort(descending=True).indices[:10]).tolist())
+    drawn = [arriving(view, score, number) for number in range(50)]
+    assert all(len(rows) == 10 and rows == sorted(rows) for rows in drawn)
+    # Scores that lie half a unit apart are rarely exchanged.
+    assert sum(len(best & set(rows)) for rows in drawn) / 50 > 8 and len({tuple(rows) for rows in drawn}) > 5
+    ties = [arriving(view, torch.zeros(40), number) for number in range(200)]
+    counts = torch.bincount(torch.tensor(ties).flatten() - 100, minlength=40)
+    assert int(counts.min()) > 20 and int(counts.max()) < 90
+
+
+def test_a_budget_larger_than_the_message_and_none_at_all_take_everything(sample):
+    view, score = sample.views[1], torch.randn(30)
+    for keep in (None, 30, 1000):
+        assert arriving(replace(view, keep=keep), score) == [*range(100, 130)]
+    assert arriving(replace(view, keep=5, lost=0.5), score[:0]) == []
+
+
+def test_what_is_lost_is_lost_by_packets(sample):
+    view, score = replace(sample.views[1], lost=0.4), torch.arange(400.0)
+    left = 0
+    for number in range(20):
+        rows = torch.tensor(arriving(view, score, number)) - 100
+        packets, counts = torch.unique(rows.div(PACKET_TOKENS, rounding_mode="floor"), return_counts=True)
+        assert bool((counts == PACKET_TOKENS).all())
+        left += len(packets)
+    assert left / (20 * 50) == pytest.approx(0.6, abs=0.05)
+
+
+def test_with_a_budget_packets_are_filled_from_the_most_important_on(sample):
+    # Scores so far apart that chance moves nothing: the order is falling, so is that of the packets.
+    score = -100.0 * torch.arange(64)
+    rows = arriving(replace(sample.views[1], keep=20, lost=0.5), score, 3)
+    packets = {(row - 100) // PACKET_TOKENS for row in rows}
+    assert 0 < len(rows) < 20 and all(row < 120 for row in rows)
+    assert {row - 100 for row in rows} == {t for p in packets for t in range(8 * p, min(8 * p + 8, 20))}
+
+
+def test_the_same_key_loses_the_same(sample):
+    view, score = (
+        replace(sample.views[1], keep=20, lost=0.5),
+        torch.randn(100, generator=torch.Generator().manual_seed(1)),
+    )
+    assert arriving(view, score, 1) == arriving(view, score, 1) != arriving(view, score, 2)
+
+
+def test_selection_passes_its_gradient_straight_through_and_changes_no_value(detector, sample):
+    """M6: under a budget the selector's weights learn from the boxes of the hearer; values are those of plain tokens."""
+    model = detector.eval()
+    n = int((forward(model, [sample]).told.sites.batch == 1).sum())
+    assert n > 40
+    few, all_of_it, free = (forward(model, [limited(sample, keep)]) for keep in (n // 2, n, None))
+    assert torch.equal(all_of_it.together.columns(), free.together.columns())
+    assert len(few.together.sites) < len(free.together.sites)
+    for outcome, flows in ((few, True), (free, False)):
+        model.zero_grad()
+        outcome.together.columns().sum().backward()
+        grads = [p.grad for p in model.selector.parameters() if p.grad is not None]
+        assert any(bool(g.any()) for g in grads) == flows
+    model.zero_grad()
+    detector.train()
+
+
+def test_the_past_is_looked_at_and_no_gradient_reaches_it(detector, sample):
+    model = detector.eval()
+    remembered = _remembered(model, [sample], 0.0)
+    assert remembered is not None and len(remembered.features) > 40
+    assert not remembered.features.requires_grad and not remembered.proposal.requires_grad
+    assert remembered.age.unique().tolist() == pytest.approx([1.0, 2.0]) and not remembered.doubt.any()
+    with torch.no_grad():
+        for weight in (model.fusion.past.out.weight, model.refine.out.weight):
+            torch.nn.init.normal_(weight)
+        with_past, without = (forward(model, [s]) for s in (sample, replace(sample, past=())))
+        for weight in (model.fusion.past.out.weight, model.refine.out.weight):
+            torch.nn.init.zeros_(weight)
+    assert torch.equal(with_past.alone.columns(), without.alone.columns())
+    assert not torch.allclose(with_past.together.columns(), without.together.columns(), atol=1e-3)
+    detector.train()
+
+
+def test_every_part_of_the_model_learns_from_a_step_on_the_road(detector, sample):
+    detector.train().zero_grad()
+    past = detector.fusion.past
+    torch.nn.init.normal_(past.out.weight, std=0.1)
+    torch.nn.init.normal_(past.ffn[2].weight, std=0.1)
+    torch.nn.init.normal_(detector.fusion.placement.outer.weight, std=0.1)
+    torch.nn.init.normal_(detector.refine.out.weight, std=0.1)
+    torch.nn.init.normal_(detector.selector.outer.weight, std=0.1)
+    late = replace(limited(sample, 60, 0.2), key=("late",))
+    terms = loss_terms(detector, [late], TargetConfig(), 0.0)
+    total = terms.total(LossConfig(iou=0.5))
+    total.backward()
+    assert bool(torch.isfinite(total))
+    silent = [name for name, p in detector.named_parameters() if p.grad is None or not bool(p.grad.any())]
+    # A bias that a norm takes away, or that all keys of a softmax share, has no effect; in a fresh model no token repeats another.
+    assert all("norm" in name or name.endswith(("key.bias", "selector.repeat")) for name in silent), silent
+    assert all(bool(torch.isfinite(p.grad).all()) for p in detector.parameters() if p.grad is not None)
+
+
+def test_study_targets_meet_in_the_egos_windows_and_teach_the_selector_alone(detector, sample):
+    model = detector.eval()
+    model.zero_grad()
+    torch.nn.init.normal_(model.selector.outer.weight, std=0.1)
+    out = forward(model, [sample], 0.0)
+    met, batch = meeting(out, [sample]), out.told.sites.batch
+    xy = out.told.sites.xy[batch == 1]
+    moved = sample.views[1].ego_from_view.apply(functional.pad(xy, (0, 1)).double())[:, :2]
+    near = GRID.inside(moved)
+    assert len(met.had) == int((batch == 0).sum()) and 0 < int((~near).sum()) < 9
+    assert torch.allclose(met.sent_mask, out.mask[batch == 1][near])
+    assert torch.allclose(met.sent.norm(dim=1), torch.ones(len(met.sent)), atol=1e-5)
+    # Windows of 12.8 m of the ego's frame.
+    columns = ((moved[near] - GRID.x_min) / 12.8).floor()
+    same = (columns[:, None] == columns[None]).all(2)
+    assert torch.equal(same, met.sent_row[:, None] == met.sent_row[None])
+    terms = {t: loss_terms(model, [sample], TargetConfig(), 0.0, target=t) for t in ("own_task", "receiver", "literal")}
+    values = [float(t.information.detach()) for t in terms.values()]
+    assert len({round(v, 4) for v in values}) == 3
+    for name in ("receiver", "literal"):
+        model.zero_grad()
+        terms[name].information.backward()
+        taught = {n.split(".")[0] for n, p in model.named_parameters() if p.grad is not None and bool(p.grad.any())}
+        assert taught == {"selector"}
+    model.zero_grad()
+    detector.train()
