@@ -93,7 +93,7 @@ def _precisions(options: Options) -> tuple[str, ...]:
     for name in options.precisions:
         if name not in PRECISIONS:
             raise ConfigError(f"Tokens are not written as {name!r}; known: {', '.join(PRECISIONS)}.")
-    has_codes = getattr(loaded(options.playing.weights), "codebook", None) is not None
+    has_codes = loaded(options.playing.weights).codebook is not None
     return options.precisions or tuple(name for name in PRECISIONS if name != CODES or has_codes)
 
 

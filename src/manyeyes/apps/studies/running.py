@@ -110,7 +110,9 @@ def publish(
     text = "\n".join([f"# {name}\n\n{title}\n", *map(markdown, sheets), *(f"{note}\n" for note in notes), picture])
     write_text(options.out / f"{name}.md", text)
     begun.console.print(
-        f"Numbers, table and picture are in {options.out / name}.json, .md and .png", highlight=False, soft_wrap=True
+        f"Intervals, numbers and picture are in {options.out / name}.md, .json and .png",
+        highlight=False,
+        soft_wrap=True,
     )
 
 

@@ -12,6 +12,8 @@ from rich.table import Table
 from manyeyes.apps.viewer.table import NOT_RUN, markdown_lines
 from manyeyes.evaluation.bootstrap import Interval
 
+_NARROW = 6
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -23,7 +25,7 @@ class Sheet:
 
 
 def terminal(sheet: Sheet) -> Table:
-    """The sheet for a terminal."""
+    """The sheet for a terminal; a wide one leaves the intervals to the document."""
     table = Table(
         title=sheet.title,
         title_justify="left",
@@ -33,9 +35,10 @@ def terminal(sheet: Sheet) -> Table:
         padding=(0, 1, 0, 0),
     )
     for column, heading in enumerate(sheet.headings):
-        table.add_column(heading, justify="left" if column < 2 else "right")
+        table.add_column(heading, justify="left" if column < 2 else "right", no_wrap=column < 2)
+    wide = len(sheet.headings) > _NARROW
     for line in sheet.lines:
-        table.add_row(*line)
+        table.add_row(*(cell.partition(" [")[0] if wide else cell for cell in line))
     return table
 
 
