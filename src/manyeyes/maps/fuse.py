@@ -96,7 +96,8 @@ def _lines(table: StationTable, chosen: NDArray[np.bool_], config: FuseConfig) -
     xy, kind = table.xy[rows], table.line.kind[rows]
     weight = 1.0 / table.line.sigma[rows] ** 2
     dashed = table.line.style[rows].argmax(1) == DASHED
-    first, members = link(xy, table.tangent[rows], kind, table.line.log_odds[rows], dashed, config.link)
+    strength, coverage = table.line.log_odds[rows], table.line.coverage[rows]
+    first, members = link(xy, table.tangent[rows], kind, strength, dashed, coverage, config.link)
     points = smooth(xy, first, members, weight, config.link.smooth)
     first, order = _canonical(first, points)
     points, members = points[order], members[order]

@@ -25,38 +25,58 @@ Flags = NDArray[np.bool_]
 @dataclass(frozen=True)
 class LinkConfig:
     """gap_m: largest gap between linked stations; join_m: between ends of lines in the second round; dashed_m: between
-    ends of dashed lines.
+    ends of dashed lines; far_m: between ends that were in view at most ``few`` times (summed visibility), where that
+    nobody saw more is likely chance.
 
-    lateral_m, lateral_slope: largest lateral gap at no gap, and how it grows. heading_rad, heading_slope: largest turn
-    and its growth a metre of gap. lateral_cost: metres of gap that a metre of lateral gap costs. smooth: Gaussian
-    scale, in stations, of the local parabola that smooths.
+    lateral_m, lateral_slope: largest lateral gap between linked stations at no gap, and how it grows;
+    end_lateral_m, end_lateral_slope: between ends, which few saw, so that they scatter more. heading_rad,
+    heading_slope: largest turn and its growth a metre of gap; far_heading_rad: over the gaps of far_m. lateral_cost:
+    metres of gap that a metre of lateral gap costs. smooth: Gaussian scale, in stations, of the local parabola that
+    smooths.
     """
 
     gap_m: float = 6.0
     join_m: float = 8.0
     dashed_m: float = 12.0
+    far_m: float = 24.0
+    few: float = 12.0
     lateral_m: float = 0.25
     lateral_slope: float = 0.08
+    end_lateral_m: float = 0.5
+    end_lateral_slope: float = 0.04
     heading_rad: float = 0.26
     heading_slope: float = 0.06
+    far_heading_rad: float = 0.6
     lateral_cost: float = 4.0
     smooth: float = 2.0
 
 
 def link(
-    xy: Floats, tangent: Floats, kind: Ints, strength: Floats, dashed: Flags, config: LinkConfig = LinkConfig()
+    xy: Floats,
+    tangent: Floats,
+    kind: Ints,
+    strength: Floats,
+    dashed: Flags,
+    coverage: Floats,
+    config: LinkConfig = LinkConfig(),
 ) -> tuple[Ints, Ints]:
     """Stations (K,) as chains: offsets (L + 1,) and station rows in order along each chain; every station is in one
     chain.
 
-    A closed loop is opened at its weakest station.
+    ``coverage`` (K,) is how often each was in view. A closed loop is opened at its weakest station.
     """
     pair = _links(xy, tangent, kind, config.gap_m, config)
     first, members = _follow(pair, strength)
-    for reach, may in ((config.join_m, np.ones(len(xy), bool)), (config.dashed_m, dashed)):
+    near, far = (config.heading_rad, config.heading_slope), (config.far_heading_rad, 0.0)
+    rounds = (
+        (config.join_m, near, np.ones(len(xy), bool)),
+        (config.dashed_m, near, dashed),
+        (config.far_m, far, coverage <= config.few),
+    )
+    for reach, turn, may in rounds:
         ends = np.unique(np.concatenate((members[first[:-1]], members[first[1:] - 1])))
         ends = ends[may[ends]]
-        pair = _join(pair, ends, xy, tangent, kind, reach, config, (first, members))
+        pair = _join(pair, ends, xy, tangent, kind, reach, turn, config, (first, members))
         first, members = _follow(pair, strength)
     return first, members
 
@@ -72,7 +92,7 @@ def _links(xy: Floats, tangent: Floats, kind: Ints, reach: float, config: LinkCo
         np.ones((len(xy), 2), np.bool_),
         (grid.keys, grid.start, order, xy, tangent),
         reach,
-        _numbers(config),
+        (config.lateral_m, config.lateral_slope, config.heading_rad, config.heading_slope, config.lateral_cost),
     )
     return _mutual(best)
 
@@ -84,6 +104,7 @@ def _join(
     tangent: Floats,
     kind: Ints,
     reach: float,
+    turn: tuple[float, float],
     config: LinkConfig,
     chains: tuple[Ints, Ints],
 ) -> Ints:
@@ -100,7 +121,7 @@ def _join(
         free,
         (grid.keys, grid.start, grid.order, xy[ends], direction[ends]),
         reach,
-        _numbers(config),
+        (config.end_lateral_m, config.end_lateral_slope, *turn, config.lateral_cost),
     )
     # A tangent that was turned round for the fit turns front and back round with it.
     more = _mutual(best)
@@ -109,10 +130,6 @@ def _join(
         rows = np.flatnonzero((more[:, side] >= 0) & free[:, side])
         added[ends[rows], side] = ends[more[rows, side]]
     return added
-
-
-def _numbers(config: LinkConfig) -> tuple[float, ...]:
-    return (config.lateral_m, config.lateral_slope, config.heading_rad, config.heading_slope, config.lateral_cost)
 
 
 @njit(cache=True, nogil=True)
