@@ -6,7 +6,8 @@ Tables: ``success``: share of frames whose best guess is within 1 m and 1 degree
 claimed (sparse traffic). ``answers``: when to answer, on DAIR-V2X's counts of common objects in dense traffic, with
 one frame and with five, and on agents that share nothing. ``rivals``: success at 1 m and 1 degree, all frames,
 against the noise of the claim. ``displacement``: of common objects after fusion with a good claim, over that of the
-claim alone. ``speed``: processor time of one call.
+claim alone. ``watchman``: share of frames that contradict the claim, where it is off by five of its stated sigma and where
+it is honest. ``speed``: processor time of one call.
 
 python benchmarks/pose.py [--tables success answers ...] [--scenes 300] [--nulls 1000] [--out benchmarks/results/pose.json]
 """
@@ -139,12 +140,22 @@ def rivals(scenes: int, nulls: int) -> Iterator[Row]:
             yield run("rivals", method, corrector, LandmarkSpec(6, 8, 10), noise, scenes // 2, 5)
 
 
+def watchman(scenes: int, nulls: int) -> Iterator[Row]:
+    """Claims that are five sigma off, and honest ones, sparse and dense."""
+    for common in (5, 8):
+        for ego_extra, other_extra in ((8, 10), (18, 24)):
+            for kind in ("offset", "gaussian"):
+                for sigma in (0.2, 0.5, 1.0):
+                    spec, noise = LandmarkSpec(common, ego_extra, other_extra), ClaimNoise(kind, sigma, sigma)
+                    yield run("watchman", "vote", correct, spec, noise, scenes, 7)
+
+
 def speed(scenes: int, nulls: int) -> Iterator[Row]:
     """40 by 40 objects."""
     yield run("speed", "vote", correct, LandmarkSpec(8, 32, 32), ClaimNoise("none"), 40, 6)
 
 
-TABLES = {f.__name__: f for f in (success, answers, displacement, rivals, speed)}
+TABLES = {f.__name__: f for f in (success, answers, displacement, rivals, watchman, speed)}
 
 
 def line(row: Row) -> str:
@@ -155,7 +166,7 @@ def line(row: Row) -> str:
         f"{' noisy' if row.noisy else ''}{' strangers' if row.disjoint else ''} {row.claim} {row.sigma:g}: "
         f"success {s.success[0]:.3f}/{s.success[1]:.3f}/{s.success[2]:.3f} coverage {s.coverage:.3f} precision {s.precision:.3f} "
         f"null {s.null_accepts:.4f} OD {s.displacement:.3f} NEES {s.nees:.2f} inside {s.inside:.3f} "
-        f"{row.mean_ms:.1f} ms (p95 {row.p95_ms:.1f})"
+        f"conflicts {s.conflicts:.3f} {row.mean_ms:.1f} ms (p95 {row.p95_ms:.1f})"
     )
 
 

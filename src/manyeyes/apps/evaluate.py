@@ -2,7 +2,8 @@
 """Judges methods on a split: AP with 95 % intervals over scenarios, bytes, age, time, and paired differences with verdicts.
 
 --study NAME runs a study instead: robustness (delay, errors of pose, lost packets), budget (AP against bytes), agents (one to
-five), ablation (branches of a training), system (every agent as ego, one budget for the channel), picture (one frame).
+five), ablation (branches of a training), system (every agent as ego, one budget for the channel), pose and pose-accuracy
+(correctors of claimed poses: AP, and the poses themselves), picture (one frame).
 """
 
 from __future__ import annotations
@@ -52,13 +53,15 @@ class Options:
     every: int = 1
     """Judge each so many-th frame of those that the recording judges."""
     study: str | None = None
-    """robustness, budget, agents, ablation, system or picture; what is finished is kept under --out and not made again."""
+    """robustness, budget, agents, ablation, system, pose, pose-accuracy or picture; what is finished is kept under --out."""
     budgets: tuple[int, ...] = ()
     """Bytes: of a message in the study 'budget', of all messages of an instant in 'system'; by default the study's own."""
     selectors: tuple[str, ...] = ()
     """Methods that choose tokens, in the studies 'budget' and 'system'; by default intermediate, confidence, random."""
     precisions: tuple[str, ...] = ()
     """Ways to write tokens, in the study 'budget'; by default all."""
+    correctors: tuple[str, ...] = ()
+    """Who corrects claimed poses, in the studies 'pose' and 'pose-accuracy'; by default the study's own."""
     branches: tuple[str, ...] = ()
     """Weights that the study 'ablation' compares, each as name=weights.safetensors."""
 

@@ -36,8 +36,12 @@ class Playing:
     precision: Literal["float32", "float16", "int8"] = "float16"
     """How features of tokens are written."""
 
+    align: bool = False
+    """Correct where others say they are before fusing, by the objects that both see; leave out whom nobody can place."""
+
     def replay_config(self, seed: int, all_egos: bool = False) -> ReplayConfig:
         """The same as the player takes it; unknown names are refused here, before any work."""
+        from manyeyes.agents.aligner import Aligner
         from manyeyes.agents.collaboration import method
         from manyeyes.agents.replay import ReplayConfig
         from manyeyes.comms.channel import channel_preset
@@ -56,6 +60,7 @@ class Playing:
             all_egos=all_egos,
             history=HISTORY,
             seed=seed,
+            aligner=Aligner() if self.align else None,
         )
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +20,7 @@ from manyeyes.apps.viewer.animation import save_animation, stack
 from manyeyes.apps.viewer.birds_eye import draw, save_png, scene_of
 from manyeyes.apps.viewer.report import Chapter, Picture, Report, save_report
 from manyeyes.apps.viewer.table import markdown
+from manyeyes.apps.whereabouts import HEADINGS, Whereabouts
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.evaluation.detection import Protocol, protocol_named
 from manyeyes.evaluation.tally import Tally
@@ -82,10 +83,12 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
     tallies = {name: Tally(name, protocol) for name in showing.methods}
     film = _Film(_filmed(showing.methods) if showing.animate else ())
     kept: list[Step] = []
+    places = {name: Whereabouts() for name in showing.methods}
     with bars(console) as progress:
         task = progress.add_task("Playing", total=len(judged) * len(showing.methods))
         for step in replay(drive, drive.scenario, detector, showing.methods, showing.replay):
             tallies[step.method].add(step)
+            places[step.method].add(step.snapshot.index, step.perception.verdicts)
             if step.snapshot.index == instant:
                 kept.append(step)
             if step.method in film.methods:
@@ -93,6 +96,10 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
             progress.advance(task)
     outcome = outcome_of([tally.result() for tally in tallies.values()], protocol)
     show(console, outcome, showing.title)
+    where = _where(places)
+    for chapter, found in zip(where, (p for p in places.values() if p.senders)):
+        for warning in found.warnings():
+            console.print(f"{chapter.title}: {warning}", highlight=False, soft_wrap=True)
     pictures = _film_picture(film, showing.out) + _still_pictures(kept, outcome, grid, showing)
     config = {"showing": showing, "detector": detector.config}
     origin = provenance.write_json(showing.out / "results.json", outcome, config, showing.replay.seed)
@@ -105,11 +112,24 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
         facts=_facts(drive, detector, showing),
         commands=showing.commands,
         notes=_notes(protocol),
-        chapters=showing.chapters,
+        chapters=(*showing.chapters, *where),
         provenance=origin,
     )
     save_report(report, showing.out / "report.html")
     return outcome, showing.out / "report.html"
+
+
+def _where(places: Mapping[str, Whereabouts]) -> tuple[Chapter, ...]:
+    """What was found of senders' claimed poses, for each method that aligns."""
+    text = (
+        "Before it fuses, the ego compares where others say they are with what both detect. Claims that objects refute are "
+        "replaced; messages that nobody can place are left out; a claim that moves off is named."
+    )
+    return tuple(
+        Chapter(f"Who is where, {name}", text, table=(HEADINGS, *found.lines()))
+        for name, found in places.items()
+        if found.senders
+    )
 
 
 def judging(detector: Detector) -> Protocol:

@@ -19,6 +19,8 @@ STUDIES = {
     "agents": "one agent to five",
     "ablation": "branches of a training, side by side (CoSTr, Table III)",
     "system": "every agent judged as ego, one budget for the channel (CoSTr, Eq. 2)",
+    "pose": "errors of pose, with and without a corrector before each fusion (FeaKM, Tables 1 and 2)",
+    "pose-accuracy": "how good corrected poses are, by corrector, error and objects in common",
     "picture": "one frame under errors, methods side by side (CoSTr, Fig. 4)",
 }
 
@@ -32,4 +34,5 @@ def check_study(name: str) -> None:
 def study(options: Options, console: Console) -> None:
     """Run the named study; cells that are kept are not made again."""
     check_study(options.study or "")
-    importlib.import_module(f"manyeyes.apps.studies.{options.study}").run(options, console)
+    name = str(options.study).replace("-", "_")
+    importlib.import_module(f"manyeyes.apps.studies.{name}").run(options, console)

@@ -70,11 +70,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Chapter:
-    """A part of a report of its own: heading, text, pictures."""
+    """A part of a report of its own: heading, text, a table (its first line the headings), pictures."""
 
     title: str
     text: str
     pictures: tuple[Picture, ...] = ()
+    table: tuple[tuple[str, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,8 @@ def render(report: Report) -> str:
         parts += ["<h2>One instant, from above</h2>", f'<div class="pair">{"".join(_figure(p) for p in pairs)}</div>']
     for chapter in report.chapters:
         parts += [f"<h2>{_text(chapter.title)}</h2>", f"<p>{_text(chapter.text)}</p>", *map(_figure, chapter.pictures)]
+        if chapter.table:
+            parts.append(_table(chapter.table[0], chapter.table[1:]))
     if report.commands:
         parts += ["<h2>Again, on your machine</h2>", f"<pre>{_text(chr(10).join(report.commands))}</pre>"]
     if report.provenance:
