@@ -14,7 +14,8 @@ from manyeyes.agents.coding import coded, readable
 from manyeyes.agents.replay import ReplayConfig, replay
 from manyeyes.comms.bus import LocalBus
 from manyeyes.comms.inbox import Inbox
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Sites, Snapshot, Transform, Truth
+from manyeyes.datatypes.message import RequestMap
 from manyeyes.models.checkpoint import fingerprint
 from manyeyes.models.codebook import CodebookConfig
 from manyeyes.models.detector import Detector
@@ -126,3 +127,37 @@ def test_codes_need_a_codebook_on_both_sides(detector):
     inbox = Inbox(tables=Agent(detector)._tables)
     inbox.push(packets[0])
     assert readable(inbox.receptions()[0], plain).message.tokens is None
+
+
+def test_requests_are_counted_and_change_what_is_sent(detector):
+    """Where all windows are seen well, all tokens are worth the same less, and the order stays; a window seen well loses cells."""
+    frames = Plane().snapshot("plane", 0).frames
+    asking = Agent(detector, budget_bytes=4096, requests=True)
+    packets = asking.share(frames[0])
+    assert sum(map(len, packets)) <= 4096
+    (heard,) = Agent(detector).perceive(frames[1], packets).heard
+    request = heard.message.request
+    assert request is not None and request.grid == detector.config.grid.at(32)
+
+    def sent(sure: torch.Tensor | None) -> Sites:
+        said = replace(heard.message, request=None if sure is None else RequestMap(request.grid, sure))
+        told = Agent(detector).share(frames[1], 1398, [said])
+        return Agent(detector).perceive(frames[0], told).heard[0].message.tokens.sites
+
+    assert torch.equal(sent(None).key, sent(torch.ones(request.grid.shape)).key)
+    nowhere = sent(torch.zeros(request.grid.shape))
+    # The windows, in the asking agent's frame, of what was sent.
+    there = (frames[0].world_from_agent.inverse() @ frames[1].world_from_agent).apply(
+        torch.cat((nowhere.xy, torch.zeros(len(nowhere), 1)), 1).double()
+    )
+    yx = request.grid.cells(there[:, :2])
+    sure = torch.zeros(request.grid.shape)
+    sure[yx[0, 0], yx[0, 1]] = 1.0
+    assert int(nowhere.key[0]) not in sent(sure).key.tolist()
+
+
+def test_requests_of_a_replay_are_heard_by_those_who_share(detector):
+    config = ReplayConfig(precision="codes", budget_bytes=1398, requests=True)
+    steps = list(replay(Plane(), "plane", detector, ["intermediate"], config))
+    assert all(r.message.request is not None for step in steps for r in step.perception.heard)
+    assert all(s.bytes <= 1398 for step in steps for s in step.sent)

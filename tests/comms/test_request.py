@@ -8,7 +8,7 @@ import torch
 
 from manyeyes.comms import wire
 from manyeyes.comms.request import need, request_map
-from manyeyes.datatypes import BevGrid, ConfigError, Message, SparseBev, Transform
+from manyeyes.datatypes import BevGrid, ConfigError, Message, Transform
 from manyeyes.datatypes.message import RequestMap
 
 torch.set_num_threads(1)
@@ -16,23 +16,18 @@ GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 1.0, 0.4, 4)
 WINDOW = GRID.at(32)
 
 
-def tokens_at(xy: list[tuple[float, float]]) -> SparseBev:
-    cells = GRID.cells(torch.tensor(xy))
-    return SparseBev.from_cells(torch.zeros(len(xy), 1), cells, GRID)
-
-
 def asking(sure: torch.Tensor, pose: Transform, agent: int = 9) -> Message:
     return Message(agent, 0, pose, torch.zeros(3, 3), request=RequestMap(WINDOW, sure))
 
 
-def test_a_window_is_as_sure_as_its_least_sure_token():
-    """Cells are sorted by row, hence by y: the two tokens near (6, 6) come last."""
-    bev = tokens_at([(-20.0, -20.0), (6.0, 5.0), (6.0, 7.0)])
-    made = request_map(bev, torch.tensor([0.5, 0.9, 0.3]), WINDOW)
-    there = WINDOW.cells(torch.tensor([[-20.0, -20.0], [6.0, 6.0], [20.0, -20.0]]))
+def test_a_window_is_as_sure_as_its_least_sure_object():
+    """Two in the window from -6.2 to 6.6 m, one far off, one beyond the map."""
+    xy = torch.tensor([[-20.0, -20.0], [6.0, 5.0], [6.0, 6.0], [80.0, 0.0]])
+    made = request_map(xy, torch.tensor([0.5, 0.9, 0.3, 1.0]), WINDOW)
+    there = WINDOW.cells(torch.tensor([[-20.0, -20.0], [0.0, 0.0], [20.0, -20.0]]))
     assert made.sure[there[:, 0], there[:, 1]].tolist() == pytest.approx([0.5, 0.3, 0.0])
     assert int((made.sure > 0).sum()) == 2
-    empty = request_map(bev.keep(torch.zeros(3, dtype=torch.bool)), torch.zeros(0), WINDOW)
+    empty = request_map(xy[:0], torch.zeros(0), WINDOW)
     assert not empty.sure.any()
 
 
@@ -82,4 +77,4 @@ def test_a_map_that_went_through_bytes_asks_for_the_same_within_half_a_step():
 @pytest.mark.parametrize("sure", [torch.zeros(2), torch.tensor([0.5]), torch.tensor([0.1, 0.2, 1.5])])
 def test_what_is_no_certainty_is_refused(sure):
     with pytest.raises(ConfigError, match="sure needs"):
-        request_map(tokens_at([(0.0, 0.0), (6.0, 5.0), (6.0, 7.0)]), sure, WINDOW)
+        request_map(torch.zeros(3, 2), sure, WINDOW)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from manyeyes.agents.aligner import Aligner, Verdict
@@ -14,12 +14,16 @@ from manyeyes.agents.memory import Memory
 from manyeyes.alignment.watchman import WatchState
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox, Reception
+from manyeyes.comms.request import need, request_map
 from manyeyes.comms.select import within_budget
 from manyeyes.comms.wire import Precision
-from manyeyes.datatypes import AgentFrame, Boxes
+from manyeyes.datatypes import AgentFrame, Boxes, Message
+from manyeyes.datatypes.message import RequestMap
 from manyeyes.models.detector import Detector
 
 OWN_BODY_M = (2.6, 1.3)
+WINDOW_STRIDE = 32
+"""Pillars on an edge of a window of a request map."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,7 @@ class Agent:
     """A detector, a way to collaborate, and a limit in bytes for each message.
 
     Nothing but the bytes of share passes between two agents; frames carry no labels, so truth cannot leak by type.
+    requests: its messages of tokens say, a byte a window, where it needs no help (``comms.request``).
     aligner: corrects where others say they are before anything is fused; None believes them.
     """
 
@@ -48,21 +53,24 @@ class Agent:
         budget_bytes: int | None = 1 << 17,
         eyes: Eyes | None = None,
         aligner: Aligner | None = None,
+        requests: bool = False,
     ) -> None:
         self.eyes, self.memory = eyes or Eyes(detector), Memory()
         self.aligner, self._watched = aligner, dict[int, WatchState]()
         self.collaboration = collaboration or Intermediate()
         self.precision: Precision = precision
         self.budget_bytes = budget_bytes
+        self.requests = requests
         self._tables = tables_of(detector)
         if precision == "codes":
             codebook_of(detector)
 
-    def share(self, frame: AgentFrame, budget_bytes: int | None = None) -> list[bytes]:
+    def share(self, frame: AgentFrame, budget_bytes: int | None = None, asked: Sequence[Message] = ()) -> list[bytes]:
         """The packets that this frame is worth to others, most important first; none if there is nothing to say.
 
         budget_bytes: less than the agent's own, where others need the channel too. A message of tokens is never longer, be
-        it that nothing is said; objects and points know no budget.
+        it that nothing is said; objects and points know no budget. asked: what came from others; those with a request weigh
+        the tokens by what they do not see themselves.
         """
         budget = min((b for b in (self.budget_bytes, budget_bytes) if b is not None), default=None)
         message = self.collaboration.say(self.eyes, frame)
@@ -70,11 +78,22 @@ class Agent:
             return []
         if message.tokens is not None and message.token_score is not None:
             tokens = coded(message.tokens, self.eyes.detector) if self.precision == "codes" else message.tokens
-            tokens, score = within_budget(tokens, message.token_score, budget, self.precision, tables=self._tables)
+            score = message.token_score * need(tokens.sites.xy, frame.world_from_agent, asked)
+            left = budget
+            if self.requests:
+                message = replace(message, request=self._request(frame))
+                spent = wire.encode(replace(message, tokens=None), precision=self.precision)
+                left = None if budget is None else budget - sum(map(len, spent))
+            tokens, score = within_budget(tokens, score, left, self.precision, tables=self._tables)
             message = replace(message, tokens=tokens, token_score=score)
         packets = wire.encode(message, precision=self.precision, tables=self._tables)
         too_long = budget is not None and message.tokens is not None and sum(map(len, packets)) > budget
         return [] if too_long else packets
+
+    def _request(self, frame: AgentFrame) -> RequestMap:
+        """How sure the agent itself is of the objects around it, in the coarsest windows that its grid knows."""
+        boxes = self.eyes.see(frame).boxes
+        return request_map(boxes.center[:, :2], boxes.score, self.eyes.detector.config.grid.at(WINDOW_STRIDE))
 
     def perceive(self, frame: AgentFrame, inbox: Inbox | Iterable[bytes] = (), now_ns: int | None = None) -> Perception:
         """Boxes around the agent from its own frame and whatever of others' messages has come.

@@ -37,6 +37,7 @@ class ReplayConfig:
     first alone. history: snapshots played before the first judged one, so that messages are under way. reach_m: radios
     farther apart do not hear each other (true poses). channel_bytes: what all agents together may send at an instant, shared as
     ``comms.budget.fair_shares`` does by what each would say alone, as if scheduled by one who is told.
+    requests: messages of tokens say where their sender needs no help, and what came lately weighs what is sent.
     aligner: corrects where others say they are, None: nobody does.
     """
 
@@ -49,6 +50,7 @@ class ReplayConfig:
     history: int = 0
     reach_m: float = 70.0
     seed: int = 0
+    requests: bool = False
     aligner: Aligner | None = None
 
     @property
@@ -136,9 +138,10 @@ class Team:
 
     def _say(self, frame: AgentFrame, budget_bytes: int | None = None) -> tuple[list[bytes], float]:
         """An agent's packets, and the seconds that they took it."""
-        agent, _ = self._at(frame)
+        agent, inbox = self._at(frame)
+        asked = inbox.messages() if self.config.requests else ()
         began = time.perf_counter()
-        packets = agent.share(frame, budget_bytes)
+        packets = agent.share(frame, budget_bytes, asked)
         return packets, time.perf_counter() - began
 
     def _at(self, frame: AgentFrame) -> tuple[Agent, Inbox]:
@@ -146,8 +149,9 @@ class Team:
         if who not in self._agents:
             eyes = Eyes(self.detector, known=self.known)
             config = self.config
+            way = method(self.method)
             self._agents[who] = Agent(
-                self.detector, method(self.method), config.precision, config.budget_bytes, eyes, config.aligner
+                self.detector, way, config.precision, config.budget_bytes, eyes, config.aligner, config.requests
             )
             self._inboxes[who] = Inbox(self.detector.fingerprint, EXPIRE_NS, tables=tables_of(self.detector))
         return self._agents[who], self._inboxes[who]

@@ -13,22 +13,24 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes import BevGrid, ConfigError, SparseBev, Transform
+from manyeyes.datatypes import BevGrid, ConfigError, Transform
 from manyeyes.datatypes.message import Message, RequestMap
 
 
-def request_map(tokens: SparseBev, sure: Tensor, window: BevGrid) -> RequestMap:
-    """One agent's map over the coarse grid window: in each cell the least sure (N,) in [0, 1] of its tokens, 0 without any.
+def request_map(xy: Tensor, sure: Tensor, windows: BevGrid) -> RequestMap:
+    """One agent's map over a coarse grid: in each window the least of sure (N,) in [0, 1], 0 where there is none.
 
-    The least: where one of two vehicles is in doubt, help is wanted. sure: how certain the agent is of each token's object.
+    xy: (N, 2) metres in the agent's frame, where it believes an object; sure: its score. The least: where one of two vehicles
+    is in doubt, help is wanted.
     """
-    if sure.shape != (len(tokens.sites),) or not bool(((sure >= 0) & (sure <= 1)).all()):
-        raise ConfigError(f"sure needs ({len(tokens.sites)},) in [0, 1]; got {tuple(sure.shape)}.")
-    rows, columns = window.shape
-    yx = window.cells(tokens.sites.xy)
+    if sure.shape != (len(xy),) or not bool(((sure >= 0) & (sure <= 1)).all()):
+        raise ConfigError(f"sure needs ({len(xy)},) in [0, 1]; got {tuple(sure.shape)}.")
+    rows, columns = windows.shape
+    near = windows.inside(xy)
+    yx = windows.cells(xy[near])
     cell = yx[:, 0] * columns + yx[:, 1]
-    least = torch.full((rows * columns,), torch.inf).scatter_reduce(0, cell, sure.float(), "amin")
-    return RequestMap(window, torch.where(least.isinf(), 0.0, least).view(rows, columns))
+    least = torch.full((rows * columns,), torch.inf).scatter_reduce(0, cell, sure[near].float(), "amin")
+    return RequestMap(windows, torch.where(least.isinf(), 0.0, least).view(rows, columns))
 
 
 def need(xy: Tensor, world_from_sender: Transform, requests: Sequence[Message], least: float = 0.1) -> Tensor:
