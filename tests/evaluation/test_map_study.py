@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +12,9 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation import map_cells
+from manyeyes.evaluation import map_cells, map_malice
 from manyeyes.evaluation.map_cells import ApRow, Cell, KindRow, Unit, cell_path, read_cell, run_unit
-from manyeyes.evaluation.map_malice import displacement, malice_units
+from manyeyes.evaluation.map_malice import displacement, malice, malice_units
 from manyeyes.evaluation.map_methods import (
     METHODS,
     OURS,
@@ -33,6 +34,7 @@ from manyeyes.maps.engine import Inline
 from manyeyes.maps.fuse import FuseConfig
 from manyeyes.maps.vector_map import VectorMap
 from manyeyes.simulator.crowd.config import CROWDS
+from manyeyes.simulator.crowd.simulate import HONEST, MALICIOUS
 
 
 def cell(method: str, count: int, seed: int, crossing: float, divider: float, f: float = 0.9, dup: float = 1.0) -> Cell:
@@ -166,6 +168,26 @@ def test_a_line_that_moved_is_measured_and_one_that_is_gone_is_lost() -> None:
     assert {(u.trial.crowd.malicious, u.trial.crowd.malicious_offset) for u in units} == {
         (m, (o, o)) for m in ("independent", "colluding") for o in (1.0, 4.0)
     }
+
+
+def test_what_liars_move_stands_beside_what_they_would_move_by_telling_the_truth(monkeypatch) -> None:
+    def carried_out(trial: Trial) -> SimpleNamespace:
+        seen = (0.0, 0.0, 0.15 + trial.crowd.malicious_offset[0])  # where each says that the line lies
+        crowd = SimpleNamespace(roles=(HONEST, HONEST, MALICIOUS))
+        return SimpleNamespace(observations=seen, crowd=crowd, place=SimpleNamespace(frame=None))
+
+    def furthest(_method, seen, *_) -> VectorMap:
+        y = max(seen)
+        return VectorMap.of(MapElements.of([[(0, y), (10, y)]], DIVIDER), agents=5)
+
+    monkeypatch.setattr(map_malice, "carry_out", carried_out)
+    monkeypatch.setattr(map_malice, "map_of", furthest)
+    found = [malice(unit) for unit in malice_units(("cross",), (0,), Settings(), (1.0, 4.0))]
+    assert [(m.malicious, m.stations, m.moved, m.lost, m.by_truth) for m in found] == 2 * [
+        (1, 2, 2, 0, 2),
+        (1, 2, 2, 2, 2),
+    ]
+    assert found[0].largest_m == pytest.approx(1.15)
 
 
 def test_every_method_is_tuned_over_fields_that_it_has_with_defaults_first() -> None:

@@ -2,9 +2,11 @@
 """Do liars move the map? What honest agents alone agree on, against what the same agents and the liars give.
 
 A crowd of 200 in which a share of agents is malicious (their elements are moved by 1 to 4 m, each its own way or all the same
-way) is fused twice: with and without the malicious agents' observations. Judged are the stations of published lines of the
-honest map that five or more agents saw: how far across the nearest published line of its kind in the map of all each lies (along a
-line there is no place to be moved from). Where no such line is within 2 m the station is lost, which counts as moved.
+way) is fused three times: without the malicious agents' observations, with them, and with the same observations free of their
+lie. Judged are the stations of published lines of the honest map that five or more agents saw: how far across the nearest
+published line of its kind in the other map each lies (along a line there is no place to be moved from). Where no such line is
+within 2 m the station is lost, which counts as moved. More observations move a map even when they are true, since it lies where
+claims that scatter have their mode: ``by_truth`` counts that, and is what ``moved`` is to be held against.
 """
 
 from __future__ import annotations
@@ -32,7 +34,10 @@ MANNERS = ("independent", "colluding")
 
 @dataclass(frozen=True)
 class Malice:
-    """One crowd with liars. stations: judged; lost: with no line near; moved: beyond the bar, lost included."""
+    """One crowd with liars. stations: judged; lost: with no line near; moved: beyond the bar, lost included.
+
+    by_truth: as moved, when the same agents say the same without their lie.
+    """
 
     place: str
     seed: int
@@ -43,6 +48,7 @@ class Malice:
     stations: int
     moved: int
     lost: int
+    by_truth: int
     p99_m: float
     largest_m: float
 
@@ -83,11 +89,11 @@ def malice(unit: MaliceUnit) -> Malice:
     """One trial."""
     scene = carry_out(unit.trial)
     honest = [o for o, role in zip(scene.observations, scene.crowd.roles) if role != MALICIOUS]
-    frame = scene.place.frame
-    alone, together = (map_of(OURS, seen, unit.settings, frame) for seen in (honest, scene.observations))
-    away = displacement(alone, together)
+    trial, frame = unit.trial, scene.place.frame
+    true = carry_out(replace(trial, crowd=replace(trial.crowd, malicious_offset=(0.0, 0.0)))).observations
+    alone, lied, told = (map_of(OURS, seen, unit.settings, frame) for seen in (honest, scene.observations, true))
+    away, by_truth = displacement(alone, lied), displacement(alone, told)
     finite = away[np.isfinite(away)]
-    trial = unit.trial
     return Malice(
         place=trial.place,
         seed=trial.seed,
@@ -98,6 +104,7 @@ def malice(unit: MaliceUnit) -> Malice:
         stations=len(away),
         moved=int((away > BAR_M).sum()),
         lost=int(np.isinf(away).sum()),
+        by_truth=int((by_truth > BAR_M).sum()),
         p99_m=float(np.quantile(finite, 0.99)) if len(finite) else math.nan,
         largest_m=float(finite.max()) if len(finite) else math.nan,
     )

@@ -75,7 +75,18 @@ def study_markdown(title: str, lines: Sequence[Line], verdicts: Sequence[Verdict
     return "\n".join(out)
 
 
-MALICE_HEADINGS = ("place", "seed", "liars", "offset m", "stations", "moved > 0.1 m", "lost", "p99 m", "largest m")
+MALICE_HEADINGS = (
+    "place",
+    "seed",
+    "liars",
+    "offset m",
+    "stations",
+    "moved > 0.1 m",
+    "lost",
+    "moved by truth",
+    "p99 m",
+    "largest m",
+)
 
 
 def malice_terminal(found: Sequence[Malice]) -> Table:
@@ -92,7 +103,7 @@ def malice_markdown(found: Sequence[Malice]) -> str:
 
 
 def _malice(m: Malice) -> tuple[str, ...]:
-    counts = (str(m.stations), str(m.moved), str(m.lost))
+    counts = (str(m.stations), str(m.moved), str(m.lost), str(m.by_truth))
     liars = f"{m.malicious} of {m.observations}, {m.manner}"
     return m.place, str(m.seed), liars, f"{m.offset_m:g}", *counts, _number(m.p99_m), _number(m.largest_m)
 
