@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import BOX, CYLINDER, Primitives
-from manyeyes.simulator.bodies import CABIN, CARGO, CHASSIS, TYRE, WINDSCREEN, Body
+from manyeyes.simulator.bodies import BODYWORK, CABIN, CARGO, CHASSIS, TYRE, WINDSCREEN, Body
 from manyeyes.simulator.vehicles import VehicleStates
 
 FACADE, WALL, HEDGE, METAL, BARK, LEAVES, PLATE, SIGNAL = range(8)
 PAINTWORK, GLAZED, GLASS, RUBBER, TARPAULIN, STEEL = range(8, 14)
 
-_MATERIAL_OF_PART = np.array([PAINTWORK, GLAZED, GLASS, RUBBER, TARPAULIN, STEEL], np.uint8)
-assert (CABIN, WINDSCREEN, TYRE, CARGO, CHASSIS) == (1, 2, 3, 4, 5)
+_OF_PART = {BODYWORK: PAINTWORK, CABIN: GLAZED, WINDSCREEN: GLASS, TYRE: RUBBER, CARGO: TARPAULIN, CHASSIS: STEEL}
 
 # Albedos, linear light. Chosen: plaster, sandstone, brick and concrete; lacquers by how much near infrared they return.
 _PLASTER = ((0.62, 0.58, 0.48), (0.55, 0.50, 0.42), (0.38, 0.17, 0.11), (0.30, 0.15, 0.11), (0.45, 0.45, 0.44),
@@ -103,7 +102,7 @@ def _one_vehicle(body: Body, size: NDArray[np.float64], seed: int, id: int) -> L
     lacquer = float(body.reflectivity[0])
     palette = _DARK if lacquer < 0.25 else _MIDDLE if lacquer < 0.6 else _BRIGHT
     paint, cover = palette[int(random.integers(len(palette)))], _COVERS[int(random.integers(len(_COVERS)))]
-    material = _MATERIAL_OF_PART[body.part]
+    material = np.array([_OF_PART[part] for part in body.part.tolist()], np.uint8)
     rgb = np.tile(np.array(paint, np.float32), (n, 1))
     rgb[material == RUBBER], rgb[material == STEEL], rgb[material == TARPAULIN] = 0.02, 0.04, cover
     axles = np.full(4, np.inf, np.float32)

@@ -7,7 +7,7 @@ to its mean instead of flickering. Sizes and colours are chosen to look like a E
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,7 +174,7 @@ class Spots:
     axles: Real
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> Spots:
-        return Spots(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+        return Spots(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def on_face(self) -> tuple[Real, Real]:
         """Metres to the right along the face, and up from its lower edge (across, on a lid), (N,) each."""
