@@ -33,9 +33,10 @@ class Playing:
     """How long an ego waits for messages after its own sweep; by default 0 on the ideal channel, else one period, 100."""
     budget_bytes: int = 1 << 17
     """The most that a message of tokens may weigh."""
-    precision: Literal["float32", "float16", "int8"] = "float16"
-    """How features of tokens are written."""
-
+    precision: Literal["float32", "float16", "int8", "codes"] = "float16"
+    """How tokens are written: their features as numbers, or all of them as the codes of the weights' codebook."""
+    requests: bool = False
+    """Messages of tokens say where their sender needs no help; what came lately weighs what is sent."""
     align: bool = False
     """Correct where others say they are before fusing, by the objects that both see; leave out whom nobody can place."""
 
@@ -58,6 +59,7 @@ class Playing:
             budget_bytes=self.budget_bytes,
             wait_s=wait_ms / 1e3,
             all_egos=all_egos,
+            requests=self.requests,
             history=HISTORY,
             seed=seed,
             aligner=Aligner() if self.align else None,
