@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Late and intermediate fusion with the same budget of settings, on the validation town; prints AP of each.
 
-Both are given every pair of (NMS IoU, power of the predicted IoU in the score). What the test table uses is chosen here.
+Both are given every pair of (NMS IoU, power of the predicted IoU in the score). What the test table uses is chosen here. Every
+frame is seen, so that agents have their sweep before and their past; every third is judged.
 Usage: python benchmarks/tuning.py --data data/towns-small --weights costr-small
 """
 
@@ -23,8 +24,10 @@ from manyeyes.agents.eyes import Eyes, Sight
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot
 from manyeyes.evaluation.detection import FrameResult, average_precisions, ego_truth, protocol_named
 from manyeyes.models.box_head import DecodeConfig, RawBoxes, decode
+from manyeyes.models.fusion.gather import Part
 
 REACH_M = 70.0
+HISTORY = 3
 SETTINGS = tuple(itertools.product((0.05, 0.15, 0.30), (0.4, 0.6, 0.8)))
 
 
@@ -38,6 +41,9 @@ class DecodedOtherwise(Eyes):
     def see(self, frame: AgentFrame) -> Sight:
         return replace(self._eyes.see(frame), config=self._setting)
 
+    def past(self, frame: AgentFrame, instants: int = 2) -> list[Part]:
+        return self._eyes.past(frame, instants)
+
     def decode(self, raw: RawBoxes) -> Boxes:
         return decode(raw, self._setting)[0]
 
@@ -48,10 +54,16 @@ def heard_by_first(snapshot: Snapshot) -> list[AgentFrame]:
     return [f for f, place in zip(snapshot.frames[1:], places[1:]) if math.dist(place, places[0]) <= REACH_M]
 
 
-def perceive(way: Collaboration, eyes: Eyes, snapshot: Snapshot) -> Boxes:
-    """What the first agent finds with this way to collaborate, through bytes."""
-    packets = [p for frame in heard_by_first(snapshot) for p in Agent(eyes.detector, way, eyes=eyes).share(frame)]
-    return Agent(eyes.detector, way, eyes=eyes).perceive(snapshot.frames[0], packets).boxes
+def perceive(way: Collaboration, eyes: dict[int, Eyes], setting: DecodeConfig, snapshot: Snapshot) -> Boxes:
+    """What the first agent finds with this way to collaborate, through bytes; eyes of every agent by its id."""
+
+    def agent(frame: AgentFrame) -> Agent:
+        own = DecodedOtherwise(eyes[frame.agent_id], setting)
+        return Agent(own.detector, way, eyes=own)
+
+    packets = [p for frame in heard_by_first(snapshot) for p in agent(frame).share(frame)]
+    ego = snapshot.frames[0]
+    return agent(ego).perceive(ego, packets).boxes
 
 
 def main() -> None:
@@ -72,13 +84,19 @@ def main() -> None:
     protocol = protocol_named("manyeyes").within(box)
     found: dict[tuple[str, float, float], list[FrameResult]] = defaultdict(list)
     for scenario in recording.scenarios:
-        for index in recording.judged(scenario)[:: options.every]:
-            snapshot, eyes = recording.snapshot(scenario, index), Eyes(detector)
+        eyes: dict[int, Eyes] = defaultdict(lambda: Eyes(detector))
+        judged = recording.judged(scenario)
+        for index in range(max(0, judged.start - HISTORY), judged.stop):
+            snapshot = recording.snapshot(scenario, index)
+            for frame in snapshot.frames:
+                eyes[frame.agent_id].see(frame)
+            if index not in judged[:: options.every]:
+                continue
             truth = ego_truth(snapshot, 0, protocol)
             for nms_iou, power in SETTINGS:
-                otherwise = DecodedOtherwise(eyes, replace(base, nms_iou=nms_iou, overlap_power=power))
+                setting = replace(base, nms_iou=nms_iou, overlap_power=power)
                 for way in (Late(nms_iou=nms_iou), Intermediate()):
-                    boxes = perceive(way, otherwise, snapshot)
+                    boxes = perceive(way, eyes, setting, snapshot)
                     found[way.name, nms_iou, power].append(FrameResult(scenario, index, boxes, truth))
     rows = []
     for (name, nms_iou, power), results in sorted(found.items()):
