@@ -41,11 +41,11 @@ def test_a_cell_is_named_by_all_that_its_numbers_depend_on(weights, tmp_path) ->
         replace(base, protocol="opencood"),
         replace(base, every=2),
         replace(base, agents=2),
-        replace(base, channel_bytes=1000),
         replace(base, noise=PoseNoise(sigma_xy_m=0.2)),
         replace(base, noise=PoseNoise(sigma_xy_m=0.2, seed=1)),
         *(replace(base, replay=ReplayConfig(**changed)) for changed in (
             {"channel": late}, {"channel": late.with_loss(0.1)}, {"precision": "int8"}, {"budget_bytes": 99},
+            {"channel_bytes": 999},
             {"seed": 1}, {"all_egos": True}, {"history": 3}, {"wait_s": 0.1},
         )),
     ]  # fmt: skip

@@ -7,7 +7,7 @@ import multiprocessing
 import pickle
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import chain, groupby, islice
 from pathlib import Path
@@ -15,7 +15,6 @@ from pathlib import Path
 import torch
 
 from manyeyes.agents.replay import ReplayConfig, Step, Views, replay
-from manyeyes.comms.budget import equal_share
 from manyeyes.datasets.disturb import PoseNoise
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import Snapshot
@@ -34,8 +33,6 @@ class BenchmarkConfig:
     """What is compared, and how it is judged. weights: a name or a path. protocol: by name, over the detector's own range.
 
     every: judge each so many-th frame. agents: the nearest so many, in scenarios that have them; None: all of all scenarios.
-    channel_bytes: what all agents of a scenario together may send at an instant, each an equal part of it, instead of
-    replay.budget_bytes for each.
     """
 
     weights: str = zoo.DEFAULT
@@ -45,7 +42,6 @@ class BenchmarkConfig:
     noise: PoseNoise | None = None
     every: int = 1
     agents: int | None = None
-    channel_bytes: int | None = None
 
     def view(self, recording: Recording) -> Recording:
         """What is judged of a recording."""
@@ -97,11 +93,8 @@ def _instants(
     recording: Recording, scenario: str, detector: Detector, config: BenchmarkConfig, known: Views
 ) -> Iterator[tuple[int, Iterator[Step]]]:
     """The steps of one configuration, judged snapshot by judged snapshot."""
-    played = config.replay
-    if config.channel_bytes is not None:
-        played = replace(played, budget_bytes=equal_share(config.channel_bytes, len(recording.agents(scenario))))
     disturb = partial(_disturb, config.noise)
-    steps = replay(recording, scenario, detector, config.methods, played, disturb, known)
+    steps = replay(recording, scenario, detector, config.methods, config.replay, disturb, known)
     return groupby(steps, lambda step: step.snapshot.index)
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The system as a whole: every agent judged as ego in turn, all senders within one budget of the channel (CoSTr, Eq. 2).
 
-What is maximised is the AP of all egos together, their detections in one list. A broadcast is heard by everybody and counted
-once. The largest budget is what 27 Mbit/s carry in 100 ms. Ways of collaboration that know no budget stand beside.
+What is maximised is the AP of all egos together, their detections in one list. What one sender does not need of its part goes
+to the others (comms/budget.py). A broadcast is heard by everybody and counted once. The largest budget is what 27 Mbit/s carry in
+100 ms. Ways of collaboration that know no budget stand beside.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from manyeyes.apps.studies.running import ALONE, carry_out, publish, selectors, start
+from manyeyes.apps.studies.running import ALONE, carry_out, publish, selectors, start, with_replay
 from manyeyes.apps.viewer.curves import Curve, Panel
 from manyeyes.apps.viewer.study_table import Sheet, change, number, value
 from manyeyes.evaluation.bootstrap import Interval
@@ -44,7 +45,7 @@ def run(options: Options, console: Console) -> None:
     begun, chosen = start(options, console, all_egos=True), selectors(options)
     others = tuple(m for m in begun.base.methods if m not in chosen)
     conditions = [
-        Condition(str(b), replace(begun.base, methods=chosen, channel_bytes=b))
+        Condition(str(b), with_replay(replace(begun.base, methods=chosen), channel_bytes=b))
         for b in sorted(options.budgets or BUDGETS)
     ]
     if others:
