@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map preset learns a few tiles of a recording by heart: mAP on those very tiles, by steps and processor seconds.
+
+The bar (issue: "Seeing the map"): map-toy above 0.9 on 16 tiles in five minutes on two cores.
+
+python benchmarks/map_overfit.py [--data data/towns-small] [--split train] [--tiles 16] [--steps 500] [--rate 2e-3]
+    [--threads 1] [--every 100]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from manyeyes.apps.train_map import open_looks, true_maps
+from manyeyes.datatypes.map_element import KINDS
+from manyeyes.evaluation.map_quality import judge
+from manyeyes.evaluation.map_tiles import side_by_side
+from manyeyes.models.map_head import decode
+from manyeyes.models.mapper import Mapper
+from manyeyes.training.map_loop import MapRun, ground_of, see
+from manyeyes.training.map_presets import MAP_TRAINING
+from manyeyes.training.map_samples import MapAugment, MapSample, TileStream
+
+
+@dataclass(frozen=True)
+class Few:
+    """The same samples over and over."""
+
+    samples: tuple[MapSample, ...]
+    towns: tuple[str, ...]
+
+    def draw(self, number: int) -> MapSample:
+        return self.samples[number % len(self.samples)]
+
+
+def mean_ap(model: Mapper, samples: tuple[MapSample, ...]) -> dict[str, float]:
+    """mAP in both ways, and AP of each kind, on the tiles of samples."""
+    config, drawn, truth = model.config, [], []
+    kinds = [KINDS.index(kind) for kind in config.head.kinds]
+    model.eval()
+    with torch.no_grad():
+        for sample in samples:
+            raw = model.draw(ground_of(model, see(model, [sample]).tokens, [sample]))[-1]
+            drawn += decode(raw, config.tile, config.head)
+            truth.append(sample.truth.take(np.isin(sample.truth.kind, kinds)))
+    quality = judge(side_by_side(drawn), side_by_side(truth), ("maptr", "exact"), config.head.kinds)
+    mean = {way: round(quality.mean_ap(way, kinds=config.head.kinds), 3) for way in ("maptr", "exact")}
+    return {**mean, **{kind: round(quality.ap(kind, "maptr"), 3) for kind in config.head.kinds}}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("data/towns-small"))
+    parser.add_argument("--split", default="train")
+    parser.add_argument("--tiles", type=int, default=16)
+    parser.add_argument("--steps", type=int, default=500)
+    parser.add_argument("--rate", type=float, default=2e-3)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--every", type=int, default=100)
+    parser.add_argument("--preset", default="map-toy", choices=MAP_TRAINING)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    preset = MAP_TRAINING[options.preset]
+    recording = open_looks(options.data, options.split, preset.mapper.bev.sensors)
+    stream = TileStream(recording, true_maps(recording), preset.mapper, MapAugment(1, 3, flip=False), 0)
+    few = Few(tuple(stream.draw(k) for k in range(options.tiles)), stream.towns)
+    print(f"{options.tiles} tiles, {sum(len(s.truth) for s in few.samples)} elements", flush=True)
+    config = replace(preset, steps=options.steps, batch=4, learning_rate=options.rate, warm_up=30, thin=0.0, ema=0.98)
+    with tempfile.TemporaryDirectory() as folder:
+        run = MapRun(config, few, Path(folder), seed=0)
+        began = time.process_time()
+        while run.step < config.steps:
+            progress = run.advance()
+            if run.step % options.every == 0 or run.step == config.steps:
+                taken = f"{time.process_time() - began:.0f} s of processor, {run.seconds:.0f} s"
+                print(f"{run.step}: loss {progress.loss:.2f}, {mean_ap(run.average, few.samples)}, {taken}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

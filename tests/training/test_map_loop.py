@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map model's loop: resumes bit by bit, logs, and thins as a budget would."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from manyeyes.datatypes import AgentFrame, BevGrid, CheckpointError, PointCloud, Sites, SparseBev, Transform
+from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
+from manyeyes.models import checkpoint
+from manyeyes.models.map_bev import BevConfig
+from manyeyes.models.map_head import MapHeadConfig
+from manyeyes.models.map_presets import FORMAT
+from manyeyes.models.mapper import Mapper, MapperConfig
+from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.training.map_loop import MapRun, MapTrainConfig, loss_terms, thinned, train_mapper
+from manyeyes.training.map_samples import MapSample, inked
+
+TINY = MapperConfig(
+    BevConfig(
+        BevGrid(-12.0, -12.0, -2.0, 12.0, 12.0, 4.0, pillar=0.5), channels=24, raster_width=12, raster_blocks=(1, 1)
+    ),
+    BevGrid(-16.0, -8.0, -1.0, 16.0, 8.0, 1.0, pillar=1.0),
+    token_channels=16,
+    neck=(1, 1),
+    head=MapHeadConfig(elements=8, points=6, many=8, channels=32, feed=64, layers=2, heads=4),
+)
+CONFIG = MapTrainConfig(TINY, steps=4, batch=2, warm_up=2, save_every=2)
+
+
+class Streets:
+    """Short streets: two edges, a divider and a crossing, which two agents see as points in the colours of each."""
+
+    towns = ("Nowhere",)
+
+    def __init__(self, count=50):
+        self.count = count
+
+    def draw(self, number):
+        rng = keyed_generator("street", number % self.count)
+        yaw, y, x = rng.uniform(-0.5, 0.5), rng.uniform(-2, 2), rng.uniform(-6, 6)
+        c, s = math.cos(yaw), math.sin(yaw)
+        turn = np.array([[c, s], [-s, c]])
+        ring = np.array([[x, -3.0], [x + 3, -3], [x + 3, 3], [x, 3]]) @ turn + [0, y]
+        lines = [np.array([[-12.0, o], [12.0, o]]) @ turn + [0, y] for o in (-3.0, 0.0, 3.0)]
+        truth = MapElements.of([*lines, ring], [BOUNDARY, DIVIDER, BOUNDARY, CROSSING])
+        looks, poses, ink = [], [], []
+        for k, pose in enumerate((Transform.from_xyz_yaw(-5, 0, 0, 0.2), Transform.from_xyz_yaw(5, 0, 0, 3.0))):
+            share = rng.uniform(size=(4, 150, 1))
+            along = np.concatenate([line[0] + share[i] * (line[1] - line[0]) for i, line in enumerate(lines)])
+            inside = (
+                ring[0]
+                + rng.uniform(size=(200, 1)) * (ring[1] - ring[0])
+                + rng.uniform(size=(200, 1)) * (ring[3] - ring[0])
+            )
+            xy = np.concatenate((along, inside, rng.uniform([-14, -8], [14, 8], (300, 2))))
+            z = np.concatenate((np.repeat([0.15, 0.0, 0.15], 150), np.zeros(500)))
+            bright = np.concatenate((np.repeat([0.3, 0.8, 0.3], 150), np.full(200, 0.6), np.full(300, 0.1)))
+            world = torch.from_numpy(np.concatenate((xy, z[:, None]), 1))
+            cloud = PointCloud.of(pose.inverse().apply(world), torch.from_numpy(bright))
+            frame = AgentFrame.of(cloud, pose, k)
+            looks.append(frame)
+            poses.append(pose)
+            x_, y_, _ = pose.inverse().translation.tolist()
+            there = truth.transform(x_, y_, -float(pose.yaw))
+            ink.append(inked(there, TINY.bev.token_grid, TINY.head.kinds))
+        return MapSample(tuple(looks), Transform.stack(poses), truth, torch.stack(ink))
+
+
+def same_state(a, b):
+    return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
+
+
+def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path):
+    whole = MapRun(CONFIG, Streets(), tmp_path / "whole", seed=3)
+    for _ in range(4):
+        whole.advance()
+    broken = MapRun(CONFIG, Streets(), tmp_path / "broken", seed=3)
+    for _ in range(3):
+        broken.advance()
+        if broken.step == 2:
+            broken.save()
+    resumed = MapRun(CONFIG, Streets(), tmp_path / "broken", seed=3)
+    assert resumed.step == 2 and not same_state(resumed.model, broken.model)
+    for _ in range(2):
+        resumed.advance()
+    assert same_state(resumed.model, whole.model) and same_state(resumed.average, whole.average)
+    with pytest.raises(CheckpointError, match="another configuration or seed"):
+        MapRun(CONFIG, Streets(), tmp_path / "broken", seed=4)
+
+
+def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
+    heard = []
+    weights = train_mapper(CONFIG, Streets(), tmp_path, seed=1, card={"command": "x"}, report=heard.append)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4] == [p.step for p in heard]
+    assert all(
+        math.isfinite(line[name]) for line in lines for name in ("loss", "kind", "point", "direction", "ink", "many")
+    )
+    card = checkpoint.read_card(weights, FORMAT)
+    assert card["towns"] == ["Nowhere"] and card["steps"] == 4 and card["command"] == "x"
+    again = checkpoint.load_as(weights, FORMAT, MapperConfig, Mapper)
+    assert again.config == TINY
+    train_mapper(CONFIG, Streets(), tmp_path, seed=1)
+    assert len((tmp_path / "log.jsonl").read_text().splitlines()) == 4
+
+
+def test_thinning_leaves_out_the_least_worth_of_each_look():
+    grid = TINY.bev.token_grid
+    key = torch.cat((torch.arange(4), grid.shape[0] * grid.shape[1] + torch.arange(6)))
+    tokens = SparseBev(torch.arange(10.0)[:, None], Sites(key, grid, 3))
+    worth = torch.tensor([0.4, 0.1, 0.3, 0.2, 0.9, 0.5, 0.8, 0.6, 0.7, 0.05])
+    kept = thinned(tokens, worth, torch.tensor([0.5, 0.34, 0.9]))
+    assert kept.features[:, 0].tolist() == [0, 2, 4, 6, 7, 8]
+    assert torch.equal(thinned(tokens, worth, torch.zeros(3)).features, tokens.features)
+
+
+def test_every_weight_of_the_lidar_path_learns():
+    torch.manual_seed(0)
+    model = Mapper(TINY)
+    terms = loss_terms(model, [Streets().draw(0), Streets().draw(1)], CONFIG.loss, torch.full((4,), 0.2))
+    terms.total(CONFIG.loss).backward()
+    silent = [name for name, p in model.named_parameters() if p.grad is None or not bool((p.grad != 0).any())]
+    # Blocks begin as their shortcuts and points begin at their references: what lies before a zero waits for one step.
+    waiting = {name for name in silent if ".inner." in name or "moves" in name}
+    assert set(silent) - waiting == set()
