@@ -4,20 +4,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from manyeyes.models.map_presets import mapper_config
 from manyeyes.training.map_loop import MapTrainConfig
 from manyeyes.training.map_losses import MapLossConfig
 from manyeyes.training.map_samples import MapAugment
 
-_NOISE = {"sigma_m": 0.2, "sigma_rad": math.radians(0.3)}
+_NOISY = MapAugment(sigma_m=0.2, sigma_rad=math.radians(0.3))
 
 MAP_TRAINING: dict[str, MapTrainConfig] = {
     "map-toy": MapTrainConfig(
         mapper_config("toy"), steps=60, batch=2, learning_rate=2e-3, warm_up=10, save_every=20, augment=MapAugment(1, 3)
     ),
     "map-small": MapTrainConfig(
-        mapper_config("small"), steps=1500, batch=4, learning_rate=1e-3, save_every=50, augment=MapAugment(**_NOISE)
+        mapper_config("small"), steps=1500, batch=4, learning_rate=1e-3, save_every=50, augment=_NOISY
     ),
     "map-small-camera": MapTrainConfig(
         mapper_config("small", ("camera",)),
@@ -25,7 +26,7 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
         batch=4,
         learning_rate=1e-3,
         save_every=50,
-        augment=MapAugment(flip=False, **_NOISE),
+        augment=replace(_NOISY, flip=False),
     ),
     "map-small-both": MapTrainConfig(
         mapper_config("small", ("lidar", "camera")),
@@ -33,7 +34,7 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
         batch=4,
         learning_rate=1e-3,
         save_every=50,
-        augment=MapAugment(flip=False, **_NOISE),
+        augment=replace(_NOISY, flip=False),
     ),
     "map-paper": MapTrainConfig(
         mapper_config("paper", ("camera",)),
