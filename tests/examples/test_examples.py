@@ -62,3 +62,11 @@ def test_04_one_map_from_many_drives(tmp_path: Path) -> None:
     assert fused.startswith("fused: ") and union.startswith("union: ") and last.endswith("shows it")
     assert float(fused.split("mAP ")[1][:4]) > float(union.split("mAP ")[1][:4])
     assert page.stat().st_size > 1_000_000
+
+
+@pytest.mark.slow
+def test_05_late_and_few_bytes(tmp_path: Path) -> None:
+    pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
+    lines = run("05_late_and_few_bytes.py", str(tmp_path / "drive")).strip().splitlines()
+    assert len(lines) == 3
+    assert "with 0 bytes" in lines[0] and "with 0 bytes" not in lines[1]

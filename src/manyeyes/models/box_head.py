@@ -62,7 +62,9 @@ class RawBoxes:
     @classmethod
     def of(cls, columns: Tensor, sites: Sites) -> RawBoxes:
         """From rows (N, RAW.total)."""
-        heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap, velocity = columns.split(WIDTHS, 1)
+        heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap, velocity = columns.split(
+            WIDTHS, 1
+        )
         return cls(
             sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind,
             sigma_xy[:, 0], sigma_yaw[:, 0], overlap[:, 0], velocity,
