@@ -185,12 +185,15 @@ MEASURE = """
 import torch
 from manyeyes.models.presets import COSTR_TINY
 from manyeyes.training.loop import Run, TrainConfig
+from manyeyes.training.losses import LossConfig
 from manyeyes.training.samples import AugmentConfig
 
 def measure(toy, out):
     # One frame of one agent without augmentation: all samples of the batch are alike.
     alike = toy(scenarios=("toy_0",), frames=1, agents_n=1, points_per_car=20, ground_points=60)
-    config = TrainConfig(COSTR_TINY, steps=6, batch=4, warm_up=2, augment=AugmentConfig.none())
+    # Windows of other samples are negatives of the selector's information: twins among them cost the logarithm of their number.
+    loss = LossConfig(information=0.0)
+    config = TrainConfig(COSTR_TINY, steps=6, batch=4, warm_up=2, augment=AugmentConfig.none(), loss=loss)
     run = Run(config, alike, out / "alike", 0)
     first = run.advance()
     state = {k: v for k, v in run.model.state_dict().items() if "running" not in k and "tracked" not in k}
@@ -227,8 +230,9 @@ def two_processes(folder: Path) -> list[dict]:
 
 
 def test_two_processes_are_one_with_their_batch(toy, tmp_path):
-    """Equal where it can be equal: each process normalises by its own samples (batch statistics, number of boxes), so one
-    process of four samples and two of two agree to rounding only when those agree, here because all samples are alike."""
+    """Equal where it can be equal: each process normalises by its own samples (batch statistics, number of boxes, windows to
+    tell apart), so one process of four samples and two of two agree to rounding only when those agree, here because all
+    samples are alike."""
     first, second = two_processes(tmp_path)
     names: dict[str, Any] = {}
     exec(MEASURE, names)
