@@ -78,14 +78,15 @@ def drive() -> type[Drive]:
 
 
 def tiny_detector() -> Detector:
-    """Tiny weights whose norms have seen something, that tell of places, ages and the past, and prune little."""
+    """Tiny weights whose norms have seen something, and prune little; all that starts at zero speaks, the second look as well."""
     torch.manual_seed(0)
     model = Detector(replace(COSTR_TINY, prune_threshold=0.08))
     moments, road = [Drive().snapshot(i) for i in range(4)], RoadConfig(past=2, late_share=0.5, late_frames=2)
     sample = make_sample(moments, 0, COSTR_TINY.grid, AugmentConfig.none(), ("norms",), road)
     fusion = model.fusion
     with torch.no_grad():
-        for linear in (fusion.placement.outer, fusion.placement.temporal, fusion.past.out, fusion.past.ffn[2]):
+        silent = (fusion.placement.outer, fusion.placement.temporal, fusion.past.out, fusion.past.ffn[2])
+        for linear in (*silent, fusion.settle.inner_trust, model.refine.out):
             torch.nn.init.normal_(linear.weight, std=0.1)
         for norm in (m for m in model.modules() if isinstance(m, ActiveNorm)):
             norm.momentum = 0.5

@@ -130,10 +130,12 @@ def test_what_a_model_has_grown_by_starts_as_if_it_were_not_there(toy, tmp_path)
         past = new.see([before], [none]).tokens
         looked_back = gather([Part(0, new.tell(past, new.look(past)).features, past.sites.xy)], old.token_grid, 1)
         tokens = gather([Part(0, mine.features, mine.sites.xy)], old.token_grid, 1)
+        fused = old.merge(tokens), new.merge(tokens, looked_back)
         boxes = old.fuse(tokens), new.fuse(tokens, looked_back)
     assert torch.equal(mine.sites.key, theirs.sites.key)
     assert torch.allclose(mine.features, theirs.features, atol=1e-5)
     assert len(looked_back.features) > 20 and torch.equal(boxes[0].sites.key, boxes[1].sites.key)
+    assert torch.allclose(fused[0].bev.features, fused[1].bev.features, atol=1e-5)
     assert torch.allclose(boxes[0].columns(), boxes[1].columns(), atol=1e-6)
 
 
