@@ -93,9 +93,10 @@ def meetings(recording: Recording, detector: Detector, score_min: float = 0.3, e
         eyes: dict[int, Eyes] = {}
         for index in recording.judged(scenario)[::every]:
             # A detector of two sweeps sees the one before as well.
-            for at in (index - 1, index) if index else (index,):
-                snapshot = recording.snapshot(scenario, at)
-                boxes = [eyes.setdefault(f.agent_id, Eyes(detector)).see(f).boxes for f in snapshot.frames]
+            for frame in recording.snapshot(scenario, index - 1).frames if index else ():
+                eyes.setdefault(frame.agent_id, Eyes(detector)).see(frame)
+            snapshot = recording.snapshot(scenario, index)
+            boxes = [eyes.setdefault(f.agent_id, Eyes(detector)).see(f).boxes for f in snapshot.frames]
             found = [b[b.score >= score_min] for b in boxes]
             yield from _met(snapshot, found)
 

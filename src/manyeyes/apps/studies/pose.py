@@ -177,7 +177,8 @@ def claims(done: Sweep, names: Collection[str], common: dict[tuple[str, int], in
             continue
         if bucket in LOSES_AT_MOST:
             what = f"{LEVELS[-1].name}, {_bucket(bucket)} in common: corrected - true claims"
-            out.append(_claim(what, paired_difference(*some, protocol=done.protocol), -LOSES_AT_MOST[bucket]))
+            less = paired_difference(some[0], some[1], protocol=done.protocol)
+            out.append(_claim(what, less, -LOSES_AT_MOST[bucket]))
         if alone in done.cells:
             less = paired_difference(some[0], _some(done, alone, bucket, common), protocol=done.protocol)
             out.append(_claim(f"{LEVELS[-1].name}, {_bucket(bucket)} in common: corrected - alone", less, 0.0))
