@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Peak memory of perceive over the number of agents and the range, and a straight line through it in tokens.
 
-A street's agents share; then the peak of the process's resident memory while the first of them perceives, above what it held
-just before, is read from the kernel (Linux: VmHWM after /proc/self/clear_refs). Weights are random and of costr-small's
-widths, nothing is pruned and no budget limits a message, so that tokens are as many as they can be. Each figure is the
-second of two runs: the first compiles loops. Tokens: all that meet at the ego, its own and those heard within range.
+A street's agents share, the ego among them, so that it has looked at its own sweep, as at every instant of a drive; then the
+peak of the process's resident memory while it perceives, above what it held just before, is read from the kernel (Linux:
+VmHWM after /proc/self/clear_refs). Weights are random and of costr-small's widths, nothing is pruned and no budget limits a
+message, so that tokens are as many as they can be. Each figure is the second of two runs: the first compiles loops. Tokens:
+all that meet at the ego, its own and those heard within range.
 
 python benchmarks/memory.py [--agents 1 2 3 5 7 10] [--range 50 100 150 200 280] [--out benchmarks/results/memory.json]
 """
@@ -110,7 +111,8 @@ def measure(model: Detector, frames: list[AgentFrame], range_m: float) -> Cell:
     peaks, eyes = [], CountingEyes(model)
     for _ in range(2):
         eyes = CountingEyes(model)
-        agent = Agent(model, eyes=eyes)
+        agent = Agent(model, budget_bytes=None, eyes=eyes)
+        agent.share(frames[0])
         peaks.append(peak_of(lambda agent=agent: agent.perceive(frames[0], packets)))
     return Cell(len(frames), range_m, eyes.tokens, peaks[-1])
 
