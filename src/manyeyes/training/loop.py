@@ -33,7 +33,6 @@ class TrainConfig:
 
     warm_up: steps of linear growth of the learning rate, then a cosine to zero. prune_from, prune_full: the pruning threshold
     grows from 0 to the detector's between these shares of the run. ema: decay of the averaged weights that are saved.
-    parts: of the detector, by name, that learn; the others stay as they were loaded, statistics of norms too. () is all.
     """
 
     detector: DetectorConfig
@@ -48,7 +47,6 @@ class TrainConfig:
     prune_from: float = 0.03
     prune_full: float = 0.10
     save_every: int = 200
-    parts: tuple[str, ...] = ()
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     road: RoadConfig = field(default_factory=RoadConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)
@@ -100,7 +98,6 @@ class Run:
             self.model = Detector(config.detector)
         if start is not None:
             _load_weights(self.model, start)
-        self._still = _hold_still(self.model, config.parts)
         self.average = copy.deepcopy(self.model).requires_grad_(False)
         self.optimiser = torch.optim.AdamW(parameter_groups(self.model, config.weight_decay), lr=config.learning_rate)
         self.step, self.seconds = 0, 0.0
@@ -116,8 +113,6 @@ class Run:
         """One step of the optimiser."""
         began, config = time.monotonic(), self.config
         self.model.train()
-        for part in self._still:
-            part.eval()
         share = config.batch // self.world
         first = self.step * config.batch + self.rank * share
         samples = [self.stream.draw(first + i) for i in range(share)]
@@ -146,7 +141,7 @@ class Run:
         if self.world == 1:
             return
         for p in self.model.parameters():
-            p.grad = torch.zeros_like(p) if p.grad is None and p.requires_grad else p.grad
+            p.grad = torch.zeros_like(p) if p.grad is None else p.grad
         mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world)
         mean_in_place([b for b in self.model.buffers() if b.is_floating_point()], self.world)
 
@@ -232,17 +227,6 @@ def train(
         }
         checkpoint.save(run.average, weights, about, half=True)
     return weights
-
-
-def _hold_still(model: nn.Module, learning: tuple[str, ...]) -> list[nn.Module]:
-    """The parts that do not learn, without gradients; an unknown name lists the known."""
-    parts = dict(model.named_children())
-    if unknown := sorted(set(learning) - set(parts)):
-        raise ConfigError(f"The model has no part {unknown[0]!r} to train; it has {', '.join(parts)}.")
-    still = [part for name, part in parts.items() if learning and name not in learning]
-    for part in still:
-        part.requires_grad_(False)
-    return still
 
 
 def _load_weights(model: Detector, start: Path) -> None:

@@ -44,10 +44,9 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
     The tokens take the very path that they take as bytes: seen in the sender's frame, moved metrically, fused, decoded.
     """
     views = [view for sample in samples for view in sample.views]
-    with torch.set_grad_enabled(torch.is_grad_enabled() and any(p.requires_grad for p in model.encoder.parameters())):
-        seen = model.see([v.now for v in views], [v.earlier for v in views], prune_threshold)
-        alone = model.look(seen.tokens)
-        told = model.tell(seen.tokens, alone)
+    seen = model.see([v.now for v in views], [v.earlier for v in views], prune_threshold)
+    alone = model.look(seen.tokens)
+    told = model.tell(seen.tokens, alone)
     score = model.choose(told)
     mask = torch.sigmoid(score)
     parts, number = [], 0
