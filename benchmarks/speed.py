@@ -55,7 +55,7 @@ from manyeyes.models.presets import OPV2V_GRID
 from manyeyes.models.pruning import FocalPrune, Pruned
 from manyeyes.models.transformer import AttentionConfig
 from manyeyes.ops.window_attention import AttentionCost, attention_cost, plan_windows, window_ids
-from manyeyes.training.targets import TargetConfig, near_objects
+from manyeyes.training.targets import TargetConfig, objects_near
 
 CANDIDATES = 200
 PRUNED_AT = (2, 4, 8)
@@ -344,7 +344,7 @@ def kept_by_truth(snapshot: Snapshot, head_stride: int, share_of_rest: float = 0
         grid = OPV2V_GRID.at(stride)
         every = Sites(torch.arange(grid.shape[0] * grid.shape[1]), grid)
         rest = torch.rand(len(every), generator=random) < share_of_rest
-        return near_objects(every, [boxes], TargetConfig()) | rest
+        return (objects_near(every, [boxes], TargetConfig()) >= 0) | rest
 
     kept = []
     for i, frame in enumerate(snapshot.frames):

@@ -26,7 +26,7 @@ def test_no_town_is_on_two_sides() -> None:
 def test_the_benchmark_has_the_scenes_it_promises() -> None:
     jobs = jobs_of(simulation_preset("towns-small"), 0)
     counts = {split: sum(job.split == split for job in jobs) for split in ("train", "validate", "test")}
-    assert counts == {"train": 110, "validate": 22, "test": 84}
+    assert counts == {"train": 150, "validate": 22, "test": 84}
     towns = {job.split: set() for job in jobs}
     for job in jobs:
         towns[job.split].add(job.spec.town)

@@ -51,15 +51,24 @@ def test_centre_focal_by_a_loop():
 
 
 def test_prune_focal_by_a_loop():
-    logit = torch.tensor([-2.0, 0.3, 1.5, -0.4])
-    near = torch.tensor([False, True, False, True])
+    logit = torch.tensor([-2.0, 0.3, 1.5, -0.4, 0.9])
+    near = [-1, 0, -1, 2, 2]
+    voice = {0: 3 / (2 * 1), 2: 3 / (2 * 2)}  # three cells, two objects: one of one cell, one of two
     total = 0.0
-    for s, y in zip(logit.tolist(), near.tolist()):
+    for s, box in zip(logit.tolist(), near):
         p = 1 / (1 + math.exp(-s))
-        pt, alpha = (p, 0.25) if y else (1 - p, 0.75)
-        total -= alpha * (1 - pt) ** 2 * math.log(pt)
-    got = prune_focal(Pruned(Sites(torch.arange(4), GRID), logit), near)
-    assert float(got) == pytest.approx(total / 2, rel=1e-5)
+        pt, weight = (p, 0.25 * voice[box]) if box >= 0 else (1 - p, 0.75)
+        total -= weight * (1 - pt) ** 2 * math.log(pt)
+    got = prune_focal(Pruned(Sites(torch.arange(5), GRID), logit), torch.tensor(near))
+    assert float(got) == pytest.approx(total / 3, rel=1e-5)
+
+
+def test_prune_focal_gives_an_object_of_one_cell_no_more_than_eight_voices():
+    near = torch.tensor([0] + [1] * 99)
+    logit = torch.zeros(100, requires_grad=True)
+    prune_focal(Pruned(Sites(torch.arange(100), GRID), logit), near).backward()
+    assert logit.grad is not None
+    assert float(logit.grad[0] / logit.grad[1]) == pytest.approx(8 / (100 / (2 * 99)), rel=1e-5)
 
 
 @pytest.mark.parametrize("scale", (1.0, 1e4))
@@ -67,7 +76,7 @@ def test_without_a_box_every_term_is_finite_and_gradients_flow(scale):
     some = raw()
     some = dataclasses.replace(some, heat=(some.heat * scale).detach().requires_grad_())
     targets = assign(SITES, [Boxes.empty()], TargetConfig())
-    prune = prune_focal(Pruned(SITES, some.heat), torch.zeros(len(SITES), dtype=torch.bool))
+    prune = prune_focal(Pruned(SITES, some.heat), torch.full((len(SITES),), -1))
     terms = head_terms(some, targets, prune, torch.zeros(()), torch.zeros(()))
     total = terms.total(LossConfig())
     total.backward()

@@ -34,7 +34,8 @@ class SimulationPreset:
     """What a recording holds.
 
     vehicles: least and most connected vehicles of a scene. roadside_chance: of a unit on a pole, which always takes part
-    where there is one vehicle only. stand_in: generated roads where a town is not found; None makes that an error.
+    where there is one vehicle only. density, clutter: of traffic and of what stands beside the road (ScenarioSpec), drawn evenly
+    between these for each scene. stand_in: generated roads where a town is not found; None makes that an error.
     layout: of the files; dair takes one vehicle and the unit, and judges every pair. cameras, roadside_cameras: as in ScenarioSpec.
     """
 
@@ -46,6 +47,8 @@ class SimulationPreset:
     lidar: str = "opv2v"
     roadside_lidar: str = "opv2v-roadside"
     min_vehicles: int = 16
+    density: tuple[float, float] = (3.5, 7.0)
+    clutter: tuple[float, float] = (0.4, 1.0)
     stand_in: str | None = None
     layout: Literal["opv2v", "dair"] = "opv2v"
     cameras: str = "none"
@@ -65,9 +68,14 @@ def _towns(train: int, validate: int, test: int) -> tuple[SplitPreset, ...]:
     )
 
 
+def _crowded(splits: tuple[SplitPreset, ...]) -> SimulationPreset:
+    """Streets where one agent sees little: much traffic, much that stands in between, and three to five agents mostly."""
+    return SimulationPreset(splits, vehicles=(2, 4), roadside_chance=0.8, density=(6.0, 10.0), clutter=(1.0, 1.8))
+
+
 SIMULATION_PRESETS: dict[str, SimulationPreset] = {
-    "towns-small": SimulationPreset(_towns(110, 22, 84)),
-    "towns-large": SimulationPreset(_towns(600, 60, 200)),
+    "towns-small": _crowded(_towns(150, 22, 84)),
+    "towns-large": _crowded(_towns(600, 60, 200)),
     "tiny": SimulationPreset(
         (
             SplitPreset("train", ("generated-1",), 2),
@@ -161,9 +169,9 @@ def jobs_of(preset: SimulationPreset, seed: int, towns: str | None = None) -> li
                 roadside_chance=1.0 if vehicles == 1 else preset.roadside_chance,
                 lidar=preset.lidar + beams,
                 roadside_lidar=preset.roadside_lidar + beams,
-                density=round(float(random.uniform(3.5, 7.0)), 3),
+                density=round(float(random.uniform(*preset.density)), 3),
                 min_vehicles=preset.min_vehicles,
-                clutter=round(float(random.uniform(0.4, 1.0)), 3),
+                clutter=round(float(random.uniform(*preset.clutter)), 3),
                 cameras=preset.cameras,
                 roadside_cameras=preset.roadside_cameras,
             )

@@ -16,6 +16,10 @@ from manyeyes.training.information import Target
 from manyeyes.training.targets import Targets
 
 
+FEW_CELLS_VOICE = 8.0
+"""At most so many times a cell's fair share, so that an object of one cell does not speak for a whole batch."""
+
+
 @dataclass(frozen=True)
 class LossConfig:
     """Weights of the terms. iou: of 1 - IoU itself, for boxes that nearly fit already; off at the start, where none do.
@@ -75,13 +79,20 @@ def centre_focal(logit: Tensor, heat: Tensor, positive: Tensor) -> Tensor:
 
 
 def prune_focal(pruned: Pruned, near: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
-    """Sigmoid focal loss (Lin et al. 2017) on whether a cell lies near an object, divided by max(1, number that do)."""
-    target = near.to(pruned.logit.dtype)
+    """Sigmoid focal loss (Lin et al. 2017) on whether a cell lies near an object, divided by max(1, number that do).
+
+    near: (N,), of objects_near. Every object has one voice, however many cells it fills: a vehicle of two cells is lost
+    as soon as they are, one of two hundred hardly.
+    """
+    found, row, cells = near.unique(return_inverse=True, return_counts=True)
+    is_near = near >= 0
+    number, objects = is_near.sum(), (found >= 0).sum()
+    voice = (number / (objects.clamp_min(1) * cells[row])).clamp_max(FEW_CELLS_VOICE)
     p = torch.sigmoid(pruned.logit)
-    right = torch.where(near, p, 1 - p)
-    share = torch.where(near, torch.as_tensor(alpha), torch.as_tensor(1 - alpha))
-    entropy = functional.binary_cross_entropy_with_logits(pruned.logit, target, reduction="none")
-    return (share * (1 - right) ** gamma * entropy).sum() / near.sum().clamp_min(1)
+    right = torch.where(is_near, p, 1 - p)
+    share = torch.where(is_near, alpha * voice, torch.as_tensor(1 - alpha))
+    entropy = functional.binary_cross_entropy_with_logits(pruned.logit, is_near.to(p.dtype), reduction="none")
+    return (share * (1 - right) ** gamma * entropy).sum() / number.clamp_min(1)
 
 
 def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, kept: Tensor, information: Tensor) -> LossTerms:

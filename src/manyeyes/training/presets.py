@@ -24,7 +24,14 @@ _ROAD = TrainConfig(
     road=RoadConfig(past=2, late_share=0.4, astray_share=0.5, lost_share=0.25, few_share=0.4),
     loss=LossConfig(iou=0.5, together=0.6),
 )
-_BRANCH = replace(_ROAD, steps=400, learning_rate=3e-4, warm_up=20, prune_full=0.001)
+_CROWD = replace(
+    _ROAD,
+    detector=replace(_ROAD.detector, prune_threshold=0.12),
+    steps=4200,
+    augment=AugmentConfig(thin=0.1, early_share=0.2),
+    loss=LossConfig(iou=0.8, together=0.6, prune=1.0),
+)
+_BRANCH = replace(_CROWD, steps=400, learning_rate=3e-4, warm_up=20, prune_full=0.001)
 
 
 def _branch(**changes: Any) -> TrainConfig:
@@ -60,6 +67,7 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
         loss=LossConfig(iou=0.5),
     ),
     "costr-small-3": _ROAD,
+    "costr-small-4": _CROWD,
     "branch-plain": _branch(**_PLAIN, encoder=_FINE_ONLY),
     "branch-se": _branch(**_PLAIN),
     "branch-se-dast": _branch(fusion="maximum"),

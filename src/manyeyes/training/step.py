@@ -18,7 +18,7 @@ from manyeyes.ops.window_attention import window_ids
 from manyeyes.training.information import STUDIED, WINDOW_CELLS, Meeting, Target, information_terms
 from manyeyes.training.losses import LossTerms, head_terms, prune_focal
 from manyeyes.training.samples import Sample, View
-from manyeyes.training.targets import TargetConfig, assign, near_objects
+from manyeyes.training.targets import TargetConfig, assign, objects_near
 
 PACKET_TOKENS = 8
 """How many tokens are lost together: what a packet of 1,398 bytes holds of float16 features, about."""
@@ -117,7 +117,7 @@ def loss_terms(
     out = forward(model, samples, prune_threshold)
     listed: list[Boxes] = [view.seen for sample in samples for view in sample.views]
     union = [sample.union for sample in samples]
-    prune = torch.stack([prune_focal(p, near_objects(p.sites, listed, targets)) for p in out.seen.pruned]).mean()
+    prune = torch.stack([prune_focal(p, objects_near(p.sites, listed, targets)) for p in out.seen.pruned]).mean()
     own = assign(out.alone.sites, listed, targets)
     kept, information = information_terms(out.told, out.mask, own.heat)
     if target != "own_task":

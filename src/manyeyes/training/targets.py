@@ -80,11 +80,14 @@ def _unique_pairs(distance: Tensor, reach_m: float) -> list[tuple[int, int]]:
     return pairs
 
 
-def near_objects(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Tensor:
-    """(N,) bool: whether a cell's centre lies in a box enlarged by max(margin, half a cell) on every side (section 4.2)."""
+def objects_near(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Tensor:
+    """(N,) int64: the box, a row of all grids' boxes, that a cell's centre lies in, -1 for none (detection.md section 4.2).
+
+    Boxes are enlarged by max(margin, half a cell) on every side; of several the one whose centre is nearest.
+    """
     margin = max(config.prune_margin_m, sites.grid.cell / 2)
     batch, xy = sites.batch, sites.xy
-    near = torch.zeros(len(sites), dtype=torch.bool)
+    near, first = torch.full((len(sites),), -1, dtype=torch.int64), 0
     for b, boxes in enumerate(truth):
         rows = (batch == b).nonzero()[:, 0]
         if len(rows) and len(boxes):
@@ -92,5 +95,8 @@ def near_objects(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Tens
             c, s = boxes.yaw.float().cos(), boxes.yaw.float().sin()
             along, across = delta[..., 0] * c + delta[..., 1] * s, delta[..., 1] * c - delta[..., 0] * s
             half = boxes.size[:, :2].float() / 2 + margin
-            near[rows] = ((along.abs() <= half[:, 0]) & (across.abs() <= half[:, 1])).any(1)
+            inside = (along.abs() <= half[:, 0]) & (across.abs() <= half[:, 1])
+            distance, which = torch.where(inside, delta.norm(dim=2), torch.inf).min(1)
+            near[rows] = torch.where(distance < torch.inf, which + first, -1)
+        first += len(boxes)
     return near
