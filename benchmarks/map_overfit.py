@@ -76,11 +76,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = MapRun(config, few, Path(folder), seed=0)
         began = time.process_time()
-        while run.step < config.steps:
+        while run.state.step < config.steps:
             progress = run.advance()
-            if run.step % options.every == 0 or run.step == config.steps:
-                taken = f"{time.process_time() - began:.0f} s of processor, {run.seconds:.0f} s"
-                print(f"{run.step}: loss {progress.loss:.2f}, {mean_ap(run.average, few.samples)}, {taken}", flush=True)
+            if run.state.step % options.every == 0 or run.state.step == config.steps:
+                taken = f"{time.process_time() - began:.0f} s of processor, {run.state.seconds:.0f} s"
+                print(
+                    f"{run.state.step}: loss {progress.loss:.2f}, {mean_ap(run.state.average, few.samples)}, {taken}",
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

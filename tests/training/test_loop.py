@@ -47,14 +47,14 @@ def test_a_run_that_was_killed_ends_as_if_it_had_not_been(toy, tmp_path, config)
     broken = Run(config, recording, tmp_path / "broken", seed=3)
     for _ in range(4):
         broken.advance()
-        if broken.step == 2:
-            broken.save()
+        if broken.state.step == 2:
+            broken.state.save()
     resumed = Run(config, recording, tmp_path / "broken", seed=3)
-    assert resumed.step == 2 and not same_state(resumed.model, broken.model)
+    assert resumed.state.step == 2 and not same_state(resumed.state.model, broken.state.model)
     last = [resumed.advance() for _ in range(4)][-1]
     assert last.step == 6
-    assert same_state(resumed.model, whole.model) and same_state(resumed.average, whole.average)
-    for mine, theirs in zip(resumed.optimiser.state.values(), whole.optimiser.state.values(), strict=True):
+    assert same_state(resumed.state.model, whole.state.model) and same_state(resumed.state.average, whole.state.average)
+    for mine, theirs in zip(resumed.state.optimiser.state.values(), whole.state.optimiser.state.values(), strict=True):
         assert torch.equal(mine["exp_avg"], theirs["exp_avg"]) and torch.equal(mine["exp_avg_sq"], theirs["exp_avg_sq"])
 
 
@@ -97,7 +97,7 @@ def test_a_second_stage_begins_where_the_first_ended(toy, tmp_path):
     kept = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, prune_threshold=0.01))
     second = Run(kept, small(toy), tmp_path / "second", 2, first)
     for name, value in checkpoint.load(first).state_dict().items():
-        assert torch.equal(second.model.state_dict()[name], value), name
+        assert torch.equal(second.state.model.state_dict()[name], value), name
     narrower = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, head_channels=24))
     with pytest.raises(CheckpointError, match=r"head\.out\.weight does not fit"):
         Run(narrower, small(toy), tmp_path / "third", 2, first)
@@ -120,7 +120,7 @@ def test_what_a_model_has_grown_by_starts_as_if_it_were_not_there(toy, tmp_path)
     first = train(dataclasses.replace(TINY, detector=plain, steps=2), small(toy), tmp_path / "first", seed=1)
     grown = dataclasses.replace(plain, sweeps=2, fusion="flow_aware")
     run = Run(dataclasses.replace(TINY, detector=grown), small(toy), tmp_path / "second", 2, first)
-    old, new = checkpoint.load(first), run.model.eval()
+    old, new = checkpoint.load(first), run.state.model.eval()
     now, before = (toy().snapshot("toy_0", i).frames[0].points for i in (1, 0))
     none = now[:0]
     with torch.no_grad():
@@ -149,7 +149,7 @@ def test_the_shipped_weights_are_the_average(toy, tmp_path):
 
 def test_a_folder_of_another_run_or_a_cut_state_is_refused(toy, tmp_path):
     run = Run(TINY, small(toy), tmp_path, seed=3)
-    run.save()
+    run.state.save()
     for config, seed in ((TINY, 4), (dataclasses.replace(TINY, learning_rate=1.0), 3)):
         with pytest.raises(CheckpointError, match=r"last\.pt: belongs to a run of another configuration or seed"):
             Run(config, small(toy), tmp_path, seed)
@@ -162,7 +162,7 @@ def test_a_folder_of_another_run_or_a_cut_state_is_refused(toy, tmp_path):
 def test_a_loss_that_is_no_number_stops_the_run_and_names_the_step(toy, tmp_path):
     run = Run(TINY, small(toy), tmp_path, seed=3)
     with torch.no_grad():
-        run.model.head.out.bias.fill_(torch.nan)
+        run.state.model.head.out.bias.fill_(torch.nan)
     with pytest.raises(ConfigError, match="The loss is nan at step 0"):
         run.advance()
 
@@ -180,7 +180,9 @@ def test_the_same_seed_is_the_same_run_and_another_is_not(toy, tmp_path):
     runs = [Run(TINY, small(toy), tmp_path / str(i), seed) for i, seed in enumerate((5, 5, 6))]
     for run in runs:
         run.advance()
-    assert same_state(runs[0].model, runs[1].model) and not same_state(runs[0].model, runs[2].model)
+    assert same_state(runs[0].state.model, runs[1].state.model) and not same_state(
+        runs[0].state.model, runs[2].state.model
+    )
 
 
 MEASURE = """
@@ -198,12 +200,12 @@ def measure(toy, out):
     config = TrainConfig(COSTR_TINY, steps=6, batch=4, warm_up=2, augment=AugmentConfig.none(), loss=loss)
     run = Run(config, alike, out / "alike", 0)
     first = run.advance()
-    state = {k: v for k, v in run.model.state_dict().items() if "running" not in k and "tracked" not in k}
+    state = {k: v for k, v in run.state.model.state_dict().items() if "running" not in k and "tracked" not in k}
     varied = Run(config, toy(frames=4, points_per_car=20, ground_points=60), out / "varied", 0)
     drawn, real = [], varied.stream.draw
     object.__setattr__(varied.stream, "draw", lambda n: drawn.append(n) or real(n))
     losses = [varied.advance().loss for _ in range(2)]
-    return dict(loss=first.loss, state=state, drawn=drawn, losses=losses, varied=varied.model.state_dict())
+    return dict(loss=first.loss, state=state, drawn=drawn, losses=losses, varied=varied.state.model.state_dict())
 """
 
 PROCESS = """
@@ -258,14 +260,14 @@ def test_a_batch_that_cannot_be_shared_is_refused(toy, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.distributed.get_rank", lambda: 0)
     monkeypatch.setattr("torch.distributed.get_world_size", lambda: 4)
     with pytest.raises(ConfigError, match="batch of 2 samples cannot be shared by 4"):
-        Run(TINY, small(toy), tmp_path, seed=0)
+        Run(TINY, small(toy), tmp_path, seed=0).advance()
 
 
 def test_the_papers_preset_takes_a_step_and_resumes(toy, tmp_path):
     config = TrainConfig(COSTR_OPV2V, steps=2, batch=1, augment=AugmentConfig(max_agents=2))
     run = Run(config, small(toy), tmp_path, seed=0)
     first = run.advance()
-    run.save()
-    assert math.isfinite(first.loss) and run.model.token_grid.stride == 8
+    run.state.save()
+    assert math.isfinite(first.loss) and run.state.model.token_grid.stride == 8
     resumed = Run(config, small(toy), tmp_path, seed=0)
-    assert resumed.step == 1 and math.isfinite(resumed.advance().loss)
+    assert resumed.state.step == 1 and math.isfinite(resumed.advance().loss)

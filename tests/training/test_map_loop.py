@@ -81,13 +81,13 @@ def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path):
     broken = MapRun(CONFIG, Streets(), tmp_path / "broken", seed=3)
     for _ in range(3):
         broken.advance()
-        if broken.step == 2:
-            broken.save()
+        if broken.state.step == 2:
+            broken.state.save()
     resumed = MapRun(CONFIG, Streets(), tmp_path / "broken", seed=3)
-    assert resumed.step == 2 and not same_state(resumed.model, broken.model)
+    assert resumed.state.step == 2 and not same_state(resumed.state.model, broken.state.model)
     for _ in range(2):
         resumed.advance()
-    assert same_state(resumed.model, whole.model) and same_state(resumed.average, whole.average)
+    assert same_state(resumed.state.model, whole.state.model) and same_state(resumed.state.average, whole.state.average)
     with pytest.raises(CheckpointError, match="another configuration or seed"):
         MapRun(CONFIG, Streets(), tmp_path / "broken", seed=4)
 

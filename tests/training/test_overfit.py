@@ -22,8 +22,8 @@ def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):
     with torch.no_grad():
         # At this rate of learning the running statistics lag behind the weights by some tens of steps: let them catch up.
         for _ in range(100):
-            forward(run.average.train(), [sample])
-        outcome = forward(run.average.eval(), [sample])
+            forward(run.state.average.train(), [sample])
+        outcome = forward(run.state.average.eval(), [sample])
     together = decode(outcome.together, DecodeConfig())[0]
     frame = FrameResult("toy_0", 0, together, sample.union)
     for iou in (0.5, 0.7):

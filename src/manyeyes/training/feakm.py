@@ -9,9 +9,7 @@ linear growth, then a cosine.
 
 from __future__ import annotations
 
-import json
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -29,8 +27,7 @@ from manyeyes.models.keypoint_net import View
 from manyeyes.models.matcher import Assignment, Points, mutual
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.training.feakm_cache import FeatureCache, Pair
-from manyeyes.training.loop import trim_log, warm_cosine
-from manyeyes.training.run_state import RunState
+from manyeyes.training.run_state import RunState, warm_cosine
 
 
 @dataclass(frozen=True)
@@ -142,6 +139,11 @@ class MatchProgress:
     learning_rate: float
     seconds: float
 
+    def line(self) -> dict[str, float]:
+        """As it stands in log.jsonl."""
+        told = {"step": self.step, "loss": round(self.loss, 5), "lr": self.learning_rate}
+        return told | {"recall": round(self.recall, 4), "precision": round(self.precision, 4)}
+
 
 class FeakmRun:
     """One training run on cached views."""
@@ -155,10 +157,11 @@ class FeakmRun:
 
     def advance(self) -> MatchProgress:
         """One step of the optimiser."""
-        began, config, state = time.monotonic(), self.config, self.state
+        config, state = self.config, self.state
         state.model.train()
-        first = state.step * config.batch
-        pairs = [self.cache.draw(self.seed, first + i) for i in range(config.batch)]
+        numbers = state.numbers(config.batch)
+        first = numbers.start
+        pairs = [self.cache.draw(self.seed, number) for number in numbers]
         ego, other, motions = self._keypoints(pairs, first)
         truth = true_matches(ego, other, motions, config.near_m, config.far_m)
         ego, other = (self._disturbed(side, name, first) for side, name in ((ego, "ego"), (other, "other")))
@@ -166,7 +169,6 @@ class FeakmRun:
         loss = matching_loss(layers, truth)
         rate = config.learning_rate * warm_cosine(config.warm_up, state.step, config.steps)
         state.descend(loss, rate, config.clip, config.ema)
-        state.seconds += time.monotonic() - began
         recall, precision = found_right(layers[-1], truth, config.net.matcher.threshold)
         return MatchProgress(state.step, config.steps, float(loss.detach()), recall, precision, rate, state.seconds)
 
@@ -230,21 +232,10 @@ def train_feakm(
     Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
     """
     run = FeakmRun(config, cache, folder, seed)
-    folder.mkdir(parents=True, exist_ok=True)
-    trim_log(folder / "log.jsonl", run.state.step)
-    while run.state.step < config.steps:
-        progress = run.advance()
-        with (folder / "log.jsonl").open("a") as log:
-            log.write(json.dumps(_log_line(progress)) + "\n")
-        report(progress)
-        if run.state.step % config.save_every == 0 or run.state.step == config.steps:
-            run.state.save()
-    about = {"seed": seed, "steps": config.steps, "train_seconds": round(run.state.seconds), "config": asdict(config)}
+    state = run.state
+    state.finish(config.steps, config.save_every, run.advance, report)
     weights = folder / "weights.safetensors"
-    checkpoint.save(run.state.average, weights, {**about, **(card or {})}, half=True, format=FORMAT)
+    if not state.rank:
+        about = {"seed": seed, "steps": config.steps, "train_seconds": round(state.seconds), "config": asdict(config)}
+        checkpoint.save(state.average, weights, {**about, **(card or {})}, half=True, format=FORMAT)
     return weights
-
-
-def _log_line(progress: MatchProgress) -> dict[str, float]:
-    told = {"step": progress.step, "loss": round(progress.loss, 5), "lr": progress.learning_rate}
-    return told | {"recall": round(progress.recall, 4), "precision": round(progress.precision, 4)}

@@ -15,7 +15,6 @@ from manyeyes.ops.box_iou import aligned_iou
 from manyeyes.training.information import Target
 from manyeyes.training.targets import Targets
 
-
 FEW_CELLS_VOICE = 8.0
 """At most so many times a cell's fair share, so that an object of one cell does not speak for a whole batch."""
 

@@ -6,28 +6,23 @@ A step sees every look by itself, fuses those of each tile by their claimed pose
 
 from __future__ import annotations
 
-import copy
-import json
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
-from torch import Tensor, nn
+from torch import Tensor
 
-from manyeyes.datatypes import CheckpointError, ConfigError, SparseBev, Transform
+from manyeyes.datatypes import SparseBev, Transform
 from manyeyes.models import checkpoint
-from manyeyes.models.checkpoint import config_to_json
 from manyeyes.models.map_presets import FORMAT
 from manyeyes.models.mapper import Look, Mapper, MapperConfig
 from manyeyes.ops.keyed_random import keyed_uniform
-from manyeyes.training.loop import mean_in_place, parameter_groups, trim_log, warm_cosine
 from manyeyes.training.map_losses import MapLossConfig, MapTerms, ink_loss, map_terms
 from manyeyes.training.map_samples import MapAugment, MapSample, MapSamples
 from manyeyes.training.map_targets import target_of
+from manyeyes.training.run_state import RunState, warm_cosine
 
 
 @dataclass(frozen=True)
@@ -62,6 +57,11 @@ class MapProgress:
     terms: MapTerms
     learning_rate: float
     seconds: float
+
+    def line(self) -> dict[str, float]:
+        """As it stands in log.jsonl."""
+        terms = {name: round(float(value.detach()), 5) for name, value in vars(self.terms).items()}
+        return {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
 
 
 def see(model: Mapper, samples: Sequence[MapSample]) -> Look:
@@ -107,102 +107,27 @@ def loss_terms(
 
 
 class MapRun:
-    """Model, optimiser and average of one training run, in a folder from which it resumes."""
+    """One training run of the map model, in a folder from which it resumes."""
 
     def __init__(self, config: MapTrainConfig, samples: MapSamples, folder: Path, seed: int) -> None:
-        self.config, self.samples, self.folder, self.seed = config, samples, folder, seed
-        self.rank, self.world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
-        if config.batch % self.world:
-            raise ConfigError(f"A batch of {config.batch} tiles cannot be shared by {self.world} processes evenly.")
+        self.config, self.samples, self.seed = config, samples, seed
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            self.model = Mapper(config.mapper)
-        self.average = copy.deepcopy(self.model).requires_grad_(False)
-        self.optimiser = torch.optim.AdamW(parameter_groups(self.model, config.weight_decay), lr=config.learning_rate)
-        self.step, self.seconds = 0, 0.0
-        if self.state_path.exists():
-            self._resume()
-
-    @property
-    def state_path(self) -> Path:
-        """Where the run is kept between saves."""
-        return self.folder / "last.pt"
+            model = Mapper(config.mapper)
+        self.state = RunState(model, config, seed, folder, config.weight_decay)
 
     def advance(self) -> MapProgress:
         """One step of the optimiser."""
-        began, config = time.monotonic(), self.config
-        self.model.train()
-        share = config.batch // self.world
-        first = self.step * config.batch + self.rank * share
-        samples = [self.samples.draw(first + i) for i in range(share)]
-        rate = config.learning_rate * warm_cosine(config.warm_up, self.step, config.steps)
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
-        self.optimiser.zero_grad(set_to_none=True)
+        config, state = self.config, self.state
+        numbers = state.numbers(config.batch)
+        samples = [self.samples.draw(number) for number in numbers]
         looks = sum(len(sample.looks) for sample in samples)
-        thin = config.thin * keyed_uniform((looks,), "thin", self.seed, first).float()
-        terms = loss_terms(self.model, samples, config.loss, thin)
+        thin = config.thin * keyed_uniform((looks,), "thin", self.seed, numbers.start).float()
+        terms = loss_terms(state.model.train(), samples, config.loss, thin)
         loss = terms.total(config.loss)
-        if not bool(torch.isfinite(loss)):
-            raise ConfigError(
-                f"The loss is {float(loss.detach())} at step {self.step}; lower the learning rate, or resume from an older save."
-            )
-        loss.backward()
-        self._share_gradients()
-        nn.utils.clip_grad_norm_(self.model.parameters(), config.clip)
-        self.optimiser.step()
-        self._average()
-        self.step += 1
-        self.seconds += time.monotonic() - began
-        return MapProgress(self.step, config.steps, float(loss.detach()), terms, rate, self.seconds)
-
-    def _share_gradients(self) -> None:
-        """The mean over processes, one flat exchange; a parameter that nobody used has none."""
-        if self.world == 1:
-            return
-        for p in self.model.parameters():
-            p.grad = torch.zeros_like(p) if p.grad is None else p.grad
-        mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world)
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
-        for mean, value in zip(self.average.parameters(), self.model.parameters()):
-            mean.lerp_(value, 1 - decay)
-
-    def save(self) -> None:
-        """Everything that the run needs to go on as if it had not stopped; atomic."""
-        if self.rank:
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        partial = self.state_path.with_suffix(".partial")
-        state: dict[str, Any] = {
-            "config": config_to_json(self.config),
-            "seed": self.seed,
-            "step": self.step,
-            "seconds": self.seconds,
-            "model": self.model.state_dict(),
-            "average": self.average.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-        }
-        torch.save(state, partial)
-        partial.replace(self.state_path)
-
-    def _resume(self) -> None:
-        try:
-            state = torch.load(self.state_path, weights_only=True)
-        except Exception as error:
-            raise CheckpointError(
-                f"{self.state_path}: not a whole training state ({type(error).__name__}); delete it to start anew."
-            ) from error
-        if state["config"] != config_to_json(self.config) or state["seed"] != self.seed:
-            raise CheckpointError(
-                f"{self.state_path}: belongs to a run of another configuration or seed; give another --out, or delete it."
-            )
-        self.model.load_state_dict(state["model"])
-        self.average.load_state_dict(state["average"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.step, self.seconds = state["step"], state["seconds"]
+        rate = config.learning_rate * warm_cosine(config.warm_up, state.step, config.steps)
+        state.descend(loss, rate, config.clip, config.ema)
+        return MapProgress(state.step, config.steps, float(loss.detach()), terms, rate, state.seconds)
 
 
 def train_mapper(
@@ -218,31 +143,16 @@ def train_mapper(
     Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
     """
     run = MapRun(config, samples, folder, seed)
-    folder.mkdir(parents=True, exist_ok=True)
-    if run.rank == 0:
-        trim_log(folder / "log.jsonl", run.step)
-    while run.step < config.steps:
-        progress = run.advance()
-        if run.rank == 0:
-            with (folder / "log.jsonl").open("a") as log:
-                log.write(json.dumps(_log_line(progress)) + "\n")
-            report(progress)
-        if run.step % config.save_every == 0 or run.step == config.steps:
-            run.save()
+    state = run.state
+    state.finish(config.steps, config.save_every, run.advance, report)
     weights = folder / "weights.safetensors"
-    if run.rank == 0:
+    if not state.rank:
         about = {
             "seed": seed,
             "steps": config.steps,
             "towns": list(samples.towns),
-            "train_seconds": round(run.seconds),
+            "train_seconds": round(state.seconds),
             "config": asdict(config),
-            **(card or {}),
         }
-        checkpoint.save(run.average, weights, about, half=True, format=FORMAT)
+        checkpoint.save(state.average, weights, {**about, **(card or {})}, half=True, format=FORMAT)
     return weights
-
-
-def _log_line(progress: MapProgress) -> dict[str, float]:
-    terms = {name: round(float(value.detach()), 5) for name, value in vars(progress.terms).items()}
-    return {"step": progress.step, "loss": round(progress.loss, 5), **terms, "lr": progress.learning_rate}
