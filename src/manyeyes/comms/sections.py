@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bodies of packets: tokens, objects, points, requests to bytes and back, as :mod:`manyeyes.comms.wire` lays down."""
+"""The bodies of packets: tokens, objects, points, requests to bytes and back, as :mod:`manyeyes.comms.wire` lays down.
+
+Those of map elements stand in :mod:`manyeyes.comms.elements`.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ from torch import Tensor
 
 from manyeyes.comms import codec
 from manyeyes.comms.codec import PacketError
+from manyeyes.comms.elements import ElementRows, read_elements
 from manyeyes.comms.entropy import MOST_CELLS, CodeTables, coded_counts, pack_coded, unpack_coded
 from manyeyes.datatypes import LABELS, BevGrid, Boxes, ConfigError, PointCloud, Sites, SparseBev, WireError
 from manyeyes.datatypes.message import DESCRIPTOR, RequestMap
@@ -26,7 +30,7 @@ Precision = Literal["float32", "float16", "int8", "codes"]
 PRECISIONS: tuple[Precision, ...] = ("float32", "float16", "int8", "codes")
 # The middle of what drives in European cities.
 LABEL_HEIGHTS = (1.6, 2.3, 3.2, 3.2)
-NONE, TOKENS, OBJECTS, POINTS, REQUEST = range(5)
+NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS = range(6)
 
 _GRID = struct.Struct("<6hHB")
 _TOKENS = struct.Struct("<BHH")
@@ -82,7 +86,7 @@ class PointRows:
     rows: NDArray[Any]
 
 
-Body = TokenRows | ObjectRows | PointRows | RequestMap | None
+Body = TokenRows | ObjectRows | PointRows | RequestMap | ElementRows | None
 
 
 def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int16]:
@@ -338,6 +342,8 @@ def read_body(kind: int, body: bytes, fingerprint: bytes, tables: CodeTables | N
         return _read_objects(body)
     if kind == REQUEST:
         return _read_request(body)
+    if kind == ELEMENTS:
+        return read_elements(body)
     if kind == POINTS:
         return PointRows(_rows(body, _POINT))
     if kind != NONE or body:

@@ -8,8 +8,9 @@ offset bytes type     meaning
 ====== ===== ======== =====================================================================================
 0      2     bytes    ``ME``
 2      1     u8       version, 2
-3      1     u8       flags: bits 0-2 kind of body (0 none, 1 tokens, 2 objects, 3 points, 4 request), bit 3 sender
-                      is infrastructure, bits 4-5 which part of the quaternion (w, x, y, z) is left out, 6-7 zero
+3      1     u8       flags: bits 0-2 kind of body (0 none, 1 tokens, 2 objects, 3 points, 4 request, 5 map
+                      elements), bit 3 sender is infrastructure, bits 4-5 which part of the quaternion (w, x, y, z)
+                      is left out, 6-7 zero
 4      2     u16      number of this packet within its message, from 0
 6      2     u16      packets in the message, all kinds together
 8      4     i32      agent id
@@ -64,9 +65,24 @@ within the sweep is not sent. Packet k of K points packets has every K-th point 
 request (kind 4) is one packet: a grid as tokens begin with (15 bytes), then for each of its cells, row by row, u8 how sure the
 sender is of what it sees there, 1/255.
 
-Packets are numbered objects first, then the request, then tokens by falling score (ties by key), then points: a message that
-is cut after any packet still helps. A message without sections is one packet of kind 0. Empty sections are one packet with no
-rows. There is no length: what was cut or padded fails the checksum.
+Map elements (kind 5), in the sender's frame: u8 rings R, 1 to 32, then R rings, the same in all packets: what the sender could
+see, then what hid parts of it from it. Then elements to the end of the body, the highest score first:
+
+====== ===== ======== =====================================================================================
+0      1     u8       bits 0-1 kind (index into KINDS), bits 2-3 likeliest style (index into STYLES), bits 4-7 its
+                      probability, 1/4 to 1 in 15 steps; the other styles share the rest evenly
+1      1     u8       score, 1/255
+2      1     u8       sigma, the mean of its points': 0 is 0; codes 1 to 255 are 0.01 to 20 m in equal ratios
+3      ...            its line
+====== ===== ======== =====================================================================================
+
+A line is varints (``codec.pack_varints``): how many points, 2 or more (3 of a ring, whose first is not repeated), then x and y of
+the first and what each further one adds to the one before it, units of 2 cm, zigzag (v << 1 ^ v >> 63), within 327.66 m. No
+point is as the one before it.
+
+Packets are numbered objects first, then the request, then tokens by falling score (ties by key), then map elements, then points:
+a message that is cut after any packet still helps. A message without sections is one packet of kind 0. Empty sections are one
+packet with no rows. There is no length: what was cut or padded fails the checksum.
 """
 
 from __future__ import annotations
@@ -85,6 +101,7 @@ from numpy.typing import NDArray
 
 from manyeyes.comms import sections
 from manyeyes.comms.codec import PacketError, log_codes, log_values
+from manyeyes.comms.elements import ElementRows, element_bodies, merge_elements
 from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.sections import Body, Form, ObjectRows, PointRows, Precision, TokenRows
 from manyeyes.datatypes import BevGrid, ConfigError, Message, Transform, WireError
@@ -160,6 +177,8 @@ def encode(
             )
         rows = sections.token_bodies(message.tokens, message.token_score, form, capacity)
         bodies += [(sections.TOKENS, body) for body in rows]
+    if message.seen_map is not None:
+        bodies += [(sections.ELEMENTS, body) for body in element_bodies(message.seen_map, capacity)]
     if message.points is not None:
         bodies += [(sections.POINTS, body) for body in sections.point_bodies(message.points, capacity)]
     bodies = bodies or [(sections.NONE, b"")]
@@ -335,6 +354,7 @@ class Assembly:
         self._form: tuple[BevGrid, Precision, int] | None = None
         self._objects: np.dtype[Any] | None = None
         self._requested = False
+        self._rings: bytes | None = None
         self._cells: set[int] = set()
         self.add(first)
 
@@ -364,6 +384,11 @@ class Assembly:
                 name = self._name(fragment)
                 raise PacketError("contradiction", f"{name} is a second request; there is one a message.")
             self._requested = True
+        if isinstance(fragment.body, ElementRows):
+            if (self._rings or fragment.body.rings) != fragment.body.rings:
+                name = self._name(fragment)
+                raise PacketError("contradiction", f"The map in {name} was seen in another view than those before.")
+            self._rings = fragment.body.rings
         self.fragments[fragment.number] = fragment
         return True
 
@@ -390,6 +415,7 @@ class Assembly:
             descriptors=sections.merge_descriptors(objects),
             points=sections.merge_points([b.rows for b in bodies if isinstance(b, PointRows)]),
             request=next((b for b in bodies if isinstance(b, RequestMap)), None),
+            seen_map=merge_elements([b for b in bodies if isinstance(b, ElementRows)]),
         )
 
 

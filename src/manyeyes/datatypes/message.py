@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from manyeyes.datatypes.boxes import Boxes
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.grid import BevGrid
+from manyeyes.datatypes.map_element import MapElements, Polygons, frozen
 from manyeyes.datatypes.point_cloud import PointCloud
 from manyeyes.datatypes.sparse_bev import SparseBev
 from manyeyes.datatypes.transform import Transform
@@ -33,15 +36,33 @@ class RequestMap:
             raise ShapeError(f"RequestMap.sure needs shape {self.grid.shape}; got {tuple(self.sure.shape)}.")
 
 
+@dataclass(frozen=True, eq=False)
+class SeenMap:
+    """What an agent sees of the map, in its own frame, metres: elements, and where it would have seen others.
+
+    view: (K, 2), an open ring; occluders: open rings that hide parts of it. Nothing where nothing is said: there the agent
+    looked, and says that the street is empty.
+    """
+
+    elements: MapElements
+    view: NDArray[np.float64]
+    occluders: Polygons = field(default_factory=Polygons.of)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "view", frozen(self.view, np.float64))
+        if self.view.ndim != 2 or self.view.shape[1] != 2 or len(self.view) < 3:
+            raise ShapeError(f"SeenMap.view needs shape (K, 2), K >= 3; got {self.view.shape}.")
+
+
 @dataclass(frozen=True)
 class Message:
-    """Header and up to four sections; a section that is not sent is None.
+    """Header and up to five sections; a section that is not sent is None.
 
     world_from_agent: the claimed pose at timestamp_ns, the time of capture; pose_covariance: (3, 3), x, y, yaw.
     fingerprint: 8 bytes that name the weights which made the tokens; tokens of other weights are refused.
     tokens: one grid, in the sender's frame; features float, or uint8 rows of the weights' codebook. token_score: (N,), which
     cells matter most. objects and points: sender's frame. descriptors: (objects, DESCRIPTOR) in [-1, 1], of each object, for
-    matching. request: what the sender would hear.
+    matching. request: what the sender would hear. seen_map: what it sees of the map.
     """
 
     agent_id: int
@@ -56,3 +77,4 @@ class Message:
     points: PointCloud | None = None
     descriptors: Tensor | None = None
     request: RequestMap | None = None
+    seen_map: SeenMap | None = None
