@@ -19,7 +19,7 @@ COSTR_SMALL = DetectorConfig(
     grid=SMALL_GRID,
     pillars="moments",
     pillar_channels=32,
-    encoder=EncoderConfig((32, 32, 64, 64, 64, 64), (0, 2, 2, 2, 1, 1), prune_strides=(2, 4, 8)),
+    encoder=EncoderConfig((32, 32, 64, 64, 64, 64), (0, 2, 2, 2, 1, 1), prune_strides=(2, 4)),
     head_channels=64,
     prune_threshold=0.1,
     decode=DecodeConfig(overlap_power=0.6),

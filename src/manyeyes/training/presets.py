@@ -27,7 +27,7 @@ _ROAD = TrainConfig(
 _CROWD = replace(
     _ROAD,
     detector=replace(_ROAD.detector, prune_threshold=0.12),
-    steps=4200,
+    steps=3400,
     augment=AugmentConfig(thin=0.1, early_share=0.2),
     loss=LossConfig(iou=0.8, together=0.6, prune=1.0),
 )
@@ -74,6 +74,8 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
     "branch-se-dast-dast": _branch(fusion="self_attention"),
     "branch-se-fast": _branch(dast=_NO_BLOCKS),
     "branch-se-dast-fast": _BRANCH,
+    "branch-v2x-vit": _branch(fusion="v2x_vit"),
+    "branch-multi-scale": _branch(fusion="multi_scale"),
     "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
     "costr-tiny": TrainConfig(
         COSTR_TINY, steps=60, batch=2, learning_rate=3e-3, warm_up=5, save_every=20, augment=AugmentConfig(max_agents=3)
