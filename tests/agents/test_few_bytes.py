@@ -63,12 +63,12 @@ def detector() -> Detector:
 @pytest.mark.parametrize("precision", ["float16", "codes"])
 @pytest.mark.parametrize("channel_bytes", [None, 2500])
 def test_the_bytes_of_a_table_are_those_handed_to_the_bus(detector, monkeypatch, precision, channel_bytes):
-    """Packet by packet: what a step reports of a sender is the number and the length of what the bus was given."""
-    handed: dict[tuple[int, int], list[int]] = {}
+    """Packet by packet: what a step reports of a sender is the length of every packet that the bus was given, in order."""
+    handed: dict[tuple[int, int], tuple[int, ...]] = {}
     publish = LocalBus.publish
 
     def counted(self, agent_id, position_xy, packets, now_ns):
-        handed[now_ns, agent_id] = [len(packet) for packet in packets]
+        handed[now_ns, agent_id] = tuple(map(len, packets))
         publish(self, agent_id, position_xy, packets, now_ns)
 
     monkeypatch.setattr(LocalBus, "publish", counted)
@@ -77,11 +77,10 @@ def test_the_bytes_of_a_table_are_those_handed_to_the_bus(detector, monkeypatch,
     assert len(steps) == 2
     for step in steps:
         now = step.snapshot.frames[0].timestamp_ns
-        sizes = {s.agent_id: (s.bytes, s.packets) for s in step.sent}
-        assert sizes == {a: (sum(v), len(v)) for (t, a), v in handed.items() if t == now}
-        assert all(size <= 4096 for size, _ in sizes.values())
+        assert {s.agent_id: s.sizes for s in step.sent} == {a: v for (t, a), v in handed.items() if t == now}
+        assert all(s.packets == len(s.sizes) > 0 and s.bytes <= 4096 for s in step.sent)
         if channel_bytes is not None:
-            assert channel_bytes - 400 < sum(size for size, _ in sizes.values()) <= channel_bytes
+            assert channel_bytes - 400 < sum(s.bytes for s in step.sent) <= channel_bytes
         assert len(step.perception.heard) == sum(1 for s in step.sent if s.packets and s.agent_id != 0)
 
 

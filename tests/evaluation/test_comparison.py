@@ -32,10 +32,12 @@ def step(method: str, scenario: str, index: int, found: int, sent_bytes: int, ag
         for i in range(2)
     )
     truth = Truth(boxes(SPOTS), torch.ones(2, 4, dtype=torch.bool), Transform.identity(2))
-    packets = int(sent_bytes > 0)
     # The ego's own message is on the air too, and must not be counted as one that it receives.
-    sent = (Sent(100, 7 * sent_bytes, packets, 0.010), Sent(101, sent_bytes, packets, 0.030))
-    ages = (age_s,) if packets else ()
+    sent = tuple(
+        Sent(a, (size,) if size else (), took)
+        for a, size, took in ((100, 7 * sent_bytes, 0.01), (101, sent_bytes, 0.03))
+    )
+    ages = (age_s,) if sent_bytes else ()
     return Step(
         method, Snapshot(scenario, index, frames, truth), 0, Perception(boxes(SPOTS[:found]), ()), sent, ages, 0.05
     )

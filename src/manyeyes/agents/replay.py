@@ -61,12 +61,21 @@ class ReplayConfig:
 
 @dataclass(frozen=True)
 class Sent:
-    """What one agent put on the air at one instant. seconds: the time that share took."""
+    """What one agent put on the air at one instant. sizes: bytes of each packet; seconds: the time that share took."""
 
     agent_id: int
-    bytes: int
-    packets: int
+    sizes: tuple[int, ...]
     seconds: float
+
+    @property
+    def bytes(self) -> int:
+        """Of all packets."""
+        return sum(self.sizes)
+
+    @property
+    def packets(self) -> int:
+        """Their number."""
+        return len(self.sizes)
 
 
 @dataclass(frozen=True)
@@ -132,8 +141,7 @@ class Team:
         for frame, (packets, _) in zip(frames, said):
             self._bus.publish(frame.agent_id, places[frame.agent_id], packets, frame.timestamp_ns)
         return tuple(
-            Sent(frame.agent_id, sum(map(len, packets)), len(packets), took)
-            for frame, (packets, took) in zip(frames, said)
+            Sent(frame.agent_id, tuple(map(len, packets)), took) for frame, (packets, took) in zip(frames, said)
         )
 
     def _say(self, frame: AgentFrame, budget_bytes: int | None = None) -> tuple[list[bytes], float]:
