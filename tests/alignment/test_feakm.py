@@ -12,14 +12,16 @@ import torch
 from manyeyes.alignment.estimate import PoseClaim, PoseStatus, difference
 from manyeyes.alignment.feakm import ConsensusConfig, Feakm, RansacConfig, mended, published
 from manyeyes.alignment.landmarks import Landmarks
+from manyeyes.alignment.rivals.table import corrector
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox
-from manyeyes.datatypes import BevGrid, Boxes, Message, SparseBev, Transform
+from manyeyes.datatypes import BevGrid, Boxes, ManyeyesError, Message, SparseBev, Transform
 from manyeyes.datatypes.keypoints import Keypoints
-from manyeyes.models.feakm import FeakmConfig, FeakmNet, Matches
+from manyeyes.models import checkpoint
+from manyeyes.models.feakm import FORMAT, FeakmConfig, FeakmNet, Matches
 from manyeyes.models.keypoint_boxes import BoxKeypoints
 from manyeyes.models.keypoint_net import DenseKeypoints, View
-from manyeyes.models.matcher import MatcherConfig
+from manyeyes.models.matcher import MatcherConfig, Points
 
 TRUTH = np.array([20.0, -7.0, 2.2])
 SOLVERS = {"published": published, "mended": mended}
@@ -156,7 +158,7 @@ class Drawn:
     def config(self) -> FeakmConfig:
         return self.net.config
 
-    def match(self, ego: Keypoints, other: Keypoints) -> Matches:
+    def match(self, ego: Points, other: Points) -> Matches:
         return Matches(self.pairs, torch.ones(len(self.pairs)))
 
 
@@ -182,10 +184,59 @@ def test_a_pose_is_found_from_what_comes_as_bytes():
     other = Keypoints(heard.message.objects, heard.message.descriptors)
     alike = (ego.descriptor @ other.descriptor.T).argmax(1)
     net = FeakmNet(FeakmConfig(BoxKeypoints(4, 32, 8), MatcherConfig(32, 8, 1, 1)))
-    found = Feakm.of(Drawn(net, torch.stack((torch.arange(n), alike), 1)))(ego, other, None)
+    by_looks = Feakm.of(Drawn(net, torch.stack((torch.arange(n), alike), 1)))
+    found = by_looks(Landmarks.of_keypoints(ego), Landmarks.of_keypoints(other), None)
     assert found.inliers == n
     off = difference(found.pose, TRUTH)
     assert np.hypot(off[0], off[1]) < 0.02 and abs(off[2]) < 1e-3
+
+
+def test_objects_that_nobody_described_are_recognised_by_nobody():
+    ego = marks(6)
+    look = np.eye(6, 32)
+    net = FeakmNet(FeakmConfig(BoxKeypoints(4, 32, 8), MatcherConfig(32, 8, 1, 1)))
+    by_looks, claimed = Feakm.of(Drawn(net, torch.from_numpy(same(6)))), claim(TRUTH, 0.5)
+    other = moved_back(TRUTH, ego)
+    for pair in ((ego, replace(other, look=look)), (replace(ego, look=look), other)):
+        assert by_looks(*pair, claimed).status is PoseStatus.NO_MATCH
+    found = by_looks(replace(ego, look=look), replace(other, look=look), None)
+    np.testing.assert_allclose(difference(found.pose, TRUTH), 0, atol=1e-6)
+
+
+def test_a_net_is_told_what_landmarks_say():
+    """The matcher gets of landmarks what it gets of the keypoints that they were made of."""
+    torch.manual_seed(0)
+    net = FeakmNet(FeakmConfig(BoxKeypoints(4, 32, 8), MatcherConfig(32, 16, 1, 1, threshold=0.0))).eval()
+    seen = marks(5)
+    boxes = Boxes.of(
+        torch.from_numpy(np.column_stack((seen.xy, np.ones(5)))).float(),
+        torch.tensor([4.5, 1.9, 1.6]).expand(5, 3),
+        torch.from_numpy(seen.yaw).float(),
+    )
+    points = [Keypoints(boxes, torch.nn.functional.normalize(torch.randn(5, 32))) for _ in range(2)]
+    wanted = net.match(Points.of(points[:1]), Points.of(points[1:]))
+    heard = []
+    by_looks = Feakm(net, lambda ego, other, pairs, claimed: heard.append(pairs))
+    by_looks(*map(Landmarks.of_keypoints, points), None)
+    assert len(wanted.pairs) and torch.equal(torch.from_numpy(heard[0]), wanted.pairs)
+
+
+def test_names_say_whose_weights_and_how_many_pairs(tmp_path):
+    path = tmp_path / "net.safetensors"
+    net = FeakmNet(FeakmConfig(BoxKeypoints(4, 32, 8), MatcherConfig(32, 8, 1, 1)))
+    checkpoint.save(net, path, {}, format=FORMAT)
+    four, eight = corrector(str(path)), corrector(f"{path}@8")
+    assert corrector(f"{path}@4").net is four.net and corrector(str(path)) is not eight
+    ego = marks(6)
+    for least, said in ((4, four), (8, eight)):
+        assert said.solver(ego, moved_back(TRUTH, ego), same(6), None).status.answered == (least == 4)
+    for name, why in (
+        (f"{path}@x", "4 or 8"),
+        ("magic", "known: vote"),
+        (str(tmp_path / "no.safetensors"), "no such file"),
+    ):
+        with pytest.raises(ManyeyesError, match=why):
+            corrector(name)
 
 
 def test_the_half_pixel():
@@ -216,8 +267,8 @@ def test_the_half_pixel():
         points = net.describe(views)
         mirrored = torch.tensor([2 * middle, 2 * middle]) - points[1].xy
         pairs = torch.cdist(points[0].xy, mirrored).argmin(1)
-        corrector = Feakm.of(Drawn(net, torch.stack((torch.arange(6), pairs), 1)))
-        off = difference(corrector(*points, None).pose, truth)
+        by_looks = Feakm.of(Drawn(net, torch.stack((torch.arange(6), pairs), 1)))
+        off = difference(by_looks(*map(Landmarks.of_keypoints, points), None).pose, truth)
         errors[name] = float(np.hypot(off[0], off[1]))
         assert abs(off[2]) < 1e-6
     assert errors["mended"] < 1e-3

@@ -62,3 +62,14 @@ def test_shapes_and_errors_are_checked():
     with pytest.raises(ConfigError, match="sigma_xy_m > 0"):
         DetectorError(sigma_xy_m=0.0)
     assert len(Landmarks.cat([])) == 0 and len(Landmarks.cat([marks(2), marks(3)])) == 5
+
+
+def test_looks_go_where_their_landmarks_go():
+    one, look = marks(3), np.arange(12.0).reshape(3, 4)
+    seen = replace(one, look=look)
+    np.testing.assert_array_equal(seen[np.array([2, 0])].look, look[[2, 0]])
+    np.testing.assert_array_equal(seen.moved(np.ones(3)).look, look)
+    np.testing.assert_array_equal(Landmarks.cat([seen, seen[:1]]).look, look[[0, 1, 2, 0]])
+    assert Landmarks.cat([seen, one]).look is None and one[:2].look is None
+    with pytest.raises(ShapeError, match=r"Landmarks\.look"):
+        replace(one, look=look[:2])

@@ -17,7 +17,7 @@ from manyeyes.datasets.disturb import PoseNoise
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.evaluation.feakm_ablation import Branch, _Scene, ablation
-from manyeyes.evaluation.feakm_pose import by_landmarks, described, pose_frames
+from manyeyes.evaluation.feakm_pose import described, pose_frames
 from manyeyes.evaluation.pose import ClaimNoise, score
 from manyeyes.models.detector import Detector
 from manyeyes.models.feakm import FeakmConfig, FeakmNet
@@ -120,7 +120,7 @@ def test_correctors_are_judged_on_the_same_pairs_and_claims():
         x, y, yaw = made.ego_from_other.tolist()
         points = [Keypoints(boxes, torch.zeros(len(boxes), 1)) for boxes in (made.ego[0], made.other[0])]
         pairs.append((*points, Transform.from_xyz_yaw(x, y, 0.0, yaw)))
-    finders = {"vote": by_landmarks(correct), "claim": lambda ego, other, claimed: unanswered(claimed)}
+    finders = {"vote": correct, "claim": lambda ego, other, claimed: unanswered(claimed)}
     found = pose_frames(pairs, finders, ClaimNoise("gaussian", 1.0, 1.0))
     assert all(len(frames) == 4 for frames in found.values())
     assert [f.common for f in found["vote"]] == [f.common for f in found["claim"]] and found["vote"][0].common >= 6

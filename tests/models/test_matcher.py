@@ -135,7 +135,7 @@ def test_rotary_positions_hold_under_a_shift_and_not_under_a_turn_and_the_conste
 
 def test_nothing_to_match_is_no_match_and_gives_finite_gradients():
     net = FeakmNet(FeakmConfig(BoxKeypoints(8, 8, 16), SMALL))
-    assert net.match(keypoints(0), keypoints(3)).pairs.shape == (0, 2)
+    assert net.match(Points.of([keypoints(0)]), Points.of([keypoints(3)])).pairs.shape == (0, 2)
     out = net.matcher(Points.of([keypoints(0), keypoints(3)]), Points.of([keypoints(4), keypoints(0)]))[-1]
     (out.log_p.sum() + out.log_alone_a.sum()).backward()
     assert all(p.grad is None or bool(p.grad.isfinite().all()) for p in net.parameters())

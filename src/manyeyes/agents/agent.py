@@ -76,12 +76,15 @@ class Agent:
         message = self.collaboration.say(self.eyes, frame)
         if message is None:
             return []
+        if self.aligner is not None:
+            message = self.aligner.describe(frame, self.eyes, message)
         if message.tokens is not None and message.token_score is not None:
             tokens = coded(message.tokens, self.eyes.detector) if self.precision == "codes" else message.tokens
             score = message.token_score * need(tokens.sites.xy, frame.world_from_agent, asked)
             left = budget
             if self.requests:
                 message = replace(message, request=self._request(frame))
+            if message.request is not None or message.objects is not None:
                 spent = wire.encode(replace(message, tokens=None), precision=self.precision)
                 left = None if budget is None else budget - sum(map(len, spent))
             tokens, score = within_budget(tokens, score, left, self.precision, tables=self._tables)

@@ -3,7 +3,8 @@
 
 No byte is added for this: the landmarks of a sender are the boxes it sends, or those that its tokens propose, or, where it
 sends its cloud, what the ego's own eyes find in it. Boxes seen earlier are moved by their velocity to the ego's instant.
-Spec: specs/pose.md 4.4, 4.7, 4.8.
+Where the corrector is FeaKM's, senders add descriptors, and the boxes that these describe where they send none
+(describing.py): 32 and 13 bytes an object. Spec: specs/pose.md 4.4, 4.7, 4.8.
 """
 
 from __future__ import annotations
@@ -17,17 +18,22 @@ from enum import Enum
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from manyeyes.agents.collaboration.heading import age_s
+from manyeyes.agents.describing import described, seen_points, told_points
 from manyeyes.agents.eyes import Eyes
 from manyeyes.alignment.decide import inflated
 from manyeyes.alignment.estimate import PoseClaim, PoseEstimate, PoseStatus, upright
+from manyeyes.alignment.feakm import Feakm
 from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.alignment.pose_graph import Link, settle
 from manyeyes.alignment.rivals.table import corrector
 from manyeyes.alignment.watchman import Health, Report, WatchConfig, WatchState, watch
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message
+from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.box_head import RawBoxes
+from manyeyes.models.feakm import FeakmNet
 from manyeyes.models.proposal import PROPOSAL
 
 Floats = NDArray[np.float64]
@@ -76,9 +82,9 @@ class Aligned:
 
 @dataclass(frozen=True)
 class Aligner:
-    """Settings. corrector: of two agents' landmarks, by name (alignment/rivals/table.py). score_min: boxes below it are no
-    landmarks. unsure_m: a message whose cells may lie this far off (one standard deviation, reach_m from its sender) is
-    not fused. speed_sigma_mps: error of an object's stated velocity.
+    """Settings. corrector: of two agents' landmarks, by name (alignment/rivals/table.py), read again where this is sent to
+    another process. score_min: boxes below it are no landmarks. unsure_m: a message whose cells may lie this far off (one
+    standard deviation, reach_m from its sender) is not fused. speed_sigma_mps: error of an object's stated velocity.
     """
 
     corrector: str = "vote"
@@ -101,8 +107,8 @@ class Aligner:
         watched = {a: s for a, s in states.items() if not len(s.time) or abs(now_s - s.time[-1]) <= FORGET_S}
         if not messages:
             return Aligned((), (), watched)
-        own = self._landmarks(eyes.see(frame).boxes, 0.0)
-        marks = [self._landmarks(boxes_of(eyes, message), age_s(frame, message)) for message in messages]
+        own = self.own_landmarks(frame, eyes)
+        marks = [self._told_landmarks(eyes, message, age_s(frame, message)) for message in messages]
         claims = [PoseClaim.between(frame, message) for message in messages]
         answers = [corrector(self.corrector)(own, theirs, claim) for theirs, claim in zip(marks, claims)]
         health = []
@@ -122,9 +128,37 @@ class Aligner:
                 kept.append(moved(message, frame, estimate))
         return Aligned(tuple(kept), tuple(verdicts), watched)
 
-    def _landmarks(self, boxes: Boxes, seconds: float) -> Landmarks:
-        """Boxes seen so long ago, where they are now."""
-        marks = Landmarks.of_boxes(boxes[boxes.score >= self.score_min].after(seconds))
+    @property
+    def net(self) -> FeakmNet | None:
+        """Whose descriptors the corrector reads, if any."""
+        found = corrector(self.corrector)
+        return found.net if isinstance(found, Feakm) else None
+
+    def describe(self, frame: AgentFrame, eyes: Eyes, message: Message) -> Message:
+        """An agent's own message with what the corrector needs beside; one that is dated otherwise than the frame stays."""
+        if self.net is None or message.timestamp_ns != frame.timestamp_ns:
+            return message
+        return described(self.net, eyes, frame, message)
+
+    def own_landmarks(self, frame: AgentFrame, eyes: Eyes) -> Landmarks:
+        """What an agent itself sees, as far as the corrector goes by it."""
+        if self.net is None:
+            return self._landmarks(eyes.see(frame).boxes, None, 0.0)
+        points = seen_points(self.net, eyes, frame)
+        return self._landmarks(points.boxes, points.descriptor, 0.0)
+
+    def _told_landmarks(self, eyes: Eyes, message: Message, seconds: float) -> Landmarks:
+        """What a message says that left so long ago; nothing, where the corrector needs descriptors and none came."""
+        if self.net is None:
+            return self._landmarks(boxes_of(eyes, message), None, seconds)
+        points = told_points(message)
+        return Landmarks.empty() if points is None else self._landmarks(points.boxes, points.descriptor, seconds)
+
+    def _landmarks(self, boxes: Boxes, look: Tensor | None, seconds: float) -> Landmarks:
+        """Boxes that are sure enough, seen so long ago, where they are now."""
+        sure = boxes.score >= self.score_min
+        now = boxes[sure].after(seconds)
+        marks = Landmarks.of_boxes(now) if look is None else Landmarks.of_keypoints(Keypoints(now, look[sure]))
         drifted = self.speed_sigma_mps * abs(seconds)
         return replace(marks, sigma_xy=np.hypot(marks.sigma_xy, drifted)) if drifted else marks
 

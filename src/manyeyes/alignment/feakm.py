@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -25,9 +25,10 @@ from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.alignment.rivals.answer import answered, information, pose_of
 from manyeyes.alignment.vote import Candidate, placed
 from manyeyes.datatypes import ConfigError
-from manyeyes.datatypes.keypoints import Keypoints
+from manyeyes.models import zoo
 from manyeyes.models.feakm import FeakmNet
 from manyeyes.models.keypoint_net import DenseKeypoints
+from manyeyes.models.matcher import Points
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.rigid import fit_se2
 
@@ -198,7 +199,10 @@ def _refined(pose: Floats, a: Landmarks, b: Landmarks, pairs: Ints, config: Cons
 
 @dataclass(frozen=True)
 class Feakm:
-    """A corrector on keypoints: what two agents described, and what is claimed, to a pose and how far to believe it."""
+    """A corrector on landmarks that a net described: which are one object it knows by their looks, a pose is what they give.
+
+    Landmarks without looks, of an agent that sends no descriptors, are recognised by nobody.
+    """
 
     net: FeakmNet
     solver: Solver
@@ -210,7 +214,22 @@ class Feakm:
             return cls(net, partial(published, config=RansacConfig(pairs)))
         return cls(net, partial(mended, config=ConsensusConfig(pairs)))
 
-    def __call__(self, ego: Keypoints, other: Keypoints, claimed: PoseClaim | None) -> PoseEstimate:
+    def __call__(self, ego: Landmarks, other: Landmarks, claimed: PoseClaim | None) -> PoseEstimate:
         """Where the other agent is."""
-        pairs = self.net.match(ego, other).pairs.numpy()
-        return self.solver(Landmarks.of_boxes(ego.boxes), Landmarks.of_boxes(other.boxes), pairs, claimed)
+        if ego.look is None or other.look is None:
+            return unanswered(claimed)
+        pairs = self.net.match(_points(ego, ego.look), _points(other, other.look)).pairs.numpy()
+        return self.solver(ego, other, pairs, claimed)
+
+
+def _points(marks: Landmarks, look: Floats) -> Points:
+    """One view's landmarks as the matcher takes them."""
+    columns = (look, marks.xy, marks.yaw, marks.size, np.ones(len(marks)))
+    descriptor, xy, yaw, size, mask = (torch.from_numpy(c).float()[None] for c in columns)
+    return Points(descriptor, xy, yaw, size, mask.bool())
+
+
+@cache
+def learned(where: str, pairs: int = 4) -> Feakm:
+    """The corrector with the weights of that shipped name or file; read once in a process."""
+    return Feakm.of(zoo.load_feakm(where), pairs)

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import Boxes, ConfigError, ShapeError
+from manyeyes.datatypes.keypoints import Keypoints
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,7 +46,7 @@ class Landmarks:
     pi. size: (N, 2) length and width (m). score: (N,) in [0, 1]. sigma_xy: (N,) one standard deviation an axis (m);
     sigma_yaw: (N,) of the yaw modulo pi (rad). instant: (N,) int64, which frame a landmark was seen in, 0 for the
     current one and counting back: objects move, so only landmarks of one instant can be the same object
-    (specs/pose.md 4.8).
+    (specs/pose.md 4.8). look: (N, D) what a learned net says of how each looks (feakm.py); None where no net was asked.
     """
 
     xy: Floats
@@ -55,12 +57,17 @@ class Landmarks:
     sigma_yaw: Floats
     flip: Floats
     instant: Ints
+    look: Floats | None = None
 
     def __post_init__(self) -> None:
         n = len(self.xy)
         wanted = {"xy": (n, 2), "size": (n, 2)}
+        if self.look is not None:
+            wanted["look"] = (n, *self.look.shape[1:2])
         for field in fields(self):
-            shape = getattr(self, field.name).shape
+            if (value := getattr(self, field.name)) is None:
+                continue
+            shape = value.shape
             if shape != wanted.get(field.name, (n,)):
                 raise ShapeError(f"Landmarks.{field.name} needs shape {wanted.get(field.name, (n,))}; got {shape}.")
 
@@ -91,6 +98,11 @@ class Landmarks:
         )
 
     @classmethod
+    def of_keypoints(cls, points: Keypoints, error: DetectorError | None = None) -> Landmarks:
+        """What described boxes say, and how they look."""
+        return replace(cls.of_boxes(points.boxes, error), look=points.descriptor.detach().cpu().double().numpy())
+
+    @classmethod
     def empty(cls) -> Landmarks:
         """None."""
         zero = np.zeros(0)
@@ -98,22 +110,23 @@ class Landmarks:
 
     @classmethod
     def cat(cls, many: Sequence[Landmarks]) -> Landmarks:
-        """Several sets of one frame as one."""
-        return cls(*(np.concatenate([getattr(m, f.name) for m in many]) for f in fields(cls))) if many else cls.empty()
+        """Several sets of one frame as one; looks are lost where one of them has none."""
+        columns = [[getattr(m, f.name) for m in many] for f in fields(cls)]
+        return cls(*(_joined(column) for column in columns)) if many else cls.empty()
 
     def __len__(self) -> int:
         return len(self.xy)
 
     def __getitem__(self, index: slice | Ints | NDArray[np.bool_]) -> Landmarks:
-        return Landmarks(*(getattr(self, f.name)[index] for f in fields(self)))
+        look = None if self.look is None else self.look[index]
+        return Landmarks(*(getattr(self, f.name)[index] for f in fields(self)[:-1]), look=look)
 
     def moved(self, pose: Floats) -> Landmarks:
         """The same landmarks in another frame, pose (3,) = target_from_source as x, y (m), yaw (rad)."""
         c, s = np.cos(pose[2]), np.sin(pose[2])
         x, y = self.xy[:, 0], self.xy[:, 1]
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        values |= {"xy": np.stack((c * x - s * y + pose[0], s * x + c * y + pose[1]), 1), "yaw": self.yaw + pose[2]}
-        return Landmarks(**values)
+        there = np.stack((c * x - s * y + pose[0], s * x + c * y + pose[1]), 1)
+        return replace(self, xy=there, yaw=self.yaw + pose[2])
 
     def usable(self, reach_m: float, at_most: int) -> Ints:
         """Rows that can be matched, in an order that does not depend on the order given.
@@ -134,3 +147,7 @@ class Landmarks:
     def _best(self, rows: Ints, at_most: int) -> Ints:
         """Places in rows of the highest scores, in the order of rows."""
         return np.sort(np.argsort(-self.score[rows], kind="stable")[:at_most])
+
+
+def _joined(column: Sequence[Any]) -> Any:
+    return None if any(part is None for part in column) else np.concatenate(column)

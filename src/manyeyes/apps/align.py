@@ -18,11 +18,10 @@ if TYPE_CHECKING:
 
     from manyeyes.agents.eyes import Eyes
     from manyeyes.alignment.estimate import PoseClaim, PoseEstimate
-    from manyeyes.alignment.landmarks import Landmarks
     from manyeyes.alignment.watchman import Report
     from manyeyes.apps.playing import Excerpt
     from manyeyes.datasets.disturb import PoseNoise
-    from manyeyes.datatypes import AgentFrame, Snapshot
+    from manyeyes.datatypes import Snapshot
     from manyeyes.evaluation.pose import PoseFrame, PoseScore
 
 
@@ -39,7 +38,8 @@ class Options:
     frames: int = 60
     """At most so many judged frames."""
     correctors: tuple[str, ...] = ("given", "vote")
-    """Any of vote, given, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist, v2x-reg-oiou, mash."""
+    """Any of vote, given, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist, v2x-reg-oiou, mash, feakm, or a .safetensors
+    file of FeaKM."""
     noise_xy_m: float = 0.0
     """Standard deviation of errors of collaborators' claimed positions."""
     noise_yaw_deg: float = 0.0
@@ -112,27 +112,22 @@ def main(options: Options) -> None:
 
 def _answers(drive: Excerpt, eyes: Eyes, options: Options, noise: PoseNoise) -> Iterator[Found]:
     """Every corrector's answer about every collaborator in every judged frame."""
+    from manyeyes.agents.aligner import Aligner
     from manyeyes.alignment.estimate import PoseClaim
     from manyeyes.alignment.rivals.table import corrector
 
+    aligners = {name: Aligner(name, options.score_min) for name in options.correctors}
     for index in drive.judged(drive.scenario):
         snapshot = drive.snapshot(drive.scenario, index)
         told = noise.apply(snapshot, 0)
-        marks = [_landmarks(eyes, frame, options.score_min) for frame in snapshot.frames]
+        seen = {name: [aligner.own_landmarks(f, eyes) for f in snapshot.frames] for name, aligner in aligners.items()}
         for row in range(1, len(told.frames)):
             claimed = None if options.unknown else PoseClaim.between(told.frames[0], told.frames[row])
-            for name in options.correctors:
+            for name, marks in seen.items():
                 said = corrector(name)(marks[0], marks[row], claimed)
                 counts, other = (len(marks[0]), len(marks[row])), told.frames[row]
                 judged, time_s = _judged(said, snapshot, row), other.timestamp_ns * 1e-9
                 yield Found(index, time_s, other.agent_id, name, counts, claimed, said, judged)
-
-
-def _landmarks(eyes: Eyes, frame: AgentFrame, score_min: float) -> Landmarks:
-    from manyeyes.alignment.landmarks import Landmarks
-
-    boxes = eyes.see(frame).boxes
-    return Landmarks.of_boxes(boxes[boxes.score >= score_min])
 
 
 def _judged(said: PoseEstimate, snapshot: Snapshot, row: int) -> PoseFrame | None:

@@ -37,8 +37,10 @@ class Playing:
     """How tokens are written: their features as numbers, or all of them as the codes of the weights' codebook."""
     requests: bool = False
     """Messages of tokens say where their sender needs no help; what came lately weighs what is sent."""
-    align: bool = False
-    """Correct where others say they are before fusing, by the objects that both see; leave out whom nobody can place."""
+    align: str | None = None
+    """Correct where others say they are before fusing, by the objects that both see; leave out whom nobody can place. By whom:
+    vote, feakm, a .safetensors file of FeaKM, or a rival: given, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist,
+    v2x-reg-oiou, mash."""
 
     def replay_config(self, seed: int, all_egos: bool = False) -> ReplayConfig:
         """The same as the player takes it; unknown names are refused here, before any work."""
@@ -62,7 +64,7 @@ class Playing:
             requests=self.requests,
             history=HISTORY,
             seed=seed,
-            aligner=Aligner() if self.align else None,
+            aligner=None if self.align is None else Aligner(self.align),
         )
 
 

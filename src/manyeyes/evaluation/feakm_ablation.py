@@ -19,6 +19,7 @@ from manyeyes.agents.agent import OWN_BODY_M
 from manyeyes.agents.eyes import Eyes, Sight
 from manyeyes.alignment.estimate import PoseClaim
 from manyeyes.alignment.feakm import Feakm
+from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.datasets.disturb import PoseNoise
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Snapshot
@@ -50,12 +51,7 @@ class Branch:
     corrector: Feakm
 
     def __post_init__(self) -> None:
-        taught_on = self.corrector.net.config.detector
-        if taught_on and taught_on != self.detector.fingerprint.hex():
-            raise ConfigError(
-                f"Branch {self.name!r}: its net was taught on views of the weights {taught_on}, these are "
-                f"{self.detector.fingerprint.hex()}; train it on this detector."
-            )
+        self.corrector.net.check_views(self.detector.fingerprint)
 
 
 @dataclass(frozen=True)
@@ -137,7 +133,8 @@ class _Scene:
         own = self.sights[0].told
         parts, answers = [Part(0, own.features, own.sites.xy)], []
         for sight, frame, points in zip(self.sights[1:], frames[1:], self.points):
-            said = self.branch.corrector(points[0], points[1], PoseClaim.between(frames[0], frame))
+            ego, other = map(Landmarks.of_keypoints, points)
+            said = self.branch.corrector(ego, other, PoseClaim.between(frames[0], frame))
             answers.append(said.status.answered)
             if said.ego_from_other is not None:
                 doubt = said.covariance.diagonal().clip(0)

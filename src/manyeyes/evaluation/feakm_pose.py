@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import torch
 
-from manyeyes.alignment.estimate import PoseClaim, PoseEstimate, planar
+from manyeyes.alignment.estimate import Corrector, planar
 from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.datatypes import Transform
 from manyeyes.datatypes.keypoints import Keypoints
@@ -15,31 +15,24 @@ from manyeyes.evaluation.pose import ClaimNoise, PoseFrame, judged
 from manyeyes.models.feakm import FeakmNet
 from manyeyes.models.keypoint_net import View
 
-Finder = Callable[[Keypoints, Keypoints, "PoseClaim | None"], PoseEstimate]
-"""A corrector on keypoints; see by_landmarks for those that look at boxes alone."""
-
-
-def by_landmarks(correct: Callable[[Landmarks, Landmarks, PoseClaim | None], PoseEstimate]) -> Finder:
-    """A corrector of another kind on the same keypoints, whose descriptors it does not read."""
-    return lambda ego, other, claimed: correct(Landmarks.of_boxes(ego.boxes), Landmarks.of_boxes(other.boxes), claimed)
-
 
 def pose_frames(
     described: Iterable[tuple[Keypoints, Keypoints, Transform]],
-    finders: Mapping[str, Finder],
+    correctors: Mapping[str, Corrector],
     noise: ClaimNoise,
     near_m: float = 1.5,
 ) -> dict[str, list[PoseFrame]]:
-    """Every finder's answers on the same pairs of views (ego, other, true ego_from_other), judged (evaluation/pose.py).
+    """Every corrector's answers on the same pairs of views (ego, other, true ego_from_other), judged (evaluation/pose.py).
 
     Objects in common are those that both detect: mutual nearest within near_m under the true pose.
     """
-    found: dict[str, list[PoseFrame]] = {name: [] for name in finders}
+    found: dict[str, list[PoseFrame]] = {name: [] for name in correctors}
     for scene, (ego, other, truth) in enumerate(described):
         claimed, pose = noise.claim(planar(truth), scene), planar(truth)
         common = ego.xy[_common(ego, other, truth, near_m)].double().numpy()
-        for name, finder in finders.items():
-            found[name].append(judged(finder(ego, other, claimed), pose, common))
+        marks = Landmarks.of_keypoints(ego), Landmarks.of_keypoints(other)
+        for name, correct in correctors.items():
+            found[name].append(judged(correct(*marks, claimed), pose, common))
     return found
 
 

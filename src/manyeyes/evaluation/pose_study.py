@@ -15,18 +15,22 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from manyeyes.agents.describing import seen_points
 from manyeyes.agents.eyes import Eyes
 from manyeyes.alignment.estimate import PoseStatus, planar
 from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.alignment.rivals.table import corrector
 from manyeyes.comms import wire
 from manyeyes.datasets.recording import Recording
-from manyeyes.datatypes import Boxes, Message, Snapshot, Transform
+from manyeyes.datatypes import AgentFrame, Message, Snapshot, Transform
+from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.evaluation.pose import BUCKETS, ClaimNoise, PoseFrame, PoseScore, confusion, judged, risk_coverage, score
 from manyeyes.maps.whole_file import write_whole
 from manyeyes.models.detector import Detector
+from manyeyes.models.feakm import FeakmNet
 
 Floats = NDArray[np.float64]
 
@@ -87,8 +91,13 @@ class AccuracyRow:
     confusion: tuple[tuple[int, ...], ...]
 
 
-def meetings(recording: Recording, detector: Detector, score_min: float = 0.3, every: int = 1) -> Iterator[Meeting]:
-    """The first agent and each other, at every so many-th judged instant of every scenario."""
+def meetings(
+    recording: Recording, detector: Detector, score_min: float = 0.3, every: int = 1, net: FeakmNet | None = None
+) -> Iterator[Meeting]:
+    """The first agent and each other, at every so many-th judged instant of every scenario.
+
+    Landmarks are boxes of at least score_min; net: who describes them, for correctors that go by their looks.
+    """
     for scenario in recording.scenarios:
         eyes: dict[int, Eyes] = {}
         for index in recording.judged(scenario)[::every]:
@@ -96,23 +105,29 @@ def meetings(recording: Recording, detector: Detector, score_min: float = 0.3, e
             for frame in recording.snapshot(scenario, index - 1).frames if index else ():
                 eyes.setdefault(frame.agent_id, Eyes(detector)).see(frame)
             snapshot = recording.snapshot(scenario, index)
-            boxes = [eyes.setdefault(f.agent_id, Eyes(detector)).see(f).boxes for f in snapshot.frames]
-            found = [b[b.score >= score_min] for b in boxes]
-            yield from _met(snapshot, found)
+            told = [_told(eyes.setdefault(f.agent_id, Eyes(detector)), f, net) for f in snapshot.frames]
+            yield from _met(snapshot, [t[t.boxes.score >= score_min] for t in told], net is not None)
 
 
-def _met(snapshot: Snapshot, boxes: Sequence[Boxes]) -> Iterator[Meeting]:
+def _told(eyes: Eyes, frame: AgentFrame, net: FeakmNet | None) -> Keypoints:
+    if net is not None:
+        return seen_points(net, eyes, frame)
+    boxes = eyes.see(frame).boxes
+    return Keypoints(boxes, torch.zeros(len(boxes), 0))
+
+
+def _met(snapshot: Snapshot, told: Sequence[Keypoints], described: bool) -> Iterator[Meeting]:
     truth = snapshot.truth
     if truth is None:
         return
-    marks = [Landmarks.of_boxes(b) for b in boxes]
+    marks = [Landmarks.of_keypoints(t) if described else Landmarks.of_boxes(t.boxes) for t in told]
     ego_from_world = truth.world_from_agent[0].inverse()
     for row in range(1, len(snapshot.frames)):
         both = truth.boxes.center[truth.seen[0] & truth.seen[row]].double()
         frame = snapshot.frames[row]
-        message = Message(
-            frame.agent_id, frame.timestamp_ns, frame.world_from_agent, frame.pose_covariance, objects=boxes[row]
-        )
+        header = frame.agent_id, frame.timestamp_ns, frame.world_from_agent, frame.pose_covariance
+        looks = told[row].descriptor if described else None
+        message = Message(*header, objects=told[row].boxes, descriptors=looks)
         yield Meeting(
             snapshot.scenario,
             snapshot.index,

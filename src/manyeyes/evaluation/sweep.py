@@ -20,6 +20,7 @@ from manyeyes.evaluation.benchmark import BenchmarkConfig, judging_protocol, loa
 from manyeyes.evaluation.bootstrap import Drawn, Interval, drawn
 from manyeyes.evaluation.cell import Cell, Speeds, cell_of, read_cell, write_cell
 from manyeyes.evaluation.detection import Protocol
+from manyeyes.models.checkpoint import fingerprint
 
 SOURCES = (
     "agents", "alignment", "comms", "datasets", "datatypes", "models", "ops",
@@ -101,7 +102,9 @@ def sweep(
 def cell_path(folder: Path, config: BenchmarkConfig, method: str, data: str) -> Path:
     """The file of a cell, named by all that its numbers depend on. data: the recording's digest."""
     alone = replace(config, methods=(method,), weights=loaded(config.weights).fingerprint.hex())
-    digest = hashlib.blake2b(repr((alone, data, code_digest())).encode(), digest_size=8)
+    net = config.replay.aligner.net if config.replay.aligner is not None else None
+    eyes = "" if net is None else fingerprint(net).hex()
+    digest = hashlib.blake2b(repr((alone, eyes, data, code_digest())).encode(), digest_size=8)
     return folder / f"{method}-{digest.hexdigest()}.npz"
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models import checkpoint
 from manyeyes.models.constellation import ConstellationConfig
@@ -56,12 +57,19 @@ class FeakmNet(nn.Module):
         return self.keypoints(views, together)
 
     @torch.no_grad()
-    def match(self, ego: Keypoints, other: Keypoints) -> Matches:
-        """Points that are one object, by what they look like and how they stand; no pose is given."""
-        if not len(ego) or not len(other):
+    def match(self, ego: Points, other: Points) -> Matches:
+        """Points of one view each that are one object, by what they look like and how they stand; no pose is given."""
+        if not ego.mask.any() or not other.mask.any():
             return Matches(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0))
-        assignment = self.matcher(Points.of([ego]), Points.of([other]))[-1]
-        return Matches(*mutual(assignment, self.config.matcher.threshold)[0])
+        return Matches(*mutual(self.matcher(ego, other)[-1], self.config.matcher.threshold)[0])
+
+    def check_views(self, detector: bytes) -> None:
+        """Refuse views of a detector of that fingerprint, where the net was taught on another's."""
+        if self.config.detector and self.config.detector != detector.hex():
+            raise ConfigError(
+                f"This net of FeaKM was taught on views of the weights {self.config.detector}, these are {detector.hex()}; "
+                "train it on this detector: manyeyes train --preset feakm --weights DETECTOR."
+            )
 
 
 FEAKM_PAPER = FeakmConfig(DenseKeypoints(), MatcherConfig())

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default corrector and its rivals by the names that a person gives them."""
+"""The default corrector and its rivals by the names that a person gives them.
+
+FeaKM's has weights: ``feakm`` is the shipped net, a path that ends in .safetensors one of 'manyeyes train'; ``@8`` behind either
+asks for eight pairs in place of four.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +11,12 @@ from functools import partial
 
 from manyeyes.alignment.decide import DETECTED, correct
 from manyeyes.alignment.estimate import Corrector
+from manyeyes.alignment.feakm import learned
 from manyeyes.alignment.rivals import coalign, feaco, fpv_rcnn, given, icp, mash, v2x_reg, vips
 from manyeyes.alignment.rivals.v2x_reg import V2xRegConfig
 from manyeyes.datatypes import ConfigError
 
+FEAKM = "feakm"
 CORRECTORS: dict[str, Corrector] = {
     "vote": partial(correct, config=DETECTED),
     "given": given.correct,
@@ -27,6 +33,13 @@ CORRECTORS: dict[str, Corrector] = {
 
 def corrector(name: str) -> Corrector:
     """The corrector of that name; an unknown name lists the known ones."""
+    where, _, pairs = name.partition("@")
+    if where == FEAKM or where.endswith(".safetensors"):
+        if pairs and not pairs.isdecimal():
+            raise ConfigError(f"{name!r}: behind @ stands how many pairs must agree, the paper's 4 or 8.")
+        return learned(where, int(pairs or 4))
     if name not in CORRECTORS:
-        raise ConfigError(f"No corrector is called {name!r}; known: {', '.join(CORRECTORS)}.")
+        raise ConfigError(
+            f"No corrector is called {name!r}; known: {', '.join(CORRECTORS)}, {FEAKM}, or a .safetensors file of FeaKM."
+        )
     return CORRECTORS[name]

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from manyeyes.agents.aligner import Aligner
 from manyeyes.alignment.rivals.table import corrector
 from manyeyes.apps.showcase import bars
 from manyeyes.apps.studies.running import Start, publish, start
@@ -19,6 +20,7 @@ from manyeyes.evaluation.bootstrap import Interval
 from manyeyes.evaluation.pose import ClaimNoise
 from manyeyes.evaluation.pose_study import AccuracyRow, Meeting, Trial, answered, kept, meetings, rows
 from manyeyes.evaluation.sweep import code_digest, recording_digest
+from manyeyes.models.checkpoint import fingerprint
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -49,22 +51,24 @@ def run(options: Options, console: Console) -> None:
 
 def carried_out(begun: Start, trials: Sequence[Trial]) -> list[AccuracyRow]:
     """The rows of every trial; answers that are kept under --out are not made again."""
-    met: list[Meeting] = []
+    met: dict[str, list[Meeting]] = {}
     base, detector = begun.base, loaded(begun.base.weights)
     recording = begun.opener()
     data = (recording_digest(recording), detector.fingerprint.hex(), base.every, code_digest())
+    nets = {name: Aligner(name).net for name in {trial.corrector for trial in trials}}
+    marks = {name: "" if net is None else fingerprint(net).hex() for name, net in nets.items()}
 
-    def seen() -> list[Meeting]:
-        if not met:
-            met.extend(meetings(recording, detector, every=base.every))
-        return met
+    def seen(name: str) -> list[Meeting]:
+        if marks[name] not in met:
+            met[marks[name]] = list(meetings(recording, detector, every=base.every, net=nets[name]))
+        return met[marks[name]]
 
     out = []
     with bars(begun.console) as progress:
         for trial in progress.track(trials, description="Aligning"):
-            key = hashlib.blake2b(repr((trial, data)).encode(), digest_size=8).hexdigest()
-            path = Path(begun.options.out) / "cells" / f"pose-{trial.corrector}-{key}.json"
-            found = kept(path, lambda trial=trial: answered(seen(), trial))
+            key = hashlib.blake2b(repr((trial, marks[trial.corrector], data)).encode(), digest_size=8).hexdigest()
+            path = Path(begun.options.out) / "cells" / f"pose-{Path(trial.corrector).stem}-{key}.json"
+            found = kept(path, lambda trial=trial: answered(seen(trial.corrector), trial))
             out += rows(trial, found)
     return out
 
