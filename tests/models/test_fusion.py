@@ -16,12 +16,13 @@ from manyeyes.models.fusion.maximum import MaximumFusion
 from manyeyes.models.fusion.placement import Placement
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
 from manyeyes.models.fusion.settle import VOTING_HEAT, settle
+from manyeyes.models.fusion.v2x_vit import V2xVitFusion
 from manyeyes.models.proposal import PROPOSAL, proposed_velocity
 from manyeyes.models.transformer import AttentionConfig
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 16
-FUSIONS = ("maximum", "self_attention", "flow_aware")
+FUSIONS = ("maximum", "self_attention", "flow_aware", "v2x_vit")
 
 
 def fusion(name: str, random_placement: bool = True) -> torch.nn.Module:
@@ -31,6 +32,7 @@ def fusion(name: str, random_placement: bool = True) -> torch.nn.Module:
         "maximum": lambda: MaximumFusion(CHANNELS),
         "self_attention": lambda: SelfAttentionFusion(CHANNELS, attention),
         "flow_aware": lambda: FlowAwareFusion(CHANNELS, attention),
+        "v2x_vit": lambda: V2xVitFusion(CHANNELS, attention),
     }[name]()
     if random_placement:
         torch.nn.init.normal_(model.placement.outer.weight, std=0.3)

@@ -19,6 +19,7 @@ from manyeyes.models.fusion.maximum import MaximumFusion
 from manyeyes.models.fusion.multi_scale import MultiScaleFusion
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
 from manyeyes.models.fusion.settle import Fused
+from manyeyes.models.fusion.v2x_vit import V2xVitFusion
 from manyeyes.models.pillars import PillarEncoder, PillarKind
 from manyeyes.models.proposal import propose
 from manyeyes.models.pruning import FocalPrune, Pruned
@@ -39,7 +40,7 @@ class DetectorConfig:
     pillar_channels: int = 32
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     dast: AttentionConfig = field(default_factory=AttentionConfig)
-    fusion: Literal["flow_aware", "self_attention", "maximum", "multi_scale"] = "self_attention"
+    fusion: Literal["flow_aware", "self_attention", "maximum", "multi_scale", "v2x_vit"] = "self_attention"
     fusion_attention: AttentionConfig = field(default_factory=AttentionConfig)
     head_channels: int = 64
     prune_threshold: float = 0.1
@@ -126,10 +127,12 @@ class Detector(nn.Module):
         return self.fusion(tokens, past)
 
 
+_ATTENTIVE = {"flow_aware": FlowAwareFusion, "self_attention": SelfAttentionFusion, "v2x_vit": V2xVitFusion}
+
+
 def _fusion(
     channels: int, config: DetectorConfig
-) -> FlowAwareFusion | SelfAttentionFusion | MaximumFusion | MultiScaleFusion:
-    if config.fusion in ("maximum", "multi_scale"):
-        return MaximumFusion(channels) if config.fusion == "maximum" else MultiScaleFusion(channels)
-    kind = FlowAwareFusion if config.fusion == "flow_aware" else SelfAttentionFusion
-    return kind(channels, config.fusion_attention)
+) -> FlowAwareFusion | SelfAttentionFusion | MaximumFusion | MultiScaleFusion | V2xVitFusion:
+    if config.fusion in _ATTENTIVE:
+        return _ATTENTIVE[config.fusion](channels, config.fusion_attention)
+    return MaximumFusion(channels) if config.fusion == "maximum" else MultiScaleFusion(channels)
