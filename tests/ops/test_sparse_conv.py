@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, conv_transpose2d
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
+from manyeyes.ops.pair_loops import add_products
 from manyeyes.ops.sparse_conv import (
     coalesce,
     inverse_conv,
@@ -397,30 +398,50 @@ def test_blocks_do_not_change_the_result(monkeypatch):
         assert_near(got, wanted)
 
 
-@pytest.mark.parametrize("inputs, outputs", [(4, 4), (8, 3), (32, 64), (64, 130), (12, 64)])
+@pytest.mark.parametrize("inputs, outputs", [(5, 16), (1, 32), (32, 48), (64, 144), (12, 64)])
 @pytest.mark.parametrize("layer", ["submanifold", "strided", "dilating"])
 def test_compiled_loops_and_blocks_give_the_same(monkeypatch, layer, inputs, outputs):
-    x, w = scene(0.5), weights(outputs, inputs, 3, 3)
-    generator = torch.Generator().manual_seed(5)
-    x = x.with_features(torch.randn(len(x.features), inputs, generator=generator))
-    w = w.float()
-    b = torch.randn(outputs, generator=generator)
+    x, w = scene(0.5, channels=inputs), weights(outputs, inputs, 3, 3).float()
+    x, b = x.with_features(x.features.float()), weights(outputs, seed=2).float()
 
-    def run() -> Tensor:
+    def run() -> list[Tensor]:
+        f, v = leaves(x.features, w)
         with torch.inference_mode():
-            if layer == "submanifold":
-                return submanifold_conv(x, w, b).features
-            return strided_conv(x, w, b, dilating=layer == "dilating").features
+            inferred = convolved(f, v)
+        learnt = convolved(f, v)
+        learnt.square().sum().backward()
+        assert f.grad is not None and v.grad is not None
+        return [inferred, learnt.detach(), f.grad, v.grad]
+
+    def convolved(f: Tensor, v: Tensor) -> Tensor:
+        if layer == "submanifold":
+            return submanifold_conv(x.with_features(f), v, b).features
+        return strided_conv(x.with_features(f), v, b, dilating=layer == "dilating").features
 
     in_loops = run()
-    monkeypatch.setattr("manyeyes.ops.sparse_conv.LOOPS_UP_TO", 0)
-    in_blocks = run()
-    assert in_loops.shape == in_blocks.shape and len(in_loops) > 5
-    assert torch.allclose(in_loops, in_blocks, atol=1e-5) and float(in_blocks.abs().max()) > 0.1
+    with monkeypatch.context() as patch:
+        patch.setattr("manyeyes.ops.sparse_conv._in_loops", lambda x, taps: False)
+        in_blocks = run()
+    for got, wanted in zip(in_loops, in_blocks, strict=True):
+        assert_near(got, wanted, 1e-5)
+    assert len(in_loops[0]) > 50 and float(in_blocks[0].abs().max()) > 0.1
+    # Without what the loops add there is something else: they are what ran.
     monkeypatch.setattr("manyeyes.ops.sparse_conv.add_products", lambda *_: None)
-    assert torch.equal(run(), in_blocks)
-    monkeypatch.setattr("manyeyes.ops.sparse_conv.LOOPS_UP_TO", 1 << 30)
-    assert not torch.allclose(run(), in_blocks, atol=1e-2)
+    assert not torch.allclose(run()[0], in_blocks[0], atol=1e-2)
+
+
+@pytest.mark.parametrize("pairs", [0, 1, 5, 6, 7, 13])
+def test_the_loop_of_pairs_is_the_sum_over_them(pairs):
+    generator = torch.Generator().manual_seed(pairs)
+    x, w = torch.randn(20, 3, generator=generator), torch.randn(4, 3, 112, generator=generator)
+    source, target = (torch.randperm(20, generator=generator)[:pairs].repeat(2) for _ in range(2))
+    out = torch.randn(20, 112, generator=generator)
+    wanted = out.double()
+    for tap in (3, 1):
+        wanted = wanted.index_add(0, target[:pairs], x[source[:pairs]].double() @ w[tap].double())
+    counts = torch.tensor([pairs, pairs])
+    add_products(x.numpy(), w.numpy(), 3, -2, source.numpy(), target.numpy(), counts.numpy(), out.numpy())
+    assert_near(out.double(), wanted, 1e-6)
 
 
 def test_wrong_arguments_are_named():

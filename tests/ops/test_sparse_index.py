@@ -83,12 +83,11 @@ def test_back_holds_each_meeting_once_and_from_the_other_side():
     back = {(o, t, i) for i, row in enumerate(table.back.tolist()) for t, o in enumerate(row) if o < len(found)}
     assert back == wanted
     for reverse in (False, True):
-        pairs = [
-            (t, *ends) for t, *rows in table.pairs(reverse) for ends in zip(*(r.tolist() for r in rows), strict=True)
-        ]
+        blocks = table.blocks(1000, reverse)[1]
+        pairs = [(b.tap, *ends) for b in blocks for ends in zip(b.source.tolist(), b.target.tolist(), strict=True)]
         assert len(pairs) == len(wanted)
         assert {(t, b, a) if reverse else (t, a, b) for t, a, b in pairs} == {(t, i, o) for o, t, i in wanted}
-        assert all(len(s.unique()) == len(s) and len(e.unique()) == len(e) for _, s, e in table.pairs(reverse))
+        assert all(len(b.source.unique()) == len(b.target.unique()) == b.size for b in blocks)
 
 
 def test_a_map_of_one_set_is_its_own_transpose_flipped():
@@ -96,15 +95,31 @@ def test_a_map_of_one_set_is_its_own_transpose_flipped():
     index = neighbours(key, shape, key, shape, BATCH, Window(5, 1, 4, 2))
     symmetric, plain = NeighbourMap(index, len(key), is_symmetric=True), NeighbourMap(index, len(key))
     assert torch.equal(symmetric.back, plain.back)
-    middle = plain.pairs()[12]
+    middle = plain.blocks(1000)[1][12]
     assert middle.tap == 12 and torch.equal(middle.source, middle.target) and len(middle.source) == len(key)
-    assert [pairs.tap for pairs in symmetric.pairs()] == [t for t in range(25) if t != 12]
+    assert [block.tap for block in symmetric.blocks(1000)[1]] == [t for t in range(25) if t != 12]
     for reverse, rows in ((False, 7), (True, 7), (False, 1000)):
         longest, blocks = symmetric.blocks(rows, reverse)
         others = [block for block in plain.blocks(rows, reverse)[1] if block.tap != 12]
         assert longest == max(block.size for block in others) <= rows
         assert [(b.tap, b.size) for b in blocks] == [(b.tap, b.size) for b in others]
         assert all(torch.equal(a.source, b.source) and torch.equal(a.target, b.target) for a, b in zip(blocks, others))
+
+
+@pytest.mark.parametrize(("symmetric", "reverse"), [*product((False, True), repeat=2)])
+def test_sweeps_hold_the_pairs_of_the_blocks_tap_by_tap(symmetric, reverse):
+    shape, key, window = (9, 10), keys((9, 10)), Window(3, 1, 1) if symmetric else Window(3, 2, 1)
+    out = key if symmetric else parent_sites(key, shape, BATCH, 2)
+    index = neighbours(out, window.out_shape(shape), key, shape, BATCH, window)
+    table = NeighbourMap(index, len(key), is_symmetric=symmetric)
+    found = {}
+    for tap, step, source, target, counts in table.sweeps(reverse):
+        for n, some, others in zip(counts, source.split(counts.tolist()), target.split(counts.tolist()), strict=True):
+            found[tap], tap = (int(n), some, others), tap + step
+    assert len(found) == (8 if symmetric else 9)
+    for block in table.blocks(1000, reverse)[1]:
+        n, source, target = found[block.tap]
+        assert n == block.size and torch.equal(source, block.source) and torch.equal(target, block.target)
 
 
 @pytest.mark.parametrize("symmetric", (False, True))
@@ -115,8 +130,8 @@ def test_compiled_loops_find_what_whole_tensors_find(monkeypatch, symmetric):
         key = keys(shape)
         out = key if symmetric else parent_sites(key, shape, BATCH, 2)
         index = neighbours(out, window.out_shape(shape), key, shape, BATCH, window)
-        pairs = NeighbourMap(index, len(key), is_symmetric=symmetric).pairs()
-        return [out, index, *(t for tap, *ends in pairs for t in (torch.tensor(tap), *ends))]
+        blocks = NeighbourMap(index, len(key), is_symmetric=symmetric).blocks(1000)[1]
+        return [out, index, *(t for b in blocks for t in (torch.tensor(b.tap), b.source, b.target))]
 
     loops = found()
     monkeypatch.setattr("manyeyes.ops.sparse_index._in_loops", lambda key: False)

@@ -1,62 +1,97 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Products of a sparse convolution in one compiled loop: for inference on the CPU.
+"""Products of a sparse convolution in one compiled loop, on the CPU.
 
-Rows are read where they lie and added where they lead: nothing is gathered, no product is stored.
+Rows are read where they lie and added where they lead: nothing is gathered, no product is stored. The sums of six pairs and
+up to 64 outputs stay in registers over all inputs, so that the loop runs at the rate of the multipliers, whatever the
+number of channels. Loops that a compiler turns into vectors by itself keep such sums in memory, at less than half of it.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numba import njit
+from typing import Any
 
-_WIDE = 64
-# Unsigned places: a signed one might count from the end, and the test for it keeps the loops from vectors.
-_ROW, _TWO_ROWS, _THREE_ROWS = np.uintp(_WIDE), np.uintp(2 * _WIDE), np.uintp(3 * _WIDE)
-_ONE, _TWO, _THREE = np.uintp(1), np.uintp(2), np.uintp(3)
-_FAST = {"contract", "nsz", "arcp", "reassoc"}
+from llvmlite import binding, ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
-
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def add_products(x, weight, source, target, out, inputs, outputs):  # pragma: no cover
-    """out[target[p]] += x[source[p]] @ weight for each pair p; x, weight (inputs, outputs), out flat; inputs in fours."""
-    sums = np.empty(4 * _WIDE, np.float32)
-    pairs, step = source.shape[0], np.uintp(outputs)
-    for first in range(0, outputs, _WIDE):
-        wide = np.uintp(min(_WIDE, outputs - first))
-        for p in range(0, pairs, 4):
-            last = pairs - 1
-            a, b = np.uintp(source[p] * inputs), np.uintp(source[min(p + 1, last)] * inputs)
-            d, e = np.uintp(source[min(p + 2, last)] * inputs), np.uintp(source[min(p + 3, last)] * inputs)
-            for c in range(0, inputs, 4):
-                u, w = np.uintp(c), np.uintp(c * outputs + first)
-                block = (_four(x, a + u), _four(x, b + u), _four(x, d + u), _four(x, e + u))
-                _multiply(block, weight, w, step, sums, wide, c == 0)
-            for j in range(min(4, pairs - p)):
-                to, at = np.uintp(target[p + j] * outputs + first), np.uintp(j * _WIDE)
-                for i in range(wide):
-                    out[to + i] += sums[at + i]
+LANES = 16
+"""Outputs come in so many at once."""
+# AVX-512 has registers for 6 x 4 sums of 16 lanes; others hold 6 x 1, in two to four registers each.
+_FOUR = bool(binding.get_host_cpu_features().get("avx512f", False))
 
 
 @njit(cache=True, nogil=True)
-def _four(x, at):  # pragma: no cover
-    return x[at], x[at + _ONE], x[at + _TWO], x[at + _THREE]
+def add_products(x, weight, tap, step, source, target, counts, out):  # pragma: no cover
+    """out[target[p]] += x[source[p]] @ weight[tap] for each pair p; after counts[0] pairs tap goes on by step, and so on.
+
+    x (N, C), weight (taps, C, D), out (M, D), float32 without gaps, D divisible by LANES; source, target: int64.
+    """
+    at, outputs = 0, out.shape[1]
+    for n in counts:
+        matrix, sixes, end, column = weight[tap], at + n // 6 * 6, at + n, 0
+        while column < outputs:
+            if _FOUR and outputs - column >= 4 * LANES:
+                for p in range(at, sixes, 6):
+                    _add_tile(6, 4, x, matrix, out, source, target, p, column)
+                for p in range(sixes, end):
+                    _add_tile(1, 4, x, matrix, out, source, target, p, column)
+                column += 4 * LANES
+            elif _FOUR and outputs - column >= 2 * LANES:
+                for p in range(at, sixes, 6):
+                    _add_tile(6, 2, x, matrix, out, source, target, p, column)
+                for p in range(sixes, end):
+                    _add_tile(1, 2, x, matrix, out, source, target, p, column)
+                column += 2 * LANES
+            else:
+                for p in range(at, sixes, 6):
+                    _add_tile(6, 1, x, matrix, out, source, target, p, column)
+                for p in range(sixes, end):
+                    _add_tile(1, 1, x, matrix, out, source, target, p, column)
+                column += LANES
+        at, tap = end, tap + step
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _multiply(block, x, s, step, out, wide, is_first):  # pragma: no cover
-    (a0, a1, a2, a3), (b0, b1, b2, b3), (d0, d1, d2, d3), (e0, e1, e2, e3) = block
-    s1, s2, s3 = s + step, s + step + step, s + step + step + step
-    if is_first:
-        for i in range(wide):
-            w, y, z, t = x[s + i], x[s1 + i], x[s2 + i], x[s3 + i]
-            out[i] = a0 * w + a1 * y + a2 * z + a3 * t
-            out[_ROW + i] = b0 * w + b1 * y + b2 * z + b3 * t
-            out[_TWO_ROWS + i] = d0 * w + d1 * y + d2 * z + d3 * t
-            out[_THREE_ROWS + i] = e0 * w + e1 * y + e2 * z + e3 * t
-    else:
-        for i in range(wide):
-            w, y, z, t = x[s + i], x[s1 + i], x[s2 + i], x[s3 + i]
-            out[i] += a0 * w + a1 * y + a2 * z + a3 * t
-            out[_ROW + i] += b0 * w + b1 * y + b2 * z + b3 * t
-            out[_TWO_ROWS + i] += d0 * w + d1 * y + d2 * z + d3 * t
-            out[_THREE_ROWS + i] += e0 * w + e1 * y + e2 * z + e3 * t
+@intrinsic(prefer_literal=True)
+def _add_tile(
+    _: Any, rows: Any, vectors: Any, x: Any, matrix: Any, out: Any, source: Any, target: Any, pair: Any, column: Any
+) -> Any:
+    """The products of ``rows`` pairs, from pair on, with ``vectors`` x LANES columns of a matrix, from column on.
+
+    Written for LLVM in vectors, because numba has no name for a vector that stays in a register.
+    """
+    given_types = (rows, vectors, x, matrix, out, source, target, pair, column)
+    vector, place = ir.VectorType(ir.FloatType(), LANES), ir.IntType(64)
+    undefined, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
+
+    def generate(context: Any, b: ir.IRBuilder, signature: Any, given: Any) -> Any:
+        x_, matrix_, out_, source_, target_ = (
+            context.make_array(kind)(context, b, value) for kind, value in zip(given_types[2:7], given[2:7])
+        )
+        inputs, outputs = (cgutils.unpack_tuple(b, array.shape)[1] for array in (x_, out_))
+
+        def row(array: Any, names: Any, r: int, width: Any) -> Any:
+            name = b.load(b.gep(names.data, [b.add(given[7], place(r))]))
+            return b.gep(array.data, [b.mul(name, width)])
+
+        def across(start: Any) -> list[Any]:
+            places = (b.gep(start, [b.add(given[8], place(v * LANES))]) for v in range(vectors.literal_value))
+            return [b.bitcast(p, vector.as_pointer()) for p in places]
+
+        sources = [row(x_, source_, r, inputs) for r in range(rows.literal_value)]
+        targets = [across(row(out_, target_, r, outputs)) for r in range(rows.literal_value)]
+        sums = [[cgutils.alloca_once_value(b, ir.Constant(vector, None)) for _ in line] for line in targets]
+        with cgutils.for_range(b, inputs) as loop:
+            factors = [b.load(p, align=4) for p in across(b.gep(matrix_.data, [b.mul(loop.index, outputs)]))]
+            for start, totals in zip(sources, sums):
+                one = b.insert_element(undefined, b.load(b.gep(start, [loop.index])), ir.IntType(32)(0))
+                many = b.shuffle_vector(one, undefined, first)
+                for factor, total in zip(factors, totals):
+                    product = b.fmul(many, factor, flags=["contract"])
+                    b.store(b.fadd(product, b.load(total), flags=["contract"]), total)
+        for line, totals in zip(targets, sums):
+            for p, total in zip(line, totals):
+                b.store(b.fadd(b.load(p, align=4), b.load(total)), p, align=4)
+        return context.get_dummy_value()
+
+    return types.void(*given_types), generate

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convolutions and pooling over occupied cells only, in plain PyTorch: exact, deterministic, on any device.
 
-A layer gathers, tap by tap, the rows that a tap meets, multiplies them by its matrix and adds them where they lead, in
-blocks that stay in the CPU's cache: only pairs that exist are multiplied (six of nine on a street). A tap leads to a
-row once at most, so that results do not depend on threads. Backward does the same with the pairs turned round.
+A layer takes, tap by tap, the rows that a tap meets, multiplies them by its matrix and adds them where they lead: only
+pairs that exist are multiplied (six of nine on a street). On the CPU float32 goes through one compiled loop where it can;
+all else is gathered in blocks that stay in the cache. A tap leads to a row once at most, so that results do not depend on
+threads. Backward does the same with the pairs turned round.
 Semantics: cross-correlation as in ``conv2d``; a bias is added to active rows alone; output keys are ascending.
 """
 
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
-from manyeyes.ops.pair_loops import add_products
+from manyeyes.ops.pair_loops import LANES, add_products
 from manyeyes.ops.sparse_index import (
     NeighbourMap,
     Window,
@@ -28,8 +29,6 @@ from manyeyes.ops.sparse_index import (
 from manyeyes.ops.voxelize import segment_max, segment_mean, segment_sum
 
 BLOCK_ROWS = 1024
-LOOPS_UP_TO = 128 * 128
-"""Channels in times channels out up to which compiled loops beat the products of blocks on one core."""
 
 
 def coalesce(
@@ -229,9 +228,9 @@ def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, b
         else bias.expand(table.rows(reverse), -1).contiguous()
     )
     if _in_loops(x, taps):
-        rows, flat, matrices = x.contiguous().view(-1).numpy(), out.view(-1).numpy(), taps.contiguous().flatten(1)
-        for tap, source, target in table.pairs(reverse):
-            add_products(rows, matrices[tap].numpy(), source.numpy(), target.numpy(), flat, x.shape[1], out.shape[1])
+        rows, matrices, sums = x.contiguous().numpy(), taps.contiguous().numpy(), out.numpy()
+        for tap, step, source, target, counts in table.sweeps(reverse):
+            add_products(rows, matrices, tap, step, source.numpy(), target.numpy(), counts.numpy(), sums)
         return out
     matrices, (longest, blocks) = taps.unbind(), table.blocks(_block_rows(x), reverse)
     gathered, product = x.new_empty(longest, x.shape[1]), x.new_empty(longest, taps.shape[2])
@@ -243,9 +242,9 @@ def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, b
 
 
 def _in_loops(x: Tensor, taps: Tensor) -> bool:
-    """Inference on the CPU with few channels: compiled loops do without the copies, which there cost as much as the products."""
-    plain = x.device.type == "cpu" and x.dtype == taps.dtype == torch.float32 and x.shape[1] % 4 == 0
-    return plain and not torch.is_grad_enabled() and taps.shape[1] * taps.shape[2] <= LOOPS_UP_TO
+    """The compiled loop does without copies before and after a product: at any number of channels they cost time beside it."""
+    plain = x.device.type == "cpu" and x.dtype == taps.dtype == torch.float32
+    return plain and taps.shape[2] % LANES == 0
 
 
 def _pair_outer(x: Tensor, dy: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:

@@ -36,12 +36,17 @@ class Window(NamedTuple):
         return max(rows, 0), max(columns, 0)
 
 
-class Pairs(NamedTuple):
-    """By one tap, rows source (P,) int64 lead to rows target (P,) int64; no row stands twice on either side."""
+class Sweep(NamedTuple):
+    """Pairs of consecutive taps, from tap on by step (1 or -1), counts (taps,) int64 of each.
+
+    Rows source (P,) int64 lead to rows target (P,) int64; within a tap no row stands twice on either side.
+    """
 
     tap: int
+    step: int
     source: Tensor
     target: Tensor
+    counts: Tensor
 
 
 class Block(NamedTuple):
@@ -83,8 +88,8 @@ class NeighbourMap:
         return back[: self.n_in].contiguous()
 
     @cached_property
-    def _met(self) -> tuple[Tensor, Tensor, list[int]]:
-        """Tap by tap, which input (P,) leads to which output (P,), and how many pairs each tap has.
+    def _met(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Tap by tap, which input (P,) leads to which output (P,), and how many pairs each tap (taps,) has, all int64.
 
         Where the map is symmetric, taps before the middle alone: those behind it have the same pairs turned round.
         """
@@ -92,15 +97,26 @@ class NeighbourMap:
         if _in_loops(self.index):
             counts = np.zeros(taps, np.int64)
             source, target = map(torch.from_numpy, _pairs_by_tap(self.index.numpy(), self.n_in, counts))
-            return source, target, counts.tolist()
+            return source, target, torch.from_numpy(counts)
         by_tap = self.index[:, :taps].T.contiguous()
         met = by_tap < self.n_in
-        return by_tap[met].long(), met.nonzero()[:, 1], met.sum(1).tolist()
+        return by_tap[met].long(), met.nonzero()[:, 1], met.sum(1)
+
+    def sweeps(self, reverse: bool = False) -> tuple[Sweep, ...]:
+        """The pairs of all taps, from inputs to outputs, or turned round.
+
+        A symmetric map has none by its middle tap, which leads from each row to itself, and two sweeps: taps behind the
+        middle have the pairs of those before it turned round, the last tap those of the first.
+        """
+        source, target, counts = self._met
+        ends = (target, source) if reverse else (source, target)
+        ahead = Sweep(0, 1, *ends, counts)
+        return (ahead, Sweep(self.index.shape[1] - 1, -1, *ends[::-1], counts)) if self.is_symmetric else (ahead,)
 
     def _cut(self, rows: int) -> list[Block]:
         """The pairs of every tap, from inputs to outputs, in blocks of so many rows at most, as views."""
         source, target, counts = self._met
-        sizes = [(tap, min(rows, n - at)) for tap, n in enumerate(counts) for at in range(0, n, rows)]
+        sizes = [(tap, min(rows, n - at)) for tap, n in enumerate(counts.tolist()) for at in range(0, n, rows)]
         lengths = [size for _, size in sizes]
         parts = zip(sizes, source.split(lengths), target.split(lengths))
         blocks = [Block(tap, some, others, size) for (tap, size), some, others in parts]
@@ -119,14 +135,6 @@ class NeighbourMap:
                 found = [Block(b.tap, b.target, b.source, b.size) for b in found]
             self.cut[rows, reverse] = max((block.size for block in found), default=0), tuple(found)
         return self.cut[rows, reverse]
-
-    def pairs(self, reverse: bool = False) -> tuple[Pairs, ...]:
-        """The pairs of every tap that has any, from inputs to outputs, or turned round.
-
-        A symmetric map has none by its middle tap, which leads from each row to itself.
-        """
-        whole = self.blocks(max(1, self.index.shape[0]), reverse)[1]
-        return tuple(Pairs(b.tap, b.source, b.target) for b in whole)
 
     def on(self, device: torch.device) -> NeighbourMap:
         """The same map on another device; kept."""
