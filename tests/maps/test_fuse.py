@@ -33,7 +33,7 @@ def road(length=100.0, sides=(-5.25, -1.75, 1.75, 5.25)):
     return [(BOUNDARY if y in (sides[0], sides[-1]) else DIVIDER, line) for y, line in zip(sides, lines)]
 
 
-def look(world, at, agent="a", hour=0, error=(0.0, 0.0, 0.0), noise=0.0, seed=0, style=NO_STYLE, **more):
+def look(world, at, agent="a", hour=0, error=(0.0, 0.0, 0.0), noise=0.0, seed=0, style=NO_STYLE, score=0.9, **more):
     """What an agent at true pose ``at`` sees of world lines, when its claimed pose is off by ``error``."""
     rng = np.random.default_rng(seed)
     x, y, yaw = at
@@ -49,7 +49,7 @@ def look(world, at, agent="a", hour=0, error=(0.0, 0.0, 0.0), noise=0.0, seed=0,
         for piece in pieces:
             lines.append(piece + rng.normal(0.0, noise, piece.shape) if noise else piece)
             kinds.append(kind)
-    elements = MapElements.of(lines, kinds, 0.9, style=style)
+    elements = MapElements.of(lines, kinds, score, style=style)
     pose = np.array(at) + error
     fields = {"covariance": CLAIM, "view": VIEW, **more}
     return Observation(
@@ -200,6 +200,26 @@ def test_what_many_looked_for_in_vain_needs_more_than_one_word():
     assert dividers(late[:1]) == 3  # nobody looked before
     assert dividers([*early, *late[:1]]) == 2
     assert dividers([*early, *late]) == 3  # three agree: it is new
+
+
+@pytest.mark.parametrize(("score", "found"), [(0.35, 0), (0.55, 0), (0.8, 4)])
+def test_what_models_were_not_sure_of_needs_more_who_saw_it(score, found):
+    # Two agents: 2 x 1.54 at full score, half of that at .55, nothing at .35; published from 2.2.
+    two = [look(road(), (30.0, 1.5, 0.0), agent=f"agent{k}", hour=k, score=score) for k in range(2)]
+    assert len(fuse(two).published()) == found
+    four = [look(road(), (30.0, 1.5, 0.0), agent=f"agent{k}", hour=k, score=score) for k in range(4)]
+    assert len(fuse(four).published()) == (0 if score < 0.4 else 4)
+
+
+@pytest.mark.parametrize(("together", "left"), [(True, 1), (False, 0)])
+def test_a_painted_line_beside_an_edge_stays_where_both_were_seen_at_once(together, left):
+    edge, paint = np.array([[0.0, 0.0], [60.0, 0.0]]), np.array([[0.0, 0.5], [60.0, 0.5]])
+    both, only = [(BOUNDARY, edge), (DIVIDER, paint)], [(BOUNDARY, edge)]
+    # Three see the divider, beside the edge or instead of it; five more the edge alone, too few to say that it is gone.
+    worlds = [both if together else [(DIVIDER, paint)]] * 3 + [only] * 5
+    fused = fuse([look(w, (30.0, 1.5, 0.0), agent=f"agent{k}", hour=k) for k, w in enumerate(worlds)])
+    assert len(lines_of(fused, BOUNDARY)) == 1
+    assert len(lines_of(fused, DIVIDER)) == left
 
 
 def test_i_a_moved_divider_switches_and_is_never_averaged():

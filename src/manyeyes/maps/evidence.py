@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What speaks for and against each station of a map: who saw it, who could have and did not, in the order of time.
 
-Stages 4 and 7 of specs/maps.md 3.4. A station gains log(P_D / P_FA) for an observation that has a line there and loses
-visibility times log((1 - P_FA) / (1 - P_D)) for one that could see the place and has none; a line a little aside says
-neither. Each agent's sum of a day is capped, so that one busy or malicious agent cannot decide. It is published and
-retired with hysteresis. Clear views of the place before the first sighting count against it too, but only down to
-``doubt``: what many looked for in vain and one saw is more likely false than new, and still a few who agree suffice.
+Stages 4 and 7 of specs/maps.md 3.4. A station gains log(P_D / P_FA) for an observation that has a line there, or a
+share of it where that agent's model was not sure of the line, and loses visibility times log((1 - P_FA) / (1 - P_D))
+for one that could see the place and has none; a line a little aside says neither. Each agent's sum of a day is capped,
+so that one busy or malicious agent cannot decide. It is published and retired with hysteresis. Clear views of the place
+before the first sighting count against it too, but only down to ``doubt``: what many looked for in vain and one saw is
+more likely false than new, and still a few who agree suffice.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _DAY_S = 86400.0
 @dataclass(frozen=True)
 class EvidenceConfig:
     """detection, false_alarm: P_D and P_FA. clamp: largest |log-odds|; doubt: before the first sighting. daily: largest
-    change one agent makes in a day.
+    change one agent makes in a day. unsure, sure: scores of an element below which a sighting adds nothing and above
+    which it adds all; in between, a share.
 
     publish: log-odds at which a station is published, given publish_agents distinct agents or a surveyed pole. retire:
     at which it is retired, given retire_agents distinct agents that missed it. margin_m: of a view, within which a miss
@@ -43,6 +45,8 @@ class EvidenceConfig:
     clamp: float = 6.0
     doubt: float = 2.0
     daily: float = 2.0
+    unsure: float = 0.4
+    sure: float = 0.7
     publish: float = 2.2
     publish_agents: int = 2
     retire: float = -1.4
@@ -60,6 +64,10 @@ class EvidenceConfig:
     def hit(self) -> float:
         """What a sighting adds."""
         return float(np.log(self.detection / self.false_alarm))
+
+    def worth(self, score: Floats) -> Floats:
+        """(E,) which share of ``hit`` a sighting of an element of that score adds."""
+        return np.clip((np.asarray(score) - self.unsure) / (self.sure - self.unsure), 0.0, 1.0)
 
     @property
     def miss(self) -> float:
@@ -184,7 +192,7 @@ def witness(
         (index.keys, index.start, index.of),
         witnesses(sightings, pose),
         sights(sightings),
-        np.asarray(sightings.elements.style),
+        (np.asarray(sightings.elements.style), config.worth(sightings.elements.score)),
         config.numbers,
         (config.publish_agents, config.retire_agents),
         np.array(config.decay_s),
@@ -193,8 +201,9 @@ def witness(
 
 
 @njit(cache=True, nogil=True)
-def _witness(stations, others, index, who, sights, style, numbers, least, decay):  # pragma: no cover - compiled
+def _witness(stations, others, index, who, sights, told, numbers, least, decay):  # pragma: no cover - compiled
     xy, tangent, kind = stations
+    style, worth = told
     count, observations = len(xy), len(who[0])
     shift, sigma, odds, coverage = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
     support, agents, state = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
@@ -202,7 +211,7 @@ def _witness(stations, others, index, who, sights, style, numbers, least, decay)
     votes = np.zeros((count, style.shape[1]))
     first, sources, filled = np.zeros(count + 1, np.int64), np.empty(max(16, 8 * count), np.int64), 0
     mass, offset, pull = np.zeros(observations), np.zeros(observations), np.zeros(observations)
-    nearest, element = np.zeros(observations), np.zeros(observations, np.int64)
+    nearest, element, gain = np.zeros(observations), np.zeros(observations, np.int64), np.zeros(observations)
     aside_of = np.zeros(observations, np.int64)  # 1: a line at the station, 2: one a little aside
     touched, place = np.empty(observations, np.int64), np.empty((1, 2))
     book = np.zeros((who[4], 4))
@@ -227,13 +236,14 @@ def _witness(stations, others, index, who, sights, style, numbers, least, decay)
                 sources[filled] = o
                 filled += 1
                 votes[k] += style[element[o]]
+                gain[o] = worth[element[o]]
         first[k + 1] = filled
         place[0, 0], place[0, 1] = xy[k, 0] - shift[k] * tangent[k, 1], xy[k, 1] + shift[k] * tangent[k, 0]
         odds[k], coverage[k], agents[k], state[k] = fold_looks(
             place,
             k,
             sources[first[k] : filled],
-            aside_of,
+            (aside_of, gain),
             index,
             who,
             sights,
@@ -328,15 +338,18 @@ def _agree(n, touched, aside_of, mass, offset, pull, numbers):  # pragma: no cov
 
 @njit(cache=True, nogil=True)
 def fold_looks(
-    places, k, hits, aside_of, index, who, sights, numbers, least, decay, book, stamp
+    places, k, hits, found_by, index, who, sights, numbers, least, decay, book, stamp
 ):  # pragma: no cover - compiled
     """Log-odds, coverage, distinct agents and state of one thing after all looks at it, in time order.
 
-    ``places`` (M, 2) are points of it whose visibilities are averaged. ``hits`` are the rows that saw it, ascending.
+    ``places`` (M, 2) are points of it whose visibilities are averaged. ``hits`` are the rows that saw it, ascending;
+    ``found_by`` tells for each row whether it saw it (1) or something a little aside (2), and what share of a hit that
+    is worth.
     Scratch by agent: ``book`` holds the sum of a day; ``stamp`` the thing and day of that sum, and when it last counted
     as a supporter and as a witness of absence.
     """
     agent, time_ns, trusted = who[1], who[2], who[3]
+    aside_of, worth = found_by
     hit, miss, clamp, daily, publish, retire = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
     low, high = _cell_of(places, index)
     of = index[2]
@@ -366,7 +379,7 @@ def fold_looks(
             book[a, 0], book[a, 1] = 0.0, 0.0
         if stamp[a, 1] != day:
             stamp[a, 1], book[a, 0] = day, 0.0
-        change = hit if found else miss * seen
+        change = hit * worth[o] if found else miss * seen
         if not trusted[o]:
             allowed = min(daily, max(-daily, book[a, 0] + change))
             change, book[a, 0] = allowed - book[a, 0], allowed

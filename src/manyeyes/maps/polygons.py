@@ -96,7 +96,7 @@ def find_crossings(
         (index.keys, index.start, index.of),
         witnesses(sightings, pose),
         sights(sightings),
-        np.asarray(sightings.elements.style),
+        (np.asarray(sightings.elements.style), evidence.worth(sightings.elements.score)),
         evidence.numbers,
         (evidence.publish_agents, evidence.retire_agents),
         evidence.decay_s[CROSSING],
@@ -372,15 +372,17 @@ def _median(value, weight):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _evidence(fused, rings, index, who, seen, style, numbers, least, decay, overlap):  # pragma: no cover - compiled
+def _evidence(fused, rings, index, who, seen, told, numbers, least, decay, overlap):  # pragma: no cover - compiled
     start, xy = fused
+    style, worth = told
     hull_first, hulls, area, owner, rows = rings
     count, observations = len(start) - 1, len(who[0])
     odds, coverage = np.zeros(count), np.zeros(count)
     support, agents, state = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
     t_first, t_last, votes = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, style.shape[1]))
     first, found, filled = np.zeros(count + 1, np.int64), np.empty(max(16, len(area)), np.int64), 0
-    aside_of, book, stamp = np.zeros(observations, np.int64), np.zeros((who[4], 4)), np.zeros((who[4], 4), np.int64)
+    aside_of, gain = np.zeros(observations, np.int64), np.zeros(observations)
+    book, stamp = np.zeros((who[4], 4)), np.zeros((who[4], 4), np.int64)
     for k in range(count):
         ring = xy[start[k] : start[k + 1]]
         size = _area(ring)
@@ -400,6 +402,8 @@ def _evidence(fused, rings, index, who, seen, style, numbers, least, decay, over
             if share >= overlap:
                 if aside_of[owner[r]] != 1:
                     votes[k] += style[rows[r]]
+                    gain[owner[r]] = 0.0
+                gain[owner[r]] = max(gain[owner[r]], worth[rows[r]])
                 aside_of[owner[r]] = 1
             elif share > 0.05 and aside_of[owner[r]] == 0:
                 aside_of[owner[r]] = 2
@@ -414,7 +418,7 @@ def _evidence(fused, rings, index, who, seen, style, numbers, least, decay, over
                 filled += 1
         hits = found[begin:filled]
         odds[k], coverage[k], agents[k], state[k] = fold_looks(
-            places, k, hits, aside_of, index, who, seen, numbers, least, decay, book, stamp
+            places, k, hits, (aside_of, gain), index, who, seen, numbers, least, decay, book, stamp
         )
         support[k] = len(hits)
         if len(hits) > 0:

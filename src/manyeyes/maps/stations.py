@@ -36,9 +36,9 @@ class StationConfig:
     found too.
 
     least_support: observations that a station needs, where at least seen_by (summed visibility) could have seen it.
-    rival_m: stations of two kinds of line this close across, or of one kind and never seen together within rival_far_m,
-    exclude each other: the one with the smaller log-odds goes if the ratio of supports, or the difference of log-odds,
-    is that large.
+    rival_m: stations of two kinds of line this close across, or of one kind within rival_far_m, exclude each other
+    unless the same observations saw both: the one with the smaller log-odds goes if the ratio of supports, or the
+    difference of log-odds, is that large.
     """
 
     most: int = 32
@@ -235,23 +235,29 @@ def _losers(xy, tangent, standing, grid, numbers):  # pragma: no cover - compile
                 if abs(ex * u + ey * v) > 1.0 or aside > far or abs(u * tangent[q, 0] + v * tangent[q, 1]) < 0.93:
                     continue
                 if kind[q] != kind[k]:
-                    if aside < near and support[q] > ratio * support[k] and odds[q] >= odds[k]:
-                        loses[k] = True
-                elif odds[q] > odds[k] + difference and support[q] >= 3:
-                    # Two lines of one kind that the same observations saw are two lines; else they are two hypotheses of one.
-                    both, i, j = 0, first[k], first[q]
-                    while i < first[k + 1] and j < first[q + 1]:
-                        if sources[i] == sources[j]:
-                            both += 1
-                            i += 1
-                            j += 1
-                        elif sources[i] < sources[j]:
-                            i += 1
-                        else:
-                            j += 1
-                    if 4 * both < min(support[k], support[q]):
-                        loses[k] = True
+                    wins = aside < near and support[q] > ratio * support[k] and odds[q] >= odds[k]
+                else:
+                    wins = odds[q] > odds[k] + difference and support[q] >= 3
+                # Two lines that the same observations saw are two lines; else they are two readings of one.
+                if wins and 4 * _shared(sources, first, k, q) < min(support[k], support[q]):
+                    loses[k] = True
     return loses
+
+
+@njit(cache=True, nogil=True)
+def _shared(sources, first, k, q):  # pragma: no cover - compiled
+    """How many observations saw both stations; each one's sources ascend."""
+    both, i, j = 0, first[k], first[q]
+    while i < first[k + 1] and j < first[q + 1]:
+        if sources[i] == sources[j]:
+            both += 1
+            i += 1
+            j += 1
+        elif sources[i] < sources[j]:
+            i += 1
+        else:
+            j += 1
+    return both
 
 
 def _rings_inside(

@@ -92,14 +92,15 @@ class StreamingMap:
         self._known.append(raw)
         xy, tangent = s.world(pose)
         weight = 0.04 / (s.sigma**2 + 0.1**2 + covariance[0, 0, 0] / 2 + covariance[0, 1, 1] / 2)
+        worth = self.config.fuse.stations.evidence.worth(s.elements.score)[s.element]
         confirmed, missed, explained = 0, 0, np.zeros(len(xy), bool)
         for ground in (self._main, self._new):
-            hits, misses, near = ground.update(s, pose, xy, tangent, weight, self.config)
+            hits, misses, near = ground.update(s, pose, xy, tangent, weight, worth, self.config)
             self._heard.append((hits, ground is self._main, len(self._known) - 1))
             confirmed, missed, explained = confirmed + len(hits), missed + misses, explained | near
         confirmed, missed = self._cross(s, pose, confirmed, missed)
         fresh = np.flatnonzero(~explained & is_line(s.kind))
-        self._begin(s, xy[fresh], tangent[fresh], fresh)
+        self._begin(s, xy[fresh], tangent[fresh], fresh, worth[fresh])
         if len(self._new) > self.config.fold_in:
             self._fold_in()
         return Assimilated(pose[0], covariance[0], confirmed, missed, len(fresh))
@@ -154,6 +155,7 @@ class StreamingMap:
         config, rows = self.config.fuse.stations, np.flatnonzero(np.asarray(s.elements.kind) == CROSSING)
         moved = s.elements.transform(*(float(v) for v in pose[0]))
         mine = [hulls_of(np.asarray(moved.polyline(int(k)))) for k in rows]
+        worth = config.evidence.worth(s.elements.score[rows])
         used = [False] * len(mine)
         reach = float(s.reach_m[0]) + 5.0
         for k in np.flatnonzero(np.hypot(*(self._middles - pose[0, :2]).T) <= reach).tolist():
@@ -162,7 +164,8 @@ class StreamingMap:
             best = max(shares, default=0.0)
             if best >= config.polygon.overlap:
                 used = [u or share >= config.polygon.overlap for u, share in zip(used, shares)]
-                self._rings.change(np.array([k]), config.evidence.hit, s, True, self.config)
+                amount = config.evidence.hit * float(worth[int(np.argmax(shares))])
+                self._rings.change(np.array([k]), amount, s, True, self.config)
                 confirmed += 1
             elif best <= 0.05:
                 places = np.concatenate((middle[None], (ring + middle) / 2))
@@ -170,18 +173,18 @@ class StreamingMap:
                 if seen > 0.0:
                     self._rings.change(np.array([k]), config.evidence.miss * seen, s, False, self.config)
                     missed += 1
-        for hull, known in zip(mine, used):
+        for k, (hull, known) in enumerate(zip(mine, used)):
             if not known and len(hull) >= 3:
                 self._ring_points.append(hull)
                 self._middles = np.concatenate((self._middles, hull.mean(0)[None]))
-                self._rings = self._rings.grown(1, np.array([CROSSING]), s, self.config)
+                self._rings = self._rings.grown(np.array([CROSSING]), worth[[k]], s, self.config)
         return confirmed, missed
 
-    def _begin(self, s: Sightings, xy: Floats, tangent: Floats, points: Ints) -> None:
-        """New candidates from points that no station explains."""
+    def _begin(self, s: Sightings, xy: Floats, tangent: Floats, points: Ints, worth: Floats) -> None:
+        """New candidates from points that no station explains, each worth a share of a hit."""
         if not len(xy):
             return
-        rows = self._new.rows.grown(len(xy), s.kind[points], s, self.config)
+        rows = self._new.rows.grown(s.kind[points], worth, s, self.config)
         # Candidates keep their order of arrival in ``order``; the grid sorts them.
         joined = _Ground.of(np.concatenate((self._new.xy, xy)), np.concatenate((self._new.tangent, tangent)), rows)
         begun = np.arange(len(self._new), len(joined))
@@ -276,25 +279,25 @@ class _Rows:
         """The chosen rows, in the order given."""
         return _Rows(*(getattr(self, n)[order] for n in self.__dataclass_fields__))
 
-    def grown(self, count: int, kind: Ints, s: Sightings, config: StreamConfig) -> _Rows:
-        """With ``count`` rows begun by an observation."""
-        evidence, time = config.fuse.stations.evidence, int(s.time_ns[0])
-        odds = min(evidence.hit, evidence.daily)
-        state = PUBLISHED if bool(s.trusted[0]) and odds >= evidence.publish else 0
+    def grown(self, kind: Ints, worth: Floats, s: Sightings, config: StreamConfig) -> _Rows:
+        """With rows begun by an observation: their kinds (N,) and which share of a hit each is worth (N,)."""
+        evidence, time, count = config.fuse.stations.evidence, int(s.time_ns[0]), len(kind)
+        odds = np.minimum(evidence.hit * worth, evidence.daily)
+        state = np.where(bool(s.trusted[0]) & (odds >= evidence.publish), PUBLISHED, 0)
         one = np.ones(count, np.int64)
         begun = _Rows(
             np.asarray(kind, np.int64),
             np.full(count, 0.3),
-            np.full(count, odds),
+            odds,
             one,
             one.copy(),
-            one * state,
+            state,
             one * time,
             one * time,
             np.full((count, len(STYLES)), 1.0 / len(STYLES)),
             np.full(count, _agent_number(s)),
             one * (time // DAY_NS),
-            np.full(count, odds),
+            odds.copy(),
         )
         return _Rows.cat(self, begun)
 
@@ -370,7 +373,14 @@ class _Ground:
         return len(self.xy)
 
     def update(
-        self, s: Sightings, pose: Floats, xy: Floats, tangent: Floats, weight: Floats, config: StreamConfig
+        self,
+        s: Sightings,
+        pose: Floats,
+        xy: Floats,
+        tangent: Floats,
+        weight: Floats,
+        worth: Floats,
+        config: StreamConfig,
     ) -> tuple[Ints, int, NDArray[np.bool_]]:
         """Evidence of one observation: rows confirmed, how many missed, and which of its points (P,) some station
         explains.
@@ -382,9 +392,9 @@ class _Ground:
         fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind[lines], 2.5)
         order = lines[fine.order]
         corner = s.world_view(pose)
-        near, place, mass, seen, explained = _compare(
+        near, place, mass, seen, sure, explained = _compare(
             (self.grid.keys, self.grid.start, self.xy, self.tangent),
-            (fine.keys, fine.start, xy[order], tangent[order], weight[order]),
+            (fine.keys, fine.start, xy[order], tangent[order], weight[order], worth[order]),
             (corner.min(0), corner.max(0)),
             witnesses(s, pose)[0],
             sights_of(s),
@@ -394,7 +404,7 @@ class _Ground:
         hit = mass > 0.0
         rows = near[hit]
         gain = mass[hit] / (mass[hit] + 1.0 / np.maximum(self.rows.sigma[rows], 0.02) ** 2 * 0.04)
-        self.rows.change(rows, evidence.hit, s, True, config)
+        self.rows.change(rows, evidence.hit * sure[hit], s, True, config)
         normal = np.stack((-self.tangent[rows, 1], self.tangent[rows, 0]), 1)
         self.xy[rows] += (gain * place[hit])[:, None] * normal
         self.rows.sigma[rows] = np.maximum(evidence.bias_m, self.rows.sigma[rows] * np.sqrt(1.0 - gain))
@@ -408,15 +418,22 @@ class _Ground:
 @njit(cache=True, nogil=True)
 def _compare(ground, points, box, pose, sights, numbers, kinds):  # pragma: no cover - compiled
     """Stations in the box of a view: rows, place across of what was seen there, its weight (0: a little aside, -1:
-    nothing) and visibility; and which points (P,), in their grid's order, have a station.
+    nothing), visibility and which share of a hit it is worth; and which points (P,), in their grid's order, have a
+    station.
     """
     keys, start, xy, tangent = ground
-    pkeys, pstart, pxy, ptangent, pweight = points
+    pkeys, pstart, pxy, ptangent, pweight, pworth = points
     reach, across, wide, cosine = numbers[7], numbers[8], numbers[9], numbers[10]
     low, high = box
     explained = np.zeros(len(pxy), np.bool_)
     size, n = 1024, 0
-    rows, place, mass, seen = np.empty(size, np.int64), np.empty(size), np.empty(size), np.empty(size)
+    rows, place, mass, seen, sure = (
+        np.empty(size, np.int64),
+        np.empty(size),
+        np.empty(size),
+        np.empty(size),
+        np.empty(size),
+    )
     spot = np.empty((1, 2))
     for kind in range(kinds):
         if kind == 2:
@@ -427,7 +444,7 @@ def _compare(ground, points, box, pose, sights, numbers, kinds):  # pragma: no c
             )
             for k in range(first, last):
                 x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
-                total, offset, heavy, beside = 0.0, 0.0, 0.0, False
+                total, offset, heavy, certain, beside = 0.0, 0.0, 0.0, 0.0, False
                 jx, jy = int(np.floor(x / 2.5)), int(np.floor(y / 2.5))
                 for dx in range(-1, 2):
                     a, b = span(pkeys, pstart, kind, jx + dx, jy - 1, jy + 1)
@@ -449,6 +466,7 @@ def _compare(ground, points, box, pose, sights, numbers, kinds):  # pragma: no c
                             total += w
                             offset += w * aside
                             heavy += w * pweight[q]
+                            certain += w * pworth[q]
                 spot[0, 0], spot[0, 1] = x, y
                 visible = visibility(spot, 0, pose, sights, numbers[6]) if not beside else 1.0
                 if total <= 0.0 and (beside or visible <= 0.0):
@@ -456,11 +474,11 @@ def _compare(ground, points, box, pose, sights, numbers, kinds):  # pragma: no c
                 if n == size:
                     size *= 2
                     rows, place = _longer(rows, size), _longer(place, size)
-                    mass, seen = _longer(mass, size), _longer(seen, size)
-                rows[n], seen[n] = k, visible
+                    mass, seen, sure = _longer(mass, size), _longer(seen, size), _longer(sure, size)
+                rows[n], seen[n], sure[n] = k, visible, certain / total if total > 0.0 else 0.0
                 place[n], mass[n] = (offset / total, heavy / total) if total > 0.0 else (0.0, -1.0)
                 n += 1
-    return rows[:n].copy(), place[:n].copy(), mass[:n].copy(), seen[:n].copy(), explained
+    return rows[:n].copy(), place[:n].copy(), mass[:n].copy(), seen[:n].copy(), sure[:n].copy(), explained
 
 
 @njit(cache=True, nogil=True)
