@@ -3,6 +3,7 @@
 
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -11,12 +12,15 @@ from PIL import Image
 
 from manyeyes.agents.eyes import Eyes
 from manyeyes.apps import cli
-from manyeyes.apps.studies import pose, pose_accuracy
+from manyeyes.apps.studies import feakm, pose, pose_accuracy
 from manyeyes.apps.studies.disturbance import Disturbance
 from manyeyes.datasets.opv2v import Opv2vWriter
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
 from manyeyes.models import checkpoint
 from manyeyes.models.detector import Detector
+from manyeyes.models.feakm import FORMAT, FeakmConfig, FeakmNet
+from manyeyes.models.keypoint_boxes import BoxKeypoints
+from manyeyes.models.matcher import MatcherConfig
 from manyeyes.models.presets import COSTR_TINY
 
 PLACES = torch.tensor(
@@ -95,6 +99,66 @@ def test_the_levels_are_feakms_columns() -> None:
     assert len(pose.LEVELS) == 11 and all(len(ap) == 11 for _, *aps in pose.PAPER_AP for ap in aps)
     assert pose.LEVELS[1] == Disturbance(heading_deg=0.2) and pose.LEVELS[-1].name == "2°, 2 m"
     assert [c.x for p in pose.panels(()) for c in p.curves] == []
+
+
+def test_rival_fusions_are_rows_by_the_claims_as_they_are(data, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(pose, "LEVELS", (pose.CLEAN, Disturbance(heading_deg=2.0, position_m=2.0)))
+    monkeypatch.setattr(pose, "SIGMAS", (0.0, 2.0))
+    monkeypatch.setattr(pose, "APART", ())
+    monkeypatch.setattr(pose, "APART_AT_MOST", {})
+    monkeypatch.setattr(pose, "_by_common", lambda table: pose.Sheet("", ("a", "b"), ()))
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        rival = Detector(replace(COSTR_TINY, fusion="v2x_vit"))
+        checkpoint.save(rival, data / "rival.safetensors", {})
+    words = ("--methods", "intermediate", "--every", 2, "--correctors", "given")
+    held = evaluate(data, tmp_path, "pose", *words, "--branches", f"V2X-ViT={data / 'rival.safetensors'}")
+    assert [(r["corrector"], r["method"]) for r in held["rows"]] == 2 * [("given", "intermediate")] + 2 * [
+        ("given", "V2X-ViT")
+    ]
+    assert held["rows"][2]["lost"][0]["value"] == 0.0
+    assert "| given" in (tmp_path / "pose.md").read_text() and "V2X-ViT" in (tmp_path / "pose.md").read_text()
+
+
+def net_file(data, name: str, detector: str = "", most: int = 64) -> str:
+    """An untrained net of FeaKM, for the untrained detector."""
+    torch.manual_seed(0)
+    channels = COSTR_TINY.encoder.channels[2]
+    config = FeakmConfig(BoxKeypoints(channels, 32, 8, score_min=0.0, most=most), MatcherConfig(32, 8, 1, 1), detector)
+    checkpoint.save(FeakmNet(config), data / name, {}, format=FORMAT)
+    return str(data / name)
+
+
+def test_the_ablation_of_feakm_has_a_row_a_branch_and_level_and_keeps_it(data, tmp_path, monkeypatch) -> None:
+    one, two = net_file(data, "one.safetensors"), net_file(data, "two.safetensors", most=3)
+    detector = data / "untrained.safetensors"
+    words = ("--every", 2, "--branches", f"map={detector},{one}", f"three points={detector},{two}@8")
+    held = evaluate(data, tmp_path, "feakm", *words)
+    assert [(r["branch"], r["sigma"]) for r in held["rows"]] == [
+        (name, sigma) for name in ("map", "three points") for sigma in (0.0, 0.4, 0.8, 1.2)
+    ]
+    assert all(len(r["ap"]) == 2 and r["frames"] == r["asked"] == 2 for r in held["rows"])
+    assert held["rows"][4]["answered"] == 0.0 and held["paper"]["rows"][3][1] == 0.768
+    monkeypatch.setattr(feakm, "ablation", None)
+    assert evaluate(data, tmp_path, "feakm", *words)["rows"] == held["rows"]
+
+
+def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(pose, "LEVELS", (pose.CLEAN,))
+    monkeypatch.setattr(pose, "SIGMAS", (0.0,))
+    monkeypatch.setattr(pose, "APART", ())
+    monkeypatch.setattr(pose, "APART_AT_MOST", {})
+    monkeypatch.setattr(pose, "_by_common", lambda table: pose.Sheet("", ("a", "b"), ()))
+    net = net_file(data, "few.safetensors", most=5)
+    words = ("--methods", "intermediate", "--every", 2, "--correctors", "given", net, f"{net}@8")
+    held = evaluate(data, tmp_path, "pose", *words)
+    plain, four, eight = (r["bytes_per_message"] for r in held["rows"])
+    # Five objects with a descriptor each; a section's own bytes and a packet more may come with them.
+    assert 5 * 45 <= four - plain <= 5 * 49 + 100 and four == eight
+    with torch.random.fork_rng():
+        wrong = net_file(data, "wrong.safetensors", detector="ab" * 8)
+    common = ("--data", data / "data", "--split", "test", "--weights", data / "untrained.safetensors", "--workers", 1)
+    assert cli.main([str(w) for w in ("evaluate", *common, "--out", tmp_path, "--align", wrong)]) == 1
 
 
 def test_poses_are_judged_by_error_and_by_common_objects_and_kept(data, tmp_path, monkeypatch) -> None:

@@ -3,7 +3,7 @@
 
 --study NAME runs a study instead: robustness (delay, errors of pose, lost packets), budget (AP against bytes), agents (one to
 five), ablation (branches of a training), system (every agent as ego, one budget for the channel), pose and pose-accuracy
-(correctors of claimed poses: AP, and the poses themselves), picture (one frame).
+(correctors of claimed poses: AP, and the poses themselves), feakm (branches of that paper's net), picture (one frame).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Options:
     every: int = 1
     """Judge each so many-th frame of those that the recording judges."""
     study: str | None = None
-    """robustness, budget, agents, ablation, system, pose, pose-accuracy or picture; what is finished is kept under --out."""
+    """robustness, budget, agents, ablation, system, pose, pose-accuracy, feakm or picture; what is finished is kept under --out."""
     budgets: tuple[int, ...] = ()
     """Bytes: of a message in the study 'budget', of all messages of an instant in 'system'; by default the study's own."""
     selectors: tuple[str, ...] = ()
@@ -61,9 +61,11 @@ class Options:
     precisions: tuple[str, ...] = ()
     """Ways to write tokens, in the study 'budget'; by default all."""
     correctors: tuple[str, ...] = ()
-    """Who corrects claimed poses, in the studies 'pose' and 'pose-accuracy'; by default the study's own."""
+    """Who corrects claimed poses, in the studies 'pose' and 'pose-accuracy', feakm or a file of its weights among them; by
+    default the study's own."""
     branches: tuple[str, ...] = ()
-    """Weights that the study 'ablation' compares, each as name=weights.safetensors."""
+    """Weights that the study 'ablation' compares, and rival fusions of the study 'pose', each as name=weights.safetensors; of
+    'feakm' each as name=detector.safetensors,net.safetensors."""
 
 
 def main(options: Options) -> None:

@@ -20,6 +20,7 @@ STUDIES = {
     "ablation": "branches of a training, side by side (CoSTr, Table III)",
     "system": "every agent judged as ego, one budget for the channel (CoSTr, Eq. 2)",
     "pose": "errors of pose, with and without a corrector before each fusion (FeaKM, Tables 1 and 2)",
+    "feakm": "branches of FeaKM: its confidence map, its scales (FeaKM, Table 3)",
     "pose-accuracy": "how good corrected poses are, by corrector, error and objects in common",
     "picture": "one frame under errors, methods side by side (CoSTr, Fig. 4)",
 }

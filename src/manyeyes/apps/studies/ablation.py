@@ -50,7 +50,7 @@ class Row:
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    branches = branches_of(options.branches)
+    branches = {name: Path(path) for name, path in branches_of(options.branches).items()}
     begun = start(options, console)
     base = replace(begun.base, methods=(OURS,))
     conditions = [
@@ -66,17 +66,16 @@ def run(options: Options, console: Console) -> None:
     publish(begun, payload, sheets, panels(table), conditions, (PAPER.replace('column "paper"', "last table"),))
 
 
-def branches_of(words: Sequence[str]) -> dict[str, Path]:
-    """Names and files of ``name=weights.safetensors``."""
+def branches_of(words: Sequence[str], study: str = "ablation", files: str = "weights.safetensors") -> dict[str, str]:
+    """Names and files of ``name=weights.safetensors``, or whatever files the study takes."""
     pairs = [word.partition("=") for word in words]
     odd = [word for word, (name, _, path) in zip(words, pairs) if not name or not path]
     names = [name for name, _, _ in pairs]
     if odd or not words or len(set(names)) < len(names):
         raise ConfigError(
-            "The study 'ablation' takes --branches name=weights.safetensors ..., each name once; "
-            f"got {' '.join(words) or 'none'}."
+            f"The study '{study}' takes --branches name={files} ..., each name once; got {' '.join(words) or 'none'}."
         )
-    return {name: Path(path) for name, _, path in pairs}
+    return {name: path for name, _, path in pairs}
 
 
 def _name(branch: str, under: Disturbance) -> str:

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """AP against errors of claimed poses, for each way to fuse and each corrector before it: FeaKM, Tables 1 and 2.
 
-Buckets are of judged frames, by the fewest objects that the ego shares with any agent within reach of its radio: the corrector
-has that much to go by. Ego alone hears nobody and is played once. "given" believes every claim.
+--branches name=weights.safetensors adds rival fusions, which believe every claim: the paper's rows F-Cooper (preset
+branch-se-dast, the maximum) and V2X-ViT (branch-v2x-vit). Buckets are of judged frames, by the fewest objects that the ego shares
+with any agent within reach of its radio: the corrector has that much to go by. Ego alone hears nobody and is played once. "given"
+believes every claim.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from manyeyes.agents.aligner import Aligner
 from manyeyes.alignment.rivals.table import corrector
+from manyeyes.apps.studies.ablation import branches_of
 from manyeyes.apps.studies.disturbance import Disturbance
 from manyeyes.apps.studies.running import ALONE, OURS, carry_out, claims_sheet, publish, start, with_replay
 from manyeyes.apps.viewer.curves import Curve, Panel
@@ -61,8 +64,9 @@ PAPER_AP = (
 
 @dataclass(frozen=True)
 class Row:
-    """A way to fuse behind a corrector, under a level of error. ap: at each IoU; lost: AP less than the same way to fuse has
-    with true poses and no corrector; over_alone: more than ego alone. by_common: AP@0.5 of each bucket of COMMON.
+    """A way to fuse (a method, or a rival's weights) behind a corrector, under a level of error. ap: at each IoU; lost: AP less
+    than the same way to fuse has with true poses and no corrector; over_alone: more than ego alone. by_common: AP@0.5 of each
+    bucket of COMMON.
     """
 
     corrector: str
@@ -88,11 +92,15 @@ def run(options: Options, console: Console) -> None:
         for level in (*LEVELS, *APART)
         if hearing
     ]
+    rivals = branches_of(options.branches, "pose") if options.branches else {}
+    for rival, weights in rivals.items():
+        base = replace(begun.base, methods=(OURS,), weights=weights)
+        conditions += [Condition(place_name(rival, level), level.on(base)) for level in (*LEVELS, *APART)]
     if ALONE in begun.base.methods:
         conditions.append(Condition(ALONE, CLEAN.on(replace(begun.base, methods=(ALONE,)))))
     done = carry_out(begun, conditions)
     common = shared(begun.base.view(begun.opener()), begun.base.replay.reach_m)
-    table, held = rows(done, names, common), claims(done, names, common)
+    table, held = rows(done, names, common, tuple(rivals)), claims(done, names, common)
     sheets = [_sheet(f"AP@{iou:g}", table, k) for k, iou in enumerate(IOUS)]
     sheets += [_by_common(table), claims_sheet(held), *(_paper(k) for k in range(len(IOUS)))]
     payload: dict[str, object] = {
@@ -124,8 +132,10 @@ def shared(recording: Recording, reach_m: float) -> dict[tuple[str, int], int]:
     }
 
 
-def rows(done: Sweep, names: Sequence[str], common: dict[tuple[str, int], int]) -> tuple[Row, ...]:
-    """The table, corrector by corrector, method by method, level by level."""
+def rows(
+    done: Sweep, names: Sequence[str], common: dict[tuple[str, int], int], rivals: Sequence[str] = ()
+) -> tuple[Row, ...]:
+    """The table, corrector by corrector, method by method, level by level; then rival fusions, which believe every claim."""
     out = []
     for name in names:
         methods = [method for condition, method in done.cells if condition == place_name(name, CLEAN)]
@@ -134,6 +144,10 @@ def rows(done: Sweep, names: Sequence[str], common: dict[tuple[str, int], int]) 
             for level in (*LEVELS, *APART):
                 place = (place_name(name, level), method)
                 out.append(_row(done, name, level, place, clean, common))
+    for rival in rivals:
+        for level in (*LEVELS, *APART):
+            place, clean = ((place_name(rival, at), OURS) for at in (level, CLEAN))
+            out.append(replace(_row(done, GIVEN, level, place, clean, common), method=rival))
     return tuple(out)
 
 
