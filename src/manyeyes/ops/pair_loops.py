@@ -52,8 +52,7 @@ def add_products(x, weight, tap, step, source, target, counts, out):  # pragma: 
         at, tap = end, tap + step
 
 
-@intrinsic(prefer_literal=True)
-def _add_tile(
+def _tile(
     _: Any, rows: Any, vectors: Any, x: Any, matrix: Any, out: Any, source: Any, target: Any, pair: Any, column: Any
 ) -> Any:
     """The products of ``rows`` pairs, from pair on, with ``vectors`` x LANES columns of a matrix, from column on.
@@ -64,7 +63,7 @@ def _add_tile(
     vector, place = ir.VectorType(ir.FloatType(), LANES), ir.IntType(64)
     undefined, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
 
-    def generate(context: Any, b: ir.IRBuilder, signature: Any, given: Any) -> Any:
+    def generate(context: Any, b: Any, signature: Any, given: Any) -> Any:
         x_, matrix_, out_, source_, target_ = (
             context.make_array(kind)(context, b, value) for kind, value in zip(given_types[2:7], given[2:7])
         )
@@ -95,3 +94,6 @@ def _add_tile(
         return context.get_dummy_value()
 
     return types.void(*given_types), generate
+
+
+_add_tile: Any = intrinsic(prefer_literal=True)(_tile)

@@ -109,9 +109,9 @@ class NeighbourMap:
         middle have the pairs of those before it turned round, the last tap those of the first.
         """
         source, target, counts = self._met
-        ends = (target, source) if reverse else (source, target)
-        ahead = Sweep(0, 1, *ends, counts)
-        return (ahead, Sweep(self.index.shape[1] - 1, -1, *ends[::-1], counts)) if self.is_symmetric else (ahead,)
+        a, b = (target, source) if reverse else (source, target)
+        ahead, last = Sweep(0, 1, a, b, counts), self.index.shape[1] - 1
+        return (ahead, Sweep(last, -1, b, a, counts)) if self.is_symmetric else (ahead,)
 
     def _cut(self, rows: int) -> list[Block]:
         """The pairs of every tap, from inputs to outputs, in blocks of so many rows at most, as views."""
