@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from manyeyes.agents.agent import Agent
 from manyeyes.agents.cartographer import Cartographer
+from manyeyes.agents.collaboration import Alone
 from manyeyes.agents.map_team import MapTeam
 from manyeyes.agents.mapping import receive, share_look
 from manyeyes.agents.surveyor import SURVEYS, SurveyConfig, Surveyor, rectangle, said, survey_config
+from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, PointCloud, Transform
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.datatypes.message import SeenMap
@@ -150,3 +153,43 @@ def test_what_comes_late_is_taken_with_the_next_instant_or_at_the_end():
     assert len(service.observations) == 1
     team.finish(second)
     assert len(service.observations) == 2
+
+
+def test_an_agents_message_carries_its_map_beside_what_it_says_anyway(drive, detector):
+    ego, other = drive().frame(0, 0), drive().frame(1, 0)
+    plain = Agent(detector, precision="float32", budget_bytes=None).share(other)
+    both = Agent(detector, precision="float32", budget_bytes=None, survey=straight_on).share(other)
+    inbox, bare = Inbox(), Inbox()
+    for packets, into in ((both, inbox), (plain, bare)):
+        for packet in packets:
+            into.push(packet)
+    (heard,), (without,) = inbox.messages(), bare.messages()
+    assert heard.seen_map is not None and len(heard.seen_map.elements) == 1
+    assert heard.tokens is not None and without.tokens is not None
+    assert torch.equal(heard.tokens.features, without.tokens.features)
+    listener = Agent(detector)
+    assert torch.equal(listener.perceive(ego, both).boxes.center, Agent(detector).perceive(ego, plain).boxes.center)
+    service = Cartographer()
+    assert len(service.listen(inbox.receptions())) == 1
+
+
+def test_who_says_nothing_else_may_still_say_its_map(drive, detector):
+    assert Agent(detector, Alone()).share(drive().frame(1, 0)) == []
+    (packet,) = Agent(detector, Alone(), survey=straight_on).share(drive().frame(1, 0))
+    assert len(packet) < 130
+    silent = Agent(detector, Alone(), survey=lambda frame, heard: None)
+    assert silent.share(drive().frame(1, 0)) == []
+
+
+def test_a_map_takes_its_bytes_from_the_tokens_of_a_budget(drive, detector):
+    for budget in (900, 2000):
+        packets = Agent(detector, budget_bytes=budget, survey=straight_on).share(drive().frame(1, 0))
+        message = heard_message(packets)
+        assert sum(map(len, packets)) <= budget and message.seen_map is not None and message.tokens is not None
+
+
+def heard_message(packets):
+    inbox = Inbox()
+    for packet in packets:
+        inbox.push(packet)
+    return inbox.messages()[0]

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from manyeyes.agents.aligner import Aligner, Verdict
 from manyeyes.agents.coding import codebook_of, coded, readable, tables_of
 from manyeyes.agents.collaboration import Collaboration, Intermediate
+from manyeyes.agents.collaboration.heading import header
 from manyeyes.agents.eyes import Eyes
 from manyeyes.agents.memory import Memory
 from manyeyes.alignment.watchman import WatchState
@@ -20,6 +22,9 @@ from manyeyes.comms.wire import Precision
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 from manyeyes.datatypes.message import RequestMap
 from manyeyes.models.detector import Detector
+
+if TYPE_CHECKING:
+    from manyeyes.agents.surveyor import Survey
 
 OWN_BODY_M = (2.6, 1.3)
 WINDOW_STRIDE = 32
@@ -42,7 +47,8 @@ class Agent:
 
     Nothing but the bytes of share passes between two agents; frames carry no labels, so truth cannot leak by type.
     requests: its messages of tokens say, a byte a window, where it needs no help (``comms.request``).
-    aligner: corrects where others say they are before anything is fused; None believes them.
+    aligner: corrects where others say they are before anything is fused; None believes them. survey: draws what the agent then
+    says of the map (``agents.surveyor``); None: nothing.
     """
 
     def __init__(
@@ -54,13 +60,14 @@ class Agent:
         eyes: Eyes | None = None,
         aligner: Aligner | None = None,
         requests: bool = False,
+        survey: Survey | None = None,
     ) -> None:
         self.eyes, self.memory = eyes or Eyes(detector), Memory()
         self.aligner, self._watched = aligner, dict[int, WatchState]()
         self.collaboration = collaboration or Intermediate()
         self.precision: Precision = precision
         self.budget_bytes = budget_bytes
-        self.requests = requests
+        self.requests, self.survey = requests, survey
         self._tables = tables_of(detector)
         if precision == "codes":
             codebook_of(detector)
@@ -69,11 +76,14 @@ class Agent:
         """The packets that this frame is worth to others, most important first; none if there is nothing to say.
 
         budget_bytes: less than the agent's own, where others need the channel too. A message of tokens is never longer, be
-        it that nothing is said; objects and points know no budget. asked: what came from others; those with a request weigh
-        the tokens by what they do not see themselves.
+        it that nothing is said; objects, points and the map know no budget, but what they take is not there for tokens. asked:
+        what came from others; those with a request weigh the tokens by what they do not see themselves.
         """
         budget = min((b for b in (self.budget_bytes, budget_bytes) if b is not None), default=None)
         message = self.collaboration.say(self.eyes, frame)
+        seen_map = None if self.survey is None else self.survey(frame, asked)
+        if seen_map is not None:
+            message = replace(message or header(frame, self.eyes.detector.fingerprint), seen_map=seen_map)
         if message is None:
             return []
         if self.aligner is not None:
@@ -84,7 +94,7 @@ class Agent:
             left = budget
             if self.requests:
                 message = replace(message, request=self._request(frame))
-            if message.request is not None or message.objects is not None:
+            if any(part is not None for part in (message.request, message.objects, message.seen_map)):
                 spent = wire.encode(replace(message, tokens=None), precision=self.precision)
                 left = None if budget is None else budget - sum(map(len, spent))
             tokens, score = within_budget(tokens, score, left, self.precision, tables=self._tables)

@@ -10,20 +10,31 @@ from manyeyes.datatypes import CheckpointError
 from manyeyes.models import checkpoint, feakm
 from manyeyes.models.detector import Detector
 from manyeyes.models.folded import folded
+from manyeyes.models.map_presets import FORMAT
+from manyeyes.models.mapper import Mapper, MapperConfig
 
 DEFAULT = "costr-small"
 FEAKM = "feakm"
 """The shipped net that recognises objects; no detector, so that it is not among the names."""
+MAPPER = "map-small"
+"""The map model of agents with LiDAR; those with cameras are map-small-camera and map-small-both."""
+_MAPPERS = "map-"
 
 
 def names() -> tuple[str, ...]:
     """The shipped detectors."""
+    return tuple(name for name in _shipped() if name != FEAKM and not name.startswith(_MAPPERS))
+
+
+def mappers() -> tuple[str, ...]:
+    """The shipped map models."""
+    return tuple(name for name in _shipped() if name.startswith(_MAPPERS))
+
+
+def _shipped() -> tuple[str, ...]:
     folder = files("manyeyes.models") / "weights"
-    return (
-        tuple(sorted({Path(f.name).stem for f in folder.iterdir() if f.name.endswith(".safetensors")} - {FEAKM}))
-        if folder.is_dir()
-        else ()
-    )
+    found = folder.iterdir() if folder.is_dir() else ()
+    return tuple(sorted(Path(f.name).stem for f in found if f.name.endswith(".safetensors")))
 
 
 def load(name_or_path: str | Path = DEFAULT) -> Detector:
@@ -53,3 +64,23 @@ def load_feakm(name_or_path: str | Path = FEAKM) -> feakm.FeakmNet:
         )
     with as_file(shipped) as path:
         return feakm.load(path)
+
+
+def load_mapper(name_or_path: str | Path = MAPPER) -> Mapper:
+    """A map model for inference: a shipped name, or a .safetensors file of 'manyeyes train --preset map-small'."""
+    if str(name_or_path) in mappers():
+        with as_file(files("manyeyes.models") / "weights" / f"{name_or_path}.safetensors") as path:
+            return _mapper(path)
+    path = Path(name_or_path)
+    if path.suffix != ".safetensors":
+        raise CheckpointError(
+            f"No map weights are named {name_or_path!r}; shipped are {', '.join(mappers()) or 'none'}: train some "
+            "(manyeyes train --preset map-small) and give the .safetensors file."
+        )
+    return _mapper(path)
+
+
+def _mapper(path: Path) -> Mapper:
+    mapper = checkpoint.load_as(path, FORMAT, MapperConfig, Mapper)
+    mapper.fingerprint = checkpoint.fingerprint(mapper)
+    return mapper
