@@ -9,7 +9,16 @@ import torch
 
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.datatypes.map_element import KINDS
-from manyeyes.models.map_head import DeformableAttention, MapHead, MapHeadConfig, RawMap, _SelfAttention, decode
+from manyeyes.models.map_head import (
+    DeformableAttention,
+    MapHead,
+    MapHeadConfig,
+    RawMap,
+    _SelfAttention,
+    decode,
+    start_lines,
+    waves,
+)
 
 TINY = MapHeadConfig(elements=6, points=5, many=9, channels=16, feed=32, layers=2, heads=4, places=3)
 TILE = BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=2.0)
@@ -22,7 +31,7 @@ def test_every_layer_answers_for_every_query_of_its_group():
         assert len(layers) == 2
         for raw in layers:
             assert raw.logit.shape == (2, count, 3) and raw.point.shape == (2, count, 5, 2)
-            assert bool(((raw.point > 0) & (raw.point < 1)).all())
+            assert bool(torch.isfinite(raw.point).all())
     start = head(ground)[0].logit.sigmoid()
     assert 0.001 < float(start.detach().mean()) < 0.1
 
@@ -82,6 +91,53 @@ def test_answers_come_best_first_in_metres_and_only_those_sure_enough():
     np.testing.assert_allclose(found.polyline(0), [[-20, 0], [20, 10]])
     np.testing.assert_allclose(found.polyline(1), [[-10, -5], [0, -5]])
     np.testing.assert_allclose(found.polyline(2), found.polyline(0))
+
+
+def test_points_beyond_the_tile_are_drawn_at_its_border():
+    config = MapHeadConfig(elements=1, points=3, channels=8)
+    raw = RawMap(torch.full((1, 1, 3), 9.0), torch.tensor([[[[-0.2, 0.5], [0.5, 0.5], [1.1, 1.3]]]]))
+    np.testing.assert_allclose(decode(raw, TILE, config)[0].polyline(0), [[-20, 0], [0, 0], [20, 10]])
+
+
+def test_queries_begin_as_straight_lines_all_over_the_tile():
+    lines = start_lines(48, 5)
+    assert lines.shape == (48, 5, 2) and float(lines.min()) >= 0 and float(lines.max()) <= 1
+    whole = lines[((lines > 0) & (lines < 1)).all(-1).all(-1)]
+    steps = whole.diff(dim=1)
+    assert len(whole) > 30 and torch.allclose(steps, steps[:, :1].expand_as(steps), atol=1e-6)
+    assert torch.allclose((whole[:, -1] - whole[:, 0]).norm(dim=1), torch.tensor(0.3), atol=1e-5)
+    # Each sixth of the tile, and each quarter of all directions, holds half of its even part or more.
+    middle, along = lines[:, 2], whole[:, -1] - whole[:, 0]
+    sixth = torch.bincount((middle * torch.tensor([3, 2])).long() @ torch.tensor([2, 1]), minlength=6)
+    quarter = torch.bincount((torch.atan2(along[:, 1], along[:, 0]).remainder(math.pi) * 4 / math.pi).long())
+    assert int(sixth.min()) >= 4 and int(quarter.min()) >= len(whole) // 6
+    assert start_lines(0, 5).shape == (0, 5, 2)
+
+
+def test_before_anything_is_learnt_every_layer_answers_with_the_lines_that_queries_begin_as():
+    head = MapHead(TINY)
+    for raw in head(torch.randn(1, 16, 10, 20)):
+        assert torch.equal(raw.point[0], start_lines(6, 5))
+
+
+def test_waves_tell_places_apart_to_a_hundredth_of_the_tile():
+    x, y = torch.meshgrid(torch.linspace(0, 1, 101), torch.linspace(0, 1, 51), indexing="ij")
+    code = waves(torch.stack((x, y), -1)).flatten(0, 1)
+    assert code.shape == (5151, 32)
+    some = torch.arange(0, 5151, 37)
+    away = torch.cdist(code[some], code)
+    away[torch.arange(len(some)), some] = torch.inf
+    assert float(away.min()) > 0.5
+
+
+def test_a_layer_is_told_where_its_points_lie():
+    head, ground = MapHead(TINY).eval(), torch.zeros(1, 16, 10, 20)
+    before = head(ground)[0].logit
+    with torch.no_grad():
+        head.start[2, :, 0] += 0.05
+    after = head(ground)[0].logit
+    # Nothing is seen anywhere, so only the place itself can have changed the answer.
+    assert not torch.allclose(before[0, 2], after[0, 2], atol=1e-6)
 
 
 def test_nothing_sure_is_an_empty_map():

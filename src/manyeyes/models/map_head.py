@@ -3,8 +3,13 @@
 
 Sources: MapTR (Liao et al., ICLR 2023): hierarchical queries, an instance's and a point's embedding added, and reference points
 refined layer by layer; MapTRv2 (IJCV 2024): self-attention among instances and within each in turn, and a second group of queries
-for one-to-many matching in training; Deformable DETR (ICLR 2021): attention to a few learned places. The two groups never
-attend to each other, which here is said by running the same layers on each.
+for one-to-many matching in training; Deformable DETR (ICLR 2021): attention to a few learned places; DAB-DETR (ICLR 2022): each
+layer is told where its points lie by now. The two groups never attend to each other, which here is said by running the same
+layers on each.
+
+Three things differ from MapTR, without which a few tiles are not learnt by heart in hundreds of steps: an element's points begin
+as one straight line, not each at a place of its own; their places are told to every layer; and points move by metres, not by
+logits, which are flat at the tile's border, where most lines end.
 """
 
 from __future__ import annotations
@@ -23,6 +28,11 @@ from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
 from manyeyes.ops.deformable import sample_weighted
 
 Group = Literal["one", "many"]
+
+STEP = 0.1
+"""What one unit of a move's output is, as a share of the tile."""
+
+_WAVES = math.pi * 2.0 ** torch.arange(8)
 
 
 @dataclass(frozen=True)
@@ -54,7 +64,7 @@ class MapHeadConfig:
 
 @dataclass(frozen=True, eq=False)
 class RawMap:
-    """What one layer says of B tiles: logit (B, I, kinds) and point (B, I, P, 2), x and y as shares of the tile, in (0, 1)."""
+    """What one layer says of B tiles: logit (B, I, kinds) and point (B, I, P, 2), shares of the tile, in it from 0 to 1."""
 
     logit: Tensor
     point: Tensor
@@ -119,8 +129,8 @@ class MapLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(c) for _ in range(4))
 
     def forward(self, x: Tensor, place: Tensor, reference: Tensor, ground: Tensor) -> Tensor:
-        """x (B, I, P, C), place (I, P, C), reference (B, I, P, 2), ground (B, rows, columns, C), to (B, I, P, C)."""
-        among = self.among(x.transpose(1, 2), place.transpose(0, 1)).transpose(1, 2)
+        """x and place (B, I, P, C), reference (B, I, P, 2), ground (B, rows, columns, C), to (B, I, P, C)."""
+        among = self.among(x.transpose(1, 2), place.transpose(1, 2)).transpose(1, 2)
         x = self.norms[0](x + among)
         x = self.norms[1](x + self.within(x, place))
         look = self.look((x + place).flatten(1, 2), reference.flatten(1, 2), ground)
@@ -137,9 +147,9 @@ class MapHead(nn.Module):
         c = config.channels
         self.instance = nn.Parameter(torch.randn(config.elements + config.many, 2 * c))
         self.point = nn.Parameter(torch.randn(config.points, 2 * c))
-        self.reference = nn.Linear(c, 2)
-        # Queries begin all over the tile, not in its middle.
-        nn.init.xavier_uniform_(self.reference.weight)
+        starts = [start_lines(count, config.points) for count in (config.elements, config.many)]
+        self.start = nn.Parameter(torch.cat(starts))
+        self.where = nn.Sequential(nn.Linear(4 * len(_WAVES), c), nn.ReLU(), nn.Linear(c, c))
         self.layers = nn.ModuleList(MapLayer(config) for _ in range(config.layers))
         self.kinds = nn.ModuleList(_kind_branch(c, len(config.kinds)) for _ in range(config.layers))
         self.moves = nn.ModuleList(_move_branch(c) for _ in range(config.layers))
@@ -147,19 +157,37 @@ class MapHead(nn.Module):
     def forward(self, ground: Tensor, group: Group = "one") -> tuple[RawMap, ...]:
         """Features of B tiles (B, C, rows, columns) to one RawMap a layer, the last the best; group: which queries."""
         ones = self.config.elements
-        instance = self.instance[:ones] if group == "one" else self.instance[ones:]
-        place, content = (instance[:, None] + self.point).chunk(2, -1)
+        mine = slice(ones) if group == "one" else slice(ones, None)
+        embedded, content = (self.instance[mine][:, None] + self.point).chunk(2, -1)
         b = ground.shape[0]
         x = content.expand(b, *content.shape)
-        reference = self.reference(place).sigmoid().expand(b, *place.shape[:-1], 2)
+        reference = self.start[mine].expand(b, *self.start[mine].shape)
         ground = ground.permute(0, 2, 3, 1)
         out = []
         for layer, kind, move in zip(self.layers, self.kinds, self.moves):
-            x = layer(x, place, reference, ground)
-            point = torch.sigmoid(move(x) + torch.logit(reference, 1e-5))
+            x = layer(x, embedded + self.where(waves(reference)), reference, ground)
+            point = reference + STEP * move(x)
             out.append(RawMap(kind(x.mean(2)), point))
             reference = point.detach()
         return tuple(out)
+
+
+def start_lines(count: int, points: int) -> Tensor:
+    """(count, points, 2) straight lines all over the tile, in shares of it, 0.3 long, of all directions.
+
+    Middles and directions are the additive recurrence of least discrepancy in three dimensions (Roberts 2018).
+    """
+    ratio = torch.tensor(1.2207440846).double() ** -torch.arange(1, 4)
+    x, y, way = ((0.5 + torch.arange(count)[:, None] * ratio) % 1).unbind(-1)
+    along = torch.stack(((math.pi * way).cos(), (math.pi * way).sin()), -1)
+    middle = 0.1 + 0.8 * torch.stack((x, y), -1)
+    return (middle[:, None] + torch.linspace(-0.15, 0.15, points)[:, None] * along[:, None]).clamp(0, 1).float()
+
+
+def waves(place: Tensor) -> Tensor:
+    """Places (..., 2), shares of the tile, as (..., 32) sines and cosines of waves from twice the tile to a 64th of it."""
+    phase = (place[..., None] * _WAVES.to(place)).flatten(-2)
+    return torch.cat((phase.sin(), phase.cos()), -1)
 
 
 def _kind_branch(channels: int, kinds: int) -> nn.Sequential:
@@ -178,13 +206,13 @@ def _move_branch(channels: int) -> nn.Sequential:
 
 
 def decode(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[MapElements]:
-    """The elements of each tile, in its frame, metres, best first; a query may answer under two kinds, as in MapTR."""
+    """The elements of each tile, in its frame, metres, within it, best first; a query may answer under two kinds, as in MapTR."""
     score = raw.logit.detach().sigmoid()
     low = np.array([tile.x_min, tile.y_min])
     size = np.array([tile.x_max, tile.y_max]) - low
     code = np.array([KINDS.index(kind) for kind in config.kinds])
     out = []
-    for scores, points in zip(score, raw.point.detach().double()):
+    for scores, points in zip(score, raw.point.detach().clamp(0, 1).double()):
         value, order = scores.flatten().sort(descending=True, stable=True)
         kept = order[: config.keep][value[: config.keep] >= config.threshold]
         query, kind = (kept // scores.shape[1]).numpy(), (kept % scores.shape[1]).numpy()
