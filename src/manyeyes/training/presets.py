@@ -31,7 +31,7 @@ _CROWD = replace(
     augment=AugmentConfig(thin=0.1, early_share=0.2),
     loss=LossConfig(iou=0.8, together=0.6, prune=1.0),
 )
-_BRANCH = replace(_CROWD, steps=400, learning_rate=3e-4, warm_up=20, prune_full=0.001)
+_BRANCH = replace(_CROWD, steps=240, learning_rate=3e-4, warm_up=20, prune_full=0.001)
 
 
 def _branch(**changes: Any) -> TrainConfig:
