@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import DASHED, MapElements, rows_of
 from manyeyes.maps.align import AlignConfig, Alignment, solve_poses
+from manyeyes.maps.beside import BesideConfig, continued
 from manyeyes.maps.linking import LinkConfig, link, smooth
 from manyeyes.maps.observation import Frame, Observation
 from manyeyes.maps.sightings import gather
@@ -41,6 +42,7 @@ class FuseConfig:
     align: AlignConfig = field(default_factory=AlignConfig)
     stations: StationConfig = field(default_factory=StationConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
+    beside: BesideConfig = field(default_factory=BesideConfig)
     least_m: tuple[float, float, float, float] = (4.0, 4.0, 0.0, 2.0)
     full_score_m: tuple[float, float, float, float] = (20.0, 20.0, 0.0, 3.0)
 
@@ -73,11 +75,14 @@ def assemble(table: StationTable, config: FuseConfig = FuseConfig(), frame: Fram
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """Elements on their way: points (P, 2), offsets first (N + 1,), and the row of evidence behind each point (P,)."""
+    """Elements on their way: points (P, 2), offsets first (N + 1,), the row of evidence behind each point (P,), and
+    whether that place itself was seen (P,) or is inferred.
+    """
 
     points: Floats
     first: Ints
     row: Ints
+    seen: NDArray[np.bool_]
     score: Floats
 
     @classmethod
@@ -87,17 +92,27 @@ class _Parts:
             np.concatenate([m.points for m in many]),
             np.concatenate([m.first[:-1] + start for m, start in zip(many, starts)] + [starts[-1:]]),
             np.concatenate([m.row for m in many]),
+            np.concatenate([m.seen for m in many]),
             np.concatenate([m.score for m in many]),
         )
 
 
 def _lines(table: StationTable, chosen: NDArray[np.bool_], config: FuseConfig) -> _Parts:
     rows = np.flatnonzero(chosen)
-    xy, kind = table.xy[rows], table.line.kind[rows]
-    weight = 1.0 / table.line.sigma[rows] ** 2
-    dashed = table.line.style[rows].argmax(1) == DASHED
-    strength, coverage = table.line.log_odds[rows], table.line.coverage[rows]
-    first, members = link(xy, table.tangent[rows], kind, strength, dashed, coverage, config.link)
+    xy, tangent = table.xy[rows], table.tangent[rows]
+    first, members = _linked(table, rows, xy, tangent, config)
+    seen = len(rows)
+    added, turned, source = continued(
+        xy, table.line.kind[rows], table.line.coverage[rows], (first, members), config.beside
+    )
+    if len(added):
+        xy, tangent, rows = (
+            np.concatenate((xy, added)),
+            np.concatenate((tangent, turned)),
+            np.concatenate((rows, rows[source])),
+        )
+        first, members = _linked(table, rows, xy, tangent, config)
+    kind, weight = table.line.kind[rows], 1.0 / table.line.sigma[rows] ** 2
     points = smooth(xy, first, members, weight, config.link.smooth)
     first, order = _canonical(first, points)
     points, members = points[order], members[order]
@@ -112,13 +127,23 @@ def _lines(table: StationTable, chosen: NDArray[np.bool_], config: FuseConfig) -
     score = share / (1.0 + np.exp(-mean / 4.0))
     stays = np.flatnonzero(length >= np.array(config.least_m)[line_kind])
     kept, places = rows_of(first, stays)
-    return _Parts(points[places], kept, rows[members[places]], score[stays])
+    return _Parts(points[places], kept, rows[members[places]], members[places] < seen, score[stays])
+
+
+def _linked(table: StationTable, rows: Ints, xy: Floats, tangent: Floats, config: FuseConfig) -> tuple[Ints, Ints]:
+    """Chains of stations at xy with the evidence of the table's rows."""
+    line = table.line
+    dashed = line.style[rows].argmax(1) == DASHED
+    return link(xy, tangent, line.kind[rows], line.log_odds[rows], dashed, line.coverage[rows], config.link)
 
 
 def _crossings(table: StationTable) -> _Parts:
     offset = len(table.line.kind)
     owner = np.repeat(np.arange(len(table.ring_start) - 1), np.diff(table.ring_start))
-    return _Parts(table.ring_xy, table.ring_start, offset + owner, 1.0 / (1.0 + np.exp(-table.ring.log_odds / 4.0)))
+    seen = np.ones(len(owner), bool)
+    return _Parts(
+        table.ring_xy, table.ring_start, offset + owner, seen, 1.0 / (1.0 + np.exp(-table.ring.log_odds / 4.0))
+    )
 
 
 def _as_map(parts: _Parts, evidence: Evidence, frame: Frame) -> VectorMap:
@@ -145,7 +170,8 @@ def _as_map(parts: _Parts, evidence: Evidence, frame: Frame) -> VectorMap:
     )
     sources_first, sources = _sources(owner, row, count, evidence)
     stations = Stations(
-        *(getattr(evidence, n)[row] for n in ("support", "agents", "log_odds", "sigma", "t_first", "t_last"))
+        *(getattr(evidence, n)[row] * parts.seen for n in ("support", "agents")),
+        *(getattr(evidence, n)[row] for n in ("log_odds", "sigma", "t_first", "t_last")),
     )
     t_first, t_last = np.full(count, np.iinfo(np.int64).max), np.zeros(count, np.int64)
     np.minimum.at(t_first, owner, evidence.t_first[row])
