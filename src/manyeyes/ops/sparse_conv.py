@@ -221,17 +221,18 @@ class _PairProduct(torch.autograd.Function):
 def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, bias: Tensor | None = None) -> Tensor:
     """(rows, D): for each pair of a tap its row of x (N, C) times the matrix (C, D) of the tap, summed where it leads."""
     bias = x.new_zeros(taps.shape[2]) if bias is None else bias.to(x.dtype)
+    if _in_loops(x, taps):
+        out = bias.expand(table.rows(reverse), -1).contiguous()
+        rows, matrices, sums = x.contiguous().numpy(), taps.contiguous().numpy(), out.numpy()
+        for tap, step, source, target, counts in table.sweeps(reverse):
+            add_products(rows, matrices, tap, step, source, target, counts, sums)
+        return out
     # Every site meets itself by the middle tap: no gathering there.
     out = (
         torch.addmm(bias, x, taps[taps.shape[0] // 2])
         if table.is_symmetric
         else bias.expand(table.rows(reverse), -1).contiguous()
     )
-    if _in_loops(x, taps):
-        rows, matrices, sums = x.contiguous().numpy(), taps.contiguous().numpy(), out.numpy()
-        for tap, step, source, target, counts in table.sweeps(reverse):
-            add_products(rows, matrices, tap, step, source.numpy(), target.numpy(), counts.numpy(), sums)
-        return out
     matrices, (longest, blocks) = taps.unbind(), table.blocks(_block_rows(x), reverse)
     gathered, product = x.new_empty(longest, x.shape[1]), x.new_empty(longest, taps.shape[2])
     for tap, source, target, size in blocks:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -37,16 +38,16 @@ class Window(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """Pairs of consecutive taps, from tap on by step (1 or -1), counts (taps,) int64 of each.
+    """Pairs of consecutive taps, from tap on by step (1 or -1), counts (taps,) of each: int64, in the CPU's memory.
 
-    Rows source (P,) int64 lead to rows target (P,) int64; within a tap no row stands twice on either side.
+    Rows source (P,) lead to rows target (P,); within a tap no row stands twice on either side.
     """
 
     tap: int
     step: int
-    source: Tensor
-    target: Tensor
-    counts: Tensor
+    source: NDArray[np.int64]
+    target: NDArray[np.int64]
+    counts: NDArray[np.int64]
 
 
 class Block(NamedTuple):
@@ -70,6 +71,7 @@ class NeighbourMap:
     is_symmetric: bool = False
     moved: dict[torch.device, NeighbourMap] = field(default_factory=dict, repr=False)
     cut: dict[tuple[int, bool], tuple[int, tuple[Block, ...]]] = field(default_factory=dict, repr=False)
+    swept: dict[bool, tuple[Sweep, ...]] = field(default_factory=dict, repr=False)
 
     def rows(self, reverse: bool) -> int:
         """How many rows pairs lead to: outputs, or inputs when they are turned round."""
@@ -103,15 +105,21 @@ class NeighbourMap:
         return by_tap[met].long(), met.nonzero()[:, 1], met.sum(1)
 
     def sweeps(self, reverse: bool = False) -> tuple[Sweep, ...]:
-        """The pairs of all taps, from inputs to outputs, or turned round.
+        """The pairs of all taps, from inputs to outputs, or turned round; found once and kept.
 
-        A symmetric map has none by its middle tap, which leads from each row to itself, and two sweeps: taps behind the
-        middle have the pairs of those before it turned round, the last tap those of the first.
+        A symmetric map has three: its middle tap leads from each row to itself, and taps behind the middle have the pairs of
+        those before it turned round, the last tap those of the first.
         """
-        source, target, counts = self._met
-        a, b = (target, source) if reverse else (source, target)
-        ahead, last = Sweep(0, 1, a, b, counts), self.index.shape[1] - 1
-        return (ahead, Sweep(last, -1, b, a, counts)) if self.is_symmetric else (ahead,)
+        if reverse not in self.swept:
+            source, target, counts = (t.numpy(force=True) for t in self._met)
+            a, b = (target, source) if reverse else (source, target)
+            found, last = [Sweep(0, 1, a, b, counts)], self.index.shape[1] - 1
+            if self.is_symmetric:
+                rows = np.arange(self.n_in)
+                middle = Sweep(last // 2, 1, rows, rows, np.array([self.n_in]))
+                found = [middle, *found, Sweep(last, -1, b, a, counts)]
+            self.swept[reverse] = tuple(found)
+        return self.swept[reverse]
 
     def _cut(self, rows: int) -> list[Block]:
         """The pairs of every tap, from inputs to outputs, in blocks of so many rows at most, as views."""
