@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from manyeyes.datatypes import Boxes, Transform
 from manyeyes.datatypes.keypoints import Keypoints
-from manyeyes.models import checkpoint
+from manyeyes.models import checkpoint, zoo
 from manyeyes.models.constellation import Constellation, ConstellationConfig
 from manyeyes.models.feakm import FEAKM, FORMAT, FeakmConfig, FeakmNet, load
 from manyeyes.models.keypoint_boxes import BoxKeypoints
@@ -152,3 +152,15 @@ def test_weights_are_saved_with_their_settings_and_loaded_strictly(tmp_path):
     assert torch.equal(last(loaded.matcher, a, b), last(net.matcher, a, b))
     with pytest.raises(checkpoint.CheckpointError, match="format is 'manyeyes-feakm-1', not 'manyeyes-detector-1'"):
         checkpoint.load(path)
+
+
+def test_the_shipped_net_has_a_name_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(zoo, "files", lambda package: tmp_path)
+    with pytest.raises(checkpoint.CheckpointError, match="No weights of FeaKM are shipped; train them"):
+        zoo.load_feakm()
+    checkpoint.save(
+        FeakmNet(FeakmConfig(BoxKeypoints(8, 8, 16), SMALL)), tmp_path / "weights/feakm.safetensors", {}, format=FORMAT
+    )
+    assert zoo.load_feakm("feakm").config.matcher == SMALL and zoo.names() == ()
+    with pytest.raises(checkpoint.CheckpointError, match="No weights are named 'feakm'"):
+        zoo.load("feakm")
