@@ -23,14 +23,14 @@ NOW = 5
 
 
 class RecordingEyes(Eyes):
-    """Keeps what the ego fused last; looks back at so many instants."""
+    """Keeps what the ego fused last; looks back at so many instants, and states velocities as the detector does."""
 
     raw: RawBoxes
     heard: Tokens
     remembered: Tokens | None
 
     def __init__(self, detector: Detector, instants: int) -> None:
-        super().__init__(detector)
+        super().__init__(detector, tracks=None)
         self.instants = instants
 
     def past(self, frame: AgentFrame, instants: int = 2) -> list[Part]:
@@ -48,7 +48,7 @@ def told_by_bytes(drive, detector: Detector, sample: Sample, first: int) -> tupl
     for view in sample.views[1:]:
         then = NOW - round(view.age_s / 0.1)
         (true,) = (f for f in drive.frames(then) if torch.equal(f.points.xyz, view.now.xyz))
-        sender = Agent(detector, precision="float32", budget_bytes=None)
+        sender = Agent(detector, precision="float32", budget_bytes=None, eyes=Eyes(detector, tracks=None))
         if then > first:
             sender.share(drive.frame(true.agent_id, then - 1))
         sigma = torch.tensor([view.doubt_xy_m, view.doubt_xy_m, view.doubt_yaw_rad]).double()
@@ -86,7 +86,10 @@ ROADS = {
 
 @pytest.mark.parametrize("name", ROADS)
 def test_training_forward_equals_share_bytes_perceive(drive, detector: Detector, name: str) -> None:
-    """With float32 features, what training computes and what the bytes give agree within 1e-5, site by site."""
+    """With float32 features, what training computes and what the bytes give agree within 1e-5, site by site.
+
+    Boxes are not followed: training sees two sweeps of an instant, and the velocities that the detector states.
+    """
     agents, moments, road = ROADS[name]
     some, first = drive(agents), NOW + 1 - moments
     seen = [some.snapshot(i) for i in range(first, NOW + 1)]

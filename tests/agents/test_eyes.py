@@ -10,10 +10,13 @@ import torch
 
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.collaboration import method
-from manyeyes.agents.eyes import FASTEST_M, LONGEST_GAP_NS, Eyes, follows
+from manyeyes.agents.eyes import FASTEST_M, LONGEST_GAP_NS, Eyes, Sight, follows
+from manyeyes.agents.tracks import FOLLOWING, TrackConfig
 from manyeyes.comms.inbox import Inbox
-from manyeyes.datatypes import AgentFrame, PointCloud, Transform
+from manyeyes.datatypes import AgentFrame, BevGrid, PointCloud, Sites, SparseBev, Transform
+from manyeyes.models.box_head import RAW, DecodeConfig, RawBoxes
 from manyeyes.models.detector import Detector
+from manyeyes.models.proposal import PROPOSAL, propose, proposed_velocity
 
 TENTH_NS = 100_000_000
 
@@ -32,7 +35,7 @@ def astray(frame: AgentFrame, x: float) -> AgentFrame:
 
 def test_the_sweep_before_takes_part_and_only_once(drive, detector: Detector) -> None:
     before, now = drive().frame(0, 2), drive().frame(0, 3)
-    eyes, fresh = Eyes(detector), Eyes(detector)
+    eyes, fresh = Eyes(detector, tracks=None), Eyes(detector)
     eyes.see(before)
     assert not same(eyes, now, fresh, now)
     moved = before.points.transform(now.from_earlier(before))
@@ -159,3 +162,72 @@ def test_fused_messages_echo_what_the_hearer_said(drive, detector: Detector) -> 
         if echoes:
             # Dated as what it tells of: a tenth of a second before it was sent.
             assert [m.timestamp_ns for m in inbox.messages()] == [first[1].timestamp_ns]
+
+
+GRID = BevGrid(-40, -40, -1, 40, 40, 3, 1.0)
+Places = list[tuple[float, float]]
+
+
+def seeing(cells: Places, cars: Places, heat: float = 4.0) -> Sight:
+    """A token in each cell that proposes the middle of a car; nothing moves, as far as it states."""
+    yx = GRID.cells(torch.tensor(cells))
+    order = (yx[:, 0] * GRID.shape[1] + yx[:, 1]).argsort()
+    sites = Sites((yx[:, 0] * GRID.shape[1] + yx[:, 1])[order], GRID)
+    columns = torch.zeros(len(cells), RAW.total)
+    columns[:, RAW.offset] = torch.tensor(cars)[order] - sites.xy
+    for column, value in ((RAW.heat, heat), (RAW.overlap, 4.0), (RAW.log_sigma_xy, -3.0)):
+        columns[:, column] = value
+    columns[:, RAW.axis.start] = columns[:, RAW.direction.start] = 1
+    raw = RawBoxes.of(columns, sites)
+    told = SparseBev(torch.cat((torch.ones(len(cells), 4), propose(raw)), 1), sites)
+    return Sight(told, torch.ones(len(cells)), raw, DecodeConfig())
+
+
+def test_tokens_are_as_fast_as_the_box_that_they_propose_and_what_is_no_box_stands() -> None:
+    """Two tokens propose one car, a third another, and a fourth, farther from both than a car is wide, no box that is left."""
+    cells = [(0.5, 0.5), (1.5, 0.5), (10.5, 0.5), (0.5, 3.5)]
+    sight = seeing(cells, [(0.7, 0.5), (0.7, 0.5), (10.5, 0.5), (0.5, 3.5)])
+    sight.raw.heat[3] = -9
+    assert sorted(sight.boxes.center[:, 0].tolist()) == pytest.approx([0.7, 10.5])
+    fast = torch.where(sight.boxes.center[:, :1] < 5, torch.tensor([[7.0, -1.0]]), torch.tensor([[0.0, 3.0]]))
+    moved = sight.moving(fast)
+    assert torch.allclose(moved.boxes.velocity, fast) and torch.equal(moved.boxes.center, sight.boxes.center)
+    told, before = moved.told.features, sight.told.features
+    want = torch.tensor([[7.0, -1.0], [7.0, -1.0], [0.0, 3.0], [0.0, 0.0]])
+    assert torch.allclose(proposed_velocity(told[:, -PROPOSAL:]), want)
+    silent = seeing(cells[:1], cells[:1], heat=-9.0)
+    assert torch.equal(silent.moving(torch.zeros(0, 2)).raw.velocity, torch.zeros(1, 2))
+    # Of what is told, nothing else changes.
+    speeds = list(range(told.shape[1]))[4:][RAW.velocity]
+    rest = [c for c in range(told.shape[1]) if c not in speeds]
+    sent = torch.cat((before[:, :4], propose(sight.raw)), 1)
+    assert torch.equal(told[:, rest], sent[:, rest])
+
+
+class Scripted(Eyes):
+    """Sees what is written."""
+
+    def __init__(self, detector: Detector, script: list[Sight], tracks: TrackConfig | None = FOLLOWING) -> None:
+        super().__init__(detector, tracks=tracks)
+        self.script = iter(script)
+
+    def see_cloud(self, cloud: PointCloud, earlier: PointCloud | None = None) -> Sight:
+        return next(self.script)
+
+
+def test_boxes_are_followed_over_the_ground_until_another_scenario_begins(detector: Detector) -> None:
+    """The agent drives at 5 m/s past a car that stands and behind one that drives at 8 m/s; no velocity is stated."""
+    nothing, frames, script = PointCloud.of(torch.zeros(0, 3)), [], []
+    for k in range(5):
+        pose = Transform.from_xyz_yaw(0.5 * k, 0.0)
+        frames.append(AgentFrame.of(nothing, pose, timestamp_ns=k * TENTH_NS))
+        cars = [(20.3 - 0.5 * k, 5.2), (5.1 + 0.3 * k, -4.7)]
+        script.append(seeing(cars, cars))
+    strange = another(frames[-1])["a gap"]
+    eyes = Scripted(detector, [*script, script[-1]])
+    boxes = [eyes.see(frame).boxes for frame in frames]
+    stands, drives = (boxes[-1][boxes[-1].center[:, 1] * side > 0].velocity[0].tolist() for side in (1, -1))
+    assert stands == [0, 0] and drives == pytest.approx([8, 0], abs=0.4)
+    assert not boxes[0].velocity.any() and not eyes.see(strange).boxes.velocity.any()
+    stated = Scripted(detector, script, tracks=None)
+    assert not any(stated.see(frame).boxes.velocity.any() for frame in frames)

@@ -3,21 +3,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from manyeyes.agents.tracks import FOLLOWING, Earlier, TrackConfig, followed
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, SparseBev
-from manyeyes.models.box_head import DecodeConfig, RawBoxes, decode
+from manyeyes.models.box_head import SPEED_UNIT, DecodeConfig, RawBoxes, decode
 from manyeyes.models.detector import Detector
 from manyeyes.models.fusion.gather import Part, Tokens
+from manyeyes.models.proposal import PROPOSAL, propose
 
 LONGEST_GAP_NS = 250_000_000
 """A sweep that lies farther back than this, or one of another agent or scenario, says nothing of the motion since."""
 FASTEST_M = 30.0
 """An agent that moved farther between two sweeps did not drive there: another scenario has begun."""
+FOLLOWED = 5
+"""So many instants back boxes are followed: half a second at 10 Hz, in which a vehicle hardly changes its speed."""
+OWN_M = 2.0
+"""A token belongs to the box whose centre is the nearest to the one that it proposes, if it is no farther."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,16 @@ class Sight:
         """The agent's own boxes, in its frame, best first; decoded when first asked for, since not everybody sends them."""
         return decode(self.raw, self.config)[0]
 
+    def moving(self, velocity: Tensor) -> Sight:
+        """The same view, its boxes as fast as (M, 2) m/s says, and so their tokens; what belongs to no box stands still."""
+        place = self.raw.sites.xy + self.raw.offset * self.raw.sites.grid.cell
+        apart = torch.cdist(place, self.boxes.center[:, :2])
+        # One more column, for those that belong to none.
+        nearest = pad(apart, (0, 1), value=OWN_M).argmin(1)
+        raw = replace(self.raw, velocity=pad(velocity, (0, 0, 0, 1))[nearest] / SPEED_UNIT)
+        told = torch.cat((self.told.features[:, :-PROPOSAL], propose(raw)), 1)
+        return replace(self, told=self.told.with_features(told), raw=raw)
+
 
 class Eyes:
     """A detector and the last few frames that it saw, of one agent. Frames are told apart by identity.
@@ -41,14 +58,19 @@ class Eyes:
     remember: how many. They are forgotten where time goes back, stands still, or jumps: a scenario has ended.
     known: views by agent and time of capture, which are taken as they are and added to, so that several players of one recording
     look at each sweep once between them. perceived: the last frame in which the agent fused what it heard, and the fused
-    tokens, where a method keeps them.
+    tokens, where a method keeps them. tracks: how boxes are followed through those frames; None leaves the velocities that the
+    detector states.
     """
 
     def __init__(
-        self, detector: Detector, remember: int = 8, known: dict[tuple[int, int], Sight] | None = None
+        self,
+        detector: Detector,
+        remember: int = 8,
+        known: dict[tuple[int, int], Sight] | None = None,
+        tracks: TrackConfig | None = FOLLOWING,
     ) -> None:
         self.detector = detector
-        self._remember, self._known = remember, known
+        self._remember, self._known, self._tracks = remember, known, tracks
         self._seen: list[tuple[AgentFrame, Sight]] = []
         self._merged: tuple[AgentFrame, PointCloud] | None = None
         self.perceived: tuple[AgentFrame, SparseBev] | None = None
@@ -65,11 +87,25 @@ class Eyes:
         if sight is None:
             before = self._seen[-1][0] if self._seen else None
             earlier = None if before is None else before.points.transform(frame.from_earlier(before))
-            sight = self.see_cloud(frame.points, earlier)
+            sight = self._followed(frame, self.see_cloud(frame.points, earlier))
         if self._known is not None:
             self._known[key] = sight
         self._seen = [*self._seen, (frame, sight)][-self._remember :]
         return sight
+
+    def _followed(self, frame: AgentFrame, sight: Sight) -> Sight:
+        """The view with its boxes as fast as the last frames in which there were any tell."""
+        if self._tracks is None:
+            return sight
+        earlier = [
+            Earlier(
+                seen.boxes.transform(frame.from_earlier(before)).to(torch.float32),
+                (frame.timestamp_ns - before.timestamp_ns) / 1e9,
+            )
+            for before, seen in self._seen[: -FOLLOWED - 1 : -1]
+            if len(seen.boxes)
+        ]
+        return sight.moving(followed(sight.boxes, earlier, self._tracks)) if earlier else sight
 
     def past(self, frame: AgentFrame, instants: int = 2) -> list[Part]:
         """What the agent itself told at its last instants before this frame, newest first, for the ego 0."""
