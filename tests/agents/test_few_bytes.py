@@ -110,6 +110,17 @@ def test_a_message_of_tokens_never_exceeds_any_budget_and_a_smaller_one_keeps_a_
     assert all(a <= b for a, b in pairwise(kept)) and 0 < len(kept[-3]) < len(kept[-1])
 
 
+def test_weights_with_a_codebook_send_codes_unless_told_otherwise(detector):
+    """And those without one float16: an agent alone, and one in a recording that is played."""
+    plain = Detector(replace(detector.config, codebook=None)).eval()
+    frame = Plane().snapshot("plane", 0).frames[1]
+    for model, usual in ((detector, "codes"), (plain, "float16")):
+        packets = Agent(model).share(frame)
+        assert packets == Agent(model, precision=usual).share(frame) != Agent(model, precision="float32").share(frame)
+        first = next(replay(Plane(), "plane", model, ["intermediate"], ReplayConfig()))
+        assert [s.bytes for s in first.sent if s.agent_id == 1] == [sum(map(len, packets))]
+
+
 def test_codes_need_a_codebook_on_both_sides(detector):
     plain = Detector(replace(detector.config, codebook=None)).eval()
     with pytest.raises(ConfigError, match="manyeyes quantise"):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from manyeyes.agents.aligner import Aligner, Verdict
-from manyeyes.agents.coding import codebook_of, coded, readable, tables_of
+from manyeyes.agents.coding import codebook_of, coded, readable, tables_of, usual_precision
 from manyeyes.agents.collaboration import Collaboration, Intermediate
 from manyeyes.agents.collaboration.heading import header
 from manyeyes.agents.eyes import Eyes
@@ -46,6 +46,7 @@ class Agent:
     """A detector, a way to collaborate, and a limit in bytes for each message.
 
     Nothing but the bytes of share passes between two agents; frames carry no labels, so truth cannot leak by type.
+    precision: how tokens are written; None: as is usual for these weights (``agents.coding``).
     requests: its messages of tokens say, a byte a window, where it needs no help (``comms.request``).
     aligner: corrects where others say they are before anything is fused; None believes them. survey: draws what the agent then
     says of the map (``agents.surveyor``); None: nothing.
@@ -55,7 +56,7 @@ class Agent:
         self,
         detector: Detector,
         collaboration: Collaboration | None = None,
-        precision: Precision = "float16",
+        precision: Precision | None = None,
         budget_bytes: int | None = 1 << 17,
         eyes: Eyes | None = None,
         aligner: Aligner | None = None,
@@ -65,7 +66,7 @@ class Agent:
         self.eyes, self.memory = eyes or Eyes(detector), Memory()
         self.aligner, self._watched = aligner, dict[int, WatchState]()
         self.collaboration = collaboration or Intermediate()
-        self.precision: Precision = precision
+        self.precision: Precision = precision or usual_precision(detector)
         self.budget_bytes = budget_bytes
         self.requests, self.survey = requests, survey
         self._tables = tables_of(detector)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.inbox import Reception
+from manyeyes.comms.wire import Precision
 from manyeyes.datatypes import ConfigError, SparseBev
 from manyeyes.models.codebook import Codebook
 from manyeyes.models.detector import Detector
@@ -17,6 +18,11 @@ def codebook_of(detector: Detector) -> Codebook:
     if detector.codebook is None:
         raise ConfigError("These weights have no codebook, so they cannot send codes: fit one by 'manyeyes quantise'.")
     return detector.codebook
+
+
+def usual_precision(detector: Detector) -> Precision:
+    """How tokens are written where nobody says: as codes where the weights can, a tenth of the bytes; else as float16."""
+    return "float16" if detector.codebook is None else "codes"
 
 
 def tables_of(detector: Detector) -> CodeTables | None:

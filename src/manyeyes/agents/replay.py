@@ -32,17 +32,18 @@ Views = dict[tuple[int, int], Sight]
 class ReplayConfig:
     """How a recording is played.
 
-    channel: a preset by name, or any other radio. wait_s: how long after its own sweep an ego waits for messages before it
-    perceives; whatever came by then takes part, the newest of each sender. all_egos: every agent is judged as ego, not the
-    first alone. history: snapshots played before the first judged one, so that messages are under way. reach_m: radios
-    farther apart do not hear each other (true poses). channel_bytes: what all agents together may send at an instant, shared as
-    ``comms.budget.fair_shares`` does by what each would say alone, as if scheduled by one who is told.
+    channel: a preset by name, or any other radio. precision: of tokens; None: the weights' usual. wait_s: how long after its own
+    sweep an ego waits for messages before it perceives; whatever came by then takes part, the newest of each sender. all_egos:
+    every agent is judged as ego, not the first alone. history: snapshots played before the first judged one, so that messages are
+    under way and boxes followed. reach_m: radios farther apart do not hear each other (true poses). channel_bytes: what all
+    agents together may send at an instant, shared as ``comms.budget.fair_shares`` does by what each would say alone, as if
+    scheduled by one who is told.
     requests: messages of tokens say where their sender needs no help, and what came lately weighs what is sent.
     aligner: corrects where others say they are, None: nobody does.
     """
 
     channel: str | ChannelPreset = "ideal"
-    precision: Precision = "float16"
+    precision: Precision | None = None
     budget_bytes: int | None = 1 << 17
     channel_bytes: int | None = None
     wait_s: float = 0.0

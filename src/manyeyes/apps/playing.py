@@ -33,8 +33,9 @@ class Playing:
     """How long an ego waits for messages after its own sweep; by default 0 on the ideal channel, else one period, 100."""
     budget_bytes: int = 1 << 17
     """The most that a message of tokens may weigh."""
-    precision: Literal["float32", "float16", "int8", "codes"] = "float16"
-    """How tokens are written: their features as numbers, or all of them as the codes of the weights' codebook."""
+    precision: Literal["float32", "float16", "int8", "codes"] | None = None
+    """How tokens are written: their features as numbers, or all of them as the codes of the weights' codebook; by default as
+    codes where the weights have one, else as float16."""
     requests: bool = False
     """Messages of tokens say where their sender needs no help; what came lately weighs what is sent."""
     align: str | None = None
