@@ -30,7 +30,7 @@ class PointPillars(nn.Module):
 
     def forward(self, xyz: Tensor, bright: Tensor, old: Tensor, pillars: Pillars) -> Tensor:
         """Kept points (P, 3), their intensities (P,) and whether they are of the sweep before (P,) to (N, channels)."""
-        intensity = torch.stack((bright, old.to(bright.dtype)), 1)[:, : self.sweeps]
+        intensity = bright[:, None] if self.sweeps == 1 else torch.stack((bright, old.to(bright.dtype)), 1)
         sites, row = pillars.sites, pillars.row
         mean = segment_mean(xyz, row, len(sites))
         grid = sites.grid
@@ -48,7 +48,8 @@ class PointPillars(nn.Module):
         points = torch.cat((xyz, intensity), 1)
         origin = torch.cat((centre, centre.new_zeros(len(centre), self.sweeps)), 1)
         top = affine_segment_max(points, origin, varying, row)
-        return torch.relu_(top + centre @ place.T + (centre - mean) @ to_mean.T + bias)
+        common = torch.addmm(bias, torch.cat((centre, centre - mean), 1), torch.cat((place, to_mean), 1).T)
+        return torch.relu_(top.add_(common))
 
 
 class MomentPillars(nn.Module):
@@ -87,13 +88,17 @@ class PillarEncoder(nn.Module):
         earlier: the sweep before each, moved into the same frame; left out where the net looks at one sweep only.
         """
         before = earlier if earlier is not None and self.sweeps == 2 else []
-        many = [*clouds, *before]
-        cloud, lengths = PointCloud.cat(many), torch.tensor([len(c) for c in many])
-        agents = torch.arange(len(clouds))
-        batch = torch.repeat_interleave(torch.cat((agents, agents[: len(before)])), lengths)
-        old = torch.arange(len(cloud)) >= int(lengths[: len(clouds)].sum())
-        pillars = pillar_sites(cloud.xyz, batch, self.grid, len(clouds))
+        many, agents = [*clouds, *before], [*range(len(clouds)), *range(len(before))]
+        xyz, bright = _joined([cloud.xyz for cloud in many]), _joined([cloud.intensity for cloud in many])
+        batch = _joined([torch.full((len(cloud),), agent) for cloud, agent in zip(many, agents)])
+        pillars = pillar_sites(xyz, batch, self.grid, len(clouds))
         kept = pillars.inside.nonzero()[:, 0]
-        xyz, bright = cloud.xyz.index_select(0, kept), cloud.intensity.index_select(0, kept)
-        features = self.net(xyz, bright, old.index_select(0, kept), pillars)
+        old = kept >= sum(map(len, clouds))
+        xyz, bright = xyz.index_select(0, kept), bright.index_select(0, kept)
+        features = self.net(xyz, bright, old, pillars)
         return SparseBev(features, pillars.sites)
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    """All rows as one tensor; a single part is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)
