@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from manyeyes.agents.eyes import Eyes
+from manyeyes.alignment.estimate import unanswered
+from manyeyes.alignment.rivals.table import CLOUDS
 from manyeyes.apps import cli
 from manyeyes.datasets.opv2v import Opv2vWriter
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
@@ -79,6 +81,22 @@ def test_an_unknown_pose_is_found_and_a_noisy_claim_improved(drive, capsys) -> N
         assert answer["error_m"] < 1e-3
     scores = noisy["scores"]
     assert scores["vote"]["displacement"] < scores["given"]["displacement"] and math.isfinite(scores["vote"]["nees"])
+
+
+def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
+    data, weights, out = drive
+    sizes = []
+
+    def cloud(ego, other, claimed):
+        sizes.append((len(ego), len(other)))
+        return unanswered(claimed)
+
+    monkeypatch.setitem(CLOUDS, "register", cloud)
+    words = ("--split", "test", "--weights", weights, "--out", out, "--correctors", "register", "vote")
+    assert run("align", data, *words) == 0
+    answers = json.loads((out / "align.json").read_text())["result"]["answers"]
+    assert [a["corrector"] for a in answers] == ["register", "vote"] * len(sizes) and len(sizes) > 0
+    assert [tuple(a["landmarks"]) for a in answers[::2]] == sizes and answers[0]["status"] == "no match"
 
 
 def test_an_unknown_corrector_lists_the_known(drive, capsys) -> None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -39,7 +39,7 @@ class Options:
     """At most so many judged frames."""
     correctors: tuple[str, ...] = ("given", "vote")
     """Any of vote, given, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist, v2x-reg-oiou, mash, feakm, or a .safetensors
-    file of FeaKM."""
+    file of FeaKM; of whole clouds register and gicp."""
     noise_xy_m: float = 0.0
     """Standard deviation of errors of collaborators' claimed positions."""
     noise_yaw_deg: float = 0.0
@@ -58,7 +58,9 @@ class Options:
 
 @dataclass(frozen=True)
 class Found:
-    """One corrector's answer about one agent in one frame; judged is None where the recording has no truth."""
+    """One corrector's answer about one agent in one frame; landmarks: how many each has, or points where clouds are compared;
+    judged is None where the recording has no truth.
+    """
 
     frame: int
     time_s: float
@@ -75,7 +77,7 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.agents.eyes import Eyes
-    from manyeyes.alignment.rivals.table import corrector
+    from manyeyes.alignment.rivals.table import CLOUDS, corrector
     from manyeyes.apps import provenance
     from manyeyes.apps.recordings import open_recording
     from manyeyes.datasets.disturb import PoseNoise
@@ -84,7 +86,8 @@ def main(options: Options) -> None:
 
     console = Console()
     for name in options.correctors:
-        corrector(name)
+        if name not in CLOUDS:
+            corrector(name)
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
     drive = excerpt(open_recording(options.recording, options.split), options.scenario, options.frames)
     eyes = Eyes(zoo.load(options.weights))
@@ -114,18 +117,23 @@ def _answers(drive: Excerpt, eyes: Eyes, options: Options, noise: PoseNoise) -> 
     """Every corrector's answer about every collaborator in every judged frame."""
     from manyeyes.agents.aligner import Aligner
     from manyeyes.alignment.estimate import PoseClaim
-    from manyeyes.alignment.rivals.table import corrector
+    from manyeyes.alignment.rivals.table import CLOUDS, corrector
 
-    aligners = {name: Aligner(name, options.score_min) for name in options.correctors}
+    names = options.correctors
+    aligners = {name: Aligner(name, options.score_min) for name in names if name not in CLOUDS}
+    correctors: dict[str, Any] = {name: CLOUDS[name] if name in CLOUDS else corrector(name) for name in names}
     for index in drive.judged(drive.scenario):
         snapshot = drive.snapshot(drive.scenario, index)
         told = noise.apply(snapshot, 0)
-        seen = {name: [aligner.own_landmarks(f, eyes) for f in snapshot.frames] for name, aligner in aligners.items()}
+        seen: dict[str, list[Any]] = {
+            name: [aligners[name].own_landmarks(f, eyes) if name in aligners else f.points for f in snapshot.frames]
+            for name in names
+        }
         for row in range(1, len(told.frames)):
             claimed = None if options.unknown else PoseClaim.between(told.frames[0], told.frames[row])
-            for name, marks in seen.items():
-                said = corrector(name)(marks[0], marks[row], claimed)
-                counts, other = (len(marks[0]), len(marks[row])), told.frames[row]
+            for name, views in seen.items():
+                said = correctors[name](views[0], views[row], claimed)
+                counts, other = (len(views[0]), len(views[row])), told.frames[row]
                 judged, time_s = _judged(said, snapshot, row), other.timestamp_ns * 1e-9
                 yield Found(index, time_s, other.agent_id, name, counts, claimed, said, judged)
 

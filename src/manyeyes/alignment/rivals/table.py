@@ -2,19 +2,21 @@
 """The default corrector and its rivals by the names that a person gives them.
 
 FeaKM's has weights: ``feakm`` is the shipped net, a path that ends in .safetensors one of 'manyeyes train'; ``@8`` behind either
-asks for eight pairs in place of four.
+asks for eight pairs in place of four. Those of CLOUDS are asked with whole clouds in place of landmarks.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 from manyeyes.alignment.decide import DETECTED, correct
-from manyeyes.alignment.estimate import Corrector
+from manyeyes.alignment.estimate import Corrector, PoseClaim, PoseEstimate
 from manyeyes.alignment.feakm import learned
-from manyeyes.alignment.rivals import coalign, feaco, fpv_rcnn, given, icp, mash, v2x_reg, vips
+from manyeyes.alignment.registration import register
+from manyeyes.alignment.rivals import coalign, feaco, fpv_rcnn, gicp, given, icp, mash, v2x_reg, vips
 from manyeyes.alignment.rivals.v2x_reg import V2xRegConfig
-from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes import ConfigError, PointCloud
 
 FEAKM = "feakm"
 CORRECTORS: dict[str, Corrector] = {
@@ -28,6 +30,11 @@ CORRECTORS: dict[str, Corrector] = {
     "v2x-reg-odist": v2x_reg.correct,
     "v2x-reg-oiou": partial(v2x_reg.correct, config=V2xRegConfig("oIoU")),
     "mash": mash.correct,
+}
+
+CLOUDS: dict[str, Callable[[PointCloud, PointCloud, PoseClaim | None], PoseEstimate]] = {
+    "register": register,
+    "gicp": gicp.correct,
 }
 
 
