@@ -56,7 +56,7 @@ def test_a_group_lists_its_verbs_and_knows_no_other(capsys) -> None:
     said = capsys.readouterr().out
     assert all(f"  {verb} " in said for verb in cli.GROUPS["map"]) and "usage: manyeyes map VERB" in said
     assert cli.main(["map", "fuze"]) == 2
-    assert "did you mean fuse? Known verbs: simulate, import, fuse" in capsys.readouterr().err
+    assert "did you mean fuse? Known verbs: build, simulate, import, fuse" in capsys.readouterr().err
 
 
 def test_wrong_arguments_exit_with_2(capsys) -> None:

@@ -19,11 +19,12 @@ VERBS = {
     "run": "replay your own OPV2V-format recording as demo does",
     "view": "draw a frame of a recording, or animate a drive",
     "align": "where agents are, from what they detect: claimed and corrected poses judged",
-    "map": "one map from many drives: simulate, fuse, evaluate, diff, export, view, import",
+    "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import",
     "doctor": "print what a bug report needs",
 }
 GROUPS = {
     "map": {
+        "build": "a recording's sensors become elements, messages, and one map",
         "simulate": "send a crowd through a place: observations and truth from a seed",
         "import": "result files of MapTR or StreamMapNet with their poses become observations",
         "fuse": "one map of a folder of observations",

@@ -14,6 +14,7 @@ from manyeyes.datatypes import ConfigError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from manyeyes.datatypes.map_element import MapElements
     from manyeyes.evaluation.map_trial import Cut, Scene
     from manyeyes.maps.observation import Frame, Observation
     from manyeyes.maps.observation_file import Quarantined, Reading
@@ -31,15 +32,19 @@ class MapFolder:
 
     def write(self, scene: Scene) -> None:
         """A scene, each file whole or not at all."""
+        self.write_observations(scene.observations, scene.place.frame)
+        self.write_truth(scene.truth, scene.place.frame, scene.cut)
+
+    def write_truth(self, truth: MapElements, frame: Frame, cut: Cut) -> None:
+        """What maps are held against, and the cut that they get before."""
         import shapely
 
         from manyeyes.maps.vector_map import VectorMap
         from manyeyes.maps.whole_file import write_whole
 
-        self.write_observations(scene.observations, scene.place.frame)
-        write_vector_map(VectorMap.of(scene.truth, scene.place.frame), self.path / "truth")
-        cut = {"junctions": shapely.to_wkt(scene.place.junctions, 3), "area": scene.place.area}
-        write_whole(self.path / "cut.json", (json.dumps(cut) + "\n").encode())
+        write_vector_map(VectorMap.of(truth, frame), self.path / "truth")
+        said = {"junctions": shapely.to_wkt(cut.junctions, 3), "area": cut.area}
+        write_whole(self.path / "cut.json", (json.dumps(said) + "\n").encode())
 
     def write_observations(self, observations: Sequence[Observation], frame: Frame) -> None:
         """The observations, instead of those that were there."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from manyeyes.datasets.dair_index import dair_root
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.opv2v import Opv2vRecording
+from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
@@ -21,9 +22,16 @@ if TYPE_CHECKING:
 PAIRS_WAIT_S = 0.05
 
 
-def open_recording(root: Path, split: str | None = None) -> Opv2vRecording | DairRecording:
-    """DAIR-V2X's layout where the folder has a vehicle-side or an infrastructure-side, else OPV2V's."""
-    return Opv2vRecording(root, split) if dair_root(root) is None else DairRecording(root, split)
+def open_recording(root: Path, split: str | None = None, images: bool = False) -> Opv2vRecording | DairRecording:
+    """DAIR-V2X's layout where the folder has a vehicle-side or an infrastructure-side, else OPV2V's.
+
+    images: with what cameras took, which is read of OPV2V's layout only.
+    """
+    if dair_root(root) is None:
+        return Opv2vRecording(root, split, images=images)
+    if images:
+        raise ConfigError(f"{root}: pictures are read in OPV2V's layout only; choose a model of agents with LiDAR.")
+    return DairRecording(root, split)
 
 
 def suited_to(config: ReplayConfig, playing: Playing, recording: Recording) -> ReplayConfig:

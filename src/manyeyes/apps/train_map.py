@@ -67,11 +67,10 @@ def _train(options: Options, console: Any) -> None:
 
 
 def open_looks(data: Path, split: str | None, sensors: Sequence[str]) -> Recording:
-    """The recording with what these sensors took: pictures are read where a model has cameras, from OPV2V's layout."""
+    """The recording with what these sensors took: pictures are read where a model has cameras."""
     from manyeyes.apps.recordings import open_recording
-    from manyeyes.datasets.opv2v import Opv2vRecording
 
-    return Opv2vRecording(data, split, images=True) if "camera" in sensors else open_recording(data, split)
+    return open_recording(data, split, images="camera" in sensors)
 
 
 def true_maps(recording: Recording) -> dict[str, MapElements]:
