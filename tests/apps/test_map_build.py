@@ -14,6 +14,7 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.apps import cli
 from manyeyes.apps.map_building import Building, build_map, instants, write_built
+from manyeyes.apps.map_demo import drive_sentence
 from manyeyes.apps.map_folder import MapFolder, read_vector_map
 from manyeyes.apps.map_ground import Ground, grounds_of, town_named
 from manyeyes.apps.recordings import open_recording
@@ -118,6 +119,23 @@ def test_a_model_draws_where_nobody_knows_what_is_true(weights, tmp_path) -> Non
     np.testing.assert_allclose(made.cartographer.observations[0].pose, [-70.0, -20.0, 0.0], atol=1e-5)
     write_built(made, tmp_path, "Nowhere")
     assert not (tmp_path / "truth").exists() and (tmp_path / "map.png").exists()
+
+
+def test_the_demos_map_is_that_of_its_drive_where_a_model_ships(weights, tmp_path, monkeypatch) -> None:
+    from rich.console import Console
+
+    from manyeyes.apps.demo import _map
+
+    monkeypatch.setattr(zoo, "mappers", lambda: (zoo.MAPPER,))
+    monkeypatch.setattr(zoo, "load_mapper", lambda load=zoo.load_mapper: load(weights))
+    (chapter,), said = _map(Crossroads(("elsewhere_0",), frames=11), tmp_path, 0, Console(quiet=True))
+    assert said.startswith("One map from 8 messages") and said.endswith("not judged.") and said in chapter.text
+    assert [p.path for p in chapter.pictures] == [tmp_path / "map.png"] and (tmp_path / "map.html").is_file()
+
+
+def test_the_map_of_a_drive_is_said_in_one_line(built) -> None:
+    said = drive_sentence(built.numbers)
+    assert f"mAP {built.numbers.quality.mean_ap():.2f}" in said and "unfused" in said and said.count("\n") == 0
 
 
 def test_the_oracle_needs_a_true_map() -> None:

@@ -2,7 +2,8 @@
 """Makes a drive that the shipped weights never saw, lets every agent share bytes and perceive, and judges the result.
 
 Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. What is found is
-compared for ego alone, late, intermediate and early fusion on the same channel. At the end a crowd maps a crossroads.
+compared for ego alone, late, intermediate and early fusion on the same channel. Beside it a map is made: of the drive, where a map
+model ships; else of a crossroads by a simulated crowd.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from manyeyes.apps.viewer.report import Chapter
+    from manyeyes.datasets.recording import Recording
 
 PRESET = "demo"
 
@@ -67,7 +69,7 @@ def main(options: Options) -> None:
     town = drive.scenario.rpartition("_")[0]
     if len(drive.judged(drive.scenario)) == 0:
         raise ConfigError(f"{folder}: the drive has no judged frame; remove the folder and run the demo again.")
-    chapters, said = _small_map(options.out / "map", options.seed, console)
+    chapters, said = _map(drive, options.out / "map", options.seed, console)
     showing = Showing(
         out=options.out,
         title="manyeyes demo: one drive, four ways to collaborate",
@@ -93,13 +95,18 @@ def main(options: Options) -> None:
     )
 
 
-def _small_map(out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
+def _map(drive: Recording, out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
     """The map part, or why there is none: it needs an extra of its own."""
     from manyeyes.datatypes import MissingExtraError
+    from manyeyes.models import zoo
 
     try:
-        from manyeyes.apps.map_demo import sentence, small_map
+        from manyeyes.apps.map_demo import drive_map, sentence, small_map
 
+        if zoo.MAPPER in zoo.mappers():
+            with console.status("Mapping the drive"):
+                said, chapter = drive_map(drive, zoo.load_mapper(), out, seed)
+            return (chapter,), said
         with console.status("Mapping a crossroads"):
             numbers, chapter = small_map(out, seed)
     except MissingExtraError as error:

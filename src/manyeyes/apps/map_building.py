@@ -69,6 +69,10 @@ class Quality:
         """mAP over crossings and dividers."""
         return next(row.mean for row in self.ap if (row.way, row.thresholds) == (way, thresholds))
 
+    def f(self, kind: str) -> float:
+        """F by length of one kind at 0.5 m."""
+        return next(row.f[1] for row in self.kinds if row.kind == kind)
+
 
 @dataclass(frozen=True)
 class Numbers:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map part of the demo: a crowd crosses one junction, and many wrong local maps become one right one."""
+"""The map part of the demo: of the drive itself where a map model ships; else of a crowd that crosses one junction."""
 
 from __future__ import annotations
 
@@ -9,20 +9,54 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.apps.map_building import Building, Numbers, build_map, write_built
 from manyeyes.apps.map_folder import MapFolder, write_vector_map
+from manyeyes.apps.map_ground import grounds_of
 from manyeyes.apps.viewer.map_figures import Panel, misalignment, save_figure
 from manyeyes.apps.viewer.map_page import page_of, save_map_page
 from manyeyes.apps.viewer.report import Chapter, Picture
+from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.evaluation.map_methods import OURS, make_map, map_of, tuned
 from manyeyes.evaluation.map_quality import MapQuality, judge
 from manyeyes.evaluation.map_trial import Scene, Trial, carry_out
 from manyeyes.maps.align import Alignment, solve_poses
 from manyeyes.maps.observation import Observation
+from manyeyes.models.mapper import Mapper
 from manyeyes.simulator.crowd.config import crowd_config
 
 Floats = NDArray[np.float64]
 PLACE, OBSERVATIONS, SIZE_M, NEAR_M = "cross", 60, 160.0, 15.0
+EVERY = 10
+"""Agents of the demo's drive draw a map once a second."""
+
+
+def drive_map(recording: Recording, mapper: Mapper, out: Path, seed: int = 0) -> tuple[str, Chapter]:
+    """The map of a drive of one scenario, from its agents' sensors by a map model, under out: in one line, and as a chapter."""
+    (ground,) = grounds_of(recording, recording.scenarios[:1], "drive")
+    built = build_map(recording, ground, Building(mapper, "semi-global", EVERY, seed=seed))
+    write_built(built, out, "One drive, one map")
+    said = drive_sentence(built.numbers)
+    text = (
+        f"{said} Each agent draws a tile of 120 m by 60 m about itself from its own sensors and from the tokens that the others "
+        "send, and sends its lines; they are fused where several agree. The truth is pale. map/map.html beside this file has it as "
+        "a web page with layers."
+    )
+    picture = Picture(out / "map.png", "What all agents drew, and what is fused of it", wide=True)
+    return said, Chapter("One drive, one map", text, (picture,))
+
+
+def drive_sentence(n: Numbers) -> str:
+    """The map of a drive in one line."""
+    judged = (
+        ""
+        if n.quality is None or n.union is None
+        else (
+            f" mAP {n.quality.mean_ap():.2f}, F of dividers at 0.5 m {n.quality.f('divider'):.2f}; "
+            f"all that was drawn, unfused, has {n.union.mean_ap():.2f} and {n.union.f('divider'):.2f}."
+        )
+    )
+    return f"One map from {n.messages} messages of {n.bytes_per_message:,.0f} bytes, drawn from sensors:{judged or ' not judged.'}"
 
 
 @dataclass(frozen=True)
