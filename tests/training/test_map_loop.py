@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map model's loop: resumes bit by bit, logs, and thins as a budget would."""
 
+import dataclasses
 import json
 import math
 
@@ -9,14 +10,18 @@ import pytest
 import torch
 
 from manyeyes.datatypes import AgentFrame, BevGrid, CheckpointError, PointCloud, Sites, SparseBev, Transform
+from manyeyes.datatypes.camera import Camera, CameraImage
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
+from manyeyes.evaluation.map_quality import judge
+from manyeyes.evaluation.map_tiles import side_by_side
 from manyeyes.models import checkpoint
 from manyeyes.models.map_bev import BevConfig
-from manyeyes.models.map_head import MapHeadConfig
+from manyeyes.models.map_head import MapHeadConfig, decode
 from manyeyes.models.map_presets import FORMAT
 from manyeyes.models.mapper import Mapper, MapperConfig
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.training.map_loop import MapRun, MapTrainConfig, loss_terms, thinned, train_mapper
+from manyeyes.training.map_loop import MapRun, MapTrainConfig, ground_of, loss_terms, see, thinned, train_mapper
+from manyeyes.training.map_presets import MAP_TRAINING
 from manyeyes.training.map_samples import MapSample, inked
 
 TINY = MapperConfig(
@@ -92,6 +97,60 @@ def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path):
         MapRun(CONFIG, Streets(), tmp_path / "broken", seed=4)
 
 
+def shrunk_paper():
+    """The paper's preset with every layer, block and point of an element that it has, but narrow, with a tenth of its queries,
+    coarse cells and a batch of one: as it stands, a step takes minutes and gigabytes."""
+    paper = MAP_TRAINING["map-paper"]
+    bev, head = paper.mapper.bev, paper.mapper.head
+    image = dataclasses.replace(bev.image, width=8, channels=16)
+    grid, tile = (dataclasses.replace(g, pillar=6.4) for g in (bev.grid, paper.mapper.tile))
+    tile = dataclasses.replace(tile, pillar=6.0)
+    bev = dataclasses.replace(bev, grid=grid, channels=16, image=image, image_size=(48, 64))
+    head = dataclasses.replace(head, elements=10, many=30, channels=32, feed=64)
+    mapper = dataclasses.replace(paper.mapper, bev=bev, tile=tile, token_channels=16, head=head)
+    return dataclasses.replace(paper, mapper=mapper, batch=1, steps=3)
+
+
+class Photos:
+    """A street about an agent with one camera that looks ahead, over and over."""
+
+    towns = ("Nowhere",)
+
+    def __init__(self, mapper):
+        self.mapper = mapper
+
+    def draw(self, number):
+        ahead = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+        k = torch.tensor([[32.0, 0, 32], [0, 32.0, 24], [0, 0, 1]], dtype=torch.float64)
+        camera = Camera(k, Transform(ahead, torch.tensor([0.0, 0.0, 1.5], dtype=torch.float64)), 64, 48)
+        rgb = torch.randint(0, 256, (3, 48, 64), generator=torch.Generator().manual_seed(number), dtype=torch.uint8)
+        pose = Transform.from_xyz_yaw(0, 0, 0, 0)
+        look = dataclasses.replace(
+            AgentFrame.of(PointCloud.of(torch.zeros(0, 3)), pose, 0), images=(CameraImage(camera, rgb),)
+        )
+        truth = MapElements.of(
+            [np.array([[-40.0, y], [40.0, y]]) for y in (-4.0, 0.0, 4.0)], [BOUNDARY, DIVIDER, BOUNDARY]
+        )
+        bev = self.mapper.bev
+        return MapSample(
+            (look,), Transform.stack([pose]), truth, inked(truth, bev.token_grid, self.mapper.head.kinds)[None]
+        )
+
+
+def test_the_papers_model_takes_a_step_and_resumes(tmp_path):
+    config = shrunk_paper()
+    samples = Photos(config.mapper)
+    run = MapRun(config, samples, tmp_path, seed=0)
+    first = run.advance()
+    assert math.isfinite(first.loss) and float(first.terms.many.detach()) > 0
+    run.state.save()
+    run.advance()
+    resumed = MapRun(config, samples, tmp_path, seed=0)
+    assert resumed.state.step == 1
+    resumed.advance()
+    assert same_state(resumed.state.model, run.state.model) and same_state(resumed.state.average, run.state.average)
+
+
 def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
     heard = []
     weights = train_mapper(CONFIG, Streets(), tmp_path, seed=1, card={"command": "x"}, report=heard.append)
@@ -116,6 +175,26 @@ def test_thinning_leaves_out_the_least_worth_of_each_look():
     kept = thinned(tokens, worth, torch.tensor([0.5, 0.34, 0.9]))
     assert kept.features[:, 0].tolist() == [0, 2, 4, 6, 7, 8]
     assert torch.equal(thinned(tokens, worth, torch.zeros(3)).features, tokens.features)
+
+
+def test_two_streets_are_learnt_by_heart(tmp_path):
+    mapper = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, many=0))
+    config = MapTrainConfig(mapper, steps=100, batch=2, learning_rate=4e-3, warm_up=10, ema=0.9, thin=0.0)
+    run = MapRun(config, Streets(2), tmp_path, seed=0)
+    streets = [Streets(2).draw(k) for k in range(2)]
+    truth = side_by_side([street.truth for street in streets])
+    before = quality(run.state.average, streets, truth)
+    for _ in range(config.steps):
+        run.advance()
+    after = quality(run.state.average, streets, truth)
+    assert before < 0.1 and after > 0.9, (before, after)
+
+
+@torch.no_grad()
+def quality(model, streets, truth):
+    raw = model.draw(ground_of(model, see(model, streets).tokens, streets))[-1]
+    drawn = side_by_side(decode(raw, TINY.tile, TINY.head))
+    return judge(drawn, truth, ("exact",), TINY.head.kinds).mean_ap("exact", kinds=TINY.head.kinds)
 
 
 def test_every_weight_of_the_lidar_path_learns():
