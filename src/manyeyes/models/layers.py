@@ -75,10 +75,17 @@ class SubmanifoldLayer(nn.Module):
         return x.with_features(_rectified(y, x.features if self.skip else None))
 
     def fold(self) -> None:
-        """Take the norm's running statistics into the weight, for good; a LayerNorm has none and stays."""
+        """Take the norm's running statistics into the weight, and the skip into its middle tap, for good.
+
+        A LayerNorm has no running statistics: it stays, and so does the skip that comes after it.
+        """
         if isinstance(self.norm, ActiveNorm):
             weight, self.bias = fold_norm(self.weight.detach(), self.norm)
             self.weight, self.norm = nn.Parameter(weight, requires_grad=False), nn.Identity()
+            if self.skip:
+                middle = weight.shape[2] // 2
+                self.weight[:, :, middle, middle] += torch.eye(len(weight), dtype=weight.dtype, device=weight.device)
+                self.skip = False
 
 
 class DownLayer(nn.Module):
