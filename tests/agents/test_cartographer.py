@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from manyeyes.agents.cartographer import LEAST_SIGMA_M, Cartographer, observation_of
+from manyeyes.agents.cartographer import FIRST_FOLD, LEAST_SIGMA_M, Cartographer, observation_of
 from manyeyes.agents.surveyor import share_map
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, PointCloud, Transform
@@ -76,14 +76,25 @@ def test_claims_without_an_error_get_the_least_that_anybody_errs():
 
 def test_a_street_from_several_agents_is_one_street_and_the_stream_is_near_the_fold():
     made, rng = service(), np.random.default_rng(4)
-    for k in range(8):
-        x = 30.0 + 5.0 * k
+    for k in range(12):
+        x = 30.0 + 5.0 * (k % 8)
         made.listen(heard(share_map(frame(k, x, k * 10**9, rng.normal(0.0, 0.3)), street(x))))
     fold = made.fold().published()
     assert sorted(fold.elements.kind) == [DIVIDER, DIVIDER, BOUNDARY, BOUNDARY, CROSSING]
     assert fold.frame == Frame(49.0, 8.4) and drift(made.map(), made.fold()) > 0.95
     assert made.fold().quantised_hash() == fuse(made.observations, frame=made.frame).quantised_hash()
     np.testing.assert_allclose(fold.elements.lengths().max(), 95.0, atol=3.0)
+
+
+def test_a_map_that_grows_is_folded_anew_as_often_as_it_doubles(monkeypatch):
+    made, folds = service(), []
+    fold = made.fold
+    monkeypatch.setattr(made, "fold", lambda: folds.append(len(made.observations)) or fold())
+    rng = np.random.default_rng(5)
+    for k in range(20):
+        made.listen(heard(share_map(frame(k, 30.0 + k, k * 10**9, rng.normal(0.0, 0.4)), street(30.0 + k))))
+    assert folds == [FIRST_FOLD, 2 * FIRST_FOLD]
+    assert len(made.map().published()) == len(fold().published()) == 5, "no line stands twice"
 
 
 def test_a_message_counts_once_however_often_the_inbox_is_asked():

@@ -70,3 +70,10 @@ def test_05_late_and_few_bytes(tmp_path: Path) -> None:
     lines = run("05_late_and_few_bytes.py", str(tmp_path / "drive")).strip().splitlines()
     assert len(lines) == 3
     assert "with 0 bytes" in lines[0] and "with 0 bytes" not in lines[1]
+
+
+def test_06_a_map_from_messages() -> None:
+    *lines, last = run("06_a_map_from_messages.py").strip().splitlines()
+    score = [float(line.rsplit("mAP ", 1)[1]) for line in (*lines, last)]
+    assert len(lines) == 8 and " 96 messages" in lines[-1]
+    assert score[-1] > 0.9 and score[-2] > 0.8 > score[0]

@@ -29,6 +29,8 @@ LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.05, float(np.radians(0.05))
 """Nobody knows where it is better than this, whatever it claims: a format without covariance reads as zero."""
 NEW_PASS_NS = 60_000_000_000
 """An agent that was silent for longer comes by anew."""
+FIRST_FOLD = 8
+"""Observations after which the map in memory is folded anew, and again whenever they have doubled."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,10 @@ class Cartographer:
 
     frame: of the map, whose zero is the world's point origin_xy (m). trusted: pseudonyms of surveyed poles, whose one word
     counts; whoever says of itself that it is one, is not. start: a map to go on from.
+
+    What is added one by one is never moved again, so that a map that grows from nothing doubles lines. Hence it is folded anew
+    whenever its observations have doubled, which costs each of them a constant number of folds; not so a map to go on from, whose
+    observations are not here.
     """
 
     def __init__(
@@ -59,6 +65,7 @@ class Cartographer:
         self._origin, self._trusted = np.array([*origin_xy, 0.0]), frozenset(trusted)
         self._config = config or StreamConfig()
         self._live = StreamingMap(VectorMap.empty(self.frame) if start is None else start, self._config)
+        self._next_fold = None if start is not None else FIRST_FOLD
         self._taken: dict[tuple[str, int], Observation] = {}
         self._refused: dict[tuple[str, int], Refused] = {}
         self._partial: set[tuple[str, int]] = set()
@@ -104,7 +111,10 @@ class Cartographer:
             self._refused[key] = Refused(*key, str(error))
             return None
         self._taken[key] = observation
-        return self._live.assimilate(observation)
+        done = self._live.assimilate(observation)
+        if len(self._taken) == self._next_fold:
+            self._live, self._next_fold = StreamingMap(self.fold(), self._config), 2 * len(self._taken)
+        return done
 
     def map(self) -> VectorMap:
         """The map as it stands: every observation added when it came."""

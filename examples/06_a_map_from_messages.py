@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Twelve vehicles say what they see of a crossroads, a few hundred bytes each; a map service hears them and its map grows.
+
+What draws here is the true map with the errors of a simulated crowd; on a recording, 'manyeyes map build' takes a map model.
+"""
+
+import numpy as np
+import torch
+
+from manyeyes import AgentFrame, Inbox, PointCloud, Transform
+from manyeyes.agents.cartographer import Cartographer
+from manyeyes.agents.surveyor import SURVEYS, share_map
+from manyeyes.evaluation.map_quality import judge
+from manyeyes.simulator.crowd.config import crowd_config
+from manyeyes.simulator.crowd.place import clip_to_box, place
+from manyeyes.simulator.eyewitness import Eyewitness
+
+where = place("cross", size_m=100.0)
+truth = where.in_area()
+witness, window = Eyewitness(where.truth, crowd_config("local")), SURVEYS["local"].vehicle
+service, inbox = Cartographer(where.frame), Inbox()
+
+spent = 0
+for instant in range(8):
+    for vehicle in range(12):
+        # Three vehicles come in on each of four arms, one behind the other, at 10 m/s, looking once a second.
+        heading, away = vehicle % 4 * np.pi / 2, 30.0 + 12.0 * (vehicle // 4) - 10.0 * instant
+        pose = np.array([-away * np.cos(heading), -away * np.sin(heading), heading])
+        seen = witness.see(pose, window, vehicle, instant)
+        # Each is wrong about where it is, and says by how much it may be.
+        error = np.random.default_rng([vehicle, instant]).normal(0.0, [0.3, 0.3, 0.005])
+        x, y, yaw = (pose + error).tolist()
+        frame = AgentFrame(
+            agent_id=vehicle,
+            timestamp_ns=instant * 10**9,
+            points=PointCloud.of(torch.zeros(0, 3)),
+            world_from_agent=Transform.from_xyz_yaw(x, y, 0.0, yaw),
+            pose_covariance=torch.diag(torch.tensor([0.09, 0.09, 2.5e-5], dtype=torch.float64)),
+        )
+        packets = share_map(frame, seen)
+        spent += sum(map(len, packets))
+        for packet in packets:
+            inbox.push(packet)
+        service.listen(inbox.receptions())
+    now = service.map().published()
+    quality = judge(clip_to_box(now.elements, where.area), truth)
+    print(
+        f"{instant} s: {len(service.observations)} messages, {spent} bytes, {len(now)} elements, mAP {quality.mean_ap():.2f}"
+    )
+
+made = service.fold().published()
+print(f"all at once: {len(made)} elements, mAP {judge(clip_to_box(made.elements, where.area), truth).mean_ap():.2f}")
