@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shipped weights by name: a detector is no map model, and each is asked for by its own function."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from manyeyes.datatypes import CheckpointError
+from manyeyes.models import checkpoint, zoo
+from manyeyes.models.map_presets import FORMAT, TOY
+from manyeyes.models.mapper import Mapper
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """A package that ships one map model, beside files that are told apart by their names alone."""
+    torch.manual_seed(0)
+    small = replace(TOY, head=replace(TOY.head, elements=5, many=5))
+    made = Mapper(small)
+    (tmp_path / "weights").mkdir()
+    checkpoint.save(made, tmp_path / "weights" / f"{zoo.MAPPER}.safetensors", {"towns": []}, half=True, format=FORMAT)
+    for name in ("costr-small", "map-small-camera", zoo.FEAKM):
+        (tmp_path / "weights" / f"{name}.safetensors").touch()
+    monkeypatch.setattr(zoo, "files", lambda package: tmp_path)
+    return small
+
+
+def test_names_are_told_apart_by_what_they_are(package):
+    assert zoo.names() == ("costr-small",)
+    assert zoo.mappers() == ("map-small", "map-small-camera")
+
+
+def test_a_shipped_map_model_comes_ready_with_its_fingerprint(package):
+    mapper = zoo.load_mapper()
+    assert mapper.config == package and not mapper.training and not any(p.requires_grad for p in mapper.parameters())
+    assert mapper.fingerprint == checkpoint.fingerprint(mapper) != bytes(8)
+
+
+def test_an_unknown_map_model_names_those_that_ship(package):
+    with pytest.raises(CheckpointError, match="map-small, map-small-camera"):
+        zoo.load_mapper("map-large")
+    with pytest.raises(CheckpointError, match="no such file"):
+        zoo.load_mapper("map-large.safetensors")
