@@ -14,6 +14,7 @@ from manyeyes.ops.window_attention import (
     window_attention,
     window_ids,
     window_offsets,
+    window_places,
 )
 
 ORIGIN, CELL, SIDE = (-16.0, -9.6), 0.4, 8
@@ -234,3 +235,18 @@ def test_plan_is_the_same_for_the_same_tokens():
     assert torch.equal(one.query_slot, one.key_slot)
     taken = one.query_slot[one.query_slot < len(ids)]
     assert torch.equal(taken.sort().values, torch.arange(len(ids)))
+
+
+@pytest.mark.parametrize("shift", (0.0, WINDOW / 2))
+def test_places_in_one_loop_are_ids_and_offsets(shift: float) -> None:
+    random = torch.Generator().manual_seed(3)
+    xy, batch = (torch.rand(500, 2, generator=random) - 0.5) * 300, torch.randint(3, (500,), generator=random)
+    learning = window_places(xy, batch, ORIGIN, WINDOW, CELL, shift)
+    with torch.no_grad():
+        ids, offsets = window_places(xy, batch, ORIGIN, WINDOW, CELL, shift)
+        with pytest.raises(ConfigError, match="edge above 0 m; got 0"):
+            window_places(xy, batch, ORIGIN, 0.0, CELL)
+    wanted = window_ids(xy, batch, ORIGIN, WINDOW, shift), window_offsets(xy, ORIGIN, WINDOW, CELL, shift)
+    for got in ((ids, offsets), learning):
+        assert torch.equal(got[0], wanted[0]) and torch.equal(got[1], wanted[1])
+    assert len(ids.unique()) > 50

@@ -56,7 +56,7 @@ def test_no_token_gives_no_row() -> None:
     assert attend_in_windows(none, none, none, window_runs(torch.zeros(0, dtype=torch.int64))).shape == (0, 2, 8)
 
 
-def test_pairs_are_counted() -> None:
+def test_windows_begin_where_ids_change() -> None:
     runs = window_runs(torch.tensor([5, -1, 5, 5]))
-    assert runs.pairs == 10
+    assert runs.order.tolist() == [1, 0, 2, 3]
     assert runs.start.tolist() == [0, 1, 4]

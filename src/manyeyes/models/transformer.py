@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, ConfigError
-from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
+from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_places
 from manyeyes.ops.window_loops import attend_in_windows, window_runs
 
 
@@ -69,8 +69,7 @@ class WindowBlock(nn.Module):
         if name not in cache:
             edge = self.window * grid.cell
             origin, shift = (grid.x_min, grid.y_min), edge / 2 if self.shifted else 0.0
-            offsets = window_offsets(xy, origin, edge, grid.cell, shift)
-            cache[name] = window_ids(xy, batch, origin, edge, shift), offsets
+            cache[name] = window_places(xy, batch, origin, edge, grid.cell, shift)
         ids, offsets = cache[name]
         place = (*name, features.shape[1])
         if place not in cache:

@@ -10,7 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 
@@ -39,10 +41,40 @@ def window_offsets(
     return ((xy.double() - start + shift_m - (at + 0.5) * window_m) / cell_m).to(xy.dtype)
 
 
+def window_places(
+    xy: Tensor, batch: Tensor, origin: tuple[float, float], window_m: float, cell_m: float, shift_m: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """:func:`window_ids` (N,) and :func:`window_offsets` (N, 2) of the same tokens; at inference on the CPU in one loop."""
+    if torch.is_grad_enabled() or xy.device.type != "cpu" or xy.dtype != torch.float32:
+        return (
+            window_ids(xy, batch, origin, window_m, shift_m),
+            window_offsets(xy, origin, window_m, cell_m, shift_m),
+        )
+    _checked(window_m)
+    ids, offsets = torch.empty(len(xy), dtype=torch.int64), torch.empty(len(xy), 2)
+    numbers = (float(v) for v in (*origin, window_m, cell_m, shift_m))
+    _place(xy.contiguous().numpy(), batch.contiguous().numpy(), *numbers, ids.numpy(), offsets.numpy())
+    return ids, offsets
+
+
+@njit(cache=True, nogil=True)
+def _place(xy, batch, x_min, y_min, window_m, cell_m, shift_m, ids, offsets):  # pragma: no cover
+    for i in range(xy.shape[0]):
+        x, y = np.float64(xy[i, 0]) - x_min + shift_m, np.float64(xy[i, 1]) - y_min + shift_m
+        column, row, half = np.floor(x / window_m), np.floor(y / window_m), 1 << (_BITS - 1)
+        ids[i] = (((batch[i] << _BITS) + np.int64(row) + half) << _BITS) + np.int64(column) + half
+        offsets[i, 0] = (x - (column + 0.5) * window_m) / cell_m
+        offsets[i, 1] = (y - (row + 0.5) * window_m) / cell_m
+
+
 def _window_at(xy: Tensor, origin: tuple[float, float], window_m: float, shift_m: float) -> Tensor:
+    _checked(window_m)
+    return ((xy.double() - xy.new_tensor(origin, dtype=torch.float64) + shift_m) / window_m).floor()
+
+
+def _checked(window_m: float) -> None:
     if window_m <= 0:
         raise ConfigError(f"A window needs an edge above 0 m; got {window_m}.")
-    return ((xy.double() - xy.new_tensor(origin, dtype=torch.float64) + shift_m) / window_m).floor()
 
 
 def sincos_encoding(u: Tensor, channels: int) -> Tensor:

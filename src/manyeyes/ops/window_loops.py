@@ -32,19 +32,28 @@ _FAST = {"contract", "nsz", "nnan", "ninf", "arcp", "reassoc"}
 
 @dataclass(frozen=True, eq=False)
 class WindowRuns:
-    """order: (N,) int64, tokens window by window; start: (windows + 1,) int64, where each begins. pairs: sum of n^2."""
+    """order: (N,) int64, tokens window by window; start: (windows + 1,) int64, where each begins."""
 
     order: Tensor
     start: Tensor
-    pairs: int
 
 
 def window_runs(window: Tensor) -> WindowRuns:
     """Tokens of windows (N,) int64, sorted."""
     ids, order = window.sort(stable=True)
-    count = torch.unique_consecutive(ids, return_counts=True)[1]
-    start = torch.cat((count.new_zeros(1), count.cumsum(0)))
-    return WindowRuns(order, start, int((count * count).sum()))
+    return WindowRuns(order, torch.from_numpy(_starts(ids.numpy())))
+
+
+@njit(cache=True, nogil=True)
+def _starts(ids):  # pragma: no cover
+    """Where each run of equal ids (N,) begins, and N."""
+    start, runs = np.empty(ids.shape[0] + 1, np.int64), 0
+    for i in range(ids.shape[0]):
+        if i == 0 or ids[i] != ids[i - 1]:
+            start[runs] = i
+            runs += 1
+    start[runs] = ids.shape[0]
+    return start[: runs + 1]
 
 
 @torch.no_grad()
