@@ -3,8 +3,8 @@
 
 The bar (issue: "Seeing the map"): map-toy above 0.9 on 16 tiles in five minutes on two cores.
 
-python benchmarks/map_overfit.py [--data data/towns-small] [--split train] [--tiles 16] [--steps 500] [--rate 2e-3]
-    [--threads 1] [--every 100]
+python benchmarks/map_overfit.py [--data data/towns-small] [--split train] [--tiles 16] [--steps 1200] [--batch 2]
+    [--rate 4e-3] [--threads 1] [--every 100] [--preset map-toy]
 """
 
 from __future__ import annotations
@@ -60,8 +60,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data/towns-small"))
     parser.add_argument("--split", default="train")
     parser.add_argument("--tiles", type=int, default=16)
-    parser.add_argument("--steps", type=int, default=500)
-    parser.add_argument("--rate", type=float, default=2e-3)
+    parser.add_argument("--steps", type=int, default=1200)
+    parser.add_argument("--batch", type=int, default=2)
+    parser.add_argument("--rate", type=float, default=4e-3)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--every", type=int, default=100)
     parser.add_argument("--preset", default="map-toy", choices=MAP_TRAINING)
@@ -72,7 +73,9 @@ def main() -> None:
     stream = TileStream(recording, true_maps(recording), preset.mapper, MapAugment(1, 3, flip=False), 0)
     few = Few(tuple(stream.draw(k) for k in range(options.tiles)), stream.towns)
     print(f"{options.tiles} tiles, {sum(len(s.truth) for s in few.samples)} elements", flush=True)
-    config = replace(preset, steps=options.steps, batch=4, learning_rate=options.rate, warm_up=30, thin=0.0, ema=0.98)
+    config = replace(
+        preset, steps=options.steps, batch=options.batch, learning_rate=options.rate, warm_up=30, thin=0.0, ema=0.98
+    )
     with tempfile.TemporaryDirectory() as folder:
         run = MapRun(config, few, Path(folder), seed=0)
         began = time.process_time()

@@ -23,7 +23,7 @@ def _tile(cell_m: float) -> BevGrid:
 
 TOY = MapperConfig(
     BevConfig(
-        BevGrid(-36.0, -36.0, -2.0, 36.0, 36.0, 4.0, pillar=0.6),
+        BevGrid(-36.0, -36.0, -2.0, 36.0, 36.0, 4.0, pillar=0.8),
         channels=32,
         raster_width=12,
         raster_blocks=(1, 1),
@@ -33,23 +33,22 @@ TOY = MapperConfig(
     ),
     _tile(1.5),
     token_channels=16,
-    neck=(1, 1),
-    head=MapHeadConfig(elements=50, points=10, many=50, channels=64, feed=128, layers=2, heads=4),
+    head=MapHeadConfig(elements=80, points=10, channels=64, feed=128, layers=2, heads=4),
 )
-"""For tests: seconds a step at most."""
+"""For tests: a quarter of a second a step of two tiles."""
 
 SMALL = MapperConfig(
     BevConfig(
         BevGrid(-38.4, -38.4, -2.0, 38.4, 38.4, 4.0, pillar=0.4),
-        channels=48,
+        channels=32,
         raster_width=16,
         image=ImageEncoderConfig((2, 2, 2), 24, channels=64),
         image_size=(150, 200),
         depth=DepthBins(1.0, 49.0, 33),
     ),
-    _tile(0.8),
+    _tile(1.2),
     token_channels=32,
-    head=MapHeadConfig(elements=50, points=20, many=50, channels=128, feed=256, layers=3),
+    head=MapHeadConfig(elements=80, points=20, channels=96, feed=192, layers=3, heads=6),
 )
 """For two cores."""
 

@@ -18,20 +18,20 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
         mapper_config("toy"), steps=60, batch=2, learning_rate=2e-3, warm_up=10, save_every=20, augment=MapAugment(1, 3)
     ),
     "map-small": MapTrainConfig(
-        mapper_config("small"), steps=1500, batch=4, learning_rate=1e-3, save_every=50, augment=_NOISY
+        mapper_config("small"), steps=3000, batch=2, learning_rate=1e-3, save_every=50, augment=_NOISY
     ),
     "map-small-camera": MapTrainConfig(
         mapper_config("small", ("camera",)),
-        steps=1500,
-        batch=4,
+        steps=3000,
+        batch=2,
         learning_rate=1e-3,
         save_every=50,
         augment=replace(_NOISY, flip=False),
     ),
     "map-small-both": MapTrainConfig(
         mapper_config("small", ("lidar", "camera")),
-        steps=1500,
-        batch=4,
+        steps=3000,
+        batch=2,
         learning_rate=1e-3,
         save_every=50,
         augment=replace(_NOISY, flip=False),
