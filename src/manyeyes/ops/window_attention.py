@@ -52,8 +52,9 @@ def window_places(
         )
     _checked(window_m)
     ids, offsets = torch.empty(len(xy), dtype=torch.int64), torch.empty(len(xy), 2)
-    numbers = (float(v) for v in (*origin, window_m, cell_m, shift_m))
-    _place(xy.contiguous().numpy(), batch.contiguous().numpy(), *numbers, ids.numpy(), offsets.numpy())
+    where, whose = xy.contiguous().numpy(), batch.contiguous().numpy()
+    x_min, y_min, edge, cell, shift = map(float, (*origin, window_m, cell_m, shift_m))
+    _place(where, whose, x_min, y_min, edge, cell, shift, ids.numpy(), offsets.numpy())
     return ids, offsets
 
 
