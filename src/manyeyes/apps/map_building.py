@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -22,8 +22,9 @@ from manyeyes.apps.viewer.map_figures import Panel, save_figure
 from manyeyes.apps.viewer.map_page import page_of, save_map_page
 from manyeyes.datasets.disturb import PoseNoise
 from manyeyes.datasets.recording import Recording
-from manyeyes.datatypes import AgentFrame, ConfigError, Transform
+from manyeyes.datatypes import AgentFrame, ConfigError, Message, Transform
 from manyeyes.datatypes.map_element import MapElements
+from manyeyes.datatypes.message import SeenMap
 from manyeyes.evaluation.map_cells import ApRow, KindRow, judge_maps
 from manyeyes.evaluation.map_methods import tuned
 from manyeyes.maps.stream import StreamConfig, drift
@@ -183,20 +184,18 @@ def _oracle(ground: Ground, scenario: str, building: Building, true: Mapping[tup
     config = survey_config(building.survey)
     witness = Eyewitness(ground.place.truth, crowd_config(building.survey), building.seed)
 
-    def survey(frame: AgentFrame, heard: object = ()) -> object:
+    def survey(frame: AgentFrame, heard: Sequence[Message]) -> SeenMap:
         who = f"{scenario}/{frame.agent_id}"
         return witness.see(true[who, frame.timestamp_ns], config.window(frame), who, frame.timestamp_ns)
 
-    return survey  # type: ignore[return-value]
+    return survey
 
 
 def _judged(ground: Ground, cartographer: Cartographer, log: _Log) -> Built:
     seen, made = cartographer.observations, cartographer.fold()
     observed = MapElements.cat([o.in_map() for o in seen])
     published = made.published().elements
-    truth = shown = None
-    if seen:
-        truth = ground.truth(seen, np.array([log.true[o.agent, o.time_ns] for o in seen]))
+    truth = ground.truth(seen, np.array([log.true[o.agent, o.time_ns] for o in seen])) if seen else None
     cut = ground.cut
     shown = published if cut is None else cut(published)
     sent = [one for one in log.said if one.map_packets]
