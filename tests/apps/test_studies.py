@@ -14,7 +14,7 @@ from manyeyes.apps.studies import robustness, running
 from manyeyes.apps.studies.disturbance import HARD, PERFECT, Disturbance
 from manyeyes.apps.viewer.curves import Panel
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
 from manyeyes.evaluation import benchmark
 from manyeyes.evaluation.benchmark import BenchmarkConfig, run_scenario
 from manyeyes.evaluation.tally import Tally
@@ -124,6 +124,17 @@ def test_robustness_has_a_row_a_disturbance_and_method(data, weights, tmp_path, 
         "late": (0, 0.1, 0.4),
         "intermediate": (0, 0.1, 0.4),
     }
+
+
+def test_disturbances_are_played_by_name(data, weights, tmp_path, panels) -> None:
+    words = ("--methods", "late", "intermediate", "--every", 2, "--disturbances", "0.4 s")
+    held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
+    assert [r["disturbance"]["delay_s"] for r in held["rows"]] == [0, 0, 0.4, 0.4]
+    assert "intermediate, 0.4 s - perfect" in {c["what"] for c in held["claims"]}
+    text = (tmp_path / "robustness.md").read_text()
+    assert "## Delay" in text and "## Position" not in text
+    with pytest.raises(ConfigError, match=r"No disturbance '4 s'; choose from perfect, 0.1 s"):
+        robustness.chosen(["4 s"])
 
 
 def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(

@@ -10,6 +10,7 @@ import torch
 
 from manyeyes.alignment.estimate import planar
 from manyeyes.alignment.feakm import Feakm
+from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.datatypes import BevGrid, Boxes, CheckpointError, ConfigError, RecordingError, SparseBev, Transform
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.constellation import ConstellationConfig
@@ -201,7 +202,8 @@ def test_a_batch_is_learnt_by_heart_and_gives_the_pose(cache, tmp_path):
     assert first.loss > 3 * last.loss and last.recall > 0.95 and last.precision > 0.95
     net = run.state.average.eval()
     for both in cache.pairs():
-        estimate = Feakm.of(net)(*net.describe([both.ego, both.other]), None)
+        ego, other = (Landmarks.of_keypoints(points) for points in net.describe([both.ego, both.other]))
+        estimate = Feakm.of(net)(ego, other, None)
         assert estimate.status.answered
         off = estimate.pose - planar(both.ego_from_other)
         assert math.hypot(off[0], off[1]) < 0.2

@@ -54,6 +54,8 @@ class Options:
     """Judge each so many-th frame of those that the recording judges."""
     study: str | None = None
     """robustness, budget, agents, ablation, system, pose, pose-accuracy, feakm or picture; what is finished is kept under --out."""
+    disturbances: tuple[str, ...] = ()
+    """Those that the study 'robustness' plays, by the names of its table, such as "0.4 s" "30 % lost"; by default all."""
     budgets: tuple[int, ...] = ()
     """Bytes: of a message in the study 'budget', of all messages of an instant in 'system'; by default the study's own."""
     selectors: tuple[str, ...] = ()
