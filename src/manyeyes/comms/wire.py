@@ -257,9 +257,11 @@ def _spread(covariance: NDArray[np.float64]) -> list[int]:
         raise WireError(f"Message.pose_covariance is a finite (3, 3); got {covariance.tolist()}.")
     sigma = np.sqrt(np.maximum(covariance.diagonal(), 0))
     # Metres and radians differ by orders of magnitude: what counts as zero is judged on the correlations.
-    correlation = np.divide(covariance, np.outer(sigma, sigma), out=np.zeros((3, 3)), where=np.outer(sigma, sigma) > 0)
-    good = np.allclose(covariance, correlation * np.outer(sigma, sigma), rtol=1e-6, atol=0)
-    good &= np.allclose(correlation, correlation.T, rtol=0, atol=1e-6)
+    scale = np.outer(sigma, sigma)
+    correlation = np.divide(covariance, scale, out=np.zeros((3, 3)), where=scale > 0)
+    back = correlation * scale
+    good = bool((np.abs(covariance - back) <= 1e-6 * np.abs(back)).all())
+    good &= bool((np.abs(correlation - correlation.T) <= 1e-6).all())
     lower = np.zeros((3, 3))
     for j in range(3):
         pivot = correlation[j, j] - lower[j, :j] @ lower[j, :j]
