@@ -66,14 +66,13 @@ def continued(
         config.nearest_m, config.farthest_m, config.even_m, config.back_m, np.cos(config.heading_rad), config.few,
         config.across_m, config.bridge_m,
     ])  # fmt: skip
-    out = _continue(
-        (first, members, line, _chords(line, first), kind[members], coverage[members]),
+    return _continue(
+        members,
+        (first, line, _chords(line, first), kind[members], coverage[members], chain[members]),
         (grid.keys, grid.start, place[grid.order]),
-        chain[members],
         numbers,
         np.array(config.open_m),
     )
-    return out
 
 
 def _chords(line: Floats, first: Ints) -> Floats:
@@ -85,8 +84,9 @@ def _chords(line: Floats, first: Ints) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def _continue(chains, grid, chain, numbers, open_m):  # pragma: no cover - compiled
-    first, members, line, chord, kind, coverage = chains
+def _continue(members, lines, grid, numbers, open_m):  # pragma: no cover - compiled
+    """lines: each chain's first point and, of every point, place, direction, kind, coverage and chain. grid: of the points."""
+    first, line, chord, kind, _, chain = lines
     xy, tangent, source = [(0.0, 0.0)], [(0.0, 0.0)], [0]
     way, turn = np.empty((1024, 2)), np.empty((1024, 2))
     met = np.zeros(len(line), np.bool_)
@@ -99,11 +99,9 @@ def _continue(chains, grid, chain, numbers, open_m):  # pragma: no cover - compi
             if met[end]:
                 continue
             best, arrived = 0, -1
-            for g in _guides(end, inward, first, line, chord, kind, chain, grid, numbers):
+            for g in _guides(end, inward, lines, grid, numbers):
                 against = (chord[g, 0] * chord[end, 0] + chord[g, 1] * chord[end, 1]) * inward > 0.0
-                n, gap, at = _walk(
-                    end, g, -1 if against else 1, line, chord, kind, coverage, chain, grid, numbers, open_m, way, turn
-                )
+                n, gap, at = _walk(end, g, -1 if against else 1, lines, grid, numbers, open_m, way, turn)
                 # One that arrives before one that does not, then the longer.
                 if n == 0 or (arrived >= 0 and at < 0) or ((at >= 0) == (arrived >= 0) and n <= best):
                     continue
@@ -123,8 +121,9 @@ def _continue(chains, grid, chain, numbers, open_m):  # pragma: no cover - compi
 
 
 @njit(cache=True, nogil=True)
-def _guides(end, inward, first, line, chord, kind, chain, grid, numbers):  # pragma: no cover - compiled
+def _guides(end, inward, lines, grid, numbers):  # pragma: no cover - compiled
     """The nearest point of each line that runs beside the end of a chain, and did so before."""
+    first, line, chord, kind, _, chain = lines
     keys, start, order = grid
     nearest, farthest, even, back, cosine = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     found = [0]
@@ -136,7 +135,7 @@ def _guides(end, inward, first, line, chord, kind, chain, grid, numbers):  # pra
             break
         walked += np.hypot(line[inner + inward, 0] - line[inner, 0], line[inner + inward, 1] - line[inner, 1])
         inner += inward
-    ix, iy = int(np.floor(x / 2.5)), int(np.floor(y / 2.5))
+    ix, iy = int(np.floor(x / _CELL_M)), int(np.floor(y / _CELL_M))
     for dx in range(-3, 4):
         low, high = span(keys, start, 0, ix + dx, iy - 3, iy + 3)
         for k in range(low, high):
@@ -169,12 +168,11 @@ def _beside(x, y, c, first, line, chord):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _walk(
-    end, g, ahead, line, chord, kind, coverage, chain, grid, numbers, open_m, way, turn
-):  # pragma: no cover - compiled
+def _walk(end, g, ahead, lines, grid, numbers, open_m, way, turn):  # pragma: no cover - compiled
     """Places beside a guide from its point g on, written to way and turn: their number, the gap across where they
     arrive, and at which point (-1: nowhere).
     """
+    _, line, chord, kind, coverage, chain = lines
     few, across, bridge = numbers[5], numbers[6], numbers[7]
     ex, ey = line[end, 0] - line[g, 0], line[end, 1] - line[g, 1]
     aside = chord[g, 0] * ey - chord[g, 1] * ex
@@ -190,7 +188,7 @@ def _walk(
         u, v = ahead * chord[q, 0], ahead * chord[q, 1]
         x, y = line[q, 0] - aside * chord[q, 1], line[q, 1] + aside * chord[q, 0]
         if walked > 2.0:
-            at, gap = _arrival(x, y, u, v, kind[end], chain[end], line, chord, kind, chain, grid, across)
+            at, gap = _arrival(x, y, u, v, end, lines, grid, across)
             if at >= 0:
                 return n, gap, at
         if walked >= 1.0:
@@ -201,18 +199,19 @@ def _walk(
 
 
 @njit(cache=True, nogil=True)
-def _arrival(x, y, u, v, what, own, line, chord, kind, chain, grid, across):  # pragma: no cover - compiled
-    """The point of another chain of the kind nearest across a way at x, y in direction u, v, and how far left it lies;
-    -1: none.
+def _arrival(x, y, u, v, end, lines, grid, across):  # pragma: no cover - compiled
+    """The point of another chain of the end's kind nearest across a way at x, y in direction u, v, and how far left it
+    lies; -1: none.
     """
+    _, line, chord, kind, _, chain = lines
     keys, start, order = grid
-    ix, iy = int(np.floor(x / 2.5)), int(np.floor(y / 2.5))
+    ix, iy = int(np.floor(x / _CELL_M)), int(np.floor(y / _CELL_M))
     best, at = np.inf, -1
     for dx in range(-1, 2):
         low, high = span(keys, start, 0, ix + dx, iy - 1, iy + 1)
         for k in range(low, high):
             q = order[k]
-            if chain[q] == own or kind[q] != what or abs(chord[q, 0] * u + chord[q, 1] * v) < 0.9:
+            if chain[q] == chain[end] or kind[q] != kind[end] or abs(chord[q, 0] * u + chord[q, 1] * v) < 0.9:
                 continue
             ex, ey = line[q, 0] - x, line[q, 1] - y
             aside = u * ey - v * ex
