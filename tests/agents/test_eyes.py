@@ -14,7 +14,7 @@ from manyeyes.agents.eyes import FASTEST_M, LONGEST_GAP_NS, Eyes, Sight, follows
 from manyeyes.agents.tracks import FOLLOWING, TrackConfig
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, BevGrid, PointCloud, Sites, SparseBev, Transform
-from manyeyes.models.box_head import RAW, DecodeConfig, RawBoxes
+from manyeyes.models.box_head import RAW, DecodeConfig, RawBoxes, decode
 from manyeyes.models.detector import Detector
 from manyeyes.models.proposal import PROPOSAL, propose, proposed_velocity
 
@@ -191,7 +191,9 @@ def test_tokens_are_as_fast_as_the_box_that_they_propose_and_what_is_no_box_stan
     assert sorted(sight.boxes.center[:, 0].tolist()) == pytest.approx([0.7, 10.5])
     fast = torch.where(sight.boxes.center[:, :1] < 5, torch.tensor([[7.0, -1.0]]), torch.tensor([[0.0, 3.0]]))
     moved = sight.moving(fast)
-    assert torch.allclose(moved.boxes.velocity, fast) and torch.equal(moved.boxes.center, sight.boxes.center)
+    assert torch.equal(moved.boxes.velocity, fast) and torch.equal(moved.boxes.center, sight.boxes.center)
+    anew = decode(moved.raw, moved.config)[0]
+    assert torch.allclose(anew.velocity, fast) and torch.equal(anew.center, moved.boxes.center)
     told, before = moved.told.features, sight.told.features
     want = torch.tensor([[7.0, -1.0], [7.0, -1.0], [0.0, 3.0], [0.0, 0.0]])
     assert torch.allclose(proposed_velocity(told[:, -PROPOSAL:]), want)

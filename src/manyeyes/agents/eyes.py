@@ -49,7 +49,10 @@ class Sight:
         nearest = pad(apart, (0, 1), value=OWN_M).argmin(1)
         raw = replace(self.raw, velocity=pad(velocity, (0, 0, 0, 1))[nearest] / SPEED_UNIT)
         told = torch.cat((self.told.features[:, :-PROPOSAL], propose(raw)), 1)
-        return replace(self, told=self.told.with_features(told), raw=raw)
+        moved = replace(self, told=self.told.with_features(told), raw=raw)
+        # Speed decides nothing in decoding: the boxes are the same, and need not be found again.
+        vars(moved)["boxes"] = replace(self.boxes, velocity=velocity)
+        return moved
 
 
 class Eyes:
