@@ -8,8 +8,9 @@ layer is told where its points lie by now. The two groups never attend to each o
 layers on each.
 
 What differs from MapTR, so that a few tiles are learnt by heart in hundreds of steps: an element's points begin as one straight
-line, not each at a place of its own; their places are told to every layer; points move by shares of the tile, not by logits, which
-are flat at the tile's border, where lines are cut; and a layer looks at the ground before it compares what was seen.
+line, not each at a place of its own; their places are told to every layer, and to what moves them; points move by shares of the
+tile, not by logits, which are flat at the tile's border, where lines are cut; and a layer looks at the ground before it compares
+what was seen.
 """
 
 from __future__ import annotations
@@ -168,8 +169,10 @@ class MapHead(nn.Module):
         ground = ground.permute(0, 2, 3, 1)
         out = []
         for layer, kind, move in zip(self.layers, self.kinds, self.moves):
-            x = layer(x, embedded + self.where(waves(reference)), reference, ground)
-            point = reference + STEP * move(x)
+            place = embedded + self.where(waves(reference))
+            x = layer(x, place, reference, ground)
+            # How far a point has still to go depends on where it is by now, which x alone does not say.
+            point = reference + STEP * move(x + place)
             out.append(RawMap(kind(x.mean(2)), point))
             reference = point.detach()
         return tuple(out)
