@@ -30,7 +30,8 @@ class MapTrainConfig:
     """A run. batch: tiles a step over all processes. warm_up: steps of linear growth of the learning rate, then a cosine to zero.
 
     thin: the greatest share of a look's tokens that is left out, those of least worth, as a budget in bytes would; uniform, so that
-    the model knows tiles of many bytes and of few. ema: decay of the averaged weights that are saved.
+    the model knows tiles of many bytes and of few. ema: decay of the averaged weights that are saved. beta2: decay of Adam's mean
+    square; at the usual 0.999 it still divides by the great gradients of the start when half of a short run is over.
     """
 
     mapper: MapperConfig
@@ -38,6 +39,7 @@ class MapTrainConfig:
     batch: int = 4
     learning_rate: float = 6e-4
     weight_decay: float = 1e-2
+    beta2: float = 0.98
     warm_up: int = 100
     clip: float = 35.0
     ema: float = 0.998
@@ -114,7 +116,7 @@ class MapRun:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             model = Mapper(config.mapper)
-        self.state = RunState(model, config, seed, folder, config.weight_decay)
+        self.state = RunState(model, config, seed, folder, config.weight_decay, config.beta2)
 
     def advance(self) -> MapProgress:
         """One step of the optimiser."""

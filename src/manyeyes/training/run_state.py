@@ -35,14 +35,17 @@ Line = TypeVar("Line", bound=LogLine)
 class RunState(Generic[Model]):
     """One process, or one of several that share every batch.
 
-    config: a frozen dataclass that names the run; a folder of another run, or of another seed, is refused.
+    config: a frozen dataclass that names the run; a folder of another run, or of another seed, is refused. beta2: decay of
+    Adam's mean square of gradients.
     """
 
-    def __init__(self, model: Model, config: Any, seed: int, folder: Path, weight_decay: float) -> None:
+    def __init__(
+        self, model: Model, config: Any, seed: int, folder: Path, weight_decay: float, beta2: float = 0.999
+    ) -> None:
         self.model, self.folder = model, folder
         self.rank, self.world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
         self.average = copy.deepcopy(model).requires_grad_(False)
-        self.optimiser = torch.optim.AdamW(parameter_groups(model, weight_decay))
+        self.optimiser = torch.optim.AdamW(parameter_groups(model, weight_decay), betas=(0.9, beta2))
         self.step, self.seconds = 0, 0.0
         self._name = {"config": config_to_json(config), "seed": seed}
         self._since = time.monotonic()
