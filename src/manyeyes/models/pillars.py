@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
 from manyeyes.models.layers import ActiveNorm, fold_norm
-from manyeyes.ops.segment_affine import affine_segment_max
+from manyeyes.ops.pillar_loops import pillar_maxima
 from manyeyes.ops.voxelize import Pillars, pillar_moments, pillar_sites, segment_max, segment_mean
 
 PillarKind = Literal["points", "moments"]
@@ -35,21 +35,13 @@ class PointPillars(nn.Module):
         mean = segment_mean(xyz, row, len(sites))
         grid = sites.grid
         centre = torch.cat((sites.xy, sites.xy.new_full((len(sites), 1), (grid.z_min + grid.z_max) / 2)), -1)
-        if not self.training and not torch.is_grad_enabled():
-            return self._infer(xyz, intensity, row, mean, centre)
         inputs = torch.cat((xyz, intensity[:, :1], xyz - mean[row], xyz - centre[row], intensity[:, 1:]), -1)
         return segment_max(torch.relu(self.norm(self.linear(inputs))), row, len(sites))
 
-    def _infer(self, xyz: Tensor, intensity: Tensor, row: Tensor, mean: Tensor, centre: Tensor) -> Tensor:
-        """The same numbers with the norm folded in: within a pillar only four of the ten inputs differ from point to point."""
+    def infer(self, now: list[PointCloud], before: list[PointCloud], grid: BevGrid) -> SparseBev:
+        """The same numbers of whole clouds, float32 in the CPU's memory, with the norm folded in: for inference."""
         weight, bias = fold_norm(self.linear.weight, self.norm)
-        place, bright, to_mean, to_centre, age = weight.split((3, 1, 3, 3, self.sweeps - 1), 1)
-        varying = torch.cat((place + to_mean + to_centre, bright, age), 1)
-        points = torch.cat((xyz, intensity), 1)
-        origin = torch.cat((centre, centre.new_zeros(len(centre), self.sweeps)), 1)
-        top = affine_segment_max(points, origin, varying, row)
-        common = torch.addmm(bias, torch.cat((centre, centre - mean), 1), torch.cat((place, to_mean), 1).T)
-        return torch.relu_(top.add_(common))
+        return pillar_maxima(now, before, grid, nn.functional.pad(weight, (0, 2 - self.sweeps)), bias)
 
 
 class MomentPillars(nn.Module):
@@ -89,6 +81,8 @@ class PillarEncoder(nn.Module):
         """
         before = earlier if earlier is not None and self.sweeps == 2 else []
         many, agents = [*clouds, *before], [*range(len(clouds)), *range(len(before))]
+        if isinstance(self.net, PointPillars) and not self.training and not torch.is_grad_enabled() and _plain(many):
+            return self.net.infer(clouds, before, self.grid)
         xyz, bright = _joined([cloud.xyz for cloud in many]), _joined([cloud.intensity for cloud in many])
         batch = _joined([torch.full((len(cloud),), agent) for cloud, agent in zip(many, agents)])
         pillars = pillar_sites(xyz, batch, self.grid, len(clouds))
@@ -97,6 +91,11 @@ class PillarEncoder(nn.Module):
         xyz, bright = xyz.index_select(0, kept), bright.index_select(0, kept)
         features = self.net(xyz, bright, old, pillars)
         return SparseBev(features, pillars.sites)
+
+
+def _plain(clouds: list[PointCloud]) -> bool:
+    """Whether compiled loops can read them."""
+    return all(cloud.xyz.dtype == torch.float32 and cloud.xyz.device.type == "cpu" for cloud in clouds)
 
 
 def _joined(parts: list[Tensor]) -> Tensor:
