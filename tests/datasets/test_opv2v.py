@@ -19,6 +19,7 @@ from manyeyes.datasets import opv2v, opv2v_yaml
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
 from manyeyes.datasets.pcd import write_pcd
 from manyeyes.datasets.recording import judged_frames, points_in_listed_boxes
+from manyeyes.datasets.single_frames import single_frames
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, RecordingError, Snapshot, Transform, Truth
 
 # CARLA's world, left-handed, degrees: [x, y, z, roll, yaw, pitch]. Nothing here is symmetric, so no sign can hide.
@@ -312,6 +313,36 @@ def test_unknown_scenario_and_index(dataset: Path) -> None:
         recording.length("x")
     with pytest.raises(RecordingError, match="index from 0 to 1"):
         recording.snapshot("2021_08_18_19_48_05", 2)
+
+
+def test_a_frame_is_that_of_the_snapshot(dataset: Path) -> None:
+    recording = Opv2vRecording(dataset, "train")
+    name = recording.scenarios[0]
+    assert single_frames(recording) is recording
+    for index in range(2):
+        frames = recording.snapshot(name, index).frames
+        assert recording.present(name, index) == tuple(frame.agent_id for frame in frames) == (1045, 641, -1)
+        for frame in frames:
+            alone = recording.frame(name, index, frame.agent_id)
+            assert (alone.agent_id, alone.timestamp_ns) == (frame.agent_id, frame.timestamp_ns)
+            assert torch.equal(alone.points.xyz, frame.points.xyz)
+            assert torch.equal(alone.world_from_agent.translation, frame.world_from_agent.translation)
+
+
+def test_no_other_agents_files_are_read_for_a_frame(scenario: Path) -> None:
+    recording = Opv2vRecording(scenario, use_cache=False)
+    shutil.rmtree(scenario / "1045")
+    assert len(recording.frame("drive", 0, 641).points) == len(scan(641))
+    with pytest.raises((RecordingError, OSError)):
+        recording.snapshot("drive", 0)
+
+
+def test_an_agent_without_the_frame_is_refused_by_name(scenario: Path) -> None:
+    (scenario / "641" / "00068.pcd").unlink()
+    recording = Opv2vRecording(scenario)
+    assert recording.present("drive", 0) == (1045, -1)
+    with pytest.raises(RecordingError, match="Agent 641 has no frame 0 of 'drive'; choose one of 1045, -1"):
+        recording.frame("drive", 0, 641)
 
 
 def _remove(*names: str) -> Callable[[Path], None]:

@@ -111,13 +111,29 @@ class Opv2vRecording:
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         """All agents that have this frame; the truth is the union of what they list, in the order of ids."""
+        stem, present = self._present(scenario, index)
+        frames = tuple(self._frame(scenario, agent, stem) for agent in present)
+        records = [self._record(agent.folder / f"{stem}.yaml") for agent in present]
+        return Snapshot(scenario, index, frames, _truth(frames, records))
+
+    def present(self, scenario: str, index: int) -> tuple[int, ...]:
+        """The ids of the agents that have this frame, in the order of the snapshot's frames."""
+        return tuple(agent.id for agent in self._present(scenario, index)[1])
+
+    def frame(self, scenario: str, index: int, agent_id: int) -> AgentFrame:
+        """The frame of one agent as it stands in the snapshot; no other agent's files are read."""
+        stem, present = self._present(scenario, index)
+        found = [agent for agent in present if agent.id == agent_id]
+        if not found:
+            ids = ", ".join(str(agent.id) for agent in present)
+            raise RecordingError(f"Agent {agent_id} has no frame {index} of '{scenario}'; choose one of {ids}.")
+        return self._frame(scenario, found[0], stem)
+
+    def _present(self, scenario: str, index: int) -> tuple[str, list[_Agent]]:
+        """The stem of an instant's files, and the agents that have them."""
         require_index(self, scenario, index)
         stem = self._scenarios[scenario].stems[index]
-        timestamp_ns = round(int(stem) * self._protocol(scenario).fixed_delta_s * 1e9)
-        present = [agent for agent in self._scenarios[scenario].agents if stem in agent.stems]
-        records = [self._record(agent.folder / f"{stem}.yaml") for agent in present]
-        frames = tuple(self._frame(a, stem, r, timestamp_ns) for a, r in zip(present, records))
-        return Snapshot(scenario, index, frames, _truth(frames, records))
+        return stem, [agent for agent in self._scenarios[scenario].agents if stem in agent.stems]
 
     def _scenario(self, name: str) -> _Scenario:
         if name not in self._scenarios:
@@ -139,8 +155,8 @@ class Opv2vRecording:
     def _cloud(self, agent: _Agent, stem: str) -> PcdCloud:
         return read_pcd(agent.folder / f"{stem}.pcd", self._drop_nan, self._cache)
 
-    def _frame(self, agent: _Agent, stem: str, record: AgentRecord, timestamp_ns: int) -> AgentFrame:
-        cloud = self._cloud(agent, stem)
+    def _frame(self, scenario: str, agent: _Agent, stem: str) -> AgentFrame:
+        record, cloud = self._record(agent.folder / f"{stem}.yaml"), self._cloud(agent, stem)
         world_from_lidar = transform_from_carla(record.lidar_pose)
         height = self._sensor_height(agent, record, world_from_lidar)
         xyz = mirror_points(cloud.xyz)
@@ -149,7 +165,7 @@ class Opv2vRecording:
         yaml = agent.folder / f"{stem}.yaml"
         return AgentFrame(
             agent_id=agent.id,
-            timestamp_ns=timestamp_ns,
+            timestamp_ns=round(int(stem) * self._protocol(scenario).fixed_delta_s * 1e9),
             points=PointCloud.of(torch.from_numpy(xyz), torch.from_numpy(cloud.intensity)),
             world_from_agent=world_from_agent,
             pose_covariance=torch.zeros(3, 3, dtype=torch.float64),

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from manyeyes.datasets.recording import Recording
+from manyeyes.datasets.single_frames import SingleFrames, single_frames
 from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, Transform
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
 from manyeyes.evaluation.map_tiles import assert_split, cut_to, met_by, town_of
@@ -94,6 +95,10 @@ class TileStream:
         return town_of(scenario, tuple(self.maps))
 
     @cached_property
+    def _frames(self) -> SingleFrames:
+        return single_frames(self.recording)
+
+    @cached_property
     def _places(self) -> dict[str, Floats]:
         """(agents, 2) where the agents of each scenario begin, world."""
         first = {s: self.recording.snapshot(s, 0).frames for s in self.recording.scenarios}
@@ -106,8 +111,9 @@ class TileStream:
         rng, augment = keyed_generator("tile", self.seed, number), self.augment
         scenarios = self.recording.scenarios
         scenario = scenarios[int(rng.integers(len(scenarios)))]
-        snapshot = self.recording.snapshot(scenario, int(rng.integers(self.recording.length(scenario))))
-        own = snapshot.frames[int(rng.integers(len(snapshot.frames)))]
+        index = int(rng.integers(self.recording.length(scenario)))
+        present = self._frames.present(scenario, index)
+        own = self._frames.frame(scenario, index, present[int(rng.integers(len(present)))])
         turn = float(own.world_from_agent.yaw) + augment.turn_rad * rng.uniform(-1, 1)
         shift = augment.shift_m * rng.uniform(-1, 1, 2)
         middle = own.world_from_agent.translation[:2].numpy() + shift
@@ -133,8 +139,9 @@ class TileStream:
         while near and len(found) < wanted:
             for k in order[: wanted - len(found)]:
                 s, row = near[int(k)]
-                frames = self.recording.snapshot(s, int(rng.integers(self.recording.length(s)))).frames
-                found.append(frames[min(row, len(frames) - 1)])
+                index = int(rng.integers(self.recording.length(s)))
+                present = self._frames.present(s, index)
+                found.append(self._frames.frame(s, index, present[min(row, len(present) - 1)]))
         return sorted(found, key=lambda frame: not frame.is_infrastructure)
 
     def _sample(
