@@ -62,6 +62,17 @@ def test_what_cannot_be_used_is_refused_by_the_name_of_its_field(field: str, cha
 def test_rings_cross_or_only_touch() -> None:
     assert is_simple_ring(VIEW) and is_simple_ring(np.array([[0.0, 0], [4, 0], [2, 1], [4, 2], [0, 2]]))
     assert not is_simple_ring(np.array(BOW_TIE, float))
+    square = np.array([[0.0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]])
+    assert is_simple_ring(square), "points along one side touch, they do not cross"
+
+
+def test_rings_cross_where_shapely_says_so() -> None:
+    shapely = pytest.importorskip("shapely")
+    generator = np.random.default_rng(4)
+    rings = [generator.normal(size=(n, 2)) for n in generator.integers(3, 8, 300)]
+    simple = [bool(shapely.LinearRing(ring).is_simple) for ring in rings]
+    assert 0.2 < np.mean(simple) < 0.8
+    assert [is_simple_ring(ring) for ring in rings] == simple
 
 
 def test_equal_content_has_one_id_and_every_field_counts() -> None:

@@ -13,7 +13,7 @@ from manyeyes.simulator.crowd.sight import (
     STATION_M,
     Noise,
     _clip_ring,
-    _crosses_itself,
+    _emit_ring,
     _hidden,
     _resample,
     normal,
@@ -77,12 +77,13 @@ def test_a_ring_is_cut_to_the_view_as_shapely_does():
     assert partly > 30
 
 
-def test_rings_that_cross_themselves_are_told_from_those_that_do_not():
-    generator = np.random.default_rng(4)
-    rings = [generator.normal(size=(n, 2)) for n in generator.integers(3, 8, 300)]
-    simple = np.array([shapely.LinearRing(ring).is_simple for ring in rings])
-    assert 0.2 < simple.mean() < 0.8
-    np.testing.assert_array_equal([not _crosses_itself(ring) for ring in rings], simple)
+def test_an_exact_rectangle_is_seen_as_it_is():
+    """Points of one side lie on one line: they touch, and nothing crosses."""
+    corners = np.array([[5.0, -2.0], [9.0, -2.0], [9.0, 2.0], [5.0, 2.0]])
+    out = np.empty((20, 2))
+    assert _emit_ring(corners, VIEW, KEY, 3, 0, out) == pytest.approx(7.0)
+    ring = shapely.Polygon(out)
+    assert ring.is_valid and ring.area == pytest.approx(16.0, abs=1.0)
 
 
 def test_points_behind_a_vehicle_are_hidden():

@@ -183,11 +183,12 @@ def _is_covariance(m: Floats) -> bool:
 
 def is_simple_ring(ring: Floats) -> bool:
     """Whether no two edges of the open ring (K, 2) cross; edges that only touch at a shared end do not."""
-    return not _ring_crosses(ring)
+    return not ring_crosses(ring)
 
 
 @numba.njit(cache=True)
-def _ring_crosses(ring: Floats) -> bool:  # pragma: no cover - compiled
+def ring_crosses(ring: Floats) -> bool:  # pragma: no cover - compiled
+    """Whether two edges of the open ring (K, 2) cross; for other compiled loops, :func:`is_simple_ring` for the rest."""
     n = len(ring)
     for i in range(n):
         ax, ay = ring[i]
@@ -209,6 +210,6 @@ def _ring_crosses(ring: Floats) -> bool:  # pragma: no cover - compiled
 @numba.njit(cache=True)
 def _first_crossed_ring(kind, first, points, ring_kind):  # pragma: no cover - compiled
     for i in range(len(kind)):
-        if kind[i] == ring_kind and _ring_crosses(points[first[i] : first[i + 1]]):
+        if kind[i] == ring_kind and ring_crosses(points[first[i] : first[i + 1]]):
             return i
     return -1

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, STOP_LINE
+from manyeyes.maps.observation import ring_crosses
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -194,27 +195,6 @@ def _clip_ring(ring, noise):
 
 
 @numba.njit(cache=True)
-def _crosses_itself(ring):
-    """Whether two edges of an open ring that are not neighbours meet."""
-    n = len(ring)
-    for i in range(n):
-        ax, ay = ring[i]
-        bx, by = ring[(i + 1) % n]
-        for j in range(i + 2, n):
-            if i == 0 and j == n - 1:
-                continue
-            cx, cy = ring[j]
-            dx, dy = ring[(j + 1) % n]
-            one = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-            two = (bx - ax) * (dy - ay) - (by - ay) * (dx - ax)
-            three = (dx - cx) * (ay - cy) - (dy - cy) * (ax - cx)
-            four = (dx - cx) * (by - cy) - (dy - cy) * (bx - cx)
-            if one * two <= 0.0 and three * four <= 0.0:
-                return True
-    return False
-
-
-@numba.njit(cache=True)
 def _emit_line(line, noise, key, element, run, part, out):
     """Write one observed line into out (n, 2); its mean distance from the agent, or -1 when it is too short to be said."""
     size = len(line)
@@ -261,7 +241,7 @@ def _emit_ring(ring, noise, key, element, run, out):
         for k in range(len(out)):
             out[k, 0] += 0.5 * scale * normal(key, element, run, _POINT + 256 + 2 * k)
             out[k, 1] += 0.5 * scale * normal(key, element, run, _POINT + 256 + 2 * k + 1)
-        if not _crosses_itself(out):
+        if not ring_crosses(out):
             return distance
     return -1.0
 
