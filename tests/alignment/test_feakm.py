@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from manyeyes.alignment import feakm
 from manyeyes.alignment.estimate import PoseClaim, PoseStatus, difference
 from manyeyes.alignment.feakm import ConsensusConfig, Feakm, RansacConfig, mended, published
 from manyeyes.alignment.landmarks import Landmarks
@@ -130,6 +131,18 @@ def test_two_answers_that_fit_alike_are_ambiguous():
     other = replace(one, xy=np.where(half[:, None], one.xy, two.xy), yaw=np.where(half, one.yaw, two.yaw))
     found = mended(ego, other, same(8), None)
     assert found.status is PoseStatus.AMBIGUOUS and found.runner_up == 4
+    # The second answer is never looked at where one hypothesis is all that may be refined.
+    bounded = mended(ego, other, same(8), None, ConsensusConfig(refined=1))
+    assert bounded.runner_up == 0 and bounded.pairs.tolist() in (same(8)[:4].tolist(), same(8)[4:].tolist())
+
+
+def test_where_nothing_holds_only_so_many_hypotheses_are_refined(monkeypatch):
+    ego, other, calls = marks(40), marks(40, seed=7), []
+    monkeypatch.setattr(feakm, "_refined", lambda *arguments: calls.append(arguments))
+    for most in (2, 4):
+        calls.clear()
+        assert mended(ego, other, same(40), None, ConsensusConfig(refined=most)).status is PoseStatus.NO_MATCH
+        assert len(calls) == most
 
 
 def test_draws_are_keyed_and_equivariant():

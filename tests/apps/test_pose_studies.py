@@ -76,13 +76,9 @@ def evaluate(data, out, study, *words):
     return json.loads((out / f"{study}.json").read_text())["result"]
 
 
-def test_every_corrector_before_every_fusion_under_every_level(data, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(pose, "LEVELS", (pose.CLEAN, Disturbance(heading_deg=2.0, position_m=2.0)))
-    monkeypatch.setattr(pose, "SIGMAS", (0.0, 2.0))
-    monkeypatch.setattr(pose, "APART", (Disturbance(position_m=0.8),))
-    monkeypatch.setattr(pose, "APART_AT_MOST", {Disturbance(position_m=0.8): 0.044})
-    monkeypatch.setattr(pose, "_by_common", lambda table: pose.Sheet("", ("a", "b"), ()))
-    held = evaluate(data, tmp_path, "pose", "--methods", "alone", "intermediate", "--every", 2)
+def test_every_corrector_before_every_fusion_under_the_levels_asked_for(data, tmp_path) -> None:
+    words = ("--methods", "alone", "intermediate", "--every", 2, "--disturbances", "2°, 2 m", "0.8 m")
+    held = evaluate(data, tmp_path, "pose", *words)
     assert [(r["corrector"], r["method"]) for r in held["rows"][::3]] == [
         ("given", "intermediate"),
         ("vote", "intermediate"),
@@ -90,7 +86,12 @@ def test_every_corrector_before_every_fusion_under_every_level(data, tmp_path, m
     assert held["frames"] == {"0 to 3": 0, "4 to 7": 0, "8 and more": 2}
     assert all(len(r["by_common"]) == 3 and r["over_alone"] for r in held["rows"])
     said = [c["what"] for c in held["claims"]]
-    assert said[0].startswith("true claims") and said[-1] == "2°, 2 m, 8 and more in common: corrected - alone"
+    assert said[:3] == [
+        "vote, perfect: corrected - true claims",
+        "vote, 0.8 m: corrected - true claims",
+        "vote, 2°, 2 m, 8 and more in common: corrected - true claims",
+    ]
+    assert said[3].startswith("vote, worst level (") and said[3].endswith("8 and more in common: corrected - alone")
     assert [c["bar"] for c in held["claims"]] == [-0.002, -0.044, -0.01, 0.0]
     assert {name: len(at5) for name, at5, _ in held["paper"]["rows"]}["FeaKM, 4 pairs"] == 11
 
@@ -101,17 +102,12 @@ def test_the_levels_are_feakms_columns() -> None:
     assert [c.x for p in pose.panels(()) for c in p.curves] == []
 
 
-def test_rival_fusions_are_rows_by_the_claims_as_they_are(data, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(pose, "LEVELS", (pose.CLEAN, Disturbance(heading_deg=2.0, position_m=2.0)))
-    monkeypatch.setattr(pose, "SIGMAS", (0.0, 2.0))
-    monkeypatch.setattr(pose, "APART", ())
-    monkeypatch.setattr(pose, "APART_AT_MOST", {})
-    monkeypatch.setattr(pose, "_by_common", lambda table: pose.Sheet("", ("a", "b"), ()))
+def test_rival_fusions_are_rows_by_the_claims_as_they_are(data, tmp_path) -> None:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         rival = Detector(replace(COSTR_TINY, fusion="v2x_vit"))
         checkpoint.save(rival, data / "rival.safetensors", {})
-    words = ("--methods", "intermediate", "--every", 2, "--correctors", "given")
+    words = ("--methods", "intermediate", "--every", 2, "--correctors", "given", "--disturbances", "2°, 2 m")
     held = evaluate(data, tmp_path, "pose", *words, "--branches", f"V2X-ViT={data / 'rival.safetensors'}")
     assert [(r["corrector"], r["method"]) for r in held["rows"]] == 2 * [("given", "intermediate")] + 2 * [
         ("given", "V2X-ViT")
@@ -143,14 +139,10 @@ def test_the_ablation_of_feakm_has_a_row_a_branch_and_level_and_keeps_it(data, t
     assert evaluate(data, tmp_path, "feakm", *words)["rows"] == held["rows"]
 
 
-def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(pose, "LEVELS", (pose.CLEAN,))
-    monkeypatch.setattr(pose, "SIGMAS", (0.0,))
-    monkeypatch.setattr(pose, "APART", ())
-    monkeypatch.setattr(pose, "APART_AT_MOST", {})
-    monkeypatch.setattr(pose, "_by_common", lambda table: pose.Sheet("", ("a", "b"), ()))
+def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path) -> None:
     net = net_file(data, "few.safetensors", most=5)
-    words = ("--methods", "intermediate", "--every", 2, "--correctors", "given", net, f"{net}@8")
+    asked = ("--every", 2, "--disturbances", "perfect", "--correctors", "given", net, f"{net}@8")
+    words = ("--methods", "intermediate", *asked)
     held = evaluate(data, tmp_path, "pose", *words)
     plain, four, eight = (r["bytes_per_message"] for r in held["rows"])
     # Five objects with a descriptor each; a section's own bytes and a packet more may come with them.

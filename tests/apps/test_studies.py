@@ -11,7 +11,7 @@ from PIL import Image
 
 from manyeyes.apps import cli
 from manyeyes.apps.studies import robustness, running
-from manyeyes.apps.studies.disturbance import HARD, PERFECT, Disturbance
+from manyeyes.apps.studies.disturbance import HARD, PERFECT, Disturbance, chosen
 from manyeyes.apps.viewer.curves import Panel
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
@@ -134,7 +134,7 @@ def test_disturbances_are_played_by_name(data, weights, tmp_path, panels) -> Non
     text = (tmp_path / "robustness.md").read_text()
     assert "## Delay" in text and "## Position" not in text
     with pytest.raises(ConfigError, match=r"No disturbance '4 s'; choose from perfect, 0.1 s"):
-        robustness.chosen(["4 s"])
+        chosen(["4 s"], robustness.ALL)
 
 
 def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(

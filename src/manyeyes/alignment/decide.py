@@ -62,9 +62,10 @@ class CorrectorConfig:
     accept: Acceptance = Acceptance()
 
 
-DETECTED = CorrectorConfig(VoteConfig(shared=0.15))
-"""For what detectors find: boxes of one view err alike, each towards who sees but one side of a vehicle. Measured on 154
-pairs of agents of the validation towns: the mean NEES is 5.4 without it, 3.2 with it (3 is honest).
+DETECTED = CorrectorConfig(VoteConfig(shared=0.02))
+"""For what detectors find: boxes of one view err alike, each towards who sees but one side of a vehicle. Measured on 305
+pairs of agents of the validation town with the weights that ship: the mean NEES (3 is honest) is 3.16 without it, 2.71 with it
+where nothing is claimed; 3.57 and 3.17 where claims are off by 0.8 m and degrees.
 """
 
 

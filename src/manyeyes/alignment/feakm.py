@@ -104,20 +104,23 @@ def _away(poses: Floats, target: Floats, source: Floats) -> Floats:
 @dataclass(frozen=True)
 class ConsensusConfig:
     """pairs: how many must agree. shortest_m: two pairs nearer than this give no hypothesis. gate: largest squared misfit of
-    a pair (3 degrees of freedom), area_m2: see vote.py. apart_m, apart_rad: answers that differ by less are one.
-    accept: how much likelier than chance and than the best distinct other pose an answer must be.
+    a pair (3 degrees of freedom), area_m2: see vote.py. refined: at most so many hypotheses are refined, the best distinct
+    ones, which bounds the time where no two fit. apart_m, apart_rad: answers that differ by less are one. accept: how much
+    likelier than chance and than the best distinct other pose an answer must be.
     """
 
     pairs: int = 4
     shortest_m: float = 3.0
     gate: float = 14.16
     area_m2: float = 330.0
+    refined: int = 16
     apart_m: float = 2.0
     apart_rad: float = 0.105
     accept: Acceptance = field(default_factory=lambda: Acceptance(least_score=12.0))
 
     def __post_init__(self) -> None:
-        if self.pairs < 2 or min(self.shortest_m, self.gate, self.area_m2, self.apart_m, self.apart_rad) <= 0:
+        limits = self.shortest_m, self.gate, self.area_m2, self.refined, self.apart_m, self.apart_rad
+        if self.pairs < 2 or min(limits) <= 0:
             raise ConfigError("ConsensusConfig needs pairs >= 2 and limits above 0.")
 
 
@@ -146,8 +149,10 @@ def _candidates(ego: Landmarks, other: Landmarks, pairs: Ints, config: Consensus
     poses = fit_se2(torch.from_numpy(b.xy[ends]), torch.from_numpy(a.xy[ends])).numpy()
     scores = _gains(poses, a, b, config).sum(1)
     middle, found = b.xy.mean(0), list[Candidate]()
-    while len(found) < 2 and scores.max() > 0:
+    for _ in range(config.refined):
         best = int(scores.argmax())
+        if len(found) == 2 or not scores[best] > 0:
+            break
         candidate = _refined(poses[best], a, b, pairs, config)
         # A hypothesis that is refined to an answer already found is no other answer.
         if candidate is not None and not any(_alike(candidate.pose[None], f.pose, middle, config)[0] for f in found):

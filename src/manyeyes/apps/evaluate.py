@@ -55,7 +55,8 @@ class Options:
     study: str | None = None
     """robustness, budget, agents, ablation, system, pose, pose-accuracy, feakm or picture; what is finished is kept under --out."""
     disturbances: tuple[str, ...] = ()
-    """Those that the study 'robustness' plays, by the names of its table, such as "0.4 s" "30 % lost"; by default all."""
+    """Those that the studies 'robustness' and 'pose' play, by the names of their tables, such as "0.4 s" "30 % lost"
+    or "2°, 2 m" "0.8 m"; by default all."""
     budgets: tuple[int, ...] = ()
     """Bytes: of a message in the study 'budget', of all messages of an instant in 'system'; by default the study's own."""
     selectors: tuple[str, ...] = ()

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from manyeyes.apps.studies.running import with_replay
 from manyeyes.datasets.disturb import PoseNoise
+from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.benchmark import BenchmarkConfig
 
 LATEST = 4
@@ -52,6 +54,16 @@ class Disturbance:
 
 
 PERFECT = Disturbance()
+
+
+def chosen(names: Sequence[str], among: Sequence[Disturbance]) -> tuple[Disturbance, ...]:
+    """The perfect setting and those of a study's disturbances that have these names; all of them for none."""
+    unknown = sorted(set(names) - {d.name for d in among})
+    if unknown:
+        raise ConfigError(f"No disturbance {unknown[0]!r}; choose from {', '.join(d.name for d in among)}.")
+    return tuple(d for d in among if not names or d == PERFECT or d.name in names)
+
+
 DELAYS = tuple(Disturbance(delay_s=d) for d in (0.1, 0.2, 0.3, 0.4))
 HEADINGS = tuple(Disturbance(heading_deg=h) for h in (0.2, 0.4, 0.6, 0.8))
 POSITIONS = tuple(Disturbance(position_m=p) for p in (0.2, 0.4, 0.6, 0.8))

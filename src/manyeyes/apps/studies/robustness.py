@@ -13,11 +13,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from manyeyes.apps.studies.disturbance import DELAYS, HARD, HEADINGS, JOINT, LOSSES, PERFECT, POSITIONS, Disturbance
+from manyeyes.apps.studies.disturbance import (
+    DELAYS,
+    HARD,
+    HEADINGS,
+    JOINT,
+    LOSSES,
+    PERFECT,
+    POSITIONS,
+    Disturbance,
+    chosen,
+)
 from manyeyes.apps.studies.running import ALONE, BOUND, OURS, PAPER, carry_out, claims_sheet, publish, start
 from manyeyes.apps.viewer.curves import Curve, Panel
 from manyeyes.apps.viewer.study_table import Sheet, change, number, value
-from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.bootstrap import Interval
 from manyeyes.evaluation.claims import Claim, claim
 from manyeyes.evaluation.sweep import Condition, Sweep
@@ -71,7 +80,7 @@ def run(options: Options, console: Console) -> None:
     hearing = tuple(m for m in methods if m != ALONE)
     conditions = [
         Condition(d.name, d.on(replace(begun.base, methods=methods if d == PERFECT else hearing)))
-        for d in chosen(options.disturbances)
+        for d in chosen(options.disturbances, ALL)
         if d == PERFECT or hearing
     ]
     done = carry_out(begun, conditions)
@@ -89,14 +98,6 @@ def run(options: Options, console: Console) -> None:
     ]
     payload: dict[str, object] = {"rows": table, "claims": held, "paper": PAPER}
     publish(begun, payload, [*sheets, claims_sheet(held)], panels(table), conditions, (PAPER,))
-
-
-def chosen(names: Sequence[str]) -> tuple[Disturbance, ...]:
-    """The perfect setting and the disturbances of these names; all of them for none."""
-    unknown = sorted(set(names) - {d.name for d in ALL})
-    if unknown:
-        raise ConfigError(f"No disturbance {unknown[0]!r}; choose from {', '.join(d.name for d in ALL)}.")
-    return tuple(d for d in ALL if not names or d == PERFECT or d.name in names)
 
 
 def rows(done: Sweep) -> tuple[Row, ...]:
