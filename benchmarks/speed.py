@@ -37,7 +37,7 @@ from torch import Tensor
 
 from manyeyes.agents.agent import OWN_BODY_M, Agent
 from manyeyes.agents.collaboration.heading import header
-from manyeyes.agents.collaboration.intermediate import parts_of
+from manyeyes.agents.collaboration.intermediate import tokens_around
 from manyeyes.agents.eyes import Eyes
 from manyeyes.apps.provenance import write_json
 from manyeyes.comms import wire
@@ -276,7 +276,7 @@ def staged(model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -
         inbox.push(packet)
     heard = inbox.messages()
     watch.lap("from bytes")
-    together = gather(parts_of(frames[0], own, heard), own.grid, 1)
+    together, _ = tokens_around(frames[0], own, (), heard)
     fused = model.merge(together)
     watch.lap("gather, FAST")
     raw = model.refine(fused.bev, fused.given)

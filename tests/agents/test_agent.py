@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import pytest
@@ -16,7 +17,7 @@ from manyeyes.datatypes import AgentFrame, ConfigError, Message, PointCloud, Tra
 from manyeyes.models.box_head import RawBoxes
 from manyeyes.models.detector import Detector
 from manyeyes.models.fusion.gather import Part, Tokens
-from manyeyes.training.samples import AugmentConfig, RoadConfig, Sample, make_sample
+from manyeyes.training.samples import AugmentConfig, RoadConfig, View, make_sample
 from manyeyes.training.step import forward
 
 NOW = 5
@@ -42,10 +43,10 @@ class RecordingEyes(Eyes):
         return self.raw
 
 
-def told_by_bytes(drive, detector: Detector, sample: Sample, first: int) -> tuple[list[bytes], list[Message]]:
-    """Packets of the sample's collaborators, and what they say: each looked when, and claims to be where, its view has it."""
+def told_by_bytes(drive, detector: Detector, views: Sequence[View], first: int) -> tuple[list[bytes], list[Message]]:
+    """Packets of those who had these views, and what they say: each looked when, and claims to be where, its view has it."""
     ego, packets, inbox = drive.frame(0, NOW).world_from_agent, [], Inbox(detector.fingerprint)
-    for view in sample.views[1:]:
+    for view in views:
         then = NOW - round(view.age_s / 0.1)
         (true,) = (f for f in drive.frames(then) if torch.equal(f.points.xyz, view.now.xyz))
         sender = Agent(detector, precision="float32", budget_bytes=None, eyes=Eyes(detector, tracks=None))
@@ -59,18 +60,18 @@ def told_by_bytes(drive, detector: Detector, sample: Sample, first: int) -> tupl
     return packets, list(inbox.messages())
 
 
-def as_said(drive, sample: Sample, messages: list[Message]) -> Sample:
-    """The sample with the doubts that arrived: a standard deviation travels as a code of one byte."""
-    ego, views = drive.frame(0, NOW).world_from_agent, [sample.views[0]]
-    for view in sample.views[1:]:
+def as_said(drive, views: Sequence[View], messages: list[Message]) -> tuple[View, ...]:
+    """The views with the doubts that arrived: a standard deviation travels as a code of one byte."""
+    ego, said = drive.frame(0, NOW).world_from_agent, []
+    for view in views:
         place = (ego @ view.ego_from_view).translation
         message = min(messages, key=lambda m: float(place.dist(m.world_from_agent.translation)))
         sigma = message.pose_covariance.diagonal().sqrt().tolist()
         assert sigma[0] == pytest.approx(view.doubt_xy_m, rel=0.1) and sigma[2] == pytest.approx(
             view.doubt_yaw_rad, rel=0.1
         )
-        views.append(replace(view, doubt_xy_m=sigma[0], doubt_yaw_rad=sigma[2]))
-    return replace(sample, views=tuple(views))
+        said.append(replace(view, doubt_xy_m=sigma[0], doubt_yaw_rad=sigma[2]))
+    return tuple(said)
 
 
 ROADS = {
@@ -80,7 +81,8 @@ ROADS = {
     "alone with a past": (1, 4, RoadConfig(past=2)),
     "late": (3, 4, RoadConfig(late_share=1.0, late_frames=2)),
     "astray": (2, 2, RoadConfig(astray_share=1.0)),
-    "all": (3, 4, RoadConfig(past=2, late_share=1.0, late_frames=2, astray_share=1.0)),
+    "said before": (3, 4, RoadConfig(past=2, said=1)),
+    "all": (3, 5, RoadConfig(past=2, said=1, late_share=1.0, late_frames=2, astray_share=1.0)),
 }
 
 
@@ -94,18 +96,22 @@ def test_training_forward_equals_share_bytes_perceive(drive, detector: Detector,
     some, first = drive(agents), NOW + 1 - moments
     seen = [some.snapshot(i) for i in range(first, NOW + 1)]
     sample = make_sample(seen, 0, detector.config.grid, AugmentConfig.none(), ("same", 1), road)
-    packets, messages = told_by_bytes(some, detector, sample, first)
+    packets, messages = told_by_bytes(some, detector, sample.views[1:], first)
+    before, older = told_by_bytes(some, detector, sample.said, first)
+    assert len(sample.said) == road.said * (agents - 1)
+    views = (sample.views[0], *as_said(some, sample.views[1:], messages))
     with torch.no_grad():
-        trained = forward(detector, [as_said(some, sample, messages)]).together
+        trained = forward(detector, [replace(sample, views=views, said=as_said(some, sample.said, older))]).together
     eyes = RecordingEyes(detector, road.past)
     ego = Agent(detector, precision="float32", eyes=eyes)
     for index in range(first, NOW):
-        ego.perceive(some.frame(0, index))
+        ego.perceive(some.frame(0, index), before if index == NOW - 1 else ())
     ego.perceive(some.frame(0, NOW), packets)
     # The case is what its name says, and there is something to compare.
     heard = eyes.heard
     assert len(sample.views) == agents and len(sample.past) == road.past and len(trained.sites) > 20
-    assert bool(heard.age.any()) == bool(road.late_share) and bool(heard.doubt.any()) == bool(road.astray_share)
+    aged = bool(road.late_share or road.past or road.said)
+    assert bool(heard.age.any()) == aged and bool(heard.doubt.any()) == bool(road.astray_share)
     assert (eyes.remembered is not None and len(eyes.remembered.features) > 20) == bool(road.past)
     assert torch.equal(trained.sites.key, eyes.raw.sites.key)
     for name in (f.name for f in fields(RawBoxes) if f.name != "sites"):

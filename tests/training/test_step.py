@@ -15,7 +15,7 @@ from manyeyes.models.detector import Detector
 from manyeyes.models.presets import COSTR_TINY
 from manyeyes.training.losses import LossConfig
 from manyeyes.training.samples import AugmentConfig, RoadConfig, Sample, View, make_sample
-from manyeyes.training.step import PACKET_TOKENS, _arriving, _remembered, forward, loss_terms, meeting
+from manyeyes.training.step import PACKET_TOKENS, _arriving, _before, forward, loss_terms, meeting
 from manyeyes.training.targets import TargetConfig
 
 GRID: BevGrid = COSTR_TINY.grid
@@ -31,7 +31,7 @@ def detector() -> Detector:
 def sample(toy) -> Sample:
     recording = toy(agents_n=2, points_per_car=20, ground_points=60)
     moments = [recording.snapshot("toy_0", i) for i in range(4)]
-    return make_sample(moments, 0, GRID, AugmentConfig.none(), ("step",), RoadConfig(past=2))
+    return make_sample(moments, 0, GRID, AugmentConfig.none(), ("step",), RoadConfig(past=2, said=1))
 
 
 def limited(sample: Sample, keep: int | None = None, lost: float = 0.0) -> Sample:
@@ -112,18 +112,31 @@ def test_selection_passes_its_gradient_straight_through_and_changes_no_value(det
 
 def test_the_past_is_looked_at_and_no_gradient_reaches_it(detector, sample):
     model = detector.eval()
-    remembered = _remembered(model, [sample], 0.0)
-    assert remembered is not None and len(remembered.features) > 40
-    assert not remembered.features.requires_grad and not remembered.proposal.requires_grad
-    assert remembered.age.unique().tolist() == pytest.approx([1.0, 2.0]) and not remembered.doubt.any()
+    past, said = (_before(model, [sample], which, 0.0) for which in ("past", "said"))
+    assert [round(part.age_s, 6) for part in past] == [0.1, 0.2] and [round(part.age_s, 6) for part in said] == [0.1]
+    assert all(len(part.told) > 20 and not part.told.requires_grad and not part.doubt_xy_m for part in past)
     with torch.no_grad():
         for weight in (model.fusion.past.out.weight, model.refine.out.weight):
             torch.nn.init.normal_(weight)
-        with_past, without = (forward(model, [s]) for s in (sample, replace(sample, past=())))
+        with_past, without, nothing_said = (
+            forward(model, [s]) for s in (sample, replace(sample, past=()), replace(sample, said=()))
+        )
         for weight in (model.fusion.past.out.weight, model.refine.out.weight):
             torch.nn.init.zeros_(weight)
     assert torch.equal(with_past.alone.columns(), without.alone.columns())
-    assert not torch.allclose(with_past.together.columns(), without.together.columns(), atol=1e-3)
+    for less in (without, nothing_said):
+        assert less.together.columns().shape != with_past.together.columns().shape or not torch.allclose(
+            with_past.together.columns(), less.together.columns(), atol=1e-3
+        )
+    detector.train()
+
+
+def test_under_a_budget_and_losses_what_was_said_before_is_cut_like_what_is_said_now(detector, sample):
+    model = detector.eval()
+    whole = _before(model, [sample], "said", 0.0)[0]
+    cut = replace(sample, said=tuple(replace(view, keep=5) for view in sample.said))
+    few = _before(model, [cut], "said", 0.0)[0]
+    assert len(few.told) == 5 < len(whole.told)
     detector.train()
 
 

@@ -21,6 +21,8 @@ LONGEST_GAP_NS = 250_000_000
 """A sweep that lies farther back than this, or one of another agent or scenario, says nothing of the motion since."""
 FASTEST_M = 30.0
 """An agent that moved farther between two sweeps did not drive there: another scenario has begun."""
+REMEMBERED = 2
+"""So many instants back what was seen takes part in what is perceived."""
 FOLLOWED = 5
 """So many instants back boxes are followed: half a second at 10 Hz, in which a vehicle hardly changes its speed."""
 OWN_M = 2.0
@@ -75,7 +77,7 @@ class Eyes:
         self.detector = detector
         self._remember, self._known, self._tracks = remember, known, tracks
         self._seen: list[tuple[AgentFrame, Sight]] = []
-        self._merged: tuple[AgentFrame, PointCloud] | None = None
+        self._merged: list[tuple[AgentFrame, PointCloud, Sight]] = []
         self.perceived: tuple[AgentFrame, SparseBev] | None = None
 
     def see(self, frame: AgentFrame) -> Sight:
@@ -110,21 +112,31 @@ class Eyes:
         ]
         return sight.moving(followed(sight.boxes, earlier, self._tracks)) if earlier else sight
 
-    def past(self, frame: AgentFrame, instants: int = 2) -> list[Part]:
-        """What the agent itself told at its last instants before this frame, newest first, for the ego 0."""
+    def before(self, frame: AgentFrame, instants: int = REMEMBERED) -> list[tuple[AgentFrame, Sight]]:
+        """What the agent saw at its last instants before this frame, newest first."""
         at = next((i for i, (known, _) in enumerate(self._seen) if known is frame), 0)
+        return self._seen[max(0, at - instants) : at][::-1]
+
+    def past(self, frame: AgentFrame, instants: int = REMEMBERED) -> list[Part]:
+        """What the agent itself told at its last instants before this frame, newest first, for the ego 0."""
         parts = []
-        for before, sight in self._seen[max(0, at - instants) : at][::-1]:
+        for before, sight in self.before(frame, instants):
             age_s = (frame.timestamp_ns - before.timestamp_ns) / 1e9
             parts.append(Part(0, sight.told.features, sight.told.sites.xy, frame.from_earlier(before), age_s))
         return parts
 
-    def earlier_merged(self, frame: AgentFrame, merged: PointCloud) -> PointCloud | None:
-        """What was merged around the agent at its last instant, moved to this one; what is merged now is kept for the next."""
-        last, self._merged = self._merged, (frame, merged)
-        if last is None or not follows(frame, last[0]):
-            return None
-        return last[1].transform(frame.from_earlier(last[0]))
+    def see_merged(self, frame: AgentFrame, merged: PointCloud) -> Sight:
+        """The view of the clouds of all agents around this one, with what was merged before."""
+        if self._merged and not follows(frame, self._merged[0][0]):
+            self._merged = []
+        earlier = self._merged[0][1].transform(frame.from_earlier(self._merged[0][0])) if self._merged else None
+        sight = self.see_cloud(merged, earlier)
+        self._merged = [(frame, merged, sight), *self._merged[:REMEMBERED]]
+        return sight
+
+    def merged_before(self) -> list[tuple[AgentFrame, Sight]]:
+        """Such views of the instants before the last, newest first."""
+        return [(frame, sight) for frame, _, sight in self._merged[1:]]
 
     def see_cloud(self, cloud: PointCloud, earlier: PointCloud | None = None) -> Sight:
         """The view of any cloud in an agent's frame, and of the one before it in the same frame; not remembered."""

@@ -46,13 +46,15 @@ class AugmentConfig:
 class RoadConfig:
     """What goes wrong, drawn anew for every sample (issue: training for the real world; detection.md 5.3).
 
-    past: instants before now that the ego looks back at. late_share: of collaborators that looked 1 … late_frames ago.
+    past: instants before now that the ego looks back at. said: messages of each collaborator before its last that the ego
+    remembers. late_share: of collaborators that looked 1 … late_frames ago.
     astray_share: of samples whose collaborators' claims are off, with deviations uniform up to xy_m and yaw_rad, each of which
     is nothing half of the time. lost_share: of collaborators that lose packets, up to lost of their tokens. few_share: of
     collaborators under a budget, which leaves them from few tokens to all, uniform in the logarithm.
     """
 
     past: int = 0
+    said: int = 0
     late_share: float = 0.0
     late_frames: int = 4
     astray_share: float = 0.0
@@ -88,11 +90,13 @@ class View:
 class Sample:
     """One ego and its collaborators: views[0] is the ego's own. past: the ego's own looks before, newest first.
 
-    union: what any of the agents lists now, in the ego's frame. key: of draws that follow.
+    said: what each collaborator looked at before, newest first, agent by agent. union: what any of the agents lists now, in the
+    ego's frame. key: of draws that follow.
     """
 
     views: tuple[View, ...]
     past: tuple[View, ...]
+    said: tuple[View, ...]
     union: Boxes
     key: tuple[int | str, ...]
 
@@ -130,7 +134,7 @@ def make_sample(
     xy_m, yaw_rad = (astray * (rng.random() < 0.5) * top * rng.random() for top in (road.xy_m, road.yaw_rad))
     if not xy_m and not yaw_rad and astray:
         xy_m = road.xy_m * rng.random()
-    views = [scene.view(0, ids[0], ego_pose)]
+    views, said = [scene.view(0, ids[0], ego_pose)], list[View]()
     if rng.random() < config.early_share:
         views = [scene.merged(ids, ego_pose, union)]
     else:
@@ -139,16 +143,19 @@ def make_sample(
             off = rng.standard_normal(3) * (xy_m, xy_m, yaw_rad)
             lost = road.lost * rng.random() * (rng.random() < road.lost_share)
             few = math.exp(rng.uniform(math.log(road.few), math.log(1500))) if rng.random() < road.few_share else None
-            view = scene.view(back, who, ego_pose, off) if scene.pose(back, who) is not None else None
-            if view is None:
-                view = scene.view(0, who, ego_pose, off)
+            back = back if scene.pose(back, who) is not None else 0
             keep = None if few is None else int(few)
-            views.append(replace(view, doubt_xy_m=xy_m, doubt_yaw_rad=yaw_rad, lost=lost, keep=keep))
+            instants = [k for k in range(back, back + 1 + road.said) if scene.pose(k, who) is not None]
+            looks = (scene.view(k, who, ego_pose, off) for k in instants)
+            told = [replace(v, doubt_xy_m=xy_m, doubt_yaw_rad=yaw_rad, lost=lost, keep=keep) for v in looks]
+            views.append(told[0])
+            said += told[1:]
     known = (k for k in range(1, road.past + 1) if scene.pose(k, ids[0]) is not None)
     past = tuple(scene.view(k, ids[0], ego_pose) for k in known) if len(views) > 1 or len(ids) == 1 else ()
     return Sample(
         tuple(_resize_view(view, scale, flip, grid) for view in views),
         tuple(_resize_view(view, scale, flip, grid) for view in past),
+        tuple(_resize_view(view, scale, flip, grid) for view in said),
         _in_range(_resize_boxes(union, scale, flip), grid),
         key,
     )
@@ -287,7 +294,7 @@ class SampleStream:
         scenarios = self.recording.scenarios
         scenario = scenarios[int(rng.integers(len(scenarios)))]
         index = int(rng.integers(self.recording.length(scenario)))
-        back = 1 + max(self.road.past, self.road.late_frames if self.road.late_share else 0)
+        back = 1 + max(self.road.past, self.road.said + (self.road.late_frames if self.road.late_share else 0))
         moments = [self.recording.snapshot(scenario, i) for i in range(max(0, index - back), index + 1)]
         ego = int(rng.integers(len(moments[-1].frames)))
         return make_sample(moments, ego, self.grid, self.augment, (self.seed, number), self.road)

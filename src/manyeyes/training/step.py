@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from torch.nn import functional
 from manyeyes.datatypes import Boxes, SparseBev
 from manyeyes.models.box_head import RawBoxes
 from manyeyes.models.detector import Detector, Seen
-from manyeyes.models.fusion.gather import Part, Tokens, gather
+from manyeyes.models.fusion.gather import Part, gather
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.window_attention import window_ids
 from manyeyes.training.information import STUDIED, WINDOW_CELLS, Meeting, Target, information_terms
@@ -63,8 +64,10 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
                 part = replace(part, told=told.features[rows], xy=xy[rows], kept=kept)
             parts.append(part)
             number += 1
-    past = _remembered(model, samples, prune_threshold)
-    return Outcome(seen, alone, model.fuse(gather(parts, told.grid, len(samples)), past), told, mask)
+    past, said = (_before(model, samples, which, prune_threshold) for which in ("past", "said"))
+    tokens = gather([*parts, *past, *said], told.grid, len(samples))
+    looked_back = gather(past, told.grid, len(samples)) if past else None
+    return Outcome(seen, alone, model.fuse(tokens, looked_back), told, mask)
 
 
 def _part(ego: int, view: View, told: Tensor, xy: Tensor) -> Part:
@@ -87,19 +90,22 @@ def _arriving(rows: Tensor, score: Tensor, view: View, key: tuple[int | str, ...
 
 
 @torch.no_grad()
-def _remembered(model: Detector, samples: list[Sample], prune_threshold: float | None) -> Tokens | None:
-    """What every ego told at its last instants, as its memory holds it: no gradient reaches the past."""
-    views = [(ego, view) for ego, sample in enumerate(samples) for view in sample.past]
-    if not views:
-        return None
-    seen = model.see([v.now for _, v in views], [v.earlier for _, v in views], prune_threshold)
+def _before(
+    model: Detector, samples: list[Sample], which: Literal["past", "said"], prune_threshold: float | None
+) -> list[Part]:
+    """What egos, or those that they hear, told at instants before, as memory holds it: no gradient reaches it."""
+    looks = [(ego, view) for ego, sample in enumerate(samples) for view in getattr(sample, which)]
+    if not looks:
+        return []
+    seen = model.see([v.now for _, v in looks], [v.earlier for _, v in looks], prune_threshold)
     told = model.tell(seen.tokens, model.look(seen.tokens))
-    batch, xy = told.sites.batch, told.sites.xy
+    score, batch, xy = model.choose(told), told.sites.batch, told.sites.xy
     parts = []
-    for number, (ego, view) in enumerate(views):
-        rows = batch == number
+    for number, (ego, view) in enumerate(looks):
+        key = (*samples[ego].key, which, number)
+        rows = _arriving((batch == number).nonzero()[:, 0], score, view, key)
         parts.append(_part(ego, view, told.features[rows], xy[rows]))
-    return gather(parts, told.grid, len(samples))
+    return parts
 
 
 def loss_terms(

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import torch
 
 from manyeyes.agents.collaboration.heading import header
-from manyeyes.agents.collaboration.intermediate import Intermediate, parts_of
+from manyeyes.agents.collaboration.intermediate import Intermediate, tokens_around
 from manyeyes.agents.eyes import Eyes, follows
 from manyeyes.datatypes import AgentFrame, Boxes, Message
-from manyeyes.models.fusion.gather import gather
 
 
 @dataclass(frozen=True)
@@ -35,11 +34,9 @@ class Fused:
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the fused tokens, which are kept to be said."""
-        own = eyes.see(frame).told
-        past = eyes.past(frame)
-        tokens = gather(parts_of(frame, own, messages), own.grid, 1)
         with torch.inference_mode():
-            fused = eyes.detector.merge(tokens, gather(past, own.grid, 1) if past else None)
+            around = tokens_around(frame, eyes.see(frame).told, eyes.past(frame), messages)
+            fused = eyes.detector.merge(*around)
             raw = eyes.detector.refine(fused.bev, fused.given)
             eyes.perceived = frame, eyes.detector.tell(fused.bev, raw)
         return eyes.decode(raw)

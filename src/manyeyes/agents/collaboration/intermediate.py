@@ -12,7 +12,7 @@ from torch import Tensor
 from manyeyes.agents.collaboration.heading import age_s, ego_from_sender, header
 from manyeyes.agents.eyes import Eyes, Sight
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
-from manyeyes.models.fusion.gather import Part, gather
+from manyeyes.models.fusion.gather import Part, Tokens, gather
 from manyeyes.models.proposal import PROPOSAL, proposed_heat
 from manyeyes.ops.keyed_random import keyed_uniform
 
@@ -48,17 +48,21 @@ class Intermediate:
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the fused tokens, with the agent's own last two instants to look back at."""
-        own = eyes.see(frame).told
-        past = eyes.past(frame)
-        tokens = gather(parts_of(frame, own, messages), own.grid, 1)
-        return eyes.decode(eyes.fuse(tokens, gather(past, own.grid, 1) if past else None))
+        return eyes.decode(eyes.fuse(*tokens_around(frame, eyes.see(frame).told, eyes.past(frame), messages)))
 
 
-def parts_of(frame: AgentFrame, own: SparseBev, messages: Sequence[Message]) -> list[Part]:
-    """The ego's own tokens and those of every message on the same lattice."""
+def tokens_around(
+    frame: AgentFrame, own: SparseBev, past: Sequence[Part], messages: Sequence[Message]
+) -> tuple[Tokens, Tokens | None]:
+    """The ego's own tokens, of now and of its past, and those of every message on the same lattice; and its own past alone.
+
+    What was seen or said a moment ago stands beside what is seen now, where its object should be by now, and weighs what its age
+    leaves of its trust (``models.fusion.settle``).
+    """
     there = [(m, m.tokens) for m in messages if m.tokens is not None and m.tokens.grid == own.grid]
     heard = [_part(frame, message, tokens.features, tokens.sites.xy) for message, tokens in there]
-    return [Part(0, own.features, own.sites.xy), *heard]
+    tokens = gather([Part(0, own.features, own.sites.xy), *heard, *past], own.grid, 1)
+    return tokens, gather(past, own.grid, 1) if past else None
 
 
 def _part(frame: AgentFrame, message: Message, told: Tensor, xy: Tensor) -> Part:

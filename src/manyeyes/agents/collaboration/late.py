@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from manyeyes.agents.collaboration.fading import SAME_IOU, faded, moved, strongest
 from manyeyes.agents.collaboration.heading import age_s, ego_from_sender, header
 from manyeyes.agents.eyes import Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, Message
-from manyeyes.ops.nms import rotated_nms
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Late:
     """nms_iou: boxes of several agents that overlap more are one object; say_above: the lowest score worth its bytes."""
 
     name: str = "late"
-    nms_iou: float = 0.15
+    nms_iou: float = SAME_IOU
     say_above: float = 0.05
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
@@ -26,11 +26,15 @@ class Late:
         return replace(header(frame, eyes.detector.fingerprint), objects=found[found.score > self.say_above])
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """All boxes in the ego's frame, each where its velocity has taken it by now, after suppression by score."""
-        heard = [
-            m.objects.after(age_s(frame, m)).transform(ego_from_sender(frame, m)).to(frame.points.xyz.dtype)
-            for m in messages
-            if m.objects is not None
-        ]
-        boxes = Boxes.cat([eyes.see(frame).boxes, *heard])
-        return boxes[rotated_nms(boxes.bev().double(), boxes.score, self.nms_iou)]
+        """All boxes in the ego's frame, each where its velocity has taken it by now, after suppression by score.
+
+        What a sender said before its newest message, and what the ego saw before, is a little less sure (``fading``).
+        """
+        newest = {m.agent_id: m.timestamp_ns for m in sorted(messages, key=lambda m: m.timestamp_ns)}
+        boxes = [eyes.see(frame).boxes, *moved(frame, eyes.before(frame))]
+        for m in messages:
+            if m.objects is not None:
+                there = m.objects.after(age_s(frame, m)).transform(ego_from_sender(frame, m))
+                behind_s = (newest[m.agent_id] - m.timestamp_ns) / 1e9
+                boxes.append(faded(there.to(frame.points.xyz.dtype), behind_s))
+        return strongest(boxes, self.nms_iou)
