@@ -113,7 +113,10 @@ class _Line:
 
 
 class _Scene:
-    """What does not depend on the claimed poses: every agent's view of the last snapshot, and its keypoints with the ego's."""
+    """What does not depend on the claimed poses: every agent's view of the last snapshot, and its keypoints with the ego's.
+
+    Of the others nothing is remembered: each would stand where another correction put it.
+    """
 
     def __init__(self, branch: Branch, snapshots: Sequence[Snapshot]) -> None:
         self.branch = branch
@@ -122,8 +125,7 @@ class _Scene:
         for snapshot in snapshots:
             sights = [eyes[frame.agent_id].see(frame) for frame in snapshot.frames]
         self.ego_eyes, self.sights = eyes[snapshots[-1].frames[0].agent_id], sights
-        past = self.ego_eyes.past(snapshots[-1].frames[0])
-        self.past = gather(past, sights[0].told.grid, 1) if past else None
+        self.past = self.ego_eyes.past(snapshots[-1].frames[0])
         views = [View.of(sight.told, sight.boxes) for sight in sights]
         with torch.no_grad():
             self.points = [branch.corrector.net.describe([views[0], view]) for view in views[1:]]
@@ -141,6 +143,7 @@ class _Scene:
                 told, xy = sight.told.features, sight.told.sites.xy
                 across, turn = math.sqrt(doubt[:2].mean()), math.sqrt(doubt[2])
                 parts.append(Part(0, told, xy, said.ego_from_other, 0.0, across, turn))
-        boxes = self.ego_eyes.decode(self.ego_eyes.fuse(gather(parts, own.grid, 1), self.past))
+        looked_back = gather(self.past, own.grid, 1) if self.past else None
+        boxes = self.ego_eyes.decode(self.ego_eyes.fuse(gather([*parts, *self.past], own.grid, 1), looked_back))
         apart = (boxes.center[:, 0].abs() > OWN_BODY_M[0]) | (boxes.center[:, 1].abs() > OWN_BODY_M[1])
         return boxes if frames[0].is_infrastructure else boxes[apart], answers
