@@ -77,9 +77,8 @@ def test_back_holds_each_meeting_once_and_from_the_other_side():
     shape, window = (9, 10), Window(3, 2, 1)
     key = keys(shape)
     found = parent_sites(key, shape, BATCH, 2)
-    index = neighbours(found, window.out_shape(shape), key, shape, BATCH, window)
-    table = NeighbourMap(index, len(key))
-    wanted = {(o, t, i) for o, row in enumerate(index.tolist()) for t, i in enumerate(row) if i < len(key)}
+    table = NeighbourMap(found, window.out_shape(shape), key, shape, BATCH, window)
+    wanted = {(o, t, i) for o, row in enumerate(table.index.tolist()) for t, i in enumerate(row) if i < len(key)}
     back = {(o, t, i) for i, row in enumerate(table.back.tolist()) for t, o in enumerate(row) if o < len(found)}
     assert back == wanted
     for reverse in (False, True):
@@ -92,8 +91,9 @@ def test_back_holds_each_meeting_once_and_from_the_other_side():
 
 def test_a_map_of_one_set_is_its_own_transpose_flipped():
     shape, key = (9, 10), keys((9, 10))
-    index = neighbours(key, shape, key, shape, BATCH, Window(5, 1, 4, 2))
-    symmetric, plain = NeighbourMap(index, len(key), is_symmetric=True), NeighbourMap(index, len(key))
+    symmetric, plain = (NeighbourMap(out, shape, key, shape, BATCH, Window(5, 1, 4, 2)) for out in (key, key.clone()))
+    assert symmetric.is_symmetric and not plain.is_symmetric
+    assert not NeighbourMap(key, (5, 6), key, shape, BATCH, Window(5, 1, 2, 2)).is_symmetric
     assert torch.equal(symmetric.back, plain.back)
     middle = plain.blocks(1000)[1][12]
     assert middle.tap == 12 and torch.equal(middle.source, middle.target) and len(middle.source) == len(key)
@@ -106,21 +106,17 @@ def test_a_map_of_one_set_is_its_own_transpose_flipped():
         assert all(torch.equal(a.source, b.source) and torch.equal(a.target, b.target) for a, b in zip(blocks, others))
 
 
-@pytest.mark.parametrize(("symmetric", "reverse"), [*product((False, True), repeat=2)])
-def test_sweeps_hold_the_pairs_of_the_blocks_tap_by_tap(symmetric, reverse):
+@pytest.mark.parametrize("symmetric", (False, True))
+def test_pairs_are_those_of_the_blocks_tap_by_tap(symmetric):
     shape, key, window = (9, 10), keys((9, 10)), Window(3, 1, 1) if symmetric else Window(3, 2, 1)
     out = key if symmetric else parent_sites(key, shape, BATCH, 2)
-    index = neighbours(out, window.out_shape(shape), key, shape, BATCH, window)
-    table = NeighbourMap(index, len(key), is_symmetric=symmetric)
-    found = {}
-    for tap, step, source, target, counts in table.sweeps(reverse):
-        ends = counts.cumsum()
-        assert len(source) == len(target) == ends[-1]
-        for n, end in zip(counts, ends):
-            found[tap], tap = (source[end - n : end].tolist(), target[end - n : end].tolist()), tap + step
-    assert sorted(found) == list(range(9)) and (not symmetric or found[4] == 2 * (list(range(len(key))),))
-    for block in table.blocks(1000, reverse)[1]:
-        assert found[block.tap] == (block.source.tolist(), block.target.tolist())
+    table = NeighbourMap(out, window.out_shape(shape), key, shape, BATCH, window)
+    (source, target, counts), blocks = table.pairs, {b.tap: b for b in table.blocks(1000)[1]}
+    ends = counts.cumsum()
+    assert len(source) == len(target) == ends[-1] and len(counts) == (4 if symmetric else 9)
+    for tap, (n, end) in enumerate(zip(counts, ends)):
+        assert source[end - n : end].tolist() == blocks[tap].source.tolist()
+        assert target[end - n : end].tolist() == blocks[tap].target.tolist()
 
 
 @pytest.mark.parametrize("symmetric", (False, True))
@@ -130,9 +126,14 @@ def test_compiled_loops_find_what_whole_tensors_find(monkeypatch, symmetric):
     def found() -> list[torch.Tensor]:
         key = keys(shape)
         out = key if symmetric else parent_sites(key, shape, BATCH, 2)
-        index = neighbours(out, window.out_shape(shape), key, shape, BATCH, window)
-        blocks = NeighbourMap(index, len(key), is_symmetric=symmetric).blocks(1000)[1]
-        return [out, index, *(t for b in blocks for t in (torch.tensor(b.tap), b.source, b.target))]
+        table = NeighbourMap(out, window.out_shape(shape), key, shape, BATCH, window)
+        blocks = table.blocks(1000)[1]
+        return [
+            out,
+            table.index,
+            *map(torch.from_numpy, table.pairs),
+            *(t for b in blocks for t in (torch.tensor(b.tap), b.source, b.target)),
+        ]
 
     loops = found()
     monkeypatch.setattr("manyeyes.ops.sparse_index._in_loops", lambda key: False)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from llvmlite import binding, ir
 from numba import njit, types
 from numba.core import cgutils
@@ -19,6 +20,23 @@ LANES = 16
 """Outputs come in so many at once."""
 # AVX-512 has registers for 6 x 4 sums of 16 lanes; others hold 6 x 1, in two to four registers each.
 _FOUR = bool(binding.get_host_cpu_features().get("avx512f", False))
+
+
+@njit(cache=True, nogil=True)
+def convolve(x, weight, bias, source, target, counts, is_symmetric, out):  # pragma: no cover
+    """out[target[p]] = bias + the sum of x[source[p]] @ weight[tap] over pairs p, counts (taps,) of each tap from 0 on.
+
+    is_symmetric: the middle tap leads from each row to itself, and taps behind it have the pairs of those before it, which
+    alone are given, turned round, the last tap those of the first.
+    """
+    for o in range(out.shape[0]):
+        out[o] = bias
+    if is_symmetric:
+        rows = np.arange(x.shape[0])
+        add_products(x, weight, counts.shape[0], 1, rows, rows, np.full(1, x.shape[0]), out)
+    add_products(x, weight, 0, 1, source, target, counts, out)
+    if is_symmetric:
+        add_products(x, weight, 2 * counts.shape[0], -1, target, source, counts, out)
 
 
 @njit(cache=True, nogil=True)

@@ -17,13 +17,12 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
-from manyeyes.ops.pair_loops import LANES, add_products
+from manyeyes.ops.pair_loops import LANES, convolve
 from manyeyes.ops.sparse_index import (
     NeighbourMap,
     Window,
     dilated_sites,
     distinct,
-    neighbours,
     parent_sites,
 )
 from manyeyes.ops.voxelize import segment_max, segment_mean, segment_sum
@@ -133,8 +132,7 @@ def same_sites_map(sites: Sites, kernel: int, dilation: int = 1) -> NeighbourMap
     name = ("same", kernel, dilation)
     if name not in sites.cache:
         window, shape = Window(kernel, 1, kernel // 2 * dilation, dilation), sites.grid.shape
-        index = neighbours(sites.key, shape, sites.key, shape, sites.batch_size, window)
-        sites.cache[name] = NeighbourMap(index, len(sites), is_symmetric=True)
+        sites.cache[name] = NeighbourMap(sites.key, shape, sites.key, shape, sites.batch_size, window)
     return sites.cache[name]
 
 
@@ -160,9 +158,9 @@ def _pair_map(fine: Sites, coarse: Sites, window: Window) -> NeighbourMap:
     """What the sites ``coarse`` meet among ``fine``; kept in the finer set, with the coarser that it names."""
     name = ("pair", window, id(coarse))
     if name not in fine.cache:
-        index = neighbours(coarse.key, coarse.grid.shape, fine.key, fine.grid.shape, fine.batch_size, window)
+        table = NeighbourMap(coarse.key, coarse.grid.shape, fine.key, fine.grid.shape, fine.batch_size, window)
         # Holding the coarser set keeps its id from being given to another one.
-        fine.cache[name] = (NeighbourMap(index, len(fine)), coarse)
+        fine.cache[name] = (table, coarse)
     return fine.cache[name][0]
 
 
@@ -222,10 +220,10 @@ def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, b
     """(rows, D): for each pair of a tap its row of x (N, C) times the matrix (C, D) of the tap, summed where it leads."""
     bias = x.new_zeros(taps.shape[2]) if bias is None else bias.to(x.dtype)
     if _in_loops(x, taps):
-        out = bias.expand(table.rows(reverse), -1).contiguous()
-        rows, matrices, sums = x.contiguous().numpy(), taps.contiguous().numpy(), out.numpy()
-        for tap, step, source, target, counts in table.sweeps(reverse):
-            add_products(rows, matrices, tap, step, source, target, counts, sums)
+        (source, target, counts), out = table.pairs, x.new_empty(table.rows(reverse), taps.shape[2])
+        source, target = (target, source) if reverse else (source, target)
+        arrays = (t.contiguous().numpy() for t in (x, taps, bias))
+        convolve(*arrays, source, target, counts, table.is_symmetric, out.numpy())
         return out
     # Every site meets itself by the middle tap: no gathering there.
     out = (
@@ -250,7 +248,7 @@ def _in_loops(x: Tensor, taps: Tensor) -> bool:
 
 def _pair_outer(x: Tensor, dy: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
     """(taps, C, D): for each tap the sum over its pairs of the row of x (N, C), transposed, times the row of dy (M, D)."""
-    dw = x.new_zeros(table.index.shape[1], x.shape[1], dy.shape[1])
+    dw = x.new_zeros(table.window.kernel**2, x.shape[1], dy.shape[1])
     if table.is_symmetric:
         torch.mm(x.T, dy, out=dw[dw.shape[0] // 2])
     longest, blocks = table.blocks(_block_rows(x), reverse)
@@ -280,7 +278,7 @@ class _GatherMax(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, table: NeighbourMap) -> Tensor:
-        padded, out = _padded(x, -torch.inf), x.new_full((table.index.shape[0], x.shape[1]), -torch.inf)
+        padded, out = _padded(x, -torch.inf), x.new_full((table.n_out, x.shape[1]), -torch.inf)
         for rows, index in _row_blocks(table.index, x):
             for tap in index:
                 torch.maximum(out[rows], padded.index_select(0, tap), out=out[rows])

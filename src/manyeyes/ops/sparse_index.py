@@ -9,7 +9,7 @@ output o meets input ``i = o * stride - padding + t * dilation``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 from typing import NamedTuple
@@ -29,6 +29,11 @@ class Window(NamedTuple):
     padding: int = 0
     dilation: int = 1
 
+    @property
+    def is_centred(self) -> bool:
+        """The middle tap of an output lies on the input of the same place."""
+        return self.stride == 1 and 2 * self.padding == self.dilation * (self.kernel - 1) and self.kernel % 2 == 1
+
     def out_shape(self, shape: tuple[int, int]) -> tuple[int, int]:
         """Rows and columns of the output of a convolution."""
         rows, columns = (
@@ -37,14 +42,12 @@ class Window(NamedTuple):
         return max(rows, 0), max(columns, 0)
 
 
-class Sweep(NamedTuple):
-    """Pairs of consecutive taps, from tap on by step (1 or -1), counts (taps,) of each: int64, in the CPU's memory.
+class Pairs(NamedTuple):
+    """Rows source (P,) that lead to rows target (P,), tap by tap, counts (taps,) of each: int64, in the CPU's memory.
 
-    Rows source (P,) lead to rows target (P,); within a tap no row stands twice on either side.
+    Within a tap no row stands twice on either side. Of a symmetric map, taps before the middle alone.
     """
 
-    tap: int
-    step: int
     source: NDArray[np.int64]
     target: NDArray[np.int64]
     counts: NDArray[np.int64]
@@ -61,21 +64,40 @@ class Block(NamedTuple):
 
 @dataclass(eq=False)
 class NeighbourMap:
-    """index: (outputs, taps) int32, see the module; n_in: how many inputs there are.
+    """Which of the sites out_key (outputs,) meet which of in_key (inputs,) through a window; found when first asked for."""
 
-    is_symmetric: inputs and outputs are one set, so that the middle tap leads from each row to itself.
-    """
-
-    index: Tensor
-    n_in: int
-    is_symmetric: bool = False
+    out_key: Tensor
+    out_shape: tuple[int, int]
+    in_key: Tensor
+    in_shape: tuple[int, int]
+    batch_size: int
+    window: Window
     moved: dict[torch.device, NeighbourMap] = field(default_factory=dict, repr=False)
     cut: dict[tuple[int, bool], tuple[int, tuple[Block, ...]]] = field(default_factory=dict, repr=False)
-    swept: dict[bool, tuple[Sweep, ...]] = field(default_factory=dict, repr=False)
+
+    @property
+    def n_in(self) -> int:
+        """How many inputs there are."""
+        return self.in_key.shape[0]
+
+    @property
+    def n_out(self) -> int:
+        """How many outputs there are."""
+        return self.out_key.shape[0]
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Inputs and outputs are one set, so that the middle tap leads from each row to itself."""
+        return self.out_key is self.in_key and self.window.is_centred
 
     def rows(self, reverse: bool) -> int:
         """How many rows pairs lead to: outputs, or inputs when they are turned round."""
-        return self.n_in if reverse else self.index.shape[0]
+        return self.n_in if reverse else self.n_out
+
+    @cached_property
+    def index(self) -> Tensor:
+        """(outputs, taps) int32, see the module."""
+        return neighbours(self.out_key, self.out_shape, self.in_key, self.in_shape, self.batch_size, self.window)
 
     @cached_property
     def back(self) -> Tensor:
@@ -89,37 +111,35 @@ class NeighbourMap:
         back.scatter_(0, self.index.long(), rows[:, None].expand(n_out, taps))
         return back[: self.n_in].contiguous()
 
+    @property
+    def _taps(self) -> int:
+        """Of how many taps pairs are kept: where the map is symmetric, those behind the middle have them turned round."""
+        return self.window.kernel**2 // 2 if self.is_symmetric else self.window.kernel**2
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """Which inputs lead to which outputs, on the CPU."""
+        if _in_loops(self.in_key):
+            kernel, stride, padding, dilation = self.window
+            rows, columns = _bordered(self.out_shape, self.in_shape, self.window)
+            image = np.full(self.batch_size * rows * columns, self.n_in, np.int32)
+            _place(self.in_key.numpy(), *self.in_shape, rows, columns, padding, image)
+            first, counts = np.empty(self.n_out, np.int32), np.empty(self._taps, np.int64)
+            _place_first(self.out_key.numpy(), *self.out_shape, rows, columns, stride, first)
+            source, target = (np.empty(self._taps * self.n_out + 1, np.int64) for _ in range(2))
+            met = _meet(image, first, columns * dilation, dilation, kernel, self.n_in, source, target, counts)
+            return Pairs(source[:met], target[:met], counts)
+        return Pairs(*(part.numpy() for part in self._met))
+
     @cached_property
     def _met(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Tap by tap, which input (P,) leads to which output (P,), and how many pairs each tap (taps,) has, all int64.
-
-        Where the map is symmetric, taps before the middle alone: those behind it have the same pairs turned round.
-        """
-        taps = self.index.shape[1] // 2 if self.is_symmetric else self.index.shape[1]
-        if _in_loops(self.index):
-            counts = np.zeros(taps, np.int64)
-            source, target = map(torch.from_numpy, _pairs_by_tap(self.index.numpy(), self.n_in, counts))
-            return source, target, torch.from_numpy(counts)
-        by_tap = self.index[:, :taps].T.contiguous()
+        """The same as tensors, on the device of the sites."""
+        if _in_loops(self.in_key):
+            source, target, counts = map(torch.from_numpy, self.pairs)
+            return source, target, counts
+        by_tap = self.index[:, : self._taps].T.contiguous()
         met = by_tap < self.n_in
         return by_tap[met].long(), met.nonzero()[:, 1], met.sum(1)
-
-    def sweeps(self, reverse: bool = False) -> tuple[Sweep, ...]:
-        """The pairs of all taps, from inputs to outputs, or turned round; found once and kept.
-
-        A symmetric map has three: its middle tap leads from each row to itself, and taps behind the middle have the pairs of
-        those before it turned round, the last tap those of the first.
-        """
-        if reverse not in self.swept:
-            source, target, counts = (t.numpy(force=True) for t in self._met)
-            a, b = (target, source) if reverse else (source, target)
-            found, last = [Sweep(0, 1, a, b, counts)], self.index.shape[1] - 1
-            if self.is_symmetric:
-                rows = np.arange(self.n_in)
-                middle = Sweep(last // 2, 1, rows, rows, np.array([self.n_in]))
-                found = [middle, *found, Sweep(last, -1, b, a, counts)]
-            self.swept[reverse] = tuple(found)
-        return self.swept[reverse]
 
     def _cut(self, rows: int) -> list[Block]:
         """The pairs of every tap, from inputs to outputs, in blocks of so many rows at most, as views."""
@@ -129,7 +149,7 @@ class NeighbourMap:
         parts = zip(sizes, source.split(lengths), target.split(lengths))
         blocks = [Block(tap, some, others, size) for (tap, size), some, others in parts]
         if self.is_symmetric:
-            last = self.index.shape[1] - 1
+            last = self.window.kernel**2 - 1
             turned = (Block(last - b.tap, b.target, b.source, b.size) for b in blocks)
             # Within a tap inputs ascend as outputs do: the blocks of a tap turned round stand in the same order.
             blocks += sorted(turned, key=lambda block: block.tap)
@@ -146,10 +166,12 @@ class NeighbourMap:
 
     def on(self, device: torch.device) -> NeighbourMap:
         """The same map on another device; kept."""
-        if device == self.index.device:
+        if device == self.in_key.device:
             return self
         if device not in self.moved:
-            self.moved[device] = NeighbourMap(self.index.to(device), self.n_in, self.is_symmetric)
+            in_key = self.in_key.to(device)
+            out_key = in_key if self.out_key is self.in_key else self.out_key.to(device)
+            self.moved[device] = replace(self, out_key=out_key, in_key=in_key, moved={}, cut={})
         return self.moved[device]
 
 
@@ -192,9 +214,9 @@ def parent_sites(key: Tensor, shape: tuple[int, int], batch_size: int, stride: i
     """Keys of the cells ``floor(i / stride)`` of active cells i, on a grid of ceil(shape / stride)."""
     rows, columns = -(-shape[0] // stride), -(-shape[1] // stride)
     if _in_loops(key):
-        marked = np.zeros(batch_size * rows * columns, np.bool_)
-        _mark_parents(key.numpy(), shape[0], shape[1], rows, columns, stride, marked)
-        return torch.from_numpy(np.flatnonzero(marked))
+        marks = np.zeros(batch_size * rows * columns // 8 * 8 + 8, np.uint8)
+        _mark_parents(key.numpy(), *shape, rows, columns, stride, marks)
+        return torch.from_numpy(mark_ranks(marks)[0])
     batch, y, x = split(key, shape)
     y, x = y.div(stride, rounding_mode="floor"), x.div(stride, rounding_mode="floor")
     return distinct((batch * rows + y) * columns + x, batch_size * rows * columns)[0]
@@ -214,17 +236,8 @@ def neighbours(
     wrap from the last column to the next row.
     """
     kernel, stride, padding, dilation = window
-    reach = dilation * (kernel - 1)
-    rows, columns = (
-        padding + max(n, (o - 1) * stride - padding + reach + 1) for o, n in zip(out_shape, in_shape, strict=True)
-    )
+    rows, columns = _bordered(out_shape, in_shape, window)
     device, n_in = in_key.device, in_key.shape[0]
-    if _in_loops(in_key):
-        index = np.empty((out_key.shape[0], kernel * kernel), np.int32)
-        image = np.full(batch_size * rows * columns, n_in, np.int32)
-        _place(in_key.numpy(), in_shape[0], in_shape[1], rows, columns, padding, image)
-        _look_up(out_key.numpy(), out_shape[0], out_shape[1], rows, columns, stride, kernel, dilation, image, index)
-        return torch.from_numpy(index)
     image = torch.full((batch_size * rows * columns,), n_in, dtype=torch.int32, device=device)
     batch, y, x = split(in_key, in_shape)
     image[(batch * rows + y + padding) * columns + x + padding] = torch.arange(n_in, dtype=torch.int32, device=device)
@@ -234,6 +247,16 @@ def neighbours(
     step = torch.arange(kernel, device=device) * dilation
     taps = (step[:, None] * columns + step).flatten()
     return image.index_select(0, (first[:, None] + taps).flatten()).view(first.shape[0], kernel * kernel)
+
+
+def _bordered(out_shape: tuple[int, int], in_shape: tuple[int, int], window: Window) -> tuple[int, int]:
+    """Rows and columns of an index image with a border that no tap leaves."""
+    kernel, stride, padding, dilation = window
+    reach = dilation * (kernel - 1)
+    rows, columns = (
+        padding + max(n, (o - 1) * stride - padding + reach + 1) for o, n in zip(out_shape, in_shape, strict=True)
+    )
+    return rows, columns
 
 
 def _in_loops(key: Tensor) -> bool:
@@ -270,44 +293,54 @@ def _distinct(key, marks):  # pragma: no cover
     return found, row
 
 
-@njit(cache=True)
-def _mark_parents(key, in_rows, in_columns, rows, columns, stride, marked):  # pragma: no cover
+@njit(cache=True, nogil=True)
+def _mark_parents(key, in_rows, in_columns, rows, columns, stride, marks):  # pragma: no cover
+    start, end, first = 0, 0, 0
     for k in key:
-        line = k // in_columns
-        batch = line // in_rows
-        marked[(batch * rows + (line - batch * in_rows) // stride) * columns + (k - line * in_columns) // stride] = True
+        if k >= end:
+            line = k // in_columns
+            start, end, batch = line * in_columns, (line + 1) * in_columns, line // in_rows
+            first = (batch * rows + (line - batch * in_rows) // stride) * columns
+        marks[first + (k - start) // stride] = 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _place(key, in_rows, in_columns, rows, columns, padding, image):  # pragma: no cover
+    """The number of each of ascending keys, at its place in an image of rows and columns with a border."""
+    end, shift = 0, 0
     for i in range(key.shape[0]):
-        line = key[i] // in_columns
-        batch = line // in_rows
-        y, x = line - batch * in_rows + padding, key[i] - line * in_columns + padding
-        image[(batch * rows + y) * columns + x] = i
+        if key[i] >= end:
+            line = key[i] // in_columns
+            end, batch = (line + 1) * in_columns, line // in_rows
+            shift = (batch * rows + line - batch * in_rows + padding) * columns + padding - line * in_columns
+        image[key[i] + shift] = i
 
 
-@njit(cache=True)
-def _look_up(key, out_rows, out_columns, rows, columns, stride, kernel, dilation, image, index):  # pragma: no cover
+@njit(cache=True, nogil=True)
+def _place_first(key, out_rows, out_columns, rows, columns, stride, first):  # pragma: no cover
+    """Where in such an image the first tap of each of ascending keys lies."""
+    end, shift = 0, 0
     for o in range(key.shape[0]):
-        line = key[o] // out_columns
-        batch = line // out_rows
-        first = (batch * rows + (line - batch * out_rows) * stride) * columns + (key[o] - line * out_columns) * stride
-        for ty in range(kernel):
-            for tx in range(kernel):
-                index[o, ty * kernel + tx] = image[first + (ty * columns + tx) * dilation]
+        if key[o] >= end:
+            line = key[o] // out_columns
+            end, batch = (line + 1) * out_columns, line // out_rows
+            shift = (batch * rows + (line - batch * out_rows) * stride) * columns - line * out_columns * stride
+        first[o] = key[o] * stride + shift
 
 
-@njit(cache=True)
-def _pairs_by_tap(index, n_in, counts):  # pragma: no cover
-    """Rows source and target, (P,) int64 each, of the first taps, tap by tap; counts (taps,), zeros, is filled."""
-    for o in range(index.shape[0]):
-        for t in range(counts.shape[0]):
-            counts[t] += index[o, t] < n_in
-    # One place to spare: writing always and moving on only past a pair costs no branch that is guessed wrong.
-    source, target, at = np.empty(counts.sum() + 1, np.int64), np.empty(counts.sum() + 1, np.int64), 0
+@njit(cache=True, nogil=True)
+def _meet(image, first, down, across, kernel, n_in, source, target, counts):  # pragma: no cover
+    """Fills rows source and target of pairs, tap by tap, and counts (taps,); how many pairs there are.
+
+    down, across: from a tap to the one below it and beside it.
+    """
+    at = 0
     for t in range(counts.shape[0]):
-        for o in range(index.shape[0]):
-            source[at], target[at] = index[o, t], o
-            at += index[o, t] < n_in
-    return source[:at], target[:at]
+        step, before = t // kernel * down + t % kernel * across, at
+        # Writing always and moving on only past a pair costs no branch that is guessed wrong.
+        for o in range(first.shape[0]):
+            found = image[first[o] + step]
+            source[at], target[at] = found, o
+            at += found < n_in
+        counts[t] = at - before
+    return at
