@@ -9,9 +9,12 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, PointCloud, Snapshot, Transform, Truth
 from manyeyes.models.detector import Detector
 from manyeyes.models.layers import ActiveNorm
+from manyeyes.models.map_bev import BevConfig
+from manyeyes.models.map_head import MapHeadConfig
+from manyeyes.models.mapper import Mapper, MapperConfig
 from manyeyes.models.presets import COSTR_TINY
 from manyeyes.training.samples import AugmentConfig, RoadConfig, make_sample
 from manyeyes.training.step import forward
@@ -99,3 +102,22 @@ def tiny_detector() -> Detector:
 @pytest.fixture(scope="session")
 def detector() -> Detector:
     return tiny_detector()
+
+
+TINY_MAPPER = MapperConfig(
+    BevConfig(BevGrid(-8.0, -8.0, -2.0, 8.0, 8.0, 4.0, pillar=0.5), channels=16, raster_width=8, raster_blocks=(1, 1)),
+    BevGrid(-16.0, -8.0, -1.0, 16.0, 8.0, 1.0, pillar=1.0),
+    token_channels=8,
+    neck=(1, 1),
+    head=MapHeadConfig(elements=6, points=5, channels=16, feed=32, layers=2, heads=4, threshold=0.0),
+)
+"""Looks of 16 m by 16 m, tiles of 32 m by 16 m; no guess is too unsure to be drawn."""
+
+
+@pytest.fixture(scope="session")
+def mapper() -> Mapper:
+    """A map model that has learnt nothing."""
+    torch.manual_seed(0)
+    model = Mapper(TINY_MAPPER).eval().requires_grad_(False)
+    model.fingerprint = bytes(range(8))
+    return model

@@ -5,31 +5,14 @@ import dataclasses
 import math
 
 import numpy as np
-import pytest
 import torch
 
 from manyeyes.agents.mapping import draw_tile, receive, share_look
-from manyeyes.datatypes import AgentFrame, BevGrid, PointCloud, Transform
-from manyeyes.models.map_bev import BevConfig
-from manyeyes.models.map_head import MapHeadConfig, decode
-from manyeyes.models.mapper import Mapper, MapperConfig
+from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Transform
+from manyeyes.models.map_head import decode
+from manyeyes.models.mapper import Mapper
 
-CONFIG = MapperConfig(
-    BevConfig(BevGrid(-8.0, -8.0, -2.0, 8.0, 8.0, 4.0, pillar=0.5), channels=16, raster_width=8, raster_blocks=(1, 1)),
-    BevGrid(-16.0, -8.0, -1.0, 16.0, 8.0, 1.0, pillar=1.0),
-    token_channels=8,
-    neck=(1, 1),
-    head=MapHeadConfig(elements=6, points=5, channels=16, feed=32, layers=2, heads=4, threshold=0.0),
-)
 PLACE = Transform.from_xyz_yaw(1000.0, -200.0, 0.0, 0.4)
-
-
-@pytest.fixture(scope="module")
-def mapper():
-    torch.manual_seed(0)
-    model = Mapper(CONFIG).eval().requires_grad_(False)
-    model.fingerprint = bytes(range(8))
-    return model
 
 
 def frame(agent, x=0.0, yaw=0.0, points=200):
@@ -48,7 +31,7 @@ def test_full_precision_through_bytes_is_the_model_itself(mapper):
     look = mapper.see([f.points for f in frames])
     motion = Transform.stack([PLACE.inverse() @ f.world_from_agent for f in frames])
     raw = mapper.draw(mapper.fuse(look.tokens, motion, torch.zeros(2, dtype=torch.int64), 1))[-1]
-    here = decode(raw, CONFIG.tile, CONFIG.head)[0]
+    here = decode(raw, mapper.config.tile, mapper.config.head)[0]
     np.testing.assert_allclose(there.score, here.score, atol=1e-4)
     np.testing.assert_array_equal(there.kind, here.kind)
     np.testing.assert_allclose(there.points, here.points, atol=1e-2)
@@ -81,7 +64,7 @@ def test_who_sees_nothing_says_nothing_and_a_tile_of_no_looks_is_drawn_from_noth
 
 
 def test_tokens_of_other_weights_are_not_understood(mapper):
-    other = Mapper(CONFIG).eval()
+    other = Mapper(mapper.config).eval()
     other.fingerprint = b"another!"
     assert receive(share_look(mapper, frame(1)), other) is None
 
@@ -90,3 +73,11 @@ def test_moved_poses_move_the_look(mapper):
     one = frame(1)
     moved = dataclasses.replace(one, world_from_agent=one.world_from_agent @ Transform.from_xyz_yaw(6.0, 0, 0, 0))
     assert not np.allclose(drawn(mapper, [one]).score, drawn(mapper, [moved]).score, atol=1e-5)
+
+
+def test_what_an_agent_detects_travels_with_its_look(mapper):
+    car = Boxes.of(torch.tensor([[4.0, 1.0, 0.8]]), torch.tensor([[4.5, 1.9, 1.6]]), torch.tensor([0.3]))
+    alone, both = (receive(share_look(mapper, frame(1), objects=o), mapper) for o in (None, car))
+    assert alone is not None and alone.objects is None and both is not None and both.objects is not None
+    np.testing.assert_allclose(both.objects.center.numpy(), car.center.numpy(), atol=0.05)
+    assert np.array_equal(draw_tile(mapper, [alone], PLACE).score, draw_tile(mapper, [both], PLACE).score)

@@ -16,32 +16,14 @@ from manyeyes.agents.map_team import MapTeam
 from manyeyes.agents.mapping import receive, share_look
 from manyeyes.agents.surveyor import SURVEYS, SurveyConfig, Surveyor, rectangle, said, survey_config
 from manyeyes.comms.inbox import Inbox
-from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, PointCloud, Transform
+from manyeyes.datatypes import AgentFrame, ConfigError, PointCloud, Transform
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.datatypes.message import SeenMap
-from manyeyes.models.map_bev import BevConfig
-from manyeyes.models.map_head import MapHeadConfig
-from manyeyes.models.mapper import Mapper, MapperConfig
 from manyeyes.ops.clip import clip_ring, ring_area
 
-CONFIG = MapperConfig(
-    BevConfig(BevGrid(-8.0, -8.0, -2.0, 8.0, 8.0, 4.0, pillar=0.5), channels=16, raster_width=8, raster_blocks=(1, 1)),
-    BevGrid(-16.0, -8.0, -1.0, 16.0, 8.0, 1.0, pillar=1.0),
-    token_channels=8,
-    neck=(1, 1),
-    head=MapHeadConfig(elements=6, points=5, channels=16, feed=32, layers=2, heads=4, threshold=0.0),
-)
 PLACE = Transform.from_xyz_yaw(1000.0, -200.0, 0.0, 0.4)
 TILE = (-16.0, -8.0, 16.0, 8.0)
 ALL = SurveyConfig(TILE, TILE, together=True, least_score=0.0, least_m=0.1, least_m2=0.1)
-
-
-@pytest.fixture(scope="module")
-def mapper():
-    torch.manual_seed(0)
-    model = Mapper(CONFIG).eval().requires_grad_(False)
-    model.fingerprint = bytes(range(8))
-    return model
 
 
 def frame(agent, x=0.0, yaw=0.0, points=200, time_ns=0):

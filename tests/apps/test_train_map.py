@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verb train on a map preset: from a simulated recording of generated towns to weights that draw tiles."""
 
-import subprocess
-import sys
+import json
 from pathlib import Path
 
 import pytest
 
-from manyeyes.apps import train
+from manyeyes.apps import cli, train
 from manyeyes.apps.train_map import true_maps
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import ConfigError
@@ -15,8 +14,6 @@ from manyeyes.models import checkpoint
 from manyeyes.models.map_presets import FORMAT
 from manyeyes.models.mapper import Mapper, MapperConfig
 from manyeyes.simulator.presets import simulate
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +24,7 @@ def recorded(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_train_then_judge(recorded, tmp_path):
+def test_train_then_judge(recorded, tmp_path, capsys):
     out = tmp_path / "run"
     train.main(train.Options(recorded, preset="map-toy", out=out, steps=2, batch=1))
     weights = out / "weights.safetensors"
@@ -35,21 +32,13 @@ def test_train_then_judge(recorded, tmp_path):
     assert model.config.tile.x_max == 60.0 and (out / "loss.png").exists() and (out / "train.json").exists()
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["generated-1"] and card["command"]
-    table = subprocess.run(
-        [sys.executable, "benchmarks/map_tiles.py", "--weights", weights, "--data", recorded, "--looks", "1", "2"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    assert table.count("maptr_mAP") == 2
-    again = subprocess.run(
-        [sys.executable, "benchmarks/map_tiles.py", "--weights", weights, "--data", recorded, "--split", "train"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    assert again.returncode and "Split by place" in again.stderr
+    study = ("map", "evaluate", "--study", "semi-global", "--data", recorded, "--weights", weights, "--workers", 1)
+    common = [str(word) for word in (*study, "--seeds", 1, "--every", 2, "--out", tmp_path / "study")]
+    assert cli.main(common) == 0
+    rows = json.loads((tmp_path / "study" / "semi-global.json").read_text())["result"]["rows"]["LiDAR"]
+    assert [row["row"] for row in rows] == ["1", "2", "5", "10"] and (tmp_path / "study" / "semi-global.png").exists()
+    assert cli.main([*common, "--split", "train"]) == 1
+    assert "Split by place" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ import torch
 from manyeyes.comms import wire
 from manyeyes.comms.select import within_budget
 from manyeyes.comms.wire import Precision
-from manyeyes.datatypes import AgentFrame, Message, Sites, SparseBev, Transform
+from manyeyes.datatypes import AgentFrame, Boxes, Message, Sites, SparseBev, Transform
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.models.map_head import decode
 from manyeyes.models.mapper import Mapper
@@ -23,9 +23,16 @@ DEFAULT_BUDGET = 1 << 17
 
 
 def share_look(
-    mapper: Mapper, frame: AgentFrame, precision: Precision = "int8", budget_bytes: int | None = DEFAULT_BUDGET
+    mapper: Mapper,
+    frame: AgentFrame,
+    precision: Precision = "int8",
+    budget_bytes: int | None = DEFAULT_BUDGET,
+    objects: Boxes | None = None,
 ) -> list[bytes]:
-    """The packets that one look is worth, cells that most likely hold an element first; none if nothing was seen."""
+    """The packets that one look is worth, cells that most likely hold an element first; none if nothing was seen.
+
+    objects: what the agent detected in its frame, for those who correct claimed poses by what both see; not in the budget.
+    """
     sensors = mapper.config.bev.sensors
     with torch.inference_mode():
         look = mapper.see([frame.points] if "lidar" in sensors else (), [frame.images] if "camera" in sensors else ())
@@ -41,6 +48,7 @@ def share_look(
         frame.is_infrastructure,
         tokens=tokens,
         token_score=worth,
+        objects=objects,
     )
     return wire.encode(message, precision=precision)
 

@@ -3,6 +3,8 @@
 
 Studies: fusion (four places that nothing was tuned on), noise (pose errors of 0 to 1.5 m), table3 (the CrowdMap paper's Table 3
 as a study), malicious (do liars move what honest agents saw), tuning (all methods with the same budget, on other places).
+Of the map model, on a recording of towns that it was not taught by: local, semi-global and whole (that paper's Tables 1 to 3, from
+sensors), pose (tiles under errors of claimed poses, and behind their corrector).
 """
 
 from __future__ import annotations
@@ -13,12 +15,13 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from manyeyes.apps.map_model import MODEL_STUDIES
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-STUDIES = ("fusion", "noise", "table3", "malicious", "tuning")
+STUDIES = ("fusion", "noise", "table3", "malicious", "tuning", *MODEL_STUDIES)
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class Options:
     truth: Path | None = None
     """A map's folder with the truth; 'truth' beside the map is found by itself."""
     study: str | None = None
-    """fusion, noise, table3, malicious or tuning."""
+    """fusion, noise, table3, malicious or tuning; of the map model local, semi-global, whole or pose."""
     places: tuple[str, ...] = ()
     """Only these places of a study."""
     counts: tuple[int, ...] = ()
@@ -43,6 +46,16 @@ class Options:
     """Add the oracle rows to a study: truth cut again, true poses, known association."""
     workers: int = 2
     """Processes that share a study; results do not depend on it."""
+    data: Path | None = None
+    """Of the map model's studies: a dataset of towns, as 'manyeyes simulate' leaves one."""
+    split: str = "test"
+    """Which split of it: towns that did not teach."""
+    weights: tuple[str, ...] = ()
+    """Map models, one a set of sensors: shipped names or .safetensors files; by default all that ship."""
+    every: int = 1
+    """Only every n-th scenario of it."""
+    align: str = "vote"
+    """Who corrects claimed poses in the study 'pose', by name."""
     out: Path = Path("out/map-study")
     """Folder for a study: cells are kept there, and a study that was stopped goes on."""
 
@@ -58,6 +71,11 @@ def main(options: Options) -> None:
     console = Console()
     if options.folder is not None:
         _judge_one(options, options.folder, console)
+        return
+    if options.study in MODEL_STUDIES:
+        from manyeyes.apps.map_model import model_study
+
+        model_study(options, console)
         return
     from manyeyes.apps.map_studies import study
 

@@ -8,21 +8,16 @@ rings too, and stay rings; parts of lines below 2 m and of rings below 3 m² are
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.agents.mapping import DEFAULT_BUDGET, draw_tile, receive, share_look
-from manyeyes.comms.wire import Precision
-from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, MissingExtraError, Transform
 from manyeyes.datatypes.map_element import CROSSING, MapElements
-from manyeyes.evaluation.map_quality import MapQuality, judge
 from manyeyes.evaluation.observed import SHORTEST_PART_M, with_geometry
-from manyeyes.models.mapper import LOOKS, Mapper
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -68,7 +63,7 @@ def assert_split(taught: Sequence[str], judged: Sequence[str]) -> None:
 def cut_to(truth: MapElements, world_from_tile: Transform, tile: BevGrid) -> MapElements:
     """What of the elements (world) lies in the tile, in the tile's frame."""
     shapely = _shapely()
-    x, y, yaw = _planar(world_from_tile.inverse())
+    x, y, yaw = planar(world_from_tile.inverse())
     local = truth.transform(x, y, yaw)
     box = shapely.box(tile.x_min, tile.y_min, tile.x_max, tile.y_max)
     rows: list[int] = []
@@ -91,7 +86,7 @@ def met_by(elements: MapElements, tile_from_look: Sequence[Transform], view: Bev
     )
     placed = []
     for motion in tile_from_look:
-        x, y, yaw = _planar(motion)
+        x, y, yaw = planar(motion)
         c, s = np.cos(yaw), np.sin(yaw)
         placed.append(shapely.polygons(corners @ np.array([[c, s], [-s, c]]) + [x, y]))
     area = shapely.union_all(placed)
@@ -100,70 +95,6 @@ def met_by(elements: MapElements, tile_from_look: Sequence[Transform], view: Bev
         line = shapely.linestrings(elements.polyline(row))
         kept[row] = shapely.length(shapely.intersection(line, area)) >= MET_SHARE * shapely.length(line)
     return elements.take(kept)
-
-
-def tiles_of(
-    recording: Recording, maps: Mapping[str, MapElements], tile: BevGrid, looks: int = LOOKS, every: int = 1
-) -> list[Tile]:
-    """One tile a scenario (or every n-th): about its first agent, along that agent's heading, at its first judged frame.
-
-    maps: the truth of each town, in its world frame. The first look is that agent's, then come those of the others in order,
-    then all agents again at later frames, so that a smaller number of looks takes the first of them.
-    """
-    found = []
-    for scenario in recording.scenarios[::every]:
-        judged = recording.judged(scenario)
-        snapshot = recording.snapshot(scenario, judged[0])
-        own = snapshot.frames[0]
-        x, y, yaw = _planar(own.world_from_agent)
-        world_from_tile = Transform.from_xyz_yaw(x, y, 0.0, yaw)
-        frames = list(snapshot.frames)
-        # Instants as far apart as there are: a second look from the same place adds little.
-        steps = max(1, -(-looks // len(frames)))
-        for index in np.unique(np.linspace(judged[0], judged[-1], steps + 1).round().astype(int)).tolist()[1:]:
-            frames += recording.snapshot(scenario, index).frames
-        truth = cut_to(maps[town_of(scenario, tuple(maps))], world_from_tile, tile)
-        found.append(Tile(scenario, world_from_tile, tuple(frames[:looks]), truth))
-    return found
-
-
-@dataclass(frozen=True)
-class TileScore:
-    """What a map model drew on a set of tiles from at most ``looks`` looks each.
-
-    quality: of all tiles together, predictions ranked as one list. bytes_per_look: mean over messages that said anything.
-    """
-
-    looks: int
-    quality: MapQuality
-    kinds: tuple[str, ...]
-    messages: int
-    bytes_per_look: float
-
-    def mean_ap(self, way: str = "maptr") -> float:
-        """mAP over those of the model's kinds that have truth."""
-        return self.quality.mean_ap(way, kinds=self.kinds)
-
-
-def judge_tiles(
-    mapper: Mapper,
-    tiles: Sequence[Tile],
-    looks: int = LOOKS,
-    precision: Precision = "int8",
-    budget_bytes: int | None = DEFAULT_BUDGET,
-    ways: Sequence[str] = ("maptr", "exact"),
-) -> TileScore:
-    """Draw every tile from its first looks, each shared as packets and received again, and judge all as one set."""
-    drawn, truth, sizes = [], [], []
-    for tile in tiles:
-        packets = [share_look(mapper, frame, precision, budget_bytes) for frame in tile.looks[:looks]]
-        sizes += [sum(map(len, one)) for one in packets if one]
-        messages = [message for one in packets if (message := receive(one, mapper)) is not None]
-        drawn.append(draw_tile(mapper, messages, tile.world_from_tile))
-        truth.append(tile.truth)
-    kinds = mapper.config.head.kinds
-    quality = judge(side_by_side(drawn), side_by_side(truth), ways, kinds)
-    return TileScore(looks, quality, kinds, len(sizes), sum(sizes) / max(1, len(sizes)))
 
 
 def side_by_side(maps: Sequence[MapElements]) -> MapElements:
@@ -182,7 +113,8 @@ def _inside(points: Floats, ring: bool, box: BaseGeometry) -> list[Floats]:
     return [shapely.get_coordinates(p) for p in found if p.geom_type == "LineString" and p.length >= SHORTEST_PART_M]
 
 
-def _planar(motion: Transform) -> tuple[float, float, float]:
+def planar(motion: Transform) -> tuple[float, float, float]:
+    """x, y and yaw of a motion."""
     x, y, _ = motion.translation.tolist()
     return x, y, float(motion.yaw)
 

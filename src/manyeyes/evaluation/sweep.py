@@ -123,10 +123,10 @@ def recording_digest(recording: Recording) -> str:
     return digest.hexdigest()
 
 
-@lru_cache(maxsize=1)
-def code_digest() -> str:
+@lru_cache(maxsize=8)
+def code_digest(sources: tuple[str, ...] = SOURCES) -> str:
     """A hash of the sources that a cell's numbers follow from, as they were when first asked for."""
     package = Path(__file__).resolve().parents[1]
-    files = sorted(f for s in SOURCES for f in ([package / s] if s.endswith(".py") else (package / s).rglob("*.py")))
+    files = sorted(f for s in sources for f in ([package / s] if s.endswith(".py") else (package / s).rglob("*.py")))
     said = b"".join(file.relative_to(package).as_posix().encode() + file.read_bytes() for file in files)
     return hashlib.blake2b(said, digest_size=8).hexdigest()

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -68,19 +70,28 @@ def load_feakm(name_or_path: str | Path = FEAKM) -> feakm.FeakmNet:
 
 def load_mapper(name_or_path: str | Path = MAPPER) -> Mapper:
     """A map model for inference: a shipped name, or a .safetensors file of 'manyeyes train --preset map-small'."""
+    with _mapper_file(name_or_path) as path:
+        mapper = checkpoint.load_as(path, FORMAT, MapperConfig, Mapper)
+    mapper.fingerprint = checkpoint.fingerprint(mapper)
+    return mapper
+
+
+def mapper_towns(name_or_path: str | Path = MAPPER) -> tuple[str, ...]:
+    """The towns whose maps taught a map model, as its card says."""
+    with _mapper_file(name_or_path) as path:
+        return tuple(checkpoint.read_card(path, FORMAT)["towns"])
+
+
+@contextmanager
+def _mapper_file(name_or_path: str | Path) -> Iterator[Path]:
     if str(name_or_path) in mappers():
         with as_file(files("manyeyes.models") / "weights" / f"{name_or_path}.safetensors") as path:
-            return _mapper(path)
+            yield path
+        return
     path = Path(name_or_path)
     if path.suffix != ".safetensors":
         raise CheckpointError(
             f"No map weights are named {name_or_path!r}; shipped are {', '.join(mappers()) or 'none'}: train some "
             "(manyeyes train --preset map-small) and give the .safetensors file."
         )
-    return _mapper(path)
-
-
-def _mapper(path: Path) -> Mapper:
-    mapper = checkpoint.load_as(path, FORMAT, MapperConfig, Mapper)
-    mapper.fingerprint = checkpoint.fingerprint(mapper)
-    return mapper
+    yield path

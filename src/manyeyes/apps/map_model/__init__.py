@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Studies of the map model, in the form of the CrowdMap paper's tables: 'manyeyes map evaluate --study' runs them by name."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from manyeyes.apps.map_evaluate import Options
+
+MODEL_STUDIES = ("local", "semi-global", "whole", "pose")
+
+
+def model_study(options: Options, console: Console) -> None:
+    """Runs one of MODEL_STUDIES; what is finished is kept under --out."""
+    import_module(f"manyeyes.apps.map_model.{str(options.study).replace('-', '_')}").run(options, console)

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What studies of the map model have in common: whose weights, which recording, tables by sensors, claims, pictures, files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from manyeyes.apps import provenance
+from manyeyes.apps.map_studies import executor_of
+from manyeyes.apps.showcase import bars, write_text
+from manyeyes.apps.train_map import open_looks, true_maps
+from manyeyes.apps.viewer.map_figures import Panel, save_figure
+from manyeyes.apps.viewer.study_table import Sheet, change, markdown, number, terminal, value
+from manyeyes.apps.viewer.table import NOT_RUN
+from manyeyes.datasets.recording import Recording
+from manyeyes.datatypes import ConfigError
+from manyeyes.evaluation.map_pool import MapClaim
+from manyeyes.evaluation.map_tiles import assert_split
+from manyeyes.evaluation.tile_cells import Draw, TileCell, World, run_tiles
+from manyeyes.evaluation.tile_table import KINDS, WAYS, TileRow, TileTable
+from manyeyes.models import zoo
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from manyeyes.apps.map_evaluate import Options
+
+SENSORS = {("lidar",): "LiDAR", ("camera",): "camera", ("lidar", "camera"): "both"}
+"""The rows of a table, whether there are weights for them or not."""
+HEADINGS = ("sensors", "row", "AP ped", "AP div", "mAP", "exact", "AP edge", "looks", "B/look", "B/tile")
+"""AP and mAP in the way maptr, over crossings and dividers; exact: mAP in that way; edge: boundaries; B: bytes."""
+
+
+@dataclass(frozen=True)
+class OpenLooks:
+    """Opens the recording with what these sensors took, in this process or another."""
+
+    data: Path
+    split: str
+    sensors: tuple[str, ...]
+
+    def __call__(self) -> Recording:
+        """The recording."""
+        return open_looks(self.data, self.split, self.sensors)
+
+
+@dataclass(frozen=True)
+class Model:
+    """Weights by name, the sensors that they are for, and where they are judged."""
+
+    weights: str
+    sensors: str
+    world: World
+
+
+def models(options: Options) -> tuple[Model, ...]:
+    """The models that are judged: those given, or those that ship; refused where one was taught by a town that would judge it."""
+    if options.data is None:
+        raise ConfigError(f"The study {options.study!r} needs --data, a dataset of towns such as data/towns-small.")
+    names = options.weights or zoo.mappers()
+    if not names:
+        raise ConfigError(
+            "No map model ships with this version: give --weights FILE of 'manyeyes train --preset map-small'."
+        )
+    found = []
+    for name in names:
+        sensors = zoo.load_mapper(name).config.bev.sensors
+        world = World(OpenLooks(options.data, options.split, sensors), true_maps)
+        assert_split(zoo.mapper_towns(name), tuple(true_maps(world.open())))
+        found.append(Model(str(name), SENSORS[tuple(sorted(sensors, reverse=True))], world))
+    if len({model.sensors for model in found}) < len(found):
+        raise ConfigError(f"One model a set of sensors; got {', '.join(m.sensors for m in found)}.")
+    return tuple(found)
+
+
+def tables(options: Options, console: Console, found: Sequence[Model], draw: Draw) -> dict[str, TileTable]:
+    """What each model draws, by its sensors."""
+    return {model.sensors: TileTable(_drawn(options, console, model, draw)) for model in found}
+
+
+def _drawn(options: Options, console: Console, model: Model, draw: Draw) -> tuple[TileCell, ...]:
+    with bars(console) as progress:
+        task = progress.add_task(f"Tiles, {model.sensors}", total=None)
+        return run_tiles(
+            model.world,
+            model.weights,
+            draw,
+            range(options.seeds),
+            options.out / "cells",
+            executor_of(options.workers),
+            lambda done, total: progress.update(task, completed=done, total=total),
+            options.every,
+        )
+
+
+def rows_sheet(title: str, rows: Mapping[str, Sequence[TileRow]]) -> Sheet:
+    """A line for each row of each set of sensors; sets without weights read "not run"."""
+    lines: list[tuple[str, ...]] = []
+    for sensors in SENSORS.values():
+        lines += [(sensors, row.row, *_cells(row)) for row in rows.get(sensors, ())]
+        if sensors not in rows:
+            lines.append((sensors, NOT_RUN, *[""] * (len(HEADINGS) - 2)))
+    return Sheet(title, HEADINGS, tuple(lines))
+
+
+def _cells(row: TileRow) -> tuple[str, ...]:
+    ap = dict(zip(KINDS, row.ap[WAYS.index("maptr")]))
+    means = [value(row.mean[WAYS.index(way)]) for way in WAYS]
+    sizes = (number(row.looks, 1), number(row.bytes_per_look), number(row.bytes_per_tile))
+    return (value(ap["crossing"]), value(ap["divider"]), *means, value(ap["boundary"]), *sizes)
+
+
+def claims_sheet(claims: Sequence[MapClaim], over: str) -> Sheet:
+    """The claims as a table; over: what is drawn with replacement."""
+    lines = tuple((c.what, change(c.difference), f"{c.bar:+.3f}", c.verdict) for c in claims)
+    return Sheet(
+        f"Claims, mAP paired over {over}", ("claim", "difference, 95 % interval", "at least", "verdict"), lines
+    )
+
+
+def shown(cells: Sequence[TileCell], weigh: Callable[[TileCell], int], count: int = 3) -> list[TileCell]:
+    """So many cells of the first seed for a picture, evenly spaced in the order of what they weigh, not chosen for their looks."""
+    first = sorted((c for c in cells if c.seed == cells[0].seed), key=lambda c: (weigh(c), c.scenario))
+    places = np.unique(np.linspace(0, len(first) - 1, count + 2)[1:-1].round().astype(int))
+    return [first[place] for place in places.tolist()]
+
+
+def tile_panels(cell: TileCell, rows: Mapping[str, str], area: tuple[float, float, float, float]) -> list[Panel]:
+    """The truth of a cell's tile, and the drawings of some rows on it; rows: their titles by name."""
+    held = {one.row: one for one in cell.drawings}
+    truth = held[next(iter(rows))].truth
+    sure = {name: held[name].drawn.take(held[name].drawn.score >= 0.3) for name in rows}
+    return [
+        Panel(f"{cell.scenario}: truth", truth, area=area),
+        *(Panel(f"{cell.scenario}: {title}", sure[name], truth, area=area) for name, title in rows.items()),
+    ]
+
+
+def publish(
+    options: Options,
+    console: Console,
+    title: str,
+    payload: dict[str, object],
+    sheets: Sequence[Sheet],
+    panels: Sequence[Panel],
+    columns: int,
+    notes: Sequence[str] = (),
+) -> None:
+    """Tables in the terminal; STUDY.json, STUDY.md and STUDY.png in the folder --out."""
+    name = str(options.study)
+    console.print(f"{title}\n", highlight=False, soft_wrap=True)
+    for sheet in sheets:
+        console.print(terminal(sheet))
+        console.print()
+    provenance.write_json(options.out / f"{name}.json", {"title": title, **payload}, {"options": options}, 0)
+    save_figure(panels, options.out / f"{name}.png", columns)
+    picture = f"![{name}]({name}.png)\n"
+    text = "\n".join([f"# {name}\n\n{title}\n", *map(markdown, sheets), *(f"{note}\n" for note in notes), picture])
+    write_text(options.out / f"{name}.md", text)
+    console.print(
+        f"Intervals, numbers and picture are in {options.out / name}.md, .json and .png",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def title_of(options: Options, found: Sequence[Model]) -> str:
+    """Weights, data, and how much of it."""
+    assert options.data is not None
+    scenarios = found[0].world.open().scenarios[:: options.every]
+    names = ", ".join(Path(model.weights).stem for model in found)
+    return f"{names} on {options.data.name}/{options.split}: {len(scenarios)} scenarios, {options.seeds} seeds"
