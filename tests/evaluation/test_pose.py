@@ -88,6 +88,9 @@ def test_honest_covariances_have_nees_three():
     draws = np.random.default_rng(0).standard_normal((4000, 3))
     found = score([frame(nees=float(d @ d)) for d in draws])
     assert found.nees == pytest.approx(3.0, abs=0.1) and found.inside == pytest.approx(0.95, abs=0.01)
+    # A chi^2 with three degrees of freedom has variance 6.
+    assert found.nees_error == pytest.approx(math.sqrt(6 / len(draws)), rel=0.1)
+    assert math.isnan(score([frame()]).nees_error)
 
 
 def test_risk_falls_with_confidence_and_ties_cannot_be_ordered():

@@ -7,9 +7,10 @@ translation's error (m), RRE the size of the yaw's (deg). *Success at l* is the 
 *precision* right within 2 m and 2 deg over answered, *wrong-accept rate* answered but not right over all. A frame where
 the two agents share no object can only be answered by chance: *null accepts* is the share of those that are. *Object
 displacement* (OD) is the mean distance (m) by which the used pose misplaces the objects in common. *NEES* is e' C^-1 e
-of right answers, 3 if the covariance C is honest; *inside* is the share of them within the 95 % ellipsoid. The
-*risk-coverage curve* orders frames by an estimator's own confidence: risk is the share not right among the most
-confident; AURC is its mean over all coverages. *Conflicts* is the share of all frames that contradict the claim.
+of right answers, 3 if the covariance C is honest (its mean over a hundred answers is off by 0.25, one standard error);
+*inside* is the share of them within the 95 % ellipsoid. The *risk-coverage curve* orders frames by an estimator's own
+confidence: risk is the share not right among the most confident; AURC is its mean over all coverages. *Conflicts* is
+the share of all frames that contradict the claim.
 """
 
 from __future__ import annotations
@@ -56,7 +57,9 @@ class PoseFrame:
 
 @dataclass(frozen=True)
 class PoseScore:
-    """Numbers over frames, defined in the module; NaN where there is nothing to take a mean of."""
+    """Numbers over frames, defined in the module; NaN where there is nothing to take a mean of. nees_error: one standard
+    error of nees.
+    """
 
     frames: int
     success: tuple[float, float, float]
@@ -70,6 +73,7 @@ class PoseScore:
     median_degrees: float
     displacement: float
     nees: float
+    nees_error: float
     inside: float
     aurc: float
     conflicts: float
@@ -132,6 +136,7 @@ def score(frames: Sequence[PoseFrame]) -> PoseScore:
         float(np.median(degrees)) if len(degrees) else math.nan,
         _mean(shift),
         _mean(nees),
+        float(nees.std(ddof=1) / math.sqrt(len(nees))) if len(nees) > 1 else math.nan,
         _mean((nees <= WITHIN_95).astype(np.float64)),
         _mean(risk_coverage(frames)[1]),
         _share(sum(f.status is PoseStatus.CONFLICT for f in frames), n),
