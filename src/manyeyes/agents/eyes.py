@@ -77,7 +77,7 @@ class Eyes:
         self.detector = detector
         self._remember, self._known, self._tracks = remember, known, tracks
         self._seen: list[tuple[AgentFrame, Sight]] = []
-        self._merged: list[tuple[AgentFrame, PointCloud, Sight]] = []
+        self._merged: tuple[AgentFrame, PointCloud] | None = None
         self.perceived: tuple[AgentFrame, SparseBev] | None = None
 
     def see(self, frame: AgentFrame) -> Sight:
@@ -125,18 +125,12 @@ class Eyes:
             parts.append(Part(0, sight.told.features, sight.told.sites.xy, frame.from_earlier(before), age_s))
         return parts
 
-    def see_merged(self, frame: AgentFrame, merged: PointCloud) -> Sight:
-        """The view of the clouds of all agents around this one, with what was merged before."""
-        if self._merged and not follows(frame, self._merged[0][0]):
-            self._merged = []
-        earlier = self._merged[0][1].transform(frame.from_earlier(self._merged[0][0])) if self._merged else None
-        sight = self.see_cloud(merged, earlier)
-        self._merged = [(frame, merged, sight), *self._merged[:REMEMBERED]]
-        return sight
-
-    def merged_before(self) -> list[tuple[AgentFrame, Sight]]:
-        """Such views of the instants before the last, newest first."""
-        return [(frame, sight) for frame, _, sight in self._merged[1:]]
+    def earlier_merged(self, frame: AgentFrame, merged: PointCloud) -> PointCloud | None:
+        """What was merged around the agent at its last instant, moved to this one; what is merged now is kept for the next."""
+        last, self._merged = self._merged, (frame, merged)
+        if last is None or not follows(frame, last[0]):
+            return None
+        return last[1].transform(frame.from_earlier(last[0]))
 
     def see_cloud(self, cloud: PointCloud, earlier: PointCloud | None = None) -> Sight:
         """The view of any cloud in an agent's frame, and of the one before it in the same frame; not remembered."""

@@ -7,10 +7,10 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import CheckpointError
@@ -29,8 +29,6 @@ class TrainConfig:
 
     warm_up: steps of linear growth of the learning rate, then a cosine to zero. prune_from, prune_full: the pruning threshold
     grows from 0 to the detector's between these shares of the run. ema: decay of the averaged weights that are saved.
-    learns: all of it, or fusion and the look after it alone: what an agent makes of its own sweeps then stays as it was, and so do
-    its messages.
     """
 
     detector: DetectorConfig
@@ -45,7 +43,6 @@ class TrainConfig:
     prune_from: float = 0.03
     prune_full: float = 0.10
     save_every: int = 200
-    learns: Literal["all", "fusion"] = "all"
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     road: RoadConfig = field(default_factory=RoadConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)
@@ -94,23 +91,13 @@ class Run:
             model = Detector(config.detector)
         if start is not None:
             _load_weights(model, start)
-        for part in self._still(model):
-            part.requires_grad_(False)
         self.state = RunState(model, config, seed, folder, config.weight_decay)
-
-    def _still(self, model: Detector) -> list[nn.Module]:
-        """The parts that do not learn."""
-        if self.config.learns == "all":
-            return []
-        return [part for name, part in model.named_children() if name not in ("fusion", "refine")]
 
     def advance(self) -> Progress:
         """One step of the optimiser."""
         config, state = self.config, self.state
         samples = [self.stream.draw(number) for number in state.numbers(config.batch)]
         model = state.model.train()
-        for part in self._still(model):
-            part.eval()
         threshold = prune_threshold(config, state.step, self.steps)
         terms = loss_terms(model, samples, config.targets, threshold, config.loss.together, config.loss.target)
         loss, rate = terms.total(config.loss), learning_rate(config, state.step, self.steps)

@@ -31,18 +31,6 @@ _CROWD = replace(
     augment=AugmentConfig(thin=0.1, early_share=0.2),
     loss=LossConfig(iou=0.8, together=0.6, prune=1.0),
 )
-_MEMORY = replace(
-    _CROWD,
-    steps=1200,
-    learning_rate=5e-4,
-    warm_up=30,
-    prune_full=0.001,
-    ema=0.998,
-    learns="fusion",
-    augment=AugmentConfig(thin=0.1, early_share=0.0),
-    road=replace(_CROWD.road, said=2),
-    loss=replace(_CROWD.loss, together=1.0),
-)
 _BRANCH = replace(
     _CROWD, road=replace(_CROWD.road, said=2), steps=240, learning_rate=3e-4, warm_up=20, prune_full=0.001
 )
@@ -82,7 +70,6 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
     ),
     "costr-small-3": _ROAD,
     "costr-small-4": _CROWD,
-    "costr-small-5": _MEMORY,
     "branch-plain": _branch(**_PLAIN, encoder=_FINE_ONLY),
     "branch-se": _branch(**_PLAIN),
     "branch-se-dast": _branch(fusion="maximum"),
@@ -97,6 +84,6 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
     ),
 }
 """costr-small and then, each from the weights before, costr-small-2 (what lies to the sides is seen as well, all agents at once,
-IoU itself in the loss), costr-small-3 (past, delay, pose errors, loss, budgets), costr-small-4 (fewer cells kept, object by
-object) and costr-small-5 (fusion alone, of what was said before as well): what ships. branch-*: rows of the ablation,
+IoU itself in the loss), costr-small-3 (past, delay, pose errors, loss, budgets) and costr-small-4 (fewer cells kept, object by
+object): what ships. branch-*: rows of the ablation,
 each from what ships, with equal further steps. costr-opv2v: the paper's 80 + 10 epochs. costr-tiny: tests and examples."""

@@ -89,10 +89,9 @@ class RunState(Generic[Model]):
         """The mean over processes of gradients and of running statistics: one flat exchange each."""
         if self.world == 1:
             return
-        learning = [p for p in self.model.parameters() if p.requires_grad]
-        for p in learning:
+        for p in self.model.parameters():
             p.grad = torch.zeros_like(p) if p.grad is None else p.grad
-        _mean_in_place([p.grad for p in learning if p.grad is not None], self.world)
+        _mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world)
         _mean_in_place([b for b in self.model.buffers() if b.is_floating_point()], self.world)
 
     @torch.no_grad()
@@ -142,10 +141,9 @@ class RunState(Generic[Model]):
 
 
 def parameter_groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
-    """What an optimiser is given of what learns: matrices, whose weights decay, and the rest, whose do not."""
-    learning = [p for p in model.parameters() if p.requires_grad]
-    matrices = [p for p in learning if p.dim() > 1]
-    rest = [p for p in learning if p.dim() <= 1]
+    """What an optimiser is given: matrices, whose weights decay, and the rest, whose do not."""
+    matrices = [p for p in model.parameters() if p.dim() > 1]
+    rest = [p for p in model.parameters() if p.dim() <= 1]
     return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
 
 

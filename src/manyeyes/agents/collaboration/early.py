@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from manyeyes.agents.collaboration.fading import moved, strongest
 from manyeyes.agents.collaboration.heading import ego_from_sender, header
 from manyeyes.agents.eyes import Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud
@@ -23,8 +22,7 @@ class Early:
         return replace(header(frame, eyes.detector.fingerprint), points=frame.points)
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes of the merged cloud with the one merged before it, and of the instants before."""
+        """Boxes of the merged cloud and of the one merged before it."""
         heard = [m.points.transform(ego_from_sender(frame, m)) for m in messages if m.points is not None]
         merged = PointCloud.cat([frame.points, *heard])
-        sight = eyes.see_merged(frame, merged)
-        return strongest([sight.boxes, *moved(frame, eyes.merged_before())])
+        return eyes.see_cloud(merged, eyes.earlier_merged(frame, merged)).boxes
