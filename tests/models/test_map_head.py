@@ -140,6 +140,22 @@ def test_a_layer_is_told_where_its_points_lie():
     assert not torch.allclose(before[0, 2], after[0, 2], atol=1e-6)
 
 
+def test_what_moves_a_point_is_told_where_it_lies():
+    head, ground = MapHead(TINY).eval(), torch.zeros(1, 16, 10, 20)
+    with torch.no_grad():
+        for layer in head.layers:
+            for norm in layer.norms:  # a layer that says nothing at all: x is 0, whatever it was told
+                norm.weight.zero_()
+                norm.bias.zero_()
+        for move in head.moves:
+            move[-1].weight.normal_(generator=torch.Generator().manual_seed(0))
+        moved = head(ground)[0].point[0] - head.start[:6]
+        head.start[2, :, 0] += 0.05
+        again = head(ground)[0].point[0] - head.start[:6]
+    assert float((moved[2] - again[2]).abs().max()) > 1e-3
+    assert torch.equal(moved[0], again[0])
+
+
 def test_nothing_sure_is_an_empty_map():
     raw = RawMap(torch.full((2, 6, 3), -9.0), torch.rand(2, 6, 5, 2))
     assert [len(found) for found in decode(raw, TILE, TINY)] == [0, 0]

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Moving pictures of the ground, and the maximum over those that saw: hand-worked cases, a loop, and laws."""
 
+import itertools
 import math
 
 import pytest
@@ -94,6 +95,22 @@ def test_the_maximum_does_not_know_order_and_ignores_who_sees_nothing():
     assert torch.equal(fused, masked_max(features[:, order], seen[:, order], null))
     blind = torch.cat((features, torch.full_like(features[:, :1], 1e9)), 1)
     assert torch.equal(fused, masked_max(blind, torch.cat((seen, torch.zeros_like(seen[:, :1])), 1), null))
+
+
+def test_the_maximum_is_that_of_the_loop_in_values_and_gradients():
+    generator = torch.Generator().manual_seed(1)
+    features = torch.randn(2, 4, 3, 5, 6, generator=generator, dtype=torch.float64).requires_grad_()
+    seen = torch.rand(2, 4, 5, 6, generator=generator) > 0.6
+    null = torch.randn(3, generator=generator, dtype=torch.float64).requires_grad_()
+    weight = torch.randn(2, 3, 5, 6, generator=generator, dtype=torch.float64)
+    cells = []
+    for b, c, row, column in itertools.product(range(2), range(3), range(5), range(6)):
+        those = [features[b, k, c, row, column] for k in range(4) if seen[b, k, row, column]]
+        cells.append(torch.stack(those).max() if those else null[c])
+    slow, fast = torch.stack(cells).view(2, 3, 5, 6), masked_max(features, seen, null)
+    assert torch.equal(slow, fast)
+    for one, other in zip(*(torch.autograd.grad((out * weight).sum(), (features, null)) for out in (slow, fast))):
+        assert torch.allclose(one, other, atol=1e-12)
 
 
 def test_gradients_go_to_the_greatest_that_saw_and_to_null_where_nobody_did():

@@ -4,9 +4,12 @@
 import itertools
 import math
 
+import numpy as np
 import pytest
 import torch
 
+from manyeyes.datatypes import BevGrid
+from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.models.map_head import RawMap
 from manyeyes.training.map_losses import (
     MapLossConfig,
@@ -17,7 +20,7 @@ from manyeyes.training.map_losses import (
     match,
     turned_away,
 )
-from manyeyes.training.map_targets import MapTarget, orders_of
+from manyeyes.training.map_targets import MapTarget, orders_of, target_of
 
 CONFIG = MapLossConfig()
 
@@ -57,6 +60,27 @@ def test_the_loss_does_not_know_from_which_end_a_line_or_where_a_ring_was_begun(
         # Identical, to the last bit: the same order of points is found, however they were given.
         assert torch.equal(loss, total[0])
         assert torch.equal(grads[0], total[1]) and torch.equal(grads[1], total[2])
+
+
+def test_the_loss_of_a_tile_is_the_same_however_its_map_is_stored():
+    generator, tile = torch.Generator().manual_seed(5), BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=1.0)
+    raw = RawMap(
+        torch.randn(1, 5, 3, generator=generator).requires_grad_(),
+        torch.rand(1, 5, 6, 2, generator=generator).requires_grad_(),
+    )
+    line = np.array([[-15.0, -3.0], [-2.0, 1.5], [4.0, 1.0], [18.0, 7.0]])
+    ring = np.array([[3.0, -6.0], [7.0, -6.5], [8.0, 2.0], [4.0, 2.5]])
+    grads = []
+    for drawn, turn, way in itertools.product((line, line[::-1]), range(4), (1, -1)):
+        truth = MapElements.of([drawn, np.roll(ring, turn, 0)[::way]], [DIVIDER, CROSSING])
+        target = target_of(truth, tile, ("divider", "boundary", "crossing"), 6)
+        loss = map_terms([raw], [], torch.zeros(()), [target], CONFIG).total(CONFIG)
+        grads.append((loss, *torch.autograd.grad(loss, (raw.logit, raw.point))))
+    for case in grads[1:]:
+        # Arc lengths are summed from the other end, so places agree to rounding.
+        assert all(
+            torch.allclose(mine, first, rtol=1e-5, atol=1e-5) for mine, first in zip(case, grads[0], strict=True)
+        )
 
 
 def test_the_match_is_the_best_of_all_assignments():
