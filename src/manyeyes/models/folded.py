@@ -7,6 +7,7 @@ import copy
 
 from manyeyes.models.detector import Detector
 from manyeyes.models.layers import DownLayer, SubmanifoldLayer, UpLayer
+from manyeyes.models.transformer import WindowBlock
 
 
 def folded(model: Detector) -> Detector:
@@ -17,6 +18,6 @@ def folded(model: Detector) -> Detector:
     """
     copied = copy.deepcopy(model).eval().requires_grad_(False)
     for layer in copied.modules():
-        if isinstance(layer, SubmanifoldLayer | DownLayer | UpLayer):
+        if isinstance(layer, SubmanifoldLayer | DownLayer | UpLayer | WindowBlock):
             layer.fold()
     return copied

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, ConfigError
+from manyeyes.ops.block_loops import BlockWeights, run_block
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_places
 from manyeyes.ops.window_loops import attend_in_windows, window_runs
 
@@ -56,6 +57,7 @@ class WindowBlock(nn.Module):
         self.out = nn.Linear(channels, channels)
         hidden = channels * config.expansion
         self.ffn = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels))
+        self.folded: BlockWeights | None = None
 
     def forward(
         self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
@@ -71,6 +73,8 @@ class WindowBlock(nn.Module):
             origin, shift = (grid.x_min, grid.y_min), edge / 2 if self.shifted else 0.0
             cache[name] = window_places(xy, batch, origin, edge, grid.cell, shift)
         ids, offsets = cache[name]
+        if self.folded is not None and _plain(features):
+            return run_block(features, offsets, window_runs(ids), self.folded)
         place = (*name, features.shape[1])
         if place not in cache:
             cache[place] = sincos_encoding(offsets, features.shape[1])
@@ -83,6 +87,11 @@ class WindowBlock(nn.Module):
         attended = _attend(split(self.query(placed)), split(self.key(placed)), split(self.value(normed)), ids)
         features = features + self.out(attended.flatten(1))
         return features + self.ffn(self.norm_ffn(features))
+
+    def fold(self) -> None:
+        """Copy the weights to where one compiled call finds them, for good: those of the layers are no longer asked."""
+        linears = [self.query, self.key, self.value, self.out, self.ffn[0], self.ffn[2]]
+        self.folded = BlockWeights.of(linears, [self.norm, self.norm_ffn], self.heads)
 
 
 class RoutedBlock(nn.Module):
@@ -123,9 +132,14 @@ def density_levels(window: Tensor, cells: int, levels: tuple[float, float]) -> T
 
 def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:
     """Attention of (N, heads, C / heads) within windows ids (N,)."""
-    if not torch.is_grad_enabled() and query.device.type == "cpu" and query.dtype == torch.float32:
+    if _plain(query):
         return attend_in_windows(query, key, value, window_runs(ids))
     return window_attention(query, key, value, plan_windows(ids, ids))
+
+
+def _plain(x: Tensor) -> bool:
+    """Whether compiled loops may take it: no gradient is asked for, and it is float32 in the CPU's memory."""
+    return not torch.is_grad_enabled() and x.device.type == "cpu" and x.dtype == torch.float32
 
 
 class WindowTransformer(nn.Module):

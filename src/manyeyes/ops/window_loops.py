@@ -27,7 +27,7 @@ _TWO_ROWS, _THREE_ROWS = np.uintp(2 * _TILE), np.uintp(3 * _TILE)
 _POWERS = tuple(
     map(np.float32, (1, 0.693147206, 0.240226466, 0.05550329, 0.00961851953, 0.00133998604, 0.000153375768))
 )
-_FAST = {"contract", "nsz", "nnan", "ninf", "arcp", "reassoc"}
+FAST = {"contract", "nsz", "nnan", "ninf", "arcp", "reassoc"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +65,12 @@ def attend_in_windows(q: Tensor, k: Tensor, v: Tensor, runs: WindowRuns) -> Tens
         )
     out = torch.empty_like(v, memory_format=torch.contiguous_format)
     q_, k_, v_, out_ = (t.contiguous().view(-1).numpy() for t in (q, k, v, out))
-    _attend(q_, k_, v_, out_, q.shape[1], q.shape[2], runs.order.numpy(), runs.start.numpy())
+    attend(q_, k_, v_, out_, q.shape[1], q.shape[2], runs.order.numpy(), runs.start.numpy())
     return out
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _attend(q, k, v, out, heads, width, order, start):  # pragma: no cover
+@njit(cache=True, nogil=True, fastmath=FAST)
+def attend(q, k, v, out, heads, width, order, start):  # pragma: no cover
     """Window by window and head by head, as many queries at once as a tile holds."""
     most = 4
     for w in range(start.shape[0] - 1):
@@ -100,7 +100,7 @@ def _attend(q, k, v, out, heads, width, order, start):  # pragma: no cover
                 rows[j] += np.uintp(width)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _gather(x, rows, width, wide, columns):  # pragma: no cover
     """columns[c, i] = x[rows[i] + c] times log2(e) / sqrt(width), and zeros up to wide."""
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
@@ -114,7 +114,7 @@ def _gather(x, rows, width, wide, columns):  # pragma: no cover
         columns[c * _TILE + rows.shape[0] : c * _TILE + wide] = np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _scatter(columns, sums, rows, width, out):  # pragma: no cover
     """out[rows[i] + c] = columns[c, i] / sums[1, i]."""
     for i in range(rows.shape[0]):
@@ -123,7 +123,7 @@ def _scatter(columns, sums, rows, width, out):  # pragma: no cover
             out[to + c] = columns[at + c * _ROW] * share
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _scores(k, rows, queries, weights, n, width, wide):  # pragma: no cover
     """weights (n, wide) = the rows of k (n, width) times queries (width, wide)."""
     for r in range(0, n, 4):
@@ -134,7 +134,7 @@ def _scores(k, rows, queries, weights, n, width, wide):  # pragma: no cover
             _multiply(block, queries, np.uintp(c * _TILE), weights, np.uintp(r * _TILE), np.uintp(wide), c == 0)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _mix(v, rows, weights, mixed, n, width, wide):  # pragma: no cover
     """mixed (width, wide) = the rows of v (n, width), transposed, times weights (n, wide)."""
     for c in range(0, width, 4):
@@ -153,7 +153,7 @@ def _four(x, at):  # pragma: no cover
     return x[at], x[at + _ONE], x[at + _TWO], x[at + _THREE]
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _multiply(block, x, s, out, o, wide, is_first):  # pragma: no cover
     """Four rows of out from o on (+)= block (4, 4) times four rows of x from s on; rows are _TILE apart."""
     (a0, a1, a2, a3), (b0, b1, b2, b3), (d0, d1, d2, d3), (e0, e1, e2, e3) = block
@@ -173,7 +173,7 @@ def _multiply(block, x, s, out, o, wide, is_first):  # pragma: no cover
             out[o + _THREE_ROWS + i] += e0 * w + e1 * y + e2 * z + e3 * t
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _exponentials(x, rows, wide, sums):  # pragma: no cover
     """x (rows, wide) becomes 2^(x - its column's largest); sums: those largest, then the sums of the columns."""
     wide = np.uintp(wide)
@@ -188,14 +188,14 @@ def _exponentials(x, rows, wide, sums):  # pragma: no cover
         o = np.uintp(j * _TILE)
         for i in range(wide):
             top = sums[i]
-            a, b = _power_of_two(x[o + i] - top), _power_of_two(x[o + _ROW + i] - top)
-            d, e = _power_of_two(x[o + _TWO_ROWS + i] - top), _power_of_two(x[o + _THREE_ROWS + i] - top)
+            a, b = power_of_two(x[o + i] - top), power_of_two(x[o + _ROW + i] - top)
+            d, e = power_of_two(x[o + _TWO_ROWS + i] - top), power_of_two(x[o + _THREE_ROWS + i] - top)
             x[o + i], x[o + _ROW + i], x[o + _TWO_ROWS + i], x[o + _THREE_ROWS + i] = a, b, d, e
             sums[_ROW + i] += (a + b) + (d + e)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
-def _power_of_two(x):  # pragma: no cover
+@njit(cache=True, nogil=True, fastmath=FAST)
+def power_of_two(x):  # pragma: no cover
     """2^x of x <= 0 within 2e-7 of it; below -126 as of -126."""
     x = max(x, np.float32(-126.0))
     whole = np.rint(x)
