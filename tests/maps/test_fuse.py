@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, SOLID, MapElements, Polygons
-from manyeyes.maps.align import merge, overlapping, search, solve_poses, sweep
+from manyeyes.maps.align import advance, merge, overlapping, search, solve_poses
 from manyeyes.maps.evidence import EvidenceConfig
+from manyeyes.maps.faith import NOT_BELIEVED
 from manyeyes.maps.fuse import FuseConfig, assemble, fuse, fuse_aligned
 from manyeyes.maps.observation import Observation
 from manyeyes.maps.sightings import gather
@@ -248,8 +249,9 @@ def test_j_areas_that_are_cut_give_the_map_of_one():
     near = [gather(overlapping(observations, home), 1.0) for home in tiles]
     rows = [np.array([s.ids.index(o.id) for o in home]) for s, home in zip(near, tiles)]
     state = merge([search(s, r) for s, r in zip(near, rows)])
-    for number in range(len(config.align.gates_m)):
-        state = merge([sweep(s, state.take(state.rows(s.ids)), number, r) for s, r in zip(near, rows)])
+    for number in range(config.align.steps):
+        parts = [advance(s, state.take(state.rows(s.ids)), number, r) for s, r in zip(near, rows)]
+        state = merge(parts, config.align, number)
     assert (state.pose == solve_poses(observations).pose).all()
     sightings = gather(observations, config.align.spacing_m)
     areas = [(-100.0, -100.0, 47.3, 100.0), (47.3, -100.0, 200.0, 1.1), (47.3, 1.1, 200.0, 100.0)]
@@ -293,6 +295,31 @@ def test_liars_who_agree_move_no_station_that_honest_agents_saw():
         liars = [replace(o, pose=(o.pose[0], o.pose[1], o.pose[2])) for o in liars if np.cos(o.pose[2]) > 0]
         before, after = fuse(honest).published(), fuse([*honest, *liars]).published()
         assert furthest(before.elements, after.elements) < 0.1, offset
+
+
+def test_a_lie_that_is_found_out_leaves_no_trace():
+    """Nine honest agents and two who agree on 2 m: the nine stand where they stand alone."""
+    world = [*road(), (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))]
+    honest = crowd(world, 9, sigma=0.2)
+    liars = [
+        replace(
+            o, agent=f"liar{k}", elements=o.elements.with_points(o.elements.points + (0.0, 2.0 * np.cos(o.pose[2])))
+        )
+        for k, o in enumerate(crowd(world, 2, sigma=0.2, seed=5))
+    ]
+    alone, together = solve_poses(honest), solve_poses([*honest, *liars])
+    rows = together.rows(alone.ids)
+    assert (together.faith[together.rows([o.id for o in liars])] == NOT_BELIEVED).all()
+    assert (together.faith[rows] > 0.1).all()
+    assert np.abs(together.pose[rows] - alone.pose).max() < 1e-3
+
+
+def test_a_surveyed_pole_is_believed_against_those_who_agree_on_something_else():
+    pole = look(road(), (30.0, 0.0, 0.0), "pole", trusted=True)
+    cars = [look(road(), (30.0 + k, 0.0, 0.0), f"car{k}", k, (0.0, 0.9, 0.0)) for k in range(6)]
+    pose = solve_poses([pole, *cars])
+    assert pose.faith[pose.rows([pole.id])[0]] == 1.0
+    assert np.abs(pose.pose[pose.rows([o.id for o in cars]), 1]).max() < 0.15
 
 
 def test_bends_do_not_shrink():

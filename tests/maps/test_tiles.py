@@ -71,9 +71,9 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
     work = tmp_path / "work"
     seen = []
     _tiled(store, work, 256.0, progress=lambda name, done, total: seen.append((name, done, total)))
-    steps = len(FuseConfig().align.gates_m)
+    steps = FuseConfig().align.steps
     assert [name for name, done, total in seen if done == total] == [
-        "search", *(f"sweep {k + 1}" for k in range(steps)), "stations",
+        "search", *(f"step {k + 1}" for k in range(steps)), "stations",
     ]  # fmt: skip
     before = {p.name: p.stat().st_mtime_ns for p in work.iterdir()}
     results = sorted(work.iterdir())

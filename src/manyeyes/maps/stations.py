@@ -15,9 +15,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import STYLES, rows_of
-from manyeyes.maps.align import Alignment, bounded, looks_weight
+from manyeyes.maps.align import Alignment, bounded
 from manyeyes.maps.associate import build_grid, span
 from manyeyes.maps.evidence import EvidenceConfig, Witness, witness
+from manyeyes.maps.faith import looks_weight
 from manyeyes.maps.polygons import Crossings, PolygonConfig, find_crossings
 from manyeyes.maps.ridges import RidgeConfig, shift_to_ridges, thin
 from manyeyes.maps.sightings import Sightings, is_line

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, rows_of
-from manyeyes.maps.align import AlignConfig, normal_equations, step_poses
+from manyeyes.maps.align import AlignConfig
 from manyeyes.maps.associate import PointGrid, build_grid, span
 from manyeyes.maps.evidence import sights as sights_of
 from manyeyes.maps.evidence import visibility, witnesses
@@ -26,6 +26,7 @@ from manyeyes.maps.fuse import FuseConfig, assemble
 from manyeyes.maps.gross import best_moves, moved_by
 from manyeyes.maps.observation import Observation
 from manyeyes.maps.polygons import hulls_of, overlap_of
+from manyeyes.maps.pose_step import normal_equations, step_poses
 from manyeyes.maps.sightings import DAY_NS, Sightings, gather, is_line
 from manyeyes.maps.stations import Evidence, StationTable
 from manyeyes.maps.vector_map import PUBLISHED, RETIRED, VectorMap

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.maps.align import Alignment, merge, search, sweep
+from manyeyes.maps.align import Alignment, advance, merge, search
 from manyeyes.maps.catalogue import Standing
 from manyeyes.maps.columns_file import load_columns, save_columns
 from manyeyes.maps.engine import Executor, ProcessPool, Runner, map_blocks
@@ -172,9 +172,9 @@ def _tables(
     homes = [b for b in blocks if b.home]
     steps = [_Step(b, None, -1) for b in homes]
     state = merge(each(steps, "search", _pose_step, Alignment), config.align)
-    for number in range(len(config.align.gates_m)):
+    for number in range(config.align.steps):
         steps = [_Step(b, _part(state, b), number) for b in homes]
-        state = merge(each(steps, f"sweep {number + 1}", _pose_step, Alignment), config.align)
+        state = merge(each(steps, f"step {number + 1}", _pose_step, Alignment), config.align, number)
     return each([_Step(b, _part(state, b), None) for b in blocks], "stations", _station_step, StationTable)
 
 
@@ -214,7 +214,7 @@ def _pose_step(step: _Step) -> None:
     if step.state is None or step.number is None:
         found = search(sightings, home, step.block.config.align)
     else:
-        found = sweep(sightings, step.state, step.number, home, step.block.config.align)
+        found = advance(sightings, step.state, step.number, home, step.block.config.align)
     save_columns(step.path, found)
 
 
