@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,7 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.evaluation import map_cells, map_malice
 from manyeyes.evaluation.map_cells import ApRow, Cell, KindRow, Unit, cell_path, read_cell, run_unit
-from manyeyes.evaluation.map_malice import displacement, malice, malice_units
+from manyeyes.evaluation.map_malice import displacement, malice_units, run_malice
 from manyeyes.evaluation.map_methods import (
     METHODS,
     OURS,
@@ -164,30 +165,38 @@ def test_a_line_that_moved_is_measured_and_one_that_is_gone_is_lost() -> None:
     moved = MapElements.of([[(0, 0.3), (10, 0.3)]], DIVIDER)
     assert displacement(seen_by(two, 5), seen_by(moved, 5)).tolist() == pytest.approx([0.3, 0.3, np.inf, np.inf])
     assert len(displacement(seen_by(two, 4), seen_by(moved, 5))) == 0
-    units = malice_units(("cross",), (0,), Settings(), (1.0, 4.0))
+    units = malice_units(("cross",), (0,), Settings(), Path(), (1.0, 4.0))
     assert {(u.trial.crowd.malicious, u.trial.crowd.malicious_offset) for u in units} == {
         (m, (o, o)) for m in ("independent", "colluding") for o in (1.0, 4.0)
     }
 
 
-def test_what_liars_move_stands_beside_what_they_would_move_by_telling_the_truth(monkeypatch) -> None:
+def test_what_liars_move_stands_beside_what_they_would_move_by_telling_the_truth(monkeypatch, tmp_path) -> None:
+    asked = []
+
     def carried_out(trial: Trial) -> SimpleNamespace:
         seen = (0.0, 0.0, 0.15 + trial.crowd.malicious_offset[0])  # where each says that the line lies
         crowd = SimpleNamespace(roles=(HONEST, HONEST, MALICIOUS))
         return SimpleNamespace(observations=seen, crowd=crowd, place=SimpleNamespace(frame=None))
 
     def furthest(_method, seen, *_) -> VectorMap:
-        y = max(seen)
-        return VectorMap.of(MapElements.of([[(0, y), (10, y)]], DIVIDER), agents=5)
+        asked.append(seen)
+        return VectorMap.of(MapElements.of([[(0, max(seen)), (10, max(seen))]], DIVIDER), agents=5)
 
     monkeypatch.setattr(map_malice, "carry_out", carried_out)
     monkeypatch.setattr(map_malice, "map_of", furthest)
-    found = [malice(unit) for unit in malice_units(("cross",), (0,), Settings(), (1.0, 4.0))]
+    map_malice._without_lies.cache_clear()
+    units = malice_units(("cross",), (0,), Settings(), tmp_path, (1.0, 4.0))
+    found = run_malice(units, Inline())
+    map_malice._without_lies.cache_clear()
     assert [(m.malicious, m.stations, m.moved, m.lost, m.by_truth) for m in found] == 2 * [
         (1, 2, 2, 0, 2),
         (1, 2, 2, 2, 2),
     ]
-    assert found[0].largest_m == pytest.approx(1.15)
+    assert found[0].largest_m == pytest.approx(1.15) and math.isnan(found[1].largest_m)
+    assert len(asked) == 6, "what the honest say is fused once, and the truth of all once"
+    again = run_malice(units, Inline())
+    assert repr(again) == repr(found) and len(asked) == 6, "a study that was stopped goes on"
 
 
 def test_every_method_is_tuned_over_fields_that_it_has_with_defaults_first() -> None:

@@ -101,7 +101,7 @@ def _malicious(options: Options, console: Console) -> None:
     from manyeyes.evaluation.map_malice import malice_units, run_malice
 
     settings = tuned()
-    units = malice_units(options.places or TEST_PLACES, range(options.seeds), settings)
+    units = malice_units(options.places or TEST_PLACES, range(options.seeds), settings, options.out / "cells")
     with bars(console) as progress:
         task = progress.add_task("Trials", total=len(units))
         found = run_malice(

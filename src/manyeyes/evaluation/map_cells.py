@@ -123,7 +123,7 @@ def run_unit(unit: Unit) -> list[Cell]:
             scene = scene or carry_out(unit.trial)
             found = run_cell(scene, method, unit.settings)
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, (json.dumps(_plain(found), indent=1) + "\n").encode())
+            write_whole(path, (json.dumps(plain(found), indent=1) + "\n").encode())
         cells[method] = found
     return list(cells.values())
 
@@ -181,8 +181,8 @@ def read_cell(path: Path) -> Cell | None:
     """A kept cell; None where there is none, or one of another form."""
     try:
         held = json.loads(path.read_text(encoding="utf-8"), parse_constant=float)
-        ap = tuple(ApRow(**_numbers(row)) for row in held.pop("ap"))
-        kinds = tuple(KindRow(**_numbers(row)) for row in held.pop("kinds"))
+        ap = tuple(ApRow(**numbers(row)) for row in held.pop("ap"))
+        kinds = tuple(KindRow(**numbers(row)) for row in held.pop("kinds"))
         return Cell(ap=ap, kinds=kinds, **held)
     except (OSError, ValueError, TypeError, KeyError):
         return None
@@ -194,16 +194,16 @@ def judge_maps(elements: MapElements, truth: MapElements) -> tuple[tuple[ApRow, 
     return tuple(ap_rows(quality)), tuple(kind_rows(quality))
 
 
-def _plain(value: object) -> object:
+def plain(value: object) -> object:
     """A cell as JSON holds it; NaN is null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def _numbers(row: dict[str, Any]) -> dict[str, Any]:
+def numbers(row: dict[str, Any]) -> dict[str, Any]:
     """A row as it was: null is NaN, lists are tuples."""
 
     def back(value: Any) -> Any:

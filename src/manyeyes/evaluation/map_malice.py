@@ -11,18 +11,23 @@ claims that scatter have their mode: ``by_truth`` counts that, and is what ``mov
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
 from manyeyes.datatypes.map_element import KINDS
+from manyeyes.evaluation.map_cells import Unit, cell_path, numbers, plain
 from manyeyes.evaluation.map_methods import OURS, Settings, map_of
 from manyeyes.evaluation.map_quality import lines_of_kind
 from manyeyes.evaluation.map_trial import Trial, carry_out
 from manyeyes.maps.engine import Executor, map_blocks
 from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.whole_file import write_whole
 from manyeyes.ops.nearest_line import nearest_line
 from manyeyes.simulator.crowd.config import CROWDS
 from manyeyes.simulator.crowd.simulate import MALICIOUS
@@ -55,14 +60,19 @@ class Malice:
 
 @dataclass(frozen=True)
 class MaliceUnit:
-    """What one process does at a time."""
+    """What one process does at a time. folder: where trials that are done are kept."""
 
     trial: Trial
     settings: Settings
+    folder: Path
 
 
 def malice_units(
-    places: Sequence[str], seeds: Sequence[int], settings: Settings, offsets_m: Sequence[float] = OFFSETS_M
+    places: Sequence[str],
+    seeds: Sequence[int],
+    settings: Settings,
+    folder: Path,
+    offsets_m: Sequence[float] = OFFSETS_M,
 ) -> list[MaliceUnit]:
     """The trials: places, seeds, both manners, and every size of lie."""
     units = []
@@ -73,7 +83,7 @@ def malice_units(
                     crowd = replace(
                         CROWDS["local"], malicious_share=SHARE, malicious=manner, malicious_offset=(offset, offset)
                     )
-                    units.append(MaliceUnit(Trial(place, COUNT, seed, window=manner, crowd=crowd), settings))
+                    units.append(MaliceUnit(Trial(place, COUNT, seed, window=manner, crowd=crowd), settings, folder))
     return units
 
 
@@ -82,17 +92,26 @@ def run_malice(
 ) -> tuple[Malice, ...]:
     """All trials, in order."""
     with executor.open() as runner:
-        return tuple(map_blocks(malice, units, runner, progress))
+        return tuple(map_blocks(kept_malice, units, runner, progress))
+
+
+def kept_malice(unit: MaliceUnit) -> Malice:
+    """One trial, found where it was done before with the same code and settings, else done and kept."""
+    path = cell_path(Unit(unit.trial, (OURS,), unit.settings, unit.folder / "malicious"), OURS)
+    try:
+        return Malice(**numbers(json.loads(path.read_text(encoding="utf-8"))))
+    except (OSError, ValueError, TypeError):
+        found = malice(unit)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, (json.dumps(plain(found), indent=1) + "\n").encode())
+    return found
 
 
 def malice(unit: MaliceUnit) -> Malice:
     """One trial."""
-    scene = carry_out(unit.trial)
-    honest = [o for o, role in zip(scene.observations, scene.crowd.roles) if role != MALICIOUS]
-    trial, frame = unit.trial, scene.place.frame
-    true = carry_out(replace(trial, crowd=replace(trial.crowd, malicious_offset=(0.0, 0.0)))).observations
-    alone, lied, told = (map_of(OURS, seen, unit.settings, frame) for seen in (honest, scene.observations, true))
-    away, by_truth = displacement(alone, lied), displacement(alone, told)
+    trial, scene = unit.trial, carry_out(unit.trial)
+    alone, by_truth = _without_lies(_truthful(trial), unit.settings)
+    away = displacement(alone, map_of(OURS, scene.observations, unit.settings, scene.place.frame))
     finite = away[np.isfinite(away)]
     return Malice(
         place=trial.place,
@@ -100,14 +119,29 @@ def malice(unit: MaliceUnit) -> Malice:
         manner=trial.window,
         offset_m=trial.crowd.malicious_offset[0],
         observations=len(scene.observations),
-        malicious=len(scene.observations) - len(honest),
+        malicious=sum(int(role == MALICIOUS) for role in scene.crowd.roles),
         stations=len(away),
         moved=int((away > BAR_M).sum()),
         lost=int(np.isinf(away).sum()),
-        by_truth=int((by_truth > BAR_M).sum()),
+        by_truth=by_truth,
         p99_m=float(np.quantile(finite, 0.99)) if len(finite) else math.nan,
         largest_m=float(finite.max()) if len(finite) else math.nan,
     )
+
+
+def _truthful(trial: Trial) -> Trial:
+    """The trial whose malicious agents say what they saw: one and the same for every manner and size of lie."""
+    crowd = replace(trial.crowd, malicious="independent", malicious_offset=(0.0, 0.0))
+    return replace(trial, window="truthful", crowd=crowd)
+
+
+@lru_cache(maxsize=1)
+def _without_lies(trial: Trial, settings: Settings) -> tuple[VectorMap, int]:
+    """The map of the honest agents alone, and how many of its stations the others move by telling the truth."""
+    scene = carry_out(trial)
+    honest = [o for o, role in zip(scene.observations, scene.crowd.roles) if role != MALICIOUS]
+    alone, told = (map_of(OURS, seen, settings, scene.place.frame) for seen in (honest, scene.observations))
+    return alone, int((displacement(alone, told) > BAR_M).sum())
 
 
 def displacement(alone: VectorMap, together: VectorMap, agents: int = AGENTS) -> np.ndarray:
