@@ -222,8 +222,8 @@ def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, b
     if _in_loops(x, taps):
         (source, target, counts), out = table.pairs, x.new_empty(table.rows(reverse), taps.shape[2])
         source, target = (target, source) if reverse else (source, target)
-        arrays = (t.contiguous().numpy() for t in (x, taps, bias))
-        convolve(*arrays, source, target, counts, table.is_symmetric, out.numpy())
+        rows, matrices, start = (t.contiguous().numpy() for t in (x, taps, bias))
+        convolve(rows, matrices, start, source, target, counts, table.is_symmetric, out.numpy())
         return out
     # Every site meets itself by the middle tap: no gathering there.
     out = (
