@@ -146,9 +146,7 @@ class Counting:
     """Draws the truth at both rows, and counts how often it was asked."""
 
     asked: int = 0
-
-    def __repr__(self) -> str:
-        return "Counting"
+    key: str = "counting"
 
     def __call__(self, mapper, scenery, scenario, seed):
         self.asked += 1

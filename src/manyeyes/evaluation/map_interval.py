@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.bootstrap import Interval, Pooled, resamples, weighted_ap
-from manyeyes.evaluation.map_matching import WAYS, Lines, chamfer, match, ranking
-from manyeyes.evaluation.map_quality import LATERAL_WITHIN_M, THRESHOLDS, Thresholds, lines_of_kind, pieces_of
+from manyeyes.evaluation.bootstrap import Interval, resamples
+from manyeyes.evaluation.map_pool import Judged, pooled_ap, squares
+from manyeyes.evaluation.map_quality import LATERAL_WITHIN_M, Thresholds, lines_of_kind, pieces_of
 from manyeyes.ops.nearest_line import nearest_line
 
 Floats = NDArray[np.float64]
@@ -47,19 +47,8 @@ def ap_interval(
     level: float = 0.95,
 ) -> Interval:
     """The AP of one kind, mean over the thresholds, with its interval."""
-    mine, theirs = lines_of_kind(predicted, kind), lines_of_kind(truth, kind)
-    known, block = _blocks(np.vstack((_middles(mine), _middles(theirs))))
-    own, true = block[: len(mine)], block[len(mine) :]
-    order = ranking(mine)
-    table = chamfer(mine, theirs, WAYS[way], max(THRESHOLDS[thresholds]))
-    weights = np.vstack((np.ones((1, known), dtype=np.int64), resamples(known, n, seed)))
-    found = []
-    for threshold in THRESHOLDS[thresholds]:
-        taken = match(table, order, threshold)
-        where = np.where(taken >= 0, true[taken] if len(true) else own, own)[order]
-        n_gt = np.bincount(true, minlength=known)
-        found.append(weighted_ap(Pooled((), taken[order] >= 0, where, n_gt, False), weights))
-    return _interval(np.mean(found, axis=0), level, known)
+    judged = Judged(predicted, truth, squares("", BLOCK_M))
+    return pooled_ap([judged], kind, way, thresholds, n=n, seed=seed, level=level).interval()
 
 
 def f_interval(
@@ -100,12 +89,6 @@ def _blocks(places: Floats) -> tuple[int, Ints]:
     cells = np.floor(places / BLOCK_M).astype(np.int64)
     known, block = np.unique(cells, axis=0, return_inverse=True)
     return len(known), block.reshape(-1)
-
-
-def _middles(lines: Lines) -> Floats:
-    """(N, 2) the middle of each line's bounding box."""
-    bounds = lines.bounds()
-    return (bounds[:, :2] + bounds[:, 2:]) / 2
 
 
 def _interval(values: Floats, level: float, blocks: int) -> Interval:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +52,17 @@ class World:
     maps: Callable[[Recording], Mapping[str, MapElements]]
 
 
-Draw = Callable[[Mapper, Scenery, str, int], Sequence[Drawing]]
-"""A model, a scenery, a scenario and a seed to what a study draws there; its repr must name its whole setting."""
+class Draw(Protocol):
+    """What a study draws of a scenario at a seed."""
+
+    @property
+    def key(self) -> str:
+        """Its whole setting, other weights than the map model's by what is in them: equal keys, equal drawings."""
+        ...
+
+    def __call__(self, mapper: Mapper, scenery: Scenery, scenario: str, seed: int) -> Sequence[Drawing]:
+        """The drawings, row by row."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -109,7 +119,7 @@ def run_unit(unit: TileUnit) -> TileCell:
 
 def cell_path(unit: TileUnit) -> Path:
     """The file of a cell, named by all that it depends on."""
-    said = repr((_mapper(unit.weights).fingerprint.hex(), unit.draw, unit.seed, unit.data, code_digest(SOURCES)))
+    said = repr((_mapper(unit.weights).fingerprint.hex(), unit.draw.key, unit.seed, unit.data, code_digest(SOURCES)))
     digest = hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
     return unit.folder / f"{unit.scenario}-{unit.seed}-{digest}.npz"
 

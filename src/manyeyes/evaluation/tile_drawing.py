@@ -23,6 +23,7 @@ from manyeyes.evaluation.map_tiles import cut_to
 from manyeyes.evaluation.tile_cells import Drawing
 from manyeyes.evaluation.tile_looks import Scenery, crowd_tile, local_tile, meeting, upright
 from manyeyes.models import zoo
+from manyeyes.models.checkpoint import fingerprint
 from manyeyes.models.detector import Detector
 from manyeyes.models.mapper import Mapper
 
@@ -37,6 +38,11 @@ class DrawLocal:
 
     The model draws its whole tile about the agent, and what lies in the window is cut out of it, as agents do who survey locally.
     """
+
+    @property
+    def key(self) -> str:
+        """Nothing to set."""
+        return repr(self)
 
     def __call__(self, mapper: Mapper, scenery: Scenery, scenario: str, seed: int) -> Sequence[Drawing]:
         """One drawing an agent."""
@@ -54,6 +60,11 @@ class DrawSemiGlobal:
     """The tile about a scenario's first agent from one look, and from more of a crowd; a row for each number of looks."""
 
     looks: tuple[int, ...] = (1, 2, 5, 10)
+
+    @property
+    def key(self) -> str:
+        """The numbers of looks."""
+        return repr(self)
 
     def __call__(self, mapper: Mapper, scenery: Scenery, scenario: str, seed: int) -> Sequence[Drawing]:
         """One drawing a number of looks; all share what they are a part of."""
@@ -76,6 +87,12 @@ class DrawPose:
     deg_per_m: float = 2.0
     aligner: Aligner = Aligner()
     detector: str = zoo.DEFAULT
+
+    @property
+    def key(self) -> str:
+        """The errors, the corrector and its weights, and the detector's."""
+        net = self.aligner.net
+        return repr((self, fingerprint(_detector(self.detector)), None if net is None else fingerprint(net)))
 
     def __call__(self, mapper: Mapper, scenery: Scenery, scenario: str, seed: int) -> Sequence[Drawing]:
         """Rows: one vehicle; clean; noisy; noisy, corrected; clean, corrected."""

@@ -86,6 +86,7 @@ def _seen(unit: CrowdUnit) -> tuple[tuple[Observation, ...], _Truth]:
     if truth is None:
         recording = OneInstant(unit.world.open(), unit.seed)
         built = build_map(recording, unit.ground, Building(_mapper(unit.weights), unit.survey, every=1))
+        path.parent.mkdir(parents=True, exist_ok=True)
         write_observations(path.with_suffix(".parquet"), built.cartographer.observations, unit.ground.frame)
         assert built.truth is not None
         truth = _Truth(built.truth, np.array(built.numbers.bytes_per_message))

@@ -39,19 +39,20 @@ def run(options: Options, console: Console) -> None:
     draw = DrawPose(aligner=Aligner(options.align))
     done = tables(options, console, found, draw)
     rows = {sensors: [table.row(name) for name in NAMES] for sensors, table in done.items()}
-    claims = [claim for sensors, table in done.items() for claim in _claims(sensors, table)]
+    held = [claim for sensors, table in done.items() for claim in claims(sensors, table)]
     title = f"Tiles, others' claims off by {draw.sigma_m:g} m and {draw.sigma_m * draw.deg_per_m:g} degrees (sigma)"
-    sheets = [rows_sheet(title, rows), claims_sheet(claims, "scenarios")]
+    sheets = [rows_sheet(title, rows), claims_sheet(held, "scenarios")]
     cells = next(iter(done.values())).cells
     panels = [
         panel
         for cell in shown(cells, lambda c: len(c.drawings[0].truth))
         for panel in tile_panels(cell, {name: name for name in (CLEAN, NOISY, CORRECTED)}, TILE)
     ]
-    publish(options, console, title_of(options, found), {"rows": rows, "claims": claims}, sheets, panels, 4)
+    publish(options, console, title_of(options, found), {"rows": rows, "claims": held}, sheets, panels, 4)
 
 
-def _claims(sensors: str, table: TileTable) -> list[MapClaim]:
+def claims(sensors: str, table: TileTable) -> list[MapClaim]:
+    """What errors cost, what the corrector wins back of it, and that it does no harm where there are none."""
     half = mean_of([table.mean(CLEAN), table.mean(NOISY)])
     return [
         claimed(f"{sensors}: corrected - (clean + noisy) / 2", table.mean(CORRECTED).less(half), 0.0),

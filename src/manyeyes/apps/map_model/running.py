@@ -71,7 +71,7 @@ def models(options: Options) -> tuple[Model, ...]:
     for name in names:
         sensors = zoo.load_mapper(name).config.bev.sensors
         world = World(OpenLooks(options.data, options.split, sensors), true_maps)
-        assert_split(zoo.mapper_towns(name), tuple(true_maps(world.open())))
+        assert_split(zoo.mapper_towns(name), [scenario.rpartition("_")[0] for scenario in world.open().scenarios])
         found.append(Model(str(name), SENSORS[tuple(sorted(sensors, reverse=True))], world))
     if len({model.sensors for model in found}) < len(found):
         raise ConfigError(f"One model a set of sensors; got {', '.join(m.sensors for m in found)}.")

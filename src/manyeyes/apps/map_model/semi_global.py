@@ -41,17 +41,18 @@ def run(options: Options, console: Console) -> None:
     done = tables(options, console, found, draw)
     names = tuple(map(str, draw.looks))
     rows = {sensors: [table.row(name) for name in names] for sensors, table in done.items()}
-    claims = [claim for sensors, table in done.items() for claim in _claims(sensors, table, draw.looks)]
-    sheets = [rows_sheet("Tiles, by sensors and looks", rows), claims_sheet(claims, "scenarios"), PAPER]
+    held = [claim for sensors, table in done.items() for claim in claims(sensors, table, draw.looks)]
+    sheets = [rows_sheet("Tiles, by sensors and looks", rows), claims_sheet(held, "scenarios"), PAPER]
     titles = {names[0]: "one vehicle", names[-1]: f"{names[-1]} looks"}
     cells = next(iter(done.values())).cells
     panels = [
         panel for cell in shown(cells, lambda c: len(c.drawings[0].truth)) for panel in tile_panels(cell, titles, TILE)
     ]
-    publish(options, console, title_of(options, found), {"rows": rows, "claims": claims}, sheets, panels, 3)
+    publish(options, console, title_of(options, found), {"rows": rows, "claims": held}, sheets, panels, 3)
 
 
-def _claims(sensors: str, table: TileTable, looks: tuple[int, ...]) -> list[MapClaim]:
+def claims(sensors: str, table: TileTable, looks: tuple[int, ...]) -> list[MapClaim]:
+    """More looks against one: the bar and the goal for the most, and that none is worse."""
     one, *more = map(str, looks)
     bars = ((more[-1], BAR, ""), (more[-1], GOAL, ", goal"), *((name, 0.0, "") for name in more))
     return [table.claim(f"{sensors}: {name} looks - one vehicle{said}", name, one, bar) for name, bar, said in bars]

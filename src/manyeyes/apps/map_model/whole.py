@@ -78,7 +78,7 @@ class Town:
     @cached_property
     def known(self) -> list[Block]:
         """Every square that holds anything."""
-        return blocks_of([self.judged(place) for place in self.maps])
+        return blocks_of([self.judged(place, own) for place in self.maps for own in (False, True)])
 
     def judged(self, place: Place, in_own_view: bool = False) -> list[Judged]:
         """A row's maps against the truth, seed by seed."""
@@ -89,17 +89,17 @@ class Town:
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    found = models(options)
-    if len(found) > 1:
-        raise ConfigError(f"The study 'whole' takes one model: name it with --weights; got {len(found)}.")
+    model, *others = models(options)
+    if others:
+        raise ConfigError(f"The study 'whole' takes one model: name it with --weights; got {1 + len(others)}.")
     methods = options.methods or METHODS
-    towns = _towns(options, console, found[0], methods)
+    towns = _towns(options, console, model, methods)
     means = {town.name: {place: _mean(town, place, town.known) for place in town.maps} for town in towns}
     rows = [_row(town, place, means[town.name][place]) for town in towns for place in town.maps]
     claims = _claims(means, methods)
     sheets = [_sheet(town.name, rows) for town in towns] + [claims_sheet(claims, "squares of 64 m"), PAPER]
     payload: dict[str, object] = {"rows": rows, "claims": claims}
-    publish(options, console, title_of(options, found), payload, sheets, _panels(towns, means), 3)
+    publish(options, console, title_of(options, [model]), payload, sheets, _panels(towns, means), 3)
 
 
 def _towns(options: Options, console: Console, model: Model, methods: Sequence[str]) -> list[Town]:
