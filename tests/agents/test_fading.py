@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from manyeyes.agents.collaboration.alone import Alone
+from manyeyes.agents.collaboration import method
+from manyeyes.agents.collaboration.early import Early
 from manyeyes.agents.collaboration.fading import FADE, faded, strongest
 from manyeyes.agents.collaboration.late import Late
 from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud, Transform
@@ -64,19 +65,41 @@ def test_of_boxes_that_overlap_the_best_stays() -> None:
 
 def test_what_is_hidden_now_stands_where_it_should_be_by_now() -> None:
     """Seen at 30 m a tenth of a second ago, at 10 m/s: 1 m farther on, 1 m nearer for the agent's own motion."""
-    found = Alone().hear(Sees(boxes(), boxes(30.0, speed=10.0)), frame(9), ())
+    found = method("late-remembering").hear(Sees(boxes(), boxes(30.0, speed=10.0)), frame(9), ())
     assert found.center[:, 0].tolist() == pytest.approx([30.0]) and float(found.score) == pytest.approx(0.8 * FADE)
-    still = Alone().hear(Sees(boxes(), boxes(30.0)), frame(9), ())
+    still = method("late-remembering").hear(Sees(boxes(), boxes(30.0)), frame(9), ())
     assert still.center[:, 0].tolist() == pytest.approx([29.0])
 
 
 def test_what_is_seen_now_wins_over_what_was() -> None:
-    found = Alone().hear(Sees(boxes(30.0), boxes(31.0)), frame(9), ())
+    found = method("late-remembering").hear(Sees(boxes(30.0), boxes(31.0)), frame(9), ())
     assert len(found) == 1 and float(found.score) == pytest.approx(0.8) and float(found.center[0, 0]) == 30.0
 
 
 def test_a_late_message_does_not_fade_but_what_its_sender_said_before_does() -> None:
     messages = [said(6, boxes(10.0)), said(5, boxes(10.5, 50.0))]
-    found = Late().hear(Sees(boxes()), frame(9), messages)
+    found = method("late-remembering").hear(Sees(boxes()), frame(9), messages)
     by_place = dict(zip(found.center[:, 0].tolist(), found.score.tolist()))
     assert by_place == {10.0: pytest.approx(0.8), 50.0: pytest.approx(0.8 * FADE)}
+
+
+def test_late_fusion_as_papers_have_it_knows_only_what_is_newest() -> None:
+    messages = [said(6, boxes(10.0)), said(5, boxes(50.0))]
+    found = Late().hear(Sees(boxes(), boxes(30.0)), frame(9), messages)
+    assert found.center[:, 0].tolist() == [10.0]
+
+
+def test_early_fusion_merges_what_is_newest_alone() -> None:
+    merged: list[PointCloud] = []
+
+    class Looks(Sees):
+        def earlier_merged(self, frame: AgentFrame, cloud: PointCloud) -> None:
+            merged.append(cloud)
+
+        def see_cloud(self, cloud: PointCloud, earlier: PointCloud | None) -> Seen:
+            return Seen(boxes())
+
+    clouds = [PointCloud.of(torch.tensor([[x, 0.0, 1.0]])) for x in (6.0, 5.0)]
+    messages = [replace(said(at, boxes()), points=cloud) for at, cloud in zip((6, 5), clouds)]
+    Early().hear(Looks(boxes()), frame(9), messages)
+    assert merged[0].xyz.tolist() == [[6.0, 0.0, 1.0]]

@@ -33,6 +33,7 @@ WIDTH, FILM_WIDTH, FILM_FRAME_MS = 1280, 800, 200
 TITLES = {
     "alone": "Ego alone",
     "late": "Late fusion: boxes are shared",
+    "late-remembering": "Late fusion: boxes are shared and remembered",
     "intermediate": "Intermediate fusion: tokens are shared",
     "early": "Early fusion: all points are shared",
 }

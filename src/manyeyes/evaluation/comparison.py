@@ -25,7 +25,11 @@ class Bar:
     iou: float = 0.5
 
 
-BARS = (Bar("intermediate", "alone", 0.12), Bar("intermediate", "late", 0.02))
+BARS = (
+    Bar("intermediate", "alone", 0.12),
+    Bar("intermediate", "late", 0.02),
+    Bar("intermediate", "late-remembering", 0.02),
+)
 
 
 @dataclass(frozen=True)

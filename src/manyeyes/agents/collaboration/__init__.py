@@ -11,7 +11,7 @@ from manyeyes.agents.collaboration.early import Early
 from manyeyes.agents.collaboration.fused import Fused
 from manyeyes.agents.collaboration.intermediate import Intermediate, at_random, confidence
 from manyeyes.agents.collaboration.late import Late
-from manyeyes.agents.eyes import Eyes
+from manyeyes.agents.eyes import REMEMBERED, Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message
 
 __all__ = ["METHODS", "Alone", "Collaboration", "Early", "Intermediate", "Late", "method"]
@@ -39,6 +39,7 @@ METHODS: dict[str, Collaboration] = {
     for m in (
         Alone(),
         Late(),
+        Late("late-remembering", instants=REMEMBERED),
         Intermediate(),
         Intermediate("confidence", confidence),
         Intermediate("random", at_random),

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from manyeyes.agents.collaboration.fading import moved, strongest
 from manyeyes.agents.eyes import Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 
@@ -22,5 +21,5 @@ class Alone:
         return None
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """What the agent's own clouds show, of now and of a moment ago."""
-        return strongest([eyes.see(frame).boxes, *moved(frame, eyes.before(frame))])
+        """What the agent's own cloud shows."""
+        return eyes.see(frame).boxes

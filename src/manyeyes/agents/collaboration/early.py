@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from manyeyes.agents.collaboration.heading import ego_from_sender, header
+from manyeyes.agents.collaboration.heading import behind_s, ego_from_sender, header
 from manyeyes.agents.eyes import Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud
 
@@ -23,6 +23,7 @@ class Early:
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the merged cloud and of the one merged before it."""
-        heard = [m.points.transform(ego_from_sender(frame, m)) for m in messages if m.points is not None]
+        news = [m for m, behind in zip(messages, behind_s(messages)) if not behind]
+        heard = [m.points.transform(ego_from_sender(frame, m)) for m in news if m.points is not None]
         merged = PointCloud.cat([frame.points, *heard])
         return eyes.see_cloud(merged, eyes.earlier_merged(frame, merged)).boxes

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Boxes that were seen or said a moment ago take part too: where they should be by now, a little less sure of themselves.
 
-What tokens of the instants before do for intermediate fusion, their boxes do for the other methods: all remember alike.
+What tokens of the instants before do for intermediate fusion, their boxes do for late fusion that remembers: its strongest rival.
 """
 
 from __future__ import annotations

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from manyeyes.datatypes import AgentFrame, Message, Transform
 
 
@@ -16,6 +18,12 @@ def header(frame: AgentFrame, fingerprint: bytes) -> Message:
         fingerprint=fingerprint,
         is_infrastructure=frame.is_infrastructure,
     )
+
+
+def behind_s(messages: Sequence[Message]) -> list[float]:
+    """Seconds that each message lies behind the newest of its sender: 0 for what is news, more for what is remembered."""
+    newest = {m.agent_id: m.timestamp_ns for m in sorted(messages, key=lambda m: m.timestamp_ns)}
+    return [(newest[m.agent_id] - m.timestamp_ns) / 1e9 for m in messages]
 
 
 def ego_from_sender(frame: AgentFrame, message: Message) -> Transform:
