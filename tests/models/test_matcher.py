@@ -164,3 +164,10 @@ def test_the_shipped_net_has_a_name_of_its_own(tmp_path, monkeypatch):
     assert zoo.load_feakm("feakm").config.matcher == SMALL and zoo.names() == ()
     with pytest.raises(checkpoint.CheckpointError, match="No weights are named 'feakm'"):
         zoo.load("feakm")
+
+
+def test_the_net_that_ships_is_of_the_detector_that_ships():
+    """A detector that is trained anew leaves the shipped net without meaning: it has to be taught again."""
+    net = zoo.load_feakm()
+    net.check_views(zoo.load().fingerprint)
+    assert not net.training and sum(p.numel() for p in net.parameters()) <= 2_000_000

@@ -106,7 +106,8 @@ class ConsensusConfig:
     """pairs: how many must agree. shortest_m: two pairs nearer than this give no hypothesis. gate: largest squared misfit of
     a pair (3 degrees of freedom), area_m2: see vote.py. refined: at most so many hypotheses are refined, the best distinct
     ones, which bounds the time where no two fit. apart_m, apart_rad: answers that differ by less are one. accept: how much
-    likelier than chance and than the best distinct other pose an answer must be.
+    likelier than chance and than the best distinct other pose an answer must be; with the net that ships, 0.5 % of 600 pairs of
+    views of different scenes of the validation town score more.
     """
 
     pairs: int = 4
@@ -116,7 +117,7 @@ class ConsensusConfig:
     refined: int = 16
     apart_m: float = 2.0
     apart_rad: float = 0.105
-    accept: Acceptance = field(default_factory=lambda: Acceptance(least_score=12.0))
+    accept: Acceptance = field(default_factory=lambda: Acceptance(least_score=18.0))
 
     def __post_init__(self) -> None:
         limits = self.shortest_m, self.gate, self.area_m2, self.refined, self.apart_m, self.apart_rad
