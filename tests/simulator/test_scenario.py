@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -8,7 +9,7 @@ pytest.importorskip("libsumo", reason="scenarios need the sim extra")
 
 from manyeyes.datasets.recording import points_in_listed_boxes
 from manyeyes.datatypes import ConfigError, PointCloud, Snapshot
-from manyeyes.simulator.scenario import RSU_ID, NoSceneError, Scenario, ScenarioSpec, make_scenario
+from manyeyes.simulator.scenario import RSU_ID, NoSceneError, Scenario, ScenarioSpec, make_scenario, seen_boxes
 from manyeyes.simulator.towns import load_town
 
 SPEC = ScenarioSpec(
@@ -35,6 +36,25 @@ def test_points_lie_in_the_boxes_that_agents_list(snapshot: Snapshot) -> None:
         flip = frame.points.xyz * torch.tensor([1.0, -1.0, 1.0])
         mirrored.append(replace(frame, points=PointCloud(flip, frame.points.intensity, frame.points.time_s)))
     assert int((points_in_listed_boxes(replace(snapshot, frames=tuple(mirrored))) == 0).sum()) > 5
+
+
+def test_a_box_is_seen_where_a_return_of_its_own_vehicle_lies_in_it(snapshot: Snapshot) -> None:
+    """Against box by box: of returns at random, named after any vehicle, some lie in their own box and some in another's."""
+    assert snapshot.truth is not None
+    boxes, rng = snapshot.truth.boxes, np.random.default_rng(0)
+    row = rng.integers(0, len(boxes), 400)
+    near = boxes.center[row].numpy() + rng.normal(0, 1.5, (400, 3))
+    named = np.where(rng.random(400) < 0.3, boxes.id[rng.integers(0, len(boxes), 400)], boxes.id[row])
+    named[:20] = 0
+    pose = snapshot.frames[0].world_from_agent
+    cloud = PointCloud.of(pose.inverse().apply(torch.from_numpy(near)).float())
+    local, own = boxes.transform(pose.inverse()).to(torch.float32), int(boxes.id[2])
+    slow = [
+        int(id) != own and bool(local[i : i + 1].contains(cloud.xyz[torch.from_numpy(named == int(id))], 0.05).any())
+        for i, id in enumerate(boxes.id)
+    ]
+    assert seen_boxes(cloud, named, pose, boxes, own).tolist() == slow and 0 < sum(slow) < len(slow)
+    assert not seen_boxes(cloud[:0], named[:0], pose, boxes, own).any()
 
 
 def test_agents_are_vehicles_and_a_unit_on_a_pole_that_list_others(scenario: Scenario, snapshot: Snapshot) -> None:

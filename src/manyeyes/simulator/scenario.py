@@ -181,19 +181,19 @@ def seen_boxes(
     points: PointCloud, instance: NDArray[np.int64], pose: Transform, boxes: Boxes, own: int
 ) -> torch.Tensor:
     """(N,) bool: boxes with at least one return of that vehicle inside (5 cm margin); never the agent's own."""
-    met = np.flatnonzero(instance > 0)
+    met = torch.from_numpy(np.flatnonzero((instance > 0) & (instance != own)))
     seen = torch.zeros(len(boxes), dtype=torch.bool)
-    if not len(met):
-        return seen
-    order = met[np.argsort(instance[met], kind="stable")]
-    ids, first = np.unique(instance[order], return_index=True)
+    # Each return is asked of its own vehicle's box alone.
+    by_id = boxes.id.argsort()
+    row = by_id[torch.searchsorted(boxes.id[by_id], torch.from_numpy(instance)[met])]
     local = boxes.transform(pose.inverse()).to(torch.float32)
-    row_of = {int(i): row for row, i in enumerate(boxes.id)}
-    for id, part in zip(ids.tolist(), np.split(order, first[1:])):
-        if id != own:
-            row = row_of[id]
-            inside = local[row : row + 1].contains(points.xyz[torch.from_numpy(part)], 0.05)
-            seen[row] = bool(inside.any())
+    delta = points.xyz[met] - local.center[row]
+    c, s = local.yaw.cos()[row], local.yaw.sin()[row]
+    half = local.size[row] / 2 + 0.05
+    inside = (delta[:, 0] * c + delta[:, 1] * s).abs() <= half[:, 0]
+    inside &= (delta[:, 1] * c - delta[:, 0] * s).abs() <= half[:, 1]
+    inside &= delta[:, 2].abs() <= half[:, 2]
+    seen[row[inside]] = True
     return seen
 
 
