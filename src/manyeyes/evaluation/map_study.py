@@ -2,8 +2,8 @@
 """Studies of map fusion: methods side by side over places, counts of observations and seeds, held against bars.
 
 A cell is a place and a seed; intervals are percentile bootstraps over cells (Efron and Tibshirani, 1993), 95 %, and a difference
-of two methods is paired over the same cells. The best rival at a count is the one with the greatest mean there. A bar is reached
-when the mean difference is at or above it; the interval says how sure that is.
+of two methods is paired over the same cells. The best rival at a count is the one with the greatest mean there. A bar is judged
+by the whole interval, as everywhere: where it straddles the bar, the table says "not resolved".
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.bootstrap import Interval, mean_interval
+from manyeyes.evaluation.bootstrap import Interval, mean_interval, resolved
+from manyeyes.evaluation.bootstrap import Verdict as Word
 from manyeyes.evaluation.map_cells import Cell, Unit, run_unit
 from manyeyes.evaluation.map_methods import OURS, RIVALS, Settings
 from manyeyes.evaluation.map_oracle import ORACLES
@@ -97,7 +98,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A bar of the study, what was measured against it, and whether that is enough."""
+    """A bar of the study, what was measured against it, and the word on it: reached, missed or not resolved."""
 
     group: str
     what: str
@@ -106,7 +107,7 @@ class Verdict:
     low: float
     high: float
     bar: float
-    reached: bool
+    word: Word
 
 
 def group_of(config: StudyConfig, cell: Cell) -> str:
@@ -163,10 +164,15 @@ def verdicts(config: StudyConfig, cells: Sequence[Cell]) -> tuple[Verdict, ...]:
         if group.startswith("200 "):
             ours = [c.kind("divider") for c in own if c.method == OURS]
             f, duplication = mean_interval([k.f[1] for k in ours]), mean_interval([k.duplication for k in ours])
-            out.append(Verdict(group, "F@0.5 m of dividers", "", f.value, f.low, f.high, 0.97, f.value >= 0.97))
-            inside = 0.95 <= duplication.value <= 1.05
+            out.append(
+                Verdict(group, "F@0.5 m of dividers", "", f.value, f.low, f.high, 0.97, resolved(0.97, f.low, f.high))
+            )
+            low, high = duplication.low, duplication.high
+            # Within both sides: the worse of two words.
+            words = resolved(0.95, low, high), resolved(-1.05, -high, -low)
+            word: Word = "reached" if words == ("reached",) * 2 else "missed" if "missed" in words else "not resolved"
             what = "duplication of dividers, 0.95 to 1.05"
-            out.append(Verdict(group, what, "", duplication.value, duplication.low, duplication.high, 1.0, inside))
+            out.append(Verdict(group, what, "", duplication.value, low, high, 1.0, word))
     return tuple(out)
 
 
@@ -178,7 +184,7 @@ def _against_best(
         return []
     gain = difference(cells, OURS, rival, "mean", way, thresholds)
     what = f"mAP ({way}, {thresholds}) above the best rival"
-    return [Verdict(group, what, rival, gain.value, gain.low, gain.high, 0.10, gain.value >= 0.10)]
+    return [Verdict(group, what, rival, gain.value, gain.low, gain.high, 0.10, resolved(0.10, gain.low, gain.high))]
 
 
 def _dividers(group: str, cells: Sequence[Cell], methods: Sequence[str]) -> list[Verdict]:
@@ -190,7 +196,7 @@ def _dividers(group: str, cells: Sequence[Cell], methods: Sequence[str]) -> list
     bar = min(2 * theirs, theirs + 0.5 * (1 - theirs))
     ours = mean_interval([c.ap_of("divider") for c in cells if c.method == OURS])
     what = f"AP of dividers; {rival} has {theirs:.3f}"
-    return [Verdict(group, what, rival, ours.value, ours.low, ours.high, bar, ours.value >= bar)]
+    return [Verdict(group, what, rival, ours.value, ours.low, ours.high, bar, resolved(bar, ours.low, ours.high))]
 
 
 def best_rival(cells: Sequence[Cell], methods: Sequence[str], what: str, way: str, thresholds: str) -> str | None:

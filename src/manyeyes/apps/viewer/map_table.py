@@ -125,7 +125,7 @@ def _cells(line: Line) -> tuple[str, ...]:
 
 def _verdict(v: Verdict) -> tuple[str, ...]:
     interval = f"[{v.low:.3f}, {v.high:.3f}]"
-    return v.what, v.rival, f"{v.value:.3f}", interval, f"{v.bar:.3f}", "reached" if v.reached else "missed"
+    return v.what, v.rival, f"{v.value:.3f}", interval, f"{v.bar:.3f}", v.word
 
 
 def _table(title: str, headings: Sequence[str]) -> Table:
