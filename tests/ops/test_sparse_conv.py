@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, conv_transpose2d
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
-from manyeyes.ops.pair_loops import add_products
+from manyeyes.ops.pair_loops import add_products, panels
 from manyeyes.ops.sparse_conv import (
     coalesce,
     inverse_conv,
@@ -440,7 +440,7 @@ def test_the_loop_of_pairs_is_the_sum_over_them(pairs):
     for tap in (3, 1):
         wanted = wanted.index_add(0, target[:pairs], x[source[:pairs]].double() @ w[tap].double())
     counts = torch.tensor([pairs, pairs])
-    add_products(x.numpy(), w.numpy(), 3, -2, source.numpy(), target.numpy(), counts.numpy(), out.numpy())
+    add_products(x.numpy(), panels(w), 3, -2, source.numpy(), target.numpy(), counts.numpy(), out.numpy())
     assert_near(out.double(), wanted, 1e-6)
 
 

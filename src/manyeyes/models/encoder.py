@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch import nn
 
 from manyeyes.datatypes import ConfigError, SparseBev
-from manyeyes.models.layers import DownLayer, SubmanifoldLayer, UpLayer
+from manyeyes.models.layers import DownLayer, SubmanifoldLayer, SubmanifoldStage, UpLayer
 from manyeyes.models.pruning import FocalPrune, Pruned
 from manyeyes.ops.sparse_conv import merge
 
@@ -65,10 +65,8 @@ class SparseEncoder(nn.Module):
             [SubmanifoldLayer(inputs, width[1], kernel=1)]
             + [DownLayer(width[s // 2], width[s], config.dilating) for s in self.strides[1:]]
         )
-        self.stages = nn.ModuleList(
-            nn.Sequential(*(SubmanifoldLayer(c, c) for _ in range(n)))
-            for _, c, n in zip(self.strides, config.channels, config.layers)
-        )
+        stages = zip(self.strides, config.channels, config.layers)
+        self.stages = nn.ModuleList(SubmanifoldStage(channels, layers) for _, channels, layers in stages)
         self.prune = nn.ModuleDict({str(s): FocalPrune(width[s]) for s in config.prune_strides})
         self.post_merge = SubmanifoldLayer(width[8], width[8])
         ups = [s for s in (4, 2) if s >= config.head_stride]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import copy
 
 from manyeyes.models.detector import Detector
-from manyeyes.models.layers import DownLayer, SubmanifoldLayer, UpLayer
+from manyeyes.models.layers import DownLayer, SubmanifoldLayer, SubmanifoldStage, UpLayer
 from manyeyes.models.transformer import WindowBlock
 
 
@@ -18,6 +18,6 @@ def folded(model: Detector) -> Detector:
     """
     copied = copy.deepcopy(model).eval().requires_grad_(False)
     for layer in copied.modules():
-        if isinstance(layer, SubmanifoldLayer | DownLayer | UpLayer | WindowBlock):
+        if isinstance(layer, SubmanifoldStage | SubmanifoldLayer | DownLayer | UpLayer | WindowBlock):
             layer.fold()
     return copied

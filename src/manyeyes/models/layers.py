@@ -10,7 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import Sites, SparseBev
-from manyeyes.ops.sparse_conv import inverse_conv, strided_conv, submanifold_conv
+from manyeyes.ops.folded_conv import FoldedConvs
+from manyeyes.ops.sparse_conv import inverse_conv, same_sites_map, strided_conv, strided_map, submanifold_conv
+from manyeyes.ops.sparse_index import Window
 
 
 class ActiveNorm(nn.BatchNorm1d):
@@ -68,9 +70,12 @@ class SubmanifoldLayer(nn.Module):
         self.weight, self.norm = conv_weight(outputs, inputs, kernel), norm(outputs)
         self.skip = inputs == outputs
         self.register_buffer("bias", None, persistent=False)
+        self.folded: FoldedConvs | None = None
 
     def forward(self, x: SparseBev) -> SparseBev:
         """(N, inputs) to (N, outputs) on the same sites."""
+        if self.folded is not None and self.folded.takes(x.features):
+            return x.with_features(self.folded(x.features, same_sites_map(x.sites, self.weight.shape[2])))
         y = self.norm(submanifold_conv(x, self.weight, self.bias).features)
         return x.with_features(_rectified(y, x.features if self.skip else None))
 
@@ -86,6 +91,31 @@ class SubmanifoldLayer(nn.Module):
                 middle = weight.shape[2] // 2
                 self.weight[:, :, middle, middle] += torch.eye(len(weight), dtype=weight.dtype, device=weight.device)
                 self.skip = False
+            self.folded = FoldedConvs.of([self.weight], [self.bias])
+
+
+class SubmanifoldStage(nn.Sequential):
+    """So many layers of equal width on the same sites, one after another."""
+
+    def __init__(self, channels: int, layers: int) -> None:
+        super().__init__(*(SubmanifoldLayer(channels, channels) for _ in range(layers)))
+        self.folded: FoldedConvs | None = None
+
+    def forward(self, input: SparseBev) -> SparseBev:
+        """(N, channels) to (N, channels)."""
+        if self.folded is not None and self.folded.takes(input.features):
+            return input.with_features(self.folded(input.features, same_sites_map(input.sites, kernel=3)))
+        return super().forward(input)
+
+    def fold(self) -> None:
+        """Fold every layer, for good, into weights that one compiled call goes through."""
+        layers = [layer for layer in self if isinstance(layer, SubmanifoldLayer)]
+        for layer in layers:
+            layer.fold()
+            layer.folded = None
+        self.folded = FoldedConvs.of(
+            [layer.weight for layer in layers], [layer.bias for layer in layers if layer.bias is not None]
+        )
 
 
 class DownLayer(nn.Module):
@@ -98,9 +128,13 @@ class DownLayer(nn.Module):
         self.weight, self.dilating = conv_weight(outputs, inputs, 3), dilating
         self.norm: nn.Module = ActiveNorm(outputs)
         self.register_buffer("bias", None, persistent=False)
+        self.folded: FoldedConvs | None = None
 
     def forward(self, x: SparseBev) -> SparseBev:
         """Features at twice the stride."""
+        if self.folded is not None and self.folded.takes(x.features):
+            sites, table = strided_map(x.sites, Window(3, 2, 1), self.dilating)
+            return SparseBev(self.folded(x.features, table), sites)
         y = strided_conv(x, self.weight, self.bias, stride=2, padding=1, dilating=self.dilating)
         return y.with_features(_rectified(self.norm(y.features), None))
 
@@ -109,6 +143,7 @@ class DownLayer(nn.Module):
         if isinstance(self.norm, ActiveNorm):
             weight, self.bias = fold_norm(self.weight.detach(), self.norm)
             self.weight, self.norm = nn.Parameter(weight, requires_grad=False), nn.Identity()
+            self.folded = FoldedConvs.of([self.weight], [self.bias])
 
 
 class UpLayer(nn.Module):

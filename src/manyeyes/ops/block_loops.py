@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from manyeyes.ops.pair_loops import LANES, add_products
+from manyeyes.ops.pair_loops import LANES, add_products, empty_rows, panels
 from manyeyes.ops.window_loops import FAST, WindowRuns, attend, power_of_two
 
 _EPS = 1e-5
@@ -32,8 +32,8 @@ _ERF_T, _SQUARE = np.float32(0.3275911 / math.sqrt(2)), np.float32(-math.log2(ma
 
 @dataclass(frozen=True, eq=False)
 class BlockWeights:
-    """matrices: (1, inputs, outputs) of query, key, value, output, and the net's two layers; vectors: their biases, then
-    weights and biases of the two norms. All float32.
+    """matrices: (inputs, outputs), each in panels, of query, key, value, output, and the net's two layers; vectors: their
+    biases, then weights and biases of the two norms. All float32.
     """
 
     matrices: tuple[NDArray[np.float32], ...]
@@ -46,7 +46,7 @@ class BlockWeights:
         if any(n.eps != _EPS for n in norms) or any(w.out_features % LANES or w.weight.is_cuda for w in linears):
             return None
         tensors = [*(w.bias for w in linears), *(t for n in norms for t in (n.weight, n.bias))]
-        matrices = tuple(w.weight.detach().float().T.contiguous().numpy()[None] for w in linears)
+        matrices = tuple(panels(w.weight.detach().float().T[None]) for w in linears)
         return cls(matrices, tuple(t.detach().float().contiguous().numpy() for t in tensors), heads)
 
 
@@ -64,7 +64,7 @@ def run_block(features: Tensor, offsets: Tensor, runs: WindowRuns, weights: Bloc
 def _block(x, offsets, frequency, order, start, heads, matrices, vectors):  # pragma: no cover
     n, channels = x.shape
     rows, counts = np.arange(n), np.full(1, n)
-    normed, placed = np.empty_like(x), np.empty_like(x)
+    normed, placed = empty_rows(n, channels), empty_rows(n, channels)
     _norm(x, vectors[6], vectors[7], normed)
     _place(normed, offsets, frequency, placed)
     q, k, v = _sums(n, vectors[0]), _sums(n, vectors[1]), _sums(n, vectors[2])
@@ -72,7 +72,8 @@ def _block(x, offsets, frequency, order, start, heads, matrices, vectors):  # pr
     add_products(placed, matrices[1], 0, 1, rows, rows, counts, k)
     add_products(normed, matrices[2], 0, 1, rows, rows, counts, v)
     attend(q.reshape(-1), k.reshape(-1), v.reshape(-1), placed.reshape(-1), heads, channels // heads, order, start)
-    out = x + vectors[3]
+    out = empty_rows(n, channels)
+    out[:] = x + vectors[3]
     add_products(placed, matrices[3], 0, 1, rows, rows, counts, out)
     _norm(out, vectors[8], vectors[9], normed)
     hidden = _sums(n, vectors[4])
@@ -86,7 +87,7 @@ def _block(x, offsets, frequency, order, start, heads, matrices, vectors):  # pr
 @njit(cache=True, nogil=True)
 def _sums(n, bias):  # pragma: no cover
     """(n, outputs): what the products are added to."""
-    out = np.empty((n, bias.shape[0]), np.float32)
+    out = empty_rows(n, bias.shape[0])
     for i in range(n):
         out[i] = bias
     return out

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
-from manyeyes.ops.pair_loops import LANES, convolve
+from manyeyes.ops.pair_loops import LANES, convolve, panels
 from manyeyes.ops.sparse_index import (
     NeighbourMap,
     Window,
@@ -222,8 +222,8 @@ def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, b
     if _in_loops(x, taps):
         (source, target, counts), out = table.pairs, x.new_empty(table.rows(reverse), taps.shape[2])
         source, target = (target, source) if reverse else (source, target)
-        rows, matrices, start = (t.contiguous().numpy() for t in (x, taps, bias))
-        convolve(rows, matrices, start, source, target, counts, table.is_symmetric, out.numpy())
+        rows, start = x.contiguous().numpy(), bias.contiguous().numpy()
+        convolve(rows, panels(taps), start, source, target, counts, table.is_symmetric, False, out.numpy())
         return out
     # Every site meets itself by the middle tap: no gathering there.
     out = (

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Layers in one call: what each convolution, bias and ReLU of them gives by itself."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes import BevGrid, Sites, SparseBev
+from manyeyes.ops.folded_conv import FoldedConvs
+from manyeyes.ops.pair_loops import empty_rows, panels
+from manyeyes.ops.sparse_conv import same_sites_map, strided_conv, strided_map, submanifold_conv
+from manyeyes.ops.sparse_index import Window
+
+GROUND = BevGrid(-12.8, -6.4, -3.0, 12.8, 6.4, 1.0)
+
+
+def scene(channels: int, share: float = 0.4) -> SparseBev:
+    random = torch.Generator().manual_seed(channels)
+    rows, columns = GROUND.shape
+    key = (torch.rand(2 * rows * columns, generator=random) < share).nonzero()[:, 0]
+    return SparseBev(torch.randn(len(key), channels, generator=random), Sites(key, GROUND, 2))
+
+
+def layer(inputs: int, outputs: int, kernel: int, seed: int) -> tuple[Tensor, Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    weight = torch.randn(outputs, inputs, kernel, kernel, generator=random) / (kernel * inputs**0.5)
+    return weight, torch.randn(outputs, generator=random)
+
+
+@pytest.mark.parametrize("channels", [16, 32, 48, 64, 112, 128, 256])
+@pytest.mark.parametrize("layers", [1, 2, 3])
+@torch.no_grad()
+def test_a_run_of_layers_equals_one_after_another(channels: int, layers: int) -> None:
+    x = scene(channels)
+    convs = [layer(channels, channels, 3, seed) for seed in range(layers)]
+    folded, wanted, before = FoldedConvs.of(*zip(*convs)), x, x.features.clone()
+    for weight, bias in convs:
+        wanted = wanted.with_features(torch.relu(submanifold_conv(wanted, weight.double(), bias.double()).features))
+    assert folded is not None and folded.takes(x.features)
+    got = folded(x.features, same_sites_map(x.sites, kernel=3))
+    assert torch.equal(x.features, before) and float(wanted.features.abs().max()) > 0.5
+    assert 0.2 < float((wanted.features == 0).float().mean()) < 0.8
+    assert torch.allclose(got, wanted.features.float(), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [(5, 32), (32, 16), (64, 128)])
+@pytest.mark.parametrize("dilating", [False, True])
+@torch.no_grad()
+def test_a_strided_layer_and_one_without_neighbours(inputs: int, outputs: int, dilating: bool) -> None:
+    x = scene(inputs, share=0.15)
+    weight, bias = layer(inputs, outputs, 3, seed=0)
+    folded = FoldedConvs.of([weight], [bias])
+    assert folded is not None
+    wanted = torch.relu(strided_conv(x, weight, bias, dilating=dilating).features)
+    sites, table = strided_map(x.sites, Window(3, 2, 1), dilating)
+    got = folded(x.features, table)
+    assert got.shape == (len(sites), outputs)
+    assert torch.allclose(got, wanted, atol=1e-5)
+    weight, bias = layer(inputs, outputs, 1, seed=1)
+    alone = FoldedConvs.of([weight], [bias])
+    assert alone is not None
+    wanted = torch.relu(x.features @ weight[:, :, 0, 0].T + bias)
+    assert torch.allclose(alone(x.features, same_sites_map(x.sites, kernel=1)), wanted, atol=1e-5)
+
+
+@torch.no_grad()
+def test_no_sites() -> None:
+    x = scene(16, share=0.0)
+    folded = FoldedConvs.of(*zip(*(layer(16, 16, 3, seed) for seed in range(2))))
+    assert folded is not None
+    assert folded(x.features, same_sites_map(x.sites, kernel=3)).shape == (0, 16)
+
+
+def test_what_the_loops_do_not_know_is_left_to_the_layers() -> None:
+    assert FoldedConvs.of(*zip(layer(16, 24, 3, seed=0))) is None
+    assert FoldedConvs.of([], []) is None
+    folded = FoldedConvs.of(*zip(layer(16, 16, 3, seed=0)))
+    assert folded is not None
+    assert not folded.takes(torch.zeros(1, 16))  # A gradient might be asked for.
+    with torch.no_grad():
+        assert folded.takes(torch.zeros(1, 16))
+        assert not folded.takes(torch.zeros(1, 16, dtype=torch.float64))
+
+
+def test_panels_hold_every_column_once() -> None:
+    taps = torch.arange(2 * 3 * 192.0).view(2, 3, 192)
+    cut = panels(taps)
+    assert np.array_equal(np.concatenate([cut[:, q] for q in range(cut.shape[1])], 2), taps.numpy())
+
+
+def test_rows_begin_with_a_line_of_the_cache() -> None:
+    blocks = [empty_rows(n, 16) for n in (0, 1, 7, 1000, 5000)]
+    assert [b.shape[0] for b in blocks] == [0, 1, 7, 1000, 5000]
+    assert all(b.ctypes.data % 64 == 0 and b.flags.c_contiguous for b in blocks)
+    for block in blocks:
+        block[:] = len(block)
+    assert all((block == len(block)).all() for block in blocks)
+    assert all(not np.shares_memory(a, b) for a, b in pairwise(blocks))
