@@ -31,7 +31,7 @@ def test_the_benchmark_has_the_scenes_it_promises() -> None:
     for job in jobs:
         towns[job.split].add(job.spec.town)
         assert job.spec.frames - job.spec.history_frames == 10
-        assert job.spec.history_frames == 6
+        assert (job.spec.history_frames, job.spec.lead_frames) == (6, 6)
         assert job.spec.vehicles + (job.spec.roadside_chance == 1.0) >= 2
     assert towns["validate"] == {"Town07"}
     assert towns["test"] == {"Town05", "Town10HD"}

@@ -95,8 +95,26 @@ def test_the_same_seed_gives_the_same_points(snapshot: Snapshot) -> None:
         assert torch.equal(one.points.intensity, two.points.intensity)
 
 
+def test_a_lead_comes_before_and_changes_nothing_after(scenario: Scenario) -> None:
+    longer = make_scenario(replace(SPEC, lead_frames=3), load_town("generated-1"))
+    assert (len(longer), longer.agents, longer.moving_share) == (6, scenario.agents, scenario.moving_share)
+    one, two = scenario.snapshot(1), longer.snapshot(4)
+    for before, after in zip(one.frames, two.frames, strict=True):
+        assert torch.equal(before.points.xyz, after.points.xyz)
+        assert after.timestamp_ns - before.timestamp_ns == 300_000_000
+    assert one.truth is not None and two.truth is not None
+    assert torch.equal(one.truth.boxes.center, two.truth.boxes.center)
+    agent = [longer.snapshot(i).frames[0].world_from_agent.translation for i in (0, 3)]
+    ago = longer.states[0].speed[longer.states[0].id == longer.agents[0]][0]
+    assert float((agent[1] - agent[0]).norm()) == pytest.approx(0.3 * ago, abs=0.3)
+
+
 def test_what_cannot_be_had_is_named() -> None:
     with pytest.raises(NoSceneError, match="no crossing in generated-1 has 5000 vehicles"):
         make_scenario(replace(SPEC, min_vehicles=5000), load_town("generated-1"))
     with pytest.raises(ConfigError, match="frames > history_frames"):
         replace(SPEC, frames=1)
+    with pytest.raises(ConfigError, match="lead_frames >= 0"):
+        replace(SPEC, lead_frames=-1)
+    with pytest.raises(ConfigError, match="low_m < high_m"):
+        replace(SPEC, low_m=45.0, high_m=8.0)

@@ -86,6 +86,12 @@ def test_same_seed_same_traffic_other_seed_other_traffic(town, drive):
     for one, two in zip(drive, again, strict=True):
         for field in fields(one):
             np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
+    led = simulate_traffic(town, 4, STEPS, vehicles_per_lane_km=12.0, warmup_s=20.0, lead=2)
+    assert len(led) == STEPS + 2
+    np.testing.assert_array_equal(led[2].position, drive[0].position)
+    both = np.isin(led[1].id, led[2].id)
+    way = led[2].position[np.isin(led[2].id, led[1].id)] - led[1].position[both]
+    assert 0 < np.abs(way).max() < 3
     other = simulate_traffic(town, 5, 1, count=10, warmup_s=2.0)[0]
     assert 5 <= len(other) <= 10
     assert not np.isin(other.position, drive[0].position).all()
@@ -103,6 +109,8 @@ def test_converted_net_is_kept(town, drive, monkeypatch: pytest.MonkeyPatch):
 def test_nonsense_is_refused(town):
     with pytest.raises(ConfigError, match="steps >= 1"):
         simulate_traffic(town, 1, 0)
+    with pytest.raises(ConfigError, match="lead"):
+        simulate_traffic(town, 1, 2, warmup_s=1.0, lead=11)
 
 
 def test_sizes_and_shares():

@@ -34,14 +34,17 @@ class SimulationPreset:
     """What a recording holds.
 
     vehicles: least and most connected vehicles of a scene. roadside_chance: of a unit on a pole, which always takes part
-    where there is one vehicle only. density, clutter: of traffic and of what stands beside the road (ScenarioSpec), drawn evenly
-    between these for each scene. stand_in: generated roads where a town is not found; None makes that an error.
-    layout: of the files; dair takes one vehicle and the unit, and judges every pair. cameras, roadside_cameras: as in ScenarioSpec.
+    where there is one vehicle only. lead_frames: before the frames of a scene (ScenarioSpec): whoever hears a message of 0.4 s ago
+    then hears a sender that had looked for half a second by the time it spoke. density, clutter: of traffic and of what stands
+    beside the road (ScenarioSpec), drawn evenly between these for each scene. stand_in: generated roads where a town is not
+    found; None makes that an error. layout: of the files; dair takes one vehicle and the unit, and judges every pair.
+    cameras, roadside_cameras: as in ScenarioSpec.
     """
 
     splits: tuple[SplitPreset, ...]
     frames: int = 16
     history_frames: int = 6
+    lead_frames: int = 0
     vehicles: tuple[int, int] = (1, 4)
     roadside_chance: float = 0.7
     lidar: str = "opv2v"
@@ -70,7 +73,9 @@ def _towns(train: int, validate: int, test: int) -> tuple[SplitPreset, ...]:
 
 def _crowded(splits: tuple[SplitPreset, ...]) -> SimulationPreset:
     """Streets where one agent sees little: much traffic, much that stands in between, and three to five agents mostly."""
-    return SimulationPreset(splits, vehicles=(2, 4), roadside_chance=0.8, density=(6.0, 10.0), clutter=(1.0, 1.8))
+    return SimulationPreset(
+        splits, lead_frames=6, vehicles=(2, 4), roadside_chance=0.8, density=(6.0, 10.0), clutter=(1.0, 1.8)
+    )
 
 
 SIMULATION_PRESETS: dict[str, SimulationPreset] = {
@@ -166,6 +171,7 @@ def jobs_of(preset: SimulationPreset, seed: int, towns: str | None = None) -> li
                 vehicles=vehicles,
                 frames=preset.frames,
                 history_frames=preset.history_frames,
+                lead_frames=preset.lead_frames,
                 roadside_chance=1.0 if vehicles == 1 else preset.roadside_chance,
                 lidar=preset.lidar + beams,
                 roadside_lidar=preset.roadside_lidar + beams,

@@ -160,7 +160,7 @@ def record_scenario(job: Job, root: Path) -> Entry:
         seed=scenario.spec.seed,
         agents=agents,
         frames=len(scenario),
-        history_frames=job.spec.history_frames,
+        history_frames=job.spec.lead_frames + job.spec.history_frames,
         vehicles=len(scenario.states[0].id),
         moving=round(scenario.moving_share, 4),
         points=points,
@@ -209,7 +209,7 @@ def _write(scenario: Scenario, folder: Path) -> int:
         sensors["roadside"] = asdict(scenario.roadside.lidar)
     writer.close(
         {
-            "history_frames": spec.history_frames,
+            "history_frames": spec.lead_frames + spec.history_frames,
             "world": {"fixed_delta_seconds": _STEP_S, "town": spec.town, "seed": spec.seed},
             "simulation": asdict(spec),
             "lidar": sensors,

@@ -39,7 +39,8 @@ class ScenarioSpec:
     """What is asked of a scenario; the rest follows from the seed.
 
     vehicles: connected vehicles, each at least min_gap_m from the others and within low_m … high_m of the crossing at the
-    first frame. frames: at rate_hz, the first history_frames of which are not judged. roadside_chance: how often a unit
+    first frame. frames: at rate_hz, the first history_frames of which are not judged. lead_frames: as many more before the first,
+    in which everybody is already under way; they change nothing in the frames after them. roadside_chance: how often a unit
     on a pole takes part. density: of the traffic, in units of 9 vehicles per kilometre of lane. min_vehicles: within
     60 m of the crossing, or another one is drawn. clutter: times the numbers of ClutterSpec. cameras, roadside_cameras:
     names of CAMERA_RIGS, of each vehicle and of the unit, whose cameras are at its LiDAR's height.
@@ -51,6 +52,7 @@ class ScenarioSpec:
     vehicles: int = 3
     frames: int = 16
     history_frames: int = 6
+    lead_frames: int = 0
     rate_hz: float = 10.0
     roadside_chance: float = 0.7
     lidar: str = "opv2v"
@@ -65,10 +67,12 @@ class ScenarioSpec:
     roadside_cameras: str = "none"
 
     def __post_init__(self) -> None:
-        if not (1 <= self.vehicles <= 6 and self.frames > self.history_frames >= 0 and 0 <= self.low_m < self.high_m):
+        if not (1 <= self.vehicles <= 6 and self.frames > self.history_frames >= 0 <= self.lead_frames):
             raise ConfigError(
-                f"ScenarioSpec needs 1 … 6 vehicles, frames > history_frames >= 0 and low_m < high_m; got {self}."
+                f"ScenarioSpec needs 1 … 6 vehicles, frames > history_frames >= 0 and lead_frames >= 0; got {self}."
             )
+        if not 0 <= self.low_m < self.high_m:
+            raise ConfigError(f"ScenarioSpec needs 0 <= low_m < high_m; got {self}.")
 
 
 class NoSceneError(ConfigError):
@@ -104,8 +108,8 @@ class Scenario:
 
     @property
     def moving_share(self) -> float:
-        """Share of the first frame's vehicles that are elsewhere in the last."""
-        return float(_moving(self.states).mean())
+        """Share of the first frame's vehicles that are elsewhere in the last; frames of the lead do not count."""
+        return float(_moving(self.states[self.spec.lead_frames :]).mean())
 
     def snapshot(self, index: int) -> Snapshot:
         """What every agent senses at one instant, and the truth: claimed poses are the true ones."""
@@ -114,17 +118,18 @@ class Scenario:
         rig = camera_rig(spec.cameras)
         stage = self.stage(index) if {spec.cameras, spec.roadside_cameras} != {"none"} else None
         time_ns = round(index * 1e9 / spec.rate_hz)
+        drawn_ms = round((index - spec.lead_frames) * 1e3 / spec.rate_hz)
         frames, seen = [], []
         for agent in self.agents:
             row = int(np.flatnonzero(states.id == agent)[0])
             pose = _pose(states, row)
             speed = float(states.speed[row])
-            frame, mine = self._sense(scene, agent, pose, lidar_spec(spec.lidar), boxes, time_ns, speed)
+            frame, mine = self._sense(scene, agent, pose, lidar_spec(spec.lidar), boxes, (time_ns, drawn_ms), speed)
             frames.append(_with_images(frame, stage, rig))
             seen.append(mine)
         if self.roadside is not None:
             unit = self.roadside
-            frame, mine = self._sense(scene, RSU_ID, unit.world_from_agent, unit.lidar, boxes, time_ns, 0.0)
+            frame, mine = self._sense(scene, RSU_ID, unit.world_from_agent, unit.lidar, boxes, (time_ns, drawn_ms), 0.0)
             frames.append(_with_images(frame, stage, unit.cameras))
             seen.append(mine)
         truth = Truth(boxes, torch.stack(seen), Transform.stack([f.world_from_agent for f in frames]))
@@ -145,10 +150,18 @@ class Scenario:
         return Stage.of(self.scene(index), look, draw_light(seed, self.spec.name))
 
     def _sense(
-        self, scene: Scene, agent: int, pose: Transform, lidar: LidarSpec, boxes: Boxes, time_ns: int, speed: float
+        self,
+        scene: Scene,
+        agent: int,
+        pose: Transform,
+        lidar: LidarSpec,
+        boxes: Boxes,
+        time: tuple[int, int],
+        speed: float,
     ) -> tuple[AgentFrame, torch.Tensor]:
-        """One agent's frame, and which boxes it sees."""
-        key = (self.spec.seed, self.spec.name, time_ns // 1_000_000, agent)
+        """One agent's frame, and which boxes it sees. time: its own in ns, and that which draws are keyed by in ms."""
+        time_ns, drawn_ms = time
+        key = (self.spec.seed, self.spec.name, drawn_ms, agent)
         points, instance = scan(scene, pose, lidar, key, own=agent)
         frame = AgentFrame(
             agent_id=agent,
@@ -215,24 +228,28 @@ def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> Scenario:
     random = keyed_generator(spec.seed, "scenario", spec.town)
     # Dense traffic jams when it runs for long, and most signals of a town turn red together at 25 s.
     warmup_s = round(float(random.uniform(8.0, 15.0)), 1)
-    traffic = simulate_traffic(network, spec.seed, spec.frames, 1 / spec.rate_hz, 9.0 * spec.density, warmup_s=warmup_s)
+    lead = spec.lead_frames
+    traffic = simulate_traffic(
+        network, spec.seed, spec.frames, 1 / spec.rate_hz, 9.0 * spec.density, warmup_s=warmup_s, lead=lead
+    )
     # SUMO counts from 0, which is the instance of what is not a vehicle.
     traffic = tuple(replace(states, id=states.id + 1) for states in traffic)
-    for junction in _crossings(network, traffic, spec, random):
+    for junction in _crossings(network, traffic[lead:], spec, random):
         middle = np.asarray(junction.center[:2], np.float64)
-        agents = _choose_agents(traffic, middle, spec, random)
+        agents = _choose_agents(traffic[lead:], middle, spec, random)
         near = tuple(s[np.hypot(*(s.position[:, :2] - middle).T) < _HALF_SIZE_M - 10.0] for s in traffic)
         if len(agents) < spec.vehicles or not all((s.id == a).any() for a in agents for s in near):
             continue
         # Cheap refusals before the ground is drawn: a jam, and roads over roads.
-        if _moving(near).mean() < 0.5 or is_multilevel(network, middle, 1.5 * _NEAR_M):
+        if _moving(near[lead:]).mean() < 0.5 or is_multilevel(network, middle, 1.5 * _NEAR_M):
             continue
         field = height_field(build_ground(network, middle, _HALF_SIZE_M))
         plot = Plot.of(field)
         states = tuple(s[np.abs(plot.height(s.position[:, :2]) - s.position[:, 2]) < _LEVEL_GAP_M] for s in near)
         parked = parked_cars(network, spec.seed, middle, 110.0, float(random.uniform(0.1, 0.6)))
-        states = _with_parked(states, parked, random)
-        if _moving(states).mean() < 0.5 or not all((s.id == a).any() for a in agents for s in states):
+        parked = _parked(states[lead:], parked, random)
+        states = tuple(VehicleStates.cat([now, parked]) for now in states)
+        if _moving(states[lead:]).mean() < 0.5 or not all((s.id == a).any() for a in agents for s in states):
             continue
         return _furnish(spec, network, field, plot, states, agents, middle, random)
     raise NoSceneError(
@@ -283,14 +300,11 @@ def _choose_agents(
     return tuple(sorted(first.id[chosen].tolist()))
 
 
-def _with_parked(
-    states: tuple[VehicleStates, ...], parked: VehicleStates, random: np.random.Generator
-) -> tuple[VehicleStates, ...]:
-    """Parked cars added, at most so many that half of all vehicles move."""
+def _parked(states: tuple[VehicleStates, ...], parked: VehicleStates, random: np.random.Generator) -> VehicleStates:
+    """Some of the parked cars, at most so many that half of all vehicles move."""
     moving = _moving(states)
     room = max(0, int(2 * moving.sum() - len(moving)))
-    chosen = parked[np.sort(random.permutation(len(parked))[:room])]
-    return tuple(VehicleStates.cat([now, chosen]) for now in states)
+    return parked[np.sort(random.permutation(len(parked))[:room])]
 
 
 def _furnish(
@@ -298,7 +312,8 @@ def _furnish(
     agents: tuple[int, ...], middle: Array, random: np.random.Generator,
 ) -> Scenario:  # fmt: skip
     """A roadside unit and everything that stands still, put around vehicles that are already there."""
-    still = states[0][states[0].speed == 0]
+    drawn = states[spec.lead_frames]
+    still = drawn[drawn.speed == 0]
     for position, size, yaw in zip(still.position, still.size, still.yaw):
         plot.keep_out(position[:2], (float(size[0]) / 2 + 0.5, float(size[1]) / 2 + 0.5), float(yaw))
     roadside, solids = None, []

@@ -69,14 +69,17 @@ def simulate_traffic(
     vehicles_per_lane_km: float = 9.0,
     count: int | None = None,
     warmup_s: float = 60.0,
+    lead: int = 0,
 ) -> tuple[VehicleStates, ...]:
     """Moving and waiting vehicles of the whole network, one VehicleStates a step, after warmup_s of driving.
 
-    Each vehicle walks the net at random, far enough not to arrive before the end. count overrides vehicles_per_lane_km.
+    Each vehicle walks the net at random, far enough not to arrive before the end. count overrides vehicles_per_lane_km. lead: the
+    last so many steps of the warm-up come first; the others stay as they are.
     """
-    if steps < 1 or step_s <= 0 or warmup_s < 0:
+    if steps < 1 or step_s <= 0 or not 0 <= lead * step_s <= warmup_s:
         raise ConfigError(
-            f"simulate_traffic needs steps >= 1, step_s > 0, warmup_s >= 0; got {steps}, {step_s}, {warmup_s}."
+            "simulate_traffic needs steps >= 1, step_s > 0 and 0 <= lead * step_s <= warmup_s; got "
+            f"{steps}, {step_s}, {lead} and {warmup_s}."
         )
     net = sumo_net(network)
     edges = _read_edges(net)
@@ -93,7 +96,7 @@ def simulate_traffic(
             "--no-warnings", "true", "--duration-log.disable", "true", "--default.action-step-length", repr(step_s),
         ]  # fmt: skip
         output = Path(folder) / "states.npz"
-        before = min(round(_TRAIL_S / step_s), round(warmup_s / step_s))
+        before = min(max(lead, round(_TRAIL_S / step_s)), round(warmup_s / step_s))
         skipped = round(warmup_s / step_s) - before
         job = {"arguments": arguments, "warmup_steps": skipped, "steps": steps + before, "output": str(output)}
         _run_worker(Path(folder) / "job.json", job)
@@ -101,11 +104,11 @@ def simulate_traffic(
             step, vehicle, state = states["step"], states["vehicle"], states["state"]
     heading = _headings(vehicle, state, size[:, 0])
     aside = np.clip(random.normal(0.0, _LATERAL_SIGMA_M, wanted), -_LATERAL_LIMIT_M, _LATERAL_LIMIT_M)
-    shown = step >= before
+    shown = step >= before - lead
     everything = _to_states(network, vehicle[shown], state[shown], heading[shown], kind, size, aside)
     everything = replace(everything, speed=_speeds(step, vehicle, state, step_s)[shown])
-    frames = tuple(everything[step[shown] == before + k] for k in range(steps))
-    touching = np.unique(np.concatenate([_touching(frame) for frame in frames]))
+    frames = tuple(everything[step[shown] == before + k] for k in range(-lead, steps))
+    touching = np.unique(np.concatenate([_touching(frame) for frame in frames[lead:]]))
     return tuple(frame[~np.isin(frame.id, touching)] for frame in frames)
 
 
