@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import torch
+
 from manyeyes.agents.aligner import Aligner, Verdict
 from manyeyes.agents.coding import codebook_of, coded, readable, tables_of, usual_precision
 from manyeyes.agents.collaboration import Collaboration, Intermediate
@@ -90,7 +92,8 @@ class Agent:
         if self.aligner is not None:
             message = self.aligner.describe(frame, self.eyes, message)
         if message.tokens is not None and message.token_score is not None:
-            tokens = coded(message.tokens, self.eyes.detector) if self.precision == "codes" else message.tokens
+            told = message.tokens
+            tokens = coded(told, self.eyes.detector) if self.precision == "codes" else told
             score = message.token_score * need(tokens.sites.xy, frame.world_from_agent, asked)
             left = budget
             if self.requests:
@@ -99,6 +102,7 @@ class Agent:
                 spent = wire.encode(replace(message, tokens=None), precision=self.precision)
                 left = None if budget is None else budget - sum(map(len, spent))
             tokens, score = within_budget(tokens, score, left, self.precision, tables=self._tables)
+            self.eyes.said(frame, told.keep(torch.isin(told.sites.key, tokens.sites.key)))
             message = replace(message, tokens=tokens, token_score=score)
         packets = wire.encode(message, precision=self.precision, tables=self._tables)
         too_long = budget is not None and message.tokens is not None and sum(map(len, packets)) > budget

@@ -22,7 +22,7 @@ LONGEST_GAP_NS = 250_000_000
 FASTEST_M = 30.0
 """An agent that moved farther between two sweeps did not drive there: another scenario has begun."""
 REMEMBERED = 2
-"""So many instants back what was seen takes part in what is perceived."""
+"""So many instants back what was seen or heard takes part in what is perceived (``agents.memory`` has as many messages)."""
 FOLLOWED = 5
 """So many instants back boxes are followed: half a second at 10 Hz, in which a vehicle hardly changes its speed."""
 OWN_M = 2.0
@@ -78,6 +78,7 @@ class Eyes:
         self._remember, self._known, self._tracks = remember, known, tracks
         self._seen: list[tuple[AgentFrame, Sight]] = []
         self._merged: tuple[AgentFrame, PointCloud] | None = None
+        self._said: list[tuple[AgentFrame, SparseBev]] = []
         self.perceived: tuple[AgentFrame, SparseBev] | None = None
 
     def see(self, frame: AgentFrame) -> Sight:
@@ -102,15 +103,16 @@ class Eyes:
         """The view with its boxes as fast as the last frames in which there were any tell."""
         if self._tracks is None:
             return sight
-        earlier = [
-            Earlier(
-                seen.boxes.transform(frame.from_earlier(before)).to(torch.float32),
-                (frame.timestamp_ns - before.timestamp_ns) / 1e9,
-            )
-            for before, seen in self._seen[: -FOLLOWED - 1 : -1]
-            if len(seen.boxes)
-        ]
-        return sight.moving(followed(sight.boxes, earlier, self._tracks)) if earlier else sight
+        earlier = []
+        for before, seen in self._seen[: -FOLLOWED - 1 : -1]:
+            if len(seen.boxes):
+                ago, motion = (frame.timestamp_ns - before.timestamp_ns) / 1e9, frame.from_earlier(before)
+                compared = self._tracks.compared_s[0] <= ago <= self._tracks.compared_s[1]
+                points = before.points.transform(motion).xyz if compared else None
+                earlier.append(Earlier(seen.boxes.transform(motion).to(torch.float32), ago, points))
+        if not earlier:
+            return sight
+        return sight.moving(followed(sight.boxes, earlier, self._tracks, frame.points.xyz))
 
     def before(self, frame: AgentFrame, instants: int = REMEMBERED) -> list[tuple[AgentFrame, Sight]]:
         """What the agent saw at its last instants before this frame, newest first."""
@@ -124,6 +126,15 @@ class Eyes:
             age_s = (frame.timestamp_ns - before.timestamp_ns) / 1e9
             parts.append(Part(0, sight.told.features, sight.told.sites.xy, frame.from_earlier(before), age_s))
         return parts
+
+    def said(self, frame: AgentFrame, told: SparseBev) -> None:
+        """Keeps which tokens (N, C + PROPOSAL) of this frame went out; who says the same frame anew takes the first word back."""
+        self._said = [*(s for s in self._said if s[0] is not frame), (frame, told)][-REMEMBERED - 1 :]
+
+    def said_before(self, frame: AgentFrame) -> list[tuple[AgentFrame, SparseBev]]:
+        """What the agent said at its last instants before this frame, oldest first: what others still remember."""
+        earlier = [(then, told) for then, told in self._said if then is not frame]
+        return [(then, told) for then, told in earlier[-REMEMBERED:] if follows(frame, then)]
 
     def earlier_merged(self, frame: AgentFrame, merged: PointCloud) -> PointCloud | None:
         """What was merged around the agent at its last instant, moved to this one; what is merged now is kept for the next."""

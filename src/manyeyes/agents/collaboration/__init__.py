@@ -9,7 +9,7 @@ from typing import Protocol
 from manyeyes.agents.collaboration.alone import Alone
 from manyeyes.agents.collaboration.early import Early
 from manyeyes.agents.collaboration.fused import Fused
-from manyeyes.agents.collaboration.intermediate import Intermediate, at_random, confidence
+from manyeyes.agents.collaboration.intermediate import Intermediate, at_random, confidence, learned
 from manyeyes.agents.collaboration.late import Late
 from manyeyes.agents.eyes import REMEMBERED, Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message
@@ -41,6 +41,7 @@ METHODS: dict[str, Collaboration] = {
         Late(),
         Late("late-remembering", instants=REMEMBERED),
         Intermediate(),
+        Intermediate("learned", learned),
         Intermediate("confidence", confidence),
         Intermediate("random", at_random),
         Fused(),

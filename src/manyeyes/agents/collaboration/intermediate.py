@@ -10,26 +10,27 @@ import torch
 from torch import Tensor
 
 from manyeyes.agents.collaboration.heading import age_s, ego_from_sender, header
-from manyeyes.agents.eyes import Eyes, Sight
+from manyeyes.agents.collaboration.unsaid import unsaid
+from manyeyes.agents.eyes import Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
 from manyeyes.models.fusion.gather import Part, Tokens, gather
 from manyeyes.models.proposal import PROPOSAL, proposed_heat
 from manyeyes.ops.keyed_random import keyed_uniform
 
 
-def learned(sight: Sight, frame: AgentFrame) -> Tensor:
-    """What the trained selector says (CoSTr section III-E)."""
-    return sight.worth
+def learned(eyes: Eyes, frame: AgentFrame) -> Tensor:
+    """What the trained mask says (CoSTr section III-E)."""
+    return eyes.see(frame).worth
 
 
-def confidence(sight: Sight, frame: AgentFrame) -> Tensor:
+def confidence(eyes: Eyes, frame: AgentFrame) -> Tensor:
     """How sure the sender is that the token is the middle of an object: the rule of Where2comm, on tokens."""
-    return torch.sigmoid(proposed_heat(sight.told.features[:, -PROPOSAL:]))
+    return torch.sigmoid(proposed_heat(eyes.see(frame).told.features[:, -PROPOSAL:]))
 
 
-def at_random(sight: Sight, frame: AgentFrame) -> Tensor:
+def at_random(eyes: Eyes, frame: AgentFrame) -> Tensor:
     """A uniform draw for every token, keyed by sender and time."""
-    return keyed_uniform((len(sight.worth),), 0, "selection", frame.agent_id, frame.timestamp_ns).float()
+    return keyed_uniform((len(eyes.see(frame).worth),), 0, "selection", frame.agent_id, frame.timestamp_ns).float()
 
 
 @dataclass(frozen=True)
@@ -37,14 +38,12 @@ class Intermediate:
     """Tokens of the weights that the ego carries itself; the inbox refuses others. score: which of them a budget keeps first."""
 
     name: str = "intermediate"
-    score: Callable[[Sight, AgentFrame], Tensor] = learned
+    score: Callable[[Eyes, AgentFrame], Tensor] = unsaid
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
         """The tokens that pruning kept with what the agent makes of them, and their worth, by which a budget chooses."""
-        sight = eyes.see(frame)
-        return replace(
-            header(frame, eyes.detector.fingerprint), tokens=sight.told, token_score=self.score(sight, frame)
-        )
+        told = eyes.see(frame).told
+        return replace(header(frame, eyes.detector.fingerprint), tokens=told, token_score=self.score(eyes, frame))
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the fused tokens, with the agent's own last two instants to look back at."""

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 BUDGETS = (1398, 2796, 4096, 8192, 16384, 32768, 65536, 131072)
 REFERENCES, WHOLE, CODES = "references", "float32", "codes"
-THREE_PACKETS, SMALL, FEWER = 4096, 8192, 4.7
+THREE_PACKETS, FEWER = 4096, 4.7
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def claims(
     budgets: Sequence[int | None],
     chosen: Sequence[str],
 ) -> tuple[Claim, ...]:
-    """What is claimed of the learned selection: little lost at few bytes, never worse than a rival at equal budgets."""
+    """What is claimed of our selection: little lost at few bytes, never worse than a rival at equal budgets."""
     if OURS not in chosen:
         return ()
     out: list[Claim] = []
