@@ -103,16 +103,15 @@ class Eyes:
         """The view with its boxes as fast as the last frames in which there were any tell."""
         if self._tracks is None:
             return sight
-        earlier = []
-        for before, seen in self._seen[: -FOLLOWED - 1 : -1]:
-            if len(seen.boxes):
-                ago, motion = (frame.timestamp_ns - before.timestamp_ns) / 1e9, frame.from_earlier(before)
-                compared = self._tracks.compared_s[0] <= ago <= self._tracks.compared_s[1]
-                points = before.points.transform(motion).xyz if compared else None
-                earlier.append(Earlier(seen.boxes.transform(motion).to(torch.float32), ago, points))
-        if not earlier:
-            return sight
-        return sight.moving(followed(sight.boxes, earlier, self._tracks, frame.points.xyz))
+        earlier = [
+            Earlier(
+                seen.boxes.transform(frame.from_earlier(before)).to(torch.float32),
+                (frame.timestamp_ns - before.timestamp_ns) / 1e9,
+            )
+            for before, seen in self._seen[: -FOLLOWED - 1 : -1]
+            if len(seen.boxes)
+        ]
+        return sight.moving(followed(sight.boxes, earlier, self._tracks)) if earlier else sight
 
     def before(self, frame: AgentFrame, instants: int = REMEMBERED) -> list[tuple[AgentFrame, Sight]]:
         """What the agent saw at its last instants before this frame, newest first."""
