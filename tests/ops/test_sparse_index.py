@@ -5,7 +5,16 @@ import pytest
 import torch
 from torch.nn.functional import conv2d
 
-from manyeyes.ops.sparse_index import NeighbourMap, Window, dilated_sites, distinct, neighbours, parent_sites, split
+from manyeyes.ops.sparse_index import (
+    NeighbourMap,
+    Window,
+    dilated_sites,
+    distinct,
+    finer_keys,
+    neighbours,
+    parent_sites,
+    split,
+)
 
 BATCH = 2
 
@@ -157,3 +166,15 @@ def test_no_sites_give_empty_maps():
     assert parent_sites(none, (5, 5), BATCH, 2).shape == (0,)
     assert neighbours(none, (3, 3), none, (5, 5), BATCH, window).shape == (0, 9)
     assert Window(5, 1, 0).out_shape((3, 3)) == (0, 0)
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 4])
+@pytest.mark.parametrize("in_loops", [True, False])
+def test_a_cell_on_a_finer_grid_is_where_its_first_child_is(monkeypatch, ratio, in_loops):
+    monkeypatch.setattr("manyeyes.ops.sparse_index._in_loops", lambda key: in_loops)
+    shape, finer = (5, 7), (5 * ratio - ratio // 2, 7 * ratio - ratio // 2)
+    key = keys(shape)
+    found = finer_keys(key, shape, finer, ratio)
+    wanted = [(b * finer[0] + y * ratio) * finer[1] + x * ratio for b, y, x in zip(*split(key, shape))]
+    assert len(key) > 10 and found.tolist() == [int(k) for k in wanted]
+    assert torch.equal(parent_sites(found, finer, BATCH, ratio), key)

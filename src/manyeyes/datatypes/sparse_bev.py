@@ -81,7 +81,9 @@ class SparseBev:
 
     def keep(self, mask: Tensor) -> SparseBev:
         """The sites where mask (N,) is true, as a new set."""
-        return SparseBev(self.features[mask], Sites(self.sites.key[mask], self.grid, self.sites.batch_size))
+        rows = mask.nonzero()[:, 0]
+        sites = Sites(self.sites.key.index_select(0, rows), self.grid, self.sites.batch_size)
+        return SparseBev(self.features.index_select(0, rows), sites)
 
     def dense(self) -> Tensor:
         """(B, C, rows, columns), zero where no site is; for pictures, tests and dense rivals."""

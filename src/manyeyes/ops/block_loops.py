@@ -129,7 +129,7 @@ def _place(x, offsets, frequency, out):  # pragma: no cover
                 to[2 * j + 1] = row[2 * j + 1] + (-b if quadrant == 1 or quadrant == 2 else b)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _gelu(x):  # pragma: no cover
     """x (N,) becomes x / 2 (1 + erf(x / sqrt(2)))."""
     for i in range(np.uintp(x.shape[0])):

@@ -23,6 +23,7 @@ from manyeyes.ops.sparse_index import (
     Window,
     dilated_sites,
     distinct,
+    finer_keys,
     parent_sites,
 )
 from manyeyes.ops.voxelize import segment_max, segment_mean, segment_sum
@@ -103,16 +104,14 @@ def strided_max_pool(
 
 def merge(levels: Sequence[SparseBev], reduce: Literal["sum", "mean", "max"] = "sum") -> SparseBev:
     """Sites of coarser levels, indices times the ratio of strides, united with the first level's (CoSTr, Eq. 3)."""
-    fine = levels[0]
-    rows, columns = fine.grid.shape
-    keys = []
+    fine, keys = levels[0], []
     for level in levels:
         if level.grid.at(fine.grid.stride) != fine.grid or level.grid.stride % fine.grid.stride:
             raise ShapeError(f"merge needs levels on one ground, finest first; got {level.grid} after {fine.grid}.")
         if level.sites.batch_size != fine.sites.batch_size or level.features.shape[1] != fine.features.shape[1]:
             raise ShapeError("merge needs one batch size and one number of channels over all levels.")
-        yx = level.sites.yx * (level.grid.stride // fine.grid.stride)
-        keys.append((level.sites.batch * rows + yx[:, 0]) * columns + yx[:, 1])
+        ratio = level.grid.stride // fine.grid.stride
+        keys.append(finer_keys(level.sites.key, level.grid.shape, fine.grid.shape, ratio))
     features = torch.cat([level.features for level in levels])
     return coalesce(features, torch.cat(keys), fine.grid, fine.sites.batch_size, reduce)
 

@@ -120,15 +120,9 @@ class NeighbourMap:
     def pairs(self) -> Pairs:
         """Which inputs lead to which outputs, on the CPU."""
         if _in_loops(self.in_key):
-            kernel, stride, padding, dilation = self.window
-            rows, columns = _bordered(self.out_shape, self.in_shape, self.window)
-            image = np.full(self.batch_size * rows * columns, self.n_in, np.int32)
-            _place(self.in_key.numpy(), *self.in_shape, rows, columns, padding, image)
-            first, counts = np.empty(self.n_out, np.int32), np.empty(self._taps, np.int64)
-            _place_first(self.out_key.numpy(), *self.out_shape, rows, columns, stride, first)
-            source, target = (np.empty(self._taps * self.n_out + 1, np.int64) for _ in range(2))
-            met = _meet(image, first, columns * dilation, dilation, kernel, self.n_in, source, target, counts)
-            return Pairs(source[:met], target[:met], counts)
+            bordered = (self.batch_size, *_bordered(self.out_shape, self.in_shape, self.window))
+            out_key, in_key, window = self.out_key.numpy(), self.in_key.numpy(), tuple(self.window)
+            return Pairs(*_pairs(out_key, in_key, self.out_shape, self.in_shape, bordered, window, self._taps))
         return Pairs(*(part.numpy() for part in self._met))
 
     @cached_property
@@ -214,12 +208,20 @@ def parent_sites(key: Tensor, shape: tuple[int, int], batch_size: int, stride: i
     """Keys of the cells ``floor(i / stride)`` of active cells i, on a grid of ceil(shape / stride)."""
     rows, columns = -(-shape[0] // stride), -(-shape[1] // stride)
     if _in_loops(key):
-        marks = np.zeros(batch_size * rows * columns // 8 * 8 + 8, np.uint8)
-        _mark_parents(key.numpy(), *shape, rows, columns, stride, marks)
-        return torch.from_numpy(mark_ranks(marks)[0])
+        return torch.from_numpy(_parents(key.numpy(), *shape, batch_size, rows, columns, stride))
     batch, y, x = split(key, shape)
     y, x = y.div(stride, rounding_mode="floor"), x.div(stride, rounding_mode="floor")
     return distinct((batch * rows + y) * columns + x, batch_size * rows * columns)[0]
+
+
+def finer_keys(key: Tensor, shape: tuple[int, int], finer: tuple[int, int], ratio: int) -> Tensor:
+    """Ascending keys (N,) of the cells ``i * ratio`` on a finer grid, of cells i with ascending keys (N,)."""
+    if _in_loops(key):
+        out = torch.empty_like(key)
+        _finer(key.numpy(), *shape, *finer, ratio, out.numpy())
+        return out
+    batch, y, x = split(key, shape)
+    return (batch * finer[0] + y * ratio) * finer[1] + x * ratio
 
 
 def neighbours(
@@ -294,7 +296,8 @@ def _distinct(key, marks):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _mark_parents(key, in_rows, in_columns, rows, columns, stride, marks):  # pragma: no cover
+def _parents(key, in_rows, in_columns, batch_size, rows, columns, stride):  # pragma: no cover
+    marks = np.zeros(batch_size * rows * columns // 8 * 8 + 8, np.uint8)
     start, end, first = 0, 0, 0
     for k in key:
         if k >= end:
@@ -302,6 +305,34 @@ def _mark_parents(key, in_rows, in_columns, rows, columns, stride, marks):  # pr
             start, end, batch = line * in_columns, (line + 1) * in_columns, line // in_rows
             first = (batch * rows + (line - batch * in_rows) // stride) * columns
         marks[first + (k - start) // stride] = 1
+    return mark_ranks(marks)[0]
+
+
+@njit(cache=True, nogil=True)
+def _finer(key, in_rows, in_columns, rows, columns, ratio, out):  # pragma: no cover
+    """As finer_keys, of ascending keys."""
+    start, end, first = 0, 0, 0
+    for i in range(key.shape[0]):
+        if key[i] >= end:
+            line = key[i] // in_columns
+            start, end, batch = line * in_columns, (line + 1) * in_columns, line // in_rows
+            first = (batch * rows + (line - batch * in_rows) * ratio) * columns
+        out[i] = first + (key[i] - start) * ratio
+
+
+@njit(cache=True, nogil=True)
+def _pairs(out_key, in_key, out_shape, in_shape, bordered, window, taps):  # pragma: no cover
+    """Pairs of so many taps. bordered: how many images of how many rows and columns hold the inputs and a border."""
+    kernel, stride, padding, dilation = window
+    batch_size, rows, columns = bordered
+    image = np.full(batch_size * rows * columns, in_key.shape[0], np.int32)
+    _place(in_key, in_shape[0], in_shape[1], rows, columns, padding, image)
+    first, counts = np.empty(out_key.shape[0], np.int32), np.empty(taps, np.int64)
+    _place_first(out_key, out_shape[0], out_shape[1], rows, columns, stride, first)
+    most = taps * out_key.shape[0] + 1
+    source, target = np.empty(most, np.int64), np.empty(most, np.int64)
+    met = _meet(image, first, columns * dilation, dilation, kernel, in_key.shape[0], source, target, counts)
+    return source[:met], target[:met], counts
 
 
 @njit(cache=True, nogil=True)
