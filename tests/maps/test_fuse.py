@@ -314,6 +314,19 @@ def test_a_lie_that_is_found_out_leaves_no_trace():
     assert np.abs(together.pose[rows] - alone.pose).max() < 1e-3
 
 
+@pytest.mark.parametrize("later, moved", [({}, True), ({"pass_id": "another"}, False)])
+def test_where_one_looks_alone_the_error_of_its_drive_counts(later, moved):
+    """Twelve agents see the first half of a road, one of them the second half too; its claims are off by 0.6 m."""
+    world = road(300.0)
+    others = crowd(world, 12, sigma=0.05)
+    seen, alone = (look(world, (x, 0.0, 0.0), "far", k, (0.0, 0.6, 0.0)) for k, x in enumerate((60.0, 250.0)))
+    alone = replace(alone, **later)
+    solved = solve_poses([*others, seen, alone])
+    off = solved.pose[solved.rows([seen.id, alone.id]), 1]
+    assert abs(off[0]) < 0.1
+    assert off[1] < 0.4 if moved else off[1] == pytest.approx(0.6, abs=0.05)
+
+
 def test_a_surveyed_pole_is_believed_against_those_who_agree_on_something_else():
     pole = look(road(), (30.0, 0.0, 0.0), "pole", trusted=True)
     cars = [look(road(), (30.0 + k, 0.0, 0.0), f"car{k}", k, (0.0, 0.9, 0.0)) for k in range(6)]

@@ -39,6 +39,6 @@ def test_a_gap_is_bridged_where_few_looked(gap, coverage, dashed, lines):
     assert chains([(0.0, 30.0, 0.0), (30.0 + gap, 60.0 + gap, 0.0)], coverage, dashed) == lines
 
 
-@pytest.mark.parametrize("aside, lines", [(0.6, 1), (0.9, 2)])
+@pytest.mark.parametrize("aside, lines", [(0.9, 1), (1.2, 2)])
 def test_ends_may_lie_farther_aside_than_neighbours(aside, lines):
-    assert chains([(0.0, 30.0, 0.0), (35.0, 65.0, aside)]) == lines  # 0.5 m and 0.04 a metre of gap
+    assert chains([(0.0, 30.0, 0.0), (35.0, 65.0, aside)]) == lines  # 0.8 m and 0.04 a metre of gap

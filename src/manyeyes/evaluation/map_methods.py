@@ -51,7 +51,11 @@ Changes = tuple[tuple[str, Any], ...]
 # Ours: one agent's word publishes, as it does for every rival, since average precision ranks: a line that one agent saw costs
 # nothing behind those that many saw.
 TUNED: dict[str, Changes] = {
-    OURS: (("stations.evidence.publish", 1.0), ("stations.evidence.publish_agents", 1)),
+    OURS: (
+        ("stations.evidence.publish", 1.0),
+        ("stations.evidence.publish_ring", 0.5),
+        ("stations.evidence.publish_agents", 1),
+    ),
     "chamfer_nms": (("gate_m", 0.75), ("rules.min_score", 0.2)),
     "polymerge": (("gate_m", 0.75), ("share", 0.3), ("rules.min_score", 0.5)),
     "heatmap_buffer": (("buffer_m", 0.5), ("share", 0.3), ("simplify_m", 0.1), ("rules.min_score", 0.0)),

@@ -4,11 +4,13 @@
 Stages 1 and 2 of specs/maps.md 3.4. Each sweep moves every observation a damped Gauss-Newton step towards the lines of
 the others as they stood before the sweep (Jacobi), so that the order of observations does not matter. Residuals count
 across lines only, along the mean normal of both lines, which has no bias on a bend; each point has at most one vote;
-the prior is the claimed pose. What the lines cannot tell (along a straight road) stays as claimed.
+the prior is the claimed pose, less what the lines around its other looks tell of its drive (drive_error). What no line
+tells (along a straight road) stays as claimed.
 
 It is done twice. A few sweeps, the trial, tell whose claims are off alike by more than honest errors explain; then all
 begins again from the claims, and those agents pull nobody. So a lie that was found out leaves no trace, neither in the
-search nor in poses that have come halfway back.
+search nor in poses that have come halfway back. Once they are out, the mode of corrections that is taken back is wider,
+which errs less.
 
 A step of an observation reads only observations that overlap it. So a city is solved tile by tile with the result of
 one piece: :func:`search` and each :func:`advance` are run for the home observations of each tile, given all
@@ -25,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.maps.associate import bound_observations, build_grid, cell_key
+from manyeyes.maps.drive_error import drive_error
 from manyeyes.maps.faith import NOT_BELIEVED, common_error, faith_of, looks_weight, told_by_lines
 from manyeyes.maps.gross import GrossConfig, gross_search
 from manyeyes.maps.observation import Observation
@@ -47,8 +50,9 @@ class AlignConfig:
     beyond about so many standard deviations stop pulling back. frozen_above: posterior over prior variance above which
     a direction stays as claimed. most: observations that count in a cell of 8 m, class and heading. gauge_m: within
     which distance what all were moved alike is taken back; gauge_scale: standard deviations beyond which a correction
-    has little say in that; agent_scale: beyond which an agent's mean correction makes its lines weigh little, and
-    agent_limit next to nothing; alike: part of the variance of claims that is one error of a whole agent.
+    has little say in that, trial_gauge_scale in the trial; agent_scale: beyond which an agent's mean correction makes
+    its lines weigh little, and agent_limit next to nothing; alike: part of the variance of claims that is one error of
+    a whole drive; drive_scale: standard deviations beyond which such an error is no longer held to be small.
     """
 
     spacing_m: float = 1.0
@@ -65,10 +69,12 @@ class AlignConfig:
     frozen_above: float = 0.8
     most: int = 32
     gauge_m: float = 250.0
-    gauge_scale: float = 1.0
+    gauge_scale: float = 1.25
+    trial_gauge_scale: float = 1.0
     agent_scale: float = 2.0
     agent_limit: float = 3.0
     alike: float = 0.5
+    drive_scale: float = 3.0
     gross: GrossConfig = field(default_factory=GrossConfig)
 
     @property
@@ -85,13 +91,16 @@ class Alignment:
     of the observation's agent lie from others' (robust). observability: (O, 3) from 0 (only the prior speaks) to 1,
     ascending, of the three directions of the pose. residual: (O,) and matched (O,): weighted square residual (m²) and
     number of points with neighbours. offset: (O, 2) metres moved more than those around. faith: (O,) in (0, 1], how
-    well the claims of the observation's agent and others' fit. claim: (O, 2, 2) covariance of the claimed place. voice:
+    well the claims of the observation's agent and others' fit. claim: (O, 3, 3) covariance of the claimed pose. voice:
     (O,) how much that claim counts for where all stand, 0 if the search moved it. fixed: (O,) 1 for surveyed poles.
-    moved: (O, 2) metres that the gross search moved.
+    moved: (O, 2) metres that the gross search moved. heard: (O, 3, 3) and urge (O, 3): information of the lines on the
+    pose, and that times the move from start that they ask for. lean: (O, 3) from start, where the prior has its mode.
+    drives: (O,) names of drives, each one agent's.
     """
 
     ids: tuple[str, ...]
     agents: tuple[str, ...]
+    drives: tuple[str, ...]
     claim: Floats
     start: Floats
     pose: Floats
@@ -105,6 +114,9 @@ class Alignment:
     voice: Floats
     fixed: Floats
     moved: Floats
+    heard: Floats
+    urge: Floats
+    lean: Floats
 
     def rows(self, ids: Sequence[str]) -> Ints:
         """Where these ids stand."""
@@ -116,12 +128,13 @@ class Alignment:
         return Alignment(
             tuple(self.ids[k] for k in rows.tolist()),
             tuple(self.agents[k] for k in rows.tolist()),
+            tuple(self.drives[k] for k in rows.tolist()),
             *(getattr(self, name)[rows] for name in _COLUMNS),
         )
 
 
 _STATE = ("claim", "start", "pose", "covariance", "scale", "observability", "residual", "matched")
-_COLUMNS = (*_STATE, "offset", "faith", "voice", "fixed", "moved")
+_COLUMNS = (*_STATE, "offset", "faith", "voice", "fixed", "moved", "heard", "urge", "lean")
 
 
 def solve_poses(observations: Sequence[Observation], config: AlignConfig = AlignConfig()) -> Alignment:
@@ -158,7 +171,8 @@ def claimed(sightings: Sightings) -> Alignment:
     start = Alignment(
         sightings.ids,
         tuple(sightings.agents[a] for a in sightings.agent.tolist()),
-        np.array(sightings.covariance)[:, :2, :2],
+        sightings.drives,
+        np.array(sightings.covariance),
         pose,
         pose,
         np.array(sightings.covariance),
@@ -171,6 +185,9 @@ def claimed(sightings: Sightings) -> Alignment:
         looks_weight(sightings, pose, np.zeros(count), np.ones(count)),
         np.asarray(sightings.trusted).astype(np.float64),
         np.zeros((count, 2)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
     )
     return start.take(np.array(sorted(range(count), key=lambda k: sightings.ids[k]), np.int64))
 
@@ -204,7 +221,7 @@ def _search_again(sightings: Sightings, state: Alignment, home: Ints, config: Al
     """
     before = _of(state, sightings, home)
     begun = _of(claimed(sightings), sightings, home)
-    begun = replace(begun, faith=before.faith, scale=before.scale)
+    begun = replace(begun, faith=np.where(before.faith > NOT_BELIEVED, 1.0, NOT_BELIEVED))
     again = np.flatnonzero((before.moved != 0.0).any(1) | (before.faith <= NOT_BELIEVED))
     rows = _rows_in(sightings, begun)
     keep = bounded(sightings, np.asarray(sightings.pose), config.most)
@@ -237,7 +254,7 @@ def _sweep(
 ) -> Alignment:
     """The home observations after one sweep with this gate and kernel."""
     rows = state.rows(sightings.ids)
-    start, pose = state.start[rows], state.pose[rows]
+    start, lean, pose = state.start[rows], state.lean[rows], state.pose[rows]
     keep = np.flatnonzero(bounded(sightings, start, config.most))
     xy, tangent = sightings.world(pose)
     weight = looks_weight(sightings, start, state.scale[rows], state.faith[rows])
@@ -250,7 +267,7 @@ def _sweep(
         (grid.keys, grid.start, xy[order], tangent[order], far, weight[far]),
         (*width, config.along_m, np.cos(config.heading_rad), config.sigma_m, config.correlation),
     )
-    moved = step_poses(sightings, home, (start, pose), sums, config)
+    moved = step_poses(sightings, home, (start, lean, pose), sums, config)
     part = state.take(rows[home])
     part = replace(part, **moved)
     return part.take(np.array(sorted(range(len(part.ids)), key=lambda k: part.ids[k]), np.int64))
@@ -258,14 +275,16 @@ def _sweep(
 
 def merge(parts: Sequence[Alignment], config: AlignConfig = AlignConfig(), number: int | None = None) -> Alignment:
     """Home observations of all tiles as one after a step (None: the first search), ids ascending; after a sweep with
-    each agent's scale from all its residuals, after one of the trial with its faith from all its offsets.
+    each agent's scale from all its residuals and its faith from all its offsets, after the trial with each drive's error.
     """
     ids = [name for part in parts for name in part.ids]
     agents = [name for part in parts for name in part.agents]
+    drives = [name for part in parts for name in part.drives]
     order = np.array(sorted(range(len(ids)), key=lambda k: ids[k]), np.int64)
     whole = Alignment(
         tuple(ids[k] for k in order.tolist()),
         tuple(agents[k] for k in order.tolist()),
+        tuple(drives[k] for k in order.tolist()),
         *(np.concatenate([getattr(part, name) for part in parts])[order] for name in _COLUMNS),
     )
     trial = len(config.trial_gates_m)
@@ -276,10 +295,11 @@ def merge(parts: Sequence[Alignment], config: AlignConfig = AlignConfig(), numbe
     matched = np.bincount(agent, whole.matched, len(names))
     # Two points of prior knowledge keep an agent that nobody else saw at the usual scatter.
     variance = (residual + 20.0 * 0.04) / (matched + 20.0)
-    told = told_by_lines(whole.covariance, whole.claim)
-    usual = np.trace(whole.claim, axis1=1, axis2=2) / 2
-    places = (whole.start, whole.pose)
-    common = common_error(places, told, whole.voice * whole.faith, usual, (config.gauge_m, config.gauge_scale))
+    claim = whole.claim[:, :2, :2]
+    told = told_by_lines(whole.covariance, claim)
+    usual = np.trace(claim, axis1=1, axis2=2) / 2
+    gauge = (config.gauge_m, config.trial_gauge_scale if number < trial else config.gauge_scale)
+    common = common_error((whole.start, whole.pose), told, whole.voice * whole.faith, usual, gauge)
     offset = (whole.pose - whole.start)[:, :2] - common
     pose = whole.pose.copy()
     pose[:, :2] -= np.where(whole.fixed[:, None] > 0, 0.0, common)
@@ -288,7 +308,19 @@ def merge(parts: Sequence[Alignment], config: AlignConfig = AlignConfig(), numbe
     # Whom the trial did not believe is not heard again.
     silent = (number > trial) & (whole.faith <= NOT_BELIEVED)
     faith = np.where(whole.fixed > 0, 1.0, np.where(silent, NOT_BELIEVED, faith))
-    return replace(whole, pose=pose, offset=offset, scale=np.sqrt(variance)[agent], faith=faith)
+    lean = whole.lean if number < trial else _lean(whole, common, config)
+    return replace(whole, pose=pose, offset=offset, scale=np.sqrt(variance)[agent], faith=faith, lean=lean)
+
+
+def _lean(whole: Alignment, common: Floats, config: AlignConfig) -> Floats:
+    """(O, 3) from start, where each observation stands by its claim and the error of its drive."""
+    drive = np.unique(np.array(whole.drives), return_inverse=True)[1]
+    from_claim = np.zeros((len(drive), 3))
+    from_claim[:, :2] = whole.moved - common
+    urge = whole.urge + np.einsum("oij,oj->oi", whole.heard, from_claim)
+    lean = drive_error(whole.heard, urge, whole.claim, drive, config.alike, config.drive_scale)
+    lean[:, :2] -= whole.moved
+    return np.where(whole.fixed[:, None] > 0, 0.0, lean)
 
 
 def bounded(sightings: Sightings, pose: Floats, most: int) -> NDArray[np.bool_]:

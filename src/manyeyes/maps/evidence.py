@@ -33,7 +33,8 @@ class EvidenceConfig:
     change one agent makes in a day. unsure, sure: scores of an element below which a sighting adds nothing and above
     which it adds all; in between, a share.
 
-    publish: log-odds at which a station is published, given publish_agents distinct agents or a surveyed pole. retire:
+    publish: log-odds at which a station is published, given publish_agents distinct agents or a surveyed pole;
+    publish_ring: the same of a crossing. retire:
     at which it is retired, given retire_agents distinct agents that missed it. margin_m: of a view, within which a miss
     counts less. decay_s: by kind, seconds in which evidence fades to 1/e. along_m, across_m, heading_rad: when a line
     is at the station; aside_m: when it may be. kernel_m: Geman-McClure scale of the place across. bias_m: error that no
@@ -48,6 +49,7 @@ class EvidenceConfig:
     unsure: float = 0.4
     sure: float = 0.7
     publish: float = 2.2
+    publish_ring: float = 2.2
     publish_agents: int = 2
     retire: float = -1.4
     retire_agents: int = 3
@@ -57,7 +59,7 @@ class EvidenceConfig:
     across_m: float = 0.9
     aside_m: float = 1.2
     heading_rad: float = 0.35
-    kernel_m: float = 0.35
+    kernel_m: float = 0.5
     bias_m: float = 0.05
 
     @property
@@ -68,6 +70,10 @@ class EvidenceConfig:
     def worth(self, score: Floats) -> Floats:
         """(E,) which share of ``hit`` a sighting of an element of that score adds."""
         return np.clip((np.asarray(score) - self.unsure) / (self.sure - self.unsure), 0.0, 1.0)
+
+    def publish_from(self, kind: Ints) -> Floats:
+        """(K,) log-odds at which something of that kind is published."""
+        return np.where(is_line(kind), self.publish, self.publish_ring)
 
     @property
     def miss(self) -> float:

@@ -43,7 +43,7 @@ class FuseConfig:
     stations: StationConfig = field(default_factory=StationConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
     beside: BesideConfig = field(default_factory=BesideConfig)
-    least_m: tuple[float, float, float, float] = (4.0, 4.0, 0.0, 2.0)
+    least_m: tuple[float, float, float, float] = (2.0, 4.0, 0.0, 2.0)
     full_score_m: tuple[float, float, float, float] = (20.0, 20.0, 0.0, 3.0)
 
 

@@ -42,7 +42,7 @@ class LinkConfig:
     few: float = 12.0
     lateral_m: float = 0.25
     lateral_slope: float = 0.08
-    end_lateral_m: float = 0.5
+    end_lateral_m: float = 0.8
     end_lateral_slope: float = 0.04
     heading_rad: float = 0.26
     heading_slope: float = 0.06

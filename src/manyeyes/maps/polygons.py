@@ -10,7 +10,7 @@ rectangle.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -97,7 +97,7 @@ def find_crossings(
         witnesses(sightings, pose),
         sights(sightings),
         (np.asarray(sightings.elements.style), evidence.worth(sightings.elements.score)),
-        evidence.numbers,
+        replace(evidence, publish=evidence.publish_ring).numbers,
         (evidence.publish_agents, evidence.retire_agents),
         evidence.decay_s[CROSSING],
         config.overlap,

@@ -2,7 +2,7 @@
 """One damped Gauss-Newton step of each observation's rigid motion towards lines near its own, held back by its claim.
 
 Stage 2 of specs/maps.md 3.4: residuals count across lines only, along the mean normal of both lines, which has no bias on a
-bend; each point has at most one vote; the prior is the claimed pose.
+bend; each point has at most one vote; the prior is the claimed pose, less what its drive is known to be off.
 """
 
 from __future__ import annotations
@@ -86,10 +86,10 @@ def normal_equations(home, own, others, numbers):  # pragma: no cover - compiled
 
 
 def step_poses(
-    sightings: Sightings, home: Ints, at: tuple[Floats, Floats], sums: Floats, config: AlignConfig
+    sightings: Sightings, home: Ints, at: tuple[Floats, Floats, Floats], sums: Floats, config: AlignConfig
 ) -> dict[str, Floats]:
-    """The columns of an Alignment that a sweep changes, for the home rows."""
-    start, pose = at
+    """The columns of an Alignment that a sweep changes, for the home rows; at: start, lean and pose (O, 3) of all."""
+    start, lean, pose = at
     prior = np.asarray(sightings.covariance)[home]
     pivot, now, begin = sums[:, :2], pose[home], start[home]
     jacobian = np.tile(np.eye(3), (len(home), 1, 1))
@@ -97,8 +97,9 @@ def step_poses(
     jacobian[:, 1, 2] = now[:, 0] - pivot[:, 0]
     information = sums[:, [2, 3, 4, 3, 5, 6, 4, 6, 7]].reshape(-1, 3, 3)
     gradient = sums[:, 8:11]
-    off = now - begin
-    off[:, 2] = (off[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    moved = now - begin
+    moved[:, 2] = (moved[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    off = moved - lean[home]
     # In units in which the prior is a unit ball the data's information tells directly how much it adds to the prior.
     inverse = np.linalg.inv(jacobian)
     root = np.linalg.cholesky(inverse @ prior @ inverse.transpose(0, 2, 1))
@@ -127,10 +128,14 @@ def step_poses(
     )
     spread = jacobian @ root @ axes
     covariance = (spread / (1.0 + strength * speaks)[:, None, :]) @ spread.transpose(0, 2, 1)
+    outward = np.linalg.inv(spread).transpose(0, 2, 1)
+    heard = (outward * (strength * speaks)[:, None, :]) @ outward.transpose(0, 2, 1)
     return {
         "pose": after,
         "covariance": (covariance + covariance.transpose(0, 2, 1)) / 2,
         "observability": np.sort(strength * speaks / (1.0 + strength), axis=1),
+        "heard": heard,
+        "urge": _apply(heard, moved) + _apply(outward, pull),
         "residual": sums[:, 11],
         "matched": sums[:, 12],
     }

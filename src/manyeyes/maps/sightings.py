@@ -36,7 +36,8 @@ class Rings:
 class Sightings:
     """O observations, ordered by time and then by id, and the P points of their E elements, in the agents' frames.
 
-    ids: (O,) hexadecimal. agent, time_ns: (O,). pose: (O, 3) and covariance (O, 3, 3) as claimed. trusted: (O,).
+    ids: (O,) hexadecimal. drives: (O,) names of drives, each one agent's. agent, time_ns: (O,). pose: (O, 3) and
+    covariance (O, 3, 3) as claimed. trusted: (O,).
     reach_m: (O,) from the agent to the farthest point or corner of view. first: (O + 1,) offsets of points.
     observation, element, kind: (P,). xy, tangent: (P, 2). sigma: (P,) metres. priority: (P,) of
     associate.content_priority. elements: all, agents' frames; element_observation: (E,). element_first: (E + 1,)
@@ -44,6 +45,7 @@ class Sightings:
     """
 
     ids: tuple[str, ...]
+    drives: tuple[str, ...]
     agents: tuple[str, ...]
     agent: Ints
     time_ns: Ints
@@ -113,6 +115,7 @@ def gather(observations: Sequence[Observation], spacing_m: float) -> Sightings:
     np.maximum.at(reach, np.repeat(np.arange(count), np.diff(view.first)), np.hypot(view.xy[:, 0], view.xy[:, 1]))
     return Sightings(
         ids=tuple(o.id for o in chosen),
+        drives=tuple(f"{o.agent}\n{o.pass_id}" for o in chosen),
         agents=agents,
         agent=frozen([number[o.agent] for o in chosen], np.int64),
         time_ns=frozen([o.time_ns for o in chosen], np.int64),

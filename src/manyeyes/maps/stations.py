@@ -44,7 +44,7 @@ class StationConfig:
 
     most: int = 32
     halo_m: float = 24.0
-    least_support: int = 2
+    least_support: int = 1
     seen_by: float = 3.0
     rival_m: float = 0.6
     rival_far_m: float = 2.0

@@ -147,7 +147,7 @@ class StreamingMap:
                 (ground.grid.keys, ground.grid.start, ground.xy, ground.tangent, ground.owner, ground.weight),
                 (gate, kernel, one.along_m, float(np.cos(one.heading_rad)), one.sigma_m, one.correlation),
             )
-            moved = step_poses(s, home, (begin, pose), sums, one)
+            moved = step_poses(s, home, (begin, np.zeros((1, 3)), pose), sums, one)
             pose, covariance = moved["pose"], moved["covariance"]
         return pose, covariance
 
@@ -284,7 +284,7 @@ class _Rows:
         """With rows begun by an observation: their kinds (N,) and which share of a hit each is worth (N,)."""
         evidence, time, count = config.fuse.stations.evidence, int(s.time_ns[0]), len(kind)
         odds = np.minimum(evidence.hit * worth, evidence.daily)
-        state = np.where(bool(s.trusted[0]) & (odds >= evidence.publish), PUBLISHED, 0)
+        state = np.where(bool(s.trusted[0]) & (odds >= evidence.publish_from(kind)), PUBLISHED, 0)
         one = np.ones(count, np.int64)
         begun = _Rows(
             np.asarray(kind, np.int64),
@@ -323,7 +323,7 @@ class _Rows:
         if hit:
             self.t_last[rows] = np.maximum(self.t_last[rows], time)
         enough = (self.agents[rows] >= evidence.publish_agents) | bool(s.trusted[0])
-        state = np.where((odds >= evidence.publish) & enough & hit, PUBLISHED, self.state[rows])
+        state = np.where((odds >= evidence.publish_from(self.kind[rows])) & enough & hit, PUBLISHED, self.state[rows])
         self.state[rows] = np.where(odds <= evidence.retire, RETIRED, state)
 
     def evidence(self, listed: Sequence[Sequence[int]], ids: NDArray[np.uint8]) -> Evidence:
