@@ -130,3 +130,27 @@ def test_neighbours_keep_their_own_past_and_a_gap_is_bridged() -> None:
     got = followed(cars([(0, 0), (0, 3.2)], velocity=stated), both, TrackConfig(place_m=0.05))
     assert got[:, 0].tolist() == pytest.approx([12, 4], abs=0.1)
     assert got[:, 1].abs().max() < 0.05
+
+
+def body(middle: float) -> Tensor:
+    """(60, 3): what a LiDAR meets of a car's side and of its back, its middle at (middle, 0)."""
+    side = torch.stack((torch.linspace(-2.25, 2.25, 40), torch.full((40,), -0.95), torch.full((40,), 1.0)), 1)
+    behind = torch.stack((torch.full((20,), -2.25), torch.linspace(-0.95, 0.95, 20), torch.full((20,), 1.0)), 1)
+    return torch.cat((side, behind)) + torch.tensor([middle, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("speed", (6.0, 11.0))
+def test_points_tell_a_speed_that_boxes_get_wrong(speed: float) -> None:
+    """Boxes creep ahead by 15 cm a sweep, which is 1.5 m/s; points do not."""
+    now, earlier = cars([(0.0, 0.0)]), []
+    for t in (0.1, 0.2, 0.3, 0.4, 0.5):
+        earlier.append(Earlier(cars([(-(speed + 1.5) * t, 0.0)]), t, body(-speed * t) if t in (0.2, 0.3) else None))
+    by_boxes = float(followed(now, earlier, CONFIG)[0, 0])
+    by_points = float(followed(now, earlier, CONFIG, body(0.0))[0, 0])
+    assert by_boxes > speed + 0.8
+    assert by_points == pytest.approx(speed, abs=0.5)
+
+
+def test_where_no_points_are_the_boxes_tell() -> None:
+    now, earlier = cars([(0, 0)]), [replace(e, points=torch.zeros(0, 3)) for e in drive((8, 0), 5)]
+    assert torch.equal(followed(now, earlier, CONFIG, torch.zeros(0, 3)), followed(now, earlier, CONFIG))

@@ -31,10 +31,13 @@ OWN_M = 2.0
 
 @dataclass(frozen=True)
 class Sight:
-    """One agent's own view: what it can tell others (N, C + PROPOSAL), the worth (N,) of each token, and its raw boxes."""
+    """One agent's own view: what it can tell others (N, C + PROPOSAL), and its raw boxes.
+
+    stated: what it would tell without its past, with velocities as the detector states them: the selector has learned on that.
+    """
 
     told: SparseBev
-    worth: Tensor
+    stated: SparseBev
     raw: RawBoxes
     config: DecodeConfig
 
@@ -103,15 +106,16 @@ class Eyes:
         """The view with its boxes as fast as the last frames in which there were any tell."""
         if self._tracks is None:
             return sight
-        earlier = [
-            Earlier(
-                seen.boxes.transform(frame.from_earlier(before)).to(torch.float32),
-                (frame.timestamp_ns - before.timestamp_ns) / 1e9,
-            )
-            for before, seen in self._seen[: -FOLLOWED - 1 : -1]
-            if len(seen.boxes)
-        ]
-        return sight.moving(followed(sight.boxes, earlier, self._tracks)) if earlier else sight
+        earlier = []
+        for before, seen in self._seen[: -FOLLOWED - 1 : -1]:
+            if len(seen.boxes):
+                ago, motion = (frame.timestamp_ns - before.timestamp_ns) / 1e9, frame.from_earlier(before)
+                compared = self._tracks.compared_s[0] <= ago <= self._tracks.compared_s[1]
+                points = before.points.transform(motion).xyz if compared else None
+                earlier.append(Earlier(seen.boxes.transform(motion).to(torch.float32), ago, points))
+        if not earlier:
+            return sight
+        return sight.moving(followed(sight.boxes, earlier, self._tracks, frame.points.xyz))
 
     def before(self, frame: AgentFrame, instants: int = REMEMBERED) -> list[tuple[AgentFrame, Sight]]:
         """What the agent saw at its last instants before this frame, newest first."""
@@ -149,7 +153,7 @@ class Eyes:
             seen = self.detector.see([cloud], [before])
             raw = self.detector.look(seen.tokens)
             told = self.detector.tell(seen.tokens, raw)
-            return Sight(told, torch.sigmoid(self.detector.choose(told)), raw, self.detector.config.decode)
+            return Sight(told, told, raw, self.detector.config.decode)
 
     def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
         """Raw boxes around one ego."""

@@ -4,7 +4,9 @@
 What a detector states of a velocity, it reads from two sweeps, a tenth of a second apart: 10 cm of error in a place are 1 m/s.
 Half a second of the same boxes says more. A line is laid through the places of each box by weighted least squares; what is
 stated, and that vehicles move along their length, is the prior (the MAP estimate of a Gaussian linear model: Bishop, Pattern
-Recognition and Machine Learning, 2006, section 3.3). A velocity that is not significantly more than none is none.
+Recognition and Machine Learning, 2006, section 3.3). Then the points themselves are asked: of the speeds that the line leaves open,
+that one is taken at which the box's points of now meet those of earlier sweeps best (``ops.sweep_match``). A velocity that is not
+significantly more than none is none.
 """
 
 from __future__ import annotations
@@ -16,6 +18,11 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import Boxes
+from manyeyes.ops.sweep_match import MOST, meeting_costs
+
+SPEEDS = 31
+"""Speeds that are tried, evenly within OPEN standard deviations of the line's on both sides."""
+OPEN = 3.0
 
 
 @dataclass(frozen=True)
@@ -24,13 +31,17 @@ class TrackConfig:
 
     gate_m: a box farther from where it should have been is another. place_m: of a centre from sweep to sweep, beside what the
     detector says itself of its error. stated_mps: of the velocity that it states. sideways_mps: of motion across a vehicle's
-    length. sure: a vehicle whose velocity is fewer standard deviations from none stands, and so does one below still_mps.
+    length. compared_s: sweeps so old are compared with that of now; trust: what it weighs if no point of an object of many points
+    meets another there, in units of half a squared standard deviation. sure: a vehicle whose velocity is fewer standard deviations
+    from none stands, and so does one below still_mps.
     """
 
     gate_m: float = 2.0
     place_m: float = 0.15
     stated_mps: float = 3.0
     sideways_mps: float = 0.5
+    compared_s: tuple[float, float] = (0.15, 0.35)
+    trust: float = 80.0
     sure: float = 1.0
     still_mps: float = 1.0
 
@@ -41,16 +52,18 @@ FOLLOWING = TrackConfig()
 
 @dataclass(frozen=True)
 class Earlier:
-    """What the agent saw some seconds ago, in its frame of now."""
+    """What the agent saw some seconds ago, in its frame of now: boxes, and (Q, 3) float32 points, none where they are not asked."""
 
     boxes: Boxes
     seconds_ago: float
+    points: Tensor | None = None
 
 
-def followed(boxes: Boxes, earlier: Sequence[Earlier], config: TrackConfig) -> Tensor:
+def followed(boxes: Boxes, earlier: Sequence[Earlier], config: TrackConfig, points: Tensor | None = None) -> Tensor:
     """(N, 2) m/s of boxes, in their frame, from where they were earlier, newest first; as stated where a box was not there.
 
     A box and one of an earlier sweep are the same where each is the nearest to where the other should be, within the gate.
+    points: (P, 3) float32 of now; None: only boxes tell.
     """
     if not len(boxes):
         return boxes.velocity
@@ -62,11 +75,30 @@ def followed(boxes: Boxes, earlier: Sequence[Earlier], config: TrackConfig) -> T
             mutual = apart.argmin(0)[nearest] == torch.arange(len(boxes))
             same = mutual & (apart.gather(1, nearest[:, None])[:, 0] <= config.gate_m)
             line = line.plus(then.boxes[nearest], -then.seconds_ago, same)
-    known, velocity = line.known, line.velocity
+    known, velocity, there = line.known, line.velocity, line.sums[:, 2] > 0
+    if points is not None:
+        matched = _matched(boxes[there], velocity[there], known[there], earlier, points, config)
+        velocity = velocity.index_put((there,), matched)
     sure = (velocity[:, None] @ known @ velocity[:, :, None])[:, 0, 0] >= config.sure**2
     moves = sure & (velocity.norm(dim=1) >= config.still_mps)
-    was_there = line.sums[:, 2] > 0
-    return torch.where(was_there[:, None], velocity * moves[:, None], boxes.velocity)
+    return torch.where(there[:, None], velocity * moves[:, None], boxes.velocity)
+
+
+def _matched(
+    boxes: Boxes, velocity: Tensor, known: Tensor, earlier: Sequence[Earlier], points: Tensor, config: TrackConfig
+) -> Tensor:
+    """The velocities (N, 2) with the speed along each box's length at which sweeps meet best; known as in _Line."""
+    ahead = torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
+    variance = (ahead[:, None] @ torch.linalg.inv(known) @ ahead[:, :, None])[:, 0, 0]
+    sigma = variance.sqrt().clamp_max(config.stated_mps)
+    away = torch.linspace(-OPEN, OPEN, SPEEDS).to(velocity.dtype)
+    cost = (away**2).expand(len(boxes), -1)
+    for then in earlier:
+        if then.points is not None:
+            t = then.seconds_ago
+            missed, asked = meeting_costs(points, then.points, boxes, velocity * t, OPEN * sigma * t, SPEEDS)
+            cost = cost + config.trust * (asked / MOST)[:, None] * missed
+    return velocity + (sigma * away[cost.argmin(1)])[:, None] * ahead
 
 
 @dataclass(frozen=True)
