@@ -38,7 +38,8 @@ from torch import Tensor
 from manyeyes.agents.agent import OWN_BODY_M, Agent
 from manyeyes.agents.collaboration.heading import header
 from manyeyes.agents.collaboration.intermediate import tokens_around
-from manyeyes.agents.eyes import Eyes
+from manyeyes.agents.collaboration.unsaid import unsaid
+from manyeyes.agents.eyes import Eyes, Sight
 from manyeyes.apps.provenance import write_json
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox
@@ -75,7 +76,7 @@ class Widths:
     bar_pruned: float
 
 
-WIDE = Widths((64, 128, 256), (3, 5, 8), 64, 128, 128, 3.0, 6.0)
+WIDE = Widths((64, 128, 256), (3, 5, 8), 64, 128, 128, 3.0, 8.0)
 SMALL = Widths((32, 64, 128), (2, 2, 2), 32, 64, 64, 1.8, 3.0)
 
 
@@ -113,11 +114,11 @@ class GivenPrune(FocalPrune):
         self.kept: Tensor | None = None
 
     def forward(self, x: SparseBev, threshold: float) -> tuple[SparseBev, Pruned]:
-        probability = torch.sigmoid(self.score(x.features)[:, 0])
+        pruned = Pruned(x.sites, self.score(x.features)[:, 0])
+        likely = torch.sigmoid(pruned.logit) > threshold
         if self.kept is None:
-            return x, Pruned(x.sites, torch.full_like(probability, 9.0))
-        mask = self.kept[x.sites.key]
-        return x.keep(mask), Pruned(x.sites, mask * 18.0 - 9.0)
+            return x, pruned
+        return x.keep(torch.index_select(self.kept, 0, x.sites.key, out=likely)), pruned
 
 
 @dataclass(frozen=True)
@@ -261,13 +262,15 @@ def staged(model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -
         if not i:
             attention["DAST, the ego's tokens"] = pairs(model.config.dast, sites.xy, sites.batch, sites.grid)
         tokens, _ = model.token_prune(tokens, model.config.prune_threshold)
-        told = model.tell(tokens, model.look(tokens))
+        raw = model.look(tokens)
+        told = model.tell(tokens, raw)
         watch.lap("head")
-        message = replace(header(frame, model.fingerprint), tokens=told, token_score=torch.sigmoid(model.choose(told)))
-        assert message.token_score is not None
-        some, score = within_budget(told, message.token_score, 1 << 17, "float16")
+        sight = Sight(told, told, raw, model.config.decode)
+        eyes = Eyes(model, known={(frame.agent_id, frame.timestamp_ns): sight})
+        some, score = within_budget(told, unsaid(eyes, frame), 1 << 17, "float16")
         watch.lap("selection")
-        messages.append(wire.encode(replace(message, tokens=some, token_score=score), precision="float16"))
+        message = replace(header(frame, model.fingerprint), tokens=some, token_score=score)
+        messages.append(wire.encode(message, precision="float16"))
         watch.lap("to bytes")
         own = own or told
     assert own is not None

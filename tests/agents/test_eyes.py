@@ -180,7 +180,7 @@ def seeing(cells: Places, cars: Places, heat: float = 4.0) -> Sight:
     columns[:, RAW.axis.start] = columns[:, RAW.direction.start] = 1
     raw = RawBoxes.of(columns, sites)
     told = SparseBev(torch.cat((torch.ones(len(cells), 4), propose(raw)), 1), sites)
-    return Sight(told, torch.ones(len(cells)), raw, DecodeConfig())
+    return Sight(told, told, raw, DecodeConfig())
 
 
 def test_tokens_are_as_fast_as_the_box_that_they_propose_and_what_is_no_box_stands() -> None:

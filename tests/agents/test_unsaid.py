@@ -46,9 +46,7 @@ def frame(index: int, x: float = 0.0, yaw: float = 0.0, agent: int = 1) -> Agent
 def eyes_that_saw(*views: tuple[AgentFrame, SparseBev]) -> Eyes:
     """Eyes that need no detector: what they make of these frames is known."""
     nothing = cast(RawBoxes, None)
-    known = {
-        (f.agent_id, f.timestamp_ns): Sight(t, torch.zeros(len(t.sites)), nothing, DecodeConfig()) for f, t in views
-    }
+    known = {(f.agent_id, f.timestamp_ns): Sight(t, t, nothing, DecodeConfig()) for f, t in views}
     return Eyes(cast(Detector, None), known=known)
 
 

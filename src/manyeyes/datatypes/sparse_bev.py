@@ -11,6 +11,7 @@ from torch import Tensor
 
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.grid import BevGrid
+from manyeyes.datatypes.site_loops import are_sites, middles
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +30,15 @@ class Sites:
     def __post_init__(self) -> None:
         if self.key.dtype != torch.int64 or self.key.dim() != 1:
             raise ShapeError(f"Sites.key needs int64 (N,); got {self.key.dtype} {tuple(self.key.shape)}.")
-        if self.key.numel():
-            rows, columns = self.grid.shape
-            ascending = bool((self.key[1:] > self.key[:-1]).all())
-            if not ascending or int(self.key[0]) < 0 or int(self.key[-1]) >= self.batch_size * rows * columns:
-                raise ShapeError(
-                    "Sites.key must be strictly ascending and inside the grid; use ops.sparse_conv.coalesce."
-                )
+        if self.key.numel() and not self._are_sites():
+            raise ShapeError("Sites.key must be strictly ascending and inside the grid; use ops.sparse_conv.coalesce.")
+
+    def _are_sites(self) -> bool:
+        rows, columns = self.grid.shape
+        size = self.batch_size * rows * columns
+        if self.key.device.type == "cpu":
+            return are_sites(self.key.numpy(), size)
+        return bool((self.key[1:] > self.key[:-1]).all()) and int(self.key[0]) >= 0 and int(self.key[-1]) < size
 
     def __len__(self) -> int:
         return self.key.shape[0]
@@ -56,6 +59,10 @@ class Sites:
     @property
     def xy(self) -> Tensor:
         """(N, 2) float32: metric centres in the agent's frame."""
+        if self.key.device.type == "cpu":
+            grid = self.grid
+            place = (grid.stride, float(grid.pillar), float(grid.x_min), float(grid.y_min))
+            return torch.from_numpy(middles(self.key.numpy(), *grid.shape, *place))
         return self.grid.centers(self.yx)
 
 

@@ -111,7 +111,8 @@ def merge(levels: Sequence[SparseBev], reduce: Literal["sum", "mean", "max"] = "
         if level.sites.batch_size != fine.sites.batch_size or level.features.shape[1] != fine.features.shape[1]:
             raise ShapeError("merge needs one batch size and one number of channels over all levels.")
         ratio = level.grid.stride // fine.grid.stride
-        keys.append(finer_keys(level.sites.key, level.grid.shape, fine.grid.shape, ratio))
+        key = level.sites.key
+        keys.append(key if ratio == 1 else finer_keys(key, level.grid.shape, fine.grid.shape, ratio))
     features = torch.cat([level.features for level in levels])
     return coalesce(features, torch.cat(keys), fine.grid, fine.sites.batch_size, reduce)
 

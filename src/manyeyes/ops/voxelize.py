@@ -86,7 +86,19 @@ def _point_keys(
 
 def segment_sum(values: Tensor, row: Tensor, n: int) -> Tensor:
     """(n, C): the sum of values (P, C) over segments row (P,) in [0, n)."""
+    if _in_numba(values) and values.dim() == 2 and not (torch.is_grad_enabled() and values.requires_grad):
+        return torch.from_numpy(_sums(values.detach().contiguous().numpy(), row.numpy(), n))
     return values.new_zeros(n, *values.shape[1:]).index_add(0, row, values)
+
+
+@numba.njit(cache=True, nogil=True)
+def _sums(values: np.ndarray, row: np.ndarray, n: int) -> np.ndarray:  # pragma: no cover
+    """In the order of the points, as by tensors."""
+    out = np.zeros((n, values.shape[1]), values.dtype)
+    for p in range(values.shape[0]):
+        for c in range(values.shape[1]):
+            out[row[p], c] += values[p, c]
+    return out
 
 
 def segment_mean(values: Tensor, row: Tensor, n: int) -> Tensor:

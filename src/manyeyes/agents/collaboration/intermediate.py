@@ -20,7 +20,8 @@ from manyeyes.ops.keyed_random import keyed_uniform
 
 def learned(eyes: Eyes, frame: AgentFrame) -> Tensor:
     """What the trained mask says (CoSTr section III-E)."""
-    return eyes.see(frame).worth
+    with torch.inference_mode():
+        return torch.sigmoid(eyes.detector.choose(eyes.see(frame).stated))
 
 
 def confidence(eyes: Eyes, frame: AgentFrame) -> Tensor:
@@ -30,7 +31,7 @@ def confidence(eyes: Eyes, frame: AgentFrame) -> Tensor:
 
 def at_random(eyes: Eyes, frame: AgentFrame) -> Tensor:
     """A uniform draw for every token, keyed by sender and time."""
-    return keyed_uniform((len(eyes.see(frame).worth),), 0, "selection", frame.agent_id, frame.timestamp_ns).float()
+    return keyed_uniform((len(eyes.see(frame).told.sites),), 0, "selection", frame.agent_id, frame.timestamp_ns).float()
 
 
 @dataclass(frozen=True)
