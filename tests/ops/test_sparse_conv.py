@@ -430,12 +430,12 @@ def test_compiled_loops_and_blocks_give_the_same(monkeypatch, layer, inputs, out
     assert not torch.allclose(run()[0], in_blocks[0], atol=1e-2)
 
 
-@pytest.mark.parametrize("pairs", [0, 1, 5, 6, 7, 13])
+@pytest.mark.parametrize("pairs", [0, 1, 5, 6, 7, 13, 604])
 def test_the_loop_of_pairs_is_the_sum_over_them(pairs):
     generator = torch.Generator().manual_seed(pairs)
-    x, w = torch.randn(20, 3, generator=generator), torch.randn(4, 3, 112, generator=generator)
-    source, target = (torch.randperm(20, generator=generator)[:pairs].repeat(2) for _ in range(2))
-    out = torch.randn(20, 112, generator=generator)
+    x, w = torch.randn(700, 3, generator=generator), torch.randn(4, 3, 112, generator=generator)
+    source, target = (torch.randperm(700, generator=generator)[:pairs].repeat(2) for _ in range(2))
+    out = torch.randn(700, 112, generator=generator)
     wanted = out.double()
     for tap in (3, 1):
         wanted = wanted.index_add(0, target[:pairs], x[source[:pairs]].double() @ w[tap].double())

@@ -32,6 +32,8 @@ _LINE = 64
 """Bytes of a line of the cache."""
 _FRACTION = 1024
 """Shares of bytes are counted in such fractions."""
+_MANY, _NEAR = 600, 8192
+"""From so many pairs on, with so many numbers in a panel at most, it stays in the first cache, and fetching costs more."""
 
 
 def panels(taps: Tensor) -> NDArray[np.float32]:
@@ -103,20 +105,24 @@ def _panel(vectors: int) -> Any:
         sixes, tiles = at + (end - at) // 6 * 6, (end - at + 5) // 6
         # Every input of every tile fetches its share of the panel that follows, in fractions of a byte.
         share, fetched = 4 * vectors * LANES * _FRACTION // max(tiles, 1), 0
-        for p in range(at, sixes, 6):
-            _add_tile(6, vectors, x, panel, following, fetched, share, source, target, p, column, out)
-            fetched += share * x.shape[1]
+        if end - at >= _MANY and panel.size <= _NEAR:
+            for p in range(at, sixes, 6):
+                _add_tile(6, vectors, False, x, panel, following, fetched, share, source, target, p, column, out)
+        else:
+            for p in range(at, sixes, 6):
+                _add_tile(6, vectors, True, x, panel, following, fetched, share, source, target, p, column, out)
+                fetched += share * x.shape[1]
         rest = end - sixes
         if rest == 5:
-            _add_tile(5, vectors, x, panel, following, fetched, share, source, target, sixes, column, out)
+            _add_tile(5, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
         elif rest == 4:
-            _add_tile(4, vectors, x, panel, following, fetched, share, source, target, sixes, column, out)
+            _add_tile(4, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
         elif rest == 3:
-            _add_tile(3, vectors, x, panel, following, fetched, share, source, target, sixes, column, out)
+            _add_tile(3, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
         elif rest == 2:
-            _add_tile(2, vectors, x, panel, following, fetched, share, source, target, sixes, column, out)
+            _add_tile(2, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
         elif rest == 1:
-            _add_tile(1, vectors, x, panel, following, fetched, share, source, target, sixes, column, out)
+            _add_tile(1, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
 
     return add
 
@@ -125,6 +131,7 @@ def _tile(
     _: Any,
     rows: Any,
     vectors: Any,
+    fetching: Any,
     x: Any,
     panel: Any,
     following: Any,
@@ -138,18 +145,19 @@ def _tile(
 ) -> Any:
     """Add the products of ``rows`` pairs, from pair on, and a panel of ``vectors`` x LANES columns, from column on of out.
 
+    fetching: whether the panel that follows is brought nearer meanwhile, from fetched on a share for each input.
     Written for LLVM in vectors, because numba has no name for a vector that stays in a register.
     """
-    kinds = (rows, vectors, x, panel, following, fetched, share, source, target, pair, column, out)
+    kinds = (rows, vectors, fetching, x, panel, following, fetched, share, source, target, pair, column, out)
     vector, place, byte = ir.VectorType(ir.FloatType(), LANES), ir.IntType(64), ir.IntType(8).as_pointer()
     undefined, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
     width = place(vectors.literal_value * LANES)
 
     def generate(context: Any, b: Any, signature: Any, given: Any) -> Any:
         x_, panel_, following_, source_, target_, out_ = (
-            context.make_array(kinds[i])(context, b, given[i]) for i in (2, 3, 4, 7, 8, 11)
+            context.make_array(kinds[i])(context, b, given[i]) for i in (3, 4, 5, 8, 9, 12)
         )
-        fetched_, share_, pair_, column_ = (given[i] for i in (5, 6, 9, 10))
+        fetched_, share_, pair_, column_ = (given[i] for i in (6, 7, 10, 11))
         inputs, outputs = (cgutils.unpack_tuple(b, array.shape)[1] for array in (x_, out_))
         kind = ir.FunctionType(ir.VoidType(), [byte, *[ir.IntType(32)] * 3])
         prefetch = cgutils.get_or_insert_function(b.module, kind, "llvm.prefetch.p0i8")
@@ -176,10 +184,11 @@ def _tile(
         with cgutils.for_range(b, inputs) as loop:
             places = across(b.gep(panel_.data, [b.mul(loop.index, width)]))
             factors = [b.load(p, align=4) for p in places]
-            for p in places:
-                fetch(p, place(_AHEAD))
-            soon = b.udiv(b.add(fetched_, b.mul(loop.index, share_)), place(_FRACTION))
-            fetch(following_.data, b.and_(soon, place(-_LINE)))
+            if fetching.literal_value:
+                for p in places:
+                    fetch(p, place(_AHEAD))
+                soon = b.udiv(b.add(fetched_, b.mul(loop.index, share_)), place(_FRACTION))
+                fetch(following_.data, b.and_(soon, place(-_LINE)))
             for start, totals in zip(sources, sums):
                 one = b.insert_element(undefined, b.load(b.gep(start, [loop.index])), ir.IntType(32)(0))
                 many = b.shuffle_vector(one, undefined, first)
