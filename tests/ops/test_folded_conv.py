@@ -6,10 +6,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, Sites, SparseBev
-from manyeyes.ops.folded_conv import FoldedConvs
+from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, takes
 from manyeyes.ops.pair_loops import empty_rows, panels
 from manyeyes.ops.sparse_conv import same_sites_map, strided_conv, strided_map, submanifold_conv
 from manyeyes.ops.sparse_index import Window
@@ -39,7 +39,7 @@ def test_a_run_of_layers_equals_one_after_another(channels: int, layers: int) ->
     folded, wanted, before = FoldedConvs.of(*zip(*convs)), x, x.features.clone()
     for weight, bias in convs:
         wanted = wanted.with_features(torch.relu(submanifold_conv(wanted, weight.double(), bias.double()).features))
-    assert folded is not None and folded.takes(x.features)
+    assert folded is not None and takes(x.features)
     got = folded(x.features, same_sites_map(x.sites, kernel=3))
     assert torch.equal(x.features, before) and float(wanted.features.abs().max()) > 0.5
     assert 0.2 < float((wanted.features == 0).float().mean()) < 0.8
@@ -66,6 +66,21 @@ def test_a_strided_layer_and_one_without_neighbours(inputs: int, outputs: int, d
     assert torch.allclose(alone(x.features, same_sites_map(x.sites, kernel=1)), wanted, atol=1e-5)
 
 
+@pytest.mark.parametrize(("inputs", "outputs"), [(64, 64), (48, 48), (128, 64)])
+@torch.no_grad()
+def test_a_layer_whose_rows_are_normed(inputs: int, outputs: int) -> None:
+    x, (weight, _), norm = scene(inputs), layer(inputs, outputs, 3, seed=0), nn.LayerNorm(outputs, eps=1e-3)
+    nn.init.normal_(norm.weight)
+    nn.init.normal_(norm.bias)
+    wanted, is_skipped = norm(submanifold_conv(x, weight).features), inputs == outputs
+    wanted = torch.relu(wanted + x.features if is_skipped else wanted)
+    folded, before = NormedConv.of(weight, norm, is_skipped), x.features.clone()
+    assert folded is not None
+    got = folded(x.features, same_sites_map(x.sites, kernel=3))
+    assert torch.equal(x.features, before) and float(wanted.max()) > 1
+    assert torch.allclose(got, wanted, atol=1e-5)
+
+
 @torch.no_grad()
 def test_no_sites() -> None:
     x = scene(16, share=0.0)
@@ -77,12 +92,11 @@ def test_no_sites() -> None:
 def test_what_the_loops_do_not_know_is_left_to_the_layers() -> None:
     assert FoldedConvs.of(*zip(layer(16, 24, 3, seed=0))) is None
     assert FoldedConvs.of([], []) is None
-    folded = FoldedConvs.of(*zip(layer(16, 16, 3, seed=0)))
-    assert folded is not None
-    assert not folded.takes(torch.zeros(1, 16))  # A gradient might be asked for.
+    assert NormedConv.of(layer(16, 24, 3, seed=0)[0], nn.LayerNorm(24), is_skipped=False) is None
+    assert not takes(torch.zeros(1, 16))  # A gradient might be asked for.
     with torch.no_grad():
-        assert folded.takes(torch.zeros(1, 16))
-        assert not folded.takes(torch.zeros(1, 16, dtype=torch.float64))
+        assert takes(torch.zeros(1, 16))
+        assert not takes(torch.zeros(1, 16, dtype=torch.float64))
 
 
 def test_panels_hold_every_column_once() -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import Sites, SparseBev
-from manyeyes.ops.folded_conv import FoldedConvs
+from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, takes
 from manyeyes.ops.sparse_conv import inverse_conv, same_sites_map, strided_conv, strided_map, submanifold_conv
 from manyeyes.ops.sparse_index import Window
 
@@ -70,11 +70,11 @@ class SubmanifoldLayer(nn.Module):
         self.weight, self.norm = conv_weight(outputs, inputs, kernel), norm(outputs)
         self.skip = inputs == outputs
         self.register_buffer("bias", None, persistent=False)
-        self.folded: FoldedConvs | None = None
+        self.folded: FoldedConvs | NormedConv | None = None
 
     def forward(self, x: SparseBev) -> SparseBev:
         """(N, inputs) to (N, outputs) on the same sites."""
-        if self.folded is not None and self.folded.takes(x.features):
+        if self.folded is not None and takes(x.features):
             return x.with_features(self.folded(x.features, same_sites_map(x.sites, self.weight.shape[2])))
         y = self.norm(submanifold_conv(x, self.weight, self.bias).features)
         return x.with_features(_rectified(y, x.features if self.skip else None))
@@ -82,8 +82,10 @@ class SubmanifoldLayer(nn.Module):
     def fold(self) -> None:
         """Take the norm's running statistics into the weight, and the skip into its middle tap, for good.
 
-        A LayerNorm has no running statistics: it stays, and so does the skip that comes after it.
+        A LayerNorm has no running statistics: it stays, and so does the skip that comes after it, in the same compiled call.
         """
+        if isinstance(self.norm, nn.LayerNorm):
+            self.folded = NormedConv.of(self.weight, self.norm, self.skip)
         if isinstance(self.norm, ActiveNorm):
             weight, self.bias = fold_norm(self.weight.detach(), self.norm)
             self.weight, self.norm = nn.Parameter(weight, requires_grad=False), nn.Identity()
@@ -103,7 +105,7 @@ class SubmanifoldStage(nn.Sequential):
 
     def forward(self, input: SparseBev) -> SparseBev:
         """(N, channels) to (N, channels)."""
-        if self.folded is not None and self.folded.takes(input.features):
+        if self.folded is not None and takes(input.features):
             return input.with_features(self.folded(input.features, same_sites_map(input.sites, kernel=3)))
         return super().forward(input)
 
@@ -132,7 +134,7 @@ class DownLayer(nn.Module):
 
     def forward(self, x: SparseBev) -> SparseBev:
         """Features at twice the stride."""
-        if self.folded is not None and self.folded.takes(x.features):
+        if self.folded is not None and takes(x.features):
             sites, table = strided_map(x.sites, Window(3, 2, 1), self.dilating)
             return SparseBev(self.folded(x.features, table), sites)
         y = strided_conv(x, self.weight, self.bias, stride=2, padding=1, dilating=self.dilating)

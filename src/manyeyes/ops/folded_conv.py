@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from numba import njit
-from torch import Tensor
+from torch import Tensor, nn
 
 from manyeyes.ops.pair_loops import LANES, convolve, empty_rows, panels
 from manyeyes.ops.sparse_index import NeighbourMap
@@ -30,18 +31,45 @@ class FoldedConvs:
         """Copies of weights (D, C, k, k) and biases (D,); None where the loops do not know such."""
         if not weights or any(w.shape[0] % LANES or w.dtype != torch.float32 or w.is_cuda for w in weights):
             return None
-        taps = (w.permute(2, 3, 1, 0).reshape(-1, w.shape[1], w.shape[0]) for w in weights)
-        return cls(torch.stack([torch.from_numpy(panels(t)) for t in taps]), torch.stack(list(biases)))
-
-    def takes(self, x: Tensor) -> bool:
-        """Whether the loops may take it: no gradient is asked for, and it is float32 in the CPU's memory."""
-        return not torch.is_grad_enabled() and x.device.type == "cpu" and x.dtype == torch.float32
+        taps = (w.detach().permute(2, 3, 1, 0).reshape(-1, w.shape[1], w.shape[0]) for w in weights)
+        return cls(torch.stack([torch.from_numpy(panels(t)) for t in taps]), torch.stack([b.detach() for b in biases]))
 
     @torch.no_grad()
     def __call__(self, x: Tensor, table: NeighbourMap) -> Tensor:
         """(N, C) to (M, D) through all layers; more than one need a table that leads from a set of sites to itself."""
         rows, weight, bias = (t.numpy() for t in (x.contiguous(), self.weight, self.bias))
         return torch.from_numpy(_layers(rows, weight, bias, *table.pairs, table.is_symmetric, table.n_out))
+
+
+@dataclass(frozen=True, eq=False)
+class NormedConv:
+    """A convolution, the layer norm of each row, x itself where is_skipped, and ReLU. weight: (taps, D / width, C, width), its
+    ``panels``; scale, shift: (D,), of the norm; eps: beside its variance.
+    """
+
+    weight: Tensor
+    scale: Tensor
+    shift: Tensor
+    eps: float
+    is_skipped: bool
+
+    @classmethod
+    def of(cls, weight: Tensor, norm: nn.LayerNorm, is_skipped: bool) -> NormedConv | None:
+        """Copies of a weight (D, C, k, k) and a norm; None where the loops do not know such."""
+        one = FoldedConvs.of([weight], [norm.bias])
+        return one and cls(one.weight[0], norm.weight.detach().clone(), one.bias[0], norm.eps, is_skipped)
+
+    @torch.no_grad()
+    def __call__(self, x: Tensor, table: NeighbourMap) -> Tensor:
+        """(N, C) to (M, D)."""
+        rows, weight, scale, shift = (t.numpy() for t in (x.contiguous(), self.weight, self.scale, self.shift))
+        norm = (scale, shift, self.eps, self.is_skipped)
+        return torch.from_numpy(_normed(rows, weight, *norm, *table.pairs, table.is_symmetric, table.n_out))
+
+
+def takes(x: Tensor) -> bool:
+    """Whether the loops may take it: no gradient is asked for, and it is float32 in the CPU's memory."""
+    return not torch.is_grad_enabled() and x.device.type == "cpu" and x.dtype == torch.float32
 
 
 @njit(cache=True, nogil=True)
@@ -52,4 +80,25 @@ def _layers(x, weight, bias, source, target, counts, is_symmetric, rows):  # pra
     for layer in range(1, weight.shape[0]):
         convolve(out, weight[layer], bias[layer], source, target, counts, is_symmetric, True, spare)
         out, spare = spare, out
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "nnan", "reassoc"})
+def _normed(x, weight, scale, shift, eps, is_skipped, source, target, counts, is_symmetric, rows):  # pragma: no cover
+    out, channels = empty_rows(rows, scale.shape[0]), scale.shape[0]
+    convolve(x, weight, np.zeros_like(shift), source, target, counts, is_symmetric, False, out)
+    for i in range(rows):
+        mean, square = np.float32(0), np.float32(0)
+        for c in range(channels):
+            mean += out[i, c]
+        mean /= np.float32(channels)
+        for c in range(channels):
+            square += (out[i, c] - mean) * (out[i, c] - mean)
+        steep = np.float32(1) / np.sqrt(square / np.float32(channels) + np.float32(eps))
+        if is_skipped:
+            for c in range(channels):
+                out[i, c] = max((out[i, c] - mean) * steep * scale[c] + shift[c] + x[i, c], np.float32(0))
+        else:
+            for c in range(channels):
+                out[i, c] = max((out[i, c] - mean) * steep * scale[c] + shift[c], np.float32(0))
     return out
