@@ -142,8 +142,11 @@ def solve_poses(observations: Sequence[Observation], config: AlignConfig = Align
     sightings = gather(observations, config.spacing_m)
     home = np.arange(len(sightings))
     state = merge([search(sightings, home, config)], config)
+    keep = None
     for number in range(config.steps):
-        state = merge([advance(sightings, state, number, home, config)], config, number)
+        if number in (0, len(config.trial_gates_m) + 1):  # after a search, which alone moves the starts
+            keep = bounded(sightings, state.start[state.rows(sightings.ids)], config.most)
+        state = merge([advance(sightings, state, number, home, config, keep)], config, number)
     return state
 
 
@@ -201,18 +204,26 @@ def search(sightings: Sightings, home: Ints, config: AlignConfig = AlignConfig()
 
 
 def advance(
-    sightings: Sightings, state: Alignment, number: int, home: Ints, config: AlignConfig = AlignConfig()
+    sightings: Sightings,
+    state: Alignment,
+    number: int,
+    home: Ints,
+    config: AlignConfig = AlignConfig(),
+    keep: NDArray[np.bool_] | None = None,
 ) -> Alignment:
     """The home observations after one more step, ids ascending; ``state`` holds all of the sightings after the step
-    before.
+    before. keep: (P,) the points that count in a sweep, :func:`bounded` at the state's starts; None: found here.
     """
     trial = len(config.trial_gates_m)
     if number == trial:
         return _search_again(sightings, state, home, config)
+    if keep is None:
+        keep = bounded(sightings, state.start[state.rows(sightings.ids)], config.most)
     if number < trial:
-        return _sweep(sightings, state, (config.trial_gates_m[number], config.trial_kernels_m[number]), home, config)
-    number -= trial + 1
-    return _sweep(sightings, state, (config.gates_m[number], config.kernels_m[number]), home, config)
+        width = (config.trial_gates_m[number], config.trial_kernels_m[number])
+    else:
+        width = (config.gates_m[number - trial - 1], config.kernels_m[number - trial - 1])
+    return _sweep(sightings, state, np.flatnonzero(keep), width, home, config)
 
 
 def _search_again(sightings: Sightings, state: Alignment, home: Ints, config: AlignConfig) -> Alignment:
@@ -250,12 +261,11 @@ def _searched(state: Alignment, found: Floats) -> Alignment:
 
 
 def _sweep(
-    sightings: Sightings, state: Alignment, width: tuple[float, float], home: Ints, config: AlignConfig
+    sightings: Sightings, state: Alignment, keep: Ints, width: tuple[float, float], home: Ints, config: AlignConfig
 ) -> Alignment:
-    """The home observations after one sweep with this gate and kernel."""
+    """The home observations after one sweep with this gate and kernel among the points ``keep``."""
     rows = state.rows(sightings.ids)
     start, lean, pose = state.start[rows], state.lean[rows], state.pose[rows]
-    keep = np.flatnonzero(bounded(sightings, start, config.most))
     xy, tangent = sightings.world(pose)
     weight = looks_weight(sightings, start, state.scale[rows], state.faith[rows])
     grid = build_grid(xy[keep, 0], xy[keep, 1], sightings.kind[keep], 2.5)
