@@ -39,11 +39,11 @@ class TrackConfig:
     gate_m: float = 2.0
     place_m: float = 0.15
     stated_mps: float = 3.0
-    sideways_mps: float = 0.5
+    sideways_mps: float = 0.2
     compared_s: tuple[float, float] = (0.15, 0.35)
     trust: float = 80.0
-    sure: float = 1.0
-    still_mps: float = 1.0
+    sure: float = 0.7
+    still_mps: float = 0.5
 
 
 FOLLOWING = TrackConfig()
