@@ -9,7 +9,8 @@ objects (specs/pose.md 4.2) gives a yaw only as exact as a detected heading, whi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from manyeyes.datatypes.kernels import njit
 
 _PI = np.pi
 

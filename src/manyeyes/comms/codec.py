@@ -10,10 +10,10 @@ import math
 from typing import Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import WireError
+from manyeyes.datatypes.kernels import njit
 
 Reason = Literal["garbage", "version", "checksum", "implausible", "contradiction", "wrong_model"]
 

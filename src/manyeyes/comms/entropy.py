@@ -15,11 +15,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from manyeyes.comms.codec import PacketError
 from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes.kernels import njit
 
 TOTAL_BITS = 12
 TOTAL = 1 << TOTAL_BITS

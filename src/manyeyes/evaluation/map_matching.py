@@ -6,11 +6,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError, MissingExtraError
+from manyeyes.datatypes.kernels import njit
 from manyeyes.ops.nearest_line import segments_of
 
 Floats = NDArray[np.float64]
@@ -180,7 +180,7 @@ def _buffers_meet(mine: Lines, theirs: Lines, pairs: Ints) -> NDArray[np.bool_]:
     return shapely.intersects(buffers(mine)[pairs[:, 0]], buffers(theirs)[pairs[:, 1]])
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _resample(points: Floats, first: Ints, target: Ints) -> Floats:
     """Each line at target[i + 1] - target[i] points of equal arc length."""
     out = np.empty((target[-1], 2))
@@ -205,7 +205,7 @@ def _resample(points: Floats, first: Ints, target: Ints) -> Floats:
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _point_chamfer(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> Floats:
     """Half the sum of both mean distances from samples to the nearest samples, for pairs (K, 2)."""
     out = np.empty(len(pairs))
@@ -225,7 +225,7 @@ def _point_chamfer(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: In
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _directed_to_segments(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> Floats:
     """The mean distance from the samples of a to the line b itself, for pairs (K, 2)."""
     out = np.empty(len(pairs))

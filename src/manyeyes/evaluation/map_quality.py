@@ -43,10 +43,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.evaluation.map_matching import (
     WAYS,
@@ -264,7 +264,7 @@ def _order(mine: Lines, theirs: Lines, taken: NDArray[np.int64]) -> float:
     return float(np.median(found)) if found else math.nan
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def frechet(a: Floats, b: Floats) -> float:
     """Discrete Frechet distance of two sampled lines (n, 2), (m, 2), row by row (Eiter and Mannila, 1994)."""
     row = np.empty(len(b))
@@ -318,7 +318,7 @@ def branches(ends: Floats) -> Floats:
     return centres[np.lexsort((centres[:, 1], centres[:, 0]))]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _groups(ordered: Floats, join: float) -> NDArray[np.int64]:
     """(N,) single-linkage groups of points (N, 2) sorted by x: each is named after one of its members."""
     parent = np.arange(len(ordered))

@@ -12,8 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from manyeyes.datatypes.kernels import njit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

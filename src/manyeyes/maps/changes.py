@@ -12,11 +12,11 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import MissingExtraError
+from manyeyes.datatypes.kernels import njit
 from manyeyes.maps.formats.attributes import hex_ids
 from manyeyes.maps.formats.geoparquet import MapFileError, read_map, write_map
 from manyeyes.maps.observation_log import tile_of
@@ -169,7 +169,7 @@ def _overlaps(a: VectorMap, rows_a: Ints, b: VectorMap, rows_b: Ints) -> list[tu
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _near(points, line, reach):  # pragma: no cover - compiled
     """The share of points (K, 2) within reach metres of a polyline (M, 2)."""
     near = 0

@@ -6,9 +6,9 @@ that all claims around share.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.maps.associate import build_grid, span
 from manyeyes.maps.sightings import Sightings
 

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import DASHED, MapElements, rows_of
 from manyeyes.maps.align import AlignConfig, Alignment, solve_poses
 from manyeyes.maps.beside import BesideConfig, continued

@@ -16,11 +16,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from manyeyes.datatypes import ConfigError, ShapeError
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import MapElements, frozen
 from manyeyes.maps.observation import Observation
 from manyeyes.ops.polyline import close_rings, headings, near_pairs, resample_spaced
@@ -171,7 +171,7 @@ def _classified(nodes: MapElements, owner: Ints, pairs: Ints, found: Floats, con
     )
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _measure(points, first, dense, dense_first, heading, pairs, closed, numbers):  # pragma: no cover - compiled
     """(K, 13) what is measured of each pair; infinity where two ends do not continue or two lines do not cross."""
     out = np.full((len(pairs), 13), np.inf)
@@ -192,13 +192,13 @@ def _measure(points, first, dense, dense_first, heading, pairs, closed, numbers)
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _turn(ax, ay, bx, by):  # pragma: no cover - compiled
     """The angle between two directions without regard to sense, [0, pi / 2]."""
     return np.arctan2(abs(ax * by - ay * bx), abs(ax * bx + ay * by))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _face(dense, heading, line, most_turn, out):  # pragma: no cover - compiled
     """Interval and offset of the points whose foot lies inside the line, under a like direction."""
     n = len(dense)
@@ -243,7 +243,7 @@ def _face(dense, heading, line, most_turn, out):  # pragma: no cover - compiled
         out[_SPREAD] = np.median(np.abs(found - np.median(found)))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _cross(one, two, least_turn, out):  # pragma: no cover - compiled
     """Where along both they first intersect at an angle."""
     passed_i = 0.0
@@ -265,7 +265,7 @@ def _cross(one, two, least_turn, out):  # pragma: no cover - compiled
         passed_i += length_i
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _continue(one, two, numbers, out):  # pragma: no cover - compiled
     """The nearest pair of ends of which each lies ahead of the other."""
     for end_i in range(2):

@@ -12,11 +12,11 @@ import struct
 from dataclasses import dataclass, field
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import CROSSING, MapElements, Polygons, frozen
 
 Floats = NDArray[np.float64]
@@ -186,7 +186,7 @@ def is_simple_ring(ring: Floats) -> bool:
     return not ring_crosses(ring)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def ring_crosses(ring: Floats) -> bool:  # pragma: no cover - compiled
     """Whether two edges of the open ring (K, 2) cross; for other compiled loops, :func:`is_simple_ring` for the rest."""
     n = len(ring)
@@ -207,7 +207,7 @@ def ring_crosses(ring: Floats) -> bool:  # pragma: no cover - compiled
     return False
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _first_crossed_ring(kind, first, points, ring_kind):  # pragma: no cover - compiled
     for i in range(len(kind)):
         if kind[i] == ring_kind and ring_crosses(points[first[i] : first[i + 1]]):

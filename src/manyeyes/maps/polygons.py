@@ -13,9 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import CROSSING
 from manyeyes.maps.evidence import EvidenceConfig, fold_looks, looks, sights, witnesses
 from manyeyes.maps.sightings import Sightings, sight

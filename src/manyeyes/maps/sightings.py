@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import CROSSING, MapElements, frozen
 from manyeyes.maps.associate import content_priority, resample_lines
 from manyeyes.maps.observation import Observation

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.maps.vector_map import VectorMap
 
@@ -30,7 +30,7 @@ def simplified(vector_map: VectorMap, tolerance_m: float) -> VectorMap:
     return replace(vector_map, elements=elements, stations=vector_map.stations.take(np.flatnonzero(kept)))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _kept_points(points, first, closed, tolerance):  # pragma: no cover - compiled
     """(P,) bool: the points that stay."""
     kept = np.zeros(len(points), np.bool_)

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import STYLES, rows_of
 from manyeyes.maps.align import Alignment, bounded
 from manyeyes.maps.associate import build_grid, span

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, rows_of
 from manyeyes.maps.align import AlignConfig
 from manyeyes.maps.associate import PointGrid, build_grid, span

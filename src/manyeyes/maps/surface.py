@@ -6,9 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from manyeyes.datatypes.kernels import njit
 
 Array = NDArray[np.float64]
 
@@ -81,7 +82,7 @@ class Surface:
         return _query(points, wanted, self.triangles, *lattice, self.first, self.member)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _fill_buckets(triangles, x0, y0, columns, rows):  # pragma: no cover
     count = np.zeros(columns * rows + 1, np.int64)
     span = np.empty((len(triangles), 4), np.int64)
@@ -104,7 +105,7 @@ def _fill_buckets(triangles, x0, y0, columns, rows):  # pragma: no cover
     return first, member
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _plane_z(corner, x, y):  # pragma: no cover
     """(inside, z) of a triangle at a point, by barycentric coordinates; a hair of tolerance closes the seams."""
     ax, ay = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1]
@@ -116,7 +117,7 @@ def _plane_z(corner, x, y):  # pragma: no cover
     return inside, corner[0, 2] + u * (corner[1, 2] - corner[0, 2]) + v * (corner[2, 2] - corner[0, 2])
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _edge_nearest(corner, x, y):  # pragma: no cover
     """(squared distance, z) of the nearest point on a triangle's rim."""
     best, z = np.inf, 0.0
@@ -133,7 +134,7 @@ def _edge_nearest(corner, x, y):  # pragma: no cover
     return best, z
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _query(xy, near_z, triangles, x0, y0, columns, rows, first, member):  # pragma: no cover
     """Height, distance and triangle at each point: the own bucket first, then rings of buckets until none can be nearer."""
     n = len(xy)
@@ -172,7 +173,7 @@ def _query(xy, near_z, triangles, x0, y0, columns, rows, first, member):  # prag
     return height, distance, index
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _spread(xy, triangles, x0, y0, columns, rows, first, member):  # pragma: no cover
     out = np.zeros(len(xy))
     if len(triangles) == 0:

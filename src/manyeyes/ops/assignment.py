@@ -6,10 +6,10 @@ Logistics 2, 1955.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ShapeError
+from manyeyes.datatypes.kernels import njit
 
 
 def assign(cost: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.ops.pair_loops import LANES, add_products, empty_rows, panels
 from manyeyes.ops.window_loops import FAST, WindowRuns, attend, power_of_two
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor, nn
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.ops.pair_loops import LANES, convolve, empty_rows, panels
 from manyeyes.ops.sparse_index import NeighbourMap
 

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from manyeyes.datatypes.kernels import njit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -79,7 +80,7 @@ def segments_of(first: Ints) -> tuple[Ints, Ints]:
     return line, first[line] + within
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _enter(points: Floats, start: Ints, place: Floats, shape: Ints, reach: float) -> tuple[Ints, Ints]:
     """CSR over cells: offset (cells + 1,), held: rows of start, ascending in every cell. place: origin x, y and cell size."""
     size, columns, rows = place[2], shape[0], shape[1]
@@ -107,7 +108,7 @@ def _enter(points: Floats, start: Ints, place: Floats, shape: Ints, reach: float
     return offset, held
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _look_up(
     queries: Floats, points: Floats, start: Ints, line: Ints, place: Floats, shape: Ints, offset: Ints, held: Ints,
     reach: float,

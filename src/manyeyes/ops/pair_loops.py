@@ -16,11 +16,13 @@ from typing import Any
 
 import numpy as np
 from llvmlite import binding, ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 from torch import Tensor
+
+from manyeyes.datatypes.kernels import njit
 
 LANES = 16
 """Outputs come in so many at once."""

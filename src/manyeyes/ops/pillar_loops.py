@@ -11,10 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, PointCloud, Sites, SparseBev
+from manyeyes.datatypes.kernels import njit
 from manyeyes.ops.sparse_index import mark_ranks
 
 

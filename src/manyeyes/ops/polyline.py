@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import frozen, rows_of
 
 Floats = NDArray[np.float64]
@@ -141,7 +141,7 @@ def near_pairs_between(a_bounds: Floats, b_bounds: Floats, reach_m: float) -> In
     return across - (0, len(a_bounds))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _resample(points, first, target):  # pragma: no cover - compiled
     out = np.empty((target[-1], 2))
     for row in range(len(first) - 1):
@@ -170,7 +170,7 @@ def _resample(points, first, target):  # pragma: no cover - compiled
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _feet(queries, line):  # pragma: no cover - compiled
     n = len(queries)
     along, side, distance = np.empty(n), np.empty(n), np.empty(n)
@@ -197,7 +197,7 @@ def _feet(queries, line):  # pragma: no cover - compiled
     return along, side, distance, inside
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _simplify(line, tolerance):  # pragma: no cover - compiled
     n = len(line)
     keep = np.zeros(n, np.bool_)
@@ -228,7 +228,7 @@ def _simplify(line, tolerance):  # pragma: no cover - compiled
     return keep
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _pairs_in_cells(row, cell, groups, boxes, low):  # pragma: no cover - compiled
     out = np.empty((16, 2), np.int64)
     for filling in range(2):

@@ -8,10 +8,10 @@ spacing (specs/maps.md 2.1, 2.2).
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import frozen
 
 Floats = NDArray[np.float64]
@@ -43,7 +43,7 @@ def _columns(a: Floats, a_first: Ints, b: Floats, b_first: Ints) -> tuple[Floats
     return frozen(a, np.float64), frozen(a_first, np.int64), frozen(b, np.float64), frozen(b_first, np.int64)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _nearest_points(a, a0, a1, b, b0, b1):  # pragma: no cover - compiled
     total = 0.0
     for i in range(a0, a1):
@@ -56,7 +56,7 @@ def _nearest_points(a, a0, a1, b, b0, b1):  # pragma: no cover - compiled
     return total / max(a1 - a0, 1)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _chamfer(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
     out = np.empty(len(pairs))
     for k in range(len(pairs)):
@@ -66,7 +66,7 @@ def _chamfer(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _directed(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
     mean, most, least = np.empty(len(pairs)), np.zeros(len(pairs)), np.full(len(pairs), np.inf)
     for k in range(len(pairs)):
@@ -89,7 +89,7 @@ def _directed(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
     return mean, most, least
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _frechet_one(a, a0, a1, b, b0, b1, backwards):  # pragma: no cover - compiled
     n, m = a1 - a0, b1 - b0
     row = np.empty(m)
@@ -112,7 +112,7 @@ def _frechet_one(a, a0, a1, b, b0, b1, backwards):  # pragma: no cover - compile
     return np.sqrt(row[m - 1])
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _frechet(a, a_first, b, b_first, pairs, either_way):  # pragma: no cover - compiled
     out = np.empty(len(pairs))
     for k in range(len(pairs)):

@@ -13,10 +13,10 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.kernels import njit
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 NOTHING, GROUND = -1, -2

@@ -16,9 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
+
+from manyeyes.datatypes.kernels import njit
 
 
 class Window(NamedTuple):

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from manyeyes.datatypes import Boxes
+from manyeyes.datatypes.kernels import njit
 
 REACH_M = 0.4
 """A point whose nearest partner is farther has none."""

@@ -6,12 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError, Sites
+from manyeyes.datatypes.kernels import njit
 from manyeyes.ops.sparse_index import distinct
 
 MOMENTS = (
@@ -60,7 +60,7 @@ def pillar_sites(xyz: Tensor, batch: Tensor, grid: BevGrid, batch_size: int) -> 
     return Pillars(Sites(found, grid, batch_size), inside, row)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _point_keys(
     xyz: np.ndarray,
     batch: np.ndarray,
@@ -91,7 +91,7 @@ def segment_sum(values: Tensor, row: Tensor, n: int) -> Tensor:
     return values.new_zeros(n, *values.shape[1:]).index_add(0, row, values)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _sums(values: np.ndarray, row: np.ndarray, n: int) -> np.ndarray:  # pragma: no cover
     """In the order of the points, as by tensors."""
     out = np.zeros((n, values.shape[1]), values.dtype)
@@ -109,7 +109,7 @@ def segment_mean(values: Tensor, row: Tensor, n: int) -> Tensor:
     return segment_sum(values, row, n) / count[:, None]
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _means(values: np.ndarray, row: np.ndarray, n: int) -> np.ndarray:  # pragma: no cover
     """Sums in the order of the points, then the quotients, as by tensors."""
     out, count = np.zeros((n, values.shape[1]), values.dtype), np.zeros(n, values.dtype)
@@ -158,7 +158,7 @@ def _in_numba(values: Tensor) -> bool:
     return values.device.type == "cpu" and values.dtype in (torch.float32, torch.float64)
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _raise_to_max(values: np.ndarray, row: np.ndarray, out: np.ndarray) -> None:
     for p in range(values.shape[0]):
         r = row[p]
@@ -169,7 +169,7 @@ def _raise_to_max(values: np.ndarray, row: np.ndarray, out: np.ndarray) -> None:
                 out[r, c] = v
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _share_among_ties(
     values: np.ndarray, row: np.ndarray, out: np.ndarray, share: np.ndarray, spread: np.ndarray
 ) -> None:

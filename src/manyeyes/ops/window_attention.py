@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 
 from manyeyes.datatypes import ConfigError, ShapeError
+from manyeyes.datatypes.kernels import njit
 
 BUCKETS = (4, 8, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)
 _BITS = 20

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 
 from manyeyes.datatypes import ShapeError
+from manyeyes.datatypes.kernels import njit
 
 _TILE = 64
 _VECTOR = 16

@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, HeightField, Primitives
 from manyeyes.simulator.lidar import OFF_ROAD, SIDEWALK

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes.kernels import njit
 from manyeyes.maps.road_network import PAVED, WALKABLE, RoadMark, RoadNetwork
 
 Array = NDArray[np.float64]
@@ -210,7 +210,7 @@ def _fill_smooth(height: Array, default: float) -> Array:
     return guess
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _relax(z, known, sweeps):  # pragma: no cover
     """Gauss-Seidel on the unknown nodes: each becomes the mean of its neighbours."""
     rows, columns = z.shape
@@ -231,7 +231,7 @@ def _relax(z, known, sweeps):  # pragma: no cover
                         z[r, c] = total / count
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _raster_height(height, triangles, x0, y0, cell, level):  # pragma: no cover
     """z of each triangle at the nodes it covers; where several do, the one nearest to level."""
     rows, columns = height.shape
@@ -254,7 +254,7 @@ def _raster_height(height, triangles, x0, y0, cell, level):  # pragma: no cover
                         height[row, column] = z
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _fill_quads(raster, left, right, x0, y0, cell, value):  # pragma: no cover
     """Cells whose centre lies in the convex hull's rows of each quad between two borders."""
     rows, columns = raster.shape
@@ -281,7 +281,7 @@ def _fill_quads(raster, left, right, x0, y0, cell, value):  # pragma: no cover
                     raster[r, c] = value
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _fill_stripes(raster, polygon, along, x0, y0, cell, stripe, value):  # pragma: no cover
     """Every other band across ``along`` of the cells inside a polygon (even-odd)."""
     rows, columns = raster.shape

@@ -13,10 +13,10 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numba import njit
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError, PointCloud, Transform
+from manyeyes.datatypes.kernels import njit
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import GROUND, HeightField, Primitives, cast
 

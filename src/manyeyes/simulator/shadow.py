@@ -11,9 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.ops.pinhole import meet
 from manyeyes.ops.raycast import BOX, ELLIPSOID, Primitives, hit_ellipsoid
 

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import frozen
 
 
@@ -23,7 +23,7 @@ def assign(cost: NDArray[np.float64]) -> NDArray[np.int64]:
     return _assign(frozen(cost, np.float64))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _assign(cost):  # pragma: no cover - compiled
     rows, columns = cost.shape
     price_row, price_column = np.zeros(rows), np.zeros(columns)

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import frozen
 
 Floats = NDArray[np.float64]
@@ -61,7 +61,7 @@ def register(target: Floats, source: Floats, config: CpdConfig = CpdConfig()) ->
     return found
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _drift(x, y, scaled, outlier, start, tolerance, most):  # pragma: no cover - compiled
     n, m = len(x), len(y)
     scale, c, s, u, v = 1.0, 1.0, 0.0, 0.0, 0.0

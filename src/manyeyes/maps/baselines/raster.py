@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from manyeyes.datatypes.kernels import njit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def draw_lines(heat, points, first, score, low, cell, radius):  # pragma: no cover - compiled
     """Add each line's score once to every cell of heat (H, W) whose middle lies within radius of it; low: corner of cell 0, 0."""
     stamp = np.full(heat.shape, -1, np.int32)
@@ -37,7 +38,7 @@ def draw_lines(heat, points, first, score, low, cell, radius):  # pragma: no cov
                         stamp[i, j] = k
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def draw_rings(heat, points, first, score, low, cell):  # pragma: no cover - compiled
     """Add each open ring's score to every cell of heat (H, W) whose middle lies inside it."""
     for k in range(len(first) - 1):
@@ -61,7 +62,7 @@ def draw_rings(heat, points, first, score, low, cell):  # pragma: no cover - com
                     heat[i, j] += score[k]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _around(mask, i, j):  # pragma: no cover - compiled
     """The eight neighbours of a cell from above on, clockwise; beyond the border is nothing."""
     out = np.zeros(8, np.bool_)
@@ -72,7 +73,7 @@ def _around(mask, i, j):  # pragma: no cover - compiled
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def thinned(mask):  # pragma: no cover - compiled
     """The skeleton of a mask (H, W) by Zhang and Suen (Communications of the ACM 27(3), 1984)."""
     out = mask.copy()
@@ -103,7 +104,7 @@ def thinned(mask):  # pragma: no cover - compiled
     return out
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _flood(mask, label, number, start, queue, came):  # pragma: no cover - compiled
     """Walk from start (flat place) over cells of the mask, label them, note where each came from; how many were reached."""
     height, width = mask.shape
@@ -126,7 +127,7 @@ def _flood(mask, label, number, start, queue, came):  # pragma: no cover - compi
     return held
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def components(mask):  # pragma: no cover - compiled
     """(H, W) the number of each cell's component from 0 on, in the order of rows; -1 outside."""
     label, came = np.full(mask.shape, -1, np.int64), np.empty(mask.shape, np.int64)
@@ -140,7 +141,7 @@ def components(mask):  # pragma: no cover - compiled
     return label
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def longest_walks(skeleton, least, clear, every):  # pragma: no cover - compiled
     """Cells (K, 2) and offsets of the longest walks of at least so many cells; every: what a component has besides its longest.
 

@@ -18,10 +18,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import CROSSING, MapElements, frozen, rows_of
 from manyeyes.maps.observation import Frame, Observation
 from manyeyes.maps.sightings import sight
@@ -137,7 +137,7 @@ def log_odds(of: Pool, elements: MapElements, sources: Sequence[Ints]) -> Floats
     return _log_odds(places, first, frozen(who[:, 1], np.int64), start, holds, hits, pose, view, hidden)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _log_odds(places, first, who, start, holds, hits, pose, view, hidden):  # pragma: no cover - compiled
     out = np.zeros(len(first) - 1)
     for k in range(len(out)):

@@ -11,10 +11,10 @@ from __future__ import annotations
 import itertools
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, STOP_LINE
 from manyeyes.maps.observation import ring_crosses
 
@@ -102,7 +102,7 @@ def _stations(line: Array) -> Array:
     return np.stack([np.interp(s, along, line[:, axis]) for axis in (0, 1)], 1)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def unit(key, element, run, purpose):
     """A draw in (0, 1) for a key (uint64) and three counts."""
     z = key
@@ -114,14 +114,14 @@ def unit(key, element, run, purpose):
     return (np.float64(z >> np.uint64(12)) + 0.5) * 2.0**-52
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def normal(key, element, run, purpose):
     """A standard normal draw (Box and Muller 1958) from the purposes ``purpose`` and ``purpose + 1024``."""
     radius = np.sqrt(-2.0 * np.log(unit(key, element, run, purpose)))
     return radius * np.cos(2.0 * np.pi * unit(key, element, run, purpose + 1024))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _hidden(x, y, shadows):
     """Whether a point lies in one of the convex anticlockwise quadrilaterals (Q, 4, 2)."""
     for q in range(shadows.shape[0]):
@@ -137,7 +137,7 @@ def _hidden(x, y, shadows):
     return False
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _resample(line, count, closed, out):
     """Equal arc length: ``count`` points of a line (M, 2), of an open ring without repeating its first."""
     size = len(line)
@@ -163,7 +163,7 @@ def _resample(line, count, closed, out):
     return total
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _clip_ring(ring, noise):
     """A ring (M, 2) cut to the view (Sutherland and Hodgman 1974), and the cut ring's area."""
     work = ring.copy()
@@ -194,7 +194,7 @@ def _clip_ring(ring, noise):
     return work, abs(area) / 2
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _emit_line(line, noise, key, element, run, part, out):
     """Write one observed line into out (n, 2); its mean distance from the agent, or -1 when it is too short to be said."""
     size = len(line)
@@ -224,7 +224,7 @@ def _emit_line(line, noise, key, element, run, part, out):
     return total / count
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _emit_ring(ring, noise, key, element, run, out):
     """Write one observed crossing into out (n, 2): noisy corners, resampled; less noise where the ring would cross itself."""
     n = len(ring)
@@ -246,7 +246,7 @@ def _emit_ring(ring, noise, key, element, run, out):
     return -1.0
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _emit_false(line, noise, key, element, run, out):
     """Write a line that is not there: a ghost half a lane beside a true one, or one anywhere in view; its mean distance."""
     kind = DIVIDER if unit(key, element, run, _GHOST + 32) < 0.7 else BOUNDARY
@@ -271,13 +271,13 @@ def _emit_false(line, noise, key, element, run, out):
     return kind, _emit_line(stray, noise, key, element, run, 2, out)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _reach(noise):
     """The farthest that is in view."""
     return np.hypot(max(abs(noise.x_min), abs(noise.x_max)), max(abs(noise.y_min), abs(noise.y_max)))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def look(scene, noise, pose, shadows, key, room):
     """Fill a room with what is seen from a pose; how many elements that is.
 
@@ -320,7 +320,7 @@ def look(scene, noise, pose, shadows, key, room):
     return found
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _see_crossing(scene, e, local, noise, shadows, key, room, found):
     """One crossing: said when at least half of it and 4 m² are in sight; how many elements there are now."""
     points, columns, style = room
@@ -348,7 +348,7 @@ def _see_crossing(scene, e, local, noise, shadows, key, room, found):
     return found + 1
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _see_line(scene, e, run, line, noise, key, room, found):
     """One visible stretch of a line, whole or in two parts, and perhaps a false one beside it; how many elements now."""
     points, columns, style = room
@@ -393,13 +393,13 @@ def _see_line(scene, e, run, line, noise, key, room, found):
     return found
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _score(top, far, key, element, run):
     """A confidence that falls with the distance and scatters."""
     return min(0.99, max(0.05, top - 0.25 * far + 0.12 * normal(key, element, run, _SCORE)))
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _say_style(true, noise, key, element, run, out):
     """Probabilities of styles: 0.85 on one, which is another than the true one at the rate style_error."""
     size = len(out)
