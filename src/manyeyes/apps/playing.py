@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Literal
 from manyeyes.datatypes import ConfigError, Snapshot
 
 if TYPE_CHECKING:
-    from manyeyes.agents.replay import ReplayConfig
+    from manyeyes.agents.eyes import FOLLOWED
+from manyeyes.agents.memory import SAID
+from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.recording import Recording
 
 ALL_METHODS = ("alone", "late", "intermediate", "early")
 PERIOD_MS = 100.0
 IDEAL_WAIT_MS = 0.0
-HISTORY = 2
+HISTORY = FOLLOWED + SAID
+"""Snapshots before the first judged one: whoever is heard then has looked and spoken for as long as others look back."""
 
 
 @dataclass(frozen=True)
