@@ -12,7 +12,8 @@ from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.aligner import Aligner
 from manyeyes.agents.coding import tables_of
 from manyeyes.agents.collaboration import method
-from manyeyes.agents.eyes import Eyes, Sight
+from manyeyes.agents.eyes import FOLLOWED, Eyes, Sight
+from manyeyes.agents.memory import SAID
 from manyeyes.comms.budget import fair_shares
 from manyeyes.comms.bus import LocalBus
 from manyeyes.comms.channel import Channel, ChannelPreset, channel_preset
@@ -23,6 +24,8 @@ from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
 from manyeyes.models.detector import Detector
 
 EXPIRE_NS = 500_000_000
+STEADY = FOLLOWED + SAID
+"""Snapshots after which whoever is heard has looked, and spoken, for as long as anybody looks back."""
 
 Views = dict[tuple[int, int], Sight]
 """What agents made of their sweeps, by agent and time of capture."""

@@ -10,16 +10,12 @@ from typing import TYPE_CHECKING, Literal
 from manyeyes.datatypes import ConfigError, Snapshot
 
 if TYPE_CHECKING:
-    from manyeyes.agents.eyes import FOLLOWED
-from manyeyes.agents.memory import SAID
-from manyeyes.agents.replay import ReplayConfig
+    from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.recording import Recording
 
 ALL_METHODS = ("alone", "late", "intermediate", "early")
 PERIOD_MS = 100.0
 IDEAL_WAIT_MS = 0.0
-HISTORY = FOLLOWED + SAID
-"""Snapshots before the first judged one: whoever is heard then has looked and spoken for as long as others look back."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +46,7 @@ class Playing:
         """The same as the player takes it; unknown names are refused here, before any work."""
         from manyeyes.agents.aligner import Aligner
         from manyeyes.agents.collaboration import method
-        from manyeyes.agents.replay import ReplayConfig
+        from manyeyes.agents.replay import STEADY, ReplayConfig
         from manyeyes.comms.channel import channel_preset
 
         channel_preset(self.channel)
@@ -66,7 +62,7 @@ class Playing:
             wait_s=wait_ms / 1e3,
             all_egos=all_egos,
             requests=self.requests,
-            history=HISTORY,
+            history=STEADY,
             seed=seed,
             aligner=None if self.align is None else Aligner(self.align),
         )
