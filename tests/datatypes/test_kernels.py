@@ -54,4 +54,6 @@ def test_every_loop_takes_njit_from_here() -> None:
     root = Path(manyeyes.__file__).parent
     texts = {path: path.read_text() for path in root.rglob("*.py") if path.name != "kernels.py"}
     assert sum("kernels import njit" in text for text in texts.values()) > 30
-    assert not [path for path, text in texts.items() if re.search(r"from numba import .*njit|numba\.njit|numba\.jit", text)]
+    assert not [
+        path for path, text in texts.items() if re.search(r"from numba import .*njit|numba\.njit|numba\.jit", text)
+    ]
