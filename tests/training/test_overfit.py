@@ -13,7 +13,7 @@ from manyeyes.training.step import forward
 
 def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):
     recording = toy(agents_n=2, scenarios=("toy_0",), frames=1, ground_points=100)
-    schedule = {"steps": 130, "batch": 1, "learning_rate": 8e-3, "warm_up": 10, "ema": 0.9}
+    schedule = {"steps": 160, "batch": 1, "learning_rate": 8e-3, "warm_up": 10, "ema": 0.9}
     run = Run(TrainConfig(COSTR_TINY, augment=AugmentConfig.none(), **schedule), recording, tmp_path, seed=0)
     losses = [run.advance() for _ in range(run.steps)]
     heats = [float(progress.terms.heat.detach()) for progress in (losses[0], losses[-1])]
