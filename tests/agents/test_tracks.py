@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from manyeyes.agents.tracks import Earlier, TrackConfig, followed
+from manyeyes.agents.tracks import DRIVES_MPS, Earlier, TrackConfig, followed
 from manyeyes.datatypes import Boxes, Transform
 
 CONFIG = TrackConfig()
@@ -149,6 +149,20 @@ def test_points_tell_a_speed_that_boxes_get_wrong(speed: float) -> None:
     by_points = float(followed(now, earlier, CONFIG, body(0.0))[0, 0])
     assert by_boxes > speed + 0.8
     assert by_points == pytest.approx(speed, abs=0.5)
+
+
+@pytest.mark.parametrize("aside", (-0.35, 0.35))
+def test_points_tell_a_motion_aside_that_a_heading_hides(aside: float) -> None:
+    """Boxes, and their heading, say straight ahead; points do not. Below DRIVES_MPS nobody asks them."""
+    for speed in (8.0, 0.8):
+        now, earlier = cars([(0.0, 0.0)]), drive((speed, 0), 5)
+        for k in (1, 2):
+            t = earlier[k].seconds_ago
+            there = body(-speed * t) - torch.tensor([0.0, aside * t, 0.0])
+            earlier[k] = replace(earlier[k], points=there)
+        got = followed(now, earlier, CONFIG, body(0.0))[0]
+        assert float(got[0]) == pytest.approx(speed, abs=0.3)
+        assert float(got[1]) == pytest.approx(aside if speed > DRIVES_MPS else 0.0, abs=0.15)
 
 
 def test_where_no_points_are_the_boxes_tell() -> None:

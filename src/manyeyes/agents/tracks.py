@@ -4,9 +4,9 @@
 What a detector states of a velocity, it reads from two sweeps, a tenth of a second apart: 10 cm of error in a place are 1 m/s.
 Half a second of the same boxes says more. A line is laid through the places of each box by weighted least squares; what is
 stated, and that vehicles move along their length, is the prior (the MAP estimate of a Gaussian linear model: Bishop, Pattern
-Recognition and Machine Learning, 2006, section 3.3). Then the points themselves are asked: of the speeds that the line leaves open,
-that one is taken at which the box's points of now meet those of earlier sweeps best (``ops.sweep_match``). A velocity that is not
-significantly more than none is none.
+Recognition and Machine Learning, 2006, section 3.3). Then the points themselves are asked: of the velocities that the line leaves
+open, that one is taken at which the box's points of now meet those of earlier sweeps best (``ops.sweep_match``). A velocity that is
+not significantly more than none is none.
 """
 
 from __future__ import annotations
@@ -20,9 +20,12 @@ from torch import Tensor
 from manyeyes.datatypes import Boxes
 from manyeyes.ops.sweep_match import MOST, meeting_costs
 
-SPEEDS = 31
-"""Speeds that are tried, evenly within OPEN standard deviations of the line's on both sides."""
-OPEN = 3.0
+AHEAD = torch.linspace(-3.0, 3.0, 31)
+"""Speeds along a box that are tried, in standard deviations of what the line leaves open."""
+ASIDE = torch.tensor([-2.0, -4 / 3, -2 / 3, 2 / 3, 4 / 3, 2.0])
+"""Speeds across it, likewise: a heading that is off by a few degrees drives a vehicle aside."""
+DRIVES_MPS = 1.0
+"""Only a box that is faster is asked about them."""
 
 
 @dataclass(frozen=True)
@@ -87,18 +90,32 @@ def followed(boxes: Boxes, earlier: Sequence[Earlier], config: TrackConfig, poin
 def _matched(
     boxes: Boxes, velocity: Tensor, known: Tensor, earlier: Sequence[Earlier], points: Tensor, config: TrackConfig
 ) -> Tensor:
-    """The velocities (N, 2) with the speed along each box's length at which sweeps meet best; known as in _Line."""
-    ahead = torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
-    variance = (ahead[:, None] @ torch.linalg.inv(known) @ ahead[:, :, None])[:, 0, 0]
-    sigma = variance.sqrt().clamp_max(config.stated_mps)
-    away = torch.linspace(-OPEN, OPEN, SPEEDS).to(velocity.dtype)
-    cost = (away**2).expand(len(boxes), -1)
-    for then in earlier:
-        if then.points is not None:
-            t = then.seconds_ago
-            missed, asked = meeting_costs(points, then.points, boxes, velocity * t, OPEN * sigma * t, SPEEDS)
-            cost = cost + config.trust * (asked / MOST)[:, None] * missed
-    return velocity + (sigma * away[cost.argmin(1)])[:, None] * ahead
+    """The velocities (N, 2), of those around them, at which sweeps meet best; known as in _Line."""
+    open_to = torch.linalg.inv(known)
+    along = torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
+    across = torch.stack((-along[:, 1], along[:, 0]), 1)
+    long, wide = ((axis[:, None] @ open_to @ axis[:, :, None])[:, 0, 0].sqrt() for axis in (along, across))
+    long = long.clamp_max(config.stated_mps)
+
+    def best(rows: Tensor, aside: float) -> tuple[Tensor, Tensor]:
+        """For some boxes, at one speed across them: the least cost, and its velocity."""
+        some, start = boxes[rows], velocity[rows] + aside * wide[rows, None] * across[rows]
+        cost = (AHEAD**2 + aside**2).to(start.dtype).expand(len(some), -1)
+        for then in earlier:
+            if then.points is not None:
+                t = then.seconds_ago
+                slack = AHEAD[-1] * long[rows] * t
+                missed, asked = meeting_costs(points, then.points, some, start * t, slack, len(AHEAD))
+                cost = cost + config.trust * (asked / MOST)[:, None] * missed
+        least, at = cost.min(1)
+        return least, start + (long[rows] * AHEAD[at])[:, None] * along[rows]
+
+    least, found = best(torch.arange(len(boxes)), 0.0)
+    drives = (found.norm(dim=1) > DRIVES_MPS).nonzero()[:, 0]
+    if len(drives):
+        cost, other = zip((least[drives], found[drives]), *(best(drives, float(aside)) for aside in ASIDE))
+        found[drives] = torch.stack(other)[torch.stack(cost).argmin(0), torch.arange(len(drives))]
+    return found
 
 
 @dataclass(frozen=True)
