@@ -195,6 +195,16 @@ def test_ablation_shows_each_branch_with_its_card(data, weights, tmp_path, panel
     assert [p.ticks for p in panels] == 2 * [("first", "again")] and len(panels[0].curves) == 3
 
 
+def test_a_branch_of_the_ablation_may_have_a_budget(data, weights, tmp_path, panels, capsys) -> None:
+    words = ("--every", 2, "--branches", f"all={weights}", f"masked={weights}@1398")
+    rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
+    assert 0 < rows[1]["bytes_per_message"] <= 1398 < rows[0]["bytes_per_message"]
+    for wrong in ("0", "many", "-5"):
+        words = ("--data", data, "--split", "test", "--study", "ablation", "--branches", f"masked={weights}@{wrong}")
+        assert cli.main([str(word) for word in ("evaluate", *words)]) == 1
+        assert "behind @ stands a number of bytes" in capsys.readouterr().err
+
+
 def test_in_the_system_everybody_is_ego_and_the_channel_has_one_budget(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "alone", "--selectors", "intermediate", "--budgets", 6000, "--every", 2)
     rows = evaluate(data, weights, tmp_path, "system", *words)["result"]["rows"]

@@ -2,7 +2,8 @@
 """Branches of a training side by side, perfect, late and displaced: CoSTr, Table III. Each part is to earn its place.
 
 The order is that of the command line; a branch is held against the one before it. What was trained, how long and from which
-seed stands in the model card of each file and is shown beside.
+seed stands in the model card of each file and is shown beside. ``@BYTES`` behind a file sends so many bytes a message at most, those
+that the trained mask takes (MI, Eq. 10-13); without it a message holds all tokens.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manyeyes.apps.studies.disturbance import PERFECT, Disturbance
-from manyeyes.apps.studies.running import OURS, PAPER, carry_out, publish, start
+from manyeyes.apps.studies.running import OURS, PAPER, carry_out, publish, start, with_replay
 from manyeyes.apps.viewer.curves import Curve, Panel
 from manyeyes.apps.viewer.study_table import Sheet, change, log2, number, value
 from manyeyes.datatypes import ConfigError
@@ -25,7 +26,9 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from manyeyes.apps.evaluate import Options
+    from manyeyes.evaluation.benchmark import BenchmarkConfig
 
+MASKED = "learned"
 UNDER = (PERFECT, Disturbance(delay_s=0.2), Disturbance(position_m=0.4))
 PAPER_TABLE = (
     ("none", 0.875, 0.831, 0.762, 16.43),
@@ -48,19 +51,42 @@ class Row:
     card: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class _Branch:
+    """A detector, and the most bytes of a message if the trained mask is to choose its tokens."""
+
+    name: str
+    weights: Path
+    budget_bytes: int | None
+
+    @property
+    def method(self) -> str:
+        return OURS if self.budget_bytes is None else MASKED
+
+    def on(self, base: BenchmarkConfig) -> BenchmarkConfig:
+        """The configuration of a benchmark of this branch."""
+        config = replace(base, methods=(self.method,), weights=str(self.weights))
+        return config if self.budget_bytes is None else with_replay(config, budget_bytes=self.budget_bytes)
+
+
+def _branch(name: str, weights: str, most: str) -> _Branch:
+    if most and not (most.isdigit() and int(most)):
+        raise ConfigError(f"Branch {name!r}: behind @ stands a number of bytes, one or more; got {most!r}.")
+    return _Branch(name, Path(weights), int(most) if most else None)
+
+
 def run(options: Options, console: Console) -> None:
     """The study."""
-    branches = {name: Path(path) for name, path in branches_of(options.branches).items()}
-    begun = start(options, console)
-    base = replace(begun.base, methods=(OURS,))
-    conditions = [
-        Condition(_name(branch, under), under.on(replace(base, weights=str(path))))
-        for branch, path in branches.items()
-        for under in UNDER
+    branches = [
+        _branch(name, *words.partition("@")[::2])
+        for name, words in branches_of(options.branches, files="weights.safetensors[@BYTES]").items()
     ]
-    cards = {branch: checkpoint.read_card(path) for branch, path in branches.items()}
-    done = carry_out(begun, conditions)
-    table = rows(done, cards)
+    begun = start(options, console)
+    conditions = [
+        Condition(_name(branch.name, under), under.on(branch.on(begun.base))) for branch in branches for under in UNDER
+    ]
+    cards = [checkpoint.read_card(branch.weights) for branch in branches]
+    table = rows(carry_out(begun, conditions), branches, cards)
     sheets = [_sheet(table), _cards(table), _paper()]
     payload: dict[str, object] = {"rows": table, "paper": {"note": PAPER, "rows": PAPER_TABLE}}
     publish(begun, payload, sheets, panels(table), conditions, (PAPER.replace('column "paper"', "last table"),))
@@ -82,22 +108,21 @@ def _name(branch: str, under: Disturbance) -> str:
     return f"{branch}: {under.name}"
 
 
-def rows(done: Sweep, cards: dict[str, dict[str, Any]]) -> tuple[Row, ...]:
+def rows(done: Sweep, branches: Sequence[_Branch], cards: Sequence[dict[str, Any]]) -> tuple[Row, ...]:
     """The table, in the order of the branches."""
-    out, last = [], ""
-    for branch, card in cards.items():
-        places = [(_name(branch, under), OURS) for under in UNDER]
-        before = [(_name(last, under), OURS) for under in UNDER] if last else []
+    out, before = [], []
+    for branch, card in zip(branches, cards):
+        places = [(_name(branch.name, under), branch.method) for under in UNDER]
         out.append(
             Row(
-                branch,
+                branch.name,
                 tuple((done.ap(place, 0), done.ap(place, 1)) for place in places),
                 tuple(done.less(place, other, 0) for place, other in zip(places, before)),
                 done.cells[places[0]].bytes_per_message,
                 card,
             )
         )
-        last = branch
+        before = places
     return tuple(out)
 
 
