@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import torch
 
-from manyeyes.agents.memory import KEPT_NS, SAID, Memory
+from manyeyes.agents.eyes import REMEMBERED
+from manyeyes.agents.memory import KEPT_NS, Memory
 from manyeyes.comms.inbox import Reception
 from manyeyes.datatypes import Message, Transform
 
@@ -27,8 +28,8 @@ def times(messages: list[Message]) -> list[tuple[int, int]]:
 
 def test_what_a_sender_said_before_stands_behind_what_it_says_newest_first_and_no_more_of_it_than_is_kept():
     memory = Memory()
-    found = [times(memory.recall(heard(said(at)))) for at in range(SAID + 2)]
-    assert SAID == 2 and found == [[(1, 0)], [(1, 1), (1, 0)], [(1, 2), (1, 1), (1, 0)], [(1, 3), (1, 2), (1, 1)]]
+    found = [times(memory.recall(heard(said(at)))) for at in range(REMEMBERED + 2)]
+    assert REMEMBERED == 2 and found == [[(1, 0)], [(1, 1), (1, 0)], [(1, 2), (1, 1), (1, 0)], [(1, 3), (1, 2), (1, 1)]]
 
 
 def test_each_sender_is_remembered_by_itself():

@@ -22,7 +22,7 @@ LONGEST_GAP_NS = 250_000_000
 FASTEST_M = 30.0
 """An agent that moved farther between two sweeps did not drive there: another scenario has begun."""
 REMEMBERED = 2
-"""So many instants back what was seen or heard takes part in what is perceived (``agents.memory`` has as many messages)."""
+"""So many instants back what was seen or heard takes part in what is perceived."""
 FOLLOWED = 5
 """So many instants back boxes are followed: half a second at 10 Hz, in which a vehicle hardly changes its speed."""
 OWN_M = 2.0

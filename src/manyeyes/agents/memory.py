@@ -6,11 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import islice
 
+from manyeyes.agents.eyes import REMEMBERED
 from manyeyes.comms.inbox import Reception
 from manyeyes.datatypes import Message
 
-SAID = 2
-"""Messages of each sender before its newest that are heard again."""
 KEPT_NS = 500_000_000
 
 
@@ -22,7 +21,7 @@ class Memory:
         self._held: dict[int, tuple[Message, ...]] = {}
 
     def recall(self, heard: Sequence[Reception]) -> list[Message]:
-        """Each message heard, and behind it up to SAID older ones of its sender, newest first.
+        """Each message heard, and behind it up to REMEMBERED older ones of its sender, newest first.
 
         A message heard again, with more of its packets, takes its own place; a time that goes back begins anew.
         """
@@ -32,7 +31,7 @@ class Memory:
             if known and message.timestamp_ns < known[0].timestamp_ns:
                 known = ()
             older = (m for m in known if m.timestamp_ns < message.timestamp_ns and self._near(m, message))
-            self._held[message.agent_id] = (message, *islice(older, SAID))
+            self._held[message.agent_id] = (message, *islice(older, REMEMBERED))
             found += self._held[message.agent_id]
         if found:
             latest = max(found, key=lambda message: message.timestamp_ns)

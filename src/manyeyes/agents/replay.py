@@ -12,8 +12,7 @@ from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.aligner import Aligner
 from manyeyes.agents.coding import tables_of
 from manyeyes.agents.collaboration import method
-from manyeyes.agents.eyes import FOLLOWED, Eyes, Sight
-from manyeyes.agents.memory import SAID
+from manyeyes.agents.eyes import FOLLOWED, REMEMBERED, Eyes, Sight
 from manyeyes.comms.budget import fair_shares
 from manyeyes.comms.bus import LocalBus
 from manyeyes.comms.channel import Channel, ChannelPreset, channel_preset
@@ -24,7 +23,7 @@ from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
 from manyeyes.models.detector import Detector
 
 EXPIRE_NS = 500_000_000
-STEADY = FOLLOWED + SAID
+STEADY = FOLLOWED + REMEMBERED
 """Snapshots after which whoever is heard has looked, and spoken, for as long as anybody looks back."""
 
 Views = dict[tuple[int, int], Sight]

@@ -40,7 +40,8 @@ class ScenarioSpec:
 
     vehicles: connected vehicles, each at least min_gap_m from the others and within low_m … high_m of the crossing at the
     first frame. frames: at rate_hz, the first history_frames of which are not judged. lead_frames: as many more before the first,
-    in which everybody is already under way; they change nothing in the frames after them. roadside_chance: how often a unit
+    in which everybody is already under way; they change nothing in the frames after them, unless a connected vehicle was not
+    on the road yet in the lead: then others are drawn. roadside_chance: how often a unit
     on a pole takes part. density: of the traffic, in units of 9 vehicles per kilometre of lane. min_vehicles: within
     60 m of the crossing, or another one is drawn. clutter: times the numbers of ClutterSpec. cameras, roadside_cameras:
     names of CAMERA_RIGS, of each vehicle and of the unit, whose cameras are at its LiDAR's height.

@@ -2,8 +2,8 @@
 """Branches of a training side by side, perfect, late and displaced: CoSTr, Table III. Each part is to earn its place.
 
 The order is that of the command line; a branch is held against the one before it. What was trained, how long and from which
-seed stands in the model card of each file and is shown beside. ``@BYTES`` behind a file sends so many bytes a message at most, those
-that the trained mask takes (MI, Eq. 10-13); without it a message holds all tokens.
+seed stands in the model card of each file and is shown beside. ``@BYTES`` behind a file: a message has so many bytes at most,
+of those tokens that the trained mask takes (MI, Eq. 10-13); without it a message holds all tokens.
 """
 
 from __future__ import annotations
