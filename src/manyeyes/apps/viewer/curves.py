@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLUMNS = 2
+_ABREAST = 40
+"""Letters below an axis beyond which names are written aslant."""
 _BYTES_TICKS = (1 << 9, 1 << 11, 1 << 13, 1 << 15, 1 << 17, 1 << 19)
 
 
@@ -83,7 +85,12 @@ def _draw(axes: Axes, panel: Panel, labels: Sequence[str]) -> None:
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     if panel.ticks:
-        axes.set_xticks(range(len(panel.ticks)), panel.ticks)
+        slant = (
+            {"rotation": 25, "ha": "right", "rotation_mode": "anchor"} if sum(map(len, panel.ticks)) > _ABREAST else {}
+        )
+        axes.set_xticks(range(len(panel.ticks)), panel.ticks, **slant)
+    elif not panel.in_bytes and all(float(x).is_integer() for curve in panel.curves for x in curve.x):
+        axes.xaxis.get_major_locator().set_params(integer=True)
     if panel.in_bytes:
         axes.set_xscale("log", base=2)
         axes.set_xticks(_BYTES_TICKS, [f"{t / 1024:g} KiB" for t in _BYTES_TICKS])
