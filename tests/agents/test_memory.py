@@ -22,62 +22,95 @@ def heard(*messages: Message, packets: int = 3) -> list[Reception]:
     return [Reception(message, packets, 3, None) for message in messages]
 
 
+def recall(
+    memory: Memory, *messages: Message, at: int | None = None, distrusted: tuple[int, ...] = ()
+) -> list[Message]:
+    """What is heard at a tenth of a second; None: that of the newest message."""
+    now = max(m.timestamp_ns for m in messages) if at is None else at * TENTH_NS
+    return memory.recall(heard(*messages), now, distrusted)
+
+
 def times(messages: list[Message]) -> list[tuple[int, int]]:
     return [(message.agent_id, message.timestamp_ns // TENTH_NS) for message in messages]
 
 
 def test_what_a_sender_said_before_stands_behind_what_it_says_newest_first_and_no_more_of_it_than_is_kept():
     memory = Memory()
-    found = [times(memory.recall(heard(said(at)))) for at in range(REMEMBERED + 2)]
+    found = [times(recall(memory, said(at))) for at in range(REMEMBERED + 2)]
     assert REMEMBERED == 2 and found == [[(1, 0)], [(1, 1), (1, 0)], [(1, 2), (1, 1), (1, 0)], [(1, 3), (1, 2), (1, 1)]]
 
 
 def test_each_sender_is_remembered_by_itself():
     memory = Memory()
-    memory.recall(heard(said(0, 1), said(0, 2)))
-    assert times(memory.recall(heard(said(1, 2), said(2, 1)))) == [(2, 1), (2, 0), (1, 2), (1, 0)]
+    recall(memory, said(0, 1), said(0, 2))
+    assert times(recall(memory, said(1, 2), said(2, 1))) == [(2, 1), (2, 0), (1, 2), (1, 0)]
 
 
 def test_a_message_heard_again_with_more_packets_takes_its_own_place():
     memory = Memory()
-    memory.recall(heard(said(0)))
-    memory.recall(heard(said(1), packets=1))
+    recall(memory, said(0))
+    memory.recall(heard(said(1), packets=1), TENTH_NS)
     again = said(1)
-    found = memory.recall(heard(again))
+    found = recall(memory, again)
     assert times(found) == [(1, 1), (1, 0)] and found[0] is again
 
 
 def test_a_sender_that_says_nothing_new_is_heard_as_it_was():
     memory = Memory()
-    memory.recall(heard(said(0)))
+    recall(memory, said(0))
     now = said(1)
-    assert times(memory.recall(heard(now))) == times(memory.recall(heard(now))) == [(1, 1), (1, 0)]
+    assert times(recall(memory, now)) == times(recall(memory, now)) == [(1, 1), (1, 0)]
 
 
 def test_what_is_older_than_half_a_second_is_forgotten():
     apart = KEPT_NS // TENTH_NS
     for gap, length in ((apart, 2), (apart + 1, 1)):
         memory = Memory()
-        memory.recall(heard(said(0)))
-        assert len(memory.recall(heard(said(gap)))) == length
+        recall(memory, said(0))
+        assert len(recall(memory, said(gap))) == length
 
 
 def test_a_time_that_goes_back_begins_anew():
     memory = Memory()
-    memory.recall(heard(said(50)))
-    memory.recall(heard(said(51)))
-    assert times(memory.recall(heard(said(49)))) == [(1, 49)]
-    assert times(memory.recall(heard(said(50)))) == [(1, 50), (1, 49)]
+    recall(memory, said(50))
+    recall(memory, said(51))
+    assert times(recall(memory, said(49))) == [(1, 49)]
+    assert times(recall(memory, said(50))) == [(1, 50), (1, 49)]
 
 
 def test_senders_that_fell_silent_are_forgotten_even_where_one_that_is_late_is_heard():
     memory = Memory()
-    memory.recall(heard(*(said(0, agent) for agent in range(100))))
-    assert times(memory.recall(heard(said(9, 7), said(2, 8)))) == [(7, 9), (8, 2), (8, 0)]
+    recall(memory, *(said(0, agent) for agent in range(100)))
+    assert times(recall(memory, said(9, 7), said(2, 8))) == [(7, 9), (8, 2), (8, 0)]
     assert list(memory._held) == [7]
 
 
-def test_who_hears_nothing_remembers_nothing_to_say():
+def test_who_falls_silent_is_remembered_for_half_a_second():
+    """Its packets were lost, or nobody could say from where it spoke."""
     memory = Memory()
-    memory.recall(heard(said(0)))
-    assert memory.recall([]) == []
+    for at in (0, 1, 2):
+        recall(memory, said(at, 1), said(at, 2))
+    assert times(recall(memory, said(3, 2))) == [(2, 3), (2, 2), (2, 1), (1, 2), (1, 1)]
+    assert times(recall(memory, at=4)) == [(1, 2), (1, 1), (2, 3), (2, 2)]
+    assert times(recall(memory, at=7)) == [(1, 2), (2, 3), (2, 2)]
+    assert times(recall(memory, at=8)) == [(2, 3)] and recall(memory, at=9) == []
+
+
+def test_who_is_late_and_falls_silent_is_no_older_than_half_a_second():
+    memory = Memory()
+    recall(memory, said(0, 1), said(0, 2), at=4)
+    assert times(recall(memory, said(1, 2), at=5)) == [(2, 1), (2, 0), (1, 0)]
+    assert times(recall(memory, said(2, 2), at=6)) == [(2, 2), (2, 1), (2, 0)]
+
+
+def test_who_is_distrusted_is_forgotten():
+    memory = Memory()
+    recall(memory, said(0, 1), said(0, 2))
+    assert times(recall(memory, said(1, 2), distrusted=(1,))) == [(2, 1), (2, 0)]
+    assert times(recall(memory, said(2, 1), said(2, 2))) == [(1, 2), (2, 2), (2, 1), (2, 0)]
+
+
+def test_silence_does_not_outlive_a_drive():
+    memory = Memory()
+    recall(memory, said(50))
+    assert recall(memory, at=49) == []

@@ -126,7 +126,9 @@ class Agent:
         came = (r for r in inbox.receptions(now_ns) if r.message.agent_id != frame.agent_id)
         heard = tuple(readable(r, self.eyes.detector) for r in came)
         heard, verdicts = self._aligned(frame, heard)
-        boxes = self.collaboration.hear(self.eyes, frame, self.memory.recall(heard))
+        distrusted = [verdict.agent_id for verdict in verdicts if verdict.distrusted]
+        recalled = self.memory.recall(heard, frame.timestamp_ns, distrusted)
+        boxes = self.collaboration.hear(self.eyes, frame, recalled)
         return Perception(_others(boxes, frame), heard, verdicts)
 
     def _aligned(

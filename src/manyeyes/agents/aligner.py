@@ -40,6 +40,7 @@ Floats = NDArray[np.float64]
 
 FORGET_S = 60.0
 """A sender that was silent for so long is judged anew."""
+_OFF = (Health.OFFSET, Health.DRIFTING)
 EGO = 0
 """The ego's node in the graph; senders are 1, 2, ... in the order of their messages."""
 
@@ -69,6 +70,11 @@ class Verdict:
     estimate: PoseEstimate
     sigma_m: float
     health: Report
+
+    @property
+    def distrusted(self) -> bool:
+        """Whether nothing that its sender said a moment ago is to be used either."""
+        return self.use is Use.CONTRADICTED or (self.use is Use.UNSURE and self.health.health in _OFF)
 
 
 @dataclass(frozen=True)
@@ -215,7 +221,7 @@ class Aligner:
             across = np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]
             sigma = math.sqrt(max(float(across + self.reach_m**2 * estimate.covariance[2, 2]), 0.0))
         answered = joined or answer.status.answered
-        caught = not answered and health.health in (Health.OFFSET, Health.DRIFTING)
+        caught = not answered and health.health in _OFF
         if contradicted:
             return Use.CONTRADICTED, sigma
         if estimate.ego_from_other is None or caught or not sigma <= self.unsure_m:

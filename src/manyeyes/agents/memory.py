@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import islice
 
 from manyeyes.agents.eyes import REMEMBERED
@@ -19,24 +19,31 @@ class Memory:
     def __init__(self, keep_ns: int = KEPT_NS) -> None:
         self._keep_ns = keep_ns
         self._held: dict[int, tuple[Message, ...]] = {}
+        self._now_ns = 0
 
-    def recall(self, heard: Sequence[Reception]) -> list[Message]:
-        """Each message heard, and behind it up to REMEMBERED older ones of its sender, newest first.
+    def recall(self, heard: Sequence[Reception], now_ns: int, distrusted: Collection[int] = ()) -> list[Message]:
+        """Each message heard, and behind it up to REMEMBERED older ones of its sender, newest first; then the last ones of those
+        who fell silent, or whose message of now nobody could place, while they are no older than keep_ns at now_ns.
 
-        A message heard again, with more of its packets, takes its own place; a time that goes back begins anew.
+        A message heard again, with more of its packets, takes its own place; a time that goes back begins anew. distrusted:
+        senders who are forgotten.
         """
-        found: list[Message] = []
-        for message in (reception.message for reception in heard):
-            known = self._held.get(message.agent_id, ())
+        if now_ns < self._now_ns:
+            self._held = {}
+        self._now_ns = now_ns
+        messages, found = [reception.message for reception in heard], list[Message]()
+        held = {who: said for who, said in self._held.items() if who not in distrusted}
+        for message in messages:
+            known = held.get(message.agent_id, ())
             if known and message.timestamp_ns < known[0].timestamp_ns:
                 known = ()
-            older = (m for m in known if m.timestamp_ns < message.timestamp_ns and self._near(m, message))
-            self._held[message.agent_id] = (message, *islice(older, REMEMBERED))
-            found += self._held[message.agent_id]
-        if found:
-            latest = max(found, key=lambda message: message.timestamp_ns)
-            self._held = {who: said for who, said in self._held.items() if self._near(said[0], latest)}
-        return found
+            older = (m for m in known if m.timestamp_ns < message.timestamp_ns and self._near(m, message.timestamp_ns))
+            held[message.agent_id] = (message, *islice(older, REMEMBERED))
+            found += held[message.agent_id]
+        latest = max((message.timestamp_ns for message in messages), default=now_ns)
+        self._held = {who: said for who, said in held.items() if self._near(said[0], latest)}
+        silent = self._held.keys() - {message.agent_id for message in messages}
+        return found + [m for who in sorted(silent) for m in self._held[who][:REMEMBERED] if self._near(m, now_ns)]
 
-    def _near(self, one: Message, other: Message) -> bool:
-        return abs(other.timestamp_ns - one.timestamp_ns) <= self._keep_ns
+    def _near(self, message: Message, time_ns: int) -> bool:
+        return abs(time_ns - message.timestamp_ns) <= self._keep_ns
