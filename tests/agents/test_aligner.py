@@ -114,6 +114,7 @@ def test_without_common_objects_only_a_claim_that_is_sure_is_used(sigma: float, 
     found = Aligner().align(frame(), eyes(cars(9, 2)), [message], {})
     assert found.verdicts[0].use is use and found.verdicts[0].estimate.status is PoseStatus.NO_MATCH
     assert [m is message for m in found.messages] == ([True] if use is Use.CLAIMED else [])
+    assert not found.verdicts[0].distrusted
 
 
 def test_an_uncertain_heading_counts_at_a_distance() -> None:
@@ -176,6 +177,7 @@ def test_who_fits_nobody_in_one_way_is_left_out() -> None:
     found = Aligner().align(frame(), eyes(Boxes.cat([all_see, parts[0]])), messages, {})
     assert [v.use for v in found.verdicts] == [Use.CORRECTED, Use.CORRECTED, Use.CONTRADICTED]
     assert [m.agent_id for m in found.messages] == [2, 3]
+    assert [v.distrusted for v in found.verdicts] == [False, False, True]
     assert all(apart(m, p)[0] < 0.1 for m, p in zip(found.messages, OTHERS))
 
 
@@ -195,6 +197,7 @@ def test_a_sender_whose_claims_were_off_is_not_believed_where_objects_are_silent
     honest, caught = watched([0.0] * 6, world, strange), watched([2.0] * 6, world, strange)
     assert honest.verdicts[0].use is Use.CLAIMED and honest.verdicts[0].health.health is Health.SOUND
     assert caught.verdicts[0].use is Use.UNSURE and caught.verdicts[0].health.health is Health.OFFSET
+    assert caught.verdicts[0].distrusted and not honest.verdicts[0].distrusted
 
 
 def test_a_message_heard_twice_says_nothing_new_and_a_new_drive_begins_anew() -> None:
@@ -225,6 +228,26 @@ def test_an_agent_fuses_boxes_from_where_their_sender_is() -> None:
         missed[aligner is None] = float(torch.cdist(wanted, found.boxes.center[:, :2]).amin(1).max())
         assert len(found.verdicts) == (aligner is not None) and len(found.heard) == 1
     assert missed[False] < 0.1 and missed[True] > 1.0
+
+
+@pytest.mark.parametrize("way, remembers", [(Late(), False), (Late("remembering", instants=2), True)])
+def test_who_cannot_be_placed_or_is_lost_is_where_it_was_if_the_method_remembers(way: Late, remembers: bool) -> None:
+    """First all is well; then the claim says nothing and there is no object in common; then nothing comes."""
+    known, hidden = cars(12, 13), cars(3, 14)
+    detector = Detector(COSTR_TINY).eval()
+    wanted = hidden.transform(EGO.inverse()).center[:, :2]
+    ego = Agent(detector, way, eyes=ToldEyes(known.transform(EGO.inverse()), detector), aligner=Aligner())
+    missed = []
+    for tenth, seen in enumerate((Boxes.cat([known, hidden]), hidden, None)):
+        packets = []
+        if seen is not None:
+            other = Agent(detector, way, eyes=ToldEyes(seen.transform(OTHERS[0].inverse()), detector))
+            claim = said(seen, OTHERS[0], off=(1.5, 1.0, 0.03), sigma=1.2)
+            where = {"world_from_agent": claim.world_from_agent, "pose_covariance": claim.pose_covariance}
+            packets = other.share(replace(frame(tenth * 100_000_000), agent_id=2, **where))
+        found = ego.perceive(frame(tenth * 100_000_000), packets)
+        missed.append(float(torch.cdist(wanted, found.boxes.center[:, :2]).amin(1).max()))
+    assert missed[0] < 0.1 and [m < 0.2 for m in missed[1:]] == [remembers, remembers]
 
 
 def test_nobody_heard_and_unknown_correctors() -> None:

@@ -84,12 +84,11 @@ def test_a_late_message_does_not_fade_but_what_its_sender_said_before_does() -> 
 
 
 def test_late_fusion_as_papers_have_it_knows_only_what_is_newest() -> None:
-    messages = [said(6, boxes(10.0)), said(5, boxes(50.0))]
-    found = Late().hear(Sees(boxes(), boxes(30.0)), frame(9), messages)
-    assert found.center[:, 0].tolist() == [10.0]
+    found = Late().hear(Sees(boxes(), boxes(30.0)), frame(9), [said(6, boxes(10.0))])
+    assert found.center[:, 0].tolist() == [10.0] and not Late().remembers
 
 
-def test_early_fusion_merges_what_is_newest_alone() -> None:
+def test_early_fusion_merges_what_is_heard_and_remembers_nothing() -> None:
     merged: list[PointCloud] = []
 
     class Looks(Sees):
@@ -99,7 +98,6 @@ def test_early_fusion_merges_what_is_newest_alone() -> None:
         def see_cloud(self, cloud: PointCloud, earlier: PointCloud | None) -> Seen:
             return Seen(boxes())
 
-    clouds = [PointCloud.of(torch.tensor([[x, 0.0, 1.0]])) for x in (6.0, 5.0)]
-    messages = [replace(said(at, boxes()), points=cloud) for at, cloud in zip((6, 5), clouds)]
-    Early().hear(Looks(boxes()), frame(9), messages)
-    assert merged[0].xyz.tolist() == [[6.0, 0.0, 1.0]]
+    cloud = PointCloud.of(torch.tensor([[6.0, 0.0, 1.0]]))
+    Early().hear(Looks(boxes()), frame(9), [replace(said(6, boxes()), points=cloud)])
+    assert merged[0].xyz.tolist() == [[6.0, 0.0, 1.0]] and not Early().remembers

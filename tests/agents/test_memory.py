@@ -7,7 +7,6 @@ import torch
 
 from manyeyes.agents.eyes import REMEMBERED
 from manyeyes.agents.memory import KEPT_NS, Memory
-from manyeyes.comms.inbox import Reception
 from manyeyes.datatypes import Message, Transform
 
 TENTH_NS = 100_000_000
@@ -18,16 +17,12 @@ def said(at: int, agent: int = 1) -> Message:
     return Message(agent, at * TENTH_NS, Transform.identity(), torch.zeros(3, 3).double())
 
 
-def heard(*messages: Message, packets: int = 3) -> list[Reception]:
-    return [Reception(message, packets, 3, None) for message in messages]
-
-
 def recall(
     memory: Memory, *messages: Message, at: int | None = None, distrusted: tuple[int, ...] = ()
 ) -> list[Message]:
     """What is heard at a tenth of a second; None: that of the newest message."""
     now = max(m.timestamp_ns for m in messages) if at is None else at * TENTH_NS
-    return memory.recall(heard(*messages), now, distrusted)
+    return memory.recall(messages, now, distrusted)
 
 
 def times(messages: list[Message]) -> list[tuple[int, int]]:
@@ -49,7 +44,7 @@ def test_each_sender_is_remembered_by_itself():
 def test_a_message_heard_again_with_more_packets_takes_its_own_place():
     memory = Memory()
     recall(memory, said(0))
-    memory.recall(heard(said(1), packets=1), TENTH_NS)
+    recall(memory, said(1))
     again = said(1)
     found = recall(memory, again)
     assert times(found) == [(1, 1), (1, 0)] and found[0] is again

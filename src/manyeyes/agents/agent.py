@@ -126,9 +126,11 @@ class Agent:
         came = (r for r in inbox.receptions(now_ns) if r.message.agent_id != frame.agent_id)
         heard = tuple(readable(r, self.eyes.detector) for r in came)
         heard, verdicts = self._aligned(frame, heard)
-        distrusted = [verdict.agent_id for verdict in verdicts if verdict.distrusted]
-        recalled = self.memory.recall(heard, frame.timestamp_ns, distrusted)
-        boxes = self.collaboration.hear(self.eyes, frame, recalled)
+        messages = [reception.message for reception in heard]
+        if self.collaboration.remembers:
+            distrusted = [verdict.agent_id for verdict in verdicts if verdict.distrusted]
+            messages = self.memory.recall(messages, frame.timestamp_ns, distrusted)
+        boxes = self.collaboration.hear(self.eyes, frame, messages)
         return Perception(_others(boxes, frame), heard, verdicts)
 
     def _aligned(

@@ -7,7 +7,6 @@ from collections.abc import Collection, Sequence
 from itertools import islice
 
 from manyeyes.agents.eyes import REMEMBERED
-from manyeyes.comms.inbox import Reception
 from manyeyes.datatypes import Message
 
 KEPT_NS = 500_000_000
@@ -21,7 +20,7 @@ class Memory:
         self._held: dict[int, tuple[Message, ...]] = {}
         self._now_ns = 0
 
-    def recall(self, heard: Sequence[Reception], now_ns: int, distrusted: Collection[int] = ()) -> list[Message]:
+    def recall(self, heard: Sequence[Message], now_ns: int, distrusted: Collection[int] = ()) -> list[Message]:
         """Each message heard, and behind it up to REMEMBERED older ones of its sender, newest first; then the last ones of those
         who fell silent, or whose message of now nobody could place, while they are no older than keep_ns at now_ns.
 
@@ -31,18 +30,18 @@ class Memory:
         if now_ns < self._now_ns:
             self._held = {}
         self._now_ns = now_ns
-        messages, found = [reception.message for reception in heard], list[Message]()
+        found: list[Message] = []
         held = {who: said for who, said in self._held.items() if who not in distrusted}
-        for message in messages:
+        for message in heard:
             known = held.get(message.agent_id, ())
             if known and message.timestamp_ns < known[0].timestamp_ns:
                 known = ()
             older = (m for m in known if m.timestamp_ns < message.timestamp_ns and self._near(m, message.timestamp_ns))
             held[message.agent_id] = (message, *islice(older, REMEMBERED))
             found += held[message.agent_id]
-        latest = max((message.timestamp_ns for message in messages), default=now_ns)
+        latest = max((message.timestamp_ns for message in heard), default=now_ns)
         self._held = {who: said for who, said in held.items() if self._near(said[0], latest)}
-        silent = self._held.keys() - {message.agent_id for message in messages}
+        silent = self._held.keys() - {message.agent_id for message in heard}
         return found + [m for who in sorted(silent) for m in self._held[who][:REMEMBERED] if self._near(m, now_ns)]
 
     def _near(self, message: Message, time_ns: int) -> bool:

@@ -25,6 +25,11 @@ class Collaboration(Protocol):
         """How tables call it."""
         ...
 
+    @property
+    def remembers(self) -> bool:
+        """Whether it also hears what was said a moment ago: older messages, and the last of those who fell silent."""
+        ...
+
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
         """The message of this frame, before selection and encoding; None says nothing."""
         ...

@@ -15,6 +15,7 @@ class Alone:
     """No collaboration."""
 
     name: str = "alone"
+    remembers: bool = False
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
         """Nothing."""

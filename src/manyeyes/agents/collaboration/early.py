@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from manyeyes.agents.collaboration.heading import behind_s, ego_from_sender, header
+from manyeyes.agents.collaboration.heading import ego_from_sender, header
 from manyeyes.agents.eyes import Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud
 
@@ -16,6 +16,7 @@ class Early:
     """The points of every agent's last two sweeps, quantised by the wire to a centimetre."""
 
     name: str = "early"
+    remembers: bool = False
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
         """The whole cloud."""
@@ -23,7 +24,6 @@ class Early:
 
     def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the merged cloud and of the one merged before it."""
-        news = [m for m, behind in zip(messages, behind_s(messages)) if not behind]
-        heard = [m.points.transform(ego_from_sender(frame, m)) for m in news if m.points is not None]
+        heard = [m.points.transform(ego_from_sender(frame, m)) for m in messages if m.points is not None]
         merged = PointCloud.cat([frame.points, *heard])
         return eyes.see_cloud(merged, eyes.earlier_merged(frame, merged)).boxes

@@ -22,6 +22,7 @@ class Fused:
     """Sends the tokens of its last perception, dated as that was; before it has perceived, its own."""
 
     name: str = "fused"
+    remembers: bool = True
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
         """What the agent perceived at its last instant, if that was just before; else what it sees."""

@@ -40,6 +40,7 @@ class Intermediate:
 
     name: str = "intermediate"
     score: Callable[[Eyes, AgentFrame], Tensor] = unsaid
+    remembers: bool = True
 
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
         """The tokens that pruning kept with what the agent makes of them, and their worth, by which a budget chooses."""

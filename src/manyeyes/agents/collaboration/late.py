@@ -25,6 +25,11 @@ class Late:
     say_above: float = 0.05
     instants: int = 0
 
+    @property
+    def remembers(self) -> bool:
+        """With the ego's own past."""
+        return self.instants > 0
+
     def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
         """The boxes of the agent's own sweeps."""
         found = eyes.see(frame).boxes
@@ -37,7 +42,7 @@ class Late:
         """
         boxes = [eyes.see(frame).boxes, *moved(frame, eyes.before(frame, self.instants))]
         for m, behind in zip(messages, behind_s(messages)):
-            if m.objects is not None and (self.instants or not behind):
+            if m.objects is not None:
                 there = m.objects.after(age_s(frame, m)).transform(ego_from_sender(frame, m))
                 boxes.append(faded(there.to(frame.points.xyz.dtype), behind))
         return strongest(boxes, self.nms_iou)
