@@ -70,6 +70,8 @@ def save_curves(panels: Sequence[Panel], path: Path) -> None:
 
 
 def _draw(axes: Axes, panel: Panel, labels: Sequence[str]) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     for curve in panel.curves:
         colour = f"C{labels.index(curve.label) % 10}"
         if not curve.x:
@@ -90,7 +92,7 @@ def _draw(axes: Axes, panel: Panel, labels: Sequence[str]) -> None:
         )
         axes.set_xticks(range(len(panel.ticks)), panel.ticks, **slant)
     elif not panel.in_bytes and all(float(x).is_integer() for curve in panel.curves for x in curve.x):
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if panel.in_bytes:
         axes.set_xscale("log", base=2)
         axes.set_xticks(_BYTES_TICKS, [f"{t / 1024:g} KiB" for t in _BYTES_TICKS])
