@@ -12,29 +12,18 @@ from manyeyes.training.map_losses import MapLossConfig
 from manyeyes.training.map_samples import MapAugment
 
 _NOISY = MapAugment(sigma_m=0.2, sigma_rad=math.radians(0.3))
+_SMALL = MapTrainConfig(mapper_config("small"), steps=3000, batch=2, learning_rate=1e-3, save_every=50, augment=_NOISY)
 
 MAP_TRAINING: dict[str, MapTrainConfig] = {
     "map-toy": MapTrainConfig(
         mapper_config("toy"), steps=60, batch=2, learning_rate=2e-3, warm_up=10, save_every=20, augment=MapAugment(1, 3)
     ),
-    "map-small": MapTrainConfig(
-        mapper_config("small"), steps=3000, batch=2, learning_rate=1e-3, save_every=50, augment=_NOISY
+    "map-small": _SMALL,
+    "map-small-camera": replace(
+        _SMALL, mapper=mapper_config("small", ("camera",)), augment=replace(_NOISY, flip=False)
     ),
-    "map-small-camera": MapTrainConfig(
-        mapper_config("small", ("camera",)),
-        steps=3000,
-        batch=2,
-        learning_rate=1e-3,
-        save_every=50,
-        augment=replace(_NOISY, flip=False),
-    ),
-    "map-small-both": MapTrainConfig(
-        mapper_config("small", ("lidar", "camera")),
-        steps=3000,
-        batch=2,
-        learning_rate=1e-3,
-        save_every=50,
-        augment=replace(_NOISY, flip=False),
+    "map-small-both": replace(
+        _SMALL, mapper=mapper_config("small", ("lidar", "camera")), augment=replace(_NOISY, flip=False)
     ),
     "map-paper": MapTrainConfig(
         mapper_config("paper", ("camera",)),
