@@ -22,7 +22,7 @@ from manyeyes.apps.train_map import open_looks, true_maps
 from manyeyes.datatypes.map_element import KINDS
 from manyeyes.evaluation.map_quality import judge
 from manyeyes.evaluation.map_tiles import side_by_side
-from manyeyes.models.map_head import decode
+from manyeyes.models.map_head import RawMap, decode
 from manyeyes.models.mapper import Mapper
 from manyeyes.training.map_loop import MapRun, ground_of, see
 from manyeyes.training.map_presets import MAP_TRAINING
@@ -41,17 +41,22 @@ class Few:
 
 
 def mean_ap(model: Mapper, samples: tuple[MapSample, ...]) -> dict[str, float]:
-    """mAP in both ways, and AP of each kind, on the tiles of samples."""
-    config, drawn, truth = model.config, [], []
+    """mAP in both ways, of the sketch's lines too, and AP of each kind, on the tiles of samples."""
+    config, drawn, begun, truth = model.config, [], [], []
     kinds = [KINDS.index(kind) for kind in config.head.kinds]
     model.eval()
     with torch.no_grad():
         for sample in samples:
-            raw = model.draw(ground_of(model, see(model, [sample]).tokens, [sample]))[-1]
-            drawn += decode(raw, config.tile, config.head)
+            ground = ground_of(model, see(model, [sample]).tokens, [sample])
+            sketch = model.sketch(ground)
+            point, logit, _ = model.head.begin(sketch)
+            begun += decode(RawMap(logit, point), config.tile, config.head)
+            drawn += decode(model.draw(ground, sketch=sketch)[-1], config.tile, config.head)
             truth.append(sample.truth.take(np.isin(sample.truth.kind, kinds)))
     quality = judge(side_by_side(drawn), side_by_side(truth), ("maptr", "exact"), config.head.kinds)
     mean = {way: round(quality.mean_ap(way, kinds=config.head.kinds), 3) for way in ("maptr", "exact")}
+    first = judge(side_by_side(begun), side_by_side(truth), ("maptr",), config.head.kinds)
+    mean["sketch"] = round(first.mean_ap("maptr", kinds=config.head.kinds), 3)
     return {**mean, **{kind: round(quality.ap(kind, "maptr"), 3) for kind in config.head.kinds}}
 
 
@@ -74,7 +79,14 @@ def main() -> None:
     few = Few(tuple(stream.draw(k) for k in range(options.tiles)), stream.towns)
     print(f"{options.tiles} tiles, {sum(len(s.truth) for s in few.samples)} elements", flush=True)
     config = replace(
-        preset, steps=options.steps, batch=options.batch, learning_rate=options.rate, warm_up=30, thin=0.0, ema=0.98
+        preset,
+        steps=options.steps,
+        batch=options.batch,
+        learning_rate=options.rate,
+        warm_up=30,
+        thin=0.0,
+        ema=0.98,
+        sketch_steps=options.steps // 4,
     )
     with tempfile.TemporaryDirectory() as folder:
         run = MapRun(config, few, Path(folder), seed=0)

@@ -40,7 +40,7 @@ CONFIG = MapperConfig(
     BevGrid(-10.0, -5.0, -1.0, 10.0, 5.0, 1.0, pillar=1.0),
     token_channels=8,
     neck=(1, 1),
-    head=MapHeadConfig(elements=4, points=5, channels=16, feed=32, layers=1, heads=4, threshold=0.0),
+    head=MapHeadConfig(elements=9, points=5, least=0.0, channels=16, feed=32, layers=1, heads=4, threshold=0.0),
 )
 LINE = MapElements.of([[[98.0, 0.0], [98.0, 100.0]]], DIVIDER)
 

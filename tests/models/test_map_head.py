@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map decoder: shapes, its attention against slow twins, and what comes out as elements."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -16,37 +17,44 @@ from manyeyes.models.map_head import (
     RawMap,
     _SelfAttention,
     decode,
-    start_lines,
     waves,
 )
 
 TINY = MapHeadConfig(elements=6, points=5, many=9, channels=16, feed=32, layers=2, heads=4, places=3)
+THREE = torch.tensor([[2.0, 0.0], [8.0, 3.0], [5.0, 6.0]])
 TILE = BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=2.0)
+
+
+def drawn(head, ground, group="one"):
+    return head(ground, head.sketch(ground), group)
 
 
 def test_every_layer_answers_for_every_query_of_its_group():
     head, ground = MapHead(TINY), torch.randn(2, 16, 10, 20)
     for group, count in (("one", 6), ("many", 9)):
-        layers = head(ground, group)
+        layers = drawn(head, ground, group)
         assert len(layers) == 2
         for raw in layers:
             assert raw.logit.shape == (2, count, 3) and raw.point.shape == (2, count, 5, 2)
             assert bool(torch.isfinite(raw.point).all())
-    start = head(ground)[0].logit.sigmoid()
+    start = drawn(head, ground)[0].logit.sigmoid()
     assert 0.001 < float(start.detach().mean()) < 0.1
 
 
 def test_one_group_knows_nothing_of_the_other():
-    head, ground = MapHead(TINY).eval(), torch.randn(1, 16, 10, 20)
-    before = head(ground, "one")[-1].point
-    with torch.no_grad():
-        head.instance[6:] += 1.0
-    assert torch.equal(before, head(ground, "one")[-1].point)
+    few, more = MapHead(TINY).eval(), MapHead(dataclasses.replace(TINY, many=12)).eval()
+    more.load_state_dict(few.state_dict())
+    ground = torch.randn(1, 16, 10, 20)
+    assert torch.equal(drawn(few, ground)[-1].point, drawn(more, ground)[-1].point)
+    # The best of all that were followed lead both groups; of the second, copies are as sure as they are.
+    one, many = few.begin(few.sketch(ground)), few.begin(few.sketch(ground), "many")
+    assert torch.equal(one[0][:, 0], many[0][:, 0]) and one[0].shape[1] == 6 and many[0].shape[1] == 9
+    assert float(many[1].sigmoid().amax(2).min()) > 0.011
 
 
 def test_tiles_of_a_batch_know_nothing_of_each_other():
     head, ground = MapHead(TINY), torch.randn(3, 16, 10, 20)
-    together, alone = head(ground)[-1], head(ground[1:2])[-1]
+    together, alone = drawn(head, ground)[-1], drawn(head, ground[1:2])[-1]
     assert torch.allclose(together.point[1], alone.point[0], atol=1e-5)
 
 
@@ -99,25 +107,21 @@ def test_points_beyond_the_tile_are_drawn_at_its_border():
     np.testing.assert_allclose(decode(raw, TILE, config)[0].polyline(0), [[-20, 0], [0, 0], [20, 10]])
 
 
-def test_queries_begin_as_straight_lines_all_over_the_tile():
-    lines = start_lines(48, 5)
-    assert lines.shape == (48, 5, 2) and float(lines.min()) >= 0 and float(lines.max()) <= 1
-    whole = lines[((lines > 0) & (lines < 1)).all(-1).all(-1)]
-    steps = whole.diff(dim=1)
-    assert len(whole) > 30 and torch.allclose(steps, steps[:, :1].expand_as(steps), atol=1e-6)
-    assert torch.allclose((whole[:, -1] - whole[:, 0]).norm(dim=1), torch.tensor(0.3), atol=1e-5)
-    # Each sixth of the tile, and each quarter of all directions, holds half of its even part or more.
-    middle, along = lines[:, 2], whole[:, -1] - whole[:, 0]
-    sixth = torch.bincount((middle * torch.tensor([3, 2])).long() @ torch.tensor([2, 1]), minlength=6)
-    quarter = torch.bincount((torch.atan2(along[:, 1], along[:, 0]).remainder(math.pi) * 4 / math.pi).long())
-    assert int(sixth.min()) >= 4 and int(quarter.min()) >= len(whole) // 6
-    assert start_lines(0, 5).shape == (0, 5, 2)
+def test_before_anything_is_learnt_every_layer_answers_with_the_lines_of_the_sketch():
+    head, ground = MapHead(TINY), torch.randn(1, 16, 10, 20)
+    start, logit, kind = head.begin(head.sketch(ground))
+    for raw in drawn(head, ground):
+        assert torch.equal(raw.point, start) and torch.equal(raw.logit, logit)
+    own = logit.gather(2, kind[..., None])
+    assert torch.allclose(logit.sum(2, keepdim=True) - own, torch.tensor(-2 * math.log(99)), atol=1e-4)
 
 
-def test_before_anything_is_learnt_every_layer_answers_with_the_lines_that_queries_begin_as():
-    head = MapHead(TINY)
-    for raw in head(torch.randn(1, 16, 10, 20)):
-        assert torch.equal(raw.point[0], start_lines(6, 5))
+def test_queries_begin_without_gradients_and_the_sketch_learns_from_its_own_loss_alone():
+    head, ground = MapHead(TINY), torch.randn(1, 16, 10, 20)
+    assert not any(part.requires_grad for part in head.begin(head.sketch(ground)))
+    raw = drawn(head, ground)[-1]
+    (raw.point.sum() + raw.logit.sum()).backward()
+    assert all(p.grad is None for p in head.sketch.parameters())
 
 
 def test_waves_tell_places_apart_to_a_hundredth_of_the_tile():
@@ -130,30 +134,44 @@ def test_waves_tell_places_apart_to_a_hundredth_of_the_tile():
     assert float(away.min()) > 0.5
 
 
-def test_a_layer_is_told_where_its_points_lie():
-    head, ground = MapHead(TINY).eval(), torch.zeros(1, 16, 10, 20)
-    before = head(ground)[0].logit
+def at_three_places(monkeypatch, head, shift):
+    """The head's answers when its queries begin at three places of the tile, one of them moved."""
+    start = (THREE[None, :, None] / torch.tensor([20.0, 10.0])).expand(1, 3, 5, 2).clone()
+    start[0, 2, :, 0] += shift
+    begin = (start, torch.full((1, 3, 3), -4.0), torch.zeros(1, 3, dtype=torch.int64))
+    monkeypatch.setattr(head, "begin", lambda sketch, group: begin)
+    # Nothing is seen anywhere, so only the place itself can change the answer.
+    ground = torch.zeros(1, 16, 10, 20)
+    return drawn(head, ground)[0], start
+
+
+def told(head):
+    """The same head with branches that say something."""
+    generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        head.start[2, :, 0] += 0.05
-    after = head(ground)[0].logit
-    # Nothing is seen anywhere, so only the place itself can have changed the answer.
+        for branch in (*head.moves, *head.kinds):
+            branch[-1].weight.normal_(generator=generator)
+    return head.eval().requires_grad_(False)
+
+
+def test_a_layer_is_told_where_its_points_lie(monkeypatch):
+    head = told(MapHead(TINY))
+    before, after = (at_three_places(monkeypatch, head, shift)[0].logit for shift in (0.0, 0.05))
     assert not torch.allclose(before[0, 2], after[0, 2], atol=1e-6)
 
 
-def test_what_moves_a_point_is_told_where_it_lies():
-    head, ground = MapHead(TINY).eval(), torch.zeros(1, 16, 10, 20)
-    with torch.no_grad():
-        for layer in head.layers:
-            for norm in layer.norms:  # a layer that says nothing at all: x is 0, whatever it was told
-                norm.weight.zero_()
-                norm.bias.zero_()
-        for move in head.moves:
-            move[-1].weight.normal_(generator=torch.Generator().manual_seed(0))
-        moved = head(ground)[0].point[0] - head.start[:6]
-        head.start[2, :, 0] += 0.05
-        again = head(ground)[0].point[0] - head.start[:6]
-    assert float((moved[2] - again[2]).abs().max()) > 1e-3
-    assert torch.equal(moved[0], again[0])
+def test_what_moves_a_point_is_told_where_it_lies(monkeypatch):
+    head = told(MapHead(TINY))
+    for layer in head.layers:
+        for norm in layer.get_submodule(
+            "norms"
+        ).children():  # a layer that says nothing at all: x is 0, whatever it was told
+            for part in norm.parameters():
+                part.zero_()
+    (first, here), (second, there) = (at_three_places(monkeypatch, head, shift) for shift in (0.0, 0.05))
+    moved, again = first.point - here, second.point - there
+    assert float((moved[0, 2] - again[0, 2]).abs().max()) > 1e-3
+    assert torch.equal(moved[0, 0], again[0, 0])
 
 
 def test_nothing_sure_is_an_empty_map():

@@ -31,7 +31,7 @@ TINY = MapperConfig(
     BevGrid(-16.0, -8.0, -1.0, 16.0, 8.0, 1.0, pillar=1.0),
     token_channels=16,
     neck=(1, 1),
-    head=MapHeadConfig(elements=8, points=6, many=8, channels=32, feed=64, layers=2, heads=4),
+    head=MapHeadConfig(elements=8, points=6, many=8, seeds=40, channels=32, feed=64, layers=2, heads=4),
 )
 CONFIG = MapTrainConfig(TINY, steps=4, batch=2, warm_up=2, save_every=2)
 
@@ -157,7 +157,9 @@ def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [1, 2, 3, 4] == [p.step for p in heard]
     assert all(
-        math.isfinite(line[name]) for line in lines for name in ("loss", "kind", "point", "direction", "ink", "many")
+        math.isfinite(line[name])
+        for line in lines
+        for name in ("loss", "kind", "point", "direction", "ink", "sketch", "many")
     )
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["Nowhere"] and card["steps"] == 4 and card["command"] == "x"
@@ -177,9 +179,24 @@ def test_thinning_leaves_out_the_least_worth_of_each_look():
     assert torch.equal(thinned(tokens, worth, torch.zeros(3)).features, tokens.features)
 
 
+def test_the_decoder_is_taught_after_the_sketch(tmp_path):
+    run = MapRun(dataclasses.replace(CONFIG, sketch_steps=1), Streets(), tmp_path, seed=0)
+    before = {name: p.clone() for name, p in run.state.model.named_parameters()}
+    first, second = run.advance(), run.advance()
+    assert float(first.terms.kind) == 0 == float(first.terms.many) and float(first.terms.sketch.detach()) > 0
+    assert float(second.terms.kind.detach()) > 0 and float(second.terms.many.detach()) > 0
+    only = MapRun(dataclasses.replace(CONFIG, sketch_steps=1), Streets(), tmp_path / "only", seed=0)
+    only.advance()
+    same = {name for name, p in only.state.model.named_parameters() if torch.equal(p, before[name])}
+    assert any(name.startswith("head.layers") for name in same)
+    assert not any(name.startswith("head.sketch") for name in same)
+
+
 def test_two_streets_are_learnt_by_heart(tmp_path):
     mapper = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, many=0))
-    config = MapTrainConfig(mapper, steps=100, batch=2, learning_rate=4e-3, warm_up=10, ema=0.9, thin=0.0)
+    config = MapTrainConfig(
+        mapper, steps=180, batch=2, learning_rate=6e-3, warm_up=10, ema=0.9, thin=0.0, sketch_steps=20
+    )
     run = MapRun(config, Streets(2), tmp_path, seed=0)
     streets = [Streets(2).draw(k) for k in range(2)]
     truth = side_by_side([street.truth for street in streets])
@@ -200,9 +217,13 @@ def quality(model, streets, truth):
 def test_every_weight_of_the_lidar_path_learns():
     torch.manual_seed(0)
     model = Mapper(TINY)
+    # Branches of the head begin by saying nothing, and what lies before a zero waits for one step.
+    with torch.no_grad():
+        for branch in (*model.head.kinds, *model.head.moves):
+            list(branch.parameters())[-2].normal_(std=0.1)
     terms = loss_terms(model, [Streets().draw(0), Streets().draw(1)], CONFIG.loss, torch.full((4,), 0.2))
     terms.total(CONFIG.loss).backward()
     silent = [name for name, p in model.named_parameters() if p.grad is None or not bool((p.grad != 0).any())]
-    # Blocks begin as their shortcuts and points begin at their references: what lies before a zero waits for one step.
-    waiting = {name for name in silent if ".inner." in name or "moves" in name}
+    # Blocks begin as their shortcuts.
+    waiting = {name for name in silent if ".inner." in name}
     assert set(silent) - waiting == set()

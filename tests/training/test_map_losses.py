@@ -52,7 +52,7 @@ def test_the_loss_does_not_know_from_which_end_a_line_or_where_a_ring_was_begun(
         drawn[1] = drawn[1].roll(turn, 0)
         if ring_back:
             drawn[1] = drawn[1].flip(0)
-        terms = map_terms([raw], [], torch.zeros(()), [targets(drawn, ring, kind)], CONFIG)
+        terms = map_terms([raw], [], torch.zeros(()), torch.zeros(()), [targets(drawn, ring, kind)], CONFIG)
         loss = terms.total(CONFIG)
         grads = torch.autograd.grad(loss, (raw.logit, raw.point))
         if total is None:
@@ -74,7 +74,7 @@ def test_the_loss_of_a_tile_is_the_same_however_its_map_is_stored():
     for drawn, turn, way in itertools.product((line, line[::-1]), range(4), (1, -1)):
         truth = MapElements.of([drawn, np.roll(ring, turn, 0)[::way]], [DIVIDER, CROSSING])
         target = target_of(truth, tile, ("divider", "boundary", "crossing"), 6)
-        loss = map_terms([raw], [], torch.zeros(()), [target], CONFIG).total(CONFIG)
+        loss = map_terms([raw], [], torch.zeros(()), torch.zeros(()), [target], CONFIG).total(CONFIG)
         grads.append((loss, *torch.autograd.grad(loss, (raw.logit, raw.point))))
     for case in grads[1:]:
         # Arc lengths are summed from the other end, so places agree to rounding.
@@ -160,9 +160,9 @@ def test_of_the_many_queries_each_element_has_several():
         logit[0, query, target.kind[query % 3]] = 12.0
         point[0, query] = where[query % 3]
     one, many = RawMap(logit[:, :3], point[:, :3]), RawMap(logit, point)
-    terms = map_terms([one], [many], torch.zeros(()), [target], config)
+    terms = map_terms([one], [many], torch.zeros(()), torch.zeros(()), [target], config)
     assert float(terms.many) == pytest.approx(0, abs=1e-4)
-    thrice = map_terms([one], [many], torch.zeros(()), [target], MapLossConfig(repeat=3))
+    thrice = map_terms([one], [many], torch.zeros(()), torch.zeros(()), [target], MapLossConfig(repeat=3))
     assert float(thrice.total(CONFIG)) == pytest.approx(float(thrice.many), abs=1e-4)
 
 

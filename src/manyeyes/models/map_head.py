@@ -3,14 +3,14 @@
 
 Sources: MapTR (Liao et al., ICLR 2023): hierarchical queries, an instance's and a point's embedding added, and reference points
 refined layer by layer; MapTRv2 (IJCV 2024): self-attention among instances and within each in turn, and a second group of queries
-for one-to-many matching in training; Deformable DETR (ICLR 2021): attention to a few learned places; DAB-DETR (ICLR 2022): each
-layer is told where its points lie by now. The two groups never attend to each other, which here is said by running the same
-layers on each.
+for one-to-many matching in training; Deformable DETR (ICLR 2021): attention to a few learned places, and queries that begin as a
+first stage's proposals (section 4.2); DAB-DETR (ICLR 2022): each layer is told where its points lie by now. The two groups never
+attend to each other, which here is said by running the same layers on each.
 
-What differs from MapTR, so that a few tiles are learnt by heart in hundreds of steps: an element's points begin as one straight
-line, not each at a place of its own; their places are told to every layer, and to what moves them; points move by shares of the
-tile, not by logits, which are flat at the tile's border, where lines are cut; and a layer looks at the ground before it compares
-what was seen.
+What differs from MapTR, so that little data and few steps teach much: an element begins as a line that a sketch of the tile shows
+(models/map_sketch.py), of the kind and as sure as it is there, and layers say what to change; their places are told to every
+layer, and to what moves them; points move by shares of the tile, not by logits, which are flat at the tile's border, where lines
+are cut; and a layer looks at the ground before it compares what was seen.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
+from manyeyes.models.map_sketch import APART, Sketch, SketchHead, propose
 from manyeyes.ops.deformable import sample_weighted
 
 Group = Literal["one", "many"]
@@ -39,7 +40,9 @@ _WAVES = math.pi * 2.0 ** torch.arange(8)
 @dataclass(frozen=True)
 class MapHeadConfig:
     """kinds: of elements that are told apart, by name. elements, points: queries of one-to-one matching, and points of each;
-    many: queries of one-to-many matching, in training only. places: looked at by each of the heads, a point and layer.
+    many: queries of one-to-many matching, in training only. seeds: cells from which lines are followed that queries begin as, no
+    fewer than these; least: how sure a cell is at least for a line to run on through it. places: looked at by each of the heads, a
+    point and layer.
 
     keep, threshold: at most so many answers, by score over all elements and kinds, and those of at least that score.
     """
@@ -48,6 +51,8 @@ class MapHeadConfig:
     elements: int = 50
     points: int = 20
     many: int = 0
+    seeds: int = 160
+    least: float = 0.2
     channels: int = 128
     feed: int = 256
     layers: int = 3
@@ -143,51 +148,48 @@ class MapLayer(nn.Module):
 
 
 class MapHead(nn.Module):
-    """Queries, layers, and after each layer kinds and points."""
+    """A sketch; queries that begin as its lines; layers, and after each layer kinds and points."""
 
     def __init__(self, config: MapHeadConfig) -> None:
         super().__init__()
         self.config = config
         c = config.channels
-        self.instance = nn.Parameter(torch.randn(config.elements + config.many, 2 * c))
+        self.sketch = SketchHead(c, len(config.kinds))
+        self.kind = nn.Parameter(torch.randn(len(config.kinds), 2 * c))
         self.point = nn.Parameter(torch.randn(config.points, 2 * c))
-        starts = [start_lines(count, config.points) for count in (config.elements, config.many)]
-        self.start = nn.Parameter(torch.cat(starts))
         self.where = nn.Sequential(nn.Linear(4 * len(_WAVES), c), nn.ReLU(), nn.Linear(c, c))
         self.layers = nn.ModuleList(MapLayer(config) for _ in range(config.layers))
         self.kinds = nn.ModuleList(_kind_branch(c, len(config.kinds)) for _ in range(config.layers))
         self.moves = nn.ModuleList(_move_branch(c) for _ in range(config.layers))
 
-    def forward(self, ground: Tensor, group: Group = "one") -> tuple[RawMap, ...]:
-        """Features of B tiles (B, C, rows, columns) to one RawMap a layer, the last the best; group: which queries."""
-        ones = self.config.elements
-        mine = slice(ones) if group == "one" else slice(ones, None)
-        embedded, content = (self.instance[mine][:, None] + self.point).chunk(2, -1)
-        b = ground.shape[0]
-        x = content.expand(b, *content.shape)
-        reference = self.start[mine].expand(b, *self.start[mine].shape)
+    def forward(self, ground: Tensor, sketch: Sketch, group: Group = "one") -> tuple[RawMap, ...]:
+        """Features of B tiles (B, C, rows, columns) and their sketch to one RawMap a layer, the last the best; group: of queries.
+
+        The first group begins as each line of the sketch once, the second as all that were followed, copies too.
+        """
+        start, logit, kind = self.begin(sketch, group)
+        embedded, content = (self.kind[kind][:, :, None] + self.point).chunk(2, -1)
+        x, reference = content, start
         ground = ground.permute(0, 2, 3, 1)
         out = []
-        for layer, kind, move in zip(self.layers, self.kinds, self.moves):
+        for layer, say, move in zip(self.layers, self.kinds, self.moves):
             place = embedded + self.where(waves(reference))
             x = layer(x, place, reference, ground)
             # How far a point has still to go depends on where it is by now, which x alone does not say.
             point = reference + STEP * move(x + place)
-            out.append(RawMap(kind(x.mean(2)), point))
+            out.append(RawMap(logit + say(x.mean(2)), point))
             reference = point.detach()
         return tuple(out)
 
-
-def start_lines(count: int, points: int) -> Tensor:
-    """(count, points, 2) straight lines all over the tile, in shares of it, 0.3 long, of all directions.
-
-    Middles and directions are the additive recurrence of least discrepancy in three dimensions (Roberts 2018).
-    """
-    ratio = torch.tensor(1.2207440846).double() ** -torch.arange(1, 4)
-    x, y, way = ((0.5 + torch.arange(count)[:, None] * ratio) % 1).unbind(-1)
-    along = torch.stack(((math.pi * way).cos(), (math.pi * way).sin()), -1)
-    middle = 0.1 + 0.8 * torch.stack((x, y), -1)
-    return (middle[:, None] + torch.linspace(-0.15, 0.15, points)[:, None] * along[:, None]).clamp(0, 1).float()
+    def begin(self, sketch: Sketch, group: Group = "one") -> tuple[Tensor, Tensor, Tensor]:
+        """What queries begin as: points (B, I, P, 2), logits (B, I, kinds) and kinds (B, I), of which nothing has gradients."""
+        config = self.config
+        rings = torch.tensor([is_ring(kind) for kind in config.kinds])
+        count, apart = (config.elements, APART) if group == "one" else (config.many, 0.0)
+        found = propose(sketch, rings, count, config.points, max(config.seeds, count), config.least, apart)
+        own = F.one_hot(found.kind, len(config.kinds)).to(found.sure)
+        # Few queries are elements of a kind that the sketch does not say: a probability of 0.01 (focal loss, Lin et al. 2017).
+        return found.point, own * (torch.logit(found.sure) + math.log(99))[..., None] - math.log(99), found.kind
 
 
 def waves(place: Tensor) -> Tensor:
@@ -198,8 +200,8 @@ def waves(place: Tensor) -> Tensor:
 
 def _kind_branch(channels: int, kinds: int) -> nn.Sequential:
     last = nn.Linear(channels, kinds)
-    # Few queries are elements: each starts at a probability of 0.01 (focal loss, Lin et al. 2017).
-    nn.init.constant_(last.bias, -math.log(99))
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
     hidden = [part for _ in range(2) for part in (nn.Linear(channels, channels), nn.LayerNorm(channels), nn.ReLU())]
     return nn.Sequential(*hidden, last)
 

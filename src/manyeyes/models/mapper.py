@@ -18,6 +18,7 @@ from manyeyes.datatypes.camera import CameraImage
 from manyeyes.models.image_encoder import Pyramid, Residual
 from manyeyes.models.map_bev import BevConfig, CameraBev, LidarBev
 from manyeyes.models.map_head import Group, MapHead, MapHeadConfig, RawMap
+from manyeyes.models.map_sketch import Sketch
 from manyeyes.ops.warp import masked_max, warp
 
 LOOKS = 10
@@ -138,9 +139,13 @@ class Mapper(nn.Module):
             levels.append(x)
         return self.pyramid(levels)
 
-    def draw(self, ground: Tensor, group: Group = "one") -> tuple[RawMap, ...]:
-        """Elements of tiles (B, D, rows, columns), one RawMap a layer, the last the best."""
-        return self.head(ground, group)
+    def sketch(self, ground: Tensor) -> Sketch:
+        """What the cells of tiles (B, D, rows, columns) say of the lines that run by them."""
+        return self.head.sketch(ground)
+
+    def draw(self, ground: Tensor, group: Group = "one", sketch: Sketch | None = None) -> tuple[RawMap, ...]:
+        """Elements of tiles (B, D, rows, columns), one RawMap a layer, the last the best; sketch: of this ground, if known."""
+        return self.head(ground, self.sketch(ground) if sketch is None else sketch, group)
 
     def forward(self, features: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
         """The part that is exported: looks on the cells of their tiles, as for ``merge``, to the last layer's logits and points."""

@@ -21,6 +21,7 @@ from manyeyes.models.mapper import Look, Mapper, MapperConfig
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.training.map_losses import MapLossConfig, MapTerms, ink_loss, map_terms
 from manyeyes.training.map_samples import MapAugment, MapSample, MapSamples
+from manyeyes.training.map_sketches import sketch_loss, sketch_of
 from manyeyes.training.map_targets import target_of
 from manyeyes.training.run_state import RunState, warm_cosine
 
@@ -31,7 +32,8 @@ class MapTrainConfig:
 
     thin: the greatest share of a look's tokens that is left out, those of least worth, as a budget in bytes would; uniform, so that
     the model knows tiles of many bytes and of few. ema: decay of the averaged weights that are saved. beta2: decay of Adam's mean
-    square; at the usual 0.999 it still divides by the great gradients of the start when half of a short run is over.
+    square; at the usual 0.999 it still divides by the great gradients of the start when half of a short run is over. sketch_steps:
+    first steps in which the decoder is not taught, since what it would begin from shows nothing yet.
     """
 
     mapper: MapperConfig
@@ -44,6 +46,7 @@ class MapTrainConfig:
     clip: float = 35.0
     ema: float = 0.998
     thin: float = 0.9
+    sketch_steps: int = 0
     save_every: int = 100
     augment: MapAugment = field(default_factory=MapAugment)
     loss: MapLossConfig = field(default_factory=MapLossConfig)
@@ -94,18 +97,26 @@ def thinned(tokens: SparseBev, worth: Tensor, share: Tensor) -> SparseBev:
 
 
 def loss_terms(
-    model: Mapper, samples: Sequence[MapSample], config: MapLossConfig, share: Tensor | None = None
+    model: Mapper,
+    samples: Sequence[MapSample],
+    config: MapLossConfig,
+    share: Tensor | None = None,
+    draws: bool = True,
 ) -> MapTerms:
-    """Losses of one batch of tiles; share (looks,): how much of each look's tokens is left out."""
+    """Losses of one batch of tiles; share (looks,): how much of each look's tokens is left out; draws: is the decoder taught?"""
     look = see(model, samples)
     drawn = torch.cat([sample.ink for sample in samples]).permute(0, 2, 3, 1).flatten(0, 2)[look.tokens.sites.key]
     ink = ink_loss(look.ink, drawn.float())
     tokens = look.tokens if share is None else thinned(look.tokens, look.worth, share)
     ground = ground_of(model, tokens, samples)
-    head = model.config.head
-    targets = [target_of(sample.truth, model.config.tile, head.kinds, head.points) for sample in samples]
-    many = model.draw(ground, "many") if head.many else ()
-    return map_terms(model.draw(ground), many, ink, targets, config)
+    head, tile = model.config.head, model.config.tile
+    sketch = model.sketch(ground)
+    sketched = sketch_loss(sketch, [sketch_of(sample.truth, tile, head.kinds) for sample in samples])
+    if not draws:
+        return MapTerms.undrawn(ink, sketched)
+    targets = [target_of(sample.truth, tile, head.kinds, head.points) for sample in samples]
+    many = model.draw(ground, "many", sketch) if head.many else ()
+    return map_terms(model.draw(ground, "one", sketch), many, ink, sketched, targets, config)
 
 
 class MapRun:
@@ -125,7 +136,7 @@ class MapRun:
         samples = [self.samples.draw(number) for number in numbers]
         looks = sum(len(sample.looks) for sample in samples)
         thin = config.thin * keyed_uniform((looks,), "thin", self.seed, numbers.start).float()
-        terms = loss_terms(state.model.train(), samples, config.loss, thin)
+        terms = loss_terms(state.model.train(), samples, config.loss, thin, state.step >= config.sketch_steps)
         loss = terms.total(config.loss)
         rate = config.learning_rate * warm_cosine(config.warm_up, state.step, config.steps)
         state.descend(loss, rate, config.clip, config.ema)

@@ -29,24 +29,34 @@ class MapLossConfig:
     point: float = 5.0
     direction: float = 0.005
     ink: float = 1.0
+    sketch: float = 2.0
     repeat: int = 2
     many: float = 1.0
 
 
 @dataclass(frozen=True)
 class MapTerms:
-    """Scalars, each a sum over the head's layers where it has any; many: all terms of the one-to-many queries, weighed already."""
+    """Scalars, each a sum over the head's layers where it has any; sketch: of what queries begin from (training/map_sketches.py);
+    many: all terms of the one-to-many queries, weighed already.
+    """
 
     kind: Tensor
     point: Tensor
     direction: Tensor
     ink: Tensor
+    sketch: Tensor
     many: Tensor
+
+    @classmethod
+    def undrawn(cls, ink: Tensor, sketch: Tensor) -> MapTerms:
+        """Where nothing was drawn."""
+        nothing = sketch.new_zeros(())
+        return cls(nothing, nothing, nothing, ink, sketch, nothing)
 
     def total(self, config: MapLossConfig) -> Tensor:
         """The loss."""
         own = config.kind * self.kind + config.point * self.point + config.direction * self.direction
-        return own + config.ink * self.ink + config.many * self.many
+        return own + config.ink * self.ink + config.sketch * self.sketch + config.many * self.many
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +130,12 @@ def ink_loss(logit: Tensor, drawn: Tensor) -> Tensor:
 
 
 def map_terms(
-    one: Sequence[RawMap], many: Sequence[RawMap], ink: Tensor, targets: Sequence[MapTarget], config: MapLossConfig
+    one: Sequence[RawMap],
+    many: Sequence[RawMap],
+    ink: Tensor,
+    sketch: Tensor,
+    targets: Sequence[MapTarget],
+    config: MapLossConfig,
 ) -> MapTerms:
     """All terms of one batch of tiles; many is empty where the head has no such queries."""
     kind, point, direction = head_terms(one, targets, config)
@@ -129,4 +144,4 @@ def map_terms(
         repeated = [target.repeated(config.repeat) for target in targets]
         more = head_terms(many, repeated, config)
         extra = config.kind * more[0] + config.point * more[1] + config.direction * more[2]
-    return MapTerms(kind, point, direction, ink, extra)
+    return MapTerms(kind, point, direction, ink, sketch, extra)

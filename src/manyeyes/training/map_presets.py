@@ -12,7 +12,17 @@ from manyeyes.training.map_losses import MapLossConfig
 from manyeyes.training.map_samples import MapAugment
 
 _NOISY = MapAugment(sigma_m=0.2, sigma_rad=math.radians(0.3))
-_SMALL = MapTrainConfig(mapper_config("small"), steps=3000, batch=2, learning_rate=1e-3, save_every=50, augment=_NOISY)
+_SMALL = MapTrainConfig(
+    mapper_config("small"),
+    steps=3000,
+    batch=2,
+    learning_rate=1.5e-3,
+    save_every=50,
+    ema=0.99,
+    thin=0.5,
+    sketch_steps=600,
+    augment=_NOISY,
+)
 
 MAP_TRAINING: dict[str, MapTrainConfig] = {
     "map-toy": MapTrainConfig(
