@@ -8,7 +8,7 @@ import pytest
 
 from manyeyes.datatypes import BevGrid, ConfigError, Transform
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.map_tiles import assert_split, cut_to, met_by, side_by_side, town_of
+from manyeyes.evaluation.map_tiles import assert_split, cut_to, side_by_side, town_of
 
 TILE = BevGrid(-10.0, -5.0, -1.0, 10.0, 5.0, 1.0, pillar=1.0)
 SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
@@ -32,19 +32,6 @@ def test_a_ring_that_is_cut_stays_a_ring_and_slivers_go():
     # A line that leaves and comes back is two; a piece below two metres is none.
     bent = MapElements.of([[[0, 0], [12, 0], [12, 3], [0, 3]], [[9.0, -4.0], [15.0, -4.0]]], DIVIDER)
     assert len(cut_to(bent, Transform.identity(), TILE)) == 2
-
-
-def test_what_no_look_covers_is_not_asked_for():
-    lines = MapElements.of([[[-10, 0], [10, 0]], [[5, 4], [10, 4]], [[-10, -3.9], [-4, -3.9]]], DIVIDER)
-    view = BevGrid(-4.0, -4.5, -1.0, 4.0, 4.5, 1.0, pillar=0.5)
-    # One look covers x from -4 to 4: 40 % of the first line, nothing of the second and the third.
-    assert len(met_by(lines, [Transform.identity()], view)) == 1
-    both = [Transform.identity(), Transform.from_xyz_yaw(8, 0, 0, math.pi)]
-    np.testing.assert_allclose(met_by(lines, both, view).polyline(1), lines.polyline(1))
-    assert len(met_by(lines, both, view)) == 2
-    # At x = -8.4 the view ends at -4.4, 28 % along the first line; turned by ninety degrees, it reaches 4.5 m along x.
-    assert len(met_by(lines, [Transform.from_xyz_yaw(-8.4, 0, 0, 0)], view)) == 1
-    assert len(met_by(lines, [Transform.from_xyz_yaw(-8.4, 0, 0, math.pi / 2)], view)) == 2
 
 
 def test_a_scenario_is_named_after_its_town_and_a_town_is_on_one_side():

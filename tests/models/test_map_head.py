@@ -53,7 +53,7 @@ def test_one_group_knows_nothing_of_the_other():
 
 
 def test_tiles_of_a_batch_know_nothing_of_each_other():
-    head, ground = MapHead(TINY), torch.randn(3, 16, 10, 20)
+    head, ground = MapHead(TINY).eval(), torch.randn(3, 16, 10, 20)
     together, alone = drawn(head, ground)[-1], drawn(head, ground[1:2])[-1]
     assert torch.allclose(together.point[1], alone.point[0], atol=1e-5)
 

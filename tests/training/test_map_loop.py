@@ -20,7 +20,7 @@ from manyeyes.models.map_head import MapHeadConfig, decode
 from manyeyes.models.map_presets import FORMAT
 from manyeyes.models.mapper import Mapper, MapperConfig
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.training.map_loop import MapRun, MapTrainConfig, ground_of, loss_terms, see, thinned, train_mapper
+from manyeyes.training.map_loop import MapRun, MapTrainConfig, loss_terms, placed, see, thinned, train_mapper
 from manyeyes.training.map_presets import MAP_TRAINING
 from manyeyes.training.map_samples import MapSample, inked
 
@@ -209,7 +209,7 @@ def test_two_streets_are_learnt_by_heart(tmp_path):
 
 @torch.no_grad()
 def quality(model, streets, truth):
-    raw = model.draw(ground_of(model, see(model, streets).tokens, streets))[-1]
+    raw = model.draw(model.merge(*placed(model, see(model, streets).tokens, streets)))[-1]
     drawn = side_by_side(decode(raw, TINY.tile, TINY.head))
     return judge(drawn, truth, ("exact",), TINY.head.kinds).mean_ap("exact", kinds=TINY.head.kinds)
 

@@ -11,7 +11,7 @@ import torch
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
 from manyeyes.models.map_sketch import REACH, Sketch
-from manyeyes.training.map_sketches import SPACING, SPREAD, middle_line, quality_focal, sketch_loss, sketch_of
+from manyeyes.training.map_sketches import SPACING, SPREAD, around_seen, middle_line, sketch_loss, sketch_of
 
 TILE = BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=2.0)
 KINDS = ("divider", "boundary", "crossing")
@@ -75,8 +75,8 @@ def test_a_tile_without_elements_says_nothing():
     assert all(float(part.float().abs().max()) == 0 for part in vars(target).values())
     flat, pairs = torch.zeros(1, 3, 10, 20), torch.zeros(1, 3, 2, 10, 20)
     sketch = Sketch(flat, flat, pairs, pairs, flat)
-    # 600 cells at a probability of one half: a quarter of ln 2 each, for ink and half as much for ends.
-    assert float(sketch_loss(sketch, [target])) == pytest.approx(1.5 * 600 * 0.25 * math.log(2), rel=1e-5)
+    # 600 cells at a probability of one half: ln 2 each, for ink and half as much for ends.
+    assert float(sketch_loss(sketch, [target])) == pytest.approx(1.5 * 600 * math.log(2), rel=1e-5)
 
 
 def test_the_loss_of_the_truth_is_its_doubt_alone_and_each_part_counts():
@@ -85,7 +85,8 @@ def test_the_loss_of_the_truth_is_its_doubt_alone_and_each_part_counts():
     ink, end = (torch.logit(share.clamp(1e-6, 1 - 1e-6))[None] for share in (target.ink, target.end))
     parts = [ink, end, target.foot[None], target.way[None], target.half[None]]
     best = float(sketch_loss(Sketch(*parts), [target]))
-    assert best == pytest.approx(0, abs=1e-3)
+    doubt = -(target.ink * target.ink.clamp_min(1e-9).log() + (1 - target.ink) * (1 - target.ink).clamp_min(1e-9).log())
+    assert best == pytest.approx(float(doubt.sum() / target.ink.sum()), abs=1e-3)
     for k in (2, 3):
         off = [part + 0.5 if i == k else part for i, part in enumerate(parts)]
         # Both coordinates are off by 0.5.
@@ -95,11 +96,13 @@ def test_the_loss_of_the_truth_is_its_doubt_alone_and_each_part_counts():
         assert float(sketch_loss(Sketch(*off), [target])) > best + 1
 
 
-def test_quality_focal_loss_is_its_formula_and_least_at_the_share():
-    logit = torch.linspace(-4, 4, 801, dtype=torch.float64)
-    p = logit.sigmoid()
-    for share in (0.0, 0.3, 1.0):
-        y = torch.full_like(logit, share)
-        expected = (y - p) ** 2 * -(y * p.log() + (1 - y) * (1 - p).log())
-        torch.testing.assert_close(quality_focal(logit, y), expected)
-    assert float(p[quality_focal(logit, torch.full_like(logit, 0.3)).argmin()]) == pytest.approx(0.3, abs=0.003)
+def test_lines_are_asked_for_where_something_was_seen_and_a_little_beyond():
+    target = sketch_of(MapElements.of([np.array([[-20.0, 1.0], [20.0, 1.0]])], [DIVIDER]), TILE, KINDS)
+    seen = torch.zeros(1, 10, 20, dtype=torch.bool)
+    seen[0, 5, 3] = True
+    around = around_seen(seen, TILE)
+    # Two cells of two metres each way.
+    assert around[0].nonzero().min(0).values.tolist() == [3, 1] and around[0].nonzero().max(0).values.tolist() == [7, 5]
+    inside = target.within(around[0])
+    assert torch.equal(inside.ink > 0, (target.ink > 0) & around[0]) and torch.equal(inside.near, inside.ink > 0)
+    assert torch.equal(inside.foot, target.foot) and float(inside.end.sum()) <= float(target.end.sum())

@@ -7,7 +7,7 @@ import torch
 
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, STOP_LINE, MapElements
-from manyeyes.training.map_targets import evenly, orders_of, target_of
+from manyeyes.training.map_targets import evenly, met, orders_of, target_of
 
 TILE = BevGrid(-10.0, -5.0, -1.0, 10.0, 5.0, 1.0, pillar=1.0)
 SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
@@ -63,3 +63,21 @@ def test_targets_are_shares_of_the_tile_and_only_of_kinds_that_are_asked_for():
 def test_an_empty_tile_has_no_targets():
     target = target_of(MapElements.empty(), TILE, ("divider",), 4)
     assert len(target) == 0 and target.orders.shape == (0, 8, 4, 2)
+
+
+def test_what_no_look_saw_is_not_asked_for():
+    lines = MapElements.of([[[-10, 0.5], [10, 0.5]], [[5, 4.5], [10, 4.5]], [[-10, -3.9], [-4, -3.9]]], DIVIDER)
+    seen = torch.zeros(10, 20, dtype=torch.bool)
+    assert len(met(lines, seen, TILE)) == 0 and len(met(MapElements.of([], []), seen, TILE)) == 0
+    # Cells from x = -4 to 4: 40 % of the first line, nothing of the others; then the whole second, and a sixth of the third.
+    seen[:, 6:14] = True
+    np.testing.assert_allclose(met(lines, seen, TILE).points, lines.polyline(0))
+    seen[9, 15:], seen[1, 5] = True, True
+    assert len(met(lines, seen, TILE)) == 2
+    seen[1, 4] = True
+    assert len(met(lines, seen, TILE)) == 3
+    # A line on the tile's border lies in the cells inside it.
+    assert (
+        len(met(MapElements.of([[[10.0, -5.0], [10.0, 5.0]]], DIVIDER), torch.ones(10, 20, dtype=torch.bool), TILE))
+        == 1
+    )

@@ -2,7 +2,7 @@
 """Tiles of a drive: where they lie, who looked at them and when, and what is truly there.
 
 A tile is judged against all that the true map has within it, seen or not: what one vehicle cannot see is what others are for.
-Training leaves out what no look could have met (``met_by``), else a model learns to invent. Lines are cut at the tile's border,
+Training leaves out what no look met (training.map_targets), else a model learns to invent. Lines are cut at the tile's border,
 rings too, and stay rings; parts of lines below 2 m and of rings below 3 m² are no elements.
 """
 
@@ -26,8 +26,6 @@ Floats = NDArray[np.float64]
 
 LEAST_RING_M2 = 3.0
 APART_M = 1000.0
-MET_SHARE = 0.3
-"""Of an element's length: what looks must have covered for it to be asked of them (specs: maps.md 1.5)."""
 
 
 @dataclass(frozen=True)
@@ -76,25 +74,6 @@ def cut_to(truth: MapElements, world_from_tile: Transform, tile: BevGrid) -> Map
             rows.append(row)
             parts.append(part)
     return with_geometry(local, rows, parts)
-
-
-def met_by(elements: MapElements, tile_from_look: Sequence[Transform], view: BevGrid) -> MapElements:
-    """Those elements of a tile that the looks together cover by MET_SHARE of their length; a look covers its grid's rectangle."""
-    shapely = _shapely()
-    corners = np.array(
-        [[view.x_min, view.y_min], [view.x_max, view.y_min], [view.x_max, view.y_max], [view.x_min, view.y_max]]
-    )
-    placed = []
-    for motion in tile_from_look:
-        x, y, yaw = planar(motion)
-        c, s = np.cos(yaw), np.sin(yaw)
-        placed.append(shapely.polygons(corners @ np.array([[c, s], [-s, c]]) + [x, y]))
-    area = shapely.union_all(placed)
-    kept = np.zeros(len(elements), bool)
-    for row in range(len(elements)):
-        line = shapely.linestrings(elements.polyline(row))
-        kept[row] = shapely.length(shapely.intersection(line, area)) >= MET_SHARE * shapely.length(line)
-    return elements.take(kept)
 
 
 def side_by_side(maps: Sequence[MapElements]) -> MapElements:

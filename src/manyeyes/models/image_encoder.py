@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures to features at an eighth of their size: a residual network and a feature pyramid, both our own.
 
-Sources: He et al., CVPR 2016 (basic and bottleneck blocks); Lin et al., CVPR 2017 (top-down pyramid); Wu and He, ECCV 2018
-(group normalisation, so that what one agent makes of its picture never depends on whose pictures share the batch).
+Sources: He et al., CVPR 2016 (basic and bottleneck blocks); Lin et al., CVPR 2017 (top-down pyramid). Norms are of the batch, by
+running statistics once learnt, so that what one agent makes of its picture never depends on whose pictures share the batch. A norm
+over channels together does not learn from rasters, most of whose cells are empty: docs/mapper.md.
 """
 
 from __future__ import annotations
@@ -39,14 +40,11 @@ class ImageEncoderConfig:
             )
 
 
-def group_norm(channels: int) -> nn.GroupNorm:
-    """Groups of 16 channels, or one group where there are fewer."""
-    return nn.GroupNorm(max(1, channels // 16), channels)
-
-
 def conv(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Convolution and group norm; sizes are divided by the stride, rounded up."""
-    return nn.Sequential(nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, bias=False), group_norm(outputs))
+    """Convolution and norm; sizes are divided by the stride, rounded up."""
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, bias=False), nn.BatchNorm2d(outputs)
+    )
 
 
 class Residual(nn.Module):
@@ -62,10 +60,6 @@ class Residual(nn.Module):
         )
         self.inner = nn.Sequential(*layers)
         self.shortcut = nn.Identity() if inputs == outputs and stride == 1 else conv(inputs, outputs, 1, stride)
-        last = layers[-1][1]
-        assert isinstance(last, nn.GroupNorm)
-        # Every block starts as its shortcut, which lets deep stacks learn from the first step (Goyal et al. 2017).
-        nn.init.zeros_(last.weight)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, inputs, h, w) to (N, outputs, ceil(h / stride), ceil(w / stride))."""

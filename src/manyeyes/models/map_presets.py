@@ -42,13 +42,14 @@ SMALL = MapperConfig(
         BevGrid(-38.4, -38.4, -2.0, 38.4, 38.4, 4.0, pillar=0.4),
         channels=24,
         raster_width=16,
-        raster_blocks=(1,),
+        raster_blocks=(1, 1, 1),
         image=ImageEncoderConfig((2, 2, 2), 24, channels=64),
         image_size=(150, 200),
         depth=DepthBins(1.0, 49.0, 33),
     ),
-    _tile(1.2),
+    _tile(0.8),
     token_channels=24,
+    neck=(1, 1, 1, 1),
     head=MapHeadConfig(elements=60, points=20, channels=64, feed=128, layers=2, heads=4),
 )
 """For two cores: a look is read with few layers, since the ground around it is read again where all looks have met."""

@@ -106,10 +106,17 @@ class Mapper(nn.Module):
         return Look(tokens, self.ink(tokens.features))
 
     def fuse(self, tokens: SparseBev, tile_from_agent: Transform, tile: Tensor, tiles: int) -> Tensor:
-        """Tokens of N looks, as they were received, to features of tiles (tiles, C, rows, columns).
+        """Tokens of N looks, as they were received, to features of tiles (tiles, C, rows, columns); arguments as for ``place``.
 
-        tile_from_agent: N motions, by claimed or corrected poses; tile: (N,) int64, which tile each look is of. The order of looks
-        does not count, nor does a look that sees nothing of its tile.
+        The order of looks does not count, nor does a look that sees nothing of its tile.
+        """
+        return self.merge(*self.place(tokens, tile_from_agent, tile, tiles))
+
+    def place(self, tokens: SparseBev, tile_from_agent: Transform, tile: Tensor, tiles: int) -> tuple[Tensor, Tensor]:
+        """Tokens of N looks on the cells of their tiles: features (tiles, K, C, rows, columns) of at most K looks a tile, and what
+        each sees (tiles, K, rows, columns).
+
+        tile_from_agent: N motions, by claimed or corrected poses; tile: (N,) int64, which tile each look is of.
         """
         rows, columns = self.config.tile.shape
         dense = tokens.dense()
@@ -124,7 +131,7 @@ class Mapper(nn.Module):
         slot = tile * looks + place
         features = moved.new_zeros(tiles * looks, moved.shape[1], rows, columns).index_copy(0, slot, moved)
         views = torch.zeros(tiles * looks, rows, columns, dtype=torch.bool).index_copy(0, slot, seen)
-        return self.merge(features.unflatten(0, (tiles, looks)), views.unflatten(0, (tiles, looks)))
+        return features.unflatten(0, (tiles, looks)), views.unflatten(0, (tiles, looks))
 
     def merge(self, features: Tensor, seen: Tensor) -> Tensor:
         """Features (B, K, C, rows, columns) of K looks on the cells of their tiles, and what they see, to (B, D, rows, columns)."""
@@ -133,6 +140,7 @@ class Mapper(nn.Module):
         b, _, rows, columns = fused.shape
         y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
         x = torch.cat((fused, coverage, torch.stack((x, y)).expand(b, 2, rows, columns)), 1)
+        x = x.contiguous(memory_format=torch.channels_last)
         levels = []
         for stage in self.neck:
             x = stage(x)

@@ -21,8 +21,8 @@ from manyeyes.models.mapper import Look, Mapper, MapperConfig
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.training.map_losses import MapLossConfig, MapTerms, ink_loss, map_terms
 from manyeyes.training.map_samples import MapAugment, MapSample, MapSamples
-from manyeyes.training.map_sketches import sketch_loss, sketch_of
-from manyeyes.training.map_targets import target_of
+from manyeyes.training.map_sketches import around_seen, sketch_loss, sketch_of
+from manyeyes.training.map_targets import met, target_of
 from manyeyes.training.run_state import RunState, warm_cosine
 
 
@@ -77,12 +77,12 @@ def see(model: Mapper, samples: Sequence[MapSample]) -> Look:
     return model.see(clouds, [look.images for look in looks] if "camera" in sensors else [])
 
 
-def ground_of(model: Mapper, tokens: SparseBev, samples: Sequence[MapSample]) -> Tensor:
-    """The features of all samples' tiles, of tokens of all their looks in order."""
+def placed(model: Mapper, tokens: SparseBev, samples: Sequence[MapSample]) -> tuple[Tensor, Tensor]:
+    """Tokens of all looks in order on the cells of all samples' tiles, and what each look sees there, as ``Mapper.merge`` wants."""
     poses = [sample.tile_from_look for sample in samples]
     motion = Transform(torch.cat([p.rotation for p in poses]), torch.cat([p.translation for p in poses]))
     tile = torch.repeat_interleave(torch.arange(len(samples)), torch.tensor([len(s.looks) for s in samples]))
-    return model.fuse(tokens, motion, tile, len(samples))
+    return model.place(tokens, motion, tile, len(samples))
 
 
 def thinned(tokens: SparseBev, worth: Tensor, share: Tensor) -> SparseBev:
@@ -108,13 +108,17 @@ def loss_terms(
     drawn = torch.cat([sample.ink for sample in samples]).permute(0, 2, 3, 1).flatten(0, 2)[look.tokens.sites.key]
     ink = ink_loss(look.ink, drawn.float())
     tokens = look.tokens if share is None else thinned(look.tokens, look.worth, share)
-    ground = ground_of(model, tokens, samples)
+    features, seen = placed(model, tokens, samples)
+    ground = model.merge(features, seen)
     head, tile = model.config.head, model.config.tile
+    around = around_seen(seen.any(1), tile)
     sketch = model.sketch(ground)
-    sketched = sketch_loss(sketch, [sketch_of(sample.truth, tile, head.kinds) for sample in samples])
+    wanted = [sketch_of(one.truth, tile, head.kinds).within(part) for one, part in zip(samples, around)]
+    sketched = sketch_loss(sketch, wanted)
     if not draws:
         return MapTerms.undrawn(ink, sketched)
-    targets = [target_of(sample.truth, tile, head.kinds, head.points) for sample in samples]
+    truths = [met(one.truth, part, tile) for one, part in zip(samples, around)]
+    targets = [target_of(truth, tile, head.kinds, head.points) for truth in truths]
     many = model.draw(ground, "many", sketch) if head.many else ()
     return map_terms(model.draw(ground, "one", sketch), many, ink, sketched, targets, config)
 

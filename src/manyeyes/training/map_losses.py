@@ -28,7 +28,7 @@ class MapLossConfig:
     kind: float = 2.0
     point: float = 5.0
     direction: float = 0.005
-    ink: float = 1.0
+    ink: float = 10.0
     sketch: float = 2.0
     repeat: int = 2
     many: float = 1.0

@@ -16,7 +16,7 @@ _SMALL = MapTrainConfig(
     mapper_config("small"),
     steps=3000,
     batch=2,
-    learning_rate=1.5e-3,
+    learning_rate=3e-3,
     save_every=50,
     ema=0.99,
     thin=0.5,

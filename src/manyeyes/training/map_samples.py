@@ -23,7 +23,7 @@ from manyeyes.datasets.recording import Recording
 from manyeyes.datasets.single_frames import SingleFrames, single_frames
 from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, Transform
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
-from manyeyes.evaluation.map_tiles import assert_split, cut_to, met_by, town_of
+from manyeyes.evaluation.map_tiles import assert_split, cut_to, town_of
 from manyeyes.models.mapper import LOOKS, MapperConfig
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.polyline import resample_spaced
@@ -156,7 +156,7 @@ class TileStream:
             error = Transform.from_xyz_yaw(float(dx), float(dy), 0.0, float(turn))
             claimed.append(tile_from_world @ look.world_from_agent @ error)
             there.append(cut_to(world, look.world_from_agent, config.bev.grid))
-        truth = met_by(cut_to(world, world_from_tile, config.tile), claimed, config.bev.grid)
+        truth = cut_to(world, world_from_tile, config.tile)
         if augment.flip and rng.random() < 0.5:
             looks, claimed = [mirrored(look) for look in looks], [mirrored_motion(motion) for motion in claimed]
             truth, *there = (_mirrored_elements(elements) for elements in (truth, *there))

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a sketch of a tile should say, and what it costs to say otherwise.
 
-Sources: soft targets with a focal weight, Li et al., Generalized Focal Loss, NeurIPS 2020, Eq. 4 (beta 2); a direction without sign
-as the cosine and sine of twice the angle.
+A direction has no sign: it is told as the cosine and sine of twice its angle.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -28,6 +27,8 @@ SPREAD = 0.6
 """Cells: at so far from a line a cell is held for drawn at exp(-1/2)."""
 SPACING = 0.25
 """Cells between the points that stand for a line."""
+BEYOND_M = 4.0
+"""So far beyond what was seen, lines are still asked for: gaps between beams, and what stands behind a car."""
 TIP = 0.75
 """Cells from the end of a line within which a cell says that it ends here, where it is not the tile's border that cuts it."""
 
@@ -45,6 +46,16 @@ class SketchTarget:
     foot: Tensor
     way: Tensor
     half: Tensor
+
+    def within(self, seen: Tensor) -> SketchTarget:
+        """Without lines where nothing was seen (rows, columns) bool."""
+        return replace(self, ink=self.ink * seen, end=self.end * seen, near=self.near & seen)
+
+
+def around_seen(seen: Tensor, tile: BevGrid) -> Tensor:
+    """(B, rows, columns) bool: cells within BEYOND_M of one that was seen (B, rows, columns), along either axis."""
+    reach = round(BEYOND_M / tile.cell)
+    return F.max_pool2d(seen[:, None].float(), 2 * reach + 1, 1, reach)[:, 0] > 0
 
 
 def sketch_of(truth: MapElements, tile: BevGrid, kinds: Sequence[str]) -> SketchTarget:
@@ -120,22 +131,16 @@ def _nearest(
 
 
 def sketch_loss(sketch: Sketch, targets: Sequence[SketchTarget]) -> Tensor:
-    """Of a batch of tiles: ink and ends by the quality focal loss per unit of true ink, or end; foot (cells), way and half (cells),
+    """Of a batch of tiles: ink and ends by cross entropy per unit of true ink, or end; foot (cells), way and half (cells),
     absolute, means over the cells near a line.
     """
     ink, end, near, foot, way, half = (
         torch.stack([getattr(target, name) for target in targets])
         for name in ("ink", "end", "near", "foot", "way", "half")
     )
-    drawn = quality_focal(sketch.ink, ink).sum() / ink.sum().clamp_min(1)
-    ended = quality_focal(sketch.end, end).sum() / end.sum().clamp_min(1)
+    drawn = F.binary_cross_entropy_with_logits(sketch.ink, ink, reduction="sum") / ink.sum().clamp_min(1)
+    ended = F.binary_cross_entropy_with_logits(sketch.end, end, reduction="sum") / end.sum().clamp_min(1)
     off = ((sketch.foot - foot).abs() + (sketch.way - way).abs()).sum(2)
     wide = near & (half > 0)
     broad = ((sketch.half - half).abs() * wide).sum() / wide.sum().clamp_min(1)
     return drawn + 0.5 * ended + (off * near).sum() / near.sum().clamp_min(1) + 0.2 * broad
-
-
-def quality_focal(logit: Tensor, share: Tensor) -> Tensor:
-    """Of each logit against a share in [0, 1]: cross entropy, weighed by the square of how far off the probability is."""
-    miss = (share - logit.sigmoid()).square()
-    return miss * F.binary_cross_entropy_with_logits(logit, share, reduction="none")

@@ -18,7 +18,10 @@ from torch import Tensor
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.models.map_head import is_ring
-from manyeyes.ops.polyline import resample
+from manyeyes.ops.polyline import resample, resample_spaced
+
+MET_SHARE = 0.3
+"""Of an element's length: what looks must have seen for it to be asked of them (specs: maps.md 1.5)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +58,17 @@ def target_of(truth: MapElements, tile: BevGrid, kinds: Sequence[str], points: i
     places = torch.from_numpy(np.array(shares).reshape(-1, points, 2)).float()
     rings = torch.tensor(ring, dtype=torch.bool)
     return MapTarget(torch.tensor(kind, dtype=torch.int64), rings, orders_of(places, rings))
+
+
+def met(truth: MapElements, seen: Tensor, tile: BevGrid) -> MapElements:
+    """Those elements of a tile of which cells that are seen (rows, columns) hold MET_SHARE of the length or more."""
+    if not len(truth):
+        return truth
+    points, first = resample_spaced(truth.points, truth.first, tile.cell / 2)
+    cell = np.floor((points - [tile.x_min, tile.y_min]) / tile.cell).astype(np.int64)
+    cell = cell.clip(0, [tile.shape[1] - 1, tile.shape[0] - 1])
+    share = np.add.reduceat(seen.numpy()[cell[:, 1], cell[:, 0]].astype(np.float64), first[:-1]) / np.diff(first)
+    return truth.take(share >= MET_SHARE)
 
 
 def evenly(line: NDArray[np.float64], points: int, ring: bool) -> NDArray[np.float64]:
