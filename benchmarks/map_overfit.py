@@ -3,7 +3,7 @@
 
 The bar (issue: "Seeing the map"): map-toy above 0.9 on 16 tiles in five minutes on two cores.
 
-python benchmarks/map_overfit.py [--data data/towns-small] [--split train] [--tiles 16] [--steps 1200] [--batch 2]
+python benchmarks/map_overfit.py [--data data/streets] [--split train] [--tiles 16] [--steps 1200] [--batch 2]
     [--rate 4e-3] [--threads 1] [--every 100] [--preset map-toy]
 """
 
@@ -24,9 +24,11 @@ from manyeyes.evaluation.map_quality import judge
 from manyeyes.evaluation.map_tiles import side_by_side
 from manyeyes.models.map_head import RawMap, decode
 from manyeyes.models.mapper import Mapper
-from manyeyes.training.map_loop import MapRun, ground_of, see
+from manyeyes.training.map_loop import MapRun, placed, see
 from manyeyes.training.map_presets import MAP_TRAINING
 from manyeyes.training.map_samples import MapAugment, MapSample, TileStream
+from manyeyes.training.map_sketches import around_seen
+from manyeyes.training.map_targets import met
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,14 @@ def mean_ap(model: Mapper, samples: tuple[MapSample, ...]) -> dict[str, float]:
     model.eval()
     with torch.no_grad():
         for sample in samples:
-            ground = ground_of(model, see(model, [sample]).tokens, [sample])
+            features, seen = placed(model, see(model, [sample]).tokens, [sample])
+            ground = model.merge(features, seen)
             sketch = model.sketch(ground)
             point, logit, _ = model.head.begin(sketch)
             begun += decode(RawMap(logit, point), config.tile, config.head)
             drawn += decode(model.draw(ground, sketch=sketch)[-1], config.tile, config.head)
-            truth.append(sample.truth.take(np.isin(sample.truth.kind, kinds)))
+            asked = met(sample.truth, around_seen(seen.any(1), config.tile)[0], config.tile)
+            truth.append(asked.take(np.isin(asked.kind, kinds)))
     quality = judge(side_by_side(drawn), side_by_side(truth), ("maptr", "exact"), config.head.kinds)
     mean = {way: round(quality.mean_ap(way, kinds=config.head.kinds), 3) for way in ("maptr", "exact")}
     first = judge(side_by_side(begun), side_by_side(truth), ("maptr",), config.head.kinds)
@@ -62,7 +66,7 @@ def mean_ap(model: Mapper, samples: tuple[MapSample, ...]) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path("data/towns-small"))
+    parser.add_argument("--data", type=Path, default=Path("data/streets"))
     parser.add_argument("--split", default="train")
     parser.add_argument("--tiles", type=int, default=16)
     parser.add_argument("--steps", type=int, default=1200)

@@ -121,7 +121,9 @@ def mapper() -> Mapper:
     model = Mapper(TINY_MAPPER).requires_grad_(False)
     # Its norms know how features are spread, as after training; nothing else is learnt.
     for _ in range(30):
-        tokens = model.see([PointCloud.of(torch.randn(200, 3) * torch.tensor([3.0, 3.0, 0.3])) for _ in range(2)]).tokens
+        tokens = model.see(
+            [PointCloud.of(torch.randn(200, 3) * torch.tensor([3.0, 3.0, 0.3])) for _ in range(2)]
+        ).tokens
         model.draw(model.fuse(tokens, Transform.stack([Transform.identity()] * 2), torch.tensor([0, 1]), 2))
     model.eval()
     model.fingerprint = bytes(range(8))

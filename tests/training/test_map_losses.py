@@ -11,6 +11,7 @@ import torch
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.models.map_head import RawMap
+from manyeyes.training import map_losses
 from manyeyes.training.map_losses import (
     MapLossConfig,
     focal,
@@ -83,7 +84,19 @@ def test_the_loss_of_a_tile_is_the_same_however_its_map_is_stored():
         )
 
 
-def test_the_match_is_the_best_of_all_assignments():
+def test_nobody_answers_for_an_element_that_is_far_from_all():
+    ends = torch.tensor([[[0.0, 0.5], [1.0, 0.5]], [[0.0, 0.9], [1.0, 0.9]]])
+    target = targets(ends, [False, False], [0, 0])
+    # The first query is .1 from the first line and .3 from the second, at each of its points; the other is .3 from the second.
+    raw = torch.stack((ends[0] + torch.tensor([0.0, 0.1]), ends[1] - torch.tensor([0.3, 0.0])))
+    found = match(torch.zeros(2, 3), raw, target, CONFIG)
+    assert (found.query.tolist(), found.element.tolist()) == ([0], [0])
+    near = match(torch.zeros(2, 3), torch.stack((raw[0], raw[1] + torch.tensor([0.15, 0.0]))), target, CONFIG)
+    assert near.query.tolist() == [0, 1] and near.element.tolist() == [0, 1]
+
+
+def test_the_match_is_the_best_of_all_assignments(monkeypatch):
+    monkeypatch.setattr(map_losses, "FAR", math.inf)
     for seed in range(5):
         where, ring, raw = random_case(seed, elements=3, queries=4)
         target = targets(where, ring, [0, 2, 1])

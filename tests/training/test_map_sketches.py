@@ -11,7 +11,7 @@ import torch
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
 from manyeyes.models.map_sketch import REACH, Sketch
-from manyeyes.training.map_sketches import SPACING, SPREAD, around_seen, middle_line, sketch_loss, sketch_of
+from manyeyes.training.map_sketches import FEW, SPACING, SPREAD, around_seen, middle_line, sketch_loss, sketch_of
 
 TILE = BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=2.0)
 KINDS = ("divider", "boundary", "crossing")
@@ -75,8 +75,8 @@ def test_a_tile_without_elements_says_nothing():
     assert all(float(part.float().abs().max()) == 0 for part in vars(target).values())
     flat, pairs = torch.zeros(1, 3, 10, 20), torch.zeros(1, 3, 2, 10, 20)
     sketch = Sketch(flat, flat, pairs, pairs, flat)
-    # 600 cells at a probability of one half: ln 2 each, for ink and half as much for ends.
-    assert float(sketch_loss(sketch, [target])) == pytest.approx(1.5 * 600 * math.log(2), rel=1e-5)
+    # Of each kind 200 cells at a probability of one half: ln 2 each, for ink and half as much for ends.
+    assert float(sketch_loss(sketch, [target])) == pytest.approx(1.5 * 200 / FEW * math.log(2), rel=1e-5)
 
 
 def test_the_loss_of_the_truth_is_its_doubt_alone_and_each_part_counts():
@@ -86,14 +86,15 @@ def test_the_loss_of_the_truth_is_its_doubt_alone_and_each_part_counts():
     parts = [ink, end, target.foot[None], target.way[None], target.half[None]]
     best = float(sketch_loss(Sketch(*parts), [target]))
     doubt = -(target.ink * target.ink.clamp_min(1e-9).log() + (1 - target.ink) * (1 - target.ink).clamp_min(1e-9).log())
-    assert best == pytest.approx(float(doubt.sum() / target.ink.sum()), abs=1e-3)
+    # One of three kinds is there.
+    assert best == pytest.approx(float(doubt.sum() / target.ink.sum().clamp_min(FEW)) / 3, abs=1e-3)
     for k in (2, 3):
         off = [part + 0.5 if i == k else part for i, part in enumerate(parts)]
         # Both coordinates are off by 0.5.
         assert float(sketch_loss(Sketch(*off), [target])) - best == pytest.approx(1.0, abs=1e-4)
     for k in (0, 1):
         off = [torch.zeros_like(part) if i == k else part for i, part in enumerate(parts)]
-        assert float(sketch_loss(Sketch(*off), [target])) > best + 1
+        assert float(sketch_loss(Sketch(*off), [target])) > best + 0.3
 
 
 def test_lines_are_asked_for_where_something_was_seen_and_a_little_beyond():

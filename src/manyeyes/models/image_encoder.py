@@ -59,11 +59,13 @@ class Residual(nn.Module):
             else [conv(inputs, inner, 3, stride), nn.ReLU(), conv(inner, outputs, 3)]
         )
         self.inner = nn.Sequential(*layers)
-        self.shortcut = nn.Identity() if inputs == outputs and stride == 1 else conv(inputs, outputs, 1, stride)
+        self.shortcut = nn.Identity() if inputs == outputs and stride == 1 else conv(inputs, outputs, 1)
+        self.stride = stride
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, inputs, h, w) to (N, outputs, ceil(h / stride), ceil(w / stride))."""
-        return torch.relu(self.shortcut(x) + self.inner(x))
+        # Not as a strided convolution: of 12 channels, innermost in memory, its gradient overran its buffer (torch 2.13, CPU).
+        return torch.relu(self.shortcut(x[..., :: self.stride, :: self.stride]) + self.inner(x))
 
 
 def finer(x: Tensor, size: tuple[int, int]) -> Tensor:

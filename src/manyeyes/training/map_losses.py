@@ -19,6 +19,9 @@ from manyeyes.ops.assignment import assign
 from manyeyes.training.map_targets import MapTarget
 
 ALPHA, GAMMA = 0.25, 2.0
+FAR = 0.2
+"""Mean over an element's points of the L1 distance, in shares of the tile, beyond which no query answers for it: where no line of
+the sketch comes near, only the sketch has something to learn, and a query that was drawn there would unlearn."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ def match(logit: Tensor, point: Tensor, target: MapTarget, config: MapLossConfig
         least, best = away.min(2)
         cost = config.kind * _focal_cost(logit)[:, target.kind] + config.point * least
         pairs = torch.from_numpy(assign(cost.double().numpy()).copy())
-    query, element = pairs.unbind(1)
+        query, element = pairs[least[pairs[:, 0], pairs[:, 1]] <= FAR * point.shape[1]].unbind(1)
     return Match(query, element, target.orders[element, best[query, element]])
 
 

@@ -14,13 +14,13 @@ from manyeyes.training.map_samples import MapAugment
 _NOISY = MapAugment(sigma_m=0.2, sigma_rad=math.radians(0.3))
 _SMALL = MapTrainConfig(
     mapper_config("small"),
-    steps=3000,
-    batch=2,
+    steps=2000,
+    batch=4,
     learning_rate=3e-3,
     save_every=50,
     ema=0.99,
     thin=0.5,
-    sketch_steps=600,
+    sketch_steps=700,
     augment=_NOISY,
 )
 

@@ -27,6 +27,8 @@ SPREAD = 0.6
 """Cells: at so far from a line a cell is held for drawn at exp(-1/2)."""
 SPACING = 0.25
 """Cells between the points that stand for a line."""
+FEW = 20.0
+"""Cells of ink, or of ends, for which a kind counts that has fewer in a batch: one short line."""
 BEYOND_M = 4.0
 """So far beyond what was seen, lines are still asked for: gaps between beams, and what stands behind a car."""
 TIP = 0.75
@@ -131,16 +133,21 @@ def _nearest(
 
 
 def sketch_loss(sketch: Sketch, targets: Sequence[SketchTarget]) -> Tensor:
-    """Of a batch of tiles: ink and ends by cross entropy per unit of true ink, or end; foot (cells), way and half (cells),
-    absolute, means over the cells near a line.
+    """Of a batch of tiles: ink and ends by cross entropy per unit of true ink, or end, of each kind by itself, since crossings are
+    few; foot (cells), way and half (cells), absolute, means over the cells near a line.
     """
     ink, end, near, foot, way, half = (
         torch.stack([getattr(target, name) for target in targets])
         for name in ("ink", "end", "near", "foot", "way", "half")
     )
-    drawn = F.binary_cross_entropy_with_logits(sketch.ink, ink, reduction="sum") / ink.sum().clamp_min(1)
-    ended = F.binary_cross_entropy_with_logits(sketch.end, end, reduction="sum") / end.sum().clamp_min(1)
+    drawn, ended = _per_unit(sketch.ink, ink), _per_unit(sketch.end, end)
     off = ((sketch.foot - foot).abs() + (sketch.way - way).abs()).sum(2)
     wide = near & (half > 0)
     broad = ((sketch.half - half).abs() * wide).sum() / wide.sum().clamp_min(1)
     return drawn + 0.5 * ended + (off * near).sum() / near.sum().clamp_min(1) + 0.2 * broad
+
+
+def _per_unit(logit: Tensor, share: Tensor) -> Tensor:
+    """Cross entropy (B, K, rows, columns) per unit of what is true, FEW units at least, kind by kind; the mean over kinds."""
+    each = F.binary_cross_entropy_with_logits(logit, share, reduction="none").sum((0, 2, 3))
+    return (each / share.sum((0, 2, 3)).clamp_min(FEW)).mean()
