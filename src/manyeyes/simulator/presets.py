@@ -82,10 +82,10 @@ def _crowded(splits: tuple[SplitPreset, ...]) -> SimulationPreset:
 SIMULATION_PRESETS: dict[str, SimulationPreset] = {
     "towns-small": _crowded(_towns(150, 22, 84)),
     "towns-large": _crowded(_towns(600, 60, 200)),
-    # For maps: many places rather than many instants, a second apart; OPV2V's own 64 beams, since paint lies between fewer.
+    # For maps: many places rather than many instants, a second apart; mostly OPV2V's own 64 beams, since paint lies between fewer.
     "streets": SimulationPreset(
         (
-            SplitPreset("train", TOWN_SPLIT["train"], 240),
+            SplitPreset("train", TOWN_SPLIT["train"], 240, ("", "", "-32", "", "", "-16")),
             SplitPreset("validate", TOWN_SPLIT["val"], 24),
             SplitPreset("test", TOWN_SPLIT["test"], 84),
         ),
