@@ -3,9 +3,10 @@
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.models.image_encoder import FEATURE_STRIDE, ImageEncoder, ImageEncoderConfig, finer
+from manyeyes.models.image_encoder import FEATURE_STRIDE, ImageEncoder, ImageEncoderConfig, Residual, finer
 
 TINY = ImageEncoderConfig((1, 1, 1), 8, channels=16)
 
@@ -35,6 +36,19 @@ def test_a_finer_map_keeps_every_cell_where_the_stride_took_it(size):
     assert torch.allclose(fine[..., : size[0] - 1, : size[1] - 1], ramp[..., : size[0] - 1, : size[1] - 1], atol=1e-5)
     if size[1] % 2:
         assert torch.allclose(fine, ramp, atol=1e-5)
+
+
+@pytest.mark.parametrize("memory", [torch.contiguous_format, torch.channels_last])
+def test_a_strided_block_takes_every_second_place_however_memory_lies(memory):
+    # 12 channels innermost in memory, and a strided 1x1 convolution of them: its gradient overran its buffer in torch 2.13.
+    x = torch.randn(2, 12, 9, 10).contiguous(memory_format=memory).requires_grad_()
+    block = Residual(12, 12, 2)
+    shortcut, norm = block.shortcut
+    expected = torch.relu(norm(F.conv2d(x, shortcut.weight, stride=2)) + block.inner(x))
+    assert torch.allclose(block(x), expected, atol=1e-5) and expected.shape == (2, 12, 5, 5)
+    (mine,) = torch.autograd.grad(block(x).square().sum(), x)
+    (plain,) = torch.autograd.grad(block(x.contiguous()).square().sum(), x)
+    assert torch.allclose(mine, plain, atol=1e-4)
 
 
 def test_fifty_layers_have_their_published_width():

@@ -61,7 +61,7 @@ class Model:
 def models(options: Options) -> tuple[Model, ...]:
     """The models that are judged: those given, or those that ship; refused where one was taught by a town that would judge it."""
     if options.data is None:
-        raise ConfigError(f"The study {options.study!r} needs --data, a dataset of towns such as data/towns-small.")
+        raise ConfigError(f"The study {options.study!r} needs --data, a dataset of towns such as data/streets.")
     names = options.weights or zoo.mappers()
     if not names:
         raise ConfigError(

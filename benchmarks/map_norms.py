@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a norm does to a network that reads sweeps as pictures of the ground, most of whose cells are empty.
+
+Four convolutions say of each cell that a look saw which kinds of element run through it: average precision over the cells of looks
+that were not learnt from, by norm.
+
+python benchmarks/map_norms.py [--data data/streets] [--tiles 60] [--steps 120] [--looks 6] [--rate 3e-3] [--held 20]
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from manyeyes.apps.train_map import open_looks, true_maps
+from manyeyes.models.map_bev import rasterise
+from manyeyes.training.map_losses import ink_loss
+from manyeyes.training.map_presets import MAP_TRAINING
+from manyeyes.training.map_samples import MapAugment, TileStream
+
+NORMS: dict[str, Callable[[int], nn.Module]] = {
+    "batch": nn.BatchNorm2d,
+    "each channel of a look": lambda channels: nn.GroupNorm(channels, channels),
+    "group, all channels": lambda channels: nn.GroupNorm(1, channels),
+    "none": lambda channels: nn.Identity(),
+}
+
+
+def network(inputs: int, kinds: int, norm: Callable[[int], nn.Module]) -> nn.Sequential:
+    """From pillars to tokens' cells, twice as wide."""
+    layers: list[nn.Module] = []
+    for before, after, stride in ((inputs, 16, 1), (16, 32, 2), (32, 32, 1), (32, 32, 1)):
+        layers += [nn.Conv2d(before, after, 3, stride, 1), norm(after), nn.ReLU()]
+    last = nn.Conv2d(32, kinds, 1)
+    assert last.bias is not None
+    nn.init.constant_(last.bias, -3.0)
+    return nn.Sequential(*layers, last)
+
+
+def average_precision(logit: Tensor, drawn: Tensor) -> float:
+    """Of cells by their logits (N,): the mean precision at each cell that is truly drawn (N,)."""
+    hit = drawn[logit.argsort(descending=True, stable=True)].double()
+    precision = hit.cumsum(0) / torch.arange(1, len(hit) + 1)
+    return float((precision * hit).sum() / hit.sum().clamp_min(1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("data/streets"))
+    parser.add_argument("--tiles", type=int, default=60)
+    parser.add_argument("--steps", type=int, default=120)
+    parser.add_argument("--looks", type=int, default=6)
+    parser.add_argument("--rate", type=float, default=3e-3)
+    parser.add_argument("--held", type=int, default=20)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    mapper = MAP_TRAINING["map-small"].mapper
+    recording = open_looks(options.data, "train", ("lidar",))
+    stream = TileStream(recording, true_maps(recording), mapper, MapAugment(3, 6), 3)
+    samples = [stream.draw(number) for number in range(options.tiles)]
+    raster, hit = rasterise([look.points for sample in samples for look in sample.looks], mapper.bev.grid)
+    drawn = torch.cat([sample.ink for sample in samples])
+    seen = F.max_pool2d(hit[:, None].float(), 5, 2, 2)[:, 0] > 0
+    learnt = len(raster) - options.held
+    print(f"{learnt} looks to learn from, {options.held} held out; kinds: {', '.join(mapper.head.kinds)}", flush=True)
+    for name, norm in NORMS.items():
+        torch.manual_seed(0)
+        net = network(raster.shape[1], drawn.shape[1], norm)
+        optimiser = torch.optim.AdamW(net.parameters(), lr=options.rate, betas=(0.9, 0.98))
+        rng, began = np.random.default_rng(0), time.process_time()
+        for step in range(options.steps):
+            rows = torch.from_numpy(rng.choice(learnt, options.looks, replace=False))
+            where = seen[rows]
+            told = net(raster[rows]).permute(0, 2, 3, 1)[where]
+            loss = ink_loss(told, drawn[rows].permute(0, 2, 3, 1)[where].float())
+            for group in optimiser.param_groups:
+                group["lr"] = options.rate * min(1.0, (step + 1) / 10) * (1 - step / options.steps)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+        net.eval()
+        with torch.inference_mode():
+            told = net(raster[learnt:]).permute(0, 2, 3, 1)[seen[learnt:]]
+        true = drawn[learnt:].permute(0, 2, 3, 1)[seen[learnt:]]
+        kinds = [round(average_precision(told[:, k], true[:, k]), 3) for k in range(true.shape[1])]
+        print(f"{name}: {kinds}, {time.process_time() - began:.0f} s of processor", flush=True)
+
+
+if __name__ == "__main__":
+    main()
