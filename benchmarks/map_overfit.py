@@ -24,10 +24,11 @@ from manyeyes.evaluation.map_quality import judge
 from manyeyes.evaluation.map_tiles import side_by_side
 from manyeyes.models.map_head import RawMap, decode
 from manyeyes.models.mapper import Mapper
-from manyeyes.training.map_loop import MapRun, placed, see
+from manyeyes.training.map_loop import MapRun
 from manyeyes.training.map_presets import MAP_TRAINING
 from manyeyes.training.map_samples import MapAugment, MapSample, TileStream
 from manyeyes.training.map_sketches import around_seen
+from manyeyes.training.map_step import placed, see
 from manyeyes.training.map_targets import met
 
 

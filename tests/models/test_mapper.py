@@ -120,6 +120,20 @@ def test_what_is_drawn_depends_on_what_was_seen(mapper):
     assert mapper.draw(ground, "many")[-1].logit.shape == (2, 4, 3)
 
 
+def test_scores_are_calibrated_when_drawing_and_not_when_learning():
+    net = Mapper(TINY).eval().requires_grad_(False)
+    ground = torch.randn(1, TINY.head.channels, 16, 32)
+    plain = net.draw(ground)
+    net.scale.copy_(torch.tensor([1.0, 2.0, 0.5]))
+    net.shift.copy_(torch.tensor([0.0, 0.3, -1.0]))
+    *before, last = net.draw(ground)
+    assert torch.equal(last.logit, plain[-1].logit * net.scale + net.shift) and torch.equal(last.point, plain[-1].point)
+    assert all(torch.equal(a.logit, b.logit) for a, b in zip(before, plain))
+    # The net learns what it says uncalibrated. Its norms stay as they are, so that nothing else differs.
+    net.training = True
+    assert torch.equal(net.draw(ground)[-1].logit, plain[-1].logit)
+
+
 def test_both_sensors_share_one_ground_and_either_alone_will_do(photo):
     torch.manual_seed(1)
     both = Mapper(dataclasses.replace(TINY, bev=dataclasses.replace(TINY.bev, sensors=("lidar", "camera"))))

@@ -20,9 +20,10 @@ from manyeyes.models.map_head import MapHeadConfig, decode
 from manyeyes.models.map_presets import FORMAT
 from manyeyes.models.mapper import Mapper, MapperConfig
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.training.map_loop import MapRun, MapTrainConfig, loss_terms, placed, see, thinned, train_mapper
+from manyeyes.training.map_loop import MapRun, MapTrainConfig, train_mapper
 from manyeyes.training.map_presets import MAP_TRAINING
 from manyeyes.training.map_samples import MapSample, inked
+from manyeyes.training.map_step import loss_terms, placed, see, thinned
 
 TINY = MapperConfig(
     BevConfig(
@@ -164,9 +165,22 @@ def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["Nowhere"] and card["steps"] == 4 and card["command"] == "x"
     again = checkpoint.load_as(weights, FORMAT, MapperConfig, Mapper)
-    assert again.config == TINY
+    assert again.config == TINY and torch.equal(again.scale, torch.ones(3))
     train_mapper(CONFIG, Streets(), tmp_path, seed=1)
     assert len((tmp_path / "log.jsonl").read_text().splitlines()) == 4
+
+
+def test_scores_are_calibrated_at_the_end_and_training_is_the_same(tmp_path):
+    # Without a threshold even a model that has learnt nothing draws something.
+    mapper = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, threshold=0.0))
+    plain, told = (
+        train_mapper(dataclasses.replace(CONFIG, mapper=mapper, calibrated=count), Streets(), tmp_path / str(count))
+        for count in (0, 3)
+    )
+    plain, told = (checkpoint.load_as(file, FORMAT, MapperConfig, Mapper) for file in (plain, told))
+    assert not torch.equal(told.scale, plain.scale) and bool((told.scale > 0).all())
+    same = {name for name, value in plain.state_dict().items() if torch.equal(value, told.state_dict()[name])}
+    assert set(plain.state_dict()) - same <= {"scale", "shift"}
 
 
 def test_thinning_leaves_out_the_least_worth_of_each_look():

@@ -84,6 +84,8 @@ class Mapper(nn.Module):
         self.neck = nn.ModuleList(stages)
         self.pyramid = Pyramid(widths, head.channels)
         self.head = MapHead(head)
+        # Of each kind's logits, once training is done (training/map_calibration.py): scores are then shares that are true.
+        self.scale, self.shift = nn.Buffer(torch.ones(len(head.kinds))), nn.Buffer(torch.zeros(len(head.kinds)))
 
     @property
     def token_grid(self) -> BevGrid:
@@ -152,8 +154,14 @@ class Mapper(nn.Module):
         return self.head.sketch(ground)
 
     def draw(self, ground: Tensor, group: Group = "one", sketch: Sketch | None = None) -> tuple[RawMap, ...]:
-        """Elements of tiles (B, D, rows, columns), one RawMap a layer, the last the best; sketch: of this ground, if known."""
-        return self.head(ground, self.sketch(ground) if sketch is None else sketch, group)
+        """Elements of tiles (B, D, rows, columns), one RawMap a layer, the last the best, its scores calibrated when not training.
+
+        sketch: of this ground, if known.
+        """
+        *before, last = self.head(ground, self.sketch(ground) if sketch is None else sketch, group)
+        if not self.training:
+            last = RawMap(last.logit * self.scale + self.shift, last.point)
+        return (*before, last)
 
     def forward(self, features: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
         """The part that is exported: looks on the cells of their tiles, as for ``merge``, to the last layer's logits and points."""

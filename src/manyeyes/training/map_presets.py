@@ -21,12 +21,20 @@ _SMALL = MapTrainConfig(
     ema=0.99,
     thin=0.5,
     sketch_steps=700,
+    calibrated=64,
     augment=_NOISY,
 )
 
 MAP_TRAINING: dict[str, MapTrainConfig] = {
     "map-toy": MapTrainConfig(
-        mapper_config("toy"), steps=60, batch=2, learning_rate=2e-3, warm_up=10, save_every=20, augment=MapAugment(1, 3)
+        mapper_config("toy"),
+        steps=60,
+        batch=2,
+        learning_rate=2e-3,
+        warm_up=10,
+        save_every=20,
+        augment=MapAugment(1, 3),
+        calibrated=2,
     ),
     "map-small": _SMALL,
     "map-small-camera": replace(
@@ -42,6 +50,7 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
         learning_rate=6e-4,
         warm_up=500,
         save_every=500,
+        calibrated=64,
         augment=MapAugment(least=10, flip=False),
         loss=MapLossConfig(repeat=6),
     ),
