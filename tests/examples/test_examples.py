@@ -77,3 +77,14 @@ def test_06_a_map_from_messages() -> None:
     score = [float(line.rsplit("mAP ", 1)[1]) for line in (*lines, last)]
     assert len(lines) == 8 and " 96 messages" in lines[-1]
     assert score[-1] > 0.9 and score[-2] > 0.8 > score[0]
+
+
+@pytest.mark.slow
+def test_07_a_street_from_sweeps(tmp_path: Path) -> None:
+    pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
+    picture = tmp_path / "street.png"
+    alone, together = run("07_a_street_from_sweeps.py", str(picture)).strip().splitlines()
+    assert alone.startswith("1 looks") and together.startswith("5 looks")
+    # Dividers: what five saw is drawn better than what one saw.
+    assert float(together.split("divider ")[1].split(",")[0]) > float(alone.split("divider ")[1].split(",")[0])
+    assert picture.stat().st_size > 10_000

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What five agents' sweeps say of a crossing's paint and edges: each sends the cells that it saw, whoever hears them draws the map.
+
+The street is made here (extra 'sim'); nothing of it was in training. The first agent draws alone, and then with all that it heard.
+"""
+
+import sys
+from pathlib import Path
+
+from manyeyes.agents.mapping import draw_tile, receive, share_look
+from manyeyes.apps.viewer.map_figures import Panel, save_figure
+from manyeyes.evaluation.map_quality import PAPER_KINDS, judge
+from manyeyes.evaluation.map_tiles import cut_to
+from manyeyes.evaluation.tile_looks import upright
+from manyeyes.maps.truth import TruthPolicy, map_truth
+from manyeyes.models import zoo
+from manyeyes.simulator.scenario import ScenarioSpec, make_scenario
+from manyeyes.simulator.towns import load_town
+
+mapper = zoo.load_mapper()
+town = load_town("generated-3")
+scene = make_scenario(ScenarioSpec("generated-3", seed=3, name="street", vehicles=4, frames=1, history_frames=0), town)
+frames = scene.snapshot(0).frames
+
+messages, spent = [], []
+for frame in frames:
+    packets = share_look(mapper, frame)
+    messages.append(receive(packets, mapper))
+    spent.append(sum(map(len, packets)))
+
+world_from_tile = upright(frames[0])
+truth = cut_to(map_truth(town, TruthPolicy(boundary="pavement")), world_from_tile, mapper.config.tile)
+panels = []
+for count in (1, len(frames)):
+    drawn = draw_tile(mapper, [m for m in messages[:count] if m is not None], world_from_tile)
+    quality = judge(drawn, truth)
+    said = ", ".join(f"{kind} {quality.ap(kind, 'maptr'):.2f}" for kind in (*PAPER_KINDS, "boundary"))
+    print(f"{count} looks, {sum(spent[:count]):,} bytes: {len(drawn)} elements, AP of {said}")
+    panels.append(Panel(f"From {count} looks", drawn.take(drawn.score >= 0.3), truth))
+save_figure(panels, Path(sys.argv[1] if len(sys.argv) > 1 else "street.png"))
