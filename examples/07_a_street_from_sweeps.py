@@ -19,7 +19,18 @@ from manyeyes.simulator.towns import load_town
 
 mapper = zoo.load_mapper()
 town = load_town("generated-3")
-scene = make_scenario(ScenarioSpec("generated-3", seed=3, name="street", vehicles=4, frames=1, history_frames=0), town)
+spec = ScenarioSpec("generated-3", seed=3, name="street", vehicles=4, frames=2, history_frames=0, roadside_chance=1.0, density=6.0)
+    "generated-3",
+    seed=3,
+    name="street",
+    vehicles=4,
+    frames=1,
+    history_frames=0,
+    roadside_chance=1.0,
+    density=8.0,
+    min_vehicles=8,
+)
+scene = make_scenario(spec, town)
 frames = scene.snapshot(0).frames
 
 messages, spent = [], []

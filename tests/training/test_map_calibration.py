@@ -6,26 +6,33 @@ import pytest
 import torch
 
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.training.map_calibration import FLATTEST, platt, true_share
+from manyeyes.training.map_calibration import FLATTEST, news_share, platt
 
 LINE = [[0.0, 0.0], [20.0, 0.0]]
 RING = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]]
 
 
-def test_the_true_share_is_that_of_length_near_a_line_of_the_same_kind():
+def test_what_is_true_is_length_near_a_line_of_the_same_kind():
     truth = MapElements.of([LINE, np.array(RING) + [30.0, 0.0]], [DIVIDER, CROSSING])
-    beside = np.array(LINE) + [0.0, 0.9]
-    half = np.array(LINE) + [11.0, 0.0]
-    drawn = MapElements.of(
-        [beside, np.array(LINE) + [0.0, 1.1], half, np.array(RING) + [30.0, 0.5], RING], [0, 0, 0, CROSSING, CROSSING]
-    )
-    share = true_share(drawn, truth)
+    beside, half = np.array(LINE) + [0.0, 0.9], np.array(LINE) + [11.0, 0.0]
+    drawn = [MapElements.of([line], [DIVIDER]) for line in (beside, np.array(LINE) + [0.0, 1.1], half)]
     # The third begins 11 m along, 9 m and the metre beyond its end are true of 20.
-    np.testing.assert_allclose(share[[0, 1, 3, 4]], [1, 0, 1, 0])
-    assert share[2] == pytest.approx(0.5, abs=0.03)
-    assert not true_share(drawn, MapElements.of([], [])).any() and true_share(MapElements.of([], []), truth).shape == (
-        0,
-    )
+    assert [float(news_share(one, truth)[0]) for one in drawn] == pytest.approx([1.0, 0.0, 0.5], abs=0.03)
+    rings = MapElements.of([np.array(RING) + [30.0, 0.5], RING], CROSSING)
+    np.testing.assert_allclose(news_share(rings, truth), [1, 0])
+    empty = MapElements.of([], [])
+    assert not news_share(rings, empty).any() and news_share(empty, truth).shape == (0,)
+
+
+def test_what_is_drawn_twice_is_news_once():
+    truth = MapElements.of([LINE], [DIVIDER])
+    first_half, again = np.array([[0.0, 0.3], [10.0, 0.3]]), np.array(LINE) + [0.0, -0.3]
+    share = news_share(MapElements.of([first_half, again, LINE], [DIVIDER] * 3), truth)
+    # Of the second, what lies beyond the first's reach; of the third, nothing.
+    assert share == pytest.approx([1.0, 0.46, 0.0], abs=0.04)
+    # A crossing along a divider tells nothing of the divider.
+    both = MapElements.of([RING, LINE], [CROSSING, DIVIDER])
+    assert news_share(both, truth)[1] == 1.0
 
 
 def test_shares_that_follow_a_line_of_logits_give_that_line():

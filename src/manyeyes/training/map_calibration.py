@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map model's scores are worth: after training they are brought to the share of an element that is true.
+"""What a map model's scores are worth: after training they are brought to the share of an element that is true, and new.
 
 Whoever fuses maps believes a score (maps/evidence.py), so that it has to mean the same whoever drew. Training ranks queries and
-makes no such promise. Source: Platt, "Probabilistic outputs for support vector machines", 1999: a line through the logits, here for
-each kind.
+makes no such promise. A line that is drawn twice is no news the second time. Source: Platt, "Probabilistic outputs for support
+vector machines", 1999: a line through the logits, here for each kind.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def calibrate(model: Mapper, samples: Iterable[MapSample]) -> None:
     for sample in samples:
         ground = model.merge(*placed(model, see(model, [sample]).tokens, [sample]))
         drawn = decode(model.draw(ground)[-1], config.tile, config.head)[0]
-        said.append((drawn, true_share(drawn, sample.truth)))
+        said.append((drawn, news_share(drawn, sample.truth)))
     for row, kind in enumerate(config.head.kinds):
         own = [(drawn.kind == KINDS.index(kind), drawn, share) for drawn, share in said]
         score = np.concatenate([drawn.score[which] for which, drawn, _ in own] or [np.zeros(0)])
@@ -51,16 +51,24 @@ def calibrate(model: Mapper, samples: Iterable[MapSample]) -> None:
     model.train(was)
 
 
-def true_share(drawn: MapElements, truth: MapElements) -> NDArray[np.float64]:
-    """(N,) how much of each element's length lies within NEAR_M of a true one of its kind."""
+def news_share(drawn: MapElements, truth: MapElements) -> NDArray[np.float64]:
+    """(N,) how much of each element's length lies within NEAR_M of a true one of its kind, and of none that is drawn before it.
+
+    drawn: the best first.
+    """
     out = np.zeros(len(drawn))
     for kind in np.unique(drawn.kind):
         rows = np.flatnonzero(drawn.kind == kind)
         mine, first = _points(drawn.take(rows))
         theirs, _ = _points(truth.take(truth.kind == kind))
-        if len(theirs):
-            away = torch.cdist(torch.from_numpy(mine), torch.from_numpy(theirs)).amin(1).numpy()
-            out[rows] = np.add.reduceat((away <= NEAR_M).astype(np.float64), first[:-1]) / np.diff(first)
+        if not len(theirs):
+            continue
+        points = torch.from_numpy(mine)
+        news = torch.cdist(points, torch.from_numpy(theirs)).amin(1) <= NEAR_M
+        owner = torch.from_numpy(np.repeat(np.arange(len(rows)), np.diff(first)))
+        told = (torch.cdist(points, points) <= NEAR_M) & (owner[None] < owner[:, None])
+        news &= ~told.any(1)
+        out[rows] = np.add.reduceat(news.numpy().astype(np.float64), first[:-1]) / np.diff(first)
     return out
 
 
