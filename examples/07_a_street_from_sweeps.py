@@ -9,7 +9,7 @@ from pathlib import Path
 
 from manyeyes.agents.mapping import draw_tile, receive, share_look
 from manyeyes.apps.viewer.map_figures import Panel, save_figure
-from manyeyes.evaluation.map_quality import PAPER_KINDS, judge
+from manyeyes.evaluation.map_quality import judge
 from manyeyes.evaluation.map_tiles import cut_to
 from manyeyes.evaluation.tile_looks import upright
 from manyeyes.maps.truth import TruthPolicy, map_truth
@@ -19,16 +19,8 @@ from manyeyes.simulator.towns import load_town
 
 mapper = zoo.load_mapper()
 town = load_town("generated-3")
-spec = ScenarioSpec("generated-3", seed=3, name="street", vehicles=4, frames=2, history_frames=0, roadside_chance=1.0, density=6.0)
-    "generated-3",
-    seed=3,
-    name="street",
-    vehicles=4,
-    frames=1,
-    history_frames=0,
-    roadside_chance=1.0,
-    density=8.0,
-    min_vehicles=8,
+spec = ScenarioSpec(
+    "generated-3", seed=3, name="street", vehicles=4, frames=2, history_frames=0, roadside_chance=1.0, density=6.0
 )
 scene = make_scenario(spec, town)
 frames = scene.snapshot(0).frames
@@ -45,7 +37,7 @@ panels = []
 for count in (1, len(frames)):
     drawn = draw_tile(mapper, [m for m in messages[:count] if m is not None], world_from_tile)
     quality = judge(drawn, truth)
-    said = ", ".join(f"{kind} {quality.ap(kind, 'maptr'):.2f}" for kind in (*PAPER_KINDS, "boundary"))
+    said = ", ".join(f"{kind} {quality.ap(kind, 'maptr'):.2f}" for kind in ("divider", "boundary"))
     print(f"{count} looks, {sum(spent[:count]):,} bytes: {len(drawn)} elements, AP of {said}")
     panels.append(Panel(f"From {count} looks", drawn.take(drawn.score >= 0.3), truth))
 save_figure(panels, Path(sys.argv[1] if len(sys.argv) > 1 else "street.png"))
