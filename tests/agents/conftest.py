@@ -109,9 +109,9 @@ TINY_MAPPER = MapperConfig(
     BevGrid(-16.0, -8.0, -1.0, 16.0, 8.0, 1.0, pillar=1.0),
     token_channels=8,
     neck=(1, 1),
-    head=MapHeadConfig(elements=6, points=5, channels=16, feed=32, layers=2, heads=4, threshold=0.0),
+    head=MapHeadConfig(elements=6, points=5, channels=16, feed=32, layers=2, heads=4, least=0.0, threshold=0.0),
 )
-"""Looks of 16 m by 16 m, tiles of 32 m by 16 m; no guess is too unsure to be drawn."""
+"""Looks of 16 m by 16 m, tiles of 32 m by 16 m; no guess is too unsure to be followed and drawn."""
 
 
 @pytest.fixture(scope="session")
