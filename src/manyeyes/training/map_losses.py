@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Losses of the map head: who answers for which element, and how far off it is, whatever order either is drawn in.
 
-Sources: MapTR (ICLR 2023) and MapTRv2 (IJCV 2024), weights as published there; focal loss, Lin et al., ICCV 2017. Terms of points
-are sums over an element's points, means over elements.
+Sources: MapTR (ICLR 2023) and MapTRv2 (IJCV 2024), weights as published there but for ink, ten times
+as much (docs/mapper.md); focal loss, Lin et al., ICCV 2017. Terms of points are sums over an element's points, means over elements.
 """
 
 from __future__ import annotations
