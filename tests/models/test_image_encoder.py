@@ -6,17 +6,19 @@ import torch
 import torch.nn.functional as F
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.models.image_encoder import FEATURE_STRIDE, ImageEncoder, ImageEncoderConfig, Residual, finer
+from manyeyes.models.image_encoder import ImageEncoder, ImageEncoderConfig, Residual, finer
 
 TINY = ImageEncoderConfig((1, 1, 1), 8, channels=16)
 
 
 @pytest.mark.parametrize("size", [(64, 112), (75, 101)])
-@pytest.mark.parametrize("config", [TINY, ImageEncoderConfig((1, 1), 8, True, 16)])
-def test_features_are_an_eighth_rounded_up(config, size):
+@pytest.mark.parametrize(
+    "config", [TINY, ImageEncoderConfig((1, 1), 8, True, 16), ImageEncoderConfig((1, 1), 8, channels=16, stride=4)]
+)
+def test_features_are_an_eighth_or_a_quarter_rounded_up(config, size):
     rgb = torch.randint(0, 256, (2, 3, *size), dtype=torch.uint8)
     out = ImageEncoder(config)(rgb)
-    assert out.shape == (2, 16, -(-size[0] // FEATURE_STRIDE), -(-size[1] // FEATURE_STRIDE))
+    assert out.shape == (2, 16, -(-size[0] // config.stride), -(-size[1] // config.stride))
     assert bool((out >= 0).all()) and float(out.detach().std()) > 0
 
 

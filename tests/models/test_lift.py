@@ -104,6 +104,18 @@ def test_what_stands_at_a_pixel_comes_to_lie_where_the_road_is():
     assert bev[0, 1, :, 0].tolist() == pytest.approx([40.0, 36.0, 32.0, 28.0, 24.0], abs=1e-3)
 
 
+def test_ground_of_which_a_pixel_covers_too_much_is_unseen():
+    # Two metres up, 32 pixels a unit of slope: a pixel d metres ahead covers (d^2 + 4) / 64 m of a level road.
+    cam, owner = camera(pitch=0.0), torch.zeros(1, dtype=torch.int64)
+    grid = BevGrid(0.0, -0.5, -1.0, 16.0, 0.5, 1.0, pillar=1.0)
+    _, all_seen = lift_ground(torch.ones(1, 1, *SIZE), [cam], owner, 1, grid, STRIDE)
+    bev, seen = lift_ground(torch.ones(1, 1, *SIZE), [cam], owner, 1, grid, STRIDE, coarsest_m=1.0)
+    # 2 m of height at 45 degrees down at most: nothing nearer than 8 / 3 m; cells are centred on halves.
+    assert all_seen[0, 0].nonzero()[:, 0].tolist() == list(range(3, 16))
+    assert seen[0, 0].nonzero()[:, 0].tolist() == [3, 4, 5, 6, 7]  # 7.5 m: .94 m; 8.5 m: 1.19 m
+    assert bev[0, 0, 0].tolist() == [0.0] * 3 + [1.0] * 5 + [0.0] * 8
+
+
 def test_a_certain_depth_puts_the_feature_there_and_nowhere_else():
     features, depth = torch.ones(1, 1, *SIZE), torch.zeros(1, BINS.count, *SIZE)
     depth[:, 3] = 1.0

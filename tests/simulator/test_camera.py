@@ -207,6 +207,14 @@ def test_a_picture_of_another_size_shows_the_same() -> None:
     assert isinstance(one, Camera)
 
 
+def test_rows_cut_off_above_move_nothing_below() -> None:
+    cut = FRONT.below(30)
+    point = torch.tensor([[9.0, 1.0, 0.3]], dtype=torch.float64)
+    shift = FRONT.camera.project(point)[0] - cut.camera.project(point)[0]
+    torch.testing.assert_close(shift, torch.tensor([[0.0, 30.0]], dtype=torch.float64))
+    assert cut.height == FRONT.height - 30 and cut.width == FRONT.width
+
+
 def test_what_cannot_be_is_named() -> None:
     with pytest.raises(ConfigError, match="No cameras 'opv'; choose one of none, opv2v"):
         camera_rig("opv")

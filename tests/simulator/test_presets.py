@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.simulator.camera import camera_rig
 from manyeyes.simulator.presets import (
     SIMULATION_PRESETS,
     SimulationPreset,
@@ -53,6 +54,12 @@ def test_cameras_see_the_same_scenes() -> None:
     }
     with pytest.raises(ConfigError, match="in OPV2V's layout only"):
         with_cameras(simulation_preset("dair-tiny"))
+
+
+def test_streets_with_pictures_are_the_same_streets() -> None:
+    blind, seeing = (jobs_of(simulation_preset(name), 0) for name in ("streets", "streets-pictures"))
+    assert [replace(job.spec, cameras="none", roadside_cameras="none") for job in seeing] == [j.spec for j in blind]
+    assert all(camera_rig(job.spec.cameras) and camera_rig(job.spec.roadside_cameras) for job in seeing)
 
 
 def test_the_demo_runs_without_any_town(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

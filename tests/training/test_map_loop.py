@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from manyeyes.datatypes import AgentFrame, BevGrid, CheckpointError, PointCloud, Sites, SparseBev, Transform
+from manyeyes.datatypes import (
+    AgentFrame,
+    BevGrid,
+    CheckpointError,
+    ConfigError,
+    PointCloud,
+    Sites,
+    SparseBev,
+    Transform,
+)
 from manyeyes.datatypes.camera import Camera, CameraImage
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
 from manyeyes.evaluation.map_quality import judge
@@ -168,6 +177,28 @@ def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
     assert again.config == TINY and torch.equal(again.scale, torch.ones(3))
     train_mapper(CONFIG, Streets(), tmp_path, seed=1)
     assert len((tmp_path / "log.jsonl").read_text().splitlines()) == 4
+
+
+def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tmp_path):
+    seeing = dataclasses.replace(
+        TINY, bev=dataclasses.replace(TINY.bev, sensors=("lidar", "camera"), image_size=(24, 32), raster_width=12)
+    )
+    lidar, camera = (
+        Mapper(TINY),
+        Mapper(dataclasses.replace(seeing, bev=dataclasses.replace(seeing.bev, sensors=("camera",)))),
+    )
+    lidar.scale += 1.0
+    config = dataclasses.replace(CONFIG, mapper=seeing)
+    random = MapRun(config, Streets(), tmp_path / "random", seed=0).state.model.state_dict()
+    begun = MapRun(config, Streets(), tmp_path / "begun", 0, [lidar.state_dict(), camera.state_dict()]).state
+    state, first, second = (m.state_dict() for m in (begun.model, lidar, camera))
+    # The first that has a tensor has the say; calibration is begun anew; the average begins where the model does.
+    assert all(torch.equal(state[k], v) for k, v in first.items() if k not in ("scale", "shift"))
+    assert all(torch.equal(state[k], v) for k, v in second.items() if k.startswith("camera."))
+    assert torch.equal(state["scale"], torch.ones(3)) and same_state(begun.average, begun.model)
+    assert not torch.equal(random["shrink.weight"], state["shrink.weight"])
+    with pytest.raises(ConfigError, match="of its size"):
+        MapRun(config, Streets(), tmp_path / "none", 0, [{"lidar.stem.0.0.weight": torch.zeros(3)}])
 
 
 def test_scores_are_calibrated_at_the_end_and_training_is_the_same(tmp_path):

@@ -125,14 +125,27 @@ def test_ink_lies_on_the_cells_of_lines_and_fills_crossings():
     assert [KINDS[CROSSING], KINDS[DIVIDER]] == ["crossing", "divider"]
 
 
-def test_a_mirror_is_no_camera():
+def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_column():
     look = Drives().snapshot("aton_0", 0).frames[0]
-    flipped = mirrored(look)
+    zero = torch.zeros((), dtype=torch.float64)
+    ahead = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+    turned = Transform.from_rpy(torch.tensor([1.0, 0.3, 1.5], dtype=torch.float64), zero + 0.02, zero + 0.1, zero + 0.6)
+    pose = turned @ Transform(ahead, torch.zeros(3, dtype=torch.float64))
+    camera = Camera(torch.tensor([[30.0, 0, 17], [0, 32, 12], [0, 0, 1]], dtype=torch.float64), pose, 40, 24)
+    photo = CameraImage(camera, torch.randint(0, 256, (3, 24, 40), dtype=torch.uint8))
+    flipped = mirrored(dataclasses.replace(look, images=(photo,)))
     assert torch.equal(flipped.points.xyz[:, 1], -look.points.xyz[:, 1])
-    camera = Camera(torch.eye(3, dtype=torch.float64), Transform.identity(), 2, 2)
-    photo = CameraImage(camera, torch.zeros(3, 2, 2, dtype=torch.uint8))
-    with pytest.raises(ConfigError, match="another camera"):
-        mirrored(dataclasses.replace(look, images=(photo,)))
+    other = flipped.images[0]
+    assert float(torch.det(other.camera.agent_from_camera.rotation)) == pytest.approx(1.0)
+    points = torch.tensor([[9.0, 4.0, 0.0], [12.0, 8.0, 0.5]], dtype=torch.float64)
+    there, depth = camera.project(points)
+    mirror, same = other.camera.project(points * torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
+    assert torch.allclose(depth, same) and torch.allclose(mirror[:, 1], there[:, 1])
+    assert torch.allclose(mirror[:, 0], 40 - there[:, 0])
+    u, v = there[0].long().tolist()
+    assert torch.equal(other.rgb[:, v, 39 - u], photo.rgb[:, v, u])
+    again = mirrored(flipped).images[0]
+    assert torch.equal(again.rgb, photo.rgb) and torch.allclose(again.camera.intrinsic, camera.intrinsic)
 
 
 def test_a_mirrored_turn_is_a_turn_the_other_way():

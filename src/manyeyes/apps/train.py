@@ -32,9 +32,10 @@ class Options:
     """Samples a step over all processes, instead of the preset's."""
     learning_rate: float | None = None
     """Instead of the preset's."""
-    weights: Path | None = None
-    """Weights to begin from instead of random ones, such as those of the stage before; for feakm and feakm-paper the detector
-    whose view they match, a shipped one by default."""
+    weights: tuple[Path, ...] = ()
+    """Weights to begin from instead of random ones, such as those of the stage before. Of a map model several, each what it has in
+    common with the preset, the first before the others. For feakm and feakm-paper the detector whose view they match, a shipped
+    one by default."""
     threads: int = 1
     """Threads of torch in each process; the result is the same only for the same number."""
 
@@ -52,6 +53,8 @@ def main(options: Options) -> None:
     from manyeyes.training.map_presets import MAP_TRAINING
     from manyeyes.training.presets import TRAINING_PRESETS
 
+    if len(options.weights) > 1 and options.preset not in MAP_TRAINING:
+        raise ConfigError(f"--weights takes one file for {options.preset}; got {len(options.weights)}.")
     if options.preset in FEAKM_TRAINING:
         return train_feakm.main(options, Console())
     if options.preset in MAP_TRAINING:
@@ -90,7 +93,7 @@ def _train(options: Options, config: Any, recording: Any, console: Any) -> None:
             progress.update(task, total=at.steps, completed=at.step, description=f"loss {at.loss:.3f}")
             last[:] = [at]
 
-        weights = train(config, recording, out, options.seed, card, report, options.weights)
+        weights = train(config, recording, out, options.seed, card, report, *options.weights)
     if console.quiet:
         return
     save_loss_curve(out / "log.jsonl", out / "loss.png")

@@ -30,7 +30,7 @@ def main(options: Options, console: Any) -> None:
     asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
     config = replace(FEAKM_TRAINING[options.preset], **{k: v for k, v in asked.items() if v is not None})
     torch.set_num_threads(options.threads)
-    detector = zoo.load(options.weights or zoo.DEFAULT)
+    detector = zoo.load(options.weights[0] if options.weights else zoo.DEFAULT)
     config = fitted(config, detector)
     out = options.out or Path("runs") / options.preset
     origin = provenance.provenance({"options": options, "training": config}, options.seed)

@@ -36,6 +36,7 @@ def _train(options: Options, console: Any) -> None:
     from manyeyes.apps import provenance
     from manyeyes.apps.showcase import bars
     from manyeyes.apps.viewer.loss_curve import save_loss_curve
+    from manyeyes.models import zoo
     from manyeyes.simulator.towns import TOWN_SPLIT
     from manyeyes.training.map_loop import MapProgress, train_mapper
     from manyeyes.training.map_presets import MAP_TRAINING
@@ -46,6 +47,7 @@ def _train(options: Options, console: Any) -> None:
     recording = open_looks(options.data, options.split, config.mapper.bev.sensors)
     held_out = tuple(town for side, towns in TOWN_SPLIT.items() if side != "train" for town in towns)
     samples = TileStream(recording, true_maps(recording), config.mapper, config.augment, options.seed, held_out)
+    start = [zoo.mapper_state(weights) for weights in options.weights]
     out = options.out or Path("runs") / options.preset
     origin = provenance.provenance({"options": options, "training": config}, options.seed)
     card = {name: origin[name] for name in ("command", "versions", "git_commit")}
@@ -57,7 +59,7 @@ def _train(options: Options, console: Any) -> None:
             progress.update(task, completed=at.step, description=f"loss {at.loss:.3f}")
             last[:] = [at]
 
-        weights = train_mapper(config, samples, out, options.seed, card, report)
+        weights = train_mapper(config, samples, out, options.seed, card, report, start)
     if console.quiet:
         return
     save_loss_curve(out / "log.jsonl", out / "loss.png")

@@ -118,9 +118,9 @@ def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config
     return model
 
 
-def read_state(path: Path) -> dict[str, torch.Tensor]:
+def read_state(path: Path, format: str = FORMAT) -> dict[str, torch.Tensor]:
     """The tensors of a file of weights by name, as they are stored."""
-    return _read(path)[0]
+    return _read(path, format)[0]
 
 
 def read_card(path: Path, format: str = FORMAT) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures to features at an eighth of their size: a residual network and a feature pyramid, both our own.
+"""Pictures to features at an eighth of their size, or a quarter: a residual network and a feature pyramid, both our own.
 
 Sources: He et al., CVPR 2016 (basic and bottleneck blocks); Lin et al., CVPR 2017 (top-down pyramid). Norms are of the batch, by
 running statistics once learnt, so that what one agent makes of its picture never depends on whose pictures share the batch. A norm
@@ -16,28 +16,29 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import ConfigError
 
-FEATURE_STRIDE = 8
-"""Pixels of the picture a pixel of the features, along each axis; feature o is centred on pixel 8 o."""
-
 
 @dataclass(frozen=True)
 class ImageEncoderConfig:
     """blocks: residual blocks at strides 4, 8, 16, …, two stages or more; width: channels of the first stage, doubled by each.
 
     bottleneck: 1-3-1 blocks with four times the channels (ResNet-50 is (3, 4, 6, 3), 64, True); else 3-3 blocks
-    (ResNet-18 is (2, 2, 2, 2), 64, False). channels: of the pyramid and of what comes out.
+    (ResNet-18 is (2, 2, 2, 2), 64, False). channels: of the pyramid and of what comes out. stride: pixels of the picture a pixel of
+    what comes out, along each axis, 8 or 4; feature o is centred on pixel stride * o.
     """
 
     blocks: tuple[int, ...] = (2, 2, 2, 2)
     width: int = 64
     bottleneck: bool = False
     channels: int = 128
+    stride: int = 8
 
     def __post_init__(self) -> None:
         if len(self.blocks) < 2 or min(self.blocks) < 1:
             raise ConfigError(
                 f"ImageEncoderConfig.blocks needs two or more stages of a block or more; got {self.blocks}."
             )
+        if self.stride not in (4, 8):
+            raise ConfigError(f"ImageEncoderConfig.stride is 4 or 8; got {self.stride}.")
 
 
 def conv(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
@@ -93,7 +94,7 @@ class Pyramid(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Colour pictures to features of stride 8."""
+    """Colour pictures to features of the configured stride."""
 
     def __init__(self, config: ImageEncoderConfig) -> None:
         super().__init__()
@@ -107,13 +108,14 @@ class ImageEncoder(nn.Module):
             stages.append(nn.Sequential(*blocks))
             inputs = width
         self.stages = nn.ModuleList(stages)
-        self.pyramid = Pyramid(tuple(widths[1:]), config.channels)
+        self.finest = 1 if config.stride == 8 else 0
+        self.pyramid = Pyramid(tuple(widths[self.finest :]), config.channels)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """(V, 3, h, w) uint8, or floats in [0, 255], to (V, channels, ceil(h / 8), ceil(w / 8))."""
+        """(V, 3, h, w) uint8, or floats in [0, 255], to (V, channels, ceil(h / stride), ceil(w / stride))."""
         x = self.stem(rgb.to(torch.float32) / 64 - 2)
         levels = []
         for stage in self.stages:
             x = stage(x)
             levels.append(x)
-        return self.pyramid(levels[1:])
+        return self.pyramid(levels[self.finest :])

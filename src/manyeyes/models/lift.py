@@ -9,14 +9,17 @@ bilinear look-up replaces the scatter (specs: maps.md 1.4). Cells that several c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
-from manyeyes.datatypes import BevGrid, ConfigError, ShapeError
+from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Transform
 from manyeyes.datatypes.camera import Camera
 
 NEAR_M = 0.5
@@ -38,44 +41,82 @@ class DepthBins:
 
 @dataclass(frozen=True)
 class _LookUp:
-    """Of V cameras at every cell of a grid: place (V, rows, columns, 2) in the features, as grid_sample counts; depth_m; inside
-    (V, rows, columns), whether the cell is in the picture and ahead of the camera.
+    """Of V cameras, the cells of a grid that each sees, M at most: cell (V, M) int64, row by row; place (V, M, 2) in the features,
+    as grid_sample counts; depth_m (V, M); there (V, M): false where a camera sees fewer than M.
     """
 
+    cell: Tensor
     place: Tensor
     depth_m: Tensor
-    inside: Tensor
+    there: Tensor
 
 
-def _look_up(cameras: Sequence[Camera], grid: BevGrid, height_m: float, features: torch.Size, stride: int) -> _LookUp:
-    """Where cells of the ground, height_m above the road, lie in features (h, w) whose cell o is centred on pixel stride * o."""
-    rows, columns = grid.shape
+@dataclass(frozen=True)
+class _View:
+    """What a look-up depends on but the camera. features: their height and width; their cell o is centred on pixel stride * o."""
+
+    grid: BevGrid
+    height_m: float
+    coarsest_m: float
+    features: tuple[int, int]
+    stride: int
+
+
+def _look_up(cameras: Sequence[Camera], view: _View) -> _LookUp:
+    """Where cells of the ground, height_m above the road, lie in the features of each camera."""
+    found = [_cells_in(_told(camera), camera.width, camera.height, view) for camera in cameras]
+    cells, places, depths = (pad_sequence(list(part), batch_first=True) for part in zip(*found))
+    there = torch.arange(cells.shape[1]) < torch.tensor([[len(one[0])] for one in found])
+    return _LookUp(cells, places, depths, there)
+
+
+def _told(camera: Camera) -> tuple[float, ...]:
+    pose = camera.agent_from_camera
+    numbers = torch.cat((camera.intrinsic.flatten(), pose.rotation.flatten(), pose.translation))
+    return tuple(numbers.double().tolist())
+
+
+@lru_cache(maxsize=256)
+def _cells_in(numbers: tuple[float, ...], width: int, height: int, view: _View) -> tuple[Tensor, Tensor, Tensor]:
+    """Cells (M,), places (M, 2) and depths (M,) of one camera, kept: a rig looks the same way from look to look."""
+    told = torch.tensor(numbers, dtype=torch.float64)
+    camera = Camera(told[:9].view(3, 3), Transform(told[9:18].view(3, 3), told[18:]), width, height)
+    rows, columns = view.grid.shape
     row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-    xy = grid.centers(torch.stack((row, column), -1).view(-1, 2)).double()
-    points = torch.cat((xy, torch.full((len(xy), 1), height_m, dtype=torch.float64)), 1)
-    size = torch.tensor([features[1], features[0]], dtype=torch.float64)
-    looks = []
-    for camera in cameras:
-        pixel, depth = camera.project(points)
-        ahead = depth > NEAR_M
-        inside = ahead & (pixel >= 0).all(-1) & (pixel[:, 0] <= camera.width) & (pixel[:, 1] <= camera.height)
-        place = (2 * (pixel - 0.5) / stride + 1) / size - 1
-        looks.append((torch.where(inside[:, None], place, torch.zeros_like(place)).float(), depth.float(), inside))
-    places, depths, insides = (torch.stack(column) for column in zip(*looks))
-    shape = (len(cameras), rows, columns)
-    return _LookUp(places.view(*shape, 2), depths.view(shape), insides.view(shape))
+    xy = view.grid.centers(torch.stack((row, column), -1).view(-1, 2)).double()
+    points = torch.cat((xy, torch.full((len(xy), 1), view.height_m, dtype=torch.float64)), 1)
+    pixel, depth = camera.project(points)
+    inside = (depth > NEAR_M) & (pixel >= 0).all(-1) & (pixel[:, 0] <= width) & (pixel[:, 1] <= height)
+    if view.coarsest_m < math.inf:
+        inside &= _pixel_on_ground(camera, points) <= view.coarsest_m
+    cell = inside.nonzero()[:, 0]
+    size = torch.tensor(view.features[::-1], dtype=torch.float64)
+    return cell, ((2 * (pixel[cell] - 0.5) / view.stride + 1) / size - 1).float(), depth[cell].float()
+
+
+def _pixel_on_ground(camera: Camera, points: Tensor) -> Tensor:
+    """(N,) metres of a level plane through each point (N, 3) that one pixel covers along the ray; vast above the camera."""
+    away = points - camera.agent_from_camera.translation
+    return away.square().sum(1) / (-away[:, 2] * camera.intrinsic[1, 1]).clamp_min(1e-9)
 
 
 def lift_ground(
-    features: Tensor, cameras: Sequence[Camera], owner: Tensor, agents: int, grid: BevGrid, stride: int
+    features: Tensor,
+    cameras: Sequence[Camera],
+    owner: Tensor,
+    agents: int,
+    grid: BevGrid,
+    stride: int,
+    coarsest_m: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
     """Features (V, C, h, w) of V cameras to (agents, C, rows, columns), zero where unseen, and what is seen, bool.
 
-    owner: (V,) int64, whose camera it is. stride: pixels a feature, the first centred on the first pixel.
+    owner: (V,) int64, whose camera it is. stride: pixels a feature, the first centred on the first pixel. coarsest_m: ground of
+    which one pixel covers more than this along its ray is unseen.
     """
     _check(features, cameras, owner)
-    look = _look_up(cameras, grid, 0.0, features.shape[-2:], stride)
-    return _mean_of_cameras(_sample(features, look.place), look.inside, owner, agents)
+    look = _look_up(cameras, _View(grid, 0.0, coarsest_m, _size(features), stride))
+    return _mean_of_cameras([(look, look.there, _sample(features, look.place))], owner, agents, grid)
 
 
 def lift_depth(
@@ -99,28 +140,43 @@ def lift_depth(
         raise ShapeError(
             f"lift_depth needs depth (V, {bins.count}, h, w) beside {tuple(features.shape)}; got {tuple(depth.shape)}."
         )
-    total = features.new_zeros(features.shape[0], features.shape[1], *grid.shape)
-    inside = torch.zeros(features.shape[0], *grid.shape, dtype=torch.bool)
+    found = []
     for height_m in heights_m:
-        look = _look_up(cameras, grid, height_m, features.shape[-2:], stride)
-        within = look.inside & (look.depth_m >= bins.near_m) & (look.depth_m <= bins.far_m)
+        look = _look_up(cameras, _View(grid, height_m, math.inf, _size(features), stride))
         bin_at = (look.depth_m - bins.near_m) / (bins.far_m - bins.near_m) * (bins.count - 1)
         deep = torch.cat((look.place, (2 * bin_at[..., None] + 1) / bins.count - 1), -1)
-        likely = _sample(depth[:, None], deep[:, None])[:, :, 0]
-        total = total + _sample(features, look.place) * likely * within[:, None]
-        inside |= within
-    return _mean_of_cameras(total, inside, owner, agents)
+        likely = _sample(depth[:, None], deep[:, None])
+        within = look.there & (look.depth_m >= bins.near_m) & (look.depth_m <= bins.far_m)
+        found.append((look, within, _sample(features, look.place) * likely))
+    return _mean_of_cameras(found, owner, agents, grid)
+
+
+def _size(features: Tensor) -> tuple[int, int]:
+    return features.shape[-2], features.shape[-1]
 
 
 def _sample(values: Tensor, place: Tensor) -> Tensor:
-    return F.grid_sample(values, place, mode="bilinear", padding_mode="border", align_corners=False)
+    """(V, M, C) of values (V, C, ...) at place (V, ..., M, coordinates), bilinear."""
+    found = F.grid_sample(values, place[:, None], mode="bilinear", padding_mode="border", align_corners=False)
+    return found.flatten(2).mT
 
 
-def _mean_of_cameras(found: Tensor, inside: Tensor, owner: Tensor, agents: int) -> tuple[Tensor, Tensor]:
-    share = inside[:, None].to(found.dtype)
-    total = found.new_zeros(agents, *found.shape[1:]).index_add(0, owner, found * share)
-    count = found.new_zeros(agents, 1, *found.shape[2:]).index_add(0, owner, share)
-    return total / count.clamp_min(1), count[:, 0] > 0
+def _mean_of_cameras(
+    found: Sequence[tuple[_LookUp, Tensor, Tensor]], owner: Tensor, agents: int, grid: BevGrid
+) -> tuple[Tensor, Tensor]:
+    """Sums of what was found, (V, M, C) where within (V, M), on the cells of agents, over the number of cameras that see a cell."""
+    rows, columns = grid.shape
+    cells, channels = rows * columns, found[0][2].shape[2]
+    total = found[0][2].new_zeros(agents * cells, channels)
+    sees = torch.zeros(len(owner), cells, dtype=torch.bool)
+    camera = torch.arange(len(owner))[:, None]
+    for look, within, values in found:
+        total = total.index_add(0, (owner[:, None] * cells + look.cell)[within], values[within])
+        sees[camera.expand_as(within)[within], look.cell[within]] = True
+    count = total.new_zeros(agents, cells).index_add(0, owner, sees.to(total.dtype)).view(agents, rows, columns)
+    mean = total.view(agents, rows, columns, channels) / count.clamp_min(1)[..., None]
+    # Channels stay innermost in memory, as convolutions like them.
+    return mean.permute(0, 3, 1, 2), count > 0
 
 
 def _check(features: Tensor, cameras: Sequence[Camera], owner: Tensor) -> None:

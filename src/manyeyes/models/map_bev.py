@@ -7,6 +7,7 @@ same masked maximum that later joins agents (:func:`manyeyes.ops.warp.masked_max
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -17,7 +18,7 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, ConfigError, PointCloud
 from manyeyes.datatypes.camera import CameraImage
-from manyeyes.models.image_encoder import FEATURE_STRIDE, ImageEncoder, ImageEncoderConfig, Pyramid, Residual, conv
+from manyeyes.models.image_encoder import ImageEncoder, ImageEncoderConfig, Pyramid, Residual, conv
 from manyeyes.models.lift import DepthBins, lift_depth, lift_ground
 from manyeyes.ops.voxelize import MOMENTS, pillar_moments, pillar_sites
 
@@ -33,8 +34,8 @@ class BevConfig:
     """grid: what an agent sees, metres in its frame, and the pillars of the raster; its tokens lie at twice its stride.
 
     sensors: which it has. channels: of the features; raster_width: of the raster's first stage. image: the encoder of pictures,
-    which are first brought to image_size, (height, width) pixels. lift: how pictures reach the ground; heights_m and depth: of
-    ``depth`` alone.
+    which are first brought to image_size, (height, width) pixels. lift: how pictures reach the ground; coarsest_m: of ``ground``
+    alone, how much of the ground one pixel may cover; heights_m and depth: of ``depth`` alone.
     """
 
     grid: BevGrid
@@ -45,6 +46,7 @@ class BevConfig:
     image: ImageEncoderConfig = field(default_factory=ImageEncoderConfig)
     image_size: tuple[int, int] = (224, 400)
     lift: Lift = "depth"
+    coarsest_m: float = math.inf
     heights_m: tuple[float, ...] = (-0.5, 0.0, 0.5, 2.0)
     depth: DepthBins = field(default_factory=DepthBins)
 
@@ -79,16 +81,15 @@ def rasterise(clouds: Sequence[PointCloud], grid: BevGrid) -> tuple[Tensor, Tens
     return raster, raster[:, -1] > 0
 
 
-class LidarBev(nn.Module):
-    """A 2.5-D raster through a small residual network and a pyramid; a cell is seen where a return lies in or beside it."""
+class _GroundNet(nn.Module):
+    """A raster of the ground (N, inputs, rows, columns) through a small residual network and a pyramid, to the token grid."""
 
-    def __init__(self, config: BevConfig) -> None:
+    def __init__(self, inputs: int, config: BevConfig) -> None:
         super().__init__()
-        self.grid = config.grid
         width = config.raster_width
         widths = [width * 2**i for i in range(len(config.raster_blocks))]
         # Paint is narrower than a token: what is fine is read before it is made coarse.
-        self.stem = nn.Sequential(conv(len(MOMENTS) + 1, width, 3), nn.ReLU())
+        self.stem = nn.Sequential(conv(inputs, width, 3), nn.ReLU())
         stages, inputs = [], width
         for count, outputs in zip(config.raster_blocks, widths):
             blocks = [Residual(inputs, outputs, 2)] + [Residual(outputs, outputs) for _ in range(count - 1)]
@@ -97,51 +98,64 @@ class LidarBev(nn.Module):
         self.stages = nn.ModuleList(stages)
         self.pyramid = Pyramid(tuple(widths), config.channels)
 
-    def forward(self, clouds: Sequence[PointCloud]) -> tuple[Tensor, Tensor]:
-        """N clouds to features (N, C, h, w) on the token grid and what is seen (N, h, w)."""
-        raster, hit = rasterise(clouds, self.grid)
+    def read(self, raster: Tensor) -> Tensor:
+        """(N, channels, h, w)."""
         x, levels = self.stem(raster), []
         for stage in self.stages:
             x = stage(x)
             levels.append(x)
-        seen = F.max_pool2d(hit[:, None].float(), 5, 2, 2)[:, 0] > 0
-        return self.pyramid(levels), seen
+        return self.pyramid(levels)
 
 
-class CameraBev(nn.Module):
-    """Pictures through the image encoder, lifted to the ground, and smoothed there."""
+class LidarBev(_GroundNet):
+    """A 2.5-D raster of clouds; a cell is seen where a return lies in or beside it."""
 
     def __init__(self, config: BevConfig) -> None:
-        super().__init__()
+        super().__init__(len(MOMENTS) + 1, config)
+        self.grid = config.grid
+
+    def forward(self, clouds: Sequence[PointCloud]) -> tuple[Tensor, Tensor]:
+        """N clouds to features (N, C, h, w) on the token grid and what is seen (N, h, w)."""
+        raster, hit = rasterise(clouds, self.grid)
+        return self.read(raster), F.max_pool2d(hit[:, None].float(), 5, 2, 2)[:, 0] > 0
+
+
+class CameraBev(_GroundNet):
+    """Pictures through the image encoder, lifted to a raster of the ground beside where each of its cells lies."""
+
+    def __init__(self, config: BevConfig) -> None:
+        super().__init__(config.raster_width + 2, config)
         self.config = config
         self.encoder = ImageEncoder(config.image)
         bins = config.depth.count if config.lift == "depth" else 0
-        self.project = nn.Conv2d(config.image.channels, config.channels + bins, 1)
-        self.smooth = nn.Sequential(
-            Residual(config.channels, config.channels), Residual(config.channels, config.channels)
-        )
+        self.project = nn.Conv2d(config.image.channels, config.raster_width + bins, 1)
 
     def forward(self, images: Sequence[Sequence[CameraImage]]) -> tuple[Tensor, Tensor]:
         """The pictures of N agents, any number each, to features (N, C, h, w) on the token grid and what is seen (N, h, w)."""
-        config, grid = self.config, self.config.token_grid
+        config, grid = self.config, self.config.grid
         flat = [image for one in images for image in one]
         if not flat:
-            seen = torch.zeros(len(images), *grid.shape, dtype=torch.bool)
-            return torch.zeros(len(images), config.channels, *grid.shape), seen
+            shape = config.token_grid.shape
+            return torch.zeros(len(images), config.channels, *shape), torch.zeros(len(images), *shape, dtype=torch.bool)
         owner = torch.repeat_interleave(torch.arange(len(images)), torch.tensor([len(one) for one in images]))
         height, width = config.image_size
         cameras = [image.camera.resized(width, height) for image in flat]
         rgb = torch.cat([_resized(image.rgb, config.image_size) for image in flat])
-        told = self.project(self.encoder(rgb))
-        features = told[:, : config.channels]
+        told = self.project(self.encoder(rgb.contiguous(memory_format=torch.channels_last)))
+        features, stride = told[:, : config.raster_width], config.image.stride
         if config.lift == "ground":
-            bev, seen = lift_ground(features, cameras, owner, len(images), grid, FEATURE_STRIDE)
+            raster, seen = lift_ground(features, cameras, owner, len(images), grid, stride, config.coarsest_m)
         else:
-            depth = told[:, config.channels :].softmax(1)
-            bev, seen = lift_depth(
-                features, depth, cameras, owner, len(images), grid, FEATURE_STRIDE, config.depth, config.heights_m
+            depth = told[:, config.raster_width :].softmax(1)
+            raster, seen = lift_depth(
+                features, depth, cameras, owner, len(images), grid, stride, config.depth, config.heights_m
             )
-        return self.smooth(bev), seen
+        # How sharply a cell is seen depends on where it lies.
+        rows, columns = grid.shape
+        y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
+        raster = torch.cat((raster, torch.stack((x, y)).expand(len(images), 2, rows, columns)), 1)
+        near = F.max_pool2d(seen[:, None].float(), 3, 2, 1)[:, 0] > 0
+        return self.read(raster.contiguous(memory_format=torch.channels_last)), near
 
 
 def _resized(rgb: Tensor, size: tuple[int, int]) -> Tensor:

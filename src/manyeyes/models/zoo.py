@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from importlib.resources import as_file, files
 from pathlib import Path
 
+from torch import Tensor
+
 from manyeyes.datatypes import CheckpointError
 from manyeyes.models import checkpoint, feakm
 from manyeyes.models.detector import Detector
@@ -80,6 +82,12 @@ def mapper_towns(name_or_path: str | Path = MAPPER) -> tuple[str, ...]:
     """The towns whose maps taught a map model, as its card says."""
     with _mapper_file(name_or_path) as path:
         return tuple(checkpoint.read_card(path, FORMAT)["towns"])
+
+
+def mapper_state(name_or_path: str | Path = MAPPER) -> dict[str, Tensor]:
+    """The tensors of a map model by name, to begin a training from."""
+    with _mapper_file(name_or_path) as path:
+        return checkpoint.read_state(path, FORMAT)
 
 
 @contextmanager

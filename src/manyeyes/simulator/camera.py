@@ -78,6 +78,10 @@ class CameraSpec:
         u, v = width / self.width, height / self.height
         return replace(self, fx=u * self.fx, fy=v * self.fy, cx=u * self.cx, cy=v * self.cy, width=width, height=height)
 
+    def below(self, row: int) -> CameraSpec:
+        """The same view without its rows above row."""
+        return replace(self, cy=self.cy - row, height=self.height - row)
+
 
 # opv2v: front, right, left and back, 100 degrees wide (intrinsics: recordings.md; places [x, y to the right, z, yaw to the
 # right] [2.5, 0, 1.0, 0], [0, 0.3, 1.8, 100], [0, -0.3, 1.8, -100], [-2, 0, 1.5, 180] as OpenCDA, OPV2V's simulator, has them).
@@ -100,8 +104,11 @@ CAMERA_RIGS: dict[str, tuple[CameraSpec, ...]] = {
     "none": (),
     "opv2v": _OPV2V,
     "opv2v-small": tuple(camera.resized(400, 300) for camera in _OPV2V),
+    # From a little above the horizon downwards: what lies on the road.
+    "opv2v-road": tuple(camera.resized(320, 240).below(104) for camera in _OPV2V),
     "dair-infrastructure": (_DAIR,),
     "dair-infrastructure-small": (replace(_DAIR.resized(480, 270), samples=2),),
+    "dair-infrastructure-road": (replace(_DAIR.resized(320, 180), samples=2),),
 }
 
 

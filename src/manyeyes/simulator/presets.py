@@ -79,23 +79,27 @@ def _crowded(splits: tuple[SplitPreset, ...]) -> SimulationPreset:
     )
 
 
+# For maps: many places rather than many instants, a second apart; mostly OPV2V's own 64 beams, since paint lies between fewer.
+_STREETS = SimulationPreset(
+    (
+        SplitPreset("train", TOWN_SPLIT["train"], 240, ("", "", "-32", "", "", "-16")),
+        SplitPreset("validate", TOWN_SPLIT["val"], 24),
+        SplitPreset("test", TOWN_SPLIT["test"], 84),
+    ),
+    frames=4,
+    history_frames=0,
+    rate_hz=1.0,
+    vehicles=(3, 5),
+    roadside_chance=0.8,
+    density=(3.5, 8.0),
+)
+
 SIMULATION_PRESETS: dict[str, SimulationPreset] = {
     "towns-small": _crowded(_towns(150, 22, 84)),
     "towns-large": _crowded(_towns(600, 60, 200)),
-    # For maps: many places rather than many instants, a second apart; mostly OPV2V's own 64 beams, since paint lies between fewer.
-    "streets": SimulationPreset(
-        (
-            SplitPreset("train", TOWN_SPLIT["train"], 240, ("", "", "-32", "", "", "-16")),
-            SplitPreset("validate", TOWN_SPLIT["val"], 24),
-            SplitPreset("test", TOWN_SPLIT["test"], 84),
-        ),
-        frames=4,
-        history_frames=0,
-        rate_hz=1.0,
-        vehicles=(3, 5),
-        roadside_chance=0.8,
-        density=(3.5, 8.0),
-    ),
+    "streets": _STREETS,
+    # The same scenes, to the last point of their clouds, with pictures of what lies on the road.
+    "streets-pictures": replace(_STREETS, cameras="opv2v-road", roadside_cameras="dair-infrastructure-road"),
     "tiny": SimulationPreset(
         (
             SplitPreset("train", ("generated-1",), 2),

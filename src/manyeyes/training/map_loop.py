@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from manyeyes.datatypes import ConfigError
 from manyeyes.models import checkpoint
 from manyeyes.models.map_presets import FORMAT
 from manyeyes.models.mapper import Mapper, MapperConfig
@@ -19,6 +20,8 @@ from manyeyes.training.map_losses import MapLossConfig, MapTerms
 from manyeyes.training.map_samples import MapAugment, MapSamples
 from manyeyes.training.map_step import loss_terms
 from manyeyes.training.run_state import RunState, warm_cosine
+
+_LAST = ("scale", "shift")
 
 
 @dataclass(frozen=True)
@@ -69,11 +72,19 @@ class MapProgress:
 class MapRun:
     """One training run of the map model, in a folder from which it resumes."""
 
-    def __init__(self, config: MapTrainConfig, samples: MapSamples, folder: Path, seed: int) -> None:
+    def __init__(
+        self,
+        config: MapTrainConfig,
+        samples: MapSamples,
+        folder: Path,
+        seed: int,
+        start: Sequence[Mapping[str, torch.Tensor]] = (),
+    ) -> None:
         self.config, self.samples, self.seed = config, samples, seed
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             model = Mapper(config.mapper)
+        _begin_from(model, start)
         self.state = RunState(model, config, seed, folder, config.weight_decay, config.beta2)
 
     def advance(self) -> MapProgress:
@@ -97,12 +108,14 @@ def train_mapper(
     seed: int = 0,
     card: dict[str, Any] | None = None,
     report: Callable[[MapProgress], None] = lambda progress: None,
+    start: Sequence[Mapping[str, torch.Tensor]] = (),
 ) -> Path:
     """Train, or go on where the run in folder stopped; returns the file of averaged weights, whose card names the towns.
 
+    start: tensors of map models to begin from, in place of random ones where they fit; the first that has one has the say.
     Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
     """
-    run = MapRun(config, samples, folder, seed)
+    run = MapRun(config, samples, folder, seed, start)
     state = run.state
     state.finish(config.steps, config.save_every, run.advance, report)
     weights = folder / "weights.safetensors"
@@ -118,3 +131,16 @@ def train_mapper(
         }
         checkpoint.save(state.average, weights, {**about, **(card or {})}, half=True, format=FORMAT)
     return weights
+
+
+def _begin_from(model: Mapper, start: Sequence[Mapping[str, torch.Tensor]]) -> None:
+    """Tensors of these names and shapes are taken over: a model of other sensors has its tiles and its drawing in common."""
+    own = model.state_dict()
+    for state in reversed(start):
+        # Scores are calibrated in the end; what is taught is what comes before.
+        fitting = {k: v.float() for k, v in state.items() if k in own and v.shape == own[k].shape and k not in _LAST}
+        if not fitting:
+            raise ConfigError(
+                "None of the given weights' tensors fits this preset; begin from a map model of its size."
+            )
+        model.load_state_dict(fitting, strict=False)

@@ -37,12 +37,8 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
         calibrated=2,
     ),
     "map-small": _SMALL,
-    "map-small-camera": replace(
-        _SMALL, mapper=mapper_config("small", ("camera",)), augment=replace(_NOISY, flip=False)
-    ),
-    "map-small-both": replace(
-        _SMALL, mapper=mapper_config("small", ("lidar", "camera")), augment=replace(_NOISY, flip=False)
-    ),
+    "map-small-camera": replace(_SMALL, mapper=mapper_config("small", ("camera",)), steps=1600, sketch_steps=400),
+    "map-small-both": replace(_SMALL, mapper=mapper_config("small", ("lidar", "camera")), steps=800, sketch_steps=0),
     "map-paper": MapTrainConfig(
         mapper_config("paper", ("camera",)),
         steps=60000,
@@ -51,9 +47,10 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
         warm_up=500,
         save_every=500,
         calibrated=64,
-        augment=MapAugment(least=10, flip=False),
+        augment=MapAugment(least=10),
         loss=MapLossConfig(repeat=6),
     ),
 }
-"""map-toy: tests. map-small: one to ten looks a tile, two cores; its two siblings need pictures in the recording. map-paper: the
+"""map-toy: tests. map-small: one to ten looks a tile, two cores; its two siblings need pictures in the recording, and their steps
+are enough where a run begins from weights (the verb's --weights) that know tiles already. map-paper: the
 paper's ten pictures a tile and batch of eight; steps and rate are MapTRv2's, the paper gives none."""

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from manyeyes.datasets.recording import Recording
 from manyeyes.datasets.single_frames import SingleFrames, single_frames
-from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, Transform
+from manyeyes.datatypes import AgentFrame, BevGrid, Camera, CameraImage, Transform
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
 from manyeyes.evaluation.map_tiles import assert_split, cut_to, town_of
 from manyeyes.models.mapper import LOOKS, MapperConfig
@@ -197,10 +197,20 @@ _MIRROR = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
 
 
 def mirrored(look: AgentFrame) -> AgentFrame:
-    """The look seen in a mirror: left is right in its frame. One with pictures is refused: a mirror is no camera."""
-    if look.images:
-        raise ConfigError("A mirrored look would need another camera; train on pictures with MapAugment(flip=False).")
-    return replace(look, points=replace(look.points, xyz=look.points.xyz * _MIRROR.to(look.points.xyz.dtype)))
+    """The look seen in a mirror: left is right in its frame, its cloud, its cameras and their pictures."""
+    cloud = replace(look.points, xyz=look.points.xyz * _MIRROR.to(look.points.xyz.dtype))
+    return replace(look, points=cloud, images=tuple(_mirrored_image(image) for image in look.images))
+
+
+def _mirrored_image(image: CameraImage) -> CameraImage:
+    """What a camera on the other side would have taken of a mirrored world: columns swapped, and no axis of it the wrong way."""
+    camera, pose = image.camera, image.camera.agent_from_camera
+    # Mirrored in the agent's y and in the camera's x: two mirrors are a rotation.
+    rotation = _MIRROR[:, None] * pose.rotation * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    intrinsic = camera.intrinsic.clone()
+    intrinsic[0, 2] = camera.width - intrinsic[0, 2]
+    placed = Camera(intrinsic, Transform(rotation, pose.translation * _MIRROR), camera.width, camera.height)
+    return CameraImage(placed, image.rgb.flip(-1))
 
 
 def mirrored_motion(motion: Transform) -> Transform:
