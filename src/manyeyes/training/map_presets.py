@@ -37,8 +37,8 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
         calibrated=2,
     ),
     "map-small": _SMALL,
-    "map-small-camera": replace(_SMALL, mapper=mapper_config("small", ("camera",)), steps=1600, sketch_steps=400),
-    "map-small-both": replace(_SMALL, mapper=mapper_config("small", ("lidar", "camera")), steps=800, sketch_steps=0),
+    "map-small-camera": replace(_SMALL, mapper=mapper_config("small", ("camera",)), steps=1200, sketch_steps=300),
+    "map-small-both": replace(_SMALL, mapper=mapper_config("small", ("lidar", "camera")), steps=500, sketch_steps=0),
     "map-paper": MapTrainConfig(
         mapper_config("paper", ("camera",)),
         steps=60000,
