@@ -38,7 +38,14 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
     ),
     "map-small": _SMALL,
     "map-small-camera": replace(_SMALL, mapper=mapper_config("small", ("camera",)), steps=1200, sketch_steps=300),
-    "map-small-both": replace(_SMALL, mapper=mapper_config("small", ("lidar", "camera")), steps=500, sketch_steps=0),
+    "map-small-both": replace(
+        _SMALL,
+        mapper=mapper_config("small", ("lidar", "camera")),
+        steps=300,
+        learning_rate=2e-3,
+        warm_up=40,
+        sketch_steps=0,
+    ),
     "map-paper": MapTrainConfig(
         mapper_config("paper", ("camera",)),
         steps=60000,
