@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from manyeyes.apps import cli, train
+from manyeyes.apps import cli, map_evaluate, train
+from manyeyes.apps.map_model import running
 from manyeyes.apps.train_map import true_maps
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import ConfigError
@@ -50,3 +51,12 @@ def test_true_maps_are_those_of_the_scenarios_towns(recorded):
 def test_an_unknown_preset_names_the_map_presets():
     with pytest.raises(ConfigError, match="map-small"):
         train.main(train.Options(Path("nowhere"), preset="map-large"))
+
+
+@pytest.mark.slow
+def test_a_model_with_cameras_needs_pictures(recorded, capsys):
+    with pytest.raises(ConfigError, match="no pictures in generated-1_0000"):
+        train.main(train.Options(recorded, preset="map-small-camera"))
+    # Of the models that ship those are judged whose sensors the recording has.
+    options = map_evaluate.Options(study="local", data=recorded, split="test")
+    assert [model.sensors for model in running.models(options)] == ["LiDAR"]

@@ -124,6 +124,26 @@ def test_queries_begin_without_gradients_and_the_sketch_learns_from_its_own_loss
     assert all(p.grad is None for p in head.sketch.parameters())
 
 
+def test_learned_lines_follow_those_of_the_sketch_and_learn_where_they_begin():
+    config = dataclasses.replace(TINY, elements=10, learned=4)
+    head, ground = MapHead(config), torch.randn(2, 16, 10, 20)
+    sketch = head.sketch(ground)
+    start, logit, kind = head.begin(sketch)
+    plain = MapHead(TINY).begin(sketch)
+    assert torch.equal(start[:, :6], plain[0]) and torch.equal(logit[:, :6], plain[1]) and kind.shape == (2, 6)
+    # Of a probability of .01, somewhere on the tile, each elsewhere, the same in every tile.
+    torch.testing.assert_close(logit[:, 6:].sigmoid(), torch.full((2, 4, 3), 0.01))
+    lines = start[0, 6:].detach()
+    assert torch.equal(start[1, 6:], start[0, 6:]) and float(lines.min()) >= 0 and float(lines.max()) <= 1
+    assert float(torch.pdist(lines.mean(1)).min()) > 0.1
+    for move in head.moves:
+        torch.nn.init.normal_(move[-1].weight)  # untaught, nothing moves
+    drawn(head, ground)[0].point.square().sum().backward()
+    assert all(part.grad is not None and float(part.grad.abs().max()) > 0 for part in (head.start, head.own))
+    # One-to-many queries are the sketch's alone.
+    assert drawn(head, ground, "many")[0].point.shape[1] == 9
+
+
 def test_waves_tell_places_apart_to_a_hundredth_of_the_tile():
     x, y = torch.meshgrid(torch.linspace(0, 1, 101), torch.linspace(0, 1, 51), indexing="ij")
     code = waves(torch.stack((x, y), -1)).flatten(0, 1)
@@ -179,7 +199,9 @@ def test_nothing_sure_is_an_empty_map():
     assert [len(found) for found in decode(raw, TILE, TINY)] == [0, 0]
 
 
-@pytest.mark.parametrize("fields", [{"channels": 10}, {"points": 1}, {"kinds": ("divider", "kerb")}, {"kinds": ()}])
+@pytest.mark.parametrize(
+    "fields", [{"channels": 10}, {"points": 1}, {"kinds": ("divider", "kerb")}, {"kinds": ()}, {"learned": 50}]
+)
 def test_impossible_settings_are_refused(fields):
     with pytest.raises(ConfigError, match="MapHeadConfig"):
         MapHeadConfig(**{"heads": 8, **fields})

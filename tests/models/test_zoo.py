@@ -16,7 +16,7 @@ from manyeyes.models.mapper import Mapper
 def package(tmp_path, monkeypatch):
     """A package that ships one map model, beside files that are told apart by their names alone."""
     torch.manual_seed(0)
-    small = replace(TOY, head=replace(TOY.head, elements=5, many=5))
+    small = replace(TOY, head=replace(TOY.head, elements=5, learned=0, many=5))
     made = Mapper(small)
     (tmp_path / "weights").mkdir()
     checkpoint.save(made, tmp_path / "weights" / f"{zoo.MAPPER}.safetensors", {"towns": []}, half=True, format=FORMAT)

@@ -3,6 +3,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ import torch
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.models.map_head import RawMap
-from manyeyes.training import map_losses
 from manyeyes.training.map_losses import (
     MapLossConfig,
     focal,
@@ -95,12 +95,11 @@ def test_nobody_answers_for_an_element_that_is_far_from_all():
     assert near.query.tolist() == [0, 1] and near.element.tolist() == [0, 1]
 
 
-def test_the_match_is_the_best_of_all_assignments(monkeypatch):
-    monkeypatch.setattr(map_losses, "FAR", math.inf)
+def test_the_match_is_the_best_of_all_assignments():
     for seed in range(5):
         where, ring, raw = random_case(seed, elements=3, queries=4)
         target = targets(where, ring, [0, 2, 1])
-        found = match(raw.logit[0].detach(), raw.point[0].detach(), target, CONFIG)
+        found = match(raw.logit[0].detach(), raw.point[0].detach(), target, replace(CONFIG, far=math.inf))
         logit, point = raw.logit[0].detach(), raw.point[0].detach()
 
         def cost(query, element, logit=logit, point=point, target=target):

@@ -69,10 +69,22 @@ def _train(options: Options, console: Any) -> None:
 
 
 def open_looks(data: Path, split: str | None, sensors: Sequence[str]) -> Recording:
-    """The recording with what these sensors took: pictures are read where a model has cameras."""
+    """The recording with what these sensors took: pictures are read where a model has cameras, and must then be there."""
     from manyeyes.apps.recordings import open_recording
+    from manyeyes.datatypes import ConfigError
 
-    return open_recording(data, split, images="camera" in sensors)
+    recording = open_recording(data, split, images="camera" in sensors)
+    if "camera" in sensors and not has_pictures(recording):
+        raise ConfigError(
+            f"{data}: no pictures in {recording.scenarios[0]}, and the model has cameras; give a recording of 'manyeyes simulate "
+            "--preset streets-pictures' (or any preset with --cameras), or a model of agents with LiDAR."
+        )
+    return recording
+
+
+def has_pictures(recording: Recording) -> bool:
+    """Whether any agent of the first snapshot has; the recording reads them."""
+    return any(frame.images for frame in recording.snapshot(recording.scenarios[0], 0).frames)
 
 
 def true_maps(recording: Recording) -> dict[str, MapElements]:

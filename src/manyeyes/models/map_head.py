@@ -40,7 +40,8 @@ _WAVES = math.pi * 2.0 ** torch.arange(8)
 @dataclass(frozen=True)
 class MapHeadConfig:
     """kinds: of elements that are told apart, by name. elements, points: queries of one-to-one matching, and points of each;
-    many: queries of one-to-many matching, in training only. seeds: cells from which lines are followed that queries begin as, no
+    many: queries of one-to-many matching, in training only. learned: of the former's number, those that begin as lines of their own
+    rather than the sketch's, as MapTR's do. seeds: cells from which lines are followed that queries begin as, no
     fewer than these; least: how sure a cell is at least for a line to run on through it. places: looked at by each of the heads, a
     point and layer.
 
@@ -51,6 +52,7 @@ class MapHeadConfig:
     elements: int = 50
     points: int = 20
     many: int = 0
+    learned: int = 0
     seeds: int = 160
     least: float = 0.2
     channels: int = 128
@@ -64,6 +66,8 @@ class MapHeadConfig:
     def __post_init__(self) -> None:
         if self.channels % self.heads or self.points < 2 or min(self.elements, self.layers, self.places) < 1:
             raise ConfigError(f"MapHeadConfig needs channels divisible by heads and two points or more; got {self}.")
+        if not 0 <= self.learned < self.elements:
+            raise ConfigError(f"MapHeadConfig.learned are fewer than its {self.elements} elements; got {self.learned}.")
         if not self.kinds or not set(self.kinds) <= set(KINDS) or len(set(self.kinds)) != len(self.kinds):
             raise ConfigError(f"MapHeadConfig.kinds are some of {', '.join(KINDS)}; got {self.kinds}.")
 
@@ -157,6 +161,9 @@ class MapHead(nn.Module):
         self.sketch = SketchHead(c, len(config.kinds))
         self.kind = nn.Parameter(torch.randn(len(config.kinds), 2 * c))
         self.point = nn.Parameter(torch.randn(config.points, 2 * c))
+        if config.learned:
+            self.own = nn.Parameter(torch.randn(config.learned, 2 * c))
+            self.start = nn.Parameter(start_lines(config.learned, config.points))
         self.where = nn.Sequential(nn.Linear(4 * len(_WAVES), c), nn.ReLU(), nn.Linear(c, c))
         self.layers = nn.ModuleList(MapLayer(config) for _ in range(config.layers))
         self.kinds = nn.ModuleList(_kind_branch(c, len(config.kinds)) for _ in range(config.layers))
@@ -167,9 +174,11 @@ class MapHead(nn.Module):
 
         The first group begins as each line of the sketch once, the second as all that were followed, copies too.
         """
-        start, logit, kind = self.begin(sketch, group)
-        embedded, content = (self.kind[kind][:, :, None] + self.point).chunk(2, -1)
-        x, reference = content, start
+        reference, logit, kind = self.begin(sketch, group)
+        each = self.kind[kind]
+        if self.config.learned and group == "one":
+            each = torch.cat((each, self.own.expand(len(each), *self.own.shape)), 1)
+        embedded, x = (each[:, :, None] + self.point).chunk(2, -1)
         ground = ground.permute(0, 2, 3, 1)
         out = []
         for layer, say, move in zip(self.layers, self.kinds, self.moves):
@@ -182,14 +191,35 @@ class MapHead(nn.Module):
         return tuple(out)
 
     def begin(self, sketch: Sketch, group: Group = "one") -> tuple[Tensor, Tensor, Tensor]:
-        """What queries begin as: points (B, I, P, 2), logits (B, I, kinds) and kinds (B, I), of which nothing has gradients."""
+        """What queries begin as: points (B, I, P, 2), logits (B, I, kinds) and kinds of those from the sketch, which come first.
+
+        Nothing of the sketch has gradients.
+        """
         config = self.config
         rings = torch.tensor([is_ring(kind) for kind in config.kinds])
-        count, apart = (config.elements, APART) if group == "one" else (config.many, 0.0)
+        count, apart = (config.elements - config.learned, APART) if group == "one" else (config.many, 0.0)
         found = propose(sketch, rings, count, config.points, max(config.seeds, count), config.least, apart)
         own = F.one_hot(found.kind, len(config.kinds)).to(found.sure)
         # Few queries are elements of a kind that the sketch does not say: a probability of 0.01 (focal loss, Lin et al. 2017).
-        return found.point, own * (torch.logit(found.sure) + math.log(99))[..., None] - math.log(99), found.kind
+        point, logit = found.point, own * (torch.logit(found.sure) + math.log(99))[..., None] - math.log(99)
+        if config.learned and group == "one":
+            point = torch.cat((point, self.start.expand(len(point), *self.start.shape)), 1)
+            logit = torch.cat(
+                (logit, logit.new_full((len(point), config.learned, len(config.kinds)), -math.log(99))), 1
+            )
+        return point, logit, found.kind
+
+
+def start_lines(count: int, points: int) -> Tensor:
+    """(count, points, 2) straight lines all over the tile, in shares of it, 0.3 long, of all directions.
+
+    Middles and directions are the additive recurrence of least discrepancy in three dimensions (Roberts 2018).
+    """
+    ratio = torch.tensor(1.2207440846).double() ** -torch.arange(1, 4)
+    x, y, way = ((0.5 + torch.arange(count)[:, None] * ratio) % 1).unbind(-1)
+    along = torch.stack(((math.pi * way).cos(), (math.pi * way).sin()), -1)
+    middle = 0.1 + 0.8 * torch.stack((x, y), -1)
+    return (middle[:, None] + torch.linspace(-0.15, 0.15, points)[:, None] * along[:, None]).clamp(0, 1).float()
 
 
 def waves(place: Tensor) -> Tensor:

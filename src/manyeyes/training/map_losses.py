@@ -19,14 +19,16 @@ from manyeyes.ops.assignment import assign
 from manyeyes.training.map_targets import MapTarget
 
 ALPHA, GAMMA = 0.25, 2.0
-FAR = 0.2
-"""Mean over an element's points of the L1 distance, in shares of the tile, beyond which no query answers for it: where no line of
-the sketch comes near, only the sketch has something to learn, and a query that was drawn there would unlearn."""
 
 
 @dataclass(frozen=True)
 class MapLossConfig:
-    """Weights of the terms. repeat: how often each element is wanted of the one-to-many queries; many: their share of the loss."""
+    """Weights of the terms. repeat: how often each element is wanted of the one-to-many queries; many: their share of the loss.
+
+    far: mean over an element's points of the L1 distance, in shares of the tile, beyond which no query answers for it: where no
+    line of the sketch comes near, only the sketch has something to learn, and a query that was drawn there would unlearn. Queries
+    that begin as lines of their own have to be drawn from anywhere.
+    """
 
     kind: float = 2.0
     point: float = 5.0
@@ -34,6 +36,7 @@ class MapLossConfig:
     ink: float = 10.0
     sketch: float = 2.0
     repeat: int = 2
+    far: float = 0.2
     many: float = 1.0
 
 
@@ -85,7 +88,7 @@ def match(logit: Tensor, point: Tensor, target: MapTarget, config: MapLossConfig
         least, best = away.min(2)
         cost = config.kind * _focal_cost(logit)[:, target.kind] + config.point * least
         pairs = torch.from_numpy(assign(cost.double().numpy()).copy())
-        query, element = pairs[least[pairs[:, 0], pairs[:, 1]] <= FAR * point.shape[1]].unbind(1)
+        query, element = pairs[least[pairs[:, 0], pairs[:, 1]] <= config.far * point.shape[1]].unbind(1)
     return Match(query, element, target.orders[element, best[query, element]])
 
 

@@ -34,6 +34,7 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
         warm_up=10,
         save_every=20,
         augment=MapAugment(1, 3),
+        loss=MapLossConfig(far=math.inf),
         calibrated=2,
     ),
     "map-small": _SMALL,

@@ -12,11 +12,13 @@ import numpy as np
 
 from manyeyes.apps import provenance
 from manyeyes.apps.map_studies import executor_of
+from manyeyes.apps.recordings import open_recording
 from manyeyes.apps.showcase import bars, write_text
-from manyeyes.apps.train_map import open_looks, true_maps
+from manyeyes.apps.train_map import has_pictures, open_looks, true_maps
 from manyeyes.apps.viewer.map_figures import Panel, save_figure
 from manyeyes.apps.viewer.study_table import Sheet, change, markdown, number, terminal, value
 from manyeyes.apps.viewer.table import NOT_RUN
+from manyeyes.datasets.dair_index import dair_root
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.map_pool import MapClaim
@@ -62,7 +64,7 @@ def models(options: Options) -> tuple[Model, ...]:
     """The models that are judged: those given, or those that ship; refused where one was taught by a town that would judge it."""
     if options.data is None:
         raise ConfigError(f"The study {options.study!r} needs --data, a dataset of towns such as data/streets.")
-    names = options.weights or zoo.mappers()
+    names = options.weights or _shipped_for(options)
     if not names:
         raise ConfigError(
             "No map model ships with this version: give --weights FILE of 'manyeyes train --preset map-small'."
@@ -76,6 +78,13 @@ def models(options: Options) -> tuple[Model, ...]:
     if len({model.sensors for model in found}) < len(found):
         raise ConfigError(f"One model a set of sensors; got {', '.join(m.sensors for m in found)}.")
     return tuple(found)
+
+
+def _shipped_for(options: Options) -> tuple[str, ...]:
+    """The shipped models whose sensors the recording has."""
+    assert options.data is not None
+    seeing = dair_root(options.data) is None and has_pictures(open_recording(options.data, options.split, images=True))
+    return tuple(name for name in zoo.mappers() if seeing or "camera" not in zoo.load_mapper(name).config.bev.sensors)
 
 
 def tables(options: Options, console: Console, found: Sequence[Model], draw: Draw) -> dict[str, TileTable]:
