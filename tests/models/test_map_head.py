@@ -137,7 +137,7 @@ def test_learned_lines_follow_those_of_the_sketch_and_learn_where_they_begin():
     assert torch.equal(start[1, 6:], start[0, 6:]) and float(lines.min()) >= 0 and float(lines.max()) <= 1
     assert float(torch.pdist(lines.mean(1)).min()) > 0.1
     for move in head.moves:
-        torch.nn.init.normal_(move[-1].weight)  # untaught, nothing moves
+        torch.nn.init.normal_(list(move.parameters())[-2])  # untaught, nothing moves
     drawn(head, ground)[0].point.square().sum().backward()
     assert all(part.grad is not None and float(part.grad.abs().max()) > 0 for part in (head.start, head.own))
     # One-to-many queries are the sketch's alone.

@@ -187,7 +187,7 @@ def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tm
         Mapper(TINY),
         Mapper(dataclasses.replace(seeing, bev=dataclasses.replace(seeing.bev, sensors=("camera",)))),
     )
-    lidar.scale += 1.0
+    lidar.scale.add_(1.0)
     config = dataclasses.replace(CONFIG, mapper=seeing)
     random = MapRun(config, Streets(), tmp_path / "random", seed=0).state.model.state_dict()
     begun = MapRun(config, Streets(), tmp_path / "begun", 0, [lidar.state_dict(), camera.state_dict()]).state
