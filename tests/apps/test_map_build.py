@@ -19,6 +19,7 @@ from manyeyes.apps.map_folder import MapFolder, read_vector_map
 from manyeyes.apps.map_ground import Ground, grounds_of, town_named
 from manyeyes.apps.recordings import open_recording
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes.map_element import KINDS
 from manyeyes.maps.observation_file import read_observations
 from manyeyes.models import checkpoint, zoo
 from manyeyes.models.map_presets import FORMAT, TOY
@@ -198,3 +199,22 @@ def test_the_verb_on_a_simulated_recording(tmp_path, capsys) -> None:
     assert numbers["name"] == "generated-3" and numbers["observations"] == numbers["messages"] > 2
     assert held["provenance"]["config"]["options"]["source"] == "truth"
     assert Path(tmp_path / "out" / "generated-3" / "map.html").is_file()
+
+
+def test_a_real_maps_file_is_the_truth_where_no_town_is_named(tmp_path):
+    lanes = {
+        name: {
+            "lane_type": "CITY_DRIVING",
+            "left_boundary": ["(0, 0)", "(60, 0)"][::way],
+            "right_boundary": edge[::way],
+        }
+        for name, way, edge in (("a", 1, ["(0, -3.5)", "(60, -3.5)"]), ("b", -1, ["(0, 3.5)", "(60, 3.5)"]))
+    }
+    path = tmp_path / "yizhuang06.json"
+    path.write_text(json.dumps({"LANE": lanes}))
+    ground = Ground("road", ("x",), None, (0.0, 0.0), path)
+    assert ground.place is not None and ground.origin_xy == (30.0, 0.0)
+    truth = ground.place.truth
+    assert sorted(KINDS[kind] for kind in truth.kind) == ["boundary", "boundary", "divider"]
+    # A town's own map stands, whatever file is given for elsewhere.
+    assert Ground("cross", ("cross_0",), "cross", (0.0, 0.0), path).origin_xy != (30.0, 0.0)

@@ -45,6 +45,9 @@ class Options:
     """The air between all: ideal, its-g5, its-g5-27, lte-v2x, nr-sidelink, cellular."""
     pose_sigma: float = 0.0
     """Standard deviation of errors added to claimed positions, metres; headings err in proportion, 1 degree a metre."""
+    map: Path | None = None
+    """The true map of a recording that no town is named after, in its world: an intersection of V2X-Seq (.json), a map of Argoverse
+    2 (log_map_archive_*.json), or Lanelet2's .osm; without it such a map is made, not judged."""
     seed: int = 0
     """Of errors and losses."""
     out: Path = Path("out/map-build")
@@ -70,7 +73,8 @@ def main(options: Options) -> None:
     recording = open_recording(options.recording, options.split, images="camera" in sensors)
     for problem in recording.problems:
         console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
-    grounds = grounds_of(recording, recording.scenarios[: options.scenarios], options.recording.resolve().name)
+    name = options.recording.resolve().name
+    grounds = grounds_of(recording, recording.scenarios[: options.scenarios], name, options.map)
     all_numbers = []
     for ground in grounds:
         with bars(console) as progress:

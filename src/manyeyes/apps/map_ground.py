@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +25,8 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Ground:
-    """Scenarios of one piece of world. town: whose true map is known by name; None: nobody knows what is true.
+    """Scenarios of one piece of world. town: whose true map is known by name. map: a file of the true map of elsewhere, in the
+    recording's world; without either nobody knows what is true.
 
     first_xy: where the first agent begins, world metres.
     """
@@ -33,13 +35,16 @@ class Ground:
     scenarios: tuple[str, ...]
     town: str | None
     first_xy: tuple[float, float]
+    map: Path | None = None
 
     @cached_property
     def place(self) -> Place | None:
-        """The whole town: true map, ground of junctions, frame."""
-        from manyeyes.simulator.crowd.place import place
+        """The whole town, or what the file shows: true map, ground of junctions, frame."""
+        from manyeyes.simulator.crowd.place import place, place_of_map
 
-        return None if self.town is None else place(self.town, None)
+        if self.town is not None:
+            return place(self.town, None)
+        return None if self.map is None else place_of_map(self.map)
 
     @property
     def frame(self) -> Frame:
@@ -68,15 +73,18 @@ class Ground:
         return self.cut(clip(whole, observed_area([o.view for o in observations], true_poses)))
 
 
-def grounds_of(recording: Recording, scenarios: Sequence[str], otherwise: str) -> list[Ground]:
-    """The grounds of the scenarios: one a town, and one, called otherwise, of all whose names are no town's."""
+def grounds_of(
+    recording: Recording, scenarios: Sequence[str], otherwise: str, real: Path | None = None
+) -> list[Ground]:
+    """The grounds of the scenarios: one a town, and one, called otherwise, of all whose names are no town's; real: its map."""
     groups: dict[str | None, list[str]] = {}
     for scenario in scenarios:
         groups.setdefault(town_named(scenario), []).append(scenario)
     found = []
     for town, own in groups.items():
         x, y = recording.snapshot(own[0], 0).frames[0].world_from_agent.translation[:2].round().tolist()
-        found.append(Ground(otherwise if town is None else town.lower(), tuple(own), town, (x, y)))
+        mapped = real if town is None else None
+        found.append(Ground(otherwise if town is None else town.lower(), tuple(own), town, (x, y), mapped))
     return found
 
 

@@ -83,6 +83,8 @@ def models(options: Options) -> tuple[Model, ...]:
 def _shipped_for(options: Options) -> tuple[str, ...]:
     """The shipped models whose sensors the recording has."""
     assert options.data is not None
+    if not zoo.mappers():
+        return ()
     seeing = dair_root(options.data) is None and has_pictures(open_recording(options.data, options.split, images=True))
     return tuple(name for name in zoo.mappers() if seeing or "camera" not in zoo.load_mapper(name).config.bev.sensors)
 

@@ -15,6 +15,7 @@ from manyeyes.datatypes import ConfigError, MissingExtraError
 from manyeyes.datatypes.map_element import CROSSING, MapElements
 from manyeyes.maps.formats.argoverse2_map import read_argoverse2_map, read_argoverse2_poses
 from manyeyes.maps.formats.lanelet2 import lanelet2_origin, read_lanelet2
+from manyeyes.maps.formats.v2x_seq_map import read_v2x_seq_map
 from manyeyes.maps.observation import Frame
 from manyeyes.maps.road_network import RoadNetwork
 from manyeyes.maps.transverse_mercator import degrees_from_metres
@@ -105,6 +106,19 @@ def _place(name: str, size_m: float | None, data: str | None) -> Place:
         path = _data(data) / "lanelet2" / "mapping_example.osm"
         return place_of(read_lanelet2(path), name, TruthPolicy(), size_m, lanelet2_origin(path))
     raise ConfigError(f"Unknown place '{name}'; known: {', '.join(PLACES)}, grid-<n>, {GENERATED}<seed>.")
+
+
+@lru_cache(maxsize=4)
+def place_of_map(path: Path) -> Place:
+    """A place out of a file of a real map: an intersection of V2X-Seq, a map (or log) of Argoverse 2, or Lanelet2's .osm."""
+    origin = (0.0, 0.0)
+    if path.suffix == ".osm":
+        network, origin = read_lanelet2(path), lanelet2_origin(path)
+    elif path.is_dir() or path.name.startswith("log_map_archive_"):
+        network = read_argoverse2_map(path)
+    else:
+        network = read_v2x_seq_map(path)
+    return place_of(network, path.stem, TruthPolicy(), None, origin)
 
 
 def place_of(
