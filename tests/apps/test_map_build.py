@@ -199,6 +199,8 @@ def test_the_verb_on_a_simulated_recording(tmp_path, capsys) -> None:
     assert numbers["name"] == "generated-3" and numbers["observations"] == numbers["messages"] > 2
     assert held["provenance"]["config"]["options"]["source"] == "truth"
     assert Path(tmp_path / "out" / "generated-3" / "map.html").is_file()
+    assert cli.main([*words, "--map", str(tmp_path / "other.json"), "--out", str(tmp_path / "two")]) == 1
+    assert "named after a town" in capsys.readouterr().err and not (tmp_path / "two").exists()
 
 
 def test_a_real_maps_file_is_the_truth_where_no_town_is_named(tmp_path):

@@ -75,6 +75,10 @@ def main(options: Options) -> None:
         console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
     name = options.recording.resolve().name
     grounds = grounds_of(recording, recording.scenarios[: options.scenarios], name, options.map)
+    if options.map is not None and all(ground.map is None for ground in grounds):
+        raise ConfigError(
+            f"--map {options.map}: every scenario is named after a town, whose own map is known; leave it out."
+        )
     all_numbers = []
     for ground in grounds:
         with bars(console) as progress:
