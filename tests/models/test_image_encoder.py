@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The encoder of pictures: sizes, alignment of its levels, and that looks do not know of each other."""
 
+import dataclasses
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -63,3 +65,37 @@ def test_fifty_layers_have_their_published_width():
 def test_one_stage_is_refused():
     with pytest.raises(ConfigError, match="two or more stages"):
         ImageEncoderConfig((2,))
+
+
+def test_what_is_computed_again_is_the_same_to_the_last_bit_and_told_to_running_statistics_once():
+    config = ImageEncoderConfig((2, 1), 8, True, 16)
+    kept, again = ImageEncoder(config), ImageEncoder(dataclasses.replace(config, recompute=True))
+    again.load_state_dict(kept.state_dict())
+    rgb = torch.randint(0, 256, (3, 3, 40, 56), dtype=torch.uint8)
+    outs = [net.train()(rgb) for net in (kept, again)]
+    for net, out in zip((kept, again), outs):
+        out.square().sum().backward()
+        assert all(bool((p.grad != 0).any()) for name, p in net.named_parameters() if "weight" in name)
+    assert torch.equal(*outs)
+    assert all(torch.equal(p.grad, q.grad) for p, q in zip(kept.parameters(), again.parameters(), strict=True))
+    assert all(torch.equal(p, q) for p, q in zip(kept.state_dict().values(), again.state_dict().values(), strict=True))
+    assert all(module.momentum for module in again.modules() if isinstance(module, torch.nn.BatchNorm2d))
+    with torch.no_grad():
+        assert torch.equal(kept.eval()(rgb), again.eval()(rgb))
+
+
+def test_fewer_activations_are_kept_where_they_are_computed_again():
+    def kept_bytes(recompute):
+        sizes = []
+
+        def pack(x):
+            sizes.append(x.nbytes)
+            return x
+
+        net = ImageEncoder(ImageEncoderConfig((2, 2), 8, True, 16, recompute=recompute)).train()
+        own = {p.data_ptr() for p in net.parameters()}
+        with torch.autograd.graph.saved_tensors_hooks(lambda x: pack(x) if x.data_ptr() not in own else x, lambda x: x):
+            net(torch.zeros(2, 3, 64, 64))
+        return sum(sizes)
+
+    assert kept_bytes(True) < kept_bytes(False) / 2

@@ -28,7 +28,7 @@ from manyeyes.models.map_bev import BevConfig
 from manyeyes.models.map_head import MapHeadConfig, decode
 from manyeyes.models.map_presets import FORMAT
 from manyeyes.models.mapper import Mapper, MapperConfig
-from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.ops.keyed_random import keyed_generator, keyed_uniform
 from manyeyes.training.map_loop import MapRun, MapTrainConfig, train_mapper
 from manyeyes.training.map_presets import MAP_TRAINING
 from manyeyes.training.map_samples import MapSample, inked
@@ -105,6 +105,32 @@ def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path):
     assert same_state(resumed.state.model, whole.state.model) and same_state(resumed.state.average, whole.state.average)
     with pytest.raises(CheckpointError, match="another configuration or seed"):
         MapRun(CONFIG, Streets(), tmp_path / "broken", seed=4)
+
+
+def test_a_batch_in_parts_goes_down_the_mean_of_its_parts(tmp_path):
+    config = dataclasses.replace(CONFIG, batch=4, at_once=3)
+    run = MapRun(config, Streets(), tmp_path, seed=3)
+    losses, gradients = [], []
+    for part in (range(3), range(3, 4)):
+        model = MapRun(config, Streets(), tmp_path / "alone", seed=3).state.model.train()
+        samples = [Streets().draw(number) for number in part]
+        looks = sum(len(sample.looks) for sample in samples)
+        thin = config.thin * keyed_uniform((looks,), "thin", 3, part.start).float()
+        loss = loss_terms(model, samples, config.loss, thin, config.sketch_steps == 0).total(config.loss)
+        loss.backward()
+        losses.append(float(loss.detach()))
+        gradients.append([torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()])
+    seen = []
+    run.state.optimiser.register_step_pre_hook(
+        lambda *_: seen.extend(torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in run.state.model.parameters())
+    )
+    progress = run.advance()
+    assert progress.loss == pytest.approx(0.75 * losses[0] + 0.25 * losses[1], rel=1e-6)
+    assert float(progress.terms.total(config.loss)) == pytest.approx(progress.loss, rel=1e-5)
+    expected = [0.75 * a + 0.25 * b for a, b in zip(*gradients)]
+    length = float(torch.stack([g.square().sum() for g in expected]).sum().sqrt())
+    shrink = min(1.0, config.clip / length)
+    assert all(torch.allclose(g, shrink * e, atol=1e-5, rtol=1e-4) for g, e in zip(seen, expected, strict=True))
 
 
 def shrunk_paper():

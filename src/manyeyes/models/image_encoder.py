@@ -8,11 +8,15 @@ over channels together does not learn from rasters, most of whose cells are empt
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from manyeyes.datatypes import ConfigError
 
@@ -23,7 +27,8 @@ class ImageEncoderConfig:
 
     bottleneck: 1-3-1 blocks with four times the channels (ResNet-50 is (3, 4, 6, 3), 64, True); else 3-3 blocks
     (ResNet-18 is (2, 2, 2, 2), 64, False). channels: of the pyramid and of what comes out. stride: pixels of the picture a pixel of
-    what comes out, along each axis, 8 or 4; feature o is centred on pixel stride * o.
+    what comes out, along each axis, 8 or 4; feature o is centred on pixel stride * o. recompute: training keeps what blocks begin from
+    and computes the rest again for its gradients, the same to the last bit: more time for a fraction of the memory.
     """
 
     blocks: tuple[int, ...] = (2, 2, 2, 2)
@@ -31,6 +36,7 @@ class ImageEncoderConfig:
     bottleneck: bool = False
     channels: int = 128
     stride: int = 8
+    recompute: bool = False
 
     def __post_init__(self) -> None:
         if len(self.blocks) < 2 or min(self.blocks) < 1:
@@ -110,12 +116,36 @@ class ImageEncoder(nn.Module):
         self.stages = nn.ModuleList(stages)
         self.finest = 1 if config.stride == 8 else 0
         self.pyramid = Pyramid(tuple(widths[self.finest :]), config.channels)
+        self.recompute = config.recompute
 
     def forward(self, rgb: Tensor) -> Tensor:
         """(V, 3, h, w) uint8, or floats in [0, 255], to (V, channels, ceil(h / stride), ceil(w / stride))."""
-        x = self.stem(rgb.to(torch.float32) / 64 - 2)
+        x = self._through(self.stem, rgb.to(torch.float32) / 64 - 2)
         levels = []
         for stage in self.stages:
-            x = stage(x)
+            for block in stage.children():
+                x = self._through(block, x)
             levels.append(x)
         return self.pyramid(levels[self.finest :])
+
+    def _through(self, part: nn.Module, x: Tensor) -> Tensor:
+        if not (self.recompute and self.training and torch.is_grad_enabled()):
+            return part(x)
+        return cast(
+            Tensor,
+            checkpoint(part, x, use_reentrant=False, context_fn=lambda: (nullcontext(), _statistics_kept(part))),
+        )
+
+
+@contextmanager
+def _statistics_kept(part: nn.Module) -> Iterator[None]:
+    """While it is computed again, a norm has told its running statistics already."""
+    norms = [module for module in part.modules() if isinstance(module, nn.BatchNorm2d)]
+    before = [(norm, norm.momentum, norm.num_batches_tracked) for norm in norms]
+    for norm in norms:
+        norm.momentum, norm.num_batches_tracked = 0.0, None
+    try:
+        yield
+    finally:
+        for norm, momentum, batches in before:
+            norm.momentum, norm.num_batches_tracked = momentum, batches

@@ -61,7 +61,7 @@ PAPER = MapperConfig(
         channels=256,
         raster_width=64,
         raster_blocks=(2, 2, 2),
-        image=ImageEncoderConfig((3, 4, 6, 3), 64, True, 256),
+        image=ImageEncoderConfig((3, 4, 6, 3), 64, True, 256, recompute=True),
         image_size=(480, 640),
         depth=DepthBins(1.0, 69.0, 69),
     ),

@@ -168,7 +168,8 @@ class FeakmRun:
         layers = state.model.matcher(Points.of(ego), Points.of(other))
         loss = matching_loss(layers, truth)
         rate = config.learning_rate * warm_cosine(config.warm_up, state.step, config.steps)
-        state.descend(loss, rate, config.clip, config.ema)
+        state.backward(loss)
+        state.descend(rate, config.clip, config.ema)
         recall, precision = found_right(layers[-1], truth, config.net.matcher.threshold)
         return MatchProgress(state.step, config.steps, float(loss.detach()), recall, precision, rate, state.seconds)
 

@@ -101,7 +101,8 @@ class Run:
         threshold = prune_threshold(config, state.step, self.steps)
         terms = loss_terms(model, samples, config.targets, threshold, config.loss.together, config.loss.target)
         loss, rate = terms.total(config.loss), learning_rate(config, state.step, self.steps)
-        state.descend(loss, rate, config.clip, config.ema)
+        state.backward(loss)
+        state.descend(rate, config.clip, config.ema)
         return Progress(state.step, self.steps, float(loss.detach()), terms, rate, state.seconds)
 
 

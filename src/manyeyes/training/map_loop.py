@@ -32,7 +32,8 @@ class MapTrainConfig:
     the model knows tiles of many bytes and of few. ema: decay of the averaged weights that are saved. beta2: decay of Adam's mean
     square; at the usual 0.999 it still divides by the great gradients of the start when half of a short run is over. sketch_steps:
     first steps in which the decoder is not taught, since what it would begin from shows nothing yet. calibrated: tiles that follow
-    those of the last step, by which scores are brought to what is true in the end; without any they stay as they are.
+    those of the last step, by which scores are brought to what is true in the end; without any they stay as they are. at_once:
+    tiles that a process holds in memory together; parts of a batch are normed each by itself, as those of several processes are.
     """
 
     mapper: MapperConfig
@@ -47,6 +48,7 @@ class MapTrainConfig:
     thin: float = 0.9
     sketch_steps: int = 0
     calibrated: int = 0
+    at_once: int = 8
     save_every: int = 100
     augment: MapAugment = field(default_factory=MapAugment)
     loss: MapLossConfig = field(default_factory=MapLossConfig)
@@ -91,14 +93,18 @@ class MapRun:
         """One step of the optimiser."""
         config, state = self.config, self.state
         numbers = state.numbers(config.batch)
-        samples = [self.samples.draw(number) for number in numbers]
-        looks = sum(len(sample.looks) for sample in samples)
-        thin = config.thin * keyed_uniform((looks,), "thin", self.seed, numbers.start).float()
-        terms = loss_terms(state.model.train(), samples, config.loss, thin, state.step >= config.sketch_steps)
-        loss = terms.total(config.loss)
+        loss, parts = 0.0, []
+        for first in numbers[:: config.at_once]:
+            part = [self.samples.draw(number) for number in numbers[first - numbers.start :][: config.at_once]]
+            looks = sum(len(sample.looks) for sample in part)
+            thin = config.thin * keyed_uniform((looks,), "thin", self.seed, first).float()
+            terms = loss_terms(state.model.train(), part, config.loss, thin, state.step >= config.sketch_steps)
+            share = len(part) / len(numbers)
+            loss += state.backward(terms.total(config.loss), share)
+            parts.append(terms.shared(share))
         rate = config.learning_rate * warm_cosine(config.warm_up, state.step, config.steps)
-        state.descend(loss, rate, config.clip, config.ema)
-        return MapProgress(state.step, config.steps, float(loss.detach()), terms, rate, state.seconds)
+        state.descend(rate, config.clip, config.ema)
+        return MapProgress(state.step, config.steps, loss, MapTerms.summed(parts), rate, state.seconds)
 
 
 def train_mapper(

@@ -8,7 +8,7 @@ as much (docs/mapper.md); focal loss, Lin et al., ICCV 2017. Terms of points are
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
@@ -58,6 +58,15 @@ class MapTerms:
         """Where nothing was drawn."""
         nothing = sketch.new_zeros(())
         return cls(nothing, nothing, nothing, ink, sketch, nothing)
+
+    def shared(self, share: float) -> MapTerms:
+        """What they count where they are of this share of a batch, without their gradients."""
+        return MapTerms(**{name: share * value.detach() for name, value in vars(self).items()})
+
+    @classmethod
+    def summed(cls, parts: Sequence[MapTerms]) -> MapTerms:
+        """The terms of a batch from those of its parts."""
+        return cls(**{f.name: torch.stack([getattr(part, f.name) for part in parts]).sum() for f in fields(cls)})
 
     def total(self, config: MapLossConfig) -> Tensor:
         """The loss."""

@@ -55,6 +55,7 @@ MAP_TRAINING: dict[str, MapTrainConfig] = {
         warm_up=500,
         save_every=500,
         calibrated=64,
+        at_once=1,
         augment=MapAugment(least=10),
         loss=MapLossConfig(repeat=6),
     ),

@@ -68,19 +68,24 @@ class RunState(Generic[Model]):
         first = self.step * batch + self.rank * share
         return range(first, first + share)
 
-    def descend(self, loss: Tensor, rate: float, clip: float, decay: float) -> None:
-        """One step down the mean loss of all processes; the average follows with this decay, faster at the start."""
-        if not bool(torch.isfinite(loss)):
+    def backward(self, loss: Tensor, share: float = 1.0) -> float:
+        """The gradient of a loss that counts for this share of the step's, added to what is there; returns its part of the loss."""
+        value = float(loss.detach())
+        if not math.isfinite(value):
             raise ConfigError(
-                f"The loss is {float(loss.detach())} at step {self.step}; lower the learning rate, or resume from an older save."
+                f"The loss is {value} at step {self.step}; lower the learning rate, or resume from an older save."
             )
+        (loss * share).backward()
+        return value * share
+
+    def descend(self, rate: float, clip: float, decay: float) -> None:
+        """One step down the mean loss of all processes; the average follows with this decay, faster at the start."""
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
         self._share()
         nn.utils.clip_grad_norm_(self.model.parameters(), clip)
         self.optimiser.step()
+        self.optimiser.zero_grad(set_to_none=True)
         self._follow(min(decay, (1 + self.step) / (10 + self.step)))
         self.step += 1
         self.seconds += time.monotonic() - self._since
