@@ -45,12 +45,20 @@ def main() -> None:
             begun, spent = run.state.step, run.state.seconds
             if not begun:
                 size = sum(p.numel() for p in run.state.model.parameters())
-                print(f"{options.preset}: {size:,} parameters, batch of {config.batch}, {config.at_once} at once", flush=True)
+                print(
+                    f"{options.preset}: {size:,} parameters, batch of {config.batch}, {config.at_once} at once",
+                    flush=True,
+                )
             progress = run.advance()
             run.state.save()
-            terms = ", ".join(f"{name} {value:.3f}" for name, value in progress.line().items() if name not in ("step", "lr"))
+            terms = ", ".join(
+                f"{name} {value:.3f}" for name, value in progress.line().items() if name not in ("step", "lr")
+            )
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / GIB
-            print(f"step {begun} to {run.state.step}: {terms}; {run.state.seconds - spent:.0f} s, peak {peak:.1f} GiB", flush=True)
+            print(
+                f"step {begun} to {run.state.step}: {terms}; {run.state.seconds - spent:.0f} s, peak {peak:.1f} GiB",
+                flush=True,
+            )
             del run
             gc.collect()
 

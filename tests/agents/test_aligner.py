@@ -255,3 +255,32 @@ def test_nobody_heard_and_unknown_correctors() -> None:
     assert (found.messages, found.verdicts, dict(found.states)) == ((), (), {})
     with pytest.raises(ConfigError, match="known: vote, given"):
         Aligner(corrector="magic")
+
+
+def body(pose: Transform) -> Boxes:
+    """The vehicle that carries an agent there."""
+    one = torch.ones(1, dtype=torch.float64)
+    found = Boxes.of(
+        pose.translation[None] + torch.tensor([0.0, 0.0, 0.8]), torch.tensor([[4.6, 1.85, 1.6]]), one * float(pose.yaw)
+    )
+    return replace(found, sigma_xy=0.1 * one, sigma_yaw=0.02 * one, flip=0.01 * one)
+
+
+def meeting(pole: bool, late_ns: int) -> Any:
+    """Ego and sender share one car, and see each other; a claim 0.8 m off."""
+    shared, sender = cars(1, 14), OTHERS[0]
+    told = Boxes.cat([shared, body(EGO)])
+    message = replace(said(told, sender, off=(0.6, -0.5, 0.01)), is_infrastructure=pole)
+    seen = eyes(Boxes.cat([shared, body(sender)]))
+    return Aligner().align(frame(late_ns), seen, [message], {}), sender
+
+
+def test_vehicles_that_see_each_other_are_landmarks_themselves() -> None:
+    found, sender = meeting(pole=False, late_ns=0)
+    (verdict,) = found.verdicts
+    assert verdict.use is Use.CORRECTED and verdict.estimate.inliers == 3
+    assert apart(found.messages[0], sender)[0] < 0.15
+    # A pole is no vehicle that the ego could have seen, and where a sender was it may not be any more.
+    for pole, late_ns in ((True, 0), (False, 100_000_000)):
+        (verdict,) = meeting(pole, late_ns)[0].verdicts
+        assert verdict.estimate.inliers < 3

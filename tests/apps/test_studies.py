@@ -137,6 +137,22 @@ def test_disturbances_are_played_by_name(data, weights, tmp_path, panels) -> Non
         chosen(["4 s"], robustness.ALL)
 
 
+def test_rival_fusions_are_held_against_ours_under_each_disturbance(data, weights, tmp_path, panels, capsys) -> None:
+    words = ("--methods", "intermediate", "--every", 2, "--disturbances", "0.4 s", "--branches", f"same={weights}")
+    held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
+    assert [(r["method"], r["disturbance"]["delay_s"]) for r in held["rows"]] == [
+        ("intermediate", 0), ("same", 0), ("intermediate", 0.4), ("same", 0.4),
+    ]  # fmt: skip
+    # A rival of the same weights is as good, and loses as much.
+    for ours, same in (held["rows"][:2], held["rows"][2:]):
+        assert ours["ap"] == same["ap"] and ours["lost"] == same["lost"]
+    against = [c for c in held["claims"] if "intermediate - same" in c["what"]]
+    assert len(against) == 4 and all(c["difference"]["value"] == 0 for c in against)
+    common = ("evaluate", "--data", data, "--split", "test", "--weights", weights, "--study", "robustness")
+    assert cli.main([str(word) for word in (*common, "--out", tmp_path / "b", "--branches", f"late={weights}")]) != 0
+    assert "methods of the names late" in capsys.readouterr().err and not (tmp_path / "b").exists()
+
+
 def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(
     data, weights, tmp_path, monkeypatch, few, panels
 ) -> None:

@@ -122,7 +122,9 @@ def test_a_batch_in_parts_goes_down_the_mean_of_its_parts(tmp_path):
         gradients.append([torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()])
     seen = []
     run.state.optimiser.register_step_pre_hook(
-        lambda *_: seen.extend(torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in run.state.model.parameters())
+        lambda *_: seen.extend(
+            torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in run.state.model.parameters()
+        )
     )
     progress = run.advance()
     assert progress.loss == pytest.approx(0.75 * losses[0] + 0.25 * losses[1], rel=1e-6)

@@ -2,7 +2,8 @@
 """Before messages are fused: where their senders really are, from what both detect; whom not to believe; who drifts.
 
 No byte is added for this: the landmarks of a sender are the boxes it sends, or those that its tokens propose, or, where it
-sends its cloud, what the ego's own eyes find in it. Boxes seen earlier are moved by their velocity to the ego's instant.
+sends its cloud, what the ego's own eyes find in it, and beside them its own vehicle, which others see. Boxes seen earlier are
+moved by their velocity to the ego's instant.
 Where the corrector is FeaKM's, senders add descriptors, and the boxes that these describe where they send none
 (describing.py): 32 and 13 bytes an object. Spec: specs/pose.md 4.4, 4.7, 4.8.
 """
@@ -149,14 +150,17 @@ class Aligner:
     def own_landmarks(self, frame: AgentFrame, eyes: Eyes) -> Landmarks:
         """What an agent itself sees, as far as the corrector goes by it."""
         if self.net is None:
-            return self._landmarks(eyes.see(frame).boxes, None, 0.0)
+            seen = self._landmarks(eyes.see(frame).boxes, None, 0.0)
+            return seen if frame.is_infrastructure else seen.with_body()
         points = seen_points(self.net, eyes, frame)
         return self._landmarks(points.boxes, points.descriptor, 0.0)
 
     def _told_landmarks(self, eyes: Eyes, message: Message, seconds: float) -> Landmarks:
         """What a message says that left so long ago; nothing, where the corrector needs descriptors and none came."""
         if self.net is None:
-            return self._landmarks(boxes_of(eyes, message), None, seconds)
+            told = self._landmarks(boxes_of(eyes, message), None, seconds)
+            # Where a sender was is not where it is: how fast it goes, it does not say.
+            return told if message.is_infrastructure or seconds else told.with_body()
         points = told_points(message)
         return Landmarks.empty() if points is None else self._landmarks(points.boxes, points.descriptor, seconds)
 

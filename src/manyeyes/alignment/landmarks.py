@@ -38,6 +38,11 @@ class DetectorError:
             )
 
 
+BODY = DetectorError(0.3, 0.03, 0.01)
+"""How far the middle of a vehicle may lie off the origin of its own frame, and its heading off the frame's."""
+BODY_SIZE_M = (4.5, 1.9)
+
+
 @dataclass(frozen=True)
 class Landmarks:
     """N objects on the ground in one agent's frame (x forward, y left).
@@ -107,6 +112,21 @@ class Landmarks:
         """None."""
         zero = np.zeros(0)
         return cls(np.zeros((0, 2)), zero, np.zeros((0, 2)), zero, zero, zero, zero, np.zeros(0, np.int64))
+
+    def with_body(self) -> Landmarks:
+        """And the vehicle itself that looks out of this frame's origin: it does not see itself, but others do."""
+        one = np.ones(1)
+        own = Landmarks(
+            np.zeros((1, 2)),
+            np.zeros(1),
+            np.array([BODY_SIZE_M]),
+            one,
+            BODY.sigma_xy_m * one,
+            BODY.sigma_yaw_rad * one,
+            BODY.flip * one,
+            np.zeros(1, np.int64),
+        )
+        return Landmarks.cat([self, own])
 
     @classmethod
     def cat(cls, many: Sequence[Landmarks]) -> Landmarks:

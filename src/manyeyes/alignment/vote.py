@@ -37,7 +37,8 @@ class VoteConfig:
     pair (3 degrees of freedom; 14.16 is p = 0.003). area_m2: see the module, fitted on simulated crossings. apart_m,
     apart_rad: answers that differ by less are one. still_m: what moved less between instants counts once. trust: degrees
     of freedom that stated errors are worth against those that the pairs show. shared: the part of a box's variance that
-    all boxes of one view have in common, which no number of pairs averages out.
+    all boxes of one view have in common, which no number of pairs averages out. across: error of a place across its heading, as a
+    share of that along it, which is the one that landmarks state.
     """
 
     reach_m: float = 300.0
@@ -58,12 +59,13 @@ class VoteConfig:
     still_m: float = 1.5
     trust: float = 10.0
     shared: float = 0.0
+    across: float = 1.0
 
     def __post_init__(self) -> None:
         if min(self.landmarks, self.edges, self.hypotheses, self.refined) < 1 or not self.shortest_m < self.longest_m:
             raise ConfigError("VoteConfig needs caps of at least 1 and shortest_m < longest_m.")
-        if not (self.trust > 0 and 0 <= self.shared < 1):
-            raise ConfigError("VoteConfig needs trust > 0 and shared in [0, 1).")
+        if not (self.trust > 0 and 0 <= self.shared < 1 and 0 < self.across <= 1):
+            raise ConfigError("VoteConfig needs trust > 0, shared in [0, 1) and across in (0, 1].")
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ _Found = tuple[Floats, Floats, Ints, Floats, float]
 def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None) -> list[_Found]:
     """Distinct refined poses a_from_b, best first."""
     numbers_a, numbers_b = _numbers(a), _numbers(b)
+    exact_a, exact_b = _exact(a, config.across), _exact(b, config.across)
     may = loops.compatible(a.size, b.size, a.instant, b.instant, config.size_gate_m)
     poses = _hypotheses(a, b, may, config)
     grid = loops.grid_of(numbers_a[0], config.tau_m)
@@ -125,7 +128,7 @@ def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None
         best = np.concatenate((best, start[None]))
     found = []
     for pose in best:
-        pose, information, pairs, misfit = loops.refine(pose, numbers_a, numbers_b, may, 1.0, config.pair_gate, 14)
+        pose, information, pairs, misfit = loops.refine(pose, exact_a, exact_b, may, 1.0, config.pair_gate, 14)
         if len(pairs):
             found.append((pose, information, pairs, misfit, _score(a, b, pose, pairs, misfit, config)))
     found.sort(key=lambda f: (-f[4], *f[0]))
@@ -134,6 +137,15 @@ def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None
 
 def _numbers(x: Landmarks) -> tuple[Floats, Floats, Floats, Floats]:
     return tuple(np.ascontiguousarray(v) for v in (x.xy, x.yaw, x.sigma_xy, x.sigma_yaw))  # type: ignore[return-value]
+
+
+def _exact(x: Landmarks, across: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """As ``_numbers``, with the places' covariances (N, 3): xx, xy and yy, less across the heading than along it."""
+    xy, yaw, sigma_xy, sigma_yaw = _numbers(x)
+    c, s = np.cos(yaw), np.sin(yaw)
+    share = across * across
+    shape = np.stack((c * c + share * s * s, (1 - share) * c * s, s * s + share * c * c), 1)
+    return xy, yaw, shape * sigma_xy[:, None] ** 2, sigma_yaw
 
 
 def _hypotheses(a: Landmarks, b: Landmarks, may: NDArray[np.bool_], config: VoteConfig) -> Floats:
@@ -207,8 +219,8 @@ def _covariance(information: Floats, pairs: int, misfit: float, freedom: int, co
     """
     scale = (config.trust + misfit) / (config.trust + freedom)
     covariance = np.asarray(np.linalg.inv(information) * scale, np.float64)
-    # information[0, 0] sums the pairs' inverse variances along an axis.
-    covariance[[0, 1], [0, 1]] += config.shared * pairs / information[0, 0]
+    # The first two of the diagonal sum the pairs' inverse variances along an axis.
+    covariance[[0, 1], [0, 1]] += config.shared * pairs * 2 / (information[0, 0] + information[1, 1])
     return covariance
 
 

@@ -188,12 +188,25 @@ def distinct(poses, order, middle, at_most, apart, turn):  # pragma: no cover - 
 
 
 @njit(cache=True, nogil=True)
+def weight_of(error_a, error_b, c, s, slack):  # pragma: no cover - compiled
+    """xx, xy and yy of the inverse covariance, in a's axes, of where two landmarks are from each other: errors (3,) are xx, xy
+    and yy of each in its own frame, a's turned from b's by an angle of cosine c and sine s, and slack of both axes (m).
+    """
+    bxx, bxy, byy = error_b[0], error_b[1], error_b[2]
+    xx = error_a[0] + c * c * bxx - 2.0 * c * s * bxy + s * s * byy + slack * slack
+    yy = error_a[2] + s * s * bxx + 2.0 * c * s * bxy + c * c * byy + slack * slack
+    xy = error_a[1] + c * s * (bxx - byy) + (c * c - s * s) * bxy
+    size = xx * yy - xy * xy
+    return yy / size, -xy / size, xx / size
+
+
+@njit(cache=True, nogil=True)
 def pair_up(pose, a, b, may, slack, gate):  # pragma: no cover - compiled
     """One-to-one pairs (P, 2), nearest first, and their squared misfits (P,) in standard deviations (3 numbers a
-    pair).
+    pair). a, b: xy, yaw, error (xx, xy and yy of the place's covariance), sigma_yaw.
     """
-    xy_a, yaw_a, sxy_a, syaw_a = a
-    xy_b, yaw_b, sxy_b, syaw_b = b
+    xy_a, yaw_a, error_a, syaw_a = a
+    xy_b, yaw_b, error_b, syaw_b = b
     c, s = np.cos(pose[2]), np.sin(pose[2])
     rows = np.empty((len(xy_a) * len(xy_b), 2), np.int64)
     cost = np.empty(len(xy_a) * len(xy_b))
@@ -202,12 +215,14 @@ def pair_up(pose, a, b, may, slack, gate):  # pragma: no cover - compiled
         x = c * xy_b[k, 0] - s * xy_b[k, 1] + pose[0]
         y = s * xy_b[k, 0] + c * xy_b[k, 1] + pose[1]
         for i in range(len(xy_a)):
-            spread = sxy_a[i] ** 2 + sxy_b[k] ** 2 + slack * slack
-            square = (x - xy_a[i, 0]) ** 2 + (y - xy_a[i, 1]) ** 2
-            if square > gate * spread or not may[i, k]:
+            dx, dy = x - xy_a[i, 0], y - xy_a[i, 1]
+            widest = error_a[i, 0] + error_a[i, 2] + error_b[k, 0] + error_b[k, 2] + slack * slack
+            if dx * dx + dy * dy > gate * widest or not may[i, k]:
                 continue
+            wxx, wxy, wyy = weight_of(error_a[i], error_b[k], c, s, slack)
             turn = fold(yaw_a[i] - yaw_b[k] - pose[2])
-            square = square / spread + turn * turn / (syaw_a[i] ** 2 + syaw_b[k] ** 2 + (0.1 * slack) ** 2)
+            square = wxx * dx * dx + 2.0 * wxy * dx * dy + wyy * dy * dy
+            square += turn * turn / (syaw_a[i] ** 2 + syaw_b[k] ** 2 + (0.1 * slack) ** 2)
             if square < gate:
                 rows[count, 0], rows[count, 1], cost[count] = i, k, square
                 count += 1
@@ -228,8 +243,8 @@ def pair_up(pose, a, b, may, slack, gate):  # pragma: no cover - compiled
 @njit(cache=True, nogil=True)
 def fit(pose, pairs, a, b, rounds):  # pragma: no cover - compiled
     """Least squares on given pairs from a pose (3,): pose and the information matrix (3, 3) of x, y, yaw."""
-    xy_a, yaw_a, sxy_a, syaw_a = a
-    xy_b, yaw_b, sxy_b, syaw_b = b
+    xy_a, yaw_a, error_a, syaw_a = a
+    xy_b, yaw_b, error_b, syaw_b = b
     pose = pose.copy()
     information = np.zeros((3, 3))
     for _round in range(rounds):
@@ -238,19 +253,26 @@ def fit(pose, pairs, a, b, rounds):  # pragma: no cover - compiled
         gradient = np.zeros(3)
         for p in range(len(pairs)):
             i, k = pairs[p]
-            w = 1.0 / (sxy_a[i] ** 2 + sxy_b[k] ** 2)
+            wxx, wxy, wyy = weight_of(error_a[i], error_b[k], c, s, 0.0)
             v = 1.0 / (syaw_a[i] ** 2 + syaw_b[k] ** 2)
             ux, uy = c * xy_b[k, 0] - s * xy_b[k, 1], s * xy_b[k, 0] + c * xy_b[k, 1]
             rx, ry = xy_a[i, 0] - ux - pose[0], xy_a[i, 1] - uy - pose[1]
-            information[0, 0] += w
-            information[0, 2] -= w * uy
-            information[1, 2] += w * ux
-            information[2, 2] += w * (ux * ux + uy * uy) + v
-            gradient[0] += w * rx
-            gradient[1] += w * ry
-            gradient[2] += w * (ux * ry - uy * rx) + v * fold(yaw_a[i] - yaw_b[k] - pose[2])
-        information[1, 1] = information[0, 0]
-        information[2, 0], information[2, 1] = information[0, 2], information[1, 2]
+            # What a turn of the pose moves the landmark by, weighed.
+            tx, ty = wxy * ux - wxx * uy, wyy * ux - wxy * uy
+            information[0, 0] += wxx
+            information[0, 1] += wxy
+            information[1, 1] += wyy
+            information[0, 2] += tx
+            information[1, 2] += ty
+            information[2, 2] += ux * ty - uy * tx + v
+            gradient[0] += wxx * rx + wxy * ry
+            gradient[1] += wxy * rx + wyy * ry
+            gradient[2] += tx * rx + ty * ry + v * fold(yaw_a[i] - yaw_b[k] - pose[2])
+        information[1, 0], information[2, 0], information[2, 1] = (
+            information[0, 1],
+            information[0, 2],
+            information[1, 2],
+        )
         if information[0, 0] <= 0.0:
             break
         step = np.linalg.solve(information, gradient)

@@ -67,8 +67,8 @@ class Options:
     """Who corrects claimed poses, in the studies 'pose' and 'pose-accuracy', feakm or a file of its weights among them; by
     default the study's own."""
     branches: tuple[str, ...] = ()
-    """Weights that the study 'ablation' compares, and rival fusions of the study 'pose', each as name=weights.safetensors; of
-    'feakm' each as name=detector.safetensors,net.safetensors."""
+    """Weights that the study 'ablation' compares, and rival fusions of 'robustness' and 'pose', each as name=weights.safetensors;
+    of 'feakm' each as name=detector.safetensors,net.safetensors."""
 
 
 def main(options: Options) -> None:

@@ -25,7 +25,7 @@ from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.alignment.rivals.table import corrector
 from manyeyes.comms import wire
 from manyeyes.datasets.recording import Recording
-from manyeyes.datatypes import AgentFrame, Message, Snapshot, Transform
+from manyeyes.datatypes import AgentFrame, Boxes, Message, Snapshot, Transform
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.evaluation.pose import BUCKETS, ClaimNoise, PoseFrame, PoseScore, confusion, judged, risk_coverage, score
 from manyeyes.maps.whole_file import write_whole
@@ -116,11 +116,19 @@ def _told(eyes: Eyes, frame: AgentFrame, net: FeakmNet | None) -> Keypoints:
     return Keypoints(boxes, torch.zeros(len(boxes), 0))
 
 
+def _seen_from(frame: AgentFrame, boxes: Boxes) -> Landmarks:
+    marks = Landmarks.of_boxes(boxes)
+    return marks if frame.is_infrastructure else marks.with_body()
+
+
 def _met(snapshot: Snapshot, told: Sequence[Keypoints], described: bool) -> Iterator[Meeting]:
     truth = snapshot.truth
     if truth is None:
         return
-    marks = [Landmarks.of_keypoints(t) if described else Landmarks.of_boxes(t.boxes) for t in told]
+    marks = [
+        Landmarks.of_keypoints(points) if described else _seen_from(frame, points.boxes)
+        for frame, points in zip(snapshot.frames, told)
+    ]
     ego_from_world = truth.world_from_agent[0].inverse()
     for row in range(1, len(snapshot.frames)):
         both = truth.boxes.center[truth.seen[0] & truth.seen[row]].double()

@@ -27,8 +27,8 @@ class ImageEncoderConfig:
 
     bottleneck: 1-3-1 blocks with four times the channels (ResNet-50 is (3, 4, 6, 3), 64, True); else 3-3 blocks
     (ResNet-18 is (2, 2, 2, 2), 64, False). channels: of the pyramid and of what comes out. stride: pixels of the picture a pixel of
-    what comes out, along each axis, 8 or 4; feature o is centred on pixel stride * o. recompute: training keeps what blocks begin from
-    and computes the rest again for its gradients, the same to the last bit: more time for a fraction of the memory.
+    what comes out, along each axis, 8 or 4; feature o is centred on pixel stride * o. recompute: training keeps what blocks begin
+    from and computes the rest again for its gradients, the same to the last bit: more time for a fraction of the memory.
     """
 
     blocks: tuple[int, ...] = (2, 2, 2, 2)

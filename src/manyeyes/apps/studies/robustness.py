@@ -3,7 +3,8 @@
 
 Oracle rows tell what is lost to geometry from what is lost to the model: of each joint disturbance, the row with true poses has
 its delay and loss alone, the row without delay its errors of pose alone. Early fusion is the bound. Ego alone hears nobody,
-hence is the same under every disturbance: it is played once.
+hence is the same under every disturbance: it is played once. --branches name=weights.safetensors plays rival fusions beside, such
+as the ablation's branches; for a fair race --weights is then the branch of as many steps.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from manyeyes.agents.collaboration import METHODS
+from manyeyes.apps.studies.ablation import branches_of
 from manyeyes.apps.studies.disturbance import (
     DELAYS,
     HARD,
@@ -27,9 +30,10 @@ from manyeyes.apps.studies.disturbance import (
 from manyeyes.apps.studies.running import ALONE, BOUND, OURS, PAPER, carry_out, claims_sheet, publish, start
 from manyeyes.apps.viewer.curves import Curve, Panel
 from manyeyes.apps.viewer.study_table import Sheet, change, number, value
+from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.bootstrap import Interval
 from manyeyes.evaluation.claims import Claim, claim
-from manyeyes.evaluation.sweep import Condition, Sweep
+from manyeyes.evaluation.sweep import Condition, Place, Sweep
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -83,8 +87,16 @@ def run(options: Options, console: Console) -> None:
         for d in chosen(options.disturbances, ALL)
         if d == PERFECT or hearing
     ]
+    rivals = branches_of(options.branches, "robustness") if options.branches else {}
+    if taken := sorted(set(rivals) & set(METHODS)):
+        raise ConfigError(
+            f"The study 'robustness' has methods of the names {', '.join(taken)}; call these branches otherwise."
+        )
+    for rival, weights in rivals.items():
+        base = replace(begun.base, methods=(OURS,), weights=weights)
+        conditions += [Condition(_place(d, rival, (rival,))[0], d.on(base)) for d in chosen(options.disturbances, ALL)]
     done = carry_out(begun, conditions)
-    table, held = rows(done), claims(done)
+    table, held = rows(done, tuple(rivals)), claims(done, tuple(rivals))
     sheets = [
         _sheet(title, table, group)
         for title, group in (
@@ -100,13 +112,24 @@ def run(options: Options, console: Console) -> None:
     publish(begun, payload, [*sheets, claims_sheet(held)], panels(table), conditions, (PAPER,))
 
 
-def rows(done: Sweep) -> tuple[Row, ...]:
+def _place(disturbance: Disturbance, method: str, rivals: Sequence[str]) -> Place:
+    """Where a method, or a rival's weights, lies in the sweep."""
+    return (f"{method}: {disturbance.name}", OURS) if method in rivals else (disturbance.name, method)
+
+
+def rows(done: Sweep, rivals: Sequence[str] = ()) -> tuple[Row, ...]:
     """The table, a disturbance after the other."""
-    return tuple(_row(done, d, method) for d in ALL for name, method in done.cells if name == d.name)
+    return tuple(
+        _row(done, d, method, rivals)
+        for d in ALL
+        for method in (*(m for name, m in done.cells if name == d.name), *rivals)
+        if _place(d, method, rivals) in done.cells
+    )
 
 
-def _row(done: Sweep, disturbance: Disturbance, method: str) -> Row:
-    place, perfect, alone = (disturbance.name, method), (PERFECT.name, method), (PERFECT.name, ALONE)
+def _row(done: Sweep, disturbance: Disturbance, method: str, rivals: Sequence[str]) -> Row:
+    place, perfect = (_place(d, method, rivals) for d in (disturbance, PERFECT))
+    alone = (PERFECT.name, ALONE)
     cell = done.cells[place]
     late = disturbance == PERFECT or disturbance.delay_s > 0
     return Row(
@@ -123,16 +146,17 @@ def _row(done: Sweep, disturbance: Disturbance, method: str) -> Row:
     )
 
 
-def claims(done: Sweep) -> tuple[Claim, ...]:
+def claims(done: Sweep, branches: Sequence[str] = ()) -> tuple[Claim, ...]:
     """What is claimed of the project's own method: better than every other but the bound everywhere, and little lost."""
     if (PERFECT.name, OURS) not in done.cells:
         return ()
     rivals = [method for name, method in done.cells if name == PERFECT.name and method not in (OURS, BOUND)]
+    rivals += branches
     out = []
     played = [d for d in ALL if (d.name, OURS) in done.cells]
     for disturbance in played:
         for rival in rivals:
-            other = (PERFECT.name if rival == ALONE else disturbance.name, rival)
+            other = _place(PERFECT if rival == ALONE else disturbance, rival, branches)
             what = f"{OURS} - {rival}, {disturbance.name}"
             out += [claim(what, done, (disturbance.name, OURS), other, iou, 0.0) for iou in (0, 1)]
     for disturbance, most in ((d, LOSES_AT_MOST[d]) for d in played if d in LOSES_AT_MOST):
