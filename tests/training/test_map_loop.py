@@ -107,6 +107,17 @@ def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path):
         MapRun(CONFIG, Streets(), tmp_path / "broken", seed=4)
 
 
+def test_a_run_remembers_the_weights_that_it_began_from(tmp_path):
+    one, other = (MapRun(CONFIG, Streets(), tmp_path / "x", seed=n).state.model.state_dict() for n in (1, 2))
+    run = MapRun(CONFIG, Streets(), tmp_path / "run", seed=3, start=[one])
+    run.advance()
+    run.state.save()
+    assert MapRun(CONFIG, Streets(), tmp_path / "run", seed=3, start=[one]).state.step == 1
+    for start in ([other], []):
+        with pytest.raises(CheckpointError, match="began from other weights"):
+            MapRun(CONFIG, Streets(), tmp_path / "run", seed=3, start=start)
+
+
 def test_a_batch_in_parts_goes_down_the_mean_of_its_parts(tmp_path):
     config = dataclasses.replace(CONFIG, batch=4, at_once=3)
     run = MapRun(config, Streets(), tmp_path, seed=3)

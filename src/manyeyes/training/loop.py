@@ -91,7 +91,7 @@ class Run:
             model = Detector(config.detector)
         if start is not None:
             _load_weights(model, start)
-        self.state = RunState(model, config, seed, folder, config.weight_decay)
+        self.state = RunState(model, config, seed, folder, config.weight_decay, given=start is not None)
 
     def advance(self) -> Progress:
         """One step of the optimiser."""

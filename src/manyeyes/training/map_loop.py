@@ -87,7 +87,7 @@ class MapRun:
             torch.manual_seed(seed)
             model = Mapper(config.mapper)
         _begin_from(model, start)
-        self.state = RunState(model, config, seed, folder, config.weight_decay, config.beta2)
+        self.state = RunState(model, config, seed, folder, config.weight_decay, config.beta2, bool(start))
 
     def advance(self) -> MapProgress:
         """One step of the optimiser."""

@@ -16,7 +16,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from manyeyes.datatypes import CheckpointError, ConfigError
-from manyeyes.models.checkpoint import config_to_json
+from manyeyes.models.checkpoint import config_to_json, fingerprint
 
 Model = TypeVar("Model", bound=nn.Module)
 
@@ -35,19 +35,27 @@ Line = TypeVar("Line", bound=LogLine)
 class RunState(Generic[Model]):
     """One process, or one of several that share every batch.
 
-    config: a frozen dataclass that names the run; a folder of another run, or of another seed, is refused. beta2: decay of
-    Adam's mean square of gradients.
+    config: a frozen dataclass that names the run; a folder of another run, or of another seed, is refused, and of other weights
+    where the model was given some to begin from. beta2: decay of Adam's mean square of gradients.
     """
 
     def __init__(
-        self, model: Model, config: Any, seed: int, folder: Path, weight_decay: float, beta2: float = 0.999
+        self,
+        model: Model,
+        config: Any,
+        seed: int,
+        folder: Path,
+        weight_decay: float,
+        beta2: float = 0.999,
+        given: bool = False,
     ) -> None:
         self.model, self.folder = model, folder
         self.rank, self.world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
         self.average = copy.deepcopy(model).requires_grad_(False)
         self.optimiser = torch.optim.AdamW(parameter_groups(model, weight_decay), betas=(0.9, beta2))
         self.step, self.seconds = 0, 0.0
-        self._name = {"config": config_to_json(config), "seed": seed}
+        begun = fingerprint(model).hex() if given else ""
+        self._name = {"config": config_to_json(config), "seed": seed, "begun": begun}
         self._since = time.monotonic()
         if self.path.exists():
             self._resume()
@@ -136,9 +144,10 @@ class RunState(Generic[Model]):
             raise CheckpointError(
                 f"{self.path}: not a whole training state ({type(error).__name__}); delete it to start anew."
             ) from error
-        if {name: state[name] for name in self._name} != self._name:
+        if {name: state.get(name, "") for name in self._name} != self._name:
             raise CheckpointError(
-                f"{self.path}: belongs to a run of another configuration or seed; give another --out, or delete it."
+                f"{self.path}: belongs to a run of another configuration or seed, or that began from other weights; give another "
+                "--out, or delete it."
             )
         for name in ("model", "average", "optimiser"):
             getattr(self, name).load_state_dict(state[name])
