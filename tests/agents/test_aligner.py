@@ -208,7 +208,7 @@ def test_a_message_heard_twice_says_nothing_new_and_a_new_drive_begins_anew() ->
     assert again.verdicts[0].health.frames == 1
     earlier = replace(message, timestamp_ns=0)
     anew = Aligner().align(frame(), eyes(world), [earlier], again.states)
-    assert anew.verdicts[0].health.frames == 1 and anew.states[2].time.tolist() == [0.0]
+    assert anew.verdicts[0].health.frames == 1 and anew.states[2].watch.time.tolist() == [0.0]
 
 
 def test_an_agent_fuses_boxes_from_where_their_sender_is() -> None:
@@ -236,7 +236,7 @@ def test_who_cannot_be_placed_or_is_lost_is_where_it_was_if_the_method_remembers
     known, hidden = cars(12, 13), cars(3, 14)
     detector = Detector(COSTR_TINY).eval()
     wanted = hidden.transform(EGO.inverse()).center[:, :2]
-    ego = Agent(detector, way, eyes=ToldEyes(known.transform(EGO.inverse()), detector), aligner=Aligner())
+    ego = Agent(detector, way, eyes=ToldEyes(known.transform(EGO.inverse()), detector), aligner=Aligner(follow_s=0))
     missed = []
     for tenth, seen in enumerate((Boxes.cat([known, hidden]), hidden, None)):
         packets = []
@@ -248,6 +248,41 @@ def test_who_cannot_be_placed_or_is_lost_is_where_it_was_if_the_method_remembers
         found = ego.perceive(frame(tenth * 100_000_000), packets)
         missed.append(float(torch.cdist(wanted, found.boxes.center[:, :2]).amin(1).max()))
     assert missed[0] < 0.1 and [m < 0.2 for m in missed[1:]] == [remembers, remembers]
+
+
+def told_on(drive: Sequence[Boxes], steps_ms: Sequence[int], **settings: Any) -> list[Any]:
+    """What becomes of a sender that drives on by 1 m a message, its claims 1.5 m off; drive: what it sees at each."""
+    known, states, found = cars(12, 13), {}, []
+    at_ms = 0
+    for n, (seen, step) in enumerate(zip(drive, steps_ms)):
+        at_ms += step
+        pose = Transform(
+            OTHERS[0].rotation, OTHERS[0].translation + torch.tensor([1.0 * n, 0.0, 0.0], dtype=torch.float64)
+        )
+        message = said(seen, pose, off=(1.5 * (-1) ** n, 1.0, 0.03), sigma=1.2, time_ns=at_ms * 1_000_000)
+        one = Aligner(**settings).align(frame(at_ms * 1_000_000), eyes(known), [message], states)
+        states = one.states
+        found.append((one.verdicts[0], apart(one.messages[0], pose)[0] if one.messages else None))
+    return found
+
+
+def test_a_sender_whom_nobody_recognises_is_followed_from_where_it_was_placed() -> None:
+    known, hidden, strange = cars(12, 13), cars(6, 14), cars(6, 15)
+    drive = [Boxes.cat([known, hidden]), hidden, hidden]
+    (first, _), *later = told_on(drive, (0, 100, 100))
+    assert all(verdict.use is Use.CORRECTED and off < 0.15 for verdict, off in later)
+    sigmas = [first.sigma_m, *(verdict.sigma_m for verdict, _ in later)]
+    assert sigmas == sorted(sigmas) and sigmas[0] < sigmas[2]
+    # Not what fits nothing that it saw before, not after long, not where nothing was placed, not if it is not asked for.
+    for seen, steps, settings in (
+        ([drive[0], strange], (0, 100), {}),
+        (drive[:2], (0, 600), {}),
+        ([hidden, hidden], (0, 100), {}),
+        (drive[:2], (0, 100), {"follow_s": 0.0}),
+    ):
+        assert told_on(seen, steps, **settings)[-1][0].use is Use.UNSURE
+    with pytest.raises(ConfigError, match="pace_mps"):
+        Aligner(pace_mps=0.0)
 
 
 def test_nobody_heard_and_unknown_correctors() -> None:

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from manyeyes.agents.aligner import Aligner, Verdict
+from manyeyes.agents.aligner import Aligner, Known, Verdict
 from manyeyes.agents.coding import codebook_of, coded, readable, tables_of, usual_precision
 from manyeyes.agents.collaboration import Collaboration, Intermediate
 from manyeyes.agents.collaboration.heading import header
 from manyeyes.agents.eyes import Eyes
 from manyeyes.agents.memory import Memory
-from manyeyes.alignment.watchman import WatchState
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox, Reception
 from manyeyes.comms.request import need, request_map
@@ -66,7 +65,7 @@ class Agent:
         survey: Survey | None = None,
     ) -> None:
         self.eyes, self.memory = eyes or Eyes(detector), Memory()
-        self.aligner, self._watched = aligner, dict[int, WatchState]()
+        self.aligner, self._known = aligner, dict[int, Known]()
         self.collaboration = collaboration or Intermediate()
         self.precision: Precision = precision or usual_precision(detector)
         self.budget_bytes = budget_bytes
@@ -139,8 +138,8 @@ class Agent:
         """What was heard from where it belongs, without what belongs nowhere."""
         if self.aligner is None:
             return heard, ()
-        aligned = self.aligner.align(frame, self.eyes, [r.message for r in heard], self._watched)
-        self._watched = dict(aligned.states)
+        aligned = self.aligner.align(frame, self.eyes, [r.message for r in heard], self._known)
+        self._known = dict(aligned.states)
         said = {message.agent_id: message for message in aligned.messages}
         kept = (replace(r, message=said[r.message.agent_id]) for r in heard if r.message.agent_id in said)
         return tuple(kept), aligned.verdicts

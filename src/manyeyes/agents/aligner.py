@@ -3,7 +3,8 @@
 
 No byte is added for this: the landmarks of a sender are the boxes it sends, or those that its tokens propose, or, where it
 sends its cloud, what the ego's own eyes find in it, and beside them its own vehicle, which others see. Boxes seen earlier are
-moved by their velocity to the ego's instant.
+moved by their velocity to the ego's instant. A sender whom nobody recognises now is followed from where it was placed a moment ago:
+what it sees itself now is matched with what it saw then.
 Where the corrector is FeaKM's, senders add descriptors, and the boxes that these describe where they send none
 (describing.py): 32 and 13 bytes an object. Spec: specs/pose.md 4.4, 4.7, 4.8.
 """
@@ -31,7 +32,7 @@ from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.alignment.pose_graph import Link, settle
 from manyeyes.alignment.rivals.table import corrector
 from manyeyes.alignment.watchman import Health, Report, WatchConfig, WatchState, watch
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message, Transform
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.box_head import RawBoxes
 from manyeyes.models.feakm import FeakmNet
@@ -79,19 +80,29 @@ class Verdict:
 
 
 @dataclass(frozen=True)
+class Known:
+    """What to remember of a sender. placed: its last message that objects put where it belongs, if any."""
+
+    watch: WatchState
+    placed: Message | None = None
+
+
+@dataclass(frozen=True)
 class Aligned:
     """messages: those to be fused, corrected; verdicts: one for each that came; states: what to remember, by sender."""
 
     messages: tuple[Message, ...]
     verdicts: tuple[Verdict, ...]
-    states: Mapping[int, WatchState]
+    states: Mapping[int, Known]
 
 
 @dataclass(frozen=True)
 class Aligner:
     """Settings. corrector: of two agents' landmarks, by name (alignment/rivals/table.py), read again where this is sent to
     another process. score_min: boxes below it are no landmarks. unsure_m: a message whose cells may lie this far off (one
-    standard deviation, reach_m from its sender) is not fused. speed_sigma_mps: error of an object's stated velocity.
+    standard deviation, reach_m from its sender) is not fused. speed_sigma_mps: error of an object's stated velocity. follow_s: how
+    long ago a sender may have been placed to be followed from there, 0 for never; pace_mps, pace_rps: how fast it may have gone and
+    turned since, one standard deviation.
     """
 
     corrector: str = "vote"
@@ -99,41 +110,55 @@ class Aligner:
     unsure_m: float = 0.5
     reach_m: float = 20.0
     speed_sigma_mps: float = 1.0
+    follow_s: float = 0.5
+    pace_mps: float = 15.0
+    pace_rps: float = 0.5
     watch: WatchConfig = field(default_factory=WatchConfig)
 
     def __post_init__(self) -> None:
         corrector(self.corrector)
-        if not (self.unsure_m > 0 and self.reach_m >= 0 and self.speed_sigma_mps >= 0):
-            raise ConfigError("Aligner needs unsure_m > 0, reach_m >= 0 and speed_sigma_mps >= 0.")
+        if not (self.unsure_m > 0 and min(self.reach_m, self.speed_sigma_mps, self.follow_s) >= 0):
+            raise ConfigError("Aligner needs unsure_m > 0, and reach_m, speed_sigma_mps and follow_s of 0 or more.")
+        if not min(self.pace_mps, self.pace_rps) > 0:
+            raise ConfigError("Aligner needs pace_mps > 0 and pace_rps > 0.")
 
-    def align(
-        self, frame: AgentFrame, eyes: Eyes, messages: Sequence[Message], states: Mapping[int, WatchState]
-    ) -> Aligned:
+    def align(self, frame: AgentFrame, eyes: Eyes, messages: Sequence[Message], states: Mapping[int, Known]) -> Aligned:
         """The messages that came for a frame, put where they belong. states: of the frame before, by sender."""
         now_s = frame.timestamp_ns * 1e-9
-        watched = {a: s for a, s in states.items() if not len(s.time) or abs(now_s - s.time[-1]) <= FORGET_S}
+        known = {a: s for a, s in states.items() if not len(s.watch.time) or abs(now_s - s.watch.time[-1]) <= FORGET_S}
         if not messages:
-            return Aligned((), (), watched)
+            return Aligned((), (), known)
         own = self.own_landmarks(frame, eyes)
         marks = [self._told_landmarks(eyes, message, age_s(frame, message)) for message in messages]
         claims = [PoseClaim.between(frame, message) for message in messages]
         answers = [corrector(self.corrector)(own, theirs, claim) for theirs, claim in zip(marks, claims)]
-        health = []
+        health, placed = [], {a: s.placed for a, s in known.items()}
         for message, claim, answer in zip(messages, claims, answers):
-            state, report = self._watched(watched.get(message.agent_id), message, claim, answer)
-            watched[message.agent_id] = state
+            before = known.get(message.agent_id)
+            state, report = self._watched(before.watch if before else None, message, claim, answer)
+            known[message.agent_id] = Known(state)
             health.append(report)
+        followed = set[int]()
+        for n, message in enumerate(messages):
+            last = placed.get(message.agent_id)
+            since = None if last is None or answers[n].status.answered else self._followed(frame, eyes, last, message)
+            if since is not None:
+                claims[n], answers[n] = since, corrector(self.corrector)(own, marks[n], since)
+                followed.add(n)
         settled, contradicted = self._settled(messages, marks, claims, answers)
         kept, verdicts = [], []
         for n, message in enumerate(messages):
             estimate = settled.get(n, answers[n])
-            use, sigma = self._use(estimate, answers[n], n in settled, n in contradicted, health[n])
+            use, sigma = self._use(estimate, answers[n], n in settled or n in followed, n in contradicted, health[n])
             verdicts.append(Verdict(message.agent_id, message.is_infrastructure, use, estimate, sigma, health[n]))
             if use is Use.CLAIMED:
                 kept.append(message)
             elif use is Use.CORRECTED:
                 kept.append(moved(message, frame, estimate))
-        return Aligned(tuple(kept), tuple(verdicts), watched)
+            put = kept[-1] if use is Use.CORRECTED else placed.get(message.agent_id)
+            watch_state = known[message.agent_id].watch
+            known[message.agent_id] = Known(watch_state, None if use is Use.CONTRADICTED else put)
+        return Aligned(tuple(kept), tuple(verdicts), known)
 
     @property
     def net(self) -> FeakmNet | None:
@@ -171,6 +196,26 @@ class Aligner:
         marks = Landmarks.of_boxes(now) if look is None else Landmarks.of_keypoints(Keypoints(now, look[sure]))
         drifted = self.speed_sigma_mps * abs(seconds)
         return replace(marks, sigma_xy=np.hypot(marks.sigma_xy, drifted)) if drifted else marks
+
+    def _followed(self, frame: AgentFrame, eyes: Eyes, last: Message, message: Message) -> PoseClaim | None:
+        """Where a sender is, by where it was placed when it said something before and what it saw then and sees now; None where
+        that is too long ago, or does not fit.
+        """
+        seconds = (message.timestamp_ns - last.timestamp_ns) * 1e-9
+        if not 0 < seconds <= self.follow_s:
+            return None
+        then, now = self._told_landmarks(eyes, last, seconds), self._told_landmarks(eyes, message, 0.0)
+        stayed = np.array([self.pace_mps, self.pace_mps, self.pace_rps]) * seconds
+        moved_on = corrector(self.corrector)(then, now, PoseClaim(Transform.identity(), np.diag(stayed**2)))
+        if not moved_on.status.answered or moved_on.ego_from_other is None:
+            return None
+        there = PoseClaim.between(frame, last)
+        x, y = (there.ego_from_other.rotation[:2, :2] @ moved_on.ego_from_other.translation[:2]).tolist()
+        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        turn = np.eye(3)
+        turn[:2, :2] = there.ego_from_other.rotation[:2, :2].numpy()
+        covariance = lever @ there.covariance @ lever.T + turn @ moved_on.covariance @ turn.T
+        return PoseClaim(there.ego_from_other @ moved_on.ego_from_other, (covariance + covariance.T) / 2)
 
     def _watched(
         self, state: WatchState | None, message: Message, claim: PoseClaim, answer: PoseEstimate
