@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from manyeyes.alignment.decide import Acceptance, CorrectorConfig, correct, fused
+from manyeyes.alignment.decide import Acceptance, CorrectorConfig, correct, fused, rank
 from manyeyes.alignment.estimate import PoseClaim, PoseStatus, difference
 from manyeyes.alignment.landmarks import Landmarks
 from manyeyes.alignment.vote import VoteConfig, candidates
@@ -115,6 +115,24 @@ def test_a_refuted_claim_is_a_conflict_and_not_used(metres, degrees):
     assert found.status is PoseStatus.CONFLICT and found.distance > 16.27
     np.testing.assert_allclose(found.pose, found.measured, atol=1e-12)
     assert max(off(found.pose, made.ego_from_other)) < 1.0
+
+
+def test_more_is_asked_of_a_vote_that_refutes_a_claim():
+    ego, other, made = views(common=5, ego_extra=3, other_extra=3)
+    wrong = claim(made.ego_from_other + np.array([9.0, -6.0, 0.8]))
+    plain = correct(ego, other, wrong)
+    assert plain.status is PoseStatus.CONFLICT
+    ranked = rank(candidates(ego, other, VoteConfig(), wrong), wrong, Acceptance().anywhere)
+    for more, status in ((0.9, PoseStatus.CONFLICT), (1.1, PoseStatus.NO_MATCH)):
+        enough = more * (ranked.score - Acceptance().least_score)
+        asked = correct(ego, other, wrong, CorrectorConfig(accept=Acceptance(refuting=enough, least_margin=0.0)))
+        assert asked.status is status
+    # A claim that objects agree with needs none of it.
+    right = claim(made.ego_from_other)
+    much = CorrectorConfig(accept=Acceptance(refuting=1e3))
+    assert correct(ego, other, right, much).status is correct(ego, other, right).status is PoseStatus.OK
+    with pytest.raises(ConfigError, match="refuting"):
+        Acceptance(refuting=-1.0)
 
 
 def test_a_good_claim_is_fused_and_sharpens_both():

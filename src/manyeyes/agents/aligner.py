@@ -81,7 +81,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Known:
-    """What to remember of a sender. placed: its last message that objects put where it belongs, if any."""
+    """What to remember of a sender. placed: its last message that objects put where it belongs, near what it claimed."""
 
     watch: WatchState
     placed: Message | None = None
@@ -155,9 +155,10 @@ class Aligner:
                 kept.append(message)
             elif use is Use.CORRECTED:
                 kept.append(moved(message, frame, estimate))
+            # Whom objects put elsewhere than it says is not followed from there: were it a mistake, it would go on.
+            refuted = use is Use.CONTRADICTED or estimate.status is PoseStatus.CONFLICT
             put = kept[-1] if use is Use.CORRECTED else placed.get(message.agent_id)
-            watch_state = known[message.agent_id].watch
-            known[message.agent_id] = Known(watch_state, None if use is Use.CONTRADICTED else put)
+            known[message.agent_id] = Known(known[message.agent_id].watch, None if refuted else put)
         return Aligned(tuple(kept), tuple(verdicts), known)
 
     @property

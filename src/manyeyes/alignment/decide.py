@@ -35,7 +35,8 @@ class Acceptance:
     least_score: log-likelihood ratio against chance that it needs; least_margin: and against the best distinct other
     vote. least_pairs: and how many pairs, where no claim supports it. rival_pairs: a runner-up that would be believed
     if it were alone must be so many (mean) pairs behind: a queue that slips by one place loses only one. anywhere:
-    volume (m^2 rad) of poses that an unknown pose may take, 100 m around with any yaw.
+    volume (m^2 rad) of poses that an unknown pose may take, 100 m around with any yaw. refuting: how much more of score and margin
+    a vote needs that refutes the claim, since claims are seldom that wrong.
     """
 
     least_score: float = 24.0
@@ -44,6 +45,7 @@ class Acceptance:
     rival_pairs: float = 2.0
     per_instant: float = 4.0
     anywhere: float = 2.0e5
+    refuting: float = 0.0
 
     def __post_init__(self) -> None:
         if not (
@@ -52,6 +54,8 @@ class Acceptance:
             raise ConfigError(
                 "Acceptance needs a finite least_score, least_margin >= 0, least_pairs >= 1 and anywhere > 0."
             )
+        if not self.refuting >= 0:
+            raise ConfigError(f"Acceptance needs refuting >= 0; got {self.refuting}.")
 
 
 @dataclass(frozen=True)
@@ -62,9 +66,9 @@ class CorrectorConfig:
     accept: Acceptance = Acceptance()
 
 
-DETECTED = CorrectorConfig(VoteConfig(shared=0.05, across=0.6))
+DETECTED = CorrectorConfig(VoteConfig(shared=0.05, across=0.6), Acceptance(refuting=5.0))
 """For what detectors find: boxes of one view err alike, each towards who sees but one side of a vehicle, and along a vehicle, whose
-far end is seldom seen, more than across it (docs/pose.md has the figures of both).
+far end is seldom seen, more than across it; and vehicles that stand in a queue agree by chance (docs/pose.md has the figures).
 """
 
 
@@ -110,11 +114,13 @@ def decide(found: list[Candidate], claimed: PoseClaim | None, accept: Acceptance
         return unanswered(claimed)
     best = ranked.best
     known = _bonus(best, claimed, accept.anywhere) > 0
-    if ranked.score < least or len(best.pairs) < (1 if known else accept.least_pairs):
+    refutes = claimed is not None and mahalanobis(best.pose, best.covariance, claimed) > REFUTED
+    more = accept.refuting if refutes else 0.0
+    if ranked.score < least + more or len(best.pairs) < (1 if known else accept.least_pairs):
         return replace(unanswered(claimed), inliers=len(best.pairs), runner_up=ranked.runner_up, margin=ranked.margin)
     rival = ranked.score - ranked.margin >= least
     wanted = accept.rival_pairs * best.score / len(best.pairs) if rival else accept.least_margin
-    if ranked.margin < max(wanted, accept.least_margin):
+    if ranked.margin < max(wanted, accept.least_margin) + more:
         said = unanswered(claimed, PoseStatus.AMBIGUOUS)
         return replace(
             said, inliers=len(best.pairs), runner_up=ranked.runner_up, margin=ranked.margin, pairs=best.pairs
