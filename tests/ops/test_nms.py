@@ -49,3 +49,12 @@ def test_empty_and_misshapen_input():
     assert rotated_nms(torch.zeros(0, 5), torch.zeros(0), 0.15).shape == (0,)
     with pytest.raises(ShapeError, match=r"score \(N,\)"):
         rotated_nms(torch.zeros(2, 5), torch.zeros(3), 0.15)
+
+
+def test_rectangles_that_share_sides_and_corners():
+    g = torch.Generator().manual_seed(1)
+    place = torch.randint(0, 4, (200, 2), generator=g).double() * torch.tensor([2.0, 1.0]).double()
+    quarter = torch.randint(0, 4, (200, 1), generator=g) * (torch.pi / 2)
+    boxes = torch.cat((place, torch.tensor([[4.0, 2.0]]).double().expand(200, 2), quarter + 0.4), 1)
+    score = torch.rand(200, generator=g)
+    assert rotated_nms(boxes, score, 0.34).tolist() == slow_nms(boxes, score, 0.34)
