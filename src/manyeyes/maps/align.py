@@ -38,6 +38,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _BOUND_CELL_M = 8.0
+_SWEEP_CELL_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -268,13 +269,13 @@ def _sweep(
     start, lean, pose = state.start[rows], state.lean[rows], state.pose[rows]
     xy, tangent = sightings.world(pose)
     weight = looks_weight(sightings, start, state.scale[rows], state.faith[rows])
-    grid = build_grid(xy[keep, 0], xy[keep, 1], sightings.kind[keep], 2.5)
+    grid = build_grid(xy[keep, 0], xy[keep, 1], sightings.kind[keep], _SWEEP_CELL_M)
     order = keep[grid.order]
     far = np.asarray(sightings.observation)[order]
     sums = normal_equations(
         home,
         (sightings.first, xy, tangent, sightings.kind, sightings.sigma),
-        (grid.keys, grid.start, xy[order], tangent[order], far, weight[far]),
+        (grid.cell_m, grid.keys, grid.start, xy[order], tangent[order], far, weight[far]),
         (*width, config.along_m, np.cos(config.heading_rad), config.sigma_m, config.correlation),
     )
     moved = step_poses(sightings, home, (start, lean, pose), sums, config)

@@ -72,14 +72,7 @@ class Sightings:
 
     def world(self, pose: Floats) -> tuple[Floats, Floats]:
         """Points and tangents (P, 2) in the map's frame when the agents stand at pose (O, 3)."""
-        at = pose[self.observation]
-        c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
-        x, y = self.xy[:, 0], self.xy[:, 1]
-        u, v = self.tangent[:, 0], self.tangent[:, 1]
-        return (
-            np.stack((c * x - s * y + at[:, 0], s * x + c * y + at[:, 1]), 1),
-            np.stack((c * u - s * v, s * u + c * v), 1),
-        )
+        return _in_world(self.xy, self.tangent, self.first, np.ascontiguousarray(pose))
 
     def world_view(self, pose: Floats) -> Floats:
         """Corners (Q, 2) of all views in the map's frame when the agents stand at pose (O, 3)."""
@@ -88,6 +81,19 @@ class Sightings:
         c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
         x, y = self.view.xy[:, 0], self.view.xy[:, 1]
         return np.stack((c * x - s * y + at[:, 0], s * x + c * y + at[:, 1]), 1)
+
+
+@njit(cache=True, nogil=True)
+def _in_world(xy, tangent, first, pose):  # pragma: no cover - compiled
+    """Points and tangents (P, 2) of observations, those of o from first[o] on, that stand at pose (O, 3)."""
+    out, turned = np.empty_like(xy), np.empty_like(tangent)
+    for o in range(len(first) - 1):
+        c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
+        for p in range(first[o], first[o + 1]):
+            x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
+            out[p, 0], out[p, 1] = c * x - s * y + pose[o, 0], s * x + c * y + pose[o, 1]
+            turned[p, 0], turned[p, 1] = c * u - s * v, s * u + c * v
+    return out, turned
 
 
 def gather(observations: Sequence[Observation], spacing_m: float) -> Sightings:

@@ -144,7 +144,7 @@ class StreamingMap:
             sums = normal_equations(
                 home,
                 (s.first, xy, tangent, s.kind, s.sigma),
-                (ground.grid.keys, ground.grid.start, ground.xy, ground.tangent, ground.owner, ground.weight),
+                (ground.grid.cell_m, ground.grid.keys, ground.grid.start, ground.xy, ground.tangent, ground.owner, ground.weight),
                 (gate, kernel, one.along_m, float(np.cos(one.heading_rad)), one.sigma_m, one.correlation),
             )
             moved = step_poses(s, home, (begin, np.zeros((1, 3)), pose), sums, one)
