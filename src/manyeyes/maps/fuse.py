@@ -21,6 +21,7 @@ from manyeyes.datatypes.map_element import DASHED, MapElements, rows_of
 from manyeyes.maps.align import AlignConfig, Alignment, solve_poses
 from manyeyes.maps.beside import BesideConfig, continued
 from manyeyes.maps.linking import LinkConfig, link, smooth
+from manyeyes.maps.looked import cut_unseen
 from manyeyes.maps.observation import Frame, Observation
 from manyeyes.maps.sightings import gather
 from manyeyes.maps.stations import Area, Evidence, StationConfig, StationTable, find_stations, with_style
@@ -114,6 +115,8 @@ def _lines(table: StationTable, chosen: NDArray[np.bool_], config: FuseConfig) -
         first, members = _linked(table, rows, xy, tangent, config)
     kind, weight = table.line.kind[rows], 1.0 / table.line.sigma[rows] ** 2
     points = smooth(xy, first, members, weight, config.link.smooth)
+    first, kept = cut_unseen(points, first, members >= seen, table.looked)
+    points, members = points[kept], members[kept]
     first, order = _canonical(first, points)
     points, members = points[order], members[order]
     length = _lengths(first, points)

@@ -19,6 +19,7 @@ from manyeyes.maps.align import Alignment, bounded
 from manyeyes.maps.associate import build_grid, span
 from manyeyes.maps.evidence import EvidenceConfig, Witness, witness
 from manyeyes.maps.faith import looks_weight
+from manyeyes.maps.looked import looked_at, merged
 from manyeyes.maps.polygons import Crossings, PolygonConfig, find_crossings
 from manyeyes.maps.ridges import RidgeConfig, shift_to_ridges, thin
 from manyeyes.maps.sightings import Sightings, is_line
@@ -103,7 +104,7 @@ class StationTable:
     """Stations of lines and whole crossings of an area, with their evidence.
 
     xy, tangent: (K, 2) metres and unit, map frame; line: (K,) their evidence. ring_start: (C + 1,), ring_xy: crossings'
-    rings; ring: (C,) their evidence.
+    rings; ring: (C,) their evidence. looked: (R, 3) runs of ground that was in some view (maps.looked); none: not known.
     """
 
     xy: Floats
@@ -112,6 +113,7 @@ class StationTable:
     ring_start: Ints
     ring_xy: Floats
     ring: Evidence
+    looked: Ints
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -130,7 +132,8 @@ class StationTable:
         order = np.lexsort((xy[:, 1], xy[:, 0], line.kind))
         rings = np.lexsort((points[start[:-1], 1], points[start[:-1], 0])) if len(sizes) else np.zeros(0, np.int64)
         ring_start, places = rows_of(start, rings)
-        return cls(xy[order], tangent[order], line.take(order), ring_start, points[places], ring.take(rings))
+        looked = merged(np.concatenate([t.looked for t in many]))
+        return cls(xy[order], tangent[order], line.take(order), ring_start, points[places], ring.take(rings), looked)
 
 
 def find_stations(
@@ -147,7 +150,8 @@ def find_stations(
     rank = np.argsort(np.argsort(np.array(sightings.ids)))
     crossings = find_crossings(sightings, pose, weight, rank, config.polygon, config.evidence)
     ring, ring_start, ring_xy = _rings_inside(crossings, sightings, area, config)
-    return StationTable.cat([StationTable(*lines, ring_start, ring_xy, ring)])
+    looked = looked_at(sightings, pose, area)
+    return StationTable.cat([StationTable(*lines, ring_start, ring_xy, ring, looked)])
 
 
 def _lines(

@@ -24,6 +24,7 @@ from manyeyes.maps.evidence import sights as sights_of
 from manyeyes.maps.evidence import visibility, witnesses
 from manyeyes.maps.fuse import FuseConfig, assemble
 from manyeyes.maps.gross import best_moves, moved_by
+from manyeyes.maps.looked import along, looked_at, merged
 from manyeyes.maps.observation import Observation
 from manyeyes.maps.polygons import hulls_of, overlap_of
 from manyeyes.maps.pose_step import normal_equations, step_poses
@@ -79,6 +80,9 @@ class StreamingMap:
         self._known = [row.tobytes() for row in start.observations]
         self._origin = np.repeat(lines, start.elements.counts[lines])[order]
         self._start = start
+        # Of a map nobody knows where its observations looked, but under its lines somebody did.
+        kept = start.elements.take(lines)
+        self._looked = [along(kept.points, kept.first)]
         self._heard: list[tuple[Ints, bool, int]] = []
         self._ids = {name: k for k, name in enumerate(self._known)}
 
@@ -91,6 +95,7 @@ class StreamingMap:
         pose, covariance = self._align(s)
         self._ids[raw] = len(self._known)
         self._known.append(raw)
+        self._looked.append(looked_at(s, pose))
         xy, tangent = s.world(pose)
         weight = 0.04 / (s.sigma**2 + 0.1**2 + covariance[0, 0, 0] / 2 + covariance[0, 1, 1] / 2)
         worth = self.config.fuse.stations.evidence.worth(s.elements.score)[s.element]
@@ -126,7 +131,8 @@ class StreamingMap:
         ring_xy = np.concatenate(self._ring_points) if self._ring_points else np.zeros((0, 2))
         line, ring = ground.rows.evidence(listed, ids), self._rings.evidence(of_rings, ids)
         alive = np.flatnonzero((line.log_odds > 0.0) | (line.state != 0))
-        table = StationTable(ground.xy[alive], ground.tangent[alive], line.take(alive), starts, ring_xy, ring)
+        looked = merged(np.concatenate(self._looked))
+        table = StationTable(ground.xy[alive], ground.tangent[alive], line.take(alive), starts, ring_xy, ring, looked)
         return assemble(StationTable.cat([table]), self.config.fuse, self.frame)
 
     def _align(self, s: Sightings) -> tuple[Floats, Floats]:
@@ -144,7 +150,15 @@ class StreamingMap:
             sums = normal_equations(
                 home,
                 (s.first, xy, tangent, s.kind, s.sigma),
-                (ground.grid.cell_m, ground.grid.keys, ground.grid.start, ground.xy, ground.tangent, ground.owner, ground.weight),
+                (
+                    ground.grid.cell_m,
+                    ground.grid.keys,
+                    ground.grid.start,
+                    ground.xy,
+                    ground.tangent,
+                    ground.owner,
+                    ground.weight,
+                ),
                 (gate, kernel, one.along_m, float(np.cos(one.heading_rad)), one.sigma_m, one.correlation),
             )
             moved = step_poses(s, home, (begin, np.zeros((1, 3)), pose), sums, one)
