@@ -154,6 +154,9 @@ def _hypotheses(a: Landmarks, b: Landmarks, may: NDArray[np.bool_], config: Vote
         _numbers(a), _numbers(b), _edges(a, config), _edges(b, config), may, config.edge_gate, most
     )
     if len(poses) > config.hypotheses:
+        # Sorting all of them, of which most are not kept, would cost as much as finding them.
+        near = misfit <= np.partition(misfit, config.hypotheses - 1)[config.hypotheses - 1]
+        poses, misfit = poses[near], misfit[near]
         poses = poses[np.lexsort((*poses.T, misfit))[: config.hypotheses]]
     return poses
 
