@@ -54,6 +54,7 @@ TUNED: dict[str, Changes] = {
     OURS: (
         ("stations.evidence.publish", 1.0),
         ("stations.evidence.publish_ring", 0.5),
+        ("stations.evidence.publish_seldom", 0.3),
         ("stations.evidence.publish_agents", 1),
     ),
     "chamfer_nms": (("gate_m", 0.75), ("rules.min_score", 0.2)),

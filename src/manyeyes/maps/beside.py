@@ -22,6 +22,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _CELL_M = 2.5
+_BESIDE_M = 0.8  # along a line, within which a point of it lies beside another point
 
 
 @dataclass(frozen=True)
@@ -35,14 +36,14 @@ class BesideConfig:
     """
 
     nearest_m: float = 2.0
-    farthest_m: float = 5.0
-    even_m: float = 0.5
+    farthest_m: float = 9.0
+    even_m: float = 0.8
     back_m: float = 8.0
     heading_rad: float = 0.15
-    few: float = 6.0
+    few: float = 5.0
     across_m: float = 1.2
     bridge_m: float = 80.0
-    open_m: tuple[float, float, float, float] = (20.0, 0.0, 0.0, 0.0)
+    open_m: tuple[float, float, float, float] = (80.0, 0.0, 0.0, 0.0)
 
 
 def continued(
@@ -136,8 +137,9 @@ def _guides(end, inward, lines, grid, numbers):  # pragma: no cover - compiled
         walked += np.hypot(line[inner + inward, 0] - line[inner, 0], line[inner + inward, 1] - line[inner, 1])
         inner += inward
     ix, iy = int(np.floor(x / _CELL_M)), int(np.floor(y / _CELL_M))
-    for dx in range(-3, 4):
-        low, high = span(keys, start, 0, ix + dx, iy - 3, iy + 3)
+    wide = int(np.ceil(np.hypot(farthest, _BESIDE_M) / _CELL_M))
+    for dx in range(-wide, wide + 1):
+        low, high = span(keys, start, 0, ix + dx, iy - wide, iy + wide)
         for k in range(low, high):
             q = order[k]
             if chain[q] == chain[end] or kind[q] > 1:
@@ -145,7 +147,7 @@ def _guides(end, inward, lines, grid, numbers):  # pragma: no cover - compiled
             dot = chord[q, 0] * chord[end, 0] + chord[q, 1] * chord[end, 1]
             ex, ey = x - line[q, 0], y - line[q, 1]
             aside, along = chord[q, 0] * ey - chord[q, 1] * ex, chord[q, 0] * ex + chord[q, 1] * ey
-            if abs(dot) < cosine or abs(along) > 0.8 or abs(aside) < nearest or abs(aside) > farthest:
+            if abs(dot) < cosine or abs(along) > _BESIDE_M or abs(aside) < nearest or abs(aside) > farthest:
                 continue
             before = _beside(line[inner, 0], line[inner, 1], chain[q], first, line, chord)
             if abs(before - aside) <= even:

@@ -23,7 +23,7 @@ from manyeyes.maps.looked import looked_at, merged
 from manyeyes.maps.polygons import Crossings, PolygonConfig, find_crossings
 from manyeyes.maps.ridges import RidgeConfig, shift_to_ridges, thin
 from manyeyes.maps.sightings import Sightings, is_line
-from manyeyes.maps.vector_map import PUBLISHED, RETIRED
+from manyeyes.maps.vector_map import CANDIDATE, PUBLISHED, RETIRED
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -176,7 +176,7 @@ def _lines(
     stays = np.flatnonzero((found.support > 0) & (enough | (found.state == RETIRED)))
     again = thin(places[stays], turned[stays], kind[stays], sightings.priority[seeds[stays]], config.ridge)
     stays = stays[again]
-    table = _evidence_of(found, kind, sightings).take(stays)
+    table = _published_seldom(_evidence_of(found, kind, sightings).take(stays), config.evidence)
     places, turned = places[stays], turned[stays]
     loses = _rivals(places, turned, table, config)
     chosen = np.flatnonzero(_within(places, area, 0.0) & ~loses & ((table.log_odds > 0.0) | (table.state != 0)))
@@ -193,6 +193,13 @@ def _evidence_of(found: Witness | Crossings, kind: Ints, sightings: Sightings) -
     return Evidence(
         kind=kind, first=found.first, sources=sources[np.lexsort((sources, owner))], observations=known, **columns
     )
+
+
+def _published_seldom(table: Evidence, config: EvidenceConfig) -> Evidence:
+    """The table with those candidates published that few could have seen and that are likely enough for that."""
+    seldom = (table.coverage <= config.seldom) & (table.log_odds >= config.publish_seldom)
+    seldom &= (table.state == CANDIDATE) & (table.agents >= config.publish_agents)
+    return replace(table, state=np.where(seldom, PUBLISHED, table.state))
 
 
 def _information(sightings: Sightings, xy: Floats, tangent: Floats, pose: Floats, covariance: Floats) -> Floats:
