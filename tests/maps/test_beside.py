@@ -56,10 +56,10 @@ def test_it_is_inferred_only_where_few_looked(coverage, found):
     assert bool(len(places)) == bool(found)
 
 
-def test_an_end_that_arrives_nowhere_goes_on_for_a_short_way():
-    places, source = inferred([row(0.0, 100.0, 0.0), row(0.0, 30.0, 3.5)])
+def test_an_end_that_arrives_nowhere_goes_on_as_far_as_it_may():
+    places, source = inferred([row(0.0, 150.0, 0.0), row(0.0, 30.0, 3.5)])
     assert set(source.tolist()) == {1}
-    assert places[:, 0].max() == pytest.approx(50.0, abs=1.0)  # 20 m
+    assert places[:, 0].max() == pytest.approx(70.0, abs=1.0)  # 40 m
     edge, _ = inferred([row(0.0, 100.0, 0.0), row(0.0, 30.0, 3.5)], kinds=[DIVIDER, BOUNDARY])
     assert not len(edge)
 

@@ -41,6 +41,7 @@ CHOICES: dict[str, Choices] = {
         "stations.ridge.across_sigma_m": (0.35, 0.45, 0.6),
         "stations.evidence.publish": (1.0, 1.5, 2.2, 3.0),
         "stations.evidence.publish_ring": (0.5, 1.0, 2.2),
+        "stations.evidence.publish_seldom": (0.3, 1.0, 2.2),
         "stations.evidence.publish_agents": (1, 2),
         "link.join_m": (6.0, 12.0, 18.0),
         "link.lateral_m": (0.25, 0.4, 0.6),

@@ -36,14 +36,14 @@ class BesideConfig:
     """
 
     nearest_m: float = 2.0
-    farthest_m: float = 9.0
-    even_m: float = 0.8
+    farthest_m: float = 5.0
+    even_m: float = 0.5
     back_m: float = 8.0
     heading_rad: float = 0.15
     few: float = 5.0
     across_m: float = 1.2
     bridge_m: float = 80.0
-    open_m: tuple[float, float, float, float] = (80.0, 0.0, 0.0, 0.0)
+    open_m: tuple[float, float, float, float] = (40.0, 0.0, 0.0, 0.0)
 
 
 def continued(

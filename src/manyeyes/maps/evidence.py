@@ -34,11 +34,11 @@ class EvidenceConfig:
     which it adds all; in between, a share.
 
     publish: log-odds at which a station is published, given publish_agents distinct agents or a surveyed pole;
-    publish_ring: the same of a crossing; publish_seldom: of a line's station that was in view at most ``seldom`` times (summed
-    visibility), where nobody else could have seen it. retire: at which it is retired, given retire_agents distinct agents that missed it. margin_m: of a view, within which a miss
-    counts less. decay_s: by kind, seconds in which evidence fades to 1/e. along_m, across_m, heading_rad: when a line
-    is at the station; aside_m: when it may be. kernel_m: Geman-McClure scale of the place across. bias_m: error that no
-    number of observations removes.
+    publish_ring: the same of a crossing; publish_seldom: of a line's station that was in view at most ``seldom`` times
+    (summed visibility), which few could have confirmed. retire: at which it is retired, given retire_agents distinct
+    agents that missed it. margin_m: of a view, within which a miss counts less. decay_s: by kind, seconds in which
+    evidence fades to 1/e. along_m, across_m, heading_rad: when a line is at the station; aside_m: when it may be.
+    kernel_m: Geman-McClure scale of the place across. bias_m: error that no number of observations removes.
     """
 
     detection: float = 0.7
