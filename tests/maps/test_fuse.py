@@ -382,3 +382,15 @@ def test_gauge_is_the_mean_of_the_claims(error, count):
     line = lines_of(fuse_aligned(seen, solve_poses(seen)), DIVIDER)
     across = sorted(float(one[:, 1].mean()) for one in line)
     assert len(across) == 2 and abs(across[0] + 1.75) < 0.06 and abs(across[1] - 1.75) < 0.06
+
+
+@pytest.mark.parametrize(("score", "looks", "lines"), [(0.55, 1, 2), (0.45, 1, 0), (0.55, 5, 0), (0.9, 5, 0)])
+def test_what_few_could_have_seen_is_published_on_less(score, looks, lines):
+    """One agent draws two dividers, half or hardly sure; one more look sees nothing there, or five."""
+    evidence = EvidenceConfig(publish=1.0, publish_seldom=0.3, publish_agents=1)
+    seen = look(road(sides=(-1.75, 1.75)), (30.0, 0.0, 0.0), "a", score=score)
+    blank = [look([], (30.0, 0.0, 0.0), f"b{k}", k + 1) for k in range(looks - 1)]
+    config = FuseConfig(stations=StationConfig(evidence=evidence))
+    assert len(fuse([seen, *blank], config).published()) == lines
+    never = replace(evidence, publish_seldom=1.0)
+    assert score == 0.9 or not len(fuse([seen, *blank], FuseConfig(stations=StationConfig(evidence=never))).published())
