@@ -36,6 +36,7 @@ from manyeyes.ops.nearest_line import nearest_line
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+_CELL_M = 1.25
 _STILL = -1  # the observation that the map's own points belong to: none
 
 
@@ -377,7 +378,7 @@ class _Ground:
     @classmethod
     def of(cls, xy: Floats, tangent: Floats, rows: _Rows) -> _Ground:
         xy, tangent = np.ascontiguousarray(xy), np.ascontiguousarray(tangent)
-        grid = build_grid(xy[:, 0], xy[:, 1], rows.kind, 2.5)
+        grid = build_grid(xy[:, 0], xy[:, 1], rows.kind, _CELL_M)
         wide = build_grid(xy[:, 0], xy[:, 1], rows.kind, 8.0)
         order = wide.order
         nobody = np.full(len(xy), _STILL, np.int64)
@@ -404,7 +405,7 @@ class _Ground:
         if not len(self) or not len(xy):
             return np.zeros(0, np.int64), 0, np.zeros(len(xy), bool)
         lines = np.flatnonzero(is_line(s.kind))
-        fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind[lines], 2.5)
+        fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind[lines], _CELL_M)
         order = lines[fine.order]
         corner = s.world_view(pose)
         near, place, mass, seen, sure, explained = _compare(
@@ -440,6 +441,7 @@ def _compare(ground, points, box, pose, sights, numbers, kinds):  # pragma: no c
     pkeys, pstart, pxy, ptangent, pweight, pworth = points
     reach, across, wide, cosine = numbers[7], numbers[8], numbers[9], numbers[10]
     low, high = box
+    radius = np.hypot(reach, wide)
     explained = np.zeros(len(pxy), np.bool_)
     size, n = 1024, 0
     rows, place, mass, seen, sure = (
@@ -453,20 +455,20 @@ def _compare(ground, points, box, pose, sights, numbers, kinds):  # pragma: no c
     for kind in range(kinds):
         if kind == 2:
             continue
-        for ix in range(int(np.floor((low[0] - 2.0) / 2.5)), int(np.floor((high[0] + 2.0) / 2.5)) + 1):
+        for ix in range(int(np.floor((low[0] - 2.0) / _CELL_M)), int(np.floor((high[0] + 2.0) / _CELL_M)) + 1):
             first, last = span(
-                keys, start, kind, ix, int(np.floor((low[1] - 2.0) / 2.5)), int(np.floor((high[1] + 2.0) / 2.5))
+                keys, start, kind, ix, int(np.floor((low[1] - 2.0) / _CELL_M)), int(np.floor((high[1] + 2.0) / _CELL_M))
             )
             for k in range(first, last):
                 x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
                 total, offset, heavy, certain, beside = 0.0, 0.0, 0.0, 0.0, False
-                jx, jy = int(np.floor(x / 2.5)), int(np.floor(y / 2.5))
-                for dx in range(-1, 2):
-                    a, b = span(pkeys, pstart, kind, jx + dx, jy - 1, jy + 1)
+                lowest, highest = int(np.floor((y - radius) / _CELL_M)), int(np.floor((y + radius) / _CELL_M))
+                for jx in range(int(np.floor((x - radius) / _CELL_M)), int(np.floor((x + radius) / _CELL_M)) + 1):
+                    a, b = span(pkeys, pstart, kind, jx, lowest, highest)
                     for q in range(a, b):
                         ex, ey = pxy[q, 0] - x, pxy[q, 1] - y
                         dot = u * ptangent[q, 0] + v * ptangent[q, 1]
-                        if abs(dot) < cosine or ex * ex + ey * ey > reach * reach + wide * wide:
+                        if abs(dot) < cosine or ex * ex + ey * ey > radius * radius:
                             continue
                         sign = 1.0 if dot > 0.0 else -1.0
                         norm = np.sqrt(2.0 + 2.0 * abs(dot))
@@ -545,7 +547,7 @@ def _points_of(elements: MapElements) -> tuple[Floats, Floats]:
 
 
 def _order(xy: Floats, kind: Ints) -> Ints:
-    return build_grid(xy[:, 0], xy[:, 1], kind, 2.5).order
+    return build_grid(xy[:, 0], xy[:, 1], kind, _CELL_M).order
 
 
 def _agent_number(s: Sightings) -> int:
