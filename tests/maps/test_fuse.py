@@ -386,7 +386,7 @@ def test_gauge_is_the_mean_of_the_claims(error, count):
 
 @pytest.mark.parametrize(("score", "looks", "lines"), [(0.55, 1, 2), (0.45, 1, 0), (0.55, 5, 0), (0.9, 5, 0)])
 def test_what_few_could_have_seen_is_published_on_less(score, looks, lines):
-    """One agent draws two dividers, half or hardly sure; one more look sees nothing there, or five."""
+    """One agent draws two dividers, half sure or hardly; nobody else looks there, or four see nothing."""
     evidence = EvidenceConfig(publish=1.0, publish_seldom=0.3, publish_agents=1)
     seen = look(road(sides=(-1.75, 1.75)), (30.0, 0.0, 0.0), "a", score=score)
     blank = [look([], (30.0, 0.0, 0.0), f"b{k}", k + 1) for k in range(looks - 1)]

@@ -132,8 +132,9 @@ class StreamingMap:
         ring_xy = np.concatenate(self._ring_points) if self._ring_points else np.zeros((0, 2))
         line, ring = ground.rows.evidence(listed, ids), self._rings.evidence(of_rings, ids)
         alive = np.flatnonzero((line.log_odds > 0.0) | (line.state != 0))
-        looked = merged(np.concatenate(self._looked))
-        table = StationTable(ground.xy[alive], ground.tangent[alive], line.take(alive), starts, ring_xy, ring, looked)
+        table = StationTable(
+            ground.xy[alive], ground.tangent[alive], line.take(alive), starts, ring_xy, ring, self._looked[0]
+        )
         return assemble(StationTable.cat([table]), self.config.fuse, self.frame)
 
     def _align(self, s: Sightings) -> tuple[Floats, Floats]:
@@ -216,7 +217,8 @@ class StreamingMap:
         self._new = _Ground.of(joined.xy[order], joined.tangent[order], joined.rows.take(order))
 
     def _fold_in(self) -> None:
-        """Make candidates part of the main ground."""
+        """Make candidates part of the main ground, and what was looked at one whole."""
+        self._looked = [merged(np.concatenate(self._looked))]
         if not len(self._new):
             return
         both = _Rows.cat(self._main.rows, self._new.rows)
