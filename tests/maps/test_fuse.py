@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, SOLID, MapElements, Polygons
-from manyeyes.maps.align import advance, merge, overlapping, search, solve_poses
+from manyeyes.maps.align import AlignConfig, advance, merge, overlapping, search, solve_poses
 from manyeyes.maps.evidence import EvidenceConfig
 from manyeyes.maps.faith import NOT_BELIEVED
 from manyeyes.maps.fuse import FuseConfig, assemble, fuse, fuse_aligned
@@ -21,6 +21,8 @@ from manyeyes.maps.sightings import gather
 from manyeyes.maps.stations import StationConfig, StationTable, find_stations
 from manyeyes.maps.vector_map import PUBLISHED, RETIRED
 from manyeyes.ops.nearest_line import nearest_line
+from manyeyes.simulator.crowd import CROWDS, place, simulate_crowd
+from manyeyes.simulator.crowd.simulate import MALICIOUS
 
 HALF_X, HALF_Y = 30.0, 15.0
 VIEW = np.array([[-HALF_X, -HALF_Y], [HALF_X, -HALF_Y], [HALF_X, HALF_Y], [-HALF_X, HALF_Y]])
@@ -312,6 +314,22 @@ def test_a_lie_that_is_found_out_leaves_no_trace():
     assert (together.faith[together.rows([o.id for o in liars])] == NOT_BELIEVED).all()
     assert (together.faith[rows] > 0.1).all()
     assert np.abs(together.pose[rows] - alone.pose).max() < 1e-3
+
+
+def test_whom_liars_made_look_a_liar_is_heard_again():
+    """Of a crossroads' crowd every fifth lies by 3 m as the others do: honest agents stand where they stand alone."""
+    lying = replace(CROWDS["local"], malicious_share=0.2, malicious="colluding", malicious_offset=(3.0, 3.0))
+    told = simulate_crowd(place("cross"), 60, lying, seed=1)
+    honest = [o for o, role in zip(told.observations, told.roles) if role != MALICIOUS]
+    off, silenced = {}, {}
+    for trials in (1, 2):
+        config = AlignConfig(trials=trials)
+        alone, together = solve_poses(honest, config), solve_poses(told.observations, config)
+        rows = together.rows(alone.ids)
+        off[trials] = np.abs(together.pose[rows] - alone.pose).max()
+        silenced[trials] = int(((together.faith[rows] == NOT_BELIEVED) & (alone.faith > NOT_BELIEVED)).sum())
+    assert silenced[1] > 0 and off[1] > 0.1
+    assert silenced[2] == 0 and off[2] < 1e-3
 
 
 @pytest.mark.parametrize("later, moved", [({}, True), ({"pass_id": "another"}, False)])

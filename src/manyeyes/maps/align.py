@@ -7,10 +7,11 @@ across lines only, along the mean normal of both lines, which has no bias on a b
 the prior is the claimed pose, less what the lines around its other looks tell of its drive (drive_error). What no line
 tells (along a straight road) stays as claimed.
 
-It is done twice. A few sweeps, the trial, tell whose claims are off alike by more than honest errors explain; then all
-begins again from the claims, and those agents pull nobody. So a lie that was found out leaves no trace, neither in the
-search nor in poses that have come halfway back. Once they are out, the mode of corrections that is taken back is wider,
-which errs less.
+It is done three times. A few sweeps, the trial, tell whose claims are off alike by more than honest errors explain; then
+all begins again from the claims, and those agents pull nobody. So a lie that was found out leaves no trace, neither in the
+search nor in poses that have come halfway back. The second trial is held among those who were believed, and judges all
+anew at its end: whom liars had made look a liar is heard again. Once liars are out, the mode of corrections that is taken
+back is wider, which errs less.
 
 A step of an observation reads only observations that overlap it. So a city is solved tile by tile with the result of
 one piece: :func:`search` and each :func:`advance` are run for the home observations of each tile, given all
@@ -42,9 +43,20 @@ _SWEEP_CELL_M = 1.0
 
 
 @dataclass(frozen=True)
+class Step:
+    """width: gate and kernel of a sweep, metres; None: the search once more. judges: those whom nobody believed before
+    may be believed again after it.
+    """
+
+    width: tuple[float, float] | None
+    trial: bool
+    judges: bool
+
+
+@dataclass(frozen=True)
 class AlignConfig:
     """gates_m: how far across a line a neighbour may be, one number a sweep; kernels_m: the Geman-McClure scale of each
-    sweep. trial_gates_m, trial_kernels_m: of the sweeps that only tell whom to believe; after them all begins again.
+    sweep. trial_gates_m, trial_kernels_m: of the sweeps that only tell whom to believe, trials times; after each all begins again.
 
     along_m, heading_rad: how far along and how turned a neighbour may be. sigma_m: what lines of other observations
     scatter. correlation: points of one line that count as one. damping: share of a step taken. prior_scale: corrections
@@ -59,6 +71,7 @@ class AlignConfig:
     spacing_m: float = 1.0
     trial_gates_m: tuple[float, ...] = (2.0, 2.0, 1.3, 0.8)
     trial_kernels_m: tuple[float, ...] = (0.8, 0.8, 0.5, 0.35)
+    trials: int = 2
     gates_m: tuple[float, ...] = (2.0, 2.0, 1.6, 1.3, 1.0, 0.8, 0.8, 0.8)
     kernels_m: tuple[float, ...] = (0.8, 0.8, 0.6, 0.5, 0.4, 0.35, 0.35, 0.35)
     along_m: float = 1.0
@@ -73,15 +86,25 @@ class AlignConfig:
     gauge_scale: float = 1.25
     trial_gauge_scale: float = 1.0
     agent_scale: float = 2.0
-    agent_limit: float = 3.0
+    agent_limit: float = 2.5
     alike: float = 0.5
     drive_scale: float = 3.0
     gross: GrossConfig = field(default_factory=GrossConfig)
 
     @property
+    def schedule(self) -> tuple[Step, ...]:
+        """What follows the first search: the sweeps of each trial and the search once more, then the sweeps."""
+        tried, last = tuple(zip(self.trial_gates_m, self.trial_kernels_m)), len(self.trial_gates_m) - 1
+        out: list[Step] = []
+        for trial in range(self.trials):
+            out += [Step(width, True, trial == 0 or k == last) for k, width in enumerate(tried)]
+            out.append(Step(None, True, False))
+        return (*out, *(Step(width, False, False) for width in zip(self.gates_m, self.kernels_m)))
+
+    @property
     def steps(self) -> int:
-        """How many follow the first search: the trial's sweeps, the search once more, the sweeps."""
-        return len(self.trial_gates_m) + 1 + len(self.gates_m)
+        """How many follow the first search."""
+        return len(self.schedule)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +168,7 @@ def solve_poses(observations: Sequence[Observation], config: AlignConfig = Align
     state = merge([search(sightings, home, config)], config)
     keep = None
     for number in range(config.steps):
-        if number in (0, len(config.trial_gates_m) + 1):  # after a search, which alone moves the starts
+        if number == 0 or config.schedule[number - 1].width is None:  # after a search, which alone moves the starts
             keep = bounded(sightings, state.start[state.rows(sightings.ids)], config.most)
         state = merge([advance(sightings, state, number, home, config, keep)], config, number)
     return state
@@ -215,15 +238,11 @@ def advance(
     """The home observations after one more step, ids ascending; ``state`` holds all of the sightings after the step
     before. keep: (P,) the points that count in a sweep, :func:`bounded` at the state's starts; None: found here.
     """
-    trial = len(config.trial_gates_m)
-    if number == trial:
+    width = config.schedule[number].width
+    if width is None:
         return _search_again(sightings, state, home, config)
     if keep is None:
         keep = bounded(sightings, state.start[state.rows(sightings.ids)], config.most)
-    if number < trial:
-        width = (config.trial_gates_m[number], config.trial_kernels_m[number])
-    else:
-        width = (config.gates_m[number - trial - 1], config.kernels_m[number - trial - 1])
     return _sweep(sightings, state, np.flatnonzero(keep), width, home, config)
 
 
@@ -298,8 +317,8 @@ def merge(parts: Sequence[Alignment], config: AlignConfig = AlignConfig(), numbe
         tuple(drives[k] for k in order.tolist()),
         *(np.concatenate([getattr(part, name) for part in parts])[order] for name in _COLUMNS),
     )
-    trial = len(config.trial_gates_m)
-    if number is None or number == trial:
+    step = None if number is None else config.schedule[number]
+    if step is None or step.width is None:
         return whole
     names, agent = np.unique(np.array(whole.agents), return_inverse=True)
     residual = np.bincount(agent, whole.residual, len(names))
@@ -309,17 +328,17 @@ def merge(parts: Sequence[Alignment], config: AlignConfig = AlignConfig(), numbe
     claim = whole.claim[:, :2, :2]
     told = told_by_lines(whole.covariance, claim)
     usual = np.trace(claim, axis1=1, axis2=2) / 2
-    gauge = (config.gauge_m, config.trial_gauge_scale if number < trial else config.gauge_scale)
+    gauge = (config.gauge_m, config.trial_gauge_scale if step.trial else config.gauge_scale)
     common = common_error((whole.start, whole.pose), told, whole.voice * whole.faith, usual, gauge)
     offset = (whole.pose - whole.start)[:, :2] - common
     pose = whole.pose.copy()
     pose[:, :2] -= np.where(whole.fixed[:, None] > 0, 0.0, common)
-    limits = (config.agent_scale, config.agent_limit if number < trial else np.inf, config.alike)
+    limits = (config.agent_scale, config.agent_limit if step.trial else np.inf, config.alike)
     faith = faith_of(offset + whole.moved, told, usual, agent, limits)
-    # Whom the trial did not believe is not heard again.
-    silent = (number > trial) & (whole.faith <= NOT_BELIEVED)
+    # Whom a trial did not believe is not heard until the next one ends.
+    silent = (whole.faith <= NOT_BELIEVED) & (not step.judges)
     faith = np.where(whole.fixed > 0, 1.0, np.where(silent, NOT_BELIEVED, faith))
-    lean = whole.lean if number < trial else _lean(whole, common, config)
+    lean = whole.lean if step.trial else _lean(whole, common, config)
     return replace(whole, pose=pose, offset=offset, scale=np.sqrt(variance)[agent], faith=faith, lean=lean)
 
 

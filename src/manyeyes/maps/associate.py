@@ -56,7 +56,10 @@ def span(keys: Ints, start: Ints, kind: int, ix: int, iy0: int, iy1: int) -> tup
     """The range in a grid's order of the points of cells (ix, iy0..iy1) of a kind."""
     base = (kind << 60) | ((ix + 536870912) << 30)
     low = lower_bound(keys, base | (iy0 + 536870912))
-    return start[low], start[lower_bound(keys, (base | (iy1 + 536870912)) + 1)]
+    high, end = low, base | (iy1 + 536870912)
+    while high < len(keys) and keys[high] <= end:
+        high += 1
+    return start[low], start[high]
 
 
 @njit(cache=True, nogil=True)

@@ -118,7 +118,7 @@ def best_moves(home, pose, trusted, own, others, agent, yaws, numbers, stride): 
 
 @njit(cache=True, nogil=True)
 def _draw(pose, agent, others, x0, y0, nx, ny, cell):  # pragma: no cover - compiled
-    """What other agents saw, in the frame of a pose: (layers, nx, ny) of s / (s + 1)."""
+    """What other agents saw, in the frame of a pose: (layers, nx, ny) of s."""
     keys, start, rxy, rtangent, ragent = others
     picture = np.zeros((24, nx, ny), np.float32)
     stamp = np.empty((5, 5), np.float32)
@@ -152,19 +152,19 @@ def _draw(pose, agent, others, x0, y0, nx, ny, cell):  # pragma: no cover - comp
                     for di in range(5):
                         for dj in range(5):
                             picture[layer, i + di - 2, j + dj - 2] += stamp[di, dj]
-    return picture / (picture + np.float32(1.0))
+    return picture
 
 
 @njit(cache=True, nogil=True)
 def _correlate(picture, xy, tangent, kind, turn, x0, y0, cell, radius, stride):  # pragma: no cover - compiled
-    """Mean value of the picture under the points for each shift (2 radius + 1, 2 radius + 1) after a turn about their
-    mean.
+    """Mean of s / (s + 1) of the picture under the points for each shift (2 radius + 1, 2 radius + 1) after a turn about
+    their mean.
     """
     _, nx, ny = picture.shape
     score = np.zeros((2 * radius + 1, 2 * radius + 1))
     c, s = np.cos(turn), np.sin(turn)
     mx, my = xy[:, 0].mean(), xy[:, 1].mean()
-    count = 0
+    count, one = 0, np.float32(1.0)
     for p in range(0, len(xy), stride):
         dx, dy = xy[p, 0] - mx, xy[p, 1] - my
         i = int(np.floor((c * dx - s * dy + mx - x0) / cell))
@@ -175,6 +175,7 @@ def _correlate(picture, xy, tangent, kind, turn, x0, y0, cell, radius, stride): 
         if i < radius or j < radius or i >= nx - radius or j >= ny - radius:
             continue
         for di in range(2 * radius + 1):
+            row = picture[layer, i + di - radius, j - radius : j + radius + 1]
             for dj in range(2 * radius + 1):
-                score[di, dj] += picture[layer, i + di - radius, j + dj - radius]
+                score[di, dj] += row[dj] / (row[dj] + one)
     return score / max(1, count)

@@ -189,9 +189,10 @@ def _inside(x: float, y: float, xy: Floats, a: int, b: int) -> tuple[bool, float
         dx, dy = x1 - x0, y1 - y0
         norm = dx * dx + dy * dy
         t = min(1.0, max(0.0, ((x - x0) * dx + (y - y0) * dy) / norm)) if norm > 0.0 else 0.0
-        nearest = min(nearest, np.hypot(x0 + t * dx - x, y0 + t * dy - y))
+        ex, ey = x0 + t * dx - x, y0 + t * dy - y
+        nearest = min(nearest, ex * ex + ey * ey)
         j = i
-    return inside, nearest
+    return inside, np.sqrt(nearest)
 
 
 @njit(cache=True, nogil=True)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,8 @@ from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, rows_of
 from manyeyes.maps.align import AlignConfig
 from manyeyes.maps.associate import PointGrid, build_grid, span
+from manyeyes.maps.evidence import EvidenceConfig, visibility
 from manyeyes.maps.evidence import sights as sights_of
-from manyeyes.maps.evidence import visibility, witnesses
 from manyeyes.maps.fuse import FuseConfig, assemble
 from manyeyes.maps.gross import best_moves, moved_by
 from manyeyes.maps.looked import along, looked_at, merged
@@ -84,6 +85,8 @@ class StreamingMap:
         # Of a map nobody knows where its observations looked, but under its lines somebody did.
         kept = start.elements.take(lines)
         self._looked = [along(kept.points, kept.first)]
+        # Candidates are sorted anew with every observation; what was heard of them counts them as they came.
+        self._arrival = np.zeros(0, np.int64)
         self._heard: list[tuple[Ints, bool, int]] = []
         self._ids = {name: k for k, name in enumerate(self._known)}
 
@@ -101,9 +104,11 @@ class StreamingMap:
         weight = 0.04 / (s.sigma**2 + 0.1**2 + covariance[0, 0, 0] / 2 + covariance[0, 1, 1] / 2)
         worth = self.config.fuse.stations.evidence.worth(s.elements.score)[s.element]
         confirmed, missed, explained = 0, 0, np.zeros(len(xy), bool)
+        look = _Look.of(s, pose, (xy, tangent, weight, worth), self.config.fuse.stations.evidence)
         for ground in (self._main, self._new):
-            hits, misses, near = ground.update(s, pose, xy, tangent, weight, worth, self.config)
-            self._heard.append((hits, ground is self._main, len(self._known) - 1))
+            hits, misses, near = ground.update(s, look, self.config)
+            main = ground is self._main
+            self._heard.append((hits if main else self._arrival[hits], main, len(self._known) - 1))
             confirmed, missed, explained = confirmed + len(hits), missed + misses, explained | near
         confirmed, missed = self._cross(s, pose, confirmed, missed)
         fresh = np.flatnonzero(~explained & is_line(s.kind))
@@ -144,8 +149,7 @@ class StreamingMap:
         pose, covariance = np.array(s.pose), np.array(s.covariance)
         if not len(ground) or not len(s.xy):
             return pose, covariance
-        wide = (ground.wide.keys, ground.wide.start, *ground.wide_points)
-        pose = moved_by(s, home, best_moves(*_search_arguments(s, home, wide, config)))
+        pose = moved_by(s, home, best_moves(*_search_arguments(s, home, ground.wide, config)))
         begin = pose
         for gate, kernel in zip(one.gates_m, one.kernels_m):
             xy, tangent = s.world(pose)
@@ -201,20 +205,13 @@ class StreamingMap:
         """New candidates from points that no station explains, each worth a share of a hit."""
         if not len(xy):
             return
+        count = len(self._new)
         rows = self._new.rows.grown(s.kind[points], worth, s, self.config)
-        # Candidates keep their order of arrival in ``order``; the grid sorts them.
-        joined = _Ground.of(np.concatenate((self._new.xy, xy)), np.concatenate((self._new.tangent, tangent)), rows)
-        begun = np.arange(len(self._new), len(joined))
-        self._heard.append((begun, False, len(self._known) - 1))
-        self._settle_new(joined)
-
-    def _settle_new(self, joined: _Ground) -> None:
-        """Sort the candidates by their grid and renumber what was heard of them."""
-        order = joined.grid.order
-        place = np.empty(len(order), np.int64)
-        place[order] = np.arange(len(order))
-        self._heard = [(rows if main else place[rows], main, k) for rows, main, k in self._heard]
-        self._new = _Ground.of(joined.xy[order], joined.tangent[order], joined.rows.take(order))
+        xy, tangent = np.concatenate((self._new.xy, xy)), np.concatenate((self._new.tangent, tangent))
+        order = _order(xy, rows.kind)
+        self._arrival = np.concatenate((self._arrival, np.arange(count, len(xy))))[order]
+        self._new = _Ground.of(xy[order], tangent[order], rows.take(order))
+        self._heard.append((np.arange(count, len(xy)), False, len(self._known) - 1))
 
     def _fold_in(self) -> None:
         """Make candidates part of the main ground, and what was looked at one whole."""
@@ -227,8 +224,10 @@ class StreamingMap:
         order = _order(xy, both.kind)
         place = np.empty(len(order), np.int64)
         place[order] = np.arange(len(order))
-        shift = len(self._main)
-        self._heard = [(place[rows if main else rows + shift], True, k) for rows, main, k in self._heard]
+        came = np.empty(len(self._new), np.int64)
+        came[self._arrival] = place[len(self._main) :]
+        self._heard = [((place if main else came)[rows], True, k) for rows, main, k in self._heard]
+        self._arrival = self._arrival[:0]
         self._origin = np.concatenate((self._origin, np.full(len(self._new), -1, np.int64)))[order]
         self._main = _Ground.of(xy[order], tangent[order], both.take(order))
         self._new = _Ground.of(np.zeros((0, 2)), np.zeros((0, 2)), both.take(order[:0]))
@@ -324,24 +323,16 @@ class _Rows:
         their state.
         """
         evidence, time = config.fuse.stations.evidence, int(s.time_ns[0])
-        decay = np.array(evidence.decay_s)[self.kind[rows]]
-        age = np.maximum(0.0, (time - self.t_last[rows]) * 1e-9)
-        odds = self.log_odds[rows] * np.exp(-age / decay)
-        same = (self.last_agent[rows] == _agent_number(s)) & (self.day[rows] == time // DAY_NS)
-        before = np.where(same, self.day_sum[rows], 0.0)
-        after = before + amount
-        if not bool(s.trusted[0]):
-            after = np.clip(after, -evidence.daily, evidence.daily)
-        odds = np.clip(odds + after - before, -evidence.clamp, evidence.clamp)
-        self.log_odds[rows], self.day_sum[rows] = odds, after
-        self.agents[rows] += hit & ~same
-        self.support[rows] += hit
-        self.last_agent[rows], self.day[rows] = _agent_number(s), time // DAY_NS
-        if hit:
-            self.t_last[rows] = np.maximum(self.t_last[rows], time)
-        enough = (self.agents[rows] >= evidence.publish_agents) | bool(s.trusted[0])
-        state = np.where((odds >= evidence.publish_from(self.kind[rows])) & enough & hit, PUBLISHED, self.state[rows])
-        self.state[rows] = np.where(odds <= evidence.retire, RETIRED, state)
+        kinds = np.arange(len(KINDS))
+        _change(
+            rows,
+            np.broadcast_to(np.asarray(amount, np.float64), len(rows)),
+            tuple(getattr(self, name) for name in _CHANGED),
+            (time, time // DAY_NS, _agent_number(s)),
+            (hit, bool(s.trusted[0])),
+            (evidence.daily, evidence.clamp, float(evidence.publish_agents), evidence.retire),
+            (np.array(evidence.decay_s), evidence.publish_from(kinds)),
+        )
 
     def evidence(self, listed: Sequence[Sequence[int]], ids: NDArray[np.uint8]) -> Evidence:
         """As the fold's table; ``listed``: the observations (rows of ids) of each row."""
@@ -364,6 +355,60 @@ class _Rows:
         )
 
 
+_CHANGED = ("kind", "log_odds", "support", "agents", "state", "t_last", "last_agent", "day", "day_sum")
+
+
+@njit(cache=True, nogil=True)
+def _change(rows, amount, columns, now, flags, numbers, by_kind):  # pragma: no cover - compiled
+    kind, log_odds, support, agents, state, t_last, last_agent, day, day_sum = columns
+    time, today, agent = now
+    hit, trusted = flags
+    daily, clamp, least, retire = numbers
+    decay, publish = by_kind
+    for k, added in zip(rows, amount):
+        odds = log_odds[k] * np.exp(-max(0.0, (time - t_last[k]) * 1e-9) / decay[kind[k]])
+        same = last_agent[k] == agent and day[k] == today
+        before = day_sum[k] if same else 0.0
+        after = before + added
+        if not trusted:
+            after = min(max(after, -daily), daily)
+        odds = min(max(odds + after - before, -clamp), clamp)
+        log_odds[k], day_sum[k], last_agent[k], day[k] = odds, after, agent, today
+        if hit:
+            agents[k] += not same
+            support[k] += 1
+            t_last[k] = max(t_last[k], time)
+        if odds <= retire:
+            state[k] = RETIRED
+        elif hit and odds >= publish[kind[k]] and (trusted or agents[k] >= least):
+            state[k] = PUBLISHED
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """One observation at its pose (1, 3), as :func:`_compare` reads it; order: where its points stand among all."""
+
+    pose: Floats
+    order: Ints
+    points: tuple[Ints, Ints, Floats, Floats, Floats, Floats]
+    box: tuple[Floats, Floats]
+    sights: tuple
+    numbers: Floats
+
+    @classmethod
+    def of(
+        cls, s: Sightings, pose: Floats, columns: tuple[Floats, Floats, Floats, Floats], evidence: EvidenceConfig
+    ) -> _Look:
+        """columns: places, tangents, weights and worths of its points."""
+        lines = np.flatnonzero(is_line(s.kind))
+        xy, tangent, weight, worth = columns
+        fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind[lines], _CELL_M)
+        order, corner = lines[fine.order], s.world_view(pose)
+        points = (fine.keys, fine.start, xy[order], tangent[order], weight[order], worth[order])
+        box = corner.min(0), corner.max(0)
+        return cls(np.ascontiguousarray(pose), order, points, box, sights_of(s), evidence.numbers)
+
+
 @dataclass(eq=False)
 class _Ground:
     """Stations in the order of their grid, so that the compiled loops read them in place."""
@@ -372,8 +417,6 @@ class _Ground:
     tangent: Floats
     rows: _Rows
     grid: PointGrid
-    wide: PointGrid
-    wide_points: tuple[Floats, Floats, Ints]
     owner: Ints
     weight: Floats
 
@@ -381,42 +424,33 @@ class _Ground:
     def of(cls, xy: Floats, tangent: Floats, rows: _Rows) -> _Ground:
         xy, tangent = np.ascontiguousarray(xy), np.ascontiguousarray(tangent)
         grid = build_grid(xy[:, 0], xy[:, 1], rows.kind, _CELL_M)
-        wide = build_grid(xy[:, 0], xy[:, 1], rows.kind, 8.0)
-        order = wide.order
         nobody = np.full(len(xy), _STILL, np.int64)
         weight = np.minimum(4.0, rows.support.astype(np.float64))
-        return cls(xy, tangent, rows, grid, wide, (xy[order], tangent[order], nobody), nobody, weight)
+        return cls(xy, tangent, rows, grid, nobody, weight)
+
+    @cached_property
+    def wide(self) -> tuple[Ints, Ints, Floats, Floats, Ints]:
+        """The stations as the gross search reads them, where they stood when they were first asked for."""
+        grid = build_grid(self.xy[:, 0], self.xy[:, 1], self.rows.kind, 8.0)
+        return grid.keys, grid.start, self.xy[grid.order], self.tangent[grid.order], self.owner
 
     def __len__(self) -> int:
         return len(self.xy)
 
-    def update(
-        self,
-        s: Sightings,
-        pose: Floats,
-        xy: Floats,
-        tangent: Floats,
-        weight: Floats,
-        worth: Floats,
-        config: StreamConfig,
-    ) -> tuple[Ints, int, NDArray[np.bool_]]:
+    def update(self, s: Sightings, look: _Look, config: StreamConfig) -> tuple[Ints, int, NDArray[np.bool_]]:
         """Evidence of one observation: rows confirmed, how many missed, and which of its points (P,) some station
         explains.
         """
-        evidence = config.fuse.stations.evidence
-        if not len(self) or not len(xy):
-            return np.zeros(0, np.int64), 0, np.zeros(len(xy), bool)
-        lines = np.flatnonzero(is_line(s.kind))
-        fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind[lines], _CELL_M)
-        order = lines[fine.order]
-        corner = s.world_view(pose)
+        evidence, whole = config.fuse.stations.evidence, np.zeros(len(s.xy), bool)
+        if not len(self) or not len(whole):
+            return np.zeros(0, np.int64), 0, whole
         near, place, mass, seen, sure, explained = _compare(
             (self.grid.keys, self.grid.start, self.xy, self.tangent),
-            (fine.keys, fine.start, xy[order], tangent[order], weight[order], worth[order]),
-            (corner.min(0), corner.max(0)),
-            witnesses(s, pose)[0],
-            sights_of(s),
-            evidence.numbers,
+            look.points,
+            look.box,
+            look.pose,
+            look.sights,
+            look.numbers,
             len(KINDS),
         )
         hit = mass > 0.0
@@ -428,8 +462,7 @@ class _Ground:
         self.rows.sigma[rows] = np.maximum(evidence.bias_m, self.rows.sigma[rows] * np.sqrt(1.0 - gain))
         lost = (mass < 0.0) & (seen > 0.0)
         self.rows.change(near[lost], evidence.miss * seen[lost], s, False, config)
-        whole = np.zeros(len(xy), bool)
-        whole[order] = explained
+        whole[look.order] = explained
         return rows, int(lost.sum()), whole
 
 
