@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, SOLID, MapElements, Polygons
+from manyeyes.evaluation.map_malice import displacement
 from manyeyes.maps.align import AlignConfig, advance, merge, overlapping, search, solve_poses
-from manyeyes.maps.evidence import EvidenceConfig
+from manyeyes.maps.evidence import EvidenceConfig, vouched
 from manyeyes.maps.faith import NOT_BELIEVED
 from manyeyes.maps.fuse import FuseConfig, assemble, fuse, fuse_aligned
 from manyeyes.maps.observation import Observation
@@ -319,7 +320,7 @@ def test_a_lie_that_is_found_out_leaves_no_trace():
 def test_whom_liars_made_look_a_liar_is_heard_again():
     """Of a crossroads' crowd every fifth lies by 3 m as the others do: honest agents stand where they stand alone."""
     lying = replace(CROWDS["local"], malicious_share=0.2, malicious="colluding", malicious_offset=(3.0, 3.0))
-    told = simulate_crowd(place("cross"), 60, lying, seed=1)
+    told = simulate_crowd(place("cross"), 60, lying, seed=6)
     honest = [o for o, role in zip(told.observations, told.roles) if role != MALICIOUS]
     off, silenced = {}, {}
     for trials in (1, 2):
@@ -330,6 +331,24 @@ def test_whom_liars_made_look_a_liar_is_heard_again():
         silenced[trials] = int(((together.faith[rows] == NOT_BELIEVED) & (alone.faith > NOT_BELIEVED)).sum())
     assert silenced[1] > 0 and off[1] > 0.1
     assert silenced[2] == 0 and off[2] < 1e-3
+    # Where five honest agents looked, what the liars add does not count; smoothing brings a centimetre from where fewer did.
+    away = displacement(fuse(honest), fuse(told.observations))
+    assert len(away) > 500 and away.max() < 0.03 and np.median(away) < 1e-5
+
+
+def test_what_nobody_believes_counts_only_where_few_believed_agents_looked():
+    """Two lines in a view of 60 m by 30 m; believed agents stand 20 m behind, so that they see two thirds of it."""
+    told = [look(road(), (30.0, 0.0, 0.0), "doubted")]
+    told += [look(road(), (10.0, 0.0, 0.0), f"agent{k}", k) for k in range(4)]
+    sightings = gather(told, 1.0)
+    pose = np.array(sightings.pose)
+    believed = np.array([sightings.agents[a] != "doubted" for a in sightings.agent])
+    mine = ~believed[sightings.observation]
+    x = sightings.world(pose)[0][:, 0]
+    seen = vouched(sightings, pose, believed, 4, 2.0)
+    assert (seen[mine] == (x[mine] < 40.0)).all() and not seen[~mine].any()
+    assert not vouched(sightings, pose, believed, 5, 2.0).any()
+    assert not vouched(sightings, pose, np.ones(5, bool), 1, 2.0).any()
 
 
 @pytest.mark.parametrize("later, moved", [({}, True), ({"pass_id": "another"}, False)])

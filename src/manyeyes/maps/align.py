@@ -247,19 +247,14 @@ def advance(
 
 
 def _search_again(sightings: Sightings, state: Alignment, home: Ints, config: AlignConfig) -> Alignment:
-    """The home observations where they claim to stand, or where the search finds those that it moved before, or whom
-    nobody believes now: compared with those alone who are believed, so that the others leave no trace.
+    """The home observations where they claim to stand, or where the search finds them among those alone who are believed now:
+    the others leave no trace.
     """
-    before = _of(state, sightings, home)
     begun = _of(claimed(sightings), sightings, home)
-    begun = replace(begun, faith=np.where(before.faith > NOT_BELIEVED, 1.0, NOT_BELIEVED))
-    again = np.flatnonzero((before.moved != 0.0).any(1) | (before.faith <= NOT_BELIEVED))
-    rows = _rows_in(sightings, begun)
+    begun = replace(begun, faith=np.where(_of(state, sightings, home).faith > NOT_BELIEVED, 1.0, NOT_BELIEVED))
     keep = bounded(sightings, np.asarray(sightings.pose), config.most)
     keep &= (state.faith[state.rows(sightings.ids)] > NOT_BELIEVED)[sightings.observation]
-    found = begun.pose.copy()
-    found[again] = gross_search(sightings, keep, rows[again], config.gross)
-    return _searched(begun, found)
+    return _searched(begun, gross_search(sightings, keep, _rows_in(sightings, begun), config.gross))
 
 
 def _of(state: Alignment, sightings: Sightings, home: Ints) -> Alignment:

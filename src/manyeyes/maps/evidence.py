@@ -124,8 +124,10 @@ class Witness:
     sources: Ints
 
 
-def looks(sightings: Sightings, pose: Floats) -> Looks:
-    """The index of who may see what, by cells of 32 m that each view's box meets, for agents at pose (O, 3)."""
+def looks(sightings: Sightings, pose: Floats, heard: NDArray[np.bool_] | None = None) -> Looks:
+    """The index of who may see what, by cells of 32 m that each view's box meets, for agents at pose (O, 3); heard: (O,) who
+    is in it, None: all.
+    """
     xy, first, of = sightings.view.xy, sightings.view.first, sightings.view.of
     owner = np.repeat(np.repeat(np.arange(len(of) - 1), np.diff(of)), np.diff(first))
     c, s = np.cos(pose[owner, 2]), np.sin(pose[owner, 2])
@@ -134,6 +136,8 @@ def looks(sightings: Sightings, pose: Floats) -> Looks:
     np.minimum.at(low, owner, placed)
     np.maximum.at(high, owner, placed)
     cell, who = _cells(np.floor(low / _LOOK_CELL_M).astype(np.int64), np.floor(high / _LOOK_CELL_M).astype(np.int64))
+    if heard is not None:
+        cell, who = cell[heard[who]], who[heard[who]]
     order = np.lexsort((who, cell))
     keys, start = np.unique(cell[order], return_index=True)
     return Looks(keys, np.append(start, len(order)).astype(np.int64), who[order])
@@ -174,18 +178,19 @@ def witness(
     sightings: Sightings,
     pose: Floats,
     weight: Floats,
+    believed: NDArray[np.bool_],
     config: EvidenceConfig = EvidenceConfig(),
 ) -> Witness:
     """The evidence for line stations (K,) at xy with unit tangents, from all sightings with agents at pose (O, 3).
 
-    ``weight`` (P,) is how much each point of the sightings counts for the place across; what it is seen counts once an
-    observation.
+    ``weight`` (P,) is how much each point of the sightings counts for the place across, 0: it is not there; what it is seen
+    counts once an observation. believed: (O,) whose word that something is not there counts.
     """
-    points = np.flatnonzero(is_line(sightings.kind))
+    points = np.flatnonzero(is_line(sightings.kind) & (weight > 0.0))
     world, direction = sightings.world(pose)
     grid = build_grid(world[points, 0], world[points, 1], sightings.kind[points], 2.5)
     order = points[grid.order]
-    index = looks(sightings, pose)
+    index = looks(sightings, pose, believed)
     out = _witness(
         (xy, tangent, kind),
         (
@@ -414,6 +419,38 @@ def fold_looks(
             era_seen += 1
             seen_by, surveyed = 0, False
     return odds, coverage, all_by, state
+
+
+def vouched(
+    sightings: Sightings, pose: Floats, believed: NDArray[np.bool_], agents: int, margin_m: float
+) -> NDArray[np.bool_]:
+    """(P,) which points of observations that nobody believes (O,) lie where so many believed agents looked."""
+    out = np.zeros(len(sightings.xy), np.bool_)
+    if not believed.all():
+        index = looks(sightings, pose, believed)
+        doubted = np.flatnonzero(~believed)
+        xy = sightings.world(pose)[0]
+        among = (index.keys, index.start, index.of), witnesses(sightings, pose), sights(sightings)
+        _vouch(doubted, np.asarray(sightings.first), xy, *among, margin_m, agents, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _vouch(doubted, first, xy, index, who, sights, margin, agents, out):  # pragma: no cover - compiled
+    seen, place = np.full(who[4], -1), np.empty((1, 2))
+    for o in doubted:
+        for p in range(first[o], first[o + 1]):
+            place[0, 0], place[0, 1] = xy[p, 0], xy[p, 1]
+            low, high = _cell_of(place, index)
+            count = 0
+            for q in range(low, high):
+                other = index[2][q]
+                if seen[who[1][other]] != p and visibility(place, other, who[0], sights, margin) > 0.0:
+                    seen[who[1][other]] = p
+                    count += 1
+                    if count == agents:
+                        out[p] = True
+                        break
 
 
 @njit(cache=True, nogil=True)

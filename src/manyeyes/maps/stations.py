@@ -17,8 +17,8 @@ from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import STYLES, rows_of
 from manyeyes.maps.align import Alignment, bounded
 from manyeyes.maps.associate import build_grid, span
-from manyeyes.maps.evidence import EvidenceConfig, Witness, witness
-from manyeyes.maps.faith import looks_weight
+from manyeyes.maps.evidence import EvidenceConfig, Witness, vouched, witness
+from manyeyes.maps.faith import NOT_BELIEVED, looks_weight
 from manyeyes.maps.looked import looked_at, merged
 from manyeyes.maps.polygons import Crossings, PolygonConfig, find_crossings
 from manyeyes.maps.ridges import RidgeConfig, shift_to_ridges, thin
@@ -37,7 +37,8 @@ class StationConfig:
     """most: observations that shape a ridge in a cell of 8 m, class and heading. halo_m: of an area, where ridges are
     found too.
 
-    least_support: observations that a station needs, where at least seen_by (summed visibility) could have seen it.
+    vouched: what an agent whom nobody believes says of lines counts only where fewer believed agents looked. least_support:
+    observations that a station needs, where at least seen_by (summed visibility) could have seen it.
     rival_m: stations of two kinds of line this close across, or of one kind within rival_far_m, exclude each other
     unless the same observations saw both: the one with the smaller log-odds goes if the ratio of supports, or the
     difference of log-odds, is that large.
@@ -45,6 +46,7 @@ class StationConfig:
 
     most: int = 32
     halo_m: float = 24.0
+    vouched: int = 5
     least_support: int = 1
     seen_by: float = 3.0
     rival_m: float = 0.6
@@ -146,7 +148,8 @@ def find_stations(
     rows = alignment.rows(sightings.ids)
     pose, covariance = alignment.pose[rows], alignment.covariance[rows]
     weight = looks_weight(sightings, alignment.start[rows], alignment.scale[rows], alignment.faith[rows])
-    lines = _lines(sightings, pose, covariance, weight, area, config)
+    believed = alignment.faith[rows] > NOT_BELIEVED
+    lines = _lines(sightings, pose, covariance, (weight, believed), area, config)
     rank = np.argsort(np.argsort(np.array(sightings.ids)))
     crossings = find_crossings(sightings, pose, weight, rank, config.polygon, config.evidence)
     ring, ring_start, ring_xy = _rings_inside(crossings, sightings, area, config)
@@ -155,12 +158,19 @@ def find_stations(
 
 
 def _lines(
-    sightings: Sightings, pose: Floats, covariance: Floats, weight: Floats, area: Area | None, config: StationConfig
+    sightings: Sightings,
+    pose: Floats,
+    covariance: Floats,
+    standing: tuple[Floats, NDArray[np.bool_]],
+    area: Area | None,
+    config: StationConfig,
 ) -> tuple[Floats, Floats, Evidence]:
-    """Positions, tangents and evidence of line stations in the area."""
+    """Positions, tangents and evidence of line stations in the area. standing: weight and belief (O,) of observations."""
     xy, tangent = sightings.world(pose)
-    counts = np.flatnonzero(bounded(sightings, pose, config.most) & is_line(sightings.kind))
+    weight, believed = standing
     point_weight = _information(sightings, xy, tangent, pose, covariance) * weight[sightings.observation]
+    point_weight[vouched(sightings, pose, believed, config.vouched, config.evidence.margin_m)] = 0.0
+    counts = np.flatnonzero(bounded(sightings, pose, config.most) & is_line(sightings.kind) & (point_weight > 0.0))
     inside = _within(xy[counts], area, config.halo_m)
     places, turned, _ = shift_to_ridges(
         np.flatnonzero(inside), xy[counts], tangent[counts], sightings.kind[counts], point_weight[counts], config.ridge
@@ -169,7 +179,7 @@ def _lines(
     kept = thin(places, turned, sightings.kind[seeds], sightings.priority[seeds], config.ridge)
     seeds, places, turned = seeds[kept], places[kept], turned[kept]
     kind = sightings.kind[seeds]
-    found = witness(places, turned, kind, sightings, pose, point_weight, config.evidence)
+    found = witness(places, turned, kind, sightings, pose, point_weight, believed, config.evidence)
     normal = np.stack((-turned[:, 1], turned[:, 0]), 1)
     places = places + found.shift[:, None] * normal
     enough = (found.support >= config.least_support) | (found.coverage < config.seen_by)
