@@ -45,18 +45,20 @@ _SWEEP_CELL_M = 1.0
 @dataclass(frozen=True)
 class Step:
     """width: gate and kernel of a sweep, metres; None: the search once more. judges: those whom nobody believed before
-    may be believed again after it.
+    may be believed again after it. stride: every n-th point of an observation has its vote.
     """
 
     width: tuple[float, float] | None
     trial: bool
     judges: bool
+    stride: int = 1
 
 
 @dataclass(frozen=True)
 class AlignConfig:
     """gates_m: how far across a line a neighbour may be, one number a sweep; kernels_m: the Geman-McClure scale of each
-    sweep. trial_gates_m, trial_kernels_m: of the sweeps that only tell whom to believe, trials times; after each all begins again.
+    sweep. trial_gates_m, trial_kernels_m: of the sweeps that only tell whom to believe, trials times, by every
+    trial_stride-th point; after each all begins again.
 
     along_m, heading_rad: how far along and how turned a neighbour may be. sigma_m: what lines of other observations
     scatter. correlation: points of one line that count as one. damping: share of a step taken. prior_scale: corrections
@@ -72,6 +74,7 @@ class AlignConfig:
     trial_gates_m: tuple[float, ...] = (2.0, 2.0, 1.3, 0.8)
     trial_kernels_m: tuple[float, ...] = (0.8, 0.8, 0.5, 0.35)
     trials: int = 2
+    trial_stride: int = 3
     gates_m: tuple[float, ...] = (2.0, 2.0, 1.6, 1.3, 1.0, 0.8, 0.8, 0.8)
     kernels_m: tuple[float, ...] = (0.8, 0.8, 0.6, 0.5, 0.4, 0.35, 0.35, 0.35)
     along_m: float = 1.0
@@ -97,7 +100,7 @@ class AlignConfig:
         tried, last = tuple(zip(self.trial_gates_m, self.trial_kernels_m)), len(self.trial_gates_m) - 1
         out: list[Step] = []
         for trial in range(self.trials):
-            out += [Step(width, True, trial == 0 or k == last) for k, width in enumerate(tried)]
+            out += [Step(width, True, trial == 0 or k == last, self.trial_stride) for k, width in enumerate(tried)]
             out.append(Step(None, True, False))
         return (*out, *(Step(width, False, False) for width in zip(self.gates_m, self.kernels_m)))
 
@@ -238,12 +241,12 @@ def advance(
     """The home observations after one more step, ids ascending; ``state`` holds all of the sightings after the step
     before. keep: (P,) the points that count in a sweep, :func:`bounded` at the state's starts; None: found here.
     """
-    width = config.schedule[number].width
-    if width is None:
+    step = config.schedule[number]
+    if step.width is None:
         return _search_again(sightings, state, home, config)
     if keep is None:
         keep = bounded(sightings, state.start[state.rows(sightings.ids)], config.most)
-    return _sweep(sightings, state, np.flatnonzero(keep), width, home, config)
+    return _sweep(sightings, state, np.flatnonzero(keep), (*step.width, step.stride), home, config)
 
 
 def _search_again(sightings: Sightings, state: Alignment, home: Ints, config: AlignConfig) -> Alignment:
@@ -276,9 +279,10 @@ def _searched(state: Alignment, found: Floats) -> Alignment:
 
 
 def _sweep(
-    sightings: Sightings, state: Alignment, keep: Ints, width: tuple[float, float], home: Ints, config: AlignConfig
+    sightings: Sightings, state: Alignment, keep: Ints, width: tuple[float, float, int], home: Ints, config: AlignConfig
 ) -> Alignment:
-    """The home observations after one sweep with this gate and kernel among the points ``keep``."""
+    """The home observations after one sweep with this gate, kernel and stride among the points ``keep``."""
+    gate, kernel, stride = width
     rows = state.rows(sightings.ids)
     start, lean, pose = state.start[rows], state.lean[rows], state.pose[rows]
     xy, tangent = sightings.world(pose)
@@ -290,7 +294,8 @@ def _sweep(
         home,
         (sightings.first, xy, tangent, sightings.kind, sightings.sigma),
         (grid.cell_m, grid.keys, grid.start, xy[order], tangent[order], far, weight[far]),
-        (*width, config.along_m, np.cos(config.heading_rad), config.sigma_m, config.correlation),
+        (gate, kernel, config.along_m, np.cos(config.heading_rad), config.sigma_m, config.correlation),
+        stride,
     )
     moved = step_poses(sightings, home, (start, lean, pose), sums, config)
     part = state.take(rows[home])

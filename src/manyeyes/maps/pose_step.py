@@ -24,13 +24,14 @@ Ints = NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(home, own, others, numbers):  # pragma: no cover - compiled
+def normal_equations(home, own, others, numbers, stride=1):  # pragma: no cover - compiled
     """Normal equations of each home observation: (H, 11) pivot x, y; information xx, xy, xt, yy, yt, tt; right side is
-    last of (H, 14): then x, y, t of the gradient, residual sum, vote sum, points.
+    last of (H, 14): then x, y, t of the gradient, residual sum, vote sum, points. Every stride-th point votes, for all.
     """
     first, xy, tangent, kind, sigma = own
     cell, keys, start, rxy, rtangent, robservation, rweight = others
     gate, kernel, reach, cosine, scatter, correlation = numbers
+    correlation /= stride
     out = np.zeros((len(home), 13))
     c2 = kernel * kernel
     far = gate * gate + reach * reach
@@ -42,7 +43,7 @@ def normal_equations(home, own, others, numbers):  # pragma: no cover - compiled
             continue
         px, py = xy[a:b, 0].mean(), xy[a:b, 1].mean()
         out[h, 0], out[h, 1] = px, py
-        for p in range(a, b):
+        for p in range(a, b, stride):
             x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
             lowest, highest = int(np.floor((y - radius) / cell)), int(np.floor((y + radius) / cell))
             total, pull, square = 0.0, 0.0, 0.0
