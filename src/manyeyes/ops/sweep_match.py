@@ -65,23 +65,31 @@ def _inside(points, place, away_x, away_y, along):  # pragma: no cover
 def _match(now, then, places, back, slack, cost, count):  # pragma: no cover
     """Fills cost (N, S) and count (N,)."""
     steps, limit = cost.shape[1], REACH_M * REACH_M
+    x, best = np.empty(steps), np.empty(steps)
     for n in range(len(places)):
         mine = _inside(now, places[n], 0.0, 0.0, MARGIN[0])
         theirs = _inside(then, places[n], -back[n, 0], -back[n, 1], MARGIN[0] + slack[n])
         if len(mine) < FEWEST or len(theirs) < FEWEST:
             continue
-        theirs = theirs[np.argsort(theirs[:, 0])]
         asked = min(len(mine), MOST)
         count[n] = asked
+        apart = 2.0 * slack[n] / (steps - 1)
         for a in range(asked):
             point = mine[a * len(mine) // asked]
             for s in range(steps):
-                x = point[0] - slack[n] * (2.0 * s / (steps - 1) - 1.0)
-                best = limit
-                for b in range(np.searchsorted(theirs[:, 0], x - REACH_M), len(theirs)):
-                    dx = theirs[b, 0] - x
-                    if dx > REACH_M:
-                        break
-                    dy, dz = theirs[b, 1] - point[1], theirs[b, 2] - point[2]
-                    best = min(best, dx * dx + dy * dy + dz * dz)
-                cost[n, s] += best / limit / asked
+                x[s], best[s] = point[0] - slack[n] * (2.0 * s / (steps - 1) - 1.0), limit
+            for b in range(len(theirs)):
+                dy, dz = theirs[b, 1] - point[1], theirs[b, 2] - point[2]
+                dy, dz = dy * dy, dz * dz
+                if dy + dz >= limit:
+                    continue
+                # The candidates at which it may be within reach: one more on each side, for rounding.
+                gap, first, last = theirs[b, 0] - point[0] - slack[n], 0, steps - 1
+                if apart > 0.0:
+                    first = max(first, int((-REACH_M - gap) / apart) - 1)
+                    last = min(last, int((REACH_M - gap) / apart) + 1)
+                for s in range(first, last + 1):
+                    dx = theirs[b, 0] - x[s]
+                    best[s] = min(best[s], dx * dx + dy + dz)
+            for s in range(steps):
+                cost[n, s] += best[s] / limit / asked
