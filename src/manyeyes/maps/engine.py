@@ -7,6 +7,7 @@ depend on which one did, in which order, or on how many workers.
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -164,7 +165,7 @@ class Ray:
         started = not ray.is_initialized()
         if started:
             local = {"num_cpus": self.workers or _cores(), "include_dashboard": False} if self.address is None else {}
-            ray.init(address=self.address, log_to_driver=False, logging_level="ERROR", **local)
+            ray.init(address=self.address, log_to_driver=False, logging_level=logging.ERROR, **local)
         try:
             yield _RayClient(ray)
         finally:
