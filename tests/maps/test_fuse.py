@@ -337,7 +337,7 @@ def test_whom_liars_made_look_a_liar_is_heard_again():
 
 
 def test_what_nobody_believes_counts_only_where_few_believed_agents_looked():
-    """Two lines in a view of 60 m by 30 m; believed agents stand 20 m behind, so that they see two thirds of it."""
+    """A road in a view of 60 m; four believed agents stand 20 m behind, so that they see two thirds of it."""
     told = [look(road(), (30.0, 0.0, 0.0), "doubted")]
     told += [look(road(), (10.0, 0.0, 0.0), f"agent{k}", k) for k in range(4)]
     sightings = gather(told, 1.0)

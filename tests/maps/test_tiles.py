@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map fused tile by tile is the map fused in one piece, on any engine, after a kill, and after a few more observations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.maps.align import solve_poses
 from manyeyes.maps.columns_file import load_columns, save_columns
 from manyeyes.maps.engine import Inline, named_executor
+from manyeyes.maps.faith import NOT_BELIEVED
 from manyeyes.maps.formats.attributes import hex_ids
 from manyeyes.maps.fuse import FuseConfig, fuse
 from manyeyes.maps.observation_log import read_standing
 from manyeyes.maps.sightings import gather
 from manyeyes.maps.store import MapStore
 from manyeyes.maps.tiles import TileConfig, fuse_tiles, make_blocks
-from manyeyes.simulator.crowd import place, simulate_crowd
+from manyeyes.simulator.crowd import CROWDS, place, simulate_crowd
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")
 pytest.importorskip("shapely", reason="the map extra is not installed")
@@ -65,6 +69,17 @@ def test_small_tiles_give_the_map_of_one_piece_and_no_line_is_cut_at_a_border(st
     got = _tiled(store, tmp_path / "work", 90.0)
     assert got.quantised_hash() == whole.quantised_hash()
     assert got.elements.lengths().max() > 90.0
+
+
+def test_whom_nobody_believes_is_left_out_alike_in_tiles_and_in_one_piece(tmp_path):
+    lying = replace(CROWDS["local"], malicious_share=0.2, malicious="colluding", malicious_offset=(3.0, 3.0))
+    told = simulate_crowd(place("cross"), COUNT, lying, seed=6)
+    assert (solve_poses(told.observations).faith == NOT_BELIEVED).sum() > 3
+    made = MapStore.create(tmp_path / "store", told.place.frame)
+    with made.writing() as log:
+        log.append(told.observations)
+    one_piece = fuse(told.observations, frame=told.place.frame)
+    assert _tiled(made, tmp_path / "work", 90.0).quantised_hash() == one_piece.quantised_hash()
 
 
 def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, whole, tmp_path):
