@@ -34,9 +34,11 @@ def test_every_example_is_run_here() -> None:
 
 
 def test_01_bytes_between_two_agents() -> None:
-    out = run("01_bytes_between_two_agents.py")
-    assert "from 1 agent" in out
-    assert int(out.split()[0]) > 80
+    sent, alone, together = run("01_bytes_between_two_agents.py").strip().splitlines()
+    assert "from 1 agent" in sent and int(sent.split()[0]) > 80
+    # One car stands hidden behind another; the pole sees it.
+    assert alone.startswith("alone: 5 of 6 cars") and "(18, 3)" not in alone
+    assert together.startswith("together: 6 of 6 cars") and "(18, 3)" in together
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.numbers import Numbers, as_tensor
 from manyeyes.datatypes.transform import Transform
 
 
@@ -33,16 +34,29 @@ class PointCloud:
             )
 
     @classmethod
-    def of(cls, xyz: Tensor, intensity: Tensor | None = None, time_s: Tensor | None = None) -> PointCloud:
-        """A cloud from points alone: intensity and time default to zero. NaN or infinite points are refused."""
-        xyz = xyz.to(torch.float32)
-        if not bool(torch.isfinite(xyz).all()):
-            bad = int((~torch.isfinite(xyz).all(-1)).sum())
+    def of(cls, xyz: Numbers, intensity: Numbers | None = None, time_s: Numbers | None = None) -> PointCloud:
+        """Build a cloud from tensors or numpy arrays of any number type; intensity and time default to zero.
+
+        Args:
+            xyz: (N, 3), metres. intensity: (N,) in [0, 1]. time_s: (N,), seconds.
+
+        Raises:
+            ShapeError: another shape, or points that are NaN or infinite as float32.
+        """
+        points = as_tensor(xyz, "PointCloud.xyz", torch.float32)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ShapeError(f"PointCloud.of needs xyz (N, 3); got {tuple(points.shape)}: pass x, y, z columns alone.")
+        if not bool(torch.isfinite(points).all()):
+            bad = int((~torch.isfinite(points).all(-1)).sum())
             raise ShapeError(
-                f"{bad} of {xyz.shape[0]} points are NaN or infinite; drop them before building a PointCloud."
+                f"{bad} of {points.shape[0]} points are NaN or infinite; drop them before building a PointCloud."
             )
-        zeros = torch.zeros(xyz.shape[0])
-        return cls(xyz, zeros if intensity is None else intensity.float(), zeros if time_s is None else time_s.float())
+        zeros = torch.zeros(points.shape[0])
+        return cls(
+            points,
+            zeros if intensity is None else as_tensor(intensity, "PointCloud.intensity", torch.float32),
+            zeros if time_s is None else as_tensor(time_s, "PointCloud.time_s", torch.float32),
+        )
 
     def __len__(self) -> int:
         return self.xyz.shape[0]

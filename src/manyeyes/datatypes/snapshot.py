@@ -40,6 +40,10 @@ class AgentFrame:
     def __post_init__(self) -> None:
         if self.pose_covariance.shape != (3, 3):
             raise ShapeError(f"AgentFrame.pose_covariance needs (3, 3); got {tuple(self.pose_covariance.shape)}.")
+        # World coordinates reach kilometres, where float32 is off by millimetres; all later products are of float64.
+        object.__setattr__(self, "world_from_agent", self.world_from_agent.double())
+        if self.odometry is not None:
+            object.__setattr__(self, "odometry", self.odometry.double())
 
     @classmethod
     def of(

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.numbers import Numbers, as_tensor
 
 
 @dataclass(frozen=True)
@@ -35,15 +36,28 @@ class Transform:
         return cls(torch.eye(3, dtype=dtype).expand(*batch, 3, 3), torch.zeros(*batch, 3, dtype=dtype))
 
     @classmethod
-    def from_matrix(cls, matrix: Tensor) -> Transform:
-        """From homogeneous matrices (..., 4, 4)."""
-        if matrix.shape[-2:] != (4, 4):
-            raise ShapeError(f"A rigid motion is a (..., 4, 4) matrix; got {tuple(matrix.shape)}.")
-        rotation = matrix[..., :3, :3]
-        eye = torch.eye(3, dtype=matrix.dtype)
+    def from_matrix(cls, matrix: Numbers) -> Transform:
+        """Build poses from homogeneous matrices (..., 4, 4), tensors or numpy arrays of any number type; kept in float64.
+
+        Raises:
+            ShapeError: another shape, NaN or infinite entries, or an upper left block that is not a rotation.
+        """
+        pose = as_tensor(matrix, "Transform.from_matrix", torch.float64)
+        if pose.shape[-2:] != (4, 4):
+            raise ShapeError(f"A rigid motion is a (..., 4, 4) matrix; got {tuple(pose.shape)}.")
+        if not bool(torch.isfinite(pose).all()):
+            raise ShapeError("A rigid motion has finite entries; this matrix has NaN or infinite ones.")
+        rotation = pose[..., :3, :3]
+        eye = torch.eye(3, dtype=torch.float64)
         if not bool(((rotation @ rotation.mT - eye).abs() < 1e-3).all()) or not bool((torch.det(rotation) > 0).all()):
             raise ShapeError("The upper left 3x3 block is not a rotation (orthonormal, determinant +1).")
-        return cls(rotation, matrix[..., :3, 3])
+        return cls(rotation, pose[..., :3, 3])
+
+    def double(self) -> Transform:
+        """The same motion in float64."""
+        if self.rotation.dtype == self.translation.dtype == torch.float64:
+            return self
+        return Transform(self.rotation.double(), self.translation.double())
 
     @classmethod
     def from_rpy(cls, translation: Tensor, roll: Tensor, pitch: Tensor, yaw: Tensor) -> Transform:
