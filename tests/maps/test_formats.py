@@ -125,7 +125,7 @@ def test_counter_clockwise_turns_only_rings_that_run_clockwise():
 
 
 def test_lanelet2_reads_lanes_crosswalk_and_styles_back(two_lanes, tmp_path):
-    lanelet2 = pytest.importorskip("lanelet2", reason="the lanelet2 extra is not installed")
+    lanelet2 = pytest.importorskip("lanelet2", reason="the lanelet2 package is not installed")
     m = two_lanes()
     export_map(m, tmp_path / "m.osm")
     origin = lanelet2.io.Origin(m.frame.latitude, m.frame.longitude)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording played through agents on a channel: share, bytes, deliver, perceive; the same two functions as live."""
+"""A recording played through agents on a channel: share, bytes, deliver, perceive: the two functions that an agent calls on the road."""
 
 from __future__ import annotations
 

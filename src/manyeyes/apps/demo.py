@@ -8,7 +8,7 @@ model ships; else of a crossroads by a simulated crowd.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,7 +48,8 @@ def main(options: Options) -> None:
     """The verb."""
     from rich.console import Console
 
-    from manyeyes.apps.showcase import Showing, bars, play
+    from manyeyes.apps.showcase import REPORT, Showing, bars, play
+    from manyeyes.apps.viewer.report import save_report
     from manyeyes.datasets.opv2v import Opv2vRecording
     from manyeyes.models import zoo
     from manyeyes.simulator.presets import simulate
@@ -69,7 +70,6 @@ def main(options: Options) -> None:
     town = drive.scenario.rpartition("_")[0]
     if len(drive.judged(drive.scenario)) == 0:
         raise ConfigError(f"{folder}: the drive has no judged frame; remove the folder and run the demo again.")
-    chapters, said = _map(drive, options.out / "map", options.seed, console)
     showing = Showing(
         out=options.out,
         title="manyeyes demo: one drive, four ways to collaborate",
@@ -86,12 +86,14 @@ def main(options: Options) -> None:
             f"manyeyes view {folder} --split test --out drive.gif",
             f"manyeyes map fuse {options.out / 'map'}",
         ),
-        chapters=chapters,
     )
-    _, report = play(drive, detector, showing, console)
+    report, place = play(drive, detector, showing, console), options.out / REPORT
+    # The report of the detections is on disk before the map begins, so that nothing of it is lost where the map fails.
+    chapters, said = _map(drive, options.out / "map", options.seed, console)
+    save_report(replace(report, chapters=(*chapters, *report.chapters)), place)
     console.print(f"\n{said}", highlight=False, soft_wrap=True)
     console.print(
-        f"\nPictures, animation and JSON are in {options.out}; open {report}", highlight=False, soft_wrap=True
+        f"\nPictures, animation and JSON are in {options.out}; open {place}", highlight=False, soft_wrap=True
     )
 
 

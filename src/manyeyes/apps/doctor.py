@@ -19,11 +19,13 @@ from manyeyes.apps import provenance
 from manyeyes.datatypes import ConfigError
 
 EXTRAS = {
-    "sim": ("libsumo", "sumo", "shapely"),
-    "map": ("shapely", "pyarrow"),
+    "sim": ("libsumo", "sumo", "shapely", "pyarrow"),
+    "map": ("shapely", "pyarrow", "pyogrio"),
     "view": ("matplotlib", "PIL"),
-    "live": ("zenoh",),
-    "av2": ("pyarrow",),
+    "av2": ("pyarrow", "shapely"),
+    "dask": ("dask", "distributed"),
+    "ray": ("ray",),
+    "register": ("small_gicp",),
 }
 
 

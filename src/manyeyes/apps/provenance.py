@@ -21,7 +21,7 @@ from manyeyes import __version__
 
 PACKAGES = (
     "torch", "numpy", "numba", "safetensors", "tyro", "rich", "PyYAML", "zstandard", "eclipse-sumo", "libsumo",
-    "shapely", "pyarrow", "matplotlib", "pillow", "eclipse-zenoh",
+    "shapely", "pyarrow", "matplotlib", "pillow",
 )  # fmt: skip
 
 

@@ -42,7 +42,7 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.apps.recordings import open_recording, suited_to
-    from manyeyes.apps.showcase import Showing, play
+    from manyeyes.apps.showcase import REPORT, Showing, play
     from manyeyes.models import zoo
 
     console = Console()
@@ -64,7 +64,9 @@ def main(options: Options) -> None:
         score_min=options.score_min,
         commands=(f"manyeyes run {options.recording}{split} --scenario {drive.scenario}",),
     )
-    _, report = play(drive, zoo.load(options.playing.weights), showing, console)
+    play(drive, zoo.load(options.playing.weights), showing, console)
     console.print(
-        f"\nPictures, animation and JSON are in {options.out}; open {report}", highlight=False, soft_wrap=True
+        f"\nPictures, animation and JSON are in {options.out}; open {options.out / REPORT}",
+        highlight=False,
+        soft_wrap=True,
     )

@@ -29,6 +29,7 @@ from manyeyes.models.detector import Detector
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+REPORT = "report.html"
 WIDTH, FILM_WIDTH, FILM_FRAME_MS = 1280, 800, 200
 TITLES = {
     "alone": "Ego alone",
@@ -54,7 +55,6 @@ class Showing:
     animate: bool = True
     facts: tuple[tuple[str, str], ...] = ()
     commands: tuple[str, ...] = ()
-    chapters: tuple[Chapter, ...] = ()
 
 
 @dataclass
@@ -73,8 +73,8 @@ class _Film:
             self.pending = {}
 
 
-def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console) -> tuple[Outcome, Path]:
-    """Plays the drive and writes everything under showing.out; the outcome and the report's path."""
+def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console) -> Report:
+    """Play the drive and write everything under showing.out; the report as it was saved, to which chapters can be added."""
     judged = drive.judged(drive.scenario)
     instant = judged[len(judged) // 2] if showing.frame is None else showing.frame
     if instant not in judged:
@@ -113,11 +113,11 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
         facts=_facts(drive, detector, showing),
         commands=showing.commands,
         notes=_notes(protocol),
-        chapters=(*showing.chapters, *where),
+        chapters=where,
         provenance=origin,
     )
-    save_report(report, showing.out / "report.html")
-    return outcome, showing.out / "report.html"
+    save_report(report, showing.out / REPORT)
+    return report
 
 
 def _where(places: Mapping[str, Whereabouts]) -> tuple[Chapter, ...]:
