@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the package imports is what its metadata install: core dependencies, and for each feature its extra."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+tomllib = pytest.importorskip("tomllib", reason="Python 3.11 reads pyproject.toml")
+REPOSITORY = Path(__file__).resolve().parents[1]
+SOURCE = REPOSITORY / "src" / "manyeyes"
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+MODULES = {"PIL": "pillow", "yaml": "pyyaml", "sumo": "eclipse-sumo", "small_gicp": "small-gicp", "llvmlite": "numba"}
+"""Modules whose package on the index has another name; numba brings llvmlite of its own version."""
+
+
+def packages(requirements: list[str]) -> set[str]:
+    return {re.split(r"[\[<>=;]", line)[0].strip().lower() for line in requirements}
+
+
+CORE = packages(PROJECT["dependencies"])
+EXTRAS = {name: packages(lines) for name, lines in PROJECT["optional-dependencies"].items() if name != "dev"}
+
+
+def imported(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Top-level modules that are imported at run time, also by name, with their lines."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
+            node.body = []
+        elif isinstance(node, ast.Import):
+            yield from ((alias.name.split(".")[0], node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield str(node.module).split(".")[0], node.lineno
+        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "import_module" and node.args:
+            name = node.args[0]
+            if isinstance(name, ast.Constant):
+                yield str(name.value).split(".")[0], node.lineno
+
+
+def third_party() -> list[tuple[str, str, ast.Module]]:
+    found = []
+    for path in sorted(SOURCE.rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        for module, line in imported(tree):
+            if module not in sys.stdlib_module_names and module not in ("manyeyes", "__future__"):
+                found.append((MODULES.get(module, module), f"{path.relative_to(SOURCE)}:{line}", tree))
+    return found
+
+
+def named_extras(tree: ast.Module) -> set[str]:
+    """The extras that a file names in the error for a package that is not there."""
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "MissingExtraError"]
+    return {call.args[0].value for call in calls if isinstance(call.args[0], ast.Constant)}
+
+
+def test_every_import_is_of_a_core_dependency_or_of_an_extra() -> None:
+    known = CORE.union(*EXTRAS.values())
+    assert [(package, place) for package, place, _ in third_party() if package.lower() not in known] == []
+
+
+def test_a_file_that_names_an_extra_imports_nothing_that_this_extra_lacks() -> None:
+    lacking = []
+    for package, place, tree in third_party():
+        for extra in named_extras(tree):
+            # One file may offer features of several extras: what it imports lies in one of them.
+            if package.lower() not in CORE.union(*(EXTRAS[name] for name in named_extras(tree))):
+                lacking.append((extra, package, place))
+    assert lacking == []
+
+
+def test_the_compiled_linear_algebra_finds_its_library() -> None:
+    assert "scipy" in CORE
+
+
+def test_the_install_line_of_the_readme_holds_what_the_demo_imports() -> None:
+    """The demo makes scenes (SUMO, shapely), writes a map (pyarrow) and draws (pillow, matplotlib)."""
+    install = re.search(r"pip install .*\[([a-z,0-9]+)\]'", (REPOSITORY / "README.md").read_text())
+    assert install is not None
+    held = CORE.union(*(EXTRAS[name] for name in install[1].split(",")))
+    assert {"eclipse-sumo", "libsumo", "shapely", "pyarrow", "pillow", "matplotlib"} <= held
+
+
+def test_doctor_looks_for_what_the_extras_install(capsys: pytest.CaptureFixture[str]) -> None:
+    from manyeyes.apps import cli
+    from manyeyes.apps.doctor import EXTRAS as LOOKED_FOR
+
+    wanted = {name: {MODULES.get(m, m).lower() for m in modules} for name, modules in LOOKED_FOR.items()}
+    assert wanted == EXTRAS
+    assert cli.main(["doctor", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert {entry["name"] for entry in said["extras"]} == set(EXTRAS)
+
+
+def test_the_package_imports_no_extra_before_it_is_needed() -> None:
+    code = (
+        "import sys, manyeyes.apps.cli, manyeyes.agents.agent; "
+        "sys.exit(any(m in sys.modules for m in ('shapely', 'pyarrow', 'PIL', 'matplotlib', 'libsumo')))"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
