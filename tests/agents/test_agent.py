@@ -164,15 +164,19 @@ def test_an_agent_does_not_hear_itself_nor_report_its_own_body(drive, detector: 
 
 
 def test_late_fusion_keeps_one_box_of_two_that_overlap(drive, detector: Detector) -> None:
-    """What another says of the very same boxes adds none; the same boxes far aside add all."""
+    """What another says of the very same boxes adds none; the same boxes aside add all that lie in the ego's range."""
     frame = drive(1).frame(0, 3)
     eyes, late = Eyes(detector), method("late")
     said = late.say(eyes, frame)
     assert said is not None and said.objects is not None
     own = eyes.see(frame).boxes
     assert len(late.hear(eyes, frame, [said])) == len(own) > 0
-    far = replace(said, world_from_agent=frame.world_from_agent @ Transform.from_xyz_yaw(0.0, 200.0))
-    assert len(late.hear(eyes, frame, [far])) == len(own) + len(said.objects)
+    aside = replace(said, world_from_agent=frame.world_from_agent @ Transform.from_xyz_yaw(0.0, 200.0))
+    assert len(late.hear(eyes, frame, [aside])) == len(own)
+    lattice = torch.cartesian_prod(torch.arange(-24.0, 25.0), torch.arange(-24.0, 25.0), torch.tensor([0.8]))
+    free = lattice[torch.cdist(lattice[:, :2], own.center[:, :2]).min(1).values.argmax()][None]
+    one = replace(said, objects=replace(own[:1], center=free, size=torch.tensor([[0.5, 0.5, 1.5]])))
+    assert len(late.hear(eyes, frame, [one])) == len(own) + 1
 
 
 def test_an_unknown_method_lists_the_known() -> None:

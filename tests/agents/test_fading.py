@@ -12,7 +12,7 @@ from manyeyes.agents.collaboration import method
 from manyeyes.agents.collaboration.early import Early
 from manyeyes.agents.collaboration.fading import FADE, faded, strongest
 from manyeyes.agents.collaboration.late import Late
-from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud, Transform
+from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, Message, PointCloud, Transform
 
 TENTH_NS = 100_000_000
 
@@ -37,6 +37,8 @@ class Seen:
 
 class Sees:
     """Eyes that saw these boxes, newest first, a tenth of a second apart, while the agent drove on at 1 m a sweep."""
+
+    grid = BevGrid(-100.0, -40.0, -3.0, 100.0, 40.0, 1.0)
 
     def __init__(self, *views: Boxes) -> None:
         self.views = [(frame(9 - i, -float(i)), Seen(view)) for i, view in enumerate(views)]
@@ -86,6 +88,22 @@ def test_a_late_message_does_not_fade_but_what_its_sender_said_before_does() -> 
 def test_late_fusion_as_papers_have_it_knows_only_what_is_newest() -> None:
     found = Late().hear(Sees(boxes(), boxes(30.0)), frame(9), [said(6, boxes(10.0))])
     assert found.center[:, 0].tolist() == [10.0] and not Late().remembers
+
+
+def test_boxes_of_others_are_cropped_and_capped_before_they_are_ranked() -> None:
+    """Beyond 100 m nobody is asked; of 200 boxes within, the best 128 of the message take part, and the ego's own stands."""
+    crowd = replace(boxes(*torch.linspace(-98, 98, 40).tolist() * 5), score=torch.linspace(0.1, 0.9, 200))
+    rows = torch.arange(200)
+    crowd = replace(crowd, center=crowd.center + torch.stack((0 * rows, 10 + 4.0 * (rows // 40), 0 * rows), 1))
+    found = Late().hear(Sees(boxes(0.0, score=0.1)), frame(9), [said(9, Boxes.cat([boxes(150.0, score=1.0), crowd]))])
+    assert len(found) == 129 and float(found.center[:, 0].max()) < 100
+    assert found.center[found.score.argmin()].tolist() == pytest.approx([0.0, 0.0, 0.8])
+
+
+def test_a_better_box_of_another_replaces_an_own_one_at_the_same_place_only() -> None:
+    own = boxes(0.0, 20.0, score=0.3)
+    found = Late().hear(Sees(own), frame(9), [said(9, boxes(0.9, 21.5, score=0.9))])
+    assert sorted(found.center[:, 0].tolist()) == pytest.approx([0.9, 20.0])
 
 
 def test_early_fusion_merges_what_is_heard_and_remembers_nothing() -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.coding import coded, readable
+from manyeyes.agents.coding import coded
 from manyeyes.agents.replay import ReplayConfig, replay
 from manyeyes.comms.bus import LocalBus
 from manyeyes.comms.inbox import Inbox
@@ -136,7 +136,7 @@ def test_codes_need_a_codebook_on_both_sides(detector):
     assert inbox.dropped.wrong_model == len(packets)
     inbox = Inbox(tables=Agent(detector)._tables)
     inbox.push(packets[0])
-    assert readable(inbox.receptions()[0], plain).message.tokens is None
+    assert Agent(plain).perceive(frames[0], inbox).heard[0].message.tokens is None
 
 
 def test_requests_are_counted_and_change_what_is_sent(detector):

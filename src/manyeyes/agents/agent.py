@@ -4,21 +4,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 
 from manyeyes.agents.aligner import Aligner, Known, Verdict
-from manyeyes.agents.coding import codebook_of, coded, readable, tables_of, usual_precision
+from manyeyes.agents.coding import codebook_of, coded, readable, tables_of, token_format_of, usual_precision
 from manyeyes.agents.collaboration import Collaboration, Intermediate
 from manyeyes.agents.collaboration.heading import header
-from manyeyes.agents.eyes import Eyes
+from manyeyes.agents.eyes import Eyes, History
 from manyeyes.agents.memory import Memory
 from manyeyes.comms import wire
-from manyeyes.comms.inbox import Inbox, Reception
+from manyeyes.comms.inbox import Inbox, Reception, Rejection
 from manyeyes.comms.request import need, request_map
 from manyeyes.comms.select import within_budget
+from manyeyes.comms.token_format import TokenFormat, within_range
 from manyeyes.comms.wire import Precision
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 from manyeyes.datatypes.message import RequestMap
@@ -35,12 +37,23 @@ WINDOW_STRIDE = 32
 @dataclass(frozen=True)
 class Perception:
     """boxes: in the agent's own frame, best first. heard: the messages that took part, by agent id, from where they were
-    believed to come. verdicts: on every message that came, where the agent aligns them.
+    believed to come. verdicts: on every message that came, where the agent aligns them. rejected: senders whose content took no
+    part, or only part of it, and why.
     """
 
     boxes: Boxes
     heard: tuple[Reception, ...]
     verdicts: tuple[Verdict, ...] = ()
+    rejected: tuple[Rejection, ...] = ()
+
+
+@dataclass(frozen=True)
+class _State:
+    """What a perception leaves behind; it is taken over only where the whole perception succeeded."""
+
+    memory: Memory
+    known: dict[int, Known]
+    history: History
 
 
 class Agent:
@@ -91,7 +104,7 @@ class Agent:
         if self.aligner is not None:
             message = self.aligner.describe(frame, self.eyes, message)
         if message.tokens is not None and message.token_score is not None:
-            told = message.tokens
+            told = message.tokens.with_features(within_range(message.tokens.features))
             tokens = coded(told, self.eyes.detector) if self.precision == "codes" else told
             score = message.token_score * need(tokens.sites.xy, frame.world_from_agent, asked)
             left = budget
@@ -112,25 +125,85 @@ class Agent:
         boxes = self.eyes.see(frame).boxes
         return request_map(boxes.center[:, :2], boxes.score, self.eyes.detector.config.grid.at(WINDOW_STRIDE))
 
+    @property
+    def token_format(self) -> TokenFormat:
+        """What tokens must look like to be fused by this agent."""
+        return token_format_of(self.eyes.detector, self._tables)
+
+    def inbox(self, expire_ns: int | None = None) -> Inbox:
+        """An inbox that keeps no tokens but those that this agent can fuse."""
+        return Inbox(expire_ns=expire_ns, token_format=self.token_format)
+
     def perceive(self, frame: AgentFrame, inbox: Inbox | Iterable[bytes] = (), now_ns: int | None = None) -> Perception:
         """Boxes around the agent from its own frame and whatever of others' messages has come.
 
-        inbox: an Inbox that packets were pushed into, or plain packets. now_ns: when the ego stops waiting; messages that
-        the inbox holds too old by then are left out.
+        What others send never raises: tokens of another form are left out, and a sender whose content makes fusion fail is left
+        out whole; both stand in ``Perception.rejected``. Nothing of a perception that failed is remembered.
+
+        inbox: an Inbox that packets were pushed into, best the agent's own (``inbox``), or plain packets. now_ns: when the ego
+        stops waiting; messages that the inbox holds too old by then are left out.
         """
         if not isinstance(inbox, Inbox):
-            packets, inbox = inbox, Inbox(self.eyes.detector.fingerprint, tables=self._tables)
+            packets, inbox = inbox, self.inbox()
             for packet in packets:
                 inbox.push(packet)
-        came = (r for r in inbox.receptions(now_ns) if r.message.agent_id != frame.agent_id)
-        heard = tuple(readable(r, self.eyes.detector) for r in came)
-        heard, verdicts = self._aligned(frame, heard)
-        messages = [reception.message for reception in heard]
-        if self.collaboration.remembers:
-            distrusted = [verdict.agent_id for verdict in verdicts if verdict.distrusted]
-            messages = self.memory.recall(messages, frame.timestamp_ns, distrusted)
-        boxes = self.collaboration.hear(self.eyes, frame, messages)
-        return Perception(_others(boxes, frame), heard, verdicts)
+        rejected, heard, form = list(inbox.take_rejections()), list[Reception](), self.token_format
+        for reception in inbox.receptions(now_ns):
+            if reception.message.agent_id != frame.agent_id:
+                usable, rejection = readable(reception, self.eyes.detector, form)
+                heard.append(usable)
+                rejected += [] if rejection is None else [rejection]
+        perception, failed = self._perceive(frame, heard)
+        for rejection in failed:
+            inbox.discard(rejection.agent_id)
+        return replace(perception, rejected=(*rejected, *failed))
+
+    def _perceive(self, frame: AgentFrame, heard: list[Reception]) -> tuple[Perception, list[Rejection]]:
+        """Fuse what can be fused; the rejections of those whose content cannot."""
+        failed: list[Rejection] = []
+        try:
+            perception, state = self._attempt(frame, heard)
+        except Exception as error:
+            failed = self._failing(frame, heard, error)
+            names = {rejection.agent_id for rejection in failed}
+            left = [reception for reception in heard if reception.message.agent_id not in names]
+            try:
+                perception, state = self._attempt(frame, left)
+            except Exception as together:
+                # Each passes alone and all fail together: nobody can be named, so nobody takes part, not even what is remembered.
+                failed += [_content_error(reception, together) for reception in left]
+                self.memory, self._known = Memory(), {}
+                perception, state = self._attempt(frame, [])
+        self.memory, self._known, self.eyes.history = state.memory, state.known, state.history
+        return perception, failed
+
+    def _failing(self, frame: AgentFrame, heard: Sequence[Reception], error: Exception) -> list[Rejection]:
+        """Those of a group that fails whose content alone makes fusion fail, by halving the group."""
+        if len(heard) <= 1:
+            return [_content_error(reception, error) for reception in heard]
+        failed = []
+        for half in (heard[: len(heard) // 2], heard[len(heard) // 2 :]):
+            try:
+                self._attempt(frame, half)
+            except Exception as of_half:
+                failed += self._failing(frame, half, of_half)
+        return failed
+
+    def _attempt(self, frame: AgentFrame, heard: Sequence[Reception]) -> tuple[Perception, _State]:
+        """One perception and the state after it; the agent's own state is as before, also after an error."""
+        before = _State(copy(self.memory), self._known, self.eyes.history)
+        try:
+            usable, verdicts = self._aligned(frame, tuple(heard))
+            messages = [reception.message for reception in usable]
+            if self.collaboration.remembers:
+                distrusted = [verdict.agent_id for verdict in verdicts if verdict.distrusted]
+                messages = self.memory.recall(messages, frame.timestamp_ns, distrusted)
+            boxes = self.collaboration.hear(self.eyes, frame, messages)
+            return Perception(_others(boxes, frame), usable, verdicts), _State(
+                self.memory, self._known, self.eyes.history
+            )
+        finally:
+            self.memory, self._known, self.eyes.history = before.memory, before.known, before.history
 
     def _aligned(
         self, frame: AgentFrame, heard: tuple[Reception, ...]
@@ -143,6 +216,11 @@ class Agent:
         said = {message.agent_id: message for message in aligned.messages}
         kept = (replace(r, message=said[r.message.agent_id]) for r in heard if r.message.agent_id in said)
         return tuple(kept), aligned.verdicts
+
+
+def _content_error(reception: Reception, error: Exception) -> Rejection:
+    text = " ".join(f"fusing its content failed: {type(error).__name__}: {error}".split())
+    return Rejection(reception.message.agent_id, "content_error", text, error)
 
 
 def _others(boxes: Boxes, frame: AgentFrame) -> Boxes:

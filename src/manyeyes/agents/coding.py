@@ -6,11 +6,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.inbox import Reception
+from manyeyes.comms.inbox import Reception, Rejection, token_rejection
+from manyeyes.comms.token_format import TokenFormat
 from manyeyes.comms.wire import Precision
 from manyeyes.datatypes import ConfigError, SparseBev
 from manyeyes.models.codebook import Codebook
 from manyeyes.models.detector import Detector
+from manyeyes.models.proposal import PROPOSAL
 
 
 def codebook_of(detector: Detector) -> Codebook:
@@ -32,16 +34,27 @@ def tables_of(detector: Detector) -> CodeTables | None:
     return CodeTables(detector.fingerprint, detector.codebook.frequencies.numpy())
 
 
+def token_format_of(detector: Detector, tables: CodeTables | None) -> TokenFormat:
+    """What these weights send and read; tables: those of ``tables_of``."""
+    channels = detector.encoder.out_channels + PROPOSAL
+    return TokenFormat(detector.fingerprint, detector.token_grid, channels, tables)
+
+
 def coded(tokens: SparseBev, detector: Detector) -> SparseBev:
     """Told rows (N, C + PROPOSAL) as bytes (N, W) of the codebook, on the same cells."""
     return tokens.with_features(codebook_of(detector).write(tokens.features))
 
 
-def readable(reception: Reception, detector: Detector) -> Reception:
-    """The same, with codes read: tokens are told rows again. Codes that these weights cannot mean are left out."""
+def readable(reception: Reception, detector: Detector, token_format: TokenFormat) -> tuple[Reception, Rejection | None]:
+    """The same with codes read, so that tokens are rows of floats again; tokens of another form are left out and rejected."""
     message, book = reception.message, detector.codebook
-    if message.tokens is None or message.tokens.features.is_floating_point():
-        return reception
-    fits = book is not None and message.tokens.features.shape[1] == book.width
-    tokens = message.tokens.with_features(book.read(message.tokens.features)) if book is not None and fits else None
-    return replace(reception, message=replace(message, tokens=tokens))
+    tokens = message.tokens
+    if tokens is None:
+        return reception, None
+    if book is not None and not tokens.features.is_floating_point() and tokens.features.shape[1] == book.width:
+        tokens = tokens.with_features(book.read(tokens.features))
+    others = message.fingerprint != token_format.fingerprint
+    reason = "wrong_model" if others else token_format.refusal_of(tokens)
+    if reason is not None:
+        return replace(reception, message=replace(message, tokens=None)), token_rejection(message.agent_id, reason)
+    return replace(reception, message=replace(message, tokens=tokens)), None

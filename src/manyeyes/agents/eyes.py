@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from manyeyes.agents.tracks import FOLLOWING, Earlier, TrackConfig, followed
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, SparseBev
+from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, PointCloud, SparseBev
 from manyeyes.models.box_head import SPEED_UNIT, DecodeConfig, RawBoxes, decode
 from manyeyes.models.detector import Detector
 from manyeyes.models.fusion.gather import Part, Tokens
@@ -60,6 +60,10 @@ class Sight:
         return moved
 
 
+History = tuple[tuple[AgentFrame, PointCloud] | None, tuple[AgentFrame, SparseBev] | None]
+"""The last merged cloud and the last fused tokens, each with its frame."""
+
+
 class Eyes:
     """A detector and the last few frames that it saw, of one agent. Frames are told apart by identity.
 
@@ -83,6 +87,11 @@ class Eyes:
         self._merged: tuple[AgentFrame, PointCloud] | None = None
         self._said: list[tuple[AgentFrame, SparseBev]] = []
         self.perceived: tuple[AgentFrame, SparseBev] | None = None
+
+    @property
+    def grid(self) -> BevGrid:
+        """The range that the detector sees around the agent."""
+        return self.detector.config.grid
 
     def see(self, frame: AgentFrame) -> Sight:
         """The agent's own view of its frame, with the sweep before it where there is one."""
@@ -145,6 +154,15 @@ class Eyes:
         if last is None or not follows(frame, last[0]):
             return None
         return last[1].transform(frame.from_earlier(last[0]))
+
+    @property
+    def history(self) -> History:
+        """What perceiving leaves behind; assign it to take a perception back."""
+        return self._merged, self.perceived
+
+    @history.setter
+    def history(self, history: History) -> None:
+        self._merged, self.perceived = history
 
     def see_cloud(self, cloud: PointCloud, earlier: PointCloud | None = None) -> Sight:
         """The view of any cloud in an agent's frame, and of the one before it in the same frame; not remembered."""

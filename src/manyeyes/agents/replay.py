@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording played through agents on a channel: share, bytes, deliver, perceive: the two functions that an agent calls on the road."""
+"""A recording played through agents on a channel: share, bytes, deliver, perceive; the functions that an agent calls."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.aligner import Aligner
-from manyeyes.agents.coding import tables_of
 from manyeyes.agents.collaboration import method
 from manyeyes.agents.eyes import FOLLOWED, REMEMBERED, Eyes, Sight
 from manyeyes.comms.budget import fair_shares
@@ -130,6 +129,10 @@ class Team:
                 began = time.perf_counter()
                 perception = agent.perceive(frame, inbox, until)
                 took = time.perf_counter() - began
+                for rejection in perception.rejected:
+                    # All senders of a replay are agents of this program: an error is a defect, not an attack.
+                    if rejection.cause is not None:
+                        raise rejection.cause
                 ages = tuple(heard.age_ns(until) / 1e9 for heard in perception.heard)
                 yield Step(self.method, snapshot, ego, perception, sent, ages, took)
 
@@ -164,7 +167,7 @@ class Team:
             self._agents[who] = Agent(
                 self.detector, way, config.precision, config.budget_bytes, eyes, config.aligner, config.requests
             )
-            self._inboxes[who] = Inbox(self.detector.fingerprint, EXPIRE_NS, tables=tables_of(self.detector))
+            self._inboxes[who] = self._agents[who].inbox(EXPIRE_NS)
         return self._agents[who], self._inboxes[who]
 
 

@@ -272,6 +272,13 @@ def _are_finite(raw, at, size):  # pragma: no cover
     return not bad
 
 
+def largest_magnitude(data: bytes, size: int) -> float:
+    """The largest magnitude of little-endian floats of size bytes, 2 or 4, none of them NaN; at least one float."""
+    # Without their signs, the bits of floats are in the order of their values.
+    bits = np.frombuffer(data, f"<u{size}") & np.array((1 << 8 * size - 1) - 1, f"<u{size}")
+    return float(np.frombuffer(bits.max().tobytes(), f"<f{size}")[0])
+
+
 def _scales() -> NDArray[np.float32]:
     # Eighths of an octave times an exact power of two: the same table on every machine.
     steps = [math.ldexp(2.0 ** (k % 8 / 8), _FIRST_OCTAVE + k // 8) for k in range(255)]

@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 from manyeyes.comms.codec import PacketError, Reason
 from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.sections import TokenRows
+from manyeyes.comms.token_format import TokenFormat, TokenRefusal
 from manyeyes.comms.wire import Assembly, Fragment, decode_packet
 from manyeyes.datatypes import Message
 
-DropReason = Reason | Literal["duplicate", "expired", "full"]
+DropReason = Reason | TokenRefusal | Literal["duplicate", "expired", "full"]
 
 _CLOCK_SLACK_NS = 1_000_000_000
 
@@ -23,8 +24,9 @@ class Dropped:
 
     garbage: not a packet, or cut. version: of another wire version. checksum: bytes were changed. implausible: values
     that cannot be (NaN, cells outside the grid, captured over 1 s after arrival). contradiction: another packet of the
-    same message says otherwise. wrong_model: tokens of other weights. duplicate: a copy. expired: too old, or older
-    than what this agent has since said. full: no room for more agents or more bytes of this agent.
+    same message says otherwise. wrong_model: tokens of other weights. grid, width, value: tokens that name these weights but
+    lie on another grid, have other channels, or values beyond what the weights send. duplicate: a copy. expired: too old, or
+    older than what this agent has since said. full: no room for more agents or more bytes of this agent.
     """
 
     garbage: int = 0
@@ -33,6 +35,9 @@ class Dropped:
     implausible: int = 0
     contradiction: int = 0
     wrong_model: int = 0
+    grid: int = 0
+    width: int = 0
+    value: int = 0
     duplicate: int = 0
     expired: int = 0
     full: int = 0
@@ -45,6 +50,32 @@ class Dropped:
     def plus(self, reason: DropReason) -> Dropped:
         """One more packet of that reason."""
         return replace(self, **{reason: getattr(self, reason) + 1})
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Content of one sender that takes no part in a perception.
+
+    reason: as in Dropped, or content_error: fusing it raised an error, which is the cause. text: what was expected, what came.
+    """
+
+    agent_id: int
+    reason: TokenRefusal | Literal["content_error"]
+    text: str
+    cause: Exception | None = field(default=None, compare=False)
+
+
+def token_rejection(agent_id: int, reason: TokenRefusal) -> Rejection:
+    """The rejection of a sender's tokens."""
+    return Rejection(agent_id, reason, _TOKEN_TEXTS[reason])
+
+
+_TOKEN_TEXTS: dict[TokenRefusal, str] = {
+    "wrong_model": "tokens of other weights than the receiver's; send with the same weights",
+    "grid": "tokens name the receiver's weights but lie on another grid",
+    "width": "tokens name the receiver's weights but have another number of channels",
+    "value": "token values lie beyond the range that the weights send, or are NaN",
+}
 
 
 @dataclass(frozen=True)
@@ -80,7 +111,8 @@ class Inbox:
     expire_ns: a message captured longer ago than this is neither taken nor given; None keeps it until a newer one comes.
     At most max_agents senders of max_agent_bytes of packets each are held: a flood of ids cannot exhaust the memory.
     Beyond it the sender heard of least recently (by capture) gives way to a newer one. tables: of the codebook of these
-    weights; without them coded tokens cannot be read and are refused as of other weights.
+    weights; without them coded tokens cannot be read and are refused as of other weights. token_format: refuses, beyond the
+    fingerprint, tokens of another grid, width or range, and holds the tables; an agent's own inbox has it (``Agent.inbox``).
     """
 
     def __init__(
@@ -90,14 +122,17 @@ class Inbox:
         max_agents: int = 64,
         max_agent_bytes: int = 4 << 20,
         tables: CodeTables | None = None,
+        token_format: TokenFormat | None = None,
     ) -> None:
-        self._fingerprint = fingerprint
+        self._token_format = token_format
+        self._fingerprint = fingerprint if token_format is None else token_format.fingerprint
         self._expire_ns = expire_ns
         self._max_agents = max_agents
         self._max_agent_bytes = max_agent_bytes
-        self._tables = tables
+        self._tables = tables if token_format is None else token_format.tables
         self._held: dict[int, _Held] = {}
         self._dropped = Dropped()
+        self._rejections: dict[int, Rejection] = {}
 
     @property
     def dropped(self) -> Dropped:
@@ -108,7 +143,12 @@ class Inbox:
         """Take one packet; whatever is wrong with it is counted and never raised."""
         try:
             fragment = decode_packet(packet, self._tables)
-            refusal = self._refusal(fragment, arrival_ns) or self._store(fragment, arrival_ns)
+            refusal = self._refusal(fragment, arrival_ns)
+            if refusal is None:
+                token_refusal = self._token_refusal(fragment)
+                if token_refusal is not None:
+                    self._reject(fragment.header.agent_id, token_refusal)
+                refusal = token_refusal or self._store(fragment, arrival_ns)
         except PacketError as error:
             refusal = error.reason
         if refusal is not None:
@@ -130,6 +170,15 @@ class Inbox:
             for _, held in sorted(self._held.items())
         )
 
+    def take_rejections(self) -> tuple[Rejection, ...]:
+        """Senders whose tokens were refused since the last call, the last reason of each, by agent id."""
+        taken, self._rejections = self._rejections, {}
+        return tuple(rejection for _, rejection in sorted(taken.items()))
+
+    def discard(self, agent_id: int) -> None:
+        """Let go what is held of one sender; its next message is taken anew."""
+        self._held.pop(agent_id, None)
+
     def messages(self, now_ns: int | None = None) -> tuple[Message, ...]:
         """The newest message of each agent, as far as it came, by agent id."""
         return tuple(reception.message for reception in self.receptions(now_ns))
@@ -146,8 +195,23 @@ class Inbox:
             # A stamp from the future would otherwise silence its agent id until that time has come.
             if stamp - arrival_ns > _CLOCK_SLACK_NS:
                 return "implausible"
+        return None
+
+    def _token_refusal(self, fragment: Fragment) -> TokenRefusal | None:
+        """Why the tokens of a packet are not of this inbox's weights; None where they are, or where it has none."""
+        if not isinstance(fragment.body, TokenRows):
+            return None
+        if self._token_format is not None:
+            return self._token_format.refusal(fragment.header.fingerprint, fragment.body)
         others = self._fingerprint is not None and fragment.header.fingerprint != self._fingerprint
-        return "wrong_model" if others and isinstance(fragment.body, TokenRows) else None
+        return "wrong_model" if others else None
+
+    def _reject(self, agent_id: int, reason: TokenRefusal) -> None:
+        """Keep the reason for the next who asks, of at most as many senders as are held: ids are free for all."""
+        self._rejections.pop(agent_id, None)
+        if len(self._rejections) >= self._max_agents:
+            del self._rejections[next(iter(self._rejections))]
+        self._rejections[agent_id] = token_rejection(agent_id, reason)
 
     def _store(self, fragment: Fragment, arrival_ns: int | None) -> DropReason | None:
         """Put a packet with its message; the reason where there is no place for it."""

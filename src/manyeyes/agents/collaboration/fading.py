@@ -37,4 +37,4 @@ def moved(frame: AgentFrame, seen: Iterable[tuple[AgentFrame, Sight]]) -> list[B
 def strongest(boxes: list[Boxes], iou: float = SAME_IOU) -> Boxes:
     """All boxes, best first, without those that overlap a better one."""
     all_of_them = Boxes.cat(boxes)
-    return all_of_them[rotated_nms(all_of_them.bev().double(), all_of_them.score, iou)]
+    return all_of_them[rotated_nms(all_of_them.bev().double(), all_of_them.score, iou, pre=len(all_of_them))]
