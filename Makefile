@@ -11,13 +11,14 @@ export PIP_NO_WARN_SCRIPT_LOCATION := 1
 export PYTHONWARNINGS := ignore:::pip
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help venv demo test check format bench clean
+.PHONY: help venv demo test check wheel format bench clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    make a drive, share bytes, perceive, judge: table, pictures, report in $(OUT)"
 	@echo "make test    every test"
 	@echo "make check   formatting, lint, types, floors"
+	@echo "make wheel   build the wheel and run demo, align and map fuse from it in an empty environment"
 	@echo "make format  rewrite the sources in the house format"
 	@echo "make bench   the speed benchmarks, each with its stored result"
 	@echo "make clean   remove the environment, outputs and caches"
@@ -42,6 +43,9 @@ check: $(STAMP)
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/basedpyright
 	@$(BIN)/lint-imports --no-cache
+
+wheel:
+	@PYTHON=$(PYTHON) bash .ci/wheel
 
 format: $(STAMP)
 	@$(BIN)/ruff format .

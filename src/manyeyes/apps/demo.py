@@ -92,9 +92,7 @@ def main(options: Options) -> None:
     chapters, said = _map(drive, options.out / "map", options.seed, console)
     save_report(replace(report, chapters=(*chapters, *report.chapters)), place)
     console.print(f"\n{said}", highlight=False, soft_wrap=True)
-    console.print(
-        f"\nPictures, animation and JSON are in {options.out}; open {place}", highlight=False, soft_wrap=True
-    )
+    console.print(f"\nPictures, animation and JSON are in {options.out}; open {place}", highlight=False, soft_wrap=True)
 
 
 def _map(drive: Recording, out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
