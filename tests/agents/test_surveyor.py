@@ -56,6 +56,13 @@ def test_looks_of_others_widen_the_view_and_change_what_is_drawn(mapper):
     stranger = replace(heard, fingerprint=b"another!")
     other = Surveyor(mapper, ALL)(both, [stranger])
     assert other is not None and np.array_equal(other.elements.points, own.elements.points)
+    # Looks that name these weights and are not of their form ended in an error, or in no map at all.
+    tokens = heard.tokens
+    assert tokens is not None
+    for features in (tokens.features[:, :1], torch.full_like(tokens.features, 3e38), tokens.features * torch.nan):
+        wrong = replace(heard, tokens=tokens.with_features(features))
+        other = Surveyor(mapper, ALL)(both, [wrong])
+        assert other is not None and np.array_equal(other.elements.points, own.elements.points)
 
 
 def test_who_sees_nothing_says_nothing(mapper):

@@ -13,6 +13,7 @@ import torch
 
 from manyeyes.comms import wire
 from manyeyes.comms.select import within_budget
+from manyeyes.comms.token_format import TokenFormat, within_range
 from manyeyes.comms.wire import Precision
 from manyeyes.datatypes import AgentFrame, Boxes, Message, Sites, SparseBev, Transform
 from manyeyes.datatypes.map_element import MapElements
@@ -36,7 +37,8 @@ def share_look(
     sensors = mapper.config.bev.sensors
     with torch.inference_mode():
         look = mapper.see([frame.points] if "lidar" in sensors else (), [frame.images] if "camera" in sensors else ())
-    tokens, worth = within_budget(look.tokens, look.worth, budget_bytes, precision)
+    told = look.tokens.with_features(within_range(look.tokens.features))
+    tokens, worth = within_budget(told, look.worth, budget_bytes, precision)
     if not len(tokens.sites):
         return []
     message = Message(
@@ -54,12 +56,20 @@ def share_look(
 
 
 def receive(packets: Iterable[bytes], mapper: Mapper) -> Message | None:
-    """The message of one look, as far as its packets came; None without tokens of these weights."""
+    """The message of one look, as far as its packets came; None without tokens that these weights can fuse."""
     fragments = [wire.decode_packet(packet) for packet in packets]
     if not fragments:
         return None
     message = wire.assemble(fragments)
-    return message if message.tokens is not None and message.fingerprint == mapper.fingerprint else None
+    return message if is_readable(message, mapper) else None
+
+
+def is_readable(message: Message, mapper: Mapper) -> bool:
+    """Whether a message has tokens of these weights, on their grid, of their width and within their range."""
+    form = TokenFormat(mapper.fingerprint, mapper.token_grid, mapper.config.token_channels)
+    if message.tokens is None or message.fingerprint != form.fingerprint:
+        return False
+    return form.refusal_of(message.tokens) is None
 
 
 def draw_tile(mapper: Mapper, looks: Sequence[Message], world_from_tile: Transform) -> MapElements:

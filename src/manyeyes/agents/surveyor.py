@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.agents.collaboration.heading import header
-from manyeyes.agents.mapping import draw_tile, receive, share_look
+from manyeyes.agents.mapping import draw_tile, is_readable, receive, share_look
 from manyeyes.comms import wire
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, Transform
 from manyeyes.datatypes.map_element import MapElements
@@ -73,7 +73,7 @@ class Surveyor:
     def __call__(self, frame: AgentFrame, heard: Sequence[Message] = ()) -> SeenMap | None:
         """The elements in the agent's frame; None where its own sensors, and those whose looks it heard, saw nothing."""
         own = receive(share_look(self.mapper, frame), self.mapper)
-        others = [m for m in heard if m.tokens is not None and m.fingerprint == self.mapper.fingerprint]
+        others = [m for m in heard if is_readable(m, self.mapper)]
         looks = [look for look in (own, *(others if self.config.together else ())) if look is not None]
         if not looks:
             return None
