@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page on refused messages names every reason, and the bounds that the code has."""
+
+from dataclasses import fields
+from pathlib import Path
+
+from manyeyes.agents.collaboration.late import SAME_PLACE_M, Late
+from manyeyes.comms.inbox import Dropped
+from manyeyes.comms.token_format import MAX_TOKEN_VALUE
+
+TEXT = (Path(__file__).resolve().parents[2] / "docs" / "messages.md").read_text(encoding="utf-8")
+
+
+def test_every_reason_is_in_the_table() -> None:
+    assert [f.name for f in fields(Dropped) if f"`{f.name}`" not in TEXT] == []
+
+
+def test_the_bounds_are_those_of_the_code() -> None:
+    assert f"beyond ±{MAX_TOKEN_VALUE:g}" in TEXT
+    assert f"best {Late().max_boxes} of a message" in TEXT and f"within {SAME_PLACE_M:g} m" in TEXT
