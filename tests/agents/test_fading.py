@@ -100,10 +100,12 @@ def test_boxes_of_others_are_cropped_and_capped_before_they_are_ranked() -> None
     assert found.center[found.score.argmin()].tolist() == pytest.approx([0.0, 0.0, 0.8])
 
 
-def test_a_better_box_of_another_replaces_an_own_one_at_the_same_place_only() -> None:
+def test_an_own_box_that_gives_way_to_one_elsewhere_returns_at_half_its_score() -> None:
+    """At 0 m another box stands 0.9 m aside, the same place; at 20 m it stands 1.5 m aside."""
     own = boxes(0.0, 20.0, score=0.3)
     found = Late().hear(Sees(own), frame(9), [said(9, boxes(0.9, 21.5, score=0.9))])
-    assert sorted(found.center[:, 0].tolist()) == pytest.approx([0.9, 20.0])
+    assert found.center[:, 0].tolist() == pytest.approx([0.9, 21.5, 20.0])
+    assert found.score.tolist() == pytest.approx([0.9, 0.9, 0.15])
 
 
 def test_early_fusion_merges_what_is_heard_and_remembers_nothing() -> None:

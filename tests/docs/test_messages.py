@@ -4,7 +4,7 @@
 from dataclasses import fields
 from pathlib import Path
 
-from manyeyes.agents.collaboration.late import SAME_PLACE_M, Late
+from manyeyes.agents.collaboration.late import RETURNED_SCORE, SAME_PLACE_M, Late
 from manyeyes.comms.inbox import Dropped
 from manyeyes.comms.token_format import MAX_TOKEN_VALUE
 
@@ -18,3 +18,4 @@ def test_every_reason_is_in_the_table() -> None:
 def test_the_bounds_are_those_of_the_code() -> None:
     assert f"beyond ±{MAX_TOKEN_VALUE:g}" in TEXT
     assert f"best {Late().max_boxes} of a message" in TEXT and f"within {SAME_PLACE_M:g} m" in TEXT
+    assert RETURNED_SCORE == 0.5 and "half its score" in TEXT

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Late fusion: every agent sends its boxes; the ego keeps the best of those that overlap (detection.md A.9).
 
-What others send is bounded before it is ranked, and no box of another agent removes an object that the ego detects itself: it may
-replace the ego's box only by one at the same place.
+What others send is bounded before it is ranked, and no box of another agent removes what the ego detects itself: an own box that
+gave way to a box elsewhere returns at half its score.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from manyeyes.agents.collaboration.fading import SAME_IOU, faded, moved, stronge
 from manyeyes.agents.collaboration.heading import age_s, behind_s, ego_from_sender, header
 from manyeyes.agents.eyes import Eyes
 from manyeyes.datatypes import AgentFrame, Boxes, Message
-from manyeyes.ops.box_iou import pairwise_iou
 
 SAME_PLACE_M = 1.0
-"""A box of another agent replaces an overlapping one of the ego's own where their centres are no farther apart."""
+"""An own box is replaced by one whose centre is no farther away."""
+RETURNED_SCORE = 0.5
+"""What is left of the score of an own box that gave way to one farther away."""
 
 
 @dataclass(frozen=True)
@@ -52,20 +53,20 @@ class Late:
 
         What is remembered is a little less sure (``fading``).
         """
-        own = strongest([eyes.see(frame).boxes], self.nms_iou)
-        others = [Boxes.empty(own.center.dtype)]
+        own, others = eyes.see(frame).boxes, list[Boxes]()
         for m, behind in zip(messages, behind_s(messages)):
             if m.objects is not None:
                 there = m.objects.after(age_s(frame, m)).transform(ego_from_sender(frame, m))
                 near = there[eyes.grid.inside(there.center[:, :2])]
                 best = near[near.score.argsort(descending=True, stable=True)[: self.max_boxes]]
                 others.append(faded(best.to(own.center.dtype), behind))
-        agreeing = _without_conflicts(Boxes.cat(others), own, self.nms_iou)
-        return strongest([own, *moved(frame, eyes.before(frame, self.instants)), agreeing], self.nms_iou)
+        ranked = strongest([own, *moved(frame, eyes.before(frame, self.instants)), *others], self.nms_iou)
+        return _with_own(ranked, own)
 
 
-def _without_conflicts(others: Boxes, own: Boxes, iou: float) -> Boxes:
-    """Drop boxes of others that overlap an own one but stand elsewhere: suppression would take the own one away for them."""
-    overlaps = pairwise_iou(others.bev().double(), own.bev().double()) > iou
-    elsewhere = torch.cdist(others.center[:, :2], own.center[:, :2]) > SAME_PLACE_M
-    return others[~(overlaps & elsewhere).any(1)]
+def _with_own(ranked: Boxes, own: Boxes) -> Boxes:
+    """All of ranked, and the own boxes that none of them replaces, less sure: within SAME_PLACE_M of each own box is a result."""
+    replaced = (torch.cdist(own.center[:, :2], ranked.center[:, :2]) <= SAME_PLACE_M).any(1)
+    displaced = own[~replaced]
+    found = Boxes.cat([ranked, replace(displaced, score=displaced.score * RETURNED_SCORE)])
+    return found[found.score.argsort(descending=True, stable=True)] if len(displaced) else ranked
