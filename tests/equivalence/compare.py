@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run the probes of an older commit and of this checkout in turn, and compare what they computed bit for bit.
+
+``python tests/equivalence/compare.py COMMIT [PROBE ...]``; exits with 1 and names what differs. COMMIT holds this folder too. The
+older code runs in a worktree of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PROBE = Path("tests") / "equivalence" / "probe.py"
+
+
+def run(code: Path, place: Path, name: str, probes: list[str]) -> dict[str, np.ndarray]:
+    """The arrays that the probes of one checkout compute."""
+    environment = {**os.environ, "PYTHONPATH": str(code / "src"), "OMP_NUM_THREADS": "1"}
+    environment.setdefault("MANYEYES_TOWNS", str(REPOSITORY.parent / "shared" / "data" / "carla_opendrive"))
+    words = [sys.executable, str(code / PROBE), str(place / f"{name}.npz"), str(place / name), *probes]
+    subprocess.run(words, check=True, env=environment, cwd=place)
+    with np.load(place / f"{name}.npz") as file:
+        return {key: file[key] for key in file.files}
+
+
+def differences(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> list[str]:
+    """One line for each key that is missing, or whose array differs in shape, type or any bit."""
+    lines = [f"{key}: only in the {'old' if key in old else 'new'} code" for key in sorted(old.keys() ^ new.keys())]
+    for key in sorted(old.keys() & new.keys()):
+        a, b = old[key], new[key]
+        if a.dtype != b.dtype or a.shape != b.shape:
+            lines.append(f"{key}: {a.dtype}{a.shape} became {b.dtype}{b.shape}")
+        elif a.tobytes() != b.tobytes():
+            lines.append(f"{key}: {int((a != b).sum())} of {a.size} values differ")
+    return lines
+
+
+def main() -> int:
+    commit, *probes = sys.argv[1:]
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        subprocess.run(["git", "worktree", "add", "--detach", str(place / "code"), commit], check=True, cwd=REPOSITORY)
+        try:
+            old = run(place / "code", place, "old", probes)
+            new = run(REPOSITORY, place, "new", probes)
+        finally:
+            remove = ["git", "worktree", "remove", "--force", str(place / "code")]
+            subprocess.run(remove, check=False, cwd=REPOSITORY)
+    lines = differences(old, new)
+    print("\n".join(lines) or f"{len(old)} arrays, all equal bit for bit")
+    return int(bool(lines))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compute what a renaming must not change, and save it: ``python tests/equivalence/probe.py OUT.npz DATA``.
+
+The keys of the saved arrays are fixed; the names behind them follow the package. ``compare.py`` runs this file of two commits, each
+on its own code, and compares the arrays bit for bit. DATA: a folder in which the probes simulate, kept between runs of one code.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from manyeyes.agents.agent import Agent
+from manyeyes.agents.collaboration import METHODS
+from manyeyes.alignment.estimate import PoseClaim
+from manyeyes.alignment.landmarks import Landmarks
+from manyeyes.alignment.rivals.table import CORRECTORS
+from manyeyes.apps import cli
+from manyeyes.datasets.opv2v import Opv2vRecording
+from manyeyes.datatypes import Transform
+from manyeyes.evaluation.map_methods import map_of, tuned
+from manyeyes.evaluation.map_trial import Trial, carry_out
+from manyeyes.models import zoo
+from manyeyes.models.presets import COSTR_TINY
+from manyeyes.simulator.landmarks import BoxError, LandmarkSpec, make_landmark_scene
+from manyeyes.training.loop import Run, TrainConfig
+from manyeyes.training.samples import AugmentConfig
+
+Arrays = Iterator[tuple[str, np.ndarray]]
+
+STRATEGIES = ("alone", "late", "late-remembering", "intermediate", "learned", "confidence", "random", "fused", "early")
+"""Keys of the strategies, in the order of the package's table."""
+POSE_CORRECTORS = ("vote", "given", "coalign", "fpv-rcnn", "feaco", "icp", "vips", "odist", "oiou", "mash")
+FINGERPRINT = slice(56, 64)
+
+
+def flat(value: Any) -> Iterator[float | str]:
+    """All numbers and strings of a nested value, in order; names of fields play no part."""
+    if is_dataclass(value) and not isinstance(value, type):
+        for field in fields(value):
+            yield from flat(getattr(value, field.name))
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from flat(item)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from flat(item)
+    elif isinstance(value, (bool, int, float)):
+        yield float(value)
+
+
+def fresh(folder: Path) -> Path:
+    """The same path, with nothing there."""
+    shutil.rmtree(folder, ignore_errors=True)
+    return folder
+
+
+def content(packets: list[bytes]) -> np.ndarray:
+    """The bytes of packets without fingerprint and checksum, which hash names, and the lengths."""
+    kept = [p[: FINGERPRINT.start] + p[FINGERPRINT.stop : -4] for p in packets]
+    return np.frombuffer(b"".join(len(p).to_bytes(4, "little") + p for p in kept), np.uint8)
+
+
+def strategies(data: Path) -> Arrays:
+    """Packets of every strategy and precision on one drive, and the boxes of every strategy."""
+    if not (data / "tiny" / "manifest.json").is_file():
+        assert cli.main(["simulate", "--preset", "tiny", "--out", str(data / "tiny"), "--workers", "1"]) == 0
+    recording, detector = Opv2vRecording(data / "tiny", "test", use_cache=False), zoo.load()
+    scenario = recording.scenarios[0]
+    snapshots = [recording.snapshot(scenario, index) for index in range(recording.length(scenario))]
+    for number, frame in enumerate(snapshots[0].frames):
+        yield f"simulator/points/{number}", frame.points.xyz.numpy()
+    for key, strategy in zip(STRATEGIES, METHODS.values(), strict=True):
+        for precision in ("float32", "float16", "int8", "codes"):
+            agents = {f.agent_id: Agent(detector, strategy, precision=precision) for f in snapshots[0].frames}
+            for time, snapshot in enumerate(snapshots):
+                sent = {f.agent_id: agents[f.agent_id].share(f) for f in snapshot.frames}
+                yield f"packets/{key}/{precision}/{time}", content([p for packets in sent.values() for p in packets])
+                ego = snapshot.frames[0]
+                heard = [p for sender, packets in sent.items() if sender != ego.agent_id for p in packets]
+                boxes = agents[ego.agent_id].perceive(ego, heard).boxes
+                yield (
+                    f"boxes/{key}/{precision}/{time}",
+                    torch.cat((boxes.bev(), boxes.score[:, None], boxes.velocity), 1).numpy(),
+                )
+
+
+def corrected_poses(data: Path) -> Arrays:
+    """Answers of every pose corrector on 50 scenes of landmarks, with a prior and without."""
+    spec = LandmarkSpec(common=6, ego_extra=4, other_extra=4, error=BoxError(0.3, np.radians(2.0), 0.05, 0.1))
+    for number in range(50):
+        scene = make_landmark_scene(spec, 7, number)
+        ego, other = Landmarks.of_boxes(scene.ego[0]), Landmarks.of_boxes(scene.other[0])
+        x, y, yaw = (scene.ego_from_other + np.array([0.8, -0.5, 0.02])).tolist()
+        wrong = Transform.from_xyz_yaw(x, y, 0.0, yaw)
+        for key, corrector in zip(POSE_CORRECTORS, CORRECTORS.values(), strict=True):
+            for prior_key, prior in (("prior", PoseClaim(wrong, np.diag([0.5, 0.5, 0.01]))), ("none", None)):
+                found = corrector(ego, other, prior)
+                pose = np.full(3, np.nan) if found.pose is None else np.asarray(found.pose)
+                numbers = [found.inliers, found.runner_up, found.margin, found.distance]
+                yield f"pose/{key}/{prior_key}/{number}", np.concatenate((pose, found.covariance.ravel(), numbers))
+
+
+def fused_maps(data: Path) -> Arrays:
+    """The fused map of two places."""
+    for place in ("cross", "Town07"):
+        scene = carry_out(Trial(place, 24, 3, 150.0))
+        made = map_of("manyeyes", scene.observations, tuned(), scene.place.frame)
+        for field in ("points", "score", "sigma", "style", "kind", "first"):
+            yield f"map/{place}/{field}", np.asarray(getattr(made.elements, field))
+
+
+def trained_weights(data: Path) -> Arrays:
+    """Weights after 20 training steps, in the order of the state dictionary."""
+    config = TrainConfig(COSTR_TINY, steps=20, batch=1, augment=AugmentConfig(max_agents=2))
+    run = Run(config, Opv2vRecording(data / "tiny", "train", use_cache=False), fresh(data / "run"), seed=5)
+    for step in range(20):
+        yield f"training/loss/{step}", np.array([*flat(run.advance())][:2])
+    for number, value in enumerate(run.state.model.state_dict().values()):
+        yield f"training/weights/{number}", value.numpy()
+
+
+STUDIES: dict[str, tuple[str, ...]] = {
+    "evaluate": ("evaluate", "--methods", "alone", "late", "intermediate"),
+    "robustness": ("evaluate", "--study", "robustness", "--methods", "late", "--disturbances", "0.8 m"),
+    "budget": ("evaluate", "--study", "budget", "--methods", "late", "--selectors", "confidence", "--budgets", "4096"),
+    "agents": ("evaluate", "--study", "agents", "--methods", "intermediate"),
+    "pose": ("evaluate", "--study", "pose", "--correctors", "vote", "--disturbances", "0.8 m"),
+}
+UNTIMED = ("evaluate",)
+
+
+def studies(data: Path) -> Arrays:
+    """The numbers of one cell of each study, on a drive of a few frames; times are left out."""
+    for key, words in STUDIES.items():
+        out = fresh(data / f"study-{key}")
+        timing = ("--timed-frames", "0") if key in UNTIMED else ()
+        common = ("--data", str(data / "tiny"), "--split", "test", "--workers", "1", *timing, "--out", str(out))
+        assert cli.main([words[0], *common, *words[1:]]) == 0, key
+        for path in sorted(out.glob("*.json")):
+            yield f"study/{key}", np.array([*flat(without_times(json.loads(path.read_text())["result"]))])
+
+
+def without_times(value: Any) -> Any:
+    """The same without fields of measured time, whose names end in a unit of time."""
+    if isinstance(value, dict):
+        return {k: without_times(v) for k, v in value.items() if not k.endswith(("_ms", "_s", "seconds"))}
+    return [without_times(item) for item in value] if isinstance(value, list) else value
+
+
+PROBES = (strategies, corrected_poses, fused_maps, trained_weights, studies)
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    out, data = Path(sys.argv[1]), Path(sys.argv[2])
+    data.mkdir(parents=True, exist_ok=True)
+    wanted = sys.argv[3:]
+    found: dict[str, np.ndarray] = {}
+    for probe in PROBES:
+        if wanted and probe.__name__ not in wanted:
+            continue
+        for key, value in probe(data):
+            assert key not in found, key
+            found[key] = value
+        print(f"{probe.__name__}: {len(found)} arrays so far", flush=True)
+    np.savez_compressed(out, **found)
+
+
+if __name__ == "__main__":
+    main()
