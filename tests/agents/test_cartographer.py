@@ -142,6 +142,44 @@ def test_a_view_that_crosses_itself_is_refused_and_a_ring_that_does_is_left_out(
     assert len(made.observations[0].elements) == 4
 
 
+def zigzag(count: int) -> np.ndarray:
+    """A ring of many points that does not cross itself: there along y = 0 in steps, back along a line above it."""
+    along = np.arange(count // 2) * 0.02
+    return np.concatenate(
+        (np.stack((along, 0.02 * (np.arange(count // 2) % 2)), 1), np.stack((along, along * 0 + 2.0), 1)[::-1])
+    )
+
+
+FAR = Transform.from_xyz_yaw(9.9e7, -9.9e7, 12.0, 0.7)
+WIDE = np.array([[-300.0, -300.0], [300.0, -300.0], [300.0, 300.0], [-300.0, 300.0]])
+
+
+@pytest.mark.parametrize(
+    ("hostile", "field"),
+    [
+        (lambda f: share_map(replace(f, world_from_agent=FAR), street(30.0)), "pose"),
+        (lambda f: share_map(replace(f, pose_covariance=f.pose_covariance * 1e8), street(30.0)), "covariance"),
+        (lambda f: share_map(f, SeenMap(MapElements.of([WIDE], CROSSING), WINDOW)), "points"),
+        (lambda f: share_map(f, SeenMap(MapElements.of([zigzag(6000)], CROSSING), WINDOW), mtu=60_000), "points"),
+        (lambda f: share_map(f, SeenMap(street(30.0).elements, zigzag(6000)), mtu=60_000), "view"),
+    ],
+    ids=["pose", "covariance", "wide-crossing", "points-of-a-crossing", "points-of-the-view"],
+)
+def test_a_hostile_map_is_refused_with_its_reason_and_the_others_are_fused(hostile, field):
+    made, rest = service(), service()
+    for k in range(10):
+        packets = share_map(frame(k, 30.0 + 2 * k, k), street(30.0 + 2 * k))
+        made.listen(heard(packets))
+        rest.listen(heard(packets))
+        if k == 4:
+            assert made.listen(heard(hostile(frame(66, 30.0, k)))) == []
+    (refused,) = made.refused
+    assert refused.agent == "66" and refused.reason.startswith(f"Observation.{field}: expected ")
+    assert len(made.observations) == 10
+    assert made.fold().quantised_hash() == rest.fold().quantised_hash()
+    assert made.map().quantised_hash() == rest.map().quantised_hash()
+
+
 def test_a_message_without_a_map_is_no_observation():
     (reception,) = heard(share_map(frame(1, 30.0), street(30.0)))
     bare = replace(reception, message=replace(reception.message, seen_map=None))

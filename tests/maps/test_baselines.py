@@ -92,7 +92,7 @@ def test_the_pre_filter_drops_weak_and_short_elements_and_a_repeated_observation
 
 
 def test_scores_follow_who_saw_who_missed_and_how_long() -> None:
-    far = VIEW + (500.0, 0.0)
+    far = VIEW + (400.0, 0.0)
     many = [seen(0, [line(0.0)]), seen(1, []), seen(2, []), seen(3, [], view=far)]
     made = union.fuse(many)
     assert made.log_odds[0] == pytest.approx(HIT + 2 * MISS, abs=1e-9)

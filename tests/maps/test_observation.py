@@ -4,13 +4,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import re
+import warnings
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import MapElements, Polygons
 from manyeyes.maps.observation import Frame, Observation, ObservationError, is_simple_ring
+from manyeyes.maps.observation_limits import LIMITS
 
 VIEW = np.array([[0.0, -15.0], [60.0, -15.0], [60.0, 15.0], [0.0, 15.0]])
 ELEMENTS = MapElements.of(
@@ -18,6 +22,20 @@ ELEMENTS = MapElements.of(
 )
 GOOD = Observation("car", "pass", 7, np.array([1.0, 2.0, 0.1]), np.diag([0.5, 0.5, 1e-4]), VIEW, ELEMENTS)
 BOW_TIE = [[0, 0], [2, 2], [2, 0], [0, 2]]
+CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 1001)[:-1]) for f in (np.cos, np.sin)], 1)
+SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def lines(*many: object, kind: int = 0) -> dict:
+    return {"elements": MapElements.of([np.asarray(line, float) for line in many], kind)}
+
+
+def placed(x: float, yaw: float = 0.0) -> dict:
+    return {"pose": np.array([x, -x, yaw])}
+
+
+def stds(position: float, yaw: float) -> dict:
+    return {"covariance": np.diag([position**2, position**2, yaw**2])}
 
 
 def with_nan(points: np.ndarray) -> np.ndarray:
@@ -57,6 +75,81 @@ def test_what_cannot_be_used_is_refused_by_the_name_of_its_field(field: str, cha
     with pytest.raises(ObservationError, match=rf"^Observation\.{field}: expected .*; got .*\. Mend it") as caught:
         replace(GOOD, **changes)
     assert "\n" not in str(caught.value)
+
+
+# One pair a bound: what is just within it, and what is just outside.
+BOUNDS = {
+    "agent": ({"agent": "a" * 256}, {"agent": "a" * 257}),
+    "pass_id": ({"pass_id": "a" * 256}, {"pass_id": "a" * 257}),
+    "model": ({"model": "a" * 256}, {"model": "a" * 257}),
+    "pose": (placed(200_000.0), placed(200_001.0)),
+    "pose yaw": (placed(0.0, -100.0), placed(0.0, -100.1)),
+    "covariance": (stds(999.0, 0.1), stds(1001.0, 0.1)),
+    "covariance yaw": (stds(1.0, 3.14), stds(1.0, 3.15)),
+    "covariance least": (stds(1.1e-6, 1e-5), stds(0.9e-6, 1e-5)),
+    "covariance least yaw": (stds(1.0, 1.1e-6), stds(1.0, 0.9e-6)),
+    "view": ({"view": 500.0 * SQUARE}, {"view": 500.1 * SQUARE}),
+    "view points": ({"view": CIRCLE}, {"view": np.concatenate((CIRCLE, [[1.1, 0.0]]))}),
+    "occluders": ({"occluders": Polygons.of([500.0 * SQUARE])}, {"occluders": Polygons.of([500.1 * SQUARE])}),
+    "occluders rings": ({"occluders": Polygons.of([SQUARE] * 256)}, {"occluders": Polygons.of([SQUARE] * 257)}),
+    "occluders points": (
+        {"occluders": Polygons.of([CIRCLE])},
+        {"occluders": Polygons.of([np.concatenate((CIRCLE, CIRCLE[:1]))])},
+    ),
+    "points": (lines([[0, 0], [500, -500]]), lines([[0, 0], [0, -500.1]])),
+    "points of a ring": (lines(50 * CIRCLE, kind=2), lines(50 * np.concatenate((CIRCLE, [[1.0, -0.001]])), kind=2)),
+    "points around a ring": (lines(62.5 * SQUARE, kind=2), lines(62.6 * SQUARE, kind=2)),
+    "points a metre": (
+        lines(np.linspace([0, 0], [10, 0], 600), [[0, 0], [0, 0]], [[1, 1]] * 100),
+        lines(np.linspace([0, 0], [10, 0], 601)),
+    ),
+    "points at one place": (lines([[1, 1]] * 100), lines([[1, 1]] * 101)),
+    "points metres": (
+        lines([[500 * (-1) ** k, 0] for k in range(21)]),
+        lines([[500 * (-1) ** k, 0.1] for k in range(21)], [[0, 0], [1, 0]]),
+    ),
+    "points of all": (lines(*[50 * CIRCLE] * 50), lines(*[50 * CIRCLE] * 50, [[0, 0], [1, 0]])),
+    "elements": (lines(*[[[0, 0], [1, 0]]] * 1000), lines(*[[[0, 0], [1, 0]]] * 1001)),
+    "sigma": (
+        {"elements": MapElements.of([[[0, 0], [1, 1]]], 0, sigma=1000.0)},
+        {"elements": MapElements.of([[[0, 0], [1, 1]]], 0, sigma=1000.1)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_numbers_are_taken_up_to_their_bound_and_refused_beyond(name: str) -> None:
+    within, outside = BOUNDS[name]
+    assert replace(GOOD, **within).agent
+    with pytest.raises(ObservationError, match=rf"^Observation\.{name.split()[0]}: expected .*; got .+\. ") as error:
+        replace(GOOD, **outside)
+    assert len(str(error.value)) < 250 and "\n" not in str(error.value)
+
+
+def test_the_documented_limits_are_those_that_are_checked() -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "observation.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \| (\S+) \| [\w, ]+ \| ", page, re.MULTILINE)
+    assert rows == [(f.name, f"{getattr(LIMITS, f.name):g}") for f in fields(LIMITS)]
+
+
+@pytest.mark.parametrize("value", [1e300, -1e308, 1.7e308])
+def test_numbers_that_overflow_when_squared_are_refused_without_a_warning(value: float) -> None:
+    far = np.array([[value, -value], [value, value], [-value, value]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for changes in (
+            placed(value),
+            placed(0.0, value),
+            {"covariance": np.full((3, 3), abs(value)) + np.eye(3)},
+            {"view": far},
+            {"occluders": Polygons.of([far])},
+            lines(far),
+            lines(far, kind=2),
+            {"elements": MapElements.of([[[0, 0], [1, 1]]], 0, score=value)},
+            {"elements": MapElements.of([[[0, 0], [1, 1]]], 0, style=np.full((1, 4), value))},
+        ):
+            with pytest.raises(ObservationError, match="got"):
+                replace(GOOD, **changes)
 
 
 def test_rings_cross_or_only_touch() -> None:

@@ -20,6 +20,7 @@ from manyeyes.datatypes.map_element import MapElements
 from manyeyes.datatypes.message import SeenMap
 from manyeyes.maps.fuse import fuse
 from manyeyes.maps.observation import Frame, Observation, ObservationError, is_simple_ring
+from manyeyes.maps.observation_limits import LIMITS
 from manyeyes.maps.stream import Assimilated, StreamConfig, StreamingMap
 from manyeyes.maps.vector_map import VectorMap
 
@@ -161,7 +162,8 @@ def observation_of(
 
 
 def _simple(seen: SeenMap) -> MapElements:
+    """The elements without crossings whose rings cross themselves; rings of too many points stay, and are refused later."""
     elements = seen.elements
-    rings = np.flatnonzero(elements.closed).tolist()
+    rings = np.flatnonzero(elements.closed & (elements.counts <= LIMITS.max_ring_points)).tolist()
     crossed = [row for row in rings if not is_simple_ring(elements.polyline(row))]
     return elements.take(np.setdiff1d(np.arange(len(elements)), crossed)) if crossed else elements

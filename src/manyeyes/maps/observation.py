@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.datatypes.kernels import njit
 from manyeyes.datatypes.map_element import CROSSING, MapElements, Polygons, frozen
+from manyeyes.maps.observation_limits import LIMITS
 
 Floats = NDArray[np.float64]
 
 FORMAT_VERSION = 1
-_MOST_SIGMA_M = 1000.0
+# Characters of a wrong value that an error text repeats.
+_MAX_SHOWN = 120
+_REMEDY = "Mend it where it is made."
 
 
 class ObservationError(ManyeyesError, ValueError):
@@ -55,14 +58,8 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Observation:
-    """One agent's map elements, once.
-
-    agent: a pseudonym. pass_id: one drive of that agent. time_ns: of the look, nanoseconds since 1970, UTC.
-    pose: (3,) x, y (m), yaw (rad) of the agent in the map's frame, as claimed. covariance: (3, 3) of that pose, m and rad.
-    view: (K, 2) metres, the polygon that the agent could see, an open ring in the agent's frame; occluders: what hid parts
-    of it, same frame. elements: in the agent's frame. model: what made them. trusted: a surveyed pole, whose one word counts.
-    """
+class ObservationContent:
+    """Hold the fields of an observation as they are stored, unchecked, and name them by their content."""
 
     agent: str
     pass_id: str
@@ -78,7 +75,6 @@ class Observation:
     def __post_init__(self) -> None:
         for name in ("pose", "covariance", "view"):
             object.__setattr__(self, name, frozen(getattr(self, name), np.float64))
-        _check(self)
 
     @cached_property
     def id(self) -> str:
@@ -108,6 +104,21 @@ class Observation:
             out.append(struct.pack("<I", array.size) + array.astype("<i8", copy=False).tobytes())
         return b"".join(out)
 
+
+@dataclass(frozen=True, eq=False)
+class Observation(ObservationContent):
+    """One agent's map elements, once; every field is checked, and lies within ``observation_limits.LIMITS``.
+
+    agent: a pseudonym. pass_id: one drive of that agent. time_ns: of the look, nanoseconds since 1970, UTC.
+    pose: (3,) x, y (m), yaw (rad) of the agent in the map's frame, as claimed. covariance: (3, 3) of that pose, m and rad.
+    view: (K, 2) metres, the polygon that the agent could see, an open ring in the agent's frame; occluders: what hid parts
+    of it, same frame. elements: in the agent's frame. model: what made them. trusted: a surveyed pole, whose one word counts.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check(self)
+
     def in_map(self, pose: Floats | None = None) -> MapElements:
         """The elements in the map's frame, at the claimed pose or at another (3,)."""
         x, y, yaw = (float(v) for v in (self.pose if pose is None else pose))
@@ -117,6 +128,8 @@ class Observation:
 def _check(o: Observation) -> None:
     """Raise ObservationError for the first field that cannot be used."""
     _require(bool(o.agent), "agent", "a non-empty pseudonym", "none")
+    for name in ("agent", "pass_id", "model"):
+        _require_count(name, "characters", len(getattr(o, name)), LIMITS.max_text_length)
     _require(
         isinstance(o.time_ns, int) and 0 <= o.time_ns < 2**63, "time_ns", "whole nanoseconds since 1970", o.time_ns
     )
@@ -124,37 +137,62 @@ def _check(o: Observation) -> None:
         value = getattr(o, name)
         _require(value.shape == shape, name, f"shape {shape}", value.shape)
         _require_finite(name, value)
+    remedy = "State it in metres of the map's frame, or choose an origin nearby."
+    _require_near("pose", o.pose[:2], LIMITS.max_position_m, "m from the origin along x and y", remedy)
+    _require_near("pose", o.pose[2:], LIMITS.max_yaw_rad, "rad of yaw")
+    variance, least = np.diag(o.covariance), LIMITS.min_pose_std**2
+    _require_between("covariance", variance[:2], least, LIMITS.max_position_std_m**2, "variances of x and y (m²)")
+    _require_between("covariance", variance[2:], least, LIMITS.max_yaw_std_rad**2, "a variance of yaw (rad²)")
     _require(_is_covariance(o.covariance), "covariance", "a symmetric, positive definite matrix", o.covariance)
     _require(
         o.view.ndim == 2 and o.view.shape[1] == 2 and len(o.view) >= 3, "view", "a ring (K, 2), K >= 3", o.view.shape
     )
-    _require_finite("view", o.view)
+    _check_rings("view", o.view, np.array([len(o.view)]))
     _require(is_simple_ring(o.view), "view", "a ring that does not cross itself", "one that does")
-    _require_finite("occluders", o.occluders.points)
+    _require_count("occluders", "rings", len(o.occluders), LIMITS.max_occluders)
     if len(o.occluders):
-        least = int(np.diff(o.occluders.first).min())
-        _require(least >= 3, "occluders", "rings of 3 points or more", least)
+        _check_rings("occluders", o.occluders.points, np.diff(o.occluders.first))
     if len(o.elements):
         _check_elements(o.elements)
 
 
+def _check_rings(name: str, points: Floats, counts: NDArray[np.int64]) -> None:
+    """Raise ObservationError unless each ring has a usable number of points, all within reach."""
+    least = int(counts.min())
+    _require(least >= 3, name, "rings of 3 points or more", least)
+    _require_count(name, "points a ring", int(counts.max()), LIMITS.max_ring_points)
+    _require_reach(name, points)
+
+
 def _check_elements(e: MapElements) -> None:
     """Raise ObservationError for the first column of the elements that cannot be used."""
-    _require_finite("points", e.points)
-    _require_within("score", e.score, 1.0)
-    _require_within("sigma", e.sigma, _MOST_SIGMA_M)
-    _require_within("style", e.style, 1.0)
+    _require_count("elements", "elements", len(e), LIMITS.max_elements)
+    _require_count("points", "points of all elements", len(e.points), LIMITS.max_points)
+    _require_reach("points", e.points)
+    _require_between("score", e.score, 0.0, 1.0)
+    _require_between("sigma", e.sigma, 0.0, LIMITS.max_sigma_m)
+    _require_between("style", e.style, 0.0, 1.0)
     _require(bool((np.abs(e.style.sum(1) - 1.0) < 1e-6).all()), "style", "probabilities that sum to 1", "others")
-    counts = e.counts
-    _require(not (counts < 2 + e.closed).any(), "points", "2 points a line and 3 a crossing, or more", counts)
+    counts, lengths, closed = e.counts, e.lengths(), e.closed
+    _require_all(counts >= 2 + closed, counts, "2 points a line and 3 a crossing, or more")
+    _require_all(
+        ~closed | (counts <= LIMITS.max_ring_points), counts, f"at most {LIMITS.max_ring_points} points a ring"
+    )
+    longest = LIMITS.max_crossing_perimeter_m
+    _require_all(~closed | (lengths <= longest), lengths, f"at most {longest:g} m around a crossing")
+    dense, per_m = LIMITS.max_points_at_once, LIMITS.max_points_per_m
+    _require_all(
+        counts <= dense + per_m * lengths, counts, f"at most {dense} points an element and {per_m:g} more a metre"
+    )
+    total = float(lengths.sum())
+    _require(total <= LIMITS.max_length_m, "points", f"at most {LIMITS.max_length_m:g} m of elements", f"{total:g} m")
     bad = int(_first_crossed_ring(e.kind, e.first, e.points, CROSSING))
     _require(bad < 0, "points", "crossings whose ring does not cross itself", f"element {bad}, whose ring does")
 
 
-def _require(holds: bool, name: str, expected: str, came: object) -> None:
+def _require(holds: bool, name: str, expected: str, came: object, remedy: str = _REMEDY) -> None:
     if not holds:
-        text = " ".join(str(came).split())
-        raise ObservationError(f"Observation.{name}: expected {expected}; got {text}. Mend it where it is made.")
+        raise ObservationError(f"Observation.{name}: expected {expected}; got {shortened(came)}. {remedy}")
 
 
 def _require_finite(name: str, values: Floats) -> None:
@@ -162,11 +200,41 @@ def _require_finite(name: str, values: Floats) -> None:
         _require(False, name, "finite numbers", "NaN or infinity")
 
 
-def _require_within(name: str, values: Floats, most: float) -> None:
-    """Every value in [0, most]; NaN is not."""
-    inside = (values >= 0.0) & (values <= most)
+def _require_near(name: str, values: Floats, most: float, what: str, remedy: str = _REMEDY) -> None:
+    """Require that no value exceeds ``most`` on either side of zero."""
+    far = np.abs(values) > most
+    if far.any():
+        _require(False, name, f"at most {most:g} {what}", f"{values[far].flat[0]:g}", remedy)
+
+
+def _require_reach(name: str, points: Floats) -> None:
+    """Require finite points (P, 2) within the reach of an agent."""
+    _require_finite(name, points)
+    _require_near(name, points, LIMITS.max_reach_m, "m from the agent along x and y")
+
+
+def _require_between(name: str, values: Floats, low: float, high: float, what: str = "values") -> None:
+    """Require every value in [low, high]; NaN is outside."""
+    inside = (values >= low) & (values <= high)
     if not inside.all():
-        _require(False, name, f"values in [0, {most:g}]", values[~inside].flat[0])
+        _require(False, name, f"{what} in [{low:g}, {high:g}]", f"{values[~inside].flat[0]:g}")
+
+
+def _require_count(name: str, what: str, count: int, most: int) -> None:
+    _require(count <= most, name, f"at most {most} {what}", count)
+
+
+def _require_all(holds: NDArray[np.bool_], values: NDArray, expected: str) -> None:
+    """Require a condition (N,) of the points of every element; the text names the first that misses it and its value."""
+    if not holds.all():
+        row = int(np.argmin(holds))
+        _require(False, "points", expected, f"{values[row]:g} in element {row}")
+
+
+def shortened(value: object) -> str:
+    """Format a value on one line, cut where it is long."""
+    text = " ".join(str(value).split())
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]} ..."
 
 
 def _is_covariance(m: Floats) -> bool:

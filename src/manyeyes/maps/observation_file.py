@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import MissingExtraError, ShapeError
 from manyeyes.datatypes.map_element import DEFAULT_SIGMA_M, KINDS, NO_STYLE, STYLES, MapElements, Polygons
-from manyeyes.maps.observation import FORMAT_VERSION, Frame, Observation, ObservationError
+from manyeyes.maps.observation import (
+    FORMAT_VERSION,
+    Frame,
+    Observation,
+    ObservationContent,
+    ObservationError,
+    shortened,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -38,6 +45,19 @@ class Quarantined:
     row: int
     count: int
     reason: str
+
+
+@dataclass(frozen=True)
+class RefusedRow:
+    """A row that is no observation, and why.
+
+    id: of its content, "" where the content has none or the row states another; agent, pass_id: as the row states them.
+    """
+
+    reason: str
+    id: str
+    agent: str
+    pass_id: str
 
 
 @dataclass(frozen=True)
@@ -144,12 +164,18 @@ def metadata(frame: Frame) -> dict[str, Any]:
 
 def observations_of(table: pa.Table) -> Iterator[tuple[int, Observation | str]]:
     """Each row of a table as an observation, or as the reason why it cannot be one."""
+    for row, item in enumerate(rows_of(table)):
+        yield row, item.reason if isinstance(item, RefusedRow) else item
+
+
+def rows_of(table: pa.Table) -> Iterator[Observation | RefusedRow]:
+    """Each row of a table as an observation, or as one that is refused."""
     columns = _Columns(table)
     for row in range(table.num_rows):
         try:
-            yield row, columns.observation(row)
+            yield columns.observation(row)
         except (ObservationError, ShapeError) as error:
-            yield row, str(error)
+            yield columns.refused(row, str(error))
 
 
 def _open(file: Path, expected: Frame | None) -> tuple[Frame, Iterator[tuple[int, Observation | tuple[int, str]]]]:
@@ -250,13 +276,34 @@ class _Columns:
 
     def observation(self, row: int) -> Observation:
         """The observation of one row; raises ObservationError or ShapeError where it is none."""
+        content = self.content(row)
+        made = Observation(**{f.name: getattr(content, f.name) for f in fields(ObservationContent)})
+        stated = self.text["id"][row]
+        if stated and stated != made.id:
+            raise ObservationError(
+                f"Observation.id: expected {made.id}, as its content says; got {shortened(stated)}. Fetch it again."
+            )
+        return made
+
+    def refused(self, row: int, reason: str) -> RefusedRow:
+        """The record of a row that is no observation."""
+        try:
+            name = self.content(row).id
+        except (ObservationError, ShapeError):
+            name = ""
+        stated = self.text["id"][row]
+        return RefusedRow(
+            reason, "" if stated and stated != name else name, self.text["agent"][row], self.text["pass_id"][row]
+        )
+
+    def content(self, row: int) -> ObservationContent:
+        """The fields of one row, unchecked; raises ObservationError or ShapeError where they have no such form."""
         a, b = self.first[row], self.first[row + 1]
         p, q = self.point_first[a], self.point_first[b]
         kind = self.kind[a:b]
         if (kind < 0).any():
-            raise ObservationError(
-                f"Observation.kind: expected one of {', '.join(KINDS)}; got {self.kind_text[int(a + np.argmin(kind))]}."
-            )
+            wrong = shortened(self.kind_text[int(a + np.argmin(kind))])
+            raise ObservationError(f"Observation.kind: expected one of {', '.join(KINDS)}; got {wrong}.")
         elements = MapElements(
             kind,
             self.point_first[a : b + 1] - p,
@@ -267,7 +314,7 @@ class _Columns:
         )
         r, s = self.ring_first[row], self.ring_first[row + 1]
         u, v = self.ring_point[r], self.ring_point[s]
-        made = Observation(
+        return ObservationContent(
             agent=self.text["agent"][row],
             pass_id=self.text["pass_id"][row],
             time_ns=self.time[row],
@@ -279,12 +326,6 @@ class _Columns:
             trusted=self.trusted[row],
             occluders=Polygons(self.corners[u:v], self.ring_point[r : s + 1] - u),
         )
-        stated = self.text["id"][row]
-        if stated and stated != made.id:
-            raise ObservationError(
-                f"Observation.id: expected {made.id}, as its content says; got {stated}. Fetch it again."
-            )
-        return made
 
 
 def _square(upper: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -167,7 +167,7 @@ def _observation(at: SamplePose, vectors: list[_Vector] | None, options: ResultO
         points = _points(vector.points, f"{where} vector {number}")
         if options.axes == "lidar":
             points = np.stack((points[:, 1], -points[:, 0]), 1)
-        if kind == CROSSING and len(points) > 3 and np.linalg.norm(points[0] - points[-1]) < _CLOSED_M:
+        if kind == CROSSING and len(points) > 3 and math.dist(points[0], points[-1]) < _CLOSED_M:
             points = points[:-1]
         # A ring needs three points, a line two: evaluators drop shorter ones too.
         if len(points) >= (3 if kind == CROSSING else 2):
@@ -180,7 +180,7 @@ def _observation(at: SamplePose, vectors: list[_Vector] | None, options: ResultO
         pass_id=at.pass_id,
         time_ns=at.time_ns,
         pose=np.array(at.pose),
-        covariance=np.diag(np.square(at.sigma)),
+        covariance=np.diag([sigma * sigma for sigma in at.sigma]),
         view=np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]),
         elements=MapElements.of(lines, np.array(kinds, np.int64), np.array(scores), options.sigma_m),
         model=options.model,
