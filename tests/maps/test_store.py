@@ -17,6 +17,7 @@ from manyeyes.maps.changes import apply_delta, delta_between, home_tiles, with_i
 from manyeyes.maps.formats.attributes import hex_ids
 from manyeyes.maps.observation import Frame, Observation
 from manyeyes.maps.observation_file import write_observations
+from manyeyes.maps.observation_limits import LIMITS
 from manyeyes.maps.observation_log import StoreError, locked, read_standing
 from manyeyes.maps.store import MapStore, watermark_of
 from manyeyes.maps.vector_map import VectorMap
@@ -68,6 +69,66 @@ def test_a_retracted_observation_counts_no_more_and_does_not_come_back(tmp_path)
         assert set(log.standing().ids) == {o.id for o in many} - {many[2].id}
         with pytest.raises(StoreError, match=r"no observation 00+"):
             log.retract(["00" * 16], "unknown")
+
+
+def test_observations_are_found_by_the_start_of_an_id_and_by_agent_and_pass(tmp_path):
+    store = MapStore.create(tmp_path, FRAME)
+    many = [_observation(k) for k in range(40)]
+    with store.writing() as log:
+        log.append(many)
+        one = many[7]
+        assert log.find([one.id]) == log.find([one.id[:9], one.id[:10].upper()]) == (one.id,)
+        assert log.find(agent="agent7") == log.find(agent="agent7", pass_id="pass") == (one.id,)
+        assert log.find(pass_id="pass") == tuple(sorted(o.id for o in many))
+        digit = one.id[0]
+        count = sum(o.id[0] == digit for o in many)
+        for words, text in (
+            ({"ids": [digit]}, rf"{count} observations have an id that starts with {digit}; give more digits"),
+            ({"ids": ["0" * 33]}, r"32 hexadecimal digits"),
+            ({"ids": [""]}, r"32 hexadecimal digits"),
+            ({"agent": "agnt7"}, r"agent 'agnt7'; did you mean 'agent\d*7'"),
+            ({"agent": "agent7", "pass_id": "?"}, r"pass '\?'; there are 1 others"),
+        ):
+            with pytest.raises(StoreError, match=text):
+                log.find(**words)
+
+
+def test_a_retraction_says_how_many_counted_and_appends_nothing_twice(tmp_path):
+    store = MapStore.create(tmp_path, FRAME)
+    many = [_observation(k) for k in range(5)]
+    with store.writing() as log:
+        log.append(many)
+        assert log.retract([many[0].id, many[1].id], "test") == 2
+        entries = sorted(log.folder.iterdir())
+        assert log.retract([many[0].id], "again") == 0 and sorted(log.folder.iterdir()) == entries
+        assert log.retract([many[0].id, many[2].id], "more") == 1
+        assert len(log.standing()) == 2
+
+
+def test_other_limits_make_the_index_again_and_rows_outside_are_quarantined(tmp_path, monkeypatch):
+    store = MapStore.create(tmp_path, FRAME)
+    many = [_observation(k) for k in range(300)]
+    far = [o for o in many if o.pose[0] > 10_000.0]
+    with store.writing() as log:
+        log.append(many)
+        before = log.standing()
+        log.retract([many[0].id], "test")
+    narrow = replace(LIMITS, max_position_m=10_000.0)
+    for module in ("observation", "observation_log"):
+        monkeypatch.setattr(f"manyeyes.maps.{module}.LIMITS", narrow)
+    with MapStore(tmp_path).writing() as log:
+        assert len(log.refused) == len(log.catalogue.quarantined()) == len(far) == 49
+        assert set(log.standing().ids) == {o.id for o in many} - {o.id for o in (*far, many[0])}
+        rows = np.arange(len(log.standing()))
+        assert len(read_standing(log.folder, log.standing(), rows)) == len(rows)
+        assert log.find(agent=far[0].agent) == (far[0].id,) and log.retract([far[0].id], "far") == 1
+    with MapStore(tmp_path).writing() as log:
+        assert log.refused == () and len(log.catalogue.quarantined()) == len(far)
+    monkeypatch.undo()
+    with MapStore(tmp_path).writing() as log:
+        assert set(log.standing().ids) == {o.id for o in many} - {far[0].id, many[0].id}
+        assert log.catalogue.quarantined() == []
+    assert len(before) == 300
 
 
 def test_ingest_puts_aside_what_cannot_be_used_with_its_reason_and_keeps_the_rest(tmp_path):

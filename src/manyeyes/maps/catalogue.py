@@ -19,16 +19,20 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_VERSION = 1
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS entries (name TEXT PRIMARY KEY, rows INTEGER NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS observations (
-    id BLOB PRIMARY KEY, segment TEXT NOT NULL, row_group INTEGER NOT NULL, time_ns INTEGER NOT NULL,
-    agent TEXT NOT NULL, x REAL NOT NULL, y REAL NOT NULL, reach_m REAL NOT NULL
-) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS retracted (id BLOB PRIMARY KEY, reason TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS quarantine (entry TEXT, file TEXT, row INTEGER, count INTEGER, reason TEXT);
-"""
+_VERSION = 2
+_SCHEMA = {
+    "entries": "(name TEXT PRIMARY KEY, rows INTEGER NOT NULL) WITHOUT ROWID",
+    "observations": """(
+        id BLOB PRIMARY KEY, segment TEXT NOT NULL, row_group INTEGER NOT NULL, time_ns INTEGER NOT NULL,
+        agent TEXT NOT NULL, x REAL NOT NULL, y REAL NOT NULL, reach_m REAL NOT NULL, pass_id TEXT NOT NULL
+    ) WITHOUT ROWID""",
+    # Rows of segments that are outside the limits; each is in the quarantine too, with its reason.
+    "refused": "(id BLOB PRIMARY KEY, agent TEXT NOT NULL, pass_id TEXT NOT NULL) WITHOUT ROWID",
+    "retracted": "(id BLOB PRIMARY KEY, reason TEXT NOT NULL) WITHOUT ROWID",
+    "quarantine": "(entry TEXT, file TEXT, row INTEGER, count INTEGER, reason TEXT)",
+    # The limits that the segments were checked against when they were indexed.
+    "checked": "(limits TEXT)",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +62,18 @@ class Indexed:
     x: float
     y: float
     reach_m: float
+    pass_id: str
+
+
+@dataclass(frozen=True)
+class RefusedEntry:
+    """One row of a segment that is outside the limits: its number in the segment, and why."""
+
+    id: str
+    agent: str
+    pass_id: str
+    row: int
+    reason: str
 
 
 class Catalogue:
@@ -67,8 +83,7 @@ class Catalogue:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         with self._open() as db:
-            db.executescript(_SCHEMA)
-            db.execute(f"PRAGMA user_version = {_VERSION}")
+            _create_tables(db)
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
@@ -79,26 +94,78 @@ class Catalogue:
             with db:
                 yield db
 
+    def is_current(self, limits: str) -> bool:
+        """Tell whether the index has this version's tables and was made under these limits."""
+        with self._open() as db:
+            (version,) = db.execute("PRAGMA user_version").fetchone()
+            return version == _VERSION and db.execute("SELECT limits FROM checked").fetchall() == [(limits,)]
+
+    def clear(self, limits: str) -> None:
+        """Empty the index, so that it is made again from the log under these limits."""
+        with self._open() as db:
+            db.execute("BEGIN IMMEDIATE")
+            for name in _SCHEMA:
+                db.execute(f"DROP TABLE IF EXISTS {name}")
+            _create_tables(db)
+            db.execute("INSERT INTO checked VALUES (?)", (limits,))
+            db.execute(f"PRAGMA user_version = {_VERSION}")
+
     def entries(self) -> set[str]:
         """Names of the log's files that are indexed."""
         with self._open() as db:
             return {name for (name,) in db.execute("SELECT name FROM entries")}
 
     def known(self, ids: Iterable[str]) -> set[str]:
-        """Which of these observations are indexed, retracted ones too."""
-        with self._open() as db:
-            found = set()
-            for name in ids:
-                if db.execute("SELECT 1 FROM observations WHERE id = ?", (bytes.fromhex(name),)).fetchone():
-                    found.add(name)
-            return found
+        """Which of these observations are indexed, retracted and refused ones too."""
+        return self._among(
+            ids, "SELECT 1 FROM observations WHERE id = ?1 UNION ALL SELECT 1 FROM refused WHERE id = ?1"
+        )
 
-    def add_segment(self, name: str, rows: Iterable[Indexed]) -> None:
-        """Index a segment of observations; one that stands in two segments keeps its first place."""
-        values = [(bytes.fromhex(r.id), name, r.row_group, r.time_ns, r.agent, r.x, r.y, r.reach_m) for r in rows]
+    def retracted(self, ids: Iterable[str]) -> set[str]:
+        """Which of these observations are retracted."""
+        return self._among(ids, "SELECT 1 FROM retracted WHERE id = ?1")
+
+    def _among(self, ids: Iterable[str], query: str) -> set[str]:
         with self._open() as db:
-            db.executemany("INSERT OR IGNORE INTO observations VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
-            db.execute("INSERT OR REPLACE INTO entries VALUES (?, ?)", (name, len(values)))
+            return {name for name in ids if db.execute(query, (bytes.fromhex(name),)).fetchone()}
+
+    def between(self, low: str, high: str) -> list[str]:
+        """Ids of indexed and refused observations from low to high, ascending."""
+        query = "SELECT id FROM observations WHERE id BETWEEN ?1 AND ?2 UNION SELECT id FROM refused WHERE id BETWEEN ?1 AND ?2"
+        return self._ids(query, (bytes.fromhex(low), bytes.fromhex(high)))
+
+    def sent_by(self, agent: str | None, pass_id: str | None) -> list[str]:
+        """Ids of indexed and refused observations of an agent, of a pass or of both, ascending; None: of any."""
+        chosen = "(?1 IS NULL OR agent = ?1) AND (?2 IS NULL OR pass_id = ?2)"
+        query = f"SELECT id FROM observations WHERE {chosen} UNION SELECT id FROM refused WHERE {chosen}"
+        return self._ids(query, (agent, pass_id))
+
+    def names(self, column: str) -> list[str]:
+        """All values of the column ``agent`` or ``pass_id``, ascending."""
+        with self._open() as db:
+            rows = db.execute(f"SELECT {column} FROM observations UNION SELECT {column} FROM refused ORDER BY 1")
+            return [name for (name,) in rows]
+
+    def _ids(self, query: str, values: tuple[object, ...]) -> list[str]:
+        with self._open() as db:
+            return sorted(name.hex() for (name,) in db.execute(query, values))
+
+    def add_segment(self, name: str, rows: Iterable[Indexed], refused: Iterable[RefusedEntry] = ()) -> None:
+        """Index a segment of observations, and its rows that are none; one in two segments keeps its first place."""
+        values = [
+            (bytes.fromhex(r.id), name, r.row_group, r.time_ns, r.agent, r.x, r.y, r.reach_m, r.pass_id) for r in rows
+        ]
+        outside = list(refused)
+        with self._open() as db:
+            db.executemany("INSERT OR IGNORE INTO observations VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
+            db.executemany(
+                "INSERT OR IGNORE INTO refused VALUES (?, ?, ?)",
+                [(bytes.fromhex(r.id), r.agent, r.pass_id) for r in outside],
+            )
+            db.executemany(
+                "INSERT INTO quarantine VALUES (?, ?, ?, 1, ?)", [(name, name, r.row, r.reason) for r in outside]
+            )
+            db.execute("INSERT OR REPLACE INTO entries VALUES (?, ?)", (name, len(values) + len(outside)))
 
     def add_retraction(self, name: str, ids: Iterable[str], reason: str) -> None:
         """Index a retraction: these observations count no more."""
@@ -137,3 +204,8 @@ class Catalogue:
             xy=np.array([row[4:6] for row in rows], np.float64).reshape(-1, 2),
             reach_m=np.array([row[6] for row in rows], np.float64),
         )
+
+
+def _create_tables(db: sqlite3.Connection) -> None:
+    for name, columns in _SCHEMA.items():
+        db.execute(f"CREATE TABLE IF NOT EXISTS {name} {columns}")

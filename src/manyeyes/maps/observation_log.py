@@ -9,6 +9,7 @@ to be written.
 
 from __future__ import annotations
 
+import difflib
 import fcntl
 import hashlib
 import json
@@ -23,14 +24,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
-from manyeyes.maps.catalogue import Catalogue, Indexed, Standing
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.observation_file import Quarantined, observation_table, observations_of, read_observations
+from manyeyes.maps.catalogue import Catalogue, Indexed, RefusedEntry, Standing
+from manyeyes.maps.observation import Frame, Observation, shortened
+from manyeyes.maps.observation_file import Quarantined, RefusedRow, observation_table, read_observations, rows_of
+from manyeyes.maps.observation_limits import LIMITS
 from manyeyes.maps.whole_file import remove_unfinished, replacing, write_whole
 
 TILE_M = 256.0
 # Observations of a tile stand together, so that reading a tile decodes little else.
 _ROWS_A_GROUP = 128
+_ID_DIGITS = 32
 
 
 class StoreError(ManyeyesError):
@@ -47,16 +50,22 @@ class Ingested:
 
 
 class ObservationLog:
-    """The log in a folder; frame: of all its poses."""
+    """The log in a folder; frame: of all its poses.
+
+    refused: rows of segments that were found to be outside the limits since this object was made; the catalogue lists all.
+    """
 
     def __init__(self, folder: Path, frame: Frame) -> None:
         self.folder, self.frame = folder, frame
         self.catalogue = Catalogue(folder.parent / "catalogue.sqlite")
+        self.refused: tuple[Quarantined, ...] = ()
 
     def recover(self) -> None:
-        """Index entries that a killed writer left without; the caller holds the lock."""
+        """Index entries that a killed writer left without, or all under new limits; the caller holds the lock."""
         self.folder.mkdir(parents=True, exist_ok=True)
         remove_unfinished(self.folder)
+        if not self.catalogue.is_current(repr(LIMITS)):
+            self.catalogue.clear(repr(LIMITS))
         indexed = self.catalogue.entries()
         for path in sorted(self.folder.iterdir()):
             if path.name not in indexed:
@@ -84,20 +93,64 @@ class ObservationLog:
             digest = hashlib.blake2b("".join(o.id for o in fresh).encode(), digest_size=8).hexdigest()
             path = self.folder / self._name(digest, "parquet")
             self._write_segment(fresh, path)
-            self.catalogue.add_segment(path.name, _indexed(fresh))
+            self.catalogue.add_segment(path.name, [_indexed(o, k // _ROWS_A_GROUP) for k, o in enumerate(fresh)])
         return len(fresh), len(observations) - len(fresh)
 
-    def retract(self, ids: Sequence[str], reason: str) -> None:
-        """Append that these observations count no more, for privacy or because they were made up; unknown ids are an error."""
+    def find(self, ids: Sequence[str] = (), agent: str | None = None, pass_id: str | None = None) -> tuple[str, ...]:
+        """Find observations by id or the start of one, or by agent and pass; retracted and refused ones too.
+
+        Returns:
+            Full ids, each once.
+
+        Raises:
+            StoreError: an id is not hexadecimal, is unknown or is the start of several; no such agent or pass.
+        """
+        found = {name for one in ids for name in self._starting(one)}
+        if agent is not None or pass_id is not None:
+            sent = self.catalogue.sent_by(agent, pass_id)
+            if not sent:
+                raise StoreError(f"{self.folder}: no observation of {self._unknown(agent, pass_id)}")
+            found.update(sent)
+        return tuple(sorted(found))
+
+    def _starting(self, start: str) -> list[str]:
+        digits = start.lower()
+        if not 0 < len(digits) <= _ID_DIGITS or set(digits) - set("0123456789abcdef"):
+            raise StoreError(f"An id is 32 hexadecimal digits, or the first of them; got '{shortened(start)}'.")
+        found = self.catalogue.between(digits.ljust(_ID_DIGITS, "0"), digits.ljust(_ID_DIGITS, "f"))
+        if len(found) != 1:
+            count = f"{len(found)} observations have" if found else "no observation has"
+            remedy = "give more digits." if found else "ids are those that a map or a quarantine names."
+            raise StoreError(f"{self.folder}: {count} an id that starts with {digits}; {remedy}")
+        return found
+
+    def _unknown(self, agent: str | None, pass_id: str | None) -> str:
+        """Name what is not there, with the nearest name that is."""
+        for column, word, name in (("agent", "agent", agent), ("pass_id", "pass", pass_id)):
+            if name is not None and name not in (known := self.catalogue.names(column)):
+                close = difflib.get_close_matches(name, known, 1)
+                hint = f"did you mean '{close[0]}'?" if close else f"there are {len(known)} others."
+                return f"{word} '{shortened(name)}'; {hint}"
+        return f"agent '{agent}' in pass '{pass_id}', though both are known."
+
+    def retract(self, ids: Sequence[str], reason: str) -> int:
+        """Append that these observations count no more, for privacy or because they were made up; unknown ids are an error.
+
+        Returns:
+            How many counted until now; where none did, nothing is appended.
+        """
         missing = sorted(set(ids) - self.catalogue.known(ids))
         if missing:
             raise StoreError(
                 f"{self.folder}: no observation {missing[0]} to retract; {len(missing)} of {len(ids)} are unknown."
             )
-        text = json.dumps({"retracted": sorted(set(ids)), "reason": reason}, indent=1).encode()
-        path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "retract.json")
-        write_whole(path, text)
-        self._index(path)
+        fresh = sorted(set(ids) - self.catalogue.retracted(ids))
+        if fresh:
+            text = json.dumps({"retracted": fresh, "reason": reason}, indent=1).encode()
+            path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "retract.json")
+            write_whole(path, text)
+            self._index(path)
+        return len(fresh)
 
     def standing(self) -> Standing:
         """Where every observation that counts stands."""
@@ -117,8 +170,7 @@ class ObservationLog:
 
     def _index(self, path: Path) -> None:
         if path.name.endswith(".parquet"):
-            found = [o for group in range(_groups(path)) for o in read_groups(path, [group])]
-            self.catalogue.add_segment(path.name, _indexed(found))
+            self._index_segment(path)
             return
         content = json.loads(path.read_bytes())
         if path.name.endswith(".retract.json"):
@@ -128,9 +180,32 @@ class ObservationLog:
         else:
             raise StoreError(f"{path}: no entry of a log of observations; move the file elsewhere.")
 
+    def _index_segment(self, path: Path) -> None:
+        """Index the observations of a segment; rows outside the limits are put aside."""
+        rows: list[Indexed] = []
+        refused: list[RefusedEntry] = []
+        for group in range(_groups(path)):
+            for item in _read_rows(path, [group]):
+                if isinstance(item, Observation):
+                    rows.append(_indexed(item, group))
+                else:
+                    number = len(rows) + len(refused)
+                    reason = f"{item.reason} Its id is {item.id}."
+                    refused.append(RefusedEntry(item.id, item.agent, item.pass_id, number, reason))
+        self.catalogue.add_segment(path.name, rows, refused)
+        self.refused += tuple(Quarantined(str(path), r.row, 1, r.reason) for r in refused)
+
 
 def read_groups(segment: Path, groups: Sequence[int]) -> list[Observation]:
-    """The observations of some row groups of a segment, in their order."""
+    """The observations of some row groups of a segment, in their order; rows outside the limits are left out."""
+    return [item for item in _read_rows(segment, groups) if isinstance(item, Observation)]
+
+
+def _read_rows(segment: Path, groups: Sequence[int]) -> list[Observation | RefusedRow]:
+    """Read the rows of some row groups; one that is no observation has an id that agrees with its content.
+
+    Such a row is what an older version, with wider limits, wrote. Any other wrong row is damage, hence a StoreError.
+    """
     parquet = _parquet()
     from pyarrow import ArrowException
 
@@ -140,11 +215,12 @@ def read_groups(segment: Path, groups: Sequence[int]) -> list[Observation]:
     except (ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{segment}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
-    out: list[Observation] = []
-    for row, item in observations_of(table):
-        if isinstance(item, str):
-            raise StoreError(f"{segment}: row {row} of groups {list(groups)[:3]}: {item} Restore the file from a copy.")
-        out.append(item)
+    out = list(rows_of(table))
+    for row, item in enumerate(out):
+        if isinstance(item, RefusedRow) and not item.id:
+            raise StoreError(
+                f"{segment}: row {row} of groups {list(groups)[:3]}: {item.reason} Restore the file from a copy."
+            )
     return out
 
 
@@ -194,11 +270,9 @@ def _by_place(observations: Sequence[Observation]) -> list[Observation]:
     return [observations[k] for k in sorted(range(len(keys)), key=keys.__getitem__)]
 
 
-def _indexed(observations: Sequence[Observation]) -> list[Indexed]:
-    return [
-        Indexed(o.id, k // _ROWS_A_GROUP, o.time_ns, o.agent, float(o.pose[0]), float(o.pose[1]), reach_of(o))
-        for k, o in enumerate(observations)
-    ]
+def _indexed(o: Observation, group: int) -> Indexed:
+    x, y = float(o.pose[0]), float(o.pose[1])
+    return Indexed(o.id, group, o.time_ns, o.agent, x, y, reach_of(o), o.pass_id)
 
 
 def reach_of(o: Observation) -> float:
