@@ -28,6 +28,7 @@ GROUPS = {
         "simulate": "send a crowd through a place: observations and truth from a seed",
         "import": "result files of MapTR or StreamMapNet with their poses become observations",
         "fuse": "one map of a folder of observations",
+        "retract": "take observations of a store back, and publish the map without them",
         "evaluate": "judge a map against the truth, or methods in a study",
         "diff": "what changed from one map to another",
         "export": "GeoJSON, GeoPackage, Lanelet2, Argoverse 2, nuScenes, PMTiles",

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import TaskID
 
+    from manyeyes.maps.engine import Executor
+    from manyeyes.maps.store import MapStore
+
 
 @dataclass(frozen=True)
 class Options:
@@ -77,7 +80,6 @@ def main(options: Options) -> None:
 def _into_store(options: Options, folder: Path, console: Console) -> None:
     """Takes the observations into a store's log and publishes a release, tile by tile."""
     from manyeyes.apps.map_folder import observation_files, say_put_aside
-    from manyeyes.apps.showcase import bars
     from manyeyes.maps.engine import named_executor
     from manyeyes.maps.observation_file import read_observations
     from manyeyes.maps.store import MapStore
@@ -89,7 +91,20 @@ def _into_store(options: Options, folder: Path, console: Console) -> None:
     store = MapStore(folder) if there else MapStore.create(folder, read_observations(source).frame)
     with store.writing() as log:
         done = log.ingest(source)
-    say_put_aside(done.quarantined, console)
+    put_aside = (*log.refused, *done.quarantined)
+    say_put_aside(put_aside, console)
+    number = publish_release(store, executor, console)
+    console.print(
+        f"{folder}: release {number} after {done.added} new observations, {done.known} known, {len(put_aside)} put aside",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def publish_release(store: MapStore, executor: Executor, console: Console) -> int:
+    """Fuse all observations of a store that count, publish the map, and return the release's number."""
+    from manyeyes.apps.showcase import bars
+
     with bars(console) as progress:
         tasks: dict[str, TaskID] = {}
 
@@ -99,10 +114,4 @@ def _into_store(options: Options, folder: Path, console: Console) -> None:
                 task = tasks[step] = progress.add_task(step, total=total)
             progress.update(task, completed=finished, total=total)
 
-        manifest = store.fuse(executor=executor, progress=report)
-    console.print(
-        f"{folder}: release {manifest.number} after {done.added} new observations, {done.known} known, "
-        f"{len(done.quarantined)} put aside",
-        highlight=False,
-        soft_wrap=True,
-    )
+        return store.fuse(executor=executor, progress=report).number
