@@ -22,7 +22,16 @@ def test_a_map_that_cannot_be_written_leaves_the_report(tmp_path: Path, capsys: 
     out = tmp_path / "demo"
     out.mkdir()
     (out / "map").write_text("a file where the map's folder would be")
-    words = ("demo", "--out", str(out), "--frames", "1", "--no-animate", "--weights", str(tmp_path / "untrained.safetensors"))
+    words = (
+        "demo",
+        "--out",
+        str(out),
+        "--frames",
+        "1",
+        "--no-animate",
+        "--weights",
+        str(tmp_path / "untrained.safetensors"),
+    )
     assert cli.main([*words, "--towns", str(tmp_path)]) == 1
     assert str(out / "map") in capsys.readouterr().err
     assert {p.name for p in out.iterdir()} >= {"report.html", "results.json", "results.md", "alone.png", "early.png"}

@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
@@ -17,7 +18,7 @@ pytest.importorskip("libsumo", reason="scenarios need the sim extra")
 from manyeyes.datasets import dair_json, dair_v2x
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.pcd import PcdCloud, read_table
-from manyeyes.datatypes import ConfigError, Transform
+from manyeyes.datatypes import ConfigError, RecordingError, Transform
 from manyeyes.simulator import dair
 from manyeyes.simulator.dair import record_dair
 from manyeyes.simulator.presets import jobs_of, simulation_preset
@@ -161,6 +162,41 @@ def test_finished_drives_are_kept_and_lost_ones_made_again(made: Path) -> None:
     assert files(made) == before
     assert (made / "batches/000000.json").stat().st_mtime_ns == kept
     assert [p.name for p in seen] == ["train/one", "val/two"]
+
+
+def test_another_run_is_refused_and_nothing_changes(made: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(made, tmp_path / "copy"))
+    before = files(root)
+    with pytest.raises(ConfigError, match=r"2 finished scenarios of no named settings .* this run makes 2 of seed 5"):
+        record_dair(JOBS, root, settings={"seed": 5})
+    with pytest.raises(ConfigError, match=r"batches/000000.json has seed 7 instead of 8"):
+        record_dair([Job("train", replace(SPEC, seed=8)), JOBS[1]], root)
+    shutil.rmtree(root / "batches")
+    (root / "manifest.json").unlink()
+    with pytest.raises(ConfigError, match="1 scenario folder that no run of 'manyeyes simulate' for this layout wrote"):
+        record_dair(JOBS, root)
+    shutil.copytree(made / "batches", root / "batches")
+    shutil.copyfile(made / "manifest.json", root / "manifest.json")
+    assert files(root) == before
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_damaged_files_of_finished_drives_are_named(made: Path, tmp_path: Path, older: bool) -> None:
+    root = Path(shutil.copytree(made, tmp_path / "copy"))
+    path = root / "vehicle-side" / "velodyne" / "000001.pcd"
+    path.write_bytes(path.read_bytes()[::-1])
+    if older:  # a version that noted the digest of all files together
+        batch = root / "batches" / "000000.json"
+        content = json.loads(batch.read_text())
+        del content["files"]
+        batch.write_text(json.dumps(content))
+    assert [problem.kind for problem in DairRecording(root).verify().files] == ["mismatched"]
+    with pytest.raises(RecordingError, match=r"mismatched in the finished scenario train/one .* remove .*000000.json"):
+        record_dair(JOBS, root)
+    (root / "batches" / "000000.json").unlink()
+    record_dair(JOBS, root)
+    assert files(root) == files(made)
+    assert DairRecording(root).verify().count == 0
 
 
 @pytest.mark.slow

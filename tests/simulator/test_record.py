@@ -79,6 +79,8 @@ def test_the_manifest_counts_and_hashes_what_is_there(made: Path) -> None:
         folder = made / "train" / entry["name"]
         inside = {n: d for n, d in files(folder).items() if n != "scenario.json"}
         lines = [f"{hashlib.sha256(data).hexdigest()}  {name}" for name, data in inside.items()]
+        digests = json.loads((folder / "scenario.json").read_text())["files"]
+        assert digests == {name: hashlib.sha256(data).hexdigest() for name, data in inside.items()}
         assert entry["sha256"] == hashlib.sha256("\n".join(lines).encode()).hexdigest()
         assert entry["bytes"] == sum(map(len, inside.values()))
         pictures = 2 * (entry["name"] == "two")

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from manyeyes.apps.playing import excerpt, weights_name
+from manyeyes.apps.playing import FileChecks, excerpt, weights_name
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -54,6 +54,8 @@ class Options:
     """Of pose errors."""
     out: Path = Path("out/align")
     """Folder for align.json."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ def main(options: Options) -> None:
     from manyeyes.agents.eyes import Eyes
     from manyeyes.alignment.rivals.table import CLOUDS, corrector
     from manyeyes.apps import provenance
-    from manyeyes.apps.recordings import open_recording
+    from manyeyes.apps.recordings import check_files, open_recording, played_scenarios
+    from manyeyes.apps.viewer.table import missing_footer
     from manyeyes.datasets.disturb import PoseNoise
     from manyeyes.evaluation.pose import score
     from manyeyes.models import zoo
@@ -89,7 +92,10 @@ def main(options: Options) -> None:
         if name not in CLOUDS:
             corrector(name)
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
-    drive = excerpt(open_recording(options.recording, options.split), options.scenario, options.frames)
+    recording = open_recording(options.recording, options.split)
+    drive = excerpt(recording, options.scenario, options.frames)
+    played = played_scenarios(recording, drive.scenario, options.scenario)
+    missing = check_files(recording, options.checks, console, played)
     eyes = Eyes(zoo.load(options.weights))
     found = list(_answers(drive, eyes, options, noise))
     judged = {name: [f.judged for f in found if f.corrector == name and f.judged] for name in options.correctors}
@@ -97,6 +103,8 @@ def main(options: Options) -> None:
     if scores:
         title = f"{weights_name(options.weights)} on {drive.scenario}: {len(found) // len(options.correctors)} pairs of agents"
         console.print(_table(scores, title))
+    if missing.count:
+        console.print(missing_footer(missing.count, "align.json"), highlight=False, soft_wrap=True)
     health = watched([f for f in found if f.corrector == "vote"])
     for agent, report in health.items():
         console.print(f"agent {agent}: {report.health.value} over {report.frames} frames", highlight=False)
@@ -106,6 +114,7 @@ def main(options: Options) -> None:
             "scores": {name: asdict(s) for name, s in scores.items()},
             "health": {str(agent): report.health.value for agent, report in health.items()},
             "answers": [_plain(f) for f in found],
+            "missing": missing,
         },
         {"options": options},
         options.seed,

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from manyeyes.apps.playing import Playing, excerpt, weights_name
+from manyeyes.apps.playing import FileChecks, Playing, excerpt, weights_name
 
 if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
@@ -69,6 +69,8 @@ class Options:
     branches: tuple[str, ...] = ()
     """Weights that the study 'ablation' compares, and rival fusions of 'robustness' and 'pose', each as name=weights.safetensors;
     of 'feakm' each as name=detector.safetensors,net.safetensors."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files."""
 
 
 def main(options: Options) -> None:
@@ -77,7 +79,7 @@ def main(options: Options) -> None:
 
     from manyeyes.apps import provenance
     from manyeyes.apps.outcome import outcome_of, show
-    from manyeyes.apps.recordings import open_recording, suited_to
+    from manyeyes.apps.recordings import check_files, open_recording, suited_to
     from manyeyes.apps.showcase import bars, write_text
     from manyeyes.apps.viewer.table import DIFFERENCE_HEADINGS, difference_cells, markdown, markdown_lines
     from manyeyes.datasets.disturb import PoseNoise
@@ -104,13 +106,12 @@ def main(options: Options) -> None:
     opener = partial(open_recording, options.data, options.split)
     recording = opener()
     config = replace(config, replay=suited_to(config.replay, options.playing, recording))
-    for problem in recording.problems:
-        console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
+    missing = check_files(recording, options.checks, console)
     with bars(console) as progress:
         task = progress.add_task("Judging", total=len(recording.scenarios))
         results = benchmark(opener, config, options.workers, lambda done, total: progress.update(task, completed=done))
     timed = [_timed(r, recording, detector, config.replay, options.timed_frames) for r in results]
-    outcome = outcome_of(timed, protocol)
+    outcome = outcome_of(timed, protocol, missing)
     where = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
     title = f"{weights_name(config.weights)} on {where}: {len(recording.scenarios)} scenarios, {protocol.name}"
     show(console, outcome, title)
@@ -120,6 +121,8 @@ def main(options: Options) -> None:
     text = f"{title}\n\n{markdown(outcome.rows)}"
     if outcome.differences:
         text += "\n" + markdown_lines([DIFFERENCE_HEADINGS, *map(difference_cells, outcome.differences)])
+    if outcome.footer:
+        text += f"\n{outcome.footer}\n"
     write_text(options.out / "results.md", text)
     console.print(
         f"\nNumbers, configuration and versions are in {options.out / 'results.json'}", highlight=False, soft_wrap=True

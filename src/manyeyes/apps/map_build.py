@@ -6,13 +6,14 @@ Scenarios that are named after a town (town05_0066, generated-1_0) are judged ag
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from manyeyes.apps.playing import FileChecks
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
@@ -52,6 +53,8 @@ class Options:
     """Of errors and losses."""
     out: Path = Path("out/map-build")
     """Folder for the maps, one a town: observations, truth, map, page, picture; and build.json."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files."""
 
 
 def main(options: Options) -> None:
@@ -61,8 +64,9 @@ def main(options: Options) -> None:
     from manyeyes.apps import provenance
     from manyeyes.apps.map_building import Building, build_map, instants, write_built
     from manyeyes.apps.map_ground import grounds_of
-    from manyeyes.apps.recordings import open_recording
+    from manyeyes.apps.recordings import check_files, open_recording
     from manyeyes.apps.showcase import bars
+    from manyeyes.apps.viewer.table import missing_footer
     from manyeyes.comms.channel import channel_preset
 
     console = Console()
@@ -71,10 +75,11 @@ def main(options: Options) -> None:
     building = Building(mapper, options.survey, options.every, options.channel, options.pose_sigma, options.seed)
     sensors = () if mapper is None else mapper.config.bev.sensors
     recording = open_recording(options.recording, options.split, images="camera" in sensors)
-    for problem in recording.problems:
-        console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
+    mapped = recording.scenarios[: options.scenarios]
+    left_out = recording.left_out if options.scenarios is None else frozenset[str]()
+    missing = check_files(recording, options.checks, console, {*mapped, *left_out})
     name = options.recording.resolve().name
-    grounds = grounds_of(recording, recording.scenarios[: options.scenarios], name, options.map)
+    grounds = grounds_of(recording, mapped, name, options.map)
     if options.map is not None and all(ground.map is None for ground in grounds):
         raise ConfigError(
             f"--map {options.map}: every scenario is named after a town, whose own map is known; leave it out."
@@ -84,6 +89,7 @@ def main(options: Options) -> None:
         with bars(console) as progress:
             task = progress.add_task(ground.name, total=instants(recording, ground, options.every))
             built = build_map(recording, ground, building, partial(progress.advance, task))
+            built = replace(built, numbers=replace(built.numbers, missing=missing))
         write_built(built, options.out / ground.name, f"A map of {ground.name} from sensors")
         _say(console, built.numbers, options.out / ground.name)
         for refused in built.cartographer.refused:
@@ -95,6 +101,8 @@ def main(options: Options) -> None:
         "model": None if mapper is None else {"fingerprint": mapper.fingerprint.hex(), "config": mapper.config},
     }
     provenance.write_json(options.out / "build.json", all_numbers, config, options.seed)
+    if missing.count:
+        console.print(missing_footer(missing.count, "build.json"), highlight=False, soft_wrap=True)
     console.print(f"All numbers are in {options.out / 'build.json'}", highlight=False, soft_wrap=True)
 
 

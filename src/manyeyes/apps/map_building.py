@@ -21,6 +21,7 @@ from manyeyes.apps.map_ground import Ground
 from manyeyes.apps.viewer.map_figures import Panel, save_figure
 from manyeyes.apps.viewer.map_page import page_of, save_map_page
 from manyeyes.datasets.disturb import PoseNoise
+from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, Transform
 from manyeyes.datatypes.map_element import MapElements
@@ -80,7 +81,8 @@ class Numbers:
     """What came of one ground. messages: with a map; bytes of them, and of looks, a message. lost: sent and never whole there.
 
     drift: F of published lines at 0.5 m between the map as it grew, observation by observation, and the fold over all.
-    quality, union: of the map, and of all observations as they are; None where the true map is not known.
+    quality, union: of the map, and of all observations as they are; None where the true map is not known. missing: files of
+    the recording.
     """
 
     name: str
@@ -97,6 +99,7 @@ class Numbers:
     drift: float
     quality: Quality | None
     union: Quality | None
+    missing: MissingFiles = NONE_MISSING
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from rich.console import Console
 
-from manyeyes.apps.viewer.table import Row, differences_terminal, row_of, terminal
+from manyeyes.apps.viewer.table import Row, differences_terminal, missing_footer, row_of, terminal
+from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.evaluation.bootstrap import Interval
 from manyeyes.evaluation.communication import Communication
 from manyeyes.evaluation.comparison import Difference, differences
@@ -47,13 +48,19 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A comparison, ready to be shown. protocol: whose rules AP follows, over which range."""
+    """A comparison, ready to be shown. protocol: whose rules AP follows, over which range. missing: files of the recording."""
 
     protocol: Protocol
     numbers: tuple[Numbers, ...]
     rows: tuple[Row, ...]
     differences: tuple[Difference, ...]
     checks: tuple[str, ...]
+    missing: MissingFiles = NONE_MISSING
+
+    @property
+    def footer(self) -> str:
+        """What a reader of the table must know of missing files; empty where there are none."""
+        return missing_footer(self.missing.count)
 
     @property
     def several(self) -> bool:
@@ -61,7 +68,7 @@ class Outcome:
         return any(number.precision[0].ap.scenarios > 1 for number in self.numbers)
 
 
-def outcome_of(results: Sequence[MethodResult], protocol: Protocol) -> Outcome:
+def outcome_of(results: Sequence[MethodResult], protocol: Protocol, missing: MissingFiles = NONE_MISSING) -> Outcome:
     """The outcome of measured methods."""
     numbers = []
     for result in results:
@@ -73,12 +80,14 @@ def outcome_of(results: Sequence[MethodResult], protocol: Protocol) -> Outcome:
         sent = result.communication
         numbers.append(Numbers(result.method, precision, sent, result.age_ms, result.share_ms, result.perceive_ms))
     rows = tuple(row_of(result) for result in results)
-    return Outcome(protocol, tuple(numbers), rows, differences(results, protocol), _checks(rows))
+    return Outcome(protocol, tuple(numbers), rows, differences(results, protocol), _checks(rows), missing)
 
 
 def show(console: Console, outcome: Outcome, title: str) -> None:
     """Table, differences and checks in the terminal."""
     console.print(terminal(outcome.rows, title))
+    if outcome.footer:
+        console.print(outcome.footer, highlight=False, soft_wrap=True)
     if not outcome.several:
         return
     if outcome.differences:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the verbs that play a recording have in common: options, an excerpt, how long an ego waits."""
+"""What the verbs that read a recording have in common: options, an excerpt, how long an ego waits."""
 
 from __future__ import annotations
 
@@ -66,6 +66,15 @@ class Playing:
             seed=seed,
             aligner=None if self.align is None else Aligner(self.align),
         )
+
+
+@dataclass(frozen=True)
+class FileChecks:
+    """What all commands that make numbers or weights of a recording do about its files."""
+
+    allow_missing: bool = False
+    """Go on where files of the recording are missing or do not match; they are counted in the JSON and under the table. Without
+    it they are an error."""
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+from manyeyes.apps.playing import FileChecks
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,8 @@ class Options:
     """Of how many judged frames one is looked at."""
     seed: int = 0
     """Of the first centres."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files."""
 
 
 def main(options: Options) -> None:
@@ -33,7 +37,7 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.apps import provenance
-    from manyeyes.apps.recordings import open_recording
+    from manyeyes.apps.recordings import check_files, open_recording
     from manyeyes.models import checkpoint
     from manyeyes.models.codebook import CodebookConfig
     from manyeyes.training.codebook import fit
@@ -43,6 +47,7 @@ def main(options: Options) -> None:
     half = any(v.dtype == torch.float16 for v in checkpoint.read_state(options.weights).values())
     recording = open_recording(options.data, options.split)
     console, tokens = Console(), 0
+    missing = check_files(recording, options.checks, console)
     with console.status("Tokens") as status:
 
         def report(count: int) -> None:
@@ -53,6 +58,7 @@ def main(options: Options) -> None:
         fitted = fit(detector, recording, options.seed, CodebookConfig(options.stages), options.every, report)
     origin = provenance.provenance({"options": options}, options.seed)
     made = {"command": origin["command"], "seed": options.seed, "tokens": tokens, "git_commit": origin["git_commit"]}
+    made["missing"] = provenance.plain(missing)
     checkpoint.save(fitted, options.out, card | {"codebook": made}, half)
     width = fitted.codebook.width if fitted.codebook else 0
     console.print(

@@ -1,25 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opens a recording by what its folder holds, and suits the replay to it."""
+"""Opens a recording by what its folder holds, checks its files, and suits the replay to it."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manyeyes.datasets.dair_index import dair_root
 from manyeyes.datasets.dair_v2x import DairRecording
+from manyeyes.datasets.missing import MissingFiles
 from manyeyes.datasets.opv2v import Opv2vRecording
-from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes import ConfigError, RecordingError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from manyeyes.agents.replay import ReplayConfig
-    from manyeyes.apps.playing import Playing
+    from manyeyes.apps.playing import FileChecks, Playing
     from manyeyes.datasets.recording import Recording
 
 # Half of DAIR-V2X's period: a pair's later sweep is heard, and the next pair has not begun.
 PAIRS_WAIT_S = 0.05
+_MAX_NOTES = 8
 
 
 def open_recording(root: Path, split: str | None = None, images: bool = False) -> Opv2vRecording | DairRecording:
@@ -32,6 +37,42 @@ def open_recording(root: Path, split: str | None = None, images: bool = False) -
     if images:
         raise ConfigError(f"{root}: pictures are read in OPV2V's layout only; choose a model of agents with LiDAR.")
     return DairRecording(root, split)
+
+
+def check_files(
+    recording: Opv2vRecording | DairRecording,
+    checks: FileChecks,
+    console: Console,
+    scenarios: Collection[str] | None = None,
+) -> MissingFiles:
+    """Name the missing and mismatched files of a recording, and refuse them unless they are allowed.
+
+    Args:
+        recording: what is played.
+        checks: whether to go on.
+        console: for notes.
+        scenarios: names of the scenarios that are played; None for all.
+
+    Raises:
+        RecordingError: files are missing or mismatched, and that is not allowed.
+    """
+    with console.status("Checking files") as status:
+        missing = recording.verify(scenarios, lambda done, total: status.update(f"Checking files: {done} of {total}"))
+    if missing.count and not checks.allow_missing:
+        more = f", and {missing.count - 1:,} more files are missing or mismatched" if missing.count > 1 else ""
+        raise RecordingError(
+            f"{missing.files[0]}{more}: ground truth and results would change. Restore the files, or add --allow-missing to "
+            "go on and have them counted."
+        )
+    mismatched = [str(problem) for problem in missing.files if problem.kind == "mismatched"]
+    for line in (*recording.problems, *mismatched[:_MAX_NOTES]):
+        console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
+    return missing
+
+
+def played_scenarios(recording: Opv2vRecording | DairRecording, played: str, named: str | None) -> frozenset[str]:
+    """The scenarios whose files count where one is played; those that are left out count if it was not chosen by name."""
+    return frozenset({played}) | (recording.left_out if named is None else frozenset())
 
 
 def suited_to(config: ReplayConfig, playing: Playing, recording: Recording) -> ReplayConfig:

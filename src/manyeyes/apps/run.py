@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from manyeyes.apps.playing import Playing, excerpt, weights_name
+from manyeyes.apps.playing import FileChecks, Playing, excerpt, weights_name
 
 
 @dataclass(frozen=True)
@@ -35,22 +35,24 @@ class Options:
     """Detections below this score are not drawn; they count all the same."""
     playing: Playing = field(default_factory=Playing)
     """How agents collaborate."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files."""
 
 
 def main(options: Options) -> None:
     """The verb."""
     from rich.console import Console
 
-    from manyeyes.apps.recordings import open_recording, suited_to
+    from manyeyes.apps.recordings import check_files, open_recording, played_scenarios, suited_to
     from manyeyes.apps.showcase import REPORT, Showing, play
     from manyeyes.models import zoo
 
     console = Console()
     replay = options.playing.replay_config(options.seed)
     recording = open_recording(options.recording, options.split)
-    for problem in recording.problems:
-        console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
     drive = excerpt(recording, options.scenario, options.frames)
+    played = played_scenarios(recording, drive.scenario, options.scenario)
+    missing = check_files(recording, options.checks, console, played)
     split = f" --split {options.split}" if options.split else ""
     showing = Showing(
         out=options.out,
@@ -62,6 +64,7 @@ def main(options: Options) -> None:
         frame=options.frame,
         animate=options.animate,
         score_min=options.score_min,
+        missing=missing,
         commands=(f"manyeyes run {options.recording}{split} --scenario {drive.scenario}",),
     )
     play(drive, zoo.load(options.playing.weights), showing, console)

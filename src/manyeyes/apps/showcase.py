@@ -21,6 +21,7 @@ from manyeyes.apps.viewer.birds_eye import draw, save_png, scene_of
 from manyeyes.apps.viewer.report import Chapter, Picture, Report, save_report
 from manyeyes.apps.viewer.table import markdown
 from manyeyes.apps.whereabouts import HEADINGS, Whereabouts
+from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.evaluation.detection import Protocol, protocol_named
 from manyeyes.evaluation.tally import Tally
@@ -42,7 +43,7 @@ TITLES = {
 
 @dataclass(frozen=True)
 class Showing:
-    """What is shown and where it goes. frame: index of the pictured instant, None: the middle one."""
+    """What is shown and where it goes. frame: index of the pictured instant, None: the middle one. missing: files of the drive."""
 
     out: Path
     title: str
@@ -55,6 +56,7 @@ class Showing:
     animate: bool = True
     facts: tuple[tuple[str, str], ...] = ()
     commands: tuple[str, ...] = ()
+    missing: MissingFiles = NONE_MISSING
 
 
 @dataclass
@@ -95,7 +97,7 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
             if step.method in film.methods:
                 film.add(step.method, _picture(step, grid, _caption_of(step), showing.score_min, FILM_WIDTH))
             progress.advance(task)
-    outcome = outcome_of([tally.result() for tally in tallies.values()], protocol)
+    outcome = outcome_of([tally.result() for tally in tallies.values()], protocol, showing.missing)
     show(console, outcome, showing.title)
     where = _where(places)
     for chapter, found in zip(where, (p for p in places.values() if p.senders)):
@@ -104,7 +106,7 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
     pictures = _film_picture(film, showing.out) + _still_pictures(kept, outcome, grid, showing)
     config = {"showing": showing, "detector": detector.config}
     origin = provenance.write_json(showing.out / "results.json", outcome, config, showing.replay.seed)
-    write_text(showing.out / "results.md", markdown(outcome.rows))
+    write_text(showing.out / "results.md", markdown(outcome.rows) + (f"\n{outcome.footer}\n" if outcome.footer else ""))
     report = Report(
         title=showing.title,
         lead=showing.lead,
@@ -112,7 +114,7 @@ def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console)
         pictures=pictures,
         facts=_facts(drive, detector, showing),
         commands=showing.commands,
-        notes=_notes(protocol),
+        notes=(*((outcome.footer,) if outcome.footer else ()), *_notes(protocol)),
         chapters=where,
         provenance=origin,
     )

@@ -7,9 +7,14 @@ Several processes (not for FeaKM): torchrun -m manyeyes.apps.cli train.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from manyeyes.apps.playing import FileChecks
+
+if TYPE_CHECKING:
+    from manyeyes.datasets.missing import MissingFiles
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,8 @@ class Options:
     one by default."""
     threads: int = 1
     """Threads of torch in each process; the result is the same only for the same number."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files."""
 
 
 def main(options: Options) -> None:
@@ -47,7 +54,7 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.apps import train_feakm, train_map
-    from manyeyes.apps.recordings import open_recording
+    from manyeyes.apps.recordings import check_files, open_recording
     from manyeyes.datatypes import ConfigError
     from manyeyes.training.feakm import FEAKM_TRAINING
     from manyeyes.training.map_presets import MAP_TRAINING
@@ -67,19 +74,21 @@ def main(options: Options) -> None:
     torch.set_num_threads(options.threads)
     recording = open_recording(options.data, options.split)
     several = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    missing = check_files(recording, options.checks, Console(quiet=int(os.environ.get("RANK", "0")) > 0))
     if several:
         dist.init_process_group("gloo")
     try:
-        _train(options, config, recording, Console(quiet=several and dist.get_rank() > 0))
+        _train(options, config, recording, missing, Console(quiet=several and dist.get_rank() > 0))
     finally:
         if several:
             dist.destroy_process_group()
 
 
-def _train(options: Options, config: Any, recording: Any, console: Any) -> None:
+def _train(options: Options, config: Any, recording: Any, missing: MissingFiles, console: Any) -> None:
     from manyeyes.apps import provenance
     from manyeyes.apps.showcase import bars
     from manyeyes.apps.viewer.loss_curve import save_loss_curve
+    from manyeyes.apps.viewer.table import missing_footer
     from manyeyes.training.loop import Progress, train
 
     out = options.out or Path("runs") / options.preset
@@ -101,6 +110,9 @@ def _train(options: Options, config: Any, recording: Any, console: Any) -> None:
         "weights": weights.name,
         "loss": last[0].loss if last else None,
         "seconds": last[0].seconds if last else None,
+        "missing": missing,
     }
     provenance.write_json(out / "train.json", result, {"options": options, "training": config}, options.seed)
+    if missing.count:
+        console.print(missing_footer(missing.count, "train.json"), highlight=False, soft_wrap=True)
     console.print(f"{weights}; the loss over steps is in {out / 'loss.png'}", highlight=False, soft_wrap=True)

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from manyeyes.apps.train import Options
+    from manyeyes.datasets.missing import MissingFiles
+    from manyeyes.datasets.recording import Recording
     from manyeyes.models.detector import Detector
     from manyeyes.training.feakm import FeakmTrainConfig
     from manyeyes.training.feakm_cache import FeatureCache
@@ -22,8 +24,10 @@ def main(options: Options, console: Any) -> None:
     import torch
 
     from manyeyes.apps import provenance
+    from manyeyes.apps.recordings import check_files, open_recording
     from manyeyes.apps.showcase import bars
     from manyeyes.apps.viewer.loss_curve import save_loss_curve
+    from manyeyes.apps.viewer.table import missing_footer
     from manyeyes.models import zoo
     from manyeyes.training.feakm import FEAKM_TRAINING, MatchProgress, train_feakm
 
@@ -36,8 +40,10 @@ def main(options: Options, console: Any) -> None:
     origin = provenance.provenance({"options": options, "training": config}, options.seed)
     card = {name: origin[name] for name in ("command", "versions", "git_commit")}
     last: list[MatchProgress] = []
+    recording = open_recording(options.data, options.split)
+    missing = check_files(recording, options.checks, console)
     with bars(console) as progress:
-        cache = _seen(options, detector, progress)
+        cache = _seen(options, recording, missing, detector, progress)
         task = progress.add_task("Training", total=config.steps)
 
         def report(at: MatchProgress) -> None:
@@ -47,8 +53,10 @@ def main(options: Options, console: Any) -> None:
 
         weights = train_feakm(config, cache, out, options.seed, card, report)
     save_loss_curve(out / "log.jsonl", out / "loss.png")
-    result = {"weights": weights.name, "loss": last[0].loss if last else None}
+    result = {"weights": weights.name, "loss": last[0].loss if last else None, "missing": missing}
     provenance.write_json(out / "train.json", result, {"options": options, "training": config}, options.seed)
+    if missing.count:
+        console.print(missing_footer(missing.count, "train.json"), highlight=False, soft_wrap=True)
     console.print(f"{weights}; the loss over steps is in {out / 'loss.png'}", highlight=False, soft_wrap=True)
 
 
@@ -58,13 +66,14 @@ def fitted(config: FeakmTrainConfig, detector: Detector) -> FeakmTrainConfig:
     return replace(config, net=replace(config.net, keypoints=keypoints, detector=detector.fingerprint.hex()))
 
 
-def _seen(options: Options, detector: Detector, progress: Progress) -> FeatureCache:
-    """Kept under runs/views, by detector, data and split, so that both presets share it."""
-    from manyeyes.apps.recordings import open_recording
+def _seen(
+    options: Options, recording: Recording, missing: MissingFiles, detector: Detector, progress: Progress
+) -> FeatureCache:
+    """Kept under runs/views, by detector, data, split and missing files, so that both presets share it."""
     from manyeyes.training.feakm_cache import build, wanted
 
-    recording = open_recording(options.data, options.split)
-    where = hashlib.blake2b(f"{options.data.resolve()}|{options.split}".encode(), digest_size=4).hexdigest()
+    lacking = f"|{missing}" if missing.count else ""
+    where = hashlib.blake2b(f"{options.data.resolve()}|{options.split}{lacking}".encode(), digest_size=4).hexdigest()
     task = progress.add_task("Seeing", total=len(wanted(recording)))
     cache = None
     for cache in build(recording, detector, Path("runs") / "views" / where):

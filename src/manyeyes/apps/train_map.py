@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from manyeyes.apps.train import Options
+    from manyeyes.datasets.dair_v2x import DairRecording
+    from manyeyes.datasets.opv2v import Opv2vRecording
     from manyeyes.datasets.recording import Recording
     from manyeyes.datatypes.map_element import MapElements
 
@@ -34,8 +36,10 @@ def main(options: Options) -> None:
 
 def _train(options: Options, console: Any) -> None:
     from manyeyes.apps import provenance
+    from manyeyes.apps.recordings import check_files
     from manyeyes.apps.showcase import bars
     from manyeyes.apps.viewer.loss_curve import save_loss_curve
+    from manyeyes.apps.viewer.table import missing_footer
     from manyeyes.models import zoo
     from manyeyes.simulator.towns import TOWN_SPLIT
     from manyeyes.training.map_loop import MapProgress, train_mapper
@@ -45,6 +49,7 @@ def _train(options: Options, console: Any) -> None:
     asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
     config = replace(MAP_TRAINING[options.preset], **{k: v for k, v in asked.items() if v is not None})
     recording = open_looks(options.data, options.split, config.mapper.bev.sensors)
+    missing = check_files(recording, options.checks, console)
     held_out = tuple(town for side, towns in TOWN_SPLIT.items() if side != "train" for town in towns)
     samples = TileStream(recording, true_maps(recording), config.mapper, config.augment, options.seed, held_out)
     start = [zoo.mapper_state(weights) for weights in options.weights]
@@ -63,12 +68,14 @@ def _train(options: Options, console: Any) -> None:
     if console.quiet:
         return
     save_loss_curve(out / "log.jsonl", out / "loss.png")
-    result = {"weights": weights.name, "loss": last[0].loss if last else None}
+    result = {"weights": weights.name, "loss": last[0].loss if last else None, "missing": missing}
     provenance.write_json(out / "train.json", result, {"options": options, "training": config}, options.seed)
+    if missing.count:
+        console.print(missing_footer(missing.count, "train.json"), highlight=False, soft_wrap=True)
     console.print(f"{weights}; the loss over steps is in {out / 'loss.png'}", highlight=False, soft_wrap=True)
 
 
-def open_looks(data: Path, split: str | None, sensors: Sequence[str]) -> Recording:
+def open_looks(data: Path, split: str | None, sensors: Sequence[str]) -> Opv2vRecording | DairRecording:
     """The recording with what these sensors took: pictures are read where a model has cameras, and must then be there."""
     from manyeyes.apps.recordings import open_recording
     from manyeyes.datatypes import ConfigError

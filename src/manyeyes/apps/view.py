@@ -59,11 +59,14 @@ def main(options: Options) -> None:
 
     if options.out.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"--out ends in {', '.join(SUFFIXES)}; got {options.out.name}.")
-    drive = excerpt(open_recording(options.recording, options.split), options.scenario)
+    recording = open_recording(options.recording, options.split)
+    drive = excerpt(recording, options.scenario)
     single = options.out.suffix.lower() == ".png"
     first = drive.judged(drive.scenario).start if options.frame is None else options.frame
     last = min(drive.length(drive.scenario), first + (1 if single else options.frames))
     console = Console()
+    for problem in recording.problems:
+        console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
     images = _images(options, drive, range(first, last))
     if single:
         save_png(images[0], options.out)

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from manyeyes.datasets.dair_json import REMEDY, load_json, load_list, number_of, offset_of, text_of
+from manyeyes.datasets.missing import FileProblem
 from manyeyes.datatypes import RecordingError
 
 ARCHIVE = "cooperative-vehicle-infrastructure"
 SPLIT_FILE = "cooperative-split-data.json"
 # Pairs of the official cooperative split (recordings.md).
 OFFICIAL_PAIRS = {"train": 4813, "val": 1783, "test": 2688, "test_A": 851}
-_SIDES = ("vehicle-side", "infrastructure-side")
+SIDES = ("vehicle-side", "infrastructure-side")
 _LABEL_FOLDER = {"vehicle-side": "lidar", "infrastructure-side": "virtuallidar"}
 _LABEL_KEYS = ("label_lidar_std_path", "label_lidar_path", "label_virtuallidar_path")
 _MOTIONS = {"vehicle-side": ("novatel_to_world", "lidar_to_novatel"), "infrastructure-side": ("virtuallidar_to_world",)}
@@ -56,15 +57,16 @@ class Pair:
 
 @dataclass(frozen=True)
 class Index:
-    """Usable pairs by drive, in order of time, and one line for each kind of thing that is missing."""
+    """Usable pairs by drive, in order of time; one line for each kind of thing that is missing, and a record for each file."""
 
     pairs: dict[str, tuple[Pair, ...]]
     problems: tuple[str, ...]
+    missing: tuple[FileProblem, ...]
 
 
 def dair_root(path: Path) -> Path | None:
     """The folder that holds the two sides: path itself, the official archive's folder in it, or None."""
-    return next((p for p in (path, path / ARCHIVE) if any((p / side).is_dir() for side in _SIDES)), None)
+    return next((p for p in (path, path / ARCHIVE) if any((p / side).is_dir() for side in SIDES)), None)
 
 
 @dataclass
@@ -126,14 +128,14 @@ class Sides:
     """Both sides of a root: which sweep came before another."""
 
     def __init__(self, root: Path) -> None:
-        wanted = [f"{name}/data_info.json" for name in (*_SIDES, "cooperative")]
+        wanted = [f"{name}/data_info.json" for name in (*SIDES, "cooperative")]
         missing = [name for name in wanted if not (root / name).is_file()]
         if missing:
             raise RecordingError(
                 f"{root}: expected DAIR-V2X's vehicle-side, infrastructure-side and cooperative folders with a "
                 f"data_info.json each; missing: {', '.join(missing)}. Download what is missing."
             )
-        self.vehicle, self.infrastructure = (_Side.read(root, name) for name in _SIDES)
+        self.vehicle, self.infrastructure = (_Side.read(root, name) for name in SIDES)
 
 
 def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frames: int, label_folder: str) -> Index:
@@ -145,6 +147,7 @@ def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frame
     there = _Listing()
     lacking = _Lacking()
     drives: dict[str, list[Pair]] = {}
+    missing: list[FileProblem] = []
     entries = load_list(path)
     named = set()
     for row, entry in enumerate(entries):
@@ -158,6 +161,7 @@ def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frame
         )
         if absent is not None:
             lacking.note("an entry in the index of its side", absent)
+            missing += _absent_entries(sides, vehicle, infrastructure)
             continue
         second: SideFrame | None = sides.infrastructure.frame(infrastructure)
         if delay_frames:
@@ -166,6 +170,7 @@ def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frame
                 lacking.note(f"an infrastructure sweep {delay_frames} earlier", f"the first is frame {vehicle}")
                 continue
         pair = _pair(root, path, entry, row, sides.vehicle.frame(vehicle), second, label_folder)
+        missing += _absent_files(pair, there)
         gone = next((f for f in _needed(pair, there) if not there.has(f)), None)
         if gone is not None:
             lacking.note(f"their {gone.parent.relative_to(root)} file", f"the first is {gone}")
@@ -180,13 +185,27 @@ def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frame
         problems.append(
             f"{path}: {len(gone)} of the split's {len(ids)} frames are not in it, the first is {gone[0]}; left out"
         )
+        clouds = (root / "vehicle-side" / "velodyne" / f"{id}.pcd" for id in gone)
+        missing += (FileProblem(p, "missing", "", f"the split names this frame, {path.name} does not") for p in clouds)
     order = sorted(drives, key=lambda name: (not name.isdecimal(), int(name) if name.isdecimal() else 0, name))
     kept = {n: tuple(sorted(drives[n], key=lambda p: (p.vehicle.timestamp_ns, p.vehicle.id))) for n in order}
-    return Index(kept, tuple(problems))
+    return Index(kept, tuple(problems), tuple(missing))
 
 
 def _both(sides: Sides, vehicle: str, infrastructure: str) -> tuple[tuple[_Side, str], ...]:
     return (sides.vehicle, vehicle), (sides.infrastructure, infrastructure)
+
+
+def _absent_entries(sides: Sides, vehicle: str, infrastructure: str) -> list[FileProblem]:
+    """The frames of a pair that the index of their side does not have."""
+    batch = sides.vehicle.frame(vehicle).batch if vehicle in sides.vehicle.entries else ""
+    return [
+        FileProblem(
+            side.path.parent / "velodyne" / f"{id}.pcd", "missing", batch, f"{side.path.name} has no such frame"
+        )
+        for side, id in _both(sides, vehicle, infrastructure)
+        if id not in side.entries
+    ]
 
 
 def _frame_id(path: Path, entry: Mapping[str, Any], side: str, row: int) -> str:
@@ -219,6 +238,19 @@ def _needed(pair: Pair, there: _Listing) -> Iterable[Path]:
         yield from pair.infrastructure.motions
 
 
+def _absent_files(pair: Pair, there: _Listing) -> list[FileProblem]:
+    """The files of a pair that are not there.
+
+    Labels and calibrations of the infrastructure are absent only where their folder has others: some releases have none.
+    """
+    needed = list(_needed(pair, there))
+    beside = [pair.vehicle.label, pair.infrastructure.label, *pair.infrastructure.motions]
+    beside += [pair.label] if pair.label is not None else []
+    absent = [p for p in needed if not there.has(p)]
+    absent += [p for p in beside if p not in needed and not there.has(p) and there.any_in(p.parent)]
+    return [FileProblem(p, "missing", pair.vehicle.batch, "the index names it") for p in absent]
+
+
 class _Listing:
     """Which files are there; every folder is listed once."""
 
@@ -226,13 +258,18 @@ class _Listing:
         self._names: dict[Path, frozenset[str]] = {}
 
     def has(self, path: Path) -> bool:
-        folder = path.parent
+        return path.name in self._in(path.parent)
+
+    def any_in(self, folder: Path) -> bool:
+        return bool(self._in(folder))
+
+    def _in(self, folder: Path) -> frozenset[str]:
         if folder not in self._names:
             try:
                 self._names[folder] = frozenset(os.listdir(folder))  # noqa: PTH208 - names are all that is wanted
             except OSError:
                 self._names[folder] = frozenset()
-        return path.name in self._names[folder]
+        return self._names[folder]
 
 
 class _Lacking:

@@ -9,6 +9,7 @@ pair have their own time stamps. The format has neither the height of a LiDAR (f
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Literal
 
@@ -23,7 +24,11 @@ from manyeyes.datasets.dair_json import (
     read_side_labels,
     read_world_labels,
 )
+from manyeyes.datasets.dair_writer import pair_files
 from manyeyes.datasets.ground_height import height_above_ground
+from manyeyes.datasets.manifest import BATCHES, Digests
+from manyeyes.datasets.mismatch import copied_files
+from manyeyes.datasets.missing import FileProblem, MissingFiles
 from manyeyes.datasets.pcd import PcdCloud, read_pcd
 from manyeyes.datasets.recording import require_index
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, RecordingError, Snapshot, Transform, Truth
@@ -48,6 +53,7 @@ class DairRecording:
     as ``label_world_backup`` of the complemented release. delay_frames: the infrastructure's sweep is so many sweeps older.
     native_pose_error: the infrastructure claims the pose of its calibration, without the correction by hand that the truth
     keeps. A pair that lacks a file is left out and named in ``problems``, one line a kind; with strict it is an error.
+    ``verify`` names each file that is absent, and each whose content does not belong to its frame.
     """
 
     def __init__(
@@ -105,6 +111,41 @@ class DairRecording:
         """The vehicle and the infrastructure, always 0 and -1."""
         self._pairs(scenario)
         return (VEHICLE_ID, INFRASTRUCTURE_ID)
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """The names of the drives of which nothing can be read; the empty name stands for frames whose drive is not known."""
+        return frozenset(problem.scenario for problem in self._index.missing) - self._index.pairs.keys()
+
+    def verify(
+        self, scenarios: Collection[str] | None = None, progress: Callable[[int, int], None] | None = None
+    ) -> MissingFiles:
+        """Name the files that are missing, or whose content does not belong to their frame.
+
+        Drives of the simulator are compared with their digests; of others a cloud that is a copy of another is mismatched.
+
+        Args:
+            scenarios: names of the drives to verify; None for all.
+            progress: called with the number of drives that are verified, and of all.
+        """
+        names = [name for name in self.scenarios if scenarios is None or name in scenarios]
+        found = [p for p in self._index.missing if scenarios is None or p.scenario in scenarios]
+        for count, name in enumerate(names, 1):
+            found += self._verify_contents(name)
+            if progress is not None:
+                progress(count, len(names))
+        return MissingFiles.of(found)
+
+    def _verify_contents(self, name: str) -> list[FileProblem]:
+        pairs = self._index.pairs[name]
+        number = f"{int(name):06d}.json" if name.isdecimal() else ""
+        digests = Digests.read(self.root / BATCHES / number) if number else None
+        whole = not any(problem.scenario == name for problem in self._index.missing)
+        if digests is not None and (digests.by_path is not None or whole):
+            files = sorted(path for pair in pairs for path in pair_files(self.root, pair.vehicle.id))
+            return digests.check(self.root, name, files, f"{BATCHES}/{number}")
+        clouds = {path: None for pair in pairs for path in (pair.vehicle.cloud, pair.infrastructure.cloud)}
+        return copied_files(clouds, name)
 
     def pair(self, scenario: str, index: int) -> Pair:
         """Which files a snapshot comes from."""

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from manyeyes.datasets.cache import write_whole
-from manyeyes.datasets.dair_index import SPLIT_FILE
+from manyeyes.datasets.dair_index import SIDES, SPLIT_FILE
 from manyeyes.datasets.pcd import PcdTable, write_table
 from manyeyes.datatypes import LABELS, AgentFrame, Boxes, RecordingError, Snapshot, Transform
 
@@ -155,6 +155,29 @@ class DairWriter:
                 "system_error_offset": {"delta_x": offset[0], "delta_y": offset[1]},
             }
         )
+
+
+def pair_files(root: Path, stem: str) -> list[Path]:
+    """The files that DairWriter writes of one pair."""
+    vehicle, infrastructure, cooperative = (
+        root / name for name in ("vehicle-side", "infrastructure-side", "cooperative")
+    )
+    return [
+        vehicle / "velodyne" / f"{stem}.pcd",
+        infrastructure / "velodyne" / f"{stem}.pcd",
+        vehicle / "calib" / "novatel_to_world" / f"{stem}.json",
+        vehicle / "calib" / "lidar_to_novatel" / f"{stem}.json",
+        infrastructure / "calib" / "virtuallidar_to_world" / f"{stem}.json",
+        cooperative / "calib" / "lidar_i2v" / f"{stem}.json",
+        vehicle / "label" / "lidar" / f"{stem}.json",
+        infrastructure / "label" / "virtuallidar" / f"{stem}.json",
+        cooperative / "label_world" / f"{stem}.json",
+    ]
+
+
+def index_files(root: Path) -> list[Path]:
+    """The files that write_dair_index writes."""
+    return [root / SPLIT_FILE, *(root / f"{name}/data_info.json" for name in (*SIDES, "cooperative"))]
 
 
 def write_dair_index(root: Path, drives: Sequence[DairRows], splits: Mapping[str, Sequence[str]]) -> None:

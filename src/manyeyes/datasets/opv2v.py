@@ -8,11 +8,13 @@ the time of a point, nor an agent's word on its own error (both read as zero), n
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,16 @@ import torch
 from manyeyes.datasets.cache import ArrayCache, default_cache_folder
 from manyeyes.datasets.carla import carla_from_transform, mirror_points, transform_from_carla
 from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, height_above_ground
-from manyeyes.datasets.opv2v_camera import camera_yaml, missing_pictures, picture_path, read_images
+from manyeyes.datasets.manifest import PARTIAL, SCENARIO, Digests, listed_scenarios, scenario_files
+from manyeyes.datasets.mismatch import mismatched_files
+from manyeyes.datasets.missing import FileProblem, MissingFiles
+from manyeyes.datasets.opv2v_camera import (
+    camera_yaml,
+    lacking_pictures,
+    missing_pictures,
+    picture_path,
+    read_images,
+)
 from manyeyes.datasets.opv2v_yaml import (
     AgentRecord,
     Protocol,
@@ -43,9 +54,17 @@ _KEPT_RECORDS = 20_000
 
 @dataclass(frozen=True)
 class _Agent:
+    """One agent's files. stems: of frames with a cloud and metadata; pictures: stems that a camera lacks, by its number."""
+
     id: int
     folder: Path
-    stems: frozenset[str]
+    clouds: frozenset[str]
+    records: frozenset[str]
+    pictures: Mapping[int, Sequence[str]]
+
+    @cached_property
+    def stems(self) -> frozenset[str]:
+        return self.clouds & self.records
 
 
 @dataclass(frozen=True)
@@ -62,6 +81,10 @@ class Opv2vRecording:
     agent that lacks a frame is left out of that snapshot. What is missing stands in ``problems``, one line each; with
     strict it is an error instead. Clouds are read when a snapshot is asked for; pictures too, with images=True.
     cache_folder: where parsed yaml and ascii clouds are kept (default: the user's cache folder); None with ``use_cache=False``.
+
+    All agents of a scenario have the same stems in OPV2V and V2XSet: their public reader looks every agent up by the ego's
+    stems. A stem that any agent has is hence expected of all, the ego included; ``verify`` names each file that is absent,
+    and each whose content does not belong to its frame.
     """
 
     def __init__(
@@ -81,9 +104,14 @@ class Opv2vRecording:
         self._drop_nan = drop_nan
         self._cache = ArrayCache(cache_folder or default_cache_folder()) if use_cache else None
         problems: list[str] = []
-        found = (_scan(folder, problems, images) for folder in _scenario_folders(self.root, split))
+        missing: list[FileProblem] = []
+        folders = _scenario_folders(self.root, split)
+        found = [_scan(folder, problems, missing, images) for folder in folders]
         self._scenarios = {s.folder.name: s for s in found if s is not None}
+        if folders[0] not in (self.root, self.root / str(split)):  # one scenario may be opened by itself
+            _compare_with_manifest(folders, problems, missing)
         self.problems = tuple(problems)
+        self._missing = tuple(missing)
         if not self._scenarios or (strict and problems):
             more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
             first = f"{problems[0]}{more}" if problems else "it is empty"
@@ -109,10 +137,38 @@ class Opv2vRecording:
         """The ids of all agents of the scenario, the ego first and infrastructure last."""
         return tuple(agent.id for agent in self._scenario(scenario).agents)
 
+    @property
+    def left_out(self) -> frozenset[str]:
+        """The names of the scenarios of which nothing can be read."""
+        return frozenset(problem.scenario for problem in self._missing) - self._scenarios.keys()
+
+    def verify(
+        self, scenarios: Collection[str] | None = None, progress: Callable[[int, int], None] | None = None
+    ) -> MissingFiles:
+        """Name the files that are missing, or whose content does not belong to their frame.
+
+        Scenarios of the simulator are compared with their digests, others by ``mismatched_files``. The verdict on a scenario
+        is kept in the cache while its files stay as they are.
+
+        Args:
+            scenarios: names of the scenarios to verify; None for all.
+            progress: called with the number of scenarios that are verified, and of all.
+        """
+        names = [name for name in self.scenarios if scenarios is None or name in scenarios]
+        found = [problem for problem in self._missing if scenarios is None or problem.scenario in scenarios]
+        for count, name in enumerate(names, 1):
+            found += self._verify_contents(name)
+            if progress is not None:
+                progress(count, len(names))
+        return MissingFiles.of(found)
+
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         """All agents that have this frame; the truth is the union of what they list, in the order of ids."""
+        return self._snapshot(scenario, index, self._with_images)
+
+    def _snapshot(self, scenario: str, index: int, images: bool) -> Snapshot:
         stem, present = self._present(scenario, index)
-        frames = tuple(self._frame(scenario, agent, stem) for agent in present)
+        frames = tuple(self._frame(scenario, agent, stem, images) for agent in present)
         records = [self._record(agent.folder / f"{stem}.yaml") for agent in present]
         return Snapshot(scenario, index, frames, _truth(frames, records))
 
@@ -127,7 +183,38 @@ class Opv2vRecording:
         if not found:
             ids = ", ".join(str(agent.id) for agent in present)
             raise RecordingError(f"Agent {agent_id} has no frame {index} of '{scenario}'; choose one of {ids}.")
-        return self._frame(scenario, found[0], stem)
+        return self._frame(scenario, found[0], stem, self._with_images)
+
+    def _verify_contents(self, name: str) -> list[FileProblem]:
+        """Compare the contents of a scenario's files, unless the cache has them as sound."""
+        folder = self._scenarios[name].folder
+        files = scenario_files(folder)
+        kind = f"sound1{'-pictures' if self._with_images else ''}"
+        state = _state(files, folder)
+        kept = self._cache.load(folder, kind) if self._cache is not None else None
+        if kept is not None and np.array_equal(kept, state):
+            return []
+        digests, found = Digests.read(folder / SCENARIO), []
+        if digests is not None and digests.by_path is None and any(p.scenario == name for p in self._missing):
+            digests = None  # a total of files says nothing of the others where some are absent
+        if digests is not None:
+            suffixes = (".pcd", ".yaml", *((".png",) if self._with_images else ()))
+            found = digests.check(folder, name, files, used=lambda path: path.endswith(suffixes))
+        if digests is None or (found and digests.by_path is None):
+            found = (
+                mismatched_files(lambda index: self._snapshot(name, index, False), name, self._clouds(name)) or found
+            )
+        if self._cache is not None and not found:
+            self._cache.store(folder, kind, state)
+        return found
+
+    def _clouds(self, name: str) -> list[dict[int, Path]]:
+        """The paths of the clouds of each snapshot, by agent."""
+        scenario = self._scenarios[name]
+        return [
+            {agent.id: agent.folder / f"{stem}.pcd" for agent in scenario.agents if stem in agent.stems}
+            for stem in scenario.stems
+        ]
 
     def _present(self, scenario: str, index: int) -> tuple[str, list[_Agent]]:
         """The stem of an instant's files, and the agents that have them."""
@@ -155,7 +242,7 @@ class Opv2vRecording:
     def _cloud(self, agent: _Agent, stem: str) -> PcdCloud:
         return read_pcd(agent.folder / f"{stem}.pcd", self._drop_nan, self._cache)
 
-    def _frame(self, scenario: str, agent: _Agent, stem: str) -> AgentFrame:
+    def _frame(self, scenario: str, agent: _Agent, stem: str, images: bool) -> AgentFrame:
         record, cloud = self._record(agent.folder / f"{stem}.yaml"), self._cloud(agent, stem)
         world_from_lidar = transform_from_carla(record.lidar_pose)
         height = self._sensor_height(agent, record, world_from_lidar)
@@ -172,7 +259,7 @@ class Opv2vRecording:
             sensor_height_m=height,
             speed_mps=record.speed_kmh / _KMH,
             is_infrastructure=record.is_infrastructure,
-            images=read_images(yaml, world_from_agent, self._cache) if self._with_images else (),
+            images=read_images(yaml, world_from_agent, self._cache) if images else (),
         )
 
     def _sensor_height(self, agent: _Agent, record: AgentRecord, world_from_lidar: Transform) -> float:
@@ -226,6 +313,12 @@ def _is_scenario(folder: Path) -> bool:
     return any(_AGENT.fullmatch(p.name) and not _is_scenario(p) for p in _subfolders(folder))
 
 
+def holds_frames(folder: Path) -> bool:
+    """Whether a folder has agents with clouds or metadata, that is, whether it is a scenario with anything in it."""
+    agents = [p for p in _subfolders(folder) if _AGENT.fullmatch(p.name)]
+    return any(p.suffix in (".pcd", ".yaml") and p.stem.isdecimal() for agent in agents for p in agent.iterdir())
+
+
 def _scenario_folders(root: Path, split: str | None) -> list[Path]:
     """The folders to scan, after the root was checked; the text of every error lists what is there instead."""
     if not root.is_dir():
@@ -249,11 +342,18 @@ def _scenario_folders(root: Path, split: str | None) -> list[Path]:
     )
 
 
-def _scan(folder: Path, problems: list[str], images: bool) -> _Scenario | None:
-    """What a scenario's folder holds, by names alone; what is missing is added to problems."""
+def _scan(folder: Path, problems: list[str], missing: list[FileProblem], images: bool) -> _Scenario | None:
+    """What a scenario's folder holds, by names alone; what is missing is added to problems and to missing."""
+    if folder.name.endswith(PARTIAL):
+        reason = "an interrupted run of 'manyeyes simulate' left it unfinished"
+        problems.append(f"{folder}: {reason}, the scenario is left out")
+        missing.append(FileProblem(folder, "missing", folder.name.removesuffix(PARTIAL), reason))
+        return None
     names = [p for p in _subfolders(folder) if _AGENT.fullmatch(p.name)]
     ordered = [p for p in names if int(p.name) >= 0] + [p for p in names if int(p.name) < 0]
-    agents = [a for a in (_scan_agent(p, problems, images) for p in ordered) if a.stems]
+    everyone = [_scan_agent(p, problems, images) for p in ordered]
+    missing += _absent_files(folder, everyone)
+    agents = [a for a in everyone if a.stems]
     if not agents:
         problems.append(f"{folder}: no agent with a whole frame, the scenario is left out")
         return None
@@ -275,17 +375,56 @@ def _scan(folder: Path, problems: list[str], images: bool) -> _Scenario | None:
 def _scan_agent(folder: Path, problems: list[str], images: bool) -> _Agent:
     everything = list(folder.iterdir())
     files = [p for p in everything if p.stem.isdecimal()]
-    clouds = {p.stem for p in files if p.suffix == ".pcd"}
-    records = {p.stem for p in files if p.suffix == ".yaml"}
+    clouds = frozenset(p.stem for p in files if p.suffix == ".pcd")
+    records = frozenset(p.stem for p in files if p.suffix == ".yaml")
     if not clouds and not records:
         problems.append(f"{folder}: holds neither pcd nor yaml, the agent is left out")
     for there, suffix in ((clouds - records, "yaml"), (records - clouds, "pcd")):
         if there:
             count = f"{len(there)} of {len(clouds | records)} frames"
             problems.append(f"{folder}: {count} lack their {suffix}, the first is {min(there, key=int)}; left out")
+    stems = sorted(clouds & records, key=int)
     if images:
-        problems += [f"{folder}: {line}" for line in missing_pictures(everything, sorted(clouds & records, key=int))]
-    return _Agent(int(folder.name), folder, frozenset(clouds & records))
+        problems += [f"{folder}: {line}" for line in missing_pictures(everything, stems)]
+    return _Agent(int(folder.name), folder, clouds, records, lacking_pictures(everything, stems) if images else {})
+
+
+def _absent_files(folder: Path, agents: Sequence[_Agent]) -> Iterator[FileProblem]:
+    """The files that a scenario lacks: every stem of any agent is expected of all."""
+    stems = frozenset[str]().union(*(agent.clouds | agent.records for agent in agents))
+    # A folder of something else may stand beside the scenarios; an empty one was a scenario.
+    if not stems and (agents or (folder / "data_protocol.yaml").is_file() or not any(folder.iterdir())):
+        yield FileProblem(folder, "missing", folder.name, "no agent of the scenario has a frame")
+    for agent in agents:
+        for stem in sorted(stems, key=int):
+            for there, beside, suffix in ((agent.clouds, agent.records, "pcd"), (agent.records, agent.clouds, "yaml")):
+                if stem not in there:
+                    reason = "the other file of its frame is there" if stem in beside else "other agents have the frame"
+                    yield FileProblem(agent.folder / f"{stem}.{suffix}", "missing", folder.name, reason)
+        for number, lacking in agent.pictures.items():
+            for stem in lacking:
+                path = picture_path(agent.folder, stem, number)
+                yield FileProblem(path, "missing", folder.name, "the camera has pictures of other frames")
+
+
+def _compare_with_manifest(folders: Sequence[Path], problems: list[str], missing: list[FileProblem]) -> None:
+    """Add the scenarios of a split that the manifest of the simulator lists and that are not there."""
+    split = folders[0].parent
+    root = split.absolute().parent
+    absent = set(listed_scenarios(root, split.absolute().name)) - {folder.name for folder in folders}
+    for name in sorted(absent - {problem.scenario for problem in missing}):
+        reason = "the recording's manifest lists this scenario"
+        problems.append(f"{split / name}: not there, and {reason}")
+        missing.append(FileProblem(split / name, "missing", name, reason))
+
+
+def _state(files: Sequence[Path], folder: Path) -> np.ndarray:
+    """(32,) uint8 digest of names, sizes and times of files; replacing any of them changes it."""
+    lines = []
+    for path in files:
+        stat = path.stat()
+        lines.append(f"{path.relative_to(folder).as_posix()} {stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns}")
+    return np.frombuffer(hashlib.sha256("\n".join(lines).encode()).digest(), np.uint8)
 
 
 class Opv2vWriter:

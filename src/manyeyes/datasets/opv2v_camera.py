@@ -100,18 +100,20 @@ def _row(path: Path, key: str, entry: object) -> list[float]:
     return values
 
 
-def missing_pictures(files: Sequence[Path], stems: Sequence[str]) -> list[str]:
-    """One line for each camera that has pictures of some of an agent's frames and lacks those of others."""
+def lacking_pictures(files: Sequence[Path], stems: Sequence[str]) -> dict[int, list[str]]:
+    """The stems that a camera lacks while it has pictures of others, by the camera's number; a camera without any is absent."""
     there = {p.name for p in files if p.suffix == ".png"}
     numbers = sorted(
         {int(n.rsplit("_camera", 1)[1][:-4]) for n in there if n.rsplit("_camera", 1)[-1][:-4].isdecimal()}
     )
-    lines = []
-    for number in numbers:
-        lacking = [stem for stem in stems if f"{stem}_camera{number}.png" not in there]
-        if lacking:
-            text = (
-                f"{len(lacking)} of {len(stems)} frames lack the picture of camera {number}, the first is {lacking[0]}"
-            )
-            lines.append(f"{text}; it is left out there")
-    return lines
+    lacking = {n: [stem for stem in stems if f"{stem}_camera{n}.png" not in there] for n in numbers}
+    return {number: found for number, found in lacking.items() if found}
+
+
+def missing_pictures(files: Sequence[Path], stems: Sequence[str]) -> list[str]:
+    """One line for each camera that has pictures of some of an agent's frames and lacks those of others."""
+    return [
+        f"{len(lacking)} of {len(stems)} frames lack the picture of camera {number}, the first is {lacking[0]}; "
+        "it is left out there"
+        for number, lacking in lacking_pictures(files, stems).items()
+    ]

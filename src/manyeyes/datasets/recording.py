@@ -68,8 +68,15 @@ def points_in_listed_boxes(snapshot: Snapshot, margin_m: float = 0.1) -> Tensor:
         listed = truth.seen[row].nonzero()[:, 0]
         boxes = truth.boxes[listed].transform(truth.world_from_agent[row].inverse())
         points = frame.points.xyz.to(boxes.center.dtype)
+        points = points[points[:, 0].argsort()]  # a box then needs a slice of them
         reach = boxes.size.norm(dim=-1) / 2 + margin_m
-        for column, radius, one in zip(listed.tolist(), reach.tolist(), range(len(boxes))):
-            near = points[((points - boxes.center[one]).abs() <= radius).all(-1)]
+        x, ahead = boxes.center[:, 0], points[:, 0].contiguous()
+        first, end = (
+            torch.searchsorted(ahead, x - reach).tolist(),
+            torch.searchsorted(ahead, x + reach, right=True).tolist(),
+        )
+        for one, (column, radius) in enumerate(zip(listed.tolist(), reach.tolist())):
+            near = points[first[one] : end[one]]
+            near = near[((near - boxes.center[one]).abs() <= radius).all(-1)]
             counts[row, column] = boxes[one : one + 1].contains(near, margin_m).sum()
     return counts

@@ -4,27 +4,39 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from manyeyes.datasets.dair_writer import DairRows, DairWriter, write_dair_index
+from manyeyes.datasets.dair_writer import DairRows, DairWriter, index_files, pair_files, write_dair_index
+from manyeyes.datasets.manifest import (
+    BATCHES,
+    MANIFEST,
+    UNFINISHED_MANIFEST,
+    Digests,
+    digest_files,
+    total_digest,
+)
+from manyeyes.datasets.missing import FileProblem
 from manyeyes.datatypes import ConfigError, RecordingError
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.simulator.record import (
-    MANIFEST,
     Entry,
     Job,
+    Plan,
     Progress,
-    digest_of,
+    entry_of,
     first_scene,
-    run_jobs,
-    versions,
+    require_listed,
+    require_own_folder,
+    require_sound,
+    run_unfinished,
     write_json,
+    write_manifest,
 )
-from manyeyes.simulator.scenario import RSU_ID, Scenario
+from manyeyes.simulator.scenario import RSU_ID, Scenario, ScenarioSpec
 
-BATCHES = "batches"
 # The world is stepped so many times between two pairs, and the pole's sweep is at most _LATEST steps older than the
 # vehicle's: 0 or 20 ms at 10 pairs a second. Chosen; DAIR-V2X's own pairs are not simultaneous either.
 _STEPS = 5
@@ -51,41 +63,45 @@ def record_dair(
 ) -> Path:
     """Write all drives into one root in DAIR-V2X's layout, with its split file and a manifest; the manifest's path.
 
-    What a former run finished under the same settings is kept. Drives are numbered in the order of jobs, frames throughout.
+    What a former run finished under the same settings is checked and kept. Drives are numbered in the order of jobs, frames
+    throughout.
+
+    Raises:
+        ConfigError: the folder holds another recording; nothing in it was changed.
+        RecordingError: a file of a finished drive is missing or damaged; nothing was changed.
     """
     root = Path(out)
     if workers < 1:
         raise ConfigError(f"record_dair needs workers >= 1; got {workers}.")
     if any(job.spec.vehicles != 1 for job in jobs):
         raise ConfigError("DAIR-V2X has one vehicle a drive; give every ScenarioSpec vehicles=1.")
-    (root / BATCHES).mkdir(parents=True, exist_ok=True)
+    names = [(job.split, job.spec.name) for job in jobs]
+    if len(set(names)) < len(names):
+        raise ConfigError("Two drives of one split have one name; give each its own.")
     starts = [sum(job.spec.frames for job in jobs[:i]) for i in range(len(jobs))]
     work = [DairJob(job, i, start) for i, (job, start) in enumerate(zip(jobs, starts))]
-    entries: dict[int, Entry] = {}
-    for count, (one, entry) in enumerate(run_jobs(record_drive, work, root, workers), 1):
-        entries[one.batch] = entry
-        if progress is not None:
-            progress(Progress(count, len(work), f"{one.job.split}/{one.job.spec.name}"))
-    drives = [_rows(root, one) for one in work]
-    splits: dict[str, list[str]] = {}
-    for one, rows in zip(work, drives):
-        splits.setdefault(one.job.split, []).extend(rows.frames)
-    write_dair_index(root, drives, splits)
-    content = {
-        "format": "DAIR-V2X",
-        "settings": settings or {},
-        "versions": versions(),
-        "scenarios": [{"batch": one.batch, **asdict(entries[one.batch])} for one in work],
-    }
-    write_json(root / MANIFEST, content)
+    plan = Plan("DAIR-V2X", settings or {}, {_place(one): _asked(one) for one in work}, names)
+    finished = {p.relative_to(root).as_posix(): _content(p) for p in sorted((root / BATCHES).glob("*.json"))}
+    require_own_folder(root, plan, {place: content["asked"] for place, content in finished.items()})
+    require_sound(root, {place: _check(root, place, content) for place, content in finished.items()})
+    require_listed(root, {place: content["entry"] for place, content in finished.items()})
+    kept = {name: entry_of(finished[_place(one)]) for name, one in zip(names, work) if _place(one) in finished}
+    todo = {name: one for name, one in zip(names, work) if name not in kept}
+    entries = kept | run_unfinished(record_drive, todo, root, workers, plan, progress)
+    if todo or not all(path.is_file() for path in (root / MANIFEST, *index_files(root))):
+        drives = [_rows(root, one) for one in work]
+        splits: dict[str, list[str]] = {}
+        for one, rows in zip(work, drives):
+            splits.setdefault(one.job.split, []).extend(rows.frames)
+        write_dair_index(root, drives, splits)
+        scenarios = [{"batch": one.batch, **asdict(entries[name])} for name, one in zip(names, work)]
+        write_manifest(root, plan, scenarios)
+    (root / UNFINISHED_MANIFEST).unlink(missing_ok=True)
     return root / MANIFEST
 
 
 def record_drive(one: DairJob, root: Path) -> Entry:
-    """Write one drive's files, its rows of the indices last; or read back the entry of a former run."""
-    kept = _kept(root, one)
-    if kept is not None:
-        return kept
+    """Write one drive's files, its rows of the indices last."""
     spec = one.job.spec
     fast = replace(spec, frames=_STEPS * spec.frames, rate_hz=_STEPS * spec.rate_hz, history_frames=0)
     scenario = first_scene(fast, one.job.towns, roadside=True)
@@ -93,6 +109,7 @@ def record_drive(one: DairJob, root: Path) -> Entry:
     points = _write(scenario, writer, one.first_frame)
     rows = writer.rows
     files = sorted(writer.files)
+    digests = digest_files(files, root)
     agents = (*scenario.agents, RSU_ID)
     entry = Entry(
         split=one.job.split,
@@ -108,9 +125,11 @@ def record_drive(one: DairJob, root: Path) -> Entry:
         returns=points // (len(agents) * spec.frames),
         files=len(files),
         bytes=sum(p.stat().st_size for p in files),
-        sha256=digest_of(files, root),
+        sha256=total_digest(digests),
     )
-    write_json(_batch_file(root, one), {"asked": _asked(one), "entry": asdict(entry), "rows": asdict(rows)})
+    content = {"asked": _asked(one), "entry": asdict(entry), "rows": asdict(rows), "files": digests}
+    (root / BATCHES).mkdir(exist_ok=True)
+    write_json(root / _place(one), content)
     return entry
 
 
@@ -128,33 +147,36 @@ def _write(scenario: Scenario, writer: DairWriter, first_frame: int) -> int:
     return points
 
 
-def _batch_file(root: Path, one: DairJob) -> Path:
-    return root / BATCHES / f"{one.batch:06d}.json"
+def _place(one: DairJob) -> str:
+    """The file that marks a drive as finished."""
+    return f"{BATCHES}/{one.batch:06d}.json"
 
 
-def _asked(one: DairJob) -> dict[str, object]:
+def _asked(one: DairJob) -> dict[str, Any]:
     asked = {"split": one.job.split, "first_frame": one.first_frame, "spec": asdict(one.job.spec)}
     return json.loads(json.dumps(asked))
 
 
-def _kept(root: Path, one: DairJob) -> Entry | None:
-    path = _batch_file(root, one)
-    if not path.is_file():
-        return None
-    content = _content(path)
-    if content.get("asked") != _asked(one):
-        return None
-    entry = content["entry"]
-    return Entry(**{**entry, "agents": tuple(entry["agents"])})
-
-
 def _rows(root: Path, one: DairJob) -> DairRows:
-    return DairRows(**_content(_batch_file(root, one))["rows"])
+    return DairRows(**_content(root / _place(one))["rows"])
 
 
-def _content(path: Path) -> dict:
+def _check(root: Path, place: str, content: Mapping[str, Any]) -> list[FileProblem]:
+    """Compare a finished drive with its digests."""
+    entry, digests = content["entry"], Digests.read(root / place)
+    if digests is None:
+        return [FileProblem(root / place, "mismatched", entry["name"], "it has no digests")]
+    files = sorted(p for stem in DairRows(**content["rows"]).frames for p in pair_files(root, stem) if p.is_file())
+    return digests.check(root, f"{entry['split']}/{entry['name']}", files, place)
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """The content of a drive's file, its specification with the defaults of fields that an older version did not have."""
     try:
-        content = json.loads(path.read_text())
-        return {key: content[key] for key in ("asked", "entry", "rows")}
+        content = json.loads(path.read_text(encoding="utf-8"))
+        asked = {**content["asked"], "spec": asdict(ScenarioSpec(**content["asked"]["spec"]))}
+        entry_of(content)
+        DairRows(**content["rows"])
+        return {"asked": json.loads(json.dumps(asked)), "entry": content["entry"], "rows": content["rows"]}
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{path}: expected what a recording run writes; {error}: remove the file.") from error

@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manyeyes.alignment.feakm import Feakm
@@ -75,7 +74,7 @@ def rows(begun: Start, branches: Sequence[tuple[Branch, str]]) -> list[BranchRow
             done = {s: n * len(recording.scenarios) + k for k, s in enumerate(recording.scenarios)}
             who = branch.detector.fingerprint, fingerprint(branch.corrector.net), pairs
             key = hashlib.blake2b(repr((who, data)).encode(), digest_size=8).hexdigest()
-            path = Path(begun.options.out) / "cells" / f"feakm-{key}.json"
+            path = begun.cells / f"feakm-{key}.json"
             if not path.is_file():
 
                 def report(scenario: str, index: int, done: dict[str, int] = done) -> None:

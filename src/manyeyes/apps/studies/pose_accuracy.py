@@ -67,7 +67,7 @@ def carried_out(begun: Start, trials: Sequence[Trial]) -> list[AccuracyRow]:
     with bars(begun.console) as progress:
         for trial in progress.track(trials, description="Aligning"):
             key = hashlib.blake2b(repr((trial, marks[trial.corrector], data)).encode(), digest_size=8).hexdigest()
-            path = Path(begun.options.out) / "cells" / f"pose-{Path(trial.corrector).stem}-{key}.json"
+            path = begun.cells / f"pose-{Path(trial.corrector).stem}-{key}.json"
             found = kept(path, lambda trial=trial: answered(seen(trial.corrector), trial))
             out += rows(trial, found)
     return out

@@ -3,18 +3,22 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manyeyes.agents.collaboration import METHODS, method
 from manyeyes.apps import provenance
 from manyeyes.apps.playing import weights_name
-from manyeyes.apps.recordings import open_recording, suited_to
+from manyeyes.apps.recordings import check_files, open_recording, suited_to
 from manyeyes.apps.showcase import bars, write_text
 from manyeyes.apps.viewer.curves import Panel, save_curves
 from manyeyes.apps.viewer.study_table import Sheet, change, markdown, terminal
+from manyeyes.apps.viewer.table import missing_footer
+from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.benchmark import BenchmarkConfig
@@ -33,12 +37,21 @@ PAPER = 'The column "paper" holds CoSTr\'s own figures: another data set (OPV2V)
 
 @dataclass(frozen=True)
 class Start:
-    """What a study's conditions are changes of, and the recording that they are played on."""
+    """What a study's conditions are changes of, the recording that they are played on, and files that it lacks."""
 
     options: Options
     console: Console
     opener: Callable[[], Recording]
     base: BenchmarkConfig
+    missing: MissingFiles = NONE_MISSING
+
+    @property
+    def cells(self) -> Path:
+        """The folder of the cells under --out, another one for each set of missing files."""
+        if not self.missing.count:
+            return self.options.out / "cells"
+        digest = hashlib.blake2b(repr(self.missing).encode(), digest_size=4).hexdigest()
+        return self.options.out / f"cells-missing-{digest}"
 
     @property
     def title(self) -> str:
@@ -57,13 +70,12 @@ def start(options: Options, console: Console, all_egos: bool = False) -> Start:
         )
     opener = partial(open_recording, options.data, options.split)
     recording = opener()
-    for problem in recording.problems:
-        console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
+    missing = check_files(recording, options.checks, console)
     replay = suited_to(options.playing.replay_config(options.seed, all_egos), options.playing, recording)
     base = BenchmarkConfig(
         options.playing.weights, options.playing.methods, options.protocol, replay, every=options.every
     )
-    return Start(options, console, opener, base)
+    return Start(options, console, opener, base, missing)
 
 
 def selectors(options: Options) -> tuple[str, ...]:
@@ -74,7 +86,7 @@ def selectors(options: Options) -> tuple[str, ...]:
 
 
 def carry_out(begun: Start, conditions: Sequence[Condition]) -> Sweep:
-    """The sweep; cells lie in the folder ``cells`` under --out."""
+    """The sweep; its cells lie in the folder of the start."""
     with bars(begun.console) as progress:
         task = progress.add_task("Judging", total=None)
 
@@ -82,7 +94,7 @@ def carry_out(begun: Start, conditions: Sequence[Condition]) -> Sweep:
             progress.update(task, completed=done, total=total)
 
         options = begun.options
-        return sweep(begun.opener, conditions, options.out / "cells", options.workers, report)
+        return sweep(begun.opener, conditions, begun.cells, options.workers, report)
 
 
 def publish(
@@ -96,6 +108,8 @@ def publish(
     """Table in the terminal; STUDY.json, STUDY.md and STUDY.png in the folder --out."""
     options, name = begun.options, str(begun.options.study)
     title = begun.title
+    footer = missing_footer(begun.missing.count, f"{name}.json")
+    notes = (*notes, footer) if footer else notes
     begun.console.print(f"{title}\n", highlight=False, soft_wrap=True)
     for sheet in sheets:
         begun.console.print(terminal(sheet))
@@ -103,7 +117,9 @@ def publish(
     for note in notes:
         begun.console.print(note, highlight=False, soft_wrap=True)
     config = {"options": options, "conditions": conditions}
-    provenance.write_json(options.out / f"{name}.json", {"title": title, **payload}, config, options.seed)
+    provenance.write_json(
+        options.out / f"{name}.json", {"title": title, "missing": begun.missing, **payload}, config, options.seed
+    )
     if panels:
         save_curves(panels, options.out / f"{name}.png")
     picture = f"![{name}]({name}.png)\n"

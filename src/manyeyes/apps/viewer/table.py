@@ -87,6 +87,14 @@ def markdown(rows: Sequence[Row]) -> str:
     return markdown_lines([HEADINGS, *(cells(row) for row in rows)])
 
 
+def missing_footer(count: int, listed_in: str = "results.json") -> str:
+    """The footer of a table whose recording lacks files; empty where it lacks none."""
+    if not count:
+        return ""
+    files = "1 file" if count == 1 else f"{count:,} files"
+    return f"{files} missing or mismatched: the ground truth and all rows are affected; see {listed_in}."
+
+
 def differences_terminal(differences: Sequence[Difference]) -> Table:
     """Paired differences for a terminal."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
