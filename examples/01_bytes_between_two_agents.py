@@ -43,4 +43,6 @@ alone, together = Agent(detector).perceive(road[1]), Agent(detector).perceive(ro
 print(f"{sum(map(len, packets))} bytes in {len(packets)} packets from {len(together.heard)} agent")
 for name, boxes in (("alone", alone.boxes), ("together", together.boxes)):
     sure = boxes[boxes.score > 0.5]
-    print(f"{name}: {len(sure)} of {len(CARS)} cars at x, y {[tuple(xy) for xy in sure.center[:, :2].round().int().tolist()]}")
+    print(
+        f"{name}: {len(sure)} of {len(CARS)} cars at x, y {[tuple(xy) for xy in sure.center[:, :2].round().int().tolist()]}"
+    )
