@@ -19,7 +19,7 @@ VERBS = {
     "run": "replay your own OPV2V-format recording as demo does",
     "view": "draw a frame of a recording, or animate a drive",
     "align": "where agents are, from what they detect: claimed and corrected poses judged",
-    "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import",
+    "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",
     "doctor": "print what a bug report needs",
 }
 GROUPS = {
