@@ -107,13 +107,13 @@ def test_doctor_says_as_json_what_a_bug_report_needs(capsys) -> None:
     import torch
 
     assert said["versions"]["torch"] == torch.__version__ and said["torch_threads"] == torch.get_num_threads()
-    assert {e["name"] for e in said["extras"]} == {"sim", "map", "view", "live", "av2"}
+    assert {e["name"] for e in said["extras"]} == {"sim", "map", "view", "av2", "dask", "ray", "register"}
     assert {"cpu", "cores", "system", "git_commit", "weights", "towns", "towns_from", "package"} <= set(said)
 
 
 def test_doctor_names_the_pip_line_of_a_missing_extra(monkeypatch, capsys) -> None:
     from manyeyes.apps import doctor
 
-    monkeypatch.setattr(doctor, "_installed", lambda module: module != "zenoh")
+    monkeypatch.setattr(doctor, "_installed", lambda module: module != "pyogrio")
     assert cli.main(["doctor"]) == 0
-    assert "pip install 'manyeyes[live]'" in capsys.readouterr().out
+    assert "pip install 'manyeyes[map]'" in capsys.readouterr().out
