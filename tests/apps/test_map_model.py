@@ -16,6 +16,7 @@ from manyeyes.apps import cli
 from manyeyes.apps.map_building import Building
 from manyeyes.apps.map_ground import Ground
 from manyeyes.apps.map_model import crowd, local, pose, running, semi_global, whole
+from manyeyes.datasets.missing import NONE_MISSING
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, PointCloud, Snapshot, Transform, Truth
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
 from manyeyes.evaluation.tile_cells import Drawing, TileCell
@@ -78,6 +79,7 @@ def save(path, sensors=("lidar",), towns=()):
 def weights(tmp_path, monkeypatch):
     monkeypatch.setattr(running, "open_looks", lambda data, split, sensors: Crossroads())
     monkeypatch.setattr(running, "true_maps", lambda recording: {"cross": STREETS})
+    monkeypatch.setattr(running, "missing_files", lambda options, console: NONE_MISSING)
     return save(tmp_path / "random.safetensors")
 
 

@@ -299,6 +299,16 @@ def test_every_command_refuses_and_counts(
         assert "1 file missing or mismatched" in capsys.readouterr().out
 
 
+def test_a_study_of_the_map_model_refuses_before_it_looks_for_weights(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = shutil.copytree(whole, tmp_path / "data")
+    path = no_record_of_the_ego(data)
+    assert run("map", "evaluate", "--study", "local", "--data", data, "--weights", "none", "--out", tmp_path / "o") == 1
+    said = capsys.readouterr().err
+    assert str(path) in said and "--allow-missing" in said and not (tmp_path / "o").exists()
+
+
 def test_the_report_of_a_drive_has_the_footer(whole: Path, weights: Path, tmp_path: Path) -> None:
     data = shutil.copytree(whole, tmp_path / "data")
     no_record_of_the_ego(data)

@@ -9,13 +9,14 @@ sensors), pose (tiles under errors of claimed poses, and behind their corrector)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
 from manyeyes.apps.map_model import MODEL_STUDIES
+from manyeyes.apps.playing import FileChecks
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ class Options:
     """Who corrects claimed poses in the study 'pose', by name."""
     out: Path = Path("out/map-study")
     """Folder for a study: cells are kept there, and a study that was stopped goes on."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files of --data."""
 
 
 def main(options: Options) -> None:

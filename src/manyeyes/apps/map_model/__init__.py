@@ -16,4 +16,10 @@ MODEL_STUDIES = ("local", "semi-global", "whole", "pose")
 
 def model_study(options: Options, console: Console) -> None:
     """Runs one of MODEL_STUDIES; what is finished is kept under --out."""
+    from manyeyes.apps.map_model.running import missing_files
+    from manyeyes.datatypes import ConfigError
+
+    if options.data is None:
+        raise ConfigError(f"The study {options.study!r} needs --data, a dataset of towns such as data/streets.")
+    missing_files(options, console)
     import_module(f"manyeyes.apps.map_model.{str(options.study).replace('-', '_')}").run(options, console)

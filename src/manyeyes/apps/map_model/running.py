@@ -3,22 +3,25 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.console import Console
 
 from manyeyes.apps import provenance
 from manyeyes.apps.map_studies import executor_of
-from manyeyes.apps.recordings import open_recording
+from manyeyes.apps.recordings import check_files, open_recording
 from manyeyes.apps.showcase import bars, write_text
 from manyeyes.apps.train_map import has_pictures, open_looks, true_maps
 from manyeyes.apps.viewer.map_figures import Panel, save_figure
 from manyeyes.apps.viewer.study_table import Sheet, change, markdown, number, terminal, value
-from manyeyes.apps.viewer.table import NOT_RUN
+from manyeyes.apps.viewer.table import NOT_RUN, missing_footer
 from manyeyes.datasets.dair_index import dair_root
+from manyeyes.datasets.missing import MissingFiles
 from manyeyes.datasets.recording import Recording
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.map_pool import MapClaim
@@ -28,8 +31,6 @@ from manyeyes.evaluation.tile_table import KINDS, WAYS, TileRow, TileTable
 from manyeyes.models import zoo
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from manyeyes.apps.map_evaluate import Options
 
 SENSORS = {("lidar",): "LiDAR", ("camera",): "camera", ("lidar", "camera"): "both"}
@@ -60,10 +61,24 @@ class Model:
     world: World
 
 
+def missing_files(options: Options, console: Console) -> MissingFiles:
+    """The files that the recording of a study lacks; an error unless they are allowed."""
+    assert options.data is not None
+    return check_files(open_recording(options.data, options.split), options.checks, console)
+
+
+def cells_folder(options: Options) -> Path:
+    """The folder of the cells under --out, another one for each set of missing files."""
+    missing = missing_files(options, Console(quiet=True))
+    if not missing.count:
+        return options.out / "cells"
+    digest = hashlib.blake2b(repr(missing).encode(), digest_size=4).hexdigest()
+    return options.out / f"cells-missing-{digest}"
+
+
 def models(options: Options) -> tuple[Model, ...]:
     """The models that are judged: those given, or those that ship; refused where one was taught by a town that would judge it."""
-    if options.data is None:
-        raise ConfigError(f"The study {options.study!r} needs --data, a dataset of towns such as data/streets.")
+    assert options.data is not None
     names = options.weights or _shipped_for(options)
     if not names:
         raise ConfigError(
@@ -102,7 +117,7 @@ def _drawn(options: Options, console: Console, model: Model, draw: Draw) -> tupl
             model.weights,
             draw,
             range(options.seeds),
-            options.out / "cells",
+            cells_folder(options),
             executor_of(options.workers),
             lambda done, total: progress.update(task, completed=done, total=total),
             options.every,
@@ -164,11 +179,18 @@ def publish(
 ) -> None:
     """Tables in the terminal; STUDY.json, STUDY.md and STUDY.png in the folder --out."""
     name = str(options.study)
+    missing = missing_files(options, Console(quiet=True))
+    footer = missing_footer(missing.count, f"{name}.json")
+    notes = (*notes, footer) if footer else notes
     console.print(f"{title}\n", highlight=False, soft_wrap=True)
     for sheet in sheets:
         console.print(terminal(sheet))
         console.print()
-    provenance.write_json(options.out / f"{name}.json", {"title": title, **payload}, {"options": options}, 0)
+    if footer:
+        console.print(footer, highlight=False, soft_wrap=True)
+    provenance.write_json(
+        options.out / f"{name}.json", {"title": title, "missing": missing, **payload}, {"options": options}, 0
+    )
     save_figure(panels, options.out / f"{name}.png", columns)
     picture = f"![{name}]({name}.png)\n"
     text = "\n".join([f"# {name}\n\n{title}\n", *map(markdown, sheets), *(f"{note}\n" for note in notes), picture])
