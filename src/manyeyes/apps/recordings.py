@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Collection
 from dataclasses import replace
@@ -68,6 +69,14 @@ def check_files(
     for line in (*recording.problems, *mismatched[:_MAX_NOTES]):
         console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
     return missing
+
+
+def cells_folder(out: Path, missing: MissingFiles) -> Path:
+    """The folder under out for the kept results of a study, another one for each set of missing files."""
+    if not missing.count:
+        return out / "cells"
+    digest = hashlib.blake2b(repr(missing).encode(), digest_size=4).hexdigest()
+    return out / f"cells-missing-{digest}"
 
 
 def played_scenarios(recording: Opv2vRecording | DairRecording, played: str, named: str | None) -> frozenset[str]:

@@ -21,7 +21,7 @@ from manyeyes.datatypes import BevGrid, SparseBev
 TokenRefusal = Literal["wrong_model", "grid", "width", "value"]
 
 MAX_TOKEN_VALUE = 32.0
-"""Largest magnitude of a value that is sent; senders clamp theirs to it. Shipped weights stay below half of it."""
+"""Largest magnitude of a value that is sent; senders clamp theirs to it."""
 _ROUNDING = 1.01
 """int8 rounds a value up by half a step at most, 1/254 of the largest."""
 

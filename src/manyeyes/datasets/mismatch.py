@@ -4,10 +4,7 @@
 A file that was replaced by another of its scenario is a copy: two files with the same bytes. A file that was replaced by one
 from elsewhere does not fit the boxes of its metadata: OPV2V, V2XSet and the simulator list vehicles that the agent's LiDAR hit,
 so each listed box holds a point. The rule is applied to scenarios in which most clouds meet their boxes, since other data sets
-may list vehicles by distance alone.
-
-Measured on the preset towns-small (16 to 64 beams, 11 vehicles and more): none of 3,586 clouds is flagged. The boxes flag 99.7 %
-of 936 clouds of another agent, 99.7 % of 353 of another scenario, 46 % of those of 0.5 s later and 3 % of those of 0.1 s later.
+may list vehicles by distance alone. Two frames of one agent that follow each other and were exchanged are not found.
 """
 
 from __future__ import annotations

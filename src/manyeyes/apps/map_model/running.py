@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from rich.console import Console
 
 from manyeyes.apps import provenance
 from manyeyes.apps.map_studies import executor_of
-from manyeyes.apps.recordings import check_files, open_recording
+from manyeyes.apps.recordings import cells_folder, check_files, open_recording
 from manyeyes.apps.showcase import bars, write_text
 from manyeyes.apps.train_map import has_pictures, open_looks, true_maps
 from manyeyes.apps.viewer.map_figures import Panel, save_figure
@@ -67,13 +66,9 @@ def missing_files(options: Options, console: Console) -> MissingFiles:
     return check_files(open_recording(options.data, options.split), options.checks, console)
 
 
-def cells_folder(options: Options) -> Path:
-    """The folder of the cells under --out, another one for each set of missing files."""
-    missing = missing_files(options, Console(quiet=True))
-    if not missing.count:
-        return options.out / "cells"
-    digest = hashlib.blake2b(repr(missing).encode(), digest_size=4).hexdigest()
-    return options.out / f"cells-missing-{digest}"
+def cells_of(options: Options) -> Path:
+    """The folder for the kept results of this study."""
+    return cells_folder(options.out, missing_files(options, Console(quiet=True)))
 
 
 def models(options: Options) -> tuple[Model, ...]:
@@ -117,7 +112,7 @@ def _drawn(options: Options, console: Console, model: Model, draw: Draw) -> tupl
             model.weights,
             draw,
             range(options.seeds),
-            cells_folder(options),
+            cells_of(options),
             executor_of(options.workers),
             lambda done, total: progress.update(task, completed=done, total=total),
             options.every,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from manyeyes.apps.map_ground import grounds_of
 from manyeyes.apps.map_model.crowd import CrowdMap, CrowdUnit, run_unit
-from manyeyes.apps.map_model.running import Model, cells_folder, claims_sheet, models, publish, title_of
+from manyeyes.apps.map_model.running import Model, cells_of, claims_sheet, models, publish, title_of
 from manyeyes.apps.map_studies import executor_of
 from manyeyes.apps.showcase import bars
 from manyeyes.apps.viewer.map_figures import Panel
@@ -104,7 +104,7 @@ def run(options: Options, console: Console) -> None:
 
 def _towns(options: Options, console: Console, model: Model, methods: Sequence[str]) -> list[Town]:
     recording = model.world.open()
-    data, cells = recording_digest(recording), cells_folder(options)
+    data, cells = recording_digest(recording), cells_of(options)
     grounds = grounds_of(recording, recording.scenarios[:: options.every], "elsewhere")
     units = [
         CrowdUnit(model.world, model.weights, ground, survey, seed, tuple(methods), cells, data)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING
 from manyeyes.agents.collaboration import METHODS, method
 from manyeyes.apps import provenance
 from manyeyes.apps.playing import weights_name
-from manyeyes.apps.recordings import check_files, open_recording, suited_to
+from manyeyes.apps.recordings import cells_folder, check_files, open_recording, suited_to
 from manyeyes.apps.showcase import bars, write_text
 from manyeyes.apps.viewer.curves import Panel, save_curves
 from manyeyes.apps.viewer.study_table import Sheet, change, markdown, terminal
@@ -48,10 +47,7 @@ class Start:
     @property
     def cells(self) -> Path:
         """The folder of the cells under --out, another one for each set of missing files."""
-        if not self.missing.count:
-            return self.options.out / "cells"
-        digest = hashlib.blake2b(repr(self.missing).encode(), digest_size=4).hexdigest()
-        return self.options.out / f"cells-missing-{digest}"
+        return cells_folder(self.options.out, self.missing)
 
     @property
     def title(self) -> str:
