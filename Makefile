@@ -8,6 +8,11 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 export PIP_NO_WARN_SCRIPT_LOCATION := 1
+MAPS := $(wildcard ../shared/data)
+ifneq ($(MAPS),)
+export MANYEYES_MAPS ?= $(abspath $(MAPS))
+export MANYEYES_TOWNS ?= $(abspath $(MAPS)/carla_opendrive)
+endif
 export PYTHONWARNINGS := ignore:::pip
 export OMP_NUM_THREADS ?= 1
 

@@ -21,10 +21,10 @@ from statistics import median
 
 import torch
 
-from manyeyes.apps.provenance import write_json
-from manyeyes.simulator.camera import CAMERA_RIGS, take
 from manyeyes.simulator.record import first_scene
-from manyeyes.simulator.scenario import RSU_ID, ScenarioSpec
+from manyeyes.simulator.scene.scenario import RSU_ID, ScenarioSpec
+from manyeyes.simulator.sensors.camera import CAMERA_RIGS, take
+from manyeyes.studies.provenance import write_json
 
 VIEWS = (("opv2v", 1), ("opv2v", 2), ("opv2v-small", 1), ("opv2v-small", 2), ("dair-infrastructure-small", 2))
 

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from manyeyes.apps.provenance import write_json
-from manyeyes.simulator.crowd.config import crowd_config
-from manyeyes.simulator.crowd.place import place
-from manyeyes.simulator.crowd.simulate import simulate_crowd
+from manyeyes.simulator.fleet.config import crowd_config
+from manyeyes.simulator.fleet.place import place
+from manyeyes.simulator.fleet.simulate import simulate_crowd
+from manyeyes.studies.provenance import write_json
 
 CASES = (
     ("cross", "local", 300.0),

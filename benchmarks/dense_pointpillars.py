@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, PointCloud
-from manyeyes.models.pillars import PillarEncoder
+from manyeyes.models.detector.pillars import PillarEncoder
 from manyeyes.ops.nms import rotated_nms
 
 ANCHORS = ((4.5, 1.9, 1.6, 0.0), (4.5, 1.9, 1.6, math.pi / 2))

@@ -27,12 +27,12 @@ from memory import peak_of
 from street import street
 from torch import Tensor
 
-from manyeyes.apps.provenance import write_json
 from manyeyes.datatypes import BevGrid, Sites, SparseBev, Transform
-from manyeyes.models.map_presets import MAPPERS, mapper_config
-from manyeyes.models.mapper import LOOKS, Mapper, MapperConfig
+from manyeyes.models.maps.map_model import LOOKS, Mapper, MapperConfig
+from manyeyes.models.maps.presets import MAPPERS, mapper_config
+from manyeyes.ops.bev_warp import warp
 from manyeyes.ops.keyed_random import keyed_uniform
-from manyeyes.ops.warp import warp
+from manyeyes.studies.provenance import write_json
 
 MIB = 1 << 20
 

@@ -32,19 +32,19 @@ import numpy as np
 import psutil
 import torch
 
-from manyeyes.apps.provenance import write_json
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
 from manyeyes.maps.baselines import crowdmap_literal
-from manyeyes.maps.engine import named_executor
-from manyeyes.maps.fuse import fuse
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.store import MapStore
-from manyeyes.maps.stream import StreamingMap
-from manyeyes.maps.tiles import TileConfig
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.fusion.fuse import fuse
+from manyeyes.maps.fusion.incremental import StreamingMap
+from manyeyes.maps.store.executors import named_executor
+from manyeyes.maps.store.store import MapStore
+from manyeyes.maps.store.tiled_fusion import TileConfig
 from manyeyes.ops.polyline import close_rings, resample
 from manyeyes.ops.polyline_distance import chamfer
-from manyeyes.simulator.crowd import CROWDS, CrowdConfig, place, simulate_crowd
+from manyeyes.simulator.fleet import CROWDS, CrowdConfig, place, simulate_crowd
+from manyeyes.studies.provenance import write_json
 
 CITY = replace(CROWDS["local"], range_x=(-45.0, 45.0), range_y=(-25.0, 25.0))
 LITERAL_BAR, STREAM_BAR_MS, CITY_BAR_S, CITY_BAR_GB = 50.0, 10.0, 1200.0, 8.0

@@ -19,11 +19,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from manyeyes.apps.train_map import open_looks, true_maps
-from manyeyes.models.map_bev import rasterise
-from manyeyes.training.map_losses import ink_loss
-from manyeyes.training.map_presets import MAP_TRAINING
-from manyeyes.training.map_samples import MapAugment, TileStream
+from manyeyes.models.maps.bev import rasterise
+from manyeyes.studies.map_recordings import open_looks, true_maps
+from manyeyes.training.maps.losses import ink_loss
+from manyeyes.training.maps.presets import MAP_TRAINING
+from manyeyes.training.maps.samples import MapAugment, TileStream
 
 NORMS: dict[str, Callable[[int], nn.Module]] = {
     "batch": nn.BatchNorm2d,

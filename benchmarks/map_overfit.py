@@ -19,19 +19,19 @@ import numpy as np
 import torch
 import torch.distributed as dist
 
-from manyeyes.apps.train_map import open_looks, true_maps
 from manyeyes.datatypes.map_element import KINDS
-from manyeyes.evaluation.map_quality import judge
-from manyeyes.evaluation.map_tiles import side_by_side
-from manyeyes.models.map_head import RawMap, decode
-from manyeyes.models.mapper import Mapper
+from manyeyes.evaluation.maps.metrics import judge
+from manyeyes.evaluation.maps.tiles import side_by_side
+from manyeyes.models.maps.head import RawMap, decode
+from manyeyes.models.maps.map_model import Mapper
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.training.map_loop import MapRun
-from manyeyes.training.map_presets import MAP_TRAINING
-from manyeyes.training.map_samples import MapAugment, MapSample, TileStream
-from manyeyes.training.map_sketches import around_seen
-from manyeyes.training.map_step import placed, see
-from manyeyes.training.map_targets import met
+from manyeyes.studies.map_recordings import open_looks, true_maps
+from manyeyes.training.maps.line_field_targets import around_seen
+from manyeyes.training.maps.loop import MapRun
+from manyeyes.training.maps.presets import MAP_TRAINING
+from manyeyes.training.maps.samples import MapAugment, MapSample, TileStream
+from manyeyes.training.maps.step import placed, see
+from manyeyes.training.maps.targets import met
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import torch
 
-from manyeyes.apps.train_map import open_looks, true_maps
-from manyeyes.training.map_loop import MapRun
-from manyeyes.training.map_presets import MAP_TRAINING
-from manyeyes.training.map_samples import TileStream
+from manyeyes.studies.map_recordings import open_looks, true_maps
+from manyeyes.training.maps.loop import MapRun
+from manyeyes.training.maps.presets import MAP_TRAINING
+from manyeyes.training.maps.samples import TileStream
 
 GIB = 1 << 30
 

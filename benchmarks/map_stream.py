@@ -14,10 +14,10 @@ import time
 import numpy as np
 
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.maps.fuse import fuse
-from manyeyes.maps.stream import StreamingMap
-from manyeyes.maps.vector_map import VectorMap
-from manyeyes.simulator.crowd import place, simulate_crowd
+from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.fusion.fuse import fuse
+from manyeyes.maps.fusion.incremental import StreamingMap
+from manyeyes.simulator.fleet import place, simulate_crowd
 
 WARM_UP, APART_M = 3, 400.0
 

@@ -27,14 +27,14 @@ import torch
 from street import street
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.eyes import Eyes
-from manyeyes.apps.provenance import write_json
+from manyeyes.agents.perception_cache import Eyes
 from manyeyes.datatypes import AgentFrame, BevGrid
-from manyeyes.models.box_head import RawBoxes
-from manyeyes.models.detector import Detector
-from manyeyes.models.folded import folded
-from manyeyes.models.fusion.gather import Tokens
-from manyeyes.models.presets import COSTR_SMALL
+from manyeyes.models.detector.box_head import RawBoxes
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.fold_norms import folded
+from manyeyes.models.detector.presets import COSTR_SMALL
+from manyeyes.models.fusion.transform_tokens import Tokens
+from manyeyes.studies.provenance import write_json
 
 HALF_WIDTH_M = 38.4
 MIB = 1 << 20

@@ -26,15 +26,15 @@ from pathlib import Path
 
 import numpy as np
 
-from manyeyes.alignment.accumulate import Sighting, accumulated
-from manyeyes.alignment.decide import Acceptance, CorrectorConfig, correct
-from manyeyes.alignment.estimate import Corrector, PoseStatus
-from manyeyes.alignment.landmarks import Landmarks
-from manyeyes.alignment.rivals.table import CORRECTORS
-from manyeyes.alignment.watchman import Health, WatchState, watch
-from manyeyes.apps.provenance import write_json
-from manyeyes.evaluation.pose import ClaimNoise, PoseFrame, PoseScore, judged, score
-from manyeyes.simulator.landmarks import BoxError, LandmarkScene, LandmarkSpec, between, make_landmark_scene
+from manyeyes.evaluation.pose.metrics import ClaimNoise, PoseFrame, PoseScore, judged, score
+from manyeyes.pose.corrector import Acceptance, CorrectorConfig, correct
+from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.multi_frame import Sighting, accumulated
+from manyeyes.pose.pose_monitor import Health, WatchState, watch
+from manyeyes.pose.registry import CORRECTORS
+from manyeyes.pose.types import Corrector, PoseStatus
+from manyeyes.simulator.fleet.landmark_scenes import BoxError, LandmarkScene, LandmarkSpec, between, make_landmark_scene
+from manyeyes.studies.provenance import write_json
 
 NOISY = BoxError(0.45, np.radians(4.0), 0.10, 0.3)
 GUESS = CorrectorConfig(accept=Acceptance(-1e9, 0.0, 1, 0.0))

@@ -20,10 +20,10 @@ from statistics import median
 
 import torch
 
-from manyeyes.apps.provenance import write_json
-from manyeyes.simulator.lidar import lidar_spec
-from manyeyes.simulator.scenario import NoSceneError, Scenario, ScenarioSpec, make_scenario
-from manyeyes.simulator.towns import load_town
+from manyeyes.simulator.scene.scenario import NoSceneError, Scenario, ScenarioSpec, make_scenario
+from manyeyes.simulator.scene.towns import load_town
+from manyeyes.simulator.sensors.lidar import lidar_spec
+from manyeyes.studies.provenance import write_json
 
 BAR_MS = 80.0
 LIDAR, AGENTS, SEEDS = "spinning-64", 4, 40

@@ -36,27 +36,27 @@ from street import street
 from torch import Tensor
 
 from manyeyes.agents.agent import OWN_BODY_M, Agent
-from manyeyes.agents.collaboration.heading import header
-from manyeyes.agents.collaboration.intermediate import tokens_around
-from manyeyes.agents.collaboration.unsaid import unsaid
-from manyeyes.agents.eyes import Eyes, Sight
-from manyeyes.apps.provenance import write_json
+from manyeyes.agents.perception_cache import Eyes, Sight
+from manyeyes.agents.strategies.intermediate import tokens_around
+from manyeyes.agents.strategies.message_header import header
+from manyeyes.agents.strategies.redundancy import unsaid
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox
-from manyeyes.comms.select import within_budget
+from manyeyes.comms.token_selection import within_budget
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, Sites, Snapshot, SparseBev
-from manyeyes.models import zoo
-from manyeyes.models.box_head import DecodeConfig, decode
-from manyeyes.models.detector import Detector, DetectorConfig
-from manyeyes.models.encoder import STRIDES, EncoderConfig
-from manyeyes.models.folded import folded
-from manyeyes.models.fusion.gather import Part, gather
-from manyeyes.models.layers import ActiveNorm
-from manyeyes.models.presets import OPV2V_GRID
-from manyeyes.models.pruning import FocalPrune, Pruned
-from manyeyes.models.transformer import AttentionConfig
+from manyeyes.models import pretrained
+from manyeyes.models.detector.box_head import DecodeConfig, decode
+from manyeyes.models.detector.detector import Detector, DetectorConfig
+from manyeyes.models.detector.encoder import STRIDES, EncoderConfig
+from manyeyes.models.detector.fold_norms import folded
+from manyeyes.models.detector.layers import ActiveNorm
+from manyeyes.models.detector.presets import OPV2V_GRID
+from manyeyes.models.detector.pruning import FocalPrune, Pruned
+from manyeyes.models.detector.transformer import AttentionConfig
+from manyeyes.models.fusion.transform_tokens import Part, gather
 from manyeyes.ops.window_attention import AttentionCost, attention_cost, plan_windows, window_ids
-from manyeyes.training.targets import TargetConfig, objects_near
+from manyeyes.studies.provenance import write_json
+from manyeyes.training.detector.targets import TargetConfig, objects_near
 
 CANDIDATES = 200
 PRUNED_AT = (2, 4)
@@ -491,9 +491,9 @@ def main() -> None:
     snapshot = street()
     load = os.getloadavg()[0]
     with torch.inference_mode():
-        if wanted.weights != "truth" and (wanted.weights or zoo.DEFAULT in zoo.names()):
-            source = f"kept as {wanted.weights or zoo.DEFAULT} does"
-            weights = zoo.load(wanted.weights or zoo.DEFAULT)
+        if wanted.weights != "truth" and (wanted.weights or pretrained.DEFAULT in pretrained.names()):
+            source = f"kept as {wanted.weights or pretrained.DEFAULT} does"
+            weights = pretrained.load(wanted.weights or pretrained.DEFAULT)
             kept = {s: kept_by_model(weights, list(snapshot.frames), s) for s in wanted.head_stride}
         else:
             source = "pruning emulated from truth: cells near a listed box and a tenth of the rest"

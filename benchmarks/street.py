@@ -11,8 +11,8 @@ import torch
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform, Truth
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, HeightField, Primitives
-from manyeyes.simulator.bodies import place_bodies, rotation_of, vehicle_body
-from manyeyes.simulator.lidar import Scene, lidar_spec, scan
+from manyeyes.simulator.scene.vehicle_shapes import place_bodies, rotation_of, vehicle_body
+from manyeyes.simulator.sensors.lidar import Scene, lidar_spec, scan
 
 CARS, BUILDINGS, POLES, TREES = 55, 40, 40, 50
 ROAD_HALF_M = 8.0

@@ -19,12 +19,12 @@ from pathlib import Path
 import torch
 
 from manyeyes import Agent, Opv2vRecording, load_detector
-from manyeyes.agents.collaboration import Collaboration, Intermediate, Late
-from manyeyes.agents.eyes import Eyes, Sight
+from manyeyes.agents.perception_cache import Eyes, Sight
+from manyeyes.agents.strategies import Collaboration, Intermediate, Late
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot
-from manyeyes.evaluation.detection import FrameResult, average_precisions, ego_truth, protocol_named
-from manyeyes.models.box_head import DecodeConfig, RawBoxes, decode
-from manyeyes.models.fusion.gather import Part
+from manyeyes.evaluation.detection.average_precision import FrameResult, average_precisions, ego_truth, protocol_named
+from manyeyes.models.detector.box_head import DecodeConfig, RawBoxes, decode
+from manyeyes.models.fusion.transform_tokens import Part
 
 REACH_M = 70.0
 HISTORY = 3

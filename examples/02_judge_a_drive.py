@@ -8,7 +8,7 @@ from pathlib import Path
 
 from manyeyes import Opv2vRecording
 from manyeyes.agents.replay import ReplayConfig
-from manyeyes.evaluation.benchmark import BenchmarkConfig, benchmark
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, benchmark
 from manyeyes.simulator.presets import simulate
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from manyeyes import Agent, Argoverse2Recording, load_detector
-from manyeyes.apps.viewer.birds_eye import draw, save_png, scene_of
+from manyeyes.viz.birds_eye import draw, save_png, scene_of
 
 root = Path(sys.argv[1] if len(sys.argv) > 1 else "../shared/data/av2")
 if not root.is_dir():

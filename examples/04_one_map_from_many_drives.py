@@ -7,13 +7,13 @@ python examples/04_one_map_from_many_drives.py out/crossroads.html
 import sys
 from pathlib import Path
 
-from manyeyes.apps.viewer.map_page import page_of, save_map_page
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.map_quality import judge
-from manyeyes.maps.fuse import fuse
-from manyeyes.maps.observation_file import read_observations, write_observations
-from manyeyes.simulator.crowd.place import place
-from manyeyes.simulator.crowd.simulate import simulate_crowd
+from manyeyes.evaluation.maps.metrics import judge
+from manyeyes.maps.elements.observation_file import read_observations, write_observations
+from manyeyes.maps.fusion.fuse import fuse
+from manyeyes.simulator.fleet.place import place
+from manyeyes.simulator.fleet.simulate import simulate_crowd
+from manyeyes.viz.map_page import page_of, save_map_page
 
 page = Path(sys.argv[1] if len(sys.argv) > 1 else "out/crossroads.html")
 page.parent.mkdir(parents=True, exist_ok=True)

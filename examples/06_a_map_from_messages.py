@@ -8,12 +8,12 @@ import numpy as np
 import torch
 
 from manyeyes import AgentFrame, Inbox, PointCloud, Transform
-from manyeyes.agents.cartographer import Cartographer
-from manyeyes.agents.surveyor import SURVEYS, share_map
-from manyeyes.evaluation.map_quality import judge
-from manyeyes.simulator.crowd.config import crowd_config
-from manyeyes.simulator.crowd.place import clip_to_box, place
-from manyeyes.simulator.eyewitness import Eyewitness
+from manyeyes.agents.map_perception import SURVEYS, share_map
+from manyeyes.agents.map_server import Cartographer
+from manyeyes.evaluation.maps.metrics import judge
+from manyeyes.simulator.fleet.config import crowd_config
+from manyeyes.simulator.fleet.map_predictor import Eyewitness
+from manyeyes.simulator.fleet.place import clip_to_box, place
 
 where = place("cross", size_m=100.0)
 truth = where.in_area()

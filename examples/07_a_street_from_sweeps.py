@@ -7,17 +7,17 @@ The street is made here (extra 'sim'); nothing of it was in training. The first 
 import sys
 from pathlib import Path
 
-from manyeyes.agents.mapping import draw_tile, receive, share_look
-from manyeyes.apps.viewer.map_figures import Panel, save_figure
-from manyeyes.evaluation.map_quality import judge
-from manyeyes.evaluation.map_tiles import cut_to
-from manyeyes.evaluation.tile_looks import upright
-from manyeyes.maps.truth import TruthPolicy, map_truth
-from manyeyes.models import zoo
-from manyeyes.simulator.scenario import ScenarioSpec, make_scenario
-from manyeyes.simulator.towns import load_town
+from manyeyes.agents.map_features import draw_tile, receive, share_look
+from manyeyes.evaluation.maps.metrics import judge
+from manyeyes.evaluation.maps.tile_sampling import upright
+from manyeyes.evaluation.maps.tiles import cut_to
+from manyeyes.maps.roads.ground_truth import TruthPolicy, map_truth
+from manyeyes.models import pretrained
+from manyeyes.simulator.scene.scenario import ScenarioSpec, make_scenario
+from manyeyes.simulator.scene.towns import load_town
+from manyeyes.viz.map_figures import Panel, save_figure
 
-mapper = zoo.load_mapper()
+mapper = pretrained.load_mapper()
 town = load_town("generated-3")
 spec = ScenarioSpec(
     "generated-3", seed=3, name="street", vehicles=4, frames=2, history_frames=0, roadside_chance=1.0, density=6.0

@@ -88,8 +88,8 @@ def test_the_install_line_of_the_readme_holds_what_the_demo_imports() -> None:
 
 
 def test_doctor_looks_for_what_the_extras_install(capsys: pytest.CaptureFixture[str]) -> None:
-    from manyeyes.apps import cli
-    from manyeyes.apps.doctor import EXTRAS as LOOKED_FOR
+    from manyeyes.cli import main as cli
+    from manyeyes.cli.doctor import EXTRAS as LOOKED_FOR
 
     wanted = {name: {MODULES.get(m, m).lower() for m in modules} for name, modules in LOOKED_FOR.items()}
     assert wanted == EXTRAS
@@ -100,7 +100,7 @@ def test_doctor_looks_for_what_the_extras_install(capsys: pytest.CaptureFixture[
 
 def test_the_package_imports_no_extra_before_it_is_needed() -> None:
     code = (
-        "import sys, manyeyes.apps.cli, manyeyes.agents.agent; "
+        "import sys, manyeyes.cli.main, manyeyes.agents.agent; "
         "sys.exit(any(m in sys.modules for m in ('shapely', 'pyarrow', 'PIL', 'matplotlib', 'libsumo')))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

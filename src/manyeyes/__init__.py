@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         SparseBev,
         Transform,
     )
-    from manyeyes.models.zoo import load as load_detector
+    from manyeyes.models.pretrained import load as load_detector
 
 _HOME = {
     "Agent": "manyeyes.agents.agent",
@@ -43,7 +43,7 @@ _HOME = {
     "Snapshot": "manyeyes.datatypes",
     "SparseBev": "manyeyes.datatypes",
     "Transform": "manyeyes.datatypes",
-    "load_detector": "manyeyes.models.zoo",
+    "load_detector": "manyeyes.models.pretrained",
 }
 
 __all__ = [

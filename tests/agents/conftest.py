@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, PointCloud, Snapshot, Transform, Truth
-from manyeyes.models.detector import Detector
-from manyeyes.models.layers import ActiveNorm
-from manyeyes.models.map_bev import BevConfig
-from manyeyes.models.map_head import MapHeadConfig
-from manyeyes.models.mapper import Mapper, MapperConfig
-from manyeyes.models.presets import COSTR_TINY
-from manyeyes.training.samples import AugmentConfig, RoadConfig, make_sample
-from manyeyes.training.step import forward
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.layers import ActiveNorm
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.models.maps.bev import BevConfig
+from manyeyes.models.maps.head import MapHeadConfig
+from manyeyes.models.maps.map_model import Mapper, MapperConfig
+from manyeyes.training.detector.samples import AugmentConfig, RoadConfig, make_sample
+from manyeyes.training.detector.step import forward
 
 TENTH_NS = 100_000_000
 

@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.collaboration import METHODS, method
-from manyeyes.agents.eyes import Eyes
+from manyeyes.agents.perception_cache import Eyes
+from manyeyes.agents.strategies import METHODS, method
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, PointCloud, Transform
-from manyeyes.models.box_head import RawBoxes
-from manyeyes.models.detector import Detector
-from manyeyes.models.fusion.gather import Part, Tokens
-from manyeyes.training.samples import AugmentConfig, RoadConfig, View, make_sample
-from manyeyes.training.step import forward
+from manyeyes.models.detector.box_head import RawBoxes
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.fusion.transform_tokens import Part, Tokens
+from manyeyes.training.detector.samples import AugmentConfig, RoadConfig, View, make_sample
+from manyeyes.training.detector.step import forward
 
 NOW = 5
 

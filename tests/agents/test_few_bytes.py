@@ -10,17 +10,17 @@ import pytest
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.coding import coded
 from manyeyes.agents.replay import ReplayConfig, replay
-from manyeyes.comms.bus import LocalBus
+from manyeyes.agents.token_codec import coded
 from manyeyes.comms.inbox import Inbox
+from manyeyes.comms.local_bus import LocalBus
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Sites, Snapshot, Transform, Truth
 from manyeyes.datatypes.message import RequestMap
 from manyeyes.models.checkpoint import fingerprint
-from manyeyes.models.codebook import CodebookConfig
-from manyeyes.models.detector import Detector
-from manyeyes.models.presets import COSTR_TINY
-from manyeyes.training.codebook import with_codebook
+from manyeyes.models.detector.codebook import CodebookConfig
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.training.detector.codebook import with_codebook
 
 torch.set_num_threads(1)
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from manyeyes import Agent, AgentFrame, Boxes, Inbox
-from manyeyes.agents.collaboration import METHODS, method
+from manyeyes.agents.strategies import METHODS, method
 
 BODY, CHANNELS, CELLS, KEYS = 64, 80, 82, 84
 TENTH_NS = 100_000_000

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from manyeyes.datatypes import BevGrid
-from manyeyes.models.map_presets import TOY
+from manyeyes.models.maps.presets import TOY
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 

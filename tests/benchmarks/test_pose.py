@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from benchmarks.pose import Row, bars
 
-from manyeyes.alignment.estimate import PoseStatus
-from manyeyes.evaluation.pose import PoseFrame, score
+from manyeyes.evaluation.pose.metrics import PoseFrame, score
+from manyeyes.pose.types import PoseStatus
 
 
 def row(table: str, claim: str, sigma: float, flagged: int, nees: tuple[float, ...] = (3.0,) * 100) -> Row:

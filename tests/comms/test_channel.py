@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manyeyes.comms.bus import LocalBus
 from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, Send, channel_preset
+from manyeyes.comms.local_bus import LocalBus
 from manyeyes.datatypes import ConfigError
 
 MS = 1_000_000

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manyeyes.comms import wire
-from manyeyes.comms.codec import PacketError, pack_cells
 from manyeyes.comms.entropy import TOTAL, CodeTables, coded_counts, pack_coded, unpack_coded
 from manyeyes.comms.inbox import Dropped, Inbox
-from manyeyes.comms.select import within_budget
+from manyeyes.comms.primitives import PacketError, pack_cells
+from manyeyes.comms.token_selection import within_budget
 from manyeyes.datatypes import BevGrid, ConfigError, Message, Sites, SparseBev, Transform, WireError
 
 torch.set_num_threads(1)

@@ -11,7 +11,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from manyeyes.comms import sections, wire
+from manyeyes.comms import payloads, wire
 from manyeyes.datatypes import (
     LABELS,
     BevGrid,
@@ -88,7 +88,7 @@ sizes = st.one_of(st.none(), st.integers(0, 300))
 
 
 @QUICK
-@given(st.integers(0, 10**6), sizes, sizes, sizes, st.sampled_from(sections.PRECISIONS), st.integers(300, 3000))
+@given(st.integers(0, 10**6), sizes, sizes, sizes, st.sampled_from(payloads.PRECISIONS), st.integers(300, 3000))
 def test_round_trip(seed, tokens, objects, points, precision, mtu):
     message = random_message(seed, tokens, objects, points)
     message = with_codes(message) if precision == "codes" else message
@@ -118,7 +118,7 @@ def test_round_trip(seed, tokens, objects, points, precision, mtu):
         assert ((back.points.intensity - message.points.intensity).abs() <= 0.5 / 255 + 1e-6).all()
 
 
-def check_tokens(got: SparseBev, sent: SparseBev, precision: sections.Precision) -> None:
+def check_tokens(got: SparseBev, sent: SparseBev, precision: payloads.Precision) -> None:
     assert got.grid == sent.grid
     assert torch.equal(got.sites.key, sent.sites.key)
     if precision == "codes":
@@ -146,7 +146,7 @@ def check_objects(got: Boxes, sent: Boxes) -> None:
     assert ((got.sigma_xy / sent.sigma_xy).log().abs() <= math.log(20 / 0.01) / 254 / 2 + 1e-5).all()
     assert ((got.sigma_yaw / sent.sigma_yaw).log().abs() <= math.log(3.2 / 0.001) / 254 / 2 + 1e-5).all()
     assert ((got.velocity - sent.velocity).abs() <= 0.125 + 1e-5).all()
-    assert torch.equal(got.size[:, 2], torch.tensor(sections.LABEL_HEIGHTS)[sent.label])
+    assert torch.equal(got.size[:, 2], torch.tensor(payloads.LABEL_HEIGHTS)[sent.label])
     assert torch.equal(got.center[:, 2], got.size[:, 2] / 2)
 
 
@@ -383,7 +383,7 @@ def test_what_a_faulty_sender_is_told(at, data, reason):
 )
 def test_implausible_objects_are_refused(row, value):
     (packet,) = wire.encode(random_message(6, None, 1, None))
-    rows = np.frombuffer(packet[65:-4], sections._object_type(1)).copy()
+    rows = np.frombuffer(packet[65:-4], payloads._object_type(1)).copy()
     rows[row] = value
     with pytest.raises(wire.PacketError) as caught:
         wire.decode_packet(forge(packet, 65, rows.tobytes()))

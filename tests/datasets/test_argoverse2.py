@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from manyeyes.datasets.argoverse2 import Argoverse2Recording
-from manyeyes.datasets.recording import points_in_listed_boxes
+from manyeyes.datasets.base import points_in_listed_boxes
 from manyeyes.datatypes import LABELS, MissingExtraError, RecordingError, Snapshot
 
 pyarrow = pytest.importorskip("pyarrow", reason="needs the 'av2' extra")

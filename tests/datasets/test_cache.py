@@ -9,14 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manyeyes.datasets.cache import ArrayCache, default_cache_folder, write_whole
+from manyeyes._io import atomic_write
+from manyeyes.datasets.cache import ArrayCache, default_cache_folder
 
 
 def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
-    write_whole(path, b"old")
+    atomic_write(path, b"old")
     with pytest.raises(TypeError):
-        write_whole(path, b"new", "not bytes")  # type: ignore[arg-type]
+        atomic_write(path, b"new", "not bytes")  # type: ignore[arg-type]
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 

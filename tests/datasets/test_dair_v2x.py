@@ -15,9 +15,9 @@ import pytest
 import torch
 
 from manyeyes.datasets import dair_json, dair_v2x
+from manyeyes.datasets.base import judged_frames, points_in_listed_boxes
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.pcd import PcdCloud, PcdTable, write_table
-from manyeyes.datasets.recording import judged_frames, points_in_listed_boxes
 from manyeyes.datatypes import ConfigError, RecordingError, Transform
 
 

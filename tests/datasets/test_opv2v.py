@@ -16,10 +16,10 @@ import torch
 import yaml
 
 from manyeyes.datasets import opv2v, opv2v_yaml
+from manyeyes.datasets.base import judged_frames, points_in_listed_boxes
+from manyeyes.datasets.frame_reader import single_frames
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
 from manyeyes.datasets.pcd import write_pcd
-from manyeyes.datasets.recording import judged_frames, points_in_listed_boxes
-from manyeyes.datasets.single_frames import single_frames
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, RecordingError, Snapshot, Transform, Truth
 
 # CARLA's world, left-handed, degrees: [x, y, z, roll, yaw, pitch]. Nothing here is symmetric, so no sign can hide.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from manyeyes.simulator.crowd import CROWDS, PLACES
+from manyeyes.simulator.fleet import CROWDS, PLACES
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "crowd.md").read_text(encoding="utf-8")

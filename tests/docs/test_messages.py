@@ -4,7 +4,7 @@
 from dataclasses import fields
 from pathlib import Path
 
-from manyeyes.agents.collaboration.late import RETURNED_SCORE, SAME_PLACE_M, Late
+from manyeyes.agents.strategies.late import RETURNED_SCORE, SAME_PLACE_M, Late
 from manyeyes.comms.inbox import Dropped
 from manyeyes.comms.token_format import MAX_TOKEN_VALUE
 

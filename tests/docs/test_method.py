@@ -42,6 +42,6 @@ def test_a_named_place_exists(file, symbol):
 
 
 def test_settings_that_the_page_quotes():
-    source = (ROOT / "src" / "manyeyes" / "models" / "encoder.py").read_text(encoding="utf-8")
+    source = (ROOT / "src" / "manyeyes" / "models" / "detector" / "encoder.py").read_text(encoding="utf-8")
     for field in re.findall(r"`EncoderConfig\.(\w+)", TEXT):
         assert re.search(rf"^    {field}:", source, re.MULTILINE), field

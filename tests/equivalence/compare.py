@@ -22,7 +22,9 @@ PROBE = Path("tests") / "equivalence" / "probe.py"
 def run(code: Path, place: Path, name: str, probes: list[str]) -> dict[str, np.ndarray]:
     """The arrays that the probes of one checkout compute."""
     environment = {**os.environ, "PYTHONPATH": str(code / "src"), "OMP_NUM_THREADS": "1"}
-    environment.setdefault("MANYEYES_TOWNS", str(REPOSITORY.parent / "shared" / "data" / "carla_opendrive"))
+    maps = REPOSITORY.parent / "shared" / "data"
+    environment.setdefault("MANYEYES_TOWNS", str(maps / "carla_opendrive"))
+    environment.setdefault("MANYEYES_MAPS", str(maps))
     words = [sys.executable, str(code / PROBE), str(place / f"{name}.npz"), str(place / name), *probes]
     subprocess.run(words, check=True, env=environment, cwd=place)
     with np.load(place / f"{name}.npz") as file:

@@ -19,20 +19,20 @@ import numpy as np
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.collaboration import METHODS
-from manyeyes.alignment.estimate import PoseClaim
-from manyeyes.alignment.landmarks import Landmarks
-from manyeyes.alignment.rivals.table import CORRECTORS
-from manyeyes.apps import cli
+from manyeyes.agents.strategies import METHODS
+from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import Transform
-from manyeyes.evaluation.map_methods import map_of, tuned
-from manyeyes.evaluation.map_trial import Trial, carry_out
-from manyeyes.models import zoo
-from manyeyes.models.presets import COSTR_TINY
-from manyeyes.simulator.landmarks import BoxError, LandmarkSpec, make_landmark_scene
-from manyeyes.training.loop import Run, TrainConfig
-from manyeyes.training.samples import AugmentConfig
+from manyeyes.evaluation.maps.experiment import Trial, carry_out
+from manyeyes.evaluation.maps.registry import map_of, tuned
+from manyeyes.models import pretrained
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import CORRECTORS
+from manyeyes.pose.types import PoseClaim
+from manyeyes.simulator.fleet.landmark_scenes import BoxError, LandmarkSpec, make_landmark_scene
+from manyeyes.training.detector.loop import Run, TrainConfig
+from manyeyes.training.detector.samples import AugmentConfig
 
 Arrays = Iterator[tuple[str, np.ndarray]]
 
@@ -73,7 +73,7 @@ def strategies(data: Path) -> Arrays:
     """Packets of every strategy and precision on one drive, and the boxes of every strategy."""
     if not (data / "tiny" / "manifest.json").is_file():
         assert cli.main(["simulate", "--preset", "tiny", "--out", str(data / "tiny"), "--workers", "1"]) == 0
-    recording, detector = Opv2vRecording(data / "tiny", "test", use_cache=False), zoo.load()
+    recording, detector = Opv2vRecording(data / "tiny", "test", use_cache=False), pretrained.load()
     scenario = recording.scenarios[0]
     snapshots = [recording.snapshot(scenario, index) for index in range(recording.length(scenario))]
     for number, frame in enumerate(snapshots[0].frames):

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.bootstrap import (
+from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch, ap_of_matches
+from manyeyes.evaluation.statistics.bootstrap import (
     mean_interval,
     paired_difference,
     resamples,
@@ -15,7 +16,6 @@ from manyeyes.evaluation.bootstrap import (
     scenario_interval,
     weighted_recall,
 )
-from manyeyes.evaluation.detection import PROTOCOLS, FrameMatch, ap_of_matches
 
 MANYEYES = PROTOCOLS["manyeyes"]
 

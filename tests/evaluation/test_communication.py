@@ -4,7 +4,7 @@ import math
 import pytest
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.communication import MessageRecord, paper_bytes, summarise
+from manyeyes.evaluation.detection.communication import MessageRecord, paper_bytes, summarise
 
 
 def test_the_papers_formula():

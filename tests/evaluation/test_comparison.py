@@ -9,9 +9,9 @@ import torch
 from manyeyes.agents.agent import Perception
 from manyeyes.agents.replay import Sent, Step
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
-from manyeyes.evaluation.comparison import Bar, differences
-from manyeyes.evaluation.detection import PROTOCOLS
-from manyeyes.evaluation.tally import MethodResult, Tally
+from manyeyes.evaluation.detection.accumulator import MethodResult, Tally
+from manyeyes.evaluation.detection.average_precision import PROTOCOLS
+from manyeyes.evaluation.statistics.comparison import Bar, differences
 
 PROTOCOL = PROTOCOLS["manyeyes"]
 SPOTS = ((10.0, 3.0), (20.0, -3.0), (30.0, 3.0), (40.0, -3.0))

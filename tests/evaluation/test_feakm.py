@@ -9,23 +9,23 @@ import pytest
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.alignment.decide import correct
-from manyeyes.alignment.estimate import unanswered
-from manyeyes.alignment.feakm import Feakm, RansacConfig, published
 from manyeyes.comms.inbox import Inbox
-from manyeyes.datasets.disturb import PoseNoise
+from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
 from manyeyes.datatypes.keypoints import Keypoints
-from manyeyes.evaluation.feakm_ablation import Branch, _Scene, ablation
-from manyeyes.evaluation.feakm_pose import described, pose_frames
-from manyeyes.evaluation.pose import ClaimNoise, score
-from manyeyes.models.detector import Detector
-from manyeyes.models.feakm import FeakmConfig, FeakmNet
-from manyeyes.models.keypoint_boxes import BoxKeypoints
-from manyeyes.models.keypoint_net import View
-from manyeyes.models.matcher import MatcherConfig
-from manyeyes.models.presets import COSTR_TINY
-from manyeyes.simulator.landmarks import LandmarkSpec, make_landmark_scene
+from manyeyes.evaluation.pose.feakm_ablation import Branch, _Scene, ablation
+from manyeyes.evaluation.pose.feakm_pose import described, pose_frames
+from manyeyes.evaluation.pose.metrics import ClaimNoise, score
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.models.pose.box_descriptors import BoxKeypoints
+from manyeyes.models.pose.feakm import FeakmConfig, FeakmNet
+from manyeyes.models.pose.keypoint_net import View
+from manyeyes.models.pose.matcher import MatcherConfig
+from manyeyes.pose.corrector import correct
+from manyeyes.pose.feakm import Feakm, RansacConfig, published
+from manyeyes.pose.types import unanswered
+from manyeyes.simulator.fleet.landmark_scenes import LandmarkSpec, make_landmark_scene
 
 CHANNELS = COSTR_TINY.encoder.channels[2]
 

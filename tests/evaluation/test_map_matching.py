@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.map_matching import (
+from manyeyes.evaluation.maps.matching import (
     WAYS,
     Lines,
     area_under,

@@ -13,10 +13,14 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation import map_cells, map_malice
-from manyeyes.evaluation.map_cells import ApRow, Cell, KindRow, Unit, cell_path, read_cell, run_unit
-from manyeyes.evaluation.map_malice import displacement, malice_units, run_malice
-from manyeyes.evaluation.map_methods import (
+from manyeyes.evaluation.maps import adversarial as map_malice
+from manyeyes.evaluation.maps import map_cells
+from manyeyes.evaluation.maps.adversarial import displacement, malice_units, run_malice
+from manyeyes.evaluation.maps.experiment import Trial, at_poses, carry_out
+from manyeyes.evaluation.maps.hyperparameter_search import CHOICES, drawn
+from manyeyes.evaluation.maps.map_cells import ApRow, Cell, KindRow, Unit, cell_path, read_cell, run_unit
+from manyeyes.evaluation.maps.oracles import associated, halves
+from manyeyes.evaluation.maps.registry import (
     METHODS,
     OURS,
     TUNED,
@@ -27,15 +31,12 @@ from manyeyes.evaluation.map_methods import (
     map_of,
     tuned,
 )
-from manyeyes.evaluation.map_oracle import associated, halves
-from manyeyes.evaluation.map_study import StudyConfig, best_rival, difference, lines, smaller, trials, verdicts
-from manyeyes.evaluation.map_trial import Trial, at_poses, carry_out
-from manyeyes.evaluation.map_tuning import CHOICES, drawn
-from manyeyes.maps.engine import Inline
-from manyeyes.maps.fuse import FuseConfig
-from manyeyes.maps.vector_map import VectorMap
-from manyeyes.simulator.crowd.config import CROWDS
-from manyeyes.simulator.crowd.simulate import HONEST, MALICIOUS
+from manyeyes.evaluation.maps.study import StudyConfig, best_rival, difference, lines, smaller, trials, verdicts
+from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.fusion.fuse import FuseConfig
+from manyeyes.maps.store.executors import Inline
+from manyeyes.simulator.fleet.config import CROWDS
+from manyeyes.simulator.fleet.simulate import HONEST, MALICIOUS
 
 
 def cell(method: str, count: int, seed: int, crossing: float, divider: float, f: float = 0.9, dup: float = 1.0) -> Cell:
@@ -156,7 +157,7 @@ def test_oracles_know_what_they_are_told(scene) -> None:
     true = at_poses(scene.observations, scene.crowd.true_poses)
     assert np.allclose([o.pose for o in true], scene.crowd.true_poses)
     assert all((o.covariance.diagonal() < 1e-3).all() for o in true)
-    from manyeyes.evaluation.map_quality import judge
+    from manyeyes.evaluation.maps.metrics import judge
 
     known = judge(scene.cut(associated(scene)), scene.truth)
     union = judge(scene.cut(map_of("union", scene.observations, Settings()).elements), scene.truth)
@@ -222,7 +223,7 @@ def test_every_method_is_tuned_over_fields_that_it_has_with_defaults_first() -> 
 
 
 def test_an_executor_changes_nothing_in_the_order_of_cells(scene, tmp_path, monkeypatch) -> None:
-    from manyeyes.evaluation import map_study
+    from manyeyes.evaluation.maps import study as map_study
 
     monkeypatch.setattr(map_cells, "carry_out", lambda trial: replace(scene, trial=trial))
     config = smaller(StudyConfig("fusion", methods=("union",)), ("cross",), (12,), 2)

@@ -8,7 +8,7 @@ import pytest
 
 from manyeyes.datatypes import BevGrid, ConfigError, Transform
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.map_tiles import assert_split, cut_to, side_by_side, town_of
+from manyeyes.evaluation.maps.tiles import assert_split, cut_to, side_by_side, town_of
 
 TILE = BevGrid(-10.0, -5.0, -1.0, 10.0, 5.0, 1.0, pillar=1.0)
 SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])

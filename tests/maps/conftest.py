@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, SOLID, STOP_LINE, MapElements
-from manyeyes.maps.observation import Frame
-from manyeyes.maps.vector_map import Stations, Topology, VectorMap
+from manyeyes.maps.elements.observation import Frame
+from manyeyes.maps.elements.vector_map import Stations, Topology, VectorMap
 
 FRAME = Frame(48.137, 11.575)
 

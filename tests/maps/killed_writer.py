@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.store import MapStore, watermark_of
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.store.store import MapStore, watermark_of
 
 FRAME = Frame(48.0, 11.0)
 _WATCHED = ("open", "os.rename", "os.remove", "os.mkdir", "sqlite3.connect", "shutil.rmtree")

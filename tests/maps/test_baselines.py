@@ -20,11 +20,11 @@ from manyeyes.maps.baselines import (
     polymerge,
     union,
 )
+from manyeyes.maps.baselines._common import CLAMP, HIT, MISS, Rules, pool
+from manyeyes.maps.baselines._raster import components, longest_walks, thinned
 from manyeyes.maps.baselines.assignment import assign
-from manyeyes.maps.baselines.raster import components, longest_walks, thinned
-from manyeyes.maps.baselines.rules import CLAMP, HIT, MISS, Rules, pool
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.vector_map import CANDIDATE, PUBLISHED, VectorMap
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, VectorMap
 
 VIEW = np.array([[-10.0, -20.0], [60.0, -20.0], [60.0, 20.0], [-10.0, 20.0]])
 SQUARE = [[20.0, -4.0], [24.0, -4.0], [24.0, 4.0], [20.0, 4.0]]

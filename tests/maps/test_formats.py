@@ -9,16 +9,16 @@ import pytest
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.maps.export import FORMATS, export_map
+from manyeyes.maps.elements.observation import Frame
+from manyeyes.maps.elements.vector_map import Stations, VectorMap
 from manyeyes.maps.formats.argoverse2_map import read_argoverse2_map
 from manyeyes.maps.formats.attributes import counter_clockwise, hex_ids
+from manyeyes.maps.formats.export import FORMATS, export_map
 from manyeyes.maps.formats.geoparquet import MapFileError, projjson, read_map, write_map
 from manyeyes.maps.formats.lanes import lane_pairs
 from manyeyes.maps.formats.rings import long_sides
-from manyeyes.maps.observation import Frame
-from manyeyes.maps.simplify import simplified
-from manyeyes.maps.transverse_mercator import degrees_from_metres
-from manyeyes.maps.vector_map import Stations, VectorMap
+from manyeyes.maps.fusion.simplify import simplified
+from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")
 shapely = pytest.importorskip("shapely", reason="the map extra is not installed")

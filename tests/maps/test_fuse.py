@@ -12,18 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, SOLID, MapElements, Polygons
-from manyeyes.evaluation.map_malice import displacement
-from manyeyes.maps.align import AlignConfig, advance, merge, overlapping, search, solve_poses
-from manyeyes.maps.evidence import EvidenceConfig, vouched
-from manyeyes.maps.faith import NOT_BELIEVED
-from manyeyes.maps.fuse import FuseConfig, assemble, fuse, fuse_aligned
-from manyeyes.maps.observation import Observation
-from manyeyes.maps.sightings import gather
-from manyeyes.maps.stations import StationConfig, StationTable, find_stations
-from manyeyes.maps.vector_map import PUBLISHED, RETIRED
+from manyeyes.evaluation.maps.adversarial import displacement
+from manyeyes.maps.elements.observation import Observation
+from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED
+from manyeyes.maps.fusion.agent_weights import NOT_BELIEVED
+from manyeyes.maps.fusion.existence import EvidenceConfig, vouched
+from manyeyes.maps.fusion.fuse import FuseConfig, assemble, fuse, fuse_aligned
+from manyeyes.maps.fusion.observation_arrays import gather
+from manyeyes.maps.fusion.pose_config import AlignConfig
+from manyeyes.maps.fusion.pose_optimization import advance, merge, overlapping, search, solve_poses
+from manyeyes.maps.fusion.stations import StationConfig, StationTable, find_stations
 from manyeyes.ops.nearest_line import nearest_line
-from manyeyes.simulator.crowd import CROWDS, place, simulate_crowd
-from manyeyes.simulator.crowd.simulate import MALICIOUS
+from manyeyes.simulator.fleet import CROWDS, place, simulate_crowd
+from manyeyes.simulator.fleet.simulate import MALICIOUS
 
 HALF_X, HALF_Y = 30.0, 15.0
 VIEW = np.array([[-HALF_X, -HALF_Y], [HALF_X, -HALF_Y], [HALF_X, HALF_Y], [-HALF_X, HALF_Y]])

@@ -10,8 +10,8 @@ import pytest
 
 from manyeyes.datatypes import ConfigError, ShapeError
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.maps.graph import GraphConfig, element_graph, observation_graph
-from manyeyes.maps.observation import Observation
+from manyeyes.maps.elements.observation import Observation
+from manyeyes.maps.fusion.graph import GraphConfig, element_graph, observation_graph
 
 VIEW = np.array([[-10.0, -20.0], [60.0, -20.0], [60.0, 20.0], [-10.0, 20.0]])
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from manyeyes.maps.formats.lanelet2 import Lanelet2Error, lanelet2_origin, read_lanelet2
-from manyeyes.maps.transverse_mercator import degrees_from_metres
+from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 
 pytest.importorskip("shapely")
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "lanelet2" / "mapping_example.osm"

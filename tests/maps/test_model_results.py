@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER
+from manyeyes.maps.elements.observation import Frame
 from manyeyes.maps.formats.model_results import (
     RESULT_OPTIONS,
     ModelResultsError,
@@ -14,7 +15,6 @@ from manyeyes.maps.formats.model_results import (
     read_nuscenes_poses,
     read_pose_csv,
 )
-from manyeyes.maps.observation import Frame
 
 FRAME = Frame(49.0, 8.4)
 RING = [[4.0, -3.0], [7.0, -3.0], [7.0, 3.0], [4.0, 3.0], [4.0, -3.0]]

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import MapElements, Polygons
-from manyeyes.maps.observation import Frame, Observation, ObservationError, is_simple_ring
-from manyeyes.maps.observation_limits import LIMITS
+from manyeyes.maps.elements.observation import Frame, Observation, ObservationError, is_simple_ring
+from manyeyes.maps.elements.observation_limits import LIMITS
 
 VIEW = np.array([[0.0, -15.0], [60.0, -15.0], [60.0, 15.0], [0.0, 15.0]])
 ELEMENTS = MapElements.of(

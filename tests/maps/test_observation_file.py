@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import MapElements, Polygons
-from manyeyes.maps.observation import Frame, Observation, ObservationError
-from manyeyes.maps.observation_file import (
+from manyeyes.maps.elements.observation import Frame, Observation, ObservationError
+from manyeyes.maps.elements.observation_file import (
     METADATA_KEY,
     metadata,
     observation_table,

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
-from manyeyes.maps.changes import apply_delta, delta_between, home_tiles, with_ids_of
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.observation_file import write_observations
+from manyeyes.maps.elements.observation_limits import LIMITS
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.attributes import hex_ids
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.observation_file import write_observations
-from manyeyes.maps.observation_limits import LIMITS
-from manyeyes.maps.observation_log import StoreError, locked, read_standing
-from manyeyes.maps.store import MapStore, watermark_of
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.store.map_diff import apply_delta, delta_between, home_tiles, with_ids_of
+from manyeyes.maps.store.observation_log import StoreError, locked, read_standing
+from manyeyes.maps.store.store import MapStore, watermark_of
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")
 pytest.importorskip("shapely", reason="the map extra is not installed")
@@ -114,7 +114,7 @@ def test_other_limits_make_the_index_again_and_rows_outside_are_quarantined(tmp_
         before = log.standing()
         log.retract([many[0].id], "test")
     narrow = replace(LIMITS, max_position_m=10_000.0)
-    for module in ("observation", "observation_log"):
+    for module in ("elements.observation", "store.observation_log"):
         monkeypatch.setattr(f"manyeyes.maps.{module}.LIMITS", narrow)
     with MapStore(tmp_path).writing() as log:
         assert len(log.refused) == len(log.catalogue.quarantined()) == len(far) == 49

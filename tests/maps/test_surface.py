@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from manyeyes.maps.surface import Surface
+from manyeyes.maps.roads.surface import Surface
 
 
 def strips(random: np.random.Generator, count: int) -> tuple[list[np.ndarray], list[np.ndarray]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.maps.topology import topology_of
+from manyeyes.maps.fusion.topology import topology_of
 
 
 def _line(x0, y0, x1, y1):

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from manyeyes.maps.transverse_mercator import degrees_from_metres, metres_from_degrees
+from manyeyes.maps.roads.transverse_mercator import degrees_from_metres, metres_from_degrees
 
 ORIGIN = (49.0, 8.4)
 

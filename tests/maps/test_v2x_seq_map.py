@@ -8,7 +8,7 @@ import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, STOP_LINE
 from manyeyes.maps.formats.v2x_seq_map import V2xSeqMapError, read_v2x_seq_map
-from manyeyes.maps.truth import map_truth
+from manyeyes.maps.roads.ground_truth import map_truth
 
 pytest.importorskip("shapely")
 

@@ -10,8 +10,8 @@ import pytest
 
 from manyeyes.datatypes import ShapeError
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.maps.observation import Frame
-from manyeyes.maps.vector_map import PUBLISHED, RETIRED, Stations, Topology, VectorMap
+from manyeyes.maps.elements.observation import Frame
+from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, Stations, Topology, VectorMap
 
 LINES = [
     [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]],

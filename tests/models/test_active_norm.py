@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import torch
 
-from manyeyes.models.layers import ActiveNorm
+from manyeyes.models.detector.layers import ActiveNorm
 
 
 def test_statistics_are_those_of_active_rows():

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from manyeyes.datatypes import LABELS, BevGrid, Boxes, Sites, SparseBev
-from manyeyes.models.box_head import SPEED_UNIT, TYPICAL_SIZE, WIDTHS, BoxHead, DecodeConfig, RawBoxes, decode
+from manyeyes.models.detector.box_head import SPEED_UNIT, TYPICAL_SIZE, WIDTHS, BoxHead, DecodeConfig, RawBoxes, decode
 from manyeyes.ops.box_iou import pairwise_iou
-from manyeyes.training.targets import TargetConfig, assign
+from manyeyes.training.detector.targets import TargetConfig, assign
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0)
 

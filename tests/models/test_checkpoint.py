@@ -10,10 +10,10 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from manyeyes.datatypes import BevGrid, CheckpointError, ConfigError, PointCloud
-from manyeyes.models import checkpoint, zoo
+from manyeyes.models import checkpoint, pretrained
 from manyeyes.models.checkpoint import FORMAT, config_from_json, config_to_json, fingerprint
-from manyeyes.models.detector import Detector, DetectorConfig
-from manyeyes.models.presets import COSTR_TINY, DETECTORS
+from manyeyes.models.detector.detector import Detector, DetectorConfig
+from manyeyes.models.detector.presets import COSTR_TINY, DETECTORS
 
 
 @pytest.fixture(scope="module")
@@ -144,21 +144,21 @@ def test_a_misspelt_field_is_an_error():
 
 def test_an_unknown_name_lists_the_known():
     with pytest.raises(CheckpointError, match=r"No weights are named 'costr-huge'; shipped are .*safetensors"):
-        zoo.load("costr-huge")
+        pretrained.load("costr-huge")
     with pytest.raises(CheckpointError, match="no such file of weights"):
-        zoo.load("somewhere/else.safetensors")
+        pretrained.load("somewhere/else.safetensors")
 
 
 def test_a_path_is_loaded_as_it_is(model, path):
-    assert zoo.load(path).fingerprint == fingerprint(model)
+    assert pretrained.load(path).fingerprint == fingerprint(model)
 
 
-@pytest.mark.skipif(not zoo.names(), reason="no weights are shipped yet")
-@pytest.mark.parametrize("name", zoo.names())
+@pytest.mark.skipif(not pretrained.names(), reason="no weights are shipped yet")
+@pytest.mark.parametrize("name", pretrained.names())
 def test_shipped_weights_load_and_see(name):
-    loaded = zoo.load(name)
+    loaded = pretrained.load(name)
     assert len(loaded.see([cloud()]).tokens.features) >= 0
-    assert checkpoint.read_card(Path(zoo.__file__).parent / "weights" / f"{name}.safetensors")
+    assert checkpoint.read_card(Path(pretrained.__file__).parent / "weights" / f"{name}.safetensors")
 
 
 def test_a_configuration_with_an_option_comes_back_and_an_older_one_gets_its_default():

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manyeyes.datatypes import LABELS, BevGrid, ConfigError, ShapeError, Sites
-from manyeyes.models.box_head import RAW, DecodeConfig, RawBoxes, axis_yaw, decode, facing
-from manyeyes.models.codebook import FREQUENCY_TOTAL, Codebook, CodebookConfig, nearest, residual_codes
-from manyeyes.models.proposal import PROPOSAL, move_proposal, propose
-from manyeyes.models.proposal_codes import PROPOSAL_CODES, proposal_from_codes, proposal_to_codes
+from manyeyes.models.detector.box_head import RAW, DecodeConfig, RawBoxes, axis_yaw, decode, facing
+from manyeyes.models.detector.codebook import FREQUENCY_TOTAL, Codebook, CodebookConfig, nearest, residual_codes
+from manyeyes.models.detector.proposal import PROPOSAL, move_proposal, propose
+from manyeyes.models.detector.proposal_codes import PROPOSAL_CODES, proposal_from_codes, proposal_to_codes
 
 torch.set_num_threads(1)
 QUICK = settings(max_examples=10, derandomize=True, deadline=None)

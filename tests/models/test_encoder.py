@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, ConfigError, PointCloud, SparseBev
-from manyeyes.models.encoder import STRIDES, EncoderConfig, SparseEncoder
-from manyeyes.models.pillars import PillarEncoder
+from manyeyes.models.detector.encoder import STRIDES, EncoderConfig, SparseEncoder
+from manyeyes.models.detector.pillars import PillarEncoder
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0)
 CONFIG = EncoderConfig((8, 8, 12, 16, 16, 16), (1, 1, 1, 1, 1, 1), prune_strides=(4,), head_stride=8)

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, SparseBev, Transform
-from manyeyes.models.box_head import RAW, SPEED_UNIT
+from manyeyes.models.detector.box_head import RAW, SPEED_UNIT
+from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.transformer import AttentionConfig
 from manyeyes.models.fusion.flow_aware import FlowAwareFusion, PastAttention
-from manyeyes.models.fusion.gather import FASTEST_MPS, Part, Tokens, gather
-from manyeyes.models.fusion.placement import Placement, temporal_encoding
+from manyeyes.models.fusion.positional_encoding import Placement, temporal_encoding
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
-from manyeyes.models.fusion.settle import DRIFT_MPS, settle
-from manyeyes.models.proposal import PROPOSAL
-from manyeyes.models.transformer import AttentionConfig
+from manyeyes.models.fusion.token_merge import DRIFT_MPS, settle
+from manyeyes.models.fusion.transform_tokens import FASTEST_MPS, Part, Tokens, gather
 from manyeyes.ops.window_attention import sincos_encoding, window_ids, window_offsets
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)

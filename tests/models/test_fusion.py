@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, Boxes, Sites, SparseBev, Transform
-from manyeyes.models.box_head import RAW, SPEED_UNIT, TYPICAL_SIZE, RawBoxes, RefineHead, axis_yaw, facing
+from manyeyes.models.detector.box_head import RAW, SPEED_UNIT, TYPICAL_SIZE, RawBoxes, RefineHead, axis_yaw, facing
+from manyeyes.models.detector.proposal import PROPOSAL, proposed_velocity
+from manyeyes.models.detector.transformer import AttentionConfig
 from manyeyes.models.fusion.flow_aware import FlowAwareFusion
-from manyeyes.models.fusion.gather import CUES, Part, Tokens, gather, rotate_vectors
-from manyeyes.models.fusion.maximum import MaximumFusion
-from manyeyes.models.fusion.placement import Placement
+from manyeyes.models.fusion.max_fusion import MaximumFusion
+from manyeyes.models.fusion.positional_encoding import Placement
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
-from manyeyes.models.fusion.settle import VOTING_HEAT, settle
+from manyeyes.models.fusion.token_merge import VOTING_HEAT, settle
+from manyeyes.models.fusion.transform_tokens import CUES, Part, Tokens, gather, rotate_vectors
 from manyeyes.models.fusion.v2x_vit import V2xVitFusion
-from manyeyes.models.proposal import PROPOSAL, proposed_velocity
-from manyeyes.models.transformer import AttentionConfig
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 16

@@ -6,9 +6,9 @@ import torch
 
 from manyeyes.datatypes import BevGrid, ConfigError, PointCloud, Transform
 from manyeyes.datatypes.camera import Camera, CameraImage
-from manyeyes.models.image_encoder import ImageEncoderConfig
-from manyeyes.models.lift import DepthBins
-from manyeyes.models.map_bev import BevConfig, CameraBev, LidarBev, rasterise
+from manyeyes.models.maps.bev import BevConfig, CameraBev, LidarBev, rasterise
+from manyeyes.models.maps.image_encoder import ImageEncoderConfig
+from manyeyes.models.maps.view_transform import DepthBins
 from manyeyes.ops.voxelize import MOMENTS
 
 GRID = BevGrid(-8.0, -8.0, -2.0, 8.0, 8.0, 4.0, pillar=0.5)

@@ -10,7 +10,7 @@ import torch
 
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.datatypes.map_element import KINDS
-from manyeyes.models.map_head import (
+from manyeyes.models.maps.head import (
     DeformableAttention,
     MapHead,
     MapHeadConfig,

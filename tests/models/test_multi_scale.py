@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, ConfigError
-from manyeyes.models.box_head import RAW
-from manyeyes.models.fusion.gather import CUES, Tokens
-from manyeyes.models.fusion.maximum import MaximumFusion
+from manyeyes.models.detector.box_head import RAW
+from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.fusion.max_fusion import MaximumFusion
 from manyeyes.models.fusion.multi_scale import MultiScaleFusion, Scale
-from manyeyes.models.fusion.settle import settle
-from manyeyes.models.proposal import PROPOSAL
+from manyeyes.models.fusion.token_merge import settle
+from manyeyes.models.fusion.transform_tokens import CUES, Tokens
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 8

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, PointCloud
-from manyeyes.models.layers import ActiveNorm
-from manyeyes.models.pillars import PillarEncoder
+from manyeyes.models.detector.layers import ActiveNorm
+from manyeyes.models.detector.pillars import PillarEncoder
 
 GRID = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0)
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, Boxes, Sites, SparseBev
-from manyeyes.models.pruning import FocalPrune
-from manyeyes.training.targets import TargetConfig, objects_near
+from manyeyes.models.detector.pruning import FocalPrune
+from manyeyes.training.detector.targets import TargetConfig, objects_near
 
 GRID = BevGrid(-51.2, -51.2, -3.0, 51.2, 51.2, 5.0)
 

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, Sites, SparseBev
-from manyeyes.models.box_head import RAW
-from manyeyes.models.proposal import PROPOSAL
-from manyeyes.models.selector import Selector, rank_in_group
+from manyeyes.models.detector.box_head import RAW
+from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.selector import Selector, rank_in_group
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 8

@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError
-from manyeyes.models.transformer import AttentionConfig, RoutedBlock, WindowBlock, WindowTransformer, density_levels
+from manyeyes.models.detector.transformer import (
+    AttentionConfig,
+    RoutedBlock,
+    WindowBlock,
+    WindowTransformer,
+    density_levels,
+)
 from manyeyes.ops.window_attention import attention_cost, plan_windows, window_ids
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)

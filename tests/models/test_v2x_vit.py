@@ -9,12 +9,12 @@ import torch
 from torch.nn import functional
 
 from manyeyes.datatypes import BevGrid, ConfigError
-from manyeyes.models.box_head import RAW
-from manyeyes.models.fusion.gather import CUES, Tokens
-from manyeyes.models.fusion.settle import Settle, settle
+from manyeyes.models.detector.box_head import RAW
+from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.transformer import AttentionConfig
+from manyeyes.models.fusion.token_merge import Settle, settle
+from manyeyes.models.fusion.transform_tokens import CUES, Tokens
 from manyeyes.models.fusion.v2x_vit import AgentAttention, MultiScaleWindows, V2xVitFusion, kinds
-from manyeyes.models.proposal import PROPOSAL
-from manyeyes.models.transformer import AttentionConfig
 from manyeyes.ops.window_attention import sincos_encoding
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, Sites, SparseBev
+from manyeyes.ops._sparse_conv_kernels import empty_rows, panels
 from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, takes
-from manyeyes.ops.pair_loops import empty_rows, panels
 from manyeyes.ops.sparse_conv import same_sites_map, strided_conv, strided_map, submanifold_conv
 from manyeyes.ops.sparse_index import Window
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, conv_transpose2d
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
-from manyeyes.ops.pair_loops import add_products, panels
+from manyeyes.ops._sparse_conv_kernels import add_products, panels
 from manyeyes.ops.sparse_conv import (
     coalesce,
     inverse_conv,

@@ -8,13 +8,13 @@ from scipy.spatial import ConvexHull
 
 from manyeyes.datatypes import LABELS, Boxes, Camera, ConfigError, Transform
 from manyeyes.ops.raycast import BOX, HeightField, Primitives
-from manyeyes.simulator.bodies import place_bodies, vehicle_body
-from manyeyes.simulator.camera import CAMERA_RIGS, CameraSpec, Picture, Stage, camera_rig, take
-from manyeyes.simulator.lidar import ASPHALT, PAINT, LidarSpec, Scene, scan
-from manyeyes.simulator.light import Light
-from manyeyes.simulator.look import Look, still_look, vehicle_look
-from manyeyes.simulator.scenario import true_boxes
-from manyeyes.simulator.vehicles import VehicleStates
+from manyeyes.simulator.scene.scenario import true_boxes
+from manyeyes.simulator.scene.vehicle_shapes import place_bodies, vehicle_body
+from manyeyes.simulator.scene.vehicles import VehicleStates
+from manyeyes.simulator.sensors.camera import CAMERA_RIGS, CameraSpec, Picture, Stage, camera_rig, take
+from manyeyes.simulator.sensors.lidar import ASPHALT, PAINT, LidarSpec, Scene, scan
+from manyeyes.simulator.sensors.lighting import Light
+from manyeyes.simulator.sensors.materials import Look, still_look, vehicle_look
 
 HERE = Transform.from_xyz_yaw(3.0, -2.0, 0.0, 0.3)
 RIG = CAMERA_RIGS["opv2v-small"]

@@ -5,10 +5,8 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, DOUBLE, NO_STYLE
-from manyeyes.simulator.crowd.config import CROWDS
-from manyeyes.simulator.crowd.place import place
-from manyeyes.simulator.crowd.routes import Routes, along
-from manyeyes.simulator.crowd.sight import (
+from manyeyes.simulator.fleet.config import CROWDS
+from manyeyes.simulator.fleet.observation_model import (
     CHUNK,
     STATION_M,
     Noise,
@@ -20,7 +18,9 @@ from manyeyes.simulator.crowd.sight import (
     scenery,
     unit,
 )
-from manyeyes.simulator.crowd.simulate import _role, simulate_crowd
+from manyeyes.simulator.fleet.place import place
+from manyeyes.simulator.fleet.routes import Routes, along
+from manyeyes.simulator.fleet.simulate import _role, simulate_crowd
 
 shapely = pytest.importorskip("shapely")
 VIEW = Noise(-30.0, 30.0, -15.0, 15.0, *([0.0] * 9))

@@ -23,7 +23,7 @@ from manyeyes.simulator import dair
 from manyeyes.simulator.dair import record_dair
 from manyeyes.simulator.presets import jobs_of, simulation_preset
 from manyeyes.simulator.record import Job, Progress, first_scene
-from manyeyes.simulator.scenario import Scenario, ScenarioSpec
+from manyeyes.simulator.scene.scenario import Scenario, ScenarioSpec
 
 SPEC = ScenarioSpec(
     town="generated-1",

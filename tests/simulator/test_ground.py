@@ -10,7 +10,7 @@ import pytest
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.maps.formats.opendrive import read_opendrive
-from manyeyes.simulator.ground import (
+from manyeyes.simulator.scene.ground import (
     ASPHALT,
     CROSSING,
     GRASS,

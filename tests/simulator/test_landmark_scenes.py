@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.simulator.landmarks import BoxError, LandmarkSpec, make_landmark_scene
+from manyeyes.simulator.fleet.landmark_scenes import BoxError, LandmarkSpec, make_landmark_scene
 
 EXACT = BoxError(1e-9, 1e-9, 0.0, 1e-9)
 

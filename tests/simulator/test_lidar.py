@@ -8,8 +8,8 @@ import torch
 
 from manyeyes.datatypes import ConfigError, Transform
 from manyeyes.ops.raycast import HeightField, Primitives
-from manyeyes.simulator.bodies import place_bodies, vehicle_body
-from manyeyes.simulator.lidar import ASPHALT, LIDAR_PRESETS, PAINT, LidarSpec, Scene, lidar_spec, scan
+from manyeyes.simulator.scene.vehicle_shapes import place_bodies, vehicle_body
+from manyeyes.simulator.sensors.lidar import ASPHALT, LIDAR_PRESETS, PAINT, LidarSpec, Scene, lidar_spec, scan
 
 QUIET = LidarSpec(per_turn=900, drop_general=0, drop_dark=0, drop_grazing=0, range_sigma_m=0)
 HERE = Transform.from_xyz_yaw(0, 0)

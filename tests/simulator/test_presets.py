@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.simulator.camera import camera_rig
 from manyeyes.simulator.presets import (
     SIMULATION_PRESETS,
     SimulationPreset,
@@ -14,6 +13,7 @@ from manyeyes.simulator.presets import (
     simulation_preset,
     with_cameras,
 )
+from manyeyes.simulator.sensors.camera import camera_rig
 
 
 def test_no_town_is_on_two_sides() -> None:

@@ -9,12 +9,12 @@ import torch
 
 pytest.importorskip("libsumo", reason="scenarios need the sim extra")
 
+from manyeyes.datasets.base import points_in_listed_boxes
 from manyeyes.datasets.opv2v import Opv2vRecording
-from manyeyes.datasets.recording import points_in_listed_boxes
 from manyeyes.datatypes import ConfigError
 from manyeyes.simulator.record import Job, Progress, record
-from manyeyes.simulator.scenario import ScenarioSpec, make_scenario
-from manyeyes.simulator.towns import load_town
+from manyeyes.simulator.scene.scenario import ScenarioSpec, make_scenario
+from manyeyes.simulator.scene.towns import load_town
 
 SPEC = ScenarioSpec(
     "generated-1", 7, "one", vehicles=1, frames=2, history_frames=1, roadside_chance=1.0, min_vehicles=6

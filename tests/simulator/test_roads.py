@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from manyeyes.maps.formats.opendrive import read_opendrive
-from manyeyes.simulator.roads import (
+from manyeyes.simulator.scene.roads import (
     _count_arms,
     crossing_sites,
     distance_to_road,

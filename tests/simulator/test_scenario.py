@@ -7,10 +7,10 @@ import torch
 
 pytest.importorskip("libsumo", reason="scenarios need the sim extra")
 
-from manyeyes.datasets.recording import points_in_listed_boxes
+from manyeyes.datasets.base import points_in_listed_boxes
 from manyeyes.datatypes import ConfigError, PointCloud, Snapshot
-from manyeyes.simulator.scenario import RSU_ID, NoSceneError, Scenario, ScenarioSpec, make_scenario, seen_boxes
-from manyeyes.simulator.towns import load_town
+from manyeyes.simulator.scene.scenario import RSU_ID, NoSceneError, Scenario, ScenarioSpec, make_scenario, seen_boxes
+from manyeyes.simulator.scene.towns import load_town
 
 SPEC = ScenarioSpec(
     "generated-1", 7, "one", vehicles=2, frames=3, history_frames=1, roadside_chance=1.0, min_vehicles=6

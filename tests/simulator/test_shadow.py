@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, Primitives, reference_hit
-from manyeyes.simulator.shadow import daylight, index_shadows
+from manyeyes.simulator.sensors.shadow import daylight, index_shadows
 
 SUN = np.array([0.48, -0.36, 0.8])
 

@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 
 from manyeyes.ops.raycast import HeightField
-from manyeyes.simulator.ground import ASPHALT, CROSSING, GRASS, PAINT, SIDEWALK
-from manyeyes.simulator.look import FACADE, PAINTWORK, STEEL
-from manyeyes.simulator.noise import noise
-from manyeyes.simulator.texture import Spots, ground_cover, ground_rgb, smooth, solid_rgb
+from manyeyes.simulator.scene.ground import ASPHALT, CROSSING, GRASS, PAINT, SIDEWALK
+from manyeyes.simulator.sensors.fractal_noise import noise
+from manyeyes.simulator.sensors.materials import FACADE, PAINTWORK, STEEL
+from manyeyes.simulator.sensors.texture import Spots, ground_cover, ground_rgb, smooth, solid_rgb
 
 
 def field(surface: np.ndarray) -> HeightField:

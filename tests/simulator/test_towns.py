@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.simulator import towns
-from manyeyes.simulator.towns import TOWN_SPLIT, TOWNS, assert_disjoint_split, find_town, load_town
+from manyeyes.simulator.scene.towns import TOWN_SPLIT, TOWNS, assert_disjoint_split, find_town, load_town
 
 ROAD = b"""<OpenDRIVE><road id="1" length="9" junction="-1"><planView><geometry s="0" x="0" y="0" hdg="0" length="9"><line/>
 </geometry></planView><lanes><laneSection s="0"><right><lane id="-1" type="driving"><width sOffset="0" a="3" b="0" c="0" d="0"/>
@@ -24,7 +23,6 @@ def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     for name in ("MANYEYES_TOWNS", "CARLA_ROOT"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(towns, "__file__", str(tmp_path / "a" / "b" / "c" / "towns.py"))
     return tmp_path
 
 
@@ -43,10 +41,6 @@ def test_path_before_variable_before_carla(nowhere: Path, monkeypatch: pytest.Mo
         (place / "Town05.xodr").write_bytes(ROAD)
     monkeypatch.setenv("CARLA_ROOT", str(nowhere / "carla"))
     assert find_town("Town05") == carla / "Town05.xodr"
-    beside = nowhere / "shared" / "data" / "carla_opendrive"
-    beside.mkdir(parents=True)
-    (beside / "Town05.xodr.gz").write_bytes(gzip.compress(ROAD))
-    assert find_town("Town05") == beside / "Town05.xodr.gz"
     monkeypatch.setenv("MANYEYES_TOWNS", str(places["variable"]))
     assert find_town("Town05") == places["variable"] / "Town05.xodr"
     assert find_town("Town05", places["given"]) == places["given"] / "Town05.xodr"

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes import LABELS, ConfigError, MissingExtraError, ShapeError
-from manyeyes.simulator import traffic
-from manyeyes.simulator.parking import parked_cars
-from manyeyes.simulator.towns import load_town
-from manyeyes.simulator.traffic import _headings, _speeds, _without_dead_ends, simulate_traffic
-from manyeyes.simulator.vehicles import VehicleStates, draw_vehicles, overlaps
+from manyeyes.simulator.scene import traffic
+from manyeyes.simulator.scene.parking import parked_cars
+from manyeyes.simulator.scene.towns import load_town
+from manyeyes.simulator.scene.traffic import _headings, _speeds, _without_dead_ends, simulate_traffic
+from manyeyes.simulator.scene.vehicles import VehicleStates, draw_vehicles, overlaps
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data" / "carla_opendrive"
 STEPS = 12

@@ -6,11 +6,11 @@ import torch
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.models import checkpoint
-from manyeyes.models.codebook import FREQUENCY_TOTAL, CodebookConfig
-from manyeyes.models.detector import Detector
-from manyeyes.models.presets import COSTR_TINY
-from manyeyes.models.proposal import PROPOSAL
-from manyeyes.training.codebook import fit, fit_centres, fit_frequencies, k_means, told_tokens, with_codebook
+from manyeyes.models.detector.codebook import FREQUENCY_TOTAL, CodebookConfig
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.training.detector.codebook import fit, fit_centres, fit_frequencies, k_means, told_tokens, with_codebook
 
 torch.set_num_threads(1)
 

@@ -17,10 +17,10 @@ import torch
 
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
-from manyeyes.models.fusion.gather import Part, gather
-from manyeyes.models.presets import COSTR_OPV2V, COSTR_TINY
-from manyeyes.training.loop import Run, TrainConfig, _grown, learning_rate, prune_threshold, train
-from manyeyes.training.samples import AugmentConfig, RoadConfig
+from manyeyes.models.detector.presets import COSTR_OPV2V, COSTR_TINY
+from manyeyes.models.fusion.transform_tokens import Part, gather
+from manyeyes.training.detector.loop import Run, TrainConfig, _grown, learning_rate, prune_threshold, train
+from manyeyes.training.detector.samples import AugmentConfig, RoadConfig
 
 TINY = TrainConfig(COSTR_TINY, steps=6, batch=2, warm_up=2, save_every=2, augment=AugmentConfig(max_agents=2))
 ROAD = dataclasses.replace(
@@ -187,10 +187,10 @@ def test_the_same_seed_is_the_same_run_and_another_is_not(toy, tmp_path):
 
 MEASURE = """
 import torch
-from manyeyes.models.presets import COSTR_TINY
-from manyeyes.training.loop import Run, TrainConfig
-from manyeyes.training.losses import LossConfig
-from manyeyes.training.samples import AugmentConfig
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.training.detector.loop import Run, TrainConfig
+from manyeyes.training.detector.losses import LossConfig
+from manyeyes.training.detector.samples import AugmentConfig
 
 def measure(toy, out):
     # One frame of one agent without augmentation: all samples of the batch are alike.

@@ -8,10 +8,17 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, Boxes, Sites
-from manyeyes.models.box_head import SPEED_UNIT, WIDTHS, RawBoxes
-from manyeyes.models.pruning import Pruned
-from manyeyes.training.losses import LossConfig, LossTerms, _gaussian_nll, centre_focal, head_terms, prune_focal
-from manyeyes.training.targets import TargetConfig, Targets, assign
+from manyeyes.models.detector.box_head import SPEED_UNIT, WIDTHS, RawBoxes
+from manyeyes.models.detector.pruning import Pruned
+from manyeyes.training.detector.losses import (
+    LossConfig,
+    LossTerms,
+    _gaussian_nll,
+    centre_focal,
+    head_terms,
+    prune_focal,
+)
+from manyeyes.training.detector.targets import TargetConfig, Targets, assign
 
 GRID = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0).at(4)
 SITES = Sites(torch.arange(GRID.shape[0] * GRID.shape[1]), GRID)

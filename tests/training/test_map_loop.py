@@ -21,18 +21,18 @@ from manyeyes.datatypes import (
 )
 from manyeyes.datatypes.camera import Camera, CameraImage
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.map_quality import judge
-from manyeyes.evaluation.map_tiles import side_by_side
+from manyeyes.evaluation.maps.metrics import judge
+from manyeyes.evaluation.maps.tiles import side_by_side
 from manyeyes.models import checkpoint
-from manyeyes.models.map_bev import BevConfig
-from manyeyes.models.map_head import MapHeadConfig, decode
-from manyeyes.models.map_presets import FORMAT
-from manyeyes.models.mapper import Mapper, MapperConfig
+from manyeyes.models.maps.bev import BevConfig
+from manyeyes.models.maps.head import MapHeadConfig, decode
+from manyeyes.models.maps.map_model import Mapper, MapperConfig
+from manyeyes.models.maps.presets import FORMAT
 from manyeyes.ops.keyed_random import keyed_generator, keyed_uniform
-from manyeyes.training.map_loop import MapRun, MapTrainConfig, train_mapper
-from manyeyes.training.map_presets import MAP_TRAINING
-from manyeyes.training.map_samples import MapSample, inked
-from manyeyes.training.map_step import loss_terms, placed, see, thinned
+from manyeyes.training.maps.loop import MapRun, MapTrainConfig, train_mapper
+from manyeyes.training.maps.presets import MAP_TRAINING
+from manyeyes.training.maps.samples import MapSample, inked
+from manyeyes.training.maps.step import loss_terms, placed, see, thinned
 
 TINY = MapperConfig(
     BevConfig(

@@ -11,8 +11,8 @@ import torch
 
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.models.map_head import RawMap
-from manyeyes.training.map_losses import (
+from manyeyes.models.maps.head import RawMap
+from manyeyes.training.maps.losses import (
     MapLossConfig,
     focal,
     head_terms,
@@ -21,7 +21,7 @@ from manyeyes.training.map_losses import (
     match,
     turned_away,
 )
-from manyeyes.training.map_targets import MapTarget, orders_of, target_of
+from manyeyes.training.maps.targets import MapTarget, orders_of, target_of
 
 CONFIG = MapLossConfig()
 

@@ -11,11 +11,11 @@ import torch
 from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.camera import Camera, CameraImage
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, KINDS, MapElements
-from manyeyes.models.map_bev import BevConfig
-from manyeyes.models.map_head import MapHeadConfig
-from manyeyes.models.mapper import MapperConfig
+from manyeyes.models.maps.bev import BevConfig
+from manyeyes.models.maps.head import MapHeadConfig
+from manyeyes.models.maps.map_model import MapperConfig
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.training.map_samples import MapAugment, TileStream, inked, mirrored, mirrored_motion
+from manyeyes.training.maps.samples import MapAugment, TileStream, inked, mirrored, mirrored_motion
 
 CONFIG = MapperConfig(
     BevConfig(BevGrid(-12.0, -12.0, -2.0, 12.0, 12.0, 4.0, pillar=0.5)),

@@ -7,7 +7,7 @@ import torch
 
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, STOP_LINE, MapElements
-from manyeyes.training.map_targets import evenly, met, orders_of, target_of
+from manyeyes.training.maps.targets import evenly, met, orders_of, target_of
 
 TILE = BevGrid(-10.0, -5.0, -1.0, 10.0, 5.0, 1.0, pillar=1.0)
 SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])

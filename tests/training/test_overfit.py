@@ -3,12 +3,12 @@
 
 import torch
 
-from manyeyes.evaluation.detection import PROTOCOLS, FrameResult, average_precision
-from manyeyes.models.box_head import DecodeConfig, decode
-from manyeyes.models.presets import COSTR_TINY
-from manyeyes.training.loop import Run, TrainConfig
-from manyeyes.training.samples import AugmentConfig
-from manyeyes.training.step import forward
+from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameResult, average_precision
+from manyeyes.models.detector.box_head import DecodeConfig, decode
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.training.detector.loop import Run, TrainConfig
+from manyeyes.training.detector.samples import AugmentConfig
+from manyeyes.training.detector.step import forward
 
 
 def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):

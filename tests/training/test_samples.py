@@ -8,7 +8,15 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, Boxes, ConfigError, Snapshot, Transform, Truth
-from manyeyes.training.samples import AugmentConfig, RoadConfig, Sample, SampleStream, View, epoch_length, make_sample
+from manyeyes.training.detector.samples import (
+    AugmentConfig,
+    RoadConfig,
+    Sample,
+    SampleStream,
+    View,
+    epoch_length,
+    make_sample,
+)
 
 GRID = BevGrid(-51.2, -51.2, -3.0, 51.2, 51.2, 5.0)
 TURN = AugmentConfig(turn_rad=0.8, scale=0.0, flip=False, thin=0.0, early_share=0.0)

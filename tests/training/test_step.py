@@ -11,12 +11,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from manyeyes.datatypes import BevGrid
-from manyeyes.models.detector import Detector
-from manyeyes.models.presets import COSTR_TINY
-from manyeyes.training.losses import LossConfig
-from manyeyes.training.samples import AugmentConfig, RoadConfig, Sample, View, make_sample
-from manyeyes.training.step import PACKET_TOKENS, _arriving, _before, forward, loss_terms, meeting
-from manyeyes.training.targets import TargetConfig
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.training.detector.losses import LossConfig
+from manyeyes.training.detector.samples import AugmentConfig, RoadConfig, Sample, View, make_sample
+from manyeyes.training.detector.step import PACKET_TOKENS, _arriving, _before, forward, loss_terms, meeting
+from manyeyes.training.detector.targets import TargetConfig
 
 GRID: BevGrid = COSTR_TINY.grid
 

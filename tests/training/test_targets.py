@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, Boxes, Sites
-from manyeyes.training.targets import TargetConfig, assign
+from manyeyes.training.detector.targets import TargetConfig, assign
 
 GRID = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0)
 

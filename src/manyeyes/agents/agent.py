@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from manyeyes.agents.aligner import Aligner, Known, Verdict
-from manyeyes.agents.coding import codebook_of, coded, readable, tables_of, token_format_of, usual_precision
-from manyeyes.agents.collaboration import Collaboration, Intermediate
-from manyeyes.agents.collaboration.heading import header
-from manyeyes.agents.eyes import Eyes, History
-from manyeyes.agents.memory import Memory
+from manyeyes.agents.message_history import Memory
+from manyeyes.agents.perception_cache import Eyes, History
+from manyeyes.agents.pose_correction import Aligner, Known, Verdict
+from manyeyes.agents.strategies import Collaboration, Intermediate
+from manyeyes.agents.strategies.message_header import header
+from manyeyes.agents.token_codec import codebook_of, coded, readable, tables_of, token_format_of, usual_precision
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox, Reception, Rejection
-from manyeyes.comms.request import need, request_map
-from manyeyes.comms.select import within_budget
+from manyeyes.comms.request_map import need, request_map
 from manyeyes.comms.token_format import TokenFormat, within_range
+from manyeyes.comms.token_selection import within_budget
 from manyeyes.comms.wire import Precision
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 from manyeyes.datatypes.message import RequestMap
-from manyeyes.models.detector import Detector
+from manyeyes.models.detector.detector import Detector
 
 if TYPE_CHECKING:
-    from manyeyes.agents.surveyor import Survey
+    from manyeyes.agents.map_perception import Survey
 
 OWN_BODY_M = (2.6, 1.3)
 WINDOW_STRIDE = 32
@@ -60,10 +60,10 @@ class Agent:
     """A detector, a way to collaborate, and a limit in bytes for each message.
 
     Nothing but the bytes of share passes between two agents; frames carry no labels, so truth cannot leak by type.
-    precision: how tokens are written; None: as is usual for these weights (``agents.coding``).
-    requests: its messages of tokens say, a byte a window, where it needs no help (``comms.request``).
+    precision: how tokens are written; None: as is usual for these weights (``agents.token_codec``).
+    requests: its messages of tokens say, a byte a window, where it needs no help (``comms.request_map``).
     aligner: corrects where others say they are before anything is fused; None believes them. survey: draws what the agent then
-    says of the map (``agents.surveyor``); None: nothing.
+    says of the map (``agents.map_perception``); None: nothing.
     """
 
     def __init__(

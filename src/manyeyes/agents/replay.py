@@ -9,17 +9,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from manyeyes.agents.agent import Agent, Perception
-from manyeyes.agents.aligner import Aligner
-from manyeyes.agents.collaboration import method
-from manyeyes.agents.eyes import FOLLOWED, REMEMBERED, Eyes, Sight
-from manyeyes.comms.budget import fair_shares
-from manyeyes.comms.bus import LocalBus
+from manyeyes.agents.perception_cache import FOLLOWED, REMEMBERED, Eyes, Sight
+from manyeyes.agents.pose_correction import Aligner
+from manyeyes.agents.strategies import method
+from manyeyes.comms.bandwidth import fair_shares
 from manyeyes.comms.channel import Channel, ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
+from manyeyes.comms.local_bus import LocalBus
 from manyeyes.comms.wire import Precision
-from manyeyes.datasets.recording import Recording
+from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
-from manyeyes.models.detector import Detector
+from manyeyes.models.detector.detector import Detector
 
 EXPIRE_NS = 500_000_000
 STEADY = FOLLOWED + REMEMBERED
@@ -37,7 +37,7 @@ class ReplayConfig:
     sweep an ego waits for messages before it perceives; whatever came by then takes part, the newest of each sender. all_egos:
     every agent is judged as ego, not the first alone. history: snapshots played before the first judged one, so that messages are
     under way and boxes followed. reach_m: radios farther apart do not hear each other (true poses). channel_bytes: what all
-    agents together may send at an instant, shared as ``comms.budget.fair_shares`` does by what each would say alone, as if
+    agents together may send at an instant, shared as ``comms.bandwidth.fair_shares`` does by what each would say alone, as if
     scheduled by one who is told.
     requests: messages of tokens say where their sender needs no help, and what came lately weighs what is sent.
     aligner: corrects where others say they are, None: nobody does.

@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.comms.codec import PacketError
+from manyeyes._jit import njit
+from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import ConfigError
-from manyeyes.datatypes.kernels import njit
 
 TOTAL_BITS = 12
 TOTAL = 1 << TOTAL_BITS

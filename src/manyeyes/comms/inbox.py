@@ -6,9 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
-from manyeyes.comms.codec import PacketError, Reason
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.sections import TokenRows
+from manyeyes.comms.payloads import TokenRows
+from manyeyes.comms.primitives import PacketError, Reason
 from manyeyes.comms.token_format import TokenFormat, TokenRefusal
 from manyeyes.comms.wire import Assembly, Fragment, decode_packet
 from manyeyes.datatypes import Message

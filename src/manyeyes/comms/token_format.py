@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 from torch import Tensor
 
-from manyeyes.comms import codec
+from manyeyes.comms import primitives
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.sections import TokenRows
+from manyeyes.comms.payloads import TokenRows
 from manyeyes.datatypes import BevGrid, SparseBev
 
 TokenRefusal = Literal["wrong_model", "grid", "width", "value"]
@@ -72,7 +72,9 @@ def largest_magnitude(rows: TokenRows) -> float:
     if not len(rows.key):
         return 0.0
     if rows.precision == "int8":
-        scale = codec.dequantise_int8(np.frombuffer(rows.scales, np.uint8), np.full((1, rows.channels), 127, np.int8))
+        scale = primitives.dequantise_int8(
+            np.frombuffer(rows.scales, np.uint8), np.full((1, rows.channels), 127, np.int8)
+        )
         steps = np.frombuffer(rows.values, np.int8).reshape(-1, rows.channels)
         return float((np.abs(steps.astype(np.int16)).max(0) / 127 * scale[0]).max())
-    return codec.largest_magnitude(rows.values, 4 if rows.precision == "float32" else 2)
+    return primitives.largest_magnitude(rows.values, 4 if rows.precision == "float32" else 2)

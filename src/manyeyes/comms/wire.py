@@ -99,11 +99,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from manyeyes.comms import sections
-from manyeyes.comms.codec import PacketError, log_codes, log_values
-from manyeyes.comms.elements import ElementRows, element_bodies, merge_elements
+from manyeyes.comms import payloads
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.sections import Body, Form, ObjectRows, PointRows, Precision, TokenRows
+from manyeyes.comms.map_payload import ElementRows, element_bodies, merge_elements
+from manyeyes.comms.payloads import Body, Form, ObjectRows, PointRows, Precision, TokenRows
+from manyeyes.comms.primitives import PacketError, log_codes, log_values
 from manyeyes.datatypes import BevGrid, ConfigError, Message, Transform, WireError
 from manyeyes.datatypes.message import RequestMap
 
@@ -161,27 +161,27 @@ def encode(
     tables: those of the weights that the message names; with them, codes are entropy-coded.
     """
     form = Form(precision, tables)
-    if not HEADER_BYTES + sections.TOKENS_BYTES < mtu <= 65535:
-        raise ConfigError(f"mtu is from {HEADER_BYTES + sections.TOKENS_BYTES + 1} to 65535 bytes; got {mtu}.")
+    if not HEADER_BYTES + payloads.TOKENS_BYTES < mtu <= 65535:
+        raise ConfigError(f"mtu is from {HEADER_BYTES + payloads.TOKENS_BYTES + 1} to 65535 bytes; got {mtu}.")
     capacity = mtu - HEADER_BYTES
     bodies: list[tuple[int, bytes]] = []
     if message.objects is not None:
-        rows = sections.object_bodies(message.objects, message.descriptors, capacity)
-        bodies += [(sections.OBJECTS, body) for body in rows]
+        rows = payloads.object_bodies(message.objects, message.descriptors, capacity)
+        bodies += [(payloads.OBJECTS, body) for body in rows]
     if message.request is not None:
-        bodies.append((sections.REQUEST, sections.request_body(message.request, capacity)))
+        bodies.append((payloads.REQUEST, payloads.request_body(message.request, capacity)))
     if message.tokens is not None:
         if tables is not None and tables.fingerprint != message.fingerprint:
             raise WireError(
                 f"Tables of weights {tables.fingerprint.hex()} do not code tokens of {message.fingerprint.hex()}."
             )
-        rows = sections.token_bodies(message.tokens, message.token_score, form, capacity)
-        bodies += [(sections.TOKENS, body) for body in rows]
+        rows = payloads.token_bodies(message.tokens, message.token_score, form, capacity)
+        bodies += [(payloads.TOKENS, body) for body in rows]
     if message.seen_map is not None:
-        bodies += [(sections.ELEMENTS, body) for body in element_bodies(message.seen_map, capacity)]
+        bodies += [(payloads.ELEMENTS, body) for body in element_bodies(message.seen_map, capacity)]
     if message.points is not None:
-        bodies += [(sections.POINTS, body) for body in sections.point_bodies(message.points, capacity)]
-    bodies = bodies or [(sections.NONE, b"")]
+        bodies += [(payloads.POINTS, body) for body in payloads.point_bodies(message.points, capacity)]
+    bodies = bodies or [(payloads.NONE, b"")]
     if len(bodies) > 65535:
         raise WireError(
             f"A message has at most 65535 packets; this one needs {len(bodies)}: send less or raise the mtu."
@@ -317,7 +317,7 @@ def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
     if flags >> 6 or number >= count:
         raise PacketError("garbage", f"Contradictory header: flags {flags:#04x}, packet {number} of {count}.")
     header = _header(common, flags >> 3, count)
-    body = sections.read_body(flags & 7, packet[_BODY_AT : -_CRC.size], header.fingerprint, tables)
+    body = payloads.read_body(flags & 7, packet[_BODY_AT : -_CRC.size], header.fingerprint, tables)
     return Fragment(header, number, body, packet)
 
 
@@ -412,10 +412,10 @@ class Assembly:
             pose_covariance=torch.from_numpy(_covariance(head.spread)),
             fingerprint=head.fingerprint,
             is_infrastructure=head.is_infrastructure,
-            tokens=sections.merge_tokens([b for b in bodies if isinstance(b, TokenRows)]),
-            objects=sections.merge_objects(objects),
-            descriptors=sections.merge_descriptors(objects),
-            points=sections.merge_points([b.rows for b in bodies if isinstance(b, PointRows)]),
+            tokens=payloads.merge_tokens([b for b in bodies if isinstance(b, TokenRows)]),
+            objects=payloads.merge_objects(objects),
+            descriptors=payloads.merge_descriptors(objects),
+            points=payloads.merge_points([b.rows for b in bodies if isinstance(b, PointRows)]),
             request=next((b for b in bodies if isinstance(b, RequestMap)), None),
             seen_map=merge_elements([b for b in bodies if isinstance(b, ElementRows)]),
         )

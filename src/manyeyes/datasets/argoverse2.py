@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes.datasets.recording import require_index
+from manyeyes.datasets.base import require_index
 from manyeyes.datatypes import (
     LABELS,
     AgentFrame,

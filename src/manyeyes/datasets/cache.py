@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole files or none, and arrays that were slow to parse kept where the next run finds them."""
+"""Arrays that were slow to parse, kept where the next run finds them."""
 
 from __future__ import annotations
 
@@ -12,17 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-
-def write_whole(path: Path, *chunks: bytes | memoryview) -> None:
-    """Write a file under a temporary name beside it and rename it: a reader sees the old file, the new one, or none."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            for chunk in chunks:
-                file.write(chunk)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+from manyeyes._io import atomic_write
 
 
 def default_cache_folder() -> Path:
@@ -62,7 +52,7 @@ class ArrayCache:
         np.save(data, array, allow_pickle=False)
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
-            write_whole(folder / name, data.getbuffer())
+            atomic_write(folder / name, data.getbuffer(), durable=False)
             digest = name.split(".")[0]
             for old in folder.glob(f"{digest}.{kind}.*.npy"):
                 if old.name != name:

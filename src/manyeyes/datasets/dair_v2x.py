@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from manyeyes.datasets.base import require_index
 from manyeyes.datasets.dair_index import Index, Pair, SideFrame, Sides, dair_root, read_index, split_ids
 from manyeyes.datasets.dair_json import (
     read_calibration,
@@ -30,7 +31,6 @@ from manyeyes.datasets.manifest import BATCHES, Digests
 from manyeyes.datasets.mismatch import copied_files
 from manyeyes.datasets.missing import FileProblem, MissingFiles
 from manyeyes.datasets.pcd import PcdCloud, read_pcd
-from manyeyes.datasets.recording import require_index
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, RecordingError, Snapshot, Transform, Truth
 from manyeyes.ops.box_iou import pairwise_iou
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from manyeyes.datasets.cache import write_whole
+from manyeyes._io import atomic_write_text
 from manyeyes.datasets.dair_index import SIDES, SPLIT_FILE
 from manyeyes.datasets.pcd import PcdTable, write_table
 from manyeyes.datatypes import LABELS, AgentFrame, Boxes, RecordingError, Snapshot, Transform
@@ -215,7 +215,7 @@ def _lidar_points(frame: AgentFrame) -> np.ndarray:
 
 def _write_json(path: Path, content: object) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, (json.dumps(content, indent=1) + "\n").encode())
+    atomic_write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def _motion(target_from_source: Transform) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from manyeyes.datatypes.kernels import njit
+from manyeyes._jit import njit
 
 _OVERRUN = -1
 # How far back a copy may reach, and how many bytes it may hold: 13 bits, and 3 + 8 bits of length on top of 2.

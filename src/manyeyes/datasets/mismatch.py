@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from manyeyes.datasets.base import points_in_listed_boxes
 from manyeyes.datasets.manifest import sha256_of
 from manyeyes.datasets.missing import FileProblem
-from manyeyes.datasets.recording import points_in_listed_boxes
 from manyeyes.datatypes import Snapshot
 
 # Files below this size hold no sweep (fewer than 250 points as floats), so equal bytes mean nothing.

@@ -21,9 +21,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from manyeyes.datasets.base import require_index
 from manyeyes.datasets.cache import ArrayCache, default_cache_folder
 from manyeyes.datasets.carla import carla_from_transform, mirror_points, transform_from_carla
 from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, height_above_ground
+from manyeyes.datasets.image_io import write_png
 from manyeyes.datasets.manifest import PARTIAL, SCENARIO, Digests, listed_scenarios, scenario_files
 from manyeyes.datasets.mismatch import mismatched_files
 from manyeyes.datasets.missing import FileProblem, MissingFiles
@@ -43,8 +45,6 @@ from manyeyes.datasets.opv2v_yaml import (
     write_record,
 )
 from manyeyes.datasets.pcd import PcdCloud, read_pcd, write_pcd
-from manyeyes.datasets.picture import write_png
-from manyeyes.datasets.recording import require_index
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, RecordingError, Snapshot, Transform, Truth
 
 _AGENT = re.compile(r"-?\d+")

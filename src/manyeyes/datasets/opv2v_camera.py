@@ -17,8 +17,8 @@ import torch
 
 from manyeyes.datasets.cache import ArrayCache
 from manyeyes.datasets.carla import carla_from_transform, transform_from_carla
+from manyeyes.datasets.image_io import read_picture
 from manyeyes.datasets.opv2v_yaml import load_yaml
-from manyeyes.datasets.picture import read_picture
 from manyeyes.datatypes import Camera, CameraImage, RecordingError, Transform
 
 _KIND, _COLUMNS = "opv2v-cameras1", 16

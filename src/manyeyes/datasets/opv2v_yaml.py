@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from manyeyes.datasets.cache import ArrayCache, write_whole
+from manyeyes._io import atomic_write_text
+from manyeyes.datasets.cache import ArrayCache
 from manyeyes.datatypes import LABELS, RecordingError
 
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -200,7 +201,7 @@ def write_record(
             lines += _list(name, getattr(record, name)[i].tolist(), "    ")
         lines.append(f"    obj_type: {LABELS[int(record.label[i])]}")
         lines.append(f"    speed: {_number(float(record.speed[i]))}")
-    write_whole(path, ("\n".join(lines) + "\n").encode())
+    atomic_write_text(path, "\n".join(lines) + "\n")
 
 
 def _list(key: str, values: Sequence[float], indent: str) -> list[str]:
@@ -228,7 +229,7 @@ def write_protocol(folder: Path, protocol: Mapping[str, Any], fixed_delta_s: flo
             f"{folder / 'data_protocol.yaml'}: world.fixed_delta_seconds is {world['fixed_delta_seconds']}, but the "
             f"frames were written with {fixed_delta_s}: give both the same value."
         )
-    write_whole(folder / "data_protocol.yaml", yaml.safe_dump(content, sort_keys=False, width=120).encode())
+    atomic_write_text(folder / "data_protocol.yaml", yaml.safe_dump(content, sort_keys=False, width=120))
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from manyeyes.datasets.cache import ArrayCache, write_whole
+from manyeyes._io import atomic_write
+from manyeyes.datasets.cache import ArrayCache
 from manyeyes.datatypes import RecordingError
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
@@ -99,7 +100,7 @@ def write_pcd(path: Path, xyz: np.ndarray, intensity: np.ndarray) -> None:
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\n"
         f"COUNT 1 1 1 1\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA binary\n"
     )
-    write_whole(path, header.encode(), record.tobytes())
+    atomic_write(path, header.encode(), record.tobytes(), durable=False)
 
 
 def write_table(path: Path, table: PcdTable) -> None:
@@ -122,7 +123,7 @@ def write_table(path: Path, table: PcdTable) -> None:
         f"TYPE {' '.join(_LETTERS[c.dtype.kind] for c in columns)}\nCOUNT {' '.join('1' for _ in columns)}\n"
         f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA binary_compressed\n"
     )
-    write_whole(path, header.encode(), np.array([len(packed), len(plain)], "<u4").tobytes(), packed)
+    atomic_write(path, header.encode(), np.array([len(packed), len(plain)], "<u4").tobytes(), packed, durable=False)
 
 
 def _read(path: Path) -> tuple[_Header, PcdTable]:

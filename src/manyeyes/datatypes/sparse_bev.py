@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from manyeyes.datatypes._site_kernels import are_sites, middles
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.grid import BevGrid
-from manyeyes.datatypes.site_loops import are_sites, middles
 
 
 @dataclass(frozen=True, eq=False)

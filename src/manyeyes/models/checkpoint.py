@@ -16,8 +16,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
+from manyeyes._io import atomic_replace
 from manyeyes.datatypes import CheckpointError, ConfigError
-from manyeyes.models.detector import Detector, DetectorConfig
+from manyeyes.models.detector.detector import Detector, DetectorConfig
 
 FORMAT = "manyeyes-detector-1"
 """Of a detector's file; models of other kinds have formats of their own."""
@@ -77,10 +78,10 @@ def _tensors(model: nn.Module) -> dict[str, torch.Tensor]:
 def save(model: nn.Module, path: Path, card: dict[str, Any], half: bool = False, format: str = FORMAT) -> None:
     """Write weights, the model's config and a model card (command, seed, time, result) to one file, atomically."""
     state = {k: (v.half() if half and v.is_floating_point() else v).contiguous() for k, v in _tensors(model).items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    save_file(state, partial, {"format": format, "config": config_to_json(model.config), "card": json.dumps(card)})
-    partial.replace(path)
+    with atomic_replace(path, durable=False) as temporary:
+        save_file(
+            state, temporary, {"format": format, "config": config_to_json(model.config), "card": json.dumps(card)}
+        )
 
 
 def load(path: Path) -> Detector:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._jit import njit
 from manyeyes.datatypes import ShapeError
-from manyeyes.datatypes.kernels import njit
 
 
 def assign(cost: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -2,7 +2,7 @@
 """Convolutions on occupied cells with bias and ReLU, one after another on one set of sites, in one compiled call.
 
 For inference on the CPU, where norms and skips are folded into the weights: a few hundred rows are little work for each of
-the tensor operations of a layer. ``models.layers`` holds the twin with gradients.
+the tensor operations of a layer. ``models.detector.layers`` holds the twin with gradients.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from manyeyes.datatypes.kernels import njit
-from manyeyes.ops.pair_loops import LANES, convolve, empty_rows, panels
+from manyeyes._jit import njit
+from manyeyes.ops._sparse_conv_kernels import LANES, convolve, empty_rows, panels
 from manyeyes.ops.sparse_index import NeighbourMap
 
 

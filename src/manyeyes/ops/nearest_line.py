@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes.kernels import njit
+from manyeyes._jit import njit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from manyeyes._jit import njit
 from manyeyes.datatypes import ShapeError
-from manyeyes.datatypes.kernels import njit
 
 
 @torch.no_grad()

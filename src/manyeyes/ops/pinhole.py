@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes.kernels import njit
+from manyeyes._jit import njit
 from manyeyes.ops.raycast import (
     BOX,
     CYLINDER,

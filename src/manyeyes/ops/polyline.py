@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from manyeyes.datatypes.kernels import njit
+from manyeyes._jit import njit
 from manyeyes.datatypes.map_element import frozen, rows_of
 
 Floats = NDArray[np.float64]

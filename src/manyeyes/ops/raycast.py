@@ -15,8 +15,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._jit import njit
 from manyeyes.datatypes.errors import ShapeError
-from manyeyes.datatypes.kernels import njit
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 NOTHING, GROUND = -1, -2

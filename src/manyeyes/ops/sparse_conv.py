@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
-from manyeyes.ops.pair_loops import LANES, convolve, panels
+from manyeyes.ops._sparse_conv_kernels import LANES, convolve, panels
 from manyeyes.ops.sparse_index import (
     NeighbourMap,
     Window,

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from manyeyes.datatypes.kernels import njit
+from manyeyes._jit import njit
 
 
 class Window(NamedTuple):

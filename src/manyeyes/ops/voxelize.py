@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from manyeyes._jit import njit
 from manyeyes.datatypes import BevGrid, ConfigError, Sites
-from manyeyes.datatypes.kernels import njit
 from manyeyes.ops.sparse_index import distinct
 
 MOMENTS = (

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 
+from manyeyes._jit import njit
 from manyeyes.datatypes import ConfigError, ShapeError
-from manyeyes.datatypes.kernels import njit
 
 BUCKETS = (4, 8, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)
 _BITS = 20

@@ -35,7 +35,7 @@ from manyeyes.simulator.record import (
     write_json,
     write_manifest,
 )
-from manyeyes.simulator.scenario import RSU_ID, Scenario, ScenarioSpec
+from manyeyes.simulator.scene.scenario import RSU_ID, Scenario, ScenarioSpec
 
 # The world is stepped so many times between two pairs, and the pole's sweep is at most _LATEST steps older than the
 # vehicle's: 0 or 20 ms at 10 pairs a second. Chosen; DAIR-V2X's own pairs are not simultaneous either.

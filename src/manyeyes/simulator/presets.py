@@ -12,8 +12,8 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.simulator.dair import record_dair
 from manyeyes.simulator.record import Job, Progress, record
-from manyeyes.simulator.scenario import ScenarioSpec
-from manyeyes.simulator.towns import GENERATED, TOWN_SPLIT, assert_disjoint_split, find_town
+from manyeyes.simulator.scene.scenario import ScenarioSpec
+from manyeyes.simulator.scene.towns import GENERATED, TOWN_SPLIT, assert_disjoint_split, find_town
 
 
 @dataclass(frozen=True)

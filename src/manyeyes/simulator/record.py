@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from manyeyes._io import atomic_write_text
 from manyeyes.datasets.dair_index import dair_root
 from manyeyes.datasets.manifest import (
     BATCHES,
@@ -39,10 +40,10 @@ from manyeyes.datasets.manifest import (
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datasets.opv2v import Opv2vWriter, holds_frames
 from manyeyes.datatypes import ConfigError, ManyeyesError, RecordingError
-from manyeyes.maps.road_network import RoadNetwork
-from manyeyes.simulator.lidar import lidar_spec
-from manyeyes.simulator.scenario import NoSceneError, Scenario, ScenarioSpec, make_scenario
-from manyeyes.simulator.towns import load_town
+from manyeyes.maps.roads.road_network import RoadNetwork
+from manyeyes.simulator.scene.scenario import NoSceneError, Scenario, ScenarioSpec, make_scenario
+from manyeyes.simulator.scene.towns import load_town
+from manyeyes.simulator.sensors.lidar import lidar_spec
 
 _STEP_S = 0.05
 _UNCHANGED = "Nothing was changed: choose another --out, or remove the folder yourself."
@@ -461,6 +462,4 @@ def versions() -> dict[str, str]:
 
 def write_json(path: Path, content: object) -> None:
     """Write a file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(content, indent=1) + "\n")
-    temporary.replace(path)
+    atomic_write_text(path, json.dumps(content, indent=1) + "\n")

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes.kernels import njit
+from manyeyes._jit import njit
 from manyeyes.datatypes.map_element import frozen
 
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from manyeyes.maps.baselines.rules import Ints, Merged, Pool, Rules, as_map, pool
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.baselines._common import Ints, Merged, Pool, Rules, as_map, pool
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.ops.polyline import near_pairs, resample
 from manyeyes.ops.polyline_distance import chamfer
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes.kernels import njit
+from manyeyes._jit import njit
 from manyeyes.datatypes.map_element import frozen
 
 Floats = NDArray[np.float64]

@@ -18,11 +18,11 @@ import numpy as np
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING
+from manyeyes.maps.baselines._common import Floats, Ints, Merged, Rules, as_map, pool
 from manyeyes.maps.baselines.chamfer_nms import overlaps
 from manyeyes.maps.baselines.cpd import CpdConfig, register
-from manyeyes.maps.baselines.rules import Floats, Ints, Merged, Rules, as_map, pool
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.ops.polyline import feet, resample
 from manyeyes.ops.polyline_distance import chamfer
 

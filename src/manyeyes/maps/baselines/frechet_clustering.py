@@ -17,10 +17,10 @@ import numpy as np
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING
-from manyeyes.maps.baselines.rules import Floats, Ints, Merged, Pool, Rules, as_map, pool
-from manyeyes.maps.lane_links import components
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.baselines._common import Floats, Ints, Merged, Pool, Rules, as_map, pool
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.roads.lane_links import components
 from manyeyes.ops.polyline import near_pairs, resample
 from manyeyes.ops.polyline_distance import frechet
 

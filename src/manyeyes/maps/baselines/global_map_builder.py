@@ -20,10 +20,10 @@ import numpy as np
 
 from manyeyes.datatypes import MissingExtraError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements, Polygons
+from manyeyes.maps.baselines._common import Floats, Ints, Merged, Pool, Rules, as_map, pool
 from manyeyes.maps.baselines.assignment import assign
-from manyeyes.maps.baselines.rules import Floats, Ints, Merged, Pool, Rules, as_map, pool
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.ops.polyline import close_rings, feet, part, resample, simplify
 from manyeyes.ops.polyline_distance import directed
 

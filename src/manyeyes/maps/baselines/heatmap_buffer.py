@@ -18,11 +18,11 @@ import numpy as np
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
+from manyeyes.maps.baselines._common import Floats, Ints, Merged, Pool, Rules, as_map, pool
+from manyeyes.maps.baselines._raster import components, draw_lines, draw_rings, longest_walks, thinned
 from manyeyes.maps.baselines.polymerge import blurred, rectangle
-from manyeyes.maps.baselines.raster import components, draw_lines, draw_rings, longest_walks, thinned
-from manyeyes.maps.baselines.rules import Floats, Ints, Merged, Pool, Rules, as_map, pool
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.ops.polyline import feet, near_pairs_between, resample_spaced, simplify
 
 _MOST_CELLS = 64_000_000

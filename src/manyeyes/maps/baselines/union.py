@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from manyeyes.maps.baselines.rules import Merged, Rules, as_map, pool
-from manyeyes.maps.observation import Frame, Observation
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.baselines._common import Merged, Rules, as_map, pool
+from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.vector_map import VectorMap
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@
 Layout (Argoverse 2 map, version 2022): ``lane_segments`` with two boundaries as lists of x, y, z and the kind of their paint,
 ``pedestrian_crossings`` with two edges, ``drivable_areas`` with one ring each. World axes are the city frame of the log.
 Drivable areas overlap each other; their union's rings become edges of the road, kind "curb". Paint between two lanes that
-both name it stands in the network twice, as in the file: :mod:`manyeyes.maps.truth` merges it.
+both name it stands in the network twice, as in the file: :mod:`manyeyes.maps.roads.ground_truth` merges it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
-from manyeyes.maps.lane_links import components, equal_stations, junctions_of_lanes, link_neighbors
-from manyeyes.maps.road_network import Crossing, Lane, RoadMark, RoadNetwork
+from manyeyes.maps.roads.lane_links import components, equal_stations, junctions_of_lanes, link_neighbors
+from manyeyes.maps.roads.road_network import Crossing, Lane, RoadMark, RoadNetwork
 
 Array = NDArray[np.float64]
 

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._io import atomic_write
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, DOUBLE, SOLID
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.lanes import lane_pairs
 from manyeyes.maps.formats.rings import long_sides
-from manyeyes.maps.vector_map import VectorMap
-from manyeyes.maps.whole_file import write_whole
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def write_argoverse2(vector_map: VectorMap, path: Path | str) -> None:
         "drivable_areas": {str(k): {"id": k, "area_boundary": _points(ring)} for k, ring in enumerate(rings, 1)},
         "road_boundaries": {str(k): {"id": k, "points": _points(line)} for k, line in enumerate(boundaries, 1)},
     }
-    write_whole(Path(path), json.dumps(root, separators=(",", ":"), allow_nan=False).encode())
+    atomic_write(Path(path), json.dumps(root, separators=(",", ":"), allow_nan=False).encode())
 
 
 def _paint(m: VectorMap, row: int) -> str:

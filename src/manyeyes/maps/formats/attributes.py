@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import KINDS, STYLES, MapElements
-from manyeyes.maps.transverse_mercator import degrees_from_metres
-from manyeyes.maps.vector_map import STATES, VectorMap
+from manyeyes.maps.elements.vector_map import STATES, VectorMap
+from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

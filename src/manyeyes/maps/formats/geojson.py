@@ -6,9 +6,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from manyeyes._io import atomic_write
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.attributes import Attributes, in_degrees
-from manyeyes.maps.vector_map import VectorMap
-from manyeyes.maps.whole_file import write_whole
 
 # 1e-8 degrees are 1.1 mm on a meridian.
 _DIGITS = 8
@@ -18,7 +18,7 @@ def write_geojson(vector_map: VectorMap, path: Path | str) -> None:
     """Write all elements as one FeatureCollection; crossings are polygons, all others lines."""
     features = ",\n".join(geojson_features(vector_map))
     text = f'{{"type":"FeatureCollection","features":[\n{features}\n]}}\n'
-    write_whole(Path(path), text.encode())
+    atomic_write(Path(path), text.encode())
 
 
 def geojson_features(vector_map: VectorMap) -> list[str]:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from manyeyes._io import atomic_replace
 from manyeyes.datatypes import MissingExtraError
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.attributes import Attributes, in_degrees
 from manyeyes.maps.formats.geoparquet import geometries
-from manyeyes.maps.vector_map import VectorMap
-from manyeyes.maps.whole_file import replacing
 
 # GeoPackages hold the time of their last change; a fixed one makes equal maps equal files.
 _NO_DATE = "1970-01-01T00:00:00.000Z"
@@ -28,7 +28,7 @@ def write_geopackage(vector_map: VectorMap, path: Path | str) -> None:
     geometry = shapely.to_wkb(geometries(shapely, degrees))
     columns = list(Attributes.of(vector_map).columns())
     fields = [name for name, _ in columns]
-    with replacing(Path(path), keep_suffix=True) as temporary:
+    with atomic_replace(Path(path), keep_suffix=True) as temporary:
         pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _NO_DATE})
         try:
             for layer, kind, rows in (

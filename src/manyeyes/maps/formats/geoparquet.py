@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._io import atomic_replace
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, rows_of
+from manyeyes.maps.elements.observation import Frame
+from manyeyes.maps.elements.vector_map import STATES, Stations, Topology, VectorMap
 from manyeyes.maps.formats.attributes import Attributes, hex_ids, in_degrees
-from manyeyes.maps.observation import Frame
-from manyeyes.maps.vector_map import STATES, Stations, Topology, VectorMap
-from manyeyes.maps.whole_file import replacing
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -380,7 +380,7 @@ def projjson(frame: Frame) -> dict[str, Any]:
 def _write(table: pa.Table, path: Path) -> None:
     from pyarrow import parquet
 
-    with replacing(path) as temporary:
+    with atomic_replace(path) as temporary:
         parquet.write_table(table, temporary, compression="zstd", row_group_size=_GROUP_ROWS, store_schema=True)
 
 

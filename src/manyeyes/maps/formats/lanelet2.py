@@ -2,7 +2,7 @@
 """Read a Lanelet2 map (OSM XML) into a RoadNetwork.
 
 Sources: the tag lists of Lanelet2's documentation (LinestringTagging, LaneletAndAreaTagging). Degrees become metres by a
-transverse Mercator with scale 1 about an origin (:mod:`manyeyes.maps.transverse_mercator`): the one given, else the middle of
+transverse Mercator with scale 1 about an origin (:mod:`manyeyes.maps.roads.transverse_mercator`): the one given, else the middle of
 the nodes' bounding box rounded to 1e-4 degrees. Nodes that carry ``local_x`` and ``local_y`` keep degrees: those tags have no
 frame of their own.
 
@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
-from manyeyes.maps.lane_links import components, equal_stations, junctions_of_lanes, link_neighbors
-from manyeyes.maps.road_network import Crossing, Lane, RoadMark, RoadNetwork
-from manyeyes.maps.transverse_mercator import metres_from_degrees
+from manyeyes.maps.roads.lane_links import components, equal_stations, junctions_of_lanes, link_neighbors
+from manyeyes.maps.roads.road_network import Crossing, Lane, RoadMark, RoadNetwork
+from manyeyes.maps.roads.transverse_mercator import metres_from_degrees
 
 Array = NDArray[np.float64]
 

@@ -14,13 +14,13 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._io import atomic_write
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, DOUBLE, SOLID, STOP_LINE, STYLES
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.attributes import Attributes
 from manyeyes.maps.formats.lanes import lane_pairs
 from manyeyes.maps.formats.rings import long_sides
-from manyeyes.maps.transverse_mercator import degrees_from_metres
-from manyeyes.maps.vector_map import VectorMap
-from manyeyes.maps.whole_file import write_whole
+from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 
 Tags = tuple[tuple[str, str], ...]
 
@@ -54,7 +54,7 @@ def write_lanelet2(vector_map: VectorMap, path: Path | str) -> None:
         marking: Tags = (("type", "pedestrian_marking"), ("manyeyes:id", writer.ids[row]))
         left, right = (writer.way(side, marking) for side in long_sides(e.polyline(row)))
         writer.lanelet(left, right, _CROSSWALK)
-    write_whole(Path(path), writer.text().encode())
+    atomic_write(Path(path), writer.text().encode())
 
 
 def _line_tags(m: VectorMap, row: int) -> Tags:

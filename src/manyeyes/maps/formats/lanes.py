@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import BOUNDARY, DIVIDER
-from manyeyes.maps.vector_map import VectorMap
+from manyeyes.maps.elements.vector_map import VectorMap
 
 Floats = NDArray[np.float64]
 

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, STOP_LINE, MapElements
-from manyeyes.maps.observation import Frame, Observation, ObservationError
-from manyeyes.maps.observation_file import Quarantined, Reading
+from manyeyes.maps.elements.observation import Frame, Observation, ObservationError
+from manyeyes.maps.elements.observation_file import Quarantined, Reading
 
 Array = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._io import atomic_write
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, DOUBLE, SOLID, STOP_LINE
-from manyeyes.maps.vector_map import VectorMap
-from manyeyes.maps.whole_file import write_whole
+from manyeyes.maps.elements.vector_map import VectorMap
 
 Floats = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def write_nuscenes(vector_map: VectorMap, path: Path | str) -> None:
     edge = e.points.max(0).tolist() if len(e.points) else [0.0, 0.0]
     root: dict[str, Any] = {"version": "1.3", **{name: [] for name in _EMPTY}, **tables.rows}
     root |= {"canvas_edge": edge, "arcline_path_3": {}, "connectivity": {}}
-    write_whole(Path(path), json.dumps(root, separators=(",", ":"), allow_nan=False).encode())
+    atomic_write(Path(path), json.dumps(root, separators=(",", ":"), allow_nan=False).encode())
 
 
 class _Tables:

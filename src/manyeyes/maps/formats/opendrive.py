@@ -19,7 +19,7 @@ import numpy as np
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.maps.formats.opendrive_geometry import Array, Cubics, Primitive, ReferenceLine
 from manyeyes.maps.formats.opendrive_links import connect, junctions_of
-from manyeyes.maps.road_network import Crossing, Lane, ParkingSpace, Road, RoadMark, RoadNetwork
+from manyeyes.maps.roads.road_network import Crossing, Lane, ParkingSpace, Road, RoadMark, RoadNetwork
 
 STEP_M = 1.0
 TIGHT_STEP_M = 0.5

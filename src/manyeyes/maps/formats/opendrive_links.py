@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from manyeyes.maps.road_network import Junction, Lane
+from manyeyes.maps.roads.road_network import Junction, Lane
 
 _End = tuple[int, bool]
 """A lane and whether its end at the road's larger s is meant."""

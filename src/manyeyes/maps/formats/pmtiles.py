@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from manyeyes._io import atomic_replace
 from manyeyes.datatypes import ConfigError, MissingExtraError
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.attributes import Attributes, in_degrees
 from manyeyes.maps.formats.geoparquet import geometries
-from manyeyes.maps.vector_map import VectorMap
-from manyeyes.maps.whole_file import replacing
 
 # At zoom 16 a tile's 4096 steps are 15 cm each at the equator.
 _LEAST_ZOOM, _MOST_ZOOM = 12, 16
@@ -30,7 +30,7 @@ def write_pmtiles(
         raise MissingExtraError("map", "Maps as PMTiles") from None
     degrees = in_degrees(vector_map)
     columns = list(Attributes.of(vector_map).columns())
-    with replacing(Path(path), keep_suffix=True) as temporary:
+    with atomic_replace(Path(path), keep_suffix=True) as temporary:
         pyogrio.raw.write(
             temporary,
             shapely.to_wkb(geometries(shapely, degrees)),

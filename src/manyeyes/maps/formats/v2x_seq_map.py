@@ -5,7 +5,7 @@ Layout: ``LANE`` (``left_boundary`` and ``right_boundary``, ``lane_type``; in th
 ``predecessors``, ``successors`` too), ``JUNCTION`` and ``CROSSWALK`` (``polygon``), ``STOPLINE`` (``centerline``), each by id.
 Points are texts "(x, y)", metres. There is no layer of dividers (specs: maps.md 2.4), so they are derived: of lanes outside
 junctions, a border that another such lane has as well is paint between them; one that no other has is the road's edge.
-:mod:`manyeyes.maps.truth` then makes one line of what is stored twice, and chains what continues.
+:mod:`manyeyes.maps.roads.ground_truth` then makes one line of what is stored twice, and chains what continues.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
-from manyeyes.maps.lane_links import equal_stations, junctions_of_lanes, link_neighbors
-from manyeyes.maps.road_network import PAVED, Crossing, Lane, RoadMark, RoadNetwork
+from manyeyes.maps.roads.lane_links import equal_stations, junctions_of_lanes, link_neighbors
+from manyeyes.maps.roads.road_network import PAVED, Crossing, Lane, RoadMark, RoadNetwork
 
 Array = NDArray[np.float64]
 

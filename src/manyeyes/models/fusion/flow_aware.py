@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from manyeyes.models.fusion.gather import Tokens
-from manyeyes.models.fusion.placement import Placement
-from manyeyes.models.fusion.settle import Fused, Settle, settle
-from manyeyes.models.transformer import AttentionConfig, WindowTransformer
+from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
+from manyeyes.models.fusion.positional_encoding import Placement
+from manyeyes.models.fusion.token_merge import Fused, Settle, settle
+from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
 
 

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import ConfigError, Sites, SparseBev
-from manyeyes.models.fusion.gather import Tokens
-from manyeyes.models.fusion.placement import Placement
-from manyeyes.models.fusion.settle import Fused, Settle, settle
-from manyeyes.models.layers import SubmanifoldLayer
+from manyeyes.models.detector.layers import SubmanifoldLayer
+from manyeyes.models.fusion.positional_encoding import Placement
+from manyeyes.models.fusion.token_merge import Fused, Settle, settle
+from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.sparse_index import distinct
 from manyeyes.ops.voxelize import segment_max
 

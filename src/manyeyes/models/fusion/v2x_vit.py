@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.models.fusion.gather import Tokens
-from manyeyes.models.fusion.placement import Placement
-from manyeyes.models.fusion.settle import Fused, Settle, settle
-from manyeyes.models.transformer import AttentionConfig
+from manyeyes.models.detector.transformer import AttentionConfig
+from manyeyes.models.fusion.positional_encoding import Placement
+from manyeyes.models.fusion.token_merge import Fused, Settle, settle
+from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.voxelize import segment_sum
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
 

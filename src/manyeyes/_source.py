@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A hash of the code that a result follows from, found from the code: kept results of other code are not taken for its own."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parent
+
+
+@lru_cache(maxsize=64)
+def source_digest(*modules: str, package: Path = PACKAGE) -> str:
+    """Hash the import closure of modules of the package, as it was when first asked for.
+
+    Comments, docstrings and layout do not count, statements do. Imports inside functions count, those for type checkers do not;
+    what is imported by a computed name is to be given as a module of its own.
+
+    Args:
+        modules: full names, such as ``manyeyes.evaluation.detection.benchmark``. package: the folder of ``manyeyes``.
+
+    Returns:
+        16 hexadecimal digits.
+    """
+    digest = hashlib.blake2b(digest_size=8)
+    for file in import_closure(*modules, package=package):
+        digest.update(file.relative_to(package).as_posix().encode() + _parsed(file.read_text(encoding="utf-8")).digest)
+    return digest.hexdigest()
+
+
+def import_closure(*modules: str, package: Path = PACKAGE) -> list[Path]:
+    """The files that run when these modules, and all that they import of the package, are used; sorted."""
+    found: set[Path] = set()
+    left = [file for module in modules for file in _files_of(module, package, required=True)]
+    while left:
+        file = left.pop()
+        if file not in found:
+            found.add(file)
+            names = _parsed(file.read_text(encoding="utf-8")).imports
+            left += [other for name in names for other in _files_of(name, package)]
+    return sorted(found)
+
+
+class _Parsed:
+    """What counts of one file: a digest of its statements, and the names in the package that it imports."""
+
+    def __init__(self, text: str) -> None:
+        tree = ast.parse(text)
+        self.imports = tuple(sorted(set(_imports(tree))))
+        self.digest = hashlib.blake2b(ast.dump(_Statements().visit(tree)).encode(), digest_size=16).digest()
+
+
+@lru_cache(maxsize=1024)
+def _parsed(text: str) -> _Parsed:
+    return _Parsed(text)
+
+
+class _Statements(ast.NodeTransformer):
+    """Leaves out strings that stand alone: docstrings of modules, classes, functions and constants."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
+        if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            return None
+        return node
+
+
+def _imports(node: ast.AST) -> Iterator[str]:
+    """Names that are imported at run time; of ``from a import b`` both a and a.b, since b may be a module."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and getattr(child.test, "id", "") == "TYPE_CHECKING":
+            for other in child.orelse:
+                yield from _imports(other)
+        elif isinstance(child, ast.Import):
+            yield from (alias.name for alias in child.names)
+        elif isinstance(child, ast.ImportFrom):
+            if child.level:
+                raise ValueError("Relative imports are not followed; write the full name.")
+            yield str(child.module)
+            yield from (f"{child.module}.{alias.name}" for alias in child.names)
+        else:
+            yield from _imports(child)
+
+
+def _files_of(name: str, package: Path, required: bool = False) -> list[Path]:
+    """The file of a module and those of the packages that hold it, without the outermost; none of another package's names."""
+    first, *parts = name.split(".")
+    if first != package.name:
+        return []
+    files, place = [], package
+    for part in parts:
+        place = place / part
+        if place.with_suffix(".py").is_file():
+            return [*files, place.with_suffix(".py")]
+        if not place.is_dir():
+            break
+        files.append(place / "__init__.py")
+    if required and (not parts or not place.is_dir()):
+        raise ValueError(f"There is no module {name} below {package}.")
+    return files

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes a drive that the shipped weights never saw, lets every agent share bytes and perceive, and judges the result.
+
+Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. What is found is
+compared for ego alone, late, intermediate and early fusion on the same channel. Beside it a map is made: of the drive, where a map
+model ships; else of a crossroads by a simulated crowd.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.studies.replay_options import Playing, excerpt, weights_name
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from manyeyes.datasets.base import Recording
+    from manyeyes.viz.report import Chapter
+
+PRESET = "demo"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Where the drive goes and how it is played."""
+
+    out: Path = Path("out/demo")
+    """Folder for the recording, pictures, animation, report and JSON."""
+    seed: int = 0
+    """Another seed, another drive."""
+    towns: Path | None = None
+    """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
+    frames: int | None = None
+    """At most so many judged frames, instead of all."""
+    animate: bool = True
+    """Draw the animation of the drive."""
+    score_min: float = 0.4
+    """Detections below this score are not drawn; they count all the same."""
+    playing: Playing = field(default_factory=lambda: Playing(channel="its-g5-27"))
+    """How agents collaborate."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    from rich.console import Console
+
+    from manyeyes.datasets.opv2v import Opv2vRecording
+    from manyeyes.models import pretrained
+    from manyeyes.simulator.presets import simulate
+    from manyeyes.simulator.record import Progress
+    from manyeyes.studies.replay_report import REPORT, Showing, play
+    from manyeyes.viz.progress import bars
+    from manyeyes.viz.report import save_report
+
+    console = Console()
+    replay = options.playing.replay_config(options.seed)
+    detector = pretrained.load(options.playing.weights)
+    folder = options.out / "recording" / f"seed-{options.seed}"
+    with bars(console) as progress:
+        task = progress.add_task("Simulating", total=None)
+
+        def report_scene(at: Progress) -> None:
+            progress.update(task, total=at.total, completed=at.done)
+
+        simulate(PRESET, folder, options.seed, 1, report_scene, options.towns)
+    drive = excerpt(Opv2vRecording(folder, "test"), None, options.frames)
+    town = drive.scenario.rpartition("_")[0]
+    if len(drive.judged(drive.scenario)) == 0:
+        raise ConfigError(f"{folder}: the drive has no judged frame; remove the folder and run the demo again.")
+    showing = Showing(
+        out=options.out,
+        title="manyeyes demo: one drive, four ways to collaborate",
+        lead=f"Simulated in {town}, which the shipped weights never saw. All that passes between agents is bytes.",
+        methods=options.playing.methods,
+        replay=replay,
+        weights=weights_name(options.playing.weights),
+        animate=options.animate,
+        score_min=options.score_min,
+        facts=(("Town", town),),
+        commands=(
+            f"manyeyes demo --seed {options.seed}",
+            f"manyeyes run {folder} --split test",
+            f"manyeyes view {folder} --split test --out drive.gif",
+            f"manyeyes map fuse {options.out / 'map'}",
+        ),
+    )
+    report, place = play(drive, detector, showing, console), options.out / REPORT
+    # The report of the detections is on disk before the map begins, so that nothing of it is lost where the map fails.
+    chapters, said = _map(drive, options.out / "map", options.seed, console)
+    save_report(replace(report, chapters=(*chapters, *report.chapters)), place)
+    console.print(f"\n{said}", highlight=False, soft_wrap=True)
+    console.print(f"\nPictures, animation and JSON are in {options.out}; open {place}", highlight=False, soft_wrap=True)
+
+
+def _map(drive: Recording, out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
+    """The map part, or why there is none: it needs an extra of its own."""
+    from manyeyes.datatypes import MissingExtraError
+    from manyeyes.models import pretrained
+
+    try:
+        from manyeyes.cli.demo_map import drive_map, sentence, small_map
+
+        if pretrained.MAPPER in pretrained.mappers():
+            with console.status("Mapping the drive"):
+                said, chapter = drive_map(drive, pretrained.load_mapper(), out, seed)
+            return (chapter,), said
+        with console.status("Mapping a crossroads"):
+            numbers, chapter = small_map(out, seed)
+    except MissingExtraError as error:
+        return (), f"No map: {error}"
+    return (chapter,), sentence(numbers)

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits a codebook to trained weights, so that their tokens can be sent as a few bytes (--precision codes)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from manyeyes.studies.replay_options import FileChecks
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which weights, which scenes, where to."""
+
+    data: Path
+    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario; or a root in DAIR-V2X's layout."""
+    out: Path
+    """The file of the new weights; it may be the old one."""
+    weights: Path
+    """Weights that 'manyeyes train' wrote. They are kept as they are; a codebook that they have is replaced."""
+    split: str | None = "train"
+    """Which split of a dataset: a folder inside it."""
+    stages: int = 4
+    """Bytes for the features of a token."""
+    every: int = 10
+    """Of how many judged frames one is looked at."""
+    seed: int = 0
+    """Of the first centres."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    import torch
+    from rich.console import Console
+
+    from manyeyes.models import checkpoint
+    from manyeyes.models.detector.codebook import CodebookConfig
+    from manyeyes.studies import provenance
+    from manyeyes.studies.recordings import check_files, open_recording
+    from manyeyes.training.detector.codebook import fit
+
+    torch.set_num_threads(1)
+    detector, card = checkpoint.load(options.weights), checkpoint.read_card(options.weights)
+    half = any(v.dtype == torch.float16 for v in checkpoint.read_state(options.weights).values())
+    recording = open_recording(options.data, options.split)
+    console, tokens = Console(), 0
+    missing = check_files(recording, options.checks, console)
+    with console.status("Tokens") as status:
+
+        def report(count: int) -> None:
+            nonlocal tokens
+            tokens = count
+            status.update(f"{count:,} tokens")
+
+        fitted = fit(detector, recording, options.seed, CodebookConfig(options.stages), options.every, report)
+    origin = provenance.provenance({"options": options}, options.seed)
+    made = {"command": origin["command"], "seed": options.seed, "tokens": tokens, "git_commit": origin["git_commit"]}
+    made["missing"] = provenance.plain(missing)
+    checkpoint.save(fitted, options.out, card | {"codebook": made}, half)
+    width = fitted.codebook.width if fitted.codebook else 0
+    console.print(
+        f"{options.out}: a token is {width} bytes before entropy coding, fitted to {tokens:,}", soft_wrap=True
+    )

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Says what changed from one map to another: elements by id, metres by place; optionally as a web page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Options:
+    """Two maps of one frame."""
+
+    old: tyro.conf.Positional[Path]
+    """The earlier map's folder, of 'map fuse'."""
+    new: tyro.conf.Positional[Path]
+    """The later map's folder."""
+    out: Path | None = None
+    """Also write this: .json with all numbers, or .html, a page that shows what is new and what is gone."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    from rich.console import Console
+
+    from manyeyes.datatypes import ConfigError
+    from manyeyes.evaluation.maps.change_summary import map_change
+    from manyeyes.studies import provenance
+    from manyeyes.studies.map_folder import read_vector_map
+    from manyeyes.viz.map_page import page_of_change, save_map_page
+    from manyeyes.viz.map_table import change_terminal
+
+    if options.out is not None and options.out.suffix.lower() not in (".json", ".html"):
+        raise ConfigError(f"--out ends in .json or .html; got {options.out.name}.")
+    console = Console()
+    old, new = read_vector_map(options.old), read_vector_map(options.new)
+    change = map_change(old, new)
+    console.print(change_terminal(change.kinds, f"From {options.old} to {options.new}"))
+    if options.out is None:
+        return
+    if options.out.suffix.lower() == ".json":
+        provenance.write_json(options.out, change, options, None)
+    else:
+        save_map_page(page_of_change(f"{options.old.name} to {options.new.name}", old, new, change), options.out)
+    console.print(f"{options.out} holds it", highlight=False, soft_wrap=True)

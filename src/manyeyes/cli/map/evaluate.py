@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Judges a map against the truth, or runs a study: methods side by side over places, counts and seeds, against bars.
+
+Studies: fusion (four places that nothing was tuned on), noise (pose errors of 0 to 1.5 m), table3 (the CrowdMap paper's Table 3
+as a study), malicious (do liars move what honest agents saw), tuning (all methods with the same budget, on other places).
+Of the map model, on a recording of towns that it was not taught by: local, semi-global and whole (that paper's Tables 1 to 3, from
+sensors), pose (tiles under errors of claimed poses, and behind their corrector).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.studies.maps import MODEL_STUDIES
+from manyeyes.studies.maps.options import Options
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+STUDIES = ("fusion", "noise", "table3", "malicious", "tuning", *MODEL_STUDIES)
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    from rich.console import Console
+
+    if options.study is not None and options.study not in STUDIES:
+        raise ConfigError(f"No study is called {options.study!r}; known: {', '.join(STUDIES)}.")
+    if (options.study is None) == (options.folder is None):
+        raise ConfigError(f"Give a map's folder, or --study with one of {', '.join(STUDIES)}.")
+    console = Console()
+    if options.folder is not None:
+        _judge_one(options, options.folder, console)
+        return
+    if options.study in MODEL_STUDIES:
+        from manyeyes.studies.maps import model_study
+
+        model_study(options, console)
+        return
+    from manyeyes.studies.maps.fleet import study
+
+    study(options, console)
+
+
+def _judge_one(options: Options, path: Path, console: Console) -> None:
+    from manyeyes.evaluation.maps.map_cells import judge_maps
+    from manyeyes.evaluation.maps.spatial_bootstrap import Sureness, ap_interval, f_interval
+    from manyeyes.studies import provenance
+    from manyeyes.studies.map_folder import MapFolder, read_vector_map
+    from manyeyes.viz.map_table import kinds_terminal
+
+    truth_folder = options.truth or path.parent / "truth"
+    if not truth_folder.is_dir():
+        raise ConfigError(f"{truth_folder}: no truth there; name one with --truth.")
+    made, truth = read_vector_map(path).published().elements, read_vector_map(truth_folder).elements
+    cut = MapFolder(truth_folder.parent).cut()
+    judged = cut(made) if cut else made
+    ap, kinds = judge_maps(judged, truth)
+    console.print(kinds_terminal(ap, kinds, f"{path} against {truth_folder}"))
+    sure = tuple(
+        Sureness(row.kind, ap_interval(judged, truth, row.kind), f_interval(judged, truth, row.kind))
+        for row in kinds
+        if row.n_truth
+    )
+    for s in sure:
+        console.print(
+            f"{s.kind}: AP exact {s.ap.value:.3f} [{s.ap.low:.3f}, {s.ap.high:.3f}], "
+            f"F@0.5 m {s.f.value:.3f} [{s.f.low:.3f}, {s.f.high:.3f}] over {s.ap.scenarios} squares of 64 m",
+            highlight=False,
+            soft_wrap=True,
+        )
+    out = path / "quality.json"
+    provenance.write_json(out, {"ap": ap, "kinds": kinds, "intervals": sure}, options, None)
+    console.print(f"All numbers are in {out}", highlight=False, soft_wrap=True)

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes a map for others: GeoJSON, GeoPackage, GeoParquet, Lanelet2, Argoverse 2, nuScenes, PMTiles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is written, and as what."""
+
+    folder: tyro.conf.Positional[Path]
+    """The map's folder, of 'map fuse'."""
+    file: tyro.conf.Positional[Path]
+    """The file; .geojson, .gpkg, .parquet, .osm and .pmtiles name their format, .json needs --format."""
+    format: str | None = None
+    """geojson, geopackage, geoparquet, lanelet2, argoverse2, nuscenes or pmtiles, where the file's ending does not say it."""
+    simplify: float = 0.05
+    """Lines may leave their stations by so much, metres; 0 writes every station."""
+    everything: bool = False
+    """Also what is not published: candidates, deprecated and retired elements."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    from rich.console import Console
+
+    from manyeyes.maps.formats.export import export_map
+    from manyeyes.studies.map_folder import read_vector_map
+
+    made = read_vector_map(options.folder)
+    chosen = made if options.everything else made.published()
+    options.file.parent.mkdir(parents=True, exist_ok=True)
+    export_map(chosen, options.file, options.format, options.simplify)
+    Console().print(f"{options.file}: {len(chosen)} elements", highlight=False, soft_wrap=True)

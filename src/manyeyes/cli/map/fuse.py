@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes one map of a folder of observations: each observation's pose is corrected once, then lines and crossings are fused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from manyeyes.datatypes import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import TaskID
+
+    from manyeyes.maps.store.executors import Executor
+    from manyeyes.maps.store.store import MapStore
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is fused, and how."""
+
+    observations: tyro.conf.Positional[Path]
+    """A Parquet file of observations, a folder of them, or a folder of 'map simulate'; see docs/observation.md."""
+    out: Path | None = None
+    """Folder for the map, two GeoParquet files; 'map' beside the observations by default."""
+    method: str = "manyeyes"
+    """manyeyes, or a rival: union, chamfer_nms, crowdmap_literal, polymerge, frechet_clustering, heatmap_buffer, ..."""
+    store: Path | None = None
+    """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release."""
+    executor: str = "process"
+    """What fuses a store's tiles: inline, process, dask or ray."""
+    workers: int | None = None
+    """How many processes; one a core by default. The map does not depend on it."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    import time
+
+    from rich.console import Console
+
+    from manyeyes.evaluation.maps.registry import Settings, check_method, map_of
+    from manyeyes.studies import provenance
+    from manyeyes.studies.map_folder import observations_in, write_vector_map
+
+    check_method(options.method)
+    console = Console()
+    if options.store is not None:
+        _into_store(options, options.store, console)
+        return
+    reading = observations_in(options.observations, console)
+    base = options.observations if options.observations.is_dir() else options.observations.parent
+    out = options.out or base / ("map" if options.method == "manyeyes" else options.method)
+    start = time.perf_counter()
+    with console.status(f"Fusing {len(reading.observations)} observations"):
+        made = map_of(options.method, reading.observations, Settings(), reading.frame)
+    seconds = time.perf_counter() - start
+    write_vector_map(made, out)
+    published = len(made.published())
+    payload = {
+        "observations": len(reading.observations),
+        "put_aside": len(reading.quarantined),
+        "elements": len(made),
+        "published": published,
+        "hash": made.quantised_hash(),
+        "seconds": seconds,
+    }
+    provenance.write_json(out / "fuse.json", payload, {"options": options, "settings": Settings()}, None)
+    console.print(
+        f"{out}: {published} published elements of {len(made)} from {len(reading.observations)} observations in {seconds:.1f} s",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _into_store(options: Options, folder: Path, console: Console) -> None:
+    """Takes the observations into a store's log and publishes a release, tile by tile."""
+    from manyeyes.maps.elements.observation_file import read_observations
+    from manyeyes.maps.store.executors import named_executor
+    from manyeyes.maps.store.store import MapStore
+    from manyeyes.studies.map_folder import observation_files, say_put_aside
+
+    if options.method != "manyeyes":
+        raise ConfigError(f"A store is fused by manyeyes' own method; fuse without --store for {options.method}.")
+    executor, source = named_executor(options.executor, options.workers), observation_files(options.observations)
+    there = (folder / "store.json").exists()
+    store = MapStore(folder) if there else MapStore.create(folder, read_observations(source).frame)
+    with store.writing() as log:
+        done = log.ingest(source)
+    put_aside = (*log.refused, *done.quarantined)
+    say_put_aside(put_aside, console)
+    number = publish_release(store, executor, console)
+    console.print(
+        f"{folder}: release {number} after {done.added} new observations, {done.known} known, {len(put_aside)} put aside",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def publish_release(store: MapStore, executor: Executor, console: Console) -> int:
+    """Fuse all observations of a store that count, publish the map, and return the release's number."""
+    from manyeyes.viz.progress import bars
+
+    with bars(console) as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def report(step: str, finished: int, total: int) -> None:
+            task = tasks.get(step)
+            if task is None:
+                task = tasks[step] = progress.add_task(step, total=total)
+            progress.update(task, completed=finished, total=total)
+
+        return store.fuse(executor=executor, progress=report).number

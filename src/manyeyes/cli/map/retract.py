@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Retract observations of a store, then fuse and publish the map without them.
+
+The log's files and former releases still hold them: a retraction changes what is fused and erases nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from manyeyes.datatypes import ConfigError
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which observations, and why."""
+
+    store: tyro.conf.Positional[Path]
+    """The store's folder, of 'map fuse --store'."""
+    reason: str
+    """Why; the log records it."""
+    ids: tuple[str, ...] = ()
+    """Ids of observations: 32 hexadecimal digits each, or enough of the first ones to be unique."""
+    agent: str | None = None
+    """Instead of ids: all observations of this pseudonym."""
+    pass_id: str | None = None
+    """Instead of ids: all observations of this pass; with --agent, only that agent's."""
+    fuse: bool = True
+    """Fuse and publish a release at once; else the next fusion leaves them out."""
+    executor: str = "process"
+    """What fuses the tiles: inline, process, dask or ray."""
+    workers: int | None = None
+    """How many processes; one a core by default. The map does not depend on it."""
+
+
+def main(options: Options) -> None:
+    """Run the command."""
+    from rich.console import Console
+
+    from manyeyes.cli.map.fuse import publish_release
+    from manyeyes.maps.store.executors import named_executor
+    from manyeyes.maps.store.store import MapStore, watermark_of
+    from manyeyes.studies.map_folder import say_put_aside
+
+    named = options.agent is not None or options.pass_id is not None
+    if bool(options.ids) == named:
+        raise ConfigError("Name the observations: --ids ID ..., or --agent NAME, --pass-id NAME or both.")
+    if not options.reason.strip():
+        raise ConfigError("--reason is empty; the log records why observations are retracted.")
+    executor = named_executor(options.executor, options.workers)
+    store, console = MapStore(options.store), Console()
+
+    def say(text: str) -> None:
+        console.print(f"{options.store}: {text}", highlight=False, markup=False, soft_wrap=True)
+
+    with store.writing() as log:
+        say_put_aside(log.refused, console)
+        chosen = log.find(options.ids, options.agent, options.pass_id)
+        count = log.retract(chosen, options.reason)
+        standing = log.standing()
+    say(f"{count} observations retracted now, {len(chosen) - count} before; {len(standing)} count")
+    last = store.manifest() if store.releases() else None
+    if last is not None and last.watermark == watermark_of(standing.ids, standing.time_ns):
+        say(f"release {last.number} is already without them")
+    elif options.fuse:
+        say(f"release {publish_release(store, executor, console)} is without them")
+    else:
+        say("no new release; run this again without --no-fuse, or 'manyeyes map fuse OBSERVATIONS --store' this folder")

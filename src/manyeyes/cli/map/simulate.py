@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sends a crowd through a place: observations with the errors that map models make, and the truth that was in view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which place, which crowd."""
+
+    place: tyro.conf.Positional[str] = "cross"
+    """A CARLA town, av2-miami, av2-pittsburgh, lanelet2, cross, grid, or grid-N with N crossroads a side."""
+    observations: int = 60
+    """How many; the first of a larger crowd are those of a smaller one."""
+    crowd: str = "local"
+    """Errors and habits: local, semi-global, perfect, independent-liars, colluding-liars, stale, with-poles."""
+    pose_sigma: float | None = None
+    """Another standard deviation of claimed positions, metres; headings err in proportion, 1 degree a metre."""
+    size: float = 300.0
+    """Side of the area, metres; generated places and logs are never larger than they are."""
+    seed: int = 0
+    """Another seed, other drives."""
+    out: Path | None = None
+    """Folder for observations and truth, out/map/PLACE by default."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from manyeyes.evaluation.maps.experiment import Scene, Trial
+    from manyeyes.simulator.fleet.config import crowd_config
+    from manyeyes.simulator.fleet.place import place
+    from manyeyes.simulator.fleet.simulate import simulate_crowd
+    from manyeyes.studies import provenance
+    from manyeyes.studies.map_folder import MapFolder
+    from manyeyes.viz.progress import bars
+
+    trial = Trial(
+        options.place, options.observations, options.seed, options.size, options.crowd, crowd_config(options.crowd)
+    )
+    trial = trial if options.pose_sigma is None else trial.noisy(options.pose_sigma)
+    out = options.out or Path("out/map") / options.place
+    console = Console()
+    with bars(console) as progress:
+        task = progress.add_task("Driving", total=trial.count)
+        where = place(trial.place, trial.size_m)
+        crowd = simulate_crowd(
+            where, trial.count, trial.crowd, trial.seed, (), lambda done, _: progress.update(task, completed=done)
+        )
+    scene = Scene(trial, crowd)
+    MapFolder(out).write(scene)
+    elements = sum(len(o.elements) for o in scene.observations)
+    payload = {"observations": len(scene.observations), "elements": elements, "true_elements": len(scene.truth)}
+    provenance.write_json(
+        out / "simulate.json", payload, {"options": replace(options, out=out), "trial": trial}, options.seed
+    )
+    console.print(
+        f"{len(scene.observations)} observations of {elements} elements, and {len(scene.truth)} true ones in view, in {out}",
+        highlight=False,
+        soft_wrap=True,
+    )

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes scenes from a seed, in OPV2V's or DAIR-V2X's layout, with counts and hashes; the same bytes at any worker count."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to make, and where."""
+
+    preset: str = "towns-small"
+    """Which set of scenarios; an unknown name lists the known ones."""
+    out: Path | None = None
+    """Folder for the splits and the manifest, data/PRESET or data/PRESET-cameras; a run that was stopped goes on there."""
+    seed: int = 0
+    """Another seed, other scenes."""
+    workers: int = os.cpu_count() or 1
+    """How many processes share the work."""
+    towns: Path | None = None
+    """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
+    cameras: bool = False
+    """Pictures too: four cameras a vehicle and one a pole, beside the clouds."""
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    import json
+
+    from rich.console import Console
+
+    from manyeyes.simulator.presets import simulate, simulation_preset
+    from manyeyes.simulator.record import Progress
+    from manyeyes.studies import provenance
+    from manyeyes.viz.progress import bars
+
+    preset = simulation_preset(options.preset)
+    out = options.out or Path("data") / f"{options.preset}{'-cameras' if options.cameras else ''}"
+    total = sum(part.count for part in preset.splits)
+    console = Console()
+    with bars(console) as progress:
+        task = progress.add_task("Simulating", total=total)
+
+        def report(at: Progress) -> None:
+            progress.update(task, completed=at.done)
+
+        manifest = simulate(options.preset, out, options.seed, options.workers, report, options.towns, options.cameras)
+    held = json.loads(manifest.read_text(encoding="utf-8"))["scenarios"]
+    provenance.write_json(
+        out / "simulate.json",
+        {"scenarios": len(held), "frames": sum(entry["frames"] for entry in held), "manifest": manifest.name},
+        {"options": options, "preset": preset},
+        options.seed,
+    )
+    console.print(
+        f"{len(held)} scenarios in {out}; {manifest} lists counts and hashes", highlight=False, soft_wrap=True
+    )

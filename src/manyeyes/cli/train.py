@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trains a detector or a map model on a recording, or FeaKM on what a detector sees; goes on where a stopped run was.
+
+Several processes (not for FeaKM): torchrun -m manyeyes.cli.main train.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from manyeyes.cli.train_options import Options
+
+if TYPE_CHECKING:
+    from manyeyes.datasets.missing import MissingFiles
+
+
+def main(options: Options) -> None:
+    """The verb."""
+    import torch
+    import torch.distributed as dist
+    from rich.console import Console
+
+    from manyeyes.cli import train_maps as train_map
+    from manyeyes.cli import train_pose as train_feakm
+    from manyeyes.datatypes import ConfigError
+    from manyeyes.studies.recordings import check_files, open_recording
+    from manyeyes.training.detector.presets import TRAINING_PRESETS
+    from manyeyes.training.maps.presets import MAP_TRAINING
+    from manyeyes.training.pose.feakm import FEAKM_TRAINING
+
+    if len(options.weights) > 1 and options.preset not in MAP_TRAINING:
+        raise ConfigError(f"--weights takes one file for {options.preset}; got {len(options.weights)}.")
+    if options.preset in FEAKM_TRAINING:
+        return train_feakm.main(options, Console())
+    if options.preset in MAP_TRAINING:
+        return train_map.main(options)
+    if options.preset not in TRAINING_PRESETS:
+        known = ", ".join((*TRAINING_PRESETS, *FEAKM_TRAINING, *MAP_TRAINING))
+        raise ConfigError(f"No training preset {options.preset!r}; choose one of {known}.")
+    asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
+    config = replace(TRAINING_PRESETS[options.preset], **{k: v for k, v in asked.items() if v is not None})
+    torch.set_num_threads(options.threads)
+    recording = open_recording(options.data, options.split)
+    several = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    missing = check_files(recording, options.checks, Console(quiet=int(os.environ.get("RANK", "0")) > 0))
+    if several:
+        dist.init_process_group("gloo")
+    try:
+        _train(options, config, recording, missing, Console(quiet=several and dist.get_rank() > 0))
+    finally:
+        if several:
+            dist.destroy_process_group()
+
+
+def _train(options: Options, config: Any, recording: Any, missing: MissingFiles, console: Any) -> None:
+    from manyeyes.studies import provenance
+    from manyeyes.training.detector.loop import Progress, train
+    from manyeyes.viz.loss_curve import save_loss_curve
+    from manyeyes.viz.progress import bars
+    from manyeyes.viz.table import missing_footer
+
+    out = options.out or Path("runs") / options.preset
+    origin = provenance.provenance({"options": options, "training": config}, options.seed)
+    card = {"command": origin["command"], "versions": origin["versions"], "git_commit": origin["git_commit"]}
+    last: list[Progress] = []
+    with bars(console) as progress:
+        task = progress.add_task("Training", total=None)
+
+        def report(at: Progress) -> None:
+            progress.update(task, total=at.steps, completed=at.step, description=f"loss {at.loss:.3f}")
+            last[:] = [at]
+
+        weights = train(config, recording, out, options.seed, card, report, *options.weights)
+    if console.quiet:
+        return
+    save_loss_curve(out / "log.jsonl", out / "loss.png")
+    result = {
+        "weights": weights.name,
+        "loss": last[0].loss if last else None,
+        "seconds": last[0].seconds if last else None,
+        "missing": missing,
+    }
+    provenance.write_json(out / "train.json", result, {"options": options, "training": config}, options.seed)
+    if missing.count:
+        console.print(missing_footer(missing.count, "train.json"), highlight=False, soft_wrap=True)
+    console.print(f"{weights}; the loss over steps is in {out / 'loss.png'}", highlight=False, soft_wrap=True)

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trains FeaKM's net on what a frozen detector sees; the part of the verb train that its presets ask for."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from manyeyes.cli.train_options import Options
+    from manyeyes.datasets.base import Recording
+    from manyeyes.datasets.missing import MissingFiles
+    from manyeyes.models.detector.detector import Detector
+    from manyeyes.training.pose.feakm import FeakmTrainConfig
+    from manyeyes.training.pose.feakm_cache import FeatureCache
+
+
+def main(options: Options, console: Any) -> None:
+    """See the recording once with the detector, or find that done; then train, or go on."""
+    import torch
+
+    from manyeyes.models import pretrained
+    from manyeyes.studies import provenance
+    from manyeyes.studies.recordings import check_files, open_recording
+    from manyeyes.training.pose.feakm import FEAKM_TRAINING, MatchProgress, train_feakm
+    from manyeyes.viz.loss_curve import save_loss_curve
+    from manyeyes.viz.progress import bars
+    from manyeyes.viz.table import missing_footer
+
+    asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
+    config = replace(FEAKM_TRAINING[options.preset], **{k: v for k, v in asked.items() if v is not None})
+    torch.set_num_threads(options.threads)
+    detector = pretrained.load(options.weights[0] if options.weights else pretrained.DEFAULT)
+    config = fitted(config, detector)
+    out = options.out or Path("runs") / options.preset
+    origin = provenance.provenance({"options": options, "training": config}, options.seed)
+    card = {name: origin[name] for name in ("command", "versions", "git_commit")}
+    last: list[MatchProgress] = []
+    recording = open_recording(options.data, options.split)
+    missing = check_files(recording, options.checks, console)
+    with bars(console) as progress:
+        cache = _seen(options, recording, missing, detector, progress)
+        task = progress.add_task("Training", total=config.steps)
+
+        def report(at: MatchProgress) -> None:
+            told = f"loss {at.loss:.3f}, recall {at.recall:.2f}, precision {at.precision:.2f}"
+            progress.update(task, completed=at.step, description=told)
+            last[:] = [at]
+
+        weights = train_feakm(config, cache, out, options.seed, card, report)
+    save_loss_curve(out / "log.jsonl", out / "loss.png")
+    result = {"weights": weights.name, "loss": last[0].loss if last else None, "missing": missing}
+    provenance.write_json(out / "train.json", result, {"options": options, "training": config}, options.seed)
+    if missing.count:
+        console.print(missing_footer(missing.count, "train.json"), highlight=False, soft_wrap=True)
+    console.print(f"{weights}; the loss over steps is in {out / 'loss.png'}", highlight=False, soft_wrap=True)
+
+
+def fitted(config: FeakmTrainConfig, detector: Detector) -> FeakmTrainConfig:
+    """The settings for this detector's views."""
+    keypoints = replace(config.net.keypoints, inputs=detector.encoder.out_channels)
+    return replace(config, net=replace(config.net, keypoints=keypoints, detector=detector.fingerprint.hex()))
+
+
+def _seen(
+    options: Options, recording: Recording, missing: MissingFiles, detector: Detector, progress: Progress
+) -> FeatureCache:
+    """Kept under runs/views, by detector, data, split and missing files, so that both presets share it."""
+    from manyeyes.training.pose.feakm_cache import build, wanted
+
+    lacking = f"|{missing}" if missing.count else ""
+    where = hashlib.blake2b(f"{options.data.resolve()}|{options.split}{lacking}".encode(), digest_size=4).hexdigest()
+    task = progress.add_task("Seeing", total=len(wanted(recording)))
+    cache = None
+    for cache in build(recording, detector, Path("runs") / "views" / where):
+        progress.update(task, completed=len(cache.snapshots))
+    assert cache is not None  # wanted refuses a recording without a snapshot
+    return cache

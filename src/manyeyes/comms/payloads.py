@@ -1,0 +1,492 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The bodies of packets: tokens, objects, points, requests to bytes and back, as :mod:`manyeyes.comms.wire` lays down.
+
+Those of map elements stand in :mod:`manyeyes.comms.map_payload`.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from manyeyes.comms import primitives
+from manyeyes.comms.entropy import MOST_CELLS, CodeTables, coded_counts, pack_coded, unpack_coded
+from manyeyes.comms.map_payload import ElementRows, read_elements
+from manyeyes.comms.primitives import PacketError
+from manyeyes.datatypes import LABELS, BevGrid, Boxes, ConfigError, PointCloud, Sites, SparseBev, WireError
+from manyeyes.datatypes.message import DESCRIPTOR, RequestMap
+
+Precision = Literal["float32", "float16", "int8", "codes"]
+
+PRECISIONS: tuple[Precision, ...] = ("float32", "float16", "int8", "codes")
+# The middle of what drives in European cities.
+LABEL_HEIGHTS = (1.6, 2.3, 3.2, 3.2)
+NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS = range(6)
+
+_GRID = struct.Struct("<6hHB")
+_TOKENS = struct.Struct("<BHH")
+TOKENS_BYTES = _GRID.size + _TOKENS.size
+_OBJECT = np.dtype(
+    [("xy", "<i2", 2), ("yaw", "<i2"), ("size", "u1", 2), ("score", "u1")]
+    + [(name, "u1") for name in ("sigma_xy", "sigma_yaw", "label_flip", "id")]
+)
+_VELOCITY, _DESCRIPTOR = 1, 2
+_METRES_PER_S = 0.25
+_POINT = np.dtype([("xyz", "<i2", 3), ("intensity", "u1")])
+_FEATURE_TYPES: dict[Precision, np.dtype[Any]] = {
+    "float32": np.dtype("<f4"),
+    "float16": np.dtype("<f2"),
+    "int8": np.dtype("i1"),
+    "codes": np.dtype("u1"),
+}
+_CODED = 2
+_MOST_CELLS = 1 << 24
+_SIGMA_XY, _SIGMA_YAW = (0.01, 20.0), (0.001, 3.2)
+
+
+@dataclass(frozen=True, eq=False)
+class TokenRows:
+    """Some cells of a grid: key (n,) ascending; scales and values: the bytes of C scale codes (none but for int8) and n rows
+    of C.
+    """
+
+    grid: BevGrid
+    precision: Precision
+    channels: int
+    key: NDArray[np.int64]
+    scales: bytes
+    values: bytes
+
+    @property
+    def features(self) -> NDArray[Any]:
+        """(n, C) float32, what the values stand for; uint8 where they are codes."""
+        return _features([self])
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectRows:
+    """Some objects, as they stand in the packet."""
+
+    rows: NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class PointRows:
+    """Some points, as they stand in the packet."""
+
+    rows: NDArray[Any]
+
+
+Body = TokenRows | ObjectRows | PointRows | RequestMap | ElementRows | None
+
+
+def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int16]:
+    """Metres as int16 centimetres; what does not fit is a WireError that names it."""
+    codes = np.rint(metres.astype(np.float64) * 100)
+    bad = ~(np.abs(codes) <= 32767)
+    if bad.any():
+        raise WireError(
+            f"{what} are sent within 327.67 m of the agent; {int(bad.sum())} values are not: crop them first."
+        )
+    return codes.astype(np.int16)
+
+
+def _object_type(flags: int) -> np.dtype[Any]:
+    """The row of an object, with what the flags of its body add."""
+    velocity = [("velocity", "i1", 2)] if flags & _VELOCITY else []
+    return np.dtype(_OBJECT.descr + velocity + ([("descriptor", "i1", DESCRIPTOR)] if flags & _DESCRIPTOR else []))
+
+
+def object_bodies(boxes: Boxes, descriptors: Tensor | None, capacity: int) -> list[bytes]:
+    """Bodies of whole objects, the highest score first; no objects are one body without rows.
+
+    Velocities are sent where any of them is not 0, descriptors where there are any.
+    """
+    order = boxes.score.argsort(descending=True, stable=True)
+    boxes = boxes[order]
+    values = torch.cat(
+        [
+            boxes.center,
+            boxes.size,
+            torch.stack((boxes.yaw, boxes.score, boxes.sigma_xy, boxes.sigma_yaw, boxes.flip), -1),
+            boxes.velocity,
+        ],
+        -1,
+    )
+    values = values.detach().double().cpu()
+    if not bool(torch.isfinite(values).all()):
+        raise WireError("Message.objects has NaN or infinite values; drop those objects before sending.")
+    label = boxes.label.cpu().numpy()
+    if len(label) and not (label.min() >= 0 and label.max() < len(LABELS)):
+        raise WireError(
+            f"Message.objects.label is an index into {LABELS}; got {int(label.min())} to {int(label.max())}."
+        )
+    v = values.numpy()
+    velocity = np.clip(np.rint(v[:, 11:] / _METRES_PER_S), -127, 127)
+    flags = (_VELOCITY if velocity.any() else 0) | (_DESCRIPTOR if descriptors is not None else 0)
+    rows = np.zeros(len(boxes), _object_type(flags))
+    rows["xy"] = _centimetres(v[:, :2], "Objects")
+    hundredths = np.rint(np.rad2deg(v[:, 6]) * 100)
+    rows["yaw"] = np.mod(hundredths + 18000, 36000) - 18000
+    rows["size"] = np.clip(np.rint(v[:, 3:5] * 10), 1, 255)
+    rows["score"] = np.rint(np.clip(v[:, 7], 0, 1) * 255)
+    rows["sigma_xy"] = primitives.log_codes(v[:, 8], *_SIGMA_XY)
+    rows["sigma_yaw"] = primitives.log_codes(v[:, 9], *_SIGMA_YAW)
+    rows["label_flip"] = label | np.rint(np.clip(v[:, 10], 0, 1) * 31).astype(np.int64) << 3
+    ids = boxes.id.cpu().numpy()
+    rows["id"] = np.where(ids < 0, 255, np.mod(ids, 255))
+    if flags & _VELOCITY:
+        rows["velocity"] = velocity
+    if descriptors is not None:
+        rows["descriptor"] = _descriptor_codes(descriptors, len(boxes))[order.cpu().numpy()]
+    each, head = (capacity - 1) // rows.dtype.itemsize, bytes([flags])
+    return [head + rows[i : i + each].tobytes() for i in range(0, max(len(rows), 1), each)]
+
+
+def _descriptor_codes(descriptors: Tensor, count: int) -> NDArray[np.int8]:
+    values = descriptors.detach().double().cpu()
+    if tuple(values.shape) != (count, DESCRIPTOR) or not bool((values.abs() <= 1).all()):
+        raise WireError(
+            f"Message.descriptors needs ({count}, {DESCRIPTOR}) in [-1, 1], one an object; got {tuple(values.shape)}."
+        )
+    return np.rint(values.numpy() * 127).astype(np.int8)
+
+
+def point_bodies(cloud: PointCloud, capacity: int) -> list[bytes]:
+    """Bodies of whole points, dealt out in turn; no points are one empty body."""
+    rows = np.zeros(len(cloud), _POINT)
+    rows["xyz"] = _centimetres(cloud.xyz.cpu().numpy(), "Points")
+    rows["intensity"] = np.rint(np.clip(np.nan_to_num(cloud.intensity.cpu().numpy()), 0, 1) * 255)
+    packets = max(1, -(-len(rows) // (capacity // _POINT.itemsize)))
+    return [rows[k::packets].tobytes() for k in range(packets)]
+
+
+def token_order(tokens: SparseBev, score: Tensor | None) -> NDArray[np.int64]:
+    """(N,) rows of tokens by falling score, ties and a missing score by key: the order in which they are sent."""
+    if tokens.sites.batch_size != 1:
+        raise WireError(f"A message has the tokens of one grid; got a batch of {tokens.sites.batch_size}.")
+    if score is None:
+        return np.arange(len(tokens.sites))
+    if score.shape != (len(tokens.sites),) or bool(score.isnan().any()):
+        raise WireError(f"Message.token_score needs ({len(tokens.sites)},) without NaN; got {tuple(score.shape)}.")
+    return score.detach().argsort(descending=True, stable=True).cpu().numpy()
+
+
+@dataclass(frozen=True)
+class Form:
+    """How tokens are written: precision, and the tables by which codes are, or None where their bytes are sent as they are."""
+
+    precision: Precision
+    tables: CodeTables | None = None
+
+    def __post_init__(self) -> None:
+        if self.precision not in PRECISIONS:
+            raise ConfigError(f"precision is one of {', '.join(PRECISIONS)}; got {self.precision!r}.")
+
+    def tables_of(self, tokens: SparseBev) -> CodeTables | None:
+        """The tables, where these tokens are to be coded by them; tokens of another kind than the form's are a WireError."""
+        codes = tokens.features.dtype == torch.uint8
+        if codes != (self.precision == "codes"):
+            raise WireError(
+                f"Tokens of {tokens.features.dtype} are not sent as {self.precision}: codes are uint8 rows of the model's "
+                "codebook, and only codes are."
+            )
+        if not codes or self.tables is None:
+            return None
+        if self.tables.width != tokens.features.shape[1]:
+            raise WireError(
+                f"The tables are of rows of {self.tables.width} bytes; these have {tokens.features.shape[1]}."
+            )
+        rows, columns = tokens.grid.shape
+        return self.tables if rows * columns <= MOST_CELLS else None
+
+
+def packet_counts(
+    tokens: SparseBev,
+    order: NDArray[np.int64],
+    form: Form,
+    capacity: int,
+    header_bytes: int = 0,
+    budget_bytes: int | None = None,
+) -> list[int]:
+    """How many cells each tokens packet takes, in that order (N,) of rows: bodies of at most capacity bytes.
+
+    Bodies with header_bytes each take at most budget_bytes altogether. Each packet is filled before the next is begun,
+    so a smaller budget keeps a prefix of what a larger one keeps.
+    """
+    channels, precision, tables = tokens.features.shape[1], form.precision, form.tables_of(tokens)
+    each = channels * _FEATURE_TYPES[precision].itemsize
+    fixed = TOKENS_BYTES + (channels if precision == "int8" else 0)
+    if channels < 1 or channels > 65535 or fixed + each + 5 > capacity:
+        raise WireError(
+            f"One cell of {channels} channels as {precision} does not fit a body of {capacity} bytes: lower the "
+            "precision or raise the mtu."
+        )
+    key = np.ascontiguousarray(tokens.sites.key.cpu().numpy()[order], np.int64)
+    left = -1 if budget_bytes is None else max(0, budget_bytes)
+    if tables is None:
+        return primitives.counts_in_room(key, each, fixed, capacity, header_bytes, left).tolist()
+    rows = tokens.features.cpu().numpy()[order]
+    return coded_counts(key, rows, tokens.grid.shape, tables, fixed, capacity, header_bytes, left).tolist()
+
+
+def _grid_fields(grid: BevGrid) -> tuple[int, ...]:
+    """The grid as the integers of the format; a grid that they do not name exactly is a WireError."""
+    ends = (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
+    fields = (*(round(v * 100) for v in ends), round(grid.pillar * 1000), grid.stride)
+    rows, columns = grid.shape
+    if (
+        any(abs(v) > 32767 for v in fields[:6])
+        or fields[6] > 65535
+        or _grid(fields) != grid
+        or rows * columns > _MOST_CELLS
+    ):
+        raise WireError(
+            "A grid is sent in whole centimetres within 327.67 m, a pillar in whole millimetres, at most 2^24 cells; "
+            f"got {grid}."
+        )
+    return fields
+
+
+@lru_cache(maxsize=64)
+def _grid(fields: tuple[int, ...]) -> BevGrid:
+    # A correctly rounded quotient gives back the very float that 140.8 is in the source of both sides.
+    return BevGrid(*(v / 100 for v in fields[:6]), pillar=fields[6] / 1000, stride=fields[7])
+
+
+@lru_cache(maxsize=64)
+def _grid_and_cells(fields: tuple[int, ...]) -> tuple[BevGrid, int]:
+    grid = _grid(fields)
+    rows, columns = grid.shape
+    return grid, rows * columns
+
+
+def token_bodies(tokens: SparseBev, score: Tensor | None, form: Form, capacity: int) -> list[bytes]:
+    """The bodies of the tokens packets, the cells of highest score in the first."""
+    order = token_order(tokens, score)
+    key, precision = tokens.sites.key.cpu().numpy()[order], form.precision
+    features = tokens.features.detach().cpu()
+    features = features if precision == "codes" else features.float()
+    largest, peak = 65504 if precision == "float16" else math.inf, 0.0
+    if features.numel() and precision != "codes":
+        peak = float(features.abs().max())
+    if not (math.isfinite(peak) and peak <= largest):
+        raise WireError(f"Features sent as {precision} must be finite and at most {largest:g}; these are not.")
+    grid, channels = _GRID.pack(*_grid_fields(tokens.grid)), features.shape[1]
+    counts = packet_counts(tokens, order, form, capacity) or [0]
+    # All bodies at once, each with its cells in ascending order.
+    inner = np.argsort(np.repeat(np.arange(len(counts)) * _MOST_CELLS, counts) + key)
+    key, features = key[inner], features.index_select(0, torch.from_numpy(order[inner]))
+    number, tables = PRECISIONS.index(precision), form.tables_of(tokens)
+
+    def head(layout: int, count: int) -> bytes:
+        return grid + _TOKENS.pack(number | layout << 2, channels, count)
+
+    if tables is not None:
+        rows, ends = features.numpy(), np.cumsum([0, *counts])
+        return [
+            head(_CODED, b - a) + pack_coded(key[a:b], rows[a:b], tokens.grid.shape, tables)
+            for a, b in pairwise(ends.tolist())
+        ]
+    cells = primitives.pack_cell_runs(key, counts)
+    values, scales = _values(features, precision, counts)
+    each, bodies, at = channels * _FEATURE_TYPES[precision].itemsize, [], 0
+    for count, (layout, packed), scale in zip(counts, cells, scales):
+        end = at + count * each
+        bodies.append(b"".join((head(layout, count), packed, scale, values[at:end])))
+        at = end
+    return bodies
+
+
+def request_body(request: RequestMap, capacity: int) -> bytes:
+    """The body of the one packet of a request map."""
+    sure = request.sure.detach().double().cpu()
+    if not bool(((sure >= 0) & (sure <= 1)).all()):
+        raise WireError("Message.request.sure is from 0 to 1; this is not.")
+    if _GRID.size + sure.numel() > capacity:
+        raise WireError(
+            f"A request map fits one packet, {capacity - _GRID.size} cells; got {sure.numel()}: coarser, please."
+        )
+    return _GRID.pack(*_grid_fields(request.grid)) + np.rint(sure.numpy() * 255).astype(np.uint8).tobytes()
+
+
+def _values(features: Tensor, precision: Precision, counts: list[int]) -> tuple[bytes, list[bytes]]:
+    """Features (N, C) as the bytes of their rows, and the bytes of each body's scales; counts: the rows of each body."""
+    if precision == "int8":
+        codes, steps = primitives.quantise_int8_runs(features.numpy(), counts)
+        return steps.tobytes(), [code.tobytes() for code in codes]
+    if precision == "codes":
+        return features.numpy().tobytes(), [b""] * len(counts)
+    # Several times as fast here as numpy's conversion, to the same bits.
+    rows = (features.half() if precision == "float16" else features).numpy()
+    return rows.astype(_FEATURE_TYPES[precision], copy=False).tobytes(), [b""] * len(counts)
+
+
+def read_body(kind: int, body: bytes, fingerprint: bytes, tables: CodeTables | None) -> Body:
+    """The rows of a body, checked; whatever is wrong is a PacketError with a reason.
+
+    tables: of the reader's weights; coded tokens can only be read by those that the packet's fingerprint names.
+    """
+    if kind == TOKENS:
+        return _read_tokens(body, fingerprint, tables)
+    if kind == OBJECTS:
+        return _read_objects(body)
+    if kind == REQUEST:
+        return _read_request(body)
+    if kind == ELEMENTS:
+        return read_elements(body)
+    if kind == POINTS:
+        return PointRows(_rows(body, _POINT))
+    if kind != NONE or body:
+        raise PacketError("garbage", f"A body of kind {kind} and {len(body)} bytes is not known.")
+    return None
+
+
+def _rows(body: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
+    if len(body) % dtype.itemsize:
+        raise PacketError("garbage", f"Rows of {dtype.itemsize} bytes do not fill a body of {len(body)}.")
+    return np.frombuffer(body, dtype)
+
+
+def _read_objects(body: bytes) -> ObjectRows:
+    if not body or body[0] & ~(_VELOCITY | _DESCRIPTOR):
+        raise PacketError("garbage", "A body of objects begins with its flags, of which two are known.")
+    rows = _rows(body[1:], _object_type(body[0]))
+    good = (rows["label_flip"] & 7 < len(LABELS)) & (rows["size"] > 0).all(-1)
+    good &= (rows["yaw"] >= -18000) & (rows["yaw"] < 18000)
+    for name in set(rows.dtype.names or ()) & {"velocity", "descriptor"}:
+        good &= (rows[name] > -128).all(-1)
+    if not good.all():
+        raise PacketError(
+            "implausible", f"{int((~good).sum())} objects have an unknown label, no size, or a number out of range."
+        )
+    return ObjectRows(rows)
+
+
+def _read_grid(body: bytes) -> tuple[BevGrid, int]:
+    """The grid that a body begins with, and its cells."""
+    if len(body) < _GRID.size:
+        raise PacketError("garbage", f"A grid has {_GRID.size} bytes; got {len(body)}.")
+    try:
+        grid, cells = _grid_and_cells(_GRID.unpack_from(body))
+    except ConfigError as error:
+        raise PacketError("implausible", str(error)) from error
+    if cells > _MOST_CELLS:
+        raise PacketError("implausible", f"A grid of {cells} cells is huge.")
+    return grid, cells
+
+
+def _read_request(body: bytes) -> RequestMap:
+    grid, cells = _read_grid(body)
+    if len(body) != _GRID.size + cells:
+        raise PacketError("garbage", f"A request of {cells} cells does not fill a body of {len(body)} bytes.")
+    sure = np.frombuffer(body, np.uint8, offset=_GRID.size).astype(np.float32) / 255
+    return RequestMap(grid, torch.from_numpy(sure).view(grid.shape))
+
+
+def _read_tokens(body: bytes, fingerprint: bytes, tables: CodeTables | None) -> TokenRows:
+    if len(body) < TOKENS_BYTES:
+        raise PacketError("garbage", f"A tokens body begins with {TOKENS_BYTES} bytes; got {len(body)}.")
+    grid, cells = _read_grid(body)
+    form, channels, count = _TOKENS.unpack_from(body, _GRID.size)
+    precision, layout, data = PRECISIONS[form & 3], form >> 2, body[TOKENS_BYTES:]
+    if layout > (_CODED if precision == "codes" else primitives.BITMAP) or not channels:
+        raise PacketError("garbage", f"Unknown form of tokens: {form:#04x}, {channels} channels.")
+    if layout == _CODED:
+        if tables is None or tables.fingerprint != fingerprint:
+            raise PacketError("wrong_model", "These tokens are coded by the tables of other weights.")
+        if tables.width != channels or cells > MOST_CELLS:
+            raise PacketError("implausible", f"Coded rows of {channels} bytes on {cells} cells are not of this model.")
+        key, rows = unpack_coded(data, count, grid.shape, tables)
+        return TokenRows(grid, precision, channels, key, b"", rows.tobytes())
+    key, used = primitives.unpack_cells(layout, data, count)
+    if count and int(key[-1]) >= cells:
+        raise PacketError("implausible", f"Cells lie outside a grid of {grid.shape} rows and columns.")
+    size = _FEATURE_TYPES[precision].itemsize
+    end = used + (channels if precision == "int8" else 0)
+    if len(data) != end + count * channels * size:
+        raise PacketError(
+            "garbage", f"{count} cells of {channels} channels as {precision} do not fill {len(body)} bytes."
+        )
+    if size > 1 and not primitives.are_finite(data, used, size):
+        raise PacketError("implausible", "Features are NaN or infinite.")
+    return TokenRows(grid, precision, channels, key, data[used:end], data[end:])
+
+
+def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
+    """The cells of several packets, all of one form, as one set, by key; None of none."""
+    if not parts:
+        return None
+    key = np.concatenate([p.key for p in parts])
+    order = np.argsort(key)
+    features = torch.from_numpy(_features(parts)).index_select(0, torch.from_numpy(order))
+    return SparseBev(features, Sites(torch.from_numpy(key[order]), parts[0].grid))
+
+
+def _features(parts: list[TokenRows]) -> NDArray[Any]:
+    """(n, C) float32, or uint8 of codes, of the rows of several packets of one form."""
+    dtype, channels = _FEATURE_TYPES[parts[0].precision], parts[0].channels
+    # A copy that may be written to, in the machine's own order of bytes.
+    values = np.frombuffer(b"".join(p.values for p in parts), dtype).astype(dtype.newbyteorder("="))
+    values = values.reshape(-1, channels)
+    if parts[0].precision == "int8":
+        codes = np.frombuffer(b"".join(p.scales for p in parts), np.uint8).reshape(-1, channels)
+        return primitives.dequantise_int8(np.repeat(codes, [len(p.key) for p in parts], axis=0), values)
+    if parts[0].precision == "codes":
+        return values
+    return torch.from_numpy(values).float().numpy()
+
+
+def merge_objects(parts: list[NDArray[Any]]) -> Boxes | None:
+    """The objects of several packets, in that order, with height and z from their labels; None of none."""
+    if not parts:
+        return None
+    rows = np.concatenate(parts)
+    label = torch.from_numpy((rows["label_flip"] & 7).astype(np.int64))
+    height = torch.tensor(LABEL_HEIGHTS)[label]
+    ids = rows["id"].astype(np.int64)
+    return Boxes(
+        center=torch.cat((torch.from_numpy(rows["xy"].astype(np.float32) / 100), height[:, None] / 2), -1),
+        size=torch.cat((torch.from_numpy(rows["size"].astype(np.float32) / 10), height[:, None]), -1),
+        yaw=torch.from_numpy(np.deg2rad(rows["yaw"] / 100).astype(np.float32)),
+        score=torch.from_numpy(rows["score"].astype(np.float32) / 255),
+        label=label,
+        id=torch.from_numpy(np.where(ids == 255, -1, ids)),
+        sigma_xy=torch.from_numpy(primitives.log_values(rows["sigma_xy"], *_SIGMA_XY)),
+        sigma_yaw=torch.from_numpy(primitives.log_values(rows["sigma_yaw"], *_SIGMA_YAW)),
+        flip=torch.from_numpy((rows["label_flip"] >> 3).astype(np.float32) / 31),
+        velocity=torch.from_numpy(_numbers(rows, "velocity", 2) * np.float32(_METRES_PER_S)),
+    )
+
+
+def merge_descriptors(parts: list[NDArray[Any]]) -> Tensor | None:
+    """(N, DESCRIPTOR) of the objects of several packets, in that order; None where they have none."""
+    if not parts or "descriptor" not in (parts[0].dtype.names or ()):
+        return None
+    return torch.from_numpy(_numbers(np.concatenate(parts), "descriptor", DESCRIPTOR) / np.float32(127))
+
+
+def _numbers(rows: NDArray[Any], name: str, width: int) -> NDArray[np.float32]:
+    """A column of small integers, zeros where the rows have none."""
+    known = name in (rows.dtype.names or ())
+    return rows[name].astype(np.float32) if known else np.zeros((len(rows), width), np.float32)
+
+
+def merge_points(parts: list[NDArray[Any]]) -> PointCloud | None:
+    """The points of several packets in the sender's order, less those lost; None of none."""
+    if not parts:
+        return None
+    # Packet k of K holds points k, k + K, …: sorting by place within the packet restores the order.
+    place = np.concatenate([np.arange(len(p)) for p in parts])
+    rows = np.concatenate(parts)[np.argsort(place, kind="stable")]
+    xyz = torch.from_numpy(rows["xyz"].astype(np.float32) / 100)
+    return PointCloud.of(xyz, torch.from_numpy(rows["intensity"].astype(np.float32) / 255))

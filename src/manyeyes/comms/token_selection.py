@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which cells to send when bytes are few: the best by score, in exactly the bytes that the wire will count."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from manyeyes.comms.entropy import CodeTables
+from manyeyes.comms.payloads import Form, Precision, packet_counts, token_order
+from manyeyes.comms.wire import DEFAULT_MTU, HEADER_BYTES
+from manyeyes.datatypes import SparseBev
+
+
+def within_budget(
+    bev: SparseBev,
+    score: Tensor,
+    budget_bytes: int | None,
+    precision: Precision = "float16",
+    mtu: int = DEFAULT_MTU,
+    tables: CodeTables | None = None,
+) -> tuple[SparseBev, Tensor]:
+    """The cells of highest score (N,), ties by key, whose packets together have at most budget_bytes; None is no limit.
+
+    Header, cell indices, scales and checksums are counted, so that the packets ``wire.encode`` makes of the result
+    never exceed the budget. A smaller budget keeps a subset. A budget that holds no cell keeps none: then the section
+    is left out of the message (an empty section would still cost its header). Source: CoSTr Eq. 13 with real bytes.
+    """
+    form = Form(precision, tables)
+    order = token_order(bev, score)
+    if budget_bytes is None:
+        return bev, score
+    kept = sum(packet_counts(bev, order, form, mtu - HEADER_BYTES, HEADER_BYTES, budget_bytes))
+    mask = torch.zeros(len(order), dtype=torch.bool)
+    mask[torch.from_numpy(order[:kept])] = True
+    mask = mask.to(score.device)
+    return bev.keep(mask), score[mask]

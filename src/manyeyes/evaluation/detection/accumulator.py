@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one method did, counted step by step as a drive is played, and the numbers that follow from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from manyeyes.agents.replay import Step
+from manyeyes.evaluation.detection.average_precision import (
+    ApResult,
+    FrameMatch,
+    FrameOverlap,
+    FrameResult,
+    Protocol,
+    ap_of_matches,
+    ego_truth,
+    match_frame,
+    overlap_frame,
+)
+from manyeyes.evaluation.detection.communication import Communication, MessageRecord, summarise
+from manyeyes.evaluation.statistics.bootstrap import Interval, paired_difference, scenario_interval
+
+IOUS = (0.5, 0.7)
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """One method over all scenarios. ap and intervals: one an IoU threshold, in the order of IOUS."""
+
+    method: str
+    ap: tuple[ApResult, ...]
+    intervals: tuple[Interval, ...]
+    communication: Communication
+    age_ms: float
+    share_ms: float
+    perceive_ms: float
+
+    def less(self, other: MethodResult, iou: int, protocol: Protocol) -> Interval:
+        """AP of this method minus that of another, paired over scenarios. iou: index into IOUS."""
+        return paired_difference(self.ap[iou].frames, other.ap[iou].frames, protocol=protocol)
+
+
+@dataclass
+class Tally:
+    """What one method did so far, in the little that judging needs: no cloud is kept.
+
+    speeds: (G,) m/s of each frame's true boxes. Messages are those that other agents sent for an ego's frame, arrived or not.
+    share_s counts calls that said something.
+    """
+
+    method: str
+    protocol: Protocol
+    frames: list[FrameOverlap] = field(default_factory=list)
+    speeds: list[Tensor] = field(default_factory=list)
+    messages: list[MessageRecord] = field(default_factory=list)
+    ages_s: list[float] = field(default_factory=list)
+    share_s: list[float] = field(default_factory=list)
+    perceive_s: list[float] = field(default_factory=list)
+
+    def add(self, step: Step) -> None:
+        """Count one ego at one instant."""
+        snapshot, ego = step.snapshot, step.snapshot.frames[step.ego].agent_id
+        truth = ego_truth(snapshot, step.ego, self.protocol)
+        result = FrameResult(snapshot.scenario, snapshot.index, step.boxes, truth)
+        self.frames.append(overlap_frame(result, self.protocol))
+        self.speeds.append(truth.velocity.norm(dim=1))
+        heard = (h.message for h in step.perception.heard)
+        arrived = {m.agent_id: tuple(m.tokens.features.shape) for m in heard if m.tokens is not None}
+        for sent in step.sent:
+            if sent.packets:
+                self.share_s.append(sent.seconds)
+            if sent.packets and sent.agent_id != ego:
+                cells, channels = arrived.get(sent.agent_id, (0, 0))
+                record = MessageRecord(
+                    snapshot.scenario, snapshot.index, sent.agent_id, sent.bytes, cells, channels, ego=ego
+                )
+                self.messages.append(record)
+        self.ages_s += step.ages_s
+        self.perceive_s.append(step.perceive_seconds)
+
+    def extend(self, other: Tally) -> None:
+        """Count what another tally of this method counted."""
+        self.frames += other.frames
+        self.speeds += other.speeds
+        self.messages += other.messages
+        self.ages_s += other.ages_s
+        self.share_s += other.share_s
+        self.perceive_s += other.perceive_s
+
+    def matches(self) -> tuple[tuple[FrameMatch, ...], ...]:
+        """The frames matched at each of IOUS, in the order they came in."""
+        return tuple(tuple(match_frame(frame, iou, self.protocol) for frame in self.frames) for iou in IOUS)
+
+    def communication(self) -> Communication:
+        """What was sent."""
+        return summarise(self.messages, len(self.frames))
+
+    def age_ms(self) -> float:
+        """The mean age of what took part, when it was used; NaN where nothing did."""
+        return _mean_ms(self.ages_s)
+
+    def result(self) -> MethodResult:
+        """The numbers of everything counted so far."""
+        matches = self.matches()
+        return MethodResult(
+            self.method,
+            tuple(ap_of_matches(m, self.protocol) for m in matches),
+            tuple(scenario_interval(m, protocol=self.protocol) for m in matches),
+            self.communication(),
+            self.age_ms(),
+            _mean_ms(self.share_s),
+            _mean_ms(self.perceive_s),
+        )
+
+
+def _mean_ms(seconds: Sequence[float]) -> float:
+    return 1000 * sum(seconds) / len(seconds) if seconds else math.nan

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording in which everybody looks once a scenario, at an instant of the seed: a crowd of drivers, not a film."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from manyeyes.datasets.base import Recording
+from manyeyes.datatypes import Snapshot
+from manyeyes.ops.keyed_random import keyed_generator
+
+
+@dataclass(frozen=True)
+class OneInstant:
+    """The recording with one of its judged snapshots a scenario, which is the scenario's first and last."""
+
+    recording: Recording
+    seed: int
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """As in the recording."""
+        return self.recording.scenarios
+
+    def length(self, scenario: str) -> int:
+        """One."""
+        return 1
+
+    def judged(self, scenario: str) -> range:
+        """The one there is."""
+        return range(1)
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        """As in the recording."""
+        return self.recording.agents(scenario)
+
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        """The one there is, counted as 0."""
+        rng = keyed_generator("one instant", self.seed, scenario)
+        return replace(self.recording.snapshot(scenario, int(rng.choice(self.recording.judged(scenario)))), index=0)

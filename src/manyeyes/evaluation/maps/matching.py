@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chamfer distance between map elements in three named ways, and who matches whom. The definition stands in map_quality."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import njit
+from manyeyes.datatypes import ConfigError, MissingExtraError
+from manyeyes.ops.nearest_line import segments_of
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+BUFFER_M = 2.0
+MOST_SAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Way:
+    """How two elements are held against each other.
+
+    samples: points a line at equal arc length, or None: as many as keep spacing_m. buffered: pairs whose flat-capped
+    2 m buffers do not meet are no pairs. to_segments: distances go to the other line itself, not to its samples.
+    """
+
+    name: str
+    samples: int | None = None
+    spacing_m: float = 0.5
+    buffered: bool = False
+    to_segments: bool = False
+
+
+WAYS = {
+    way.name: way
+    for way in (
+        Way("maptr", samples=100, buffered=True),
+        Way("streammapnet", samples=200),
+        Way("exact", to_segments=True),
+    )
+}
+
+
+def way_named(name: str) -> Way:
+    """The way of that name."""
+    if name not in WAYS:
+        raise ConfigError(f"No way to measure a Chamfer distance is called {name!r}; known: {', '.join(WAYS)}.")
+    return WAYS[name]
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Polylines as columns, rings closed: points (P, 2) metres, first (N+1,); score (N,). All of one kind."""
+
+    points: Floats
+    first: Ints
+    score: Floats
+
+    def __len__(self) -> int:
+        return len(self.first) - 1
+
+    def line(self, row: int) -> Floats:
+        """(n, 2) points of one line."""
+        return self.points[self.first[row] : self.first[row + 1]]
+
+    def lengths(self) -> Floats:
+        """(N,) metres."""
+        step = np.hypot(*np.diff(self.points, axis=0).T) if len(self.points) > 1 else np.zeros(0)
+        line, start = segments_of(self.first)
+        return np.bincount(line, weights=step[start], minlength=len(self)).astype(np.float64)
+
+    def bounds(self) -> Floats:
+        """(N, 4) x_min, y_min, x_max, y_max."""
+        if len(self) == 0:
+            return np.zeros((0, 4))
+        low = np.minimum.reduceat(self.points, self.first[:-1], axis=0)
+        return np.hstack((low, np.maximum.reduceat(self.points, self.first[:-1], axis=0)))
+
+
+def lines_of(parts: list[Floats], score: Floats | None = None) -> Lines:
+    """Lines of a list of (n, 2) arrays; scores are 1 where none are given."""
+    first = np.concatenate(([0], np.cumsum([len(p) for p in parts], dtype=np.int64))).astype(np.int64)
+    points = np.concatenate(parts).astype(np.float64) if parts else np.zeros((0, 2))
+    return Lines(points, first, np.ones(len(parts)) if score is None else np.asarray(score, dtype=np.float64))
+
+
+def spaced(lines: Lines, way: Way) -> Lines:
+    """The samples of each line: equal arc length, both ends included."""
+    lengths = lines.lengths()
+    if way.samples is not None:
+        count = np.full(len(lines), way.samples, dtype=np.int64)
+    else:
+        count = np.clip(np.ceil(lengths / way.spacing_m - 1e-9).astype(np.int64) + 1, 2, MOST_SAMPLES)
+    first = np.concatenate(([0], np.cumsum(count))).astype(np.int64)
+    return Lines(_resample(lines.points, lines.first, first), first, lines.score)
+
+
+def chamfer(predicted: Lines, truth: Lines, way: Way, reach_m: float) -> Floats:
+    """(N, M) Chamfer distances; inf where the bounding boxes are farther apart than reach_m, or the way sees no pair.
+
+    No Chamfer distance is below the gap between the boxes, so that thresholds up to reach_m are judged exactly.
+    """
+    table = np.full((len(predicted), len(truth)), np.inf)
+    if table.size == 0:
+        return table
+    mine, theirs = spaced(predicted, way), spaced(truth, way)
+    pairs = _near(predicted.bounds(), truth.bounds(), reach_m)
+    if way.buffered:
+        pairs = pairs[_buffers_meet(mine, theirs, pairs)]
+    if way.to_segments:
+        there = _directed_to_segments(mine.points, mine.first, truth.points, truth.first, pairs)
+        back = _directed_to_segments(theirs.points, theirs.first, predicted.points, predicted.first, pairs[:, ::-1])
+        table[pairs[:, 0], pairs[:, 1]] = 0.5 * (there + back)
+    else:
+        table[pairs[:, 0], pairs[:, 1]] = _point_chamfer(
+            mine.points, mine.first, theirs.points, theirs.first, np.ascontiguousarray(pairs)
+        )
+    return table
+
+
+def ranking(lines: Lines) -> Ints:
+    """Rows by descending score; ties by descending length, then by the smallest x, then y, of the element."""
+    low = lines.bounds()[:, :2].reshape(-1, 2)
+    # Lengths that differ by rounding alone must not decide before the place does.
+    return np.lexsort((low[:, 1], low[:, 0], -np.round(lines.lengths(), 6), -lines.score)).astype(np.int64)
+
+
+def match(table: Floats, order: Ints, threshold_m: float) -> Ints:
+    """(N,) the truth row that each prediction takes, -1 for a false positive.
+
+    Predictions in their order look only at their nearest truth (of equally near ones the first), and take it when it is
+    free and within the threshold; there is no second choice.
+    """
+    taken = np.full(table.shape[0], -1, dtype=np.int64)
+    if table.shape[1] == 0:
+        return taken
+    nearest = table.argmin(1)
+    free = np.ones(table.shape[1], dtype=bool)
+    for row in order:
+        column = nearest[row]
+        if table[row, column] <= threshold_m and free[column]:
+            free[column] = False
+            taken[row] = column
+    return taken
+
+
+def area_under(ranked: NDArray[np.bool_], n_truth: int) -> float:
+    """All-point AP of true positives (N,) in ranked order; NaN without truth."""
+    if n_truth == 0:
+        return math.nan
+    hits = np.cumsum(ranked)
+    precision = hits / np.arange(1, len(ranked) + 1)
+    envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    return float(envelope[ranked].sum() / n_truth)
+
+
+def _near(a: Floats, b: Floats, reach_m: float) -> Ints:
+    """(K, 2) pairs of rows whose boxes are at most reach_m apart."""
+    gap_x = np.maximum(np.maximum(a[:, None, 0] - b[None, :, 2], b[None, :, 0] - a[:, None, 2]), 0.0)
+    gap_y = np.maximum(np.maximum(a[:, None, 1] - b[None, :, 3], b[None, :, 1] - a[:, None, 3]), 0.0)
+    return np.argwhere(np.hypot(gap_x, gap_y) <= reach_m).astype(np.int64)
+
+
+def _buffers_meet(mine: Lines, theirs: Lines, pairs: Ints) -> NDArray[np.bool_]:
+    """(K,) whether the buffers of each pair meet."""
+    try:
+        import shapely
+    except ImportError as error:
+        raise MissingExtraError("map", "the Chamfer distance 'maptr'") from error
+
+    def buffers(lines: Lines) -> NDArray[np.object_]:
+        rows = np.repeat(np.arange(len(lines)), np.diff(lines.first))
+        strings = shapely.linestrings(lines.points, indices=rows)
+        return np.asarray(shapely.buffer(strings, BUFFER_M, cap_style="flat", join_style="mitre"), dtype=object)
+
+    return shapely.intersects(buffers(mine)[pairs[:, 0]], buffers(theirs)[pairs[:, 1]])
+
+
+@njit(cache=True)
+def _resample(points: Floats, first: Ints, target: Ints) -> Floats:
+    """Each line at target[i + 1] - target[i] points of equal arc length."""
+    out = np.empty((target[-1], 2))
+    for row in range(len(first) - 1):
+        begin, end = first[row], first[row + 1]
+        total = 0.0
+        for k in range(begin, end - 1):
+            total += np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
+        count = target[row + 1] - target[row]
+        k, passed = begin, 0.0
+        step = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]) if end - begin > 1 else 0.0
+        for j in range(count):
+            at = total * j / (count - 1)
+            while k < end - 2 and passed + step < at:
+                passed += step
+                k += 1
+                step = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
+            share = min(1.0, max(0.0, (at - passed) / step)) if step > 0 else 0.0
+            after = min(k + 1, end - 1)
+            out[target[row] + j, 0] = points[k, 0] + share * (points[after, 0] - points[k, 0])
+            out[target[row] + j, 1] = points[k, 1] + share * (points[after, 1] - points[k, 1])
+    return out
+
+
+@njit(cache=True)
+def _point_chamfer(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> Floats:
+    """Half the sum of both mean distances from samples to the nearest samples, for pairs (K, 2)."""
+    out = np.empty(len(pairs))
+    for p in range(len(pairs)):
+        i0, i1 = a_first[pairs[p, 0]], a_first[pairs[p, 0] + 1]
+        j0, j1 = b_first[pairs[p, 1]], b_first[pairs[p, 1] + 1]
+        back = np.full(j1 - j0, np.inf)
+        there = 0.0
+        for i in range(i0, i1):
+            best = np.inf
+            for j in range(j0, j1):
+                square = (a[i, 0] - b[j, 0]) ** 2 + (a[i, 1] - b[j, 1]) ** 2
+                best = min(best, square)
+                back[j - j0] = min(back[j - j0], square)
+            there += np.sqrt(best)
+        out[p] = 0.5 * (there / (i1 - i0) + np.sqrt(back).sum() / (j1 - j0))
+    return out
+
+
+@njit(cache=True)
+def _directed_to_segments(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> Floats:
+    """The mean distance from the samples of a to the line b itself, for pairs (K, 2)."""
+    out = np.empty(len(pairs))
+    for p in range(len(pairs)):
+        i0, i1 = a_first[pairs[p, 0]], a_first[pairs[p, 0] + 1]
+        j0, j1 = b_first[pairs[p, 1]], b_first[pairs[p, 1] + 1]
+        total = 0.0
+        for i in range(i0, i1):
+            best = np.inf
+            for j in range(j0, j1 - 1):
+                dx, dy = b[j + 1, 0] - b[j, 0], b[j + 1, 1] - b[j, 1]
+                square = dx * dx + dy * dy
+                t = ((a[i, 0] - b[j, 0]) * dx + (a[i, 1] - b[j, 1]) * dy) / square if square > 0 else 0.0
+                t = min(1.0, max(0.0, t))
+                best = min(best, (a[i, 0] - b[j, 0] - t * dx) ** 2 + (a[i, 1] - b[j, 1] - t * dy) ** 2)
+            total += np.sqrt(best)
+        out[p] = total / (i1 - i0)
+    return out

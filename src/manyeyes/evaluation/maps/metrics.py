@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How good a map is. This text is the definition of the metrics.
+
+**What is judged.** Two tables of map elements in one metric frame, kind by kind (divider, boundary, crossing, stop_line);
+kinds never mix. A crossing enters as its closed ring. Elements with fewer than two points or without length are left out.
+Nothing is clipped here: whoever calls cuts the truth to what was observed (evaluation.observed) and says so.
+
+**Average precision** (after MapTR, ICLR 2023; StreamMapNet, WACV 2024). The Chamfer distance of two elements is half the sum
+of the two directed mean distances, Euclidean, in the plane. It is measured in three named ways:
+
+- ``maptr``: both are resampled to 100 points of equal arc length and distances go from sample to sample; pairs whose
+  flat-capped 2 m buffers do not meet are no pairs.
+- ``streammapnet``: the same with 200 points and no buffers.
+- ``exact``: samples every 0.5 m (at most 2,000), distances go from each sample to the other *line*. The first two have a floor
+  of about a quarter of the sample spacing, 0.76 m on a line of 300 m, which no map can get below; this one has none.
+
+Predictions are walked by descending score; ties by descending length, then by the smallest x, then y, of the element, so that
+the order in which a map is stored never matters. Each looks only at its nearest truth, and is a true positive when that
+distance is at most the threshold and the truth is still free; else it is a false positive: there is no second choice. With
+hits cumulated along that walk, r = tp / n_truth, p = tp / (tp + fp), p made non-increasing from the right, AP = sum of
+(r_i - r_{i-1}) p_i. The AP of a kind is the mean over the thresholds .5, 1, 1.5 m (or 1, 1.5, 2 m: ``wide``). mAP is the mean
+over the kinds asked for that have truth (the CrowdMap paper: crossing and divider); kinds without truth are NaN.
+
+**Length** at d = .3, .5, 1 m. Precision: the share of predicted length within d of any true line of the kind; recall: the
+share of true length within d of any predicted line; F their harmonic mean. Length is counted in pieces of at most 0.25 m, by
+their middles; distances go to the line itself. These do not depend on where lines are cut.
+
+**Duplication**: predicted length over true length. **Fragmentation**: a predicted element belongs to the true one that most
+of its length within 1.5 m is nearest to; the mean number of predicted elements of those true ones that have any.
+**Lateral error**: median and 95th percentile of the distance to the nearest true line, over predicted length within 1.5 m.
+**Order**: the median discrete Frechet distance (samples every 0.5 m, the better of both directions; rings are left out) of
+true positives of the exact way at 1.5 m.
+
+**Topology**, lines only. Endpoint error: the median over true ends of the distance to the nearest predicted end, at most
+10 m each. A branch is a place where three or more ends meet within 1 m (single linkage); predicted and true branches match
+within 3 m, nearest first, one to one; branch F1, NaN where neither side has one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import njit
+from manyeyes.datatypes.map_element import KINDS, MapElements
+from manyeyes.evaluation.maps.matching import (
+    WAYS,
+    Lines,
+    area_under,
+    chamfer,
+    lines_of,
+    match,
+    ranking,
+    spaced,
+    way_named,
+)
+from manyeyes.ops.nearest_line import nearest_line
+
+Floats = NDArray[np.float64]
+Thresholds = Literal["narrow", "wide"]
+
+THRESHOLDS: dict[Thresholds, tuple[float, ...]] = {"narrow": (0.5, 1.0, 1.5), "wide": (1.0, 1.5, 2.0)}
+PAPER_KINDS = ("crossing", "divider")
+LENGTH_WITHIN_M = (0.3, 0.5, 1.0)
+PIECE_M, LATERAL_WITHIN_M = 0.25, 1.5
+END_CAP_M, BRANCH_JOIN_M, BRANCH_MATCH_M = 10.0, 1.0, 3.0
+
+
+@dataclass(frozen=True)
+class Precision:
+    """AP of one kind in one way: at each threshold, and their mean; hits: true positives at the largest threshold."""
+
+    way: str
+    thresholds: tuple[float, ...]
+    at: tuple[float, ...]
+    ap: float
+    hits: int
+
+
+@dataclass(frozen=True)
+class LengthScore:
+    """Precision, recall and F by length within a distance; NaN where there is nothing to take a share of."""
+
+    within_m: float
+    precision: float
+    recall: float
+    f: float
+
+
+@dataclass(frozen=True)
+class KindQuality:
+    """Everything about one kind; the module's text defines each number."""
+
+    kind: str
+    n_predicted: int
+    n_truth: int
+    precision: tuple[Precision, ...]
+    length: tuple[LengthScore, ...]
+    duplication: float
+    fragmentation: float
+    lateral_median_m: float
+    lateral_p95_m: float
+    order_m: float
+    end_error_m: float
+    branch_f1: float
+
+
+@dataclass(frozen=True)
+class MapQuality:
+    """A map judged against the truth, one entry a kind in the order of KINDS."""
+
+    kinds: tuple[KindQuality, ...]
+
+    def of(self, kind: str) -> KindQuality:
+        """The numbers of one kind."""
+        return next(k for k in self.kinds if k.kind == kind)
+
+    def ap(self, kind: str, way: str = "exact", thresholds: Thresholds = "narrow") -> float:
+        """The AP of one kind, mean over the thresholds."""
+        wanted = THRESHOLDS[thresholds]
+        return next(p.ap for p in self.of(kind).precision if p.way == way and p.thresholds == wanted)
+
+    def mean_ap(
+        self, way: str = "exact", thresholds: Thresholds = "narrow", kinds: Sequence[str] = PAPER_KINDS
+    ) -> float:
+        """mAP: the mean over those of the kinds that have truth."""
+        found = [self.ap(kind, way, thresholds) for kind in kinds if self.of(kind).n_truth > 0]
+        return sum(found) / len(found) if found else math.nan
+
+    def length(self, kind: str, within_m: float = 0.5) -> LengthScore:
+        """The length score of one kind."""
+        return next(s for s in self.of(kind).length if s.within_m == within_m)
+
+
+def judge(
+    predicted: MapElements, truth: MapElements, ways: Sequence[str] = tuple(WAYS), kinds: Sequence[str] = KINDS
+) -> MapQuality:
+    """All numbers of a map (elements with scores) against the truth, both in one metric frame."""
+    for name in ways:
+        way_named(name)
+    return MapQuality(tuple(_judge_kind(k, lines_of_kind(predicted, k), lines_of_kind(truth, k), ways) for k in kinds))
+
+
+def _judge_kind(kind: str, mine: Lines, theirs: Lines, ways: Sequence[str]) -> KindQuality:
+    order = ranking(mine)
+    precision: list[Precision] = []
+    frechet = math.nan
+    reach = max(max(t) for t in THRESHOLDS.values())
+    for name in ways:
+        table = chamfer(mine, theirs, WAYS[name], reach)
+        for thresholds in THRESHOLDS.values():
+            hits = [match(table, order, threshold) for threshold in thresholds]
+            at = tuple(area_under(taken[order] >= 0, len(theirs)) for taken in hits)
+            precision.append(Precision(name, thresholds, at, sum(at) / len(at), int((hits[-1] >= 0).sum())))
+        if name == "exact" and kind != "crossing":
+            frechet = _order(mine, theirs, match(table, order, THRESHOLDS["narrow"][-1]))
+    there, back = pieces_of(mine), pieces_of(theirs)
+    near_truth = nearest_line(there.middle, theirs.points, theirs.first, LATERAL_WITHIN_M)
+    near_mine = nearest_line(back.middle, mine.points, mine.first, max(LENGTH_WITHIN_M))
+    lateral = _quantiles(near_truth.distance, there.length, (0.5, 0.95))
+    ends = (math.nan, math.nan) if kind == "crossing" else topology(mine, theirs)
+    return KindQuality(
+        kind=kind,
+        n_predicted=len(mine),
+        n_truth=len(theirs),
+        precision=tuple(precision),
+        length=tuple(
+            _length_score(d, near_truth.distance, there.length, near_mine.distance, back.length)
+            for d in LENGTH_WITHIN_M
+        ),
+        duplication=_ratio(there.length.sum(), back.length.sum()),
+        fragmentation=_fragmentation(there, near_truth.line, len(theirs)),
+        lateral_median_m=lateral[0],
+        lateral_p95_m=lateral[1],
+        order_m=frechet,
+        end_error_m=ends[0],
+        branch_f1=ends[1],
+    )
+
+
+def lines_of_kind(elements: MapElements, kind: str) -> Lines:
+    """The elements of one kind that have length, rings closed."""
+    parts, scores = [], []
+    for row in np.flatnonzero(elements.kind == KINDS.index(kind)):
+        points = elements.polyline(int(row))
+        if len(points) > 1 and np.ptp(points, axis=0).any():
+            parts.append(np.vstack((points, points[:1])) if kind == "crossing" else points)
+            scores.append(float(elements.score[row]))
+    return lines_of(parts, np.array(scores))
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Lines in short pieces: middle (P, 2), length (P,), owner (P,) row of the line."""
+
+    middle: Floats
+    length: Floats
+    owner: NDArray[np.int64]
+
+
+def pieces_of(lines: Lines) -> Pieces:
+    """Every segment in equal pieces of at most PIECE_M."""
+    start = np.delete(np.arange(len(lines.points)), lines.first[1:] - 1) if len(lines) else np.zeros(0, dtype=np.int64)
+    owner = np.repeat(np.arange(len(lines)), np.diff(lines.first) - 1)
+    step = lines.points[start + 1] - lines.points[start] if len(start) else np.zeros((0, 2))
+    length = np.hypot(step[:, 0], step[:, 1])
+    count = np.maximum(np.ceil(length / PIECE_M - 1e-9).astype(np.int64), 1)
+    segment = np.repeat(np.arange(len(start)), count)
+    within = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count, count)
+    share = ((within + 0.5) / count[segment])[:, None]
+    return Pieces(lines.points[start[segment]] + share * step[segment], (length / count)[segment], owner[segment])
+
+
+def _length_score(within_m: float, there: Floats, mine: Floats, back: Floats, theirs: Floats) -> LengthScore:
+    precision = _ratio(mine[there <= within_m].sum(), mine.sum())
+    recall = _ratio(theirs[back <= within_m].sum(), theirs.sum())
+    if math.isnan(recall):
+        return LengthScore(within_m, precision, recall, math.nan)
+    # Without a prediction there is no precision, but F is plainly 0.
+    both = (0.0 if math.isnan(precision) else precision) + recall
+    return LengthScore(within_m, precision, recall, 2 * precision * recall / both if both > 0 else 0.0)
+
+
+def _ratio(part: float, whole: float) -> float:
+    return float(part / whole) if whole > 0 else math.nan
+
+
+def _quantiles(distance: Floats, weight: Floats, levels: Sequence[float]) -> list[float]:
+    """Weighted quantiles of the finite distances; NaN where there are none."""
+    kept = np.isfinite(distance)
+    if not kept.any():
+        return [math.nan] * len(levels)
+    order = np.argsort(distance[kept], kind="stable")
+    values, mass = distance[kept][order], np.cumsum(weight[kept][order])
+    return [float(values[min(np.searchsorted(mass, level * mass[-1]), len(values) - 1)]) for level in levels]
+
+
+def _fragmentation(pieces: Pieces, nearest: NDArray[np.int64], n_truth: int) -> float:
+    """The mean number of predicted elements on those true ones that have any."""
+    near = nearest >= 0
+    if n_truth == 0 or not near.any():
+        return math.nan
+    shared = np.zeros((int(pieces.owner.max()) + 1, n_truth))
+    np.add.at(shared, (pieces.owner[near], nearest[near]), pieces.length[near])
+    belongs = shared.argmax(1)[shared.sum(1) > 0]
+    count = np.bincount(belongs, minlength=n_truth)
+    return float(count[count > 0].mean())
+
+
+def _order(mine: Lines, theirs: Lines, taken: NDArray[np.int64]) -> float:
+    """The median discrete Frechet distance of matched lines."""
+    a, b = spaced(mine, WAYS["exact"]), spaced(theirs, WAYS["exact"])
+    found = [
+        min(
+            frechet(a.line(int(row)), b.line(int(taken[row]))), frechet(a.line(int(row))[::-1], b.line(int(taken[row])))
+        )
+        for row in np.flatnonzero(taken >= 0)
+    ]
+    return float(np.median(found)) if found else math.nan
+
+
+@njit(cache=True)
+def frechet(a: Floats, b: Floats) -> float:
+    """Discrete Frechet distance of two sampled lines (n, 2), (m, 2), row by row (Eiter and Mannila, 1994)."""
+    row = np.empty(len(b))
+    for i in range(len(a)):
+        diagonal = 0.0
+        for j in range(len(b)):
+            above = row[j]
+            if i == 0:
+                reached = row[j - 1] if j > 0 else 0.0
+            elif j == 0:
+                reached = above
+            else:
+                reached = min(above, diagonal, row[j - 1])
+            row[j] = max(reached, np.hypot(a[i, 0] - b[j, 0], a[i, 1] - b[j, 1]))
+            diagonal = above
+    return row[-1]
+
+
+def topology(mine: Lines, theirs: Lines) -> tuple[float, float]:
+    """The endpoint error, and F1 of branches."""
+    ours, true = _ends(mine), _ends(theirs)
+    end_error = math.nan
+    if len(true):
+        gap = np.full(len(true), END_CAP_M)
+        if len(ours):
+            gap = np.hypot(true[:, None, 0] - ours[None, :, 0], true[:, None, 1] - ours[None, :, 1]).min(1)
+        end_error = float(np.median(np.minimum(gap, END_CAP_M)))
+    found, wanted = branches(ours), branches(true)
+    if len(found) + len(wanted) == 0:
+        return end_error, math.nan
+    hits = _mutual(found, wanted, BRANCH_MATCH_M)
+    return end_error, 2 * hits / (len(found) + len(wanted))
+
+
+def _ends(lines: Lines) -> Floats:
+    """(2 N, 2): both ends of every line."""
+    return (
+        np.vstack((lines.points[lines.first[:-1]], lines.points[lines.first[1:] - 1]))
+        if len(lines)
+        else np.zeros((0, 2))
+    )
+
+
+def branches(ends: Floats) -> Floats:
+    """(B, 2) centres of groups of three or more ends, joined within 1 m; by x, then y."""
+    ordered = ends[np.lexsort((ends[:, 1], ends[:, 0]))] if len(ends) else ends
+    names, label, count = np.unique(_groups(ordered, BRANCH_JOIN_M), return_inverse=True, return_counts=True)
+    total = np.zeros((len(names), 2))
+    np.add.at(total, label, ordered)
+    centres = (total / count[:, None])[count >= 3]
+    return centres[np.lexsort((centres[:, 1], centres[:, 0]))]
+
+
+@njit(cache=True)
+def _groups(ordered: Floats, join: float) -> NDArray[np.int64]:
+    """(N,) single-linkage groups of points (N, 2) sorted by x: each is named after one of its members."""
+    parent = np.arange(len(ordered))
+    for i in range(len(ordered)):
+        for j in range(i + 1, len(ordered)):
+            if ordered[j, 0] - ordered[i, 0] > join:
+                break
+            if np.hypot(ordered[j, 0] - ordered[i, 0], ordered[j, 1] - ordered[i, 1]) <= join:
+                a, b = i, j
+                while parent[a] != a:
+                    a = parent[a]
+                while parent[b] != b:
+                    b = parent[b]
+                parent[max(a, b)] = min(a, b)
+    for i in range(len(ordered)):
+        a = i
+        while parent[a] != a:
+            a = parent[a]
+        parent[i] = a
+    return parent
+
+
+def _mutual(a: Floats, b: Floats, within_m: float) -> int:
+    """How many pairs match one to one, nearest first."""
+    gap = np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1])
+    hits = 0
+    while gap.size and gap.min() <= within_m:
+        row, column = np.unravel_index(int(gap.argmin()), gap.shape)
+        gap[row, :], gap[:, column] = np.inf, np.inf
+        hits += 1
+    return hits

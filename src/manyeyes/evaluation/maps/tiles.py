@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tiles of a drive: where they lie, who looked at them and when, and what is truly there.
+
+A tile is judged against all that the true map has within it, seen or not: what one vehicle cannot see is what others are for.
+Training leaves out what no look met (training.map_targets), else a model learns to invent. Lines are cut at the tile's border,
+rings too, and stay rings; parts of lines below 2 m and of rings below 3 m² are no elements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, MissingExtraError, Transform
+from manyeyes.datatypes.map_element import CROSSING, MapElements
+from manyeyes.evaluation.maps.observed_area import SHORTEST_PART_M, with_geometry
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
+
+Floats = NDArray[np.float64]
+
+LEAST_RING_M2 = 3.0
+APART_M = 1000.0
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A tile of one scenario's town. world_from_tile: upright, float64. looks: who looked, in the order in which they are taken.
+
+    truth: in the tile's frame, cut to it.
+    """
+
+    scenario: str
+    world_from_tile: Transform
+    looks: tuple[AgentFrame, ...]
+    truth: MapElements
+
+
+def town_of(scenario: str, towns: Sequence[str]) -> str:
+    """The town that a scenario is named after: ``town05_0066`` was driven in Town05."""
+    for town in sorted(towns, key=len, reverse=True):
+        if scenario.lower().startswith(town.lower()):
+            return town
+    raise ConfigError(
+        f"Scenario {scenario!r} is named after none of the towns {', '.join(towns)}; give the map of its town."
+    )
+
+
+def assert_split(taught: Sequence[str], judged: Sequence[str]) -> None:
+    """ConfigError where a town is on both sides: the map of a town is one sample, however many frames were driven there."""
+    shared = sorted({town.lower() for town in taught} & {town.lower() for town in judged})
+    if shared:
+        raise ConfigError(f"Split by place: {', '.join(shared)} may not both teach and judge; leave one side out.")
+
+
+def cut_to(truth: MapElements, world_from_tile: Transform, tile: BevGrid) -> MapElements:
+    """What of the elements (world) lies in the tile, in the tile's frame."""
+    shapely = _shapely()
+    x, y, yaw = planar(world_from_tile.inverse())
+    local = truth.transform(x, y, yaw)
+    box = shapely.box(tile.x_min, tile.y_min, tile.x_max, tile.y_max)
+    rows: list[int] = []
+    parts: list[Floats] = []
+    for row in range(len(local)):
+        points = local.polyline(row)
+        if (points.max(0) < [tile.x_min, tile.y_min]).any() or (points.min(0) > [tile.x_max, tile.y_max]).any():
+            continue
+        for part in _inside(points, bool(local.kind[row] == CROSSING), box):
+            rows.append(row)
+            parts.append(part)
+    return with_geometry(local, rows, parts)
+
+
+def side_by_side(maps: Sequence[MapElements]) -> MapElements:
+    """Maps of many tiles in one frame, so far apart that none is near another: so one list is ranked over all of them."""
+    return MapElements.cat([elements.transform(APART_M * i, 0.0, 0.0) for i, elements in enumerate(maps)])
+
+
+def _inside(points: Floats, ring: bool, box: BaseGeometry) -> list[Floats]:
+    shapely = _shapely()
+    if ring:
+        shape = shapely.make_valid(shapely.polygons(points))
+        found = shapely.get_parts(shapely.intersection(shape, box))
+        polygons = [p for p in found if p.geom_type == "Polygon" and p.area >= LEAST_RING_M2]
+        return [shapely.get_coordinates(p.exterior)[:-1] for p in polygons]
+    found = shapely.get_parts(shapely.line_merge(shapely.intersection(shapely.linestrings(points), box)))
+    return [shapely.get_coordinates(p) for p in found if p.geom_type == "LineString" and p.length >= SHORTEST_PART_M]
+
+
+def planar(motion: Transform) -> tuple[float, float, float]:
+    """x, y and yaw of a motion."""
+    x, y, _ = motion.translation.tolist()
+    return x, y, float(motion.yaw)
+
+
+def _shapely() -> Any:
+    try:
+        import shapely
+    except ImportError as error:
+        raise MissingExtraError("map", "cutting the true map to tiles") from error
+    return shapely

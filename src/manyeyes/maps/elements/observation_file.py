@@ -1,0 +1,421 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Observations as Parquet, one row each (docs/observation.md), and reading that puts aside what cannot be used."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._io import atomic_replace
+from manyeyes.datatypes import MissingExtraError, ShapeError
+from manyeyes.datatypes.map_element import DEFAULT_SIGMA_M, KINDS, NO_STYLE, STYLES, MapElements, Polygons
+from manyeyes.maps.elements.observation import (
+    FORMAT_VERSION,
+    Frame,
+    Observation,
+    ObservationContent,
+    ObservationError,
+    shortened,
+)
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+METADATA_KEY = b"manyeyes"
+CRS = "local transverse Mercator, WGS 84, scale 1"
+ROWS_A_GROUP = 1024
+# Origins closer than a tenth of a millimetre are one.
+_SAME_DEGREES = 1e-9
+_UPPER = np.triu_indices(3)
+_MIRRORED = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+_REQUIRED = ("agent", "pass_id", "time_ns", "x", "y", "yaw", "covariance", "view", "elements")
+
+
+@dataclass(frozen=True)
+class Quarantined:
+    """What was put aside: the file, its first row (-1: the file as a whole), how many rows, and why, on one line."""
+
+    file: str
+    row: int
+    count: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class RefusedRow:
+    """A row that is no observation, and why.
+
+    id: of its content, "" where the content has none or the row states another; agent, pass_id: as the row states them.
+    """
+
+    reason: str
+    id: str
+    agent: str
+    pass_id: str
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a file or folder held: the frame of its poses, the observations in file and row order, and what was put aside."""
+
+    frame: Frame
+    observations: tuple[Observation, ...]
+    quarantined: tuple[Quarantined, ...]
+
+
+def write_observations(path: Path | str, observations: Sequence[Observation], frame: Frame) -> None:
+    """Write observations as one Parquet file: whole under that name, or not there."""
+    pq = _parquet()
+    path = Path(path)
+    with atomic_replace(path, durable=False) as temporary:
+        pq.write_table(
+            observation_table(observations, frame),
+            temporary,
+            compression="zstd",
+            row_group_size=ROWS_A_GROUP,
+            use_dictionary=["agent", "pass_id", "model", "elements.list.element.kind"],
+            write_page_checksum=True,
+        )
+
+
+def read_observations(source: Path | str, frame: Frame | None = None) -> Reading:
+    """Read a file, or every ``*.parquet`` of a folder by name; without a frame, the first file that states one decides."""
+    source = Path(source)
+    files = sorted(source.glob("*.parquet")) if source.is_dir() else [source]
+    if not files or not files[0].exists():
+        raise ObservationError(f"{source}: expected a Parquet file of observations or a folder of them; found none.")
+    kept: list[Observation] = []
+    aside: list[Quarantined] = []
+    for file in files:
+        try:
+            stored, groups = _open(file, frame)
+        except ObservationError as error:
+            aside.append(Quarantined(str(file), -1, 1, str(error)))
+            continue
+        frame = frame or stored
+        for row, item in groups:
+            if isinstance(item, Observation):
+                kept.append(item)
+            else:
+                aside.append(Quarantined(str(file), row, *item))
+    if frame is None:
+        raise ObservationError(f"{source}: no file could be read; the first: {aside[0].reason}")
+    return Reading(frame, tuple(kept), tuple(aside))
+
+
+def observation_table(observations: Sequence[Observation], frame: Frame) -> pa.Table:
+    """Observations as an Arrow table whose metadata name the format, its version and the frame."""
+    pa = _arrow()
+    elements = MapElements.cat([o.elements for o in observations])
+    at_point = pa.StructArray.from_arrays(
+        [*(pa.array(elements.points[:, k]) for k in range(2)), pa.array(elements.sigma)], ["x", "y", "sigma"]
+    )
+    styles = np.arange(len(elements) + 1, dtype=np.int32) * len(STYLES)
+    element = pa.StructArray.from_arrays(
+        [
+            pa.DictionaryArray.from_arrays(pa.array(elements.kind.astype(np.int32)), pa.array(KINDS)).cast(pa.string()),
+            pa.array(elements.score),
+            _list(pa, styles, pa.array(elements.style.reshape(-1))),
+            _list(pa, elements.first, at_point),
+        ],
+        ["kind", "score", "style", "points"],
+    )
+    rings = [o.occluders for o in observations]
+    starts = np.cumsum([0, *(len(r.points) for r in rings)])
+    ring_first = np.concatenate([r.first[:-1] + start for r, start in zip(rings, starts)] + [starts[-1:]])
+    poses = np.array([o.pose for o in observations]).reshape(-1, 3)
+    columns = {
+        "agent": pa.array([o.agent for o in observations], pa.string()),
+        "pass_id": pa.array([o.pass_id for o in observations], pa.string()),
+        "time_ns": pa.array([o.time_ns for o in observations], pa.int64()),
+        **{name: pa.array(poses[:, k]) for k, name in enumerate(("x", "y", "yaw"))},
+        "covariance": _list(
+            pa,
+            np.arange(len(observations) + 1) * 6,
+            pa.array(np.array([o.covariance[_UPPER] for o in observations]).reshape(-1)),
+        ),
+        "view": _list(pa, _offsets([len(o.view) for o in observations]), _xy(pa, [o.view for o in observations])),
+        "elements": _list(pa, _offsets([len(o.elements) for o in observations]), element),
+        "model": pa.array([o.model for o in observations], pa.string()),
+        "trusted": pa.array([o.trusted for o in observations], pa.bool_()),
+        "id": pa.array([o.id for o in observations], pa.string()),
+        "occluders": _list(
+            pa, _offsets([len(r) for r in rings]), _list(pa, ring_first, _xy(pa, [r.points for r in rings]))
+        ),
+    }
+    return pa.table(columns).cast(_schema(pa)).replace_schema_metadata({METADATA_KEY: json.dumps(metadata(frame))})
+
+
+def metadata(frame: Frame) -> dict[str, Any]:
+    """What the file's key-value metadata say under the key ``manyeyes``, as JSON."""
+    origin = {"crs": "EPSG:4326", "latitude": frame.latitude, "longitude": frame.longitude}
+    return {"format": "observation", "version": FORMAT_VERSION, "crs": CRS, "origin": origin}
+
+
+def observations_of(table: pa.Table) -> Iterator[tuple[int, Observation | str]]:
+    """Each row of a table as an observation, or as the reason why it cannot be one."""
+    for row, item in enumerate(rows_of(table)):
+        yield row, item.reason if isinstance(item, RefusedRow) else item
+
+
+def rows_of(table: pa.Table) -> Iterator[Observation | RefusedRow]:
+    """Each row of a table as an observation, or as one that is refused."""
+    columns = _Columns(table)
+    for row in range(table.num_rows):
+        try:
+            yield columns.observation(row)
+        except (ObservationError, ShapeError) as error:
+            yield columns.refused(row, str(error))
+
+
+def _open(file: Path, expected: Frame | None) -> tuple[Frame, Iterator[tuple[int, Observation | tuple[int, str]]]]:
+    """The frame that a file states and its rows; raises ObservationError where the file as a whole cannot be used."""
+    pa, pq = _arrow(), _parquet()
+    try:
+        opened = pq.ParquetFile(file, page_checksum_verification=True)
+    except (pa.ArrowException, OSError) as error:
+        raise ObservationError(f"{file}: expected a whole Parquet file; got {_line(error)}. Fetch it again.") from error
+    frame = _stated_frame(file, opened.schema_arrow.metadata or {}, expected)
+    missing = [name for name in _REQUIRED if name not in opened.schema_arrow.names]
+    if missing:
+        raise ObservationError(f"{file}: expected the columns of docs/observation.md; {', '.join(missing)} missing.")
+    return frame, _rows(opened)
+
+
+def _rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[int, str]]]:
+    """Row by row; a group of rows that cannot be decoded is put aside as one."""
+    pa = _arrow()
+    start = 0
+    for group in range(opened.num_row_groups):
+        count = opened.metadata.row_group(group).num_rows
+        try:
+            for row, item in observations_of(opened.read_row_group(group)):
+                yield start + row, (1, item) if isinstance(item, str) else item
+        except (pa.ArrowException, OSError, ObservationError) as error:
+            yield start, (count, f"rows {start} to {start + count - 1} cannot be decoded: {_line(error)}")
+        start += count
+
+
+def _stated_frame(file: Path, stored: dict[bytes, bytes], expected: Frame | None) -> Frame:
+    """The frame in a file's metadata, once format, version and CRS are known to be ours."""
+    try:
+        stated = json.loads(stored[METADATA_KEY])
+        kind, version, crs, origin = (stated[key] for key in ("format", "version", "crs", "origin"))
+        frame = Frame(float(origin["latitude"]), float(origin["longitude"]))
+        geographic = origin["crs"]
+    except (KeyError, ValueError, TypeError) as error:
+        raise ObservationError(
+            f"{file}: expected metadata 'manyeyes' with format, version, crs and origin as in docs/observation.md; "
+            f"{type(error).__name__} {_line(error)}."
+        ) from error
+    if kind != "observation" or not isinstance(version, int) or not 1 <= version <= FORMAT_VERSION:
+        raise ObservationError(
+            f"{file}: expected format 'observation' of version 1 to {FORMAT_VERSION}; got {kind!r} of version {version!r}. "
+            "Read a newer version with a newer manyeyes."
+        )
+    if crs != CRS or geographic != "EPSG:4326":
+        raise ObservationError(
+            f"{file}: crs: expected '{CRS}' about an origin in EPSG:4326; got {crs!r} about {geographic!r}. Reproject the poses."
+        )
+    if expected is None:
+        return frame
+    if max(abs(frame.latitude - expected.latitude), abs(frame.longitude - expected.longitude)) > _SAME_DEGREES:
+        raise ObservationError(
+            f"{file}: origin: expected latitude {expected.latitude}, longitude {expected.longitude} as asked or as in the "
+            f"files before; got {frame.latitude}, {frame.longitude}. Reproject the poses."
+        )
+    return expected
+
+
+class _Columns:
+    """A table's nested columns, taken apart once; rows are cut out of them as views."""
+
+    def __init__(self, table: pa.Table) -> None:
+        pa = _arrow()
+        schema = _schema(pa)
+        self.columns: dict[str, Any] = {}
+        for wanted in schema:
+            if wanted.name not in table.column_names:
+                self.columns[wanted.name] = pa.nulls(table.num_rows, wanted.type)
+                continue
+            try:
+                column = table.column(wanted.name).cast(wanted.type).combine_chunks()
+            except pa.ArrowException as error:
+                raise ObservationError(f"column {wanted.name}: expected {wanted.type}; {_line(error)}") from error
+            self.columns[wanted.name] = column.chunk(0) if isinstance(column, pa.ChunkedArray) else column
+        self.text = {name: self.columns[name].fill_null("").to_pylist() for name in ("agent", "pass_id", "model", "id")}
+        self.trusted = self.columns["trusted"].fill_null(False).to_pylist()
+        self.time = self.columns["time_ns"].fill_null(-1).to_pylist()
+        self.pose = np.stack([_numbers(self.columns[name]) for name in ("x", "y", "yaw")], 1)
+        self.covariance_first, covariance = _opened(self.columns["covariance"])
+        self.covariance = _numbers(covariance)
+        self.view_first, view = _opened(self.columns["view"])
+        self.view = np.stack([_numbers(axis) for axis in view.flatten()], 1)
+        self.ring_first, rings = _opened(self.columns["occluders"])
+        self.ring_point, corners = _opened(rings)
+        self.corners = np.stack([_numbers(axis) for axis in corners.flatten()], 1)
+        self.first, elements = _opened(self.columns["elements"])
+        kind, score, style, points = elements.flatten()
+        self.kind = _codes(kind)
+        self.kind_text, self.score = kind, _numbers(score)
+        self.style = _styles(style)
+        self.point_first, at_point = _opened(points)
+        x, y, sigma = at_point.flatten()
+        self.points = np.stack((_numbers(x), _numbers(y)), 1)
+        self.sigma = _numbers(sigma.fill_null(DEFAULT_SIGMA_M))
+
+    def observation(self, row: int) -> Observation:
+        """The observation of one row; raises ObservationError or ShapeError where it is none."""
+        content = self.content(row)
+        made = Observation(**{f.name: getattr(content, f.name) for f in fields(ObservationContent)})
+        stated = self.text["id"][row]
+        if stated and stated != made.id:
+            raise ObservationError(
+                f"Observation.id: expected {made.id}, as its content says; got {shortened(stated)}. Fetch it again."
+            )
+        return made
+
+    def refused(self, row: int, reason: str) -> RefusedRow:
+        """The record of a row that is no observation."""
+        try:
+            name = self.content(row).id
+        except (ObservationError, ShapeError):
+            name = ""
+        stated = self.text["id"][row]
+        return RefusedRow(
+            reason, "" if stated and stated != name else name, self.text["agent"][row], self.text["pass_id"][row]
+        )
+
+    def content(self, row: int) -> ObservationContent:
+        """The fields of one row, unchecked; raises ObservationError or ShapeError where they have no such form."""
+        a, b = self.first[row], self.first[row + 1]
+        p, q = self.point_first[a], self.point_first[b]
+        kind = self.kind[a:b]
+        if (kind < 0).any():
+            wrong = shortened(self.kind_text[int(a + np.argmin(kind))])
+            raise ObservationError(f"Observation.kind: expected one of {', '.join(KINDS)}; got {wrong}.")
+        elements = MapElements(
+            kind,
+            self.point_first[a : b + 1] - p,
+            self.points[p:q],
+            self.score[a:b],
+            self.sigma[p:q],
+            self.style[a:b],
+        )
+        r, s = self.ring_first[row], self.ring_first[row + 1]
+        u, v = self.ring_point[r], self.ring_point[s]
+        return ObservationContent(
+            agent=self.text["agent"][row],
+            pass_id=self.text["pass_id"][row],
+            time_ns=self.time[row],
+            pose=self.pose[row],
+            covariance=_square(self.covariance[self.covariance_first[row] : self.covariance_first[row + 1]]),
+            view=self.view[self.view_first[row] : self.view_first[row + 1]],
+            elements=elements,
+            model=self.text["model"][row],
+            trusted=self.trusted[row],
+            occluders=Polygons(self.corners[u:v], self.ring_point[r : s + 1] - u),
+        )
+
+
+def _square(upper: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) from xx, xy, x yaw, yy, y yaw, yaw yaw."""
+    if len(upper) != 6:
+        raise ObservationError(
+            f"Observation.covariance: expected 6 numbers, the upper triangle by rows; got {len(upper)}."
+        )
+    return upper[_MIRRORED].reshape(3, 3)
+
+
+def _styles(style: Any) -> NDArray[np.float64]:
+    """(N, S) style probabilities; where none are stated: no style for certain; a wrong number of them: NaN."""
+    first, values = _opened(style)
+    counts = np.diff(first)
+    out = np.full((len(counts), len(STYLES)), np.nan)
+    out[counts == 0] = np.eye(len(STYLES))[NO_STYLE]
+    whole = counts == len(STYLES)
+    places = first[:-1][whole][:, None] + np.arange(len(STYLES))
+    out[whole] = _numbers(values)[places]
+    return out
+
+
+def _opened(column: Any) -> tuple[NDArray[np.int64], Any]:
+    """Offsets and contents of a list column; a null list is an empty one."""
+    return column.offsets.to_numpy().astype(np.int64), column.values
+
+
+def _numbers(column: Any) -> NDArray[np.float64]:
+    """A column of numbers as float64, null as NaN."""
+    return column.to_numpy(zero_copy_only=False).astype(np.float64, copy=False)
+
+
+def _codes(kind: Any) -> NDArray[np.int64]:
+    """The place of each name in KINDS; -1 for a null or another name."""
+    coded = kind.dictionary_encode()
+    known = [KINDS.index(name) if name in KINDS else -1 for name in coded.dictionary.to_pylist()]
+    places = coded.indices.fill_null(len(known)).to_numpy(zero_copy_only=False)
+    return np.array([*known, -1], np.int64)[places]
+
+
+def _offsets(counts: Sequence[int]) -> NDArray[np.int64]:
+    return np.concatenate(([0], np.cumsum(np.asarray(counts, np.int64)))).astype(np.int64)
+
+
+def _list(pa: Any, offsets: NDArray, values: Any) -> Any:
+    return pa.ListArray.from_arrays(pa.array(np.asarray(offsets, np.int32)), values)
+
+
+def _xy(pa: Any, rings: Sequence[NDArray[np.float64]]) -> Any:
+    """Points of many rings as a struct column x, y."""
+    points = np.concatenate([*rings, np.zeros((0, 2))])
+    return pa.StructArray.from_arrays([pa.array(points[:, k]) for k in range(2)], ["x", "y"])
+
+
+def _schema(pa: Any) -> Any:
+    """The columns of docs/observation.md."""
+    number, text = pa.float64(), pa.string()
+    xy = pa.struct([("x", number), ("y", number)])
+    point = pa.struct([("x", number), ("y", number), ("sigma", number)])
+    element = pa.struct([("kind", text), ("score", number), ("style", pa.list_(number)), ("points", pa.list_(point))])
+    return pa.schema(
+        [
+            ("agent", text),
+            ("pass_id", text),
+            ("time_ns", pa.int64()),
+            ("x", number),
+            ("y", number),
+            ("yaw", number),
+            ("covariance", pa.list_(number)),
+            ("view", pa.list_(xy)),
+            ("elements", pa.list_(element)),
+            ("model", text),
+            ("trusted", pa.bool_()),
+            ("id", text),
+            ("occluders", pa.list_(pa.list_(xy))),
+        ]
+    )
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _arrow() -> Any:
+    try:
+        import pyarrow
+    except ImportError as error:
+        raise MissingExtraError("map", "Observations as Parquet") from error
+    return pyarrow
+
+
+def _parquet() -> Any:
+    _arrow()
+    import pyarrow.parquet
+
+    return pyarrow.parquet

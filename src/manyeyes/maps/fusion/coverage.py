@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ground that somebody looked at, as runs of cells of one metre; lines are cut where nobody did.
+
+A link may join two parts of a line over ground that is in no view at all. What lies there is a guess, which a map should not
+show as if it had been seen. Cells are anchored at the map's origin and count where a view holds their middle, so that the
+ground of several areas is the union of each area's. Source: this project's; GlobalMapNet's protocol (arXiv 2409.10063) judges maps
+on the union of all views.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import njit
+from manyeyes.maps.fusion.observation_arrays import Sightings
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CELL_M = 1.0
+
+
+def looked_at(sightings: Sightings, pose: Floats, area: tuple[float, float, float, float] | None = None) -> Ints:
+    """The ground in the views of agents at pose (O, 3), inside area (x0, y0, x1, y1; sides are whole metres) or everywhere.
+
+    Runs (R, 3): row and first and last column of cells, ascending, none touching another.
+    """
+    runs = _filled(sightings.world_view(pose), sightings.view.first)
+    if area is not None:
+        x0, y0, x1, y1 = np.floor(np.array(area) / CELL_M + 0.5).astype(np.int64)
+        runs = runs[(runs[:, 0] >= y0) & (runs[:, 0] < y1) & (runs[:, 1] < x1) & (runs[:, 2] >= x0)]
+        runs = np.stack((runs[:, 0], np.maximum(runs[:, 1], x0), np.minimum(runs[:, 2], x1 - 1)), 1)
+    return merged(runs)
+
+
+def along(points: Floats, first: Ints) -> Ints:
+    """The ground under lines (N): points (P, 2) metres, line i from first[i] on; runs as of :func:`looked_at`."""
+    if not len(points):
+        return np.zeros((0, 3), np.int64)
+    return merged(_under(np.ascontiguousarray(points), first))
+
+
+def merged(runs: Ints) -> Ints:
+    """Runs (R, 3) in any order as ascending ones, those that touch or overlap as one."""
+    if not len(runs):
+        return np.zeros((0, 3), np.int64)
+    return _merged(runs[np.lexsort((runs[:, 1], runs[:, 0]))])
+
+
+def cut_unseen(points: Floats, first: Ints, inferred: NDArray[np.bool_], runs: Ints) -> tuple[Ints, Ints]:
+    """Lines (L,) cut where nobody looked: offsets (M + 1,) of the parts, and which points they keep, in order.
+
+    points (P, 2), inferred (P,): places nobody saw, which go where nobody looked. A line is cut between two points where a cell of
+    the way from one to the other, half a metre at a time, is in no run (R, 3). Without runs nothing is known and nothing is cut.
+    """
+    if not len(runs) or not len(points):
+        return first, np.arange(len(points))
+    return _cut(np.ascontiguousarray(points), first, inferred, runs)
+
+
+@njit(cache=True, nogil=True)
+def _filled(corners, first):  # pragma: no cover - compiled
+    """Runs of cells whose middle lies in a ring, by the even-odd rule, ring by ring."""
+    rows, n = np.empty((1024, 3), np.int64), 0
+    for r in range(len(first) - 1):
+        a, b = first[r], first[r + 1]
+        if b - a < 3:
+            continue
+        low = int(np.ceil(corners[a:b, 1].min() / CELL_M - 0.5))
+        high = int(np.floor(corners[a:b, 1].max() / CELL_M - 0.5))
+        meets = np.empty(b - a)
+        for iy in range(low, high + 1):
+            y, count = (iy + 0.5) * CELL_M, 0
+            j = b - 1
+            for i in range(a, b):
+                y0, y1 = corners[j, 1], corners[i, 1]
+                if (y0 > y) != (y1 > y):
+                    meets[count] = corners[j, 0] + (corners[i, 0] - corners[j, 0]) * (y - y0) / (y1 - y0)
+                    count += 1
+                j = i
+            across = np.sort(meets[:count])
+            for k in range(0, count - 1, 2):
+                begin = int(np.ceil(across[k] / CELL_M - 0.5))
+                end = int(np.floor(across[k + 1] / CELL_M - 0.5))
+                if end < begin:
+                    continue
+                if n == len(rows):
+                    longer = np.empty((2 * n, 3), np.int64)
+                    longer[:n] = rows
+                    rows = longer
+                rows[n, 0], rows[n, 1], rows[n, 2] = iy, begin, end
+                n += 1
+    return rows[:n].copy()
+
+
+@njit(cache=True, nogil=True)
+def _under(points, first):  # pragma: no cover - compiled
+    total = len(points)
+    for c in range(len(first) - 1):
+        for i in range(first[c], first[c + 1] - 1):
+            total += _steps(points, i)
+    rows, n = np.empty((total, 3), np.int64), 0
+    for c in range(len(first) - 1):
+        for i in range(first[c], first[c + 1]):
+            steps = _steps(points, i) if i + 1 < first[c + 1] else 1
+            after = i + 1 if i + 1 < first[c + 1] else i
+            for k in range(steps):
+                x = points[i, 0] + (points[after, 0] - points[i, 0]) * k / steps
+                y = points[i, 1] + (points[after, 1] - points[i, 1]) * k / steps
+                rows[n, 0] = int(np.floor(y / CELL_M))
+                rows[n, 1] = rows[n, 2] = int(np.floor(x / CELL_M))
+                n += 1
+    return rows[:n]
+
+
+@njit(cache=True, nogil=True)
+def _steps(points, i):  # pragma: no cover - compiled
+    """How many steps of half a cell it takes from a point to the next."""
+    return max(
+        1, int(np.ceil(2.0 * np.hypot(points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]) / CELL_M))
+    )
+
+
+@njit(cache=True, nogil=True)
+def _merged(runs):  # pragma: no cover - compiled
+    out, n = runs.copy(), 0
+    for k in range(1, len(runs)):
+        if runs[k, 0] == out[n, 0] and runs[k, 1] <= out[n, 2] + 1:
+            out[n, 2] = max(out[n, 2], runs[k, 2])
+        else:
+            n += 1
+            out[n] = runs[k]
+    return out[: n + 1].copy()
+
+
+@njit(cache=True, nogil=True)
+def _cut(points, first, inferred, runs):  # pragma: no cover - compiled
+    offsets, kept, n = [0], np.empty(len(points), np.int64), 0
+    for c in range(len(first) - 1):
+        for i in range(first[c], first[c + 1]):
+            if inferred[i] and not _seen(runs, points[i, 0], points[i, 1]):
+                if n > offsets[-1]:
+                    offsets.append(n)
+                continue
+            if n > offsets[-1] and not _whole(points, kept[n - 1], i, runs):
+                offsets.append(n)
+            kept[n] = i
+            n += 1
+        if n > offsets[-1]:
+            offsets.append(n)
+    return np.array(offsets), kept[:n].copy()
+
+
+@njit(cache=True, nogil=True)
+def _whole(points, i, j, runs):  # pragma: no cover - compiled
+    """Whether somebody looked at all of the way between two points; of neighbours less than a metre and a half apart, always."""
+    dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+    length = np.hypot(dx, dy)
+    if length < 1.5 * CELL_M:
+        return True
+    steps = int(np.ceil(2.0 * length / CELL_M))
+    k = 1
+    while k < steps and _seen(runs, points[i, 0] + dx * k / steps, points[i, 1] + dy * k / steps):
+        k += 1
+    return k == steps
+
+
+@njit(cache=True, nogil=True)
+def _seen(runs, x, y):  # pragma: no cover - compiled
+    """Whether the cell of a place is in a run."""
+    ix, iy = int(np.floor(x / CELL_M)), int(np.floor(y / CELL_M))
+    low, high = 0, len(runs)
+    while low < high:
+        middle = (low + high) >> 1
+        if runs[middle, 0] < iy or (runs[middle, 0] == iy and runs[middle, 1] <= ix):
+            low = middle + 1
+        else:
+            high = middle
+    return low > 0 and runs[low - 1, 0] == iy and runs[low - 1, 2] >= ix

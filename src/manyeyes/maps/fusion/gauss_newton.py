@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One damped Gauss-Newton step of each observation's rigid motion towards lines near its own, held back by its claim.
+
+Stage 2 of specs/maps.md 3.4: residuals count across lines only, along the mean normal of both lines, which has no bias on a
+bend; each point has at most one vote; the prior is the claimed pose, less what its drive is known to be off.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import njit
+from manyeyes.maps.fusion.observation_arrays import Sightings
+from manyeyes.maps.fusion.point_grid import span
+
+if TYPE_CHECKING:
+    from manyeyes.maps.fusion.pose_config import AlignConfig
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(home, own, others, numbers, stride=1):  # pragma: no cover - compiled
+    """Normal equations of each home observation: (H, 11) pivot x, y; information xx, xy, xt, yy, yt, tt; right side is
+    last of (H, 14): then x, y, t of the gradient, residual sum, vote sum, points. Every stride-th point votes, for all.
+    """
+    first, xy, tangent, kind, sigma = own
+    cell, keys, start, rxy, rtangent, robservation, rweight = others
+    gate, kernel, reach, cosine, scatter, correlation = numbers
+    correlation /= stride
+    out = np.zeros((len(home), 13))
+    c2 = kernel * kernel
+    far = gate * gate + reach * reach
+    radius, shorter = np.sqrt(far), 1.0 / reach
+    for h in range(len(home)):
+        o = home[h]
+        a, b = first[o], first[o + 1]
+        if a == b:
+            continue
+        px, py = xy[a:b, 0].mean(), xy[a:b, 1].mean()
+        out[h, 0], out[h, 1] = px, py
+        for p in range(a, b, stride):
+            x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
+            lowest, highest = int(np.floor((y - radius) / cell)), int(np.floor((y + radius) / cell))
+            total, pull, square = 0.0, 0.0, 0.0
+            for ix in range(int(np.floor((x - radius) / cell)), int(np.floor((x + radius) / cell)) + 1):
+                low, high = span(keys, start, kind[p], ix, lowest, highest)
+                for q in range(low, high):
+                    ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
+                    if ex * ex + ey * ey > far or robservation[q] == o:
+                        continue
+                    dot = u * rtangent[q, 0] + v * rtangent[q, 1]
+                    if abs(dot) < cosine:
+                        continue
+                    sign = 1.0 if dot > 0.0 else -1.0
+                    scale = 1.0 / np.sqrt(2.0 + 2.0 * abs(dot))
+                    mx, my = (u + sign * rtangent[q, 0]) * scale, (v + sign * rtangent[q, 1]) * scale
+                    along, aside = abs(ex * mx + ey * my), ey * mx - ex * my
+                    if along > reach or abs(aside) > gate:
+                        continue
+                    g = c2 / (c2 + aside * aside)
+                    w = rweight[q] * g * g * (1.0 - along * shorter)
+                    total += w
+                    pull += w * aside
+                    square += w * aside * aside
+            if total <= 0.0:
+                continue
+            vote = total / (total + 0.5)
+            aside = pull / total
+            w = vote / (correlation * (sigma[p] * sigma[p] + scatter * scatter))
+            jx, jy = -v, u
+            jt = -jx * (y - py) + jy * (x - px)
+            out[h, 2] += w * jx * jx
+            out[h, 3] += w * jx * jy
+            out[h, 4] += w * jx * jt
+            out[h, 5] += w * jy * jy
+            out[h, 6] += w * jy * jt
+            out[h, 7] += w * jt * jt
+            out[h, 8] += w * jx * aside
+            out[h, 9] += w * jy * aside
+            out[h, 10] += w * jt * aside
+            out[h, 11] += vote * aside * aside
+            out[h, 12] += vote
+    return out
+
+
+def step_poses(
+    sightings: Sightings, home: Ints, at: tuple[Floats, Floats, Floats], sums: Floats, config: AlignConfig
+) -> dict[str, Floats]:
+    """The columns of an Alignment that a sweep changes, for the home rows; at: start, lean and pose (O, 3) of all."""
+    start, lean, pose = (np.ascontiguousarray(rows[home]) for rows in at)
+    prior = np.ascontiguousarray(np.asarray(sightings.covariance)[home])
+    numbers = (config.frozen_above, config.prior_scale, config.damping)
+    trusted = np.asarray(sightings.trusted)[home]
+    after, covariance, observability, heard, urge = _steps(sums, start, lean, pose, prior, trusted, numbers)
+    return {
+        "pose": after,
+        "covariance": covariance,
+        "observability": observability,
+        "heard": heard,
+        "urge": urge,
+        "residual": sums[:, 11],
+        "matched": sums[:, 12],
+    }
+
+
+@njit(cache=True, nogil=True)
+def _steps(sums, start, lean, pose, prior, trusted, numbers):  # pragma: no cover - compiled
+    """Poses (H, 3) after the step, their covariances (H, 3, 3), how far lines tell each of their three directions (H, 3), and
+    the lines' information (H, 3, 3) and what they ask for (H, 3).
+    """
+    frozen_above, prior_scale, damping = numbers
+    count = len(sums)
+    after, covariance, observability = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3))
+    heard, urge = np.empty((count, 3, 3)), np.empty((count, 3))
+    jacobian, information = np.eye(3), np.empty((3, 3))
+    limit = np.array([1.0, 1.0, 0.05])
+    for h in range(count):
+        px, py = sums[h, 0], sums[h, 1]
+        jacobian[0, 2], jacobian[1, 2] = -(pose[h, 1] - py), pose[h, 0] - px
+        k = 2
+        for i in range(3):
+            for j in range(i, 3):
+                information[i, j] = information[j, i] = sums[h, k]
+                k += 1
+        moved = pose[h] - start[h]
+        moved[2] = (moved[2] + np.pi) % (2 * np.pi) - np.pi
+        off = moved - lean[h]
+        # In units in which the prior is a unit ball the data's information tells directly how much it adds to the prior.
+        inverse = np.linalg.inv(jacobian)
+        root = np.linalg.cholesky(inverse @ prior[h] @ inverse.T)
+        strength, axes = np.linalg.eigh(root.T @ information @ root)
+        strength = np.maximum(strength, 0.0)
+        spoken = np.where(1.0 / (1.0 + strength) <= frozen_above, strength, 0.0)
+        weighted = np.linalg.solve(prior[h], off)
+        distance = np.sum(off * weighted)
+        trust = (prior_scale**2 / (prior_scale**2 + distance)) ** 2
+        pull = axes.T @ (root.T @ sums[h, 8:11])
+        for i in range(3):
+            if spoken[i] <= 0.0:
+                pull[i] = 0.0
+        back = axes.T @ (root.T @ (jacobian.T @ weighted)) * trust
+        step = root @ (axes @ ((pull - back) / (spoken + trust))) * damping
+        step = np.minimum(np.maximum(step, -limit), limit)
+        if trusted[h]:
+            step[:] = 0.0
+        c, s = np.cos(step[2]), np.sin(step[2])
+        ax, ay = pose[h, 0] - px, pose[h, 1] - py
+        after[h, 0], after[h, 1] = px + c * ax - s * ay + step[0], py + s * ax + c * ay + step[1]
+        after[h, 2] = pose[h, 2] + step[2]
+        spread = jacobian @ root @ axes
+        outward = np.ascontiguousarray(np.linalg.inv(spread).T)
+        narrow = (spread / (1.0 + spoken)) @ spread.T
+        covariance[h] = (narrow + narrow.T) / 2
+        heard[h] = (outward * spoken) @ outward.T
+        observability[h] = np.sort(spoken / (1.0 + strength))
+        urge[h] = heard[h] @ moved + outward @ pull
+    return after, covariance, observability, heard, urge

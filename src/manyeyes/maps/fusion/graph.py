@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CrowdMap's sparse geometric graph as arrays: nodes are elements of maps and observations, edges say how two of them lie.
+
+CrowdMap 2.3 makes elements nodes and "spatial or semantic relations" edges and leaves both open; the relations here are those of
+specs/maps.md 3.3. Two lines face each other where the foot of a point of one lies inside the other and their directions differ
+by little; over such an interval the lateral offset has a mean and a median absolute deviation.
+
+overlap: of one class, facing each other at a small offset. parallel: lines that face each other at a lane's distance. continues:
+of one class, an end ahead of an end. crosses: they intersect at an angle. same_observation: seen by one agent in one look; where
+such elements face each other apart, they are two things, whatever others say (:attr:`ElementGraph.cannot_link`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from manyeyes._jit import njit
+from manyeyes.datatypes import ConfigError, ShapeError
+from manyeyes.datatypes.map_element import MapElements, frozen
+from manyeyes.maps.elements.observation import Observation
+from manyeyes.ops.polyline import close_rings, headings, near_pairs, resample_spaced
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+RELATIONS = ("overlap", "continues", "parallel", "crosses", "same_observation")
+OVERLAP, CONTINUES, PARALLEL, CROSSES, SAME_OBSERVATION = range(len(RELATIONS))
+# Columns of what is measured of a pair, in the order in which the compiled loop writes them.
+_START_I, _END_I, _START_J, _END_J, _MEAN, _SPREAD, _COUNT, _CROSS_I, _CROSS_J, _CROSS_TURN, _GAP, _GAP_TURN, _ENDS = (
+    range(13)
+)
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """Metres and radians. spacing_m: of the points that are compared. turn: greatest difference of directions that face.
+
+    overlap_m: greatest mean offset of an overlap; parallel_m: of a parallel. least_m: shortest interval of either, or half of the
+    shorter element. gap_m, gap_turn: of ends that continue, aside by at most aside_m + aside_share times the gap. cross_turn: least
+    angle of a crossing. apart_m: offset from which elements of one observation are two.
+    """
+
+    spacing_m: float = 1.0
+    turn: float = math.radians(20.0)
+    overlap_m: float = 1.2
+    parallel_m: float = 6.0
+    least_m: float = 5.0
+    gap_m: float = 6.0
+    gap_turn: float = math.radians(15.0)
+    aside_m: float = 0.25
+    aside_share: float = 0.08
+    cross_turn: float = math.radians(20.0)
+    apart_m: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class ElementGraph:
+    """E relations of N nodes, ordered by relation, then rows.
+
+    nodes: the elements, map's frame. observation: (N,) which one saw each, -1: an element of a map. edge: (E, 2) rows i < j.
+    relation: (E,) index into RELATIONS. interval: (E, 4) metres along i from, to, and along j from, to, where they face each
+    other or cross; NaN: nowhere. lateral, spread: (E,) mean offset of j on i's left hand, metres, and its median absolute
+    deviation. gap: (E,) metres between ends that continue. turn: (E,) radians between directions, [0, pi / 2]. ends: (E, 2)
+    which end of i and of j continue each other, 0 its first point, 1 its last; -1: none.
+    """
+
+    nodes: MapElements
+    observation: Ints
+    edge: Ints
+    relation: Ints
+    interval: Floats
+    lateral: Floats
+    spread: Floats
+    gap: Floats
+    turn: Floats
+    ends: Ints
+    apart_m: float
+
+    def __len__(self) -> int:
+        return len(self.edge)
+
+    def of(self, relation: str) -> ElementGraph:
+        """The edges of one relation."""
+        if relation not in RELATIONS:
+            raise ConfigError(
+                f"ElementGraph: expected a relation of {', '.join(RELATIONS)}; got {relation!r}. Choose one."
+            )
+        chosen = self.relation == RELATIONS.index(relation)
+        kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name in ("nodes", "observation", "apart_m")}
+        return ElementGraph(
+            **kept, **{f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name not in kept}
+        )
+
+    @property
+    def cannot_link(self) -> NDArray[np.bool_]:
+        """(E,) pairs of one observation that face each other farther apart than one thing is wide."""
+        return (self.relation == SAME_OBSERVATION) & (np.abs(self.lateral) > self.apart_m)
+
+
+def observation_graph(
+    observations: Sequence[Observation], known: MapElements | None = None, config: GraphConfig = GraphConfig()
+) -> ElementGraph:
+    """The graph of all elements of observations at their claimed poses, ordered by time and id, after those of a map."""
+    chosen = sorted({o.id: o for o in observations}.values(), key=lambda o: (o.time_ns, o.id))
+    sets = [known or MapElements.empty(), *(o.in_map() for o in chosen)]
+    owner = np.repeat(np.arange(-1, len(chosen)), [len(s) for s in sets])
+    return element_graph(MapElements.cat(sets), owner, config)
+
+
+def element_graph(nodes: MapElements, observation: ArrayLike = -1, config: GraphConfig = GraphConfig()) -> ElementGraph:
+    """The graph of elements in one frame; observation: (N,) or one for all, -1 for elements of a map."""
+    owner = np.array(np.broadcast_to(np.asarray(observation, np.int64), (len(nodes),)))
+    if len(nodes) and int(nodes.counts.min()) < 2:
+        raise ShapeError("element_graph needs elements of two points or more; got fewer: take those with counts > 1.")
+    pairs = near_pairs(nodes.bounds(), max(config.parallel_m, config.gap_m))
+    points, first = close_rings(nodes.points, nodes.first, nodes.closed)
+    dense, dense_first = resample_spaced(points, first, config.spacing_m)
+    lines = (frozen(points, np.float64), frozen(first, np.int64))
+    samples = (frozen(dense, np.float64), frozen(dense_first, np.int64), headings(dense, dense_first))
+    numbers = np.array(
+        (config.turn, config.gap_m, config.gap_turn, config.aside_m, config.aside_share, config.cross_turn)
+    )
+    found = _measure(*lines, *samples, frozen(pairs, np.int64), nodes.closed, numbers)
+    return _classified(nodes, owner, pairs, found, config)
+
+
+def _classified(nodes: MapElements, owner: Ints, pairs: Ints, found: Floats, config: GraphConfig) -> ElementGraph:
+    """The edges that the measurements (K, 13) of pairs (K, 2) make."""
+    i, j = pairs.T
+    length = nodes.lengths()
+    least = np.minimum(config.least_m, 0.5 * np.minimum(length[i], length[j]))
+    facing = (found[:, _COUNT] >= 2) & (found[:, _END_I] - found[:, _START_I] >= least)
+    offset = np.abs(found[:, _MEAN])
+    alike = nodes.kind[i] == nodes.kind[j]
+    lines = ~nodes.closed[i] & ~nodes.closed[j]
+    overlap = facing & alike & (offset <= config.overlap_m)
+    of_one = (owner[i] == owner[j]) & (owner[i] >= 0)
+    chosen = {
+        OVERLAP: overlap,
+        CONTINUES: alike & lines & ~overlap & np.isfinite(found[:, _GAP]),
+        PARALLEL: facing & lines & (offset > config.overlap_m) & (offset <= config.parallel_m),
+        CROSSES: np.isfinite(found[:, _CROSS_I]),
+        SAME_OBSERVATION: of_one,
+    }
+    rows = np.concatenate([np.flatnonzero(chosen[k]) for k in range(len(RELATIONS))]).astype(np.int64)
+    relation = np.repeat(np.arange(len(RELATIONS)), [int(chosen[k].sum()) for k in range(len(RELATIONS))])
+    held = found[rows]
+    sides = np.isin(relation, (OVERLAP, PARALLEL, SAME_OBSERVATION)) & facing[rows]
+    crossing, continuing = relation == CROSSES, relation == CONTINUES
+    interval = np.where(sides[:, None], held[:, [_START_I, _END_I, _START_J, _END_J]], np.nan)
+    interval = np.where(crossing[:, None], held[:, [_CROSS_I, _CROSS_I, _CROSS_J, _CROSS_J]], interval)
+    ends = np.where(continuing, held[:, _ENDS], -1).astype(np.int64)
+    turn = np.where(crossing, held[:, _CROSS_TURN], np.where(continuing, held[:, _GAP_TURN], np.nan))
+    return ElementGraph(
+        nodes=nodes,
+        observation=owner,
+        edge=pairs[rows],
+        relation=relation,
+        interval=interval,
+        lateral=np.where(sides, held[:, _MEAN], np.nan),
+        spread=np.where(sides, held[:, _SPREAD], np.nan),
+        gap=np.where(continuing, held[:, _GAP], np.nan),
+        turn=turn,
+        ends=np.where(ends[:, None] >= 0, np.stack((ends // 2, ends % 2), 1), -1),
+        apart_m=config.apart_m,
+    )
+
+
+@njit(cache=True)
+def _measure(points, first, dense, dense_first, heading, pairs, closed, numbers):  # pragma: no cover - compiled
+    """(K, 13) what is measured of each pair; infinity where two ends do not continue or two lines do not cross."""
+    out = np.full((len(pairs), 13), np.inf)
+    out[:, :_CROSS_I] = 0.0
+    for k in range(len(pairs)):
+        i, j = pairs[k]
+        line = points[first[j] : first[j + 1]]
+        _face(
+            dense[dense_first[i] : dense_first[i + 1]],
+            heading[dense_first[i] : dense_first[i + 1]],
+            line,
+            numbers[0],
+            out[k],
+        )
+        _cross(points[first[i] : first[i + 1]], line, numbers[5], out[k])
+        if not closed[i] and not closed[j]:
+            _continue(points[first[i] : first[i + 1]], line, numbers, out[k])
+    return out
+
+
+@njit(cache=True)
+def _turn(ax, ay, bx, by):  # pragma: no cover - compiled
+    """The angle between two directions without regard to sense, [0, pi / 2]."""
+    return np.arctan2(abs(ax * by - ay * bx), abs(ax * bx + ay * by))
+
+
+@njit(cache=True)
+def _face(dense, heading, line, most_turn, out):  # pragma: no cover - compiled
+    """Interval and offset of the points whose foot lies inside the line, under a like direction."""
+    n = len(dense)
+    lateral = np.empty(n)
+    count, passed_i = 0, 0.0
+    for p in range(n):
+        if p > 0:
+            passed_i += np.hypot(dense[p, 0] - dense[p - 1, 0], dense[p, 1] - dense[p - 1, 1])
+        x, y = dense[p]
+        cx, cy = np.cos(heading[p]), np.sin(heading[p])
+        best, side, at, passed = np.inf, 0.0, 0.0, 0.0
+        for q in range(len(line) - 1):
+            dx, dy = line[q + 1, 0] - line[q, 0], line[q + 1, 1] - line[q, 1]
+            squared = dx * dx + dy * dy
+            if squared == 0.0:
+                continue
+            length = np.sqrt(squared)
+            share = ((x - line[q, 0]) * dx + (y - line[q, 1]) * dy) / squared
+            held = min(max(share, 0.0), 1.0)
+            ex, ey = line[q, 0] + held * dx - x, line[q, 1] + held * dy - y
+            gap = ex * ex + ey * ey
+            beyond = (q == 0 and share < -1e-9) or (q == len(line) - 2 and share > 1.0 + 1e-9)
+            if gap < best:
+                best = gap
+                if beyond or _turn(cx, cy, dx, dy) > most_turn:
+                    side = np.inf
+                else:
+                    side = np.sqrt(gap) if cx * ey - cy * ex >= 0.0 else -np.sqrt(gap)
+                    at = passed + held * length
+            passed += length
+        if np.isfinite(best) and np.isfinite(side):
+            if count == 0:
+                out[_START_I], out[_START_J], out[_END_J] = passed_i, at, at
+            out[_END_I] = passed_i
+            out[_START_J], out[_END_J] = min(out[_START_J], at), max(out[_END_J], at)
+            lateral[count] = side
+            count += 1
+    out[_COUNT] = count
+    if count > 0:
+        found = lateral[:count]
+        out[_MEAN] = found.mean()
+        out[_SPREAD] = np.median(np.abs(found - np.median(found)))
+
+
+@njit(cache=True)
+def _cross(one, two, least_turn, out):  # pragma: no cover - compiled
+    """Where along both they first intersect at an angle."""
+    passed_i = 0.0
+    for p in range(len(one) - 1):
+        ax, ay = one[p + 1, 0] - one[p, 0], one[p + 1, 1] - one[p, 1]
+        length_i, passed_j = np.hypot(ax, ay), 0.0
+        for q in range(len(two) - 1):
+            bx, by = two[q + 1, 0] - two[q, 0], two[q + 1, 1] - two[q, 1]
+            length_j = np.hypot(bx, by)
+            across = ax * by - ay * bx
+            if across != 0.0 and _turn(ax, ay, bx, by) >= least_turn:
+                ox, oy = two[q, 0] - one[p, 0], two[q, 1] - one[p, 1]
+                s, t = (ox * by - oy * bx) / across, (ox * ay - oy * ax) / across
+                if 0.0 <= s <= 1.0 and 0.0 <= t <= 1.0:
+                    out[_CROSS_I], out[_CROSS_J] = passed_i + s * length_i, passed_j + t * length_j
+                    out[_CROSS_TURN] = _turn(ax, ay, bx, by)
+                    return
+            passed_j += length_j
+        passed_i += length_i
+
+
+@njit(cache=True)
+def _continue(one, two, numbers, out):  # pragma: no cover - compiled
+    """The nearest pair of ends of which each lies ahead of the other."""
+    for end_i in range(2):
+        a, before = (len(one) - 1, len(one) - 2) if end_i else (0, 1)
+        ux, uy = one[a, 0] - one[before, 0], one[a, 1] - one[before, 1]
+        norm_u = np.hypot(ux, uy)
+        for end_j in range(2):
+            b, inner = (len(two) - 1, len(two) - 2) if end_j else (0, 1)
+            vx, vy = two[b, 0] - two[inner, 0], two[b, 1] - two[inner, 1]
+            norm_v = np.hypot(vx, vy)
+            gx, gy = two[b, 0] - one[a, 0], two[b, 1] - one[a, 1]
+            gap = np.hypot(gx, gy)
+            if norm_u == 0.0 or norm_v == 0.0 or gap > numbers[1] or gap >= out[_GAP]:
+                continue
+            ahead = (gx * ux + gy * uy) / norm_u
+            aside = abs(gx * uy - gy * ux) / norm_u
+            turn = _turn(ux, uy, vx, vy)
+            # Two ends may have passed each other by as much as a line's own spread.
+            if (
+                ux * vx + uy * vy < 0.0
+                and turn < numbers[2]
+                and aside <= numbers[3] + numbers[4] * gap
+                and ahead >= -0.5
+            ):
+                out[_GAP], out[_GAP_TURN], out[_ENDS] = gap, turn, 2 * end_i + end_j

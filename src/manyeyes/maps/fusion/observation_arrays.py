@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A set of observations as columns: sorted, each once, its elements sampled to points, its views ready to be asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import njit
+from manyeyes.datatypes.map_element import CROSSING, MapElements, frozen
+from manyeyes.maps.elements.observation import Observation
+from manyeyes.maps.fusion.point_grid import content_priority, resample_lines
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+DAY_NS = 86_400_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """Polygons of O observations: ring r is ``xy[first[r]:first[r + 1]]``, rings of o are ``of[o]:of[o + 1]``; agents'
+    frames.
+    """
+
+    xy: Floats
+    first: Ints
+    of: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """O observations, ordered by time and then by id, and the P points of their E elements, in the agents' frames.
+
+    ids: (O,) hexadecimal. drives: (O,) names of drives, each one agent's. agent, time_ns: (O,). pose: (O, 3) and
+    covariance (O, 3, 3) as claimed. trusted: (O,).
+    reach_m: (O,) from the agent to the farthest point or corner of view. first: (O + 1,) offsets of points.
+    observation, element, kind: (P,). xy, tangent: (P, 2). sigma: (P,) metres. priority: (P,) of
+    associate.content_priority. elements: all, agents' frames; element_observation: (E,). element_first: (E + 1,)
+    offsets of points. agents: names, ascending; ``agent`` counts in them.
+    """
+
+    ids: tuple[str, ...]
+    drives: tuple[str, ...]
+    agents: tuple[str, ...]
+    agent: Ints
+    time_ns: Ints
+    pose: Floats
+    covariance: Floats
+    trusted: Flags
+    reach_m: Floats
+    first: Ints
+    observation: Ints
+    element: Ints
+    kind: Ints
+    xy: Floats
+    tangent: Floats
+    sigma: Floats
+    priority: NDArray[np.uint64]
+    elements: MapElements
+    element_observation: Ints
+    element_first: Ints
+    view: Rings
+    occluders: Rings
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def world(self, pose: Floats) -> tuple[Floats, Floats]:
+        """Points and tangents (P, 2) in the map's frame when the agents stand at pose (O, 3)."""
+        return _in_world(self.xy, self.tangent, self.first, np.ascontiguousarray(pose))
+
+    def world_view(self, pose: Floats) -> Floats:
+        """Corners (Q, 2) of all views in the map's frame when the agents stand at pose (O, 3)."""
+        owner = np.repeat(np.repeat(np.arange(len(self)), np.diff(self.view.of)), np.diff(self.view.first))
+        at = pose[owner]
+        c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
+        x, y = self.view.xy[:, 0], self.view.xy[:, 1]
+        return np.stack((c * x - s * y + at[:, 0], s * x + c * y + at[:, 1]), 1)
+
+
+@njit(cache=True, nogil=True)
+def _in_world(xy, tangent, first, pose):  # pragma: no cover - compiled
+    """Points and tangents (P, 2) of observations, those of o from first[o] on, that stand at pose (O, 3)."""
+    out, turned = np.empty_like(xy), np.empty_like(tangent)
+    for o in range(len(first) - 1):
+        c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
+        for p in range(first[o], first[o + 1]):
+            x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
+            out[p, 0], out[p, 1] = c * x - s * y + pose[o, 0], s * x + c * y + pose[o, 1]
+            turned[p, 0], turned[p, 1] = c * u - s * v, s * u + c * v
+    return out, turned
+
+
+def gather(observations: Sequence[Observation], spacing_m: float) -> Sightings:
+    """Observations as columns, whatever their order and however often each is given.
+
+    Elements are sampled about every spacing_m along them. Observations stand in the order of time, then id.
+    """
+    once = {o.id: o for o in observations}
+    chosen = sorted(once.values(), key=lambda o: (o.time_ns, o.id))
+    count = len(chosen)
+    agents = tuple(sorted({o.agent for o in chosen}))
+    number = {name: k for k, name in enumerate(agents)}
+    elements = MapElements.cat([o.elements for o in chosen])
+    owner = np.repeat(np.arange(count), [len(o.elements) for o in chosen]).astype(np.int64)
+    first, xy, tangent, sigma = resample_lines(
+        elements.first, elements.points, elements.sigma, elements.closed, spacing_m
+    )
+    element = np.repeat(np.arange(len(elements)), np.diff(first))
+    observation = owner[element]
+    view = _rings([o.view for o in chosen], np.arange(count + 1))
+    hidden = [o.occluders.ring(r) for o in chosen for r in range(len(o.occluders))]
+    occluders = _rings(hidden, np.cumsum([0, *(len(o.occluders) for o in chosen)]))
+    reach = np.zeros(count)
+    np.maximum.at(reach, observation, np.hypot(xy[:, 0], xy[:, 1]))
+    np.maximum.at(reach, np.repeat(np.arange(count), np.diff(view.first)), np.hypot(view.xy[:, 0], view.xy[:, 1]))
+    return Sightings(
+        ids=tuple(o.id for o in chosen),
+        drives=tuple(f"{o.agent}\n{o.pass_id}" for o in chosen),
+        agents=agents,
+        agent=frozen([number[o.agent] for o in chosen], np.int64),
+        time_ns=frozen([o.time_ns for o in chosen], np.int64),
+        pose=frozen(np.reshape([o.pose for o in chosen], (-1, 3)), np.float64),
+        covariance=frozen(np.reshape([o.covariance for o in chosen], (-1, 3, 3)), np.float64),
+        trusted=frozen([o.trusted for o in chosen], np.bool_),
+        reach_m=reach,
+        first=np.searchsorted(observation, np.arange(count + 1)).astype(np.int64),
+        observation=observation,
+        element=element,
+        kind=np.asarray(elements.kind)[element],
+        xy=xy,
+        tangent=tangent,
+        sigma=sigma,
+        priority=content_priority(xy),
+        elements=elements,
+        element_observation=owner,
+        element_first=first,
+        view=view,
+        occluders=occluders,
+    )
+
+
+def is_line(kind: Ints) -> Flags:
+    """Which kinds (N,) are lines; a crossing is a ring."""
+    return np.asarray(kind) != CROSSING
+
+
+@njit(cache=True, nogil=True)
+def sight(
+    x: float, y: float, o: int, view: tuple[Floats, Ints, Ints], occluders: tuple[Floats, Ints, Ints], margin: float
+) -> float:
+    """How well observation o could see the point x, y of its own frame: 0 outside its view or behind an occluder, 1
+    well inside.
+
+    ``view`` and ``occluders`` are (xy, first, of) of :class:`Rings`. Within ``margin`` metres of the border of what can
+    be seen it rises linearly: there a missing line says little.
+    """
+    xy, first, of = view
+    best = -1.0
+    for r in range(of[o], of[o + 1]):
+        inside, distance = _inside(x, y, xy, first[r], first[r + 1])
+        if inside:
+            best = max(best, distance)
+    if best < 0.0:
+        return 0.0
+    xy, first, of = occluders
+    for r in range(of[o], of[o + 1]):
+        inside, distance = _inside(x, y, xy, first[r], first[r + 1])
+        if inside or _blocks(x, y, xy, first[r], first[r + 1]):
+            return 0.0
+        best = min(best, distance)
+    return min(1.0, best / margin)
+
+
+@njit(cache=True, nogil=True)
+def _inside(x: float, y: float, xy: Floats, a: int, b: int) -> tuple[bool, float]:
+    """Whether x, y lies in the ring of points a..b, and how far from its border."""
+    inside, nearest = False, np.inf
+    j = b - 1
+    for i in range(a, b):
+        x0, y0, x1, y1 = xy[j, 0], xy[j, 1], xy[i, 0], xy[i, 1]
+        if (y0 > y) != (y1 > y) and x < (x1 - x0) * (y - y0) / (y1 - y0) + x0:
+            inside = not inside
+        dx, dy = x1 - x0, y1 - y0
+        norm = dx * dx + dy * dy
+        t = min(1.0, max(0.0, ((x - x0) * dx + (y - y0) * dy) / norm)) if norm > 0.0 else 0.0
+        ex, ey = x0 + t * dx - x, y0 + t * dy - y
+        nearest = min(nearest, ex * ex + ey * ey)
+        j = i
+    return inside, np.sqrt(nearest)
+
+
+@njit(cache=True, nogil=True)
+def _blocks(x: float, y: float, xy: Floats, a: int, b: int) -> bool:
+    """Whether the sight line from the agent, who stands at the origin, to x, y meets an edge of the ring a..b."""
+    j = b - 1
+    for i in range(a, b):
+        x0, y0, x1, y1 = xy[j, 0], xy[j, 1], xy[i, 0], xy[i, 1]
+        if (x * y0 - y * x0) * (x * y1 - y * x1) < 0.0:
+            dx, dy = x1 - x0, y1 - y0
+            if (dx * (0.0 - y0) - dy * (0.0 - x0)) * (dx * (y - y0) - dy * (x - x0)) < 0.0:
+                return True
+        j = i
+    return False
+
+
+def _rings(rings: Sequence[Floats], of: Ints | NDArray) -> Rings:
+    first = np.concatenate(([0], np.cumsum([len(ring) for ring in rings], dtype=np.int64))).astype(np.int64)
+    xy = np.concatenate(rings) if rings else np.zeros((0, 2))
+    return Rings(np.ascontiguousarray(xy), first, np.asarray(of, np.int64))

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lines that end where few looked go on beside a neighbour that was seen: lanes run side by side.
+
+A drop-out hides one line and not the next. Where a chain of stations ends, a line beside it that ran parallel so far may
+lead on, its guide: stations are inferred at the same distance from it, until they arrive at another part of the same
+line, or, if they arrive nowhere, for a short way. They are inferred only where the guide was in view at least once, so
+that the ground was seen, and not often, so that nobody's having seen the line is likely chance. Source: this project's
+(specs/maps.md 3.4 stage 5 bridges straight gaps alone).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import njit
+from manyeyes.maps.fusion.point_grid import build_grid, span
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_CELL_M = 2.5
+_BESIDE_M = 0.8  # along a line, within which a point of it lies beside another point
+
+
+@dataclass(frozen=True)
+class BesideConfig:
+    """nearest_m, farthest_m: of a guide. even_m: how much its distance may change over the last back_m of the line.
+    heading_rad: largest turn against it.
+
+    few: how often a place may have been in view (summed visibility). across_m: how far aside of the line's other part
+    the way may arrive. bridge_m: longest way that arrives; open_m: by kind, longest that does not (divider, boundary,
+    crossing, stop line).
+    """
+
+    nearest_m: float = 2.0
+    farthest_m: float = 5.0
+    even_m: float = 0.5
+    back_m: float = 8.0
+    heading_rad: float = 0.15
+    few: float = 5.0
+    across_m: float = 1.2
+    bridge_m: float = 80.0
+    open_m: tuple[float, float, float, float] = (40.0, 0.0, 0.0, 0.0)
+
+
+def continued(
+    xy: Floats,
+    kind: Ints,
+    coverage: Floats,
+    chains: tuple[Ints, Ints],
+    config: BesideConfig = BesideConfig(),
+) -> tuple[Floats, Floats, Ints]:
+    """Inferred stations (V, 2), their unit tangents and the end station (V,) that each continues.
+
+    xy, kind, coverage: (K,) stations, as in linking.link, whose answer is ``chains``.
+    """
+    first, members = chains
+    chain, place = np.empty(len(xy), np.int64), np.empty(len(xy), np.int64)
+    chain[members] = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    place[members] = np.arange(len(members))
+    grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _CELL_M)
+    line = xy[members]
+    numbers = np.array([
+        config.nearest_m, config.farthest_m, config.even_m, config.back_m, np.cos(config.heading_rad), config.few,
+        config.across_m, config.bridge_m,
+    ])  # fmt: skip
+    return _continue(
+        members,
+        (first, line, _chords(line, first), kind[members], coverage[members], chain[members]),
+        (grid.keys, grid.start, place[grid.order]),
+        numbers,
+        np.array(config.open_m),
+    )
+
+
+def _chords(line: Floats, first: Ints) -> Floats:
+    """(M, 2) unit direction of each chain at its points, over three points on each side."""
+    at = np.arange(len(line))
+    low, high = np.repeat(first[:-1], np.diff(first)), np.repeat(first[1:] - 1, np.diff(first))
+    step = line[np.minimum(at + 3, high)] - line[np.maximum(at - 3, low)]
+    return step / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
+
+
+@njit(cache=True, nogil=True)
+def _continue(members, lines, grid, numbers, open_m):  # pragma: no cover - compiled
+    """lines: each chain's first point and, of every point, place, direction, kind, coverage and chain. grid: of the points."""
+    first, line, chord, kind, _, chain = lines
+    xy, tangent, source = [(0.0, 0.0)], [(0.0, 0.0)], [0]
+    way, turn = np.empty((1024, 2)), np.empty((1024, 2))
+    met = np.zeros(len(line), np.bool_)
+    for c in range(len(first) - 1):
+        if first[c + 1] - first[c] < 4 or kind[first[c]] > 1:
+            continue
+        for side in range(2):
+            end, inward = (first[c], 1) if side == 0 else (first[c + 1] - 1, -1)
+            # Of two ends that lead to each other one is enough.
+            if met[end]:
+                continue
+            best, arrived = 0, -1
+            for g in _guides(end, inward, lines, grid, numbers):
+                against = (chord[g, 0] * chord[end, 0] + chord[g, 1] * chord[end, 1]) * inward > 0.0
+                n, gap, at = _walk(end, g, -1 if against else 1, lines, grid, numbers, open_m, way, turn)
+                # One that arrives before one that does not, then the longer.
+                if n == 0 or (arrived >= 0 and at < 0) or ((at >= 0) == (arrived >= 0) and n <= best):
+                    continue
+                for _ in range(best):
+                    xy.pop()
+                    tangent.pop()
+                    source.pop()
+                best, arrived = n, at
+                for i in range(n):
+                    share = gap * (i + 1) / (n + 1)
+                    xy.append((way[i, 0] - turn[i, 1] * share, way[i, 1] + turn[i, 0] * share))
+                    tangent.append((turn[i, 0], turn[i, 1]))
+                    source.append(members[end])
+            if arrived >= 0:
+                met[max(first[chain[arrived]], arrived - 4) : min(first[chain[arrived] + 1], arrived + 5)] = True
+    return np.array(xy)[1:], np.array(tangent)[1:], np.array(source)[1:]
+
+
+@njit(cache=True, nogil=True)
+def _guides(end, inward, lines, grid, numbers):  # pragma: no cover - compiled
+    """The nearest point of each line that runs beside the end of a chain, and did so before."""
+    first, line, chord, kind, _, chain = lines
+    keys, start, order = grid
+    nearest, farthest, even, back, cosine = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    found = [0]
+    x, y = line[end, 0], line[end, 1]
+    size = first[chain[end] + 1] - first[chain[end]]
+    inner, walked = end, 0.0
+    for _ in range(size - 1):
+        if walked >= back:
+            break
+        walked += np.hypot(line[inner + inward, 0] - line[inner, 0], line[inner + inward, 1] - line[inner, 1])
+        inner += inward
+    ix, iy = int(np.floor(x / _CELL_M)), int(np.floor(y / _CELL_M))
+    wide = int(np.ceil(np.hypot(farthest, _BESIDE_M) / _CELL_M))
+    for dx in range(-wide, wide + 1):
+        low, high = span(keys, start, 0, ix + dx, iy - wide, iy + wide)
+        for k in range(low, high):
+            q = order[k]
+            if chain[q] == chain[end] or kind[q] > 1:
+                continue
+            dot = chord[q, 0] * chord[end, 0] + chord[q, 1] * chord[end, 1]
+            ex, ey = x - line[q, 0], y - line[q, 1]
+            aside, along = chord[q, 0] * ey - chord[q, 1] * ex, chord[q, 0] * ex + chord[q, 1] * ey
+            if abs(dot) < cosine or abs(along) > _BESIDE_M or abs(aside) < nearest or abs(aside) > farthest:
+                continue
+            before = _beside(line[inner, 0], line[inner, 1], chain[q], first, line, chord)
+            if abs(before - aside) <= even:
+                found.append(q)
+    return found[1:]
+
+
+@njit(cache=True, nogil=True)
+def _beside(x, y, c, first, line, chord):  # pragma: no cover - compiled
+    """How far left of a chain a place lies; inf where it has no foot on it."""
+    best, out = np.inf, np.inf
+    for q in range(first[c], first[c + 1]):
+        ex, ey = x - line[q, 0], y - line[q, 1]
+        square = ex * ex + ey * ey
+        if square < best:
+            best = square
+            along = abs(chord[q, 0] * ex + chord[q, 1] * ey)
+            out = chord[q, 0] * ey - chord[q, 1] * ex if along < 3.0 else np.inf
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _walk(end, g, ahead, lines, grid, numbers, open_m, way, turn):  # pragma: no cover - compiled
+    """Places beside a guide from its point g on, written to way and turn: their number, the gap across where they
+    arrive, and at which point (-1: nowhere).
+    """
+    _, line, chord, kind, coverage, chain = lines
+    few, across, bridge = numbers[5], numbers[6], numbers[7]
+    ex, ey = line[end, 0] - line[g, 0], line[end, 1] - line[g, 1]
+    aside = chord[g, 0] * ey - chord[g, 1] * ex
+    n, walked, free, q = 0, 0.0, 0, g
+    while n < len(way):
+        after = q + ahead
+        if after < 0 or after >= len(line) or chain[after] != chain[g]:
+            break
+        step = np.hypot(line[after, 0] - line[q, 0], line[after, 1] - line[q, 1])
+        walked, q = walked + step, after
+        if step > 6.0 or walked > bridge or coverage[q] > few or coverage[q] <= 0.5:
+            break
+        u, v = ahead * chord[q, 0], ahead * chord[q, 1]
+        x, y = line[q, 0] - aside * chord[q, 1], line[q, 1] + aside * chord[q, 0]
+        if walked > 2.0:
+            at, gap = _arrival(x, y, u, v, end, lines, grid, across)
+            if at >= 0:
+                return n, gap, at
+        if walked >= 1.0:
+            way[n, 0], way[n, 1], turn[n, 0], turn[n, 1] = x, y, u, v
+            n += 1
+            free = n if walked <= open_m[kind[end]] else free
+    return free, 0.0, -1
+
+
+@njit(cache=True, nogil=True)
+def _arrival(x, y, u, v, end, lines, grid, across):  # pragma: no cover - compiled
+    """The point of another chain of the end's kind nearest across a way at x, y in direction u, v, and how far left it
+    lies; -1: none.
+    """
+    _, line, chord, kind, _, chain = lines
+    keys, start, order = grid
+    ix, iy = int(np.floor(x / _CELL_M)), int(np.floor(y / _CELL_M))
+    best, at = np.inf, -1
+    for dx in range(-1, 2):
+        low, high = span(keys, start, 0, ix + dx, iy - 1, iy + 1)
+        for k in range(low, high):
+            q = order[k]
+            if chain[q] == chain[end] or kind[q] != kind[end] or abs(chord[q, 0] * u + chord[q, 1] * v) < 0.9:
+                continue
+            ex, ey = line[q, 0] - x, line[q, 1] - y
+            aside = u * ey - v * ex
+            if abs(u * ex + v * ey) <= 1.0 and abs(aside) <= across and abs(aside) < abs(best):
+                best, at = aside, q
+    return at, best

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who is near whom: map elements as points with tangents, a sorted grid over them, and a bound on how many count.
+
+Everything here is local and free of input order: a cell of the grid is anchored at the map's origin, points of a cell
+stand in the order of their observations, and which observations of a crowded cell are kept depends on that cell alone.
+So a sum over neighbours has the same terms in the same order whichever tile it is computed in. Source: specs/maps.md
+3.4, 3.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import njit
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_BIAS = 1 << 29  # cells are counted from -2^29 to 2^29 along x and y
+_SHIFT = 30
+
+
+@dataclass(frozen=True)
+class PointGrid:
+    """Points sorted by (kind, cell): ``keys`` (U,) of the occupied cells, ``start`` (U+1,) and ``order`` (P,) into the
+    points.
+    """
+
+    cell_m: float
+    keys: Ints
+    start: Ints
+    order: Ints
+
+
+def build_grid(x: Floats, y: Floats, kind: Ints, cell_m: float) -> PointGrid:
+    """The grid of cell size cell_m over points (P,); within a cell the points keep their order."""
+    key = cell_key(kind, x, y, cell_m)
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    begins = np.flatnonzero(np.concatenate((np.ones(min(1, len(key)), bool), ordered[1:] != ordered[:-1])))
+    return PointGrid(cell_m, ordered[begins], np.concatenate((begins, [len(key)])).astype(np.int64), order)
+
+
+def cell_key(kind: Ints, x: Floats, y: Floats, cell_m: float) -> Ints:
+    """One integer (P,) for kind and cell; along y neighbouring cells have neighbouring keys."""
+    ix = np.floor(x / cell_m).astype(np.int64) + _BIAS
+    iy = np.floor(y / cell_m).astype(np.int64) + _BIAS
+    return (kind.astype(np.int64) << (2 * _SHIFT)) | (ix << _SHIFT) | iy
+
+
+@njit(cache=True, nogil=True)
+def span(keys: Ints, start: Ints, kind: int, ix: int, iy0: int, iy1: int) -> tuple[int, int]:
+    """The range in a grid's order of the points of cells (ix, iy0..iy1) of a kind."""
+    base = (kind << 60) | ((ix + 536870912) << 30)
+    low = lower_bound(keys, base | (iy0 + 536870912))
+    high, end = low, base | (iy1 + 536870912)
+    while high < len(keys) and keys[high] <= end:
+        high += 1
+    return start[low], start[high]
+
+
+@njit(cache=True, nogil=True)
+def lower_bound(keys: Ints, key: int) -> int:
+    """The first place in ascending keys whose key is at least this one."""
+    low, high = 0, len(keys)
+    while low < high:
+        middle = (low + high) >> 1
+        if keys[middle] < key:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True, nogil=True)
+def resample_lines(
+    first: Ints, points: Floats, sigma: Floats, closed: NDArray[np.bool_], spacing: float
+) -> tuple[Ints, Floats, Floats, Floats]:
+    """Elements (E) as points at equal arc length, about ``spacing`` apart, with unit tangents and sigma.
+
+    Returns first (E+1,), points (P, 2), tangents (P, 2) and sigma (P,). A closed ring is walked once and its first
+    point is not repeated; an element without length gives no points. The tangent is the chord over the two neighbours:
+    noise of a vertex counts half.
+    """
+    count = len(first) - 1
+    sizes = np.zeros(count + 1, np.int64)
+    lengths = np.zeros(count, np.float64)
+    for e in range(count):
+        length = 0.0
+        n = first[e + 1] - first[e]
+        last = n if closed[e] else n - 1
+        for k in range(last):
+            i, j = first[e] + k, first[e] + (k + 1) % n
+            length += np.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
+        lengths[e] = length
+        if n >= 2 and length > 1e-6:
+            steps = max(1 if not closed[e] else 3, int(np.floor(length / spacing + 0.5)))
+            sizes[e + 1] = steps if closed[e] else steps + 1
+    out_first = np.cumsum(sizes)
+    total = out_first[-1]
+    xy, tangent, wide = np.empty((total, 2)), np.empty((total, 2)), np.empty(total)
+    for e in range(count):
+        a, b = out_first[e], out_first[e + 1]
+        if a == b:
+            continue
+        n = first[e + 1] - first[e]
+        step = lengths[e] / ((b - a) if closed[e] else (b - a - 1))
+        k, walked = 0, 0.0
+        i, j = first[e], first[e] + 1 % n
+        piece = np.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
+        last = n if closed[e] else n - 1
+        for r in range(b - a):
+            target = r * step
+            while walked + piece < target and k < last - 1:
+                walked += piece
+                k += 1
+                i, j = first[e] + k, first[e] + (k + 1) % n
+                piece = np.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
+            f = min(1.0, (target - walked) / piece) if piece > 0.0 else 0.0
+            xy[a + r, 0] = points[i, 0] + f * (points[j, 0] - points[i, 0])
+            xy[a + r, 1] = points[i, 1] + f * (points[j, 1] - points[i, 1])
+            wide[a + r] = sigma[i] + f * (sigma[j] - sigma[i])
+        for r in range(a, b):
+            i = r - 1 if r > a else (b - 1 if closed[e] else a)
+            j = r + 1 if r < b - 1 else (a if closed[e] else b - 1)
+            dx, dy = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
+            norm = np.hypot(dx, dy)
+            if norm > 0.0:
+                tangent[r, 0], tangent[r, 1] = dx / norm, dy / norm
+            else:
+                tangent[r, 0], tangent[r, 1] = 1.0, 0.0
+    return out_first, xy, tangent, wide
+
+
+def bound_observations(key: Ints, observation: Ints, agent: Ints, rank: Ints, most: int) -> NDArray[np.bool_]:
+    """Which points (P,) stay when a cell may hold at most ``most`` observations.
+
+    ``key`` (P,) names the cell (kind, place and heading), ``observation`` (P,) its observation, ``agent`` and ``rank``
+    (O,) its agent and its place among all (lower is better: more information, then newer, then smaller id). Agents take
+    turns, each with its best observation first, so that one busy agent cannot crowd out the others. Source:
+    specs/maps.md 3.5.
+    """
+    # Points come along lines, so runs of one cell and one observation are looked at, not points.
+    begins = np.ones(len(key), bool)
+    begins[1:] = (key[1:] != key[:-1]) | (observation[1:] != observation[:-1])
+    run = np.cumsum(begins) - 1
+    cell, who = key[begins], observation[begins].astype(np.int64)
+    order = np.lexsort((who, cell))
+    fresh = np.ones(len(order), bool)
+    fresh[1:] = (cell[order][1:] != cell[order][:-1]) | (who[order][1:] != who[order][:-1])
+    pair = np.empty(len(order), np.int64)
+    pair[order] = np.cumsum(fresh) - 1
+    cell, who = cell[order][fresh], who[order][fresh]
+    turn = _place_in_group((cell, agent[who]), rank[who])
+    place = _place_in_group((cell,), turn * (rank.max(initial=0) + 1) + rank[who])
+    return (place < most)[pair[run]]
+
+
+def _place_in_group(group: tuple[Ints, ...], value: Ints) -> Ints:
+    """For each row, how many rows of its group have a smaller value."""
+    order = np.lexsort((value, *reversed(group)))
+    new = np.zeros(len(value), bool)
+    new[:1] = True
+    for column in group:
+        ordered = column[order]
+        new[1:] |= ordered[1:] != ordered[:-1]
+    index = np.arange(len(value))
+    place = np.empty(len(value), np.int64)
+    place[order] = index - np.maximum.accumulate(np.where(new, index, 0))
+    return place
+
+
+def content_priority(xy: Floats) -> NDArray[np.uint64]:
+    """A number (P,) that looks random and depends on the point's coordinates in its agent's frame alone (splitmix64 of
+    their bits).
+
+    It orders points where an order is needed that no motion of the world, no tile and no other observation changes.
+    """
+    bits = np.ascontiguousarray(xy + 0.0, np.float64).view(np.uint64).reshape(-1, 2)
+    with np.errstate(over="ignore"):
+        return _mix(_mix(bits[:, 0]) + bits[:, 1])
+
+
+def _mix(word: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    word = word + np.uint64(0x9E3779B97F4A7C15)
+    word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return word ^ (word >> np.uint64(31))

@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stations become lines: mutual best neighbours are linked, lines are smoothed without shrinking bends, and nothing
+else is invented.
+
+Stage 5 of specs/maps.md 3.4. Two stations are linked when each is the other's best in that direction, so that a line
+never passes through another's station and three lines never become one. Gaps and turns are judged along the mean normal
+of the two: a bend of constant radius has no lateral gap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import njit
+from manyeyes.maps.fusion.point_grid import build_grid, span
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class LinkConfig:
+    """gap_m: largest gap between linked stations; join_m: between ends of lines in the second round; dashed_m: between
+    ends of dashed lines; far_m: between ends that were in view at most ``few`` times (summed visibility), where that
+    nobody saw more is likely chance.
+
+    lateral_m, lateral_slope: largest lateral gap between linked stations at no gap, and how it grows;
+    end_lateral_m, end_lateral_slope: between ends, which few saw, so that they scatter more. heading_rad,
+    heading_slope: largest turn and its growth a metre of gap; far_heading_rad: over the gaps of far_m. lateral_cost:
+    metres of gap that a metre of lateral gap costs. smooth: Gaussian scale, in stations, of the local parabola that
+    smooths.
+    """
+
+    gap_m: float = 6.0
+    join_m: float = 8.0
+    dashed_m: float = 12.0
+    far_m: float = 24.0
+    few: float = 12.0
+    lateral_m: float = 0.25
+    lateral_slope: float = 0.08
+    end_lateral_m: float = 0.8
+    end_lateral_slope: float = 0.04
+    heading_rad: float = 0.26
+    heading_slope: float = 0.06
+    far_heading_rad: float = 0.6
+    lateral_cost: float = 4.0
+    smooth: float = 2.0
+
+
+def link(
+    xy: Floats,
+    tangent: Floats,
+    kind: Ints,
+    strength: Floats,
+    dashed: Flags,
+    coverage: Floats,
+    config: LinkConfig = LinkConfig(),
+) -> tuple[Ints, Ints]:
+    """Stations (K,) as chains: offsets (L + 1,) and station rows in order along each chain; every station is in one
+    chain.
+
+    ``coverage`` (K,) is how often each was in view. A closed loop is opened at its weakest station.
+    """
+    pair = _links(xy, tangent, kind, config.gap_m, config)
+    first, members = _follow(pair, strength)
+    near, far = (config.heading_rad, config.heading_slope), (config.far_heading_rad, 0.0)
+    rounds = (
+        (config.join_m, near, np.ones(len(xy), bool)),
+        (config.dashed_m, near, dashed),
+        (config.far_m, far, coverage <= config.few),
+    )
+    for reach, turn, may in rounds:
+        ends = np.unique(np.concatenate((members[first[:-1]], members[first[1:] - 1])))
+        ends = ends[may[ends]]
+        pair = _join(pair, ends, xy, tangent, kind, reach, turn, config, (first, members))
+        first, members = _follow(pair, strength)
+    return first, members
+
+
+def _links(xy: Floats, tangent: Floats, kind: Ints, reach: float, config: LinkConfig) -> Ints:
+    """(K, 2) the station linked in front of and behind each one's own tangent, or -1."""
+    grid = build_grid(xy[:, 0], xy[:, 1], kind, reach)
+    order = grid.order
+    best = _best(
+        xy,
+        tangent,
+        kind,
+        np.ones((len(xy), 2), np.bool_),
+        (grid.keys, grid.start, order, xy, tangent),
+        reach,
+        (config.lateral_m, config.lateral_slope, config.heading_rad, config.heading_slope, config.lateral_cost),
+    )
+    return _mutual(best)
+
+
+def _join(
+    pair: Ints,
+    ends: Ints,
+    xy: Floats,
+    tangent: Floats,
+    kind: Ints,
+    reach: float,
+    turn: tuple[float, float],
+    config: LinkConfig,
+    chains: tuple[Ints, Ints],
+) -> Ints:
+    """Links with those of a second round added: free ends only, by the direction that the line has over its last
+    stations.
+    """
+    direction = _end_tangents(xy, tangent, *chains)
+    grid = build_grid(xy[ends, 0], xy[ends, 1], kind[ends], reach)
+    free = (pair < 0)[ends]
+    best = _best(
+        xy[ends],
+        direction[ends],
+        kind[ends],
+        free,
+        (grid.keys, grid.start, grid.order, xy[ends], direction[ends]),
+        reach,
+        (config.end_lateral_m, config.end_lateral_slope, *turn, config.lateral_cost),
+    )
+    # A tangent that was turned round for the fit turns front and back round with it.
+    more = _mutual(best)
+    added = pair.copy()
+    for side in range(2):
+        rows = np.flatnonzero((more[:, side] >= 0) & free[:, side])
+        added[ends[rows], side] = ends[more[rows, side]]
+    return added
+
+
+@njit(cache=True, nogil=True)
+def _best(xy, tangent, kind, free, others, reach, numbers):  # pragma: no cover - compiled
+    """(K, 2, 2) best partner in front and behind: its row and which of its sides faces back (0 front, 1 behind); -1 for
+    none.
+    """
+    keys, start, order, rxy, rtangent = others
+    lateral0, lateral1, heading0, heading1, price = numbers
+    best = np.full((len(xy), 2, 2), -1, np.int64)
+    for k in range(len(xy)):
+        x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
+        ix, iy = int(np.floor(x / reach)), int(np.floor(y / reach))
+        cost = np.full(2, np.inf)
+        for dx in range(-1, 2):
+            low, high = span(keys, start, kind[k], ix + dx, iy - 1, iy + 1)
+            for place in range(low, high):
+                q = order[place]
+                if q == k:
+                    continue
+                ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
+                gap = np.hypot(ex, ey)
+                if gap > reach or gap < 1e-9:
+                    continue
+                dot = u * rtangent[q, 0] + v * rtangent[q, 1]
+                if abs(dot) < 0.5:
+                    continue
+                turn = np.arccos(min(1.0, abs(dot)))
+                if turn > heading0 + heading1 * gap:
+                    continue
+                sign = 1.0 if dot > 0.0 else -1.0
+                norm = np.sqrt(2.0 + 2.0 * abs(dot))
+                mx, my = (u + sign * rtangent[q, 0]) / norm, (v + sign * rtangent[q, 1]) / norm
+                along, aside = ex * mx + ey * my, abs(ey * mx - ex * my)
+                if aside > lateral0 + lateral1 * gap or abs(along) < 0.3 or aside > abs(along):
+                    continue
+                side = 0 if along > 0.0 else 1
+                back = 1 - side if sign > 0.0 else side
+                if not free[k, side] or not free[q, back]:
+                    continue
+                value = gap + price * aside + 2.0 * turn
+                if value < cost[side] or (value == cost[side] and q < best[k, side, 0]):
+                    cost[side] = value
+                    best[k, side, 0], best[k, side, 1] = q, back
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _mutual(best):  # pragma: no cover - compiled
+    pair = np.full((len(best), 2), -1, np.int64)
+    for k in range(len(best)):
+        for side in range(2):
+            q, back = best[k, side, 0], best[k, side, 1]
+            if q >= 0 and best[q, back, 0] == k and best[q, back, 1] == side:
+                pair[k, side] = q
+    return pair
+
+
+@njit(cache=True, nogil=True)
+def _follow(pair, strength):  # pragma: no cover - compiled
+    """Chains of linked stations: offsets and rows; open chains first by their smallest end, then loops, opened where
+    weakest.
+    """
+    count = len(pair)
+    done = np.zeros(count, np.bool_)
+    first, members, filled = [0], np.empty(count, np.int64), 0
+    for loops in range(2):
+        for k in range(count):
+            if done[k] or (loops == 0 and pair[k, 0] >= 0 and pair[k, 1] >= 0):
+                continue
+            begin = k
+            if loops == 1:
+                last, at = k, pair[k, 0]
+                while at != k:
+                    if strength[at] < strength[begin] or (strength[at] == strength[begin] and at < begin):
+                        begin = at
+                    one, two = pair[at, 0], pair[at, 1]
+                    step = two if one == last else one
+                    last, at = at, step
+            at, last = begin, -1
+            while at >= 0 and not done[at]:
+                done[at] = True
+                members[filled] = at
+                filled += 1
+                one, two = pair[at, 0], pair[at, 1]
+                if last < 0:
+                    step = one if one >= 0 else two
+                else:
+                    step = two if one == last else one
+                last, at = at, step
+            first.append(filled)
+    return np.array(first), members
+
+
+@njit(cache=True, nogil=True)
+def _end_tangents(xy, tangent, first, members):  # pragma: no cover - compiled
+    """Tangents (K, 2) with those of chain ends replaced by the chord over their last stations, of the same sign."""
+    out = tangent.copy()
+    for c in range(len(first) - 1):
+        a, b = first[c], first[c + 1]
+        far = min(5, b - a - 1)
+        if far < 2:
+            continue
+        for end, inner in ((members[a], members[a + far]), (members[b - 1], members[b - 1 - far])):
+            dx, dy = xy[end, 0] - xy[inner, 0], xy[end, 1] - xy[inner, 1]
+            norm = np.hypot(dx, dy)
+            sign = 1.0 if dx * tangent[end, 0] + dy * tangent[end, 1] > 0.0 else -1.0
+            out[end, 0], out[end, 1] = sign * dx / norm, sign * dy / norm
+    return out
+
+
+@njit(cache=True, nogil=True)
+def smooth(xy, first, members, weight, scale):  # pragma: no cover - compiled
+    """Chains' stations (M, 2) in order, each moved to a parabola through its neighbours along the chain, weighted by
+    distance.
+
+    A parabola follows a bend that a mean would cut. Stations move across the line and along it alike; ends have
+    neighbours on one side.
+    """
+    out = np.empty((len(members), 2))
+    reach = int(np.ceil(2.5 * scale))
+    for c in range(len(first) - 1):
+        a, b = first[c], first[c + 1]
+        arc = np.zeros(b - a)
+        for i in range(1, b - a):
+            p, q = members[a + i - 1], members[a + i]
+            arc[i] = arc[i - 1] + np.hypot(xy[q, 0] - xy[p, 0], xy[q, 1] - xy[p, 1])
+        for i in range(b - a):
+            low, high = max(0, i - reach), min(b - a, i + reach + 1)
+            s = np.zeros(5)
+            tx, ty = np.zeros(3), np.zeros(3)
+            for j in range(low, high):
+                m = members[a + j]
+                d = arc[j] - arc[i]
+                w = weight[m] * np.exp(-0.5 * (d / scale) ** 2)
+                power = w
+                for n in range(5):
+                    s[n] += power
+                    if n < 3:
+                        tx[n] += power * xy[m, 0]
+                        ty[n] += power * xy[m, 1]
+                    power *= d
+            out[a + i, 0], out[a + i, 1] = xy[members[a + i], 0], xy[members[a + i], 1]
+            if high - low >= 5:
+                # The parabola's value here is the first unknown of three equations: Cramer's rule.
+                c0, c1, c2 = s[2] * s[4] - s[3] * s[3], s[2] * s[3] - s[1] * s[4], s[1] * s[3] - s[2] * s[2]
+                determinant = s[0] * c0 + s[1] * c1 + s[2] * c2
+                if determinant > 1e-9 * s[0] * s[2] * s[4]:
+                    out[a + i, 0] = (tx[0] * c0 + tx[1] * c1 + tx[2] * c2) / determinant
+                    out[a + i, 1] = (ty[0] * c0 + ty[1] * c1 + ty[2] * c2) / determinant
+    return out

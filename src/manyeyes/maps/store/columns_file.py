@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frozen dataclasses of arrays as scratch files: any value whose fields are arrays, tuples of texts or such values again.
+
+Which arrays are read-only is kept, as compiled loops have one version for those and one for others.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import numpy as np
+
+from manyeyes._io import atomic_replace
+
+T = TypeVar("T")
+
+_READ_ONLY = "!"
+
+
+def save_columns(path: Path, value: object) -> None:
+    """Write a value to an uncompressed ``.npz``: whole, or not there."""
+    arrays: dict[str, np.ndarray] = {}
+    _take_apart(value, "", arrays)
+    with atomic_replace(path, durable=False) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType] - arrays have names that are no parameters
+
+
+def load_columns(path: Path, kind: type[T]) -> T | None:
+    """The value of a file that :func:`save_columns` wrote; None where there is no such file, or a damaged one."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return _put_together(kind, "", {name: stored[name] for name in stored.files})
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _take_apart(value: object, prefix: str, arrays: dict[str, np.ndarray]) -> None:
+    for f in fields(value):  # pyright: ignore[reportArgumentType]
+        item = getattr(value, f.name)
+        if is_dataclass(item):
+            _take_apart(item, f"{prefix}{f.name}.", arrays)
+        else:
+            array = np.array(item, dtype=np.str_) if isinstance(item, tuple) else np.asarray(item)
+            arrays[prefix + f.name + ("" if array.flags.writeable else _READ_ONLY)] = array
+
+
+def _put_together(kind: type[T], prefix: str, arrays: dict[str, np.ndarray]) -> T:
+    hints = get_type_hints(kind)
+    made: dict[str, Any] = {}
+    for f in fields(kind):  # pyright: ignore[reportArgumentType]
+        hint = hints[f.name]
+        if isinstance(hint, type) and is_dataclass(hint):
+            made[f.name] = _put_together(hint, f"{prefix}{f.name}.", arrays)
+            continue
+        name = prefix + f.name
+        array = arrays[name if name in arrays else name + _READ_ONLY]
+        array.flags.writeable = name in arrays
+        made[f.name] = tuple(array.tolist()) if array.dtype.kind == "U" else array
+    return kind(**made)

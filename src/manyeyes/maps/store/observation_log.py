@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An append-only log of observations: Parquet segments that are never changed, and an index beside them.
+
+An entry is one file: a segment of observations (docs/observation.md), a retraction, or what an ingest put aside; its name is
+its number and a hash of its content. An entry is written under another name, flushed and renamed, then indexed: a writer that
+is killed leaves the log without the entry or with it, and one that is there but not indexed is indexed when the log is opened
+to be written.
+"""
+
+from __future__ import annotations
+
+import difflib
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._io import atomic_replace, atomic_write, remove_unfinished
+from manyeyes.datatypes import ManyeyesError, MissingExtraError
+from manyeyes.maps.elements.observation import Frame, Observation, shortened
+from manyeyes.maps.elements.observation_file import (
+    Quarantined,
+    RefusedRow,
+    observation_table,
+    read_observations,
+    rows_of,
+)
+from manyeyes.maps.elements.observation_limits import LIMITS
+from manyeyes.maps.store.log_index import Catalogue, Indexed, RefusedEntry, Standing
+
+TILE_M = 256.0
+# Observations of a tile stand together, so that reading a tile decodes little else.
+_ROWS_A_GROUP = 128
+_ID_DIGITS = 32
+
+
+class StoreError(ManyeyesError):
+    """A store that is damaged, locked, or of another frame or version; the text names the file and the remedy."""
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """What one ingest did: observations added, those that were there already, and what was put aside."""
+
+    added: int
+    known: int
+    quarantined: tuple[Quarantined, ...]
+
+
+class ObservationLog:
+    """The log in a folder; frame: of all its poses.
+
+    refused: rows of segments that were found to be outside the limits since this object was made; the catalogue lists all.
+    """
+
+    def __init__(self, folder: Path, frame: Frame) -> None:
+        self.folder, self.frame = folder, frame
+        self.catalogue = Catalogue(folder.parent / "catalogue.sqlite")
+        self.refused: tuple[Quarantined, ...] = ()
+
+    def recover(self) -> None:
+        """Index entries that a killed writer left without, or all under new limits; the caller holds the lock."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        remove_unfinished(self.folder)
+        if not self.catalogue.is_current(repr(LIMITS)):
+            self.catalogue.clear(repr(LIMITS))
+        indexed = self.catalogue.entries()
+        for path in sorted(self.folder.iterdir()):
+            if path.name not in indexed:
+                self._index(path)
+
+    def ingest(self, source: Path | str) -> Ingested:
+        """Read a file or folder of observations, append the new ones, and keep a record of what was put aside."""
+        reading = read_observations(source, self.frame)
+        added, known = self.append(reading.observations)
+        if reading.quarantined:
+            rows = [[q.file, q.row, q.count, q.reason] for q in reading.quarantined]
+            text = json.dumps({"quarantined": rows}, indent=1).encode()
+            path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "quarantine.json")
+            atomic_write(path, text)
+            self._index(path)
+        return Ingested(added, known, reading.quarantined)
+
+    def append(self, observations: Sequence[Observation]) -> tuple[int, int]:
+        """Append those that are not there yet as one segment: (added, known)."""
+        once = {o.id: o for o in observations}
+        known = self.catalogue.known(once)
+        fresh = [o for name, o in once.items() if name not in known]
+        if fresh:
+            fresh = _by_place(fresh)
+            digest = hashlib.blake2b("".join(o.id for o in fresh).encode(), digest_size=8).hexdigest()
+            path = self.folder / self._name(digest, "parquet")
+            self._write_segment(fresh, path)
+            self.catalogue.add_segment(path.name, [_indexed(o, k // _ROWS_A_GROUP) for k, o in enumerate(fresh)])
+        return len(fresh), len(observations) - len(fresh)
+
+    def find(self, ids: Sequence[str] = (), agent: str | None = None, pass_id: str | None = None) -> tuple[str, ...]:
+        """Find observations by id or the start of one, or by agent and pass; retracted and refused ones too.
+
+        Returns:
+            Full ids, each once.
+
+        Raises:
+            StoreError: an id is not hexadecimal, is unknown or is the start of several; no such agent or pass.
+        """
+        found = {name for one in ids for name in self._starting(one)}
+        if agent is not None or pass_id is not None:
+            sent = self.catalogue.sent_by(agent, pass_id)
+            if not sent:
+                raise StoreError(f"{self.folder}: no observation of {self._unknown(agent, pass_id)}")
+            found.update(sent)
+        return tuple(sorted(found))
+
+    def _starting(self, start: str) -> list[str]:
+        digits = start.lower()
+        if not 0 < len(digits) <= _ID_DIGITS or set(digits) - set("0123456789abcdef"):
+            raise StoreError(f"An id is 32 hexadecimal digits, or the first of them; got '{shortened(start)}'.")
+        found = self.catalogue.between(digits.ljust(_ID_DIGITS, "0"), digits.ljust(_ID_DIGITS, "f"))
+        if len(found) != 1:
+            count = f"{len(found)} observations have" if found else "no observation has"
+            remedy = "give more digits." if found else "ids are those that a map or a quarantine names."
+            raise StoreError(f"{self.folder}: {count} an id that starts with {digits}; {remedy}")
+        return found
+
+    def _unknown(self, agent: str | None, pass_id: str | None) -> str:
+        """Name what is not there, with the nearest name that is."""
+        for column, word, name in (("agent", "agent", agent), ("pass_id", "pass", pass_id)):
+            if name is not None and name not in (known := self.catalogue.names(column)):
+                close = difflib.get_close_matches(name, known, 1)
+                hint = f"did you mean '{close[0]}'?" if close else f"there are {len(known)} others."
+                return f"{word} '{shortened(name)}'; {hint}"
+        return f"agent '{agent}' in pass '{pass_id}', though both are known."
+
+    def retract(self, ids: Sequence[str], reason: str) -> int:
+        """Append that these observations count no more, for privacy or because they were made up; unknown ids are an error.
+
+        Returns:
+            How many counted until now; where none did, nothing is appended.
+        """
+        missing = sorted(set(ids) - self.catalogue.known(ids))
+        if missing:
+            raise StoreError(
+                f"{self.folder}: no observation {missing[0]} to retract; {len(missing)} of {len(ids)} are unknown."
+            )
+        fresh = sorted(set(ids) - self.catalogue.retracted(ids))
+        if fresh:
+            text = json.dumps({"retracted": fresh, "reason": reason}, indent=1).encode()
+            path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "retract.json")
+            atomic_write(path, text)
+            self._index(path)
+        return len(fresh)
+
+    def standing(self) -> Standing:
+        """Where every observation that counts stands."""
+        return self.catalogue.standing()
+
+    def _write_segment(self, observations: Sequence[Observation], path: Path) -> None:
+        parquet = _parquet()
+        table = observation_table(observations, self.frame)
+        with atomic_replace(path) as temporary:
+            parquet.write_table(
+                table, temporary, compression="zstd", row_group_size=_ROWS_A_GROUP, write_page_checksum=True
+            )
+
+    def _name(self, digest: str, kind: str) -> str:
+        numbers = [int(path.name.split("-")[0]) for path in self.folder.iterdir() if path.name[0] != "."]
+        return f"{max(numbers, default=0) + 1:08d}-{digest}.{kind}"
+
+    def _index(self, path: Path) -> None:
+        if path.name.endswith(".parquet"):
+            self._index_segment(path)
+            return
+        content = json.loads(path.read_bytes())
+        if path.name.endswith(".retract.json"):
+            self.catalogue.add_retraction(path.name, content["retracted"], content["reason"])
+        elif path.name.endswith(".quarantine.json"):
+            self.catalogue.add_quarantine(path.name, [tuple(row) for row in content["quarantined"]])
+        else:
+            raise StoreError(f"{path}: no entry of a log of observations; move the file elsewhere.")
+
+    def _index_segment(self, path: Path) -> None:
+        """Index the observations of a segment; rows outside the limits are put aside."""
+        rows: list[Indexed] = []
+        refused: list[RefusedEntry] = []
+        for group in range(_groups(path)):
+            for item in _read_rows(path, [group]):
+                if isinstance(item, Observation):
+                    rows.append(_indexed(item, group))
+                else:
+                    number = len(rows) + len(refused)
+                    reason = f"{item.reason} Its id is {item.id}."
+                    refused.append(RefusedEntry(item.id, item.agent, item.pass_id, number, reason))
+        self.catalogue.add_segment(path.name, rows, refused)
+        self.refused += tuple(Quarantined(str(path), r.row, 1, r.reason) for r in refused)
+
+
+def read_groups(segment: Path, groups: Sequence[int]) -> list[Observation]:
+    """The observations of some row groups of a segment, in their order; rows outside the limits are left out."""
+    return [item for item in _read_rows(segment, groups) if isinstance(item, Observation)]
+
+
+def _read_rows(segment: Path, groups: Sequence[int]) -> list[Observation | RefusedRow]:
+    """Read the rows of some row groups; one that is no observation has an id that agrees with its content.
+
+    Such a row is what an older version, with wider limits, wrote. Any other wrong row is damage, hence a StoreError.
+    """
+    parquet = _parquet()
+    from pyarrow import ArrowException
+
+    try:
+        opened = parquet.ParquetFile(segment, page_checksum_verification=True)
+        table = opened.read_row_groups(list(groups))
+    except (ArrowException, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise StoreError(f"{segment}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
+    out = list(rows_of(table))
+    for row, item in enumerate(out):
+        if isinstance(item, RefusedRow) and not item.id:
+            raise StoreError(
+                f"{segment}: row {row} of groups {list(groups)[:3]}: {item.reason} Restore the file from a copy."
+            )
+    return out
+
+
+def read_standing(folder: Path, standing: Standing, rows: NDArray[np.int64]) -> list[Observation]:
+    """The observations in these rows of the index, ids ascending."""
+    wanted = {standing.ids[row] for row in rows.tolist()}
+    out: dict[str, Observation] = {}
+    for number in np.unique(standing.segment[rows]).tolist():
+        groups = np.unique(standing.row_group[rows[standing.segment[rows] == number]]).tolist()
+        for o in read_groups(folder / standing.segments[number], groups):
+            if o.id in wanted:
+                out[o.id] = o
+    missing = wanted - set(out)
+    if missing:
+        raise StoreError(
+            f"{folder}: observation {min(missing)} is indexed but not there; restore its segment from a copy."
+        )
+    return [out[name] for name in sorted(out)]
+
+
+def tile_of(xy: NDArray[np.float64], size_m: float = TILE_M) -> NDArray[np.int64]:
+    """(N, 2) column and row of the tile that each point (N, 2) lies in; tiles are half open and anchored at the origin."""
+    return np.floor(np.asarray(xy, np.float64).reshape(-1, 2) / size_m).astype(np.int64)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold a store's lock, which the system takes back from a program that is killed."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise StoreError(
+                f"{path.parent}: another program is writing to this store; try again when it has ended."
+            ) from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def _by_place(observations: Sequence[Observation]) -> list[Observation]:
+    """By tile, rows of tiles in turn, then by id."""
+    tiles = tile_of(np.array([o.pose[:2] for o in observations]))
+    keys: list[tuple[Any, ...]] = [(*tile, o.id) for tile, o in zip(tiles[:, ::-1].tolist(), observations)]
+    return [observations[k] for k in sorted(range(len(keys)), key=keys.__getitem__)]
+
+
+def _indexed(o: Observation, group: int) -> Indexed:
+    x, y = float(o.pose[0]), float(o.pose[1])
+    return Indexed(o.id, group, o.time_ns, o.agent, x, y, reach_of(o), o.pass_id)
+
+
+def reach_of(o: Observation) -> float:
+    """Metres from the agent to the farthest point that it saw or could have seen."""
+    points = np.concatenate((o.view, o.elements.points))
+    return float(np.hypot(points[:, 0], points[:, 1]).max())
+
+
+def _groups(path: Path) -> int:
+    parquet = _parquet()
+    from pyarrow import ArrowException
+
+    try:
+        return parquet.ParquetFile(path).num_row_groups
+    except (ArrowException, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise StoreError(f"{path}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
+
+
+def _parquet() -> Any:
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise MissingExtraError("map", "A log of observations") from None
+    return parquet

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sparse encoder (CoSTr section III-B): strides 1 to 32, the merge of Eq. 3, and the way up to the head's stride."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import nn
+
+from manyeyes.datatypes import ConfigError, SparseBev
+from manyeyes.models.detector.layers import DownLayer, SubmanifoldLayer, SubmanifoldStage, UpLayer
+from manyeyes.models.detector.pruning import FocalPrune, Pruned
+from manyeyes.ops.sparse_conv import merge
+
+STRIDES: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """channels and layers: one entry a stride 1 … 32; the last three channels are equal, because Eq. 3 sums them.
+
+    prune_strides: levels with a focal pruning layer. head_stride: stride of the tokens that are fused, sent and decoded;
+    8 is the paper's letter, 4 the default. dilating: spconv's strided active set instead of parents only.
+    coarse: whether strides 16 and 32 take part (Eq. 3); without them the merge has stride 8 alone.
+    token_channels: tokens are projected to so many channels before attention; None keeps those of their stride.
+    """
+
+    channels: tuple[int, ...] = (32, 64, 128, 128, 128, 128)
+    layers: tuple[int, ...] = (2, 3, 4, 3, 2, 2)
+    prune_strides: tuple[int, ...] = (4, 8)
+    head_stride: int = 4
+    dilating: bool = False
+    token_channels: int | None = None
+    coarse: bool = True
+
+    def __post_init__(self) -> None:
+        if len(self.channels) != 6 or len(self.layers) != 6:
+            raise ConfigError(f"EncoderConfig needs six channels and six layers, strides 1 to 32; got {self}.")
+        if len(set(self.channels[3:])) != 1:
+            raise ConfigError(
+                f"EncoderConfig.channels at strides 8, 16, 32 are summed and must be equal; got {self.channels[3:]}."
+            )
+        if self.head_stride not in (2, 4, 8):
+            raise ConfigError(f"EncoderConfig.head_stride is 2, 4 or 8; got {self.head_stride}.")
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """Tokens at the head's stride, what every pruning layer decided on, and the number of sites at each stride."""
+
+    tokens: SparseBev
+    pruned: tuple[Pruned, ...]
+    sites_per_stride: tuple[int, ...]
+
+
+class SparseEncoder(nn.Module):
+    """Pillars at stride 1 to tokens at the head's stride."""
+
+    def __init__(self, inputs: int, config: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        width = dict(zip(STRIDES, config.channels))
+        self.strides = STRIDES if config.coarse else STRIDES[:4]
+        self.down = nn.ModuleList(
+            [SubmanifoldLayer(inputs, width[1], kernel=1)]
+            + [DownLayer(width[s // 2], width[s], config.dilating) for s in self.strides[1:]]
+        )
+        stages = zip(self.strides, config.channels, config.layers)
+        self.stages = nn.ModuleList(SubmanifoldStage(channels, layers) for _, channels, layers in stages)
+        self.prune = nn.ModuleDict({str(s): FocalPrune(width[s]) for s in config.prune_strides})
+        self.post_merge = SubmanifoldLayer(width[8], width[8])
+        ups = [s for s in (4, 2) if s >= config.head_stride]
+        self.up = nn.ModuleDict({str(s): UpLayer(width[2 * s], width[s], width[s]) for s in ups})
+        self.out_channels = config.token_channels or width[config.head_stride]
+        self.project = (
+            nn.Identity() if config.token_channels is None else nn.Linear(width[config.head_stride], self.out_channels)
+        )
+
+    def forward(self, x: SparseBev, prune_threshold: float) -> Encoded:
+        """prune_threshold: probability below which a cell is dropped; 0 drops none."""
+        levels: dict[int, SparseBev] = {}
+        pruned: list[Pruned] = []
+        for stride, down, stage in zip(self.strides, self.down, self.stages):
+            x = stage(down(x))
+            if str(stride) in self.prune:
+                x, decision = self.prune[str(stride)](x, prune_threshold)
+                pruned.append(decision)
+            levels[stride] = x
+        tokens = self.post_merge(merge([levels[s] for s in self.strides[3:]]))
+        for stride, up in self.up.items():
+            tokens = up(tokens, levels[int(stride)])
+        tokens = tokens.with_features(self.project(tokens.features))
+        return Encoded(tokens, tuple(pruned), tuple(len(levels[s].sites) for s in self.strides))

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From points to features on pillars, without caps on points or pillars."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
+from manyeyes.models.detector.layers import ActiveNorm, fold_norm
+from manyeyes.ops._pillar_kernels import pillar_maxima
+from manyeyes.ops.voxelize import Pillars, pillar_moments, pillar_sites, segment_max, segment_mean
+
+PillarKind = Literal["points", "moments"]
+MOMENTS = 12
+
+
+class PointPillars(nn.Module):
+    """Per-point linear layer and maximum over each pillar (PointPillars, Lang et al. 2019, eq. in section 2.1).
+
+    With two sweeps a point's age, in sweeps, is an input more.
+    """
+
+    def __init__(self, channels: int, sweeps: int = 1) -> None:
+        super().__init__()
+        self.sweeps = sweeps
+        self.linear, self.norm = nn.Linear(9 + sweeps, channels, bias=False), ActiveNorm(channels)
+
+    def forward(self, xyz: Tensor, bright: Tensor, old: Tensor, pillars: Pillars) -> Tensor:
+        """Kept points (P, 3), their intensities (P,) and whether they are of the sweep before (P,) to (N, channels)."""
+        intensity = bright[:, None] if self.sweeps == 1 else torch.stack((bright, old.to(bright.dtype)), 1)
+        sites, row = pillars.sites, pillars.row
+        mean = segment_mean(xyz, row, len(sites))
+        grid = sites.grid
+        centre = torch.cat((sites.xy, sites.xy.new_full((len(sites), 1), (grid.z_min + grid.z_max) / 2)), -1)
+        inputs = torch.cat((xyz, intensity[:, :1], xyz - mean[row], xyz - centre[row], intensity[:, 1:]), -1)
+        return segment_max(torch.relu(self.norm(self.linear(inputs))), row, len(sites))
+
+    def infer(self, now: list[PointCloud], before: list[PointCloud], grid: BevGrid) -> SparseBev:
+        """The same numbers of whole clouds, float32 in the CPU's memory, with the norm folded in: for inference."""
+        weight, bias = fold_norm(self.linear.weight, self.norm)
+        return pillar_maxima(now, before, grid, nn.functional.pad(weight, (0, 2 - self.sweeps)), bias)
+
+
+class MomentPillars(nn.Module):
+    """A two-layer perceptron on twelve statistics of each pillar: no gradient through points, so training it costs less.
+
+    With two sweeps there are twelve of each.
+    """
+
+    def __init__(self, channels: int, sweeps: int = 1) -> None:
+        super().__init__()
+        self.sweeps = sweeps
+        self.scale = ActiveNorm(MOMENTS * sweeps)
+        self.layers = nn.Sequential(
+            nn.Linear(MOMENTS * sweeps, 2 * channels), nn.ReLU(), nn.Linear(2 * channels, channels, bias=False)
+        )
+        self.norm = ActiveNorm(channels)
+
+    def forward(self, xyz: Tensor, bright: Tensor, old: Tensor, pillars: Pillars) -> Tensor:
+        """Kept points (P, 3), their intensities (P,) and whether they are of the sweep before (P,) to (N, channels)."""
+        sweeps = (~old, old) if self.sweeps == 2 else (slice(None),)
+        moments = torch.cat([pillar_moments(xyz[s], bright[s], pillars.row[s], pillars.sites) for s in sweeps], 1)
+        return torch.relu(self.norm(self.layers(self.scale(moments))))
+
+
+class PillarEncoder(nn.Module):
+    """Clouds of a batch of agents, and with two sweeps those before them, to features at stride 1."""
+
+    def __init__(self, grid: BevGrid, channels: int, kind: PillarKind, sweeps: int = 1) -> None:
+        super().__init__()
+        self.grid, self.sweeps = grid.at(1), sweeps
+        self.net = PointPillars(channels, sweeps) if kind == "points" else MomentPillars(channels, sweeps)
+
+    def forward(self, clouds: list[PointCloud], earlier: list[PointCloud] | None = None) -> SparseBev:
+        """One cloud an agent, each in that agent's frame, to (N, channels) on a batch of as many grids.
+
+        earlier: the sweep before each, moved into the same frame; left out where the net looks at one sweep only.
+        """
+        before = earlier if earlier is not None and self.sweeps == 2 else []
+        many, agents = [*clouds, *before], [*range(len(clouds)), *range(len(before))]
+        if isinstance(self.net, PointPillars) and not self.training and not torch.is_grad_enabled() and _plain(many):
+            return self.net.infer(clouds, before, self.grid)
+        xyz, bright = _joined([cloud.xyz for cloud in many]), _joined([cloud.intensity for cloud in many])
+        batch = _joined([torch.full((len(cloud),), agent) for cloud, agent in zip(many, agents)])
+        pillars = pillar_sites(xyz, batch, self.grid, len(clouds))
+        kept = pillars.inside.nonzero()[:, 0]
+        old = kept >= sum(map(len, clouds))
+        xyz, bright = xyz.index_select(0, kept), bright.index_select(0, kept)
+        features = self.net(xyz, bright, old, pillars)
+        return SparseBev(features, pillars.sites)
+
+
+def _plain(clouds: list[PointCloud]) -> bool:
+    """Whether compiled loops can read them."""
+    return all(cloud.xyz.dtype == torch.float32 and cloud.xyz.device.type == "cpu" for cloud in clouds)
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    """All rows as one tensor; a single part is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Window attention over tokens at continuous metric positions: the block of DAST (CoSTr Eq. 4 to 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from manyeyes.datatypes import BevGrid, ConfigError
+from manyeyes.ops._attention_block_kernels import BlockWeights, run_block
+from manyeyes.ops._window_attention_kernels import attend_in_windows, window_runs
+from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_places
+
+
+@dataclass(frozen=True)
+class AttentionConfig:
+    """window: edge S of a window in cells of the token grid; blocks alternate regular and shifted windows.
+
+    levels: shares of S^2 up to which a window's number of tokens is Low, and Medium; above it is High (Eq. 5).
+    separate_weights: a block has weights for each level, the paper's letter; shared ones do not ask for the level.
+    """
+
+    window: int = 8
+    blocks: int = 2
+    heads: int = 4
+    expansion: int = 2
+    levels: tuple[float, float] = (0.125, 0.25)
+    separate_weights: bool = False
+
+    def __post_init__(self) -> None:
+        low, medium = self.levels
+        if not 0 <= low <= medium:
+            raise ConfigError(
+                f"AttentionConfig.levels are two ascending shares of a window's cells; got {self.levels}."
+            )
+
+
+class WindowBlock(nn.Module):
+    """Pre-norm attention within a window and a feed-forward net, both residual (Eq. 6, 7).
+
+    The relative position encoding (Eq. 4) enters queries and keys, measured from the middle of the window that is in force,
+    shifted or not. Padding buckets are an affair of ``ops`` alone.
+    """
+
+    def __init__(self, channels: int, config: AttentionConfig, shifted: bool) -> None:
+        super().__init__()
+        if channels % (4 * config.heads):
+            raise ConfigError(
+                f"Attention needs channels divisible by 4 * heads; got {channels} and {config.heads} heads."
+            )
+        self.heads, self.window, self.shifted = config.heads, config.window, shifted
+        self.norm, self.norm_ffn = nn.LayerNorm(channels), nn.LayerNorm(channels)
+        self.query, self.key, self.value = (nn.Linear(channels, channels) for _ in range(3))
+        self.out = nn.Linear(channels, channels)
+        hidden = channels * config.expansion
+        self.ffn = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels))
+        self.folded: BlockWeights | None = None
+
+    def forward(
+        self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
+    ) -> Tensor:
+        """features (N, C) of tokens at xy (N, 2), metres, in grids batch (N,), to (N, C).
+
+        cache: of the sites that xy and batch belong to, where they belong to any: their windows are found once.
+        """
+        cache = {} if cache is None else cache
+        name = ("windows", self.window, self.shifted)
+        if name not in cache:
+            edge = self.window * grid.cell
+            origin, shift = (grid.x_min, grid.y_min), edge / 2 if self.shifted else 0.0
+            cache[name] = window_places(xy, batch, origin, edge, grid.cell, shift)
+        ids, offsets = cache[name]
+        if self.folded is not None and _plain(features):
+            return run_block(features, offsets, window_runs(ids), self.folded)
+        place = (*name, features.shape[1])
+        if place not in cache:
+            cache[place] = sincos_encoding(offsets, features.shape[1])
+        normed = self.norm(features)
+        placed = normed + cache[place]
+
+        def split(x: Tensor) -> Tensor:
+            return x.view(x.shape[0], self.heads, x.shape[1] // self.heads)
+
+        attended = _attend(split(self.query(placed)), split(self.key(placed)), split(self.value(normed)), ids)
+        features = features + self.out(attended.flatten(1))
+        return features + self.ffn(self.norm_ffn(features))
+
+    def fold(self) -> None:
+        """Copy the weights to where one compiled call finds them, for good: those of the layers are no longer asked."""
+        linears = [self.query, self.key, self.value, self.out, self.ffn[0], self.ffn[2]]
+        self.folded = BlockWeights.of(linears, [self.norm, self.norm_ffn], self.heads)
+
+
+class RoutedBlock(nn.Module):
+    """Three blocks of attention, one for windows of Low, Medium and High density each (Eq. 5 to the letter).
+
+    All tokens of a window go through the weights of its level; one token more may send them all through others.
+    """
+
+    def __init__(self, channels: int, config: AttentionConfig, shifted: bool) -> None:
+        super().__init__()
+        self.config, self.shifted = config, shifted
+        self.levels = nn.ModuleList(WindowBlock(channels, config, shifted) for _ in range(3))
+
+    def forward(
+        self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
+    ) -> Tensor:
+        """(N, C) to (N, C); see WindowBlock. cache is not used: each level has tokens of its own."""
+        edge = self.config.window * grid.cell
+        ids = window_ids(xy, batch, (grid.x_min, grid.y_min), edge, edge / 2 if self.shifted else 0.0)
+        level = density_levels(ids, self.config.window**2, self.config.levels)
+        out = features
+        for number, block in enumerate(self.levels):
+            rows = (level == number).nonzero()[:, 0]
+            if len(rows):
+                out = out.index_copy(0, rows, block(features[rows], xy[rows], batch[rows], grid))
+        return out
+
+
+def density_levels(window: Tensor, cells: int, levels: tuple[float, float]) -> Tensor:
+    """(N,) int64: 0 Low, 1 Medium, 2 High, by how many tokens n_w the window (N,) of each holds (CoSTr Eq. 5).
+
+    Low: n_w / cells at most levels[0]; Medium: at most levels[1]; tokens at continuous places may be more than cells.
+    """
+    _, row, count = window.unique(return_inverse=True, return_counts=True)
+    share = count[row].double() / cells
+    return (share > levels[0]).long() + (share > levels[1]).long()
+
+
+def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:
+    """Attention of (N, heads, C / heads) within windows ids (N,)."""
+    if _plain(query):
+        return attend_in_windows(query, key, value, window_runs(ids))
+    return window_attention(query, key, value, plan_windows(ids, ids))
+
+
+def _plain(x: Tensor) -> bool:
+    """Whether compiled loops may take it: no gradient is asked for, and it is float32 in the CPU's memory."""
+    return not torch.is_grad_enabled() and x.device.type == "cpu" and x.dtype == torch.float32
+
+
+class WindowTransformer(nn.Module):
+    """Blocks with regular and shifted windows in turn."""
+
+    def __init__(self, channels: int, config: AttentionConfig) -> None:
+        super().__init__()
+        block = RoutedBlock if config.separate_weights else WindowBlock
+        self.blocks = nn.ModuleList(block(channels, config, shifted=bool(i % 2)) for i in range(config.blocks))
+
+    def forward(
+        self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
+    ) -> Tensor:
+        """(N, C) to (N, C); see WindowBlock."""
+        for block in self.blocks:
+            features = block(features, xy, batch, grid, cache)
+        return features

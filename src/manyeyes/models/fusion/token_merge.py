@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where tokens of several agents come to rest: on the cell of the object's centre that each of them proposes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from manyeyes.datatypes import BevGrid, Sites, SparseBev
+from manyeyes.models.detector.box_head import RAW
+from manyeyes.models.detector.proposal import PROPOSAL, proposed_heat, proposed_offset, reset_origin
+from manyeyes.models.fusion.transform_tokens import Tokens
+from manyeyes.ops.sparse_index import distinct
+from manyeyes.ops.voxelize import segment_max, segment_sum
+
+VOTING_HEAT = -3.0
+"""Logit from which a token is taken at its word and settles where it says that its object is; others stay where they are."""
+DRIFT_MPS = 1.0
+"""How fast a remembered or delayed box is taken to become uncertain: what is left of a velocity's error."""
+REACH_CELLS = 2.0
+"""A proposal that points farther, in cells, is not followed: at stride 4 heads learn centres up to 1.5 cells away."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fused:
+    """One feature a cell (N, C), and the agents' boxes for it (N, PROPOSAL), merged: where the second look starts from."""
+
+    bev: SparseBev
+    given: Tensor
+
+
+def settle(tokens: Tokens) -> tuple[Tensor, Tensor]:
+    """Key (N,) of the cell where each token comes to rest, and the token's own place (N, 2) from that cell's centre, in cells."""
+    key = resting_keys(tokens.xy, tokens.proposal, tokens.ego, tokens.grid)
+    rows, columns = tokens.grid.shape
+    within = key.remainder(rows * columns)
+    yx = torch.stack((within.div(columns, rounding_mode="floor"), within.remainder(columns)), -1)
+    return key, (tokens.xy - tokens.grid.centers(yx)) / tokens.grid.cell
+
+
+def resting_keys(xy: Tensor, proposal: Tensor, grid_of: Tensor, grid: BevGrid) -> Tensor:
+    """(N,) int64, ``(grid_of * rows + row) * columns + column`` of the cell where tokens at xy (N, 2) come to rest."""
+    offset = proposed_offset(proposal)
+    votes = (proposed_heat(proposal) > VOTING_HEAT) & (offset.abs().amax(1) <= REACH_CELLS)
+    goal = xy + offset * votes[:, None] * grid.cell
+    goal = torch.where(grid.inside(goal)[:, None], goal, xy)
+    rows, columns = grid.shape
+    yx = grid.cells(goal)
+    return (grid_of * rows + yx[:, 0]) * columns + yx[:, 1]
+
+
+class Settle(nn.Module):
+    """Tokens of a cell become one: a mean by trust, or the maximum, of features; a mean by trust of their boxes.
+
+    Trust is a softmax within the cell of what the tokens propose (heat, own word on overlap and error) and of their features;
+    it starts as heat plus overlap less log sigma, so that the first guess is a box averaged by what its senders claim; sigma
+    holds the doubt of the sender's place and what its box may have moved by since, beside the error of the box itself. How many
+    tokens met, how sure they are together and how far apart their boxes lie is told to the feature: no mean could.
+    """
+
+    def __init__(self, channels: int, reduce: Literal["trust", "max"]) -> None:
+        super().__init__()
+        self.reduce = reduce
+        self.word, self.inner_trust = nn.Linear(3, 1, bias=False), nn.Linear(channels, 1, bias=False)
+        self.inner = nn.Linear(RAW.velocity.start + 4, 2 * channels)
+        self.outer = nn.Linear(2 * channels, channels, bias=False)
+        with torch.no_grad():
+            self.word.weight.copy_(torch.tensor([[1.0, 1.0, -1.0]]))
+        nn.init.zeros_(self.inner_trust.weight)
+
+    def forward(self, features: Tensor, tokens: Tokens, key: Tensor, place: Tensor) -> Fused:
+        """Features (N, C) of tokens that rest on cells key (N,), their places from there (N, 2)."""
+        rows, columns = tokens.grid.shape
+        found, row = distinct(key, tokens.batch_size * rows * columns)
+        n = found.shape[0]
+        boxes = reset_origin(tokens.proposal, place)
+        moved = DRIFT_MPS * 0.1 * tokens.age
+        blur = (boxes[:, RAW.log_sigma_xy].clamp(-5, 3).exp() ** 2 + (tokens.doubt**2 + moved**2)[:, None]).log() / 2
+        words = torch.cat((boxes[:, RAW.heat], boxes[:, RAW.overlap], blur), 1)
+        trust = (self.word(words) + self.inner_trust(features))[:, 0] + tokens.kept.log()
+        share = _softmax(trust, row, n)[:, None]
+        given = segment_sum(share * boxes, row, n)
+        sure = torch.sigmoid(boxes[:, RAW.heat])
+        away = (boxes[:, RAW.offset] - given[row][:, RAW.offset]) ** 2
+        met = segment_sum(torch.cat((torch.ones_like(sure), sure), 1), row, n).log1p()
+        apart = segment_sum(share * away, row, n).clamp_max(1)
+        told = torch.cat(((given * WORD_SCALE)[:, : RAW.velocity.start], met, apart), 1)
+        features = features * tokens.kept[:, None]
+        merged = segment_max(features, row, n) if self.reduce == "max" else segment_sum(share * features, row, n)
+        merged = merged + self.outer(torch.relu(self.inner(told)))
+        return Fused(SparseBev(merged, Sites(found, tokens.grid, tokens.batch_size)), given)
+
+
+def _word_scale() -> Tensor:
+    scale = torch.ones(PROPOSAL)
+    for logits in (RAW.heat, RAW.overlap, RAW.kind, RAW.direction):
+        scale[logits] = 0.25
+    return scale
+
+
+WORD_SCALE = _word_scale()
+"""Brings a proposal's logits to a few units."""
+
+
+def _softmax(logit: Tensor, row: Tensor, n: int) -> Tensor:
+    peak = logit.detach().new_full((n,), -torch.inf).scatter_reduce(0, row, logit.detach(), "amax")
+    weight = (logit - peak[row]).exp()
+    return weight / segment_sum(weight, row, n)[row]

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From features of a tile to map elements: a fixed number of queries, each one element of a fixed number of points.
+
+Sources: MapTR (Liao et al., ICLR 2023): hierarchical queries, an instance's and a point's embedding added, and reference points
+refined layer by layer; MapTRv2 (IJCV 2024): self-attention among instances and within each in turn, and a second group of queries
+for one-to-many matching in training; Deformable DETR (ICLR 2021): attention to a few learned places, and queries that begin as a
+first stage's proposals (section 4.2); DAB-DETR (ICLR 2022): each layer is told where its points lie by now. The two groups never
+attend to each other, which here is said by running the same layers on each.
+
+What differs from MapTR, so that little data and few steps teach much: an element begins as a line that a sketch of the tile
+shows (models/maps/line_field_head.py), of the kind and as sure as it is there, and layers say what to change; their places are
+told to every layer, and to what moves them; points move by shares of the tile, not by logits, which are flat at the tile's
+border, where lines are cut; and a layer looks at the ground before it compares what was seen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from manyeyes.datatypes import BevGrid, ConfigError
+from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
+from manyeyes.models.maps.line_field_head import APART, Sketch, SketchHead, propose
+from manyeyes.ops.deformable import sample_weighted
+
+Group = Literal["one", "many"]
+
+STEP = 0.1
+"""What one unit of a move's output is, as a share of the tile."""
+
+_WAVES = math.pi * 2.0 ** torch.arange(8)
+
+
+@dataclass(frozen=True)
+class MapHeadConfig:
+    """kinds: of elements that are told apart, by name. elements, points: queries of one-to-one matching, and points of each;
+    many: queries of one-to-many matching, in training only. learned: of the former's number, those that begin as lines of their own
+    rather than the sketch's, as MapTR's do. seeds: cells from which lines are followed that queries begin as, no
+    fewer than these; least: how sure a cell is at least for a line to run on through it. places: looked at by each of the heads, a
+    point and layer.
+
+    keep, threshold: at most so many answers, by score over all elements and kinds, and those of at least that score.
+    """
+
+    kinds: tuple[str, ...] = ("divider", "boundary", "crossing")
+    elements: int = 50
+    points: int = 20
+    many: int = 0
+    learned: int = 0
+    seeds: int = 160
+    least: float = 0.2
+    channels: int = 128
+    feed: int = 256
+    layers: int = 3
+    heads: int = 8
+    places: int = 4
+    keep: int = 50
+    threshold: float = 0.05
+
+    def __post_init__(self) -> None:
+        if self.channels % self.heads or self.points < 2 or min(self.elements, self.layers, self.places) < 1:
+            raise ConfigError(f"MapHeadConfig needs channels divisible by heads and two points or more; got {self}.")
+        if not 0 <= self.learned < self.elements:
+            raise ConfigError(f"MapHeadConfig.learned are fewer than its {self.elements} elements; got {self.learned}.")
+        if not self.kinds or not set(self.kinds) <= set(KINDS) or len(set(self.kinds)) != len(self.kinds):
+            raise ConfigError(f"MapHeadConfig.kinds are some of {', '.join(KINDS)}; got {self.kinds}.")
+
+
+@dataclass(frozen=True, eq=False)
+class RawMap:
+    """What one layer says of B tiles: logit (B, I, kinds) and point (B, I, P, 2), shares of the tile, in it from 0 to 1."""
+
+    logit: Tensor
+    point: Tensor
+
+
+class _SelfAttention(nn.Module):
+    """Attention among the rows of each sequence; places are added to what is compared, not to what is told."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.compare, self.value = nn.Linear(channels, 2 * channels), nn.Linear(channels, channels)
+        self.out = nn.Linear(channels, channels)
+
+    def forward(self, x: Tensor, place: Tensor) -> Tensor:
+        """(..., L, C) to (..., L, C), place of a shape that broadcasts."""
+        query, key = self.compare(x + place).chunk(2, -1)
+        query, key, value = (t.unflatten(-1, (self.heads, -1)).transpose(-2, -3) for t in (query, key, self.value(x)))
+        mixed = F.scaled_dot_product_attention(query, key, value)
+        return self.out(mixed.transpose(-2, -3).flatten(-2))
+
+
+class DeformableAttention(nn.Module):
+    """Each query looks at a few places around its reference point, which it chooses itself (Deformable DETR, Eq. 2)."""
+
+    def __init__(self, channels: int, heads: int, places: int) -> None:
+        super().__init__()
+        self.heads, self.places = heads, places
+        self.value, self.out = nn.Linear(channels, channels), nn.Linear(channels, channels)
+        self.offset, self.weight = nn.Linear(channels, heads * places * 2), nn.Linear(channels, heads * places)
+        # Heads start by looking in as many directions, each place a cell farther.
+        angle = torch.arange(heads) * (2 * math.pi / heads)
+        ring = torch.stack((angle.cos(), angle.sin()), -1)
+        ring = ring / ring.abs().amax(-1, keepdim=True)
+        steps = ring[:, None] * torch.arange(1, places + 1)[:, None]
+        nn.init.zeros_(self.offset.weight)
+        nn.init.zeros_(self.weight.weight)
+        nn.init.zeros_(self.weight.bias)
+        with torch.no_grad():
+            self.offset.bias.copy_(steps.flatten())
+
+    def forward(self, query: Tensor, reference: Tensor, ground: Tensor) -> Tensor:
+        """query (B, Q, C), reference (B, Q, 2) as shares of the ground, ground (B, rows, columns, C), to (B, Q, C)."""
+        b, q, channels = query.shape
+        rows, columns = ground.shape[1:3]
+        values = self.value(ground).view(b, rows, columns, self.heads, channels // self.heads).permute(0, 3, 4, 1, 2)
+        offset = self.offset(query).view(b, q, self.heads, self.places, 2)
+        weight = self.weight(query).view(b, q, self.heads, self.places).softmax(-1)
+        at = reference[:, :, None, None] + offset / offset.new_tensor([columns, rows])
+        return self.out(sample_weighted(values, at, weight))
+
+
+class MapLayer(nn.Module):
+    """To the ground, within each instance, among instances, and each point by itself; a norm after each.
+
+    The ground comes first, not third as in MapTR: there the first layer compares queries before any has seen something.
+    """
+
+    def __init__(self, config: MapHeadConfig) -> None:
+        super().__init__()
+        c = config.channels
+        self.among, self.within = _SelfAttention(c, config.heads), _SelfAttention(c, config.heads)
+        self.look = DeformableAttention(c, config.heads, config.places)
+        self.feed = nn.Sequential(nn.Linear(c, config.feed), nn.ReLU(), nn.Linear(config.feed, c))
+        self.norms = nn.ModuleList(nn.LayerNorm(c) for _ in range(4))
+
+    def forward(self, x: Tensor, place: Tensor, reference: Tensor, ground: Tensor) -> Tensor:
+        """x and place (B, I, P, C), reference (B, I, P, 2), ground (B, rows, columns, C), to (B, I, P, C)."""
+        look = self.look((x + place).flatten(1, 2), reference.flatten(1, 2), ground)
+        x = self.norms[0](x + look.view_as(x))
+        x = self.norms[1](x + self.within(x, place))
+        among = self.among(x.transpose(1, 2), place.transpose(1, 2)).transpose(1, 2)
+        x = self.norms[2](x + among)
+        return self.norms[3](x + self.feed(x))
+
+
+class MapHead(nn.Module):
+    """A sketch; queries that begin as its lines; layers, and after each layer kinds and points."""
+
+    def __init__(self, config: MapHeadConfig) -> None:
+        super().__init__()
+        self.config = config
+        c = config.channels
+        self.sketch = SketchHead(c, len(config.kinds))
+        self.kind = nn.Parameter(torch.randn(len(config.kinds), 2 * c))
+        self.point = nn.Parameter(torch.randn(config.points, 2 * c))
+        if config.learned:
+            self.own = nn.Parameter(torch.randn(config.learned, 2 * c))
+            self.start = nn.Parameter(start_lines(config.learned, config.points))
+        self.where = nn.Sequential(nn.Linear(4 * len(_WAVES), c), nn.ReLU(), nn.Linear(c, c))
+        self.layers = nn.ModuleList(MapLayer(config) for _ in range(config.layers))
+        self.kinds = nn.ModuleList(_kind_branch(c, len(config.kinds)) for _ in range(config.layers))
+        self.moves = nn.ModuleList(_move_branch(c) for _ in range(config.layers))
+
+    def forward(self, ground: Tensor, sketch: Sketch, group: Group = "one") -> tuple[RawMap, ...]:
+        """Features of B tiles (B, C, rows, columns) and their sketch to one RawMap a layer, the last the best; group: of queries.
+
+        The first group begins as each line of the sketch once, the second as all that were followed, copies too.
+        """
+        reference, logit, kind = self.begin(sketch, group)
+        each = self.kind[kind]
+        if self.config.learned and group == "one":
+            each = torch.cat((each, self.own.expand(len(each), *self.own.shape)), 1)
+        embedded, x = (each[:, :, None] + self.point).chunk(2, -1)
+        ground = ground.permute(0, 2, 3, 1)
+        out = []
+        for layer, say, move in zip(self.layers, self.kinds, self.moves):
+            place = embedded + self.where(waves(reference))
+            x = layer(x, place, reference, ground)
+            # How far a point has still to go depends on where it is by now, which x alone does not say.
+            point = reference + STEP * move(x + place)
+            out.append(RawMap(logit + say(x.mean(2)), point))
+            reference = point.detach()
+        return tuple(out)
+
+    def begin(self, sketch: Sketch, group: Group = "one") -> tuple[Tensor, Tensor, Tensor]:
+        """What queries begin as: points (B, I, P, 2), logits (B, I, kinds) and kinds of those from the sketch, which come first.
+
+        Nothing of the sketch has gradients.
+        """
+        config = self.config
+        rings = torch.tensor([is_ring(kind) for kind in config.kinds])
+        count, apart = (config.elements - config.learned, APART) if group == "one" else (config.many, 0.0)
+        found = propose(sketch, rings, count, config.points, max(config.seeds, count), config.least, apart)
+        own = F.one_hot(found.kind, len(config.kinds)).to(found.sure)
+        # Few queries are elements of a kind that the sketch does not say: a probability of 0.01 (focal loss, Lin et al. 2017).
+        point, logit = found.point, own * (torch.logit(found.sure) + math.log(99))[..., None] - math.log(99)
+        if config.learned and group == "one":
+            point = torch.cat((point, self.start.expand(len(point), *self.start.shape)), 1)
+            logit = torch.cat(
+                (logit, logit.new_full((len(point), config.learned, len(config.kinds)), -math.log(99))), 1
+            )
+        return point, logit, found.kind
+
+
+def start_lines(count: int, points: int) -> Tensor:
+    """(count, points, 2) straight lines all over the tile, in shares of it, 0.3 long, of all directions.
+
+    Middles and directions are the additive recurrence of least discrepancy in three dimensions (Roberts 2018).
+    """
+    ratio = torch.tensor(1.2207440846).double() ** -torch.arange(1, 4)
+    x, y, way = ((0.5 + torch.arange(count)[:, None] * ratio) % 1).unbind(-1)
+    along = torch.stack(((math.pi * way).cos(), (math.pi * way).sin()), -1)
+    middle = 0.1 + 0.8 * torch.stack((x, y), -1)
+    return (middle[:, None] + torch.linspace(-0.15, 0.15, points)[:, None] * along[:, None]).clamp(0, 1).float()
+
+
+def waves(place: Tensor) -> Tensor:
+    """Places (..., 2), shares of the tile, as (..., 32) sines and cosines of waves from twice the tile to a 64th of it."""
+    phase = (place[..., None] * _WAVES.to(place)).flatten(-2)
+    return torch.cat((phase.sin(), phase.cos()), -1)
+
+
+def _kind_branch(channels: int, kinds: int) -> nn.Sequential:
+    last = nn.Linear(channels, kinds)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    hidden = [part for _ in range(2) for part in (nn.Linear(channels, channels), nn.LayerNorm(channels), nn.ReLU())]
+    return nn.Sequential(*hidden, last)
+
+
+def _move_branch(channels: int) -> nn.Sequential:
+    last = nn.Linear(channels, 2)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels), nn.ReLU(), last)
+
+
+def decode(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[MapElements]:
+    """The elements of each tile, in its frame, metres, within it, best first; a query may answer under two kinds, as in MapTR."""
+    score = raw.logit.detach().sigmoid()
+    low = np.array([tile.x_min, tile.y_min])
+    size = np.array([tile.x_max, tile.y_max]) - low
+    code = np.array([KINDS.index(kind) for kind in config.kinds])
+    out = []
+    for scores, points in zip(score, raw.point.detach().clamp(0, 1).double()):
+        value, order = scores.flatten().sort(descending=True, stable=True)
+        kept = order[: config.keep][value[: config.keep] >= config.threshold]
+        query, kind = (kept // scores.shape[1]).numpy(), (kept % scores.shape[1]).numpy()
+        lines = points.numpy()[query] * size + low
+        out.append(MapElements.of(list(lines), code[kind], scores.flatten()[kept].double().numpy()))
+    return out
+
+
+def is_ring(kind: str) -> bool:
+    """Whether the last point of such an element joins its first."""
+    return KINDS.index(kind) == CROSSING

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The semi-global map model: see (an agent's sensors to tokens), fuse (tokens of many looks to a tile), draw (its elements).
+
+Source: CrowdMap section 2.2. What an agent saw reaches the tile as tokens, its own too: cells of its ground with a feature each,
+moved by its claimed pose. A look is one agent at one time: ten looks at a tile may be ten agents, or one that drove by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from manyeyes.datatypes import BevGrid, ConfigError, PointCloud, Sites, SparseBev, Transform
+from manyeyes.datatypes.camera import CameraImage
+from manyeyes.models.maps.bev import BevConfig, CameraBev, LidarBev
+from manyeyes.models.maps.head import Group, MapHead, MapHeadConfig, RawMap
+from manyeyes.models.maps.image_encoder import Pyramid, Residual
+from manyeyes.models.maps.line_field_head import Sketch
+from manyeyes.ops.bev_warp import masked_max, warp
+
+LOOKS = 10
+"""Looks at a tile, CrowdMap section 3.1."""
+
+
+@dataclass(frozen=True)
+class MapperConfig:
+    """bev: what an agent sees. tile: the piece of map that is drawn, in its own frame, 120 m by 60 m in the paper.
+
+    token_channels: of what is sent. neck: residual blocks on the tile, at its own, twice and four times its cells.
+    """
+
+    bev: BevConfig
+    tile: BevGrid
+    token_channels: int = 32
+    neck: tuple[int, ...] = (1, 1, 1)
+    head: MapHeadConfig = field(default_factory=MapHeadConfig)
+
+    def __post_init__(self) -> None:
+        if self.tile.stride != 1:
+            raise ConfigError(f"MapperConfig.tile is given at stride 1; got {self.tile.stride}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a batch of looks made of their own sensors: tokens (N, C), one grid a look, and of what kinds each cell is.
+
+    ink: (N, kinds) logits that an element of a kind runs through the cell; worth: (N,) the greatest probability, by which
+    tokens are chosen where bytes are few.
+    """
+
+    tokens: SparseBev
+    ink: Tensor
+
+    @property
+    def worth(self) -> Tensor:
+        """(N,) in (0, 1)."""
+        return self.ink.detach().sigmoid().amax(1)
+
+
+class Mapper(nn.Module):
+    """Sensors of many looks to the elements of tiles."""
+
+    def __init__(self, config: MapperConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.fingerprint = bytes(8)
+        bev, head, tokens = config.bev, config.head, config.token_channels
+        self.lidar = LidarBev(bev) if "lidar" in bev.sensors else None
+        self.camera = CameraBev(bev) if "camera" in bev.sensors else None
+        self.shrink = nn.Conv2d(bev.channels, tokens, 1)
+        self.ink = nn.Linear(tokens, len(head.kinds))
+        nn.init.constant_(self.ink.bias, -3.0)
+        self.null = nn.Parameter(torch.zeros(tokens))
+        widths = tuple(min(head.channels, 2 * tokens * 2**i) for i in range(len(config.neck)))
+        # Beside the features: how many looks saw the cell, and each cell's place in the tile.
+        inputs, stages = tokens + 3, []
+        for i, (count, width) in enumerate(zip(config.neck, widths)):
+            blocks = [Residual(inputs, width, 2 if i else 1)] + [Residual(width, width) for _ in range(count - 1)]
+            stages.append(nn.Sequential(*blocks))
+            inputs = width
+        self.neck = nn.ModuleList(stages)
+        self.pyramid = Pyramid(widths, head.channels)
+        self.head = MapHead(head)
+        # Of each kind's logits, once training is done (training/maps/score_calibration.py): scores are then shares that are true.
+        self.scale, self.shift = nn.Buffer(torch.ones(len(head.kinds))), nn.Buffer(torch.zeros(len(head.kinds)))
+
+    @property
+    def token_grid(self) -> BevGrid:
+        """The lattice of the tokens, in each agent's frame."""
+        return self.config.bev.token_grid
+
+    def see(self, clouds: Sequence[PointCloud] = (), images: Sequence[Sequence[CameraImage]] = ()) -> Look:
+        """A cloud each, pictures each, or both, of N looks in their agents' frames; tokens lie where a sensor saw the ground.
+
+        A model of both sensors takes either alone: the other then saw nothing.
+        """
+        eyes = [net(sense) for net, sense in ((self.lidar, clouds), (self.camera, images)) if net is not None and sense]
+        if not eyes:
+            raise ConfigError(f"This mapper has {', '.join(self.config.bev.sensors)}; give what they saw.")
+        features, seen = torch.stack([e[0] for e in eyes], 1), torch.stack([e[1] for e in eyes], 1)
+        merged = self.shrink(masked_max(features, seen, features.new_zeros(features.shape[2])))
+        flat = merged.permute(0, 2, 3, 1).flatten(0, 2)
+        key = seen.any(1).flatten().nonzero()[:, 0]
+        tokens = SparseBev(flat[key], Sites(key, self.token_grid, merged.shape[0]))
+        return Look(tokens, self.ink(tokens.features))
+
+    def fuse(self, tokens: SparseBev, tile_from_agent: Transform, tile: Tensor, tiles: int) -> Tensor:
+        """Tokens of N looks, as they were received, to features of tiles (tiles, C, rows, columns); arguments as for ``place``.
+
+        The order of looks does not count, nor does a look that sees nothing of its tile.
+        """
+        return self.merge(*self.place(tokens, tile_from_agent, tile, tiles))
+
+    def place(self, tokens: SparseBev, tile_from_agent: Transform, tile: Tensor, tiles: int) -> tuple[Tensor, Tensor]:
+        """Tokens of N looks on the cells of their tiles: features (tiles, K, C, rows, columns) of at most K looks a tile, and what
+        each sees (tiles, K, rows, columns).
+
+        tile_from_agent: N motions, by claimed or corrected poses; tile: (N,) int64, which tile each look is of.
+        """
+        rows, columns = self.config.tile.shape
+        dense = tokens.dense()
+        there = torch.zeros(dense.shape[0] * dense.shape[2] * dense.shape[3], dtype=torch.bool)
+        there[tokens.sites.key] = True
+        moved, seen = warp(
+            dense, there.view(dense.shape[0], *dense.shape[2:]), tokens.grid, self.config.tile, tile_from_agent
+        )
+        # The n-th look at its tile takes the n-th place there; places that are left over see nothing.
+        place = (tile[:, None] == tile[None]).tril(-1).sum(1)
+        looks = int(place.max()) + 1 if len(tile) else 1
+        slot = tile * looks + place
+        features = moved.new_zeros(tiles * looks, moved.shape[1], rows, columns).index_copy(0, slot, moved)
+        views = torch.zeros(tiles * looks, rows, columns, dtype=torch.bool).index_copy(0, slot, seen)
+        return features.unflatten(0, (tiles, looks)), views.unflatten(0, (tiles, looks))
+
+    def merge(self, features: Tensor, seen: Tensor) -> Tensor:
+        """Features (B, K, C, rows, columns) of K looks on the cells of their tiles, and what they see, to (B, D, rows, columns)."""
+        fused = masked_max(features, seen, self.null)
+        coverage = seen.sum(1, keepdim=True).to(fused.dtype).log1p()
+        b, _, rows, columns = fused.shape
+        y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
+        x = torch.cat((fused, coverage, torch.stack((x, y)).expand(b, 2, rows, columns)), 1)
+        x = x.contiguous(memory_format=torch.channels_last)
+        levels = []
+        for stage in self.neck:
+            x = stage(x)
+            levels.append(x)
+        return self.pyramid(levels)
+
+    def sketch(self, ground: Tensor) -> Sketch:
+        """What the cells of tiles (B, D, rows, columns) say of the lines that run by them."""
+        return self.head.sketch(ground)
+
+    def draw(self, ground: Tensor, group: Group = "one", sketch: Sketch | None = None) -> tuple[RawMap, ...]:
+        """Elements of tiles (B, D, rows, columns), one RawMap a layer, the last the best, its scores calibrated when not training.
+
+        sketch: of this ground, if known.
+        """
+        *before, last = self.head(ground, self.sketch(ground) if sketch is None else sketch, group)
+        if not self.training:
+            last = RawMap(last.logit * self.scale + self.shift, last.point)
+        return (*before, last)
+
+    def forward(self, features: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """The part that is exported: looks on the cells of their tiles, as for ``merge``, to the last layer's logits and points."""
+        raw = self.draw(self.merge(features, seen))[-1]
+        return raw.logit, raw.point

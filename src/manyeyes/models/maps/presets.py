@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Map models by name and sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from manyeyes.datatypes import BevGrid, ConfigError
+from manyeyes.models.maps.bev import BevConfig, Sensor
+from manyeyes.models.maps.head import MapHeadConfig
+from manyeyes.models.maps.image_encoder import ImageEncoderConfig
+from manyeyes.models.maps.map_model import MapperConfig
+from manyeyes.models.maps.view_transform import DepthBins
+
+FORMAT = "manyeyes-mapper-1"
+"""Of a mapper's file of weights."""
+
+
+def _tile(cell_m: float) -> BevGrid:
+    """CrowdMap's semi-global tile, 120 m along its road by 60 m."""
+    return BevGrid(-60.0, -30.0, -5.0, 60.0, 30.0, 5.0, pillar=cell_m)
+
+
+TOY = MapperConfig(
+    BevConfig(
+        BevGrid(-36.0, -36.0, -2.0, 36.0, 36.0, 4.0, pillar=0.8),
+        channels=32,
+        raster_width=12,
+        raster_blocks=(1, 1),
+        image=ImageEncoderConfig((1, 1), 12, channels=32),
+        image_size=(64, 112),
+        depth=DepthBins(1.0, 37.0, 19),
+    ),
+    _tile(1.5),
+    token_channels=16,
+    head=MapHeadConfig(elements=80, points=10, learned=60, channels=64, feed=128, layers=2, heads=4),
+)
+"""For tests, and to learn a few tiles by heart: lines of its own learn those sooner than a sketch does."""
+
+SMALL = MapperConfig(
+    BevConfig(
+        BevGrid(-38.4, -38.4, -2.0, 38.4, 38.4, 4.0, pillar=0.4),
+        channels=24,
+        raster_width=16,
+        raster_blocks=(1, 1, 1),
+        image=ImageEncoderConfig((1, 1, 1), 16, channels=24, stride=4),
+        image_size=(136, 320),
+        lift="ground",
+        coarsest_m=4.0,
+    ),
+    _tile(0.8),
+    token_channels=24,
+    neck=(1, 1, 1, 1),
+    head=MapHeadConfig(elements=60, points=20, channels=64, feed=128, layers=2, heads=4),
+)
+"""For two cores: a look is read with few layers, since the ground around it is read again where all looks have met."""
+
+PAPER = MapperConfig(
+    BevConfig(
+        BevGrid(-51.2, -51.2, -2.0, 51.2, 51.2, 4.0, pillar=0.4),
+        channels=256,
+        raster_width=64,
+        raster_blocks=(2, 2, 2),
+        image=ImageEncoderConfig((3, 4, 6, 3), 64, True, 256, recompute=True),
+        image_size=(480, 640),
+        depth=DepthBins(1.0, 69.0, 69),
+    ),
+    _tile(0.6),
+    token_channels=128,
+    neck=(2, 2, 2),
+    head=MapHeadConfig(elements=100, points=20, many=300, channels=256, feed=512, layers=6),
+)
+"""ResNet-50, 120 m by 60 m, 100 queries of 20 points: CrowdMap section 3.1, and MapTRv2's decoder where it is silent. For GPUs."""
+
+MAPPERS = {"toy": TOY, "small": SMALL, "paper": PAPER}
+
+
+def mapper_config(name: str, sensors: tuple[Sensor, ...] = ("lidar",)) -> MapperConfig:
+    """A preset by its name in MAPPERS, for agents that carry these sensors."""
+    if name not in MAPPERS:
+        raise ConfigError(f"No map model is called {name!r}; choose one of {', '.join(MAPPERS)}.")
+    config = MAPPERS[name]
+    return replace(config, bev=replace(config.bev, sensors=sensors))

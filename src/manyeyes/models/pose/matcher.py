@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which keypoints of two agents are the same object: stacked self- and cross-attention, and an assignment matrix.
+
+FeaKM section 4.2.2 (Eq. 4, 5) with its reference for rotary positions (Su et al., RoFormer); the assignment is LightGlue's
+(Lindenberger et al. 2023), which FeaKM's code uses unchanged: log P_ij = log softmax over j + log softmax over i of the
+similarity, + log sigmoid of each side's matchability (specs/pose.md 1.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes.keypoints import Keypoints
+from manyeyes.models.pose.neighbour_geometry import Constellation, ConstellationConfig
+
+NEVER = -1e4
+"""Logit of what may not be attended to or assigned; finite, so that an empty set gives no NaN."""
+
+
+@dataclass(frozen=True)
+class MatcherConfig:
+    """descriptor: length of what comes in; width, layers, heads: of the attention. unit_m: in which positions are measured,
+    and frequency: spread of the angles that a unit turns, before they are learned. threshold: least probability of a match.
+    constellation: points are also told how those around them stand, whichever way their agent looks; None as published.
+    """
+
+    descriptor: int = 256
+    width: int = 256
+    layers: int = 9
+    heads: int = 4
+    unit_m: float = 100.0
+    frequency: float = 1.0
+    threshold: float = 0.1
+    constellation: ConstellationConfig | None = None
+
+    def __post_init__(self) -> None:
+        if self.width % (4 * self.heads):
+            raise ConfigError(f"MatcherConfig.width must be divisible by 4 * heads; got {self.width}, {self.heads}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Keypoints of B views as one batch. descriptor: (B, N, D); xy: (B, N, 2) m; yaw: (B, N); size: (B, N, 2) m; mask: (B, N)
+    bool, which are points and not padding.
+    """
+
+    descriptor: Tensor
+    xy: Tensor
+    yaw: Tensor
+    size: Tensor
+    mask: Tensor
+
+    @classmethod
+    def of(cls, many: Sequence[Keypoints]) -> Points:
+        """Padded to the longest."""
+
+        def pad(values: Sequence[Tensor]) -> Tensor:
+            return nn.utils.rnn.pad_sequence([v.float() for v in values], batch_first=True)
+
+        return cls(
+            pad([k.descriptor for k in many]),
+            pad([k.xy for k in many]),
+            pad([k.boxes.yaw for k in many]),
+            pad([k.boxes.size[:, :2] for k in many]),
+            pad([torch.ones(len(k)) for k in many]).bool(),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Assignment:
+    """log_p: (B, N, M) of a match; log_alone_a, log_alone_b: (B, N), (B, M) that a point has none."""
+
+    log_p: Tensor
+    log_alone_a: Tensor
+    log_alone_b: Tensor
+
+
+def mutual(assignment: Assignment, threshold: float) -> list[tuple[Tensor, Tensor]]:
+    """Of each pair of views: rows (P, 2) that are each other's best with a probability above the threshold, and that (P,)."""
+    found = []
+    for log_p in assignment.log_p:
+        if not log_p.numel():
+            found.append((torch.zeros(0, 2, dtype=torch.int64), log_p.new_zeros(0)))
+            continue
+        best, j = log_p.max(1)
+        i = torch.arange(len(log_p))
+        rows = (log_p.argmax(0)[j] == i) & (best.exp() > threshold)
+        found.append((torch.stack((i[rows], j[rows]), 1), best[rows].exp()))
+    return found
+
+
+class Matcher(nn.Module):
+    """Layers of self- and cross-attention, each with its own assignment, so that every layer can be taught."""
+
+    def __init__(self, config: MatcherConfig) -> None:
+        super().__init__()
+        self.config = config
+        d, heads = config.width, config.heads
+        self.enter = nn.Identity() if config.descriptor == d else nn.Linear(config.descriptor, d)
+        self.around = None if config.constellation is None else Constellation(d, config.constellation)
+        self.position = nn.Linear(2, d // heads // 2, bias=False)
+        nn.init.normal_(self.position.weight, std=config.frequency)
+        self.within = nn.ModuleList(SelfBlock(d, heads) for _ in range(config.layers))
+        self.across = nn.ModuleList(CrossBlock(d, heads) for _ in range(config.layers))
+        self.assign = nn.ModuleList(AssignmentHead(d) for _ in range(config.layers))
+
+    def forward(self, a: Points, b: Points) -> list[Assignment]:
+        """Pairs of views to the assignment of every layer, the last of which is the answer; see mutual."""
+        (x, turn_x), (y, turn_y) = self._enter(a), self._enter(b)
+        found = []
+        for within, across, assign in zip(self.within, self.across, self.assign):
+            x, y = within(x, turn_x, a.mask), within(y, turn_y, b.mask)
+            x, y = across(x, y, a.mask, b.mask)
+            found.append(assign(x, y, a.mask, b.mask))
+        return found
+
+    def _enter(self, points: Points) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        x = self.enter(points.descriptor)
+        if self.around is not None:
+            x = x + self.around(points.xy, points.yaw, points.size, points.mask)
+        angle = self.position(points.xy / self.config.unit_m)[:, None]
+        return x, (angle.cos(), angle.sin())
+
+
+def rotated(x: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
+    """Pairs of channels of (B, heads, N, c) turned by angles whose cosine and sine are (B, 1, N, c / 2): the product of two
+    such depends on the difference of their places alone (RoFormer, Eq. 14).
+    """
+    c, s = turn
+    u, v = x[..., 0::2], x[..., 1::2]
+    return torch.stack((u * c - v * s, u * s + v * c), -1).flatten(-2)
+
+
+def _feed(width: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(2 * width, 2 * width), nn.LayerNorm(2 * width), nn.GELU(), nn.Linear(2 * width, width)
+    )
+
+
+def _split(x: Tensor, heads: int) -> Tensor:
+    """(B, N, d) to (B, heads, N, d / heads)."""
+    return x.unflatten(-1, (heads, -1)).transpose(1, 2)
+
+
+def _bias(mask: Tensor) -> Tensor:
+    """(B, 1, 1, N) to add to attention's logits."""
+    return (~mask).float()[:, None, None] * NEVER
+
+
+class SelfBlock(nn.Module):
+    """Points of one view attend to each other, by content and relative place."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv, self.out, self.feed = nn.Linear(width, 3 * width), nn.Linear(width, width), _feed(width)
+
+    def forward(self, x: Tensor, turn: tuple[Tensor, Tensor], mask: Tensor) -> Tensor:
+        """(B, N, d) to (B, N, d)."""
+        q, k, v = (_split(part, self.heads) for part in self.qkv(x).chunk(3, -1))
+        heard = functional.scaled_dot_product_attention(rotated(q, turn), rotated(k, turn), v, _bias(mask))
+        return x + self.feed(torch.cat((x, self.out(heard.transpose(1, 2).flatten(-2))), -1))
+
+
+class CrossBlock(nn.Module):
+    """Points of two views attend to each other, by content alone; one projection serves as query and key of both."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.key, self.value, self.out = (nn.Linear(width, width) for _ in range(3))
+        self.feed = _feed(width)
+
+    def forward(self, x: Tensor, y: Tensor, mask_x: Tensor, mask_y: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, N, d), (B, M, d) to the same."""
+        key_x, key_y = (_split(self.key(z), self.heads) for z in (x, y))
+        value_x, value_y = (_split(self.value(z), self.heads) for z in (x, y))
+        to_x = functional.scaled_dot_product_attention(key_x, key_y, value_y, _bias(mask_y))
+        to_y = functional.scaled_dot_product_attention(key_y, key_x, value_x, _bias(mask_x))
+        return self._add(x, to_x), self._add(y, to_y)
+
+    def _add(self, x: Tensor, heard: Tensor) -> Tensor:
+        return x + self.feed(torch.cat((x, self.out(heard.transpose(1, 2).flatten(-2))), -1))
+
+
+class AssignmentHead(nn.Module):
+    """Similarity of two sets of points, each point's chance to have a counterpart at all, and both as one matrix."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.project, self.matchable = nn.Linear(width, width), nn.Linear(width, 1)
+
+    def forward(self, x: Tensor, y: Tensor, mask_x: Tensor, mask_y: Tensor) -> Assignment:
+        """(B, N, d), (B, M, d) to (B, N, M)."""
+        similar = self.project(x) @ self.project(y).mT / x.shape[-1] ** 0.5
+        z_x, z_y = self.matchable(x)[..., 0], self.matchable(y)[..., 0]
+        by_row = similar.masked_fill(~mask_y[:, None], NEVER).log_softmax(2)
+        by_column = similar.masked_fill(~mask_x[:, :, None], NEVER).log_softmax(1)
+        log_p = by_row + by_column + functional.logsigmoid(z_x)[:, :, None] + functional.logsigmoid(z_y)[:, None]
+        log_p = log_p.masked_fill(~(mask_x[:, :, None] & mask_y[:, None]), NEVER)
+        return Assignment(log_p, functional.logsigmoid(-z_x), functional.logsigmoid(-z_y))

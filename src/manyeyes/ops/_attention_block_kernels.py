@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole block of window attention (CoSTr Eq. 4, 6, 7) in one compiled call: for inference on the CPU.
+
+A few hundred tokens are little work for each of the thirty tensor operations of a block; here products run at the rate of
+``pair_loops``, and norms, encodings and activations are loops that a compiler turns into vectors.
+``models.detector.transformer`` is the twin with gradients.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from manyeyes._jit import njit
+from manyeyes.ops._sparse_conv_kernels import LANES, add_products, empty_rows, panels
+from manyeyes.ops._window_attention_kernels import FAST, WindowRuns, attend, power_of_two
+
+_EPS = 1e-5
+# Sine and cosine on [-pi/4, pi/4], error below 1e-7 (Taylor), and pi/2 in two parts, so that nothing is lost on taking it off.
+_SINE = tuple(map(np.float32, (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880)))
+_COSINE = tuple(map(np.float32, (-1 / 2, 1 / 24, -1 / 720, 1 / 40320)))
+_HALF_PI, _HALF_PI_REST = np.float32(1.5703125), np.float32(math.pi / 2 - 1.5703125)
+# erf within 1.5e-7 (Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.26).
+_ERF = tuple(map(np.float32, (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592)))
+_ERF_T, _SQUARE = np.float32(0.3275911 / math.sqrt(2)), np.float32(-math.log2(math.e) / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class BlockWeights:
+    """matrices: (inputs, outputs), each in panels, of query, key, value, output, and the net's two layers; vectors: their
+    biases, then weights and biases of the two norms. All float32.
+    """
+
+    matrices: tuple[NDArray[np.float32], ...]
+    vectors: tuple[NDArray[np.float32], ...]
+    heads: int
+
+    @classmethod
+    def of(cls, linears: list[nn.Linear], norms: list[nn.LayerNorm], heads: int) -> BlockWeights | None:
+        """Copies of the weights of six layers and two norms; None where the loops do not know such."""
+        if any(n.eps != _EPS for n in norms) or any(w.out_features % LANES or w.weight.is_cuda for w in linears):
+            return None
+        tensors = [*(w.bias for w in linears), *(t for n in norms for t in (n.weight, n.bias))]
+        matrices = tuple(panels(w.weight.detach().float().T[None]) for w in linears)
+        return cls(matrices, tuple(t.detach().float().contiguous().numpy() for t in tensors), heads)
+
+
+@torch.no_grad()
+def run_block(features: Tensor, offsets: Tensor, runs: WindowRuns, weights: BlockWeights) -> Tensor:
+    """features (N, C) float32 of tokens at offsets (N, 2) cells in their windows to (N, C)."""
+    x, u = features.contiguous().numpy(), offsets.contiguous().numpy()
+    channels = x.shape[1]
+    frequency = (10000.0 ** (-4.0 * np.arange(channels // 4) / channels)).astype(np.float32)
+    order, start = runs.order.numpy(), runs.start.numpy()
+    return torch.from_numpy(_block(x, u, frequency, order, start, weights.heads, weights.matrices, weights.vectors))
+
+
+@njit(cache=True, nogil=True)
+def _block(x, offsets, frequency, order, start, heads, matrices, vectors):  # pragma: no cover
+    n, channels = x.shape
+    rows, counts = np.arange(n), np.full(1, n)
+    normed, placed = empty_rows(n, channels), empty_rows(n, channels)
+    _norm(x, vectors[6], vectors[7], normed)
+    _place(normed, offsets, frequency, placed)
+    q, k, v = _sums(n, vectors[0]), _sums(n, vectors[1]), _sums(n, vectors[2])
+    add_products(placed, matrices[0], 0, 1, rows, rows, counts, q)
+    add_products(placed, matrices[1], 0, 1, rows, rows, counts, k)
+    add_products(normed, matrices[2], 0, 1, rows, rows, counts, v)
+    attend(q.reshape(-1), k.reshape(-1), v.reshape(-1), placed.reshape(-1), heads, channels // heads, order, start)
+    out = empty_rows(n, channels)
+    out[:] = x + vectors[3]
+    add_products(placed, matrices[3], 0, 1, rows, rows, counts, out)
+    _norm(out, vectors[8], vectors[9], normed)
+    hidden = _sums(n, vectors[4])
+    add_products(normed, matrices[4], 0, 1, rows, rows, counts, hidden)
+    _gelu(hidden.reshape(-1))
+    out += vectors[5]
+    add_products(hidden, matrices[5], 0, 1, rows, rows, counts, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _sums(n, bias):  # pragma: no cover
+    """(n, outputs): what the products are added to."""
+    out = empty_rows(n, bias.shape[0])
+    for i in range(n):
+        out[i] = bias
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _norm(x, weight, bias, out):  # pragma: no cover
+    """Layer norm of rows (N, C)."""
+    n, channels = x.shape
+    for i in range(n):
+        mean, square = np.float32(0), np.float32(0)
+        for c in range(channels):
+            mean += x[i, c]
+        mean /= np.float32(channels)
+        for c in range(channels):
+            square += (x[i, c] - mean) * (x[i, c] - mean)
+        scale = np.float32(1) / np.sqrt(square / np.float32(channels) + np.float32(_EPS))
+        for c in range(channels):
+            out[i, c] = (x[i, c] - mean) * scale * weight[c] + bias[c]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _place(x, offsets, frequency, out):  # pragma: no cover
+    """out = x plus ``sincos_encoding`` of offsets (N, 2)."""
+    quarter = frequency.shape[0]
+    for i in range(x.shape[0]):
+        for axis in range(2):
+            u, row, to = offsets[i, axis], x[i, 2 * quarter * axis :], out[i, 2 * quarter * axis :]
+            for j in range(quarter):
+                angle = u * frequency[j]
+                turns = np.rint(angle * np.float32(2 / math.pi))
+                r = (angle - turns * _HALF_PI) - turns * _HALF_PI_REST
+                s = r * r
+                sine = r + r * s * (_SINE[0] + s * (_SINE[1] + s * (_SINE[2] + s * _SINE[3])))
+                cosine = np.float32(1) + s * (_COSINE[0] + s * (_COSINE[1] + s * (_COSINE[2] + s * _COSINE[3])))
+                quadrant = np.int32(turns) & 3
+                a, b = (cosine, sine) if quadrant & 1 else (sine, cosine)
+                to[2 * j] = row[2 * j] + (-a if quadrant & 2 else a)
+                to[2 * j + 1] = row[2 * j + 1] + (-b if quadrant == 1 or quadrant == 2 else b)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _gelu(x):  # pragma: no cover
+    """x (N,) becomes x / 2 (1 + erf(x / sqrt(2)))."""
+    for i in range(np.uintp(x.shape[0])):
+        t = np.float32(1) / (np.float32(1) + _ERF_T * abs(x[i]))
+        tail = t * (_ERF[4] + t * (_ERF[3] + t * (_ERF[2] + t * (_ERF[1] + t * _ERF[0]))))
+        tail *= np.float32(0.5) * power_of_two(x[i] * x[i] * _SQUARE)
+        x[i] *= np.float32(1) - tail if x[i] > 0 else tail

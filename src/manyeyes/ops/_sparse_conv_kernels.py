@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Products of a sparse convolution in one compiled loop, on the CPU.
+
+Rows are read where they lie and added where they lead: nothing is gathered, no product is stored. The sums of six pairs and
+up to 64 outputs stay in registers over all inputs, so that the loop runs at the rate of the multipliers, whatever the
+number of channels. Loops that a compiler turns into vectors by itself keep such sums in memory, at less than half of it.
+Matrices lie in panels of so many columns, in the order in which they are read; while one is multiplied by, the next is
+fetched, a little with each tile: those of a layer of 256 channels come from beyond the second cache, and on few rows the wait
+would be a third of the time.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from llvmlite import binding, ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+from torch import Tensor
+
+from manyeyes._jit import njit
+
+LANES = 16
+"""Outputs come in so many at once."""
+# AVX-512 has registers for 6 x 4 sums of 16 lanes; others hold 6 x 1, in two to four registers each.
+_WIDEST = 4 * LANES if binding.get_host_cpu_features().get("avx512f", False) else LANES
+_AHEAD = 2048
+"""So many bytes ahead a panel is fetched from the second cache: some hundred cycles of products."""
+_LINE = 64
+"""Bytes of a line of the cache."""
+_FRACTION = 1024
+"""Shares of bytes are counted in such fractions."""
+_MANY, _NEAR = 600, 8192
+"""From so many pairs on, with so many numbers in a panel at most, it stays in the first cache, and fetching costs more."""
+
+
+def panels(taps: Tensor) -> NDArray[np.float32]:
+    """Matrices (taps, C, D), D divisible by LANES, cut into columns as wide as a tile: (taps, D / width, C, width) in a row."""
+    width = math.gcd(taps.shape[2], _WIDEST)
+    return taps.unflatten(2, (-1, width)).transpose(1, 2).contiguous().numpy()
+
+
+@njit(cache=True, nogil=True)
+def empty_rows(rows, columns):  # pragma: no cover
+    """(rows, columns) float32 that begins with a line of the cache: a vector across two lines is read twice."""
+    spare = _LINE // 4
+    flat = np.empty(rows * columns + spare, np.float32)
+    start = -(flat.ctypes.data // 4) % spare
+    return flat[start : start + rows * columns].reshape(rows, columns)
+
+
+@njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
+def convolve(x, weight, bias, source, target, counts, is_symmetric, is_rectified, out):  # pragma: no cover
+    """out[target[p]] = bias + the sum of x[source[p]] @ weight[tap] over pairs p, counts (taps,) of each tap from 0 on.
+
+    weight: :func:`panels`. is_symmetric: the middle tap leads from each row to itself, and taps behind it have the pairs of
+    those before it, which alone are given, turned round, the last tap those of the first. is_rectified: below 0 it is 0.
+    """
+    for o in range(out.shape[0]):
+        out[o] = bias
+    if is_symmetric:
+        rows = np.arange(x.shape[0])
+        add_products(x, weight, counts.shape[0], 1, rows, rows, np.full(1, x.shape[0]), out)
+    add_products(x, weight, 0, 1, source, target, counts, out)
+    if is_symmetric:
+        add_products(x, weight, 2 * counts.shape[0], -1, target, source, counts, out)
+    if is_rectified:
+        flat = out.reshape(-1)
+        for i in range(np.uintp(flat.shape[0])):
+            flat[i] = max(flat[i], np.float32(0))
+
+
+@njit(cache=True, nogil=True)
+def add_products(x, weight, tap, step, source, target, counts, out):  # pragma: no cover
+    """out[target[p]] += x[source[p]] @ weight[tap] for each pair p; after counts[0] pairs tap goes on by step, and so on.
+
+    x (N, C), weight (taps, D / width, C, width), out (M, D), float32 without gaps; source, target: int64, a tap's target
+    never the same twice.
+    """
+    at, last = 0, counts.shape[0] - 1
+    for k in range(last + 1):
+        end = at + counts[k]
+        for q in range(weight.shape[1]):
+            panel, column, following = weight[tap, q], q * weight.shape[3], weight[tap, q]
+            if q + 1 < weight.shape[1]:
+                following = weight[tap, q + 1]
+            elif k < last:
+                following = weight[tap + step, 0]
+            if weight.shape[3] == 4 * LANES:
+                _add_four(x, panel, following, source, target, at, end, column, out)
+            elif weight.shape[3] == 2 * LANES:
+                _add_two(x, panel, following, source, target, at, end, column, out)
+            else:
+                _add_one(x, panel, following, source, target, at, end, column, out)
+        at, tap = end, tap + step
+
+
+def _panel(vectors: int) -> Any:
+    """What adds the products of pairs at … end with one panel of so many vectors, from column on of the outputs."""
+
+    @njit(cache=True, nogil=True)
+    def add(x, panel, following, source, target, at, end, column, out):  # pragma: no cover
+        sixes, tiles = at + (end - at) // 6 * 6, (end - at + 5) // 6
+        # Every input of every tile fetches its share of the panel that follows, in fractions of a byte.
+        share, fetched = 4 * vectors * LANES * _FRACTION // max(tiles, 1), 0
+        if end - at >= _MANY and panel.size <= _NEAR:
+            for p in range(at, sixes, 6):
+                _add_tile(6, vectors, False, x, panel, following, fetched, share, source, target, p, column, out)
+        else:
+            for p in range(at, sixes, 6):
+                _add_tile(6, vectors, True, x, panel, following, fetched, share, source, target, p, column, out)
+                fetched += share * x.shape[1]
+        rest = end - sixes
+        if rest == 5:
+            _add_tile(5, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+        elif rest == 4:
+            _add_tile(4, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+        elif rest == 3:
+            _add_tile(3, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+        elif rest == 2:
+            _add_tile(2, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+        elif rest == 1:
+            _add_tile(1, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+
+    return add
+
+
+def _tile(
+    _: Any,
+    rows: Any,
+    vectors: Any,
+    fetching: Any,
+    x: Any,
+    panel: Any,
+    following: Any,
+    fetched: Any,
+    share: Any,
+    source: Any,
+    target: Any,
+    pair: Any,
+    column: Any,
+    out: Any,
+) -> Any:
+    """Add the products of ``rows`` pairs, from pair on, and a panel of ``vectors`` x LANES columns, from column on of out.
+
+    fetching: whether the panel that follows is brought nearer meanwhile, from fetched on a share for each input.
+    Written for LLVM in vectors, because numba has no name for a vector that stays in a register.
+    """
+    kinds = (rows, vectors, fetching, x, panel, following, fetched, share, source, target, pair, column, out)
+    vector, place, byte = ir.VectorType(ir.FloatType(), LANES), ir.IntType(64), ir.IntType(8).as_pointer()
+    undefined, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
+    width = place(vectors.literal_value * LANES)
+
+    def generate(context: Any, b: Any, signature: Any, given: Any) -> Any:
+        x_, panel_, following_, source_, target_, out_ = (
+            context.make_array(kinds[i])(context, b, given[i]) for i in (3, 4, 5, 8, 9, 12)
+        )
+        fetched_, share_, pair_, column_ = (given[i] for i in (6, 7, 10, 11))
+        inputs, outputs = (cgutils.unpack_tuple(b, array.shape)[1] for array in (x_, out_))
+        kind = ir.FunctionType(ir.VoidType(), [byte, *[ir.IntType(32)] * 3])
+        prefetch = cgutils.get_or_insert_function(b.module, kind, "llvm.prefetch.p0i8")
+        to_read_near = [ir.IntType(32)(flag) for flag in (0, 3, 1)]
+
+        def fetch(start: Any, offset: Any) -> None:
+            b.call(prefetch, [b.gep(b.bitcast(start, byte), [offset]), *to_read_near])
+
+        def row(array: Any, names: Any, r: int, length: Any) -> Any:
+            name = b.load(b.gep(names.data, [b.add(pair_, place(r))]))
+            return b.gep(array.data, [b.mul(name, length)])
+
+        def across(start: Any) -> list[Any]:
+            places = (b.gep(start, [place(v * LANES)]) for v in range(vectors.literal_value))
+            return [b.bitcast(p, vector.as_pointer()) for p in places]
+
+        sources = [row(x_, source_, r, inputs) for r in range(rows.literal_value)]
+        starts = [row(out_, target_, r, outputs) for r in range(rows.literal_value)]
+        targets = [across(b.gep(start, [column_])) for start in starts]
+        sums = [[cgutils.alloca_once(b, vector) for _ in line] for line in targets]
+        for line, totals in zip(targets, sums):
+            for p, total in zip(line, totals):
+                b.store(b.load(p, align=4), total)
+        with cgutils.for_range(b, inputs) as loop:
+            places = across(b.gep(panel_.data, [b.mul(loop.index, width)]))
+            factors = [b.load(p, align=4) for p in places]
+            if fetching.literal_value:
+                for p in places:
+                    fetch(p, place(_AHEAD))
+                soon = b.udiv(b.add(fetched_, b.mul(loop.index, share_)), place(_FRACTION))
+                fetch(following_.data, b.and_(soon, place(-_LINE)))
+            for start, totals in zip(sources, sums):
+                one = b.insert_element(undefined, b.load(b.gep(start, [loop.index])), ir.IntType(32)(0))
+                many = b.shuffle_vector(one, undefined, first)
+                for factor, total in zip(factors, totals):
+                    product = b.fmul(many, factor, flags=["contract"])
+                    b.store(b.fadd(product, b.load(total), flags=["contract"]), total)
+        for line, totals in zip(targets, sums):
+            for p, total in zip(line, totals):
+                b.store(b.load(total), p, align=4)
+        return context.get_dummy_value()
+
+    return types.void(*kinds), generate
+
+
+_add_tile: Any = intrinsic(prefer_literal=True)(_tile)
+_add_one, _add_two, _add_four = _panel(1), _panel(2), _panel(4)

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Self-attention within windows in compiled loops: for inference on the CPU.
+
+A window costs no call of its own and is padded to whole vectors at most. Queries lie along the vectors, so that scores,
+softmax and mixture need no sum across one. :mod:`manyeyes.ops.window_attention` is the twin with gradients.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from manyeyes._jit import njit
+from manyeyes.datatypes import ShapeError
+
+_TILE = 64
+_VECTOR = 16
+# Unsigned places: a signed one might count from the end, and the test for it keeps the loops from vectors.
+_ROW = np.uintp(_TILE)
+_ONE, _TWO, _THREE = np.uintp(1), np.uintp(2), np.uintp(3)
+_TWO_ROWS, _THREE_ROWS = np.uintp(2 * _TILE), np.uintp(3 * _TILE)
+# 2^f on [-1/2, 1/2]: the least squares of the relative error at 2000 Chebyshev nodes.
+_POWERS = tuple(
+    map(np.float32, (1, 0.693147206, 0.240226466, 0.05550329, 0.00961851953, 0.00133998604, 0.000153375768))
+)
+FAST = {"contract", "nsz", "nnan", "ninf", "arcp", "reassoc"}
+
+
+@dataclass(frozen=True, eq=False)
+class WindowRuns:
+    """order: (N,) int64, tokens window by window; start: (windows + 1,) int64, where each begins."""
+
+    order: Tensor
+    start: Tensor
+
+
+def window_runs(window: Tensor) -> WindowRuns:
+    """Tokens of windows (N,) int64, sorted."""
+    ids, order = window.sort(stable=True)
+    return WindowRuns(order, torch.from_numpy(_starts(ids.numpy())))
+
+
+@njit(cache=True, nogil=True)
+def _starts(ids):  # pragma: no cover
+    """Where each run of equal ids (N,) begins, and N."""
+    start, runs = np.empty(ids.shape[0] + 1, np.int64), 0
+    for i in range(ids.shape[0]):
+        if i == 0 or ids[i] != ids[i - 1]:
+            start[runs] = i
+            runs += 1
+    start[runs] = ids.shape[0]
+    return start[: runs + 1]
+
+
+@torch.no_grad()
+def attend_in_windows(q: Tensor, k: Tensor, v: Tensor, runs: WindowRuns) -> Tensor:
+    """softmax(q k^T / sqrt(d)) v of (N, h, d) float32 over the tokens of each window: (N, h, d); d divisible by 4."""
+    if q.shape[2] % 4 or not q.shape == k.shape == v.shape:
+        raise ShapeError(
+            f"q, k, v are (N, h, d), d divisible by 4; got {tuple(q.shape)}, {tuple(k.shape)}, {tuple(v.shape)}."
+        )
+    out = torch.empty_like(v, memory_format=torch.contiguous_format)
+    q_, k_, v_, out_ = (t.contiguous().view(-1).numpy() for t in (q, k, v, out))
+    attend(q_, k_, v_, out_, q.shape[1], q.shape[2], runs.order.numpy(), runs.start.numpy())
+    return out
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def attend(q, k, v, out, heads, width, order, start):  # pragma: no cover
+    """Window by window and head by head, as many queries at once as a tile holds."""
+    most = 4
+    for w in range(start.shape[0] - 1):
+        most = max(most, (start[w + 1] - start[w] + 3) // 4 * 4)
+    rows = np.empty(most, np.uintp)
+    # With a column for each query.
+    queries, mixed = np.empty(width * _TILE, np.float32), np.empty(width * _TILE, np.float32)
+    weights, sums = np.empty(most * _TILE, np.float32), np.empty(2 * _TILE, np.float32)
+    for w in range(start.shape[0] - 1):
+        n = start[w + 1] - start[w]
+        padded = (n + 3) // 4 * 4
+        for j in range(padded):
+            # Up to a multiple of four the last token stands again, and is given no weight.
+            rows[j] = np.uintp(order[start[w] + min(j, n - 1)] * heads * width)
+        for _ in range(heads):
+            for at in range(0, n, _TILE):
+                count = min(n - at, _TILE)
+                wide = (count + _VECTOR - 1) // _VECTOR * _VECTOR
+                some = rows[at : at + (count + 3) // 4 * 4]
+                _gather(q, some, width, wide, queries)
+                _scores(k, rows, queries, weights, padded, width, wide)
+                weights[n * _TILE : padded * _TILE] = np.float32(-1e30)
+                _exponentials(weights, padded, wide, sums)
+                _mix(v, rows, weights, mixed, padded, width, wide)
+                _scatter(mixed, sums, some, width, out)
+            for j in range(padded):
+                rows[j] += np.uintp(width)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _gather(x, rows, width, wide, columns):  # pragma: no cover
+    """columns[c, i] = x[rows[i] + c] times log2(e) / sqrt(width), and zeros up to wide."""
+    scale = np.float32(math.log2(math.e) / math.sqrt(width))
+    for i in range(0, rows.shape[0], 4):
+        a, b, d, e, at = rows[i], rows[i + 1], rows[i + 2], rows[i + 3], np.uintp(i)
+        for c in range(np.uintp(width)):
+            to = at + c * _ROW
+            w, y, z, t = x[a + c] * scale, x[b + c] * scale, x[d + c] * scale, x[e + c] * scale
+            columns[to], columns[to + _ONE], columns[to + _TWO], columns[to + _THREE] = w, y, z, t
+    for c in range(width):
+        columns[c * _TILE + rows.shape[0] : c * _TILE + wide] = np.float32(0.0)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _scatter(columns, sums, rows, width, out):  # pragma: no cover
+    """out[rows[i] + c] = columns[c, i] / sums[1, i]."""
+    for i in range(rows.shape[0]):
+        at, to, share = np.uintp(i), rows[i], np.float32(1.0) / sums[_TILE + i]
+        for c in range(np.uintp(width)):
+            out[to + c] = columns[at + c * _ROW] * share
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _scores(k, rows, queries, weights, n, width, wide):  # pragma: no cover
+    """weights (n, wide) = the rows of k (n, width) times queries (width, wide)."""
+    for r in range(0, n, 4):
+        a, b, d, e = rows[r], rows[r + 1], rows[r + 2], rows[r + 3]
+        for c in range(0, width, 4):
+            u = np.uintp(c)
+            block = (_four(k, a + u), _four(k, b + u), _four(k, d + u), _four(k, e + u))
+            _multiply(block, queries, np.uintp(c * _TILE), weights, np.uintp(r * _TILE), np.uintp(wide), c == 0)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _mix(v, rows, weights, mixed, n, width, wide):  # pragma: no cover
+    """mixed (width, wide) = the rows of v (n, width), transposed, times weights (n, wide)."""
+    for c in range(0, width, 4):
+        u = np.uintp(c)
+        for r in range(0, n, 4):
+            a0, b0, d0, e0 = _four(v, rows[r] + u)
+            a1, b1, d1, e1 = _four(v, rows[r + 1] + u)
+            a2, b2, d2, e2 = _four(v, rows[r + 2] + u)
+            a3, b3, d3, e3 = _four(v, rows[r + 3] + u)
+            block = ((a0, a1, a2, a3), (b0, b1, b2, b3), (d0, d1, d2, d3), (e0, e1, e2, e3))
+            _multiply(block, weights, np.uintp(r * _TILE), mixed, np.uintp(c * _TILE), np.uintp(wide), r == 0)
+
+
+@njit(cache=True, nogil=True)
+def _four(x, at):  # pragma: no cover
+    return x[at], x[at + _ONE], x[at + _TWO], x[at + _THREE]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _multiply(block, x, s, out, o, wide, is_first):  # pragma: no cover
+    """Four rows of out from o on (+)= block (4, 4) times four rows of x from s on; rows are _TILE apart."""
+    (a0, a1, a2, a3), (b0, b1, b2, b3), (d0, d1, d2, d3), (e0, e1, e2, e3) = block
+    if is_first:
+        for i in range(wide):
+            w, y, z, t = x[s + i], x[s + _ROW + i], x[s + _TWO_ROWS + i], x[s + _THREE_ROWS + i]
+            out[o + i] = a0 * w + a1 * y + a2 * z + a3 * t
+            out[o + _ROW + i] = b0 * w + b1 * y + b2 * z + b3 * t
+            out[o + _TWO_ROWS + i] = d0 * w + d1 * y + d2 * z + d3 * t
+            out[o + _THREE_ROWS + i] = e0 * w + e1 * y + e2 * z + e3 * t
+    else:
+        for i in range(wide):
+            w, y, z, t = x[s + i], x[s + _ROW + i], x[s + _TWO_ROWS + i], x[s + _THREE_ROWS + i]
+            out[o + i] += a0 * w + a1 * y + a2 * z + a3 * t
+            out[o + _ROW + i] += b0 * w + b1 * y + b2 * z + b3 * t
+            out[o + _TWO_ROWS + i] += d0 * w + d1 * y + d2 * z + d3 * t
+            out[o + _THREE_ROWS + i] += e0 * w + e1 * y + e2 * z + e3 * t
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _exponentials(x, rows, wide, sums):  # pragma: no cover
+    """x (rows, wide) becomes 2^(x - its column's largest); sums: those largest, then the sums of the columns."""
+    wide = np.uintp(wide)
+    for i in range(wide):
+        sums[i], sums[_ROW + i] = x[i], np.float32(0.0)
+    for j in range(0, rows, 4):
+        o = np.uintp(j * _TILE)
+        for i in range(wide):
+            a, b, d, e = x[o + i], x[o + _ROW + i], x[o + _TWO_ROWS + i], x[o + _THREE_ROWS + i]
+            sums[i] = max(sums[i], max(max(a, b), max(d, e)))
+    for j in range(0, rows, 4):
+        o = np.uintp(j * _TILE)
+        for i in range(wide):
+            top = sums[i]
+            a, b = power_of_two(x[o + i] - top), power_of_two(x[o + _ROW + i] - top)
+            d, e = power_of_two(x[o + _TWO_ROWS + i] - top), power_of_two(x[o + _THREE_ROWS + i] - top)
+            x[o + i], x[o + _ROW + i], x[o + _TWO_ROWS + i], x[o + _THREE_ROWS + i] = a, b, d, e
+            sums[_ROW + i] += (a + b) + (d + e)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def power_of_two(x):  # pragma: no cover
+    """2^x of x <= 0 within 2e-7 of it; below -126 as of -126."""
+    x = max(x, np.float32(-126.0))
+    whole = np.rint(x)
+    f = x - whole
+    y = _POWERS[6]
+    for n in (5, 4, 3, 2, 1, 0):
+        y = y * f + _POWERS[n]
+    return y * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well an object's points of now meet those of an earlier sweep, for each of the places where it may have been.
+
+Correlative matching along one line (Olson, Real-Time Correlative Scan Matching, ICRA 2009): an object moves along its length, so
+that one distance is sought, and all candidates are tried.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from manyeyes._jit import njit
+from manyeyes.datatypes import Boxes
+
+REACH_M = 0.4
+"""A point whose nearest partner is farther has none."""
+FEWEST, MOST = 5, 32
+"""An object with fewer points says nothing; of more, so many are taken evenly."""
+MARGIN = (0.3, 0.25, 0.4)
+"""Metres that a box is taken longer and wider at each end and higher at the top, since it is an estimate."""
+ROAD_M = 0.25
+"""Points nearer to the bottom of a box are the road's."""
+FLAT = 0.5
+"""Height counts so much: rings of a LiDAR meet a body at other heights as it drives away."""
+
+
+def meeting_costs(
+    now: Tensor, then: Tensor, boxes: Boxes, back: Tensor, slack: Tensor, steps: int
+) -> tuple[Tensor, Tensor]:
+    """(N, steps), how badly points now and then meet, from 0 to 1, and (N,), the number of points that were asked.
+
+    now: (P, 3), then: (Q, 3), float32 metres, in the frame of boxes (N). Candidate k has it that an object was ``back`` (N, 2) and
+    d_k along its length behind where it is, d evenly from -slack to slack (N,). The cost is the mean over its points now of
+    min(1, (distance / REACH_M)^2) to the nearest one then, moved by that much. 0, of no points, where either sweep has too few.
+    """
+    cost, count = np.zeros((len(boxes), steps)), np.zeros(len(boxes), np.int64)
+    place = torch.cat((boxes.center, boxes.yaw.cos()[:, None], boxes.yaw.sin()[:, None], boxes.size / 2), 1)
+    here, before = (cloud.to(torch.float32).contiguous().numpy() for cloud in (now, then))
+    middles, moved, away = (rows.double().contiguous().numpy() for rows in (place, back, slack))
+    _match(here, before, middles, moved, away, cost, count)
+    return torch.from_numpy(cost).to(back.dtype), torch.from_numpy(count)
+
+
+@njit(cache=True, nogil=True)
+def _inside(points, place, away_x, away_y, along):  # pragma: no cover
+    """(K, 3): points in a box moved by away and made longer at each end, from its middle, in its axes, heights scaled."""
+    x0, y0 = place[0] + away_x, place[1] + away_y
+    length, width, height = place[5] + along, place[6] + MARGIN[1], place[7]
+    radius = (length * length + width * width) ** 0.5
+    found, count = np.empty((len(points), 3)), 0
+    for p in range(len(points)):
+        x, y = points[p, 0] - x0, points[p, 1] - y0
+        if abs(x) > radius or abs(y) > radius:
+            continue
+        u, v, z = x * place[3] + y * place[4], y * place[3] - x * place[4], points[p, 2] - place[2]
+        if abs(u) < length and abs(v) < width and ROAD_M - height < z < height + MARGIN[2]:
+            found[count, 0], found[count, 1], found[count, 2] = u, v, FLAT * z
+            count += 1
+    return found[:count]
+
+
+@njit(cache=True, nogil=True)
+def _match(now, then, places, back, slack, cost, count):  # pragma: no cover
+    """Fills cost (N, S) and count (N,)."""
+    steps, limit = cost.shape[1], REACH_M * REACH_M
+    x, best = np.empty(steps), np.empty(steps)
+    for n in range(len(places)):
+        mine = _inside(now, places[n], 0.0, 0.0, MARGIN[0])
+        theirs = _inside(then, places[n], -back[n, 0], -back[n, 1], MARGIN[0] + slack[n])
+        if len(mine) < FEWEST or len(theirs) < FEWEST:
+            continue
+        asked = min(len(mine), MOST)
+        count[n] = asked
+        apart = 2.0 * slack[n] / (steps - 1)
+        for a in range(asked):
+            point = mine[a * len(mine) // asked]
+            for s in range(steps):
+                x[s], best[s] = point[0] - slack[n] * (2.0 * s / (steps - 1) - 1.0), limit
+            for b in range(len(theirs)):
+                dy, dz = theirs[b, 1] - point[1], theirs[b, 2] - point[2]
+                dy, dz = dy * dy, dz * dz
+                if dy + dz >= limit:
+                    continue
+                # The candidates at which it may be within reach: one more on each side, for rounding.
+                gap, first, last = theirs[b, 0] - point[0] - slack[n], 0, steps - 1
+                if apart > 0.0:
+                    first = max(first, int((-REACH_M - gap) / apart) - 1)
+                    last = min(last, int((REACH_M - gap) / apart) + 1)
+                for s in range(first, last + 1):
+                    dx = theirs[b, 0] - x[s]
+                    best[s] = min(best[s], dx * dx + dy + dz)
+            for s in range(steps):
+                cost[n, s] += best[s] / limit / asked

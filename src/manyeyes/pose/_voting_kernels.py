@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The compiled loops of the vote: hypotheses from matching edges, their support, and refinement on one-to-one pairs.
+
+An edge joins two landmarks of one agent. Its length and its angles to the two headings (modulo pi) are the same in
+every frame, and two matched edges give the relative pose with a yaw as exact as the edge is long; a single pair of
+objects (specs/pose.md 4.2) gives a yaw only as exact as a detected heading, which at 50 m is off by two metres.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from manyeyes._jit import njit
+
+_PI = np.pi
+
+
+@njit(cache=True, nogil=True)
+def fold(angle):  # pragma: no cover - compiled
+    """An angle modulo pi, in [-pi/2, pi/2)."""
+    return (angle + 0.5 * _PI) % _PI - 0.5 * _PI
+
+
+@njit(cache=True, nogil=True)
+def edge_table(xy, yaw, shortest, longest):  # pragma: no cover - compiled
+    """(E, 2) ends and (E, 4) length, direction, and the headings of both ends from it modulo pi."""
+    n = len(xy)
+    ends = np.empty((n * (n - 1) // 2, 2), np.int64)
+    shape = np.empty((n * (n - 1) // 2, 4))
+    count = 0
+    for i in range(n):
+        for j in range(i + 1, n):
+            dx, dy = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
+            length = np.hypot(dx, dy)
+            if length < shortest or length > longest:
+                continue
+            along = np.arctan2(dy, dx)
+            ends[count, 0], ends[count, 1] = i, j
+            shape[count, 0], shape[count, 1] = length, along
+            shape[count, 2], shape[count, 3] = fold(yaw[i] - along), fold(yaw[j] - along)
+            count += 1
+    return ends[:count], shape[:count]
+
+
+@njit(cache=True, nogil=True)
+def compatible(size_a, size_b, instant_a, instant_b, gate):  # pragma: no cover - compiled
+    """(N, M) bool: landmarks that may be one object: of one instant, widths within ``gate`` (m), lengths within about
+    twice.
+    """
+    ok = np.empty((len(size_a), len(size_b)), np.bool_)
+    for i in range(len(size_a)):
+        for j in range(len(size_b)):
+            ok[i, j] = (
+                instant_a[i] == instant_b[j]
+                and abs(size_a[i, 0] - size_b[j, 0]) < gate * 2.0 + 0.1 * size_a[i, 0]
+                and abs(size_a[i, 1] - size_b[j, 1]) < gate
+            )
+    return ok
+
+
+@njit(cache=True, nogil=True)
+def match_edges(a, b, edges_a, edges_b, may, gate, at_most):  # pragma: no cover - compiled
+    """Poses (H, 3) a_from_b of edges that agree within ``gate`` standard deviations, and their misfit (H,).
+
+    a, b: xy, yaw, sigma_xy, sigma_yaw. edges: ends and shapes sorted by length. may: (N, M) pairs that may be one
+    object.
+    """
+    xy_a, _, sxy_a, syaw_a = a
+    xy_b, _, sxy_b, syaw_b = b
+    ends_a, shape_a = edges_a
+    ends_b, shape_b = edges_b
+    out = np.empty((at_most, 3))
+    misfit = np.empty(at_most)
+    count = 0
+    largest = 0.0
+    if len(sxy_a) and len(sxy_b):
+        largest = gate * 2.0 * max(sxy_a.max(), sxy_b.max())
+    low = 0
+    for p in range(len(ends_a)):
+        while low < len(ends_b) and shape_b[low, 0] < shape_a[p, 0] - largest:
+            low += 1
+        i, j = ends_a[p]
+        for q in range(low, len(ends_b)):
+            if shape_b[q, 0] > shape_a[p, 0] + largest:
+                break
+            for way in range(2):
+                k, m = ends_b[q, way], ends_b[q, 1 - way]
+                if not (may[i, k] and may[j, m]):
+                    continue
+                spread = sxy_a[i] ** 2 + sxy_b[k] ** 2 + sxy_a[j] ** 2 + sxy_b[m] ** 2
+                cost = (shape_a[p, 0] - shape_b[q, 0]) ** 2 / spread
+                if cost > gate * gate:
+                    continue
+                tilt = spread / (shape_a[p, 0] * shape_b[q, 0])
+                one = fold(shape_a[p, 2] - shape_b[q, 2 + way])
+                two = fold(shape_a[p, 3] - shape_b[q, 3 - way])
+                # Headings relative to the edge: one unknown turn of the edge, two measured angles.
+                v1, v2 = syaw_a[i] ** 2 + syaw_b[k] ** 2, syaw_a[j] ** 2 + syaw_b[m] ** 2
+                weight = 1.0 / tilt + 1.0 / v1 + 1.0 / v2
+                turn = (one / v1 + two / v2) / weight
+                cost += turn * turn / tilt + (one - turn) ** 2 / v1 + (two - turn) ** 2 / v2
+                if cost > gate * gate or count == at_most:
+                    continue
+                yaw = shape_a[p, 1] - shape_b[q, 1] + turn + (_PI if way else 0.0)
+                c, s = np.cos(yaw), np.sin(yaw)
+                mx, my = 0.5 * (xy_b[k, 0] + xy_b[m, 0]), 0.5 * (xy_b[k, 1] + xy_b[m, 1])
+                out[count, 0] = 0.5 * (xy_a[i, 0] + xy_a[j, 0]) - (c * mx - s * my)
+                out[count, 1] = 0.5 * (xy_a[i, 1] + xy_a[j, 1]) - (s * mx + c * my)
+                out[count, 2] = (yaw + _PI) % (2.0 * _PI) - _PI
+                misfit[count] = cost
+                count += 1
+    return out[:count], misfit[:count]
+
+
+@njit(cache=True, nogil=True)
+def grid_of(xy, cell):  # pragma: no cover - compiled
+    """Rows of points by square cells: (order, start, x0, y0, columns, rows, cell); cells grow where there would be
+    too many.
+    """
+    x0, y0, x1, y1 = xy[:, 0].min(), xy[:, 1].min(), xy[:, 0].max(), xy[:, 1].max()
+    cell = max(cell, max(x1 - x0, y1 - y0) / 1000.0)
+    nx, ny = int((x1 - x0) / cell) + 1, int((y1 - y0) / cell) + 1
+    key = np.empty(len(xy), np.int64)
+    start = np.zeros(nx * ny + 1, np.int64)
+    for n in range(len(xy)):
+        key[n] = int((xy[n, 0] - x0) / cell) * ny + int((xy[n, 1] - y0) / cell)
+        start[key[n] + 1] += 1
+    start = np.cumsum(start)
+    order = np.argsort(key, kind="mergesort")
+    return order, start, x0, y0, nx, ny, cell
+
+
+@njit(cache=True, nogil=True)
+def support(poses, a, b, may, grid, tau, turn):  # pragma: no cover - compiled
+    """(H,) sum over landmarks of b of the best max(0, 1 - d^2 / tau^2) among a's; spec: specs/pose.md 4.2."""
+    xy_a, yaw_a, _, _ = a
+    xy_b, yaw_b, _, _ = b
+    order, start, x0, y0, nx, ny, cell = grid
+    score = np.zeros(len(poses))
+    for h in range(len(poses)):
+        c, s = np.cos(poses[h, 2]), np.sin(poses[h, 2])
+        total = 0.0
+        for k in range(len(xy_b)):
+            x = c * xy_b[k, 0] - s * xy_b[k, 1] + poses[h, 0]
+            y = s * xy_b[k, 0] + c * xy_b[k, 1] + poses[h, 1]
+            i0, i1 = int(np.floor((x - tau - x0) / cell)), int(np.floor((x + tau - x0) / cell))
+            j0, j1 = int(np.floor((y - tau - y0) / cell)), int(np.floor((y + tau - y0) / cell))
+            if i1 < 0 or j1 < 0 or i0 >= nx or j0 >= ny:
+                continue
+            best = 0.0
+            for i in range(max(i0, 0), min(i1, nx - 1) + 1):
+                for m in range(start[i * ny + max(j0, 0)], start[i * ny + min(j1, ny - 1) + 1]):
+                    r = order[m]
+                    gain = 1.0 - ((x - xy_a[r, 0]) ** 2 + (y - xy_a[r, 1]) ** 2) / (tau * tau)
+                    if gain <= best or not may[r, k]:
+                        continue
+                    if abs(fold(yaw_a[r] - yaw_b[k] - poses[h, 2])) < turn:
+                        best = gain
+            total += best
+        score[h] = total
+    return score
+
+
+@njit(cache=True, nogil=True)
+def distinct(poses, order, middle, at_most, apart, turn):  # pragma: no cover - compiled
+    """Rows of poses, best first, of which no two agree within ``apart`` metres at the middle (2,) of b and ``turn``
+    radians.
+    """
+    chosen = np.empty(at_most, np.int64)
+    place = np.empty((at_most, 2))
+    count = 0
+    for h in order:
+        c, s = np.cos(poses[h, 2]), np.sin(poses[h, 2])
+        x = c * middle[0] - s * middle[1] + poses[h, 0]
+        y = s * middle[0] + c * middle[1] + poses[h, 1]
+        new = True
+        for m in range(count):
+            angle = abs((poses[h, 2] - poses[chosen[m], 2] + _PI) % (2.0 * _PI) - _PI)
+            if angle < turn and np.hypot(x - place[m, 0], y - place[m, 1]) < apart:
+                new = False
+                break
+        if new:
+            chosen[count], place[count, 0], place[count, 1] = h, x, y
+            count += 1
+            if count == at_most:
+                break
+    return chosen[:count]
+
+
+@njit(cache=True, nogil=True)
+def weight_of(error_a, error_b, c, s, slack):  # pragma: no cover - compiled
+    """xx, xy and yy of the inverse covariance, in a's axes, of where two landmarks are from each other: errors (3,) are xx, xy
+    and yy of each in its own frame, a's turned from b's by an angle of cosine c and sine s, and slack of both axes (m).
+    """
+    bxx, bxy, byy = error_b[0], error_b[1], error_b[2]
+    xx = error_a[0] + c * c * bxx - 2.0 * c * s * bxy + s * s * byy + slack * slack
+    yy = error_a[2] + s * s * bxx + 2.0 * c * s * bxy + c * c * byy + slack * slack
+    xy = error_a[1] + c * s * (bxx - byy) + (c * c - s * s) * bxy
+    size = xx * yy - xy * xy
+    return yy / size, -xy / size, xx / size
+
+
+@njit(cache=True, nogil=True)
+def pair_up(pose, a, b, may, slack, gate):  # pragma: no cover - compiled
+    """One-to-one pairs (P, 2), nearest first, and their squared misfits (P,) in standard deviations (3 numbers a
+    pair). a, b: xy, yaw, error (xx, xy and yy of the place's covariance), sigma_yaw.
+    """
+    xy_a, yaw_a, error_a, syaw_a = a
+    xy_b, yaw_b, error_b, syaw_b = b
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    rows = np.empty((len(xy_a) * len(xy_b), 2), np.int64)
+    cost = np.empty(len(xy_a) * len(xy_b))
+    count = 0
+    for k in range(len(xy_b)):
+        x = c * xy_b[k, 0] - s * xy_b[k, 1] + pose[0]
+        y = s * xy_b[k, 0] + c * xy_b[k, 1] + pose[1]
+        for i in range(len(xy_a)):
+            dx, dy = x - xy_a[i, 0], y - xy_a[i, 1]
+            widest = error_a[i, 0] + error_a[i, 2] + error_b[k, 0] + error_b[k, 2] + slack * slack
+            if dx * dx + dy * dy > gate * widest or not may[i, k]:
+                continue
+            wxx, wxy, wyy = weight_of(error_a[i], error_b[k], c, s, slack)
+            turn = fold(yaw_a[i] - yaw_b[k] - pose[2])
+            square = wxx * dx * dx + 2.0 * wxy * dx * dy + wyy * dy * dy
+            square += turn * turn / (syaw_a[i] ** 2 + syaw_b[k] ** 2 + (0.1 * slack) ** 2)
+            if square < gate:
+                rows[count, 0], rows[count, 1], cost[count] = i, k, square
+                count += 1
+    used_a, used_b = np.zeros(len(xy_a), np.bool_), np.zeros(len(xy_b), np.bool_)
+    taken = 0
+    order = np.argsort(cost[:count], kind="mergesort")
+    pairs, misfit = np.empty((count, 2), np.int64), np.empty(count)
+    for m in order:
+        i, k = rows[m]
+        if used_a[i] or used_b[k]:
+            continue
+        used_a[i] = used_b[k] = True
+        pairs[taken, 0], pairs[taken, 1], misfit[taken] = i, k, cost[m]
+        taken += 1
+    return pairs[:taken], misfit[:taken]
+
+
+@njit(cache=True, nogil=True)
+def fit(pose, pairs, a, b, rounds):  # pragma: no cover - compiled
+    """Least squares on given pairs from a pose (3,): pose and the information matrix (3, 3) of x, y, yaw."""
+    xy_a, yaw_a, error_a, syaw_a = a
+    xy_b, yaw_b, error_b, syaw_b = b
+    pose = pose.copy()
+    information = np.zeros((3, 3))
+    for _round in range(rounds):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        information[:] = 0.0
+        gradient = np.zeros(3)
+        for p in range(len(pairs)):
+            i, k = pairs[p]
+            wxx, wxy, wyy = weight_of(error_a[i], error_b[k], c, s, 0.0)
+            v = 1.0 / (syaw_a[i] ** 2 + syaw_b[k] ** 2)
+            ux, uy = c * xy_b[k, 0] - s * xy_b[k, 1], s * xy_b[k, 0] + c * xy_b[k, 1]
+            rx, ry = xy_a[i, 0] - ux - pose[0], xy_a[i, 1] - uy - pose[1]
+            # What a turn of the pose moves the landmark by, weighed.
+            tx, ty = wxy * ux - wxx * uy, wyy * ux - wxy * uy
+            information[0, 0] += wxx
+            information[0, 1] += wxy
+            information[1, 1] += wyy
+            information[0, 2] += tx
+            information[1, 2] += ty
+            information[2, 2] += ux * ty - uy * tx + v
+            gradient[0] += wxx * rx + wxy * ry
+            gradient[1] += wxy * rx + wyy * ry
+            gradient[2] += tx * rx + ty * ry + v * fold(yaw_a[i] - yaw_b[k] - pose[2])
+        information[1, 0], information[2, 0], information[2, 1] = (
+            information[0, 1],
+            information[0, 2],
+            information[1, 2],
+        )
+        if information[0, 0] <= 0.0:
+            break
+        step = np.linalg.solve(information, gradient)
+        pose += step
+        pose[2] = (pose[2] + _PI) % (2.0 * _PI) - _PI
+        if np.abs(step).max() < 1e-11:
+            break
+    return pose, information
+
+
+@njit(cache=True, nogil=True)
+def refine(pose, a, b, may, slack, gate, rounds):  # pragma: no cover - compiled
+    """Pairs and fit in turn until the pairs stay: pose, information, pairs, misfits; wide at first, then as exact as
+    stated.
+    """
+    information = np.zeros((3, 3))
+    before = np.full((1, 2), -1, np.int64)
+    for round_ in range(rounds):
+        wide = slack * 0.5**round_ if round_ < 4 else 0.0
+        pairs, misfit = pair_up(pose, a, b, may, wide, gate)
+        if len(pairs) == 0:
+            return pose, information, pairs, misfit
+        if wide == 0.0 and len(pairs) == len(before) and (pairs == before).all():
+            break
+        before = pairs
+        pose, information = fit(pose, pairs, a, b, 12)
+    pairs, misfit = pair_up(pose, a, b, may, 0.0, gate)
+    return pose, information, pairs, misfit

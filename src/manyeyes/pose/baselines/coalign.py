@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CoAlign's agent-object pose graph: boxes that the claimed pose brings together are one object, and all poses are
+settled at once.
+
+Lu et al., ICRA 2023, section on agent-object pose graph optimisation; specs/pose.md 2.1. The information of an edge
+is that of the detector's stated errors in metres, which stands for the paper's exp(-s) over the anchor's diagonal.
+Clusters hold one box of an agent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from manyeyes.ops.se2 import Edges, solve
+from manyeyes.pose.baselines._common import answered, nearest
+from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.types import PoseClaim, PoseEstimate, unanswered
+
+
+@dataclass(frozen=True)
+class CoalignConfig:
+    """reach_m: boxes nearer than this are one object. least: so many objects or fewer are no graph. hard_rad2: an
+    object whose headings vary by more is left out; where half of them do, there is no answer.
+    """
+
+    reach_m: float = 1.5
+    least: int = 3
+    hard_rad2: float = 0.2
+
+
+def correct(
+    ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: CoalignConfig | None = None
+) -> PoseEstimate:
+    """The other's pose in the settled graph; NO_MATCH without a claim or with too few objects."""
+    config = config or CoalignConfig()
+    if claimed is None:
+        return unanswered(None)
+    pairs = nearest(ego.xy, other.moved(claimed.pose).xy, config.reach_m)
+    i, k = pairs.T
+    turn = ego.yaw[i] - other.yaw[k] - claimed.pose[2]
+    turn = (turn + np.pi / 2) % np.pi - np.pi / 2
+    hard = turn**2 / 4 > config.hard_rad2
+    if len(pairs) <= config.least or 2 * hard.sum() >= len(pairs):
+        return unanswered(claimed)
+    pairs = pairs[~hard]
+    poses = settled(ego, other, pairs, claimed, turn[~hard])
+    return answered(ego, other, poses[1].numpy(), pairs, claimed)
+
+
+def settled(ego: Landmarks, other: Landmarks, pairs: np.ndarray, claimed: PoseClaim, turn: np.ndarray) -> Tensor:
+    """Poses (2 + P, 3) of ego, other and objects, in the ego's frame; turn (P,): headings' difference modulo pi."""
+    i, k = pairs.T
+    n = len(pairs)
+    seen = torch.from_numpy(np.column_stack((ego.xy[i], ego.yaw[i])))
+    # The other's heading is taken as the one nearer to the ego's, so that a box turned by pi is the same object.
+    there = torch.from_numpy(np.column_stack((other.xy[k], ego.yaw[i] - claimed.pose[2] - turn)))
+    start = torch.cat((torch.zeros(1, 3, dtype=torch.float64), torch.from_numpy(claimed.pose)[None], seen))
+    objects = torch.arange(n) + 2
+    sigma = np.concatenate(
+        [np.column_stack((s.sigma_xy[r], s.sigma_xy[r], s.sigma_yaw[r])) for s, r in ((ego, i), (other, k))]
+    )
+    edges = Edges(
+        torch.cat((torch.zeros(n, dtype=torch.int64), torch.ones(n, dtype=torch.int64))),
+        torch.cat((objects, objects)),
+        torch.cat((seen, there)),
+        torch.from_numpy(sigma**-2.0).diag_embed(),
+    )
+    return solve(start, edges, torch.arange(n + 2) == 0).poses

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""V2X-Reg++: each pair of boxes is a whole pose; the pairs whose poses bring most other boxes together are the
+matches.
+
+Specs/pose.md 2.4 (V2I-Calib's oIoU, V2X-Reg++'s oDist). No pose is needed, and a heading off by pi is not tried.
+There is no class in a landmark, so the threshold is a car's; the affinity of oIoU counts the boxes that overlap.
+Nothing matched is no answer, not the identity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from manyeyes.ops.assignment import assign
+from manyeyes.ops.box_iou import pairwise_iou
+from manyeyes.pose.baselines._common import answered, nearest, pose_of
+from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.types import PoseClaim, PoseEstimate, unanswered
+
+
+@dataclass(frozen=True)
+class V2xRegConfig:
+    """kind: oDist or oIoU. boxes: the largest so many, within range_m. match_m: how near a car's centre and corners
+    meet. least: affinity that a match needs; where the best is at most ``few``, the best alone are taken.
+    """
+
+    kind: Literal["oDist", "oIoU"] = "oDist"
+    boxes: int = 15
+    range_m: float = 120.0
+    match_m: float = 1.0
+    least: int = 4
+    few: int = 5
+
+
+def correct(
+    ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: V2xRegConfig | None = None
+) -> PoseEstimate:
+    """The pose that the corners of matched boxes give; the claim has no part in it."""
+    config = config or V2xRegConfig()
+    rows_e, rows_o = _largest(ego, config), _largest(other, config)
+    if not len(rows_e) or not len(rows_o):
+        return unanswered(claimed)
+    a, b = ego[rows_e], other[rows_o]
+    affinity = _affinity(a, b, config)
+    pairs = assign(-affinity)
+    found = affinity[pairs[:, 0], pairs[:, 1]]
+    least = found.max() if found.max() <= config.few else config.least
+    pairs, weight = pairs[(found >= least) & (found > 0)], found[(found >= least) & (found > 0)]
+    if not len(pairs):
+        return unanswered(claimed)
+    corners = [_corners(x)[r].reshape(-1, 2) for x, r in ((a, pairs[:, 0]), (b, pairs[:, 1]))]
+    pose = pose_of(corners[0], corners[1], np.repeat(weight, 4))
+    return answered(ego, other, pose, np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1), claimed)
+
+
+def _largest(x: Landmarks, config: V2xRegConfig) -> np.ndarray:
+    near = np.flatnonzero(np.hypot(*x.xy.T) <= config.range_m)
+    return near[np.lexsort((*x.xy[near].T, -x.size[near].prod(1)))][: config.boxes]
+
+
+def _affinity(a: Landmarks, b: Landmarks, config: V2xRegConfig) -> np.ndarray:
+    """(N, M): how many other boxes meet when box i of a and box j of b are laid on each other."""
+    out = np.zeros((len(a), len(b)))
+    for i in range(len(a)):
+        for j in range(len(b)):
+            yaw = a.yaw[i] - b.yaw[j]
+            turned = b.moved(np.array([0.0, 0.0, yaw]))
+            moved = b.moved(np.array([*(a.xy[i] - turned.xy[j]), yaw]))
+            out[i, j] = (_overlaps(a, moved) if config.kind == "oIoU" else _meets(a, moved, config.match_m)) - 1.0
+    return out
+
+
+def _meets(a: Landmarks, moved: Landmarks, reach_m: float) -> float:
+    """Boxes matched one to one by their centres and by their corners, the mean of both counts."""
+    pairs = nearest(a.xy, moved.xy, reach_m)
+    apart = _corners(a)[pairs[:, 0]] - _corners(moved)[pairs[:, 1]]
+    by_corner = np.hypot(apart[..., 0], apart[..., 1]).mean(1) <= reach_m
+    return (len(pairs) + by_corner.sum()) / 2
+
+
+def _overlaps(a: Landmarks, moved: Landmarks) -> float:
+    """Boxes that overlap, each with its best, one to one."""
+    iou = pairwise_iou(*(torch.from_numpy(np.column_stack((x.xy, x.size, x.yaw))) for x in (a, moved))).numpy()
+    best = iou.argmax(1)
+    mutual = (iou.argmax(0)[best] == np.arange(len(iou))) & (iou.max(1) > 0)
+    return float(mutual.sum())
+
+
+def _corners(x: Landmarks) -> np.ndarray:
+    """(N, 4, 2): front left, front right, rear right, rear left."""
+    local = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]]) * x.size[:, None]
+    c, s = np.cos(x.yaw)[:, None], np.sin(x.yaw)[:, None]
+    turned = np.stack((c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1]), -1)
+    return turned + x.xy[:, None]

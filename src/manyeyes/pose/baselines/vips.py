@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""VIPS: two graphs of objects matched by the main eigenvector of their affinities.
+
+Shi et al., MobiCom 2022; specs/pose.md 2.5. The affinity of (i, i') with itself is exp(-0.5 dsize^2) exp(-0.1 d), d
+the distance that the claimed pose leaves; with (j, j') it is exp(-0.5 dlength^2) exp(-0.1 |dsin heading|). Without a
+claim d is left out. The largest boxes are kept, since the matrix has (N M)^2 entries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from manyeyes.ops.assignment import assign
+from manyeyes.pose.baselines._common import answered, pose_of
+from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.types import PoseClaim, PoseEstimate, unanswered
+
+
+@dataclass(frozen=True)
+class VipsConfig:
+    """boxes: at most so many an agent, those of highest score. share: of the best pair's weight that a pair needs.
+    least: pairs that an answer needs. rounds: of the power iteration.
+    """
+
+    boxes: int = 25
+    share: float = 0.3
+    least: int = 3
+    rounds: int = 50
+
+
+def correct(
+    ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: VipsConfig | None = None
+) -> PoseEstimate:
+    """The pose that the matched objects' places give; NO_MATCH where too few match."""
+    config = config or VipsConfig()
+    rows_e, rows_o = ego.usable(1e4, config.boxes), other.usable(1e4, config.boxes)
+    if min(len(rows_e), len(rows_o)) < config.least:
+        return unanswered(claimed)
+    a, b = ego[rows_e], other[rows_o]
+    affinity = affinities(a, b, claimed)
+    vector = np.full(len(affinity), len(affinity) ** -0.5)
+    for _ in range(config.rounds):
+        vector = affinity @ vector
+        vector /= np.linalg.norm(vector)
+    weight = vector.reshape(len(a), len(b))
+    pairs = assign(-weight)
+    strong = weight[pairs[:, 0], pairs[:, 1]]
+    pairs, strong = pairs[strong >= config.share * strong.max()], strong[strong >= config.share * strong.max()]
+    if len(pairs) < config.least:
+        return unanswered(claimed)
+    pose = pose_of(a.xy[pairs[:, 0]], b.xy[pairs[:, 1]], strong)
+    return answered(ego, other, pose, np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1), claimed)
+
+
+def affinities(a: Landmarks, b: Landmarks, claimed: PoseClaim | None) -> np.ndarray:
+    """(N M, N M), pair (i, i') in row i M + i'. Two pairs that share an object have none."""
+    n, m = len(a), len(b)
+    node = np.exp(-0.5 * np.square(a.size[:, None] - b.size[None]).sum(-1))
+    if claimed is not None:
+        node = node * np.exp(-0.1 * np.hypot(*(a.xy[:, None] - b.moved(claimed.pose).xy[None]).transpose(2, 0, 1)))
+    lengths = [np.hypot(*(x.xy[:, None] - x.xy[None]).transpose(2, 0, 1)) for x in (a, b)]
+    turns = [np.sin(x.yaw[:, None] - x.yaw[None]) for x in (a, b)]
+    # (i, i', j, j') from the two agents' own (i, j) and (i', j').
+    edge = np.exp(-0.5 * np.square(lengths[0][:, None, :, None] - lengths[1][None, :, None, :]))
+    edge *= np.exp(-0.1 * np.abs(turns[0][:, None, :, None] - turns[1][None, :, None, :]))
+    edge[np.arange(n), :, np.arange(n)] = 0.0
+    edge[:, np.arange(m), :, np.arange(m)] = 0.0
+    edge = edge.reshape(n * m, n * m)
+    np.fill_diagonal(edge, node.ravel())
+    return edge

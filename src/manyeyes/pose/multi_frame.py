@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several frames as one: earlier landmarks carried into the current frame by the agent's own motion.
+
+An object may have moved since, so only landmarks of one instant are matched with each other; what all instants share
+is where the other agent is now. Spec: specs/pose.md 4.8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.pose.landmarks import Landmarks
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one agent saw at one instant: landmarks in its frame of then. instant: how many frames ago, by a clock
+    that both agents share. now_from_then: (3,) its own motion since; sigma_xy_m, sigma_yaw_rad: how well it knows
+    that motion.
+    """
+
+    landmarks: Landmarks
+    instant: int
+    now_from_then: Floats
+    sigma_xy_m: float = 0.0
+    sigma_yaw_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.now_from_then.shape != (3,) or not np.isfinite(self.now_from_then).all() or self.instant < 0:
+            raise ConfigError(
+                "Sighting needs now_from_then as a finite x, y, yaw (3,) and an instant of at least 0; "
+                f"got {self.now_from_then.shape} and {self.instant}."
+            )
+
+
+def accumulated(sightings: Sequence[Sighting]) -> Landmarks:
+    """All landmarks in the agent's frame of now, each with the instant that it was seen in."""
+    return Landmarks.cat([_carried(s) for s in sightings])
+
+
+def _carried(sighting: Sighting) -> Landmarks:
+    here = sighting.landmarks
+    reach = np.hypot(*here.xy.T)
+    return replace(
+        here.moved(sighting.now_from_then),
+        sigma_xy=np.sqrt(here.sigma_xy**2 + sighting.sigma_xy_m**2 + (reach * sighting.sigma_yaw_rad) ** 2),
+        sigma_yaw=np.hypot(here.sigma_yaw, sighting.sigma_yaw_rad),
+        instant=np.full(len(here), sighting.instant, np.int64),
+    )

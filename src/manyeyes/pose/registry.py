@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The default corrector and its rivals by the names that a person gives them.
+
+FeaKM's has weights: ``feakm`` is the shipped net, a path that ends in .safetensors one of 'manyeyes train'; ``@8`` behind either
+asks for eight pairs in place of four. Those of CLOUDS are asked with whole clouds in place of landmarks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from manyeyes.datatypes import ConfigError, PointCloud
+from manyeyes.pose.baselines import coalign, feaco, fpv_rcnn, gicp, icp, mash, v2x_reg, vips
+from manyeyes.pose.baselines import identity as given
+from manyeyes.pose.baselines.v2x_reg import V2xRegConfig
+from manyeyes.pose.corrector import DETECTED, correct
+from manyeyes.pose.feakm import learned
+from manyeyes.pose.registration import register
+from manyeyes.pose.types import Corrector, PoseClaim, PoseEstimate
+
+FEAKM = "feakm"
+CORRECTORS: dict[str, Corrector] = {
+    "vote": partial(correct, config=DETECTED),
+    "given": given.correct,
+    "coalign": coalign.correct,
+    "fpv-rcnn": fpv_rcnn.correct,
+    "feaco": feaco.correct,
+    "icp": icp.correct,
+    "vips": vips.correct,
+    "v2x-reg-odist": v2x_reg.correct,
+    "v2x-reg-oiou": partial(v2x_reg.correct, config=V2xRegConfig("oIoU")),
+    "mash": mash.correct,
+}
+
+CLOUDS: dict[str, Callable[[PointCloud, PointCloud, PoseClaim | None], PoseEstimate]] = {
+    "register": register,
+    "gicp": gicp.correct,
+}
+
+
+def corrector(name: str) -> Corrector:
+    """The corrector of that name; an unknown name lists the known ones."""
+    where, _, pairs = name.partition("@")
+    if where == FEAKM or where.endswith(".safetensors"):
+        if pairs and not pairs.isdecimal():
+            raise ConfigError(f"{name!r}: behind @ stands how many pairs must agree, the paper's 4 or 8.")
+        return learned(where, int(pairs or 4))
+    if name not in CORRECTORS:
+        raise ConfigError(
+            f"No corrector is called {name!r}; known: {', '.join(CORRECTORS)}, {FEAKM}, or a .safetensors file of FeaKM."
+        )
+    return CORRECTORS[name]

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a corrector is told of a pose and what it answers: a transform, its covariance, and how far to believe it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import AgentFrame, ConfigError, Message, ShapeError, Transform
+from manyeyes.pose.landmarks import Landmarks
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class PoseStatus(Enum):
+    """What came of comparing what two agents see with what one claims.
+
+    OK: objects and claim agree. CORRECTED: objects give the pose; nothing was claimed, or what was claimed is
+    doubtful. CONFLICT: objects give a pose that the claim contradicts. AMBIGUOUS: objects fit in more than one way.
+    NO_MATCH: objects give no pose.
+    """
+
+    OK = "ok"
+    CORRECTED = "corrected"
+    CONFLICT = "conflict"
+    AMBIGUOUS = "ambiguous"
+    NO_MATCH = "no match"
+
+    @property
+    def answered(self) -> bool:
+        """Whether objects gave the pose."""
+        return self in (PoseStatus.OK, PoseStatus.CORRECTED, PoseStatus.CONFLICT)
+
+
+@dataclass(frozen=True)
+class PoseClaim:
+    """ego_from_other as claimed; covariance: (3, 3) of x, y (m) and yaw (rad) in the ego's axes, what is said of its
+    error.
+    """
+
+    ego_from_other: Transform
+    covariance: Floats
+
+    def __post_init__(self) -> None:
+        if self.covariance.shape != (3, 3) or self.ego_from_other.translation.shape != (3,):
+            raise ShapeError(
+                "PoseClaim needs one transform and a covariance (3, 3); "
+                f"got {tuple(self.ego_from_other.translation.shape)} and {self.covariance.shape}."
+            )
+        finite = np.isfinite(self.covariance).all() and bool(self.ego_from_other.matrix().isfinite().all())
+        if not finite or np.linalg.eigvalsh((self.covariance + self.covariance.T) / 2).min() < -1e-9:
+            raise ConfigError(
+                "PoseClaim needs a finite transform and a finite covariance without a negative variance; "
+                "give no claim (None) where nothing is known."
+            )
+
+    @classmethod
+    def of(cls, ego_from_other: Transform, sigma_xy_m: float, sigma_yaw_rad: float) -> PoseClaim:
+        """A claim whose errors in x, y and yaw are independent."""
+        return cls(ego_from_other, np.diag([sigma_xy_m**2, sigma_xy_m**2, sigma_yaw_rad**2]))
+
+    @classmethod
+    def between(cls, ego: AgentFrame | Message, other: AgentFrame | Message) -> PoseClaim:
+        """What two agents' claimed poses say together: errors of both, and the ego's yaw error at the other's distance."""
+        ego_from_other = ego.world_from_agent.inverse() @ other.world_from_agent
+        x, y, _ = planar(ego_from_other)
+        c, s = float(ego.world_from_agent.yaw.cos()), float(ego.world_from_agent.yaw.sin())
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]]) @ turn
+        parts = [(lever, ego.pose_covariance), (turn, other.pose_covariance)]
+        return cls(ego_from_other, sum((by @ c.double().numpy() @ by.T for by, c in parts), np.zeros((3, 3))))
+
+    @property
+    def pose(self) -> Floats:
+        """(3,) x, y (m), yaw (rad)."""
+        return planar(self.ego_from_other)
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A corrector's answer about ego_from_other.
+
+    ego_from_other: what to use, None where nothing is known; x, y and yaw are corrected, height and tilt are those of
+    the claim. covariance: (3, 3) of x, y (m), yaw (rad) in the ego's axes. inliers: pairs that agree with it;
+    runner_up: pairs that agree with the best *distinct* other answer; margin: by how much the answer is likelier than
+    that one (log-likelihood). pairs: (inliers, 2) rows of ego's and other's landmarks. measured, measured_covariance:
+    (3,), (3, 3) what objects alone say, where they say one thing. distance: squared Mahalanobis distance of that from
+    the claim (3 degrees of freedom), NaN without both.
+    """
+
+    ego_from_other: Transform | None
+    covariance: Floats
+    status: PoseStatus
+    inliers: int
+    runner_up: int
+    margin: float
+    pairs: Ints
+    measured: Floats | None
+    measured_covariance: Floats | None
+    distance: float
+
+    @property
+    def pose(self) -> Floats | None:
+        """(3,) x, y (m), yaw (rad) of ego_from_other."""
+        return None if self.ego_from_other is None else planar(self.ego_from_other)
+
+
+class Corrector(Protocol):
+    """The one interface of the default corrector and of its rivals."""
+
+    def __call__(self, ego: Landmarks, other: Landmarks, claimed: PoseClaim | None) -> PoseEstimate:
+        """Where the other agent is, from what both see and what is claimed."""
+        ...
+
+
+def planar(transform: Transform) -> Floats:
+    """(3,) x, y (m), yaw (rad) of one transform."""
+    x, y = transform.translation[:2].tolist()
+    return np.array([x, y, float(transform.yaw)])
+
+
+def upright(pose: Floats, claimed: PoseClaim | None) -> Transform:
+    """A pose (3,) in the plane as a transform, with the height and tilt of what was claimed."""
+    flat = Transform.from_xyz_yaw(float(pose[0]), float(pose[1]), 0.0, float(pose[2]))
+    if claimed is None:
+        return flat
+    was = claimed.ego_from_other
+    turn = Transform.from_xyz_yaw(0.0, 0.0, 0.0, float(pose[2]) - float(was.yaw)).rotation
+    lifted = torch.stack((flat.translation[0], flat.translation[1], was.translation[2].double()))
+    return Transform(turn @ was.rotation.double(), lifted)
+
+
+def unanswered(claimed: PoseClaim | None, status: PoseStatus = PoseStatus.NO_MATCH) -> PoseEstimate:
+    """What a corrector says where objects give no pose: the claim as it was, or nothing."""
+    return PoseEstimate(
+        None if claimed is None else claimed.ego_from_other,
+        np.full((3, 3), np.inf) if claimed is None else claimed.covariance,
+        status,
+        0,
+        0,
+        0.0,
+        np.zeros((0, 2), np.int64),
+        None,
+        None,
+        float("nan"),
+    )
+
+
+def wrapped(angle: float) -> float:
+    """An angle in [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def difference(a: Floats, b: Floats) -> Floats:
+    """a - b of two poses (3,), the yaw in [-pi, pi)."""
+    return np.array([a[0] - b[0], a[1] - b[1], wrapped(a[2] - b[2])])

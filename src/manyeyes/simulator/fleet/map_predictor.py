@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A true map as a map model would draw it, from true poses: an oracle for all that comes after the model.
+
+The errors are those of a simulated crowd (``simulator.fleet``): missing, invented, cut, bent and noisy elements. Poses that are
+claimed are not its business, nor is what hides parts of the view.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes.map_element import STYLES, MapElements
+from manyeyes.datatypes.message import SeenMap
+from manyeyes.ops.keyed_random import keyed_uniform
+from manyeyes.simulator.fleet.config import CrowdConfig
+from manyeyes.simulator.fleet.observation_model import MOST, Noise, Room, look, scenery
+
+Floats = NDArray[np.float64]
+
+
+class Eyewitness:
+    """Looks at one true map, whose frame its poses are in; the same look again says the same."""
+
+    def __init__(self, truth: MapElements, config: CrowdConfig, seed: int = 0) -> None:
+        self._config, self._seed = config, seed
+        lines = [truth.polyline(row) for row in range(len(truth))]
+        style = truth.style.argmax(1).astype(np.int64) if len(truth) else np.zeros(0, np.int64)
+        self._scene = scenery(lines, truth.kind, style, np.arange(len(truth)))
+        self._room = Room(np.empty((MOST, config.points, 2)), np.empty((MOST, 4)), np.empty((MOST, len(STYLES))))
+
+    def see(self, pose: Floats, window: tuple[float, float, float, float], *look_of: int | str) -> SeenMap:
+        """What is drawn from a true pose (3,) x, y, yaw within x_min, y_min, x_max, y_max of the agent's frame.
+
+        look_of: names of the look, on which its errors depend, and on nothing else.
+        """
+        x0, y0, x1, y1 = window
+        errors = {name: float(getattr(self._config, name)) for name in Noise._fields[4:]}
+        key = np.uint64(int(keyed_uniform((1,), self._seed, "eyewitness", *look_of)[0] * 2.0**52))
+        found = look(
+            self._scene, Noise(x0, x1, y0, y1, **errors), np.asarray(pose), np.zeros((0, 4, 2)), key, self._room
+        )
+        count, (points, columns, style) = self._config.points, self._room
+        elements = MapElements(
+            kind=columns[:found, 0].astype(np.int64),
+            first=np.arange(found + 1, dtype=np.int64) * count,
+            points=points[:found].reshape(-1, 2).copy(),
+            score=columns[:found, 1].copy(),
+            sigma=np.repeat(np.maximum(columns[:found, 2], 0.01), count),
+            style=style[:found].copy(),
+        )
+        return SeenMap(elements, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))

@@ -1,0 +1,417 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one agent's map model says of the true map around it, with the errors that such models make, in one compiled loop.
+
+Draws are counted, not streamed: each is a hash of (observation's key, element, run, purpose) by splitmix64's finaliser
+(Steele, Lea, Flood, OOPSLA 2014), so that an element drops out, bends and is noisy by the same unit draw whatever else is
+visible and however large the noise is.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import njit
+from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, STOP_LINE
+from manyeyes.maps.elements.observation import ring_crosses
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+STATION_M = 0.5
+CHUNK = 64
+MOST = 320
+"""Elements that one observation holds at most."""
+
+
+_DROP, _FRAGMENT, _SHARE, _GAP, _CONFUSE, _BOW, _SCORE, _STYLE, _OTHER, _FALSE, _GHOST, _HEAD, _TAIL, _SIDE = range(14)
+_PLACE = 16
+_POINT = 64
+
+
+class Noise(NamedTuple):
+    """The errors of a model. Lengths in metres, rates as probabilities; see CrowdConfig for each."""
+
+    x_min: float
+    x_max: float
+    y_min: float
+    y_max: float
+    drop_out: float
+    false_positive: float
+    fragment: float
+    confusion: float
+    point: float
+    point_per_m: float
+    bow: float
+    end: float
+    style_error: float
+
+
+class Room(NamedTuple):
+    """Where a look is written: points (MOST, n, 2), columns (MOST, 4) and style (MOST, S).
+
+    columns: kind, score, sigma, and the name of the true element, -1 for one that is not there.
+    """
+
+    points: Array
+    columns: Array
+    style: Array
+
+
+class Scenery(NamedTuple):
+    """The true map, ready to be looked at.
+
+    points: (M, 2) metres, lines at stations STATION_M apart and the corners of crossings; first: (N + 1,) offsets; kind, style:
+    (N,); name: (N,) the element each is, the same through all versions of the map. Chunk c holds the stations
+    ``chunk_first[c]:chunk_first[c + 1]``, all of one element, within chunk_radius[c] of chunk_center[c]; of_element: (N + 1,).
+    """
+
+    points: Array
+    first: Indices
+    kind: Indices
+    style: Indices
+    name: Indices
+    chunk_center: Array
+    chunk_radius: Array
+    chunk_first: Indices
+    of_element: Indices
+
+
+def scenery(points: list[Array], kind: Indices, style: Indices, name: Indices) -> Scenery:
+    """Lines (M, 2) and open rings of N elements with their kinds, styles and names."""
+    dense = [p if k == CROSSING else _stations(p) for p, k in zip(points, kind.tolist())]
+    first = np.concatenate(([0], np.cumsum([len(p) for p in dense]))).astype(np.int64)
+    flat = np.concatenate(dense) if dense else np.zeros((0, 2))
+    starts = [np.arange(a, b, CHUNK) for a, b in itertools.pairwise(first)]
+    of_element = np.concatenate(([0], np.cumsum([len(s) for s in starts]))).astype(np.int64)
+    chunk_first = np.concatenate((*starts, [len(flat)])).astype(np.int64)
+    center, radius = np.zeros((len(chunk_first) - 1, 2)), np.zeros(len(chunk_first) - 1)
+    for c, (a, b) in enumerate(itertools.pairwise(chunk_first)):
+        center[c] = (flat[a:b].min(0) + flat[a:b].max(0)) / 2
+        radius[c] = np.linalg.norm(flat[a:b] - center[c], axis=1).max()
+    return Scenery(flat, first, kind, style, name, center, radius, chunk_first, of_element)
+
+
+def _stations(line: Array) -> Array:
+    """A line (M, 2) at equal steps of at most STATION_M."""
+    along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))))
+    s = np.linspace(0.0, along[-1], max(2, int(np.ceil(along[-1] / STATION_M)) + 1))
+    return np.stack([np.interp(s, along, line[:, axis]) for axis in (0, 1)], 1)
+
+
+@njit(cache=True)
+def unit(key, element, run, purpose):
+    """A draw in (0, 1) for a key (uint64) and three counts."""
+    z = key
+    for part in (element, run, purpose):
+        z = z + np.uint64(0x9E3779B97F4A7C15) * (np.uint64(part) + np.uint64(1))
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z = z ^ (z >> np.uint64(31))
+    return (np.float64(z >> np.uint64(12)) + 0.5) * 2.0**-52
+
+
+@njit(cache=True)
+def normal(key, element, run, purpose):
+    """A standard normal draw (Box and Muller 1958) from the purposes ``purpose`` and ``purpose + 1024``."""
+    radius = np.sqrt(-2.0 * np.log(unit(key, element, run, purpose)))
+    return radius * np.cos(2.0 * np.pi * unit(key, element, run, purpose + 1024))
+
+
+@njit(cache=True)
+def _hidden(x, y, shadows):
+    """Whether a point lies in one of the convex anticlockwise quadrilaterals (Q, 4, 2)."""
+    for q in range(shadows.shape[0]):
+        inside = True
+        for a in range(4):
+            b = (a + 1) % 4
+            ax, ay = shadows[q, a, 0], shadows[q, a, 1]
+            if (shadows[q, b, 0] - ax) * (y - ay) - (shadows[q, b, 1] - ay) * (x - ax) < 0.0:
+                inside = False
+                break
+        if inside:
+            return True
+    return False
+
+
+@njit(cache=True)
+def _resample(line, count, closed, out):
+    """Equal arc length: ``count`` points of a line (M, 2), of an open ring without repeating its first."""
+    size = len(line)
+    edges = size if closed else size - 1
+    total = 0.0
+    for i in range(edges):
+        j = (i + 1) % size
+        total += np.hypot(line[j, 0] - line[i, 0], line[j, 1] - line[i, 1])
+    step = total / (count if closed else count - 1)
+    i, passed = 0, 0.0
+    length = np.hypot(line[1 % size, 0] - line[0, 0], line[1 % size, 1] - line[0, 1])
+    for k in range(count):
+        target = k * step
+        while passed + length < target and i < edges - 1:
+            passed += length
+            i += 1
+            j = (i + 1) % size
+            length = np.hypot(line[j, 0] - line[i, 0], line[j, 1] - line[i, 1])
+        t = min(1.0, (target - passed) / length) if length > 1e-12 else 0.0
+        j = (i + 1) % size
+        out[k, 0] = line[i, 0] + t * (line[j, 0] - line[i, 0])
+        out[k, 1] = line[i, 1] + t * (line[j, 1] - line[i, 1])
+    return total
+
+
+@njit(cache=True)
+def _clip_ring(ring, noise):
+    """A ring (M, 2) cut to the view (Sutherland and Hodgman 1974), and the cut ring's area."""
+    work = ring.copy()
+    for side in range(4):
+        axis = 0 if side < 2 else 1
+        sign = 1.0 if side % 2 == 0 else -1.0
+        limit = noise.x_min if side == 0 else noise.x_max if side == 1 else noise.y_min if side == 2 else noise.y_max
+        out = np.empty((2 * len(work) + 2, 2))
+        n = 0
+        for i in range(len(work)):
+            j = (i + 1) % len(work)
+            a, b = sign * (work[i, axis] - limit), sign * (work[j, axis] - limit)
+            if a >= 0.0:
+                out[n] = work[i]
+                n += 1
+            if (a >= 0.0) != (b >= 0.0):
+                t = a / (a - b)
+                out[n, 0] = work[i, 0] + t * (work[j, 0] - work[i, 0])
+                out[n, 1] = work[i, 1] + t * (work[j, 1] - work[i, 1])
+                n += 1
+        work = out[:n].copy()
+        if n < 3:
+            return work, 0.0
+    area = 0.0
+    for i in range(len(work)):
+        j = (i + 1) % len(work)
+        area += work[i, 0] * work[j, 1] - work[j, 0] * work[i, 1]
+    return work, abs(area) / 2
+
+
+@njit(cache=True)
+def _emit_line(line, noise, key, element, run, part, out):
+    """Write one observed line into out (n, 2); its mean distance from the agent, or -1 when it is too short to be said."""
+    size = len(line)
+    head = abs(normal(key, element, run, _HEAD + 128 * part)) * noise.end
+    tail = abs(normal(key, element, run, _TAIL + 128 * part)) * noise.end
+    a, b = int(head / STATION_M), size - int(tail / STATION_M)
+    if b - a < 3:
+        return -1.0
+    length = _resample(line[a:b], len(out), False, out)
+    if length < 2.0:
+        return -1.0
+    bow = normal(key, element, run, _BOW + 128 * part) * noise.bow
+    count = len(out)
+    clean = out.copy()
+    total = 0.0
+    for k in range(count):
+        before, after = clean[max(k - 1, 0)], clean[min(k + 1, count - 1)]
+        dx, dy = after[0] - before[0], after[1] - before[1]
+        size_of = max(np.hypot(dx, dy), 1e-9)
+        distance = np.hypot(clean[k, 0], clean[k, 1])
+        total += distance
+        sigma = np.hypot(noise.point, noise.point_per_m * distance)
+        bend = bow * np.sin(np.pi * k / (count - 1))
+        shift = 2 * (k + count * part)
+        out[k, 0] += sigma * normal(key, element, run, _POINT + shift) - bend * dy / size_of
+        out[k, 1] += sigma * normal(key, element, run, _POINT + shift + 1) + bend * dx / size_of
+    return total / count
+
+
+@njit(cache=True)
+def _emit_ring(ring, noise, key, element, run, out):
+    """Write one observed crossing into out (n, 2): noisy corners, resampled; less noise where the ring would cross itself."""
+    n = len(ring)
+    x, y = ring[:, 0].mean(), ring[:, 1].mean()
+    distance = np.hypot(x, y)
+    sigma = np.hypot(noise.point, noise.point_per_m * distance)
+    for attempt in range(4):
+        scale = sigma * (1.0 - attempt / 3.0)
+        moved = ring.copy()
+        for i in range(n):
+            moved[i, 0] += 1.5 * scale * normal(key, element, run, _POINT + 2 * i)
+            moved[i, 1] += 1.5 * scale * normal(key, element, run, _POINT + 2 * i + 1)
+        _resample(moved, len(out), True, out)
+        for k in range(len(out)):
+            out[k, 0] += 0.5 * scale * normal(key, element, run, _POINT + 256 + 2 * k)
+            out[k, 1] += 0.5 * scale * normal(key, element, run, _POINT + 256 + 2 * k + 1)
+        if not ring_crosses(out):
+            return distance
+    return -1.0
+
+
+@njit(cache=True)
+def _emit_false(line, noise, key, element, run, out):
+    """Write a line that is not there: a ghost half a lane beside a true one, or one anywhere in view; its mean distance."""
+    kind = DIVIDER if unit(key, element, run, _GHOST + 32) < 0.7 else BOUNDARY
+    if unit(key, element, run, _GHOST) < 0.5 and len(line) > 6:
+        side = 1.0 if unit(key, element, run, _SIDE) < 0.5 else -1.0
+        offset = side * (1.2 + 1.0 * unit(key, element, run, _SIDE + 32))
+        dx, dy = line[-1, 0] - line[0, 0], line[-1, 1] - line[0, 1]
+        size_of = max(np.hypot(dx, dy), 1e-9)
+        ghost = line.copy()
+        ghost[:, 0] -= offset * dy / size_of
+        ghost[:, 1] += offset * dx / size_of
+        return kind, _emit_line(ghost, noise, key, element, run, 2, out)
+    x = noise.x_min + (noise.x_max - noise.x_min) * unit(key, element, run, _PLACE)
+    y = noise.y_min + (noise.y_max - noise.y_min) * unit(key, element, run, _PLACE + 1)
+    heading = 2.0 * np.pi * unit(key, element, run, _PLACE + 2)
+    half = 2.5 + 7.5 * unit(key, element, run, _PLACE + 3)
+    stray = np.empty((int(4 * half), 2))
+    for i in range(len(stray)):
+        along = -half + 2.0 * half * i / (len(stray) - 1)
+        stray[i, 0] = min(max(x + along * np.cos(heading), noise.x_min), noise.x_max)
+        stray[i, 1] = min(max(y + along * np.sin(heading), noise.y_min), noise.y_max)
+    return kind, _emit_line(stray, noise, key, element, run, 2, out)
+
+
+@njit(cache=True)
+def _reach(noise):
+    """The farthest that is in view."""
+    return np.hypot(max(abs(noise.x_min), abs(noise.x_max)), max(abs(noise.y_min), abs(noise.y_max)))
+
+
+@njit(cache=True)
+def look(scene, noise, pose, shadows, key, room):
+    """Fill a room with what is seen from a pose; how many elements that is.
+
+    pose: x, y, yaw (3,) of the agent, true. shadows: (Q, 4, 2) hidden quadrilaterals in its frame.
+    """
+    reach = _reach(noise)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    found = 0
+    for e in range(len(scene.kind)):
+        near = False
+        for chunk in range(scene.of_element[e], scene.of_element[e + 1]):
+            far = reach + scene.chunk_radius[chunk]
+            dx, dy = scene.chunk_center[chunk, 0] - pose[0], scene.chunk_center[chunk, 1] - pose[1]
+            if dx * dx + dy * dy < far * far:
+                near = True
+                break
+        if not near or found >= MOST - 6:
+            continue
+        a, b = scene.first[e], scene.first[e + 1]
+        local = np.empty((b - a, 2))
+        for i in range(a, b):
+            dx, dy = scene.points[i, 0] - pose[0], scene.points[i, 1] - pose[1]
+            local[i - a, 0], local[i - a, 1] = c * dx + s * dy, c * dy - s * dx
+        if scene.kind[e] == CROSSING:
+            found = _see_crossing(scene, e, local, noise, shadows, key, room, found)
+            continue
+        start, run = -1, 0
+        for i in range(len(local) + 1):
+            seen = False
+            if i < len(local):
+                x, y = local[i, 0], local[i, 1]
+                seen = noise.x_min <= x <= noise.x_max and noise.y_min <= y <= noise.y_max
+                seen = seen and not _hidden(x, y, shadows)
+            if seen and start < 0:
+                start = i
+            elif not seen and start >= 0:
+                if found < MOST - 6:
+                    found = _see_line(scene, e, run, local[start:i], noise, key, room, found)
+                start, run = -1, run + 1
+    return found
+
+
+@njit(cache=True)
+def _see_crossing(scene, e, local, noise, shadows, key, room, found):
+    """One crossing: said when at least half of it and 4 m² are in sight; how many elements there are now."""
+    points, columns, style = room
+    reach = _reach(noise)
+    ring, area = _clip_ring(local, noise)
+    name = scene.name[e]
+    if area < 4.0 or unit(key, name, 0, _CONFUSE) < noise.confusion / 2:
+        return found
+    x, y = ring[:, 0].mean(), ring[:, 1].mean()
+    hidden = 0.0
+    for i in range(len(ring)):
+        for share in (0.2, 0.5, 0.9):
+            hidden += _hidden(x + share * (ring[i, 0] - x), y + share * (ring[i, 1] - y), shadows)
+    distance = np.hypot(x, y)
+    drop = noise.drop_out * (0.5 + distance / reach)
+    if hidden > 1.5 * len(ring) or unit(key, name, 0, _DROP) < drop:
+        return found
+    if _emit_ring(ring, noise, key, name, 0, points[found]) < 0.0:
+        return found
+    columns[found, 0], columns[found, 3] = CROSSING, name
+    columns[found, 1] = _score(0.95, distance / reach, key, name, 0)
+    columns[found, 2] = np.hypot(noise.point, noise.point_per_m * distance)
+    style[found, :] = 0.0
+    style[found, NO_STYLE] = 1.0
+    return found + 1
+
+
+@njit(cache=True)
+def _see_line(scene, e, run, line, noise, key, room, found):
+    """One visible stretch of a line, whole or in two parts, and perhaps a false one beside it; how many elements now."""
+    points, columns, style = room
+    reach = _reach(noise)
+    name, kind = scene.name[e], scene.kind[e]
+    least = 3 if kind == STOP_LINE else 8
+    if len(line) < least:
+        return found
+    middle = line[len(line) // 2]
+    drop = noise.drop_out * (0.5 + np.hypot(middle[0], middle[1]) / reach)
+    if unit(key, name, run, _DROP) >= drop:
+        parts = 1
+        cut = gap = 0
+        if kind != STOP_LINE and unit(key, name, run, _FRAGMENT) < noise.fragment:
+            parts = 2
+            cut = int(len(line) * (0.25 + 0.5 * unit(key, name, run, _SHARE)))
+            gap = int(3.0 * unit(key, name, run, _GAP) / STATION_M)
+        said = kind
+        if unit(key, name, run, _CONFUSE) < noise.confusion:
+            said = BOUNDARY if kind == DIVIDER else DIVIDER
+        for part in range(parts):
+            piece = line if parts == 1 else line[:cut] if part == 0 else line[min(cut + gap, len(line)) :]
+            if len(piece) < least:
+                continue
+            distance = _emit_line(piece, noise, key, name, run, part, points[found])
+            if distance < 0.0:
+                continue
+            columns[found, 0], columns[found, 3] = said, name
+            columns[found, 1] = _score(0.95 if said == kind else 0.6, distance / reach, key, name, run + 64 * part)
+            variance = noise.point**2 + (noise.point_per_m * distance) ** 2 + noise.bow**2 / 2
+            columns[found, 2] = np.sqrt(variance)
+            _say_style(scene.style[e] if said == DIVIDER else NO_STYLE, noise, key, name, run, style[found])
+            found += 1
+    if unit(key, name, run, _FALSE) < noise.false_positive:
+        false_kind, distance = _emit_false(line, noise, key, name, run, points[found])
+        if distance >= 0.0:
+            columns[found, 0], columns[found, 3] = false_kind, -1
+            columns[found, 1] = _score(0.55, distance / reach, key, name, run + 128)
+            columns[found, 2] = np.sqrt(noise.point**2 + (noise.point_per_m * distance) ** 2 + noise.bow**2 / 2)
+            _say_style(DASHED if false_kind == DIVIDER else NO_STYLE, noise, key, name, run + 128, style[found])
+            found += 1
+    return found
+
+
+@njit(cache=True)
+def _score(top, far, key, element, run):
+    """A confidence that falls with the distance and scatters."""
+    return min(0.99, max(0.05, top - 0.25 * far + 0.12 * normal(key, element, run, _SCORE)))
+
+
+@njit(cache=True)
+def _say_style(true, noise, key, element, run, out):
+    """Probabilities of styles: 0.85 on one, which is another than the true one at the rate style_error."""
+    size = len(out)
+    if true == NO_STYLE:
+        out[:] = 0.0
+        out[NO_STYLE] = 1.0
+        return
+    said = true
+    if unit(key, element, run, _STYLE) < noise.style_error:
+        said = (true + 1 + int(2.0 * unit(key, element, run, _OTHER))) % 3
+    out[:] = 0.15 / (size - 1)
+    out[said] = 0.85
+
+
+__all__ = ["MOST", "Noise", "Room", "Scenery", "look", "normal", "scenery", "unit"]

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Places to drive in: a true map, lanes, the ground of junctions and an area to judge, in one local metric frame."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import ConfigError, MissingExtraError
+from manyeyes.datatypes.map_element import CROSSING, MapElements
+from manyeyes.maps.elements.observation import Frame
+from manyeyes.maps.formats.argoverse2_map import read_argoverse2_map, read_argoverse2_poses
+from manyeyes.maps.formats.lanelet2 import lanelet2_origin, read_lanelet2
+from manyeyes.maps.formats.v2x_seq_map import read_v2x_seq_map
+from manyeyes.maps.roads.ground_truth import TruthPolicy, junction_region, map_truth
+from manyeyes.maps.roads.road_network import RoadNetwork
+from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
+from manyeyes.simulator.fleet.generated_streets import StreetPlan, street_junctions, street_routes, street_truth
+from manyeyes.simulator.fleet.routes import Routes
+from manyeyes.simulator.scene.roads import crossing_sites
+from manyeyes.simulator.scene.towns import GENERATED, TOWNS, load_town
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
+
+Array = NDArray[np.float64]
+
+AV2_LOGS = {
+    "av2-miami": "3b3570b4-7b0b-3268-a571-b0889dbf40b6",
+    "av2-pittsburgh": "7fab2350-7eaf-3b7e-a39d-6937a4c1bede",
+}
+# Latitude and longitude of Argoverse 2's city frames (av2-api's documentation); a city frame is UTM's, moved. Taken here as a
+# transverse Mercator of scale 1, it is off by the convergence of meridians (below 1°) and 0.4 m a kilometre from the origin:
+# good enough to lie on the right street of a web map, no survey.
+_CITY_ORIGIN = {
+    "ATX": (30.27464237939507, -97.7404457407424),
+    "DTW": (42.29993066912924, -83.17555750783717),
+    "MIA": (25.77452579915163, -80.19656914449405),
+    "PAO": (37.416065, -122.13571963362166),
+    "PIT": (40.44177902989321, -80.01294377242584),
+    "WDC": (38.889377, -77.0355047439081),
+}
+# CARLA's towns are nowhere; its own default reference.
+_CARLA_ORIGIN = (49.0, 8.0)
+_PLANS = {
+    "cross": StreetPlan(lanes=3),
+    "grid": StreetPlan(columns=4, rows=4, arm_m=90.0, lanes=2, warp_m=4.0, turn_rad=0.3),
+}
+PLACES = (*TOWNS, *AV2_LOGS, "lanelet2", *_PLANS)
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where a crowd drives. All in the local frame: metres, x east, y north, zero in the middle of the area.
+
+    truth: every true element of the place, also beyond the area. routes: lanes that vehicles drive on. junctions: the ground of
+    junctions, at which lines are cut (``maps.roads.ground_truth.cut_elements`` cuts anybody's map there). area: x_min, y_min,
+    x_max, y_max that is driven and judged. logs: recorded drives, poses (N, 3) each. world_xy: the local zero in the source's
+    own frame.
+    """
+
+    name: str
+    truth: MapElements
+    routes: Routes
+    junctions: BaseGeometry
+    area: tuple[float, float, float, float]
+    frame: Frame
+    logs: tuple[Array, ...] = ()
+    world_xy: tuple[float, float] = (0.0, 0.0)
+
+    def in_area(self, elements: MapElements | None = None, min_line_m: float = 5.0) -> MapElements:
+        """Elements (the truth unless others are given) cut to the area, by :func:`clip_to_box`."""
+        return clip_to_box(self.truth if elements is None else elements, self.area, min_line_m)
+
+
+def place(name: str, size_m: float | None = 300.0, data: Path | str | None = None) -> Place:
+    """A place by name: a CARLA town, ``generated-<seed>``, av2-miami, av2-pittsburgh, lanelet2, cross, grid or ``grid-<n>``.
+
+    size_m: side of the square area; in towns it lies about the largest junction, None takes all of the place. Real logs and
+    generated streets are never larger than they are. data: the folder with ``carla_opendrive``, ``av2`` and ``lanelet2``; where
+    none is given, ``shared/data`` beside the repository or above the working directory.
+    """
+    return _place(name, size_m, None if data is None else str(data))
+
+
+@lru_cache(maxsize=16)
+def _place(name: str, size_m: float | None, data: str | None) -> Place:
+    if name in _PLANS or name.startswith("grid-"):
+        return _generated(name, size_m)
+    if name in TOWNS or name.startswith(GENERATED):
+        folder = None if data is None or name.startswith(GENERATED) else Path(data) / "carla_opendrive"
+        network = load_town(name, folder)
+        return place_of(network, name, TruthPolicy(boundary="pavement"), size_m, _CARLA_ORIGIN)
+    if name in AV2_LOGS:
+        log = _data(data) / "av2" / AV2_LOGS[name]
+        city = next(iter(sorted(log.glob("map/log_map_archive_*.json"))), Path("____MIA")).name
+        origin = next((o for c, o in _CITY_ORIGIN.items() if f"____{c}_" in city), (0.0, 0.0))
+        found = place_of(read_argoverse2_map(log), name, TruthPolicy(), size_m, origin)
+        _, poses = read_argoverse2_poses(log)
+        return replace(found, logs=(poses - [*found.world_xy, 0.0],))
+    if name == "lanelet2":
+        path = _data(data) / "lanelet2" / "mapping_example.osm"
+        return place_of(read_lanelet2(path), name, TruthPolicy(), size_m, lanelet2_origin(path))
+    raise ConfigError(f"Unknown place '{name}'; known: {', '.join(PLACES)}, grid-<n>, {GENERATED}<seed>.")
+
+
+@lru_cache(maxsize=4)
+def place_of_map(path: Path) -> Place:
+    """A place out of a file of a real map: an intersection of V2X-Seq, a map (or log) of Argoverse 2, or Lanelet2's .osm."""
+    origin = (0.0, 0.0)
+    if path.suffix == ".osm":
+        network, origin = read_lanelet2(path), lanelet2_origin(path)
+    elif path.is_dir() or path.name.startswith("log_map_archive_"):
+        network = read_argoverse2_map(path)
+    else:
+        network = read_v2x_seq_map(path)
+    return place_of(network, path.stem, TruthPolicy(), None, origin)
+
+
+def place_of(
+    network: RoadNetwork, name: str, policy: TruthPolicy, size_m: float | None, origin: tuple[float, float]
+) -> Place:
+    """A place out of any road network; origin: latitude and longitude of the network's zero, degrees."""
+    x0, y0, x1, y1 = network.bounds
+    middle = np.round([(x0 + x1) / 2, (y0 + y1) / 2])
+    half = np.array([x1 - x0, y1 - y0]) / 2
+    if size_m is not None and 2 * half.max() > 1.2 * size_m:
+        sites = crossing_sites(network) or crossing_sites(network, single_level=False)
+        middle = np.round(sites[0].center[:2]) if sites else middle
+        half = np.full(2, size_m / 2)
+    truth = map_truth(network, policy).transform(-middle[0], -middle[1], 0.0)
+    routes = Routes.of_network(network, middle).within(-half, half)
+    ground = _moved(junction_region(network, policy.junction_margin_m), middle)
+    latitude, longitude = degrees_from_metres(middle, origin).tolist()
+    area = (-float(half[0]), -float(half[1]), float(half[0]), float(half[1]))
+    return Place(
+        name, truth, routes, ground, area, Frame(latitude, longitude), world_xy=(float(middle[0]), float(middle[1]))
+    )
+
+
+def clip_to_box(elements: MapElements, box: tuple[float, float, float, float], min_line_m: float = 0.0) -> MapElements:
+    """Lines cut to a box x_min, y_min, x_max, y_max; crossings and stop lines stay whole when their middle lies inside."""
+    shapely = _shapely()
+    parts, kinds, scores, sigmas, styles = [], [], [], [], []
+    for k in range(len(elements)):
+        points = elements.polyline(k)
+        if elements.kind[k] >= CROSSING:
+            x, y = points.mean(0)
+            pieces = [points] if box[0] <= x <= box[2] and box[1] <= y <= box[3] else []
+        else:
+            cut = shapely.clip_by_rect(shapely.LineString(points), *box)
+            pieces = [shapely.get_coordinates(part) for part in shapely.get_parts(cut) if part.length >= min_line_m]
+        for piece in pieces:
+            parts.append(piece)
+            kinds.append(elements.kind[k])
+            scores.append(elements.score[k])
+            styles.append(elements.style[k])
+            sigmas.append(np.full(len(piece), elements.sigma[elements.first[k] : elements.first[k + 1]].mean()))
+    if not parts:
+        return MapElements.empty()
+    return MapElements.of(parts, kinds, scores, np.concatenate(sigmas), np.array(styles))
+
+
+def _generated(name: str, size_m: float | None) -> Place:
+    """A lattice of streets; ``grid-<n>`` has n × n crossroads."""
+    shapely = _shapely()
+    plan = _PLANS.get(name)
+    if plan is None:
+        count = name.removeprefix("grid-")
+        if not count.isdigit() or int(count) < 1:
+            raise ConfigError(f"A generated lattice is named grid-<n> with n crossroads a side; got '{name}'.")
+        plan = replace(_PLANS["grid"], columns=int(count), rows=int(count))
+    truth, routes = street_truth(plan), street_routes(plan)
+    half = np.abs(routes.points).max(0) + 5.0
+    if size_m is not None:
+        half = np.minimum(half, size_m / 2)
+    ground = shapely.union_all([shapely.Polygon(ring) for ring in street_junctions(plan)])
+    area = (-float(half[0]), -float(half[1]), float(half[0]), float(half[1]))
+    return Place(name, truth, routes.within(-half, half), ground, area, Frame(*_CARLA_ORIGIN))
+
+
+def _moved(ground: BaseGeometry, origin: Array) -> BaseGeometry:
+    shapely = _shapely()
+    return shapely.transform(ground, lambda points: points - origin)
+
+
+def _data(data: str | None) -> Path:
+    """The folder of real maps."""
+    if data is not None:
+        return Path(data)
+    if os.environ.get("MANYEYES_MAPS"):
+        return Path(os.environ["MANYEYES_MAPS"])
+    raise ConfigError(
+        "The real maps are not here: give data= or set MANYEYES_MAPS, a folder with 'av2' and 'lanelet2'; 'grid' needs no file."
+    )
+
+
+def _shapely() -> Any:
+    try:
+        import shapely
+    except ImportError:
+        raise MissingExtraError("map", "A place to map") from None
+    return shapely

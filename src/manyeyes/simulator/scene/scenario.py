@@ -1,0 +1,352 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One drive at a crossing: traffic, connected vehicles, a roadside unit, and what each of them senses at each instant."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from manyeyes.datatypes import LABELS, AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.maps.roads.road_network import Junction, RoadNetwork
+from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.ops.raycast import HeightField, Primitives
+from manyeyes.simulator.scene.ground import Ground, build_ground, is_multilevel
+from manyeyes.simulator.scene.parking import parked_cars
+from manyeyes.simulator.scene.roadside_objects import ClutterSpec, Plot, corner_places, place_clutter, pole
+from manyeyes.simulator.scene.traffic import simulate_traffic
+from manyeyes.simulator.scene.vehicle_shapes import Body, box_centers, place_bodies, rotation_of, vehicle_body
+from manyeyes.simulator.scene.vehicles import VehicleStates
+from manyeyes.simulator.sensors.camera import CameraSpec, Stage, camera_rig, take
+from manyeyes.simulator.sensors.lidar import LidarSpec, Scene, lidar_spec, scan
+from manyeyes.simulator.sensors.lighting import draw_light
+from manyeyes.simulator.sensors.materials import Look, still_look, vehicle_look
+
+Array = NDArray[np.float64]
+
+RSU_ID = -1
+_HALF_SIZE_M = 180.0
+_NEAR_M = 60.0
+_LEVEL_GAP_M = 1.0
+_MOVED_M = 0.2
+
+
+@dataclass(frozen=True)
+class ScenarioSpec:
+    """What is asked of a scenario; the rest follows from the seed.
+
+    vehicles: connected vehicles, each at least min_gap_m from the others and within low_m … high_m of the crossing at the
+    first frame. frames: at rate_hz, the first history_frames of which are not judged. lead_frames: as many more before the first,
+    in which everybody is already under way; they change nothing in the frames after them, unless a connected vehicle was not
+    on the road yet in the lead: then others are drawn. roadside_chance: how often a unit
+    on a pole takes part. density: of the traffic, in units of 9 vehicles per kilometre of lane. min_vehicles: within
+    60 m of the crossing, or another one is drawn. clutter: times the numbers of ClutterSpec. cameras, roadside_cameras:
+    names of CAMERA_RIGS, of each vehicle and of the unit, whose cameras are at its LiDAR's height.
+    """
+
+    town: str
+    seed: int
+    name: str
+    vehicles: int = 3
+    frames: int = 16
+    history_frames: int = 6
+    lead_frames: int = 0
+    rate_hz: float = 10.0
+    roadside_chance: float = 0.7
+    lidar: str = "opv2v"
+    roadside_lidar: str = "opv2v-roadside"
+    density: float = 4.0
+    low_m: float = 8.0
+    high_m: float = 45.0
+    min_gap_m: float = 9.0
+    min_vehicles: int = 16
+    clutter: float = 1.0
+    cameras: str = "none"
+    roadside_cameras: str = "none"
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.vehicles <= 6 and self.frames > self.history_frames >= 0 <= self.lead_frames):
+            raise ConfigError(
+                f"ScenarioSpec needs 1 … 6 vehicles, frames > history_frames >= 0 and lead_frames >= 0; got {self}."
+            )
+        if not 0 <= self.low_m < self.high_m:
+            raise ConfigError(f"ScenarioSpec needs 0 <= low_m < high_m; got {self}.")
+
+
+class NoSceneError(ConfigError):
+    """No crossing of the drawn traffic fits the specification; another seed may."""
+
+
+@dataclass(frozen=True, eq=False)
+class Roadside:
+    """A unit on a pole: its upright frame on the road under it, facing the crossing, and its sensors."""
+
+    world_from_agent: Transform
+    lidar: LidarSpec
+    cameras: tuple[CameraSpec, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """All that is fixed before the first frame. states: one a frame, moving and parked vehicles alike, same ids throughout
+    where they stay near. agents: ids of the connected vehicles. still: what does not move; solids of vehicles come on top."""
+
+    spec: ScenarioSpec
+    network: RoadNetwork
+    ground: HeightField
+    still: Primitives
+    states: tuple[VehicleStates, ...]
+    bodies: dict[int, Body]
+    agents: tuple[int, ...]
+    roadside: Roadside | None
+    crossing: Array
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    @property
+    def moving_share(self) -> float:
+        """Share of the first frame's vehicles that are elsewhere in the last; frames of the lead do not count."""
+        return float(_moving(self.states[self.spec.lead_frames :]).mean())
+
+    def snapshot(self, index: int) -> Snapshot:
+        """What every agent senses at one instant, and the truth: claimed poses are the true ones."""
+        states, spec = self.states[index], self.spec
+        scene, boxes = self.scene(index), true_boxes(states)
+        rig = camera_rig(spec.cameras)
+        stage = self.stage(index) if {spec.cameras, spec.roadside_cameras} != {"none"} else None
+        time_ns = round(index * 1e9 / spec.rate_hz)
+        drawn_ms = round((index - spec.lead_frames) * 1e3 / spec.rate_hz)
+        frames, seen = [], []
+        for agent in self.agents:
+            row = int(np.flatnonzero(states.id == agent)[0])
+            pose = _pose(states, row)
+            speed = float(states.speed[row])
+            frame, mine = self._sense(scene, agent, pose, lidar_spec(spec.lidar), boxes, (time_ns, drawn_ms), speed)
+            frames.append(_with_images(frame, stage, rig))
+            seen.append(mine)
+        if self.roadside is not None:
+            unit = self.roadside
+            frame, mine = self._sense(scene, RSU_ID, unit.world_from_agent, unit.lidar, boxes, (time_ns, drawn_ms), 0.0)
+            frames.append(_with_images(frame, stage, unit.cameras))
+            seen.append(mine)
+        truth = Truth(boxes, torch.stack(seen), Transform.stack([f.world_from_agent for f in frames]))
+        return Snapshot(spec.name, index, tuple(frames), truth)
+
+    def scene(self, index: int) -> Scene:
+        """All that rays can meet at one instant."""
+        states = self.states[index]
+        moving = place_bodies(
+            [self.bodies[int(i)] for i in states.id], states.position, states.yaw, states.pitch, states.id
+        )
+        return Scene(Primitives.cat([self.still, moving]), self.ground)
+
+    def stage(self, index: int) -> Stage:
+        """The scene at one instant as cameras see it."""
+        seed = self.spec.seed
+        look = Look.cat([still_look(self.still, seed), vehicle_look(self.states[index], self.bodies, seed)])
+        return Stage.of(self.scene(index), look, draw_light(seed, self.spec.name))
+
+    def _sense(
+        self,
+        scene: Scene,
+        agent: int,
+        pose: Transform,
+        lidar: LidarSpec,
+        boxes: Boxes,
+        time: tuple[int, int],
+        speed: float,
+    ) -> tuple[AgentFrame, torch.Tensor]:
+        """One agent's frame, and which boxes it sees. time: its own in ns, and that which draws are keyed by in ms."""
+        time_ns, drawn_ms = time
+        key = (self.spec.seed, self.spec.name, drawn_ms, agent)
+        points, instance = scan(scene, pose, lidar, key, own=agent)
+        frame = AgentFrame(
+            agent_id=agent,
+            timestamp_ns=time_ns,
+            points=points,
+            world_from_agent=pose,
+            pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
+            sensor_height_m=lidar.height_m,
+            speed_mps=speed,
+            is_infrastructure=agent < 0,
+        )
+        return frame, seen_boxes(points, instance, pose, boxes, agent)
+
+
+def _with_images(frame: AgentFrame, stage: Stage | None, rig: tuple[CameraSpec, ...]) -> AgentFrame:
+    if stage is None:
+        return frame
+    pictures = (take(stage, frame.world_from_agent, camera, own=frame.agent_id) for camera in rig)
+    return replace(frame, images=tuple(picture.image for picture in pictures))
+
+
+def true_boxes(states: VehicleStates) -> Boxes:
+    """The vehicles' boxes in the world frame, float64."""
+    center = box_centers(states.position, states.yaw, states.pitch, states.size[:, 2])
+    place = torch.from_numpy(center), torch.from_numpy(states.size), torch.from_numpy(states.yaw)
+    return Boxes.of(*place, label=torch.from_numpy(states.kind), id=torch.from_numpy(states.id))
+
+
+def seen_boxes(
+    points: PointCloud, instance: NDArray[np.int64], pose: Transform, boxes: Boxes, own: int
+) -> torch.Tensor:
+    """(N,) bool: boxes with at least one return of that vehicle inside (5 cm margin); never the agent's own."""
+    met = torch.from_numpy(np.flatnonzero((instance > 0) & (instance != own)))
+    seen = torch.zeros(len(boxes), dtype=torch.bool)
+    # Each return is asked of its own vehicle's box alone.
+    by_id = boxes.id.argsort()
+    row = by_id[torch.searchsorted(boxes.id[by_id], torch.from_numpy(instance)[met])]
+    local = boxes.transform(pose.inverse()).to(torch.float32)
+    delta = points.xyz[met] - local.center[row]
+    c, s = local.yaw.cos()[row], local.yaw.sin()[row]
+    half = local.size[row] / 2 + 0.05
+    inside = (delta[:, 0] * c + delta[:, 1] * s).abs() <= half[:, 0]
+    inside &= (delta[:, 1] * c - delta[:, 0] * s).abs() <= half[:, 1]
+    inside &= delta[:, 2].abs() <= half[:, 2]
+    seen[row[inside]] = True
+    return seen
+
+
+def _pose(states: VehicleStates, row: int) -> Transform:
+    rotation = rotation_of(states.yaw[row : row + 1], states.pitch[row : row + 1])[0]
+    return Transform(torch.from_numpy(rotation), torch.from_numpy(states.position[row].copy()))
+
+
+def height_field(ground: Ground) -> HeightField:
+    """The ground as rays see it."""
+    return HeightField(ground.height, ground.surface, ground.x0, ground.y0, ground.cell_m, ground.surface_cell_m)
+
+
+def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> Scenario:
+    """Traffic of the whole town, one busy crossing of it, agents among the vehicles there, and what stands around.
+
+    Raises NoSceneError where no crossing has enough traffic; at least half of the vehicles near the chosen one move.
+    """
+    random = keyed_generator(spec.seed, "scenario", spec.town)
+    # Dense traffic jams when it runs for long, and most signals of a town turn red together at 25 s.
+    warmup_s = round(float(random.uniform(8.0, 15.0)), 1)
+    lead = spec.lead_frames
+    traffic = simulate_traffic(
+        network, spec.seed, spec.frames, 1 / spec.rate_hz, 9.0 * spec.density, warmup_s=warmup_s, lead=lead
+    )
+    # SUMO counts from 0, which is the instance of what is not a vehicle.
+    traffic = tuple(replace(states, id=states.id + 1) for states in traffic)
+    for junction in _crossings(network, traffic[lead:], spec, random):
+        middle = np.asarray(junction.center[:2], np.float64)
+        agents = _choose_agents(traffic[lead:], middle, spec, random)
+        near = tuple(s[np.hypot(*(s.position[:, :2] - middle).T) < _HALF_SIZE_M - 10.0] for s in traffic)
+        if len(agents) < spec.vehicles or not all((s.id == a).any() for a in agents for s in near):
+            continue
+        # Cheap refusals before the ground is drawn: a jam, and roads over roads.
+        if _moving(near[lead:]).mean() < 0.5 or is_multilevel(network, middle, 1.5 * _NEAR_M):
+            continue
+        field = height_field(build_ground(network, middle, _HALF_SIZE_M))
+        plot = Plot.of(field)
+        states = tuple(s[np.abs(plot.height(s.position[:, :2]) - s.position[:, 2]) < _LEVEL_GAP_M] for s in near)
+        parked = parked_cars(network, spec.seed, middle, 110.0, float(random.uniform(0.1, 0.6)))
+        parked = _parked(states[lead:], parked, random)
+        states = tuple(VehicleStates.cat([now, parked]) for now in states)
+        if _moving(states[lead:]).mean() < 0.5 or not all((s.id == a).any() for a in agents for s in states):
+            continue
+        return _furnish(spec, network, field, plot, states, agents, middle, random)
+    raise NoSceneError(
+        f"{spec.name}: no crossing in {spec.town} has {spec.min_vehicles} vehicles with {spec.vehicles} cars to connect "
+        f"at seed {spec.seed}; another seed or a higher density may."
+    )
+
+
+def _moving(states: tuple[VehicleStates, ...]) -> NDArray[np.bool_]:
+    """(N,) of the first instant: whether a vehicle is elsewhere at the last one; who left the scene moved."""
+    last = {int(i): row for row, i in enumerate(states[-1].id)}
+    moved = np.ones(len(states[0]), bool)
+    for row, id in enumerate(states[0].id.tolist()):
+        if id in last:
+            moved[row] = np.linalg.norm(states[-1].position[last[id]] - states[0].position[row]) > _MOVED_M
+    return moved
+
+
+def _crossings(
+    network: RoadNetwork, traffic: tuple[VehicleStates, ...], spec: ScenarioSpec, random: np.random.Generator
+) -> list[Junction]:
+    """Crossings of three or more incoming lanes with enough vehicles near, in an order drawn by how many these are."""
+    xy = traffic[0].position[:, :2]
+    found = []
+    for junction in network.junctions:
+        count = int((np.hypot(*(xy - junction.center[:2]).T) < _NEAR_M).sum())
+        luck = random.random()
+        if len(junction.incoming) >= 3 and count >= spec.min_vehicles:
+            found.append((luck ** (1.0 / count), junction))
+    return [junction for _, junction in sorted(found, key=lambda pair: -pair[0])]
+
+
+def _choose_agents(
+    traffic: tuple[VehicleStates, ...], middle: Array, spec: ScenarioSpec, random: np.random.Generator
+) -> tuple[int, ...]:
+    """Cars of the traffic around the crossing, drawn one after the other with a gap between any two."""
+    first = traffic[0]
+    distance = np.hypot(*(first.position[:, :2] - middle).T)
+    always = np.ones(len(first), bool)
+    for states in traffic[1:]:
+        always &= np.isin(first.id, states.id)
+    rows = np.flatnonzero((first.kind == 0) & (distance > spec.low_m) & (distance < spec.high_m) & always)
+    chosen: list[int] = []
+    for row in random.permutation(rows).tolist():
+        gaps = np.linalg.norm(first.position[chosen, :2] - first.position[row, :2], axis=-1)
+        if len(chosen) < spec.vehicles and (gaps > spec.min_gap_m).all():
+            chosen.append(row)
+    return tuple(sorted(first.id[chosen].tolist()))
+
+
+def _parked(states: tuple[VehicleStates, ...], parked: VehicleStates, random: np.random.Generator) -> VehicleStates:
+    """Some of the parked cars, at most so many that half of all vehicles move."""
+    moving = _moving(states)
+    room = max(0, int(2 * moving.sum() - len(moving)))
+    return parked[np.sort(random.permutation(len(parked))[:room])]
+
+
+def _furnish(
+    spec: ScenarioSpec, network: RoadNetwork, field: HeightField, plot: Plot, states: tuple[VehicleStates, ...],
+    agents: tuple[int, ...], middle: Array, random: np.random.Generator,
+) -> Scenario:  # fmt: skip
+    """A roadside unit and everything that stands still, put around vehicles that are already there."""
+    drawn = states[spec.lead_frames]
+    still = drawn[drawn.speed == 0]
+    for position, size, yaw in zip(still.position, still.size, still.yaw):
+        plot.keep_out(position[:2], (float(size[0]) / 2 + 0.5, float(size[1]) / 2 + 0.5), float(yaw))
+    roadside, solids = None, []
+    if random.random() < spec.roadside_chance:
+        roadside = _roadside(plot, middle, spec, random)
+    if roadside is not None:
+        xyz = roadside.world_from_agent.translation.numpy()
+        plot.keep_out(xyz[:2], (1.0, 1.0), 0.0)
+        solids.append(pole(xyz[:2], float(xyz[2]), roadside.lidar.height_m - 0.3, RSU_ID))
+    wish = ClutterSpec()
+    clutter = ClutterSpec(
+        *(round(spec.clutter * n) for n in (wish.buildings, wish.walls, wish.poles, wish.trees, wish.hedges))
+    )
+    solids.append(
+        place_clutter(plot, replace(clutter, setback_m=float(random.uniform(1.5, 6.0))), middle, (spec.seed,))
+    )
+    bodies: dict[int, Body] = {}
+    for now in states:
+        for id, kind, size in zip(now.id.tolist(), now.kind.tolist(), now.size.tolist()):
+            if id not in bodies:
+                bodies[id] = vehicle_body(LABELS[kind], tuple(size), spec.seed, id)
+    return Scenario(spec, network, field, Primitives.cat(solids), states, bodies, agents, roadside, middle)
+
+
+def _roadside(plot: Plot, middle: Array, spec: ScenarioSpec, random: np.random.Generator) -> Roadside | None:
+    """A pole beside the carriageway near the crossing, facing it, 4.5 to 6 m high; None where there is no place."""
+    places = corner_places(plot, middle)
+    if not len(places):
+        return None
+    xy = places[int(random.integers(min(len(places), 150)))]
+    toward = middle - xy
+    pose = Transform.from_xyz_yaw(float(xy[0]), float(xy[1]), float(plot.height(xy)), math.atan2(toward[1], toward[0]))
+    height = float(random.uniform(4.5, 6.0))
+    cameras = tuple(replace(camera, z_m=height) for camera in camera_rig(spec.roadside_cameras))
+    return Roadside(pose, replace(lidar_spec(spec.roadside_lidar), height_m=height), cameras)

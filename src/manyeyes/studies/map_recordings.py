@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings that map models are trained and evaluated on, and the true maps of their towns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from manyeyes.datasets.base import Recording
+    from manyeyes.datasets.dair_v2x import DairRecording
+    from manyeyes.datasets.opv2v import Opv2vRecording
+    from manyeyes.datatypes.map_element import MapElements
+
+
+def open_looks(data: Path, split: str | None, sensors: Sequence[str]) -> Opv2vRecording | DairRecording:
+    """The recording with what these sensors took: pictures are read where a model has cameras, and must then be there."""
+    from manyeyes.datatypes import ConfigError
+    from manyeyes.studies.recordings import open_recording
+
+    recording = open_recording(data, split, images="camera" in sensors)
+    if "camera" in sensors and not has_pictures(recording):
+        raise ConfigError(
+            f"{data}: no pictures in {recording.scenarios[0]}, and the model has cameras; give a recording of 'manyeyes simulate "
+            "--preset streets-pictures' (or any preset with --cameras), or a model of agents with LiDAR."
+        )
+    return recording
+
+
+def has_pictures(recording: Recording) -> bool:
+    """Whether any agent of the first snapshot has; the recording reads them."""
+    return any(frame.images for frame in recording.snapshot(recording.scenarios[0], 0).frames)
+
+
+def true_maps(recording: Recording) -> dict[str, MapElements]:
+    """The true map of every town that the recording's scenarios are named after, in its world frame; edges are the pavement's."""
+    from manyeyes.maps.roads.ground_truth import TruthPolicy, map_truth
+    from manyeyes.simulator.scene.towns import GENERATED, TOWNS, load_town
+
+    lower = {town.lower(): town for town in TOWNS}
+    named = sorted({scenario.rsplit("_", 1)[0] for scenario in recording.scenarios})
+    towns = [name if name.startswith(GENERATED) else lower.get(name, name) for name in named]
+    return {town: map_truth(load_town(town), TruthPolicy(boundary="pavement")) for town in towns}

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options of evaluations and of studies of detection and poses."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from manyeyes.studies.replay_options import FileChecks, Playing
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which recording, which methods, whose rules."""
+
+    data: Path
+    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario; or a root in DAIR-V2X's layout."""
+    split: str | None = None
+    """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
+    out: Path = Path("out/evaluate")
+    """Folder for results.json and results.md."""
+    protocol: str = "manyeyes"
+    """Rules of the AP: manyeyes, opencood, coalign, sparsealign; on DAIR-V2X also dair, heal-dair, costr-dair, sparsealign-dair."""
+    noise_xy_m: float = 0.0
+    """Standard deviation of errors of collaborators' claimed positions."""
+    noise_yaw_deg: float = 0.0
+    """Standard deviation of errors of collaborators' claimed headings, degrees."""
+    all_egos: bool = False
+    """Judge every agent as ego, not only the first."""
+    seed: int = 0
+    """Of losses, jitter and pose errors."""
+    workers: int = os.cpu_count() or 1
+    """How many processes share the scenarios; results do not depend on it."""
+    timed_frames: int = 10
+    """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""
+    playing: Playing = field(default_factory=Playing)
+    """How agents collaborate."""
+    every: int = 1
+    """Judge each so many-th frame of those that the recording judges."""
+    study: str | None = None
+    """robustness, budget, agents, ablation, system, pose, pose-accuracy, feakm or picture; what is finished is kept under --out."""
+    disturbances: tuple[str, ...] = ()
+    """Those that the studies 'robustness' and 'pose' play, by the names of their tables, such as "0.4 s" "30 % lost"
+    or "2°, 2 m" "0.8 m"; by default all."""
+    budgets: tuple[int, ...] = ()
+    """Bytes: of a message in the study 'budget', of all messages of an instant in 'system'; by default the study's own."""
+    selectors: tuple[str, ...] = ()
+    """Methods that choose tokens, in the studies 'budget' and 'system'; by default intermediate, confidence, random."""
+    precisions: tuple[str, ...] = ()
+    """Ways to write tokens, in the study 'budget'; by default all."""
+    correctors: tuple[str, ...] = ()
+    """Who corrects claimed poses, in the studies 'pose' and 'pose-accuracy', feakm or a file of its weights among them; by
+    default the study's own."""
+    branches: tuple[str, ...] = ()
+    """Weights that the study 'ablation' compares, and rival fusions of 'robustness' and 'pose', each as name=weights.safetensors;
+    of 'feakm' each as name=detector.safetensors,net.safetensors."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files."""

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where numbers come from: configuration, seed, versions and commit, written beside every result."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from datetime import datetime, timezone
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from manyeyes import __version__
+from manyeyes._io import atomic_write_text
+
+PACKAGES = (
+    "torch", "numpy", "numba", "safetensors", "tyro", "rich", "PyYAML", "zstandard", "eclipse-sumo", "libsumo",
+    "shapely", "pyarrow", "matplotlib", "pillow",
+)  # fmt: skip
+
+
+def versions() -> dict[str, str | None]:
+    """Installed versions of everything that may change a number; None for what is absent."""
+    found: dict[str, str | None] = {"manyeyes": __version__, "python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def git_commit() -> str | None:
+    """The commit of the sources that run, with ``+changes`` if tracked files differ; None outside a checkout."""
+    package = Path(__file__).resolve().parents[1]
+
+    def git(*words: str) -> str | None:
+        command = ["git", "-C", str(package), *words]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    # A package installed inside somebody else's repository must not claim that repository's commit.
+    if git("ls-files", "--error-unmatch", "__init__.py") is None:
+        return None
+    commit = git("rev-parse", "HEAD")
+    return commit and commit + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
+
+
+def cpu_name() -> str:
+    """The processor's name as the system says it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def provenance(config: object, seed: int | None) -> dict[str, Any]:
+    """What a reader needs to get the same numbers again. config: a dataclass or plain values."""
+    return {
+        "command": shlex.join(["manyeyes", *sys.argv[1:]]),
+        "config": plain(config),
+        "seed": seed,
+        "versions": versions(),
+        "git_commit": git_commit(),
+        "machine": {"system": platform.platform(), "cpu": cpu_name(), "cores": os.cpu_count()},
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    }
+
+
+def plain(value: object) -> Any:
+    """A value as JSON can hold it: dataclasses become objects, paths text, NaN and infinity null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(v) for v in value]
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())  # type: ignore[union-attr]
+    return str(value)
+
+
+def write_json(path: Path, payload: object, config: object, seed: int | None) -> dict[str, Any]:
+    """Writes ``{"provenance": …, "result": payload}``, whole or not at all, and returns the provenance."""
+    origin = provenance(config, seed)
+    text = json.dumps({"provenance": origin, "result": plain(payload)}, indent=2, ensure_ascii=False)
+    atomic_write_text(path, text + "\n")
+    return origin

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a training run is made of besides its loss: model, average, optimiser and count, kept in a folder and resumed from it."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from manyeyes._io import atomic_write_text
+from manyeyes.datatypes import CheckpointError, ConfigError
+from manyeyes.models.checkpoint import config_to_json, fingerprint
+
+Model = TypeVar("Model", bound=nn.Module)
+
+
+class LogLine(Protocol):
+    """What a step tells: one line of the log."""
+
+    def line(self) -> dict[str, float]:
+        """By name; "step" is one of them."""
+        ...
+
+
+Line = TypeVar("Line", bound=LogLine)
+
+
+class RunState(Generic[Model]):
+    """One process, or one of several that share every batch.
+
+    config: a frozen dataclass that names the run; a folder of another run, or of another seed, is refused, and of other weights
+    where the model was given some to begin from. beta2: decay of Adam's mean square of gradients.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        config: Any,
+        seed: int,
+        folder: Path,
+        weight_decay: float,
+        beta2: float = 0.999,
+        given: bool = False,
+    ) -> None:
+        self.model, self.folder = model, folder
+        self.rank, self.world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
+        self.average = copy.deepcopy(model).requires_grad_(False)
+        self.optimiser = torch.optim.AdamW(parameter_groups(model, weight_decay), betas=(0.9, beta2))
+        self.step, self.seconds = 0, 0.0
+        begun = fingerprint(model).hex() if given else ""
+        self._name = {"config": config_to_json(config), "seed": seed, "begun": begun}
+        self._since = time.monotonic()
+        if self.path.exists():
+            self._resume()
+        if not self.rank:
+            _trim_log(self.folder / "log.jsonl", self.step)
+
+    @property
+    def path(self) -> Path:
+        """Where the run is kept between saves."""
+        return self.folder / "last.pt"
+
+    def numbers(self, batch: int) -> range:
+        """The samples of the coming step that this process takes, of a run's endless stream; it starts the step's clock."""
+        if batch % self.world:
+            raise ConfigError(f"A batch of {batch} samples cannot be shared by {self.world} processes evenly.")
+        self._since = time.monotonic()
+        share = batch // self.world
+        first = self.step * batch + self.rank * share
+        return range(first, first + share)
+
+    def backward(self, loss: Tensor, share: float = 1.0) -> float:
+        """The gradient of a loss that counts for this share of the step's, added to what is there; returns its part of the loss."""
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise ConfigError(
+                f"The loss is {value} at step {self.step}; lower the learning rate, or resume from an older save."
+            )
+        (loss * share).backward()
+        return value * share
+
+    def descend(self, rate: float, clip: float, decay: float) -> None:
+        """One step down the mean loss of all processes; the average follows with this decay, faster at the start."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self._share()
+        nn.utils.clip_grad_norm_(self.model.parameters(), clip)
+        self.optimiser.step()
+        self.optimiser.zero_grad(set_to_none=True)
+        self._follow(min(decay, (1 + self.step) / (10 + self.step)))
+        self.step += 1
+        self.seconds += time.monotonic() - self._since
+
+    def _share(self) -> None:
+        """The mean over processes of gradients and of running statistics: one flat exchange each."""
+        if self.world == 1:
+            return
+        for p in self.model.parameters():
+            p.grad = torch.zeros_like(p) if p.grad is None else p.grad
+        _mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world)
+        _mean_in_place([b for b in self.model.buffers() if b.is_floating_point()], self.world)
+
+    @torch.no_grad()
+    def _follow(self, decay: float) -> None:
+        for mean, value in zip(self.average.state_dict().values(), self.model.state_dict().values()):
+            if mean.is_floating_point():
+                mean.lerp_(value, 1 - decay)
+            else:
+                mean.copy_(value)
+
+    def finish(self, steps: int, save_every: int, advance: Callable[[], Line], report: Callable[[Line], None]) -> None:
+        """Advance to the end, a line of log.jsonl and a word to report for every step, both by the first process alone."""
+        while self.step < steps:
+            progress = advance()
+            if not self.rank:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                with (self.folder / "log.jsonl").open("a") as log:
+                    log.write(json.dumps(progress.line()) + "\n")
+                report(progress)
+            if self.step % save_every == 0 or self.step == steps:
+                self.save()
+
+    def save(self) -> None:
+        """Everything that the run needs to go on as if it had not stopped; atomic."""
+        if self.rank:
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        partial = self.path.with_suffix(".partial")
+        parts = {name: getattr(self, name).state_dict() for name in ("model", "average", "optimiser")}
+        torch.save({**self._name, **parts, "step": self.step, "seconds": self.seconds}, partial)
+        partial.replace(self.path)
+
+    def _resume(self) -> None:
+        try:
+            state = torch.load(self.path, weights_only=True)
+        except Exception as error:
+            raise CheckpointError(
+                f"{self.path}: not a whole training state ({type(error).__name__}); delete it to start anew."
+            ) from error
+        if {name: state.get(name, "") for name in self._name} != self._name:
+            raise CheckpointError(
+                f"{self.path}: belongs to a run of another configuration or seed, or that began from other weights; give another "
+                "--out, or delete it."
+            )
+        for name in ("model", "average", "optimiser"):
+            getattr(self, name).load_state_dict(state[name])
+        self.step, self.seconds = state["step"], state["seconds"]
+
+
+def parameter_groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
+    """What an optimiser is given: matrices, whose weights decay, and the rest, whose do not."""
+    matrices = [p for p in model.parameters() if p.dim() > 1]
+    rest = [p for p in model.parameters() if p.dim() <= 1]
+    return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
+
+
+def warm_cosine(warm_up: int, step: int, steps: int) -> float:
+    """A share of the peak: linear growth over warm_up steps, and a cosine to zero over all."""
+    return min(1.0, (step + 1) / max(1, warm_up)) * 0.5 * (1 + math.cos(math.pi * step / steps))
+
+
+def _mean_in_place(tensors: list[Tensor], world: int) -> None:
+    """Each tensor becomes its mean over world processes, in one flat exchange."""
+    if not tensors:
+        return
+    flat = torch.cat([t.flatten() for t in tensors])
+    dist.all_reduce(flat)
+    flat /= world
+    for tensor, part in zip(tensors, flat.split([t.numel() for t in tensors])):
+        tensor.copy_(part.view_as(tensor))
+
+
+def _trim_log(path: Path, step: int) -> None:
+    """Drop the lines that a killed run wrote after its last save, the last of them perhaps cut: they will be written again."""
+    if path.exists():
+        kept = [line for line in path.read_text().splitlines() if 0 < _step_of(line) <= step]
+        atomic_write_text(path, "".join(line + "\n" for line in kept))
+
+
+def _step_of(line: str) -> int:
+    try:
+        return int(json.loads(line)["step"])
+    except (json.JSONDecodeError, KeyError, TypeError):
+        return 0

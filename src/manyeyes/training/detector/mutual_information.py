@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the selector is taught beside detection itself: to say little (L1), and to say what matters (CoSTr Eq. 10 to 12).
+
+The letter of Eq. 10 compares an aggregate with itself and teaches nothing (detection.md 5.2 has the audit and the toy). Here the
+masked words of a window are compared with what its own task says matters there, by an un-normalised product: a mask that
+withholds what matters lowers the agreement, and no scale of the mask cancels. For study there are two more targets: what the
+receiver sees itself (the paper, repaired: it drops what only the sender sees), and the letter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from manyeyes.datatypes import SparseBev
+from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.ops.voxelize import segment_sum
+from manyeyes.ops.window_attention import window_ids
+
+WINDOW_CELLS = 8
+TEMPERATURE = 0.1
+Target = Literal["own_task", "receiver", "literal"]
+
+
+def information_terms(told: SparseBev, mask: Tensor, matters: Tensor) -> tuple[Tensor, Tensor]:
+    """(mean of the mask, InfoNCE in nats) of told tokens (N, C + PROPOSAL); mask (N,), matters (N,) in [0, 1] from the truth."""
+    if not len(mask):
+        zero = mask.sum()
+        return zero, zero
+    features = functional.normalize(told.features[:, :-PROPOSAL].detach(), dim=1)
+    grid = told.grid
+    ids = window_ids(told.sites.xy, told.sites.batch, (grid.x_min, grid.y_min), WINDOW_CELLS * grid.cell)
+    row = ids.unique(return_inverse=True)[1]
+    return mask.mean(), window_information(features, mask, matters, row)
+
+
+def window_information(features: Tensor, mask: Tensor, matters: Tensor, row: Tensor) -> Tensor:
+    """Symmetric InfoNCE, scalar, between the masked and the mattering part of each window; features (N, C), row (N,) windows.
+
+    z^X is the mean over a window of mask * feature, not divided by the sum of the mask; z^Y that of matters * feature, which
+    carries no gradient. Windows without anything that matters are negatives only.
+    """
+    windows = int(row.max()) + 1
+    count = torch.bincount(row, minlength=windows).to(mask.dtype)[:, None]
+    x = segment_sum(mask[:, None] * features, row, windows) / count.sqrt()
+    y = segment_sum(matters[:, None] * features, row, windows).detach() / count.sqrt()
+    some = (segment_sum(matters[:, None], row, windows)[:, 0] > 0.5).nonzero()[:, 0]
+    return _info_nce(x, y, some) if len(some) >= 2 else mask.sum() * 0
+
+
+@dataclass(frozen=True, eq=False)
+class Meeting:
+    """Senders' and receivers' tokens in the receivers' windows, for the study targets.
+
+    sent (N, C) and had (M, C): unit features, the receivers' own turned axes; sent_mask (N,); sent_row (N,) and had_row (M,):
+    windows, numbered from 0.
+    """
+
+    sent: Tensor
+    sent_mask: Tensor
+    sent_row: Tensor
+    had: Tensor
+    had_row: Tensor
+
+
+def receiver_information(met: Meeting) -> Tensor:
+    """Symmetric InfoNCE, scalar, between what is sent of a window and what the receiver itself has there.
+
+    Windows that only one of them has cannot be compared and take no part: what only the sender sees is worth nothing here.
+    """
+    windows = _windows(met)
+    sent, had = (torch.bincount(row, minlength=windows) for row in (met.sent_row, met.had_row))
+    both = ((sent > 0) & (had > 0)).nonzero()[:, 0]
+    if len(both) < 2:
+        return met.sent_mask.sum() * 0
+    x = segment_sum(met.sent_mask[:, None] * met.sent, met.sent_row, windows)[both] / sent[both, None].sqrt()
+    y = segment_sum(met.had, met.had_row, windows)[both].detach() / had[both, None].sqrt()
+    return _info_nce(x, y, torch.arange(len(both)))
+
+
+def literal_information(met: Meeting) -> Tensor:
+    """Minus Eq. 11 of the joint aggregate of Eq. 10, scalar: each window's unit vector against itself and all others."""
+    windows = _windows(met)
+    if not windows:
+        return met.sent_mask.sum() * 0
+    joint = segment_sum(met.sent_mask[:, None] * met.sent, met.sent_row, windows)
+    z = functional.normalize(joint + segment_sum(met.had, met.had_row, windows).detach(), dim=1)
+    z = z[torch.unique(torch.cat((met.sent_row, met.had_row)))]
+    return functional.cross_entropy(z @ z.mT / TEMPERATURE, torch.arange(len(z)))
+
+
+STUDIED = {"receiver": receiver_information, "literal": literal_information}
+
+
+def _windows(met: Meeting) -> int:
+    rows = torch.cat((met.sent_row, met.had_row))
+    return int(rows.max()) + 1 if len(rows) else 0
+
+
+def _info_nce(x: Tensor, y: Tensor, some: Tensor) -> Tensor:
+    """Windows (W, C) of one side against those of the other; only some are asked for, all are negatives."""
+    agree = x @ y.mT / TEMPERATURE
+    right = functional.cross_entropy(agree[some], some)
+    return (right + functional.cross_entropy(agree.mT[some], some)) / 2

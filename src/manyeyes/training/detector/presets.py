@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training settings by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from manyeyes.models.detector.presets import COSTR_OPV2V, COSTR_SMALL, COSTR_TINY, SMALL_AROUND, SMALL_GRID
+from manyeyes.training.detector.loop import TrainConfig
+from manyeyes.training.detector.losses import LossConfig
+from manyeyes.training.detector.samples import AugmentConfig, RoadConfig
+
+_ROAD = TrainConfig(
+    replace(COSTR_SMALL, grid=SMALL_AROUND, answers=SMALL_GRID, prune_threshold=0.08),
+    steps=5200,
+    batch=4,
+    learning_rate=1e-3,
+    warm_up=100,
+    save_every=100,
+    prune_from=0.0,
+    prune_full=0.02,
+    augment=AugmentConfig(thin=0.1),
+    road=RoadConfig(past=2, late_share=0.4, astray_share=0.5, lost_share=0.25, few_share=0.4),
+    loss=LossConfig(iou=0.5, together=0.6),
+)
+_CROWD = replace(
+    _ROAD,
+    detector=replace(_ROAD.detector, prune_threshold=0.12),
+    steps=3400,
+    augment=AugmentConfig(thin=0.1, early_share=0.2),
+    loss=LossConfig(iou=0.8, together=0.6, prune=1.0),
+)
+_BRANCH = replace(
+    _CROWD, road=replace(_CROWD.road, said=2), steps=240, learning_rate=3e-4, warm_up=20, prune_full=0.001
+)
+
+
+def _branch(**changes: Any) -> TrainConfig:
+    """One row of CoSTr's Table III: the whole model trained on, with a part of it changed."""
+    return replace(_BRANCH, detector=replace(_BRANCH.detector, **changes))
+
+
+_FINE_ONLY = replace(COSTR_SMALL.encoder, coarse=False, prune_strides=())
+_NO_BLOCKS = replace(COSTR_SMALL.dast, blocks=0)
+_PLAIN = {"dast": _NO_BLOCKS, "fusion": "maximum"}
+
+TRAINING_PRESETS: dict[str, TrainConfig] = {
+    "costr-small": TrainConfig(
+        COSTR_SMALL,
+        steps=9000,
+        batch=4,
+        learning_rate=1.5e-3,
+        warm_up=200,
+        save_every=100,
+        prune_from=0.02,
+        prune_full=0.10,
+    ),
+    "costr-small-2": TrainConfig(
+        replace(COSTR_SMALL, grid=SMALL_AROUND, answers=SMALL_GRID, prune_threshold=0.08),
+        steps=3000,
+        batch=4,
+        learning_rate=5e-4,
+        warm_up=50,
+        save_every=100,
+        prune_from=0.0,
+        prune_full=0.001,
+        augment=AugmentConfig(max_agents=99),
+        loss=LossConfig(iou=0.5),
+    ),
+    "costr-small-3": _ROAD,
+    "costr-small-4": _CROWD,
+    "branch-plain": _branch(**_PLAIN, encoder=_FINE_ONLY),
+    "branch-se": _branch(**_PLAIN),
+    "branch-se-dast": _branch(fusion="maximum"),
+    "branch-se-dast-dast": _branch(fusion="self_attention"),
+    "branch-se-fast": _branch(dast=_NO_BLOCKS),
+    "branch-se-dast-fast": _BRANCH,
+    "branch-v2x-vit": _branch(fusion="v2x_vit"),
+    "branch-multi-scale": _branch(fusion="multi_scale"),
+    "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
+    "costr-tiny": TrainConfig(
+        COSTR_TINY, steps=60, batch=2, learning_rate=3e-3, warm_up=5, save_every=20, augment=AugmentConfig(max_agents=3)
+    ),
+}
+"""costr-small and then, each from the weights before, costr-small-2 (what lies to the sides is seen as well, all agents at once,
+IoU itself in the loss), costr-small-3 (past, delay, pose errors, loss, budgets) and costr-small-4 (fewer cells kept, object by
+object): what ships. branch-*: rows of the ablation,
+each from what ships, with equal further steps. costr-opv2v: the paper's 80 + 10 epochs. costr-tiny: tests and examples."""

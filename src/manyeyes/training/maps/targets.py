@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Truth as the map head learns it: every element as points of equal spacing, in every order that draws the same figure.
+
+Source: MapTR (ICLR 2023), permutation-equivalent modelling: a line may be drawn from either end, a ring from any of its points and
+either way round. The points of a ring are equally spaced around it, none twice, so that each order is an exact permutation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from manyeyes.datatypes import BevGrid
+from manyeyes.datatypes.map_element import KINDS, MapElements
+from manyeyes.models.maps.head import is_ring
+from manyeyes.ops.polyline import resample, resample_spaced
+
+MET_SHARE = 0.3
+"""Of an element's length: what looks must have seen for it to be asked of them (specs: maps.md 1.5)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapTarget:
+    """G elements of one tile. kind: (G,) int64, index into the head's kinds; ring: (G,) bool.
+
+    orders: (G, 2 P, P, 2), the same P points in 2 P orders, x and y as shares of the tile: a ring's shifts both ways round; a
+    line's two directions, over and over, which changes no minimum.
+    """
+
+    kind: Tensor
+    ring: Tensor
+    orders: Tensor
+
+    def __len__(self) -> int:
+        return self.kind.shape[0]
+
+    def repeated(self, times: int) -> MapTarget:
+        """Every element so many times, for one-to-many matching."""
+        return MapTarget(*(column.repeat(times, *(1,) * (column.dim() - 1)) for column in vars(self).values()))
+
+
+def target_of(truth: MapElements, tile: BevGrid, kinds: Sequence[str], points: int) -> MapTarget:
+    """The elements of those kinds, in the tile's frame and within it, as targets of that many points each."""
+    shares, kind, ring = [], [], []
+    size = np.array([tile.x_max - tile.x_min, tile.y_max - tile.y_min])
+    for row in range(len(truth)):
+        name = KINDS[int(truth.kind[row])]
+        if name in kinds:
+            line = evenly(truth.polyline(row), points, is_ring(name))
+            shares.append((line - [tile.x_min, tile.y_min]) / size)
+            kind.append(list(kinds).index(name))
+            ring.append(is_ring(name))
+    places = torch.from_numpy(np.array(shares).reshape(-1, points, 2)).float()
+    rings = torch.tensor(ring, dtype=torch.bool)
+    return MapTarget(torch.tensor(kind, dtype=torch.int64), rings, orders_of(places, rings))
+
+
+def met(truth: MapElements, seen: Tensor, tile: BevGrid) -> MapElements:
+    """Those elements of a tile of which cells that are seen (rows, columns) hold MET_SHARE of the length or more."""
+    if not len(truth):
+        return truth
+    points, first = resample_spaced(truth.points, truth.first, tile.cell / 2)
+    cell = np.floor((points - [tile.x_min, tile.y_min]) / tile.cell).astype(np.int64)
+    cell = cell.clip(0, [tile.shape[1] - 1, tile.shape[0] - 1])
+    share = np.add.reduceat(seen.numpy()[cell[:, 1], cell[:, 0]].astype(np.float64), first[:-1]) / np.diff(first)
+    return truth.take(share >= MET_SHARE)
+
+
+def evenly(line: NDArray[np.float64], points: int, ring: bool) -> NDArray[np.float64]:
+    """(points, 2) at equal arc length: of a line, both ends among them; of a ring (K, 2), from its least corner."""
+    if ring:
+        line = np.roll(line, -int(np.lexsort(line.T[::-1])[0]), axis=0)
+        line = np.concatenate((line, line[:1]))
+    count = points + ring
+    return resample(line, np.array([0, len(line)]), np.array([count]))[0][:points]
+
+
+def orders_of(points: Tensor, ring: Tensor) -> Tensor:
+    """(G, 2 P, P, 2) of points (G, P, 2): all orders in which an element may be drawn; see MapTarget."""
+    count = points.shape[1]
+    place = torch.arange(count)
+    shifts = (place[:, None] + place) % count
+    shifts = torch.cat((shifts, shifts.flip(1)))
+    ways = torch.stack((place, place.flip(0))).repeat(count, 1)
+    return torch.where(ring[:, None, None, None], points[:, shifts], points[:, ways])

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FeaKM's net is taught which keypoints of two agents are one object: truth, loss, augmentation, and the loop.
+
+Truth is geometry: the other's points are moved by the true pose; two points that are each other's nearest within near_m are
+one object, a point with nothing within far_m is alone, the rest is left open. The loss is half the mean of -log P of the
+true pairs and half that of the points that are alone, of each layer alike (specs/pose.md 1.5). The schedule is the house's:
+linear growth, then a cosine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from manyeyes.datatypes import ConfigError, Transform
+from manyeyes.datatypes.keypoints import Keypoints
+from manyeyes.models import checkpoint
+from manyeyes.models.pose.feakm import FEAKM_PAPER, FEAKM_SMALL, FORMAT, FeakmConfig, FeakmNet
+from manyeyes.models.pose.keypoint_net import View
+from manyeyes.models.pose.matcher import Assignment, Points, mutual
+from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.training.checkpointing import RunState, warm_cosine
+from manyeyes.training.pose.feakm_cache import FeatureCache, Pair
+
+
+@dataclass(frozen=True)
+class KeypointAugment:
+    """turn: each agent's frame is turned by any angle. flip: share of headings turned by pi before they are described.
+
+    drop: points left out, a share uniform up to this. sigma_xy_m, sigma_yaw_rad: errors added to places and headings.
+    """
+
+    turn: bool = True
+    flip: float = 0.03
+    drop: float = 0.3
+    sigma_xy_m: float = 0.15
+    sigma_yaw_rad: float = 0.03
+
+    @classmethod
+    def none(cls) -> KeypointAugment:
+        """Pairs as they were seen."""
+        return cls(False, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class FeakmTrainConfig:
+    """A run of steps with batch pairs each. near_m, far_m: see the module. ema: decay of the averaged weights that are saved."""
+
+    net: FeakmConfig
+    steps: int
+    batch: int = 16
+    learning_rate: float = 2e-4
+    weight_decay: float = 1e-2
+    warm_up: int = 100
+    clip: float = 5.0
+    ema: float = 0.999
+    save_every: int = 200
+    near_m: float = 2.4
+    far_m: float = 2.4
+    augment: KeypointAugment = field(default_factory=KeypointAugment.none)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.near_m <= self.far_m or self.steps < 1 or self.batch < 1:
+            raise ConfigError("FeakmTrainConfig needs 0 < near_m <= far_m, steps >= 1 and batch >= 1.")
+
+
+FEAKM_TRAINING: dict[str, FeakmTrainConfig] = {
+    "feakm": FeakmTrainConfig(
+        FEAKM_SMALL, steps=6000, batch=16, learning_rate=1e-3, near_m=1.5, far_m=2.4, augment=KeypointAugment()
+    ),
+    "feakm-paper": FeakmTrainConfig(FEAKM_PAPER, steps=15000, batch=16, learning_rate=2e-4, weight_decay=0.0),
+}
+"""feakm: what ships. feakm-paper: 15 M parameters, as published but for the shape of the schedule."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrueMatches:
+    """Of B pairs of views. pairs: (B, N, M) bool, one object; alone_a: (B, N), alone_b: (B, M) bool, surely without one."""
+
+    pairs: Tensor
+    alone_a: Tensor
+    alone_b: Tensor
+
+
+def true_matches(
+    a: Sequence[Keypoints], b: Sequence[Keypoints], a_from_b: Sequence[Transform], near_m: float, far_m: float
+) -> TrueMatches:
+    """What the matcher should have said, padded to the longest list on either side."""
+    shape = len(a), max(map(len, a)), max(map(len, b))
+    pairs = torch.zeros(shape, dtype=torch.bool)
+    alone_a, alone_b = torch.zeros(shape[:2], dtype=torch.bool), torch.zeros(shape[::2], dtype=torch.bool)
+    for i, (ego, other, motion) in enumerate(zip(a, b, a_from_b)):
+        n, m = len(ego), len(other)
+        alone_a[i, :n], alone_b[i, :m] = True, True
+        if n and m:
+            moved = motion.apply(other.boxes.center.double())[:, :2]
+            away = torch.cdist(ego.xy.double(), moved)
+            nearest, back = away.argmin(1), away.argmin(0)
+            rows = (back[nearest] == torch.arange(n)) & (away.amin(1) < near_m)
+            pairs[i, rows.nonzero()[:, 0], nearest[rows]] = True
+            alone_a[i, :n], alone_b[i, :m] = away.amin(1) > far_m, away.amin(0) > far_m
+    return TrueMatches(pairs, alone_a, alone_b)
+
+
+def matching_loss(layers: Sequence[Assignment], truth: TrueMatches) -> Tensor:
+    """Half of the true pairs', half of the lonely points' mean -log P, over layers and pairs of views; 0 where there is none."""
+    total = layers[0].log_p.new_zeros(())
+    for layer in layers:
+        right = _mean(-layer.log_p, truth.pairs)
+        alone = _mean(
+            -torch.cat((layer.log_alone_a, layer.log_alone_b), 1), torch.cat((truth.alone_a, truth.alone_b), 1)
+        )
+        total = total + (right + alone).mean() / 2
+    return total / len(layers)
+
+
+def _mean(value: Tensor, mask: Tensor) -> Tensor:
+    """(B,) of values (B, ...) where the mask is."""
+    value, mask = value.flatten(1), mask.flatten(1)
+    return torch.where(mask, value, 0.0).sum(1) / mask.sum(1).clamp_min(1)
+
+
+@dataclass(frozen=True)
+class MatchProgress:
+    """One line of the log. recall: found of the true pairs; precision: right among those found; of this step's batch."""
+
+    step: int
+    steps: int
+    loss: float
+    recall: float
+    precision: float
+    learning_rate: float
+    seconds: float
+
+    def line(self) -> dict[str, float]:
+        """As it stands in log.jsonl."""
+        told = {"step": self.step, "loss": round(self.loss, 5), "lr": self.learning_rate}
+        return told | {"recall": round(self.recall, 4), "precision": round(self.precision, 4)}
+
+
+class FeakmRun:
+    """One training run on cached views."""
+
+    def __init__(self, config: FeakmTrainConfig, cache: FeatureCache, folder: Path, seed: int) -> None:
+        self.config, self.cache, self.seed = config, cache, seed
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            model = FeakmNet(config.net)
+        self.state = RunState(model, config, seed, folder, config.weight_decay)
+
+    def advance(self) -> MatchProgress:
+        """One step of the optimiser."""
+        config, state = self.config, self.state
+        state.model.train()
+        numbers = state.numbers(config.batch)
+        first = numbers.start
+        pairs = [self.cache.draw(self.seed, number) for number in numbers]
+        ego, other, motions = self._keypoints(pairs, first)
+        truth = true_matches(ego, other, motions, config.near_m, config.far_m)
+        ego, other = (self._disturbed(side, name, first) for side, name in ((ego, "ego"), (other, "other")))
+        layers = state.model.matcher(Points.of(ego), Points.of(other))
+        loss = matching_loss(layers, truth)
+        rate = config.learning_rate * warm_cosine(config.warm_up, state.step, config.steps)
+        state.backward(loss)
+        state.descend(rate, config.clip, config.ema)
+        recall, precision = found_right(layers[-1], truth, config.net.matcher.threshold)
+        return MatchProgress(state.step, config.steps, float(loss.detach()), recall, precision, rate, state.seconds)
+
+    def _keypoints(self, pairs: Sequence[Pair], first: int) -> tuple[list[Keypoints], list[Keypoints], list[Transform]]:
+        """Points as they are described, some left out; still in the frames that the true motions belong to."""
+        augment = self.config.augment
+        views = []
+        for i, both in enumerate(pairs):
+            rng = keyed_generator("feakm flip", self.seed, first + i)
+            views += [_flipped(view, augment.flip, rng) for view in (both.ego, both.other)]
+        described = self.state.model.describe(views, together=2)
+        kept = []
+        for i, points in enumerate(described):
+            rng = keyed_generator("feakm drop", self.seed, first * 2 + i)
+            share = augment.drop * rng.random()
+            kept.append(points[torch.from_numpy(rng.random(len(points)) >= share)])
+        return kept[::2], kept[1::2], [both.ego_from_other for both in pairs]
+
+    def _disturbed(self, many: Sequence[Keypoints], side: str, first: int) -> list[Keypoints]:
+        """The same points, their frames turned and their places and headings off by a little."""
+        augment = self.config.augment
+        found = []
+        for i, points in enumerate(many):
+            rng = keyed_generator("feakm move", side, self.seed, first + i)
+            angle = rng.uniform(-math.pi, math.pi) if augment.turn else 0.0
+            moved = points.transform(Transform.from_xyz_yaw(0.0, 0.0, 0.0, angle))
+            error = torch.from_numpy(rng.standard_normal((len(points), 3))).to(moved.boxes.center.dtype)
+            center = moved.boxes.center.clone()
+            center[:, :2] += augment.sigma_xy_m * error[:, :2]
+            yaw = moved.boxes.yaw + augment.sigma_yaw_rad * error[:, 2]
+            found.append(replace(moved, boxes=replace(moved.boxes, center=center, yaw=yaw)))
+        return found
+
+
+def found_right(assignment: Assignment, truth: TrueMatches, threshold: float) -> tuple[float, float]:
+    """Recall and precision of the matches of a batch; 1 where there is nothing to find, or nothing found."""
+    right = found = 0
+    for (pairs, _), true in zip(mutual(assignment, threshold), truth.pairs):
+        found += len(pairs)
+        right += int(true[pairs[:, 0], pairs[:, 1]].sum())
+    wanted = int(truth.pairs.sum())
+    return right / wanted if wanted else 1.0, right / found if found else 1.0
+
+
+def _flipped(view: View, share: float, rng: np.random.Generator) -> View:
+    """With some headings off by pi, as a detector errs."""
+    turned = torch.from_numpy(rng.random(len(view.boxes)) < share)
+    return replace(view, boxes=replace(view.boxes, yaw=view.boxes.yaw + math.pi * turned))
+
+
+def train_feakm(
+    config: FeakmTrainConfig,
+    cache: FeatureCache,
+    folder: Path,
+    seed: int = 0,
+    card: dict[str, Any] | None = None,
+    report: Callable[[MatchProgress], None] = lambda progress: None,
+) -> Path:
+    """Train, or go on where the run in folder stopped; returns the file of averaged weights.
+
+    Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
+    """
+    run = FeakmRun(config, cache, folder, seed)
+    state = run.state
+    state.finish(config.steps, config.save_every, run.advance, report)
+    weights = folder / "weights.safetensors"
+    if not state.rank:
+        about = {"seed": seed, "steps": config.steps, "train_seconds": round(state.seconds), "config": asdict(config)}
+        checkpoint.save(state.average, weights, {**about, **(card or {})}, half=True, format=FORMAT)
+    return weights

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A fused map as one HTML file that needs no internet: MapLibre GL JS, the data and the style are all inside it.
+
+Layers: truth, observations, fused elements coloured by confidence, and where they disagree. MapLibre GL JS 5.13.0 (BSD-3-Clause)
+lies beside this file with its licence, as published on npm.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._io import atomic_write_text
+from manyeyes.datatypes.map_element import KINDS, MapElements
+from manyeyes.evaluation.maps.change_summary import MapChange
+from manyeyes.evaluation.maps.map_discrepancy import Disagreement, disagreement
+from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
+
+Floats = NDArray[np.float64]
+_DEGREES = 7
+
+KIND_COLOURS = {"divider": "#e07b00", "boundary": "#2e7d32", "crossing": "#1565c0", "stop_line": "#8e24aa"}
+CONFIDENCE_STOPS = ((0.0, "#d7301f"), (0.5, "#fdae61"), (0.8, "#41b6c4"), (1.0, "#0c2c84"))
+DISAGREEMENT_COLOURS = {"invented": "#d50000", "missed": "#ff6fae", "unexplained": "#9e9d24"}
+LAYERS = {"truth": "Truth", "observed": "Observations", "fused": "Fused map", "disagreement": "Disagreement"}
+CHANGE_NAMES = (
+    ("truth", "Old map"),
+    ("fused", "New map"),
+    ("disagreement", "Changes"),
+    ("invented", "new"),
+    ("missed", "gone"),
+)
+
+
+@dataclass(frozen=True)
+class MapPage:
+    """What the page shows; elements in the map's metric frame, whose origin lies at (latitude, longitude) degrees.
+
+    about: one line of text a fused element, shown when it is clicked. facts: (name, value) pairs under the title. names: other
+    words for layers and disagreements, as (the page's own, the shown) pairs.
+    """
+
+    title: str
+    fused: MapElements
+    origin: tuple[float, float]
+    truth: MapElements | None = None
+    observed: MapElements | None = None
+    disagreement: Disagreement = Disagreement()
+    about: Sequence[str] = ()
+    facts: Sequence[tuple[str, str]] = ()
+    names: Sequence[tuple[str, str]] = ()
+
+
+def page_of(
+    title: str,
+    made: VectorMap,
+    truth: MapElements | None,
+    observed: MapElements | None,
+    observations: int,
+    judged: MapElements | None = None,
+) -> MapPage:
+    """The page of what a map publishes. judged: what of it the truth can speak about, where that is not all."""
+    shown = made.published()
+    elements = shown.elements
+    facts = [("Elements", str(len(shown))), ("Length", f"{elements.lengths().sum() / 1000:.2f} km")]
+    facts += [("Observations", str(observations))] if observations else []
+    about = [
+        f"{KINDS[int(elements.kind[k])].replace('_', ' ')}, confidence {elements.score[k]:.2f}, {int(shown.supporters[k])} "
+        f"observations by {int(shown.agents[k])} agents, id {shown.id[k].tobytes().hex()[:12]}"
+        for k in range(len(shown))
+    ]
+    origin = (made.frame.latitude, made.frame.longitude)
+    odd = disagreement(elements, truth, observed)
+    if judged is not None and truth is not None:
+        odd = replace(odd, invented=disagreement(judged, truth).invented)
+    return MapPage(title, elements, origin, truth, observed, odd, about, facts)
+
+
+def page_of_change(title: str, old: VectorMap, new: VectorMap, change: MapChange) -> MapPage:
+    """The page of a difference: the new map, the old one as its background, what is new and what is gone."""
+    page = page_of(title, new, old.published().elements, None, 0)
+    facts = [
+        (c.kind.replace("_", " "), f"+{c.new_m:.0f} m, -{c.gone_m:.0f} m")
+        for c in change.kinds
+        if c.new_m + c.gone_m > 0
+    ]
+    odd = Disagreement(invented=change.new, missed=change.gone)
+    return replace(page, disagreement=odd, facts=facts, names=CHANGE_NAMES)
+
+
+def lonlat(points: Floats, origin: tuple[float, float]) -> Floats:
+    """(N, 2) longitude and latitude in degrees of metres east and north of an origin (latitude, longitude)."""
+    return degrees_from_metres(points, origin)[:, ::-1]
+
+
+def render(page: MapPage) -> str:
+    """The page as text."""
+    layers = {
+        "truth": _features(page.truth, page.origin),
+        "observed": _features(page.observed, page.origin),
+        "fused": _features(page.fused, page.origin, page.about),
+        "disagreement": _pieces(page.disagreement, page.origin),
+    }
+    names = dict(page.names)
+    data = {
+        "layers": layers,
+        "bounds": _bounds(page),
+        "kinds": KIND_COLOURS,
+        "confidence": CONFIDENCE_STOPS,
+        "disagreement": DISAGREEMENT_COLOURS,
+        "titles": {name: names.get(name, title) for name, title in LAYERS.items()},
+    }
+    facts = "".join(f"<li><b>{_text(n)}</b>{_text(v)}</li>" for n, v in page.facts)
+    return "\n".join(
+        (
+            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">',
+            f"<title>{_text(page.title)}</title>",
+            f"<style>{_file('vendor/maplibre-gl.css')}</style><style>{_file('web/map_page.css')}</style></head><body>",
+            f'<div id="map"></div><div id="panel"><h1>{_text(page.title)}</h1><ul class="facts">{facts}</ul>',
+            f'<div id="layers"></div>{_legend(names)}</div>',
+            f'<script type="application/json" id="data">{_json(data)}</script>',
+            f"<script>{_file('vendor/maplibre-gl.js')}</script>",
+            f"<script>{_file('web/map_page.js')}</script></body></html>\n",
+        )
+    )
+
+
+def save_map_page(page: MapPage, path: Path) -> None:
+    """The page as a file, whole or not at all."""
+    atomic_write_text(path, render(page))
+
+
+def _features(elements: MapElements | None, origin: tuple[float, float], about: Sequence[str] = ()) -> dict[str, Any]:
+    """GeoJSON of elements: rings closed as lines, so that one style draws them all."""
+    features = []
+    for row in range(0 if elements is None else len(elements)):
+        assert elements is not None
+        kind = KINDS[int(elements.kind[row])]
+        points = np.asarray(elements.polyline(row))
+        points = np.vstack((points, points[:1])) if kind == "crossing" else points
+        properties = {"kind": kind, "score": round(float(elements.score[row]), 3)}
+        if row < len(about):
+            properties["about"] = about[row]
+        features.append(_feature(points, origin, properties))
+    return {"type": "FeatureCollection", "features": features}
+
+
+def _pieces(disagreement: Disagreement, origin: tuple[float, float]) -> dict[str, Any]:
+    features = [
+        _feature(piece, origin, {"what": what})
+        for what in DISAGREEMENT_COLOURS
+        for piece in getattr(disagreement, what)
+    ]
+    return {"type": "FeatureCollection", "features": features}
+
+
+def _feature(points: Floats, origin: tuple[float, float], properties: dict[str, Any]) -> dict[str, Any]:
+    line = np.round(lonlat(points, origin), _DEGREES).tolist()
+    return {"type": "Feature", "properties": properties, "geometry": {"type": "LineString", "coordinates": line}}
+
+
+def _bounds(page: MapPage) -> list[list[float]]:
+    """South-west and north-east corner of what is fused and true, or of a hundred metres where nothing is."""
+    known = [e.points for e in (page.fused, page.truth) if e is not None and len(e.points)]
+    points = np.concatenate(known) if known else np.array([[-50.0, -50.0], [50.0, 50.0]])
+    return lonlat(np.stack((points.min(0), points.max(0))), page.origin).tolist()
+
+
+def _legend(names: dict[str, str]) -> str:
+    stops = ", ".join(f"{colour} {100 * at:g}%" for at, colour in CONFIDENCE_STOPS)
+    kinds = "".join(
+        f'<span><i style="background:{c}"></i>{k.replace("_", " ")}</span>' for k, c in KIND_COLOURS.items()
+    )
+    odd = "".join(
+        f'<span><i style="background:{c}"></i>{names.get(k, k)}</span>' for k, c in DISAGREEMENT_COLOURS.items()
+    )
+    return (
+        f'<div class="legend"><b>Confidence of fused elements</b><div class="bar" style="background:linear-gradient(90deg, '
+        f'{stops})"></div><div class="ends"><span>0</span><span>1</span></div><b>Truth and observations</b>'
+        f"<div>{kinds}</div><b>Disagreement</b><div>{odd}</div></div>"
+    )
+
+
+def _file(name: str) -> str:
+    """A file beside this one, without MapLibre's comment that points to a source map."""
+    text = (resources.files("manyeyes.viz") / name).read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("//# sourceMappingURL=")]
+    return "\n".join(lines).replace("</script", "<\\/script")
+
+
+def _json(value: object) -> str:
+    """JSON that cannot end the script element that holds it."""
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _text(value: str) -> str:
+    return html.escape(value, quote=True)

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boxes of a moment ago take part where they should be by now, less sure with every tenth of a second."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from manyeyes.agents.strategies import method
+from manyeyes.agents.strategies.early import Early
+from manyeyes.agents.strategies.late import Late
+from manyeyes.agents.strategies.temporal_boxes import FADE, faded, strongest
+from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, Message, PointCloud, Transform
+
+TENTH_NS = 100_000_000
+
+
+def boxes(*places: float, score: float = 0.8, speed: float = 0.0) -> Boxes:
+    """Cars at (x, 0) that drive along x."""
+    n = len(places)
+    center = torch.tensor([[x, 0.0, 0.8] for x in places]).view(n, 3)
+    blank = Boxes.of(center, torch.tensor([[4.5, 1.9, 1.6]]).expand(n, 3), torch.zeros(n))
+    return replace(blank, score=torch.full((n,), score), velocity=torch.tensor([[speed, 0.0]]).expand(n, 2))
+
+
+def frame(at: int, x: float = 0.0) -> AgentFrame:
+    cloud = PointCloud.of(torch.zeros(0, 3))
+    return replace(AgentFrame.of(cloud, Transform.from_xyz_yaw(x, 0.0)), timestamp_ns=at * TENTH_NS)
+
+
+@dataclass
+class Seen:
+    boxes: Boxes
+
+
+class Sees:
+    """Eyes that saw these boxes, newest first, a tenth of a second apart, while the agent drove on at 1 m a sweep."""
+
+    grid = BevGrid(-100.0, -40.0, -3.0, 100.0, 40.0, 1.0)
+
+    def __init__(self, *views: Boxes) -> None:
+        self.views = [(frame(9 - i, -float(i)), Seen(view)) for i, view in enumerate(views)]
+
+    def see(self, frame: AgentFrame) -> Seen:
+        return self.views[0][1]
+
+    def before(self, frame: AgentFrame, instants: int = 2) -> list[tuple[AgentFrame, Seen]]:
+        return self.views[1 : 1 + instants]
+
+
+def said(at: int, some: Boxes) -> Message:
+    return Message(5, at * TENTH_NS, Transform.identity(), torch.zeros(3, 3).double(), objects=some)
+
+
+def test_scores_fade_by_the_tenth_of_a_second_and_places_stay() -> None:
+    some = boxes(3.0)
+    assert float(faded(some, 0.2).score) == pytest.approx(0.8 * FADE**2)
+    assert torch.equal(faded(some, 0.2).center, some.center) and torch.equal(faded(some, 0.0).score, some.score)
+
+
+def test_of_boxes_that_overlap_the_best_stays() -> None:
+    kept = strongest([boxes(0.0, 20.0, score=0.5), boxes(0.5, 40.0, score=0.7)])
+    assert sorted(kept.center[:, 0].tolist()) == [0.5, 20.0, 40.0] and kept.score[0] == pytest.approx(0.7)
+
+
+def test_what_is_hidden_now_stands_where_it_should_be_by_now() -> None:
+    """Seen at 30 m a tenth of a second ago, at 10 m/s: 1 m farther on, 1 m nearer for the agent's own motion."""
+    found = method("late-remembering").hear(Sees(boxes(), boxes(30.0, speed=10.0)), frame(9), ())
+    assert found.center[:, 0].tolist() == pytest.approx([30.0]) and float(found.score) == pytest.approx(0.8 * FADE)
+    still = method("late-remembering").hear(Sees(boxes(), boxes(30.0)), frame(9), ())
+    assert still.center[:, 0].tolist() == pytest.approx([29.0])
+
+
+def test_what_is_seen_now_wins_over_what_was() -> None:
+    found = method("late-remembering").hear(Sees(boxes(30.0), boxes(31.0)), frame(9), ())
+    assert len(found) == 1 and float(found.score) == pytest.approx(0.8) and float(found.center[0, 0]) == 30.0
+
+
+def test_a_late_message_does_not_fade_but_what_its_sender_said_before_does() -> None:
+    messages = [said(6, boxes(10.0)), said(5, boxes(10.5, 50.0))]
+    found = method("late-remembering").hear(Sees(boxes()), frame(9), messages)
+    by_place = dict(zip(found.center[:, 0].tolist(), found.score.tolist()))
+    assert by_place == {10.0: pytest.approx(0.8), 50.0: pytest.approx(0.8 * FADE)}
+
+
+def test_late_fusion_as_papers_have_it_knows_only_what_is_newest() -> None:
+    found = Late().hear(Sees(boxes(), boxes(30.0)), frame(9), [said(6, boxes(10.0))])
+    assert found.center[:, 0].tolist() == [10.0] and not Late().remembers
+
+
+def test_boxes_of_others_are_cropped_and_capped_before_they_are_ranked() -> None:
+    """Beyond 100 m nobody is asked; of 200 boxes within, the best 128 of the message take part, and the ego's own stands."""
+    crowd = replace(boxes(*torch.linspace(-98, 98, 40).tolist() * 5), score=torch.linspace(0.1, 0.9, 200))
+    rows = torch.arange(200)
+    crowd = replace(crowd, center=crowd.center + torch.stack((0 * rows, 10 + 4.0 * (rows // 40), 0 * rows), 1))
+    found = Late().hear(Sees(boxes(0.0, score=0.1)), frame(9), [said(9, Boxes.cat([boxes(150.0, score=1.0), crowd]))])
+    assert len(found) == 129 and float(found.center[:, 0].max()) < 100
+    assert found.center[found.score.argmin()].tolist() == pytest.approx([0.0, 0.0, 0.8])
+
+
+def test_an_own_box_that_gives_way_to_one_elsewhere_returns_at_half_its_score() -> None:
+    """At 0 m another box stands 0.9 m aside, the same place; at 20 m it stands 1.5 m aside."""
+    own = boxes(0.0, 20.0, score=0.3)
+    found = Late().hear(Sees(own), frame(9), [said(9, boxes(0.9, 21.5, score=0.9))])
+    assert found.center[:, 0].tolist() == pytest.approx([0.9, 21.5, 20.0])
+    assert found.score.tolist() == pytest.approx([0.9, 0.9, 0.15])
+
+
+def test_early_fusion_merges_what_is_heard_and_remembers_nothing() -> None:
+    merged: list[PointCloud] = []
+
+    class Looks(Sees):
+        def earlier_merged(self, frame: AgentFrame, cloud: PointCloud) -> None:
+            merged.append(cloud)
+
+        def see_cloud(self, cloud: PointCloud, earlier: PointCloud | None) -> Seen:
+            return Seen(boxes())
+
+    cloud = PointCloud.of(torch.tensor([[6.0, 0.0, 1.0]]))
+    Early().hear(Looks(boxes()), frame(9), [replace(said(6, boxes()), points=cloud)])
+    assert merged[0].xyz.tolist() == [[6.0, 0.0, 1.0]] and not Early().remembers

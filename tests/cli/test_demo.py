@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo keeps what it has: a map that fails leaves the report of the detections on disk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
+
+from manyeyes.cli import main as cli
+from manyeyes.models import checkpoint
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.presets import COSTR_TINY
+
+
+@pytest.mark.slow
+def test_a_map_that_cannot_be_written_leaves_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    checkpoint.save(Detector(COSTR_TINY), tmp_path / "untrained.safetensors", {})
+    out = tmp_path / "demo"
+    out.mkdir()
+    (out / "map").write_text("a file where the map's folder would be")
+    words = (
+        "demo",
+        "--out",
+        str(out),
+        "--frames",
+        "1",
+        "--no-animate",
+        "--weights",
+        str(tmp_path / "untrained.safetensors"),
+    )
+    assert cli.main([*words, "--towns", str(tmp_path)]) == 1
+    assert str(out / "map") in capsys.readouterr().err
+    assert {p.name for p in out.iterdir()} >= {"report.html", "results.json", "results.md", "alone.png", "early.png"}
+    assert len(json.loads((out / "results.json").read_text())["result"]["rows"]) == 4

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command as a person meets it: in a process of its own."""
+
+import dataclasses
+import importlib
+import inspect
+import json
+import subprocess
+import sys
+
+import pytest
+
+from manyeyes.cli import main as cli
+
+
+def test_help_lists_every_verb_and_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from manyeyes.cli import main; code = main.main(['--help']); "
+        "heavy = {'torch', 'numpy', 'numba', 'tyro', 'rich'} & set(sys.modules); print('HEAVY', sorted(heavy), code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "HEAVY [] 0"
+    assert all(f"  {verb} " in done.stdout for verb in cli.VERBS)
+
+
+EVERY_VERB = [verb for verb in cli.VERBS if verb not in cli.GROUPS]
+EVERY_VERB += [f"{group} {verb}" for group, verbs in cli.GROUPS.items() for verb in verbs]
+
+
+@pytest.mark.parametrize("verb", EVERY_VERB)
+def test_every_verb_has_options_with_help(verb, capsys) -> None:
+    module = importlib.import_module(cli.module_of(verb))
+    assert module.__doc__ and callable(module.main)
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*verb.split(), "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert f"manyeyes {verb}" in text
+    fields = dataclasses.fields(module.Options)
+    assert fields and all(f.name.replace("_", "-") in text.lower() for f in fields)
+    # tyro prints nothing between a flag and its default where the field has no docstring.
+    source = inspect.getsource(module.Options)
+    assert source.count('\n    """') == len(fields) + 1, "an option is without a line of help"
+
+
+def test_an_unknown_verb_says_which_are_known(capsys) -> None:
+    assert cli.main(["demmo"]) == 2
+    assert capsys.readouterr().err == (
+        "manyeyes: there is no verb 'demmo'; did you mean demo? Known verbs: "
+        "demo, simulate, train, quantise, evaluate, run, view, align, map, doctor.\n"
+    )
+
+
+def test_a_group_lists_its_verbs_and_knows_no_other(capsys) -> None:
+    assert cli.main(["map"]) == 0
+    said = capsys.readouterr().out
+    assert all(f"  {verb} " in said for verb in cli.GROUPS["map"]) and "usage: manyeyes map VERB" in said
+    assert cli.main(["map", "fuze"]) == 2
+    assert "did you mean fuse? Known verbs: build, simulate, import, fuse" in capsys.readouterr().err
+
+
+def test_wrong_arguments_exit_with_2(capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["doctor", "--colour"])
+    assert stop.value.code == 2 and "--colour" in capsys.readouterr().err
+
+
+def test_a_designed_error_is_one_line_and_exits_with_1(monkeypatch, capsys) -> None:
+    from manyeyes.cli import doctor
+    from manyeyes.datatypes import RecordingError
+
+    def fail(options: object) -> None:
+        raise RecordingError("here/is/a.yaml: no lidar_pose;\n write one.")
+
+    monkeypatch.setattr(doctor, "main", fail)
+    assert cli.main(["doctor"]) == 1
+    assert capsys.readouterr().err == "manyeyes: here/is/a.yaml: no lidar_pose; write one.\n"
+
+
+def test_ctrl_c_is_one_line_and_exits_with_130(monkeypatch, capsys) -> None:
+    from manyeyes.cli import doctor
+
+    def stop(options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(doctor, "main", stop)
+    assert cli.main(["doctor"]) == 130
+    assert capsys.readouterr().err == "manyeyes: stopped.\n"
+
+
+def test_a_missing_file_is_one_line_and_exits_with_1(monkeypatch, capsys) -> None:
+    from manyeyes.cli import doctor
+
+    monkeypatch.setattr(doctor, "main", lambda options: open("/no/such/file"))  # noqa: PTH123, SIM115
+    assert cli.main(["doctor"]) == 1
+    assert capsys.readouterr().err == "manyeyes: /no/such/file: No such file or directory\n"
+
+
+def test_version(capsys) -> None:
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == "manyeyes 0.1.0\n"
+
+
+def test_doctor_says_as_json_what_a_bug_report_needs(capsys) -> None:
+    assert cli.main(["doctor", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    import torch
+
+    assert said["versions"]["torch"] == torch.__version__ and said["torch_threads"] == torch.get_num_threads()
+    assert {e["name"] for e in said["extras"]} == {"sim", "map", "view", "av2", "dask", "ray", "register"}
+    assert {"cpu", "cores", "system", "git_commit", "weights", "towns", "towns_from", "package"} <= set(said)
+
+
+def test_doctor_names_the_pip_line_of_a_missing_extra(monkeypatch, capsys) -> None:
+    from manyeyes.cli import doctor
+
+    monkeypatch.setattr(doctor, "_installed", lambda module: module != "pyogrio")
+    assert cli.main(["doctor"]) == 0
+    assert "pip install 'manyeyes[map]'" in capsys.readouterr().out

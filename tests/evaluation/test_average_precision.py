@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+import torch
+
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, RecordingError, Snapshot, Transform, Truth
+from manyeyes.evaluation.detection.average_precision import (
+    PROTOCOLS,
+    FrameResult,
+    average_precision,
+    average_precisions,
+    ego_truth,
+    kept_detections,
+    match_frame,
+    overlap_frame,
+    protocol_named,
+)
+from manyeyes.ops.box_iou import pairwise_iou
+
+MANYEYES = PROTOCOLS["manyeyes"]
+NO_NMS = replace(MANYEYES, nms_iou=1.0)
+
+
+def cars(*rows, size=(4.0, 2.0, 1.5), z=0.75):
+    """Boxes from rows x, y, score."""
+    xys = torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
+    center = torch.cat((xys[:, :2], torch.full((len(xys), 1), z, dtype=torch.float64)), 1)
+    return Boxes.of(
+        center, torch.tensor([size], dtype=torch.float64).repeat(len(xys), 1), torch.zeros(len(xys)).double(), xys[:, 2]
+    )
+
+
+def three_frames():
+    return [
+        FrameResult("a", 0, cars((0, 0, 0.9), (50, 0, 0.3)), cars((0, 0, 1), (20, 0, 1))),
+        FrameResult("a", 1, cars((0, 0, 0.8), (20, 0, 0.6)), cars((20, 0, 1))),
+        FrameResult("b", 0, cars((0, 0, 0.7)), cars((0, 0, 1))),
+    ]
+
+
+def test_three_frames_by_hand_sorted_and_concatenated():
+    """By score: T F T T F, precision 1 1/2 2/3 3/4 3/5; concatenated: T F F T T, precision 1 1/2 1/3 1/2 3/5."""
+    got = average_precision(three_frames(), 0.5, MANYEYES)
+    assert got.ap_global == pytest.approx(0.25 + 0.25 * 0.75 + 0.25 * 0.75, abs=1e-15)
+    assert got.ap_legacy == pytest.approx(0.25 + 0.25 * 0.6 + 0.25 * 0.6, abs=1e-15)
+    assert (got.recall, got.precision, got.n_gt, got.n_detections) == (0.75, 0.6, 4, 5)
+    assert got.ap == got.ap_global
+    assert average_precision(three_frames(), 0.5, replace(MANYEYES, sort="concatenated")).ap == got.ap_legacy
+    assert [m.tp.tolist() for m in got.frames] == [[True, False], [False, True], [True]]
+
+
+def test_several_thresholds_at_once():
+    frames = list(random_frames(5))
+    together = average_precisions(frames, (0.3, 0.5, 0.7), MANYEYES)
+    assert [r.ap_global for r in together] == [
+        average_precision(frames, t, MANYEYES).ap_global for t in (0.3, 0.5, 0.7)
+    ]
+    assert together[0].ap_global > together[2].ap_global
+
+
+def test_frames_may_come_in_any_order():
+    frames = three_frames()
+    forward, back = average_precision(frames, 0.5, MANYEYES), average_precision(frames[::-1], 0.5, MANYEYES)
+    assert (forward.ap_global, forward.ap_legacy) == (back.ap_global, back.ap_legacy)
+
+
+def slow_ap(frames, thr, global_sort):
+    """The slow twin, in plain loops, with the padded VOC area."""
+    rows, n_gt = [], 0
+    for frame in sorted(frames, key=lambda f: (f.scenario, f.index)):
+        left = list(range(len(frame.truth)))
+        n_gt += len(left)
+        for d in sorted(range(len(frame.detections)), key=lambda i: (-frame.detections.score[i].item(), i)):
+            best = [
+                (pairwise_iou(frame.detections[d : d + 1].bev(), frame.truth[g : g + 1].bev()).item(), -g) for g in left
+            ]
+            hit = bool(best) and max(best)[0] >= thr
+            if hit:
+                left.remove(-max(best)[1])
+            rows.append((frame.detections.score[d].item(), hit))
+    if global_sort:
+        rows.sort(key=lambda r: -r[0])
+    tp = fp = 0
+    recall, precision = [0.0], [0.0]
+    for _, hit in rows:
+        tp, fp = tp + hit, fp + (not hit)
+        recall.append(tp / n_gt)
+        precision.append(tp / (tp + fp))
+    recall.append(1.0)
+    precision.append(0.0)
+    for i in range(len(precision) - 2, -1, -1):
+        precision[i] = max(precision[i], precision[i + 1])
+    return sum((recall[i] - recall[i - 1]) * precision[i] for i in range(1, len(recall)))
+
+
+def random_frames(n, per=8, seed=0, miss=0.25, clutter=3):
+    g = torch.Generator().manual_seed(seed)
+    for f in range(n):
+        xy = torch.stack((torch.arange(per) * 12.0 - 40, torch.zeros(per)), 1) + torch.randn(per, 2, generator=g)
+        size = torch.tensor([4.5, 1.9, 1.5]).repeat(per, 1)
+        truth = Boxes.of(torch.cat((xy, torch.ones(per, 1)), 1), size, torch.randn(per, generator=g))
+        found = truth[torch.rand(per, generator=g) > miss]
+        found = replace(
+            found,
+            center=found.center + 0.3 * torch.randn(len(found), 3, generator=g),
+            score=(0.5 + 0.45 * torch.rand(len(found), generator=g)).mul(50).round() / 50,
+        )
+        wrong = replace(
+            truth[:clutter],
+            center=truth.center[:clutter] + torch.tensor([0.0, 20, 0]),
+            score=(0.06 + 0.8 * torch.rand(clutter, generator=g)).mul(50).round() / 50,
+        )
+        yield FrameResult(f"s{f // 10}", f % 10, Boxes.cat([found, wrong]), truth)
+
+
+@pytest.mark.parametrize("thr", [0.3, 0.5, 0.7])
+def test_agrees_with_its_slow_twin(thr):
+    frames = list(random_frames(12))
+    got = average_precision(frames, thr, MANYEYES)
+    assert got.ap_global == pytest.approx(slow_ap(frames, thr, True), abs=1e-12)
+    assert got.ap_legacy == pytest.approx(slow_ap(frames, thr, False), abs=1e-12)
+    assert 0.2 < got.ap_global < 0.95
+
+
+def test_legacy_ap_tends_to_recall_times_precision():
+    got = average_precision(list(random_frames(250, clutter=5)), 0.5, MANYEYES)
+    assert got.ap_legacy == pytest.approx(got.recall * got.precision, abs=0.02)
+    assert got.ap_global > got.ap_legacy + 0.1
+
+
+def test_frames_without_detections_add_truth_and_frames_without_truth_add_false_positives():
+    base = three_frames()
+    plain = average_precision(base, 0.5, MANYEYES)
+    silent = [*base, FrameResult("c", 0, Boxes.empty(), cars((0, 0, 1)))]
+    got = average_precision(silent, 0.5, MANYEYES)
+    assert got.n_gt == 5 and got.ap_global == pytest.approx(plain.ap_global * 4 / 5)
+    skipped = average_precision(silent, 0.5, replace(MANYEYES, count_frames_without_det=False))
+    assert skipped.n_gt == 4 and skipped.ap_global == plain.ap_global
+    ghost = average_precision([*base, FrameResult("c", 0, cars((0, 0, 0.95)), Boxes.empty())], 0.5, MANYEYES)
+    assert ghost.n_gt == 4 and ghost.precision == pytest.approx(3 / 6) and ghost.ap_global < plain.ap_global
+
+
+def test_without_truth_ap_is_nan_and_without_detections_it_is_zero():
+    nothing = average_precision([FrameResult("a", 0, cars((0, 0, 0.9)), Boxes.empty())], 0.5, MANYEYES)
+    assert math.isnan(nothing.ap_global) and math.isnan(nothing.ap_legacy) and math.isnan(nothing.recall)
+    assert nothing.precision == 0.0
+    blind = average_precision([FrameResult("a", 0, Boxes.empty(), cars((0, 0, 1)))], 0.5, MANYEYES)
+    assert (blind.ap_global, blind.ap_legacy, blind.recall) == (0.0, 0.0, 0.0) and math.isnan(blind.precision)
+    assert math.isnan(average_precision([], 0.5, MANYEYES).ap_global)
+
+
+def test_a_detection_whose_box_is_taken_takes_the_next_best_or_not():
+    frame = FrameResult("a", 0, cars((0, 0, 0.9), (0.4, 0, 0.8)), cars((0, 0, 1), (1, 0, 1)))
+    assert match_frame(frame, 0.5, NO_NMS).truth_row.tolist() == [0, 1]
+    assert match_frame(frame, 0.5, replace(NO_NMS, matching="best")).truth_row.tolist() == [0, -1]
+    assert match_frame(frame, 0.75, NO_NMS).truth_row.tolist() == [0, -1]
+
+
+def test_truth_first_lets_each_box_choose():
+    frame = FrameResult("a", 0, cars((0.4, 0, 0.9), (0, 0, 0.8)), cars((0, 0, 1), (1, 0, 1)))
+    assert match_frame(frame, 0.7, NO_NMS).truth_row.tolist() == [0, -1]
+    assert match_frame(frame, 0.7, replace(NO_NMS, matching="truth_first")).truth_row.tolist() == [1, 0]
+
+
+def test_the_first_recall_segment_can_be_dropped():
+    plain, dropped = (
+        average_precision(three_frames(), 0.5, p) for p in (MANYEYES, replace(MANYEYES, drop_first_segment=True))
+    )
+    assert dropped.ap_global == pytest.approx(plain.ap_global - 0.25)
+
+
+def test_iou_equal_to_the_threshold_is_a_true_positive():
+    frame = FrameResult("a", 0, cars((1, 0, 0.9)), cars((0, 0, 1)))
+    assert overlap_frame(frame, MANYEYES).iou.item() == 0.6
+    assert match_frame(frame, 0.6, MANYEYES).tp.tolist() == [True]
+    assert match_frame(frame, np.nextafter(0.6, 1), MANYEYES).tp.tolist() == [False]
+
+
+def test_a_bus_is_dropped_by_the_six_metre_filter_alone():
+    bus = cars((10, 0, 0.9), size=(11.0, 2.5, 1.5))
+    assert len(kept_detections(bus, MANYEYES)) == 1
+    assert len(kept_detections(bus, protocol_named("opencood"))) == 0
+    frame = FrameResult("a", 0, bus, bus)
+    assert average_precision([frame], 0.5, MANYEYES).ap_global == 1.0
+    assert average_precision([frame], 0.5, PROTOCOLS["opencood"]).ap_global == 0.0
+    turned = replace(cars((10, 0, 0.9), size=(4.5, 1.9, 1.5)), yaw=torch.tensor([math.pi / 4]).double())
+    assert len(kept_detections(turned, PROTOCOLS["opencood"])) == 1
+
+
+def test_range_by_centre_and_by_corners():
+    edge = cars((139.5, 0, 0.9))  # its front is at 141.5
+    for name, kept in (("manyeyes", 1), ("opencood", 0), ("sparsealign", 1)):
+        assert len(kept_detections(edge, PROTOCOLS[name])) == kept, name
+        assert overlap_frame(FrameResult("a", 0, edge, edge), PROTOCOLS[name]).iou.shape == (kept, kept), name
+    assert len(kept_detections(cars((0, 40, 0.9)), MANYEYES)) == 1  # closed
+    assert len(kept_detections(cars((0, 40.001, 0.9)), MANYEYES)) == 0
+    near = MANYEYES.within((-70.4, -38.4, -3.0, 70.4, 38.4, 1.0))
+    assert len(kept_detections(cars((71, 20, 0.9), (70, 0, 0.8)), near)) == 1
+
+
+def test_z_is_judged_from_the_lidar_and_only_by_the_legacy_protocols():
+    tall = cars((0, 0, 0.9), size=(5.0, 2.5, 3.2), z=1.6)  # 3.2 m over the road, 1.3 m over a roof of 1.9 m
+    truth = cars((0, 0, 1), size=(5.0, 2.5, 3.2), z=1.6)
+    assert overlap_frame(FrameResult("a", 0, tall, truth), MANYEYES).iou.shape == (1, 1)
+    assert overlap_frame(FrameResult("a", 0, tall, truth), PROTOCOLS["opencood"]).iou.shape == (0, 0)
+    low = cars((0, 0, 0.9), size=(5.0, 2.5, 2.8), z=1.4)
+    assert len(kept_detections(low, PROTOCOLS["opencood"])) == 1
+
+
+def test_score_threshold_and_nms_of_each_protocol():
+    weak = cars((0, 0, 0.2), (20, 0, 0.21), (40, 0, 0.05), (60, 0, 0.06))
+    assert kept_detections(weak, MANYEYES).score.tolist() == [0.21, 0.2, 0.06]
+    assert kept_detections(weak, PROTOCOLS["opencood"]).score.tolist() == [0.21]
+    shifted = cars((0, 0, 0.9), (3.5, 0, 0.8))  # IoU 1/15
+    assert len(kept_detections(shifted, MANYEYES)) == 2
+    assert len(kept_detections(shifted, PROTOCOLS["sparsealign"])) == 1
+
+
+def test_ties_keep_frame_and_row_order():
+    """Equal scores everywhere: order is (scenario, index, row), so AP is that of T F | F T."""
+    frames = [
+        FrameResult("a", 1, cars((50, 0, 0.5), (0, 0, 0.5)), cars((0, 0, 1))),
+        FrameResult("a", 0, cars((0, 0, 0.5), (50, 0, 0.5)), cars((0, 0, 1))),
+    ]
+    got = average_precision(frames, 0.5, MANYEYES)
+    assert got.ap_global == got.ap_legacy == pytest.approx(0.5 + 0.5 * 0.5)
+
+
+def test_unknown_protocol_lists_the_known():
+    with pytest.raises(ConfigError, match="manyeyes, opencood, coalign, sparsealign, dair"):
+        protocol_named("opencod")
+    with pytest.raises(FrozenInstanceError):
+        MANYEYES.score_threshold = 0.5  # pyright: ignore
+
+
+# Truth of an ego.
+
+
+def crossing(order=(0, 1, 2), move=None, claimed_error=0.0):
+    """Three agents 10, 11, 12 at x = 0, 60, 80; boxes of the agents and of four others, one with a repeated id.
+
+    The boxes, by id: 10, 11, 12 the agents' own bodies, 1 seen by agent 10, 2 by 11 and 12, 3 by 12 only,
+    2 again (another row, as a second listing would leave it).
+    """
+    agents = [(10, 0.0, 0.3), (11, 60.0, 0.2), (12, 80.0, -1.0)]
+    ids = torch.tensor([10, 11, 12, 1, 2, 3, 2])
+    x = torch.tensor([0.0, 60, 80, 20, 40, 90, 40.2]).double()
+    seen = torch.tensor(
+        [
+            [0, 1, 0, 1, 0, 0, 0],
+            [1, 0, 1, 0, 1, 0, 1],
+            [0, 1, 0, 0, 1, 1, 0],
+        ]
+    ).bool()
+    center = torch.stack((x, torch.arange(7).double(), torch.full((7,), 0.75).double()), 1)
+    boxes = Boxes.of(
+        center, torch.tensor([[4.0, 2, 1.5]]).double().repeat(7, 1), torch.linspace(0, 3, 7).double(), id=ids
+    )
+    move = move or Transform.identity()
+    poses = [move @ Transform.from_xyz_yaw(px, 0.0, 0.0, yaw) for _, px, yaw in agents]
+    points = [
+        PointCloud.of(p.inverse().apply(center[[3, 4, 4, 4, 4]]).float())
+        for p in (Transform.from_xyz_yaw(a[1], 0, 0, a[2]) for a in agents)
+    ]
+    wrong = [Transform.from_xyz_yaw((k + 1) * claimed_error, 0) for k in range(3)]
+    frames = [AgentFrame.of(points[k], wrong[k] @ poses[k], agents[k][0]) for k in order]
+    truth = Truth(boxes.transform(move), seen[list(order)], Transform.stack([poses[k] for k in order]))
+    return Snapshot("crossing", 0, tuple(frames), truth)
+
+
+def test_truth_is_the_union_of_agents_in_range_without_the_ego_and_without_repeats():
+    """Agent 12 is 80 m from agent 10: what it alone sees (3) does not count for 10."""
+    assert ego_truth(crossing(), 0, MANYEYES).id.tolist() == [11, 12, 1, 2]
+    assert ego_truth(crossing(), 1, MANYEYES).id.tolist() == [10, 12, 1, 2, 3]
+    far = replace(MANYEYES, com_range_m=100.0)
+    assert ego_truth(crossing(), 0, far).id.tolist() == [11, 12, 1, 2, 3]
+    assert ego_truth(crossing(), 0, replace(MANYEYES, com_range_m=1.0)).id.tolist() == [11, 1]
+
+
+def test_truth_is_in_the_egos_true_frame():
+    got = ego_truth(crossing(), 0, MANYEYES)
+    assert got.center.dtype == torch.float64
+    at = got.id.tolist().index(1)
+    c, s = math.cos(0.3), math.sin(0.3)
+    assert got.center[at].tolist() == pytest.approx([20 * c + 3 * s, -20 * s + 3 * c, 0.75])
+    assert got.yaw[at].item() == pytest.approx(1.5 - 0.3)
+
+
+@pytest.mark.parametrize("order", [(2, 1, 0), (1, 2, 0), (0, 2, 1)])
+def test_truth_does_not_depend_on_the_order_of_agents(order):
+    one, other = ego_truth(crossing(), 1, MANYEYES), ego_truth(crossing(order), order.index(1), MANYEYES)
+    assert torch.equal(one.center, other.center) and torch.equal(one.id, other.id)
+
+
+def test_truth_does_not_depend_on_where_the_world_is():
+    one = ego_truth(crossing(), 1, MANYEYES)
+    other = ego_truth(crossing(move=Transform.from_xyz_yaw(3000, -500, 7, 2.2)), 1, MANYEYES)
+    assert torch.equal(one.id, other.id)
+    torch.testing.assert_close(one.center, other.center, atol=1e-9, rtol=0)
+
+
+def test_who_is_in_range_is_decided_by_true_poses():
+    """Agent 12 is 80 m away and claims 50 m; agent 11 is 60 m away and claims 90 m."""
+    for error in (-15.0, 30.0):
+        one, other = ego_truth(crossing(), 0, MANYEYES), ego_truth(crossing(claimed_error=error), 0, MANYEYES)
+        assert torch.equal(one.id, other.id) and torch.equal(one.center, other.center)
+
+
+def test_truth_respects_range_and_points():
+    near = MANYEYES.within((-70.4, -38.4, -3.0, 25.0, 38.4, 1.0))
+    assert ego_truth(crossing(), 0, near).id.tolist() == [1]
+    # one point of box 1 and four of box 2 by each of the two agents in range; box 2's second row is its repeat
+    assert ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=2)).id.tolist() == [1, 2]
+    assert ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=3)).id.tolist() == [2]
+    assert ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=9)).id.tolist() == []
+
+
+def test_a_snapshot_without_truth_is_refused():
+    with pytest.raises(RecordingError, match="crossing #0 has no truth"):
+        ego_truth(replace(crossing(), truth=None), 0, MANYEYES)
+
+
+def test_ranges_on_dair_differ_where_their_sources_do() -> None:
+    ranges = {
+        name: PROTOCOLS[name].gt_range for name in ("dair", "coalign", "heal-dair", "costr-dair", "costr-dair-centred")
+    }
+    assert ranges["dair"] == (0.0, -39.68, -3.0, 100.0, 39.68, 1.0)
+    assert ranges["coalign"] == (-100.8, -40.0, -3.5, 100.8, 40.0, 1.5)
+    assert ranges["heal-dair"] == (-102.4, -51.2, -3.5, 102.4, 51.2, 1.5)
+    for name in ("costr-dair", "costr-dair-centred"):
+        x0, y0, _, x1, y1, _ = ranges[name]
+        assert (x1 - x0, y1 - y0) == (102.4, 102.4) and PROTOCOLS[name].sort == "concatenated"
+    assert ranges["costr-dair"][0] == 0.0
+    assert PROTOCOLS["sparsealign-dair"].com_range_m == 200.0
+    assert PROTOCOLS["sparsealign-dair"].min_points_in_gt == PROTOCOLS["sparsealign"].min_points_in_gt == 4

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps drawn by hand, judged; every number is worked out beside the drawing."""
+
+import math
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, KINDS, MapElements
+from manyeyes.evaluation.maps.metrics import branches, frechet, judge
+
+TWO_LANES = [[(0, 0), (40, 0)], [(0, 3.5), (40, 3.5)]]
+
+
+def dividers(*lines, score=1.0) -> MapElements:
+    return MapElements.of([np.array(line, dtype=float) for line in lines], DIVIDER, score)
+
+
+def test_the_truth_itself_is_perfect_in_every_number() -> None:
+    truth = MapElements.cat([dividers(*TWO_LANES), MapElements.of([[(10, 0), (14, 0), (14, 8), (10, 8)]], CROSSING)])
+    got = judge(truth, truth)
+    for way in ("maptr", "streammapnet", "exact"):
+        assert got.mean_ap(way) == got.mean_ap(way, "wide") == 1.0
+    line = got.of("divider")
+    assert (line.duplication, line.fragmentation, line.order_m, line.end_error_m) == (1.0, 1.0, 0.0, 0.0)
+    assert line.lateral_median_m == line.lateral_p95_m == 0.0
+    assert [(s.precision, s.recall, s.f) for s in line.length] == [(1.0, 1.0, 1.0)] * 3
+    assert math.isnan(got.of("boundary").precision[0].ap) and got.of("boundary").n_truth == 0
+
+
+def test_a_kind_without_truth_is_left_out_of_the_mean_but_its_inventions_cost_precision() -> None:
+    truth = dividers(*TWO_LANES)
+    invented = MapElements.cat([truth, MapElements.of([[(0, 9), (40, 9)]], BOUNDARY)])
+    got = judge(invented, truth)
+    assert got.mean_ap(kinds=KINDS) == 1.0
+    assert got.of("boundary").length[0].precision == 0.0 and math.isnan(got.of("boundary").length[0].f)
+
+
+def test_a_double_and_a_miss_by_hand() -> None:
+    """The better copy is found first: hits T, then F; recall 1/2. 80 m of 80 m, but all on one line: F by length 1/2 and 2/3.
+
+    predicted   ======== (twice, 0.2 m aside)        truth  --------  y = 0
+                                                            --------  y = 3.5
+    """
+    mine = dividers([(0, 0.2), (40, 0.2)], [(0, -0.2), (40, -0.2)], score=[0.9, 0.8])
+    got = judge(mine, dividers(*TWO_LANES)).of("divider")
+    assert next(p.at for p in got.precision if p.way == "exact") == (0.5, 0.5, 0.5)
+    assert (got.n_predicted, got.n_truth, got.duplication, got.fragmentation) == (2, 2, 1.0, 2.0)
+    assert got.length[0].precision == 1.0 and got.length[0].recall == 0.5
+    assert got.length[0].f == pytest.approx(2 / 3)
+    assert got.lateral_median_m == pytest.approx(0.2) and got.lateral_p95_m == pytest.approx(0.2)
+    assert got.order_m == pytest.approx(0.2)
+
+
+def test_pieces_of_a_line_have_its_length_but_not_its_ap() -> None:
+    mine = dividers(*[[(x, 0), (x + 10, 0)] for x in range(0, 40, 10)])
+    got = judge(mine, dividers([(0, 0), (40, 0)])).of("divider")
+    assert got.length[0].f == 1.0 and got.duplication == 1.0 and got.fragmentation == 4.0
+    assert {p.ap for p in got.precision} == {0.0}
+
+
+def test_a_score_below_another_costs_nothing_where_the_other_is_true() -> None:
+    """Hit 0.9, false 0.5: AP 1. False 0.9, hit 0.5: AP 1/2."""
+    line, far = [(0, 0), (40, 0)], [(0, 30), (40, 30)]
+    truth = dividers(line)
+    assert judge(dividers(line, far, score=[0.9, 0.5]), truth).ap("divider") == 1.0
+    assert judge(dividers(line, far, score=[0.5, 0.9]), truth).ap("divider") == 0.5
+
+
+def test_length_counts_what_lies_within() -> None:
+    """Half of the predicted line bends 2 m away; half of the truth is never predicted."""
+    mine = dividers([(0, 0.4), (20, 0.4), (20, 2.4), (38, 2.4)])
+    got = judge(mine, dividers([(0, 0), (60, 0)])).of("divider")
+    by_distance = {s.within_m: s for s in got.length}
+    assert by_distance[0.3].precision == by_distance[0.3].recall == by_distance[0.3].f == 0.0
+    assert by_distance[0.5].precision == pytest.approx(20 / 40, abs=0.26 / 40)
+    assert by_distance[0.5].recall == pytest.approx(20 / 60, abs=0.5 / 60)
+
+
+def test_ends_and_branches() -> None:
+    """Three lines meet at (20, 0); the map lets two of them end 1.5 m short of it, and joins no third."""
+    truth = dividers([(0, 0), (20, 0)], [(20, 0), (40, 5)], [(20, 0), (40, -5)])
+    perfect = judge(truth, truth).of("divider")
+    assert (perfect.branch_f1, perfect.end_error_m) == (1.0, 0.0)
+    short = dividers([(0, 0), (20, 0)], [(22.5, 0), (40, 5)], [(22.5, 0), (40, -5)])
+    got = judge(short, truth).of("divider")
+    assert got.branch_f1 == 0.0 and got.end_error_m == 0.0
+    assert math.isnan(judge(dividers(*TWO_LANES), dividers(*TWO_LANES)).of("divider").branch_f1)
+    lost = judge(dividers([(500, 0), (520, 0)]), truth).of("divider")
+    assert lost.end_error_m == 10.0
+
+
+def test_branches_are_groups_of_three_joined_in_a_chain() -> None:
+    ends = np.array([[0, 0], [0.9, 0], [1.8, 0], [10, 0], [10.2, 0], [20, 5]], dtype=float)
+    assert branches(ends).tolist() == [[pytest.approx(0.9), 0.0]]
+    assert branches(ends[[4, 2, 5, 0, 3, 1]]).tolist() == [[pytest.approx(0.9), 0.0]]
+    assert branches(np.zeros((0, 2))).shape == (0, 2)
+
+
+def slow_frechet(a, b):
+    """The recursion of Eiter and Mannila as it is printed."""
+    from functools import cache
+
+    @cache
+    def reach(i: int, j: int) -> float:
+        d = math.dist(a[i], b[j])
+        if i == 0 and j == 0:
+            return d
+        before = [reach(p, q) for p, q in ((i - 1, j), (i - 1, j - 1), (i, j - 1)) if p >= 0 and q >= 0]
+        return max(min(before), d)
+
+    return reach(len(a) - 1, len(b) - 1)
+
+
+@given(seed=st.integers(0, 10**6))
+def test_frechet_is_the_recursion(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    a, b = draw.normal(0, 3, (draw.integers(1, 9), 2)), draw.normal(0, 3, (draw.integers(1, 9), 2))
+    assert frechet(a, b) == pytest.approx(slow_frechet(a.tolist(), b.tolist()), abs=1e-12)
+
+
+def noisy_map(seed: int) -> tuple[MapElements, MapElements]:
+    draw = np.random.default_rng(seed)
+    lines = [np.stack((np.linspace(0, 30, 7), np.full(7, 3.5 * k)), 1) for k in range(4)]
+    ring = np.array([(10, 20), (14, 20), (14, 26), (10, 26)], dtype=float)
+    truth = MapElements.of([*lines, ring], [DIVIDER] * 4 + [CROSSING])
+    moved = [line + draw.normal(0, 0.5, line.shape) for line in (*lines, *lines[:2], ring)]
+    return MapElements.of(moved, [DIVIDER] * 6 + [CROSSING], np.round(draw.uniform(0, 1, 7), 1)), truth
+
+
+@given(seed=st.integers(0, 10**6))
+def test_neither_order_nor_direction_of_a_map_matters(seed: int) -> None:
+    mine, truth = noisy_map(seed)
+    order = np.random.default_rng(seed).permutation(len(mine))
+    turned = MapElements.of([mine.polyline(i)[::-1] for i in order], mine.kind[order], mine.score[order])
+    a, b = judge(mine, truth), judge(turned, truth.take(np.arange(len(truth))[::-1]))
+    for one, other in zip(a.kinds, b.kinds):
+        assert str(_rounded(asdict(one))) == str(_rounded(asdict(other)))
+
+
+@given(seed=st.integers(0, 10**6), yaw=st.floats(-3, 3))
+def test_moving_everything_changes_nothing(seed: int, yaw: float) -> None:
+    mine, truth = noisy_map(seed)
+    a, b = judge(mine, truth), judge(mine.transform(300, -80, yaw), truth.transform(300, -80, yaw))
+    for one, other in zip(a.kinds, b.kinds):
+        assert [p.ap for p in one.precision] == pytest.approx([p.ap for p in other.precision], nan_ok=True)
+        assert one.order_m == pytest.approx(other.order_m, nan_ok=True)
+        assert one.end_error_m == pytest.approx(other.end_error_m, nan_ok=True)
+
+
+def test_an_empty_map_has_recall_zero_and_no_precision() -> None:
+    got = judge(MapElements.empty(), dividers(*TWO_LANES)).of("divider")
+    assert {p.ap for p in got.precision} == {0.0} and got.duplication == 0.0
+    assert math.isnan(got.length[0].precision) and got.length[0].recall == 0.0 and got.length[0].f == 0.0
+    assert math.isnan(judge(dividers(*TWO_LANES), MapElements.empty()).mean_ap())
+
+
+def test_elements_without_length_are_left_out() -> None:
+    mine = dividers([(0, 0), (40, 0)], [(1, 1), (1, 1)], [(2, 2)], score=[0.5, 0.9, 0.9])
+    got = judge(mine, dividers([(0, 0), (40, 0)]))
+    assert got.of("divider").n_predicted == 1 and got.ap("divider") == 1.0
+
+
+def _rounded(value):
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_rounded(v) for v in value]
+    return round(value, 9) if isinstance(value, float) else value

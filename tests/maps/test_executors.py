@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A pool gives the list that a loop gives, and a block's exception reaches the caller; clusters: see test_tiles.py."""
+
+import os
+import time
+
+import pytest
+
+from manyeyes.datatypes import ConfigError, MissingExtraError
+from manyeyes.maps.store.executors import Inline, ProcessPool, map_blocks, named_executor
+
+
+def _square_late(value: int) -> tuple[int, int]:
+    """The first blocks take longest, so that finishing order is not submission order."""
+    time.sleep(0.05 if value < 2 else 0)
+    return value * value, os.getpid()
+
+
+def _fails_at_three(value: int) -> int:
+    if value == 3:
+        raise ValueError("block three")
+    return value
+
+
+def _run(executor, fn, blocks, progress=None):
+    with executor.open() as runner:
+        return map_blocks(fn, blocks, runner, progress)
+
+
+def test_a_process_pool_gives_the_inline_list_in_block_order_and_reports_every_block():
+    seen: list[tuple[int, int]] = []
+    with ProcessPool(2, ahead=1).open() as runner:
+        results = map_blocks(_square_late, range(9), runner, lambda done, total: seen.append((done, total)))
+        again = map_blocks(_square_late, range(3), runner)
+        with pytest.raises(ValueError, match="block three"):
+            map_blocks(_fails_at_three, range(6), runner)
+    assert [square for square, _ in results] == [square for square, _ in _run(Inline(), _square_late, range(9))]
+    assert os.getpid() not in {pid for _, pid in results}
+    assert {pid for _, pid in again} <= {pid for _, pid in results}
+    assert seen == [(k, 9) for k in range(1, 10)]
+
+
+def test_an_exception_of_a_block_reaches_the_caller_inline():
+    with pytest.raises(ValueError, match="block three"):
+        _run(Inline(), _fails_at_three, range(6))
+
+
+def test_without_a_runner_a_pool_of_its_own_runs_the_blocks():
+    assert map_blocks(_fails_at_three, [5]) == [5]
+    assert map_blocks(_fails_at_three, []) == []
+
+
+def test_an_absent_engine_names_its_extra(monkeypatch):
+    import builtins
+
+    real = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.split(".")[0] in ("dask", "ray"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    for name in ("dask", "ray"):
+        with pytest.raises(MissingExtraError, match=rf"manyeyes\[{name}\]"):
+            _run(named_executor(name), _fails_at_three, [1])
+
+
+def test_an_unknown_executor_lists_the_known_ones():
+    with pytest.raises(ConfigError, match="inline, process, dask, ray"):
+        named_executor("spark")

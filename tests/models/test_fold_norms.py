@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folded detector says what its model says, keeps the model as it was, and holds no batch norm in its convolutions."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from manyeyes.agents.perception_cache import Eyes
+from manyeyes.datatypes import PointCloud
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.fold_norms import folded
+from manyeyes.models.detector.layers import ActiveNorm
+from manyeyes.models.detector.presets import COSTR_TINY
+
+
+def _model(head_stride: int) -> tuple[Detector, PointCloud]:
+    torch.manual_seed(3)
+    encoder = replace(COSTR_TINY.encoder, head_stride=head_stride, token_channels=16)
+    model = Detector(replace(COSTR_TINY, encoder=encoder, prune_threshold=0.0))
+    xyz = torch.rand(3000, 3) * torch.tensor([50.0, 50.0, 4.0]) - torch.tensor([25.0, 25.0, 2.0])
+    cloud = PointCloud.of(xyz, torch.rand(3000))
+    model.train()
+    with torch.no_grad():
+        for norm in (m for m in model.modules() if isinstance(m, ActiveNorm)):
+            norm.momentum = 0.5
+            norm.weight.uniform_(0.5, 1.5)
+            norm.bias.uniform_(-0.5, 0.5)
+        model.see([cloud])
+    return model.eval(), cloud
+
+
+@pytest.mark.parametrize("head_stride", [2, 4, 8])
+def test_the_folded_copy_says_the_same(head_stride: int) -> None:
+    model, cloud = _model(head_stride)
+    before = {k: v.clone() for k, v in model.state_dict().items()}
+    ours, theirs = Eyes(folded(model)).see_cloud(cloud), Eyes(model).see_cloud(cloud)
+    assert torch.equal(ours.told.sites.key, theirs.told.sites.key)
+    scale = theirs.told.features.abs().max()
+    assert scale > 0.1
+    assert torch.allclose(ours.told.features, theirs.told.features, atol=1e-5 * float(scale.clamp_min(1)))
+    assert torch.allclose(ours.raw.heat, theirs.raw.heat, atol=1e-5)
+    after = model.state_dict()
+    assert before.keys() == after.keys()
+    assert all(torch.equal(after[k], v) for k, v in before.items())
+
+
+def test_no_norm_is_left_in_the_encoder_and_the_head_keeps_its_own() -> None:
+    model, _ = _model(4)
+    copied = folded(model)
+    assert not [m for m in copied.encoder.modules() if isinstance(m, ActiveNorm)]
+    assert [m for m in model.encoder.modules() if isinstance(m, ActiveNorm)]
+    assert [m for m in copied.head.modules() if isinstance(m, torch.nn.LayerNorm)]
+    assert copied.fingerprint == model.fingerprint
+    assert copied.config == model.config

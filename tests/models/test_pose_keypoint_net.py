@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""FeaKM's keypoints: the published ones with their defects, the mended ones without."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from manyeyes.datatypes import BevGrid, Boxes, ShapeError, SparseBev, Transform
+from manyeyes.models.detector.box_head import RAW
+from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.fusion.transform_tokens import rotate_vectors
+from manyeyes.models.pose.box_descriptors import BoxKeypointNet, BoxKeypoints
+from manyeyes.models.pose.keypoint_net import DenseKeypointNet, DenseKeypoints, View, local_maxima
+
+GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=2)
+CHANNELS = 8
+
+
+def view(cells, confidence, boxes=None, grid=GRID, seed=0) -> View:
+    """Tokens of random features at cells (row, column)."""
+    yx = torch.tensor(cells)
+    features = torch.rand(len(yx), CHANNELS, generator=torch.Generator().manual_seed(seed))
+    both = SparseBev.from_cells(torch.cat((features, torch.tensor(confidence)[:, None]), 1), yx, grid)
+    return View(both.with_features(both.features[:, :-1]), both.features[:, -1], boxes or Boxes.empty())
+
+
+def dense(**more) -> DenseKeypointNet:
+    torch.manual_seed(0)
+    return DenseKeypointNet(DenseKeypoints(CHANNELS, (8, 8, 8), 16, **more)).eval().requires_grad_(False)
+
+
+def boxed(**more) -> BoxKeypointNet:
+    torch.manual_seed(0)
+    return BoxKeypointNet(BoxKeypoints(CHANNELS, 16, 32, **more)).eval().requires_grad_(False)
+
+
+def test_it_has_as_many_weights_as_the_published_extractor():
+    net = DenseKeypointNet(DenseKeypoints(inputs=128))
+    assert sum(p.numel() for p in net.parameters()) == 3_312_640  # specs/pose.md 0.2
+
+
+def test_greedy_suppression_by_hand():
+    """Along a line 9 suppresses 8; 7, two cells farther, then stands free: a single round would have lost it to 8."""
+    line = torch.tensor([[[0.0, 9.0, 0.0, 8.0, 7.0, 0.0, 0.0, 3.0]]])
+    assert local_maxima(line, 2)[0, 0].nonzero()[:, 0].tolist() == [1, 4, 7]
+    assert local_maxima(line, 2, rounds=1)[0, 0].nonzero()[:, 0].tolist() == [1, 7]
+    assert not local_maxima(torch.zeros(1, 4, 4), 1).any()
+
+
+def test_published_points_are_peaks_at_the_corners_of_their_cells_and_padding():
+    cells = [(20, 30), (20, 31), (40, 12), (50, 50), (1, 30)]
+    made = view(cells, [0.9, 0.8, 0.5, 0.1, 0.99])
+    (points,) = dense(most=6)([made])
+    # (20, 31) is suppressed, (50, 50) is unsure, (1, 30) lies at the edge.
+    corner = [-25.6 + 0.4 / 2 - 0.4, -25.6 + 0.4 / 2 - 0.4]
+    expected = torch.tensor([[c * 0.8 + corner[0], r * 0.8 + corner[1]] for r, c in [(20, 30), (40, 12)]])
+    torch.testing.assert_close(points.xy[:2], expected)
+    torch.testing.assert_close(points.boxes.score, torch.tensor([0.9, 0.5, 0, 0, 0, 0]))
+    assert (points.xy[2:] == points.xy[2]).all() and (points.descriptor[2:] == points.descriptor[2]).all()
+    torch.testing.assert_close(points.descriptor.norm(dim=1), torch.ones(6))
+    assert points.boxes.sigma_yaw.isinf().all()
+
+
+def test_without_a_confidence_map_peaks_of_the_features_are_taken():
+    made = view([(20, 30), (40, 12)], [0.0, 0.0])
+    (points,) = dense(most=4, saliency="feature")([made])
+    assert int((points.boxes.score > 0).sum()) == 2
+    assert int((dense(most=4)([made])[0].boxes.score > 0).sum()) == 0
+
+
+def test_a_published_descriptor_depends_on_the_other_agent_and_a_mended_one_does_not():
+    boxes = Boxes.of(torch.tensor([[0.4, 1.2, 0.0]]), torch.tensor([[4.5, 1.9, 1.6]]), torch.tensor([0.3]))
+    one = view([(32, 32), (33, 33)], [0.9, 0.1], boxes)
+    loud = view([(20, 20)], [0.9])
+    loud = View(loud.tokens.with_features(loud.tokens.features * 50), loud.confidence, Boxes.empty())
+    net = dense()
+    for weight in net.trunk.parameters():
+        weight.mul_(3)  # untrained convolutions hardly pass anything on
+    assert float((net([one])[0].descriptor[0] - net([one, loud])[0].descriptor[0]).norm()) > 1e-2
+    mended = boxed()
+    assert torch.equal(mended([one])[0].descriptor, mended([one, loud])[0].descriptor)
+    assert len(mended([loud])[0]) == 0
+
+
+def test_a_mended_descriptor_turns_with_its_agent():
+    """A quarter turn maps cells of a square lattice onto cells: tokens, their vectors and boxes turn, descriptors stay."""
+    shift = 25.4  # centres lie at -25.4 + 0.8 k; a quarter turn about the middle of the lattice keeps them
+    grid = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=1)
+    rng = torch.Generator().manual_seed(3)
+    flat = torch.randperm(grid.shape[0] * grid.shape[1], generator=rng)[:6000]
+    yx = torch.stack((flat // grid.shape[1], flat % grid.shape[1]), 1)
+    features = torch.randn(len(yx), CHANNELS, generator=rng)
+    boxes = Boxes.of(
+        (torch.rand(5, 3, generator=rng) - 0.5) * 30, 1 + torch.rand(5, 3, generator=rng), torch.rand(5, generator=rng)
+    )
+    quarter = torch.tensor(math.pi / 2)
+    turned_yx = torch.stack((yx[:, 1], grid.shape[0] - 1 - yx[:, 0]), 1)
+    tokens = SparseBev.from_cells(features, yx, grid)
+    turned = SparseBev.from_cells(rotate_vectors(features, quarter), turned_yx, grid)
+    assert shift == pytest.approx(-float(grid.centers(torch.tensor([[0, 0]]))[0, 0]))
+    move = Transform.from_xyz_yaw(0.0, 0.0, 0.0, math.pi / 2)
+    (here,) = boxed()([View(tokens, torch.ones(len(yx)), boxes)])
+    (there,) = boxed()([View(turned, torch.ones(len(yx)), boxes.transform(move))])
+    torch.testing.assert_close(there.descriptor, here.descriptor, atol=1e-4, rtol=1e-4)
+    (unturned,) = boxed()([View(tokens, torch.ones(len(yx)), boxes.transform(move))])
+    assert float((unturned.descriptor - here.descriptor).norm(dim=1).min()) > 1e-2
+
+
+def test_mended_points_are_the_best_boxes():
+    n = 5
+    boxes = Boxes.of(torch.rand(n, 3) * 10, torch.ones(n, 3), torch.zeros(n), torch.tensor([0.9, 0.8, 0.5, 0.3, 0.1]))
+    (points,) = boxed(most=3)([view([(32, 32)], [0.5], boxes)])
+    assert torch.equal(points.xy, boxes.center[:3, :2])
+    assert len(boxed()([view([(32, 32)], [0.5], boxes)])[0]) == 4
+    empty = View(
+        SparseBev.from_cells(torch.zeros(0, CHANNELS), torch.zeros(0, 2, dtype=torch.int64), GRID),
+        torch.zeros(0),
+        boxes,
+    )
+    assert boxed()([empty])[0].descriptor.isfinite().all()
+
+
+def test_a_view_is_what_an_agent_tells():
+    told = SparseBev.from_cells(torch.zeros(2, CHANNELS + PROPOSAL), torch.tensor([[1, 1], [2, 2]]), GRID)
+    told.features[1, CHANNELS:][RAW.heat] = 3.0
+    made = View.of(told, Boxes.empty())
+    assert made.tokens.features.shape == (2, CHANNELS)
+    torch.testing.assert_close(made.confidence, torch.sigmoid(torch.tensor([0.0, 3.0])))
+    with pytest.raises(ShapeError, match=r"needs confidence \(2,\)"):
+        replace(made, confidence=torch.zeros(3))

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from manyeyes.datatypes import ConfigError, Transform
+from manyeyes.ops.se2 import between
+from manyeyes.pose.pose_graph import Link, consistent, cycle_distance, settle
+from manyeyes.pose.types import PoseClaim, difference
+
+PLACES = {0: (0, 0, 0.0), 1: (30, 5, 2.0), 2: (-10, 25, -1.0), 3: (12, -18, 0.5), 4: (40, -20, 3.0)}
+SIGMA = np.array([0.1, 0.1, 0.005])
+
+
+def link(i, j, noise=None, sigma=SIGMA):
+    pose = between(*(torch.tensor(PLACES[a], dtype=torch.float64) for a in (i, j))).numpy()
+    return Link(i, j, pose + (0 if noise is None else noise), np.diag(sigma**2))
+
+
+def links(agents=5, seed=None):
+    rng = np.random.default_rng(seed or 0)
+    return [
+        link(i, j, rng.standard_normal(3) * SIGMA if seed is not None else None)
+        for i, j in itertools.combinations(range(agents), 2)
+    ]
+
+
+def claim(agent, sigma=0.5):
+    x, y, yaw = PLACES[agent]
+    return PoseClaim.of(Transform.from_xyz_yaw(x, y, 0.0, yaw), sigma, 0.01)
+
+
+def test_exact_links_give_exact_poses_however_listed():
+    all_ = links()
+    for listed in (all_, all_[::-1]):
+        found = settle(0, listed, {})
+        assert not found.refused and not found.isolated
+        for agent, place in PLACES.items():
+            np.testing.assert_allclose(difference(found.pose[agent], np.array(place)), 0, atol=1e-9)
+
+
+def test_going_round_is_measured_from_any_link_and_in_any_direction():
+    one, two, three = link(0, 1, np.array([0.5, 0.0, 0.0])), link(1, 2), link(0, 2)
+    lengths = [cycle_distance(*order) for order in itertools.permutations((one, two, three))]
+    assert max(lengths) == pytest.approx(min(lengths), rel=0.05) and min(lengths) > 1.0
+    assert cycle_distance(link(0, 1), link(1, 2), link(0, 2)) == pytest.approx(0.0, abs=1e-18)
+
+
+def test_many_agents_are_surer_than_the_best_link():
+    found = settle(0, links(seed=3), {})
+    for agent in range(1, 5):
+        assert found.covariance[agent][0, 0] < SIGMA[0] ** 2
+        error = difference(found.pose[agent], np.array(PLACES[agent], float))
+        assert error @ np.linalg.solve(found.covariance[agent], error) < 16.3
+
+
+def test_one_lying_link_is_refused_and_the_rest_keep():
+    listed = [n for n in links(seed=1) if (n.i, n.j) != (1, 3)] + [link(1, 3, np.array([4.0, 0.0, 0.0]))]
+    found = settle(0, listed, {})
+    assert [(n.i, n.j) for n in found.refused] == [(1, 3)]
+    np.testing.assert_allclose(found.pose[3][:2], PLACES[3][:2], atol=0.5)
+
+
+def test_a_colluding_pair_is_isolated_by_those_who_agree():
+    listed = [n for n in links(seed=2) if 4 not in (n.i, n.j)]
+    # Agent 4's links each say another place.
+    listed += [link(i, 4, np.array([3.0 * i + 3.0, -5.0 * (i % 2), 0.3 * i])) for i in range(4)]
+    found = settle(0, listed, {})
+    assert found.isolated == (4,) and {(n.i, n.j) for n in found.refused} == {(i, 4) for i in range(4)}
+    assert 4 not in found.pose
+
+
+@pytest.mark.parametrize("liar", [(0, 1), (0, 2), (1, 2)])
+def test_in_a_single_triangle_claims_tell_which_link_lies(liar):
+    listed = [link(i, j, np.array([3.0, 0.0, 0.1]) if (i, j) == liar else None) for i, j in ((0, 1), (0, 2), (1, 2))]
+    found = settle(0, listed, {1: claim(1), 2: claim(2)})
+    assert [(n.i, n.j) for n in found.refused] == [liar]
+    for agent in (1, 2):
+        np.testing.assert_allclose(difference(found.pose[agent], np.array(PLACES[agent], float)), 0, atol=0.05)
+
+
+def test_claims_place_whom_no_link_reaches_and_weigh_little_where_links_do():
+    found = settle(0, [link(0, 1)], {1: claim(1, 5.0), 2: claim(2)})
+    np.testing.assert_allclose(found.pose[2], PLACES[2], atol=1e-9)
+    assert found.covariance[1][0, 0] == pytest.approx(1 / (1 / 0.1**2 + 1 / 5.0**2), rel=1e-3)
+    assert set(settle(0, [link(1, 2)], {}).pose) == {0}
+    assert set(settle(0, [link(1, 2)], {1: claim(1)}).pose) == {0, 1, 2}
+
+
+def test_two_agents_have_no_cycle_to_fail():
+    kept, refused = consistent([link(0, 1, np.array([50.0, 0, 0]))], 16.3)
+    assert len(kept) == 1 and not refused
+
+
+def test_gtsam_finds_the_same_poses():
+    gtsam = pytest.importorskip("gtsam", reason="gtsam is a test oracle only")
+    listed = links(seed=5)
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(0, 0, 0), gtsam.noiseModel.Constrained.All(3)))
+    for n in listed:
+        c, s = math.cos(n.pose[2]), math.sin(n.pose[2])
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        model = gtsam.noiseModel.Gaussian.Covariance(turn @ n.covariance @ turn.T + 1e-8 * np.eye(3))
+        graph.add(gtsam.BetweenFactorPose2(n.i, n.j, gtsam.Pose2(*n.pose), model))
+    for a, p in PLACES.items():
+        start.insert(a, gtsam.Pose2(*map(float, p)))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+    ours = settle(0, listed, {}, huber=1e6)
+    for a in PLACES:
+        there = found.atPose2(a)
+        np.testing.assert_allclose(
+            difference(ours.pose[a], np.array([there.x(), there.y(), there.theta()])), 0, atol=1e-6
+        )
+
+
+def test_a_link_to_itself_is_refused():
+    with pytest.raises(ConfigError, match="joins two agents"):
+        Link(1, 1, np.zeros(3), np.eye(3))

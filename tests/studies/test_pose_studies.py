@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The studies of claimed poses on a small recording: AP before and after correction, and the poses themselves."""
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from PIL import Image
+
+from manyeyes.agents.perception_cache import Eyes
+from manyeyes.cli import main as cli
+from manyeyes.datasets.opv2v import Opv2vWriter
+from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.models import checkpoint
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.models.pose.box_descriptors import BoxKeypoints
+from manyeyes.models.pose.feakm import FORMAT, FeakmConfig, FeakmNet
+from manyeyes.models.pose.matcher import MatcherConfig
+from manyeyes.studies.detection.perturbations import Disturbance
+from manyeyes.studies.pose import feakm
+from manyeyes.studies.pose import pose_estimation as pose_accuracy
+from manyeyes.studies.pose import pose_noise_ap as pose
+
+PLACES = torch.tensor(
+    [
+        (8, 5, 0.4),
+        (20, -6, 1.5),
+        (-9, 4, 0.1),
+        (14, 8, -0.3),
+        (14, 16, 2.2),
+        (2, -14, 0.9),
+        (12, -18, -1.0),
+        (-4, 15, 0.2),
+    ]
+).double()
+POSES = {5: Transform.from_xyz_yaw(0, 0, 0, 0.1), -1: Transform.from_xyz_yaw(15, 4, 0, 3.0)}
+
+
+def cars() -> Boxes:
+    n = len(PLACES)
+    center = torch.cat((PLACES[:, :2], torch.full((n, 1), 0.8).double()), 1)
+    size = torch.tensor([[4.5, 1.9, 1.6]]).double().repeat(n, 1)
+    return Boxes.of(center, size, PLACES[:, 2].clone(), id=torch.arange(n) + 100)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data")
+    for name in ("a", "b"):
+        writer = Opv2vWriter(root / "data" / "test" / name)
+        for index in range(3):
+            ground = torch.rand(150, 3, generator=torch.Generator().manual_seed(index)) * torch.tensor(
+                [30.0, 30.0, 0.02]
+            )
+            cloud = PointCloud.of(ground - torch.tensor([15.0, 15.0, 0.0]), torch.full((150,), 0.5))
+            frames = tuple(
+                AgentFrame(i, index * 100_000_000, cloud, p, torch.zeros(3, 3), is_infrastructure=i < 0)
+                for i, p in POSES.items()
+            )
+            truth = Truth(cars(), torch.ones(2, len(PLACES), dtype=torch.bool), Transform.stack(list(POSES.values())))
+            writer.write(Snapshot(name, index, frames, truth))
+        writer.close({"history_frames": 1})
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        checkpoint.save(Detector(COSTR_TINY), root / "untrained.safetensors", {})
+    return root
+
+
+def evaluate(data, out, study, *words):
+    common = ("--data", data / "data", "--split", "test", "--weights", data / "untrained.safetensors", "--workers", 1)
+    assert cli.main([str(w) for w in ("evaluate", *common, "--out", out, "--study", study, *words)]) == 0
+    with Image.open(out / f"{study}.png") as picture:
+        assert picture.width > 400
+    return json.loads((out / f"{study}.json").read_text())["result"]
+
+
+def test_every_corrector_before_every_fusion_under_the_levels_asked_for(data, tmp_path) -> None:
+    words = ("--methods", "alone", "intermediate", "--every", 2, "--disturbances", "2°, 2 m", "0.8 m")
+    held = evaluate(data, tmp_path, "pose", *words)
+    assert [(r["corrector"], r["method"]) for r in held["rows"][::3]] == [
+        ("given", "intermediate"),
+        ("vote", "intermediate"),
+    ]
+    assert held["frames"] == {"0 to 3": 0, "4 to 7": 0, "8 and more": 2}
+    assert all(len(r["by_common"]) == 3 and r["over_alone"] for r in held["rows"])
+    said = [c["what"] for c in held["claims"]]
+    assert said[:3] == [
+        "vote, perfect: corrected - true claims",
+        "vote, 0.8 m: corrected - true claims",
+        "vote, 2°, 2 m, 8 and more in common: corrected - true claims",
+    ]
+    assert said[3].startswith("vote, worst level (") and said[3].endswith("8 and more in common: corrected - alone")
+    assert [c["bar"] for c in held["claims"]] == [-0.002, -0.044, -0.01, 0.0]
+    assert {name: len(at5) for name, at5, _ in held["paper"]["rows"]}["FeaKM, 4 pairs"] == 11
+
+
+def test_the_levels_are_feakms_columns() -> None:
+    assert len(pose.LEVELS) == 11 and all(len(ap) == 11 for _, *aps in pose.PAPER_AP for ap in aps)
+    assert pose.LEVELS[1] == Disturbance(heading_deg=0.2) and pose.LEVELS[-1].name == "2°, 2 m"
+    assert [c.x for p in pose.panels(()) for c in p.curves] == []
+
+
+def test_rival_fusions_are_rows_by_the_claims_as_they_are(data, tmp_path) -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        rival = Detector(replace(COSTR_TINY, fusion="v2x_vit"))
+        checkpoint.save(rival, data / "rival.safetensors", {})
+    words = ("--methods", "intermediate", "--every", 2, "--correctors", "given", "--disturbances", "2°, 2 m")
+    held = evaluate(data, tmp_path, "pose", *words, "--branches", f"V2X-ViT={data / 'rival.safetensors'}")
+    assert [(r["corrector"], r["method"]) for r in held["rows"]] == 2 * [("given", "intermediate")] + 2 * [
+        ("given", "V2X-ViT")
+    ]
+    assert held["rows"][2]["lost"][0]["value"] == 0.0
+    assert "| given" in (tmp_path / "pose.md").read_text() and "V2X-ViT" in (tmp_path / "pose.md").read_text()
+
+
+def net_file(data, name: str, detector: str = "", most: int = 64) -> str:
+    """An untrained net of FeaKM, for the untrained detector."""
+    torch.manual_seed(0)
+    channels = COSTR_TINY.encoder.channels[2]
+    config = FeakmConfig(BoxKeypoints(channels, 32, 8, score_min=0.0, most=most), MatcherConfig(32, 8, 1, 1), detector)
+    checkpoint.save(FeakmNet(config), data / name, {}, format=FORMAT)
+    return str(data / name)
+
+
+def test_the_ablation_of_feakm_has_a_row_a_branch_and_level_and_keeps_it(data, tmp_path, monkeypatch) -> None:
+    one, two = net_file(data, "one.safetensors"), net_file(data, "two.safetensors", most=3)
+    detector = data / "untrained.safetensors"
+    words = ("--every", 2, "--branches", f"map={detector},{one}", f"three points={detector},{two}@8")
+    held = evaluate(data, tmp_path, "feakm", *words)
+    assert [(r["branch"], r["sigma"]) for r in held["rows"]] == [
+        (name, sigma) for name in ("map", "three points") for sigma in (0.0, 0.4, 0.8, 1.2)
+    ]
+    assert all(len(r["ap"]) == 2 and r["frames"] == r["asked"] == 2 for r in held["rows"])
+    assert held["rows"][4]["answered"] == 0.0 and held["paper"]["rows"][3][1] == 0.768
+    monkeypatch.setattr(feakm, "ablation", None)
+    assert evaluate(data, tmp_path, "feakm", *words)["rows"] == held["rows"]
+
+
+def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path) -> None:
+    net = net_file(data, "few.safetensors", most=5)
+    asked = ("--every", 2, "--disturbances", "perfect", "--correctors", "given", net, f"{net}@8")
+    words = ("--methods", "intermediate", *asked)
+    held = evaluate(data, tmp_path, "pose", *words)
+    plain, four, eight = (r["bytes_per_message"] for r in held["rows"])
+    # Five objects with a descriptor each; a section's own bytes and a packet more may come with them.
+    assert 5 * 45 <= four - plain <= 5 * 49 + 100 and four == eight
+    with torch.random.fork_rng():
+        wrong = net_file(data, "wrong.safetensors", detector="ab" * 8)
+    common = ("--data", data / "data", "--split", "test", "--weights", data / "untrained.safetensors", "--workers", 1)
+    assert cli.main([str(w) for w in ("evaluate", *common, "--out", tmp_path, "--align", wrong)]) == 1
+
+
+def test_poses_are_judged_by_error_and_by_common_objects_and_kept(data, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(pose_accuracy, "SIGMAS", (0.0, 0.8))
+    monkeypatch.setattr(pose_accuracy, "FAMILIES", (("offset", 0.5), ("none", 0.0)))
+    calls = []
+
+    def see(self, frame):
+        calls.append(frame.agent_id)
+        return SimpleNamespace(boxes=cars().transform(POSES[frame.agent_id].inverse()).to(torch.float32))
+
+    monkeypatch.setattr(Eyes, "see", see)
+    held = evaluate(data, tmp_path, "pose-accuracy", "--correctors", "given", "vote", "coalign")
+    rows = {(r["trial"]["corrector"], r["trial"]["noise"]["kind"], r["trial"]["noise"]["sigma_m"]): r
+            for r in held["rows"] if r["common"] is None}  # fmt: skip
+    assert len(rows) == 3 * 2 + 2 * 2 and calls
+    assert rows["vote", "gaussian", 0.8]["score"]["success"] == [1.0, 1.0, 1.0]
+    assert (
+        rows["vote", "gaussian", 0.8]["score"]["displacement"] < rows["given", "gaussian", 0.8]["score"]["displacement"]
+    )
+    assert (
+        rows["vote", "none", 0.0]["score"]["coverage"] == 1.0 and rows["given", "none", 0.0]["score"]["coverage"] == 0.0
+    )
+    # Off by 2.5 m where 0.5 m is stated, eight objects in common: each is contradicted, none of the honest is.
+    assert rows["vote", "offset", 0.5]["score"]["conflicts"] == 1.0
+    assert rows["vote", "gaussian", 0.8]["score"]["conflicts"] == 0.0
+    conflict = list(map(list, rows["vote", "offset", 0.5]["confusion"]))[2]
+    assert conflict == [0, 0, 4, 0, 0]
+    assert {r["common"][0] for r in held["rows"] if r["common"]} == {8}
+    assert all(100 < r["bytes"] < 400 and len(r["risk"]) == 20 for r in held["rows"])
+    calls.clear()
+    again = evaluate(data, tmp_path, "pose-accuracy", "--correctors", "given", "vote", "coalign")
+    assert not calls and again["rows"] == held["rows"]
+    assert not math.isnan(rows["vote", "gaussian", 0.8]["score"]["displacement"])

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands beside every number."""
+
+import json
+import math
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from manyeyes.studies import provenance
+from manyeyes.studies.provenance import git_commit, plain, write_json
+
+
+@dataclass(frozen=True)
+class Settings:
+    folder: Path = Path("a/b")
+    widths: tuple[int, ...] = (1, 2)
+    share: float = math.inf
+
+
+def test_the_file_holds_configuration_seed_versions_commit_and_result(tmp_path) -> None:
+    path = tmp_path / "new" / "result.json"
+    write_json(path, {"ap": np.float64(0.5), "curve": torch.tensor([1.0, math.nan])}, Settings(), 7)
+    held = json.loads(path.read_text())
+    origin = held["provenance"]
+    assert held["result"] == {"ap": 0.5, "curve": [1.0, None]}
+    assert set(origin) == {"command", "config", "seed", "versions", "git_commit", "machine", "written"}
+    assert origin["config"] == {"folder": "a/b", "widths": [1, 2], "share": None} and origin["seed"] == 7
+    assert origin["versions"]["torch"] == torch.__version__ and origin["versions"]["python"].startswith("3.")
+    assert [p.name for p in path.parent.iterdir()] == ["result.json"]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path) -> None:
+    path = tmp_path / "result.json"
+    write_json(path, 1, None, 0)
+
+    class Bad:
+        def __str__(self) -> str:
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write_json(path, Bad(), None, 0)
+    assert json.loads(path.read_text())["result"] == 1
+
+
+def git(folder: Path, *words: str) -> str:
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "core.hooksPath=/dev/null"]
+    return subprocess.run(
+        ["git", "-C", str(folder), *identity, *words], check=True, capture_output=True, text=True
+    ).stdout
+
+
+def test_the_commit_is_that_of_the_package_and_says_when_files_differ(tmp_path, monkeypatch) -> None:
+    if shutil.which("git") is None:
+        pytest.skip("git is not installed")
+    package = tmp_path / "manyeyes"
+    (package / "apps").mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (package / "apps" / "provenance.py").write_text("")
+    monkeypatch.setattr(provenance, "__file__", str(package / "apps" / "provenance.py"))
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "commit", "-q", "--allow-empty", "-m", "somebody else's")
+    assert git_commit() is None
+    git(tmp_path, "add", "manyeyes")
+    git(tmp_path, "commit", "-q", "-m", "ours")
+    commit = git(tmp_path, "rev-parse", "HEAD").strip()
+    assert git_commit() == commit
+    (package / "__init__.py").write_text("changed = True")
+    assert git_commit() == commit + "+changes"
+
+
+def test_plain_keeps_what_json_has_and_names_the_rest() -> None:
+    assert plain((None, True, 3, "x", 1.5, [Path("p")])) == [None, True, 3, "x", 1.5, ["p"]]
+    assert plain({1: -math.inf}) == {"1": None}

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every study from end to end on a small recording, with weights that were never trained: what is written, kept and refused."""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from manyeyes.cli import main as cli
+from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.evaluation.detection import benchmark
+from manyeyes.evaluation.detection.accumulator import Tally
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, run_scenario
+from manyeyes.models import checkpoint
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.studies import running
+from manyeyes.studies.detection import robustness
+from manyeyes.studies.detection.perturbations import HARD, PERFECT, Disturbance, chosen
+from manyeyes.viz.curves import Panel
+
+HALF = torch.tensor([2.3, 0.95, 0.8])
+
+
+def crossing(scenario: str, index: int, agents: int) -> Snapshot:
+    """Agents on a line see the ground, a parked car and one that drives at 10 m/s."""
+    rng = torch.Generator().manual_seed(index)
+    poses = [Transform.from_xyz_yaw(12.0 * k + (1.0 - k) * index, 0.5 * k, 0, 0.1 * k) for k in range(agents)]
+    cars = [Transform.from_xyz_yaw(8, 5, 0, 0.4), Transform.from_xyz_yaw(4 + index, -5, 0, 0.0)]
+    frames = []
+    for k, pose in enumerate(poses):
+        ground = (torch.rand(200, 3, generator=rng) - 0.5) * torch.tensor([50.0, 50.0, 0.02])
+        parts = [ground]
+        for car in cars:
+            body = (torch.rand(100, 3, generator=rng) * 2 - 1) * HALF + torch.tensor([0.0, 0.0, 0.8])
+            parts.append((pose.inverse() @ car).apply(body))
+        xyz = torch.cat(parts)
+        cloud = PointCloud.of(xyz, torch.full((len(xyz),), 0.5))
+        frames.append(AgentFrame(5 + k, index * 100_000_000, cloud, pose, torch.zeros(3, 3)))
+    center = torch.tensor([[8, 5, 0.8], [4 + index, -5, 0.8]], dtype=torch.float64)
+    yaw, velocity = torch.tensor([0.4, 0.0]).double(), torch.tensor([[0.0, 0.0], [10.0, 0.0]]).double()
+    boxes = Boxes.of(center, (2 * HALF).double().expand(2, 3), yaw, id=torch.tensor([90, 91]), velocity=velocity)
+    seen = torch.ones(agents, 2, dtype=torch.bool)
+    return Snapshot(scenario, index, tuple(frames), Truth(boxes, seen, Transform.stack(poses)))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("data")
+    for name, agents in (("a", 2), ("b", 3)):
+        writer = Opv2vWriter(root / "test" / name)
+        for index in range(6):
+            snapshot = crossing(name, index, agents)
+            writer.write(snapshot, snapshot.truth.boxes.velocity.norm(dim=1))
+        writer.close({"history_frames": 4})
+    return root
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "untrained.safetensors"
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        checkpoint.save(Detector(COSTR_TINY), path, {"steps": 7, "seed": 3, "command": "manyeyes train"})
+    return path
+
+
+@pytest.fixture
+def panels(monkeypatch) -> list[Panel]:
+    """What is to be drawn, instead of drawing it."""
+    last: list[Panel] = []
+
+    def keep(drawn: list[Panel], path: Path) -> None:
+        last[:] = drawn
+        Image.new("RGB", (500, 10)).save(path)
+
+    monkeypatch.setattr(running, "save_curves", keep)
+    return last
+
+
+def evaluate(data: Path, weights: Path, out: Path, study: str, *words: object) -> dict:
+    """The JSON that a study wrote."""
+    common = ("--data", data, "--split", "test", "--weights", weights, "--workers", 1, "--out", out, "--study", study)
+    assert cli.main([str(word) for word in ("evaluate", *common, *words)]) == 0
+    with Image.open(out / f"{study}.png") as picture:
+        assert picture.width > 400
+    assert (out / f"{study}.md").read_text().startswith(f"# {study}\n")
+    return json.loads((out / f"{study}.json").read_text())
+
+
+@pytest.fixture
+def few(monkeypatch) -> tuple:
+    """Six of the disturbances."""
+    assert len({d.name for d in robustness.ALL}) == len(robustness.ALL) == 21
+    delay, position, lost = robustness.DELAYS[-1], robustness.POSITIONS[-1], robustness.LOSSES[-1]
+    kept = (robustness.PERFECT, robustness.DELAYS[0], delay, position, lost, list(robustness.ORACLES)[3])
+    monkeypatch.setattr(robustness, "ALL", kept)
+    return kept
+
+
+def test_robustness_has_a_row_a_disturbance_and_method(data, weights, tmp_path, few, panels) -> None:
+    held = evaluate(data, weights, tmp_path, "robustness", "--methods", "alone", "late", "intermediate", "--every", 2)
+    rows, origin = held["result"]["rows"], held["provenance"]
+    assert {"command", "seed", "versions", "git_commit", "config"} <= set(origin)
+    assert len(rows) == 1 + 2 * len(few)
+    late = [r for r in rows if r["method"] == "late"]
+    assert [r["oracle"] for r in late] == ["", "true poses", "", "", "", "no delay"]
+    # A message that is d old when it comes is d old when it is used; frame 4 alone is judged.
+    assert [late[k]["age_ms"] for k in (0, 1, 2, 3)] == pytest.approx([0, 100, 400, 0])
+    assert [len(r["by_speed"]) for r in late] == [3, 3, 3, 0, 0, 0]
+    # One car stands, one drives at 10 m/s, none is slower: that class has no AP.
+    assert [speed["value"] is None for speed in late[0]["by_speed"]] == [False, True, False]
+    assert late[0]["lost"][0]["value"] == 0 and late[0]["bytes_per_message"] > 0
+    assert [r["paper"] for r in rows if r["method"] == "intermediate"][:3] == [0.946, 0.937, 0.909]
+    claims = held["result"]["claims"]
+    assert sum("intermediate - late" in c["what"] for c in claims) == 2 * len(few)
+    assert [c["bar"] for c in claims[-3:]] == [-0.037, -0.044, -0.03]
+    assert [p.title for p in panels] == ["Delay", "Heading", "Position", "Lost packets", "Together"]
+    assert {c.label: c.x for c in panels[0].curves} == {
+        "alone": (),
+        "late": (0, 0.1, 0.4),
+        "intermediate": (0, 0.1, 0.4),
+    }
+
+
+def test_disturbances_are_played_by_name(data, weights, tmp_path, panels) -> None:
+    words = ("--methods", "late", "intermediate", "--every", 2, "--disturbances", "0.4 s")
+    held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
+    assert [r["disturbance"]["delay_s"] for r in held["rows"]] == [0, 0, 0.4, 0.4]
+    assert "intermediate, 0.4 s - perfect" in {c["what"] for c in held["claims"]}
+    text = (tmp_path / "robustness.md").read_text()
+    assert "## Delay" in text and "## Position" not in text
+    with pytest.raises(ConfigError, match=r"No disturbance '4 s'; choose from perfect, 0.1 s"):
+        chosen(["4 s"], robustness.ALL)
+
+
+def test_rival_fusions_are_held_against_ours_under_each_disturbance(data, weights, tmp_path, panels, capsys) -> None:
+    words = ("--methods", "intermediate", "--every", 2, "--disturbances", "0.4 s", "--branches", f"same={weights}")
+    held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
+    assert [(r["method"], r["disturbance"]["delay_s"]) for r in held["rows"]] == [
+        ("intermediate", 0), ("same", 0), ("intermediate", 0.4), ("same", 0.4),
+    ]  # fmt: skip
+    # A rival of the same weights is as good, and loses as much.
+    for ours, same in (held["rows"][:2], held["rows"][2:]):
+        assert ours["ap"] == same["ap"] and ours["lost"] == same["lost"]
+    against = [c for c in held["claims"] if "intermediate - same" in c["what"]]
+    assert len(against) == 4 and all(c["difference"]["value"] == 0 for c in against)
+    common = ("evaluate", "--data", data, "--split", "test", "--weights", weights, "--study", "robustness")
+    assert cli.main([str(word) for word in (*common, "--out", tmp_path / "b", "--branches", f"late={weights}")]) != 0
+    assert "methods of the names late" in capsys.readouterr().err and not (tmp_path / "b").exists()
+
+
+def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(
+    data, weights, tmp_path, monkeypatch, few, panels
+) -> None:
+    monkeypatch.setattr(robustness, "ALL", few[:4])
+    words = ("--methods", "alone", "late", "--every", 2)
+    first = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
+    cells = sorted((tmp_path / "cells").iterdir())
+    assert len(cells) == 1 + 4
+    cells[2].unlink()
+    cells[4].write_bytes(cells[4].read_bytes()[:100])
+    played: list[object] = []
+    plain = benchmark.run_scenario
+    monkeypatch.setattr(benchmark, "run_scenario", lambda *job: [played.extend(job[1]), plain(*job)][1])
+    assert evaluate(data, weights, tmp_path, "robustness", *words)["result"] == first
+    assert len(played) == 2 * 2
+    assert sorted((tmp_path / "cells").iterdir()) == cells
+    played.clear()
+    assert evaluate(data, weights, tmp_path, "robustness", *words)["result"] == first
+    assert played == []
+
+
+def test_budgets_are_kept_and_small_ones_say_less(data, weights, tmp_path) -> None:
+    words = ("--methods", "alone", "late", "--selectors", "intermediate", "--precisions", "float16", "int8")
+    held = evaluate(data, weights, tmp_path, "budget", *words, "--budgets", 1398, 4096, "--every", 2)["result"]
+    rows = held["rows"]
+    assert [(r["precision"], r["budget_bytes"]) for r in rows] == [
+        (p, b) for p in ("float16", "int8") for b in (1398, 4096, None)
+    ]
+    for row in rows:
+        assert row["budget_bytes"] is None or 0 < row["largest"] <= row["budget_bytes"]
+        assert row["bytes_per_message"] <= row["largest"] and row["fewer"] > 1
+    assert rows[0]["bytes_per_message"] <= rows[1]["bytes_per_message"] <= rows[2]["bytes_per_message"]
+    assert {r["selector"] for r in held["beside"]} == {"alone", "late"}
+
+
+def test_agents_are_judged_on_the_scenarios_that_have_them(data, weights, tmp_path, panels) -> None:
+    words = ("--methods", "alone", "late", "--every", 2)
+    rows = evaluate(data, weights, tmp_path, "agents", *words)["result"]["rows"]
+    assert [(r["agents"], r["method"], r["scenarios"]) for r in rows] == [
+        (1, "alone", 2), (1, "late", 2), (2, "late", 2), (3, "late", 1),
+    ]  # fmt: skip
+    assert rows[1]["bytes_per_message"] == 0 < rows[2]["bytes_per_message"]
+    assert rows[1]["over_alone"]["value"] == 0 and rows[2]["over_one_fewer"]["scenarios"] == 2
+    assert rows[3]["over_alone"]["scenarios"] == 1
+    assert [(p.ylabel, c.label, c.x) for p in panels for c in p.curves] == [
+        ("AP@0.5", "late", (1, 2, 3)), ("AP@0.5 over ego alone", "late", (1, 2, 3)),
+    ]  # fmt: skip
+
+
+def test_ablation_shows_each_branch_with_its_card(data, weights, tmp_path, panels) -> None:
+    words = ("--every", 2, "--branches", f"first={weights}", f"again={weights}")
+    rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
+    assert [r["branch"] for r in rows] == ["first", "again"] and rows[0]["card"]["steps"] == 7
+    assert [d["value"] for d in rows[1]["over_last"]] == [0, 0, 0] and rows[0]["over_last"] == []
+    assert rows[0]["bytes_per_message"] > 0 and "| first" in (tmp_path / "ablation.md").read_text()
+    assert [p.ticks for p in panels] == 2 * [("first", "again")] and len(panels[0].curves) == 3
+
+
+def test_a_branch_of_the_ablation_may_have_a_budget(data, weights, tmp_path, panels, capsys) -> None:
+    words = ("--every", 2, "--branches", f"all={weights}", f"masked={weights}@1398")
+    rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
+    assert 0 < rows[1]["bytes_per_message"] <= 1398 < rows[0]["bytes_per_message"]
+    for wrong in ("0", "many", "-5"):
+        words = ("--data", data, "--split", "test", "--study", "ablation", "--branches", f"masked={weights}@{wrong}")
+        assert cli.main([str(word) for word in ("evaluate", *words)]) == 1
+        assert "behind @ stands a number of bytes" in capsys.readouterr().err
+
+
+def test_in_the_system_everybody_is_ego_and_the_channel_has_one_budget(data, weights, tmp_path, panels) -> None:
+    words = ("--methods", "alone", "--selectors", "intermediate", "--budgets", 6000, "--every", 2)
+    rows = evaluate(data, weights, tmp_path, "system", *words)["result"]["rows"]
+    bound, alone = rows
+    assert (bound["budget_bytes"], alone["budget_bytes"], alone["method"]) == (6000, None, "alone")
+    assert 0 < bound["instant_bytes"] <= bound["most"] <= 6000
+    assert bound["ego_frames"] == alone["ego_frames"] == 2 + 3
+    assert {c.label: len(c.x) for c in panels[0].curves} == {"intermediate": 1, "alone": 0}
+
+
+def test_the_picture_is_of_one_frame_with_the_most_agents(data, weights, tmp_path) -> None:
+    held = evaluate(data, weights, tmp_path, "picture")["result"]
+    assert (held["scenario"], held["frame"]) == ("b", 5)
+    assert [r["method"] for r in held["rows"]] == ["alone", "late", "intermediate", "early"]
+    assert all(r["true"] == 2 for r in held["rows"])
+
+
+def scores(tallies: list[Tally]) -> list[list[float]]:
+    """What each method found."""
+    return [[x for frame in tally.frames for x in frame.score.tolist()] for tally in tallies]
+
+
+def test_conditions_side_by_side_are_as_each_by_itself(data, weights) -> None:
+    opener = partial(Opv2vRecording, data, "test")
+    base = BenchmarkConfig(str(weights), ("late", "early"))
+    configs = [disturbance.on(base) for disturbance in (PERFECT, HARD, Disturbance(delay_s=0.1))]
+    together = [scores(tallies) for tallies in run_scenario(opener, configs, "b")]
+    apart = [scores(run_scenario(opener, [config], "b")[0]) for config in configs]
+    assert together == apart and together[0] != together[1] != together[2]
+
+
+def test_ego_alone_is_the_same_under_every_disturbance(data, weights) -> None:
+    base = BenchmarkConfig(str(weights), ("alone",))
+    calm, rough = run_scenario(partial(Opv2vRecording, data, "test"), [PERFECT.on(base), HARD.on(base)], "b")
+    assert scores(calm) == scores(rough) and len(scores(calm)[0]) > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--study", "moon"), ("moon", "robustness")),
+        (("--study", "budget", "--precisions", "moon"), ("moon", "float16")),
+        (("--study", "budget", "--selectors", "moon"), ("moon", "intermediate")),
+        (("--study", "ablation"), ("name=weights.safetensors",)),
+        (("--study", "ablation", "--branches", "a=x", "a=y"), ("each name once",)),
+        (("--study", "robustness", "--noise-xy-m", 0.2), ("--noise-xy-m",)),
+        (("--study", "agents", "--every", 0), ("at least 1",)),
+    ],
+)
+def test_what_is_wrong_is_one_line_before_any_work(data, weights, tmp_path, capsys, words, named) -> None:
+    common = ("--data", data, "--split", "test", "--weights", weights, "--out", tmp_path / "out")
+    assert cli.main([str(word) for word in ("evaluate", *common, *words)]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1 and all(name in said[0] for name in named)
+    assert not (tmp_path / "out").exists()

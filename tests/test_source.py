@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The key of a kept result follows the code that computed it: every statement of every file, and no comment or docstring."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from manyeyes._source import PACKAGE, import_closure, source_digest
+
+ROOTS = {
+    "detection": ("manyeyes.evaluation.detection.benchmark",),
+    "map fusion": ("manyeyes.evaluation.maps.map_cells", "manyeyes.maps.baselines.union"),
+}
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    to = tmp_path_factory.mktemp("copy") / "manyeyes"
+    shutil.copytree(PACKAGE, to, ignore=shutil.ignore_patterns("__pycache__", "*.safetensors", "vendor"))
+    return to
+
+
+@pytest.mark.parametrize("roots", ROOTS.values(), ids=ROOTS)
+def test_a_statement_in_any_file_of_the_closure_changes_the_key_and_a_docstring_does_not(copy: Path, roots) -> None:
+    before, closure = source_digest(*roots, package=copy), import_closure(*roots, package=copy)
+    assert before == source_digest(*roots)
+    assert len(closure) > 40
+    for file in closure:
+        text = file.read_text()
+        source_digest.cache_clear()
+        file.write_text('"""Another docstring."""\n' + text.replace('"""', '"""Changed. ', 1) + "\n# a comment\n")
+        if "from __future__" not in text.split("\n", 3)[-1][:0]:
+            file.write_text(text.replace('"""', '"""Changed. ', 1) + "\n\n# a comment\n")
+        assert source_digest(*roots, package=copy) == before, file
+        source_digest.cache_clear()
+        file.write_text(text + "\nANOTHER_STATEMENT = 1\n")
+        assert source_digest(*roots, package=copy) != before, file
+        file.write_text(text)
+    source_digest.cache_clear()
+
+
+def test_files_that_a_hand_kept_list_missed_are_in_the_closure() -> None:
+    names = {path.relative_to(PACKAGE).as_posix() for path in import_closure("manyeyes.evaluation.maps.map_cells")}
+    assert {"ops/keyed_random.py", "datatypes/map_element.py", "maps/formats/opendrive.py"} <= names
+
+
+def test_a_module_that_is_not_there_is_an_error() -> None:
+    with pytest.raises(ValueError, match=r"no module manyeyes\.moon"):
+        import_closure("manyeyes.moon")

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map page as text, and as headless Chromium draws it."""
+
+import base64
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
+from manyeyes.evaluation.maps.map_discrepancy import Disagreement
+from manyeyes.viz.map_page import MapPage, lonlat, render, save_map_page
+
+SURE, UNSURE, MISSED = (12, 44, 132), (215, 48, 31), (243, 132, 186)
+
+
+def made_page() -> MapPage:
+    """Two dividers 20 m apart, the upper one sure, the lower one not; a crossing that nobody fused."""
+    lines = [[(0, 10), (100, 10)], [(0, -10), (100, -10)]]
+    ring = [(48, -30), (52, -30), (52, 30), (48, 30)]
+    truth = MapElements.of([*lines, ring], [DIVIDER, DIVIDER, CROSSING])
+    return MapPage(
+        title="A <map> & its truth",
+        fused=MapElements.of(lines, DIVIDER, [1.0, 0.0]),
+        origin=(49.0, 8.4),
+        truth=truth,
+        observed=truth.transform(0, 1, 0),
+        disagreement=Disagreement(missed=[np.array([(48.0, -30.0), (48.0, 30.0)])]),
+        about=["</script><b>one</b>", "two"],
+        facts=[("Observations", "3")],
+    )
+
+
+def test_the_page_fetches_nothing() -> None:
+    page = render(made_page())
+    ours = page.replace(re.search(r"<script>/\*\*.*?</script>", page, re.S).group(0), "")
+    assert len(page) - len(ours) > 900_000, "MapLibre is inside"
+    assert not re.search(r"(src|href)=\"(?!data:)|@import|sourceMappingURL|url\((?!\"?data:)", ours)
+    assert "glyphs" not in ours and "A &lt;map&gt; &amp; its truth" in page
+
+
+def test_the_data_cannot_end_its_script_and_is_what_was_given() -> None:
+    page = render(made_page())
+    text = re.search(r'id="data">(.*?)</script>', page, re.S).group(1)
+    data = json.loads(text)
+    assert [len(data["layers"][n]["features"]) for n in ("truth", "observed", "fused", "disagreement")] == [3, 3, 2, 1]
+    fused = data["layers"]["fused"]["features"]
+    assert fused[0]["properties"] == {"kind": "divider", "score": 1.0, "about": "</script><b>one</b>"}
+    ring = data["layers"]["truth"]["features"][2]["geometry"]["coordinates"]
+    assert len(ring) == 5 and ring[0] == ring[-1]
+
+
+def test_north_is_up_east_is_right_and_a_metre_is_a_metre() -> None:
+    got = lonlat(np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]), (49.0, 8.4))
+    assert got[0] == pytest.approx([8.4, 49.0], abs=1e-12)
+    assert got[1] - got[0] == pytest.approx([100 / (111_319.49 * np.cos(np.radians(49)) * 1.001909), 0], abs=2e-7)
+    assert got[2] - got[0] == pytest.approx([0, 100 / 111_207], abs=2e-7)
+
+
+def test_a_map_without_anything_is_a_page(tmp_path) -> None:
+    save_map_page(MapPage("empty", MapElements.empty(), (0.0, 0.0)), tmp_path / "new" / "map.html")
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["map.html"]
+
+
+class Browser:
+    """Chromium's DevTools protocol over a pipe: enough to open a page, ask it and photograph it."""
+
+    def __init__(self, program: str, profile: str) -> None:
+        to_read, self.to = os.pipe()
+        self.back, from_write = os.pipe()
+        flags = "--headless --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars"
+        command = f'exec "$0" {flags} --window-size=1000,700 --user-data-dir="$1" --remote-debugging-pipe '
+        command += f"about:blank 3<&{to_read} 4>&{from_write}"
+        self.process = subprocess.Popen(
+            ["bash", "-c", command, program, profile],
+            pass_fds=(to_read, from_write),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        os.close(to_read)
+        os.close(from_write)
+        self.held, self.count, self.session = b"", 0, None
+
+    def ask(self, method: str, **params):
+        self.count += 1
+        message = {"id": self.count, "method": method, "params": params}
+        if self.session:
+            message["sessionId"] = self.session
+        os.write(self.to, json.dumps(message).encode() + b"\0")
+        while True:
+            while b"\0" not in self.held:
+                more = os.read(self.back, 1 << 16)
+                assert more, "Chromium went away"
+                self.held += more
+            text, self.held = self.held.split(b"\0", 1)
+            answer = json.loads(text)
+            if answer.get("id") == self.count:
+                return answer["result"]
+
+    def open(self, url: str) -> None:
+        target = self.ask("Target.createTarget", url=url)["targetId"]
+        self.session = self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        end = time.monotonic() + 40
+        while self.value("document.body && document.body.dataset.ready") is None:
+            assert time.monotonic() < end, "the map was never drawn"
+            time.sleep(0.1)
+
+    def value(self, expression: str):
+        return self.ask("Runtime.evaluate", expression=expression)["result"].get("value")
+
+    def photograph(self) -> np.ndarray:
+        shot = base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
+        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+
+    def close(self) -> None:
+        self.process.terminate()
+        self.process.wait(20)
+        os.close(self.to)
+        os.close(self.back)
+
+
+def count(pixels: np.ndarray, colour: tuple[int, int, int]) -> int:
+    return int((np.abs(pixels - colour).max(-1) < 12).sum())
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("no Chromium is installed: the page was checked as text only")
+    made = Browser(program, str(tmp_path_factory.mktemp("profile")))
+    yield made
+    made.close()
+
+
+def test_chromium_draws_the_layers_where_they_belong_and_toggles_them(browser, tmp_path) -> None:
+    save_map_page(made_page(), tmp_path / "map.html")
+    browser.open((tmp_path / "map.html").as_uri())
+    assert browser.value("document.body.dataset.error") is None
+    assert int(browser.value("document.body.dataset.ready")) >= 2
+    pixels = browser.photograph()[:, 300:]
+    assert count(pixels, SURE) > 500 and count(pixels, UNSURE) > 500 and count(pixels, MISSED) == 0
+    rows = {colour: np.argwhere(np.abs(pixels - colour).max(-1) < 12)[:, 0].mean() for colour in (SURE, UNSURE)}
+    assert rows[SURE] < rows[UNSURE], "north is up"
+    browser.value("document.querySelector('input[name=fused]').click()")
+    browser.value("document.querySelector('input[name=disagreement]').click()")
+    time.sleep(1.5)
+    pixels = browser.photograph()[:, 300:]
+    assert count(pixels, SURE) == 0 and count(pixels, MISSED) > 200
+    assert (
+        browser.value("performance.getEntriesByType('resource').filter((e) => !/^(blob|data):/.test(e.name)).length")
+        == 0
+    )
