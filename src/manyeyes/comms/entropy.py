@@ -13,11 +13,12 @@ whole numbers, so both sides agree on any machine). Then, row by row, the bytes 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, I32x2, I64x1, I64x2, U8x1, U8x2, njit
 from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import ConfigError
 
@@ -56,10 +57,35 @@ class CodeTables:
         return self.frequencies.shape[0]
 
 
+class _ByteTables(NamedTuple):
+    """:class:`CodeTables` for the loops: starts and frequencies (W, 256) int32, values (W, 4,096) uint8."""
+
+    starts: I32x2
+    frequencies: I32x2
+    values: U8x2
+
+    @classmethod
+    def of(cls, tables: CodeTables) -> _ByteTables:
+        """The arrays of the tables, not copied."""
+        return cls(tables.starts, np.asarray(tables.frequencies, np.int32), tables.values)
+
+
+class _BodyLimits(NamedTuple):
+    """Bytes of a message body: what it always holds, its maximum, its packet's header, and what is left of the budget.
+
+    remaining_bytes: for all bodies with their headers; negative without a budget.
+    """
+
+    fixed_bytes: int
+    capacity_bytes: int
+    header_bytes: int
+    remaining_bytes: int
+
+
 def pack_coded(key: NDArray[np.int64], rows: NDArray[np.uint8], shape: tuple[int, int], tables: CodeTables) -> bytes:
     """Ascending keys (n,) on a grid of shape (rows, columns), and their rows (n, W), as one stream."""
     symbols = np.empty((_room(key, rows), 2), np.int32)
-    count = _symbols(key, rows, shape[0], shape[1], tables.starts, tables.frequencies, symbols)
+    count = _symbols(key, rows, shape[0], shape[1], _ByteTables.of(tables), symbols)
     out = np.empty(2 * count + STATE_BYTES, np.uint8)
     used = _write(symbols[:count], out)
     return out[len(out) - used :].tobytes()
@@ -75,7 +101,7 @@ def unpack_coded(
     """The inverse of :func:`pack_coded` for count cells: keys (count,) and rows (count, W)."""
     key, rows = np.empty(count, np.int64), np.empty((count, tables.width), np.uint8)
     raw = np.frombuffer(data, np.uint8)
-    if not _read(raw, shape[0], shape[1], tables.starts, tables.frequencies, tables.values, key, rows):
+    if not _read(raw, shape[0], shape[1], _ByteTables.of(tables), key, rows):
         raise PacketError("garbage", f"{len(data)} bytes are not the stream of {count} cells and their rows.")
     return key, rows
 
@@ -91,14 +117,16 @@ def coded_counts(
     left: int,
 ) -> NDArray[np.int64]:
     """As ``codec.counts_in_room`` for coded tokens: how many of keys (N,) and rows (N, W), in the order given, each body takes."""
-    return _counts(
-        np.ascontiguousarray(key, np.int64), np.ascontiguousarray(rows), shape[0], shape[1],
-        tables.starts, tables.frequencies, fixed, capacity, header, left,
-    )  # fmt: skip
+    limits = _BodyLimits(fixed, capacity, header, left)
+    key, rows = np.ascontiguousarray(key, np.int64), np.ascontiguousarray(rows)
+    return _counts(key, rows, shape[0], shape[1], _ByteTables.of(tables), limits)
 
 
 @njit(cache=True)
-def _counts(key, rows, height, width, starts, frequencies, fixed, capacity, header, left):  # pragma: no cover
+def _counts(
+    key: I64x1, rows: U8x2, height: int, width: int, tables: _ByteTables, limits: _BodyLimits
+) -> I64x1:  # pragma: no cover
+    fixed, capacity, header, left = limits
     counts, bodies, at = np.empty(key.shape[0], np.int64), 0, 0
     top = 0
     for k in key:
@@ -111,7 +139,7 @@ def _counts(key, rows, height, width, starts, frequencies, fixed, capacity, head
         while low < high:
             middle = (low + high + 1) // 2
             order = np.argsort(key[at : at + middle]) + at
-            used = _symbols(key[order], rows[order], height, width, starts, frequencies, symbols)
+            used = _symbols(key[order], rows[order], height, width, tables, symbols)
             size = _size(symbols[:used])
             if size <= room:
                 low, taken = middle, size
@@ -128,7 +156,7 @@ def _counts(key, rows, height, width, starts, frequencies, fixed, capacity, head
 
 
 @njit(cache=True)
-def _context(named, at, row, column, height, width):  # pragma: no cover
+def _context(named: Boolx1, at: int, row: int, column: int, height: int, width: int) -> int:  # pragma: no cover
     """Which neighbours of a cell are named: left, above, above aside, two away."""
     left = column > 0 and named[at - 1]
     above = row > 0 and named[at - width]
@@ -140,7 +168,7 @@ def _context(named, at, row, column, height, width):  # pragma: no cover
 
 
 @njit(cache=True)
-def _prior(count, cells):  # pragma: no cover
+def _prior(count: int, cells: int) -> I64x2:  # pragma: no cover
     """Counts (contexts, 2) to begin with of cells that are not and that are named."""
     seen = np.ones((_CONTEXTS, 2), np.int64)
     seen[0, 0] = 2 * max(1, cells // max(1, count))
@@ -149,15 +177,18 @@ def _prior(count, cells):  # pragma: no cover
 
 
 @njit(cache=True)
-def _chance(seen, context):  # pragma: no cover
+def _chance(seen: I64x2, context: int) -> int:  # pragma: no cover
     """Frequency, 1 to 4,095, that a cell in this context is named."""
     chance = TOTAL * seen[context, 1] // (seen[context, 0] + seen[context, 1])
     return min(max(chance, 1), TOTAL - 1)
 
 
 @njit(cache=True)
-def _symbols(key, rows, height, width, starts, frequencies, out):  # pragma: no cover
+def _symbols(
+    key: I64x1, rows: U8x2, height: int, width: int, tables: _ByteTables, out: I32x2
+) -> int:  # pragma: no cover
     """Fills out with (start, frequency) of everything to be written; how many there are."""
+    starts, frequencies, _ = tables
     n, at = key.shape[0], 0
     if n == 0:
         return 0
@@ -187,7 +218,7 @@ def _symbols(key, rows, height, width, starts, frequencies, out):  # pragma: no 
 
 
 @njit(cache=True)
-def _size(symbols):  # pragma: no cover
+def _size(symbols: I32x2) -> int:  # pragma: no cover
     """Bytes that _write makes."""
     state, size = np.int64(_LOWEST), STATE_BYTES
     for i in range(symbols.shape[0] - 1, -1, -1):
@@ -200,7 +231,7 @@ def _size(symbols):  # pragma: no cover
 
 
 @njit(cache=True)
-def _write(symbols, out):  # pragma: no cover
+def _write(symbols: I32x2, out: U8x1) -> int:  # pragma: no cover
     """Fills the end of out, from back to front; how many bytes."""
     state, at = np.int64(_LOWEST), out.shape[0]
     for i in range(symbols.shape[0] - 1, -1, -1):
@@ -218,7 +249,7 @@ def _write(symbols, out):  # pragma: no cover
 
 
 @njit(cache=True)
-def _take(state, frequency, offset, raw, at):  # pragma: no cover
+def _take(state: int, frequency: int, offset: int, raw: U8x1, at: int) -> tuple[int, int]:  # pragma: no cover
     """State and place after a symbol; offset: how far the state lies above the symbol's start. Bytes beyond the end are 0."""
     state = frequency * (state >> TOTAL_BITS) + offset
     while state < _LOWEST and at <= raw.shape[0]:
@@ -228,8 +259,9 @@ def _take(state, frequency, offset, raw, at):  # pragma: no cover
 
 
 @njit(cache=True)
-def _read(raw, height, width, starts, frequencies, values, key, rows):  # pragma: no cover
+def _read(raw: U8x1, height: int, width: int, tables: _ByteTables, key: I64x1, rows: U8x2) -> bool:  # pragma: no cover
     """Fills key and rows; whether raw is the stream of just these."""
+    starts, frequencies, values = tables
     if raw.shape[0] < STATE_BYTES:
         return False
     state = np.int64(raw[0]) << 16 | np.int64(raw[1]) << 8 | np.int64(raw[2])

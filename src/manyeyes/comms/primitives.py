@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import I64x1, U8x1, njit
 from manyeyes.datatypes import WireError
 
 Reason = Literal["garbage", "version", "checksum", "implausible", "contradiction", "wrong_model"]
@@ -49,18 +49,18 @@ def pack_varints(values: NDArray[np.int64]) -> bytes:
 
 
 @njit(cache=True)
-def _write_varints(values, out):  # pragma: no cover
+def _write_varints(values: I64x1, out: U8x1) -> int:  # pragma: no cover
     """Bytes written to out; -1 where a value does not fit."""
     at = 0
     for value in values:
         if value < 0 or value >> 35:
             return -1
-        at = _write_varint(value, out, at)
+        at = _write_varint(int(value), out, at)
     return at
 
 
 @njit(cache=True)
-def _write_varint(value, out, at):  # pragma: no cover
+def _write_varint(value: int, out: U8x1, at: int) -> int:  # pragma: no cover
     """The place in out after the value that was written from at on."""
     while value >> 7:
         out[at] = value & 127 | 128
@@ -86,7 +86,7 @@ def _check_varints(used: int, whole: int, count: int) -> None:
 
 
 @njit(cache=True)
-def _read_varints(raw, values):  # pragma: no cover
+def _read_varints(raw: U8x1, values: I64x1) -> tuple[int, int]:  # pragma: no cover
     """Bytes read, -1 where one is too long or padded, and how many values are whole."""
     at = 0
     for i in range(values.shape[0]):
@@ -109,7 +109,7 @@ def _read_varints(raw, values):  # pragma: no cover
 
 
 @njit(cache=True)
-def _sizes(key):  # pragma: no cover
+def _sizes(key: I64x1) -> tuple[int, int]:  # pragma: no cover
     """Bytes of sorted keys as gaps and as a bitmap."""
     gaps, before = 0, -1
     for k in key:
@@ -120,7 +120,7 @@ def _sizes(key):  # pragma: no cover
 
 
 @njit(cache=True)
-def _varint_bytes(value):  # pragma: no cover
+def _varint_bytes(value: int) -> int:  # pragma: no cover
     size = 1
     while value >> 7:
         value >>= 7
@@ -134,14 +134,16 @@ def cells_size(key: NDArray[np.int64]) -> int:
 
 
 @njit(cache=True)
-def counts_in_room(key, each, fixed, capacity, header, left):  # pragma: no cover
+def counts_in_room(
+    key: I64x1, each: int, fixed: int, capacity: int, header: int, left: int
+) -> I64x1:  # pragma: no cover
     """How many keys (N,), in the order given, each body takes: its cells, each bytes a cell, and fixed bytes.
 
     A body has at most capacity bytes and, where left is not negative, all bodies with their headers at most left.
     """
     widest = 0
     for k in key:
-        widest = max(widest, _varint_bytes(k))
+        widest = max(widest, _varint_bytes(int(k)))
     counts, bodies, at = np.empty(key.shape[0], np.int64), 0, 0
     while at < key.shape[0]:
         room = max(0, (capacity if left < 0 else min(capacity, left - header)) - fixed)
@@ -185,7 +187,7 @@ def pack_cell_runs(key: NDArray[np.int64], counts: list[int]) -> list[tuple[int,
 
 
 @njit(cache=True)
-def _write_cell_runs(key, counts, out, layouts, ends):  # pragma: no cover
+def _write_cell_runs(key: I64x1, counts: I64x1, out: U8x1, layouts: U8x1, ends: I64x1) -> None:  # pragma: no cover
     """Fills out with the bytes of all runs, layouts with their forms and ends with where each ends."""
     at, first = 0, 0
     for run in range(counts.shape[0]):
@@ -231,7 +233,7 @@ def unpack_cells(layout: int, data: bytes, count: int) -> tuple[NDArray[np.int64
 
 
 @njit(cache=True)
-def _read_gaps(raw, key):  # pragma: no cover
+def _read_gaps(raw: U8x1, key: I64x1) -> tuple[int, int]:  # pragma: no cover
     """As :func:`_read_varints`, and the gaps added up to keys."""
     used, whole = _read_varints(raw, key)
     before = -1
@@ -242,7 +244,7 @@ def _read_gaps(raw, key):  # pragma: no cover
 
 
 @njit(cache=True)
-def _read_bitmap(raw, start, end, first, key):  # pragma: no cover
+def _read_bitmap(raw: U8x1, start: int, end: int, first: int, key: I64x1) -> int:  # pragma: no cover
     """How many bits are set from start to end; as many of their keys as there is room for."""
     marked = 0
     for i in range(end - start):
@@ -261,7 +263,7 @@ def are_finite(data: bytes, at: int, size: int) -> bool:
 
 
 @njit(cache=True)
-def _are_finite(raw, at, size):  # pragma: no cover
+def _are_finite(raw: U8x1, at: int, size: int) -> bool:  # pragma: no cover
     bad = False
     if size == 2:
         for i in range((raw.shape[0] - at) // 2):

@@ -3,25 +3,39 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x2, I64x1, njit
+
+
+class CellLattice(NamedTuple):
+    """A ``BevGrid`` for the loops: cells of edge stride pillars, a pillar in metres, from the corner x_min, y_min."""
+
+    rows: int
+    columns: int
+    stride: int
+    pillar: float
+    x_min: float
+    y_min: float
 
 
 @njit(cache=True, nogil=True)
-def are_sites(key, size):  # pragma: no cover
+def are_sites(key: I64x1, size: int) -> bool:  # pragma: no cover
     """Whether keys (N,) ascend strictly and lie in [0, size)."""
     last = np.int64(-1)
     for k in key:
         if k <= last:
             return False
         last = k
-    return last < size
+    return bool(last < size)
 
 
 @njit(cache=True, nogil=True)
-def middles(key, rows, columns, stride, pillar, x_min, y_min):  # pragma: no cover
+def middles(key: I64x1, lattice: CellLattice) -> F32x2:  # pragma: no cover
     """(N, 2) float32: ``BevGrid.centers`` of ascending keys (N,)."""
+    rows, columns, stride, pillar, x_min, y_min = lattice
     xy = np.empty((key.shape[0], 2), np.float32)
     start, end, y = 0, 0, 0.0
     for i in range(key.shape[0]):

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes._site_kernels import are_sites, middles
+from manyeyes.datatypes._site_kernels import CellLattice, are_sites, middles
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.grid import BevGrid
 
@@ -61,8 +61,8 @@ class Sites:
         """(N, 2) float32: metric centres in the agent's frame."""
         if self.key.device.type == "cpu":
             grid = self.grid
-            place = (grid.stride, float(grid.pillar), float(grid.x_min), float(grid.y_min))
-            return torch.from_numpy(middles(self.key.numpy(), *grid.shape, *place))
+            lattice = CellLattice(*grid.shape, grid.stride, float(grid.pillar), float(grid.x_min), float(grid.y_min))
+            return torch.from_numpy(middles(self.key.numpy(), lattice))
         return self.grid.centers(self.yx)
 
 
