@@ -18,17 +18,22 @@ from numba.core import caching
 __all__ = [
     "Boolx1",
     "Boolx2",
+    "F32x1",
     "F32x2",
     "F32x3",
+    "F32x4",
+    "F32x5",
     "F64x1",
     "F64x2",
     "F64x3",
+    "I32x1",
     "I32x2",
     "I64x1",
     "I64x2",
     "I64x3",
     "U8x1",
     "U8x2",
+    "Uintpx1",
     "njit",
 ]
 
@@ -53,14 +58,19 @@ caching.IndexDataCacheFile = _OneAtATime
 # Arrays of compiled loops: element type and number of dimensions.
 Boolx1 = np.ndarray[tuple[int], np.dtype[np.bool_]]
 Boolx2 = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
+F32x1 = np.ndarray[tuple[int], np.dtype[np.float32]]
 F32x2 = np.ndarray[tuple[int, int], np.dtype[np.float32]]
 F32x3 = np.ndarray[tuple[int, int, int], np.dtype[np.float32]]
+F32x4 = np.ndarray[tuple[int, int, int, int], np.dtype[np.float32]]
+F32x5 = np.ndarray[tuple[int, int, int, int, int], np.dtype[np.float32]]
 F64x1 = np.ndarray[tuple[int], np.dtype[np.float64]]
 F64x2 = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 F64x3 = np.ndarray[tuple[int, int, int], np.dtype[np.float64]]
+I32x1 = np.ndarray[tuple[int], np.dtype[np.int32]]
 I32x2 = np.ndarray[tuple[int, int], np.dtype[np.int32]]
 I64x1 = np.ndarray[tuple[int], np.dtype[np.int64]]
 I64x2 = np.ndarray[tuple[int, int], np.dtype[np.int64]]
 I64x3 = np.ndarray[tuple[int, int, int], np.dtype[np.int64]]
 U8x1 = np.ndarray[tuple[int], np.dtype[np.uint8]]
 U8x2 = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
+Uintpx1 = np.ndarray[tuple[int], np.dtype[np.uintp]]

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x1, F32x2, F32x4, I64x1, njit
 from manyeyes.ops._sparse_conv_kernels import LANES, add_products, empty_rows, panels
 from manyeyes.ops._window_attention_kernels import FAST, WindowRuns, attend, power_of_two
 
@@ -30,14 +30,38 @@ _ERF = tuple(map(np.float32, (1.061405429, -1.453152027, 1.421413741, -0.2844967
 _ERF_T, _SQUARE = np.float32(0.3275911 / math.sqrt(2)), np.float32(-math.log2(math.e) / 2)
 
 
+class BlockMatrices(NamedTuple):
+    """Weights (inputs, outputs) float32 of the linear layers, each in panels (1, outputs / width, inputs, width)."""
+
+    query: F32x4
+    key: F32x4
+    value: F32x4
+    output: F32x4
+    hidden: F32x4
+    feed_forward: F32x4
+
+
+class BlockVectors(NamedTuple):
+    """Biases of the six linear layers, then weights and biases of the two norms: (outputs,) and (C,) float32."""
+
+    query: F32x1
+    key: F32x1
+    value: F32x1
+    output: F32x1
+    hidden: F32x1
+    feed_forward: F32x1
+    attention_norm_weight: F32x1
+    attention_norm_bias: F32x1
+    feed_forward_norm_weight: F32x1
+    feed_forward_norm_bias: F32x1
+
+
 @dataclass(frozen=True, eq=False)
 class BlockWeights:
-    """matrices: (inputs, outputs), each in panels, of query, key, value, output, and the net's two layers; vectors: their
-    biases, then weights and biases of the two norms. All float32.
-    """
+    """Weights and biases of query, key, value, output and the feed-forward net's two layers, and of the two norms."""
 
-    matrices: tuple[NDArray[np.float32], ...]
-    vectors: tuple[NDArray[np.float32], ...]
+    matrices: BlockMatrices
+    vectors: BlockVectors
     heads: int
 
     @classmethod
@@ -46,8 +70,8 @@ class BlockWeights:
         if any(n.eps != _EPS for n in norms) or any(w.out_features % LANES or w.weight.is_cuda for w in linears):
             return None
         tensors = [*(w.bias for w in linears), *(t for n in norms for t in (n.weight, n.bias))]
-        matrices = tuple(panels(w.weight.detach().float().T[None]) for w in linears)
-        return cls(matrices, tuple(t.detach().float().contiguous().numpy() for t in tensors), heads)
+        matrices = BlockMatrices(*(panels(w.weight.detach().float().T[None]) for w in linears))
+        return cls(matrices, BlockVectors(*(t.detach().float().contiguous().numpy() for t in tensors)), heads)
 
 
 @torch.no_grad()
@@ -61,31 +85,40 @@ def run_block(features: Tensor, offsets: Tensor, runs: WindowRuns, weights: Bloc
 
 
 @njit(cache=True, nogil=True)
-def _block(x, offsets, frequency, order, start, heads, matrices, vectors):  # pragma: no cover
+def _block(
+    x: F32x2,
+    offsets: F32x2,
+    frequency: F32x1,
+    order: I64x1,
+    start: I64x1,
+    heads: int,
+    matrices: BlockMatrices,
+    vectors: BlockVectors,
+) -> F32x2:  # pragma: no cover
     n, channels = x.shape
     rows, counts = np.arange(n), np.full(1, n)
     normed, placed = empty_rows(n, channels), empty_rows(n, channels)
-    _norm(x, vectors[6], vectors[7], normed)
+    _norm(x, vectors.attention_norm_weight, vectors.attention_norm_bias, normed)
     _place(normed, offsets, frequency, placed)
-    q, k, v = _sums(n, vectors[0]), _sums(n, vectors[1]), _sums(n, vectors[2])
-    add_products(placed, matrices[0], 0, 1, rows, rows, counts, q)
-    add_products(placed, matrices[1], 0, 1, rows, rows, counts, k)
-    add_products(normed, matrices[2], 0, 1, rows, rows, counts, v)
+    q, k, v = _sums(n, vectors.query), _sums(n, vectors.key), _sums(n, vectors.value)
+    add_products(placed, matrices.query, 0, 1, rows, rows, counts, q)
+    add_products(placed, matrices.key, 0, 1, rows, rows, counts, k)
+    add_products(normed, matrices.value, 0, 1, rows, rows, counts, v)
     attend(q.reshape(-1), k.reshape(-1), v.reshape(-1), placed.reshape(-1), heads, channels // heads, order, start)
     out = empty_rows(n, channels)
-    out[:] = x + vectors[3]
-    add_products(placed, matrices[3], 0, 1, rows, rows, counts, out)
-    _norm(out, vectors[8], vectors[9], normed)
-    hidden = _sums(n, vectors[4])
-    add_products(normed, matrices[4], 0, 1, rows, rows, counts, hidden)
+    out[:] = x + vectors.output
+    add_products(placed, matrices.output, 0, 1, rows, rows, counts, out)
+    _norm(out, vectors.feed_forward_norm_weight, vectors.feed_forward_norm_bias, normed)
+    hidden = _sums(n, vectors.hidden)
+    add_products(normed, matrices.hidden, 0, 1, rows, rows, counts, hidden)
     _gelu(hidden.reshape(-1))
-    out += vectors[5]
-    add_products(hidden, matrices[5], 0, 1, rows, rows, counts, out)
+    out += vectors.feed_forward
+    add_products(hidden, matrices.feed_forward, 0, 1, rows, rows, counts, out)
     return out
 
 
 @njit(cache=True, nogil=True)
-def _sums(n, bias):  # pragma: no cover
+def _sums(n: int, bias: F32x1) -> F32x2:  # pragma: no cover
     """(n, outputs): what the products are added to."""
     out = empty_rows(n, bias.shape[0])
     for i in range(n):
@@ -94,7 +127,7 @@ def _sums(n, bias):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _norm(x, weight, bias, out):  # pragma: no cover
+def _norm(x: F32x2, weight: F32x1, bias: F32x1, out: F32x2) -> None:  # pragma: no cover
     """Layer norm of rows (N, C)."""
     n, channels = x.shape
     for i in range(n):
@@ -110,7 +143,7 @@ def _norm(x, weight, bias, out):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _place(x, offsets, frequency, out):  # pragma: no cover
+def _place(x: F32x2, offsets: F32x2, frequency: F32x1, out: F32x2) -> None:  # pragma: no cover
     """out = x plus ``sincos_encoding`` of offsets (N, 2)."""
     quarter = frequency.shape[0]
     for i in range(x.shape[0]):
@@ -130,7 +163,7 @@ def _place(x, offsets, frequency, out):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _gelu(x):  # pragma: no cover
+def _gelu(x: F32x1) -> None:  # pragma: no cover
     """x (N,) becomes x / 2 (1 + erf(x / sqrt(2)))."""
     for i in range(np.uintp(x.shape[0])):
         t = np.float32(1) / (np.float32(1) + _ERF_T * abs(x[i]))

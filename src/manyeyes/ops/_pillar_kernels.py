@@ -8,14 +8,42 @@ For inference on the CPU: 50,000 points by 64 channels would be 14 MB of a tempo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x1, F32x2, I32x1, I64x1, njit
 from manyeyes.datatypes import BevGrid, PointCloud, Sites, SparseBev
 from manyeyes.ops.sparse_index import mark_ranks
+
+
+class _Limits(NamedTuple):
+    """The range of a grid, metres; x_max and y_max follow from its shape."""
+
+    x_min: float
+    y_min: float
+    z_min: float
+    z_max: float
+
+
+class _Points(NamedTuple):
+    """xyz (P, 3), intensity (P,), and how many are of now; those of before follow."""
+
+    xyz: F32x2
+    intensity: F32x1
+    num_now: int
+
+
+class _PillarWeights(NamedTuple):
+    """What differs within a pillar, (5, C) of offsets from its middle, intensity and age; what is common, (7, C).
+
+    common: of the pillar's middle (3) and of its offset from the mean of its points (3), and the bias.
+    """
+
+    varying: F32x2
+    common: F32x2
 
 
 @torch.no_grad()
@@ -28,7 +56,8 @@ def pillar_maxima(
     point's x, y, z, intensity, offsets from the mean of its pillar's points (3) and from the pillar's middle (3), and age: 0
     of now, 1 of before.
     """
-    clouds, (rows, columns), limits = [*now, *before], grid.shape, (grid.x_min, grid.y_min, grid.z_min, grid.z_max)
+    clouds, (rows, columns) = [*now, *before], grid.shape
+    limits = _Limits(grid.x_min, grid.y_min, grid.z_min, grid.z_max)
     xyz, bright = (_joined(part).numpy() for part in zip(*((cloud.xyz, cloud.intensity) for cloud in clouds)))
     key, end = np.empty(len(xyz), np.int32), 0
     for agent, cloud in zip((*range(len(now)), *range(len(before))), clouds):
@@ -42,7 +71,7 @@ def pillar_maxima(
     varying = torch.cat((place + to_mean + to_middle, light, age), 1).T.contiguous().numpy()
     common = torch.cat((place, to_mean, bias[:, None]), 1).T.contiguous().numpy()
     out = np.empty((len(found), len(weight)), np.float32)
-    _reduce(xyz, bright, sum(map(len, now)), key, rank, middle, varying, common, out)
+    _reduce(_Points(xyz, bright, sum(map(len, now))), key, rank, middle, _PillarWeights(varying, common), out)
     return SparseBev(torch.from_numpy(out), Sites(torch.from_numpy(found), grid, len(now)))
 
 
@@ -52,7 +81,9 @@ def _joined(parts: Sequence[Tensor]) -> Tensor:
 
 
 @njit(cache=True, nogil=True)
-def _point_keys(xyz, limits, pillar, rows, columns, first, key):  # pragma: no cover
+def _point_keys(
+    xyz: F32x1, limits: _Limits, pillar: float, rows: float, columns: float, first: int, key: I32x1
+) -> None:  # pragma: no cover
     """key (P,): the pillar of each point of xyz (3 P,), numbered from first on; -1 out of range.
 
     As ``voxelize.pillar_sites``, without branches; unsigned places and whole numbers as floats leave a loop of vectors.
@@ -68,7 +99,7 @@ def _point_keys(xyz, limits, pillar, rows, columns, first, key):  # pragma: no c
 
 
 @njit(cache=True, nogil=True)
-def _occupied(key, size):  # pragma: no cover
+def _occupied(key: I32x1, size: int) -> tuple[I64x1, I32x1]:  # pragma: no cover
     """Ascending distinct keys of key (P,) from 0 on, and the number (size,) of each among them."""
     marks = np.zeros(size // 8 * 8 + 8, np.uint8)
     for k in key:
@@ -78,21 +109,24 @@ def _occupied(key, size):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _middles(found, rows, columns, limits, pillar):  # pragma: no cover
+def _middles(found: I64x1, rows: int, columns: int, limits: _Limits, pillar: float) -> F32x2:  # pragma: no cover
     """(N, 3): the middle of each pillar of ascending keys (N,)."""
     middle, line = np.empty((found.shape[0], 3), np.float32), 0
     for r in range(found.shape[0]):
         while found[r] >= (line + 1) * columns:
             line += 1
-        middle[r, 0] = limits[0] + (found[r] - line * columns + 0.5) * pillar
-        middle[r, 1] = limits[1] + (line % rows + 0.5) * pillar
-        middle[r, 2] = (limits[2] + limits[3]) / 2
+        middle[r, 0] = limits.x_min + (found[r] - line * columns + 0.5) * pillar
+        middle[r, 1] = limits.y_min + (line % rows + 0.5) * pillar
+        middle[r, 2] = (limits.z_min + limits.z_max) / 2
     return middle
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nsz", "nnan"})
-def _reduce(xyz, bright, young, key, rank, middle, varying, common, out):  # pragma: no cover
-    """The maxima over points, of which the first so many are of now, then what all points of a pillar have in common."""
+def _reduce(
+    points: _Points, key: I32x1, rank: I32x1, middle: F32x2, weights: _PillarWeights, out: F32x2
+) -> None:  # pragma: no cover
+    """The maxima over points, then what all points of a pillar have in common."""
+    (xyz, bright, young), (varying, common) = points, weights
     n, channels = out.shape
     total = np.zeros((n, 4), np.float32)
     out[:] = np.float32(-np.inf)

@@ -12,7 +12,7 @@ would be a third of the time.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import binding, ir
@@ -22,7 +22,8 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 from torch import Tensor
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x1, F32x2, F32x4, I64x1, njit
+from manyeyes.ops.sparse_index import Pairs
 
 LANES = 16
 """Outputs come in so many at once."""
@@ -38,6 +39,15 @@ _MANY, _NEAR = 600, 8192
 """From so many pairs on, with so many numbers in a panel at most, it stays in the first cache, and fetching costs more."""
 
 
+class _PairRun(NamedTuple):
+    """Pairs start … end of rows source (P,) that lead to rows target (P,)."""
+
+    source: I64x1
+    target: I64x1
+    start: int
+    end: int
+
+
 def panels(taps: Tensor) -> NDArray[np.float32]:
     """Matrices (taps, C, D), D divisible by LANES, cut into columns as wide as a tile: (taps, D / width, C, width) in a row."""
     width = math.gcd(taps.shape[2], _WIDEST)
@@ -45,7 +55,7 @@ def panels(taps: Tensor) -> NDArray[np.float32]:
 
 
 @njit(cache=True, nogil=True)
-def empty_rows(rows, columns):  # pragma: no cover
+def empty_rows(rows: int, columns: int) -> F32x2:  # pragma: no cover
     """(rows, columns) float32 that begins with a line of the cache: a vector across two lines is read twice."""
     spare = _LINE // 4
     flat = np.empty(rows * columns + spare, np.float32)
@@ -54,12 +64,15 @@ def empty_rows(rows, columns):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
-def convolve(x, weight, bias, source, target, counts, is_symmetric, is_rectified, out):  # pragma: no cover
-    """out[target[p]] = bias + the sum of x[source[p]] @ weight[tap] over pairs p, counts (taps,) of each tap from 0 on.
+def convolve(
+    x: F32x2, weight: F32x4, bias: F32x1, pairs: Pairs, is_symmetric: bool, is_rectified: bool, out: F32x2
+) -> None:  # pragma: no cover
+    """out[target[p]] = bias + the sum of x[source[p]] @ weight[tap] over pairs p, tap by tap from 0 on.
 
     weight: :func:`panels`. is_symmetric: the middle tap leads from each row to itself, and taps behind it have the pairs of
     those before it, which alone are given, turned round, the last tap those of the first. is_rectified: below 0 it is 0.
     """
+    source, target, counts = pairs
     for o in range(out.shape[0]):
         out[o] = bias
     if is_symmetric:
@@ -75,7 +88,9 @@ def convolve(x, weight, bias, source, target, counts, is_symmetric, is_rectified
 
 
 @njit(cache=True, nogil=True)
-def add_products(x, weight, tap, step, source, target, counts, out):  # pragma: no cover
+def add_products(
+    x: F32x2, weight: F32x4, tap: int, step: int, source: I64x1, target: I64x1, counts: I64x1, out: F32x2
+) -> None:  # pragma: no cover
     """out[target[p]] += x[source[p]] @ weight[tap] for each pair p; after counts[0] pairs tap goes on by step, and so on.
 
     x (N, C), weight (taps, D / width, C, width), out (M, D), float32 without gaps; source, target: int64, a tap's target
@@ -84,6 +99,7 @@ def add_products(x, weight, tap, step, source, target, counts, out):  # pragma: 
     at, last = 0, counts.shape[0] - 1
     for k in range(last + 1):
         end = at + counts[k]
+        run = _PairRun(source, target, at, end)
         for q in range(weight.shape[1]):
             panel, column, following = weight[tap, q], q * weight.shape[3], weight[tap, q]
             if q + 1 < weight.shape[1]:
@@ -91,19 +107,22 @@ def add_products(x, weight, tap, step, source, target, counts, out):  # pragma: 
             elif k < last:
                 following = weight[tap + step, 0]
             if weight.shape[3] == 4 * LANES:
-                _add_four(x, panel, following, source, target, at, end, column, out)
+                _add_four(x, panel, following, run, column, out)
             elif weight.shape[3] == 2 * LANES:
-                _add_two(x, panel, following, source, target, at, end, column, out)
+                _add_two(x, panel, following, run, column, out)
             else:
-                _add_one(x, panel, following, source, target, at, end, column, out)
+                _add_one(x, panel, following, run, column, out)
         at, tap = end, tap + step
 
 
 def _panel(vectors: int) -> Any:
-    """What adds the products of pairs at … end with one panel of so many vectors, from column on of the outputs."""
+    """What adds the products of a run of pairs with one panel of so many vectors, from column on of the outputs."""
 
     @njit(cache=True, nogil=True)
-    def add(x, panel, following, source, target, at, end, column, out):  # pragma: no cover
+    def add(
+        x: F32x2, panel: F32x2, following: F32x2, run: _PairRun, column: int, out: F32x2
+    ) -> None:  # pragma: no cover
+        source, target, at, end = run
         sixes, tiles = at + (end - at) // 6 * 6, (end - at + 5) // 6
         # Every input of every tile fetches its share of the panel that follows, in fractions of a byte.
         share, fetched = 4 * vectors * LANES * _FRACTION // max(tiles, 1), 0

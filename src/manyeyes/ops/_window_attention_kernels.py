@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x1, I64x1, Uintpx1, njit
 from manyeyes.datatypes import ShapeError
 
 _TILE = 64
@@ -27,6 +27,8 @@ _TWO_ROWS, _THREE_ROWS = np.uintp(2 * _TILE), np.uintp(3 * _TILE)
 _POWERS = tuple(
     map(np.float32, (1, 0.693147206, 0.240226466, 0.05550329, 0.00961851953, 0.00133998604, 0.000153375768))
 )
+_Four = tuple[np.float32, np.float32, np.float32, np.float32]
+_Block = tuple[_Four, _Four, _Four, _Four]
 FAST = {"contract", "nsz", "nnan", "ninf", "arcp", "reassoc"}
 
 
@@ -45,7 +47,7 @@ def window_runs(window: Tensor) -> WindowRuns:
 
 
 @njit(cache=True, nogil=True)
-def _starts(ids):  # pragma: no cover
+def _starts(ids: I64x1) -> I64x1:  # pragma: no cover
     """Where each run of equal ids (N,) begins, and N."""
     start, runs = np.empty(ids.shape[0] + 1, np.int64), 0
     for i in range(ids.shape[0]):
@@ -70,7 +72,9 @@ def attend_in_windows(q: Tensor, k: Tensor, v: Tensor, runs: WindowRuns) -> Tens
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def attend(q, k, v, out, heads, width, order, start):  # pragma: no cover
+def attend(
+    q: F32x1, k: F32x1, v: F32x1, out: F32x1, heads: int, width: int, order: I64x1, start: I64x1
+) -> None:  # pragma: no cover
     """Window by window and head by head, as many queries at once as a tile holds."""
     most = 4
     for w in range(start.shape[0] - 1):
@@ -101,7 +105,7 @@ def attend(q, k, v, out, heads, width, order, start):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _gather(x, rows, width, wide, columns):  # pragma: no cover
+def _gather(x: F32x1, rows: Uintpx1, width: int, wide: int, columns: F32x1) -> None:  # pragma: no cover
     """columns[c, i] = x[rows[i] + c] times log2(e) / sqrt(width), and zeros up to wide."""
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
     for i in range(0, rows.shape[0], 4):
@@ -115,7 +119,7 @@ def _gather(x, rows, width, wide, columns):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _scatter(columns, sums, rows, width, out):  # pragma: no cover
+def _scatter(columns: F32x1, sums: F32x1, rows: Uintpx1, width: int, out: F32x1) -> None:  # pragma: no cover
     """out[rows[i] + c] = columns[c, i] / sums[1, i]."""
     for i in range(rows.shape[0]):
         at, to, share = np.uintp(i), rows[i], np.float32(1.0) / sums[_TILE + i]
@@ -124,7 +128,9 @@ def _scatter(columns, sums, rows, width, out):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _scores(k, rows, queries, weights, n, width, wide):  # pragma: no cover
+def _scores(
+    k: F32x1, rows: Uintpx1, queries: F32x1, weights: F32x1, n: int, width: int, wide: int
+) -> None:  # pragma: no cover
     """weights (n, wide) = the rows of k (n, width) times queries (width, wide)."""
     for r in range(0, n, 4):
         a, b, d, e = rows[r], rows[r + 1], rows[r + 2], rows[r + 3]
@@ -135,7 +141,9 @@ def _scores(k, rows, queries, weights, n, width, wide):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _mix(v, rows, weights, mixed, n, width, wide):  # pragma: no cover
+def _mix(
+    v: F32x1, rows: Uintpx1, weights: F32x1, mixed: F32x1, n: int, width: int, wide: int
+) -> None:  # pragma: no cover
     """mixed (width, wide) = the rows of v (n, width), transposed, times weights (n, wide)."""
     for c in range(0, width, 4):
         u = np.uintp(c)
@@ -149,12 +157,14 @@ def _mix(v, rows, weights, mixed, n, width, wide):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _four(x, at):  # pragma: no cover
-    return x[at], x[at + _ONE], x[at + _TWO], x[at + _THREE]
+def _four(x: F32x1, at: np.uintp) -> _Four:  # pragma: no cover
+    return x[at], x[at + _ONE], x[at + _TWO], x[at + _THREE]  # pyright: ignore[reportReturnType]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _multiply(block, x, s, out, o, wide, is_first):  # pragma: no cover
+def _multiply(
+    block: _Block, x: F32x1, s: np.uintp, out: F32x1, o: np.uintp, wide: np.uintp, is_first: bool
+) -> None:  # pragma: no cover
     """Four rows of out from o on (+)= block (4, 4) times four rows of x from s on; rows are _TILE apart."""
     (a0, a1, a2, a3), (b0, b1, b2, b3), (d0, d1, d2, d3), (e0, e1, e2, e3) = block
     if is_first:
@@ -174,19 +184,19 @@ def _multiply(block, x, s, out, o, wide, is_first):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _exponentials(x, rows, wide, sums):  # pragma: no cover
+def _exponentials(x: F32x1, rows: int, wide: int, sums: F32x1) -> None:  # pragma: no cover
     """x (rows, wide) becomes 2^(x - its column's largest); sums: those largest, then the sums of the columns."""
-    wide = np.uintp(wide)
-    for i in range(wide):
+    end = np.uintp(wide)
+    for i in range(end):
         sums[i], sums[_ROW + i] = x[i], np.float32(0.0)
     for j in range(0, rows, 4):
         o = np.uintp(j * _TILE)
-        for i in range(wide):
+        for i in range(end):
             a, b, d, e = x[o + i], x[o + _ROW + i], x[o + _TWO_ROWS + i], x[o + _THREE_ROWS + i]
             sums[i] = max(sums[i], max(max(a, b), max(d, e)))
     for j in range(0, rows, 4):
         o = np.uintp(j * _TILE)
-        for i in range(wide):
+        for i in range(end):
             top = sums[i]
             a, b = power_of_two(x[o + i] - top), power_of_two(x[o + _ROW + i] - top)
             d, e = power_of_two(x[o + _TWO_ROWS + i] - top), power_of_two(x[o + _THREE_ROWS + i] - top)
@@ -195,7 +205,7 @@ def _exponentials(x, rows, wide, sums):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def power_of_two(x):  # pragma: no cover
+def power_of_two(x: np.float32) -> np.float32:  # pragma: no cover
     """2^x of x <= 0 within 2e-7 of it; below -126 as of -126."""
     x = max(x, np.float32(-126.0))
     whole = np.rint(x)

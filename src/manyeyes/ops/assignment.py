@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x2, I64x1, njit
 from manyeyes.datatypes import ShapeError
 
 
@@ -23,7 +23,7 @@ def assign(cost: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 @njit(cache=True)
-def _shortest_paths(cost):  # pragma: no cover - compiled
+def _shortest_paths(cost: F64x2) -> I64x1:  # pragma: no cover - compiled
     """(N,) the column of each row, N <= M. Column 0 and row 0 of the potentials are a sentinel."""
     n, m = cost.shape
     u, v = np.zeros(n + 1), np.zeros(m + 1)

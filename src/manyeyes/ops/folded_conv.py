@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x1, F32x2, F32x4, F32x5, njit
 from manyeyes.ops._sparse_conv_kernels import LANES, convolve, empty_rows, panels
-from manyeyes.ops.sparse_index import NeighbourMap
+from manyeyes.ops.sparse_index import NeighbourMap, Pairs
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +39,16 @@ class FoldedConvs:
     def __call__(self, x: Tensor, table: NeighbourMap) -> Tensor:
         """(N, C) to (M, D) through all layers; more than one need a table that leads from a set of sites to itself."""
         rows, weight, bias = (t.numpy() for t in (x.contiguous(), self.weight, self.bias))
-        return torch.from_numpy(_layers(rows, weight, bias, *table.pairs, table.is_symmetric, table.n_out))
+        return torch.from_numpy(_layers(rows, weight, bias, table.pairs, table.is_symmetric, table.n_out))
+
+
+class _RowNorm(NamedTuple):
+    """The norm of a :class:`NormedConv` for the loops: scale, shift (D,), eps beside the variance, and whether x is added."""
+
+    scale: F32x1
+    shift: F32x1
+    eps: float
+    is_skipped: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +73,8 @@ class NormedConv:
     def __call__(self, x: Tensor, table: NeighbourMap) -> Tensor:
         """(N, C) to (M, D)."""
         rows, weight, scale, shift = (t.numpy() for t in (x.contiguous(), self.weight, self.scale, self.shift))
-        norm = (scale, shift, self.eps, self.is_skipped)
-        return torch.from_numpy(_normed(rows, weight, *norm, *table.pairs, table.is_symmetric, table.n_out))
+        norm = _RowNorm(scale, shift, self.eps, self.is_skipped)
+        return torch.from_numpy(_normed(rows, weight, norm, table.pairs, table.is_symmetric, table.n_out))
 
 
 def takes(x: Tensor) -> bool:
@@ -73,20 +83,25 @@ def takes(x: Tensor) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _layers(x, weight, bias, source, target, counts, is_symmetric, rows):  # pragma: no cover
+def _layers(
+    x: F32x2, weight: F32x5, bias: F32x2, pairs: Pairs, is_symmetric: bool, rows: int
+) -> F32x2:  # pragma: no cover
     out = empty_rows(rows, bias.shape[1])
-    convolve(x, weight[0], bias[0], source, target, counts, is_symmetric, True, out)
+    convolve(x, weight[0], bias[0], pairs, is_symmetric, True, out)
     spare = empty_rows(*out.shape)
     for layer in range(1, weight.shape[0]):
-        convolve(out, weight[layer], bias[layer], source, target, counts, is_symmetric, True, spare)
+        convolve(out, weight[layer], bias[layer], pairs, is_symmetric, True, spare)
         out, spare = spare, out
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "nnan", "reassoc"})
-def _normed(x, weight, scale, shift, eps, is_skipped, source, target, counts, is_symmetric, rows):  # pragma: no cover
+def _normed(
+    x: F32x2, weight: F32x4, norm: _RowNorm, pairs: Pairs, is_symmetric: bool, rows: int
+) -> F32x2:  # pragma: no cover
+    scale, shift, eps, is_skipped = norm
     out, channels = empty_rows(rows, scale.shape[0]), scale.shape[0]
-    convolve(x, weight, np.zeros_like(shift), source, target, counts, is_symmetric, False, out)
+    convolve(x, weight, np.zeros_like(shift), pairs, is_symmetric, False, out)
     for i in range(rows):
         mean, square = np.float32(0), np.float32(0)
         for c in range(channels):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, njit
 from manyeyes.datatypes import ShapeError
 
 
@@ -32,7 +32,7 @@ def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, pre: int = 1
 
 
 @njit(cache=True, nogil=True)
-def _standing(boxes, threshold):  # pragma: no cover
+def _standing(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
     """Which of boxes (N, 5), best first, no better one that stands overlaps by more than the threshold."""
     n = boxes.shape[0]
     standing = np.ones(n, np.bool_)
@@ -59,7 +59,7 @@ def _standing(boxes, threshold):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _shared_area(a, b, ring, clipped):  # pragma: no cover
+def _shared_area(a: F64x1, b: F64x1, ring: F64x2, clipped: F64x2) -> float:  # pragma: no cover
     """Area that two solid boxes (5,) share; ring and clipped: (20, 2) to work in."""
     c, s = np.cos(a[4]), np.sin(a[4])
     dx, dy = b[0] - a[0], b[1] - a[1]

@@ -14,18 +14,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I32x2, njit
 from manyeyes.ops.raycast import (
     BOX,
     CYLINDER,
     GROUND,
     NOTHING,
     HeightField,
+    HeightRaster,
     Primitives,
+    SensorPose,
+    SolidArrays,
     height_at,
     hit_box,
     hit_cylinder,
@@ -39,7 +43,19 @@ _CHORD_M = 2 / 3 * LEAF_M
 _NEAR_M = 0.05
 _A, _B, _C, _D = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0xD6E8FEB86659FD93
 
+# Columns of a rectangle of pixels: from … to of columns and rows, and the least depth in metres.
+_COLUMN_START, _COLUMN_END, _ROW_START, _ROW_END, _NEAREST = range(5)
+
 Array = NDArray[np.float64]
+
+
+class _Lens(NamedTuple):
+    """Focal lengths and principal point of a pinhole camera, pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
 
 
 @dataclass(frozen=True)
@@ -54,7 +70,7 @@ class Sight:
 
 
 @njit(cache=True)
-def lattice(i, j, k, seed):
+def lattice(i: int, j: int, k: int, seed: int) -> float:
     """A number in [0, 1) of a point of the integer lattice (SplitMix64)."""
     x = np.uint64(seed) + np.uint64(i) * np.uint64(_A) + np.uint64(j) * np.uint64(_C) + np.uint64(k) * np.uint64(_D)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(_B)
@@ -64,7 +80,9 @@ def lattice(i, j, k, seed):
 
 
 @njit(cache=True)
-def first_leaf(o, d0, d1, d2, enter, leave, density, seed):
+def first_leaf(
+    o: F64x1, d0: float, d1: float, d2: float, enter: float, leave: float, density: float, seed: int
+) -> float:
     """The first t in enter … leave at which the ray o + t d is within a leaf's cube; inf where there is none.
 
     The cubes are walked one after the other. Source: Amanatides & Woo, Eurographics 1987.
@@ -89,7 +107,7 @@ def first_leaf(o, d0, d1, d2, enter, leave, density, seed):
 
 
 @njit(cache=True)
-def meet(kind, half, density, o, d0, d1, d2, seed):
+def meet(kind: int, half: F64x1, density: float, o: F64x1, d0: float, d1: float, d2: float, seed: int) -> float:
     """The t at which the ray o + t d, in a primitive's own frame, meets it from outside; inf where it does not."""
     if kind == BOX:
         t, _ = hit_box(o, half, d0, d1, d2)
@@ -103,12 +121,14 @@ def meet(kind, half, density, o, d0, d1, d2, seed):
 
 
 @njit(cache=True)
-def meet_ground(field, place, highest, origin, d0, d1, d2, limit):
+def meet_ground(
+    terrain: HeightRaster, highest: float, origin: F64x1, d0: float, d1: float, d2: float, limit: float
+) -> float:
     """The t below limit at which the ray origin + t d first sinks under the height field; inf where it does not.
 
-    Steps are 0.4 m or 2 % of the way, then false position inside the step that crosses. place: x_min, y_min, cell.
+    Steps are 0.4 m or 2 % of the way, then false position inside the step that crosses.
     """
-    x_min, y_min, cell = place
+    field, x_min, y_min, cell = terrain
     length = math.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     t = 0.0
     if origin[2] > highest:
@@ -146,9 +166,10 @@ def meet_ground(field, place, highest, origin, d0, d1, d2, limit):
 
 
 @njit(cache=True)
-def _rectangle(o, q, half, lens, width, height, bounds):
+def _rectangle(o: F64x1, q: F64x2, half: F64x1, lens: _Lens, width: int, height: int, bounds: F64x1) -> None:
     """First and past-the-last column and row that an oriented box can cover, and its least depth; empty where it is behind.
 
+    bounds: (5,), _COLUMN_START … _NEAREST, is filled.
     o: the camera in the box's frame; q: box_from_camera. Edges are cut at the near plane.
     """
     fx, fy, cx, cy = lens
@@ -178,16 +199,26 @@ def _rectangle(o, q, half, lens, width, height, bounds):
                     x, y, z = x + s * (two[0] - x), y + s * (two[1] - y), _NEAR_M
                 u, v = fx * x / z + cx, fy * y / z + cy
                 u_low, u_high, v_low, v_high = min(u_low, u), max(u_high, u), min(v_low, v), max(v_high, v)
-    bounds[0] = max(0.0, math.floor(min(u_low, 1e9) - 0.5))
-    bounds[1] = min(float(width), math.ceil(max(u_high, -1e9) + 0.5))
-    bounds[2] = max(0.0, math.floor(min(v_low, 1e9) - 0.5))
-    bounds[3] = min(float(height), math.ceil(max(v_high, -1e9) + 0.5))
-    bounds[4] = nearest
+    bounds[_COLUMN_START] = max(0.0, math.floor(min(u_low, 1e9) - 0.5))
+    bounds[_COLUMN_END] = min(float(width), math.ceil(max(u_high, -1e9) + 0.5))
+    bounds[_ROW_START] = max(0.0, math.floor(min(v_low, 1e9) - 0.5))
+    bounds[_ROW_END] = min(float(height), math.ceil(max(v_high, -1e9) + 0.5))
+    bounds[_NEAREST] = nearest
 
 
 @njit(cache=True)
-def _cast(kind, center, rotation, half, density, skip, origin, camera, lens, max_depth, seed, depth, owner):
+def _cast(
+    solids: SolidArrays,
+    skip: Boolx1,
+    pose: SensorPose,
+    lens: _Lens,
+    max_depth: float,
+    seed: int,
+    depth: F64x2,
+    owner: I32x2,
+) -> None:
     """All primitives, nearest first."""
+    (kind, center, rotation, half, density), (origin, camera) = solids, pose
     fx, fy, cx, cy = lens
     rows, columns = depth.shape
     n = kind.shape[0]
@@ -203,15 +234,16 @@ def _cast(kind, center, rotation, half, density, skip, origin, camera, lens, max
                     + rotation[i, 2, r] * camera[2, c]
                 )
         _rectangle(o[i], q[i], half[i], lens, columns, rows, bounds[i])
-        near[i] = bounds[i, 4]
-    for i in np.argsort(near, kind="mergesort"):
+        near[i] = bounds[i, _NEAREST]
+    for solid in np.argsort(near, kind="mergesort"):
+        i = int(solid)
         if near[i] > max_depth:
             break
         if skip[i]:
             continue
-        for row in range(int(bounds[i, 2]), int(bounds[i, 3])):
+        for row in range(int(bounds[i, _ROW_START]), int(bounds[i, _ROW_END])):
             y = (row + 0.5 - cy) / fy
-            for column in range(int(bounds[i, 0]), int(bounds[i, 1])):
+            for column in range(int(bounds[i, _COLUMN_START]), int(bounds[i, _COLUMN_END])):
                 if depth[row, column] <= near[i]:
                     continue
                 x = (column + 0.5 - cx) / fx
@@ -224,8 +256,11 @@ def _cast(kind, center, rotation, half, density, skip, origin, camera, lens, max
 
 
 @njit(cache=True)
-def _ground(field, place, highest, origin, camera, lens, max_depth, depth, owner):
+def _ground(
+    terrain: HeightRaster, highest: float, pose: SensorPose, lens: _Lens, max_depth: float, depth: F64x2, owner: I32x2
+) -> None:
     """The ground in every pixel where it is nearer than what stands there."""
+    origin, camera = pose
     fx, fy, cx, cy = lens
     for row in range(depth.shape[0]):
         y = (row + 0.5 - cy) / fy
@@ -234,7 +269,7 @@ def _ground(field, place, highest, origin, camera, lens, max_depth, depth, owner
             d0 = camera[0, 0] * x + camera[0, 1] * y + camera[0, 2]
             d1 = camera[1, 0] * x + camera[1, 1] * y + camera[1, 2]
             d2 = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2]
-            t = meet_ground(field, place, highest, origin, d0, d1, d2, min(depth[row, column], max_depth))
+            t = meet_ground(terrain, highest, origin, d0, d1, d2, min(depth[row, column], max_depth))
             if t < depth[row, column]:
                 depth[row, column], owner[row, column] = t, GROUND
 
@@ -258,14 +293,10 @@ def cast_pinhole(
     own: the instance that is not met, 0 for none. seed decides where leaves are.
     """
     depth, owner = np.full((height, width), np.inf), np.full((height, width), NOTHING, np.int32)
-    lens = (float(intrinsic[0, 0]), float(intrinsic[1, 1]), float(intrinsic[0, 2]), float(intrinsic[1, 2]))
-    origin, rotation = np.ascontiguousarray(origin, np.float64), np.ascontiguousarray(rotation, np.float64)
-    _cast(
-        primitives.kind, primitives.center, primitives.rotation, primitives.half, primitives.density,
-        _own(primitives, own), origin, rotation, lens, float(max_depth), seed, depth, owner,
-    )  # fmt: skip
-    place = (ground.x_min, ground.y_min, ground.cell)
-    _ground(ground.height, place, float(ground.height.max()), origin, rotation, lens, float(max_depth), depth, owner)
+    lens = _Lens(float(intrinsic[0, 0]), float(intrinsic[1, 1]), float(intrinsic[0, 2]), float(intrinsic[1, 2]))
+    pose = SensorPose(np.ascontiguousarray(origin, np.float64), np.ascontiguousarray(rotation, np.float64))
+    _cast(primitives.arrays, _own(primitives, own), pose, lens, float(max_depth), seed, depth, owner)
+    _ground(ground.raster, float(ground.height.max()), pose, lens, float(max_depth), depth, owner)
     return Sight(depth, owner)
 
 

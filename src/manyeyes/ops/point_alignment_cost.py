@@ -7,11 +7,13 @@ that one distance is sought, and all candidates are tried.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x2, F64x1, F64x2, I64x1, njit
 from manyeyes.datatypes import Boxes
 
 REACH_M = 0.4
@@ -43,18 +45,32 @@ def meeting_costs(
     return torch.from_numpy(cost).to(back.dtype), torch.from_numpy(count)
 
 
+class _Box(NamedTuple):
+    """A box in metres: its centre, cosine and sine of its yaw, and half its sizes."""
+
+    x: float
+    y: float
+    z: float
+    cos_yaw: float
+    sin_yaw: float
+    half_length: float
+    half_width: float
+    half_height: float
+
+
 @njit(cache=True, nogil=True)
-def _inside(points, place, away_x, away_y, along):  # pragma: no cover
+def _inside(points: F32x2, place: _Box, away_x: float, away_y: float, along: float) -> F64x2:  # pragma: no cover
     """(K, 3): points in a box moved by away and made longer at each end, from its middle, in its axes, heights scaled."""
-    x0, y0 = place[0] + away_x, place[1] + away_y
-    length, width, height = place[5] + along, place[6] + MARGIN[1], place[7]
+    x0, y0 = place.x + away_x, place.y + away_y
+    length, width, height = place.half_length + along, place.half_width + MARGIN[1], place.half_height
     radius = (length * length + width * width) ** 0.5
     found, count = np.empty((len(points), 3)), 0
     for p in range(len(points)):
         x, y = points[p, 0] - x0, points[p, 1] - y0
         if abs(x) > radius or abs(y) > radius:
             continue
-        u, v, z = x * place[3] + y * place[4], y * place[3] - x * place[4], points[p, 2] - place[2]
+        u, v = x * place.cos_yaw + y * place.sin_yaw, y * place.cos_yaw - x * place.sin_yaw
+        z = points[p, 2] - place.z
         if abs(u) < length and abs(v) < width and ROAD_M - height < z < height + MARGIN[2]:
             found[count, 0], found[count, 1], found[count, 2] = u, v, FLAT * z
             count += 1
@@ -62,13 +78,17 @@ def _inside(points, place, away_x, away_y, along):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _match(now, then, places, back, slack, cost, count):  # pragma: no cover
-    """Fills cost (N, S) and count (N,)."""
+def _match(
+    now: F32x2, then: F32x2, places: F64x2, back: F64x2, slack: F64x1, cost: F64x2, count: I64x1
+) -> None:  # pragma: no cover
+    """Fills cost (N, S) and count (N,); places (N, 8): the fields of a :class:`_Box`."""
     steps, limit = cost.shape[1], REACH_M * REACH_M
     x, best = np.empty(steps), np.empty(steps)
     for n in range(len(places)):
-        mine = _inside(now, places[n], 0.0, 0.0, MARGIN[0])
-        theirs = _inside(then, places[n], -back[n, 0], -back[n, 1], MARGIN[0] + slack[n])
+        p = places[n]
+        box = _Box(p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
+        mine = _inside(now, box, 0.0, 0.0, MARGIN[0])
+        theirs = _inside(then, box, -back[n, 0], -back[n, 1], MARGIN[0] + slack[n])
         if len(mine) < FEWEST or len(theirs) < FEWEST:
             continue
         asked = min(len(mine), MOST)

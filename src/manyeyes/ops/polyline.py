@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
 from manyeyes.datatypes.map_element import frozen, rows_of
 
 Floats = NDArray[np.float64]
@@ -142,7 +142,7 @@ def near_pairs_between(a_bounds: Floats, b_bounds: Floats, reach_m: float) -> In
 
 
 @njit(cache=True)
-def _resample(points, first, target):  # pragma: no cover - compiled
+def _resample(points: F64x2, first: I64x1, target: I64x1) -> F64x2:  # pragma: no cover - compiled
     out = np.empty((target[-1], 2))
     for row in range(len(first) - 1):
         begin, end = first[row], first[row + 1]
@@ -171,7 +171,7 @@ def _resample(points, first, target):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def _feet(queries, line):  # pragma: no cover - compiled
+def _feet(queries: F64x2, line: F64x2) -> tuple[F64x1, F64x1, F64x1, Boolx1]:  # pragma: no cover - compiled
     n = len(queries)
     along, side, distance = np.empty(n), np.empty(n), np.empty(n)
     inside = np.empty(n, np.bool_)
@@ -198,7 +198,7 @@ def _feet(queries, line):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def _simplify(line, tolerance):  # pragma: no cover - compiled
+def _simplify(line: F64x2, tolerance: float) -> Boolx1:  # pragma: no cover - compiled
     n = len(line)
     keep = np.zeros(n, np.bool_)
     if n == 0:
@@ -229,7 +229,9 @@ def _simplify(line, tolerance):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def _pairs_in_cells(row, cell, groups, boxes, low):  # pragma: no cover - compiled
+def _pairs_in_cells(
+    row: I64x1, cell: I64x2, groups: I64x1, boxes: F64x2, low: I64x2
+) -> I64x2:  # pragma: no cover - compiled
     out = np.empty((16, 2), np.int64)
     for filling in range(2):
         found = 0

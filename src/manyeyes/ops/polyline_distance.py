@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x1, F64x2, I64x1, I64x2, njit
 from manyeyes.datatypes.map_element import frozen
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ def _columns(a: Floats, a_first: Ints, b: Floats, b_first: Ints) -> tuple[Floats
 
 
 @njit(cache=True)
-def _nearest_points(a, a0, a1, b, b0, b1):  # pragma: no cover - compiled
+def _nearest_points(a: F64x2, a0: int, a1: int, b: F64x2, b0: int, b1: int) -> float:  # pragma: no cover - compiled
     total = 0.0
     for i in range(a0, a1):
         best = np.inf
@@ -57,20 +57,22 @@ def _nearest_points(a, a0, a1, b, b0, b1):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def _chamfer(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
+def _chamfer(a: F64x2, a_first: I64x1, b: F64x2, b_first: I64x1, pairs: I64x2) -> F64x1:  # pragma: no cover - compiled
     out = np.empty(len(pairs))
     for k in range(len(pairs)):
-        i, j = pairs[k]
+        i, j = int(pairs[k, 0]), int(pairs[k, 1])
         a0, a1, b0, b1 = a_first[i], a_first[i + 1], b_first[j], b_first[j + 1]
         out[k] = 0.5 * (_nearest_points(a, a0, a1, b, b0, b1) + _nearest_points(b, b0, b1, a, a0, a1))
     return out
 
 
 @njit(cache=True)
-def _directed(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
+def _directed(
+    a: F64x2, a_first: I64x1, b: F64x2, b_first: I64x1, pairs: I64x2
+) -> tuple[F64x1, F64x1, F64x1]:  # pragma: no cover - compiled
     mean, most, least = np.empty(len(pairs)), np.zeros(len(pairs)), np.full(len(pairs), np.inf)
     for k in range(len(pairs)):
-        i, j = pairs[k]
+        i, j = int(pairs[k, 0]), int(pairs[k, 1])
         total = 0.0
         for p in range(a_first[i], a_first[i + 1]):
             x, y = a[p, 0], a[p, 1]
@@ -90,7 +92,9 @@ def _directed(a, a_first, b, b_first, pairs):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def _frechet_one(a, a0, a1, b, b0, b1, backwards):  # pragma: no cover - compiled
+def _frechet_one(
+    a: F64x2, a0: int, a1: int, b: F64x2, b0: int, b1: int, backwards: bool
+) -> float:  # pragma: no cover - compiled
     n, m = a1 - a0, b1 - b0
     row = np.empty(m)
     for i in range(n):
@@ -113,10 +117,12 @@ def _frechet_one(a, a0, a1, b, b0, b1, backwards):  # pragma: no cover - compile
 
 
 @njit(cache=True)
-def _frechet(a, a_first, b, b_first, pairs, either_way):  # pragma: no cover - compiled
+def _frechet(
+    a: F64x2, a_first: I64x1, b: F64x2, b_first: I64x1, pairs: I64x2, either_way: bool
+) -> F64x1:  # pragma: no cover - compiled
     out = np.empty(len(pairs))
     for k in range(len(pairs)):
-        i, j = pairs[k]
+        i, j = int(pairs[k, 0]), int(pairs[k, 1])
         a0, a1, b0, b1 = a_first[i], a_first[i + 1], b_first[j], b_first[j + 1]
         out[k] = _frechet_one(a, a0, a1, b, b0, b1, False)
         if either_way:

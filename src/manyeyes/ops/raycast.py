@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x2, F64x1, F64x2, F64x3, I32x2, U8x1, U8x2, njit
 from manyeyes.datatypes.errors import ShapeError
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
@@ -24,6 +25,72 @@ _TWO_PI = 2 * math.pi
 _MIX_A, _MIX_B, _MIX_C = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 
 Array = NDArray[np.float64]
+
+
+# Columns of an interval: azimuths and elevations in radians, and the least distance in metres.
+_AZIMUTH_LOW, _AZIMUTH_HIGH, _ELEVATION_LOW, _ELEVATION_HIGH, _NEAREST = range(5)
+
+
+class SolidArrays(NamedTuple):
+    """The columns of :class:`Primitives` that compiled loops need."""
+
+    kind: U8x1
+    center: F64x2
+    rotation: F64x3
+    half: F64x2
+    density: F64x1
+
+
+class SensorPose(NamedTuple):
+    """origin: (3,) metres, rotation: (3, 3) world_from_sensor."""
+
+    origin: F64x1
+    rotation: F64x2
+
+
+class HeightRaster(NamedTuple):
+    """height (rows, columns) metres at nodes ``x_min + column * cell``, ``y_min + row * cell``."""
+
+    height: F32x2
+    x_min: float
+    y_min: float
+    cell: float
+
+
+class _SurfaceRaster(NamedTuple):
+    """surface (rows, columns): classes of cells of edge cell, whose corner is at x_min, y_min."""
+
+    surface: U8x2
+    x_min: float
+    y_min: float
+    cell: float
+
+
+class _Rays(NamedTuple):
+    """Cosines and sines of the elevations (B,) and of the azimuths (A,)."""
+
+    cos_elevation: F64x1
+    sin_elevation: F64x1
+    cos_azimuth: F64x1
+    sin_azimuth: F64x1
+
+
+class _ScanPattern(NamedTuple):
+    """elevation: (B,) ascending, azimuth: (A,), radians, per_turn to a whole turn; max_range: metres."""
+
+    elevation: F64x1
+    azimuth: F64x1
+    rays: _Rays
+    per_turn: int
+    max_range: float
+
+
+class _ScanImage(NamedTuple):
+    """The depth buffer, all (A, B): metres, index of the primitive, cosine of the incidence."""
+
+    depth: F64x2
+    owner: I32x2
+    cosine: F64x2
 
 
 @dataclass(frozen=True)
@@ -58,6 +125,11 @@ class Primitives:
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64]) -> Primitives:
         return Primitives(*(getattr(self, f.name)[index] for f in fields(self)))
 
+    @property
+    def arrays(self) -> SolidArrays:
+        """The columns for compiled loops."""
+        return SolidArrays(self.kind, self.center, self.rotation, self.half, self.density)
+
     @classmethod
     def cat(cls, many: list[Primitives]) -> Primitives:
         """Several sets as one; at least one set."""
@@ -85,6 +157,11 @@ class HeightField:
     cell: float
     surface_cell: float
 
+    @property
+    def raster(self) -> HeightRaster:
+        """The heights for compiled loops."""
+        return HeightRaster(self.height, self.x_min, self.y_min, self.cell)
+
 
 @dataclass(frozen=True)
 class Hits:
@@ -111,17 +188,18 @@ def uniform_of(seed: np.uint64, primitive: int, ray: int) -> float:
 
 
 @njit(cache=True)
-def _interval(o, q, half, bounds):
-    """Azimuths and elevations (sensor frame) that an oriented box can cover: bounds = lo, hi, el_lo, el_hi, near.
+def _interval(o: F64x1, q: F64x2, half: F64x1, bounds: F64x1) -> None:
+    """Azimuths and elevations (sensor frame) that an oriented box can cover, into bounds (5,): _AZIMUTH_LOW … _NEAREST.
 
     o: the sensor in the box's frame; q: box_from_sensor. A tilt between the two can only shrink the horizontal distance
     by the height times its sine, so the interval is never too small.
     """
     gap0, gap1, gap2 = max(abs(o[0]) - half[0], 0.0), max(abs(o[1]) - half[1], 0.0), max(abs(o[2]) - half[2], 0.0)
-    bounds[4] = math.sqrt(gap0 * gap0 + gap1 * gap1 + gap2 * gap2)
+    bounds[_NEAREST] = math.sqrt(gap0 * gap0 + gap1 * gap1 + gap2 * gap2)
     upright = min(abs(q[2, 2]), 1.0)
     flat = math.hypot(gap0, gap1) * upright - (abs(o[2]) + half[2]) * math.sqrt(1.0 - upright * upright)
-    bounds[0], bounds[1], bounds[2], bounds[3] = -math.pi, math.pi, -math.pi / 2, math.pi / 2
+    bounds[_AZIMUTH_LOW], bounds[_AZIMUTH_HIGH] = -math.pi, math.pi
+    bounds[_ELEVATION_LOW], bounds[_ELEVATION_HIGH] = -math.pi / 2, math.pi / 2
     if flat < 0.02:
         return
     middle_x = -(q[0, 0] * o[0] + q[1, 0] * o[1] + q[2, 0] * o[2])
@@ -139,13 +217,13 @@ def _interval(o, q, half, bounds):
         turn -= _TWO_PI * math.floor((turn + math.pi) / _TWO_PI)
         low, high = min(low, turn), max(high, turn)
         z_low, z_high, far = min(z_low, z), max(z_high, z), max(far, math.hypot(x, y))
-    bounds[0], bounds[1] = middle + low, middle + high
-    bounds[2] = math.atan2(z_low, flat if z_low < 0 else far)
-    bounds[3] = math.atan2(z_high, flat if z_high > 0 else far)
+    bounds[_AZIMUTH_LOW], bounds[_AZIMUTH_HIGH] = middle + low, middle + high
+    bounds[_ELEVATION_LOW] = math.atan2(z_low, flat if z_low < 0 else far)
+    bounds[_ELEVATION_HIGH] = math.atan2(z_high, flat if z_high > 0 else far)
 
 
 @njit(cache=True)
-def hit_box(o, half, d0, d1, d2):
+def hit_box(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tuple[float, float]:
     """Entry distance and cosine into a box from outside it; (inf, 0) when missed. At most three faces look at the sensor."""
     if abs(o[0]) > half[0] and o[0] * d0 < 0:
         t = ((half[0] if o[0] > 0 else -half[0]) - o[0]) / d0
@@ -163,7 +241,7 @@ def hit_box(o, half, d0, d1, d2):
 
 
 @njit(cache=True)
-def hit_cylinder(o, half, d0, d1, d2):
+def hit_cylinder(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tuple[float, float]:
     """Entry distance and cosine into the side of a cylinder of radius half[0]."""
     a, b = d0 * d0 + d1 * d1, o[0] * d0 + o[1] * d1
     c = o[0] * o[0] + o[1] * o[1] - half[0] * half[0]
@@ -177,7 +255,7 @@ def hit_cylinder(o, half, d0, d1, d2):
 
 
 @njit(cache=True)
-def hit_ellipsoid(o, half, d0, d1, d2):
+def hit_ellipsoid(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tuple[float, float]:
     """Entry and exit distance of an ellipsoid, (inf, inf) when missed; entry is 0 from within."""
     s0, s1, s2 = o[0] / half[0], o[1] / half[1], o[2] / half[2]
     e0, e1, e2 = d0 / half[0], d1 / half[1], d2 / half[2]
@@ -193,16 +271,28 @@ def hit_ellipsoid(o, half, d0, d1, d2):
 
 
 @njit(cache=True)
-def _draw(index, kind, half, density, o, q, bounds, first, per_turn, el, azimuth, rays, seed, depth, owner, cosine):
-    """One primitive into its part of the image. rays: (4 arrays) cos el, sin el, cos az, sin az."""
-    cos_el, sin_el, cos_az, sin_az = rays
+def _draw(
+    index: int,
+    solids: SolidArrays,
+    o: F64x1,
+    q: F64x2,
+    bounds: F64x1,
+    scan: _ScanPattern,
+    seed: np.uint64,
+    image: _ScanImage,
+) -> None:
+    """One primitive into its part of the image; o, q, bounds: as in :func:`_interval`."""
+    kind, half, density = solids.kind[index], solids.half[index], solids.density[index]
+    el, azimuth, (cos_el, sin_el, cos_az, sin_az), per_turn, _ = scan
+    depth, owner, cosine = image
+    first = azimuth[0]
     step = _TWO_PI / per_turn
-    beam_lo = np.searchsorted(el, bounds[2] - 1e-9)
-    beam_hi = np.searchsorted(el, bounds[3] + 1e-9)
+    beam_lo = np.searchsorted(el, bounds[_ELEVATION_LOW] - 1e-9)
+    beam_hi = np.searchsorted(el, bounds[_ELEVATION_HIGH] + 1e-9)
     if beam_hi <= beam_lo:
         return
-    k_lo = math.ceil((bounds[0] - first) / step - 1e-9)
-    k_hi = min(math.floor((bounds[1] - first) / step + 1e-9), k_lo + per_turn - 1)
+    k_lo = math.ceil((bounds[_AZIMUTH_LOW] - first) / step - 1e-9)
+    k_hi = min(math.floor((bounds[_AZIMUTH_HIGH] - first) / step + 1e-9), k_lo + per_turn - 1)
     beams = el.shape[0]
     for k in range(k_lo, k_hi + 1):
         a = k % per_turn
@@ -212,7 +302,7 @@ def _draw(index, kind, half, density, o, q, bounds, first, per_turn, el, azimuth
         u1 = cos_az[a] * q[1, 0] + sin_az[a] * q[1, 1]
         u2 = cos_az[a] * q[2, 0] + sin_az[a] * q[2, 1]
         for b in range(beam_lo, beam_hi):
-            if depth[a, b] <= bounds[4]:
+            if depth[a, b] <= bounds[_NEAREST]:
                 continue
             d0 = cos_el[b] * u0 + sin_el[b] * q[0, 2]
             d1 = cos_el[b] * u1 + sin_el[b] * q[1, 2]
@@ -233,7 +323,7 @@ def _draw(index, kind, half, density, o, q, bounds, first, per_turn, el, azimuth
 
 
 @njit(cache=True)
-def height_at(field, x_min, y_min, cell, x, y):
+def height_at(field: F32x2, x_min: float, y_min: float, cell: float, x: float, y: float) -> float:
     """Bilinear height; the border value goes on outside."""
     column = min(max((x - x_min) / cell, 0.0), field.shape[1] - 1.001)
     row = min(max((y - y_min) / cell, 0.0), field.shape[0] - 1.001)
@@ -245,12 +335,13 @@ def height_at(field, x_min, y_min, cell, x, y):
 
 
 @njit(cache=True)
-def _walk_ground(field, x_min, y_min, cell, origin, rotation, rays, max_range, depth, owner, cosine):
+def _walk_ground(terrain: HeightRaster, pose: SensorPose, rays: _Rays, max_range: float, image: _ScanImage) -> None:
     """The height field, per azimuth from the lowest beam up: a higher beam is still above ground where a lower one was.
 
     Steps are 0.4 m or 1 % of the range, then false position inside the step that crosses.
     """
     cos_el, sin_el, cos_az, sin_az = rays
+    (field, x_min, y_min, cell), (origin, rotation), (depth, owner, cosine) = terrain, pose, image
     for a in range(depth.shape[0]):
         free = 0.3
         h0 = cos_az[a] * rotation[0, 0] + sin_az[a] * rotation[0, 1]
@@ -302,26 +393,11 @@ def _walk_ground(field, x_min, y_min, cell, origin, rotation, rays, max_range, d
 
 
 @njit(cache=True)
-def _cast(
-    kind,
-    center,
-    rotation,
-    half,
-    density,
-    origin,
-    sensor,
-    el,
-    azimuth,
-    rays,
-    per_turn,
-    max_range,
-    seed,
-    depth,
-    owner,
-    cosine,
-):
+def _cast(solids: SolidArrays, pose: SensorPose, scan: _ScanPattern, seed: np.uint64, image: _ScanImage) -> None:
     """All primitives, nearest first."""
-    n = kind.shape[0]
+    center, rotation, half = solids.center, solids.rotation, solids.half
+    origin, sensor = pose
+    n = center.shape[0]
     o, q, bounds, near = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 5)), np.empty(n)
     for i in range(n):
         for r in range(3):
@@ -334,20 +410,20 @@ def _cast(
                     + rotation[i, 2, r] * sensor[2, c]
                 )
         _interval(o[i], q[i], half[i], bounds[i])
-        near[i] = bounds[i, 4]
+        near[i] = bounds[i, _NEAREST]
     for i in np.argsort(near, kind="mergesort"):
-        if near[i] > max_range:
+        if near[i] > scan.max_range:
             break
-        _draw(
-            i, kind[i], half[i], density[i], o[i], q[i], bounds[i], azimuth[0], per_turn, el, azimuth, rays, seed, depth,
-            owner, cosine,
-        )  # fmt: skip
+        _draw(i, solids, o[i], q[i], bounds[i], scan, seed, image)
 
 
 @njit(cache=True)
-def _finish(origin, rotation, rays, max_range, x_min, y_min, cell, surface_map, depth, owner, surface):
+def _finish(
+    pose: SensorPose, rays: _Rays, max_range: float, ground: _SurfaceRaster, image: _ScanImage, surface: U8x2
+) -> None:
     """Cut at the range and read the class of the ground under each ground return."""
     cos_el, sin_el, cos_az, sin_az = rays
+    (surface_map, x_min, y_min, cell), (origin, rotation), (depth, owner, _) = ground, pose, image
     rows, columns = surface_map.shape
     for a in range(depth.shape[0]):
         for b in range(depth.shape[1]):
@@ -383,14 +459,13 @@ def cast(
     shape = (azimuth.shape[0], elevation.shape[0])
     depth, owner = np.full(shape, np.inf), np.full(shape, NOTHING, np.int32)
     cosine, surface = np.zeros(shape), np.zeros(shape, np.uint8)
-    rays = (np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth))
-    _cast(
-        primitives.kind, primitives.center, primitives.rotation, primitives.half, primitives.density, origin, rotation,
-        elevation, azimuth, rays, per_turn, max_range, np.uint64(seed % 2**64), depth, owner, cosine,
-    )  # fmt: skip
-    place = (ground.x_min, ground.y_min)
-    _walk_ground(ground.height, *place, ground.cell, origin, rotation, rays, max_range, depth, owner, cosine)
-    _finish(origin, rotation, rays, max_range, *place, ground.surface_cell, ground.surface, depth, owner, surface)
+    rays = _Rays(np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth))
+    pose, image = SensorPose(origin, rotation), _ScanImage(depth, owner, cosine)
+    scan = _ScanPattern(elevation, azimuth, rays, per_turn, max_range)
+    _cast(primitives.arrays, pose, scan, np.uint64(seed % 2**64), image)
+    _walk_ground(ground.raster, pose, rays, max_range, image)
+    surfaces = _SurfaceRaster(ground.surface, ground.x_min, ground.y_min, ground.surface_cell)
+    _finish(pose, rays, max_range, surfaces, image, surface)
     return Hits(depth, owner, cosine, surface)
 
 

@@ -20,6 +20,7 @@ from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBe
 from manyeyes.ops._sparse_conv_kernels import LANES, convolve, panels
 from manyeyes.ops.sparse_index import (
     NeighbourMap,
+    Pairs,
     Window,
     dilated_sites,
     distinct,
@@ -220,10 +221,10 @@ def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, b
     """(rows, D): for each pair of a tap its row of x (N, C) times the matrix (C, D) of the tap, summed where it leads."""
     bias = x.new_zeros(taps.shape[2]) if bias is None else bias.to(x.dtype)
     if _in_loops(x, taps):
-        (source, target, counts), out = table.pairs, x.new_empty(table.rows(reverse), taps.shape[2])
-        source, target = (target, source) if reverse else (source, target)
+        pairs, out = table.pairs, x.new_empty(table.rows(reverse), taps.shape[2])
+        pairs = Pairs(pairs.target, pairs.source, pairs.counts) if reverse else pairs
         rows, start = x.contiguous().numpy(), bias.contiguous().numpy()
-        convolve(rows, panels(taps), start, source, target, counts, table.is_symmetric, False, out.numpy())
+        convolve(rows, panels(taps), start, pairs, table.is_symmetric, False, out.numpy())
         return out
     # Every site meets itself by the middle tap: no gathering there.
     out = (

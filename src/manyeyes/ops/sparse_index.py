@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from manyeyes._jit import njit
+from manyeyes._jit import I32x1, I64x1, U8x1, njit
 
 
 class Window(NamedTuple):
@@ -52,6 +52,22 @@ class Pairs(NamedTuple):
     source: NDArray[np.int64]
     target: NDArray[np.int64]
     counts: NDArray[np.int64]
+
+
+class _BorderedImages(NamedTuple):
+    """How many index images with a border that no tap leaves, and the rows and columns of each."""
+
+    batch_size: int
+    rows: int
+    columns: int
+
+
+class _TapSteps(NamedTuple):
+    """Places of an index image from a tap to the one below it and to the one beside it; taps in a row of the kernel."""
+
+    down: int
+    right: int
+    kernel: int
 
 
 class Block(NamedTuple):
@@ -121,9 +137,9 @@ class NeighbourMap:
     def pairs(self) -> Pairs:
         """Which inputs lead to which outputs, on the CPU."""
         if _in_loops(self.in_key):
-            bordered = (self.batch_size, *_bordered(self.out_shape, self.in_shape, self.window))
-            out_key, in_key, window = self.out_key.numpy(), self.in_key.numpy(), tuple(self.window)
-            return Pairs(*_pairs(out_key, in_key, self.out_shape, self.in_shape, bordered, window, self._taps))
+            bordered = _BorderedImages(self.batch_size, *_bordered(self.out_shape, self.in_shape, self.window))
+            out_key, in_key = self.out_key.numpy(), self.in_key.numpy()
+            return _pairs(out_key, in_key, self.out_shape, self.in_shape, bordered, self.window, self._taps)
         return Pairs(*(part.numpy() for part in self._met))
 
     @cached_property
@@ -268,7 +284,7 @@ def _in_loops(key: Tensor) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def mark_ranks(marks):  # pragma: no cover
+def mark_ranks(marks: U8x1) -> tuple[I64x1, I32x1]:  # pragma: no cover
     """Ascending places (M,) int64 of the ones among marks (S,) uint8, S divisible by 8, and (S,) int32: each one's number."""
     n, words = 0, marks.view(np.uint64)
     for w in words:
@@ -285,7 +301,7 @@ def mark_ranks(marks):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _distinct(key, marks):  # pragma: no cover
+def _distinct(key: I64x1, marks: U8x1) -> tuple[I64x1, I64x1]:  # pragma: no cover
     """Ascending distinct keys and the place of each key among them; marks: zeros for every key there may be."""
     for k in key:
         marks[k] = 1
@@ -297,7 +313,9 @@ def _distinct(key, marks):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _parents(key, in_rows, in_columns, batch_size, rows, columns, stride):  # pragma: no cover
+def _parents(
+    key: I64x1, in_rows: int, in_columns: int, batch_size: int, rows: int, columns: int, stride: int
+) -> I64x1:  # pragma: no cover
     marks = np.zeros(batch_size * rows * columns // 8 * 8 + 8, np.uint8)
     start, end, first = 0, 0, 0
     for k in key:
@@ -310,7 +328,9 @@ def _parents(key, in_rows, in_columns, batch_size, rows, columns, stride):  # pr
 
 
 @njit(cache=True, nogil=True)
-def _finer(key, in_rows, in_columns, rows, columns, ratio, out):  # pragma: no cover
+def _finer(
+    key: I64x1, in_rows: int, in_columns: int, rows: int, columns: int, ratio: int, out: I64x1
+) -> None:  # pragma: no cover
     """As finer_keys, of ascending keys."""
     start, end, first = 0, 0, 0
     for i in range(key.shape[0]):
@@ -322,8 +342,16 @@ def _finer(key, in_rows, in_columns, rows, columns, ratio, out):  # pragma: no c
 
 
 @njit(cache=True, nogil=True)
-def _pairs(out_key, in_key, out_shape, in_shape, bordered, window, taps):  # pragma: no cover
-    """Pairs of so many taps. bordered: how many images of how many rows and columns hold the inputs and a border."""
+def _pairs(
+    out_key: I64x1,
+    in_key: I64x1,
+    out_shape: tuple[int, int],
+    in_shape: tuple[int, int],
+    bordered: _BorderedImages,
+    window: Window,
+    taps: int,
+) -> Pairs:  # pragma: no cover
+    """Pairs of so many taps; bordered: the images that hold the inputs."""
     kernel, stride, padding, dilation = window
     batch_size, rows, columns = bordered
     image = np.full(batch_size * rows * columns, in_key.shape[0], np.int32)
@@ -332,12 +360,15 @@ def _pairs(out_key, in_key, out_shape, in_shape, bordered, window, taps):  # pra
     _place_first(out_key, out_shape[0], out_shape[1], rows, columns, stride, first)
     most = taps * out_key.shape[0] + 1
     source, target = np.empty(most, np.int64), np.empty(most, np.int64)
-    met = _meet(image, first, columns * dilation, dilation, kernel, in_key.shape[0], source, target, counts)
-    return source[:met], target[:met], counts
+    steps = _TapSteps(columns * dilation, dilation, kernel)
+    met = _meet(image, first, steps, in_key.shape[0], source, target, counts)
+    return Pairs(source[:met], target[:met], counts)
 
 
 @njit(cache=True, nogil=True)
-def _place(key, in_rows, in_columns, rows, columns, padding, image):  # pragma: no cover
+def _place(
+    key: I64x1, in_rows: int, in_columns: int, rows: int, columns: int, padding: int, image: I32x1
+) -> None:  # pragma: no cover
     """The number of each of ascending keys, at its place in an image of rows and columns with a border."""
     end, shift = 0, 0
     for i in range(key.shape[0]):
@@ -349,7 +380,9 @@ def _place(key, in_rows, in_columns, rows, columns, padding, image):  # pragma: 
 
 
 @njit(cache=True, nogil=True)
-def _place_first(key, out_rows, out_columns, rows, columns, stride, first):  # pragma: no cover
+def _place_first(
+    key: I64x1, out_rows: int, out_columns: int, rows: int, columns: int, stride: int, first: I32x1
+) -> None:  # pragma: no cover
     """Where in such an image the first tap of each of ascending keys lies."""
     end, shift = 0, 0
     for o in range(key.shape[0]):
@@ -361,11 +394,11 @@ def _place_first(key, out_rows, out_columns, rows, columns, stride, first):  # p
 
 
 @njit(cache=True, nogil=True)
-def _meet(image, first, down, across, kernel, n_in, source, target, counts):  # pragma: no cover
-    """Fills rows source and target of pairs, tap by tap, and counts (taps,); how many pairs there are.
-
-    down, across: from a tap to the one below it and beside it.
-    """
+def _meet(
+    image: I32x1, first: I32x1, steps: _TapSteps, n_in: int, source: I64x1, target: I64x1, counts: I64x1
+) -> int:  # pragma: no cover
+    """Fills rows source and target of pairs, tap by tap, and counts (taps,); how many pairs there are."""
+    down, across, kernel = steps
     at = 0
     for t in range(counts.shape[0]):
         step, before = t // kernel * down + t % kernel * across, at
@@ -375,4 +408,4 @@ def _meet(image, first, down, across, kernel, n_in, source, target, counts):  # 
             source[at], target[at] = found, o
             at += found < n_in
         counts[t] = at - before
-    return at
+    return int(at)

@@ -8,14 +8,14 @@ dropped: windows beyond the last bucket are padded to the largest among them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x2, I64x1, njit
 from manyeyes.datatypes import ConfigError, ShapeError
 
 BUCKETS = (4, 8, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)
@@ -53,13 +53,24 @@ def window_places(
     _checked(window_m)
     ids, offsets = torch.empty(len(xy), dtype=torch.int64), torch.empty(len(xy), 2)
     where, whose = xy.contiguous().numpy(), batch.contiguous().numpy()
-    x_min, y_min, edge, cell, shift = map(float, (*origin, window_m, cell_m, shift_m))
-    _place(where, whose, x_min, y_min, edge, cell, shift, ids.numpy(), offsets.numpy())
+    windows = _WindowGrid(*map(float, (*origin, window_m, cell_m, shift_m)))
+    _place(where, whose, windows, ids.numpy(), offsets.numpy())
     return ids, offsets
 
 
+class _WindowGrid(NamedTuple):
+    """Square windows of edge window_m, moved by -shift_m, from the corner (x_min, y_min); offsets count cells of cell_m."""
+
+    x_min: float
+    y_min: float
+    window_m: float
+    cell_m: float
+    shift_m: float
+
+
 @njit(cache=True, nogil=True)
-def _place(xy, batch, x_min, y_min, window_m, cell_m, shift_m, ids, offsets):  # pragma: no cover
+def _place(xy: F32x2, batch: I64x1, windows: _WindowGrid, ids: I64x1, offsets: F32x2) -> None:  # pragma: no cover
+    x_min, y_min, window_m, cell_m, shift_m = windows
     for i in range(xy.shape[0]):
         x, y = np.float64(xy[i, 0]) - x_min + shift_m, np.float64(xy[i, 1]) - y_min + shift_m
         column, row, half = np.floor(x / window_m), np.floor(y / window_m), 1 << (_BITS - 1)
