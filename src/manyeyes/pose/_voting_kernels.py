@@ -8,25 +8,86 @@ objects (specs/pose.md 4.2) gives a yaw only as exact as a detected heading, whi
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx2, F64x1, F64x2, I64x1, I64x2, njit
 
 _PI = np.pi
+# Columns of a covariance (N, 3).
+_XX, _XY, _YY = range(3)
+
+
+class LandmarkArrays(NamedTuple):
+    """xy: (N, 2) metres; yaw: (N,) radians; sigma_xy, sigma_yaw: (N,) their standard deviations."""
+
+    xy: F64x2
+    yaw: F64x1
+    sigma_xy: F64x1
+    sigma_yaw: F64x1
+
+
+class OrientedLandmarks(NamedTuple):
+    """As :class:`LandmarkArrays`, with the covariance (N, 3) of each place in its agent's axes: xx, xy and yy."""
+
+    xy: F64x2
+    yaw: F64x1
+    covariance: F64x2
+    sigma_yaw: F64x1
+
+
+class Edges(NamedTuple):
+    """ends: (E, 2) landmarks; length: (E,) metres; direction: (E,) radians; heading: (E, 2) of both ends from it, modulo pi."""
+
+    ends: I64x2
+    length: F64x1
+    direction: F64x1
+    heading: F64x2
+
+
+class PointGrid(NamedTuple):
+    """Points by square cells: cell c = column * num_rows + row holds ``order[start[c]:start[c + 1]]``; columns go along x."""
+
+    order: I64x1
+    start: I64x1
+    x_min: float
+    y_min: float
+    num_columns: int
+    num_rows: int
+    cell_m: float
+
+
+class InverseCovariance(NamedTuple):
+    """The three numbers of a symmetric matrix (2, 2)."""
+
+    xx: float
+    xy: float
+    yy: float
+
+
+class RefinedPose(NamedTuple):
+    """pose: (3,) x, y, yaw; information: (3, 3) of it; pairs: (P, 2) landmarks of a and b; misfit: (P,) squared."""
+
+    pose: F64x1
+    information: F64x2
+    pairs: I64x2
+    misfit: F64x1
 
 
 @njit(cache=True, nogil=True)
-def fold(angle):  # pragma: no cover - compiled
+def fold(angle: float) -> float:  # pragma: no cover - compiled
     """An angle modulo pi, in [-pi/2, pi/2)."""
     return (angle + 0.5 * _PI) % _PI - 0.5 * _PI
 
 
 @njit(cache=True, nogil=True)
-def edge_table(xy, yaw, shortest, longest):  # pragma: no cover - compiled
-    """(E, 2) ends and (E, 4) length, direction, and the headings of both ends from it modulo pi."""
+def edge_table(xy: F64x2, yaw: F64x1, shortest: float, longest: float) -> Edges:  # pragma: no cover - compiled
+    """Edges between landmarks from shortest to longest metres apart."""
     n = len(xy)
-    ends = np.empty((n * (n - 1) // 2, 2), np.int64)
-    shape = np.empty((n * (n - 1) // 2, 4))
+    size = n * (n - 1) // 2
+    ends, heading = np.empty((size, 2), np.int64), np.empty((size, 2))
+    lengths, direction = np.empty(size), np.empty(size)
     count = 0
     for i in range(n):
         for j in range(i + 1, n):
@@ -36,14 +97,16 @@ def edge_table(xy, yaw, shortest, longest):  # pragma: no cover - compiled
                 continue
             along = np.arctan2(dy, dx)
             ends[count, 0], ends[count, 1] = i, j
-            shape[count, 0], shape[count, 1] = length, along
-            shape[count, 2], shape[count, 3] = fold(yaw[i] - along), fold(yaw[j] - along)
+            lengths[count], direction[count] = length, along
+            heading[count, 0], heading[count, 1] = fold(yaw[i] - along), fold(yaw[j] - along)
             count += 1
-    return ends[:count], shape[:count]
+    return Edges(ends[:count], lengths[:count], direction[:count], heading[:count])
 
 
 @njit(cache=True, nogil=True)
-def compatible(size_a, size_b, instant_a, instant_b, gate):  # pragma: no cover - compiled
+def compatible(
+    size_a: F64x2, size_b: F64x2, instant_a: I64x1, instant_b: I64x1, gate: float
+) -> Boolx2:  # pragma: no cover - compiled
     """(N, M) bool: landmarks that may be one object: of one instant, widths within ``gate`` (m), lengths within about
     twice.
     """
@@ -59,16 +122,17 @@ def compatible(size_a, size_b, instant_a, instant_b, gate):  # pragma: no cover 
 
 
 @njit(cache=True, nogil=True)
-def match_edges(a, b, edges_a, edges_b, may, gate, at_most):  # pragma: no cover - compiled
+def match_edges(
+    a: LandmarkArrays, b: LandmarkArrays, edges_a: Edges, edges_b: Edges, may: Boolx2, gate: float, at_most: int
+) -> tuple[F64x2, F64x1]:  # pragma: no cover - compiled
     """Poses (H, 3) a_from_b of edges that agree within ``gate`` standard deviations, and their misfit (H,).
 
-    a, b: xy, yaw, sigma_xy, sigma_yaw. edges: ends and shapes sorted by length. may: (N, M) pairs that may be one
-    object.
+    edges_a, edges_b: by ascending length. may: (N, M) pairs that may be one object. Of more than at_most, the first.
     """
     xy_a, _, sxy_a, syaw_a = a
     xy_b, _, sxy_b, syaw_b = b
-    ends_a, shape_a = edges_a
-    ends_b, shape_b = edges_b
+    ends_a, length_a, direction_a, heading_a = edges_a
+    ends_b, length_b, direction_b, heading_b = edges_b
     out = np.empty((at_most, 3))
     misfit = np.empty(at_most)
     count = 0
@@ -77,23 +141,23 @@ def match_edges(a, b, edges_a, edges_b, may, gate, at_most):  # pragma: no cover
         largest = gate * 2.0 * max(sxy_a.max(), sxy_b.max())
     low = 0
     for p in range(len(ends_a)):
-        while low < len(ends_b) and shape_b[low, 0] < shape_a[p, 0] - largest:
+        while low < len(ends_b) and length_b[low] < length_a[p] - largest:
             low += 1
-        i, j = ends_a[p]
+        i, j = ends_a[p, 0], ends_a[p, 1]
         for q in range(low, len(ends_b)):
-            if shape_b[q, 0] > shape_a[p, 0] + largest:
+            if length_b[q] > length_a[p] + largest:
                 break
             for way in range(2):
                 k, m = ends_b[q, way], ends_b[q, 1 - way]
                 if not (may[i, k] and may[j, m]):
                     continue
                 spread = sxy_a[i] ** 2 + sxy_b[k] ** 2 + sxy_a[j] ** 2 + sxy_b[m] ** 2
-                cost = (shape_a[p, 0] - shape_b[q, 0]) ** 2 / spread
+                cost = (length_a[p] - length_b[q]) ** 2 / spread
                 if cost > gate * gate:
                     continue
-                tilt = spread / (shape_a[p, 0] * shape_b[q, 0])
-                one = fold(shape_a[p, 2] - shape_b[q, 2 + way])
-                two = fold(shape_a[p, 3] - shape_b[q, 3 - way])
+                tilt = spread / (length_a[p] * length_b[q])
+                one = fold(heading_a[p, 0] - heading_b[q, way])
+                two = fold(heading_a[p, 1] - heading_b[q, 1 - way])
                 # Headings relative to the edge: one unknown turn of the edge, two measured angles.
                 v1, v2 = syaw_a[i] ** 2 + syaw_b[k] ** 2, syaw_a[j] ** 2 + syaw_b[m] ** 2
                 weight = 1.0 / tilt + 1.0 / v1 + 1.0 / v2
@@ -101,7 +165,7 @@ def match_edges(a, b, edges_a, edges_b, may, gate, at_most):  # pragma: no cover
                 cost += turn * turn / tilt + (one - turn) ** 2 / v1 + (two - turn) ** 2 / v2
                 if cost > gate * gate or count == at_most:
                     continue
-                yaw = shape_a[p, 1] - shape_b[q, 1] + turn + (_PI if way else 0.0)
+                yaw = direction_a[p] - direction_b[q] + turn + (_PI if way else 0.0)
                 c, s = np.cos(yaw), np.sin(yaw)
                 mx, my = 0.5 * (xy_b[k, 0] + xy_b[m, 0]), 0.5 * (xy_b[k, 1] + xy_b[m, 1])
                 out[count, 0] = 0.5 * (xy_a[i, 0] + xy_a[j, 0]) - (c * mx - s * my)
@@ -113,10 +177,8 @@ def match_edges(a, b, edges_a, edges_b, may, gate, at_most):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def grid_of(xy, cell):  # pragma: no cover - compiled
-    """Rows of points by square cells: (order, start, x0, y0, columns, rows, cell); cells grow where there would be
-    too many.
-    """
+def grid_of(xy: F64x2, cell: float) -> PointGrid:  # pragma: no cover - compiled
+    """Points (N, 2) by square cells of edge cell; cells grow where there would be too many."""
     x0, y0, x1, y1 = xy[:, 0].min(), xy[:, 1].min(), xy[:, 0].max(), xy[:, 1].max()
     cell = max(cell, max(x1 - x0, y1 - y0) / 1000.0)
     nx, ny = int((x1 - x0) / cell) + 1, int((y1 - y0) / cell) + 1
@@ -127,11 +189,13 @@ def grid_of(xy, cell):  # pragma: no cover - compiled
         start[key[n] + 1] += 1
     start = np.cumsum(start)
     order = np.argsort(key, kind="mergesort")
-    return order, start, x0, y0, nx, ny, cell
+    return PointGrid(order, start, x0, y0, nx, ny, cell)
 
 
 @njit(cache=True, nogil=True)
-def support(poses, a, b, may, grid, tau, turn):  # pragma: no cover - compiled
+def support(
+    poses: F64x2, a: LandmarkArrays, b: LandmarkArrays, may: Boolx2, grid: PointGrid, tau: float, turn: float
+) -> F64x1:  # pragma: no cover - compiled
     """(H,) sum over landmarks of b of the best max(0, 1 - d^2 / tau^2) among a's; spec: specs/pose.md 4.2."""
     xy_a, yaw_a, _, _ = a
     xy_b, yaw_b, _, _ = b
@@ -162,7 +226,9 @@ def support(poses, a, b, may, grid, tau, turn):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def distinct(poses, order, middle, at_most, apart, turn):  # pragma: no cover - compiled
+def distinct(
+    poses: F64x2, order: I64x1, middle: F64x1, at_most: int, apart: float, turn: float
+) -> I64x1:  # pragma: no cover - compiled
     """Rows of poses, best first, of which no two agree within ``apart`` metres at the middle (2,) of b and ``turn``
     radians.
     """
@@ -188,22 +254,26 @@ def distinct(poses, order, middle, at_most, apart, turn):  # pragma: no cover - 
 
 
 @njit(cache=True, nogil=True)
-def weight_of(error_a, error_b, c, s, slack):  # pragma: no cover - compiled
+def weight_of(
+    error_a: F64x1, error_b: F64x1, c: float, s: float, slack: float
+) -> InverseCovariance:  # pragma: no cover - compiled
     """xx, xy and yy of the inverse covariance, in a's axes, of where two landmarks are from each other: errors (3,) are xx, xy
     and yy of each in its own frame, a's turned from b's by an angle of cosine c and sine s, and slack of both axes (m).
     """
-    bxx, bxy, byy = error_b[0], error_b[1], error_b[2]
-    xx = error_a[0] + c * c * bxx - 2.0 * c * s * bxy + s * s * byy + slack * slack
-    yy = error_a[2] + s * s * bxx + 2.0 * c * s * bxy + c * c * byy + slack * slack
-    xy = error_a[1] + c * s * (bxx - byy) + (c * c - s * s) * bxy
+    bxx, bxy, byy = error_b[_XX], error_b[_XY], error_b[_YY]
+    xx = error_a[_XX] + c * c * bxx - 2.0 * c * s * bxy + s * s * byy + slack * slack
+    yy = error_a[_YY] + s * s * bxx + 2.0 * c * s * bxy + c * c * byy + slack * slack
+    xy = error_a[_XY] + c * s * (bxx - byy) + (c * c - s * s) * bxy
     size = xx * yy - xy * xy
-    return yy / size, -xy / size, xx / size
+    return InverseCovariance(yy / size, -xy / size, xx / size)
 
 
 @njit(cache=True, nogil=True)
-def pair_up(pose, a, b, may, slack, gate):  # pragma: no cover - compiled
+def pair_up(
+    pose: F64x1, a: OrientedLandmarks, b: OrientedLandmarks, may: Boolx2, slack: float, gate: float
+) -> tuple[I64x2, F64x1]:  # pragma: no cover - compiled
     """One-to-one pairs (P, 2), nearest first, and their squared misfits (P,) in standard deviations (3 numbers a
-    pair). a, b: xy, yaw, error (xx, xy and yy of the place's covariance), sigma_yaw.
+    pair).
     """
     xy_a, yaw_a, error_a, syaw_a = a
     xy_b, yaw_b, error_b, syaw_b = b
@@ -216,7 +286,7 @@ def pair_up(pose, a, b, may, slack, gate):  # pragma: no cover - compiled
         y = s * xy_b[k, 0] + c * xy_b[k, 1] + pose[1]
         for i in range(len(xy_a)):
             dx, dy = x - xy_a[i, 0], y - xy_a[i, 1]
-            widest = error_a[i, 0] + error_a[i, 2] + error_b[k, 0] + error_b[k, 2] + slack * slack
+            widest = error_a[i, _XX] + error_a[i, _YY] + error_b[k, _XX] + error_b[k, _YY] + slack * slack
             if dx * dx + dy * dy > gate * widest or not may[i, k]:
                 continue
             wxx, wxy, wyy = weight_of(error_a[i], error_b[k], c, s, slack)
@@ -231,7 +301,7 @@ def pair_up(pose, a, b, may, slack, gate):  # pragma: no cover - compiled
     order = np.argsort(cost[:count], kind="mergesort")
     pairs, misfit = np.empty((count, 2), np.int64), np.empty(count)
     for m in order:
-        i, k = rows[m]
+        i, k = rows[m, 0], rows[m, 1]
         if used_a[i] or used_b[k]:
             continue
         used_a[i] = used_b[k] = True
@@ -241,7 +311,9 @@ def pair_up(pose, a, b, may, slack, gate):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def fit(pose, pairs, a, b, rounds):  # pragma: no cover - compiled
+def fit(
+    pose: F64x1, pairs: I64x2, a: OrientedLandmarks, b: OrientedLandmarks, rounds: int
+) -> tuple[F64x1, F64x2]:  # pragma: no cover - compiled
     """Least squares on given pairs from a pose (3,): pose and the information matrix (3, 3) of x, y, yaw."""
     xy_a, yaw_a, error_a, syaw_a = a
     xy_b, yaw_b, error_b, syaw_b = b
@@ -252,7 +324,7 @@ def fit(pose, pairs, a, b, rounds):  # pragma: no cover - compiled
         information[:] = 0.0
         gradient = np.zeros(3)
         for p in range(len(pairs)):
-            i, k = pairs[p]
+            i, k = pairs[p, 0], pairs[p, 1]
             wxx, wxy, wyy = weight_of(error_a[i], error_b[k], c, s, 0.0)
             v = 1.0 / (syaw_a[i] ** 2 + syaw_b[k] ** 2)
             ux, uy = c * xy_b[k, 0] - s * xy_b[k, 1], s * xy_b[k, 0] + c * xy_b[k, 1]
@@ -284,20 +356,20 @@ def fit(pose, pairs, a, b, rounds):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def refine(pose, a, b, may, slack, gate, rounds):  # pragma: no cover - compiled
-    """Pairs and fit in turn until the pairs stay: pose, information, pairs, misfits; wide at first, then as exact as
-    stated.
-    """
+def refine(
+    pose: F64x1, a: OrientedLandmarks, b: OrientedLandmarks, may: Boolx2, slack: float, gate: float, rounds: int
+) -> RefinedPose:  # pragma: no cover - compiled
+    """Pairs and fit in turn until the pairs stay; wide at first, then as exact as stated."""
     information = np.zeros((3, 3))
     before = np.full((1, 2), -1, np.int64)
     for round_ in range(rounds):
         wide = slack * 0.5**round_ if round_ < 4 else 0.0
         pairs, misfit = pair_up(pose, a, b, may, wide, gate)
         if len(pairs) == 0:
-            return pose, information, pairs, misfit
+            return RefinedPose(pose, information, pairs, misfit)
         if wide == 0.0 and len(pairs) == len(before) and (pairs == before).all():
             break
         before = pairs
         pose, information = fit(pose, pairs, a, b, 12)
     pairs, misfit = pair_up(pose, a, b, may, 0.0, gate)
-    return pose, information, pairs, misfit
+    return RefinedPose(pose, information, pairs, misfit)

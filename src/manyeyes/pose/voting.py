@@ -118,7 +118,7 @@ def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None
     exact_a, exact_b = _exact(a, config.across), _exact(b, config.across)
     may = loops.compatible(a.size, b.size, a.instant, b.instant, config.size_gate_m)
     poses = _hypotheses(a, b, may, config)
-    grid = loops.grid_of(numbers_a[0], config.tau_m)
+    grid = loops.grid_of(numbers_a.xy, config.tau_m)
     support = loops.support(poses, numbers_a, numbers_b, may, grid, config.tau_m, config.turn_rad)
     # Equal support is ordered by the pose itself, never by where it stands in a list.
     order = np.lexsort((*poses.T, -np.round(support, 9)))
@@ -135,17 +135,17 @@ def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None
     return _merged(found, b, config)
 
 
-def _numbers(x: Landmarks) -> tuple[Floats, Floats, Floats, Floats]:
-    return tuple(np.ascontiguousarray(v) for v in (x.xy, x.yaw, x.sigma_xy, x.sigma_yaw))  # type: ignore[return-value]
+def _numbers(x: Landmarks) -> loops.LandmarkArrays:
+    return loops.LandmarkArrays(*(np.ascontiguousarray(v) for v in (x.xy, x.yaw, x.sigma_xy, x.sigma_yaw)))
 
 
-def _exact(x: Landmarks, across: float) -> tuple[Floats, Floats, Floats, Floats]:
+def _exact(x: Landmarks, across: float) -> loops.OrientedLandmarks:
     """As ``_numbers``, with the places' covariances (N, 3): xx, xy and yy, less across the heading than along it."""
     xy, yaw, sigma_xy, sigma_yaw = _numbers(x)
     c, s = np.cos(yaw), np.sin(yaw)
     share = across * across
     shape = np.stack((c * c + share * s * s, (1 - share) * c * s, s * s + share * c * c), 1)
-    return xy, yaw, shape * sigma_xy[:, None] ** 2, sigma_yaw
+    return loops.OrientedLandmarks(xy, yaw, shape * sigma_xy[:, None] ** 2, sigma_yaw)
 
 
 def _hypotheses(a: Landmarks, b: Landmarks, may: NDArray[np.bool_], config: VoteConfig) -> Floats:
@@ -161,11 +161,11 @@ def _hypotheses(a: Landmarks, b: Landmarks, may: NDArray[np.bool_], config: Vote
     return poses
 
 
-def _edges(x: Landmarks, config: VoteConfig) -> tuple[Ints, Floats]:
-    """Ends and shapes of the edges, by length."""
-    ends, shape = loops.edge_table(np.ascontiguousarray(x.xy), x.yaw, config.shortest_m, config.longest_m)
-    order = np.argsort(shape[:, 0], kind="stable")[: config.edges]
-    return ends[order], shape[order]
+def _edges(x: Landmarks, config: VoteConfig) -> loops.Edges:
+    """The edges, by length."""
+    edges = loops.edge_table(np.ascontiguousarray(x.xy), x.yaw, config.shortest_m, config.longest_m)
+    order = np.argsort(edges.length, kind="stable")[: config.edges]
+    return loops.Edges(edges.ends[order], edges.length[order], edges.direction[order], edges.heading[order])
 
 
 def _score(a: Landmarks, b: Landmarks, pose: Floats, pairs: Ints, misfit: Floats, config: VoteConfig) -> float:
