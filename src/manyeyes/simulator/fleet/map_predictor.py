@@ -14,7 +14,16 @@ from manyeyes.datatypes.map_element import STYLES, MapElements
 from manyeyes.datatypes.message import SeenMap
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.fleet.config import CrowdConfig
-from manyeyes.simulator.fleet.observation_model import MOST, Noise, Room, look, scenery
+from manyeyes.simulator.fleet.observation_model import (
+    COLUMN_KIND,
+    COLUMN_SCORE,
+    COLUMN_SIGMA,
+    MOST,
+    Noise,
+    Room,
+    look,
+    scenery,
+)
 
 Floats = NDArray[np.float64]
 
@@ -42,11 +51,11 @@ class Eyewitness:
         )
         count, (points, columns, style) = self._config.points, self._room
         elements = MapElements(
-            kind=columns[:found, 0].astype(np.int64),
+            kind=columns[:found, COLUMN_KIND].astype(np.int64),
             first=np.arange(found + 1, dtype=np.int64) * count,
             points=points[:found].reshape(-1, 2).copy(),
-            score=columns[:found, 1].copy(),
-            sigma=np.repeat(np.maximum(columns[:found, 2], 0.01), count),
+            score=columns[:found, COLUMN_SCORE].copy(),
+            sigma=np.repeat(np.maximum(columns[:found, COLUMN_SIGMA], 0.01), count),
             style=style[:found].copy(),
         )
         return SeenMap(elements, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))

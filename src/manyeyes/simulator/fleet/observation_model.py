@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x1, F64x2, F64x3, njit
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, STOP_LINE
 from manyeyes.maps.elements.observation import ring_crosses
 
@@ -30,6 +30,10 @@ MOST = 320
 _DROP, _FRAGMENT, _SHARE, _GAP, _CONFUSE, _BOW, _SCORE, _STYLE, _OTHER, _FALSE, _GHOST, _HEAD, _TAIL, _SIDE = range(14)
 _PLACE = 16
 _POINT = 64
+
+
+COLUMN_KIND, COLUMN_SCORE, COLUMN_SIGMA, COLUMN_NAME = range(4)
+"""Columns of :class:`Room`."""
 
 
 class Noise(NamedTuple):
@@ -53,7 +57,7 @@ class Noise(NamedTuple):
 class Room(NamedTuple):
     """Where a look is written: points (MOST, n, 2), columns (MOST, 4) and style (MOST, S).
 
-    columns: kind, score, sigma, and the name of the true element, -1 for one that is not there.
+    columns: kind, score, sigma (m), and the name of the true element, -1 for one that is not there; see COLUMN_KIND.
     """
 
     points: Array
@@ -103,7 +107,7 @@ def _stations(line: Array) -> Array:
 
 
 @njit(cache=True)
-def unit(key, element, run, purpose):
+def unit(key: np.uint64, element: int, run: int, purpose: int) -> float:
     """A draw in (0, 1) for a key (uint64) and three counts."""
     z = key
     for part in (element, run, purpose):
@@ -115,14 +119,14 @@ def unit(key, element, run, purpose):
 
 
 @njit(cache=True)
-def normal(key, element, run, purpose):
+def normal(key: np.uint64, element: int, run: int, purpose: int) -> float:
     """A standard normal draw (Box and Muller 1958) from the purposes ``purpose`` and ``purpose + 1024``."""
     radius = np.sqrt(-2.0 * np.log(unit(key, element, run, purpose)))
     return radius * np.cos(2.0 * np.pi * unit(key, element, run, purpose + 1024))
 
 
 @njit(cache=True)
-def _hidden(x, y, shadows):
+def _hidden(x: float, y: float, shadows: F64x3) -> bool:
     """Whether a point lies in one of the convex anticlockwise quadrilaterals (Q, 4, 2)."""
     for q in range(shadows.shape[0]):
         inside = True
@@ -138,7 +142,7 @@ def _hidden(x, y, shadows):
 
 
 @njit(cache=True)
-def _resample(line, count, closed, out):
+def _resample(line: F64x2, count: int, closed: bool, out: F64x2) -> float:
     """Equal arc length: ``count`` points of a line (M, 2), of an open ring without repeating its first."""
     size = len(line)
     edges = size if closed else size - 1
@@ -164,7 +168,7 @@ def _resample(line, count, closed, out):
 
 
 @njit(cache=True)
-def _clip_ring(ring, noise):
+def _clip_ring(ring: F64x2, noise: Noise) -> tuple[F64x2, float]:
     """A ring (M, 2) cut to the view (Sutherland and Hodgman 1974), and the cut ring's area."""
     work = ring.copy()
     for side in range(4):
@@ -195,7 +199,7 @@ def _clip_ring(ring, noise):
 
 
 @njit(cache=True)
-def _emit_line(line, noise, key, element, run, part, out):
+def _emit_line(line: F64x2, noise: Noise, key: np.uint64, element: int, run: int, part: int, out: F64x2) -> float:
     """Write one observed line into out (n, 2); its mean distance from the agent, or -1 when it is too short to be said."""
     size = len(line)
     head = abs(normal(key, element, run, _HEAD + 128 * part)) * noise.end
@@ -225,7 +229,7 @@ def _emit_line(line, noise, key, element, run, part, out):
 
 
 @njit(cache=True)
-def _emit_ring(ring, noise, key, element, run, out):
+def _emit_ring(ring: F64x2, noise: Noise, key: np.uint64, element: int, run: int, out: F64x2) -> float:
     """Write one observed crossing into out (n, 2): noisy corners, resampled; less noise where the ring would cross itself."""
     n = len(ring)
     x, y = ring[:, 0].mean(), ring[:, 1].mean()
@@ -247,7 +251,7 @@ def _emit_ring(ring, noise, key, element, run, out):
 
 
 @njit(cache=True)
-def _emit_false(line, noise, key, element, run, out):
+def _emit_false(line: F64x2, noise: Noise, key: np.uint64, element: int, run: int, out: F64x2) -> tuple[int, float]:
     """Write a line that is not there: a ghost half a lane beside a true one, or one anywhere in view; its mean distance."""
     kind = DIVIDER if unit(key, element, run, _GHOST + 32) < 0.7 else BOUNDARY
     if unit(key, element, run, _GHOST) < 0.5 and len(line) > 6:
@@ -272,13 +276,13 @@ def _emit_false(line, noise, key, element, run, out):
 
 
 @njit(cache=True)
-def _reach(noise):
+def _reach(noise: Noise) -> float:
     """The farthest that is in view."""
     return np.hypot(max(abs(noise.x_min), abs(noise.x_max)), max(abs(noise.y_min), abs(noise.y_max)))
 
 
 @njit(cache=True)
-def look(scene, noise, pose, shadows, key, room):
+def look(scene: Scenery, noise: Noise, pose: F64x1, shadows: F64x3, key: np.uint64, room: Room) -> int:
     """Fill a room with what is seen from a pose; how many elements that is.
 
     pose: x, y, yaw (3,) of the agent, true. shadows: (Q, 4, 2) hidden quadrilaterals in its frame.
@@ -321,7 +325,9 @@ def look(scene, noise, pose, shadows, key, room):
 
 
 @njit(cache=True)
-def _see_crossing(scene, e, local, noise, shadows, key, room, found):
+def _see_crossing(
+    scene: Scenery, e: int, local: F64x2, noise: Noise, shadows: F64x3, key: np.uint64, room: Room, found: int
+) -> int:
     """One crossing: said when at least half of it and 4 m² are in sight; how many elements there are now."""
     points, columns, style = room
     reach = _reach(noise)
@@ -340,16 +346,18 @@ def _see_crossing(scene, e, local, noise, shadows, key, room, found):
         return found
     if _emit_ring(ring, noise, key, name, 0, points[found]) < 0.0:
         return found
-    columns[found, 0], columns[found, 3] = CROSSING, name
-    columns[found, 1] = _score(0.95, distance / reach, key, name, 0)
-    columns[found, 2] = np.hypot(noise.point, noise.point_per_m * distance)
+    columns[found, COLUMN_KIND], columns[found, COLUMN_NAME] = CROSSING, name
+    columns[found, COLUMN_SCORE] = _score(0.95, distance / reach, key, name, 0)
+    columns[found, COLUMN_SIGMA] = np.hypot(noise.point, noise.point_per_m * distance)
     style[found, :] = 0.0
     style[found, NO_STYLE] = 1.0
     return found + 1
 
 
 @njit(cache=True)
-def _see_line(scene, e, run, line, noise, key, room, found):
+def _see_line(
+    scene: Scenery, e: int, run: int, line: F64x2, noise: Noise, key: np.uint64, room: Room, found: int
+) -> int:
     """One visible stretch of a line, whole or in two parts, and perhaps a false one beside it; how many elements now."""
     points, columns, style = room
     reach = _reach(noise)
@@ -376,31 +384,35 @@ def _see_line(scene, e, run, line, noise, key, room, found):
             distance = _emit_line(piece, noise, key, name, run, part, points[found])
             if distance < 0.0:
                 continue
-            columns[found, 0], columns[found, 3] = said, name
-            columns[found, 1] = _score(0.95 if said == kind else 0.6, distance / reach, key, name, run + 64 * part)
+            columns[found, COLUMN_KIND], columns[found, COLUMN_NAME] = said, name
+            columns[found, COLUMN_SCORE] = _score(
+                0.95 if said == kind else 0.6, distance / reach, key, name, run + 64 * part
+            )
             variance = noise.point**2 + (noise.point_per_m * distance) ** 2 + noise.bow**2 / 2
-            columns[found, 2] = np.sqrt(variance)
+            columns[found, COLUMN_SIGMA] = np.sqrt(variance)
             _say_style(scene.style[e] if said == DIVIDER else NO_STYLE, noise, key, name, run, style[found])
             found += 1
     if unit(key, name, run, _FALSE) < noise.false_positive:
         false_kind, distance = _emit_false(line, noise, key, name, run, points[found])
         if distance >= 0.0:
-            columns[found, 0], columns[found, 3] = false_kind, -1
-            columns[found, 1] = _score(0.55, distance / reach, key, name, run + 128)
-            columns[found, 2] = np.sqrt(noise.point**2 + (noise.point_per_m * distance) ** 2 + noise.bow**2 / 2)
+            columns[found, COLUMN_KIND], columns[found, COLUMN_NAME] = false_kind, -1
+            columns[found, COLUMN_SCORE] = _score(0.55, distance / reach, key, name, run + 128)
+            columns[found, COLUMN_SIGMA] = np.sqrt(
+                noise.point**2 + (noise.point_per_m * distance) ** 2 + noise.bow**2 / 2
+            )
             _say_style(DASHED if false_kind == DIVIDER else NO_STYLE, noise, key, name, run + 128, style[found])
             found += 1
     return found
 
 
 @njit(cache=True)
-def _score(top, far, key, element, run):
+def _score(top: float, far: float, key: np.uint64, element: int, run: int) -> float:
     """A confidence that falls with the distance and scatters."""
     return min(0.99, max(0.05, top - 0.25 * far + 0.12 * normal(key, element, run, _SCORE)))
 
 
 @njit(cache=True)
-def _say_style(true, noise, key, element, run, out):
+def _say_style(true: int, noise: Noise, key: np.uint64, element: int, run: int, out: F64x1) -> None:
     """Probabilities of styles: 0.85 on one, which is another than the true one at the rate style_error."""
     size = len(out)
     if true == NO_STYLE:
@@ -414,4 +426,17 @@ def _say_style(true, noise, key, element, run, out):
     out[said] = 0.85
 
 
-__all__ = ["MOST", "Noise", "Room", "Scenery", "look", "normal", "scenery", "unit"]
+__all__ = [
+    "COLUMN_KIND",
+    "COLUMN_NAME",
+    "COLUMN_SCORE",
+    "COLUMN_SIGMA",
+    "MOST",
+    "Noise",
+    "Room",
+    "Scenery",
+    "look",
+    "normal",
+    "scenery",
+    "unit",
+]

@@ -19,7 +19,20 @@ from manyeyes.maps.elements.observation import Observation
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.fleet.changing_map import Change, World
 from manyeyes.simulator.fleet.config import CROWDS, CrowdConfig
-from manyeyes.simulator.fleet.observation_model import MOST, Noise, Room, Scenery, look, normal, scenery, unit
+from manyeyes.simulator.fleet.observation_model import (
+    COLUMN_KIND,
+    COLUMN_NAME,
+    COLUMN_SCORE,
+    COLUMN_SIGMA,
+    MOST,
+    Noise,
+    Room,
+    Scenery,
+    look,
+    normal,
+    scenery,
+    unit,
+)
 from manyeyes.simulator.fleet.place import Place
 from manyeyes.simulator.fleet.routes import along
 
@@ -252,16 +265,16 @@ class _Looker:
             trusted=drive.role == POLE,
             occluders=Polygons.of(list(shadows)),
         )
-        return observation, self.room.columns[:found, 3].astype(np.int64)
+        return observation, self.room.columns[:found, COLUMN_NAME].astype(np.int64)
 
     def _elements(self, found: int) -> MapElements:
         count = self.config.points
         return MapElements(
-            kind=self.room.columns[:found, 0].astype(np.int64),
+            kind=self.room.columns[:found, COLUMN_KIND].astype(np.int64),
             first=np.arange(found + 1, dtype=np.int64) * count,
             points=self.room.points[:found].reshape(-1, 2).copy(),
-            score=self.room.columns[:found, 1].copy(),
-            sigma=np.repeat(np.maximum(self.room.columns[:found, 2], 0.01), count),
+            score=self.room.columns[:found, COLUMN_SCORE].copy(),
+            sigma=np.repeat(np.maximum(self.room.columns[:found, COLUMN_SIGMA], 0.01), count),
             style=self.room.style[:found].copy(),
         )
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx2, F64x1, F64x2, F64x3, U8x2, njit
 from manyeyes.datatypes import ConfigError
 from manyeyes.maps.roads.road_network import PAVED, WALKABLE, RoadMark, RoadNetwork
 
@@ -211,7 +211,7 @@ def _fill_smooth(height: Array, default: float) -> Array:
 
 
 @njit(cache=True)
-def _relax(z, known, sweeps):  # pragma: no cover
+def _relax(z: F64x2, known: Boolx2, sweeps: int) -> None:  # pragma: no cover
     """Gauss-Seidel on the unknown nodes: each becomes the mean of its neighbours."""
     rows, columns = z.shape
     for _ in range(sweeps):
@@ -232,7 +232,9 @@ def _relax(z, known, sweeps):  # pragma: no cover
 
 
 @njit(cache=True)
-def _raster_height(height, triangles, x0, y0, cell, level):  # pragma: no cover
+def _raster_height(
+    height: F64x2, triangles: F64x3, x0: float, y0: float, cell: float, level: float
+) -> None:  # pragma: no cover
     """z of each triangle at the nodes it covers; where several do, the one nearest to level."""
     rows, columns = height.shape
     for t in range(len(triangles)):
@@ -255,7 +257,9 @@ def _raster_height(height, triangles, x0, y0, cell, level):  # pragma: no cover
 
 
 @njit(cache=True)
-def _fill_quads(raster, left, right, x0, y0, cell, value):  # pragma: no cover
+def _fill_quads(
+    raster: U8x2, left: F64x2, right: F64x2, x0: float, y0: float, cell: float, value: int
+) -> None:  # pragma: no cover
     """Cells whose centre lies in the convex hull's rows of each quad between two borders."""
     rows, columns = raster.shape
     x, y = np.empty(4), np.empty(4)
@@ -282,7 +286,9 @@ def _fill_quads(raster, left, right, x0, y0, cell, value):  # pragma: no cover
 
 
 @njit(cache=True)
-def _fill_stripes(raster, polygon, along, x0, y0, cell, stripe, value):  # pragma: no cover
+def _fill_stripes(
+    raster: U8x2, polygon: F64x2, along: F64x1, x0: float, y0: float, cell: float, stripe: float, value: int
+) -> None:  # pragma: no cover
     """Every other band across ``along`` of the cells inside a polygon (even-odd)."""
     rows, columns = raster.shape
     n = len(polygon)

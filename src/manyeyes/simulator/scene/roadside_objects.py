@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx2, F64x2, njit
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, HeightField, Primitives
 from manyeyes.simulator.sensors.lidar import OFF_ROAD, SIDEWALK
@@ -39,7 +39,7 @@ class ClutterSpec:
 
 
 @njit(cache=True)
-def _distance_rows(blocked, out):
+def _distance_rows(blocked: Boolx2, out: F64x2) -> None:
     rows, columns = blocked.shape
     for i in range(rows):
         last = -(10**9)
@@ -55,7 +55,7 @@ def _distance_rows(blocked, out):
 
 
 @njit(cache=True)
-def _distance_columns(flat, out):
+def _distance_columns(flat: F64x2, out: F64x2) -> None:
     """Lower envelope of parabolas down each column. Source: Felzenszwalb & Huttenlocher, Theory of Computing 2012."""
     rows, columns = flat.shape
     vertex, bound = np.empty(rows, np.int64), np.empty(rows + 1)
@@ -77,7 +77,7 @@ def _distance_columns(flat, out):
             out[q, j] = math.sqrt((q - vertex[k]) ** 2 + flat[vertex[k], j] ** 2)
 
 
-def distance_transform(blocked: NDArray[np.bool_]) -> Array:
+def distance_transform(blocked: Boolx2) -> Array:
     """Euclidean distance of each cell's centre to the nearest blocked cell's, in cells; at most 1e4."""
     flat, out = np.empty(blocked.shape), np.empty(blocked.shape)
     _distance_rows(blocked, flat)

@@ -10,15 +10,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F32x2, F64x1, F64x2, I32x2, I64x1, U8x2, njit
 from manyeyes.datatypes import ConfigError, PointCloud, Transform
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.ops.raycast import GROUND, HeightField, Primitives, cast
+from manyeyes.ops.raycast import GROUND, NOTHING, HeightField, Primitives, cast
 
 OFF_ROAD, ASPHALT, PAINT, SIDEWALK, CROSSING = range(5)
 
@@ -117,18 +118,68 @@ class Scene:
     ground: HeightField
 
 
+class _HitArrays(NamedTuple):
+    """The columns of :class:`Hits <manyeyes.ops.raycast.Hits>`, all (A, B)."""
+
+    range_m: F64x2
+    primitive: I32x2
+    cosine: F64x2
+    surface: U8x2
+
+
+class _Directions(NamedTuple):
+    """Cosines and sines of elevations (B,) and azimuths (A,), and the fraction of the turn at each azimuth (A,)."""
+
+    cos_elevation: F64x1
+    sin_elevation: F64x1
+    cos_azimuth: F64x1
+    sin_azimuth: F64x1
+    turn_fraction: F64x1
+
+
+class _Targets(NamedTuple):
+    """Reflectivity (N,) and instance (N,) of each solid, and reflectivity of each class of the ground."""
+
+    reflectivity: F64x1
+    surface_reflectivity: F64x1
+    instance: I64x1
+
+
+class _Draws(NamedTuple):
+    """Random numbers of each ray (A, B): a standard normal and a uniform one."""
+
+    noise: F32x2
+    uniform: F32x2
+
+
+class _ReturnModel(NamedTuple):
+    """Noise and drop-out of :class:`LidarSpec`, its height in metres, and the period of a turn in seconds."""
+
+    range_sigma_m: float
+    drop_general: float
+    drop_dark: float
+    drop_limit: float
+    drop_grazing: float
+    height_m: float
+    period_s: float
+
+
 @njit(cache=True)
-def _assemble(hits, rays, reflectivity, surface_reflectivity, noise, luck, spec, height, period, instance):
-    """Kept returns as rows x, y, z (agent frame), intensity, time, and their instances."""
+def _assemble(
+    hits: _HitArrays, rays: _Directions, targets: _Targets, draws: _Draws, spec: _ReturnModel
+) -> tuple[F32x2, I64x1]:
+    """Kept returns as rows x, y, z (agent frame), intensity, time (K, 5), and their instances (K,)."""
     depth, owner, cosine, surface = hits
     cos_el, sin_el, cos_az, sin_az, turned = rays
-    sigma, general, dark, limit, grazing = spec
+    reflectivity, surface_reflectivity, instance = targets
+    noise, luck = draws
+    sigma, general, dark, limit, grazing, height, period = spec
     count = 0
     out, who = np.empty((depth.size, 5), np.float32), np.empty(depth.size, np.int64)
     for a in range(depth.shape[0]):
         for b in range(depth.shape[1]):
             index = owner[a, b]
-            if index == -1:
+            if index == NOTHING:
                 continue
             t = depth[a, b]
             signal = math.exp(-ATTENUATION * t)
@@ -166,16 +217,19 @@ def scan(
     azimuth, elevation = spec.azimuth, spec.elevation
     turned = (azimuth + math.pi) / (2 * math.pi)
     rows, instance = _assemble(
-        (hits.range_m, hits.primitive, hits.cosine, hits.surface),
-        (np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth), turned),
-        solids.reflectivity,
-        SURFACE_REFLECTIVITY,
-        random.standard_normal(shape, np.float32),
-        random.random(shape, np.float32),
-        (spec.range_sigma_m, spec.drop_general, spec.drop_dark, spec.drop_limit, spec.drop_grazing),
-        spec.height_m,
-        1.0 / spec.rate_hz,
-        solids.instance,
+        _HitArrays(hits.range_m, hits.primitive, hits.cosine, hits.surface),
+        _Directions(np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth), turned),
+        _Targets(solids.reflectivity, SURFACE_REFLECTIVITY, solids.instance),
+        _Draws(random.standard_normal(shape, np.float32), random.random(shape, np.float32)),
+        _ReturnModel(
+            spec.range_sigma_m,
+            spec.drop_general,
+            spec.drop_dark,
+            spec.drop_limit,
+            spec.drop_grazing,
+            spec.height_m,
+            1.0 / spec.rate_hz,
+        ),
     )
     cloud = torch.from_numpy(rows)
     return PointCloud(cloud[:, :3].contiguous(), cloud[:, 3].contiguous(), cloud[:, 4].contiguous()), instance

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I32x1, I64x1, njit
 from manyeyes.ops.pinhole import meet
-from manyeyes.ops.raycast import BOX, ELLIPSOID, Primitives, hit_ellipsoid
+from manyeyes.ops.raycast import BOX, ELLIPSOID, Primitives, SolidArrays, hit_ellipsoid
 
 Array = NDArray[np.float64]
 
@@ -66,9 +67,31 @@ def index_shadows(solids: Primitives, sun: Array, lowest: float, seed: int = 0) 
     return Shadows(solids, sun, float(corner[0]), float(corner[1]), columns, rows, first, member[order], seed)
 
 
+class _ShadowIndex(NamedTuple):
+    """The cells of :class:`Shadows` and the solids first[c] … first[c + 1] of member that may shade each."""
+
+    x_min: float
+    y_min: float
+    columns: int
+    rows: int
+    first: I64x1
+    member: I32x1
+
+
 @njit(cache=True)
-def _light(kind, center, rotation, half, density, sun, place, first, member, seed, points, on_ground, lit, open_sky):
-    x_min, y_min, columns, rows = place
+def _light(
+    solids: SolidArrays,
+    sun: F64x1,
+    index: _ShadowIndex,
+    seed: int,
+    points: F64x2,
+    on_ground: Boolx1,
+    lit: F64x1,
+    open_sky: F64x1,
+) -> None:
+    """Lower lit (N,) and open_sky (N,) at points (N, 3) by what the solids keep off them."""
+    kind, center, rotation, half, density = solids
+    x_min, y_min, columns, rows, first, member = index
     o = np.empty(3)
     for n in range(points.shape[0]):
         column = math.floor((points[n, 0] - x_min) / _CELL_M)
@@ -77,7 +100,7 @@ def _light(kind, center, rotation, half, density, sun, place, first, member, see
             continue
         cell = row * columns + column
         for m in range(first[cell], first[cell + 1]):
-            i = member[m]
+            i = int(member[m])
             for r in range(3):
                 o[r] = 0.0
                 for c in range(3):
@@ -105,9 +128,8 @@ def daylight(shadows: Shadows, points: Array, on_ground: NDArray[np.bool_]) -> t
 
     Points on a solid must lie a little outside it. Only what lies on the ground is darkened by what stands beside it.
     """
-    lit, open_sky, s = np.ones(len(points)), np.ones(len(points)), shadows.solids
-    _light(
-        s.kind, s.center, s.rotation, s.half, s.density, shadows.sun, (shadows.x_min, shadows.y_min, shadows.columns, shadows.rows),
-        shadows.first, shadows.member, shadows.seed, np.ascontiguousarray(points, np.float64), on_ground, lit, open_sky,
-    )  # fmt: skip
+    lit, open_sky = np.ones(len(points)), np.ones(len(points))
+    index = _ShadowIndex(shadows.x_min, shadows.y_min, shadows.columns, shadows.rows, shadows.first, shadows.member)
+    at = np.ascontiguousarray(points, np.float64)
+    _light(shadows.solids.arrays, shadows.sun, index, shadows.seed, at, on_ground, lit, open_sky)
     return lit, open_sky
