@@ -17,15 +17,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import CROSSING, MapElements, frozen, rows_of
 from manyeyes.maps.elements.observation import Frame, Observation
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, VectorMap
-from manyeyes.maps.fusion.observation_arrays import sight
+from manyeyes.maps.fusion.observation_arrays import FieldsOfView, Rings, sight
 from manyeyes.ops.polyline import close_rings, near_pairs_between, resample_spaced
 
 Floats = NDArray[np.float64]
@@ -132,13 +133,25 @@ def log_odds(of: Pool, elements: MapElements, sources: Sequence[Ints]) -> Floats
     for k, seen in enumerate(sources):
         holds[start[k] : start[k + 1]] = np.isin(who[start[k] : start[k + 1], 1], seen)
     hits = HIT * np.array([len(seen) for seen in sources])
-    view, hidden = _rings(of.observations)
     pose = frozen(np.reshape([o.pose for o in of.observations], (-1, 3)), np.float64)
-    return _log_odds(places, first, frozen(who[:, 1], np.int64), start, holds, hits, pose, view, hidden)
+    seen_by = _Observers(frozen(who[:, 1], np.int64), start, holds)
+    return _log_odds(places, first, seen_by, hits, pose, _rings(of.observations))
+
+
+class _Observers(NamedTuple):
+    """Observations near each element: rows ``observation[first[k]:first[k + 1]]``, and which of them hold the element."""
+
+    observation: I64x1
+    first: I64x1
+    holds_element: Boolx1
 
 
 @njit(cache=True)
-def _log_odds(places, first, who, start, holds, hits, pose, view, hidden):  # pragma: no cover - compiled
+def _log_odds(
+    places: F64x2, first: I64x1, seen_by: _Observers, hits: F64x1, pose: F64x2, fields: FieldsOfView
+) -> F64x1:  # pragma: no cover - compiled
+    """(N,) mean log-odds over the places (P, 2) of each element, ``places[first[k]:first[k + 1]]``, within the clamp."""
+    who, start, holds = seen_by
     out = np.zeros(len(first) - 1)
     for k in range(len(out)):
         for p in range(first[k], first[k + 1]):
@@ -148,14 +161,14 @@ def _log_odds(places, first, who, start, holds, hits, pose, view, hidden):  # pr
                     o = who[w]
                     dx, dy = places[p, 0] - pose[o, 0], places[p, 1] - pose[o, 1]
                     c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
-                    odds += MISS * sight(c * dx + s * dy, c * dy - s * dx, o, view, hidden, _MARGIN_M)
+                    odds += MISS * sight(c * dx + s * dy, c * dy - s * dx, o, fields.views, fields.occluders, _MARGIN_M)
             out[k] += min(max(odds, -CLAMP), CLAMP)
         out[k] /= max(first[k + 1] - first[k], 1)
     return out
 
 
-def _rings(observations: Sequence[Observation]) -> tuple[tuple[Floats, Ints, Ints], tuple[Floats, Ints, Ints]]:
-    """Views and occluders as (points, offsets of rings, offsets of observations)."""
+def _rings(observations: Sequence[Observation]) -> FieldsOfView:
+    """Views and occluders of the observations, in their order."""
     count = len(observations)
     first = np.concatenate(([0], np.cumsum([len(o.view) for o in observations]))).astype(np.int64)
     view = np.concatenate([o.view for o in observations]) if count else np.zeros((0, 2))
@@ -163,7 +176,7 @@ def _rings(observations: Sequence[Observation]) -> tuple[tuple[Floats, Ints, Int
     ring_first = np.concatenate(([0], np.cumsum([len(r) for r in rings]))).astype(np.int64)
     of = np.concatenate(([0], np.cumsum([len(o.occluders) for o in observations]))).astype(np.int64)
     hidden = np.concatenate(rings) if rings else np.zeros((0, 2))
-    return (view, first, np.arange(count + 1)), (hidden, ring_first, of)
+    return FieldsOfView(Rings(view, first, np.arange(count + 1)), Rings(hidden, ring_first, of))
 
 
 def _view_bounds(observations: Sequence[Observation]) -> Floats:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, Boolx2, F64x1, F64x2, I64x1, I64x2, njit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -14,7 +14,9 @@ Mask = NDArray[np.bool_]
 
 
 @njit(cache=True)
-def draw_lines(heat, points, first, score, low, cell, radius):  # pragma: no cover - compiled
+def draw_lines(
+    heat: F64x2, points: F64x2, first: I64x1, score: F64x1, low: F64x1, cell: float, radius: float
+) -> None:  # pragma: no cover - compiled
     """Add each line's score once to every cell of heat (H, W) whose middle lies within radius of it; low: corner of cell 0, 0."""
     stamp = np.full(heat.shape, -1, np.int32)
     for k in range(len(first) - 1):
@@ -39,7 +41,9 @@ def draw_lines(heat, points, first, score, low, cell, radius):  # pragma: no cov
 
 
 @njit(cache=True)
-def draw_rings(heat, points, first, score, low, cell):  # pragma: no cover - compiled
+def draw_rings(
+    heat: F64x2, points: F64x2, first: I64x1, score: F64x1, low: F64x1, cell: float
+) -> None:  # pragma: no cover - compiled
     """Add each open ring's score to every cell of heat (H, W) whose middle lies inside it."""
     for k in range(len(first) - 1):
         a, b = first[k], first[k + 1]
@@ -63,7 +67,7 @@ def draw_rings(heat, points, first, score, low, cell):  # pragma: no cover - com
 
 
 @njit(cache=True)
-def _around(mask, i, j):  # pragma: no cover - compiled
+def _around(mask: Boolx2, i: int, j: int) -> Boolx1:  # pragma: no cover - compiled
     """The eight neighbours of a cell from above on, clockwise; beyond the border is nothing."""
     out = np.zeros(8, np.bool_)
     for k in range(8):
@@ -74,7 +78,7 @@ def _around(mask, i, j):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def thinned(mask):  # pragma: no cover - compiled
+def thinned(mask: Boolx2) -> Boolx2:  # pragma: no cover - compiled
     """The skeleton of a mask (H, W) by Zhang and Suen (Communications of the ACM 27(3), 1984)."""
     out = mask.copy()
     cells = np.argwhere(mask)
@@ -105,7 +109,9 @@ def thinned(mask):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def _flood(mask, label, number, start, queue, came):  # pragma: no cover - compiled
+def _flood(
+    mask: Boolx2, label: I64x2, number: int, start: int, queue: I64x1, came: I64x2
+) -> int:  # pragma: no cover - compiled
     """Walk from start (flat place) over cells of the mask, label them, note where each came from; how many were reached."""
     height, width = mask.shape
     queue[0] = start
@@ -128,9 +134,10 @@ def _flood(mask, label, number, start, queue, came):  # pragma: no cover - compi
 
 
 @njit(cache=True)
-def components(mask):  # pragma: no cover - compiled
+def components(mask: Boolx2) -> I64x2:  # pragma: no cover - compiled
     """(H, W) the number of each cell's component from 0 on, in the order of rows; -1 outside."""
-    label, came = np.full(mask.shape, -1, np.int64), np.empty(mask.shape, np.int64)
+    label = np.full(mask.shape, -1, np.int64)
+    came = np.empty(mask.shape, np.int64)
     cells = np.argwhere(mask)
     queue = np.empty(len(cells) + 1, np.int64)
     number = 0
@@ -142,14 +149,17 @@ def components(mask):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def longest_walks(skeleton, least, clear, every):  # pragma: no cover - compiled
+def longest_walks(
+    skeleton: Boolx2, least: int, clear: int, every: bool
+) -> tuple[I64x2, I64x1]:  # pragma: no cover - compiled
     """Cells (K, 2) and offsets of the longest walks of at least so many cells; every: what a component has besides its longest.
 
     A walk found clears the cells within clear steps of it, so that spurs along it are no walks.
     """
     mask = skeleton.copy()
-    height, width = mask.shape
-    label, came = np.full(mask.shape, -1, np.int64), np.empty(mask.shape, np.int64)
+    height, width = skeleton.shape
+    label = np.full(skeleton.shape, -1, np.int64)
+    came = np.empty(skeleton.shape, np.int64)
     todo = np.argwhere(mask)
     queue = np.empty(len(todo) + 1, np.int64)
     cells, first = np.empty((len(todo), 2), np.int64), np.zeros(len(todo) + 1, np.int64)

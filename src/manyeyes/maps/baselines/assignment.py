@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import frozen
 
 
@@ -24,7 +24,7 @@ def assign(cost: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 @njit(cache=True)
-def _assign(cost):  # pragma: no cover - compiled
+def _assign(cost: F64x2) -> I64x1:  # pragma: no cover - compiled
     rows, columns = cost.shape
     price_row, price_column = np.zeros(rows), np.zeros(columns)
     owner = np.full(columns, -1, np.int64)

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x2, njit
 from manyeyes.datatypes.map_element import frozen
 
 Floats = NDArray[np.float64]
@@ -31,6 +32,16 @@ class CpdConfig:
     max_shift_m: float | None = None
 
 
+class _Similarity(NamedTuple):
+    """A similarity transform of the plane: scale, rotation by angle (rad), shift (m); and how many iterations it took."""
+
+    scale: float
+    angle: float
+    shift_x: float
+    shift_y: float
+    num_iterations: int
+
+
 @dataclass(frozen=True)
 class Drift:
     """y to ``scale * y @ rotation.T + shift``; iterations: how many it took."""
@@ -51,29 +62,39 @@ def register(target: Floats, source: Floats, config: CpdConfig = CpdConfig()) ->
     centre = target.mean(0)
     x, y = frozen(target - centre, np.float64), frozen(source - centre, np.float64)
     start = -1.0 if config.sigma_m is None else config.sigma_m**2
-    scale, angle, u, v, count = _drift(x, y, config.scaled, config.outlier, start, config.tolerance, config.iterations)
-    c, s = np.cos(angle), np.sin(angle)
+    fit = _drift(x, y, config.scaled, config.outlier, start, config.tolerance, config.iterations)
+    c, s = np.cos(fit.angle), np.sin(fit.angle)
     rotation = np.array([[c, -s], [s, c]])
-    found = Drift(scale, rotation, np.array([u, v]) + centre - scale * rotation @ centre, count)
+    shift = np.array([fit.shift_x, fit.shift_y]) + centre - fit.scale * rotation @ centre
+    found = Drift(fit.scale, rotation, shift, fit.num_iterations)
     moved = found.apply(source).mean(0) - source.mean(0)
     if config.max_shift_m is not None and np.hypot(*moved) > config.max_shift_m:
-        return Drift(1.0, np.eye(2), np.zeros(2), count)
+        return Drift(1.0, np.eye(2), np.zeros(2), fit.num_iterations)
     return found
 
 
 @njit(cache=True)
-def _drift(x, y, scaled, outlier, start, tolerance, most):  # pragma: no cover - compiled
+def _initial_variance(x: F64x2, y: F64x2) -> float:  # pragma: no cover - compiled
+    """Compute sigma squared from the spread of both sets (N, 2) and (M, 2), as published."""
+    n, m = len(x), len(y)
+    variance = 0.0
+    for i in range(n):
+        for j in range(m):
+            variance += (x[i, 0] - y[j, 0]) ** 2 + (x[i, 1] - y[j, 1]) ** 2
+    return variance / (2.0 * n * m)
+
+
+@njit(cache=True)
+def _drift(
+    x: F64x2, y: F64x2, scaled: bool, outlier: float, start: float, tolerance: float, most: int
+) -> _Similarity:  # pragma: no cover - compiled
+    """Register y (M, 2) onto x (N, 2) by expectation maximization; start: sigma squared, negative: from the spread."""
     n, m = len(x), len(y)
     scale, c, s, u, v = 1.0, 1.0, 0.0, 0.0, 0.0
     variance = start
     if variance < 0.0:
-        variance = 0.0
-        for i in range(n):
-            for j in range(m):
-                variance += (x[i, 0] - y[j, 0]) ** 2 + (x[i, 1] - y[j, 1]) ** 2
-        variance /= 2.0 * n * m
-    weight = np.empty(m)
-    count = 0
+        variance = _initial_variance(x, y)
+    weight, count = np.empty(m), 0
     while count < most and variance > 1e-12:
         count += 1
         uniform = 2.0 * np.pi * variance * outlier / (1.0 - outlier) * m / n
@@ -124,4 +145,4 @@ def _drift(x, y, scaled, outlier, start, tolerance, most):  # pragma: no cover -
         variance = max((xx + scale * scale * yy - 2.0 * scale * length) / (2.0 * total), 0.0)
         if abs(before - variance) < tolerance:
             break
-    return scale, np.arctan2(s, c), u, v, count
+    return _Similarity(scale, np.arctan2(s, c), u, v, count)

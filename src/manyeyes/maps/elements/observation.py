@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x2, I64x1, njit
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.datatypes.map_element import CROSSING, MapElements, Polygons, frozen
 from manyeyes.maps.elements.observation_limits import LIMITS
@@ -255,7 +255,7 @@ def is_simple_ring(ring: Floats) -> bool:
 
 
 @njit(cache=True)
-def ring_crosses(ring: Floats) -> bool:  # pragma: no cover - compiled
+def ring_crosses(ring: F64x2) -> bool:  # pragma: no cover - compiled
     """Whether two edges of the open ring (K, 2) cross; for other compiled loops, :func:`is_simple_ring` for the rest."""
     n = len(ring)
     for i in range(n):
@@ -276,7 +276,7 @@ def ring_crosses(ring: Floats) -> bool:  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def _first_crossed_ring(kind, first, points, ring_kind):  # pragma: no cover - compiled
+def _first_crossed_ring(kind: I64x1, first: I64x1, points: F64x2, ring_kind: int) -> int:  # pragma: no cover - compiled
     for i in range(len(kind)):
         if kind[i] == ring_kind and ring_crosses(points[first[i] : first[i + 1]]):
             return i

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x1, F64x2, F64x3, I64x1, njit
 from manyeyes.maps.fusion.observation_arrays import Sightings
 from manyeyes.maps.fusion.point_grid import build_grid, span
 
@@ -76,7 +76,15 @@ def common_error(
 
 
 @njit(cache=True, nogil=True)
-def _modes(place, correction, told, weight, sigma, grid, numbers):  # pragma: no cover - compiled
+def _modes(
+    place: F64x2,
+    correction: F64x2,
+    told: F64x3,
+    weight: F64x1,
+    sigma: F64x1,
+    grid: tuple[I64x1, I64x1, I64x1],
+    numbers: tuple[float, float],
+) -> F64x2:  # pragma: no cover - compiled
     keys, start, order = grid
     radius, scale = numbers
     out = np.zeros((len(place), 2))
@@ -122,7 +130,9 @@ def looks_weight(sightings: Sightings, start: Floats, scale: Floats, faith: Floa
 
 
 @njit(cache=True, nogil=True)
-def _same_agent(pose, agent, keys, start, order, radius):  # pragma: no cover - compiled
+def _same_agent(
+    pose: F64x2, agent: I64x1, keys: I64x1, start: I64x1, order: I64x1, radius: float
+) -> F64x1:  # pragma: no cover - compiled
     """How many looks of the same agent stand within a radius, each counted by 1 - (distance / radius)²; itself counts
     1.
     """

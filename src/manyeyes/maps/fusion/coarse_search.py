@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F32x3, F64x1, F64x2, I64x1, njit
 from manyeyes.maps.fusion.observation_arrays import Sightings
 from manyeyes.maps.fusion.point_grid import build_grid, span
 
@@ -77,7 +77,17 @@ def moved_by(sightings: Sightings, home: Ints, moves: Floats) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def best_moves(home, pose, trusted, own, others, agent, yaws, numbers, stride):  # pragma: no cover - compiled
+def best_moves(
+    home: I64x1,
+    pose: F64x2,
+    trusted: Boolx1,
+    own: tuple[I64x1, F64x2, F64x2, I64x1],
+    others: tuple[I64x1, I64x1, F64x2, F64x2, I64x1],
+    agent: I64x1,
+    yaws: F64x1,
+    numbers: tuple[float, float, float, float, float],
+    stride: int,
+) -> F64x2:  # pragma: no cover - compiled
     """The move (H, 3) of each home observation's own frame that fits it best to the points of others, all zero for
     none.
     """
@@ -93,7 +103,7 @@ def best_moves(home, pose, trusted, own, others, agent, yaws, numbers, stride): 
         x0, y0 = xy[a:b, 0].min() - reach - 2.0, xy[a:b, 1].min() - reach - 2.0
         nx = int((xy[a:b, 0].max() + reach + 2.0 - x0) / cell) + 1
         ny = int((xy[a:b, 1].max() + reach + 2.0 - y0) / cell) + 1
-        picture = _draw(pose[o], agent[o], others, x0, y0, nx, ny, cell)
+        picture = _draw(pose[o], int(agent[o]), others, x0, y0, nx, ny, cell)
         best, bx, by, bt = 0.0, 0, 0, 0.0
         at_rest = 0.0
         for turn in yaws:
@@ -117,7 +127,16 @@ def best_moves(home, pose, trusted, own, others, agent, yaws, numbers, stride): 
 
 
 @njit(cache=True, nogil=True)
-def _draw(pose, agent, others, x0, y0, nx, ny, cell):  # pragma: no cover - compiled
+def _draw(
+    pose: F64x1,
+    agent: int,
+    others: tuple[I64x1, I64x1, F64x2, F64x2, I64x1],
+    x0: float,
+    y0: float,
+    nx: int,
+    ny: int,
+    cell: float,
+) -> F32x3:  # pragma: no cover - compiled
     """What other agents saw, in the frame of a pose: (layers, nx, ny) of s."""
     keys, start, rxy, rtangent, ragent = others
     picture = np.zeros((24, nx, ny), np.float32)
@@ -156,7 +175,18 @@ def _draw(pose, agent, others, x0, y0, nx, ny, cell):  # pragma: no cover - comp
 
 
 @njit(cache=True, nogil=True)
-def _correlate(picture, xy, tangent, kind, turn, x0, y0, cell, radius, stride):  # pragma: no cover - compiled
+def _correlate(
+    picture: F32x3,
+    xy: F64x2,
+    tangent: F64x2,
+    kind: I64x1,
+    turn: float,
+    x0: float,
+    y0: float,
+    cell: float,
+    radius: int,
+    stride: int,
+) -> F64x2:  # pragma: no cover - compiled
     """Mean of s / (s + 1) of the picture under the points for each shift (2 radius + 1, 2 radius + 1) after a turn about
     their mean.
     """

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x2, I64x1, I64x2, njit
 from manyeyes.maps.fusion.observation_arrays import Sightings
 
 Floats = NDArray[np.float64]
@@ -60,7 +60,7 @@ def cut_unseen(points: Floats, first: Ints, inferred: NDArray[np.bool_], runs: I
 
 
 @njit(cache=True, nogil=True)
-def _filled(corners, first):  # pragma: no cover - compiled
+def _filled(corners: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
     """Runs of cells whose middle lies in a ring, by the even-odd rule, ring by ring."""
     rows, n = np.empty((1024, 3), np.int64), 0
     for r in range(len(first) - 1):
@@ -95,7 +95,7 @@ def _filled(corners, first):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _under(points, first):  # pragma: no cover - compiled
+def _under(points: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
     total = len(points)
     for c in range(len(first) - 1):
         for i in range(first[c], first[c + 1] - 1):
@@ -115,7 +115,7 @@ def _under(points, first):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _steps(points, i):  # pragma: no cover - compiled
+def _steps(points: F64x2, i: int) -> int:  # pragma: no cover - compiled
     """How many steps of half a cell it takes from a point to the next."""
     return max(
         1, int(np.ceil(2.0 * np.hypot(points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]) / CELL_M))
@@ -123,7 +123,7 @@ def _steps(points, i):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _merged(runs):  # pragma: no cover - compiled
+def _merged(runs: I64x2) -> I64x2:  # pragma: no cover - compiled
     out, n = runs.copy(), 0
     for k in range(1, len(runs)):
         if runs[k, 0] == out[n, 0] and runs[k, 1] <= out[n, 2] + 1:
@@ -135,7 +135,9 @@ def _merged(runs):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _cut(points, first, inferred, runs):  # pragma: no cover - compiled
+def _cut(
+    points: F64x2, first: I64x1, inferred: Boolx1, runs: I64x2
+) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
     offsets, kept, n = [0], np.empty(len(points), np.int64), 0
     for c in range(len(first) - 1):
         for i in range(first[c], first[c + 1]):
@@ -153,7 +155,7 @@ def _cut(points, first, inferred, runs):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _whole(points, i, j, runs):  # pragma: no cover - compiled
+def _whole(points: F64x2, i: int, j: int, runs: I64x2) -> bool:  # pragma: no cover - compiled
     """Whether somebody looked at all of the way between two points; of neighbours less than a metre and a half apart, always."""
     dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
     length = np.hypot(dx, dy)
@@ -167,7 +169,7 @@ def _whole(points, i, j, runs):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _seen(runs, x, y):  # pragma: no cover - compiled
+def _seen(runs: I64x2, x: float, y: float) -> bool:  # pragma: no cover - compiled
     """Whether the cell of a place is in a run."""
     ix, iy = int(np.floor(x / CELL_M)), int(np.floor(y / CELL_M))
     low, high = 0, len(runs)

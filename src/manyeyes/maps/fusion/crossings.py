@@ -11,19 +11,36 @@ rectangle.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import CROSSING
-from manyeyes.maps.fusion.existence import EvidenceConfig, fold_looks, looks, sights, witnesses
-from manyeyes.maps.fusion.observation_arrays import Sightings, sight
+from manyeyes.maps.fusion.existence import (
+    MATCHED,
+    NEARBY,
+    UNMATCHED,
+    ElementStyles,
+    EvidenceConfig,
+    EvidenceParameters,
+    Hits,
+    Scene,
+    doubled,
+    fold_looks,
+    looks,
+    new_agent_scratch,
+    sights,
+    witnesses,
+)
+from manyeyes.maps.fusion.observation_arrays import FieldsOfView, Sightings, sight
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _DIRECTIONS = 32
+_MIN_AREA_M2 = 0.5  # of a ring that is used
 
 
 @dataclass(frozen=True)
@@ -74,37 +91,61 @@ def find_crossings(
     """
     rows = np.flatnonzero(np.asarray(sightings.elements.kind) == CROSSING)
     owner = sightings.element_observation[rows]
-    first, points = _placed(sightings, rows, owner, pose)
-    hull_first, hulls = _hulls(first, points)
-    area = _areas(hull_first, hulls)
-    usable = area > 0.5
-    label = _groups(
-        hull_first, hulls, area, usable, np.argsort(rank[owner], kind="stable"), config.overlap, config.most
-    )
+    seen = _Rings(*_placed(sightings, rows, owner, pose))
+    hulls = _hulls(*seen)
+    area = _areas(*hulls)
+    usable = area > _MIN_AREA_M2
+    label = _groups(*hulls, area, usable, np.argsort(rank[owner], kind="stable"), config.overlap, config.most)
     count = int(label.max(initial=-1)) + 1
-    reach = _own_reach(first, points, owner, pose, sights(sightings), config.cut_m)
+    cut = _own_reach(*seen, owner, pose, sights(sightings), config.cut_m)
     rings = [
-        _shape(np.flatnonzero(label == g), hull_first, hulls, *reach, weight[owner], config.rectangle)
-        for g in range(count)
+        _shape(np.flatnonzero(label == g), *hulls, *seen, cut, weight[owner], config.rectangle) for g in range(count)
     ]
     start = np.concatenate(([0], np.cumsum([len(r) for r in rings], dtype=np.int64))).astype(np.int64)
     xy = np.concatenate(rings) if rings else np.zeros((0, 2))
-    index = looks(sightings, pose)
     out = _evidence(
-        (start, xy),
-        (hull_first, hulls, area, owner, rows),
-        (index.keys, index.start, index.of),
-        witnesses(sightings, pose),
-        sights(sightings),
-        (np.asarray(sightings.elements.style), evidence.worth(sightings.elements.score)),
+        _Rings(start, xy),
+        _Hulls(*hulls, area, owner, rows),
+        Scene(looks(sightings, pose), witnesses(sightings, pose), sights(sightings)),
+        ElementStyles(np.asarray(sightings.elements.style), evidence.worth(sightings.elements.score)),
         replace(evidence, publish=evidence.publish_ring).numbers,
-        (evidence.publish_agents, evidence.retire_agents),
         evidence.decay_s[CROSSING],
         config.overlap,
     )
-    support = out[3]
-    sigma = np.sqrt(0.2**2 / np.maximum(1, support) + evidence.bias_m**2)
+    sigma = np.sqrt(0.2**2 / np.maximum(1, out.agents) + evidence.bias_m**2)
     return Crossings(start, xy, sigma, *out)
+
+
+class _Rings(NamedTuple):
+    """R open rings: ring r is ``points[first[r]:first[r + 1]]``."""
+
+    first: I64x1
+    points: F64x2
+
+
+class _Hulls(NamedTuple):
+    """Convex hulls of R observed crossings, their areas (m²), and the rows of their observations and elements (R,)."""
+
+    first: I64x1
+    points: F64x2
+    area: F64x1
+    observation: I64x1
+    element: I64x1
+
+
+class _CrossingEvidence(NamedTuple):
+    """The columns of :class:`Crossings` from log_odds on."""
+
+    log_odds: F64x1
+    coverage: F64x1
+    support: I64x1
+    agents: I64x1
+    state: I64x1
+    t_first: I64x1
+    t_last: I64x1
+    style: F64x2
+    first: I64x1
+    sources: I64x1
 
 
 def _placed(sightings: Sightings, rows: Ints, owner: Ints, pose: Floats) -> tuple[Ints, Floats]:
@@ -118,7 +159,7 @@ def _placed(sightings: Sightings, rows: Ints, owner: Ints, pose: Floats) -> tupl
 
 def hulls_of(ring: Floats) -> Floats:
     """The convex hull (K, 2) of one ring, anticlockwise."""
-    return _hulls(np.array([0, len(ring)]), np.ascontiguousarray(ring))[1]
+    return _hulls(np.array([0, len(ring)]), np.ascontiguousarray(ring)).points
 
 
 def overlap_of(one: Floats, two: Floats) -> float:
@@ -129,7 +170,7 @@ def overlap_of(one: Floats, two: Floats) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _hulls(first, points):  # pragma: no cover - compiled
+def _hulls(first: I64x1, points: F64x2) -> _Rings:  # pragma: no cover - compiled
     """Convex hulls, anticlockwise, of rings: offsets and points (Andrew's monotone chain)."""
     out_first, out, filled = np.zeros(len(first), np.int64), np.empty((len(points) + len(first), 2)), 0
     for r in range(len(first) - 1):
@@ -158,11 +199,11 @@ def _hulls(first, points):  # pragma: no cover - compiled
         out[filled : filled + n] = hull[:n]
         filled += n
         out_first[r + 1] = filled
-    return out_first, out[:filled].copy()
+    return _Rings(out_first, out[:filled].copy())
 
 
 @njit(cache=True, nogil=True)
-def _area(ring):  # pragma: no cover - compiled
+def _area(ring: F64x2) -> float:  # pragma: no cover - compiled
     total, j = 0.0, len(ring) - 1
     for i in range(len(ring)):
         total += (ring[j, 0] - ring[0, 0]) * (ring[i, 1] - ring[0, 1]) - (ring[i, 0] - ring[0, 0]) * (
@@ -173,7 +214,7 @@ def _area(ring):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _areas(first, points):  # pragma: no cover - compiled
+def _areas(first: I64x1, points: F64x2) -> F64x1:  # pragma: no cover - compiled
     out = np.zeros(len(first) - 1)
     for r in range(len(out)):
         if first[r + 1] - first[r] >= 3:
@@ -182,7 +223,7 @@ def _areas(first, points):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _common(a, b):  # pragma: no cover - compiled
+def _common(a: F64x2, b: F64x2) -> float:  # pragma: no cover - compiled
     """Area common to two convex anticlockwise rings (Sutherland and Hodgman's clipping)."""
     ring = a.copy()
     for k in range(len(b)):
@@ -194,7 +235,7 @@ def _common(a, b):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _half_plane(ring, px, py, nx, ny):  # pragma: no cover - compiled
+def _half_plane(ring: F64x2, px: float, py: float, nx: float, ny: float) -> F64x2:  # pragma: no cover - compiled
     """The part of a convex ring where (x - px) nx + (y - py) ny <= 0."""
     out, n = np.empty((len(ring) + 2, 2)), 0
     for i in range(len(ring)):
@@ -212,7 +253,9 @@ def _half_plane(ring, px, py, nx, ny):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _groups(first, points, area, usable, walk, overlap, most):  # pragma: no cover - compiled
+def _groups(
+    first: I64x1, points: F64x2, area: F64x1, usable: Boolx1, walk: I64x1, overlap: float, most: int
+) -> I64x1:  # pragma: no cover - compiled
     """(R,) the group of each ring, -1 for those that are too many or too small; groups numbered by their best ring.
 
     Rings whose boxes touch form a block; a block's best ``most`` rings are joined by average linkage while the best
@@ -251,14 +294,17 @@ def _groups(first, points, area, usable, walk, overlap, most):  # pragma: no cov
 
 
 @njit(cache=True, nogil=True)
-def _touch(low, high, q, r):  # pragma: no cover - compiled
+def _touch(low: F64x2, high: F64x2, q: int, r: int) -> bool:  # pragma: no cover - compiled
     """Whether the boxes of rings q and r meet."""
     across = low[q, 0] <= high[r, 0] and low[r, 0] <= high[q, 0]
     return across and low[q, 1] <= high[r, 1] and low[r, 1] <= high[q, 1]
 
 
 @njit(cache=True, nogil=True)
-def _average_linkage(chosen, first, points, area, overlap, label, groups):  # pragma: no cover - compiled
+def _average_linkage(
+    chosen: I64x1, first: I64x1, points: F64x2, area: F64x1, overlap: float, label: I64x1, groups: int
+) -> int:  # pragma: no cover - compiled
+    """Write the groups of the chosen rings to label, numbered from ``groups`` on; the number after the last."""
     n = len(chosen)
     share = np.zeros((n, n))
     for i in range(n):
@@ -297,7 +343,9 @@ def _average_linkage(chosen, first, points, area, overlap, label, groups):  # pr
 
 
 @njit(cache=True, nogil=True)
-def _own_reach(first, points, owner, pose, seen, cut):  # pragma: no cover - compiled
+def _own_reach(
+    first: I64x1, points: F64x2, owner: I64x1, pose: F64x2, seen: FieldsOfView, cut: float
+) -> Boolx1:  # pragma: no cover - compiled
     """(P,) whether each ring point, in the map's frame, lies at the border of its observation's view."""
     out = np.zeros(len(points), np.bool_)
     for r in range(len(first) - 1):
@@ -305,13 +353,22 @@ def _own_reach(first, points, owner, pose, seen, cut):  # pragma: no cover - com
         c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
         for p in range(first[r], first[r + 1]):
             dx, dy = points[p, 0] - pose[o, 0], points[p, 1] - pose[o, 1]
-            out[p] = sight(c * dx + s * dy, -s * dx + c * dy, o, seen[0], seen[1], cut) < 1.0
-    return first, points, out
+            out[p] = sight(c * dx + s * dy, -s * dx + c * dy, o, seen.views, seen.occluders, cut) < 1.0
+    return out
 
 
 @njit(cache=True, nogil=True)
-def _shape(members, hull_first, hulls, first, points, cut, weight, rectangle):  # pragma: no cover - compiled
-    """The fused ring (K, 2), anticlockwise, of the rings ``members``."""
+def _shape(
+    members: I64x1,
+    hull_first: I64x1,
+    hulls: F64x2,
+    first: I64x1,
+    points: F64x2,
+    cut: Boolx1,
+    weight: F64x1,
+    rectangle: float,
+) -> F64x2:  # pragma: no cover - compiled
+    """The fused ring (K, 2), anticlockwise, of the rings ``members``; cut: (P,) points at the border of their view."""
     cc, ss, mass, mx, my = 0.0, 0.0, 0.0, 0.0, 0.0
     for r in members:
         ring = hulls[hull_first[r] : hull_first[r + 1]]
@@ -325,10 +382,10 @@ def _shape(members, hull_first, hulls, first, points, cut, weight, rectangle):  
             mx += w * 0.5 * (ring[i, 0] + ring[(i + 1) % len(ring), 0])
             my += w * 0.5 * (ring[i, 1] + ring[(i + 1) % len(ring), 1])
     axis, mx, my = np.arctan2(ss, cc) / 4.0, mx / mass, my / mass
-    reach = np.empty(32)
+    reach = np.empty(_DIRECTIONS)
     value, certain, heavy = np.empty(len(members)), np.empty(len(members), np.bool_), np.empty(len(members))
-    for d in range(32):
-        angle = axis + 2.0 * np.pi * d / 32
+    for d in range(_DIRECTIONS):
+        angle = axis + 2.0 * np.pi * d / _DIRECTIONS
         u, v = np.cos(angle), np.sin(angle)
         for i in range(len(members)):
             r = members[i]
@@ -338,14 +395,15 @@ def _shape(members, hull_first, hulls, first, points, cut, weight, rectangle):  
                 if far > value[i]:
                     value[i], certain[i] = far, not cut[p]
         reach[d] = _median(value[certain], heavy[certain]) if certain.any() else value.max()
-    box = np.empty((4, 2))
+    box, quarter = np.empty((4, 2)), _DIRECTIONS // 4
     for k in range(4):
         one, two = axis + np.pi / 2 * k, axis + np.pi / 2 * (k + 1)
-        a, b = reach[8 * k], reach[(8 * k + 8) % 32]
+        a, b = reach[quarter * k], reach[quarter * (k + 1) % _DIRECTIONS]
         box[k, 0], box[k, 1] = mx + a * np.cos(one) + b * np.cos(two), my + a * np.sin(one) + b * np.sin(two)
     ring = box.copy()
-    for d in range(32):
-        u, v = np.cos(axis + 2.0 * np.pi * d / 32), np.sin(axis + 2.0 * np.pi * d / 32)
+    for d in range(_DIRECTIONS):
+        angle = axis + 2.0 * np.pi * d / _DIRECTIONS
+        u, v = np.cos(angle), np.sin(angle)
         clipped = _half_plane(ring, mx + reach[d] * u, my + reach[d] * v, u, v)
         if len(clipped) >= 3:
             ring = clipped
@@ -353,7 +411,7 @@ def _shape(members, hull_first, hulls, first, points, cut, weight, rectangle):  
 
 
 @njit(cache=True, nogil=True)
-def _median(value, weight):  # pragma: no cover - compiled
+def _median(value: F64x1, weight: F64x1) -> float:  # pragma: no cover - compiled
     """The weighted median, between the two middle values where the halves balance."""
     order = np.arange(len(value))
     for i in range(1, len(order)):
@@ -365,64 +423,81 @@ def _median(value, weight):  # pragma: no cover - compiled
     for i in range(len(order)):
         total += weight[order[i]]
         if total > half * (1.0 + 1e-9):
-            return value[order[i]]
+            return float(value[order[i]])
         if total >= half * (1.0 - 1e-9) and i + 1 < len(order):
-            return 0.5 * (value[order[i]] + value[order[i + 1]])
-    return value[order[-1]]
+            return float(0.5 * (value[order[i]] + value[order[i + 1]]))
+    return float(value[order[-1]])
 
 
 @njit(cache=True, nogil=True)
-def _evidence(fused, rings, index, who, seen, told, numbers, least, decay, overlap):  # pragma: no cover - compiled
+def _places_in(ring: F64x2) -> F64x2:  # pragma: no cover - compiled
+    """The middle of a ring (K, 2), and the points halfway from it to each corner: (K + 1, 2)."""
+    places = np.empty((1 + len(ring), 2))
+    places[0, 0], places[0, 1] = ring[:, 0].mean(), ring[:, 1].mean()
+    for i in range(len(ring)):
+        places[1 + i] = 0.5 * (places[0] + ring[i])
+    return places
+
+
+@njit(cache=True, nogil=True)
+def _evidence(
+    fused: _Rings,
+    rings: _Hulls,
+    scene: Scene,
+    told: ElementStyles,
+    numbers: EvidenceParameters,
+    decay: float,
+    overlap: float,
+) -> _CrossingEvidence:  # pragma: no cover - compiled
+    """The evidence of each fused ring from the hulls that have a share of at least ``overlap`` in common with it."""
     start, xy = fused
     style, worth = told
     hull_first, hulls, area, owner, rows = rings
-    count, observations = len(start) - 1, len(who[0])
+    time_ns = scene.observers.time_ns
+    count, observations = len(start) - 1, len(time_ns)
     odds, coverage = np.zeros(count), np.zeros(count)
     support, agents, state = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
     t_first, t_last, votes = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, style.shape[1]))
     first, found, filled = np.zeros(count + 1, np.int64), np.empty(max(16, len(area)), np.int64), 0
-    aside_of, gain = np.zeros(observations, np.int64), np.zeros(observations)
-    book, stamp = np.zeros((who[4], 4)), np.zeros((who[4], 4), np.int64)
+    aside_of, gain = np.full(observations, UNMATCHED, np.int64), np.zeros(observations)
+    by_agent = new_agent_scratch(scene.observers.num_agents)
     for k in range(count):
         ring = xy[start[k] : start[k + 1]]
         size = _area(ring)
-        middle = np.array([ring[:, 0].mean(), ring[:, 1].mean()])
-        places = np.empty((1 + len(ring), 2))
-        places[0] = middle
-        for i in range(len(ring)):
-            places[1 + i] = 0.5 * (middle + ring[i])
+        places = _places_in(ring)
+        middle = places[0]
         for r in range(len(area)):
             if (
-                area[r] <= 0.5
+                area[r] <= _MIN_AREA_M2
                 or abs(hulls[hull_first[r], 0] - middle[0]) > 60.0
                 or abs(hulls[hull_first[r], 1] - middle[1]) > 60.0
             ):
                 continue
             share = _common(hulls[hull_first[r] : hull_first[r + 1]], ring) / min(area[r], size)
             if share >= overlap:
-                if aside_of[owner[r]] != 1:
+                if aside_of[owner[r]] != MATCHED:
                     votes[k] += style[rows[r]]
                     gain[owner[r]] = 0.0
                 gain[owner[r]] = max(gain[owner[r]], worth[rows[r]])
-                aside_of[owner[r]] = 1
-            elif share > 0.05 and aside_of[owner[r]] == 0:
-                aside_of[owner[r]] = 2
+                aside_of[owner[r]] = MATCHED
+            elif share > 0.05 and aside_of[owner[r]] == UNMATCHED:
+                aside_of[owner[r]] = NEARBY
         begin = filled
         for o in range(observations):
-            if aside_of[o] == 1:
+            if aside_of[o] == MATCHED:
                 if filled == len(found):
-                    bigger = np.empty(2 * filled, np.int64)
-                    bigger[:filled] = found
-                    found = bigger
+                    found = doubled(found)
                 found[filled] = o
                 filled += 1
         hits = found[begin:filled]
         odds[k], coverage[k], agents[k], state[k] = fold_looks(
-            places, k, hits, (aside_of, gain), index, who, seen, numbers, least, decay, book, stamp
+            places, k, Hits(hits, aside_of, gain), scene, numbers, decay, by_agent
         )
         support[k] = len(hits)
         if len(hits) > 0:
-            t_first[k], t_last[k] = who[2][hits[0]], who[2][hits[-1]]
+            t_first[k], t_last[k] = time_ns[hits[0]], time_ns[hits[-1]]
         first[k + 1] = filled
-        aside_of[:] = 0
-    return odds, coverage, support, agents, state, t_first, t_last, votes, first, found[:filled].copy()
+        aside_of[:] = UNMATCHED
+    return _CrossingEvidence(
+        odds, coverage, support, agents, state, t_first, t_last, votes, first, found[:filled].copy()
+    )

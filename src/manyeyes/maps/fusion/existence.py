@@ -12,19 +12,50 @@ more likely false than new, and still a few who agree suffice.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
-from manyeyes.maps.fusion.observation_arrays import Sightings, is_line, sight
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
+from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
+from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, Sightings, is_line, sight
 from manyeyes.maps.fusion.point_grid import build_grid, lower_bound, span
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _LOOK_CELL_M = 32.0
+_POINT_CELL_M = 2.5
 _DAY_S = 86400.0
+
+# What an observation says of a place: nothing there, a line at the place, or one only a little aside.
+UNMATCHED, MATCHED, NEARBY = 0, 1, 2
+
+
+class EvidenceParameters(NamedTuple):
+    """The numbers of EvidenceConfig as compiled loops read them; metres, min_cosine: of the largest turn.
+
+    hit, miss: change of log-odds. max_log_odds: bound of their absolute value, max_initial_log_odds: before the first
+    sighting. min_publish_agents, min_retire_agents: distinct agents.
+    """
+
+    hit: float
+    miss: float
+    max_log_odds: float
+    max_daily_change: float
+    publish: float
+    retire: float
+    margin_m: float
+    max_longitudinal_m: float
+    max_lateral_m: float
+    max_nearby_m: float
+    min_cosine: float
+    kernel_m: float
+    bias_m: float
+    max_initial_log_odds: float
+    min_publish_agents: int
+    min_retire_agents: int
 
 
 @dataclass(frozen=True)
@@ -83,26 +114,99 @@ class EvidenceConfig:
         return float(np.log((1 - self.detection) / (1 - self.false_alarm)))
 
     @property
-    def numbers(self) -> Floats:
-        """The numbers that the compiled loops read, in their order."""
-        gates = (self.along_m, self.across_m, self.aside_m, float(np.cos(self.heading_rad)), self.kernel_m, self.bias_m)
-        sums = (self.hit, self.miss, self.clamp, self.daily, self.publish, self.retire, self.margin_m)
-        return np.array((*sums, *gates, self.doubt))
+    def numbers(self) -> EvidenceParameters:
+        """The numbers that the compiled loops read."""
+        return EvidenceParameters(
+            hit=self.hit,
+            miss=self.miss,
+            max_log_odds=float(self.clamp),
+            max_daily_change=float(self.daily),
+            publish=float(self.publish),
+            retire=float(self.retire),
+            margin_m=float(self.margin_m),
+            max_longitudinal_m=float(self.along_m),
+            max_lateral_m=float(self.across_m),
+            max_nearby_m=float(self.aside_m),
+            min_cosine=float(np.cos(self.heading_rad)),
+            kernel_m=float(self.kernel_m),
+            bias_m=float(self.bias_m),
+            max_initial_log_odds=float(self.doubt),
+            min_publish_agents=self.publish_agents,
+            min_retire_agents=self.retire_agents,
+        )
 
 
-@dataclass(frozen=True, eq=False)
-class Looks:
+class Looks(NamedTuple):
     """Which observations may see a place: rows ``of[start[c]:start[c + 1]]``, in time order, for the cell with key
     ``keys[c]``.
     """
 
-    keys: Ints
-    start: Ints
-    of: Ints
+    keys: I64x1
+    start: I64x1
+    of: I64x1
 
 
-@dataclass(frozen=True, eq=False)
-class Witness:
+class Observers(NamedTuple):
+    """O observations at their corrected poses: pose (O, 3) x, y (m), yaw (rad); agent, time_ns and trusted (O,).
+
+    num_agents: of how many agents they are; ``agent`` counts in them.
+    """
+
+    pose: F64x2
+    agent: I64x1
+    time_ns: I64x1
+    trusted: Boolx1
+    num_agents: int
+
+
+class Scene(NamedTuple):
+    """All that decides which observation could see a place: their index by cells, poses, views and occluders."""
+
+    cells: Looks
+    observers: Observers
+    fields: FieldsOfView
+
+
+class ElementStyles(NamedTuple):
+    """Of E observed elements: style (E, S) probabilities, and worth (E,), the share of a hit that a sighting adds."""
+
+    style: F64x2
+    worth: F64x1
+
+
+class AgentScratch(NamedTuple):
+    """Scratch of :func:`fold_looks`, all by agent (A,): the sum of log-odds of a day, whether it has seen the thing, the
+    thing (its index + 1) and day of that sum, and the eras in which it last counted as having seen and as having missed it.
+    """
+
+    day_sum: F64x1
+    has_seen: Boolx1
+    thing: I64x1
+    day: I64x1
+    seen_era: I64x1
+    missed_era: I64x1
+
+
+class Hits(NamedTuple):
+    """How one thing was seen: rows of the observations that saw it, ascending; of all observations (O,) UNMATCHED, MATCHED or
+    NEARBY, and which share of a hit it is worth where it is MATCHED.
+    """
+
+    rows: I64x1
+    match: I64x1
+    worth: F64x1
+
+
+class Fold(NamedTuple):
+    """Evidence of one thing: log-odds, sum of visibilities, distinct agents that saw it, and its state."""
+
+    log_odds: float
+    coverage: float
+    num_agents: int
+    state: int
+
+
+class Witness(NamedTuple):
     """Evidence of K stations. shift: (K,) metres along the normal to where the observations agree; sigma: (K,).
 
     log_odds, coverage: (K,), coverage the sum of visibilities. support, agents: (K,). state: (K,). t_first, t_last:
@@ -110,18 +214,18 @@ class Witness:
     sightings.
     """
 
-    shift: Floats
-    sigma: Floats
-    log_odds: Floats
-    coverage: Floats
-    support: Ints
-    agents: Ints
-    state: Ints
-    t_first: Ints
-    t_last: Ints
-    style: Floats
-    first: Ints
-    sources: Ints
+    shift: F64x1
+    sigma: F64x1
+    log_odds: F64x1
+    coverage: F64x1
+    support: I64x1
+    agents: I64x1
+    state: I64x1
+    t_first: I64x1
+    t_last: I64x1
+    style: F64x2
+    first: I64x1
+    sources: I64x1
 
 
 def looks(sightings: Sightings, pose: Floats, heard: NDArray[np.bool_] | None = None) -> Looks:
@@ -144,7 +248,8 @@ def looks(sightings: Sightings, pose: Floats, heard: NDArray[np.bool_] | None = 
 
 
 @njit(cache=True, nogil=True)
-def _cells(low, high):  # pragma: no cover - compiled
+def _cells(low: I64x2, high: I64x2) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
+    """Keys of the cells from low to high (O, 2) of each observation, and the observation of each."""
     total = 0
     for o in range(len(low)):
         total += (high[o, 0] - low[o, 0] + 1) * (high[o, 1] - low[o, 1] + 1)
@@ -159,16 +264,15 @@ def _cells(low, high):  # pragma: no cover - compiled
     return cell, who
 
 
-def witnesses(sightings: Sightings, pose: Floats) -> tuple[Floats, Ints, Ints, NDArray[np.bool_], int]:
-    """Who looks, as the compiled loops read it: pose (O, 3), agent, time, trust (O,) and the number of agents."""
+def witnesses(sightings: Sightings, pose: Floats) -> Observers:
+    """The observations at pose (O, 3), as the compiled loops read them."""
     arrays = (np.asarray(sightings.agent), np.asarray(sightings.time_ns), np.asarray(sightings.trusted))
-    return (np.ascontiguousarray(pose), *arrays, len(sightings.agents))
+    return Observers(np.ascontiguousarray(pose), *arrays, len(sightings.agents))
 
 
-def sights(sightings: Sightings) -> tuple[tuple[Floats, Ints, Ints], tuple[Floats, Ints, Ints]]:
+def sights(sightings: Sightings) -> FieldsOfView:
     """Views and occluders, as the compiled loops read them."""
-    view, hidden = sightings.view, sightings.occluders
-    return (view.xy, view.first, view.of), (hidden.xy, hidden.first, hidden.of)
+    return FieldsOfView(sightings.view, sightings.occluders)
 
 
 def witness(
@@ -188,36 +292,101 @@ def witness(
     """
     points = np.flatnonzero(is_line(sightings.kind) & (weight > 0.0))
     world, direction = sightings.world(pose)
-    grid = build_grid(world[points, 0], world[points, 1], sightings.kind[points], 2.5)
+    grid = build_grid(world[points, 0], world[points, 1], sightings.kind[points], _POINT_CELL_M)
     order = points[grid.order]
     index = looks(sightings, pose, believed)
-    out = _witness(
-        (xy, tangent, kind),
-        (
-            grid.keys,
-            grid.start,
-            world[order],
-            direction[order],
-            sightings.observation[order],
-            sightings.element[order],
-            weight[order],
-        ),
-        (index.keys, index.start, index.of),
-        witnesses(sightings, pose),
-        sights(sightings),
-        (np.asarray(sightings.elements.style), config.worth(sightings.elements.score)),
+    others = _Points(
+        grid.keys,
+        grid.start,
+        world[order],
+        direction[order],
+        sightings.observation[order],
+        sightings.element[order],
+        weight[order],
+    )
+    return _witness(
+        _Stations(xy, tangent, kind),
+        others,
+        Scene(index, witnesses(sightings, pose), sights(sightings)),
+        ElementStyles(np.asarray(sightings.elements.style), config.worth(sightings.elements.score)),
         config.numbers,
-        (config.publish_agents, config.retire_agents),
         np.array(config.decay_s),
     )
-    return Witness(*out)
+
+
+class _Stations(NamedTuple):
+    """Stations of lines: places (K, 2), unit tangents (K, 2) and kinds (K,)."""
+
+    xy: F64x2
+    tangent: F64x2
+    kind: I64x1
+
+
+class _Points(NamedTuple):
+    """Points of observed lines in the order of their grid of _POINT_CELL_M: its keys and starts, places and unit tangents
+    (P, 2) in the map's frame, rows of observations and elements, and weights (P,).
+    """
+
+    keys: I64x1
+    start: I64x1
+    xy: F64x2
+    tangent: F64x2
+    observation: I64x1
+    element: I64x1
+    weight: F64x1
+
+
+class _Scratch(NamedTuple):
+    """What each observation (O,) has at one station: sums over its points near of weight, weight times lateral offset and
+    weight times weight of the point; least distance along and the element there; UNMATCHED, MATCHED or NEARBY.
+
+    touched: the observations that are not UNMATCHED, as many as :func:`_collect` returns.
+    """
+
+    mass: F64x1
+    offset: F64x1
+    pull: F64x1
+    nearest: F64x1
+    element: I64x1
+    match: I64x1
+    touched: I64x1
 
 
 @njit(cache=True, nogil=True)
-def _witness(stations, others, index, who, sights, told, numbers, least, decay):  # pragma: no cover - compiled
+def new_agent_scratch(count: int) -> AgentScratch:  # pragma: no cover - compiled
+    """Make the scratch of count agents."""
+    return AgentScratch(
+        np.zeros(count),
+        np.zeros(count, np.bool_),
+        np.zeros(count, np.int64),
+        np.zeros(count, np.int64),
+        np.zeros(count, np.int64),
+        np.zeros(count, np.int64),
+    )
+
+
+@njit(cache=True, nogil=True)
+def doubled(rows: I64x1) -> I64x1:  # pragma: no cover - compiled
+    """The same rows at the start of an array of twice the length."""
+    bigger = np.empty(2 * len(rows), np.int64)
+    bigger[: len(rows)] = rows
+    return bigger
+
+
+@njit(cache=True, nogil=True)
+def _witness(
+    stations: _Stations,
+    others: _Points,
+    scene: Scene,
+    told: ElementStyles,
+    numbers: EvidenceParameters,
+    decay: F64x1,
+) -> Witness:  # pragma: no cover - compiled
+    """The evidence of each station; decay: (4,) seconds by kind."""
     xy, tangent, kind = stations
     style, worth = told
-    count, observations = len(xy), len(who[0])
+    time_ns = scene.observers.time_ns
+    count, observations = len(xy), len(time_ns)
     shift, sigma, odds, coverage = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
     support, agents, state = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
     t_first, t_last = np.zeros(count, np.int64), np.zeros(count, np.int64)
@@ -225,67 +394,60 @@ def _witness(stations, others, index, who, sights, told, numbers, least, decay):
     first, sources, filled = np.zeros(count + 1, np.int64), np.empty(max(16, 8 * count), np.int64), 0
     mass, offset, pull = np.zeros(observations), np.zeros(observations), np.zeros(observations)
     nearest, element, gain = np.zeros(observations), np.zeros(observations, np.int64), np.zeros(observations)
-    aside_of = np.zeros(observations, np.int64)  # 1: a line at the station, 2: one a little aside
+    aside_of = np.full(observations, UNMATCHED, np.int64)
     touched, place = np.empty(observations, np.int64), np.empty((1, 2))
-    book = np.zeros((who[4], 4))
-    stamp = np.zeros((who[4], 4), np.int64)
+    scratch = _Scratch(mass, offset, pull, nearest, element, aside_of, touched)
+    by_agent = new_agent_scratch(scene.observers.num_agents)
     for k in range(count):
-        n = _collect(k, stations, others, numbers, (mass, offset, pull, nearest, element, aside_of, touched))
+        n = _collect(k, stations, others, numbers, scratch)
         # Sums over observations go in their order, whatever order the grid gave.
         touched[:n].sort()
-        shift[k], sigma[k] = _agree(n, touched, aside_of, mass, offset, pull, numbers)
+        shift[k], sigma[k] = _agree(n, scratch, numbers)
         for t in range(n):
             o = touched[t]
-            if aside_of[o] == 1 and abs(offset[o] / mass[o] - shift[k]) > numbers[8]:
-                aside_of[o] = 2
+            if aside_of[o] == MATCHED and abs(offset[o] / mass[o] - shift[k]) > numbers.max_lateral_m:
+                aside_of[o] = NEARBY
         # Only now is it known which of them are at the place that they agree on.
         for t in range(n):
             o = touched[t]
-            if aside_of[o] == 1:
+            if aside_of[o] == MATCHED:
                 if filled == len(sources):
-                    bigger = np.empty(2 * filled, np.int64)
-                    bigger[:filled] = sources
-                    sources = bigger
+                    sources = doubled(sources)
                 sources[filled] = o
                 filled += 1
                 votes[k] += style[element[o]]
                 gain[o] = worth[element[o]]
         first[k + 1] = filled
         place[0, 0], place[0, 1] = xy[k, 0] - shift[k] * tangent[k, 1], xy[k, 1] + shift[k] * tangent[k, 0]
+        hits = Hits(sources[first[k] : filled], aside_of, gain)
         odds[k], coverage[k], agents[k], state[k] = fold_looks(
-            place,
-            k,
-            sources[first[k] : filled],
-            (aside_of, gain),
-            index,
-            who,
-            sights,
-            numbers,
-            least,
-            decay[kind[k]],
-            book,
-            stamp,
+            place, k, hits, scene, numbers, float(decay[kind[k]]), by_agent
         )
         support[k] = filled - first[k]
         if support[k] > 0:
-            t_first[k], t_last[k] = who[2][sources[first[k]]], who[2][sources[filled - 1]]
+            t_first[k], t_last[k] = time_ns[sources[first[k]]], time_ns[sources[filled - 1]]
         for t in range(n):
             o = touched[t]
-            mass[o], offset[o], pull[o], aside_of[o] = 0.0, 0.0, 0.0, 0
-    return shift, sigma, odds, coverage, support, agents, state, t_first, t_last, votes, first, sources[:filled].copy()
+            mass[o], offset[o], pull[o], aside_of[o] = 0.0, 0.0, 0.0, UNMATCHED
+    return Witness(
+        shift, sigma, odds, coverage, support, agents, state, t_first, t_last, votes, first, sources[:filled].copy()
+    )
 
 
 @njit(cache=True, nogil=True)
-def _collect(k, stations, others, numbers, scratch):  # pragma: no cover - compiled
+def _collect(
+    k: int, stations: _Stations, others: _Points, numbers: EvidenceParameters, scratch: _Scratch
+) -> int:  # pragma: no cover - compiled
     """Each observation's place across station k, averaged over its points near; the number of observations that have
     any.
     """
     xy, tangent, kind = stations
     keys, start, rxy, rtangent, robservation, relement, rweight = others
     mass, offset, pull, nearest, element, aside_of, touched = scratch
-    reach, across, wide, cosine = numbers[7], numbers[8], numbers[9], numbers[10]
+    reach, across, wide = numbers.max_longitudinal_m, numbers.max_lateral_m, numbers.max_nearby_m
+    cosine = numbers.min_cosine
     x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
-    ix, iy = int(np.floor(x / 2.5)), int(np.floor(y / 2.5))
+    ix, iy = int(np.floor(x / _POINT_CELL_M)), int(np.floor(y / _POINT_CELL_M))
     n = 0
     for dx in range(-1, 2):
         low, high = span(keys, start, kind[k], ix + dx, iy - 1, iy + 1)
@@ -303,14 +465,14 @@ def _collect(k, stations, others, numbers, scratch):  # pragma: no cover - compi
             if along > reach or abs(aside) > wide:
                 continue
             o = robservation[q]
-            if aside_of[o] == 0:
+            if aside_of[o] == UNMATCHED:
                 touched[n] = o
                 n += 1
-                aside_of[o] = 2
+                aside_of[o] = NEARBY
                 nearest[o] = np.inf
             if abs(aside) > across:
                 continue
-            aside_of[o] = 1
+            aside_of[o] = MATCHED
             # The nearest points decide: weights fall steeply, so that two points astride the station interpolate.
             w = (1.0 - along / reach) ** 2 + 1e-9
             mass[o] += w
@@ -323,11 +485,14 @@ def _collect(k, stations, others, numbers, scratch):  # pragma: no cover - compi
 
 
 @njit(cache=True, nogil=True)
-def _agree(n, touched, aside_of, mass, offset, pull, numbers):  # pragma: no cover - compiled
+def _agree(
+    n: int, scratch: _Scratch, numbers: EvidenceParameters
+) -> tuple[float, float]:  # pragma: no cover - compiled
     """Where across the station the observations agree, and its sigma: reweighted means, one contribution an
     observation.
     """
-    kernel, floor = numbers[11], numbers[12]
+    mass, offset, pull, aside_of, touched = scratch.mass, scratch.offset, scratch.pull, scratch.match, scratch.touched
+    kernel, floor = numbers.kernel_m, numbers.bias_m
     place, spread = 0.0, 1.0
     for turn in range(4):
         total, aside, information = 0.0, 0.0, 0.0
@@ -335,7 +500,7 @@ def _agree(n, touched, aside_of, mass, offset, pull, numbers):  # pragma: no cov
         c2 = (kernel * (2.0 if turn == 0 else 1.0)) ** 2
         for i in range(n):
             o = touched[i]
-            if aside_of[o] == 1:
+            if aside_of[o] == MATCHED:
                 d = offset[o] / mass[o]
                 g = c2 / (c2 + (d - place) ** 2)
                 w = pull[o] / mass[o] * g * g
@@ -346,32 +511,34 @@ def _agree(n, touched, aside_of, mass, offset, pull, numbers):  # pragma: no cov
             return 0.0, 1.0
         place = aside / total
         spread = np.sqrt(1.0 / max(information, 1e-9) + floor * floor)
-    return place, spread
+    return float(place), float(spread)
 
 
 @njit(cache=True, nogil=True)
 def fold_looks(
-    places, k, hits, found_by, index, who, sights, numbers, least, decay, book, stamp
-):  # pragma: no cover - compiled
-    """Log-odds, coverage, distinct agents and state of one thing after all looks at it, in time order.
+    places: F64x2,
+    k: int,
+    found: Hits,
+    scene: Scene,
+    numbers: EvidenceParameters,
+    decay: float,
+    scratch: AgentScratch,
+) -> Fold:  # pragma: no cover - compiled
+    """Log-odds, coverage, distinct agents and state of thing k after all looks at it, in time order.
 
-    ``places`` (M, 2) are points of it whose visibilities are averaged. ``hits`` are the rows that saw it, ascending;
-    ``found_by`` tells for each row whether it saw it (1) or something a little aside (2), and what share of a hit that
-    is worth.
-    Scratch by agent: ``book`` holds the sum of a day; ``stamp`` the thing and day of that sum, and when it last counted
-    as a supporter and as a witness of absence.
+    ``places`` (M, 2) are points of it whose visibilities are averaged. decay: seconds in which evidence fades to 1/e.
     """
-    agent, time_ns, trusted = who[1], who[2], who[3]
-    aside_of, worth = found_by
-    hit, miss, clamp, daily, publish, retire = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
-    low, high = _cell_of(places, index)
-    of = index[2]
-    odds, coverage, state, then, surveyed, started = 0.0, 0.0, 0, 0, False, False
-    seen_by, all_by, missed_by, next_hit, q, floor = 0, 0, 0, 0, low, -numbers[13]
+    pose, agent, time_ns, trusted, _ = scene.observers
+    hits, aside_of, worth = found
+    of = scene.cells.of
+    hit, miss, clamp, daily = numbers.hit, numbers.miss, numbers.max_log_odds, numbers.max_daily_change
+    low, high = _cell_of(places, scene.cells)
+    odds, coverage, state, then, surveyed, started = 0.0, 0.0, CANDIDATE, 0, False, False
+    seen_by, all_by, missed_by, next_hit, q, floor = 0, 0, 0, 0, low, -numbers.max_initial_log_odds
     era_seen, era_missed = 1, 1
     while next_hit < len(hits) or q < high:
-        found = next_hit < len(hits) and (q >= high or hits[next_hit] <= of[q])
-        if found:
+        is_hit = next_hit < len(hits) and (q >= high or hits[next_hit] <= of[q])
+        if is_hit:
             o, seen = hits[next_hit], 1.0
             next_hit += 1
             if q < high and of[q] == o:
@@ -379,46 +546,58 @@ def fold_looks(
         else:
             o = of[q]
             q += 1
-            seen = 0.0 if aside_of[o] == 2 else visibility(places, o, who[0], sights, numbers[6])
+            seen = 0.0 if aside_of[o] == NEARBY else visibility(places, o, pose, scene.fields, numbers.margin_m)
         coverage += seen
         if seen <= 0.0:
             continue
         if started:
             odds *= np.exp(-(time_ns[o] - then) * 1e-9 / decay)
         started, then = True, time_ns[o]
-        a, day = agent[o], time_ns[o] // 86400000000000
-        if stamp[a, 0] != k + 1:
-            stamp[a, 0], stamp[a, 1], stamp[a, 2], stamp[a, 3] = k + 1, day, 0, 0
-            book[a, 0], book[a, 1] = 0.0, 0.0
-        if stamp[a, 1] != day:
-            stamp[a, 1], book[a, 0] = day, 0.0
-        change = hit * worth[o] if found else miss * seen
+        a = int(agent[o])
+        _open_day(scratch, a, k, int(time_ns[o] // DAY_NS))
+        change = hit * worth[o] if is_hit else miss * seen
         if not trusted[o]:
-            allowed = min(daily, max(-daily, book[a, 0] + change))
-            change, book[a, 0] = allowed - book[a, 0], allowed
-        if found:
+            allowed = min(daily, max(-daily, scratch.day_sum[a] + change))
+            change, scratch.day_sum[a] = allowed - scratch.day_sum[a], allowed
+        if is_hit:
             floor = -clamp
         odds = min(clamp, max(floor, odds + change))
-        if found:
-            if stamp[a, 2] != era_seen:
-                stamp[a, 2] = era_seen
-                seen_by += 1
-            if book[a, 1] == 0.0:
-                book[a, 1] = 1.0
+        if is_hit:
+            seen_by += _count_once(scratch.seen_era, a, era_seen)
+            if not scratch.has_seen[a]:
+                scratch.has_seen[a] = True
                 all_by += 1
             surveyed = surveyed or trusted[o]
-        elif all_by > 0 and stamp[a, 3] != era_missed:
-            stamp[a, 3] = era_missed
-            missed_by += 1
-        if odds >= publish and (seen_by >= least[0] or surveyed):
-            state = 1
+        elif all_by > 0:
+            missed_by += _count_once(scratch.missed_era, a, era_missed)
+        if odds >= numbers.publish and (seen_by >= numbers.min_publish_agents or surveyed):
+            state = PUBLISHED
             era_missed += 1
             missed_by = 0
-        elif odds <= retire and missed_by >= least[1] and state != 3:
-            state = 3
+        elif odds <= numbers.retire and missed_by >= numbers.min_retire_agents and state != RETIRED:
+            state = RETIRED
             era_seen += 1
             seen_by, surveyed = 0, False
-    return odds, coverage, all_by, state
+    return Fold(float(odds), coverage, all_by, state)
+
+
+@njit(cache=True, nogil=True)
+def _count_once(eras: I64x1, a: int, era: int) -> int:  # pragma: no cover - compiled
+    """Note that agent a counts in this era; 1 if it did not yet, else 0."""
+    if eras[a] == era:
+        return 0
+    eras[a] = era
+    return 1
+
+
+@njit(cache=True, nogil=True)
+def _open_day(scratch: AgentScratch, a: int, k: int, day: int) -> None:  # pragma: no cover - compiled
+    """Clear what agent a holds of another thing than k, and its sum of another day."""
+    if scratch.thing[a] != k + 1:
+        scratch.thing[a], scratch.day[a], scratch.seen_era[a], scratch.missed_era[a] = k + 1, day, 0, 0
+        scratch.day_sum[a], scratch.has_seen[a] = 0.0, False
+    if scratch.day[a] != day:
+        scratch.day[a], scratch.day_sum[a] = day, 0.0
 
 
 def vouched(
@@ -430,23 +609,27 @@ def vouched(
         index = looks(sightings, pose, believed)
         doubted = np.flatnonzero(~believed)
         xy = sightings.world(pose)[0]
-        among = (index.keys, index.start, index.of), witnesses(sightings, pose), sights(sightings)
-        _vouch(doubted, np.asarray(sightings.first), xy, *among, margin_m, agents, out)
+        scene = Scene(index, witnesses(sightings, pose), sights(sightings))
+        _vouch(doubted, np.asarray(sightings.first), xy, scene, margin_m, agents, out)
     return out
 
 
 @njit(cache=True, nogil=True)
-def _vouch(doubted, first, xy, index, who, sights, margin, agents, out):  # pragma: no cover - compiled
-    seen, place = np.full(who[4], -1), np.empty((1, 2))
+def _vouch(
+    doubted: I64x1, first: I64x1, xy: F64x2, scene: Scene, margin: float, agents: int, out: Boolx1
+) -> None:  # pragma: no cover - compiled
+    """Mark in out (P,) the points of observations ``doubted`` that so many agents of the scene could see."""
+    agent, pose, of = scene.observers.agent, scene.observers.pose, scene.cells.of
+    seen, place = np.full(scene.observers.num_agents, -1), np.empty((1, 2))
     for o in doubted:
         for p in range(first[o], first[o + 1]):
             place[0, 0], place[0, 1] = xy[p, 0], xy[p, 1]
-            low, high = _cell_of(place, index)
+            low, high = _cell_of(place, scene.cells)
             count = 0
             for q in range(low, high):
-                other = index[2][q]
-                if seen[who[1][other]] != p and visibility(place, other, who[0], sights, margin) > 0.0:
-                    seen[who[1][other]] = p
+                other = of[q]
+                if seen[agent[other]] != p and visibility(place, other, pose, scene.fields, margin) > 0.0:
+                    seen[agent[other]] = p
                     count += 1
                     if count == agents:
                         out[p] = True
@@ -454,9 +637,11 @@ def _vouch(doubted, first, xy, index, who, sights, margin, agents, out):  # prag
 
 
 @njit(cache=True, nogil=True)
-def _cell_of(places, index):  # pragma: no cover - compiled
+def _cell_of(places: F64x2, index: Looks) -> tuple[int, int]:  # pragma: no cover - compiled
+    """The range in ``index.of`` of the observations that may see the first place."""
     keys, start, _ = index
-    key = ((int(np.floor(places[0, 0] / 32.0)) + 536870912) << 30) | (int(np.floor(places[0, 1] / 32.0)) + 536870912)
+    ix, iy = int(np.floor(places[0, 0] / _LOOK_CELL_M)), int(np.floor(places[0, 1] / _LOOK_CELL_M))
+    key = ((ix + 536870912) << 30) | (iy + 536870912)
     cell = lower_bound(keys, key)
     if cell < len(keys) and keys[cell] == key:
         return start[cell], start[cell + 1]
@@ -464,12 +649,14 @@ def _cell_of(places, index):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def visibility(places, o, pose, sights, margin):  # pragma: no cover - compiled
+def visibility(
+    places: F64x2, o: int, pose: F64x2, sights: FieldsOfView, margin: float
+) -> float:  # pragma: no cover - compiled
     """Mean visibility of the places from observation o; what is seen by less than half says nothing."""
     c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
     total = 0.0
     for i in range(len(places)):
         dx, dy = places[i, 0] - pose[o, 0], places[i, 1] - pose[o, 1]
-        total += sight(c * dx + s * dy, -s * dx + c * dy, o, sights[0], sights[1], margin)
+        total += sight(c * dx + s * dy, -s * dx + c * dy, o, sights.views, sights.occluders, margin)
     mean = total / len(places)
     return mean if len(places) == 1 or mean >= 0.5 else 0.0

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, I64x1, njit
 from manyeyes.datatypes.map_element import DASHED, MapElements, rows_of
 from manyeyes.maps.elements.observation import Frame, Observation
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED, Stations, Topology, VectorMap, content_ids
@@ -235,7 +235,7 @@ def _canonical(first: Ints, points: Floats) -> tuple[Ints, Ints]:
 
 
 @njit(cache=True, nogil=True)
-def _walk(first, walk, turned):  # pragma: no cover - compiled
+def _walk(first: I64x1, walk: I64x1, turned: Boolx1) -> I64x1:  # pragma: no cover - compiled
     order, n = np.empty(first[-1], np.int64), 0
     for c in walk:
         size = first[c + 1] - first[c]

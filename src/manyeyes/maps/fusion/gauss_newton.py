@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, F64x3, I64x1, njit
 from manyeyes.maps.fusion.observation_arrays import Sightings
 from manyeyes.maps.fusion.point_grid import span
 
@@ -22,19 +22,27 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+_Own = tuple[I64x1, F64x2, F64x2, I64x1, F64x1]
+"""first, xy, tangent, kind, sigma."""
+_Others = tuple[float, I64x1, I64x1, F64x2, F64x2, I64x1, F64x1]
+"""cell, keys, start, xy, tangent, observation, weight."""
+_Numbers = tuple[float, float, float, float, float, float]
+"""gate, kernel, reach, cosine, scatter, correlation."""
+
 
 @njit(cache=True, nogil=True)
-def normal_equations(home, own, others, numbers, stride=1):  # pragma: no cover - compiled
-    """Normal equations of each home observation: (H, 11) pivot x, y; information xx, xy, xt, yy, yt, tt; right side is
-    last of (H, 14): then x, y, t of the gradient, residual sum, vote sum, points. Every stride-th point votes, for all.
+def normal_equations(
+    home: I64x1, own: _Own, others: _Others, numbers: _Numbers, stride: int = 1
+) -> F64x2:  # pragma: no cover - compiled
+    """Sum the normal equations of each home observation (H, 13): pivot x, y; information xx, xy, xt, yy, yt, tt; right side
+    x, y, t; weighted square residual (m²) and sum of votes. Every stride-th point votes, for all.
     """
     first, xy, tangent, kind, sigma = own
     cell, keys, start, rxy, rtangent, robservation, rweight = others
     gate, kernel, reach, cosine, scatter, correlation = numbers
     correlation /= stride
     out = np.zeros((len(home), 13))
-    c2 = kernel * kernel
-    far = gate * gate + reach * reach
+    c2, far = kernel * kernel, gate * gate + reach * reach
     radius, shorter = np.sqrt(far), 1.0 / reach
     for h in range(len(home)):
         o = home[h]
@@ -109,7 +117,15 @@ def step_poses(
 
 
 @njit(cache=True, nogil=True)
-def _steps(sums, start, lean, pose, prior, trusted, numbers):  # pragma: no cover - compiled
+def _steps(
+    sums: F64x2,
+    start: F64x2,
+    lean: F64x2,
+    pose: F64x2,
+    prior: F64x3,
+    trusted: Boolx1,
+    numbers: tuple[float, float, float],
+) -> tuple[F64x2, F64x3, F64x2, F64x3, F64x2]:  # pragma: no cover - compiled
     """Poses (H, 3) after the step, their covariances (H, 3, 3), how far lines tell each of their three directions (H, 3), and
     the lines' information (H, 3, 3) and what they ask for (H, 3).
     """

@@ -15,11 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
 from manyeyes.datatypes import ConfigError, ShapeError
 from manyeyes.datatypes.map_element import MapElements, frozen
 from manyeyes.maps.elements.observation import Observation
@@ -34,6 +35,7 @@ OVERLAP, CONTINUES, PARALLEL, CROSSES, SAME_OBSERVATION = range(len(RELATIONS))
 _START_I, _END_I, _START_J, _END_J, _MEAN, _SPREAD, _COUNT, _CROSS_I, _CROSS_J, _CROSS_TURN, _GAP, _GAP_TURN, _ENDS = (
     range(13)
 )
+_NUM_COLUMNS = 13
 
 
 @dataclass(frozen=True)
@@ -120,17 +122,14 @@ def element_graph(nodes: MapElements, observation: ArrayLike = -1, config: Graph
     pairs = near_pairs(nodes.bounds(), max(config.parallel_m, config.gap_m))
     points, first = close_rings(nodes.points, nodes.first, nodes.closed)
     dense, dense_first = resample_spaced(points, first, config.spacing_m)
-    lines = (frozen(points, np.float64), frozen(first, np.int64))
-    samples = (frozen(dense, np.float64), frozen(dense_first, np.int64), headings(dense, dense_first))
-    numbers = np.array(
-        (config.turn, config.gap_m, config.gap_turn, config.aside_m, config.aside_share, config.cross_turn)
-    )
-    found = _measure(*lines, *samples, frozen(pairs, np.int64), nodes.closed, numbers)
+    lines = _Lines(frozen(points, np.float64), frozen(first, np.int64))
+    samples = _Samples(frozen(dense, np.float64), frozen(dense_first, np.int64), headings(dense, dense_first))
+    found = _measure(lines, samples, frozen(pairs, np.int64), nodes.closed, _Thresholds.of(config))
     return _classified(nodes, owner, pairs, found, config)
 
 
 def _classified(nodes: MapElements, owner: Ints, pairs: Ints, found: Floats, config: GraphConfig) -> ElementGraph:
-    """The edges that the measurements (K, 13) of pairs (K, 2) make."""
+    """The edges that the measurements (K, _NUM_COLUMNS) of pairs (K, 2) make."""
     i, j = pairs.T
     length = nodes.lengths()
     least = np.minimum(config.least_m, 0.5 * np.minimum(length[i], length[j]))
@@ -171,10 +170,45 @@ def _classified(nodes: MapElements, owner: Ints, pairs: Ints, found: Floats, con
     )
 
 
+class _Lines(NamedTuple):
+    """N polylines: line i is ``points[first[i]:first[i + 1]]``; rings are closed."""
+
+    points: F64x2
+    first: I64x1
+
+
+class _Samples(NamedTuple):
+    """The same at equal spacing: line i is ``points[first[i]:first[i + 1]]``; heading: (P,) rad of each point."""
+
+    points: F64x2
+    first: I64x1
+    heading: F64x1
+
+
+class _Thresholds(NamedTuple):
+    """The bounds of GraphConfig that decide on pairs, all as floats; metres and radians."""
+
+    max_facing_turn: float
+    max_gap_m: float
+    max_gap_turn: float
+    max_lateral_m: float
+    lateral_slope: float
+    min_cross_turn: float
+
+    @classmethod
+    def of(cls, config: GraphConfig) -> _Thresholds:
+        bounds = (config.turn, config.gap_m, config.gap_turn, config.aside_m, config.aside_share, config.cross_turn)
+        return cls(*(float(bound) for bound in bounds))
+
+
 @njit(cache=True)
-def _measure(points, first, dense, dense_first, heading, pairs, closed, numbers):  # pragma: no cover - compiled
-    """(K, 13) what is measured of each pair; infinity where two ends do not continue or two lines do not cross."""
-    out = np.full((len(pairs), 13), np.inf)
+def _measure(
+    lines: _Lines, samples: _Samples, pairs: I64x2, closed: Boolx1, numbers: _Thresholds
+) -> F64x2:  # pragma: no cover - compiled
+    """(K, _NUM_COLUMNS) what is measured of each pair; infinity where two ends do not continue or two lines do not cross."""
+    points, first = lines
+    dense, dense_first, heading = samples
+    out = np.full((len(pairs), _NUM_COLUMNS), np.inf)
     out[:, :_CROSS_I] = 0.0
     for k in range(len(pairs)):
         i, j = pairs[k]
@@ -183,23 +217,25 @@ def _measure(points, first, dense, dense_first, heading, pairs, closed, numbers)
             dense[dense_first[i] : dense_first[i + 1]],
             heading[dense_first[i] : dense_first[i + 1]],
             line,
-            numbers[0],
+            numbers.max_facing_turn,
             out[k],
         )
-        _cross(points[first[i] : first[i + 1]], line, numbers[5], out[k])
+        _cross(points[first[i] : first[i + 1]], line, numbers.min_cross_turn, out[k])
         if not closed[i] and not closed[j]:
             _continue(points[first[i] : first[i + 1]], line, numbers, out[k])
     return out
 
 
 @njit(cache=True)
-def _turn(ax, ay, bx, by):  # pragma: no cover - compiled
+def _turn(ax: float, ay: float, bx: float, by: float) -> float:  # pragma: no cover - compiled
     """The angle between two directions without regard to sense, [0, pi / 2]."""
     return np.arctan2(abs(ax * by - ay * bx), abs(ax * bx + ay * by))
 
 
 @njit(cache=True)
-def _face(dense, heading, line, most_turn, out):  # pragma: no cover - compiled
+def _face(
+    dense: F64x2, heading: F64x1, line: F64x2, most_turn: float, out: F64x1
+) -> None:  # pragma: no cover - compiled
     """Interval and offset of the points whose foot lies inside the line, under a like direction."""
     n = len(dense)
     lateral = np.empty(n)
@@ -244,7 +280,7 @@ def _face(dense, heading, line, most_turn, out):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def _cross(one, two, least_turn, out):  # pragma: no cover - compiled
+def _cross(one: F64x2, two: F64x2, least_turn: float, out: F64x1) -> None:  # pragma: no cover - compiled
     """Where along both they first intersect at an angle."""
     passed_i = 0.0
     for p in range(len(one) - 1):
@@ -266,7 +302,7 @@ def _cross(one, two, least_turn, out):  # pragma: no cover - compiled
 
 
 @njit(cache=True)
-def _continue(one, two, numbers, out):  # pragma: no cover - compiled
+def _continue(one: F64x2, two: F64x2, numbers: _Thresholds, out: F64x1) -> None:  # pragma: no cover - compiled
     """The nearest pair of ends of which each lies ahead of the other."""
     for end_i in range(2):
         a, before = (len(one) - 1, len(one) - 2) if end_i else (0, 1)
@@ -278,7 +314,7 @@ def _continue(one, two, numbers, out):  # pragma: no cover - compiled
             norm_v = np.hypot(vx, vy)
             gx, gy = two[b, 0] - one[a, 0], two[b, 1] - one[a, 1]
             gap = np.hypot(gx, gy)
-            if norm_u == 0.0 or norm_v == 0.0 or gap > numbers[1] or gap >= out[_GAP]:
+            if norm_u == 0.0 or norm_v == 0.0 or gap > numbers.max_gap_m or gap >= out[_GAP]:
                 continue
             ahead = (gx * ux + gy * uy) / norm_u
             aside = abs(gx * uy - gy * ux) / norm_u
@@ -286,8 +322,8 @@ def _continue(one, two, numbers, out):  # pragma: no cover - compiled
             # Two ends may have passed each other by as much as a line's own spread.
             if (
                 ux * vx + uy * vy < 0.0
-                and turn < numbers[2]
-                and aside <= numbers[3] + numbers[4] * gap
+                and turn < numbers.max_gap_turn
+                and aside <= numbers.max_lateral_m + numbers.lateral_slope * gap
                 and ahead >= -0.5
             ):
                 out[_GAP], out[_GAP_TURN], out[_ENDS] = gap, turn, 2 * end_i + end_j

@@ -13,22 +13,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, rows_of
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, VectorMap
 from manyeyes.maps.fusion.coarse_search import best_moves, moved_by
 from manyeyes.maps.fusion.coverage import along, looked_at, merged
 from manyeyes.maps.fusion.crossings import hulls_of, overlap_of
-from manyeyes.maps.fusion.existence import EvidenceConfig, visibility
+from manyeyes.maps.fusion.existence import EvidenceConfig, EvidenceParameters, doubled, visibility
 from manyeyes.maps.fusion.existence import sights as sights_of
 from manyeyes.maps.fusion.fuse import FuseConfig, assemble
 from manyeyes.maps.fusion.gauss_newton import normal_equations, step_poses
-from manyeyes.maps.fusion.observation_arrays import DAY_NS, Sightings, gather, is_line
+from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, Sightings, gather, is_line
 from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, span
 from manyeyes.maps.fusion.pose_config import AlignConfig
 from manyeyes.maps.fusion.stations import Evidence, StationTable
@@ -327,11 +328,30 @@ class _Rows:
         _change(
             rows,
             np.broadcast_to(np.asarray(amount, np.float64), len(rows)),
-            tuple(getattr(self, name) for name in _CHANGED),
-            (time, time // DAY_NS, _agent_number(s)),
-            (hit, bool(s.trusted[0])),
-            (evidence.daily, evidence.clamp, float(evidence.publish_agents), evidence.retire),
-            (np.array(evidence.decay_s), evidence.publish_from(kinds)),
+            self._columns,
+            _Update(time, time // DAY_NS, _agent_number(s), hit, bool(s.trusted[0])),
+            _UpdateLimits(
+                evidence.daily,
+                evidence.clamp,
+                float(evidence.publish_agents),
+                evidence.retire,
+                np.array(evidence.decay_s),
+                evidence.publish_from(kinds),
+            ),
+        )
+
+    @property
+    def _columns(self) -> _Columns:
+        return _Columns(
+            kind=self.kind,
+            log_odds=self.log_odds,
+            support=self.support,
+            agents=self.agents,
+            state=self.state,
+            t_last=self.t_last,
+            last_agent=self.last_agent,
+            day=self.day,
+            day_sum=self.day_sum,
         )
 
     def evidence(self, listed: Sequence[Sequence[int]], ids: NDArray[np.uint8]) -> Evidence:
@@ -355,16 +375,49 @@ class _Rows:
         )
 
 
-_CHANGED = ("kind", "log_odds", "support", "agents", "state", "t_last", "last_agent", "day", "day_sum")
+class _Columns(NamedTuple):
+    """The columns of :class:`_Rows` that an observation changes, and the kind."""
+
+    kind: I64x1
+    log_odds: F64x1
+    support: I64x1
+    agents: I64x1
+    state: I64x1
+    t_last: I64x1
+    last_agent: I64x1
+    day: I64x1
+    day_sum: F64x1
+
+
+class _Update(NamedTuple):
+    """What one observation says of rows: when (ns and day), of which agent, whether it saw them, whether it is surveyed."""
+
+    time_ns: int
+    day: int
+    agent: int
+    is_hit: bool
+    trusted: bool
+
+
+class _UpdateLimits(NamedTuple):
+    """Bounds of log-odds; decay_s and publish: (4,) by kind, seconds to 1/e and log-odds from which a row is published."""
+
+    max_daily_change: float
+    max_log_odds: float
+    min_publish_agents: float
+    retire: float
+    decay_s: F64x1
+    publish: F64x1
 
 
 @njit(cache=True, nogil=True)
-def _change(rows, amount, columns, now, flags, numbers, by_kind):  # pragma: no cover - compiled
+def _change(
+    rows: I64x1, amount: F64x1, columns: _Columns, now: _Update, numbers: _UpdateLimits
+) -> None:  # pragma: no cover - compiled
+    """Add amount (N,) to the log-odds of rows (N,), decayed, capped by agent and day and clamped; then set their state."""
     kind, log_odds, support, agents, state, t_last, last_agent, day, day_sum = columns
-    time, today, agent = now
-    hit, trusted = flags
-    daily, clamp, least, retire = numbers
-    decay, publish = by_kind
+    time, today, agent, hit, trusted = now
+    daily, clamp, least, retire, decay, publish = numbers
     for k, added in zip(rows, amount):
         odds = log_odds[k] * np.exp(-max(0.0, (time - t_last[k]) * 1e-9) / decay[kind[k]])
         same = last_agent[k] == agent and day[k] == today
@@ -384,16 +437,15 @@ def _change(rows, amount, columns, now, flags, numbers, by_kind):  # pragma: no 
             state[k] = PUBLISHED
 
 
-@dataclass(frozen=True, eq=False)
-class _Look:
+class _Look(NamedTuple):
     """One observation at its pose (1, 3), as :func:`_compare` reads it; order: where its points stand among all."""
 
-    pose: Floats
-    order: Ints
-    points: tuple[Ints, Ints, Floats, Floats, Floats, Floats]
-    box: tuple[Floats, Floats]
-    sights: tuple
-    numbers: Floats
+    pose: F64x2
+    order: I64x1
+    points: _LookPoints
+    box: _Box
+    sights: FieldsOfView
+    numbers: EvidenceParameters
 
     @classmethod
     def of(
@@ -404,8 +456,8 @@ class _Look:
         xy, tangent, weight, worth = columns
         fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind[lines], _CELL_M)
         order, corner = lines[fine.order], s.world_view(pose)
-        points = (fine.keys, fine.start, xy[order], tangent[order], weight[order], worth[order])
-        box = corner.min(0), corner.max(0)
+        points = _LookPoints(fine.keys, fine.start, xy[order], tangent[order], weight[order], worth[order])
+        box = _Box(corner.min(0), corner.max(0))
         return cls(np.ascontiguousarray(pose), order, points, box, sights_of(s), evidence.numbers)
 
 
@@ -445,12 +497,8 @@ class _Ground:
         if not len(self) or not len(whole):
             return np.zeros(0, np.int64), 0, whole
         near, place, mass, seen, sure, explained = _compare(
-            (self.grid.keys, self.grid.start, self.xy, self.tangent),
-            look.points,
-            look.box,
-            look.pose,
-            look.sights,
-            look.numbers,
+            _Stations(self.grid.keys, self.grid.start, self.xy, self.tangent),
+            look,
             len(KINDS),
         )
         hit = mass > 0.0
@@ -466,29 +514,63 @@ class _Ground:
         return rows, int(lost.sum()), whole
 
 
-@njit(cache=True, nogil=True)
-def _compare(ground, points, box, pose, sights, numbers, kinds):  # pragma: no cover - compiled
-    """Stations in the box of a view: rows, place across of what was seen there, its weight (0: a little aside, -1:
-    nothing), visibility and which share of a hit it is worth; and which points (P,), in their grid's order, have a
-    station.
+class _Stations(NamedTuple):
+    """Stations in the order of their grid of _CELL_M: its keys and starts, places (K, 2) and unit tangents (K, 2)."""
+
+    keys: I64x1
+    start: I64x1
+    xy: F64x2
+    tangent: F64x2
+
+
+class _LookPoints(NamedTuple):
+    """Points of one observation's lines in the order of their grid of _CELL_M: its keys and starts, places and unit
+    tangents (P, 2) in the map's frame, weights (P,) and shares of a hit (P,).
     """
+
+    keys: I64x1
+    start: I64x1
+    xy: F64x2
+    tangent: F64x2
+    weight: F64x1
+    worth: F64x1
+
+
+class _Box(NamedTuple):
+    """The lower and the upper corner (2,) of a box, metres in the map's frame."""
+
+    low: F64x1
+    high: F64x1
+
+
+class _Comparison(NamedTuple):
+    """N stations that one observation could see or has a line at: rows; lateral offset (m) of its line there; weight of
+    that, -1: no line; visibility; share of a hit. explained: (P,) which of its points, in their grid's order, have a station.
+    """
+
+    rows: I64x1
+    offset: F64x1
+    weight: F64x1
+    visibility: F64x1
+    worth: F64x1
+    explained: Boolx1
+
+
+@njit(cache=True, nogil=True)
+def _compare(ground: _Stations, look: _Look, kinds: int) -> _Comparison:  # pragma: no cover - compiled
+    """Compare the stations in the box of a view with the points seen; those with a line only a little aside are left out."""
     keys, start, xy, tangent = ground
-    pkeys, pstart, pxy, ptangent, pweight, pworth = points
-    reach, across, wide, cosine = numbers[7], numbers[8], numbers[9], numbers[10]
-    low, high = box
-    radius = np.hypot(reach, wide)
+    pkeys, pstart, pxy, ptangent, pweight, pworth = look.points
+    numbers, (low, high) = look.numbers, look.box
+    reach, across, wide = numbers.max_longitudinal_m, numbers.max_lateral_m, numbers.max_nearby_m
+    cosine, radius = numbers.min_cosine, np.hypot(reach, wide)
     explained = np.zeros(len(pxy), np.bool_)
     size, n = 1024, 0
-    rows, place, mass, seen, sure = (
-        np.empty(size, np.int64),
-        np.empty(size),
-        np.empty(size),
-        np.empty(size),
-        np.empty(size),
-    )
+    rows, place, mass = np.empty(size, np.int64), np.empty(size), np.empty(size)
+    seen, sure = np.empty(size), np.empty(size)
     spot = np.empty((1, 2))
     for kind in range(kinds):
-        if kind == 2:
+        if kind == CROSSING:
             continue
         for ix in range(int(np.floor((low[0] - 2.0) / _CELL_M)), int(np.floor((high[0] + 2.0) / _CELL_M)) + 1):
             first, last = span(
@@ -520,22 +602,23 @@ def _compare(ground, points, box, pose, sights, numbers, kinds):  # pragma: no c
                             heavy += w * pweight[q]
                             certain += w * pworth[q]
                 spot[0, 0], spot[0, 1] = x, y
-                visible = visibility(spot, 0, pose, sights, numbers[6]) if not beside else 1.0
+                visible = visibility(spot, 0, look.pose, look.sights, numbers.margin_m) if not beside else 1.0
                 if total <= 0.0 and (beside or visible <= 0.0):
                     continue
                 if n == size:
                     size *= 2
-                    rows, place = _longer(rows, size), _longer(place, size)
+                    rows, place = doubled(rows), _longer(place, size)
                     mass, seen, sure = _longer(mass, size), _longer(seen, size), _longer(sure, size)
                 rows[n], seen[n], sure[n] = k, visible, certain / total if total > 0.0 else 0.0
                 place[n], mass[n] = (offset / total, heavy / total) if total > 0.0 else (0.0, -1.0)
                 n += 1
-    return rows[:n].copy(), place[:n].copy(), mass[:n].copy(), seen[:n].copy(), sure[:n].copy(), explained
+    return _Comparison(rows[:n].copy(), place[:n].copy(), mass[:n].copy(), seen[:n].copy(), sure[:n].copy(), explained)
 
 
 @njit(cache=True, nogil=True)
-def _longer(values, size):  # pragma: no cover - compiled
-    out = np.empty(size, values.dtype)
+def _longer(values: F64x1, size: int) -> F64x1:  # pragma: no cover - compiled
+    """The same values at the start of an array of that size."""
+    out = np.empty(size)
     out[: len(values)] = values
     return out
 

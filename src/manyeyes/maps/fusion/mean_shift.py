@@ -10,15 +10,20 @@ apart never do.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
-from manyeyes.maps.fusion.point_grid import build_grid, span
+from manyeyes._jit import F64x1, F64x2, I64x1, njit
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, span
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+# Sides of grid cells, no shorter than what a point reaches along its line.
+_SHIFT_CELL_M = 2.5
+_THIN_CELL_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -46,20 +51,44 @@ def shift_to_ridges(
     """Points ``seeds`` (S,) of all points (P,) moved to their ridges: positions (S, 2), unit tangents (S, 2) and
     density (S,).
     """
-    grid = build_grid(xy[:, 0], xy[:, 1], kind, 2.5)
+    grid = build_grid(xy[:, 0], xy[:, 1], kind, _SHIFT_CELL_M)
     order = grid.order
+    cosine = float(np.cos(config.heading_rad))
     return _shift(
         xy[seeds],
         tangent[seeds],
         kind[seeds],
-        (grid.keys, grid.start, xy[order], tangent[order], weight[order]),
-        (config.along_m, config.across_m, config.along_sigma_m, config.across_sigma_m, np.cos(config.heading_rad)),
+        _WeightedPoints(grid.keys, grid.start, xy[order], tangent[order], weight[order]),
+        _Kernel(config.along_m, config.across_m, config.along_sigma_m, config.across_sigma_m, cosine),
         config.rounds,
     )
 
 
+class _WeightedPoints(NamedTuple):
+    """Points in the order of their grid of _SHIFT_CELL_M: its keys and starts, places, unit tangents and weights."""
+
+    keys: I64x1
+    start: I64x1
+    xy: F64x2
+    tangent: F64x2
+    weight: F64x1
+
+
+class _Kernel(NamedTuple):
+    """The kernel of the mean shift: half extents and Gaussian scales (m), least cosine between two tangents."""
+
+    half_length_m: float
+    half_width_m: float
+    longitudinal_sigma_m: float
+    lateral_sigma_m: float
+    min_cosine: float
+
+
 @njit(cache=True, nogil=True)
-def _shift(xy, tangent, kind, others, numbers, rounds):  # pragma: no cover - compiled
+def _shift(
+    xy: F64x2, tangent: F64x2, kind: I64x1, others: _WeightedPoints, numbers: _Kernel, rounds: int
+) -> tuple[F64x2, F64x2, F64x1]:  # pragma: no cover - compiled
+    """Positions (S, 2), unit tangents (S, 2) and density (S,) of points after some rounds of mean shift along normals."""
     keys, start, rxy, rtangent, rweight = others
     reach, across, sigma_along, sigma_across, cosine = numbers
     place, turned, density = xy.copy(), tangent.copy(), np.zeros(len(xy))
@@ -68,9 +97,9 @@ def _shift(xy, tangent, kind, others, numbers, rounds):  # pragma: no cover - co
         x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
         for _ in range(rounds):
             total, pull, cc, ss = 0.0, 0.0, 0.0, 0.0
-            ix, iy = int(np.floor(x / 2.5)), int(np.floor(y / 2.5))
+            ix, iy = int(np.floor(x / _SHIFT_CELL_M)), int(np.floor(y / _SHIFT_CELL_M))
             for dx in range(-1, 2):
-                low, high = span(keys, start, kind[p], ix + dx, iy - 1, iy + 1)
+                low, high = span(keys, start, int(kind[p]), ix + dx, iy - 1, iy + 1)
                 for q in range(low, high):
                     ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
                     if ex * ex + ey * ey > far:
@@ -108,29 +137,38 @@ def thin(
 
     Since priorities are as good as random, what happens to a point depends on few others near it, on no tile's border.
     """
-    grid = build_grid(xy[:, 0], xy[:, 1], kind, 2.0)
+    grid = build_grid(xy[:, 0], xy[:, 1], kind, _THIN_CELL_M)
     place = np.empty(len(xy), np.int64)
     place[grid.order] = np.arange(len(xy))
     walk = place[np.lexsort((xy[:, 1], xy[:, 0], priority))]
-    kept = _thin(walk, grid.keys, grid.start, xy[grid.order], tangent[grid.order], kind[grid.order], _numbers(config))
+    gates = _Gates(config.spacing_m, config.twin_m, float(np.cos(config.heading_rad * 1.5)))
+    kept = _thin(walk, grid, xy[grid.order], tangent[grid.order], kind[grid.order], gates)
     return np.sort(grid.order[kept])
 
 
-def _numbers(config: RidgeConfig) -> tuple[float, float, float]:
-    return config.spacing_m, config.twin_m, np.cos(config.heading_rad * 1.5)
+class _Gates(NamedTuple):
+    """When a point is one with a point that stays: distance along and across (m) below these, cosine at least that."""
+
+    longitudinal_m: float
+    lateral_m: float
+    min_cosine: float
 
 
 @njit(cache=True, nogil=True)
-def _thin(walk, keys, start, xy, tangent, kind, numbers):  # pragma: no cover - compiled
+def _thin(
+    walk: I64x1, grid: PointGrid, xy: F64x2, tangent: F64x2, kind: I64x1, numbers: _Gates
+) -> I64x1:  # pragma: no cover - compiled
+    """Which points stay, ascending; all arrays are in the order of the grid, and walk names places in it."""
+    keys, start = grid.keys, grid.start
     spacing, twin, cosine = numbers
     kept = np.zeros(len(xy), np.bool_)
     for step in range(len(walk)):
         p = walk[step]
         x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
-        ix, iy = int(np.floor(x / 2.0)), int(np.floor(y / 2.0))
+        ix, iy = int(np.floor(x / _THIN_CELL_M)), int(np.floor(y / _THIN_CELL_M))
         free = True
         for dx in range(-1, 2):
-            low, high = span(keys, start, kind[p], ix + dx, iy - 1, iy + 1)
+            low, high = span(keys, start, int(kind[p]), ix + dx, iy - 1, iy + 1)
             for q in range(low, high):
                 if kept[q]:
                     ex, ey = xy[q, 0] - x, xy[q, 1] - y

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import CROSSING, MapElements, frozen
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.fusion.point_grid import content_priority, resample_lines
@@ -21,15 +22,21 @@ Flags = NDArray[np.bool_]
 DAY_NS = 86_400_000_000_000
 
 
-@dataclass(frozen=True, eq=False)
-class Rings:
+class Rings(NamedTuple):
     """Polygons of O observations: ring r is ``xy[first[r]:first[r + 1]]``, rings of o are ``of[o]:of[o + 1]``; agents'
     frames.
     """
 
-    xy: Floats
-    first: Ints
-    of: Ints
+    xy: F64x2
+    first: I64x1
+    of: I64x1
+
+
+class FieldsOfView(NamedTuple):
+    """What O observations could see: the polygons of their views, and the occluders that hid parts of them."""
+
+    views: Rings
+    occluders: Rings
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +91,9 @@ class Sightings:
 
 
 @njit(cache=True, nogil=True)
-def _in_world(xy, tangent, first, pose):  # pragma: no cover - compiled
+def _in_world(
+    xy: F64x2, tangent: F64x2, first: I64x1, pose: F64x2
+) -> tuple[F64x2, F64x2]:  # pragma: no cover - compiled
     """Points and tangents (P, 2) of observations, those of o from first[o] on, that stand at pose (O, 3)."""
     out, turned = np.empty_like(xy), np.empty_like(tangent)
     for o in range(len(first) - 1):
@@ -152,12 +161,12 @@ def is_line(kind: Ints) -> Flags:
 
 @njit(cache=True, nogil=True)
 def sight(
-    x: float, y: float, o: int, view: tuple[Floats, Ints, Ints], occluders: tuple[Floats, Ints, Ints], margin: float
-) -> float:
+    x: float, y: float, o: int, view: Rings, occluders: Rings, margin: float
+) -> float:  # pragma: no cover - compiled
     """How well observation o could see the point x, y of its own frame: 0 outside its view or behind an occluder, 1
     well inside.
 
-    ``view`` and ``occluders`` are (xy, first, of) of :class:`Rings`. Within ``margin`` metres of the border of what can
+    Within ``margin`` metres of the border of what can
     be seen it rises linearly: there a missing line says little.
     """
     xy, first, of = view
@@ -178,7 +187,7 @@ def sight(
 
 
 @njit(cache=True, nogil=True)
-def _inside(x: float, y: float, xy: Floats, a: int, b: int) -> tuple[bool, float]:
+def _inside(x: float, y: float, xy: F64x2, a: int, b: int) -> tuple[bool, float]:  # pragma: no cover - compiled
     """Whether x, y lies in the ring of points a..b, and how far from its border."""
     inside, nearest = False, np.inf
     j = b - 1
@@ -196,7 +205,7 @@ def _inside(x: float, y: float, xy: Floats, a: int, b: int) -> tuple[bool, float
 
 
 @njit(cache=True, nogil=True)
-def _blocks(x: float, y: float, xy: Floats, a: int, b: int) -> bool:
+def _blocks(x: float, y: float, xy: F64x2, a: int, b: int) -> bool:  # pragma: no cover - compiled
     """Whether the sight line from the agent, who stands at the origin, to x, y meets an edge of the ring a..b."""
     j = b - 1
     for i in range(a, b):

@@ -11,12 +11,14 @@ that the ground was seen, and not often, so that nobody's having seen the line i
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
-from manyeyes.maps.fusion.point_grid import build_grid, span
+from manyeyes._jit import F64x1, F64x2, I64x1, njit
+from manyeyes.datatypes.map_element import BOUNDARY
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, span
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -63,16 +65,49 @@ def continued(
     place[members] = np.arange(len(members))
     grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _CELL_M)
     line = xy[members]
-    numbers = np.array([
-        config.nearest_m, config.farthest_m, config.even_m, config.back_m, np.cos(config.heading_rad), config.few,
-        config.across_m, config.bridge_m,
-    ])  # fmt: skip
-    return _continue(
-        members,
-        (first, line, _chords(line, first), kind[members], coverage[members], chain[members]),
-        (grid.keys, grid.start, place[grid.order]),
-        numbers,
-        np.array(config.open_m),
+    chains_of = _Chains(first, line, _chords(line, first), kind[members], coverage[members], chain[members])
+    return _continue(members, chains_of, grid._replace(order=place[grid.order]), _limits(config))
+
+
+class _Chains(NamedTuple):
+    """L chains of stations: chain c is rows ``first[c]:first[c + 1]`` of the columns, which have a row (M,) a station.
+
+    direction: (M, 2) unit vector of the chain. coverage: summed visibility. chain: index of the chain.
+    """
+
+    first: I64x1
+    xy: F64x2
+    direction: F64x2
+    kind: I64x1
+    coverage: F64x1
+    chain: I64x1
+
+
+class _Limits(NamedTuple):
+    """The fields of BesideConfig, all as floats, heading_rad as a cosine; max_open_m: (4,) by kind."""
+
+    min_distance_m: float
+    max_distance_m: float
+    max_distance_change_m: float
+    lookback_m: float
+    min_cosine: float
+    max_coverage: float
+    max_lateral_m: float
+    max_bridge_m: float
+    max_open_m: F64x1
+
+
+def _limits(config: BesideConfig) -> _Limits:
+    return _Limits(
+        min_distance_m=float(config.nearest_m),
+        max_distance_m=float(config.farthest_m),
+        max_distance_change_m=float(config.even_m),
+        lookback_m=float(config.back_m),
+        min_cosine=float(np.cos(config.heading_rad)),
+        max_coverage=float(config.few),
+        max_lateral_m=float(config.across_m),
+        max_bridge_m=float(config.bridge_m),
+        max_open_m=np.array(config.open_m),
     )
 
 
@@ -85,14 +120,19 @@ def _chords(line: Floats, first: Ints) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def _continue(members, lines, grid, numbers, open_m):  # pragma: no cover - compiled
-    """lines: each chain's first point and, of every point, place, direction, kind, coverage and chain. grid: of the points."""
-    first, line, chord, kind, _, chain = lines
+def _continue(
+    members: I64x1, lines: _Chains, grid: PointGrid, numbers: _Limits
+) -> tuple[F64x2, F64x2, I64x1]:  # pragma: no cover - compiled
+    """Inferred stations (V, 2), unit tangents (V, 2) and the end station (V,), of members, that each continues.
+
+    grid: of the points of the chains, its order in rows of lines.
+    """
+    first, chord, kind, chain = lines.first, lines.direction, lines.kind, lines.chain
     xy, tangent, source = [(0.0, 0.0)], [(0.0, 0.0)], [0]
     way, turn = np.empty((1024, 2)), np.empty((1024, 2))
-    met = np.zeros(len(line), np.bool_)
+    met = np.zeros(len(chain), np.bool_)
     for c in range(len(first) - 1):
-        if first[c + 1] - first[c] < 4 or kind[first[c]] > 1:
+        if first[c + 1] - first[c] < 4 or kind[first[c]] > BOUNDARY:
             continue
         for side in range(2):
             end, inward = (first[c], 1) if side == 0 else (first[c + 1] - 1, -1)
@@ -102,7 +142,7 @@ def _continue(members, lines, grid, numbers, open_m):  # pragma: no cover - comp
             best, arrived = 0, -1
             for g in _guides(end, inward, lines, grid, numbers):
                 against = (chord[g, 0] * chord[end, 0] + chord[g, 1] * chord[end, 1]) * inward > 0.0
-                n, gap, at = _walk(end, g, -1 if against else 1, lines, grid, numbers, open_m, way, turn)
+                n, gap, at = _walk(end, g, -1 if against else 1, lines, grid, numbers, way, turn)
                 # One that arrives before one that does not, then the longer.
                 if n == 0 or (arrived >= 0 and at < 0) or ((at >= 0) == (arrived >= 0) and n <= best):
                     continue
@@ -115,18 +155,21 @@ def _continue(members, lines, grid, numbers, open_m):  # pragma: no cover - comp
                     share = gap * (i + 1) / (n + 1)
                     xy.append((way[i, 0] - turn[i, 1] * share, way[i, 1] + turn[i, 0] * share))
                     tangent.append((turn[i, 0], turn[i, 1]))
-                    source.append(members[end])
+                    source.append(int(members[end]))
             if arrived >= 0:
                 met[max(first[chain[arrived]], arrived - 4) : min(first[chain[arrived] + 1], arrived + 5)] = True
     return np.array(xy)[1:], np.array(tangent)[1:], np.array(source)[1:]
 
 
 @njit(cache=True, nogil=True)
-def _guides(end, inward, lines, grid, numbers):  # pragma: no cover - compiled
-    """The nearest point of each line that runs beside the end of a chain, and did so before."""
+def _guides(
+    end: int, inward: int, lines: _Chains, grid: PointGrid, numbers: _Limits
+) -> list[int]:  # pragma: no cover - compiled
+    """Points within _BESIDE_M, along it, of the end of a chain, on lines that run beside it there and did so before."""
     first, line, chord, kind, _, chain = lines
-    keys, start, order = grid
-    nearest, farthest, even, back, cosine = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    keys, start, order = grid.keys, grid.start, grid.order
+    nearest, farthest, even = numbers.min_distance_m, numbers.max_distance_m, numbers.max_distance_change_m
+    back, cosine = numbers.lookback_m, numbers.min_cosine
     found = [0]
     x, y = line[end, 0], line[end, 1]
     size = first[chain[end] + 1] - first[chain[end]]
@@ -142,21 +185,23 @@ def _guides(end, inward, lines, grid, numbers):  # pragma: no cover - compiled
         low, high = span(keys, start, 0, ix + dx, iy - wide, iy + wide)
         for k in range(low, high):
             q = order[k]
-            if chain[q] == chain[end] or kind[q] > 1:
+            if chain[q] == chain[end] or kind[q] > BOUNDARY:
                 continue
             dot = chord[q, 0] * chord[end, 0] + chord[q, 1] * chord[end, 1]
             ex, ey = x - line[q, 0], y - line[q, 1]
             aside, along = chord[q, 0] * ey - chord[q, 1] * ex, chord[q, 0] * ex + chord[q, 1] * ey
             if abs(dot) < cosine or abs(along) > _BESIDE_M or abs(aside) < nearest or abs(aside) > farthest:
                 continue
-            before = _beside(line[inner, 0], line[inner, 1], chain[q], first, line, chord)
+            before = _beside(line[inner, 0], line[inner, 1], int(chain[q]), first, line, chord)
             if abs(before - aside) <= even:
                 found.append(q)
     return found[1:]
 
 
 @njit(cache=True, nogil=True)
-def _beside(x, y, c, first, line, chord):  # pragma: no cover - compiled
+def _beside(
+    x: float, y: float, c: int, first: I64x1, line: F64x2, chord: F64x2
+) -> float:  # pragma: no cover - compiled
     """How far left of a chain a place lies; inf where it has no foot on it."""
     best, out = np.inf, np.inf
     for q in range(first[c], first[c + 1]):
@@ -170,12 +215,14 @@ def _beside(x, y, c, first, line, chord):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _walk(end, g, ahead, lines, grid, numbers, open_m, way, turn):  # pragma: no cover - compiled
+def _walk(
+    end: int, g: int, ahead: int, lines: _Chains, grid: PointGrid, numbers: _Limits, way: F64x2, turn: F64x2
+) -> tuple[int, float, int]:  # pragma: no cover - compiled
     """Places beside a guide from its point g on, written to way and turn: their number, the gap across where they
     arrive, and at which point (-1: nowhere).
     """
     _, line, chord, kind, coverage, chain = lines
-    few, across, bridge = numbers[5], numbers[6], numbers[7]
+    few, across, bridge, open_m = numbers.max_coverage, numbers.max_lateral_m, numbers.max_bridge_m, numbers.max_open_m
     ex, ey = line[end, 0] - line[g, 0], line[end, 1] - line[g, 1]
     aside = chord[g, 0] * ey - chord[g, 1] * ex
     n, walked, free, q = 0, 0.0, 0, g
@@ -201,12 +248,14 @@ def _walk(end, g, ahead, lines, grid, numbers, open_m, way, turn):  # pragma: no
 
 
 @njit(cache=True, nogil=True)
-def _arrival(x, y, u, v, end, lines, grid, across):  # pragma: no cover - compiled
+def _arrival(
+    x: float, y: float, u: float, v: float, end: int, lines: _Chains, grid: PointGrid, across: float
+) -> tuple[int, float]:  # pragma: no cover - compiled
     """The point of another chain of the end's kind nearest across a way at x, y in direction u, v, and how far left it
     lies; -1: none.
     """
     _, line, chord, kind, _, chain = lines
-    keys, start, order = grid
+    keys, start, order = grid.keys, grid.start, grid.order
     ix, iy = int(np.floor(x / _CELL_M)), int(np.floor(y / _CELL_M))
     best, at = np.inf, -1
     for dx in range(-1, 2):

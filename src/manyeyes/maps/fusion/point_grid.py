@@ -9,12 +9,12 @@ So a sum over neighbours has the same terms in the same order whichever tile it 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -23,16 +23,15 @@ _BIAS = 1 << 29  # cells are counted from -2^29 to 2^29 along x and y
 _SHIFT = 30
 
 
-@dataclass(frozen=True)
-class PointGrid:
+class PointGrid(NamedTuple):
     """Points sorted by (kind, cell): ``keys`` (U,) of the occupied cells, ``start`` (U+1,) and ``order`` (P,) into the
-    points.
+    points. Points of the cell with key ``keys[c]`` are ``order[start[c]:start[c + 1]]``.
     """
 
     cell_m: float
-    keys: Ints
-    start: Ints
-    order: Ints
+    keys: I64x1
+    start: I64x1
+    order: I64x1
 
 
 def build_grid(x: Floats, y: Floats, kind: Ints, cell_m: float) -> PointGrid:
@@ -52,7 +51,9 @@ def cell_key(kind: Ints, x: Floats, y: Floats, cell_m: float) -> Ints:
 
 
 @njit(cache=True, nogil=True)
-def span(keys: Ints, start: Ints, kind: int, ix: int, iy0: int, iy1: int) -> tuple[int, int]:
+def span(
+    keys: I64x1, start: I64x1, kind: int, ix: int, iy0: int, iy1: int
+) -> tuple[int, int]:  # pragma: no cover - compiled
     """The range in a grid's order of the points of cells (ix, iy0..iy1) of a kind."""
     base = (kind << 60) | ((ix + 536870912) << 30)
     low = lower_bound(keys, base | (iy0 + 536870912))
@@ -63,7 +64,7 @@ def span(keys: Ints, start: Ints, kind: int, ix: int, iy0: int, iy1: int) -> tup
 
 
 @njit(cache=True, nogil=True)
-def lower_bound(keys: Ints, key: int) -> int:
+def lower_bound(keys: I64x1, key: int) -> int:  # pragma: no cover - compiled
     """The first place in ascending keys whose key is at least this one."""
     low, high = 0, len(keys)
     while low < high:
@@ -77,8 +78,8 @@ def lower_bound(keys: Ints, key: int) -> int:
 
 @njit(cache=True, nogil=True)
 def resample_lines(
-    first: Ints, points: Floats, sigma: Floats, closed: NDArray[np.bool_], spacing: float
-) -> tuple[Ints, Floats, Floats, Floats]:
+    first: I64x1, points: F64x2, sigma: F64x1, closed: Boolx1, spacing: float
+) -> tuple[I64x1, F64x2, F64x2, F64x1]:  # pragma: no cover - compiled
     """Elements (E) as points at equal arc length, about ``spacing`` apart, with unit tangents and sigma.
 
     Returns first (E+1,), points (P, 2), tangents (P, 2) and sigma (P,). A closed ring is walked once and its first

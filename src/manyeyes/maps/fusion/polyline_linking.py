@@ -10,16 +10,20 @@ of the two: a bend of constant radius has no lateral gap.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx2, F64x1, F64x2, I64x1, I64x2, I64x3, njit
 from manyeyes.maps.fusion.point_grid import build_grid, span
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+# Sides of a station, by its own tangent.
+_FRONT, _BEHIND = 0, 1
 
 
 @dataclass(frozen=True)
@@ -84,15 +88,14 @@ def link(
 def _links(xy: Floats, tangent: Floats, kind: Ints, reach: float, config: LinkConfig) -> Ints:
     """(K, 2) the station linked in front of and behind each one's own tangent, or -1."""
     grid = build_grid(xy[:, 0], xy[:, 1], kind, reach)
-    order = grid.order
     best = _best(
         xy,
         tangent,
         kind,
         np.ones((len(xy), 2), np.bool_),
-        (grid.keys, grid.start, order, xy, tangent),
+        _Stations(grid.keys, grid.start, grid.order, xy, tangent),
         reach,
-        (config.lateral_m, config.lateral_slope, config.heading_rad, config.heading_slope, config.lateral_cost),
+        _Gates(config.lateral_m, config.lateral_slope, config.heading_rad, config.heading_slope, config.lateral_cost),
     )
     return _mutual(best)
 
@@ -119,9 +122,9 @@ def _join(
         direction[ends],
         kind[ends],
         free,
-        (grid.keys, grid.start, grid.order, xy[ends], direction[ends]),
+        _Stations(grid.keys, grid.start, grid.order, xy[ends], direction[ends]),
         reach,
-        (config.end_lateral_m, config.end_lateral_slope, *turn, config.lateral_cost),
+        _Gates(config.end_lateral_m, config.end_lateral_slope, *turn, config.lateral_cost),
     )
     # A tangent that was turned round for the fit turns front and back round with it.
     more = _mutual(best)
@@ -132,11 +135,31 @@ def _join(
     return added
 
 
+class _Stations(NamedTuple):
+    """Stations that may be linked to: keys, starts and order of their grid, places and unit tangents by row."""
+
+    keys: I64x1
+    start: I64x1
+    order: I64x1
+    xy: F64x2
+    tangent: F64x2
+
+
+class _Gates(NamedTuple):
+    """Largest lateral gap (m) and turn (rad) at no gap, and their growth a metre of gap; cost of a metre of lateral gap."""
+
+    max_lateral_m: float
+    lateral_slope: float
+    max_turn: float
+    turn_slope: float
+    lateral_cost: float
+
+
 @njit(cache=True, nogil=True)
-def _best(xy, tangent, kind, free, others, reach, numbers):  # pragma: no cover - compiled
-    """(K, 2, 2) best partner in front and behind: its row and which of its sides faces back (0 front, 1 behind); -1 for
-    none.
-    """
+def _best(
+    xy: F64x2, tangent: F64x2, kind: I64x1, free: Boolx2, others: _Stations, reach: float, numbers: _Gates
+) -> I64x3:  # pragma: no cover - compiled
+    """(K, 2, 2) best partner on each side (_FRONT, _BEHIND): its row and which of its sides faces back; -1 for none."""
     keys, start, order, rxy, rtangent = others
     lateral0, lateral1, heading0, heading1, price = numbers
     best = np.full((len(xy), 2, 2), -1, np.int64)
@@ -166,7 +189,7 @@ def _best(xy, tangent, kind, free, others, reach, numbers):  # pragma: no cover 
                 along, aside = ex * mx + ey * my, abs(ey * mx - ex * my)
                 if aside > lateral0 + lateral1 * gap or abs(along) < 0.3 or aside > abs(along):
                     continue
-                side = 0 if along > 0.0 else 1
+                side = _FRONT if along > 0.0 else _BEHIND
                 back = 1 - side if sign > 0.0 else side
                 if not free[k, side] or not free[q, back]:
                     continue
@@ -178,7 +201,7 @@ def _best(xy, tangent, kind, free, others, reach, numbers):  # pragma: no cover 
 
 
 @njit(cache=True, nogil=True)
-def _mutual(best):  # pragma: no cover - compiled
+def _mutual(best: I64x3) -> I64x2:  # pragma: no cover - compiled
     pair = np.full((len(best), 2), -1, np.int64)
     for k in range(len(best)):
         for side in range(2):
@@ -189,7 +212,7 @@ def _mutual(best):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _follow(pair, strength):  # pragma: no cover - compiled
+def _follow(pair: I64x2, strength: F64x1) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
     """Chains of linked stations: offsets and rows; open chains first by their smallest end, then loops, opened where
     weakest.
     """
@@ -225,7 +248,7 @@ def _follow(pair, strength):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _end_tangents(xy, tangent, first, members):  # pragma: no cover - compiled
+def _end_tangents(xy: F64x2, tangent: F64x2, first: I64x1, members: I64x1) -> F64x2:  # pragma: no cover - compiled
     """Tangents (K, 2) with those of chain ends replaced by the chord over their last stations, of the same sign."""
     out = tangent.copy()
     for c in range(len(first) - 1):
@@ -242,7 +265,9 @@ def _end_tangents(xy, tangent, first, members):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def smooth(xy, first, members, weight, scale):  # pragma: no cover - compiled
+def smooth(
+    xy: F64x2, first: I64x1, members: I64x1, weight: F64x1, scale: float
+) -> F64x2:  # pragma: no cover - compiled
     """Chains' stations (M, 2) in order, each moved to a parabola through its neighbours along the chain, weighted by
     distance.
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from manyeyes._jit import njit
+from manyeyes._jit import Boolx1, F64x2, I64x1, njit
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.maps.elements.vector_map import VectorMap
@@ -31,7 +31,9 @@ def simplified(vector_map: VectorMap, tolerance_m: float) -> VectorMap:
 
 
 @njit(cache=True)
-def _kept_points(points, first, closed, tolerance):  # pragma: no cover - compiled
+def _kept_points(
+    points: F64x2, first: I64x1, closed: Boolx1, tolerance: float
+) -> Boolx1:  # pragma: no cover - compiled
     """(P,) bool: the points that stay."""
     kept = np.zeros(len(points), np.bool_)
     stack = np.zeros((2 * len(points) + 4, 2), np.int64)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
-from manyeyes.datatypes.map_element import STYLES, rows_of
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
+from manyeyes.datatypes.map_element import CROSSING, STYLES, rows_of
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
 from manyeyes.maps.fusion.agent_weights import NOT_BELIEVED, looks_weight
 from manyeyes.maps.fusion.coverage import looked_at, merged
@@ -22,12 +23,14 @@ from manyeyes.maps.fusion.crossings import Crossings, PolygonConfig, find_crossi
 from manyeyes.maps.fusion.existence import EvidenceConfig, Witness, vouched, witness
 from manyeyes.maps.fusion.mean_shift import RidgeConfig, shift_to_ridges, thin
 from manyeyes.maps.fusion.observation_arrays import Sightings, is_line
-from manyeyes.maps.fusion.point_grid import build_grid, span
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, span
 from manyeyes.maps.fusion.pose_optimization import Alignment, bounded
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Digests = NDArray[np.uint8]
+
+_RIVAL_CELL_M = 2.5
 
 Area = tuple[float, float, float, float]
 
@@ -231,26 +234,51 @@ def _within(xy: Floats, area: Area | None, halo: float) -> NDArray[np.bool_]:
 
 def _rivals(xy: Floats, tangent: Floats, table: Evidence, config: StationConfig) -> NDArray[np.bool_]:
     """(K,) which stations lose against another that cannot be true at the same time."""
-    grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), 2.5)
-    numbers = (config.rival_m, config.rival_far_m, config.rival_ratio, config.rival_odds)
-    standing = (table.kind, table.log_odds, table.support, table.state, table.first, table.sources)
-    return _losers(xy, tangent, standing, (grid.keys, grid.start, grid.order), numbers)
+    grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _RIVAL_CELL_M)
+    numbers = _RivalLimits(config.rival_m, config.rival_far_m, config.rival_ratio, config.rival_odds)
+    standing = _Standing(table.kind, table.log_odds, table.support, table.state, table.first, table.sources)
+    return _losers(xy, tangent, standing, grid, numbers)
+
+
+class _Standing(NamedTuple):
+    """The columns of :class:`Evidence` that decide which of two stations stays."""
+
+    kind: I64x1
+    log_odds: F64x1
+    support: I64x1
+    state: I64x1
+    first: I64x1
+    sources: I64x1
+
+
+class _RivalLimits(NamedTuple):
+    """Lateral distances (m) within which stations of two kinds, and of one kind, exclude each other; least advantages of
+    the one that stays: ratio of supports, difference of log-odds.
+    """
+
+    max_lateral_m: float
+    max_lateral_same_kind_m: float
+    min_support_ratio: float
+    min_log_odds_difference: float
 
 
 @njit(cache=True, nogil=True)
-def _losers(xy, tangent, standing, grid, numbers):  # pragma: no cover - compiled
+def _losers(
+    xy: F64x2, tangent: F64x2, standing: _Standing, grid: PointGrid, numbers: _RivalLimits
+) -> Boolx1:  # pragma: no cover - compiled
+    """(K,) which stations, at xy (K, 2) with unit tangents (K, 2), lose against another."""
     kind, odds, support, state, first, sources = standing
-    keys, start, order = grid
+    keys, start, order = grid.keys, grid.start, grid.order
     near, far, ratio, difference = numbers
     loses = np.zeros(len(xy), np.bool_)
     for k in range(len(xy)):
         u, v = tangent[k, 0], tangent[k, 1]
-        ix, iy = int(np.floor(xy[k, 0] / 2.5)), int(np.floor(xy[k, 1] / 2.5))
+        ix, iy = int(np.floor(xy[k, 0] / _RIVAL_CELL_M)), int(np.floor(xy[k, 1] / _RIVAL_CELL_M))
         for dx in range(-1, 2):
             low, high = span(keys, start, 0, ix + dx, iy - 1, iy + 1)
             for place in range(low, high):
                 q = order[place]
-                if q == k or state[q] == 3 or state[k] == 3:
+                if q == k or state[q] == RETIRED or state[k] == RETIRED:
                     continue
                 ex, ey = xy[q, 0] - xy[k, 0], xy[q, 1] - xy[k, 1]
                 aside = abs(ey * u - ex * v)
@@ -267,7 +295,7 @@ def _losers(xy, tangent, standing, grid, numbers):  # pragma: no cover - compile
 
 
 @njit(cache=True, nogil=True)
-def _shared(sources, first, k, q):  # pragma: no cover - compiled
+def _shared(sources: I64x1, first: I64x1, k: int, q: int) -> int:  # pragma: no cover - compiled
     """How many observations saw both stations; each one's sources ascend."""
     both, i, j = 0, first[k], first[q]
     while i < first[k + 1] and j < first[q + 1]:
@@ -287,7 +315,7 @@ def _rings_inside(
 ) -> tuple[Evidence, Ints, Floats]:
     """Evidence, offsets and rings of the crossings whose centre lies in the area."""
     count = len(crossings.support)
-    table = _evidence_of(crossings, np.full(count, 2, np.int64), sightings)
+    table = _evidence_of(crossings, np.full(count, CROSSING, np.int64), sightings)
     counts = np.diff(crossings.start)
     owner = np.repeat(np.arange(count), counts)
     centre = np.stack([np.bincount(owner, crossings.xy[:, axis], count) / np.maximum(1, counts) for axis in (0, 1)], 1)

@@ -5,15 +5,34 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x1, F64x2, F64x3, I64x1, njit
 
 Array = NDArray[np.float64]
 
 BUCKET_M = 8.0
+
+
+class _Lattice(NamedTuple):
+    """A lattice of columns x rows square buckets, BUCKET_M wide, whose lower corner is x0, y0; bucket r * columns + c."""
+
+    x0: float
+    y0: float
+    columns: int
+    rows: int
+
+
+class _Buckets(NamedTuple):
+    """The triangles (T, 3, 3) of a surface; bucket b of the lattice holds ``member[first[b]:first[b + 1]]`` of them."""
+
+    triangles: F64x3
+    lattice: _Lattice
+    first: I64x1
+    member: I64x1
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +70,7 @@ class Surface:
         low = triangles[..., :2].min((0, 1))
         high = triangles[..., :2].max((0, 1))
         columns, rows = (((high - low) / BUCKET_M).astype(int) + 1).tolist()
-        first, member = _fill_buckets(triangles, low[0], low[1], columns, rows)
+        first, member = _fill_buckets(triangles, _Lattice(low[0], low[1], columns, rows))
         return cls(triangles, owner, float(low[0]), float(low[1]), columns, rows, first, member)
 
     def height(self, xy: Array, near_z: Array | float | None = None) -> Array:
@@ -59,31 +78,44 @@ class Surface:
 
         Where several cover a point, the one nearest to near_z (one for all, or (N,)); the highest when near_z is None.
         """
-        return self._query(xy, near_z)[0]
+        return self._query(xy, near_z).height
 
     def distance(self, xy: Array) -> Array:
         """(N,) metres from points (N, 2) to the surface in plan; 0 on it, inf when there is none."""
-        return self._query(xy, None)[1]
+        return self._query(xy, None).distance
 
     def owner_at(self, xy: Array, near_z: Array | float | None = None) -> NDArray[np.int64]:
         """(N,) the strip of the triangle that :meth:`height` reads; -1 when there is none."""
-        index = self._query(xy, near_z)[2]
+        index = self._query(xy, near_z).triangle
         return np.where(index >= 0, self.owner[np.maximum(index, 0)], -1) if len(self.owner) else index
 
     def spread(self, xy: Array) -> Array:
         """(N,) metres between the lowest and the highest triangle that cover each point; 0 where one or none does."""
-        lattice = (self.x0, self.y0, self.columns, self.rows)
-        return _spread(np.ascontiguousarray(xy, np.float64), self.triangles, *lattice, self.first, self.member)
+        return _spread(np.ascontiguousarray(xy, np.float64), self._buckets)
 
-    def _query(self, xy: Array, near_z: Array | float | None) -> tuple[Array, Array, NDArray[np.int64]]:
+    @property
+    def _buckets(self) -> _Buckets:
+        lattice = _Lattice(self.x0, self.y0, self.columns, self.rows)
+        return _Buckets(self.triangles, lattice, self.first, self.member)
+
+    def _query(self, xy: Array, near_z: Array | float | None) -> _Nearest:
         points = np.ascontiguousarray(xy, np.float64)
         wanted = np.array(np.broadcast_to(np.inf if near_z is None else near_z, len(points)), np.float64)
-        lattice = (self.x0, self.y0, self.columns, self.rows)
-        return _query(points, wanted, self.triangles, *lattice, self.first, self.member)
+        return _query(points, wanted, self._buckets)
+
+
+class _Nearest(NamedTuple):
+    """Of N points: height z and distance in plan (N,) metres, and the triangle (N,) that they are of, -1: none."""
+
+    height: F64x1
+    distance: F64x1
+    triangle: I64x1
 
 
 @njit(cache=True)
-def _fill_buckets(triangles, x0, y0, columns, rows):  # pragma: no cover
+def _fill_buckets(triangles: F64x3, lattice: _Lattice) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
+    """Offsets (B + 1,) of the buckets and the triangles in each, ascending."""
+    x0, y0, columns, rows = lattice
     count = np.zeros(columns * rows + 1, np.int64)
     span = np.empty((len(triangles), 4), np.int64)
     for t in range(len(triangles)):
@@ -106,7 +138,7 @@ def _fill_buckets(triangles, x0, y0, columns, rows):  # pragma: no cover
 
 
 @njit(cache=True)
-def _plane_z(corner, x, y):  # pragma: no cover
+def _plane_z(corner: F64x2, x: float, y: float) -> tuple[bool, float]:  # pragma: no cover - compiled
     """(inside, z) of a triangle at a point, by barycentric coordinates; a hair of tolerance closes the seams."""
     ax, ay = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1]
     bx, by = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1]
@@ -118,7 +150,7 @@ def _plane_z(corner, x, y):  # pragma: no cover
 
 
 @njit(cache=True)
-def _edge_nearest(corner, x, y):  # pragma: no cover
+def _edge_nearest(corner: F64x2, x: float, y: float) -> tuple[float, float]:  # pragma: no cover - compiled
     """(squared distance, z) of the nearest point on a triangle's rim."""
     best, z = np.inf, 0.0
     for k in range(3):
@@ -135,12 +167,13 @@ def _edge_nearest(corner, x, y):  # pragma: no cover
 
 
 @njit(cache=True)
-def _query(xy, near_z, triangles, x0, y0, columns, rows, first, member):  # pragma: no cover
+def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _Nearest:  # pragma: no cover - compiled
     """Height, distance and triangle at each point: the own bucket first, then rings of buckets until none can be nearer."""
+    triangles, (x0, y0, columns, rows), first, member = buckets
     n = len(xy)
     height, distance, index = np.zeros(n), np.full(n, np.inf), np.full(n, -1, np.int64)
     if len(triangles) == 0:
-        return height, distance, index
+        return _Nearest(height, distance, index)
     for i in range(n):
         x, y = xy[i, 0], xy[i, 1]
         column, row = int(np.floor((x - x0) / BUCKET_M)), int(np.floor((y - y0) / BUCKET_M))
@@ -170,11 +203,13 @@ def _query(xy, near_z, triangles, x0, y0, columns, rows, first, member):  # prag
                 break
             ring += 1
         distance[i] = np.sqrt(best)
-    return height, distance, index
+    return _Nearest(height, distance, index)
 
 
 @njit(cache=True)
-def _spread(xy, triangles, x0, y0, columns, rows, first, member):  # pragma: no cover
+def _spread(xy: F64x2, buckets: _Buckets) -> F64x1:  # pragma: no cover - compiled
+    """(N,) metres between the lowest and the highest triangle that cover each point; 0 where one or none does."""
+    triangles, (x0, y0, columns, rows), first, member = buckets
     out = np.zeros(len(xy))
     if len(triangles) == 0:
         return out

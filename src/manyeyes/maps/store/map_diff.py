@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._io import atomic_write
-from manyeyes._jit import njit
+from manyeyes._jit import F64x2, njit
 from manyeyes.datatypes import MissingExtraError
 from manyeyes.maps.elements.vector_map import VectorMap, element_digests
 from manyeyes.maps.formats.attributes import hex_ids
@@ -170,7 +170,7 @@ def _overlaps(a: VectorMap, rows_a: Ints, b: VectorMap, rows_b: Ints) -> list[tu
 
 
 @njit(cache=True)
-def _near(points, line, reach):  # pragma: no cover - compiled
+def _near(points: F64x2, line: F64x2, reach: float) -> float:  # pragma: no cover - compiled
     """The share of points (K, 2) within reach metres of a polyline (M, 2)."""
     near = 0
     for k in range(len(points)):
