@@ -134,11 +134,11 @@ def log_odds(of: Pool, elements: MapElements, sources: Sequence[Ints]) -> Floats
         holds[start[k] : start[k + 1]] = np.isin(who[start[k] : start[k + 1], 1], seen)
     hits = HIT * np.array([len(seen) for seen in sources])
     pose = frozen(np.reshape([o.pose for o in of.observations], (-1, 3)), np.float64)
-    seen_by = _Observers(frozen(who[:, 1], np.int64), start, holds)
+    seen_by = _NearObservations(frozen(who[:, 1], np.int64), start, holds)
     return _log_odds(places, first, seen_by, hits, pose, _rings(of.observations))
 
 
-class _Observers(NamedTuple):
+class _NearObservations(NamedTuple):
     """Observations near each element: rows ``observation[first[k]:first[k + 1]]``, and which of them hold the element."""
 
     observation: I64x1
@@ -148,7 +148,7 @@ class _Observers(NamedTuple):
 
 @njit(cache=True)
 def _log_odds(
-    places: F64x2, first: I64x1, seen_by: _Observers, hits: F64x1, pose: F64x2, fields: FieldsOfView
+    places: F64x2, first: I64x1, seen_by: _NearObservations, hits: F64x1, pose: F64x2, fields: FieldsOfView
 ) -> F64x1:  # pragma: no cover - compiled
     """(N,) mean log-odds over the places (P, 2) of each element, ``places[first[k]:first[k + 1]]``, within the clamp."""
     who, start, holds = seen_by

@@ -25,8 +25,8 @@ from manyeyes.maps.fusion.existence import (
     ElementStyles,
     EvidenceConfig,
     EvidenceParameters,
-    Hits,
-    Scene,
+    MatchedObservations,
+    ObservationScene,
     doubled,
     fold_looks,
     looks,
@@ -91,7 +91,7 @@ def find_crossings(
     """
     rows = np.flatnonzero(np.asarray(sightings.elements.kind) == CROSSING)
     owner = sightings.element_observation[rows]
-    seen = _Rings(*_placed(sightings, rows, owner, pose))
+    seen = _OpenRings(*_placed(sightings, rows, owner, pose))
     hulls = _hulls(*seen)
     area = _areas(*hulls)
     usable = area > _MIN_AREA_M2
@@ -104,9 +104,9 @@ def find_crossings(
     start = np.concatenate(([0], np.cumsum([len(r) for r in rings], dtype=np.int64))).astype(np.int64)
     xy = np.concatenate(rings) if rings else np.zeros((0, 2))
     out = _evidence(
-        _Rings(start, xy),
-        _Hulls(*hulls, area, owner, rows),
-        Scene(looks(sightings, pose), witnesses(sightings, pose), sights(sightings)),
+        _OpenRings(start, xy),
+        _CrossingHulls(*hulls, area, owner, rows),
+        ObservationScene(looks(sightings, pose), witnesses(sightings, pose), sights(sightings)),
         ElementStyles(np.asarray(sightings.elements.style), evidence.worth(sightings.elements.score)),
         replace(evidence, publish=evidence.publish_ring).numbers,
         evidence.decay_s[CROSSING],
@@ -116,14 +116,14 @@ def find_crossings(
     return Crossings(start, xy, sigma, *out)
 
 
-class _Rings(NamedTuple):
+class _OpenRings(NamedTuple):
     """R open rings: ring r is ``points[first[r]:first[r + 1]]``."""
 
     first: I64x1
     points: F64x2
 
 
-class _Hulls(NamedTuple):
+class _CrossingHulls(NamedTuple):
     """Convex hulls of R observed crossings, their areas (m²), and the rows of their observations and elements (R,)."""
 
     first: I64x1
@@ -170,7 +170,7 @@ def overlap_of(one: Floats, two: Floats) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _hulls(first: I64x1, points: F64x2) -> _Rings:  # pragma: no cover - compiled
+def _hulls(first: I64x1, points: F64x2) -> _OpenRings:  # pragma: no cover - compiled
     """Convex hulls, anticlockwise, of rings: offsets and points (Andrew's monotone chain)."""
     out_first, out, filled = np.zeros(len(first), np.int64), np.empty((len(points) + len(first), 2)), 0
     for r in range(len(first) - 1):
@@ -199,7 +199,7 @@ def _hulls(first: I64x1, points: F64x2) -> _Rings:  # pragma: no cover - compile
         out[filled : filled + n] = hull[:n]
         filled += n
         out_first[r + 1] = filled
-    return _Rings(out_first, out[:filled].copy())
+    return _OpenRings(out_first, out[:filled].copy())
 
 
 @njit(cache=True, nogil=True)
@@ -441,9 +441,9 @@ def _places_in(ring: F64x2) -> F64x2:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _evidence(
-    fused: _Rings,
-    rings: _Hulls,
-    scene: Scene,
+    fused: _OpenRings,
+    rings: _CrossingHulls,
+    scene: ObservationScene,
     told: ElementStyles,
     numbers: EvidenceParameters,
     decay: float,
@@ -491,7 +491,7 @@ def _evidence(
                 filled += 1
         hits = found[begin:filled]
         odds[k], coverage[k], agents[k], state[k] = fold_looks(
-            places, k, Hits(hits, aside_of, gain), scene, numbers, decay, by_agent
+            places, k, MatchedObservations(hits, aside_of, gain), scene, numbers, decay, by_agent
         )
         support[k] = len(hits)
         if len(hits) > 0:

@@ -159,7 +159,7 @@ class Observers(NamedTuple):
     num_agents: int
 
 
-class Scene(NamedTuple):
+class ObservationScene(NamedTuple):
     """All that decides which observation could see a place: their index by cells, poses, views and occluders."""
 
     cells: Looks
@@ -187,7 +187,7 @@ class AgentScratch(NamedTuple):
     missed_era: I64x1
 
 
-class Hits(NamedTuple):
+class MatchedObservations(NamedTuple):
     """How one thing was seen: rows of the observations that saw it, ascending; of all observations (O,) UNMATCHED, MATCHED or
     NEARBY, and which share of a hit it is worth where it is MATCHED.
     """
@@ -295,7 +295,7 @@ def witness(
     grid = build_grid(world[points, 0], world[points, 1], sightings.kind[points], _POINT_CELL_M)
     order = points[grid.order]
     index = looks(sightings, pose, believed)
-    others = _Points(
+    others = _EvidencePoints(
         grid.keys,
         grid.start,
         world[order],
@@ -305,16 +305,16 @@ def witness(
         weight[order],
     )
     return _witness(
-        _Stations(xy, tangent, kind),
+        _EvidenceStations(xy, tangent, kind),
         others,
-        Scene(index, witnesses(sightings, pose), sights(sightings)),
+        ObservationScene(index, witnesses(sightings, pose), sights(sightings)),
         ElementStyles(np.asarray(sightings.elements.style), config.worth(sightings.elements.score)),
         config.numbers,
         np.array(config.decay_s),
     )
 
 
-class _Stations(NamedTuple):
+class _EvidenceStations(NamedTuple):
     """Stations of lines: places (K, 2), unit tangents (K, 2) and kinds (K,)."""
 
     xy: F64x2
@@ -322,7 +322,7 @@ class _Stations(NamedTuple):
     kind: I64x1
 
 
-class _Points(NamedTuple):
+class _EvidencePoints(NamedTuple):
     """Points of observed lines in the order of their grid of _POINT_CELL_M: its keys and starts, places and unit tangents
     (P, 2) in the map's frame, rows of observations and elements, and weights (P,).
     """
@@ -336,7 +336,7 @@ class _Points(NamedTuple):
     weight: F64x1
 
 
-class _Scratch(NamedTuple):
+class _MatchScratch(NamedTuple):
     """What each observation (O,) has at one station: sums over its points near of weight, weight times lateral offset and
     weight times weight of the point; least distance along and the element there; UNMATCHED, MATCHED or NEARBY.
 
@@ -375,9 +375,9 @@ def doubled(rows: I64x1) -> I64x1:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _witness(
-    stations: _Stations,
-    others: _Points,
-    scene: Scene,
+    stations: _EvidenceStations,
+    others: _EvidencePoints,
+    scene: ObservationScene,
     told: ElementStyles,
     numbers: EvidenceParameters,
     decay: F64x1,
@@ -396,7 +396,7 @@ def _witness(
     nearest, element, gain = np.zeros(observations), np.zeros(observations, np.int64), np.zeros(observations)
     aside_of = np.full(observations, UNMATCHED, np.int64)
     touched, place = np.empty(observations, np.int64), np.empty((1, 2))
-    scratch = _Scratch(mass, offset, pull, nearest, element, aside_of, touched)
+    scratch = _MatchScratch(mass, offset, pull, nearest, element, aside_of, touched)
     by_agent = new_agent_scratch(scene.observers.num_agents)
     for k in range(count):
         n = _collect(k, stations, others, numbers, scratch)
@@ -419,7 +419,7 @@ def _witness(
                 gain[o] = worth[element[o]]
         first[k + 1] = filled
         place[0, 0], place[0, 1] = xy[k, 0] - shift[k] * tangent[k, 1], xy[k, 1] + shift[k] * tangent[k, 0]
-        hits = Hits(sources[first[k] : filled], aside_of, gain)
+        hits = MatchedObservations(sources[first[k] : filled], aside_of, gain)
         odds[k], coverage[k], agents[k], state[k] = fold_looks(
             place, k, hits, scene, numbers, float(decay[kind[k]]), by_agent
         )
@@ -436,7 +436,7 @@ def _witness(
 
 @njit(cache=True, nogil=True)
 def _collect(
-    k: int, stations: _Stations, others: _Points, numbers: EvidenceParameters, scratch: _Scratch
+    k: int, stations: _EvidenceStations, others: _EvidencePoints, numbers: EvidenceParameters, scratch: _MatchScratch
 ) -> int:  # pragma: no cover - compiled
     """Each observation's place across station k, averaged over its points near; the number of observations that have
     any.
@@ -486,7 +486,7 @@ def _collect(
 
 @njit(cache=True, nogil=True)
 def _agree(
-    n: int, scratch: _Scratch, numbers: EvidenceParameters
+    n: int, scratch: _MatchScratch, numbers: EvidenceParameters
 ) -> tuple[float, float]:  # pragma: no cover - compiled
     """Where across the station the observations agree, and its sigma: reweighted means, one contribution an
     observation.
@@ -518,8 +518,8 @@ def _agree(
 def fold_looks(
     places: F64x2,
     k: int,
-    found: Hits,
-    scene: Scene,
+    found: MatchedObservations,
+    scene: ObservationScene,
     numbers: EvidenceParameters,
     decay: float,
     scratch: AgentScratch,
@@ -609,14 +609,14 @@ def vouched(
         index = looks(sightings, pose, believed)
         doubted = np.flatnonzero(~believed)
         xy = sightings.world(pose)[0]
-        scene = Scene(index, witnesses(sightings, pose), sights(sightings))
+        scene = ObservationScene(index, witnesses(sightings, pose), sights(sightings))
         _vouch(doubted, np.asarray(sightings.first), xy, scene, margin_m, agents, out)
     return out
 
 
 @njit(cache=True, nogil=True)
 def _vouch(
-    doubted: I64x1, first: I64x1, xy: F64x2, scene: Scene, margin: float, agents: int, out: Boolx1
+    doubted: I64x1, first: I64x1, xy: F64x2, scene: ObservationScene, margin: float, agents: int, out: Boolx1
 ) -> None:  # pragma: no cover - compiled
     """Mark in out (P,) the points of observations ``doubted`` that so many agents of the scene could see."""
     agent, pose, of = scene.observers.agent, scene.observers.pose, scene.cells.of

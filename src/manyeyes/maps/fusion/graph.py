@@ -122,7 +122,7 @@ def element_graph(nodes: MapElements, observation: ArrayLike = -1, config: Graph
     pairs = near_pairs(nodes.bounds(), max(config.parallel_m, config.gap_m))
     points, first = close_rings(nodes.points, nodes.first, nodes.closed)
     dense, dense_first = resample_spaced(points, first, config.spacing_m)
-    lines = _Lines(frozen(points, np.float64), frozen(first, np.int64))
+    lines = _Polylines(frozen(points, np.float64), frozen(first, np.int64))
     samples = _Samples(frozen(dense, np.float64), frozen(dense_first, np.int64), headings(dense, dense_first))
     found = _measure(lines, samples, frozen(pairs, np.int64), nodes.closed, _Thresholds.of(config))
     return _classified(nodes, owner, pairs, found, config)
@@ -170,7 +170,7 @@ def _classified(nodes: MapElements, owner: Ints, pairs: Ints, found: Floats, con
     )
 
 
-class _Lines(NamedTuple):
+class _Polylines(NamedTuple):
     """N polylines: line i is ``points[first[i]:first[i + 1]]``; rings are closed."""
 
     points: F64x2
@@ -203,7 +203,7 @@ class _Thresholds(NamedTuple):
 
 @njit(cache=True)
 def _measure(
-    lines: _Lines, samples: _Samples, pairs: I64x2, closed: Boolx1, numbers: _Thresholds
+    lines: _Polylines, samples: _Samples, pairs: I64x2, closed: Boolx1, numbers: _Thresholds
 ) -> F64x2:  # pragma: no cover - compiled
     """(K, _NUM_COLUMNS) what is measured of each pair; infinity where two ends do not continue or two lines do not cross."""
     points, first = lines

@@ -341,8 +341,8 @@ class _Rows:
         )
 
     @property
-    def _columns(self) -> _Columns:
-        return _Columns(
+    def _columns(self) -> _UpdatedColumns:
+        return _UpdatedColumns(
             kind=self.kind,
             log_odds=self.log_odds,
             support=self.support,
@@ -375,7 +375,7 @@ class _Rows:
         )
 
 
-class _Columns(NamedTuple):
+class _UpdatedColumns(NamedTuple):
     """The columns of :class:`_Rows` that an observation changes, and the kind."""
 
     kind: I64x1
@@ -412,7 +412,7 @@ class _UpdateLimits(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _change(
-    rows: I64x1, amount: F64x1, columns: _Columns, now: _Update, numbers: _UpdateLimits
+    rows: I64x1, amount: F64x1, columns: _UpdatedColumns, now: _Update, numbers: _UpdateLimits
 ) -> None:  # pragma: no cover - compiled
     """Add amount (N,) to the log-odds of rows (N,), decayed, capped by agent and day and clamped; then set their state."""
     kind, log_odds, support, agents, state, t_last, last_agent, day, day_sum = columns
@@ -443,7 +443,7 @@ class _Look(NamedTuple):
     pose: F64x2
     order: I64x1
     points: _LookPoints
-    box: _Box
+    box: _ViewBounds
     sights: FieldsOfView
     numbers: EvidenceParameters
 
@@ -457,7 +457,7 @@ class _Look(NamedTuple):
         fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind[lines], _CELL_M)
         order, corner = lines[fine.order], s.world_view(pose)
         points = _LookPoints(fine.keys, fine.start, xy[order], tangent[order], weight[order], worth[order])
-        box = _Box(corner.min(0), corner.max(0))
+        box = _ViewBounds(corner.min(0), corner.max(0))
         return cls(np.ascontiguousarray(pose), order, points, box, sights_of(s), evidence.numbers)
 
 
@@ -497,7 +497,7 @@ class _Ground:
         if not len(self) or not len(whole):
             return np.zeros(0, np.int64), 0, whole
         near, place, mass, seen, sure, explained = _compare(
-            _Stations(self.grid.keys, self.grid.start, self.xy, self.tangent),
+            _GridStations(self.grid.keys, self.grid.start, self.xy, self.tangent),
             look,
             len(KINDS),
         )
@@ -514,7 +514,7 @@ class _Ground:
         return rows, int(lost.sum()), whole
 
 
-class _Stations(NamedTuple):
+class _GridStations(NamedTuple):
     """Stations in the order of their grid of _CELL_M: its keys and starts, places (K, 2) and unit tangents (K, 2)."""
 
     keys: I64x1
@@ -536,7 +536,7 @@ class _LookPoints(NamedTuple):
     worth: F64x1
 
 
-class _Box(NamedTuple):
+class _ViewBounds(NamedTuple):
     """The lower and the upper corner (2,) of a box, metres in the map's frame."""
 
     low: F64x1
@@ -557,7 +557,7 @@ class _Comparison(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _compare(ground: _Stations, look: _Look, kinds: int) -> _Comparison:  # pragma: no cover - compiled
+def _compare(ground: _GridStations, look: _Look, kinds: int) -> _Comparison:  # pragma: no cover - compiled
     """Compare the stations in the box of a view with the points seen; those with a line only a little aside are left out."""
     keys, start, xy, tangent = ground
     pkeys, pstart, pxy, ptangent, pweight, pworth = look.points

@@ -141,12 +141,12 @@ def thin(
     place = np.empty(len(xy), np.int64)
     place[grid.order] = np.arange(len(xy))
     walk = place[np.lexsort((xy[:, 1], xy[:, 0], priority))]
-    gates = _Gates(config.spacing_m, config.twin_m, float(np.cos(config.heading_rad * 1.5)))
+    gates = _ThinningGates(config.spacing_m, config.twin_m, float(np.cos(config.heading_rad * 1.5)))
     kept = _thin(walk, grid, xy[grid.order], tangent[grid.order], kind[grid.order], gates)
     return np.sort(grid.order[kept])
 
 
-class _Gates(NamedTuple):
+class _ThinningGates(NamedTuple):
     """When a point is one with a point that stays: distance along and across (m) below these, cosine at least that."""
 
     longitudinal_m: float
@@ -156,7 +156,7 @@ class _Gates(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _thin(
-    walk: I64x1, grid: PointGrid, xy: F64x2, tangent: F64x2, kind: I64x1, numbers: _Gates
+    walk: I64x1, grid: PointGrid, xy: F64x2, tangent: F64x2, kind: I64x1, numbers: _ThinningGates
 ) -> I64x1:  # pragma: no cover - compiled
     """Which points stay, ascending; all arrays are in the order of the grid, and walk names places in it."""
     keys, start = grid.keys, grid.start

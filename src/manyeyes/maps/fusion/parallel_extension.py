@@ -83,7 +83,7 @@ class _Chains(NamedTuple):
     chain: I64x1
 
 
-class _Limits(NamedTuple):
+class _ExtensionLimits(NamedTuple):
     """The fields of BesideConfig, all as floats, heading_rad as a cosine; max_open_m: (4,) by kind."""
 
     min_distance_m: float
@@ -97,8 +97,8 @@ class _Limits(NamedTuple):
     max_open_m: F64x1
 
 
-def _limits(config: BesideConfig) -> _Limits:
-    return _Limits(
+def _limits(config: BesideConfig) -> _ExtensionLimits:
+    return _ExtensionLimits(
         min_distance_m=float(config.nearest_m),
         max_distance_m=float(config.farthest_m),
         max_distance_change_m=float(config.even_m),
@@ -121,7 +121,7 @@ def _chords(line: Floats, first: Ints) -> Floats:
 
 @njit(cache=True, nogil=True)
 def _continue(
-    members: I64x1, lines: _Chains, grid: PointGrid, numbers: _Limits
+    members: I64x1, lines: _Chains, grid: PointGrid, numbers: _ExtensionLimits
 ) -> tuple[F64x2, F64x2, I64x1]:  # pragma: no cover - compiled
     """Inferred stations (V, 2), unit tangents (V, 2) and the end station (V,), of members, that each continues.
 
@@ -163,7 +163,7 @@ def _continue(
 
 @njit(cache=True, nogil=True)
 def _guides(
-    end: int, inward: int, lines: _Chains, grid: PointGrid, numbers: _Limits
+    end: int, inward: int, lines: _Chains, grid: PointGrid, numbers: _ExtensionLimits
 ) -> list[int]:  # pragma: no cover - compiled
     """Points within _BESIDE_M, along it, of the end of a chain, on lines that run beside it there and did so before."""
     first, line, chord, kind, _, chain = lines
@@ -216,7 +216,7 @@ def _beside(
 
 @njit(cache=True, nogil=True)
 def _walk(
-    end: int, g: int, ahead: int, lines: _Chains, grid: PointGrid, numbers: _Limits, way: F64x2, turn: F64x2
+    end: int, g: int, ahead: int, lines: _Chains, grid: PointGrid, numbers: _ExtensionLimits, way: F64x2, turn: F64x2
 ) -> tuple[int, float, int]:  # pragma: no cover - compiled
     """Places beside a guide from its point g on, written to way and turn: their number, the gap across where they
     arrive, and at which point (-1: nowhere).

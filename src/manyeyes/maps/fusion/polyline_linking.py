@@ -93,9 +93,11 @@ def _links(xy: Floats, tangent: Floats, kind: Ints, reach: float, config: LinkCo
         tangent,
         kind,
         np.ones((len(xy), 2), np.bool_),
-        _Stations(grid.keys, grid.start, grid.order, xy, tangent),
+        _LinkCandidates(grid.keys, grid.start, grid.order, xy, tangent),
         reach,
-        _Gates(config.lateral_m, config.lateral_slope, config.heading_rad, config.heading_slope, config.lateral_cost),
+        _LinkGates(
+            config.lateral_m, config.lateral_slope, config.heading_rad, config.heading_slope, config.lateral_cost
+        ),
     )
     return _mutual(best)
 
@@ -122,9 +124,9 @@ def _join(
         direction[ends],
         kind[ends],
         free,
-        _Stations(grid.keys, grid.start, grid.order, xy[ends], direction[ends]),
+        _LinkCandidates(grid.keys, grid.start, grid.order, xy[ends], direction[ends]),
         reach,
-        _Gates(config.end_lateral_m, config.end_lateral_slope, *turn, config.lateral_cost),
+        _LinkGates(config.end_lateral_m, config.end_lateral_slope, *turn, config.lateral_cost),
     )
     # A tangent that was turned round for the fit turns front and back round with it.
     more = _mutual(best)
@@ -135,7 +137,7 @@ def _join(
     return added
 
 
-class _Stations(NamedTuple):
+class _LinkCandidates(NamedTuple):
     """Stations that may be linked to: keys, starts and order of their grid, places and unit tangents by row."""
 
     keys: I64x1
@@ -145,7 +147,7 @@ class _Stations(NamedTuple):
     tangent: F64x2
 
 
-class _Gates(NamedTuple):
+class _LinkGates(NamedTuple):
     """Largest lateral gap (m) and turn (rad) at no gap, and their growth a metre of gap; cost of a metre of lateral gap."""
 
     max_lateral_m: float
@@ -157,7 +159,7 @@ class _Gates(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _best(
-    xy: F64x2, tangent: F64x2, kind: I64x1, free: Boolx2, others: _Stations, reach: float, numbers: _Gates
+    xy: F64x2, tangent: F64x2, kind: I64x1, free: Boolx2, others: _LinkCandidates, reach: float, numbers: _LinkGates
 ) -> I64x3:  # pragma: no cover - compiled
     """(K, 2, 2) best partner on each side (_FRONT, _BEHIND): its row and which of its sides faces back; -1 for none."""
     keys, start, order, rxy, rtangent = others

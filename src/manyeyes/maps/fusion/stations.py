@@ -236,11 +236,11 @@ def _rivals(xy: Floats, tangent: Floats, table: Evidence, config: StationConfig)
     """(K,) which stations lose against another that cannot be true at the same time."""
     grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _RIVAL_CELL_M)
     numbers = _RivalLimits(config.rival_m, config.rival_far_m, config.rival_ratio, config.rival_odds)
-    standing = _Standing(table.kind, table.log_odds, table.support, table.state, table.first, table.sources)
+    standing = _RivalColumns(table.kind, table.log_odds, table.support, table.state, table.first, table.sources)
     return _losers(xy, tangent, standing, grid, numbers)
 
 
-class _Standing(NamedTuple):
+class _RivalColumns(NamedTuple):
     """The columns of :class:`Evidence` that decide which of two stations stays."""
 
     kind: I64x1
@@ -264,7 +264,7 @@ class _RivalLimits(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _losers(
-    xy: F64x2, tangent: F64x2, standing: _Standing, grid: PointGrid, numbers: _RivalLimits
+    xy: F64x2, tangent: F64x2, standing: _RivalColumns, grid: PointGrid, numbers: _RivalLimits
 ) -> Boolx1:  # pragma: no cover - compiled
     """(K,) which stations, at xy (K, 2) with unit tangents (K, 2), lose against another."""
     kind, odds, support, state, first, sources = standing

@@ -98,13 +98,13 @@ class Surface:
         lattice = _Lattice(self.x0, self.y0, self.columns, self.rows)
         return _Buckets(self.triangles, lattice, self.first, self.member)
 
-    def _query(self, xy: Array, near_z: Array | float | None) -> _Nearest:
+    def _query(self, xy: Array, near_z: Array | float | None) -> _SurfacePoints:
         points = np.ascontiguousarray(xy, np.float64)
         wanted = np.array(np.broadcast_to(np.inf if near_z is None else near_z, len(points)), np.float64)
         return _query(points, wanted, self._buckets)
 
 
-class _Nearest(NamedTuple):
+class _SurfacePoints(NamedTuple):
     """Of N points: height z and distance in plan (N,) metres, and the triangle (N,) that they are of, -1: none."""
 
     height: F64x1
@@ -167,13 +167,13 @@ def _edge_nearest(corner: F64x2, x: float, y: float) -> tuple[float, float]:  # 
 
 
 @njit(cache=True)
-def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _Nearest:  # pragma: no cover - compiled
+def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _SurfacePoints:  # pragma: no cover - compiled
     """Height, distance and triangle at each point: the own bucket first, then rings of buckets until none can be nearer."""
     triangles, (x0, y0, columns, rows), first, member = buckets
     n = len(xy)
     height, distance, index = np.zeros(n), np.full(n, np.inf), np.full(n, -1, np.int64)
     if len(triangles) == 0:
-        return _Nearest(height, distance, index)
+        return _SurfacePoints(height, distance, index)
     for i in range(n):
         x, y = xy[i, 0], xy[i, 1]
         column, row = int(np.floor((x - x0) / BUCKET_M)), int(np.floor((y - y0) / BUCKET_M))
@@ -203,7 +203,7 @@ def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _Nearest:  # pragma: 
                 break
             ring += 1
         distance[i] = np.sqrt(best)
-    return _Nearest(height, distance, index)
+    return _SurfacePoints(height, distance, index)
 
 
 @njit(cache=True)
