@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frozen dataclasses of arrays as scratch files: any value whose fields are arrays, tuples of texts or such values again.
+"""Frozen dataclasses and named tuples of arrays as scratch files: their fields are arrays, tuples of texts or such values again.
 
 Which arrays are read-only is kept, as compiled loops have one version for those and one for others.
 """
@@ -38,25 +38,32 @@ def load_columns(path: Path, kind: type[T]) -> T | None:
 
 
 def _take_apart(value: object, prefix: str, arrays: dict[str, np.ndarray]) -> None:
-    for f in fields(value):  # pyright: ignore[reportArgumentType]
-        item = getattr(value, f.name)
-        if is_dataclass(item):
-            _take_apart(item, f"{prefix}{f.name}.", arrays)
+    for field in _field_names(type(value)):
+        item = getattr(value, field)
+        if _field_names(type(item)):
+            _take_apart(item, f"{prefix}{field}.", arrays)
         else:
             array = np.array(item, dtype=np.str_) if isinstance(item, tuple) else np.asarray(item)
-            arrays[prefix + f.name + ("" if array.flags.writeable else _READ_ONLY)] = array
+            arrays[prefix + field + ("" if array.flags.writeable else _READ_ONLY)] = array
 
 
 def _put_together(kind: type[T], prefix: str, arrays: dict[str, np.ndarray]) -> T:
     hints = get_type_hints(kind)
     made: dict[str, Any] = {}
-    for f in fields(kind):  # pyright: ignore[reportArgumentType]
-        hint = hints[f.name]
-        if isinstance(hint, type) and is_dataclass(hint):
-            made[f.name] = _put_together(hint, f"{prefix}{f.name}.", arrays)
+    for field in _field_names(kind):
+        hint = hints[field]
+        if isinstance(hint, type) and _field_names(hint):
+            made[field] = _put_together(hint, f"{prefix}{field}.", arrays)
             continue
-        name = prefix + f.name
+        name = prefix + field
         array = arrays[name if name in arrays else name + _READ_ONLY]
         array.flags.writeable = name in arrays
-        made[f.name] = tuple(array.tolist()) if array.dtype.kind == "U" else array
+        made[field] = tuple(array.tolist()) if array.dtype.kind == "U" else array
     return kind(**made)
+
+
+def _field_names(kind: type) -> tuple[str, ...]:
+    """Names of the fields of a dataclass or a named tuple; none of any other type."""
+    if is_dataclass(kind):
+        return tuple(f.name for f in fields(kind))
+    return getattr(kind, "_fields", ())
