@@ -21,9 +21,9 @@ from statistics import median
 
 import torch
 
-from manyeyes.simulator.record import first_scene
+from manyeyes.simulator.record import make_first_scenario
 from manyeyes.simulator.scene.scenario import RSU_ID, ScenarioSpec
-from manyeyes.simulator.sensors.camera import CAMERA_RIGS, take
+from manyeyes.simulator.sensors.camera import CAMERA_RIGS, render_image
 from manyeyes.studies.provenance import write_json
 
 VIEWS = (("opv2v", 1), ("opv2v", 2), ("opv2v-small", 1), ("opv2v-small", 2), ("dair-infrastructure-small", 2))
@@ -65,17 +65,19 @@ def main() -> None:
     spec = ScenarioSpec(
         wanted.town, wanted.seed, "timed", vehicles=1, frames=2, history_frames=1, roadside_chance=1.0, cameras="opv2v"
     )
-    scenario = first_scene(spec, wanted.towns, roadside=True)
+    scenario = make_first_scenario(spec, wanted.towns, roadside=True)
     stage, pose_of = (
-        scenario.stage(0),
+        scenario.lit_scene(0),
         {frame.agent_id: frame.world_from_agent for frame in scenario.snapshot(0).frames},
     )
-    index = timed(lambda: scenario.stage(0), wanted.rounds)
+    index = timed(lambda: scenario.lit_scene(0), wanted.rounds)
     rows = [Row("a stage", 0, 0, 0, *index)]
     for name, samples in VIEWS:
         camera = replace(CAMERA_RIGS[name][0], samples=samples)
         agent = RSU_ID if "infrastructure" in name else scenario.agents[0]
-        took = timed(lambda camera=camera, agent=agent: take(stage, pose_of[agent], camera, agent), wanted.rounds)
+        took = timed(
+            lambda camera=camera, agent=agent: render_image(stage, pose_of[agent], camera, agent), wanted.rounds
+        )
         rows.append(Row(name, camera.width, camera.height, samples, *took))
     print(f"{wanted.town}, seed {scenario.spec.seed}, 1 thread, load {load:.1f}, {len(stage.scene.solids)} solids")
     for row in rows:

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from manyeyes.simulator.fleet.config import crowd_config
-from manyeyes.simulator.fleet.place import place
+from manyeyes.simulator.fleet.place import load_place
 from manyeyes.simulator.fleet.simulate import simulate_crowd
 from manyeyes.studies.provenance import write_json
 
@@ -50,7 +50,7 @@ class Result:
 
 def measure(name: str, crowd: str, size_m: float | None, count: int) -> Result:
     """One place."""
-    where, config = place(name, size_m), crowd_config(crowd)
+    where, config = load_place(name, size_m), crowd_config(crowd)
     simulate_crowd(where, 1, config)
     start = time.process_time()
     made = simulate_crowd(where, count, config)

@@ -51,13 +51,13 @@ def attend(maps: Tensor) -> Tensor:
     scores = torch.stack([torch.linalg.vecdot(cells[0], cell) for cell in cells])
     weight = torch.softmax(scores / math.sqrt(maps.shape[1]), 0)[..., None]
     fused = cells[0] * weight[0]
-    for cell, share in zip(cells[1:], weight[1:]):
-        fused.addcmul_(cell, share)
+    for cell, agent_weight in zip(cells[1:], weight[1:]):
+        fused.addcmul_(cell, agent_weight)
     return fused.permute(2, 0, 1)[None]
 
 
 class DensePointPillars(nn.Module):
-    """see: a cloud to three maps; fuse: maps of all agents to anchors' scores and boxes."""
+    """extract_maps: a cloud to three maps; fuse: maps of all agents to anchors' scores and boxes."""
 
     def __init__(self, config: DenseConfig) -> None:
         super().__init__()
@@ -80,7 +80,7 @@ class DensePointPillars(nn.Module):
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         self.eval().requires_grad_(False)
 
-    def see(self, cloud: PointCloud) -> list[Tensor]:
+    def extract_maps(self, cloud: PointCloud) -> list[Tensor]:
         """One map a scale, (1, C, H, W)."""
         x, maps = self.pillars([cloud]).dense(), []
         for block in self.blocks:
@@ -95,7 +95,7 @@ class DensePointPillars(nn.Module):
 
     def share(self, cloud: PointCloud) -> list[bytes]:
         """The three maps as float32 bytes: what attention at three scales needs from every agent."""
-        return self.pack(self.see(cloud))
+        return self.pack(self.extract_maps(cloud))
 
     def pack(self, maps: list[Tensor]) -> list[bytes]:
         """Maps as they are sent."""

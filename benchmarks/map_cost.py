@@ -28,9 +28,9 @@ from street import street
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, Sites, SparseBev, Transform
-from manyeyes.models.maps.map_model import LOOKS, Mapper, MapperConfig
-from manyeyes.models.maps.presets import MAPPERS, mapper_config
-from manyeyes.ops.bev_warp import warp
+from manyeyes.models.maps.map_model import FRAMES_PER_TILE, MapModel, MapModelConfig
+from manyeyes.models.maps.presets import MAP_MODELS, get_map_model_config
+from manyeyes.ops.bev_warp import warp_bev
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.studies.provenance import write_json
 
@@ -55,7 +55,7 @@ def tiles_over(length_m: float, width_m: float, tile: BevGrid) -> Tensor:
     """(T, 2) middles of the tiles that cover an area about the origin; those at its far edges reach beyond it."""
     size = torch.tensor([tile.x_max - tile.x_min, tile.y_max - tile.y_min], dtype=torch.float64)
     whole = torch.tensor([length_m, width_m], dtype=torch.float64)
-    counts = [math.ceil(share - 1e-9) for share in (whole / size).tolist()]
+    counts = [math.ceil(num_tiles - 1e-9) for num_tiles in (whole / size).tolist()]
     places = torch.cartesian_prod(*(torch.arange(count, dtype=torch.float64) for count in counts)).view(-1, 2)
     return (places + 0.5) * size - whole / 2
 
@@ -71,50 +71,50 @@ def poses_over(length_m: float, width_m: float, count: int) -> Transform:
     )
 
 
-def by_tiles(mapper: Mapper, look: SparseBev, poses: Transform, middles: Tensor) -> int:
+def by_tiles(mapper: MapModel, frame_features: SparseBev, poses: Transform, middles: Tensor) -> int:
     """Draws each tile from the tokens of those looks that may reach it; how many elements it was asked for in all."""
-    tile, grid = mapper.config.tile, look.grid
+    tile, grid = mapper.config.tile, frame_features.grid
     reach = math.hypot(grid.x_max - grid.x_min, grid.y_max - grid.y_min) / 2
     half = torch.tensor([tile.x_max - tile.x_min, tile.y_max - tile.y_min], dtype=torch.float64) / 2
     drawn = 0
     for middle in middles:
         near = (((poses.translation[:, :2] - middle).abs() - half).clamp_min(0).norm(dim=1) <= reach).nonzero()[:, 0]
         moved = Transform(poses.rotation[near], poses.translation[near] - torch.cat((middle, middle.new_zeros(1))))
-        tokens = side_by_side([look] * len(near))
+        tokens = batch_features([frame_features] * len(near))
         ground = mapper.fuse(tokens, moved, torch.zeros(len(near), dtype=torch.int64), 1)
-        drawn += mapper.draw(ground)[-1].logit.shape[1]
+        drawn += mapper.predict_elements(ground)[-1].logit.shape[1]
     return drawn
 
 
-def at_once(mapper: Mapper, look: Tensor, seen: Tensor, grid: BevGrid, poses: Transform) -> int:
+def at_once(mapper: MapModel, frame_features: Tensor, seen: Tensor, grid: BevGrid, poses: Transform) -> int:
     """Draws the whole area, which is the mapper's one tile, from dense looks folded in one by one."""
     tile = mapper.config.tile
-    greatest = look.new_full((1, look.shape[1], *tile.shape), -torch.inf)
+    greatest = frame_features.new_full((1, frame_features.shape[1], *tile.shape), -torch.inf)
     anybody = torch.zeros(1, *tile.shape, dtype=torch.bool)
     for k in range(len(poses.translation)):
         motion = Transform(poses.rotation[k : k + 1], poses.translation[k : k + 1])
-        moved, there = warp(look, seen, grid, tile, motion)
+        moved, there = warp_bev(frame_features, seen, grid, tile, motion)
         greatest = torch.maximum(greatest, moved.masked_fill(~there[:, None], -torch.inf))
         anybody |= there
-    ground = mapper.merge(greatest[:, None], anybody[:, None])
-    return mapper.draw(ground)[-1].logit.shape[1]
+    ground = mapper.fuse_features(greatest[:, None], anybody[:, None])
+    return mapper.predict_elements(ground)[-1].logit.shape[1]
 
 
-def side_by_side(looks: list[SparseBev]) -> SparseBev:
+def batch_features(frames: list[SparseBev]) -> SparseBev:
     """Tokens of several looks on a batch of as many grids."""
-    grid = looks[0].grid
+    grid = frames[0].grid
     cells = grid.shape[0] * grid.shape[1]
-    key = torch.cat([one.sites.key + i * cells for i, one in enumerate(looks)])
-    return SparseBev(torch.cat([one.features for one in looks]), Sites(key, grid, len(looks)))
+    key = torch.cat([one.sites.key + i * cells for i, one in enumerate(frames)])
+    return SparseBev(torch.cat([one.features for one in frames]), Sites(key, grid, len(frames)))
 
 
-def over_all(config: MapperConfig, length_m: float, width_m: float, tiles: int) -> MapperConfig:
+def over_all(config: MapModelConfig, length_m: float, width_m: float, tiles: int) -> MapModelConfig:
     """The same model with the whole area for its one tile, and the queries of all tiles."""
     cell, tile = config.tile.pillar, config.tile
     # Whole cells: an area that is no multiple of a cell is a little larger.
     half = [math.ceil(side / cell - 1e-9) * cell / 2 for side in (length_m, width_m)]
     area = BevGrid(-half[0], -half[1], tile.z_min, half[0], half[1], tile.z_max, pillar=cell)
-    return replace(config, tile=area, head=replace(config.head, elements=config.head.elements * tiles))
+    return replace(config, tile=area, head=replace(config.head, num_queries=config.head.num_queries * tiles))
 
 
 def second_of_two(call: Callable[[], int]) -> tuple[float, float]:
@@ -133,19 +133,19 @@ def second_of_two(call: Callable[[], int]) -> tuple[float, float]:
 
 
 @torch.inference_mode()
-def measure(config: MapperConfig, length_m: float, width_m: float) -> list[Cost]:
+def measure(config: MapModelConfig, length_m: float, width_m: float) -> list[Cost]:
     """Both ways."""
     torch.manual_seed(0)
-    mapper = Mapper(config).eval()
-    tokens = mapper.see([street(agents=1).frames[0].points]).tokens
+    mapper = MapModel(config).eval()
+    tokens = mapper.extract_features([street(agents=1).frames[0].points]).tokens
     middles = tiles_over(length_m, width_m, config.tile)
-    count = round(LOOKS * length_m * width_m / 7200)
+    count = round(FRAMES_PER_TILE * length_m * width_m / 7200)
     poses = poses_over(length_m, width_m, count)
-    whole = Mapper(over_all(config, length_m, width_m, len(middles))).eval()
-    look = tokens.dense()
-    seen = torch.zeros(look.shape[0] * look.shape[2] * look.shape[3], dtype=torch.bool)
+    whole = MapModel(over_all(config, length_m, width_m, len(middles))).eval()
+    frame_features = tokens.dense()
+    seen = torch.zeros(frame_features.shape[0] * frame_features.shape[2] * frame_features.shape[3], dtype=torch.bool)
     seen[tokens.sites.key] = True
-    seen = seen.view(look.shape[0], *look.shape[2:])
+    seen = seen.view(frame_features.shape[0], *frame_features.shape[2:])
     ways = {
         "tiles": (
             lambda: by_tiles(mapper, tokens, poses, middles),
@@ -153,15 +153,15 @@ def measure(config: MapperConfig, length_m: float, width_m: float) -> list[Cost]
             tokens.features.nbytes + tokens.sites.key.nbytes,
         ),
         "dense": (
-            lambda: at_once(whole, look, seen, tokens.grid, poses),
+            lambda: at_once(whole, frame_features, seen, tokens.grid, poses),
             math.prod(whole.config.tile.shape),
-            look.nbytes + seen.nbytes,
+            frame_features.nbytes + seen.nbytes,
         ),
     }
     costs = []
     for way, (call, cells, held) in ways.items():
         seconds, peak = second_of_two(call)
-        queries = config.head.elements * len(middles)
+        queries = config.head.num_queries * len(middles)
         mib = count * held / MIB
         costs.append(Cost(f"{length_m:g} x {width_m:g} m", way, count, cells, queries, mib, seconds, peak + mib))
         print(
@@ -173,12 +173,12 @@ def measure(config: MapperConfig, length_m: float, width_m: float) -> list[Cost]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--preset", default="small", choices=MAPPERS)
+    parser.add_argument("--preset", default="small", choices=MAP_MODELS)
     parser.add_argument("--areas", nargs="+", default=["120x60", "300x300"])
     parser.add_argument("--out", type=Path)
     wanted = parser.parse_args()
     torch.set_num_threads(1)
-    config = mapper_config(wanted.preset)
+    config = get_map_model_config(wanted.preset)
     costs = [cost for area in wanted.areas for cost in measure(config, *map(float, area.split("x")))]
     if wanted.out:
         settings = {"preset": wanted.preset, "areas": wanted.areas}

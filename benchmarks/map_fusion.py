@@ -34,19 +34,19 @@ import torch
 
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
 from manyeyes.maps.baselines import crowdmap_literal
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import fuse
-from manyeyes.maps.fusion.incremental import StreamingMap
-from manyeyes.maps.store.executors import named_executor
+from manyeyes.maps.fusion.incremental import IncrementalMap
+from manyeyes.maps.store.executors import make_executor
 from manyeyes.maps.store.store import MapStore
-from manyeyes.maps.store.tiled_fusion import TileConfig
+from manyeyes.maps.store.tiled_fusion import TiledFusionConfig
 from manyeyes.ops.polyline import close_rings, resample
-from manyeyes.ops.polyline_distance import chamfer
-from manyeyes.simulator.fleet import CROWDS, CrowdConfig, place, simulate_crowd
+from manyeyes.ops.polyline_distance import chamfer_distance
+from manyeyes.simulator.fleet import CROWDS, CrowdConfig, load_place, simulate_crowd
 from manyeyes.studies.provenance import write_json
 
-CITY = replace(CROWDS["local"], range_x=(-45.0, 45.0), range_y=(-25.0, 25.0))
+CITY = replace(CROWDS["local"], range_x_m=(-45.0, 45.0), range_y_m=(-25.0, 25.0))
 LITERAL_BAR, STREAM_BAR_MS, CITY_BAR_S, CITY_BAR_GB = 50.0, 10.0, 1200.0, 8.0
 
 
@@ -113,19 +113,19 @@ def with_pycpd(anchor: np.ndarray, other: np.ndarray, _: object) -> _Registered:
 
 def literal(count: int, rounds: int, config: CrowdConfig) -> list[Literal]:
     """Both pipelines on one crowd of a crossroads, in turn."""
-    crowd = simulate_crowd(place("cross"), count, config)
+    crowd = simulate_crowd(load_place("cross"), count, config)
     many, half = crowd.observations, count // 2
     fuse(many[:20]), crowdmap_literal.fuse(many[:5])
     own = crowdmap_literal.register
     spent: dict[str, tuple[list[float], list[float]]] = {"fold": ([], []), "one more": ([], [])}
     for _ in range(rounds):
-        live = StreamingMap(fuse(many[:half]))
+        live = IncrementalMap(fuse(many[:half]))
         spent["fold"][0].append(_cpu(lambda: fuse(many)) / count)
         # The first two of the second half compile what is left to compile.
         for o in many[half : half + 2]:
-            live.assimilate(o)
+            live.update(o)
         spent["one more"][0].append(
-            _cpu(lambda live=live: [live.assimilate(o) for o in many[half + 2 :]]) / (count - half - 2)
+            _cpu(lambda live=live: [live.update(o) for o in many[half + 2 :]]) / (count - half - 2)
         )
         crowdmap_literal.register = with_pycpd
         spent["fold"][1].append(_cpu(lambda: crowdmap_literal.fuse(many)) / count)
@@ -151,17 +151,17 @@ class LiteralMap:
 
     def assimilate(self, observation: Observation, gate_m: float = 1.5, samples: int = 50) -> int:
         """Gate by Chamfer, register each pair that overlaps by pycpd, keep the more confident; how many pairs there were."""
-        seen = observation.in_map()
-        both = MapElements.cat([self.elements, seen])
+        observed = observation.elements_in_map()
+        both = MapElements.cat([self.elements, observed])
         held = len(self.elements)
         boxes = both.bounds()
         a, b = boxes[held:, None], boxes[None, :held]
         near = (a[..., :2] - gate_m <= b[..., 2:]).all(2) & (b[..., :2] - gate_m <= a[..., 2:]).all(2)
-        near &= seen.kind[:, None] == self.elements.kind[None]
+        near &= observed.kind[:, None] == self.elements.kind[None]
         pairs = np.argwhere(near)
-        line = resample(*close_rings(both.points, both.first, both.closed), samples)[0].reshape(-1, samples, 2)
+        line = resample(*close_rings(both.points, both.offsets, both.closed), samples)[0].reshape(-1, samples, 2)
         ends = np.arange(len(both) + 1) * samples
-        distance = chamfer(line.reshape(-1, 2), ends, line.reshape(-1, 2), ends, pairs + (held, 0))
+        distance = chamfer_distance(line.reshape(-1, 2), ends, line.reshape(-1, 2), ends, pairs + (held, 0))
         pairs = pairs[distance < gate_m]
         dropped = np.zeros(len(both), bool)
         for new, old in pairs.tolist():
@@ -173,7 +173,7 @@ class LiteralMap:
         return len(pairs)
 
 
-def large_map(elements: int, frame: Frame) -> VectorMap:
+def large_map(elements: int, frame: MapFrame) -> VectorMap:
     """Lines of 20 stations on a lattice of streets: three side by side each 30 m, as many as asked for."""
     side = int(np.ceil(np.sqrt(elements / 3)))
     k = np.arange(elements)
@@ -189,39 +189,39 @@ def large_map(elements: int, frame: Frame) -> VectorMap:
 
 def stream(elements: int, rounds: int) -> Stream:
     """Observations of a large map's lines, moved by half a metre, one after the other."""
-    base = large_map(elements, Frame())
-    live = StreamingMap(base)
+    base = large_map(elements, MapFrame())
+    live = IncrementalMap(base)
     spent, counts = [], []
     view = np.array([[-60.0, -50.0], [60.0, -50.0], [60.0, 50.0], [-60.0, 50.0]])
-    middles = base.elements.points[base.elements.first[:-1]] + (10.0, 0.0)
+    middles = base.elements.points[base.elements.offsets[:-1]] + (10.0, 0.0)
     for k in range(rounds + 5):
         # A number that has no factor in common with the rows of the lattice walks all over the map.
         at = middles[(k * 7919) % elements]
         near = np.flatnonzero(np.hypot(*(middles - at).T) < 60.0)[:25]
-        seen = base.elements.take(near).transform(-float(at[0]), -float(at[1]) + 0.5, 0.0)
+        observed = base.elements.take(near).transform(-float(at[0]), -float(at[1]) + 0.5, 0.0)
         pose, covariance = np.array([at[0], at[1], 0.0]), np.diag((0.5, 0.5, 2e-4))
-        observation = Observation(f"agent{k}", "pass", 1000 + k, pose, covariance, view, seen)
+        observation = Observation(f"agent{k}", "pass", 1000 + k, pose, covariance, view, observed)
         assert observation.id
         began = time.process_time()
-        live.assimilate(observation)
+        live.update(observation)
         spent.append(1e3 * (time.process_time() - began))
         counts.append(len(near))
     spent = spent[5:]
     return Stream(elements, float(np.mean(counts)), median(spent), max(spent), median(spent) < STREAM_BAR_MS)
 
 
-def city(elements: int, engine: str, workers: int, crowd: Sequence[Observation], frame: Frame) -> City:
+def city(elements: int, engine: str, workers: int, crowd: Sequence[Observation], frame: MapFrame) -> City:
     """Ingest, fuse, publish."""
     with tempfile.TemporaryDirectory() as folder:
         store = MapStore.create(Path(folder) / "city", frame)
         load = os.getloadavg()[0]
         with _peak() as peak:
             began = time.perf_counter()
-            with store.writing() as log:
+            with store.open_for_writing() as log:
                 log.append(crowd)
             ingested = time.perf_counter()
             cpu = _all_cpu()
-            made = store.fuse(None, TileConfig(), named_executor(engine, workers), _say)
+            made = store.fuse(None, TiledFusionConfig(), make_executor(engine, workers), _report_progress)
             cpu = _all_cpu() - cpu
             ended = time.perf_counter()
         return City(
@@ -238,14 +238,14 @@ def city(elements: int, engine: str, workers: int, crowd: Sequence[Observation],
         )
 
 
-def city_crowd(elements: int, seed: int) -> tuple[tuple[Observation, ...], Frame]:
+def city_crowd(elements: int, seed: int) -> tuple[tuple[Observation, ...], MapFrame]:
     """Observations of a lattice of streets that grows with their number, until they hold so many elements."""
     side = max(2, round(np.sqrt(elements / 2500)))
-    where = place(f"grid-{side}", None)
+    where = load_place(f"grid-{side}", None)
     probe = simulate_crowd(where, 40, CITY, seed)
     count = int(np.ceil(elements / max(_mean_elements(probe.observations), 1.0)))
     return simulate_crowd(
-        where, count, CITY, seed, progress=lambda k, n: _say("simulate", k, n)
+        where, count, CITY, seed, progress=lambda k, n: _report_progress("simulate", k, n)
     ).observations, where.frame
 
 
@@ -259,7 +259,7 @@ def _cpu(work: Callable[[], object]) -> float:
     return time.process_time() - began
 
 
-def _say(name: str, done: int, total: int) -> None:
+def _report_progress(name: str, done: int, total: int) -> None:
     if sys.stderr.isatty():
         print(f"\r{name} {done}/{total}   ", end="", file=sys.stderr, flush=True)
 
@@ -284,9 +284,9 @@ def _all_cpu() -> float:
 @contextmanager
 def _peak() -> Iterator[list[float]]:
     """The largest resident memory in GB, once the block has ended."""
-    most, ended = [0.0], threading.Event()
+    max_gb, ended = [0.0], threading.Event()
 
-    def watch() -> None:
+    def sample_memory() -> None:
         while not ended.wait(0.25):
             total = 0
             for process in _family():
@@ -294,12 +294,12 @@ def _peak() -> Iterator[list[float]]:
                     total += process.memory_info().rss
                 except psutil.NoSuchProcess:
                     continue
-            most[0] = max(most[0], total / 1e9)
+            max_gb[0] = max(max_gb[0], total / 1e9)
 
-    thread = threading.Thread(target=watch, daemon=True)
+    thread = threading.Thread(target=sample_memory, daemon=True)
     thread.start()
     try:
-        yield most
+        yield max_gb
     finally:
         ended.set()
         thread.join()
@@ -309,9 +309,9 @@ def _cities(sizes: Sequence[int], engines: Sequence[str], workers: int, seed: in
     rows = []
     for size in sizes:
         crowd, frame = city_crowd(size, seed)
-        seen = sum(len(o.elements) for o in crowd)
+        num_elements = sum(len(o.elements) for o in crowd)
         for engine in engines:
-            row = city(seen, engine, workers, crowd, frame)
+            row = city(num_elements, engine, workers, crowd, frame)
             rows.append(row)
             print(
                 f"{engine}: {row.observations} observations, {row.elements} elements -> {row.map_elements}, {row.map_hash}: "

@@ -19,11 +19,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from manyeyes.models.maps.bev import rasterise
-from manyeyes.studies.map_recordings import open_looks, true_maps
-from manyeyes.training.maps.losses import ink_loss
-from manyeyes.training.maps.presets import MAP_TRAINING
-from manyeyes.training.maps.samples import MapAugment, TileStream
+from manyeyes.models.maps.bev import rasterise_clouds
+from manyeyes.studies.map_recordings import load_true_maps, open_sensor_recording
+from manyeyes.training.maps.losses import segmentation_loss
+from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
+from manyeyes.training.maps.samples import MapAugmentConfig, TileStream
 
 NORMS: dict[str, Callable[[int], nn.Module]] = {
     "batch": nn.BatchNorm2d,
@@ -61,12 +61,12 @@ def main() -> None:
     parser.add_argument("--held", type=int, default=20)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    mapper = MAP_TRAINING["map-small"].mapper
-    recording = open_looks(options.data, "train", ("lidar",))
-    stream = TileStream(recording, true_maps(recording), mapper, MapAugment(3, 6), 3)
+    mapper = MAP_TRAINING_PRESETS["map-small"].map_model
+    recording = open_sensor_recording(options.data, "train", ("lidar",))
+    stream = TileStream(recording, load_true_maps(recording), mapper, MapAugmentConfig(3, 6), 3)
     samples = [stream.draw(number) for number in range(options.tiles)]
-    raster, hit = rasterise([look.points for sample in samples for look in sample.looks], mapper.bev.grid)
-    drawn = torch.cat([sample.ink for sample in samples])
+    raster, hit = rasterise_clouds([frame.points for sample in samples for frame in sample.frames], mapper.bev.grid)
+    drawn = torch.cat([sample.line_mask for sample in samples])
     seen = F.max_pool2d(hit[:, None].float(), 5, 2, 2)[:, 0] > 0
     learnt = len(raster) - options.held
     print(f"{learnt} looks to learn from, {options.held} held out; kinds: {', '.join(mapper.head.kinds)}", flush=True)
@@ -78,8 +78,8 @@ def main() -> None:
         for step in range(options.steps):
             rows = torch.from_numpy(rng.choice(learnt, options.looks, replace=False))
             where = seen[rows]
-            told = net(raster[rows]).permute(0, 2, 3, 1)[where]
-            loss = ink_loss(told, drawn[rows].permute(0, 2, 3, 1)[where].float())
+            logits = net(raster[rows]).permute(0, 2, 3, 1)[where]
+            loss = segmentation_loss(logits, drawn[rows].permute(0, 2, 3, 1)[where].float())
             for group in optimiser.param_groups:
                 group["lr"] = options.rate * min(1.0, (step + 1) / 10) * (1 - step / options.steps)
             optimiser.zero_grad()
@@ -87,9 +87,9 @@ def main() -> None:
             optimiser.step()
         net.eval()
         with torch.inference_mode():
-            told = net(raster[learnt:]).permute(0, 2, 3, 1)[seen[learnt:]]
+            logits = net(raster[learnt:]).permute(0, 2, 3, 1)[seen[learnt:]]
         true = drawn[learnt:].permute(0, 2, 3, 1)[seen[learnt:]]
-        kinds = [round(average_precision(told[:, k], true[:, k]), 3) for k in range(true.shape[1])]
+        kinds = [round(average_precision(logits[:, k], true[:, k]), 3) for k in range(true.shape[1])]
         print(f"{name}: {kinds}, {time.process_time() - began:.0f} s of processor", flush=True)
 
 

@@ -20,18 +20,18 @@ import torch
 import torch.distributed as dist
 
 from manyeyes.datatypes.map_element import KINDS
-from manyeyes.evaluation.maps.metrics import judge
-from manyeyes.evaluation.maps.tiles import side_by_side
-from manyeyes.models.maps.head import RawMap, decode
-from manyeyes.models.maps.map_model import Mapper
+from manyeyes.evaluation.maps.metrics import evaluate_map
+from manyeyes.evaluation.maps.tiles import place_side_by_side
+from manyeyes.models.maps.head import RawMap, decode_elements
+from manyeyes.models.maps.map_model import MapModel
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.studies.map_recordings import open_looks, true_maps
-from manyeyes.training.maps.line_field_targets import around_seen
+from manyeyes.studies.map_recordings import load_true_maps, open_sensor_recording
+from manyeyes.training.maps.line_field_targets import dilate_observed
 from manyeyes.training.maps.loop import MapRun
-from manyeyes.training.maps.presets import MAP_TRAINING
-from manyeyes.training.maps.samples import MapAugment, MapSample, TileStream
-from manyeyes.training.maps.step import placed, see
-from manyeyes.training.maps.targets import met
+from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
+from manyeyes.training.maps.samples import MapAugmentConfig, MapSample, TileStream
+from manyeyes.training.maps.step import extract_features, warp_tokens
+from manyeyes.training.maps.targets import select_observed
 
 
 @dataclass(frozen=True)
@@ -46,26 +46,26 @@ class Few:
         return self.samples[int(keyed_generator("few", turn).permutation(len(self.samples))[place])]
 
 
-def mean_ap(model: Mapper, samples: tuple[MapSample, ...]) -> dict[str, float]:
+def mean_ap(model: MapModel, samples: tuple[MapSample, ...]) -> dict[str, float]:
     """mAP in both ways, of the sketch's lines too, and AP of each kind, on the tiles of samples."""
     config, drawn, begun, truth = model.config, [], [], []
     kinds = [KINDS.index(kind) for kind in config.head.kinds]
     model.eval()
     with torch.no_grad():
         for sample in samples:
-            features, seen = placed(model, see(model, [sample]).tokens, [sample])
-            ground = model.merge(features, seen)
-            sketch = model.sketch(ground)
-            point, logit, _ = model.head.begin(sketch)
-            begun += decode(RawMap(logit, point), config.tile, config.head)
-            drawn += decode(model.draw(ground, sketch=sketch)[-1], config.tile, config.head)
-            asked = met(sample.truth, around_seen(seen.any(1), config.tile)[0], config.tile)
+            features, seen = warp_tokens(model, extract_features(model, [sample]).tokens, [sample])
+            ground = model.fuse_features(features, seen)
+            sketch = model.predict_line_field(ground)
+            point, logit, _ = model.head.init_queries(sketch)
+            begun += decode_elements(RawMap(logit, point), config.tile, config.head)
+            drawn += decode_elements(model.predict_elements(ground, line_field=sketch)[-1], config.tile, config.head)
+            asked = select_observed(sample.truth, dilate_observed(seen.any(1), config.tile)[0], config.tile)
             truth.append(asked.take(np.isin(asked.kind, kinds)))
-    quality = judge(side_by_side(drawn), side_by_side(truth), ("maptr", "exact"), config.head.kinds)
+    quality = evaluate_map(place_side_by_side(drawn), place_side_by_side(truth), ("maptr", "exact"), config.head.kinds)
     mean = {way: round(quality.mean_ap(way, kinds=config.head.kinds), 3) for way in ("maptr", "exact")}
-    first = judge(side_by_side(begun), side_by_side(truth), ("maptr",), config.head.kinds)
+    first = evaluate_map(place_side_by_side(begun), place_side_by_side(truth), ("maptr",), config.head.kinds)
     mean["sketch"] = round(first.mean_ap("maptr", kinds=config.head.kinds), 3)
-    return {**mean, **{kind: round(quality.ap(kind, "maptr"), 3) for kind in config.head.kinds}}
+    return {**mean, **{kind: round(quality.get_ap(kind, "maptr"), 3) for kind in config.head.kinds}}
 
 
 def main() -> None:
@@ -78,14 +78,14 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=4e-3)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--every", type=int, default=200)
-    parser.add_argument("--preset", default="map-toy", choices=MAP_TRAINING)
+    parser.add_argument("--preset", default="map-toy", choices=MAP_TRAINING_PRESETS)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         dist.init_process_group("gloo")
-    preset = MAP_TRAINING[options.preset]
-    recording = open_looks(options.data, options.split, preset.mapper.bev.sensors)
-    stream = TileStream(recording, true_maps(recording), preset.mapper, MapAugment(1, 3, flip=False), 0)
+    preset = MAP_TRAINING_PRESETS[options.preset]
+    recording = open_sensor_recording(options.data, options.split, preset.map_model.bev.sensors)
+    stream = TileStream(recording, load_true_maps(recording), preset.map_model, MapAugmentConfig(1, 3, flip=False), 0)
     few = Few(tuple(stream.draw(k) for k in range(options.tiles)), stream.towns)
     if not dist.is_initialized() or dist.get_rank() == 0:
         print(f"{options.tiles} tiles, {sum(len(s.truth) for s in few.samples)} elements", flush=True)
@@ -98,7 +98,7 @@ def main() -> None:
         thin=0.0,
         ema=0.98,
         # Queries that begin as lines of their own learn from the first step.
-        sketch_steps=0 if preset.mapper.head.learned else options.steps // 4,
+        sketch_steps=0 if preset.map_model.head.num_learned_queries else options.steps // 4,
     )
     with tempfile.TemporaryDirectory() as folder:
         run = MapRun(config, few, Path(folder), seed=0)

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import torch
 
-from manyeyes.studies.map_recordings import open_looks, true_maps
+from manyeyes.studies.map_recordings import load_true_maps, open_sensor_recording
 from manyeyes.training.maps.loop import MapRun
-from manyeyes.training.maps.presets import MAP_TRAINING
+from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
 from manyeyes.training.maps.samples import TileStream
 
 GIB = 1 << 30
@@ -30,15 +30,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path("data/streets-pictures"))
     parser.add_argument("--split", default="train")
-    parser.add_argument("--preset", default="map-paper", choices=MAP_TRAINING)
+    parser.add_argument("--preset", default="map-paper", choices=MAP_TRAINING_PRESETS)
     parser.add_argument("--batch", type=int, help="tiles a step instead of the preset's")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    preset = MAP_TRAINING[options.preset]
+    preset = MAP_TRAINING_PRESETS[options.preset]
     config = replace(preset, batch=options.batch or preset.batch)
-    recording = open_looks(options.data, options.split, config.mapper.bev.sensors)
-    stream = TileStream(recording, true_maps(recording), config.mapper, config.augment, 0)
+    recording = open_sensor_recording(options.data, options.split, config.map_model.bev.sensors)
+    stream = TileStream(recording, load_true_maps(recording), config.map_model, config.augment, 0)
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(2):
             run = MapRun(config, stream, Path(folder), seed=0)
@@ -46,13 +46,13 @@ def main() -> None:
             if not begun:
                 size = sum(p.numel() for p in run.state.model.parameters())
                 print(
-                    f"{options.preset}: {size:,} parameters, batch of {config.batch}, {config.at_once} at once",
+                    f"{options.preset}: {size:,} parameters, batch of {config.batch}, {config.micro_batch} at once",
                     flush=True,
                 )
             progress = run.advance()
             run.state.save()
             terms = ", ".join(
-                f"{name} {value:.3f}" for name, value in progress.line().items() if name not in ("step", "lr")
+                f"{name} {value:.3f}" for name, value in progress.to_record().items() if name not in ("step", "lr")
             )
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / GIB
             print(

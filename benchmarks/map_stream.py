@@ -16,23 +16,23 @@ import numpy as np
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import fuse
-from manyeyes.maps.fusion.incremental import StreamingMap
-from manyeyes.simulator.fleet import place, simulate_crowd
+from manyeyes.maps.fusion.incremental import IncrementalMap
+from manyeyes.simulator.fleet import load_place, simulate_crowd
 
 WARM_UP, APART_M = 3, 400.0
 
 
 def main(elements: int) -> None:
-    crossroads = place("cross")
-    one = fuse(simulate_crowd(crossroads, 60).observations).published().elements
+    crossroads = load_place("cross")
+    one = fuse(simulate_crowd(crossroads, 60).observations).select_published().elements
     copies = -(-elements // len(one))
     side = int(np.ceil(np.sqrt(copies)))
     spots = [(APART_M * (k % side), APART_M * (k // side)) for k in range(copies)]
-    live = StreamingMap(VectorMap.of(MapElements.cat([one.transform(x, y, 0.0) for x, y in spots])))
+    live = IncrementalMap(VectorMap.of(MapElements.cat([one.transform(x, y, 0.0) for x, y in spots])))
     spent, seen = [], []
     for observation in simulate_crowd(crossroads, 120, seed=1).observations:
         begin = time.perf_counter()
-        live.assimilate(observation)
+        live.update(observation)
         spent.append((time.perf_counter() - begin) * 1e3)
         seen.append(len(observation.elements))
     low, middle, high = np.quantile(spent[WARM_UP:], (0.0, 0.5, 0.95))

@@ -27,11 +27,11 @@ import torch
 from street import street
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.perception_cache import Eyes
+from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.datatypes import AgentFrame, BevGrid
 from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.detector import Detector
-from manyeyes.models.detector.fold_norms import folded
+from manyeyes.models.detector.fold_norms import fold_norms
 from manyeyes.models.detector.presets import COSTR_SMALL
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.studies.provenance import write_json
@@ -59,7 +59,7 @@ class Line:
     r_squared: float
 
 
-class CountingEyes(Eyes):
+class CountingCache(PerceptionCache):
     """Counts the tokens that were fused last."""
 
     tokens = 0
@@ -102,19 +102,19 @@ def detector_of(range_m: float) -> Detector:
     half = round(max(1, round(range_m / cell)) * cell / 2, 2)
     grid = BevGrid(-half, -HALF_WIDTH_M, COSTR_SMALL.grid.z_min, half, HALF_WIDTH_M, COSTR_SMALL.grid.z_max)
     model = Detector(replace(COSTR_SMALL, grid=grid, prune_threshold=0.0))
-    return folded(model)
+    return fold_norms(model)
 
 
 def measure(model: Detector, frames: list[AgentFrame], range_m: float) -> Cell:
     """The second of two runs."""
     packets = [p for frame in frames[1:] for p in Agent(model, budget_bytes=None).share(frame)]
-    peaks, eyes = [], CountingEyes(model)
+    peaks, cache = [], CountingCache(model)
     for _ in range(2):
-        eyes = CountingEyes(model)
-        agent = Agent(model, budget_bytes=None, eyes=eyes)
+        cache = CountingCache(model)
+        agent = Agent(model, budget_bytes=None, perception_cache=cache)
         agent.share(frames[0])
         peaks.append(peak_of(lambda agent=agent: agent.perceive(frames[0], packets)))
-    return Cell(len(frames), range_m, eyes.tokens, peaks[-1])
+    return Cell(len(frames), range_m, cache.tokens, peaks[-1])
 
 
 def main() -> None:

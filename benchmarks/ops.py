@@ -68,7 +68,9 @@ def steps(level: Level, with_backward: bool) -> tuple[Callable[[], object], Call
     dense_weight = weight.contiguous(memory_format=torch.channels_last)
     same_sites_map(x.sites, 3)
     leaves = [t.clone().requires_grad_(with_backward) for t in (x.features, weight)]
-    rivals = [t.clone(memory_format=torch.preserve_format).requires_grad_(with_backward) for t in (dense, dense_weight)]
+    dense_leaves = [
+        t.clone(memory_format=torch.preserve_format).requires_grad_(with_backward) for t in (dense, dense_weight)
+    ]
 
     def finish(out: Tensor) -> None:
         if with_backward:
@@ -78,7 +80,7 @@ def steps(level: Level, with_backward: bool) -> tuple[Callable[[], object], Call
         finish(submanifold_conv(x.with_features(leaves[0]), leaves[1]).features)
 
     def dense_step() -> None:
-        finish(conv2d(rivals[0], rivals[1], padding=1))
+        finish(conv2d(dense_leaves[0], dense_leaves[1], padding=1))
 
     return sparse_step, dense_step, x
 
@@ -100,9 +102,9 @@ def main() -> None:
             sparse_step, dense_step, x = steps(level, with_backward)
             sparse_ms, dense_ms = in_turn(sparse_step, dense_step, wanted.rounds)
             n = len(x.sites)
-            share = n / (AGENTS * x.grid.shape[0] * x.grid.shape[1])
+            occupancy = n / (AGENTS * x.grid.shape[0] * x.grid.shape[1])
             print(
-                f"{level.name:<10} {level.channels:>4} {n:>6} {share:>8.1%} {'fwd+bwd' if with_backward else 'fwd':>8} "
+                f"{level.name:<10} {level.channels:>4} {n:>6} {occupancy:>8.1%} {'fwd+bwd' if with_backward else 'fwd':>8} "
                 f"{sparse_ms:>10.1f} {dense_ms:>9.1f} {dense_ms / sparse_ms:>5.1f}x"
             )
 

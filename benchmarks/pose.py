@@ -4,9 +4,9 @@ and density.
 
 Tables: ``success``: share of frames whose best guess is within 1 m and 1 degree, by common objects and by what is
 claimed (sparse traffic). ``answers``: when to answer, on DAIR-V2X's counts of common objects in dense traffic, with
-one frame and with five, and on agents that share nothing. ``rivals``: success at 1 m and 1 degree, all frames,
+one frame and with five, and on agents that share nothing. ``baselines``: success at 1 m and 1 degree, all frames,
 against the noise of the claim. ``displacement``: of common objects after fusion with a good claim, over that of the
-claim alone. ``watchman``: share of frames that contradict the claim, where it is off by five of its stated sigma and where
+claim alone. ``monitor``: share of frames that contradict the claim, where it is off by five of its stated sigma and where
 it is honest; in single frames, and as a watchman says it through drives of 20 frames at 10 Hz, which is how 'manyeyes run
 --align vote' says it. ``speed``: processor time of one call. Behind the tables the bars of issue 4 that they can answer.
 
@@ -26,18 +26,24 @@ from pathlib import Path
 
 import numpy as np
 
-from manyeyes.evaluation.pose.metrics import ClaimNoise, PoseFrame, PoseScore, judged, score
-from manyeyes.pose.corrector import Acceptance, CorrectorConfig, correct
+from manyeyes.evaluation.pose.metrics import PoseEvaluation, PoseScore, PriorNoise, evaluate_pose, summarize_evaluations
+from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_pose
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.multi_frame import Sighting, accumulated
-from manyeyes.pose.pose_monitor import Health, WatchState, watch
+from manyeyes.pose.multi_frame import TimedLandmarks, accumulate
+from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorState, update_monitor
 from manyeyes.pose.registry import CORRECTORS
-from manyeyes.pose.types import Corrector, PoseStatus
-from manyeyes.simulator.fleet.landmark_scenes import BoxError, LandmarkScene, LandmarkSpec, between, make_landmark_scene
+from manyeyes.pose.types import PoseCorrector, PoseStatus
+from manyeyes.simulator.fleet.landmark_scenes import (
+    BoxNoise,
+    LandmarkScene,
+    LandmarkSpec,
+    make_landmark_scene,
+    relative_pose,
+)
 from manyeyes.studies.provenance import write_json
 
-NOISY = BoxError(0.45, np.radians(4.0), 0.10, 0.3)
-GUESS = CorrectorConfig(accept=Acceptance(-1e9, 0.0, 1, 0.0))
+NOISY = BoxNoise(0.45, np.radians(4.0), 0.10, 0.3)
+GUESS = CorrectorConfig(accept=AcceptanceTest(-1e9, 0.0, 1, 0.0))
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,8 @@ def landmarks(scene: LandmarkScene) -> tuple[Landmarks, Landmarks]:
     """What both agents see, all instants in their frames of now."""
     both = ((scene.ego, scene.ego_from_then), (scene.other, scene.other_from_then))
     one, two = (
-        accumulated([Sighting(Landmarks.of_boxes(b), n, then[n]) for n, b in enumerate(boxes)]) for boxes, then in both
+        accumulate([TimedLandmarks(Landmarks.of_boxes(b), n, then[n]) for n, b in enumerate(boxes)])
+        for boxes, then in both
     )
     return one, two
 
@@ -76,29 +83,29 @@ def prepared(spec: LandmarkSpec, scenes: int, seed: int) -> list[tuple[LandmarkS
 
 
 def run(
-    table: str, method: str, corrector: Corrector, spec: LandmarkSpec, noise: ClaimNoise, scenes: int, seed: int
+    table: str, method: str, corrector: PoseCorrector, spec: LandmarkSpec, noise: PriorNoise, scenes: int, seed: int
 ) -> Row:
     """A method on scenes 0, 1, ... of a seed."""
-    frames: list[PoseFrame] = []
+    frames: list[PoseEvaluation] = []
     spent = []
     for n, (scene, ego, other) in enumerate(prepared(spec, scenes, seed)):
-        claimed = noise.claim(scene.ego_from_other, n)
+        prior = noise.make_prior(scene.ego_from_other, n)
         begin = time.process_time()
-        said = corrector(ego, other, claimed)
+        estimate = corrector(ego, other, prior)
         spent.append(1e3 * (time.process_time() - begin))
-        frames.append(judged(said, scene.ego_from_other, scene.common_xy))
+        frames.append(evaluate_pose(estimate, scene.ego_from_other, scene.common_xy))
     return Row(
         table,
         method,
-        spec.common,
-        spec.ego_extra,
-        spec.other_extra,
-        spec.instants,
-        spec.error == NOISY,
+        spec.num_common,
+        spec.num_ego_only,
+        spec.num_other_only,
+        spec.num_instants,
+        spec.noise == NOISY,
         spec.disjoint,
         noise.kind,
         noise.sigma_m,
-        score(frames),
+        summarize_evaluations(frames),
         float(np.mean(spent[1:] or spent)),
         float(np.percentile(spent[1:] or spent, 95)),
     )
@@ -107,87 +114,87 @@ def run(
 def success(scenes: int, nulls: int) -> Iterator[Row]:
     """Best guesses, whether or not they would be answered."""
     for common in (3, 4, 5, 6, 8):
-        spec, guess = LandmarkSpec(common, 8, 10), partial(correct, config=GUESS)
+        spec, guess = LandmarkSpec(common, 8, 10), partial(correct_pose, config=GUESS)
         for kind, sigma in (("none", 0.0), ("gaussian", 1.0), ("gaussian", 4.0), ("unknown", 0.0)):
-            yield run("success", "vote", guess, spec, ClaimNoise(kind, sigma, sigma), scenes, 0)
+            yield run("success", "vote", guess, spec, PriorNoise(kind, sigma, sigma), scenes, 0)
 
 
 def answers(scenes: int, nulls: int) -> Iterator[Row]:
     """When to answer; agents that share nothing stand at one crossing or at two."""
-    none = ClaimNoise("none")
-    for error in (BoxError(), NOISY):
-        for spec, share in (
+    none = PriorNoise("none")
+    for error in (BoxNoise(), NOISY):
+        for spec, divisor in (
             (LandmarkSpec(0, 22, 28, error, disjoint=True), 1),
-            (LandmarkSpec(error=error), 2),
+            (LandmarkSpec(noise=error), 2),
             (LandmarkSpec(0, 22, 28, error), 2),
-            (LandmarkSpec(0, 22, 28, error, disjoint=True, instants=5), 5),
-            (LandmarkSpec(error=error, instants=5), 5),
+            (LandmarkSpec(0, 22, 28, error, disjoint=True, num_instants=5), 5),
+            (LandmarkSpec(noise=error, num_instants=5), 5),
         ):
-            yield run("answers", "vote", correct, spec, none, nulls // share, 1)
+            yield run("answers", "vote", correct_pose, spec, none, nulls // divisor, 1)
 
 
 def displacement(scenes: int, nulls: int) -> Iterator[Row]:
     """Objects in common after fusion with a good claim."""
     for sigma in (0.1, 0.2, 0.5):
         for method in ("given", "vote"):
-            noise = ClaimNoise("gaussian", sigma, sigma)
+            noise = PriorNoise("gaussian", sigma, sigma)
             yield run("displacement", method, CORRECTORS[method], LandmarkSpec(), noise, scenes, 4)
 
 
-def rivals(scenes: int, nulls: int) -> Iterator[Row]:
+def baselines(scenes: int, nulls: int) -> Iterator[Row]:
     """Everybody, against the noise of the claim."""
     for sigma in (0.0, 0.4, 0.8, 1.2, 2.0):
         for method, corrector in CORRECTORS.items():
-            noise = ClaimNoise("gaussian", sigma, sigma)
+            noise = PriorNoise("gaussian", sigma, sigma)
             yield run("rivals", method, corrector, LandmarkSpec(6, 8, 10), noise, scenes // 2, 5)
 
 
-def watchman(scenes: int, nulls: int) -> Iterator[Row]:
+def monitor(scenes: int, nulls: int) -> Iterator[Row]:
     """Claims that are five sigma off, and honest ones, sparse and dense."""
     for common in (5, 8):
         for ego_extra, other_extra in ((8, 10), (18, 24)):
             for kind in ("offset", "gaussian"):
                 for sigma in (0.2, 0.5, 1.0):
-                    spec, noise = LandmarkSpec(common, ego_extra, other_extra), ClaimNoise(kind, sigma, sigma)
-                    yield run("watchman", "vote", correct, spec, noise, scenes, 7)
+                    spec, noise = LandmarkSpec(common, ego_extra, other_extra), PriorNoise(kind, sigma, sigma)
+                    yield run("watchman", "vote", correct_pose, spec, noise, scenes, 7)
 
     for kind in ("offset", "bias", "gaussian"):
         for sigma in (0.2, 0.5, 1.0):
-            spec = LandmarkSpec(5, 8, 10, instants=20, period_s=0.1)
-            yield watched(spec, ClaimNoise(kind, sigma, sigma), scenes // 4, 8)
+            spec = LandmarkSpec(5, 8, 10, num_instants=20, period_s=0.1)
+            yield run_monitor(spec, PriorNoise(kind, sigma, sigma), scenes // 4, 8)
 
 
-def watched(spec: LandmarkSpec, noise: ClaimNoise, scenes: int, seed: int) -> Row:
+def run_monitor(spec: LandmarkSpec, noise: PriorNoise, scenes: int, seed: int) -> Row:
     """Drives whose every frame is solved by itself; a frame contradicts the claim where the watchman says so.
 
     An offset lasts through a drive, as a bias does.
     """
-    frames: list[PoseFrame] = []
+    frames: list[PoseEvaluation] = []
     spent = []
     for n in range(scenes):
-        scene, state = make_landmark_scene(spec, seed, n), WatchState.new()
-        for instant in reversed(range(spec.instants)):
-            truth = between(scene.ego_from_then[instant], scene.ego_from_other)
-            claimed = noise.claim(truth, n, instant if noise.kind == "gaussian" else 0)
+        scene, state = make_landmark_scene(spec, seed, n), PoseMonitorState.new()
+        for instant in reversed(range(spec.num_instants)):
+            truth = relative_pose(scene.ego_from_then[instant], scene.ego_from_other)
+            prior = noise.make_prior(truth, n, instant if noise.kind == "gaussian" else 0)
             begin = time.process_time()
-            said = correct(*(Landmarks.of_boxes(b[instant]) for b in (scene.ego, scene.other)), claimed)
-            state, report = watch(state, said, claimed, -instant * spec.period_s)
+            estimate = correct_pose(*(Landmarks.of_boxes(b[instant]) for b in (scene.ego, scene.other)), prior)
+            state, report = update_monitor(state, estimate, prior, -instant * spec.period_s)
             spent.append(1e3 * (time.process_time() - begin))
-            wrong = report.health in (Health.OFFSET, Health.DRIFTING)
-            found = judged(said, truth, np.zeros((spec.common or 0, 2)))
-            frames.append(replace(found, status=PoseStatus.CONFLICT if wrong else PoseStatus.OK))
+            is_flagged = report.health in (PoseHealth.OFFSET, PoseHealth.DRIFTING)
+            found = evaluate_pose(estimate, truth, np.zeros((spec.num_common or 0, 2)))
+            frames.append(replace(found, status=PoseStatus.CONFLICT if is_flagged else PoseStatus.OK))
     return Row(
         "watched",
         "vote",
-        spec.common,
-        spec.ego_extra,
-        spec.other_extra,
-        spec.instants,
+        spec.num_common,
+        spec.num_ego_only,
+        spec.num_other_only,
+        spec.num_instants,
         False,
         False,
         noise.kind,
         noise.sigma_m,
-        score(frames),
+        summarize_evaluations(frames),
         float(np.mean(spent)),
         float(np.percentile(spent, 95)),
     )
@@ -195,7 +202,7 @@ def watched(spec: LandmarkSpec, noise: ClaimNoise, scenes: int, seed: int) -> Ro
 
 def speed(scenes: int, nulls: int) -> Iterator[Row]:
     """40 by 40 objects."""
-    yield run("speed", "vote", correct, LandmarkSpec(8, 32, 32), ClaimNoise("none"), 40, 6)
+    yield run("speed", "vote", correct_pose, LandmarkSpec(8, 32, 32), PriorNoise("none"), 40, 6)
 
 
 @dataclass(frozen=True)
@@ -214,27 +221,25 @@ def bars(rows: Sequence[Row]) -> Iterator[Bar]:
     """Of the rows that were run: is the covariance honest, and does the watchman say what it should?"""
     for row in rows:
         s, shown = row.score, row.claim == "none" and (row.table == "answers" or row.table == "success")
-        if not shown or not s.nees_error > 0:
+        if not shown or not s.nees_standard_error > 0:
             continue
-        low, high = s.nees - 2 * s.nees_error, s.nees + 2 * s.nees_error
+        low, high = s.nees - 2 * s.nees_standard_error, s.nees + 2 * s.nees_standard_error
         verdict = "reached" if low >= 2.5 and high <= 3.6 else "missed" if high < 2.5 or low > 3.6 else "not resolved"
         noise = ", noisy" if row.noisy else ""
-        what = (
-            f"mean NEES, {row.table}, K={row.common or 'DAIR'}, {row.instants} frames{noise} (+-{2 * s.nees_error:.2f})"
-        )
+        what = f"mean NEES, {row.table}, K={row.common or 'DAIR'}, {row.instants} frames{noise} (+-{2 * s.nees_standard_error:.2f})"
         yield Bar(what, s.nees, "2.5 to 3.6", verdict)
     for table, name in (("watched", "over drives"), ("watchman", "in single frames")):
         for sigma in sorted({row.sigma for row in rows if row.table == table}):
             some = [row for row in rows if (row.table, row.sigma) == (table, sigma)]
-            off = min(row.score.conflicts for row in some if row.claim == "offset")
-            honest = max(row.score.conflicts for row in some if row.claim != "offset")
+            off = min(row.score.conflict_rate for row in some if row.claim == "offset")
+            honest = max(row.score.conflict_rate for row in some if row.claim != "offset")
             what = f"watchman {name}, sigma {sigma:g} m"
             yield Bar(f"{what}: five sigma off, flagged", off, "at least 0.98", "reached" if off >= 0.98 else "missed")
             verdict = "reached" if honest <= 0.005 else "missed"
             yield Bar(f"{what}: honest, contradicted", honest, "at most 0.005", verdict)
 
 
-TABLES = {f.__name__: f for f in (success, answers, displacement, rivals, watchman, speed)}
+TABLES = {f.__name__: f for f in (success, answers, displacement, baselines, monitor, speed)}
 
 
 def line(row: Row) -> str:
@@ -243,9 +248,11 @@ def line(row: Row) -> str:
     return (
         f"{row.table:12} {row.method:14} K={row.common!s:4} +{row.ego_extra}/{row.other_extra} x{row.instants}"
         f"{' noisy' if row.noisy else ''}{' strangers' if row.disjoint else ''} {row.claim} {row.sigma:g}: "
-        f"success {s.success[0]:.3f}/{s.success[1]:.3f}/{s.success[2]:.3f} coverage {s.coverage:.3f} precision {s.precision:.3f} "
-        f"null {s.null_accepts:.4f} OD {s.displacement:.3f} NEES {s.nees:.2f} (+-{s.nees_error:.2f}) inside {s.inside:.3f} "
-        f"conflicts {s.conflicts:.3f} {row.mean_ms:.1f} ms (p95 {row.p95_ms:.1f})"
+        f"success {s.success_rate[0]:.3f}/{s.success_rate[1]:.3f}/{s.success_rate[2]:.3f} coverage "
+        f"{s.coverage:.3f} precision {s.precision:.3f} "
+        f"null {s.no_overlap_accept_rate:.4f} OD {s.mean_displacement_m:.3f} NEES {s.nees:.2f} "
+        f"(+-{s.nees_standard_error:.2f}) inside {s.within_95_fraction:.3f} "
+        f"conflicts {s.conflict_rate:.3f} {row.mean_ms:.1f} ms (p95 {row.p95_ms:.1f})"
     )
 
 
@@ -259,7 +266,7 @@ def main() -> None:
     options = parser.parse_args()
     done = []
     for table in options.tables:
-        for row in TABLES[table](options.scenes, options.nulls):
+        for row in TABLES[table](options.map_indices, options.nulls):
             sys.stdout.write(line(row) + "\n")
             sys.stdout.flush()
             done.append(row)

@@ -35,28 +35,28 @@ from dense_pointpillars import DenseConfig, DensePointPillars
 from street import street
 from torch import Tensor
 
-from manyeyes.agents.agent import OWN_BODY_M, Agent
-from manyeyes.agents.perception_cache import Eyes, Sight
-from manyeyes.agents.strategies.intermediate import tokens_around
-from manyeyes.agents.strategies.message_header import header
-from manyeyes.agents.strategies.redundancy import unsaid
+from manyeyes.agents.agent import EGO_HALF_SIZE_M, Agent
+from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
+from manyeyes.agents.strategies.intermediate import gather_ego_tokens
+from manyeyes.agents.strategies.message_header import make_header
+from manyeyes.agents.strategies.redundancy import novelty_score
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox
-from manyeyes.comms.token_selection import within_budget
+from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, Sites, Snapshot, SparseBev
 from manyeyes.models import pretrained
 from manyeyes.models.detector.box_head import DecodeConfig, decode
 from manyeyes.models.detector.detector import Detector, DetectorConfig
 from manyeyes.models.detector.encoder import STRIDES, EncoderConfig
-from manyeyes.models.detector.fold_norms import folded
+from manyeyes.models.detector.fold_norms import fold_norms
 from manyeyes.models.detector.layers import ActiveNorm
 from manyeyes.models.detector.presets import OPV2V_GRID
-from manyeyes.models.detector.pruning import FocalPrune, Pruned
+from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.models.detector.transformer import AttentionConfig
-from manyeyes.models.fusion.transform_tokens import Part, gather
+from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
 from manyeyes.ops.window_attention import AttentionCost, attention_cost, plan_windows, window_ids
 from manyeyes.studies.provenance import write_json
-from manyeyes.training.detector.targets import TargetConfig, objects_near
+from manyeyes.training.detector.targets import TargetConfig, find_nearby_objects
 
 CANDIDATES = 200
 PRUNED_AT = (2, 4)
@@ -80,7 +80,7 @@ WIDE = Widths((64, 128, 256), (3, 5, 8), 64, 128, 128, 3.0, 8.0)
 SMALL = Widths((32, 64, 128), (2, 2, 2), 32, 64, 64, 1.8, 3.0)
 
 
-def dense_rival(widths: Widths) -> DensePointPillars:
+def dense_baseline(widths: Widths) -> DensePointPillars:
     return DensePointPillars(
         DenseConfig(OPV2V_GRID, widths.pillar_channels, widths.channels, widths.extra_layers, widths.up)
     )
@@ -113,8 +113,8 @@ class GivenPrune(FocalPrune):
         super().__init__(channels)
         self.kept: Tensor | None = None
 
-    def forward(self, x: SparseBev, threshold: float) -> tuple[SparseBev, Pruned]:
-        pruned = Pruned(x.sites, self.score(x.features)[:, 0])
+    def forward(self, x: SparseBev, threshold: float) -> tuple[SparseBev, PruneOutput]:
+        pruned = PruneOutput(x.sites, self.score(x.features)[:, 0])
         likely = torch.sigmoid(pruned.logit) > threshold
         if self.kept is None:
             return x, pruned
@@ -141,12 +141,12 @@ def random_detector(config: DetectorConfig, frames: list[AgentFrame]) -> Detecto
     momenta = [m.momentum for m in norms]
     for norm in norms:
         norm.momentum = None  # pyright: ignore[reportAttributeAccessIssue]
-    eyes = Eyes(model.train())
+    cache = PerceptionCache(model.train())
     with torch.inference_mode():
-        eyes.see_cloud(frames[0].points)
+        cache.run_detector(frames[0].points)
     for norm, momentum in zip(norms, momenta):
         norm.momentum = momentum
-    return folded(model)
+    return fold_norms(model)
 
 
 def set_kept(model: Detector, kept: Kept | None) -> None:
@@ -170,16 +170,16 @@ class Sparse:
 
     def __init__(self, model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -> None:
         self.model, self.frames, self.kept = model, frames, kept
-        self.sites, self.message_bytes = self._look()
+        self.sites, self.message_bytes = self._count_sites()
 
-    def _look(self) -> tuple[tuple[int, ...], float]:
+    def _count_sites(self) -> tuple[tuple[int, ...], float]:
         counts, sizes = [], []
         for i, frame in enumerate(self.frames):
             set_kept(self.model, self.kept[i] if self.kept else None)
             agent = Agent(self.model)
             sizes.append(sum(map(len, agent.share(frame))))
-            seen = self.model.see([frame.points])
-            counts.append((*seen.sites_per_stride, len(seen.pruned[-1].sites), len(seen.tokens.sites)))
+            encoded = self.model.extract_features([frame.points])
+            counts.append((*encoded.sites_per_stride, len(encoded.pruned[-1].sites), len(encoded.tokens.sites)))
         return tuple(sum(c) for c in zip(*counts)), sum(sizes) / len(sizes)
 
     def once(self) -> Times:
@@ -202,7 +202,7 @@ class Dense:
 
     def once(self) -> Times:
         began, messages = _clock(), []
-        own = self.model.see(self.frames[0].points)
+        own = self.model.extract_maps(self.frames[0].points)
         messages.append(self.model.pack(own))
         messages += [self.model.share(frame.points) for frame in self.frames[1:]]
         shared = _clock()
@@ -248,53 +248,53 @@ class Staged:
 
 def staged(model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -> Staged:
     """The path of share and perceive, written out stage by stage."""
-    watch, messages, own = Stopwatch(), [], None
+    stopwatch, messages, own = Stopwatch(), [], None
     attention = {}
     for i, frame in enumerate(frames):
         set_kept(model, kept[i] if kept else None)
         x = model.pillars([frame.points])
-        watch.lap("pillars")
+        stopwatch.lap("pillars")
         tokens = model.encoder(x, model.config.prune_threshold).tokens
-        watch.lap("encoder")
+        stopwatch.lap("encoder")
         sites = tokens.sites
         tokens = tokens.with_features(model.dast(tokens.features, sites.xy, sites.batch, sites.grid, sites.cache))
-        watch.lap("DAST")
+        stopwatch.lap("DAST")
         if not i:
             attention["DAST, the ego's tokens"] = pairs(model.config.dast, sites.xy, sites.batch, sites.grid)
         tokens, _ = model.token_prune(tokens, model.config.prune_threshold)
-        raw = model.look(tokens)
-        told = model.tell(tokens, raw)
-        watch.lap("head")
-        sight = Sight(told, told, raw, model.config.decode)
-        eyes = Eyes(model, known={(frame.agent_id, frame.timestamp_ns): sight})
-        some, score = within_budget(told, unsaid(eyes, frame), 1 << 17, "float16")
-        watch.lap("selection")
-        message = replace(header(frame, model.fingerprint), tokens=some, token_score=score)
-        messages.append(wire.encode(message, precision="float16"))
-        watch.lap("to bytes")
-        own = own or told
+        raw = model.predict(tokens)
+        shared_tokens = model.make_tokens(tokens, raw)
+        stopwatch.lap("head")
+        output = AgentOutput(shared_tokens, shared_tokens, raw, model.config.decode)
+        cache = PerceptionCache(model, feature_cache={(frame.agent_id, frame.timestamp_ns): output})
+        some, score = select_within_budget(shared_tokens, novelty_score(cache, frame), 1 << 17, "float16")
+        stopwatch.lap("selection")
+        message = replace(make_header(frame, model.fingerprint), tokens=some, token_score=score)
+        messages.append(wire.encode(message, token_encoding="float16"))
+        stopwatch.lap("to bytes")
+        own = own or shared_tokens
     assert own is not None
     inbox = Inbox(model.fingerprint)
     for packet in (p for packets in messages[1:] for p in packets):
         inbox.push(packet)
-    heard = inbox.messages()
-    watch.lap("from bytes")
-    together, _ = tokens_around(frames[0], own, (), heard)
-    fused = model.merge(together)
-    watch.lap("gather, FAST")
-    raw = model.refine(fused.bev, fused.given)
-    watch.lap("refine")
+    messages_received = inbox.messages()
+    stopwatch.lap("from bytes")
+    together, _ = gather_ego_tokens(frames[0], own, (), messages_received)
+    fused = model.fuse_tokens(together)
+    stopwatch.lap("gather, FAST")
+    raw = model.refine(fused.bev, fused.merged_proposals)
+    stopwatch.lap("refine")
     boxes = decode(raw, model.config.decode)[0]
-    watch.lap("boxes, NMS")
+    stopwatch.lap("boxes, NMS")
     attention["FAST, all agents' tokens"] = pairs(
         model.config.fusion_attention, together.xy, together.ego, together.grid
     )
-    return Staged(watch.spent, attention, boxes)
+    return Staged(stopwatch.spent, attention, boxes)
 
 
 def pairs(config: AttentionConfig, xy: Tensor, batch: Tensor, grid: BevGrid) -> AttentionCost:
     """Of one layer with windows that are not shifted."""
-    ids = window_ids(xy, batch, (grid.x_min, grid.y_min), config.window * grid.cell)
+    ids = window_ids(xy, batch, (grid.x_min, grid.y_min), config.window * grid.cell_size_m)
     return attention_cost(plan_windows(ids, ids), config.window, math.prod(grid.shape))
 
 
@@ -309,15 +309,19 @@ def _times(began: float, shared: float, ended: float, agents: int) -> Times:
 
 def aim_threshold(model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -> None:
     """Set the score threshold so that CANDIDATES cells, or all if fewer, pass it in the ego's frame."""
-    parts, eyes = [], Eyes(model)
+    parts, cache = [], PerceptionCache(model)
     for i, frame in enumerate(frames):
         set_kept(model, kept[i] if kept else None)
-        told = eyes.see_cloud(frame.points).told
+        shared_tokens = cache.run_detector(frame.points).shared_tokens
         motion = frames[0].world_from_agent.inverse() @ frame.world_from_agent if i else None
-        parts.append(Part(0, told.features, told.sites.xy, motion))
-    raw = eyes.fuse(gather(parts, model.token_grid, 1))
-    power = DecodeConfig().overlap_power
-    best = (torch.sigmoid(raw.heat) ** (1 - power) * torch.sigmoid(raw.overlap) ** power).sort(descending=True).values
+        parts.append(AgentTokens(0, shared_tokens.features, shared_tokens.sites.xy, motion))
+    raw = cache.fuse(to_ego_frame(parts, model.token_grid, 1))
+    power = DecodeConfig().iou_score_weight
+    best = (
+        (torch.sigmoid(raw.heatmap_logit) ** (1 - power) * torch.sigmoid(raw.iou_logit) ** power)
+        .sort(descending=True)
+        .values
+    )
     threshold = float(best[CANDIDATES]) if len(best) > CANDIDATES else 0.0
     model.config = replace(model.config, decode=DecodeConfig(score_threshold=threshold))
 
@@ -333,13 +337,13 @@ def kept_by_model(model: Detector, frames: list[AgentFrame], head_stride: int) -
     wide.config, wide.pillars.grid = replace(config, grid=grid), grid.at(1)
     kept = []
     for frame in frames:
-        pruned = wide.see([frame.points], [frame.points]).pruned
+        pruned = wide.extract_features([frame.points], [frame.points]).pruned
         masks = [_mask(p.sites, torch.sigmoid(p.logit) > config.prune_threshold) for p in pruned]
         kept.append(Kept(tuple(masks[:-1]), _restride(masks[-1], wide.token_grid, head_stride)))
     return kept
 
 
-def kept_by_truth(snapshot: Snapshot, head_stride: int, share_of_rest: float = 0.1) -> list[Kept]:
+def kept_by_truth(snapshot: Snapshot, head_stride: int, background_fraction: float = 0.1) -> list[Kept]:
     """Emulated: the cells near a listed box, as pruning is taught, and a tenth of all others."""
     assert snapshot.truth is not None
     random = torch.Generator().manual_seed(0)
@@ -347,8 +351,8 @@ def kept_by_truth(snapshot: Snapshot, head_stride: int, share_of_rest: float = 0
     def mask(stride: int, boxes: Boxes) -> Tensor:
         grid = OPV2V_GRID.at(stride)
         every = Sites(torch.arange(grid.shape[0] * grid.shape[1]), grid)
-        rest = torch.rand(len(every), generator=random) < share_of_rest
-        return (objects_near(every, [boxes], TargetConfig()) >= 0) | rest
+        rest = torch.rand(len(every), generator=random) < background_fraction
+        return (find_nearby_objects(every, [boxes], TargetConfig()) >= 0) | rest
 
     kept = []
     for i, frame in enumerate(snapshot.frames):
@@ -392,7 +396,7 @@ class Row:
 def compare(widths: Widths, snapshot: Snapshot, kept: list[Kept], head_stride: int, rounds: int) -> list[Row]:
     """The least time of each contender over the rounds; they run in turn."""
     frames = list(snapshot.frames)
-    dense = Dense(dense_rival(widths), frames)
+    dense = Dense(dense_baseline(widths), frames)
     contenders: list[Dense | Sparse] = [dense]
     for cells in (None, kept):
         model = random_detector(sparse_config(widths, head_stride), frames)
@@ -429,7 +433,7 @@ def _check(stages: Staged, sparse: Sparse) -> None:
         set_kept(sparse.model, sparse.kept[i] if sparse.kept else None)
         packets.append(agent.share(frame))
     found = agents[0].perceive(sparse.frames[0], (p for message in packets[1:] for p in message)).boxes
-    own = (stages.boxes.center[:, :2].abs() <= torch.tensor(OWN_BODY_M)).all(1)
+    own = (stages.boxes.center[:, :2].abs() <= torch.tensor(EGO_HALF_SIZE_M)).all(1)
     if not torch.equal(stages.boxes[~own].center, found.center):
         raise RuntimeError(
             "The stages of the benchmark are no longer those of share and perceive; bring them up to date."
@@ -491,9 +495,9 @@ def main() -> None:
     snapshot = street()
     load = os.getloadavg()[0]
     with torch.inference_mode():
-        if wanted.weights != "truth" and (wanted.weights or pretrained.DEFAULT in pretrained.names()):
-            source = f"kept as {wanted.weights or pretrained.DEFAULT} does"
-            weights = pretrained.load(wanted.weights or pretrained.DEFAULT)
+        if wanted.weights != "truth" and (wanted.weights or pretrained.DEFAULT_DETECTOR in pretrained.list_detectors()):
+            source = f"kept as {wanted.weights or pretrained.DEFAULT_DETECTOR} does"
+            weights = pretrained.load(wanted.weights or pretrained.DEFAULT_DETECTOR)
             kept = {s: kept_by_model(weights, list(snapshot.frames), s) for s in wanted.head_stride}
         else:
             source = "pruning emulated from truth: cells near a listed box and a tenth of the rest"

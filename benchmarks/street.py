@@ -8,11 +8,11 @@ import math
 import numpy as np
 import torch
 
-from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, HeightField, Primitives
-from manyeyes.simulator.scene.vehicle_shapes import place_bodies, rotation_of, vehicle_body
-from manyeyes.simulator.sensors.lidar import Scene, lidar_spec, scan
+from manyeyes.simulator.scene.vehicle_shapes import make_vehicle_shape, place_vehicle_shapes, rotation_from_yaw_pitch
+from manyeyes.simulator.sensors.lidar import RaycastScene, lidar_spec, scan
 
 CARS, BUILDINGS, POLES, TREES = 55, 40, 40, 50
 ROAD_HALF_M = 8.0
@@ -25,20 +25,22 @@ def street(agents: int = 5, seed: int = 0) -> Snapshot:
     sizes = np.stack([rng.uniform(4.0, 5.0, CARS), rng.uniform(1.7, 2.0, CARS), rng.uniform(1.4, 1.8, CARS)], 1)
     ids = np.arange(1, CARS + 1)
     zero = np.zeros(CARS)
-    bodies = [vehicle_body("car", (size[0], size[1], size[2]), seed, int(i)) for i, size in zip(ids, sizes)]
-    scene = Scene(Primitives.cat([place_bodies(bodies, position, yaw, zero, ids), _clutter(rng)]), _flat())
+    bodies = [make_vehicle_shape("car", (size[0], size[1], size[2]), seed, int(i)) for i, size in zip(ids, sizes)]
+    scene = RaycastScene(
+        Primitives.cat([place_vehicle_shapes(bodies, position, yaw, zero, ids), _clutter(rng)]), _flat()
+    )
     center = torch.from_numpy(position + np.stack([zero, zero, sizes[:, 2] / 2], 1))
     boxes = Boxes.of(center, torch.from_numpy(sizes), torch.from_numpy(yaw), id=torch.from_numpy(ids))
     chosen = np.argsort(np.hypot(position[:, 0], position[:, 1]), kind="stable")[2 : 2 + 3 * agents : 3]
-    frames, seen = [], []
+    frames, visible = [], []
     for i in chosen:
         pose = Transform(
-            torch.from_numpy(rotation_of(yaw[i : i + 1], zero[:1])[0]), torch.from_numpy(position[i].copy())
+            torch.from_numpy(rotation_from_yaw_pitch(yaw[i : i + 1], zero[:1])[0]), torch.from_numpy(position[i].copy())
         )
         cloud, instance = scan(scene, pose, lidar_spec("opv2v"), ("street", seed, int(i)), own=int(ids[i]))
         frames.append(AgentFrame.of(cloud, pose, agent_id=int(ids[i])))
-        seen.append(torch.from_numpy(np.isin(ids, instance)))
-    truth = Truth(boxes, torch.stack(seen), Transform.stack([f.world_from_agent for f in frames]))
+        visible.append(torch.from_numpy(np.isin(ids, instance)))
+    truth = GroundTruth(boxes, torch.stack(visible), Transform.stack([f.world_from_agent for f in frames]))
     return Snapshot("street", 0, tuple(frames), truth)
 
 
@@ -77,7 +79,7 @@ def _clutter(rng: np.random.Generator) -> Primitives:
         wide = rng.uniform(1.2, 2.5)
         rows.append((ELLIPSOID, (x, y, 4.0), (wide, wide, 2.0), 0.9, 0.35))
     kind, center, half, density, bright = zip(*rows)
-    turns = rotation_of(rng.uniform(0, math.pi, len(rows)), np.zeros(len(rows)))
+    turns = rotation_from_yaw_pitch(rng.uniform(0, math.pi, len(rows)), np.zeros(len(rows)))
     return Primitives(
         np.array(kind, np.uint8), np.array(center), turns, np.array(half), np.array(density),
         np.zeros(len(rows), np.int64), np.array(bright),

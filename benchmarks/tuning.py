@@ -19,49 +19,56 @@ from pathlib import Path
 import torch
 
 from manyeyes import Agent, Opv2vRecording, load_detector
-from manyeyes.agents.perception_cache import Eyes, Sight
-from manyeyes.agents.strategies import Collaboration, Intermediate, Late
+from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
+from manyeyes.agents.strategies import FusionStrategy, IntermediateFusion, LateFusion
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot
-from manyeyes.evaluation.detection.average_precision import FrameResult, average_precisions, ego_truth, protocol_named
+from manyeyes.evaluation.detection.average_precision import (
+    FrameResult,
+    average_precisions,
+    get_protocol,
+    select_ego_truth,
+)
 from manyeyes.models.detector.box_head import DecodeConfig, RawBoxes, decode
-from manyeyes.models.fusion.transform_tokens import Part
+from manyeyes.models.fusion.transform_tokens import AgentTokens
 
-REACH_M = 70.0
+MAX_RANGE_M = 70.0
 HISTORY = 3
 SETTINGS = tuple(itertools.product((0.05, 0.15, 0.30), (0.4, 0.6, 0.8)))
 
 
-class DecodedOtherwise(Eyes):
+class RedecodingCache(PerceptionCache):
     """What other eyes saw, decoded with another setting."""
 
-    def __init__(self, eyes: Eyes, setting: DecodeConfig) -> None:
-        super().__init__(eyes.detector)
-        self._eyes, self._setting = eyes, setting
+    def __init__(self, cache: PerceptionCache, setting: DecodeConfig) -> None:
+        super().__init__(cache.detector)
+        self._cache, self._setting = cache, setting
 
-    def see(self, frame: AgentFrame) -> Sight:
-        return replace(self._eyes.see(frame), config=self._setting)
+    def process(self, frame: AgentFrame) -> AgentOutput:
+        return replace(self._cache.process(frame), config=self._setting)
 
-    def past(self, frame: AgentFrame, instants: int = 2) -> list[Part]:
-        return self._eyes.past(frame, instants)
+    def previous_tokens(self, frame: AgentFrame, num_frames: int = 2) -> list[AgentTokens]:
+        return self._cache.previous_tokens(frame, num_frames)
 
     def decode(self, raw: RawBoxes) -> Boxes:
         return decode(raw, self._setting)[0]
 
 
-def heard_by_first(snapshot: Snapshot) -> list[AgentFrame]:
+def frames_in_range(snapshot: Snapshot) -> list[AgentFrame]:
     """The other agents within reach of the ego."""
     places = [f.world_from_agent.translation[:2].tolist() for f in snapshot.frames]
-    return [f for f, place in zip(snapshot.frames[1:], places[1:]) if math.dist(place, places[0]) <= REACH_M]
+    return [f for f, place in zip(snapshot.frames[1:], places[1:]) if math.dist(place, places[0]) <= MAX_RANGE_M]
 
 
-def perceive(way: Collaboration, eyes: dict[int, Eyes], setting: DecodeConfig, snapshot: Snapshot) -> Boxes:
+def perceive(
+    strategy: FusionStrategy, caches: dict[int, PerceptionCache], setting: DecodeConfig, snapshot: Snapshot
+) -> Boxes:
     """What the first agent finds with this way to collaborate, through bytes; eyes of every agent by its id."""
 
     def agent(frame: AgentFrame) -> Agent:
-        own = DecodedOtherwise(eyes[frame.agent_id], setting)
-        return Agent(own.detector, way, eyes=own)
+        own = RedecodingCache(caches[frame.agent_id], setting)
+        return Agent(own.detector, strategy, perception_cache=own)
 
-    packets = [p for frame in heard_by_first(snapshot) for p in agent(frame).share(frame)]
+    packets = [p for frame in frames_in_range(snapshot) for p in agent(frame).share(frame)]
     ego = snapshot.frames[0]
     return agent(ego).perceive(ego, packets).boxes
 
@@ -79,24 +86,24 @@ def main() -> None:
         print(f"not run: {options.data} is absent; make it with 'manyeyes simulate --preset towns-small'")
         return
     detector, recording = load_detector(options.weights), Opv2vRecording(options.data, options.split)
-    grid, base = detector.config.range, detector.config.decode
+    grid, base = detector.config.detection_range, detector.config.decode
     box = (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
-    protocol = protocol_named("manyeyes").within(box)
+    protocol = get_protocol("manyeyes").with_range(box)
     found: dict[tuple[str, float, float], list[FrameResult]] = defaultdict(list)
     for scenario in recording.scenarios:
-        eyes: dict[int, Eyes] = defaultdict(lambda: Eyes(detector))
-        judged = recording.judged(scenario)
-        for index in range(max(0, judged.start - HISTORY), judged.stop):
+        caches: dict[int, PerceptionCache] = defaultdict(lambda: PerceptionCache(detector))
+        eval_indices = recording.eval_indices(scenario)
+        for index in range(max(0, eval_indices.start - HISTORY), eval_indices.stop):
             snapshot = recording.snapshot(scenario, index)
             for frame in snapshot.frames:
-                eyes[frame.agent_id].see(frame)
-            if index not in judged[:: options.every]:
+                caches[frame.agent_id].process(frame)
+            if index not in eval_indices[:: options.every]:
                 continue
-            truth = ego_truth(snapshot, 0, protocol)
+            truth = select_ego_truth(snapshot, 0, protocol)
             for nms_iou, power in SETTINGS:
-                setting = replace(base, nms_iou=nms_iou, overlap_power=power)
-                for way in (Late(nms_iou=nms_iou), Intermediate()):
-                    boxes = perceive(way, eyes, setting, snapshot)
+                setting = replace(base, nms_iou=nms_iou, iou_score_weight=power)
+                for way in (LateFusion(nms_iou=nms_iou), IntermediateFusion()):
+                    boxes = perceive(way, caches, setting, snapshot)
                     found[way.name, nms_iou, power].append(FrameResult(scenario, index, boxes, truth))
     rows = []
     for (name, nms_iou, power), results in sorted(found.items()):

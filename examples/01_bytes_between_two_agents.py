@@ -40,7 +40,7 @@ for agent_id, pose in poses.items():
 
 packets = Agent(detector).share(road[-1])  # bytes, each packet fit for one radio frame, the most important first
 alone, together = Agent(detector).perceive(road[1]), Agent(detector).perceive(road[1], packets)
-print(f"{sum(map(len, packets))} bytes in {len(packets)} packets from {len(together.heard)} agent")
+print(f"{sum(map(len, packets))} bytes in {len(packets)} packets from {len(together.received)} agent")
 for name, boxes in (("alone", alone.boxes), ("together", together.boxes)):
     sure = boxes[boxes.score > 0.5]
     print(

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from manyeyes import Agent, Argoverse2Recording, load_detector
-from manyeyes.viz.birds_eye import draw, save_png, scene_of
+from manyeyes.viz.birds_eye import draw_scene, make_scene, save_png
 
 root = Path(sys.argv[1] if len(sys.argv) > 1 else "../shared/data/av2")
 if not root.is_dir():
@@ -19,7 +19,9 @@ perception = Agent(detector).perceive(first, packets)
 print(f"{sum(map(len, packets))} bytes from {len(second.points)} real points, {len(perception.boxes)} boxes")
 picture = Path(sys.argv[2] if len(sys.argv) > 2 else "two_real_sweeps.png")
 save_png(
-    draw(scene_of(snapshot, perception.boxes), detector.config.grid, "Two real sweeps as two agents", score_min=0.6),
+    draw_scene(
+        make_scene(snapshot, perception.boxes), detector.config.grid, "Two real sweeps as two agents", min_score=0.6
+    ),
     picture,
 )
 print(picture)

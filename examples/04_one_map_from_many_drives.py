@@ -8,18 +8,18 @@ import sys
 from pathlib import Path
 
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.maps.metrics import judge
+from manyeyes.evaluation.maps.metrics import evaluate_map
 from manyeyes.maps.elements.observation_file import read_observations, write_observations
 from manyeyes.maps.fusion.fuse import fuse
-from manyeyes.simulator.fleet.place import place
+from manyeyes.simulator.fleet.place import load_place
 from manyeyes.simulator.fleet.simulate import simulate_crowd
-from manyeyes.viz.map_page import page_of, save_map_page
+from manyeyes.viz.map_page import make_page, save_map_page
 
 page = Path(sys.argv[1] if len(sys.argv) > 1 else "out/crossroads.html")
 page.parent.mkdir(parents=True, exist_ok=True)
 
 # A crowd drives through a crossroads; each look is one Observation with a claimed pose, a view and some map elements.
-where = place("cross", size_m=160.0)
+where = load_place("cross", size_m=160.0)
 crowd = simulate_crowd(where, 60, seed=1)
 
 # Yours would come from a file, as docs/observation.md describes it: one row an observation.
@@ -27,16 +27,16 @@ file = page.with_name("observations.parquet")
 write_observations(file, crowd.observations, where.frame)
 observations = read_observations(file).observations
 
-made = fuse(observations, frame=where.frame).published()
-union = MapElements.cat([observation.in_map() for observation in observations])
-truth = where.in_area()
+made = fuse(observations, frame=where.frame).select_published()
+union = MapElements.cat([observation.elements_in_map() for observation in observations])
+truth = where.clip_to_area()
 for name, elements in (("fused", made.elements), ("union", union)):
-    quality = judge(where.in_area(elements), truth)
-    divider = quality.length("divider")
+    quality = evaluate_map(where.clip_to_area(elements), truth)
+    divider = quality.get_length_score("divider")
     print(
         f"{name}: {len(elements)} elements, mAP {quality.mean_ap():.2f}, dividers: precision {divider.precision:.2f}, "
-        f"recall {divider.recall:.2f}, duplication {quality.of('divider').duplication:.2f}"
+        f"recall {divider.recall:.2f}, duplication {quality.get_kind('divider').duplication:.2f}"
     )
 
-save_map_page(page_of("Crossroads", made, truth, union, len(observations)), page)
+save_map_page(make_page("Crossroads", made, truth, union, len(observations)), page)
 print(f"{page} shows it")

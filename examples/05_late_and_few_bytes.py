@@ -24,9 +24,10 @@ on_air: list[bytes] = []
 for index in range(drive.length(scenario)):
     frames = drive.snapshot(scenario, index).frames
     ego = frames[0]
-    heard = agents[ego.agent_id].perceive(ego, on_air)
-    alone = agents[ego.agent_id].perceive(ego)
+    cooperative = agents[ego.agent_id].perceive(ego, on_air)
+    ego_only = agents[ego.agent_id].perceive(ego)
     print(
-        f"{ego.timestamp_ns / 1e9:.1f} s: {len(alone.boxes)} boxes alone, {len(heard.boxes)} with {sum(map(len, on_air))} bytes"
+        f"{ego.timestamp_ns / 1e9:.1f} s: {len(ego_only.boxes)} boxes alone, {len(cooperative.boxes)} with "
+        f"{sum(map(len, on_air))} bytes"
     )
     on_air = [packet for frame in frames[1:] for packet in agents[frame.agent_id].share(frame)]

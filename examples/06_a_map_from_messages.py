@@ -8,17 +8,17 @@ import numpy as np
 import torch
 
 from manyeyes import AgentFrame, Inbox, PointCloud, Transform
-from manyeyes.agents.map_perception import SURVEYS, share_map
-from manyeyes.agents.map_server import Cartographer
-from manyeyes.evaluation.maps.metrics import judge
+from manyeyes.agents.map_perception import MAP_MODES, encode_map_message
+from manyeyes.agents.map_server import MapServer
+from manyeyes.evaluation.maps.metrics import evaluate_map
 from manyeyes.simulator.fleet.config import crowd_config
-from manyeyes.simulator.fleet.map_predictor import Eyewitness
-from manyeyes.simulator.fleet.place import clip_to_box, place
+from manyeyes.simulator.fleet.map_predictor import SimulatedMapPredictor
+from manyeyes.simulator.fleet.place import clip_to_box, load_place
 
-where = place("cross", size_m=100.0)
-truth = where.in_area()
-witness, window = Eyewitness(where.truth, crowd_config("local")), SURVEYS["local"].vehicle
-service, inbox = Cartographer(where.frame), Inbox()
+where = load_place("cross", size_m=100.0)
+truth = where.clip_to_area()
+predictor, window = SimulatedMapPredictor(where.truth, crowd_config("local")), MAP_MODES["local"].vehicle_window
+service, inbox = MapServer(where.frame), Inbox()
 
 spent = 0
 for instant in range(8):
@@ -26,7 +26,7 @@ for instant in range(8):
         # Three vehicles come in on each of four arms, one behind the other, at 10 m/s, looking once a second.
         heading, away = vehicle % 4 * np.pi / 2, 30.0 + 12.0 * (vehicle // 4) - 10.0 * instant
         pose = np.array([-away * np.cos(heading), -away * np.sin(heading), heading])
-        seen = witness.see(pose, window, vehicle, instant)
+        local_map = predictor.predict(pose, window, vehicle, instant)
         # Each is wrong about where it is, and says by how much it may be.
         error = np.random.default_rng([vehicle, instant]).normal(0.0, [0.3, 0.3, 0.005])
         x, y, yaw = (pose + error).tolist()
@@ -37,16 +37,18 @@ for instant in range(8):
             world_from_agent=Transform.from_xyz_yaw(x, y, 0.0, yaw),
             pose_covariance=torch.diag(torch.tensor([0.09, 0.09, 2.5e-5], dtype=torch.float64)),
         )
-        packets = share_map(frame, seen)
+        packets = encode_map_message(frame, local_map)
         spent += sum(map(len, packets))
         for packet in packets:
             inbox.push(packet)
-        service.listen(inbox.receptions())
-    now = service.map().published()
-    quality = judge(clip_to_box(now.elements, where.area), truth)
+        service.ingest(inbox.received_messages())
+    now = service.map().select_published()
+    quality = evaluate_map(clip_to_box(now.elements, where.area), truth)
     print(
         f"{instant} s: {len(service.observations)} messages, {spent} bytes, {len(now)} elements, mAP {quality.mean_ap():.2f}"
     )
 
-made = service.fold().published()
-print(f"all at once: {len(made)} elements, mAP {judge(clip_to_box(made.elements, where.area), truth).mean_ap():.2f}")
+made = service.rebuild().select_published()
+print(
+    f"all at once: {len(made)} elements, mAP {evaluate_map(clip_to_box(made.elements, where.area), truth).mean_ap():.2f}"
+)

@@ -7,17 +7,17 @@ The street is made here (extra 'sim'); nothing of it was in training. The first 
 import sys
 from pathlib import Path
 
-from manyeyes.agents.map_features import draw_tile, receive, share_look
-from manyeyes.evaluation.maps.metrics import judge
-from manyeyes.evaluation.maps.tile_sampling import upright
-from manyeyes.evaluation.maps.tiles import cut_to
-from manyeyes.maps.roads.ground_truth import TruthPolicy, map_truth
+from manyeyes.agents.map_features import decode_map_features, encode_map_features, predict_tile
+from manyeyes.evaluation.maps.metrics import evaluate_map
+from manyeyes.evaluation.maps.tile_sampling import make_world_from_tile
+from manyeyes.evaluation.maps.tiles import crop_to_tile
+from manyeyes.maps.roads.ground_truth import GroundTruthPolicy, build_ground_truth_map
 from manyeyes.models import pretrained
 from manyeyes.simulator.scene.scenario import ScenarioSpec, make_scenario
 from manyeyes.simulator.scene.towns import load_town
-from manyeyes.viz.map_figures import Panel, save_figure
+from manyeyes.viz.map_figures import MapPanel, save_figure
 
-mapper = pretrained.load_mapper()
+mapper = pretrained.load_map_model()
 town = load_town("generated-3")
 spec = ScenarioSpec(
     "generated-3", seed=3, name="street", vehicles=4, frames=2, history_frames=0, roadside_chance=1.0, density=6.0
@@ -27,17 +27,19 @@ frames = scene.snapshot(0).frames
 
 messages, spent = [], []
 for frame in frames:
-    packets = share_look(mapper, frame)
-    messages.append(receive(packets, mapper))
+    packets = encode_map_features(mapper, frame)
+    messages.append(decode_map_features(packets, mapper))
     spent.append(sum(map(len, packets)))
 
-world_from_tile = upright(frames[0])
-truth = cut_to(map_truth(town, TruthPolicy(boundary="pavement")), world_from_tile, mapper.config.tile)
+world_from_tile = make_world_from_tile(frames[0])
+truth = crop_to_tile(
+    build_ground_truth_map(town, GroundTruthPolicy(boundary="pavement")), world_from_tile, mapper.config.tile
+)
 panels = []
 for count in (1, len(frames)):
-    drawn = draw_tile(mapper, [m for m in messages[:count] if m is not None], world_from_tile)
-    quality = judge(drawn, truth)
-    said = ", ".join(f"{kind} {quality.ap(kind, 'maptr'):.2f}" for kind in ("divider", "boundary"))
-    print(f"{count} looks, {sum(spent[:count]):,} bytes: {len(drawn)} elements, AP of {said}")
-    panels.append(Panel(f"From {count} looks", drawn.take(drawn.score >= 0.3), truth))
+    drawn = predict_tile(mapper, [m for m in messages[:count] if m is not None], world_from_tile)
+    quality = evaluate_map(drawn, truth)
+    ap_text = ", ".join(f"{kind} {quality.get_ap(kind, 'maptr'):.2f}" for kind in ("divider", "boundary"))
+    print(f"{count} looks, {sum(spent[:count]):,} bytes: {len(drawn)} elements, AP of {ap_text}")
+    panels.append(MapPanel(f"From {count} looks", drawn.take(drawn.score >= 0.3), truth))
 save_figure(panels, Path(sys.argv[1] if len(sys.argv) > 1 else "street.png"))

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import manyeyes
-from manyeyes._jit import _OneAtATime, njit
+from manyeyes._jit import _LockedIndexFile, njit
 
 
-class _Slow(_OneAtATime):
+class _Slow(_LockedIndexFile):
     """Between reading the index and writing it, the other process comes."""
 
     def _load_index(self) -> Any:
@@ -38,7 +38,7 @@ def test_two_processes_keep_both_variants(tmp_path: Path) -> None:
     for process in both:
         process.join(60)
         assert process.exitcode == 0
-    index = _OneAtATime(str(tmp_path), "loop", "stamp")
+    index = _LockedIndexFile(str(tmp_path), "loop", "stamp")
     assert [index.load(key) for key in ("one", "two", "three")] == ["the code of one", "the code of two", None]
 
 
@@ -47,7 +47,7 @@ def test_loops_are_kept_so() -> None:
     def loop(n):  # pragma: no cover
         return n
 
-    assert isinstance(loop._cache._cache_file, _OneAtATime)
+    assert isinstance(loop._cache._cache_file, _LockedIndexFile)
 
 
 def test_every_loop_takes_njit_from_here() -> None:

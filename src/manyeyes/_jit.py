@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 
-class _OneAtATime(caching.IndexDataCacheFile):
+class _LockedIndexFile(caching.IndexDataCacheFile):
     """numba's index of a function's variants and of their files, locked while it is read or written."""
 
     def load(self, key: Any) -> Any:
@@ -53,7 +53,7 @@ class _OneAtATime(caching.IndexDataCacheFile):
         return FileLock(f"{self._index_path}.lock")
 
 
-caching.IndexDataCacheFile = _OneAtATime
+caching.IndexDataCacheFile = _LockedIndexFile
 
 # Arrays of compiled loops: element type and number of dimensions.
 Boolx1 = np.ndarray[tuple[int], np.dtype[np.bool_]]

@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.layers import ActiveNorm
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.models.maps.bev import BevConfig
 from manyeyes.models.maps.head import MapHeadConfig
-from manyeyes.models.maps.map_model import Mapper, MapperConfig
-from manyeyes.training.detector.samples import AugmentConfig, RoadConfig, make_sample
+from manyeyes.models.maps.map_model import MapModel, MapModelConfig
+from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig, make_sample
 from manyeyes.training.detector.step import forward
 
 TENTH_NS = 100_000_000
@@ -71,7 +71,7 @@ class Drive:
         frames = tuple(self.frames(index))
         boxes = self.cars(index).transform(self.world)
         seen = torch.ones(self.agents, len(boxes), dtype=torch.bool)
-        truth = Truth(boxes, seen, Transform.stack([frame.world_from_agent for frame in frames]))
+        truth = GroundTruth(boxes, seen, Transform.stack([frame.world_from_agent for frame in frames]))
         return Snapshot("drive", index, frames, truth)
 
 
@@ -84,12 +84,20 @@ def tiny_detector() -> Detector:
     """Tiny weights whose norms have seen something, and prune little; all that starts at zero speaks, the second look as well."""
     torch.manual_seed(0)
     model = Detector(replace(COSTR_TINY, prune_threshold=0.08))
-    moments, road = [Drive().snapshot(i) for i in range(4)], RoadConfig(past=2, late_share=0.5, late_frames=2)
+    moments, road = (
+        [Drive().snapshot(i) for i in range(4)],
+        DegradationConfig(ego_history=2, delay_prob=0.5, max_delay_frames=2),
+    )
     sample = make_sample(moments, 0, COSTR_TINY.grid, AugmentConfig.none(), ("norms",), road)
     fusion = model.fusion
     with torch.no_grad():
-        silent = (fusion.placement.outer, fusion.placement.temporal, fusion.past.out, fusion.past.ffn[2])
-        for linear in (*silent, fusion.settle.inner_trust, model.refine.out):
+        silent = (
+            fusion.encoding.outer,
+            fusion.encoding.temporal,
+            fusion.past_attention.out,
+            fusion.past_attention.ffn[2],
+        )
+        for linear in (*silent, fusion.merge.feature_weight, model.refine.out):
             torch.nn.init.normal_(linear.weight, std=0.1)
         for norm in (m for m in model.modules() if isinstance(m, ActiveNorm)):
             norm.momentum = 0.5
@@ -104,27 +112,38 @@ def detector() -> Detector:
     return tiny_detector()
 
 
-TINY_MAPPER = MapperConfig(
-    BevConfig(BevGrid(-8.0, -8.0, -2.0, 8.0, 8.0, 4.0, pillar=0.5), channels=16, raster_width=8, raster_blocks=(1, 1)),
+TINY_MAPPER = MapModelConfig(
+    BevConfig(
+        BevGrid(-8.0, -8.0, -2.0, 8.0, 8.0, 4.0, pillar=0.5), channels=16, raster_channels=8, raster_blocks=(1, 1)
+    ),
     BevGrid(-16.0, -8.0, -1.0, 16.0, 8.0, 1.0, pillar=1.0),
     token_channels=8,
-    neck=(1, 1),
-    head=MapHeadConfig(elements=6, points=5, channels=16, feed=32, layers=2, heads=4, least=0.0, threshold=0.0),
+    neck_blocks=(1, 1),
+    head=MapHeadConfig(
+        num_queries=6,
+        num_points=5,
+        channels=16,
+        feedforward_channels=32,
+        layers=2,
+        heads=4,
+        min_trace_score=0.0,
+        score_threshold=0.0,
+    ),
 )
 """Looks of 16 m by 16 m, tiles of 32 m by 16 m; no guess is too unsure to be followed and drawn."""
 
 
 @pytest.fixture(scope="session")
-def mapper() -> Mapper:
+def mapper() -> MapModel:
     """A map model that has learnt nothing."""
     torch.manual_seed(0)
-    model = Mapper(TINY_MAPPER).requires_grad_(False)
+    model = MapModel(TINY_MAPPER).requires_grad_(False)
     # Its norms know how features are spread, as after training; nothing else is learnt.
     for _ in range(30):
-        tokens = model.see(
+        tokens = model.extract_features(
             [PointCloud.of(torch.randn(200, 3) * torch.tensor([3.0, 3.0, 0.3])) for _ in range(2)]
         ).tokens
-        model.draw(model.fuse(tokens, Transform.stack([Transform.identity()] * 2), torch.tensor([0, 1]), 2))
+        model.predict_elements(model.fuse(tokens, Transform.stack([Transform.identity()] * 2), torch.tensor([0, 1]), 2))
     model.eval()
     model.fingerprint = bytes(range(8))
     return model

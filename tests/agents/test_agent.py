@@ -10,79 +10,90 @@ import pytest
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.perception_cache import Eyes
-from manyeyes.agents.strategies import METHODS, method
+from manyeyes.agents.perception_cache import PerceptionCache
+from manyeyes.agents.strategies import METHODS, get_strategy
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, PointCloud, Transform
 from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.detector import Detector
-from manyeyes.models.fusion.transform_tokens import Part, Tokens
-from manyeyes.training.detector.samples import AugmentConfig, RoadConfig, View, make_sample
+from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens
+from manyeyes.training.detector.samples import AgentView, AugmentConfig, DegradationConfig, make_sample
 from manyeyes.training.detector.step import forward
 
 NOW = 5
 
 
-class RecordingEyes(Eyes):
+class RecordingCache(PerceptionCache):
     """Keeps what the ego fused last; looks back at so many instants, and states velocities as the detector does."""
 
     raw: RawBoxes
-    heard: Tokens
-    remembered: Tokens | None
+    fused_tokens: Tokens
+    fused_past: Tokens | None
 
-    def __init__(self, detector: Detector, instants: int) -> None:
-        super().__init__(detector, tracks=None)
-        self.instants = instants
+    def __init__(self, detector: Detector, num_frames: int) -> None:
+        super().__init__(detector, velocity_config=None)
+        self.num_frames = num_frames
 
-    def past(self, frame: AgentFrame, instants: int = 2) -> list[Part]:
-        return super().past(frame, self.instants)
+    def previous_tokens(self, frame: AgentFrame, num_frames: int = 2) -> list[AgentTokens]:
+        return super().previous_tokens(frame, self.num_frames)
 
     def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
-        self.heard, self.remembered = tokens, past
+        self.fused_tokens, self.fused_past = tokens, past
         self.raw = super().fuse(tokens, past)
         return self.raw
 
 
-def told_by_bytes(drive, detector: Detector, views: Sequence[View], first: int) -> tuple[list[bytes], list[Message]]:
+def packets_and_messages(
+    drive, detector: Detector, views: Sequence[AgentView], first: int
+) -> tuple[list[bytes], list[Message]]:
     """Packets of those who had these views, and what they say: each looked when, and claims to be where, its view has it."""
     ego, packets, inbox = drive.frame(0, NOW).world_from_agent, [], Inbox(detector.fingerprint)
     for view in views:
         then = NOW - round(view.age_s / 0.1)
-        (true,) = (f for f in drive.frames(then) if torch.equal(f.points.xyz, view.now.xyz))
-        sender = Agent(detector, precision="float32", budget_bytes=None, eyes=Eyes(detector, tracks=None))
+        (true,) = (f for f in drive.frames(then) if torch.equal(f.points.xyz, view.cloud.xyz))
+        sender = Agent(
+            detector,
+            token_encoding="float32",
+            budget_bytes=None,
+            perception_cache=PerceptionCache(detector, velocity_config=None),
+        )
         if then > first:
             sender.share(drive.frame(true.agent_id, then - 1))
-        sigma = torch.tensor([view.doubt_xy_m, view.doubt_xy_m, view.doubt_yaw_rad]).double()
-        claim = replace(true, odometry=true.world_from_agent, world_from_agent=ego @ view.ego_from_view)
-        packets += sender.share(replace(claim, pose_covariance=(sigma**2).diag()))
+        sigma = torch.tensor([view.sigma_xy_m, view.sigma_xy_m, view.sigma_yaw_rad]).double()
+        noisy_frame = replace(true, odometry=true.world_from_agent, world_from_agent=ego @ view.ego_from_view)
+        packets += sender.share(replace(noisy_frame, pose_covariance=(sigma**2).diag()))
     for packet in packets:
         inbox.push(packet)
     return packets, list(inbox.messages())
 
 
-def as_said(drive, views: Sequence[View], messages: list[Message]) -> tuple[View, ...]:
+def with_received_sigmas(drive, views: Sequence[AgentView], messages: list[Message]) -> tuple[AgentView, ...]:
     """The views with the doubts that arrived: a standard deviation travels as a code of one byte."""
-    ego, said = drive.frame(0, NOW).world_from_agent, []
+    ego, result = drive.frame(0, NOW).world_from_agent, []
     for view in views:
         place = (ego @ view.ego_from_view).translation
         message = min(messages, key=lambda m: float(place.dist(m.world_from_agent.translation)))
         sigma = message.pose_covariance.diagonal().sqrt().tolist()
-        assert sigma[0] == pytest.approx(view.doubt_xy_m, rel=0.1) and sigma[2] == pytest.approx(
-            view.doubt_yaw_rad, rel=0.1
+        assert sigma[0] == pytest.approx(view.sigma_xy_m, rel=0.1) and sigma[2] == pytest.approx(
+            view.sigma_yaw_rad, rel=0.1
         )
-        said.append(replace(view, doubt_xy_m=sigma[0], doubt_yaw_rad=sigma[2]))
-    return tuple(said)
+        result.append(replace(view, sigma_xy_m=sigma[0], sigma_yaw_rad=sigma[2]))
+    return tuple(result)
 
 
 ROADS = {
-    "one sweep": (3, 1, RoadConfig()),
-    "two sweeps": (3, 2, RoadConfig()),
-    "past": (2, 4, RoadConfig(past=2)),
-    "alone with a past": (1, 4, RoadConfig(past=2)),
-    "late": (3, 4, RoadConfig(late_share=1.0, late_frames=2)),
-    "astray": (2, 2, RoadConfig(astray_share=1.0)),
-    "said before": (3, 4, RoadConfig(past=2, said=1)),
-    "all": (3, 5, RoadConfig(past=2, said=1, late_share=1.0, late_frames=2, astray_share=1.0)),
+    "one sweep": (3, 1, DegradationConfig()),
+    "two sweeps": (3, 2, DegradationConfig()),
+    "past": (2, 4, DegradationConfig(ego_history=2)),
+    "alone with a past": (1, 4, DegradationConfig(ego_history=2)),
+    "late": (3, 4, DegradationConfig(delay_prob=1.0, max_delay_frames=2)),
+    "astray": (2, 2, DegradationConfig(pose_noise_prob=1.0)),
+    "said before": (3, 4, DegradationConfig(ego_history=2, sender_history=1)),
+    "all": (
+        3,
+        5,
+        DegradationConfig(ego_history=2, sender_history=1, delay_prob=1.0, max_delay_frames=2, pose_noise_prob=1.0),
+    ),
 }
 
 
@@ -96,26 +107,29 @@ def test_training_forward_equals_share_bytes_perceive(drive, detector: Detector,
     some, first = drive(agents), NOW + 1 - moments
     seen = [some.snapshot(i) for i in range(first, NOW + 1)]
     sample = make_sample(seen, 0, detector.config.grid, AugmentConfig.none(), ("same", 1), road)
-    packets, messages = told_by_bytes(some, detector, sample.views[1:], first)
-    before, older = told_by_bytes(some, detector, sample.said, first)
-    assert len(sample.said) == road.said * (agents - 1)
-    views = (sample.views[0], *as_said(some, sample.views[1:], messages))
+    packets, messages = packets_and_messages(some, detector, sample.views[1:], first)
+    before, older = packets_and_messages(some, detector, sample.sender_history, first)
+    assert len(sample.sender_history) == road.sender_history * (agents - 1)
+    views = (sample.views[0], *with_received_sigmas(some, sample.views[1:], messages))
     with torch.no_grad():
-        trained = forward(detector, [replace(sample, views=views, said=as_said(some, sample.said, older))]).together
-    eyes = RecordingEyes(detector, road.past)
-    ego = Agent(detector, precision="float32", eyes=eyes)
+        trained = forward(
+            detector,
+            [replace(sample, views=views, sender_history=with_received_sigmas(some, sample.sender_history, older))],
+        ).fused_boxes
+    cache = RecordingCache(detector, road.ego_history)
+    ego = Agent(detector, token_encoding="float32", perception_cache=cache)
     for index in range(first, NOW):
         ego.perceive(some.frame(0, index), before if index == NOW - 1 else ())
     ego.perceive(some.frame(0, NOW), packets)
     # The case is what its name says, and there is something to compare.
-    heard = eyes.heard
-    assert len(sample.views) == agents and len(sample.past) == road.past and len(trained.sites) > 20
-    aged = bool(road.late_share or road.past or road.said)
-    assert bool(heard.age.any()) == aged and bool(heard.doubt.any()) == bool(road.astray_share)
-    assert (eyes.remembered is not None and len(eyes.remembered.features) > 20) == bool(road.past)
-    assert torch.equal(trained.sites.key, eyes.raw.sites.key)
+    fused_tokens = cache.fused_tokens
+    assert len(sample.views) == agents and len(sample.ego_history) == road.ego_history and len(trained.sites) > 20
+    aged = bool(road.delay_prob or road.ego_history or road.sender_history)
+    assert bool(fused_tokens.age.any()) == aged and bool(fused_tokens.sigma_m.any()) == bool(road.pose_noise_prob)
+    assert (cache.fused_past is not None and len(cache.fused_past.features) > 20) == bool(road.ego_history)
+    assert torch.equal(trained.sites.key, cache.raw.sites.key)
     for name in (f.name for f in fields(RawBoxes) if f.name != "sites"):
-        a, b = getattr(trained, name), getattr(eyes.raw, name)
+        a, b = getattr(trained, name), getattr(cache.raw, name)
         assert torch.allclose(a, b, atol=1e-5), (name, float((a - b).abs().max()))
 
 
@@ -129,9 +143,9 @@ def test_collaborators_change_what_the_ego_sees(drive, detector: Detector) -> No
 @pytest.mark.parametrize("name", METHODS)
 def test_an_empty_cloud_and_an_empty_inbox_give_no_error(detector: Detector, name: str) -> None:
     empty = AgentFrame.of(PointCloud.of(torch.zeros(0, 3)), Transform.identity(), agent_id=7)
-    agent = Agent(detector, method(name))
+    agent = Agent(detector, get_strategy(name))
     packets = agent.share(empty)
-    found = Agent(detector, method(name)).perceive(replace(empty, agent_id=8), packets)
+    found = Agent(detector, get_strategy(name)).perceive(replace(empty, agent_id=8), packets)
     assert len(found.boxes) == 0
 
 
@@ -155,10 +169,10 @@ def test_tokens_of_other_weights_change_nothing(drive, detector: Detector) -> No
     assert torch.equal(alone.bev(), strange.boxes.bev())
 
 
-def test_an_agent_does_not_hear_itself_nor_report_its_own_body(drive, detector: Detector) -> None:
+def test_an_agent_ignores_its_own_message_and_its_own_body(drive, detector: Detector) -> None:
     frame = drive(1).frame(0, 3)
     agent = Agent(detector)
-    assert agent.perceive(frame, agent.share(frame)).heard == ()
+    assert agent.perceive(frame, agent.share(frame)).received == ()
     boxes = agent.perceive(frame).boxes
     assert not bool(((boxes.center[:, 0].abs() <= 2.6) & (boxes.center[:, 1].abs() <= 1.3)).any())
 
@@ -166,19 +180,19 @@ def test_an_agent_does_not_hear_itself_nor_report_its_own_body(drive, detector: 
 def test_late_fusion_keeps_one_box_of_two_that_overlap(drive, detector: Detector) -> None:
     """What another says of the very same boxes adds none; the same boxes aside add all that lie in the ego's range."""
     frame = drive(1).frame(0, 3)
-    eyes, late = Eyes(detector), method("late")
-    said = late.say(eyes, frame)
-    assert said is not None and said.objects is not None
-    own = eyes.see(frame).boxes
-    assert len(late.hear(eyes, frame, [said])) == len(own) > 0
-    aside = replace(said, world_from_agent=frame.world_from_agent @ Transform.from_xyz_yaw(0.0, 200.0))
-    assert len(late.hear(eyes, frame, [aside])) == len(own)
+    cache, late = PerceptionCache(detector), get_strategy("late")
+    message = late.compose_message(cache, frame)
+    assert message is not None and message.objects is not None
+    own = cache.process(frame).boxes
+    assert len(late.fuse(cache, frame, [message])) == len(own) > 0
+    aside = replace(message, world_from_agent=frame.world_from_agent @ Transform.from_xyz_yaw(0.0, 200.0))
+    assert len(late.fuse(cache, frame, [aside])) == len(own)
     lattice = torch.cartesian_prod(torch.arange(-24.0, 25.0), torch.arange(-24.0, 25.0), torch.tensor([0.8]))
     free = lattice[torch.cdist(lattice[:, :2], own.center[:, :2]).min(1).values.argmax()][None]
-    one = replace(said, objects=replace(own[:1], center=free, size=torch.tensor([[0.5, 0.5, 1.5]])))
-    assert len(late.hear(eyes, frame, [one])) == len(own) + 1
+    one = replace(message, objects=replace(own[:1], center=free, size=torch.tensor([[0.5, 0.5, 1.5]])))
+    assert len(late.fuse(cache, frame, [one])) == len(own) + 1
 
 
-def test_an_unknown_method_lists_the_known() -> None:
+def test_an_unknown_strategy_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match=", ".join(METHODS)):
-        method("telepathy")
+        get_strategy("telepathy")

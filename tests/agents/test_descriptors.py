@@ -11,25 +11,28 @@ import torch
 
 from manyeyes.agents import pose_correction as module
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.descriptors import seen_points, told_points
-from manyeyes.agents.perception_cache import Eyes
-from manyeyes.agents.pose_correction import Aligner, Use
+from manyeyes.agents.descriptors import extract_message_keypoints, extract_own_keypoints
+from manyeyes.agents.perception_cache import PerceptionCache
+from manyeyes.agents.pose_correction import MessageUse, PoseCorrection
 from manyeyes.agents.strategies import METHODS
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message, PointCloud, Transform
 from manyeyes.datatypes.keypoints import Keypoints
-from manyeyes.datatypes.message import DESCRIPTOR
+from manyeyes.datatypes.message import DESCRIPTOR_DIM
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.models.pose.box_descriptors import BoxKeypoints
+from manyeyes.models.pose.box_descriptors import BoxKeypointConfig
 from manyeyes.models.pose.feakm import FORMAT, FeakmConfig, FeakmNet, Matches
-from manyeyes.models.pose.matcher import MatcherConfig, Points
-from manyeyes.pose.feakm import Feakm
+from manyeyes.models.pose.matcher import KeypointBatch, MatcherConfig
+from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.types import PoseStatus
 
 CHANNELS = COSTR_TINY.encoder.channels[2]
-NET = FeakmConfig(BoxKeypoints(CHANNELS, DESCRIPTOR, 16, score_min=0.1, most=6), MatcherConfig(DESCRIPTOR, 16, 1, 1))
+NET = FeakmConfig(
+    BoxKeypointConfig(CHANNELS, DESCRIPTOR_DIM, 16, min_score=0.1, max_keypoints=6),
+    MatcherConfig(DESCRIPTOR_DIM, 16, 1, 1),
+)
 
 
 @pytest.fixture(scope="module")
@@ -40,20 +43,20 @@ def weights(tmp_path_factory) -> str:
     return str(path)
 
 
-def heard(detector, packets) -> Message:
+def decode_message(detector, packets) -> Message:
     inbox = Inbox(detector.fingerprint)
     for packet in packets:
         inbox.push(packet)
-    (reception,) = inbox.receptions()
+    (reception,) = inbox.received_messages()
     return reception.message
 
 
 def test_tokens_gain_45_bytes_an_object_that_the_net_describes(drive, detector, weights):
-    frame, aligner = drive().frame(1, 3), Aligner(weights)
-    plain, says = (Agent(detector, budget_bytes=None, aligner=a) for a in (None, aligner))
-    sizes = [sum(map(len, agent.share(frame))) for agent in (plain, says)]
-    points = seen_points(aligner.net, says.eyes, frame)
-    message = heard(detector, says.share(frame))
+    frame, aligner = drive().frame(1, 3), PoseCorrection(weights)
+    plain, describing = (Agent(detector, budget_bytes=None, pose_correction=a) for a in (None, aligner))
+    sizes = [sum(map(len, agent.share(frame))) for agent in (plain, describing)]
+    points = extract_own_keypoints(aligner.net, describing.perception_cache, frame)
+    message = decode_message(detector, describing.share(frame))
     assert len(points) == 6 and len(message.objects) == 6
     velocity = 4 * bool(points.boxes.velocity.any())
     # A packet more or less has a header.
@@ -66,75 +69,80 @@ def test_tokens_gain_45_bytes_an_object_that_the_net_describes(drive, detector, 
 
 def test_a_budget_holds_with_what_is_described(drive, detector, weights):
     frame = drive().frame(1, 3)
-    agent = Agent(detector, budget_bytes=1800, aligner=Aligner(weights))
+    agent = Agent(detector, budget_bytes=1800, pose_correction=PoseCorrection(weights))
     packets = agent.share(frame)
-    message = heard(detector, packets)
+    message = decode_message(detector, packets)
     assert sum(map(len, packets)) <= 1800 and len(message.objects) == 6 and len(message.tokens.sites) > 0
-    assert Agent(detector, budget_bytes=200, aligner=Aligner(weights)).share(frame) == []
+    assert Agent(detector, budget_bytes=200, pose_correction=PoseCorrection(weights)).share(frame) == []
 
 
 def test_boxes_that_are_sent_anyway_are_described_and_stay(drive, detector, weights):
-    frame, net = drive().frame(1, 3), Aligner(weights).net
-    plain, says = (Agent(detector, METHODS["late"], aligner=a) for a in (None, Aligner(weights)))
-    was, message = heard(detector, plain.share(frame)), heard(detector, says.share(frame))
+    frame, net = drive().frame(1, 3), PoseCorrection(weights).net
+    plain, describing = (Agent(detector, METHODS["late"], pose_correction=a) for a in (None, PoseCorrection(weights)))
+    was, message = decode_message(detector, plain.share(frame)), decode_message(detector, describing.share(frame))
     torch.testing.assert_close(message.objects.center, was.objects.center)
     assert len(message.objects) > 6 and int(message.descriptors.any(1).sum()) == 6
-    told = told_points(message)
+    keypoints = extract_message_keypoints(message)
     torch.testing.assert_close(
-        told.descriptor, seen_points(net, says.eyes, frame).descriptor, atol=0.5 / 127 + 1e-6, rtol=0
+        keypoints.descriptor,
+        extract_own_keypoints(net, describing.perception_cache, frame).descriptor,
+        atol=0.5 / 127 + 1e-6,
+        rtol=0,
     )
 
 
-def test_what_is_dated_otherwise_or_says_nothing_is_not_described(drive, detector, weights):
-    frame, aligner, eyes = drive().frame(1, 3), Aligner(weights), Eyes(detector)
-    message = replace(METHODS["intermediate"].say(eyes, frame), timestamp_ns=frame.timestamp_ns - 1)
-    assert aligner.describe(frame, eyes, message) is message and told_points(message) is None
-    assert Aligner().describe(frame, eyes, message) is message
-    found = aligner.align(drive().frame(0, 3), Eyes(detector), [message], {})
-    assert found.verdicts[0].estimate.status is PoseStatus.NO_MATCH
+def test_messages_of_another_time_or_without_objects_get_no_descriptors(drive, detector, weights):
+    frame, aligner, cache = drive().frame(1, 3), PoseCorrection(weights), PerceptionCache(detector)
+    message = replace(METHODS["intermediate"].compose_message(cache, frame), timestamp_ns=frame.timestamp_ns - 1)
+    assert aligner.attach_descriptors(frame, cache, message) is message and extract_message_keypoints(message) is None
+    assert PoseCorrection().attach_descriptors(frame, cache, message) is message
+    found = aligner.correct(drive().frame(0, 3), PerceptionCache(detector), [message], {})
+    assert found.corrections[0].estimate.status is PoseStatus.NO_MATCH
 
 
-def test_nets_that_messages_cannot_carry_or_that_saw_with_other_eyes_are_refused(drive, detector):
-    frame, eyes = drive().frame(1, 3), Eyes(detector)
-    long = FeakmNet(replace(NET, keypoints=BoxKeypoints(CHANNELS, 64, 16), matcher=MatcherConfig(64, 16, 1, 1)))
+def test_nets_with_other_descriptors_or_other_weights_are_refused(drive, detector):
+    frame, cache = drive().frame(1, 3), PerceptionCache(detector)
+    long = FeakmNet(replace(NET, keypoints=BoxKeypointConfig(CHANNELS, 64, 16), matcher=MatcherConfig(64, 16, 1, 1)))
     with pytest.raises(ConfigError, match="32 numbers each; this net has 64"):
-        seen_points(long, eyes, frame)
+        extract_own_keypoints(long, cache, frame)
     with pytest.raises(ConfigError, match="taught on views of the weights abab"):
-        seen_points(FeakmNet(replace(NET, detector="ab" * 8)), eyes, frame)
-    seen_points(FeakmNet(replace(NET, detector=detector.fingerprint.hex())), eyes, frame)
+        extract_own_keypoints(FeakmNet(replace(NET, detector="ab" * 8)), cache, frame)
+    extract_own_keypoints(FeakmNet(replace(NET, detector=detector.fingerprint.hex())), cache, frame)
 
 
-class Looking(FeakmNet):
+class DescriptorMatcher(FeakmNet):
     """Takes points for one object that look alike, and cannot err."""
 
-    def match(self, ego: Points, other: Points) -> Matches:
-        alike = ego.descriptor[0] @ other.descriptor[0].mT
+    def match(self, ego_keypoints: KeypointBatch, other_keypoints: KeypointBatch) -> Matches:
+        alike = ego_keypoints.descriptor[0] @ other_keypoints.descriptor[0].mT
         best, row = alike.max(1)
         rows = (best > 0.9).nonzero()[:, 0]
         return Matches(torch.stack((rows, row[rows]), 1), best[rows])
 
 
-def test_a_wrong_claim_is_corrected_by_looks_alone(drive, detector, weights, monkeypatch):
+def test_a_wrong_prior_pose_is_corrected_by_descriptors_alone(drive, detector, weights, monkeypatch):
     """Twelve cars, of which both see eight; bytes in between."""
     rng = np.random.default_rng(0)
     ego_pose, pose = Transform.from_xyz_yaw(100, 50, 0, 0.3), Transform.from_xyz_yaw(112, 58, 0, 2.8)
     center = np.column_stack((100 + rng.uniform(-25, 25, 12), 50 + rng.uniform(-25, 25, 12), np.full(12, 0.8)))
     size, yaw = np.tile((4.5, 1.9, 1.6), (12, 1)), rng.uniform(-3, 3, 12)
     world = Boxes.of(*map(torch.from_numpy, (center, size, yaw)))
-    looks = torch.nn.functional.normalize(torch.randn(12, DESCRIPTOR, generator=torch.Generator().manual_seed(1)))
+    descriptors = torch.nn.functional.normalize(
+        torch.randn(12, DESCRIPTOR_DIM, generator=torch.Generator().manual_seed(1))
+    )
     own, theirs = slice(0, 10), slice(2, 12)
     frame = AgentFrame.of(PointCloud.of(torch.zeros(1, 3)), ego_pose, agent_id=1)
     off = Transform(pose.rotation, pose.translation + torch.tensor([8.0, -5.0, 0.0]).double())
     objects = world[theirs].transform(pose.inverse())
-    message = Message(2, 0, off, torch.eye(3).double() * 36, objects=objects, descriptors=looks[theirs])
-    message = heard(detector, wire.encode(message))
-    points = Keypoints(world[own].transform(ego_pose.inverse()), looks[own])
-    monkeypatch.setattr(module, "seen_points", lambda net, eyes, frame: points)
-    by_looks = Feakm.of(Looking(NET))
-    monkeypatch.setattr(module, "corrector", lambda name: by_looks)
-    found = Aligner(weights).align(frame, Eyes(detector), [message], {})
-    (kept,), (verdict,) = found.messages, found.verdicts
-    assert verdict.use is Use.CORRECTED and verdict.estimate.inliers == 8
+    message = Message(2, 0, off, torch.eye(3).double() * 36, objects=objects, descriptors=descriptors[theirs])
+    message = decode_message(detector, wire.encode(message))
+    points = Keypoints(world[own].transform(ego_pose.inverse()), descriptors[own])
+    monkeypatch.setattr(module, "extract_own_keypoints", lambda net, eyes, frame: points)
+    by_descriptors = FeakmCorrector.of(DescriptorMatcher(NET))
+    monkeypatch.setattr(module, "load_corrector", lambda name: by_descriptors)
+    found = PoseCorrection(weights).correct(frame, PerceptionCache(detector), [message], {})
+    (kept,), (verdict,) = found.messages, found.corrections
+    assert verdict.use is MessageUse.CORRECTED and verdict.estimate.inliers == 8
     assert float((kept.world_from_agent.translation - pose.translation)[:2].norm()) < 0.02
-    silent = Aligner(weights).align(frame, Eyes(detector), [replace(message, descriptors=None)], {})
-    assert silent.verdicts[0].use is Use.UNSURE
+    silent = PoseCorrection(weights).correct(frame, PerceptionCache(detector), [replace(message, descriptors=None)], {})
+    assert silent.corrections[0].use is MessageUse.UNCERTAIN

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from manyeyes import Agent, AgentFrame, Boxes, Inbox
-from manyeyes.agents.strategies import METHODS, method
+from manyeyes.agents.strategies import METHODS, get_strategy
 
 BODY, CHANNELS, CELLS, KEYS = 64, 80, 82, 84
 TENTH_NS = 100_000_000
@@ -80,7 +80,11 @@ def drive_through(
     detector, drive, name: str, hostile: Iterable[tuple[int, bytes]], own_inbox: bool
 ) -> list[tuple[Boxes, list]]:
     """What an ego perceives in 14 instants, with an honest sender beside it, and hostile packets (instant, bytes) among them."""
-    some, ego, sender = drive(2), Agent(detector, method(name)), Agent(detector, method(name), precision="float32")
+    some, ego, sender = (
+        drive(2),
+        Agent(detector, get_strategy(name)),
+        Agent(detector, get_strategy(name), token_encoding="float32"),
+    )
     inbox, found = Inbox(detector.fingerprint), []
     for index in range(14):
         packets = [p for at, p in hostile if at == index] + sender.share(some.frame(1, index))
@@ -99,7 +103,7 @@ def drive_through(
 @pytest.mark.parametrize("what", WRONG)
 def test_one_whole_packet_of_wrong_tokens_changes_nothing(drive, detector, what: str, own_inbox: bool) -> None:
     """It raised in perceive, and again for as long as the history kept it."""
-    honest = Agent(detector, precision="float32").share(drive(2).frame(1, 2))[0]
+    honest = Agent(detector, token_encoding="float32").share(drive(2).frame(1, 2))[0]
     packet = forged(honest, 66, hostile_bodies(honest)[what], time_ns=2 * TENTH_NS)
     clean = drive_through(detector, drive, "intermediate", [], own_inbox)
     struck = drive_through(detector, drive, "intermediate", [(2, packet)], own_inbox)
@@ -110,18 +114,18 @@ def test_one_whole_packet_of_wrong_tokens_changes_nothing(drive, detector, what:
 
 def test_a_sender_whose_content_breaks_fusion_is_rejected_by_name_and_the_rest_is_fused(drive, detector) -> None:
     """A fusion of one's own that cannot bear something: the sender is named, the honest one still counts, no history is kept."""
-    intermediate = method("intermediate")
+    intermediate = get_strategy("intermediate")
 
     class Fragile:
-        name, remembers = "fragile", True
+        name, uses_history = "fragile", True
 
-        def say(self, eyes, frame):
-            return intermediate.say(eyes, frame)
+        def compose_message(self, cache, frame):
+            return intermediate.compose_message(cache, frame)
 
-        def hear(self, eyes, frame, messages):
+        def fuse(self, cache, frame, messages):
             if any(m.agent_id in (66, 68) for m in messages):
                 raise RuntimeError("a shape that nobody foresaw")
-            return intermediate.hear(eyes, frame, messages)
+            return intermediate.fuse(cache, frame, messages)
 
     some = drive(2)
     honest = Agent(detector).share(some.frame(1, 2))
@@ -130,7 +134,7 @@ def test_a_sender_whose_content_breaks_fusion_is_rejected_by_name_and_the_rest_i
     perception = ego.perceive(some.frame(0, 2), packets)
     assert [(r.agent_id, r.reason) for r in perception.rejected] == [(66, "content_error"), (68, "content_error")]
     assert "RuntimeError: a shape that nobody foresaw" in perception.rejected[0].text
-    assert {r.message.agent_id for r in perception.heard} == {1, 67}
+    assert {r.message.agent_id for r in perception.received} == {1, 67}
     wanted = other.perceive(some.frame(0, 2), [*honest, forged(honest[0], 67)])
     assert torch.equal(perception.boxes.bev(), wanted.boxes.bev())
     later = some.frame(1, 3)
@@ -139,12 +143,12 @@ def test_a_sender_whose_content_breaks_fusion_is_rejected_by_name_and_the_rest_i
 
 def test_an_error_of_the_agents_own_is_raised(drive, detector) -> None:
     class Broken:
-        name, remembers = "broken", False
+        name, uses_history = "broken", False
 
-        def say(self, eyes, frame):
+        def compose_message(self, cache, frame):
             return None
 
-        def hear(self, eyes, frame, messages):
+        def fuse(self, cache, frame, messages):
             raise ValueError("a defect")
 
     packets = Agent(detector).share(drive(2).frame(1, 2))
@@ -164,7 +168,7 @@ def far_boxes(count: int, x_m: float, y_m: float) -> bytes:
 def with_rows(detector, drive):
     """An ego that sees every car of the drive, and an honest packet whose header strangers copy."""
     frame = drive(2).frame(0, 2)
-    return frame, Agent(detector, method("late")).share(drive(2).frame(1, 2))[0]
+    return frame, Agent(detector, get_strategy("late")).share(drive(2).frame(1, 2))[0]
 
 
 @pytest.mark.parametrize("name", ["late", "late-remembering"])
@@ -172,10 +176,10 @@ def with_rows(detector, drive):
 def test_boxes_of_strangers_erase_none_that_the_ego_detects_itself(drive, detector, name: str, x_m: float) -> None:
     """Ten messages of 1,000 boxes at score 1 filled the suppression's list, and no own box was left."""
     frame, honest = with_rows(detector, drive)
-    alone = Agent(detector, method("alone")).perceive(frame).boxes
+    alone = Agent(detector, get_strategy("alone")).perceive(frame).boxes
     assert len(alone) > 5
     packets = [forged(honest, 70 + k, far_boxes(1000, x_m + k, 0.3 * k), kind=2) for k in range(10)]
-    found = Agent(detector, method(name)).perceive(frame, packets).boxes
+    found = Agent(detector, get_strategy(name)).perceive(frame, packets).boxes
     nearest = torch.cdist(alone.center[:, :2], found.center[:, :2]).min(1)
     assert float(nearest.values.max()) <= 1.0
     if x_m:
@@ -185,7 +189,7 @@ def test_boxes_of_strangers_erase_none_that_the_ego_detects_itself(drive, detect
 def test_a_stranger_that_covers_an_own_box_from_the_side_does_not_take_its_place(drive, detector) -> None:
     """One box at score 1, 1.5 m beside each own one, suppressed them all."""
     frame, honest = with_rows(detector, drive)
-    alone = Agent(detector, method("alone")).perceive(frame).boxes
+    alone = Agent(detector, get_strategy("alone")).perceive(frame).boxes
     ego_from_sender = frame.world_from_agent.inverse() @ drive(2).frame(1, 2).world_from_agent
     beside = alone.transform(ego_from_sender.inverse())
     rows = b"".join(
@@ -196,7 +200,7 @@ def test_a_stranger_that_covers_an_own_box_from_the_side_does_not_take_its_place
         )
         for x, y, yaw in zip(*beside.center[:, :2].T.tolist(), beside.yaw.tolist())
     )  # fmt: skip
-    found = Agent(detector, method("late")).perceive(frame, [forged(honest, 71, b"\0" + rows, kind=2)]).boxes
+    found = Agent(detector, get_strategy("late")).perceive(frame, [forged(honest, 71, b"\0" + rows, kind=2)]).boxes
     assert float(torch.cdist(alone.center[:, :2], found.center[:, :2]).min(1).values.max()) <= 1.0
 
 
@@ -204,11 +208,11 @@ def test_a_stranger_that_covers_an_own_box_from_the_side_does_not_take_its_place
 def test_no_bytes_make_perceive_raise(drive, detector, name: str) -> None:
     """Bytes of honest packets at random places, with checksums made right: everything decodable is fused or rejected."""
     some, random = drive(2), np.random.default_rng(20)
-    ego = Agent(detector, method(name))
+    ego = Agent(detector, get_strategy(name))
     for index in range(12):
         packets = []
         for precision in ("float32", "float16", "int8"):
-            for packet in Agent(detector, method(name), precision=precision).share(some.frame(1, index)):
+            for packet in Agent(detector, get_strategy(name), token_encoding=precision).share(some.frame(1, index)):
                 for _ in range(4):
                     spoilt = bytearray(packet[:-4])
                     for at in random.integers(0, len(spoilt), int(random.integers(1, 6))):

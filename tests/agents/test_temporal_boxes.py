@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 
-from manyeyes.agents.strategies import method
-from manyeyes.agents.strategies.early import Early
-from manyeyes.agents.strategies.late import Late
-from manyeyes.agents.strategies.temporal_boxes import FADE, faded, strongest
+from manyeyes.agents.strategies import get_strategy
+from manyeyes.agents.strategies.early import EarlyFusion
+from manyeyes.agents.strategies.late import LateFusion
+from manyeyes.agents.strategies.temporal_boxes import SCORE_DECAY_PER_100MS, decay_scores, merge_boxes_nms
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, Message, PointCloud, Transform
 
 TENTH_NS = 100_000_000
@@ -31,63 +31,67 @@ def frame(at: int, x: float = 0.0) -> AgentFrame:
 
 
 @dataclass
-class Seen:
+class FixedOutput:
     boxes: Boxes
 
 
-class Sees:
+class FixedCache:
     """Eyes that saw these boxes, newest first, a tenth of a second apart, while the agent drove on at 1 m a sweep."""
 
     grid = BevGrid(-100.0, -40.0, -3.0, 100.0, 40.0, 1.0)
 
     def __init__(self, *views: Boxes) -> None:
-        self.views = [(frame(9 - i, -float(i)), Seen(view)) for i, view in enumerate(views)]
+        self.views = [(frame(9 - i, -float(i)), FixedOutput(view)) for i, view in enumerate(views)]
 
-    def see(self, frame: AgentFrame) -> Seen:
+    def process(self, frame: AgentFrame) -> FixedOutput:
         return self.views[0][1]
 
-    def before(self, frame: AgentFrame, instants: int = 2) -> list[tuple[AgentFrame, Seen]]:
-        return self.views[1 : 1 + instants]
+    def previous_outputs(self, frame: AgentFrame, num_frames: int = 2) -> list[tuple[AgentFrame, FixedOutput]]:
+        return self.views[1 : 1 + num_frames]
 
 
-def said(at: int, some: Boxes) -> Message:
+def message_of(at: int, some: Boxes) -> Message:
     return Message(5, at * TENTH_NS, Transform.identity(), torch.zeros(3, 3).double(), objects=some)
 
 
 def test_scores_fade_by_the_tenth_of_a_second_and_places_stay() -> None:
     some = boxes(3.0)
-    assert float(faded(some, 0.2).score) == pytest.approx(0.8 * FADE**2)
-    assert torch.equal(faded(some, 0.2).center, some.center) and torch.equal(faded(some, 0.0).score, some.score)
+    assert float(decay_scores(some, 0.2).score) == pytest.approx(0.8 * SCORE_DECAY_PER_100MS**2)
+    assert torch.equal(decay_scores(some, 0.2).center, some.center) and torch.equal(
+        decay_scores(some, 0.0).score, some.score
+    )
 
 
 def test_of_boxes_that_overlap_the_best_stays() -> None:
-    kept = strongest([boxes(0.0, 20.0, score=0.5), boxes(0.5, 40.0, score=0.7)])
+    kept = merge_boxes_nms([boxes(0.0, 20.0, score=0.5), boxes(0.5, 40.0, score=0.7)])
     assert sorted(kept.center[:, 0].tolist()) == [0.5, 20.0, 40.0] and kept.score[0] == pytest.approx(0.7)
 
 
 def test_what_is_hidden_now_stands_where_it_should_be_by_now() -> None:
     """Seen at 30 m a tenth of a second ago, at 10 m/s: 1 m farther on, 1 m nearer for the agent's own motion."""
-    found = method("late-remembering").hear(Sees(boxes(), boxes(30.0, speed=10.0)), frame(9), ())
-    assert found.center[:, 0].tolist() == pytest.approx([30.0]) and float(found.score) == pytest.approx(0.8 * FADE)
-    still = method("late-remembering").hear(Sees(boxes(), boxes(30.0)), frame(9), ())
+    found = get_strategy("late-remembering").fuse(FixedCache(boxes(), boxes(30.0, speed=10.0)), frame(9), ())
+    assert found.center[:, 0].tolist() == pytest.approx([30.0]) and float(found.score) == pytest.approx(
+        0.8 * SCORE_DECAY_PER_100MS
+    )
+    still = get_strategy("late-remembering").fuse(FixedCache(boxes(), boxes(30.0)), frame(9), ())
     assert still.center[:, 0].tolist() == pytest.approx([29.0])
 
 
-def test_what_is_seen_now_wins_over_what_was() -> None:
-    found = method("late-remembering").hear(Sees(boxes(30.0), boxes(31.0)), frame(9), ())
+def test_current_boxes_win_over_past_ones() -> None:
+    found = get_strategy("late-remembering").fuse(FixedCache(boxes(30.0), boxes(31.0)), frame(9), ())
     assert len(found) == 1 and float(found.score) == pytest.approx(0.8) and float(found.center[0, 0]) == 30.0
 
 
-def test_a_late_message_does_not_fade_but_what_its_sender_said_before_does() -> None:
-    messages = [said(6, boxes(10.0)), said(5, boxes(10.5, 50.0))]
-    found = method("late-remembering").hear(Sees(boxes()), frame(9), messages)
+def test_scores_of_earlier_messages_decay_but_not_of_a_late_one() -> None:
+    messages = [message_of(6, boxes(10.0)), message_of(5, boxes(10.5, 50.0))]
+    found = get_strategy("late-remembering").fuse(FixedCache(boxes()), frame(9), messages)
     by_place = dict(zip(found.center[:, 0].tolist(), found.score.tolist()))
-    assert by_place == {10.0: pytest.approx(0.8), 50.0: pytest.approx(0.8 * FADE)}
+    assert by_place == {10.0: pytest.approx(0.8), 50.0: pytest.approx(0.8 * SCORE_DECAY_PER_100MS)}
 
 
 def test_late_fusion_as_papers_have_it_knows_only_what_is_newest() -> None:
-    found = Late().hear(Sees(boxes(), boxes(30.0)), frame(9), [said(6, boxes(10.0))])
-    assert found.center[:, 0].tolist() == [10.0] and not Late().remembers
+    found = LateFusion().fuse(FixedCache(boxes(), boxes(30.0)), frame(9), [message_of(6, boxes(10.0))])
+    assert found.center[:, 0].tolist() == [10.0] and not LateFusion().uses_history
 
 
 def test_boxes_of_others_are_cropped_and_capped_before_they_are_ranked() -> None:
@@ -95,7 +99,9 @@ def test_boxes_of_others_are_cropped_and_capped_before_they_are_ranked() -> None
     crowd = replace(boxes(*torch.linspace(-98, 98, 40).tolist() * 5), score=torch.linspace(0.1, 0.9, 200))
     rows = torch.arange(200)
     crowd = replace(crowd, center=crowd.center + torch.stack((0 * rows, 10 + 4.0 * (rows // 40), 0 * rows), 1))
-    found = Late().hear(Sees(boxes(0.0, score=0.1)), frame(9), [said(9, Boxes.cat([boxes(150.0, score=1.0), crowd]))])
+    found = LateFusion().fuse(
+        FixedCache(boxes(0.0, score=0.1)), frame(9), [message_of(9, Boxes.cat([boxes(150.0, score=1.0), crowd]))]
+    )
     assert len(found) == 129 and float(found.center[:, 0].max()) < 100
     assert found.center[found.score.argmin()].tolist() == pytest.approx([0.0, 0.0, 0.8])
 
@@ -103,21 +109,21 @@ def test_boxes_of_others_are_cropped_and_capped_before_they_are_ranked() -> None
 def test_an_own_box_that_gives_way_to_one_elsewhere_returns_at_half_its_score() -> None:
     """At 0 m another box stands 0.9 m aside, the same place; at 20 m it stands 1.5 m aside."""
     own = boxes(0.0, 20.0, score=0.3)
-    found = Late().hear(Sees(own), frame(9), [said(9, boxes(0.9, 21.5, score=0.9))])
+    found = LateFusion().fuse(FixedCache(own), frame(9), [message_of(9, boxes(0.9, 21.5, score=0.9))])
     assert found.center[:, 0].tolist() == pytest.approx([0.9, 21.5, 20.0])
     assert found.score.tolist() == pytest.approx([0.9, 0.9, 0.15])
 
 
-def test_early_fusion_merges_what_is_heard_and_remembers_nothing() -> None:
+def test_early_fusion_merges_received_clouds_and_keeps_no_history() -> None:
     merged: list[PointCloud] = []
 
-    class Looks(Sees):
-        def earlier_merged(self, frame: AgentFrame, cloud: PointCloud) -> None:
+    class CloudCache(FixedCache):
+        def previous_merged_cloud(self, frame: AgentFrame, cloud: PointCloud) -> None:
             merged.append(cloud)
 
-        def see_cloud(self, cloud: PointCloud, earlier: PointCloud | None) -> Seen:
-            return Seen(boxes())
+        def run_detector(self, cloud: PointCloud, earlier: PointCloud | None) -> FixedOutput:
+            return FixedOutput(boxes())
 
     cloud = PointCloud.of(torch.tensor([[6.0, 0.0, 1.0]]))
-    Early().hear(Looks(boxes()), frame(9), [replace(said(6, boxes()), points=cloud)])
-    assert merged[0].xyz.tolist() == [[6.0, 0.0, 1.0]] and not Early().remembers
+    EarlyFusion().fuse(CloudCache(boxes()), frame(9), [replace(message_of(6, boxes()), points=cloud)])
+    assert merged[0].xyz.tolist() == [[6.0, 0.0, 1.0]] and not EarlyFusion().uses_history

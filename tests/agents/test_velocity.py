@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from manyeyes.agents.velocity import DRIVES_MPS, Earlier, TrackConfig, followed
+from manyeyes.agents.velocity import MIN_LATERAL_SEARCH_MPS, PastDetections, VelocityConfig, estimate_velocities
 from manyeyes.datatypes import Boxes, Transform
 
-CONFIG = TrackConfig()
-SURE = TrackConfig(place_m=1e-3)
+CONFIG = VelocityConfig()
+EXACT = VelocityConfig(sigma_position_m=1e-3)
 """Places that are believed to the millimetre: what is stated counts for nothing."""
 
 
@@ -26,58 +26,63 @@ def cars(xy: list[tuple[float, float]] | Tensor, yaw: float = 0.0, velocity: Ten
     return Boxes.of(center, torch.tensor([4.5, 1.9, 1.6]).repeat(n, 1), torch.full((n,), yaw), velocity=velocity)
 
 
-def doubted(boxes: Boxes, sigma_m: float) -> Boxes:
+def with_sigma(boxes: Boxes, sigma_m: float) -> Boxes:
     """The same, of which the detector says how sure it is."""
     return replace(boxes, sigma_xy=torch.full((len(boxes),), sigma_m))
 
 
-def drive(velocity: tuple[float, float], instants: int, start: tuple[float, float] = (0.0, 0.0)) -> list[Earlier]:
+def drive(
+    velocity: tuple[float, float], instants: int, start: tuple[float, float] = (0.0, 0.0)
+) -> list[PastDetections]:
     """One car's last so many instants, a tenth of a second apart, newest first; it is at ``start`` now."""
     times = [0.1 * (k + 1) for k in range(instants)]
-    return [Earlier(cars([(start[0] - velocity[0] * t, start[1] - velocity[1] * t)]), t) for t in times]
+    return [PastDetections(cars([(start[0] - velocity[0] * t, start[1] - velocity[1] * t)]), t) for t in times]
 
 
 def test_a_car_that_drives_on_is_as_fast_as_it_drives() -> None:
-    assert followed(cars([(0, 0)]), drive((8, 0), 5), SURE)[0].tolist() == pytest.approx([8, 0], abs=1e-3)
+    assert estimate_velocities(cars([(0, 0)]), drive((8, 0), 5), EXACT)[0].tolist() == pytest.approx([8, 0], abs=1e-3)
 
 
 def test_two_places_by_hand() -> None:
     """1 m in 0.1 s, sigma of a place s = 0.25: slope 10 with variance 2 s^2 / 0.01 = 12.5; stated 2 with variance 16."""
     now = cars([(0, 0)], velocity=torch.tensor([[2.0, 0.0]]))
     want = (10 / 12.5 + 2 / 16) / (1 / 12.5 + 1 / 16)
-    config = TrackConfig(place_m=0.25, stated_mps=4.0, sure=0.0)
-    assert followed(now, drive((10, 0), 1), config)[0].tolist() == pytest.approx([want, 0], abs=1e-4)
+    config = VelocityConfig(sigma_position_m=0.25, sigma_detected_velocity_mps=4.0, min_z_score=0.0)
+    assert estimate_velocities(now, drive((10, 0), 1), config)[0].tolist() == pytest.approx([want, 0], abs=1e-4)
 
 
-def plain(now: Boxes, places: list[Tensor], sigmas: list[float], config: TrackConfig) -> Tensor:
+def plain(now: Boxes, places: list[Tensor], sigmas: list[float], config: VelocityConfig) -> Tensor:
     """The slow twin, for one box: start and velocity of one line by least squares, a row for everything known."""
     ahead = torch.stack((now.yaw.cos(), now.yaw.sin()), 1)[0].double()
     aside = torch.stack((-ahead[1], ahead[0]))
     rows, goals = [], []
     for k, place in enumerate([now.center[0, :2], *places]):
-        sigma = math.hypot(config.place_m, sigmas[k])
+        sigma = math.hypot(config.sigma_position_m, sigmas[k])
         for axis in range(2):
             row = torch.zeros(4).double()
             row[axis], row[2 + axis] = 1, -0.1 * k
             rows.append(row / sigma)
             goals.append(place[axis].double() / sigma)
     stated = now.velocity[0].double() @ ahead
-    for direction, goal, sigma in ((ahead, stated, config.stated_mps), (aside, 0.0, config.sideways_mps)):
+    for direction, goal, sigma in (
+        (ahead, stated, config.sigma_detected_velocity_mps),
+        (aside, 0.0, config.sigma_lateral_velocity_mps),
+    ):
         rows.append(torch.cat((torch.zeros(2).double(), direction)) / sigma)
         goals.append(torch.as_tensor(goal / sigma).double())
     return torch.linalg.lstsq(torch.stack(rows), torch.stack(goals)[:, None]).solution[2:, 0]
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_line_is_that_of_least_squares(seed: int) -> None:
+def test_the_line_fit_is_least_squares(seed: int) -> None:
     rng = torch.Generator().manual_seed(seed)
     velocity = torch.tensor([12.0, -4.0])
     places = [-velocity * 0.1 * (k + 1) + 0.2 * torch.randn(2, generator=rng) for k in range(4)]
     now = cars([(0, 0)], yaw=float(torch.randn(1, generator=rng)), velocity=torch.randn(1, 2, generator=rng) * 5 + 8)
     sigmas = torch.rand(5, generator=rng).tolist()
-    config = TrackConfig(gate_m=9.0, still_mps=0.0, sure=0.0)
-    then = [Earlier(doubted(cars(p[None]), sigmas[k + 1]), 0.1 * (k + 1)) for k, p in enumerate(places)]
-    got = followed(doubted(now, sigmas[0]), then, config)[0]
+    config = VelocityConfig(gate_m=9.0, min_speed_mps=0.0, min_z_score=0.0)
+    then = [PastDetections(with_sigma(cars(p[None]), sigmas[k + 1]), 0.1 * (k + 1)) for k, p in enumerate(places)]
+    got = estimate_velocities(with_sigma(now, sigmas[0]), then, config)[0]
     assert torch.allclose(got.double(), plain(now, places, sigmas, config), atol=1e-3)
 
 
@@ -85,13 +90,13 @@ def test_velocities_turn_with_the_frame() -> None:
     rng = torch.Generator().manual_seed(1)
     now = cars(torch.rand(6, 2, generator=rng) * 60, 0.3, torch.randn(6, 2, generator=rng) * 6)
     then = [
-        Earlier(cars(now.center[:, :2] - now.velocity * t + 0.1 * torch.randn(6, 2, generator=rng), 0.3), t)
+        PastDetections(cars(now.center[:, :2] - now.velocity * t + 0.1 * torch.randn(6, 2, generator=rng), 0.3), t)
         for t in (0.1, 0.2, 0.3)
     ]
     turn = Transform.from_xyz_yaw(20.0, -7.0, 0.0, 2.1)
-    moved = [Earlier(e.boxes.to(torch.float64).transform(turn).to(torch.float32), e.seconds_ago) for e in then]
+    moved = [PastDetections(e.boxes.to(torch.float64).transform(turn).to(torch.float32), e.age_s) for e in then]
     elsewhere = now.to(torch.float64).transform(turn).to(torch.float32)
-    a, b = followed(now, then, CONFIG), followed(elsewhere, moved, CONFIG)
+    a, b = estimate_velocities(now, then, CONFIG), estimate_velocities(elsewhere, moved, CONFIG)
     c, s = math.cos(2.1), math.sin(2.1)
     assert torch.allclose(a @ torch.tensor([[c, s], [-s, c]]), b, atol=1e-3) and a.norm(dim=1).max() > 3
 
@@ -101,33 +106,33 @@ def test_a_car_that_stands_stands_whatever_is_stated() -> None:
     rng = torch.Generator().manual_seed(2)
     now = cars([(5, 5)], velocity=torch.tensor([[1.5, 0.0]]))
     then = [
-        Earlier(cars(torch.tensor([[5.0, 5.0]]) + 0.05 * torch.randn(1, 2, generator=rng)), 0.1 * k)
+        PastDetections(cars(torch.tensor([[5.0, 5.0]]) + 0.05 * torch.randn(1, 2, generator=rng)), 0.1 * k)
         for k in range(1, 6)
     ]
-    assert followed(now, then, CONFIG).tolist() == [[0, 0]]
+    assert estimate_velocities(now, then, CONFIG).tolist() == [[0, 0]]
 
 
 def test_without_a_past_it_is_as_stated() -> None:
     now = cars([(0, 0), (9, 9)], velocity=torch.tensor([[6.0, 1.0], [0.1, 0.0]]))
-    for nothing in ([], [Earlier(Boxes.empty(), 0.1)]):
-        assert torch.equal(followed(now, nothing, CONFIG), now.velocity)
-    assert followed(Boxes.empty(), drive((8, 0), 3), CONFIG).shape == (0, 2)
+    for nothing in ([], [PastDetections(Boxes.empty(), 0.1)]):
+        assert torch.equal(estimate_velocities(now, nothing, CONFIG), now.velocity)
+    assert estimate_velocities(Boxes.empty(), drive((8, 0), 3), CONFIG).shape == (0, 2)
 
 
 def test_a_place_out_of_reach_is_another_car() -> None:
     """Only the car that could have come from there is drawn; a lone box 3 m aside is not its past."""
     now = cars([(0, 0)], velocity=torch.tensor([[6.0, 0.0]]))
-    far = [Earlier(cars([(0, 3)]), 0.1), Earlier(cars([(0, 3)]), 0.2)]
-    assert followed(now, far, CONFIG)[0].tolist() == pytest.approx([6, 0], abs=1e-4)
+    far = [PastDetections(cars([(0, 3)]), 0.1), PastDetections(cars([(0, 3)]), 0.2)]
+    assert estimate_velocities(now, far, CONFIG)[0].tolist() == pytest.approx([6, 0], abs=1e-4)
 
 
 def test_neighbours_keep_their_own_past_and_a_gap_is_bridged() -> None:
     """Two cars abreast, one overtakes; one sweep shows neither."""
     first, second = drive((12, 0), 5, (0, 0)), drive((4, 0), 5, (0, 3.2))
-    both = [Earlier(Boxes.cat([b.boxes, a.boxes]), a.seconds_ago) for a, b in zip(first, second)]
+    both = [PastDetections(Boxes.cat([b.boxes, a.boxes]), a.age_s) for a, b in zip(first, second)]
     del both[1]
     stated = torch.tensor([[9.0, 0.0], [6.0, 0.0]])
-    got = followed(cars([(0, 0), (0, 3.2)], velocity=stated), both, TrackConfig(place_m=0.05))
+    got = estimate_velocities(cars([(0, 0), (0, 3.2)], velocity=stated), both, VelocityConfig(sigma_position_m=0.05))
     assert got[:, 0].tolist() == pytest.approx([12, 4], abs=0.1)
     assert got[:, 1].abs().max() < 0.05
 
@@ -140,31 +145,35 @@ def body(middle: float) -> Tensor:
 
 
 @pytest.mark.parametrize("speed", (6.0, 11.0))
-def test_points_tell_a_speed_that_boxes_get_wrong(speed: float) -> None:
+def test_points_correct_a_wrong_longitudinal_speed(speed: float) -> None:
     """Boxes creep ahead by 15 cm a sweep, which is 1.5 m/s; points do not."""
     now, earlier = cars([(0.0, 0.0)]), []
     for t in (0.1, 0.2, 0.3, 0.4, 0.5):
-        earlier.append(Earlier(cars([(-(speed + 1.5) * t, 0.0)]), t, body(-speed * t) if t in (0.2, 0.3) else None))
-    by_boxes = float(followed(now, earlier, CONFIG)[0, 0])
-    by_points = float(followed(now, earlier, CONFIG, body(0.0))[0, 0])
+        earlier.append(
+            PastDetections(cars([(-(speed + 1.5) * t, 0.0)]), t, body(-speed * t) if t in (0.2, 0.3) else None)
+        )
+    by_boxes = float(estimate_velocities(now, earlier, CONFIG)[0, 0])
+    by_points = float(estimate_velocities(now, earlier, CONFIG, body(0.0))[0, 0])
     assert by_boxes > speed + 0.8
     assert by_points == pytest.approx(speed, abs=0.5)
 
 
 @pytest.mark.parametrize("aside", (-0.35, 0.35))
-def test_points_tell_a_motion_aside_that_a_heading_hides(aside: float) -> None:
+def test_points_correct_a_hidden_lateral_speed(aside: float) -> None:
     """Boxes, and their heading, say straight ahead; points do not. Below DRIVES_MPS nobody asks them."""
     for speed in (8.0, 0.8):
         now, earlier = cars([(0.0, 0.0)]), drive((speed, 0), 5)
         for k in (1, 2):
-            t = earlier[k].seconds_ago
+            t = earlier[k].age_s
             there = body(-speed * t) - torch.tensor([0.0, aside * t, 0.0])
             earlier[k] = replace(earlier[k], points=there)
-        got = followed(now, earlier, CONFIG, body(0.0))[0]
+        got = estimate_velocities(now, earlier, CONFIG, body(0.0))[0]
         assert float(got[0]) == pytest.approx(speed, abs=0.3)
-        assert float(got[1]) == pytest.approx(aside if speed > DRIVES_MPS else 0.0, abs=0.15)
+        assert float(got[1]) == pytest.approx(aside if speed > MIN_LATERAL_SEARCH_MPS else 0.0, abs=0.15)
 
 
-def test_where_no_points_are_the_boxes_tell() -> None:
+def test_without_points_boxes_alone_decide() -> None:
     now, earlier = cars([(0, 0)]), [replace(e, points=torch.zeros(0, 3)) for e in drive((8, 0), 5)]
-    assert torch.equal(followed(now, earlier, CONFIG, torch.zeros(0, 3)), followed(now, earlier, CONFIG))
+    assert torch.equal(
+        estimate_velocities(now, earlier, CONFIG, torch.zeros(0, 3)), estimate_velocities(now, earlier, CONFIG)
+    )

@@ -67,11 +67,11 @@ def test_bytes_carry_the_maps_exactly(model):
     clouds = [PointCloud.of(torch.rand(200, 3, generator=random) * 6 - 3) for _ in range(3)]
     maps = [model.see(cloud) for cloud in clouds]
     together = model.fuse([torch.cat(scale) for scale in zip(*maps)])
-    heard = model.perceive(maps[0], [model.share(cloud) for cloud in clouds[1:]], 256)
+    found = model.perceive(maps[0], [model.share(cloud) for cloud in clouds[1:]], 256)
     best, rows = torch.sigmoid(together[0]).flatten().topk(1)
     first = sys.modules["dense_pointpillars"].decode_anchors(together[1], rows, GRID.at(2))
     assert sum(map(len, model.share(clouds[0]))) == 4 * (8 * 8 * 16 + 16 * 4 * 8 + 32 * 2 * 4)
-    assert torch.allclose(heard[:1], first, atol=1e-4) and 1 < len(heard) < 256 and float(best[0]) > 0
+    assert torch.allclose(found[:1], first, atol=1e-4) and 1 < len(found) < 256 and float(best[0]) > 0
 
 
 def test_anchors_decode_by_hand(dense):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from manyeyes.datatypes import BevGrid
-from manyeyes.models.maps.presets import TOY
+from manyeyes.models.maps.presets import MAP_TINY
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -39,12 +39,12 @@ def test_tiles_cover_the_area_once(cost):
 
 @pytest.mark.parametrize(("length", "width", "tiles"), [(120.0, 60.0, 1), (300.0, 300.0, 15)])
 def test_the_dense_model_has_the_area_s_cells_and_the_tiles_queries(cost, length, width, tiles):
-    config = cost.over_all(TOY, length, width, tiles)
+    config = cost.over_all(MAP_TINY, length, width, tiles)
     assert math.prod(config.tile.shape) == (length / 1.5) * (width / 1.5)
     assert config.head.elements == 80 * tiles
 
 
-def test_looks_lie_within_the_area_and_are_the_same_again(cost):
+def test_poses_lie_within_the_area_and_are_the_same_again(cost):
     poses = cost.poses_over(300.0, 60.0, 20)
     assert float(poses.translation[:, 0].abs().max()) <= 150 and float(poses.translation[:, 1].abs().max()) <= 30
     assert poses.translation.tolist() == cost.poses_over(300.0, 60.0, 20).translation.tolist()

@@ -5,18 +5,18 @@ from dataclasses import replace
 
 from benchmarks.pose import Row, bars
 
-from manyeyes.evaluation.pose.metrics import PoseFrame, score
+from manyeyes.evaluation.pose.metrics import PoseEvaluation, summarize_evaluations
 from manyeyes.pose.types import PoseStatus
 
 
 def row(table: str, claim: str, sigma: float, flagged: int, nees: tuple[float, ...] = (3.0,) * 100) -> Row:
     """A row of a hundred answers, so many of which contradict the claim."""
     statuses = [PoseStatus.CONFLICT] * flagged + [PoseStatus.OK] * (100 - flagged)
-    frames = [PoseFrame(s, 5, 0.1, 0.1, 0.1, n, 1.0) for s, n in zip(statuses, nees)]
-    return Row(table, "vote", 5, 8, 10, 1, False, False, claim, sigma, score(frames), 1.0, 1.0)
+    frames = [PoseEvaluation(s, 5, 0.1, 0.1, 0.1, n, 1.0) for s, n in zip(statuses, nees)]
+    return Row(table, "vote", 5, 8, 10, 1, False, False, claim, sigma, summarize_evaluations(frames), 1.0, 1.0)
 
 
-def test_the_watchman_is_held_to_its_worst_row():
+def test_the_monitor_is_held_to_its_worst_row():
     rows = [row("watched", "offset", 0.5, 100), row("watched", "offset", 0.5, 97), row("watched", "bias", 0.5, 0)]
     rows += [row("watched", "offset", 1.0, 98), row("watched", "gaussian", 1.0, 1), row("watched", "bias", 1.0, 0)]
     rows += [row("watchman", "offset", 1.0, 90), row("watchman", "gaussian", 1.0, 0)]
@@ -29,12 +29,12 @@ def test_the_watchman_is_held_to_its_worst_row():
 def test_a_mean_nees_whose_interval_holds_a_bar_is_not_resolved():
     wide = tuple(2.5 + (-1) ** n for n in range(100))
     apart = {"high": tuple(4.0 + 0.01 * (n % 2) for n in range(100)), "low": tuple(n % 3 for n in range(100))}
-    said = {
+    rows = {
         "wide": row("success", "none", 0.0, 0, wide),
         "sure": row("success", "none", 0.0, 0, tuple(3.0 + 0.01 * (n % 2) for n in range(100))),
         **{name: row("answers", "none", 0.0, 0, nees) for name, nees in apart.items()},
     }
-    verdicts = {name: [bar.verdict for bar in bars([one])] for name, one in said.items()}
+    verdicts = {name: [bar.verdict for bar in bars([one])] for name, one in rows.items()}
     assert verdicts == {"wide": ["not resolved"], "sure": ["reached"], "high": ["missed"], "low": ["missed"]}
     # Where something is claimed, or one answer says nothing of its spread, there is no bar.
-    assert not list(bars([row("success", "gaussian", 1.0, 0), replace(said["sure"], score=score([]))]))
+    assert not list(bars([row("success", "gaussian", 1.0, 0), replace(rows["sure"], score=summarize_evaluations([]))]))

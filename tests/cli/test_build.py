@@ -13,17 +13,17 @@ pytest.importorskip("pyarrow", reason="the 'map' extra is not installed")
 pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.cli import main as cli
-from manyeyes.cli.demo_map import drive_sentence
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.cli.demo_map import describe_drive_map
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.map_element import KINDS
 from manyeyes.maps.elements.observation_file import read_observations
 from manyeyes.models import checkpoint, pretrained
-from manyeyes.models.maps.map_model import Mapper
-from manyeyes.models.maps.presets import FORMAT, TOY
+from manyeyes.models.maps.map_model import MapModel
+from manyeyes.models.maps.presets import FORMAT, MAP_TINY
 from manyeyes.studies.map_folder import MapFolder, read_vector_map
-from manyeyes.studies.map_pipeline import Building, build_map, instants, write_built
+from manyeyes.studies.map_pipeline import MapBuildConfig, build_map, count_snapshots, write_built_map
 from manyeyes.studies.recordings import open_recording
-from manyeyes.studies.town_maps import Ground, grounds_of, town_named
+from manyeyes.studies.town_maps import TownMap, find_named_town, group_by_town
 
 NOTHING = Boxes.of(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
 
@@ -38,7 +38,7 @@ class Crossroads:
     def length(self, scenario: str) -> int:
         return self.frames
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         return range(self.frames)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -51,109 +51,120 @@ class Crossroads:
             poses.append(Transform.from_xyz_yaw(-away * np.cos(heading), -away * np.sin(heading), 0.0, heading))
         cloud = PointCloud.of(torch.randn(400, 3) * torch.tensor([8.0, 8.0, 0.2]))
         frames = [AgentFrame.of(cloud, pose, 1 + k, index * 10**8) for k, pose in enumerate(poses)]
-        truth = Truth(NOTHING, torch.zeros(4, 0, dtype=torch.bool), Transform.stack(poses))
+        truth = GroundTruth(NOTHING, torch.zeros(4, 0, dtype=torch.bool), Transform.stack(poses))
         return Snapshot(scenario, index, tuple(frames), truth)
 
 
-CROSS = Ground("cross", ("cross_0",), "cross", (0.0, 0.0))
-NOWHERE = Ground("nowhere", ("cross_0",), None, (10.0, 20.0))
+CROSS = TownMap("cross", ("cross_0",), "cross", (0.0, 0.0))
+NOWHERE = TownMap("nowhere", ("cross_0",), None, (10.0, 20.0))
 
 
 @pytest.fixture(scope="module")
 def built():
-    return build_map(Crossroads(), CROSS, Building(None, every=4))
+    return build_map(Crossroads(), CROSS, MapBuildConfig(None, frame_stride=4))
 
 
 def test_what_agents_see_becomes_a_map_that_is_better_than_its_parts(built) -> None:
-    n = built.numbers
-    assert (n.messages, n.observations, n.lost, n.refused) == (20, 20, 0, 0)
-    assert 200 < n.bytes_per_message < 2000 and n.bytes_per_look == 0
-    assert n.quality is not None and n.union is not None and n.quality.true_elements == len(built.truth)
-    assert n.quality.mean_ap() > 0.5 and n.quality.mean_ap() > n.union.mean_ap() + 0.1
-    assert 0 < n.published <= n.elements < n.observed_elements and 0.6 < n.drift <= 1.0
-    assert {o.agent for o in built.cartographer.observations} == {f"cross_0/{k}" for k in (1, 2, 3, 4)}
+    n = built.stats
+    assert (n.num_messages, n.num_observations, n.num_lost, n.num_rejected) == (20, 20, 0, 0)
+    assert 200 < n.bytes_per_message < 2000 and n.bytes_per_frame == 0
+    assert n.scores is not None and n.union_scores is not None and n.scores.num_true_elements == len(built.truth)
+    assert n.scores.mean_ap() > 0.5 and n.scores.mean_ap() > n.union_scores.mean_ap() + 0.1
+    assert 0 < n.num_published <= n.num_elements < n.num_observed_elements and 0.6 < n.incremental_fscore <= 1.0
+    assert {o.agent for o in built.map_server.observations} == {f"cross_0/{k}" for k in (1, 2, 3, 4)}
 
 
-def test_the_folder_is_one_that_the_other_verbs_read(built, tmp_path) -> None:
-    write_built(built, tmp_path, "A crossroads")
+def test_the_folder_is_read_by_the_other_commands(built, tmp_path) -> None:
+    write_built_map(built, tmp_path, "A crossroads")
     assert {p.name for p in tmp_path.iterdir()} == {"observations", "truth", "cut.json", "map", "map.html", "map.png"}
-    assert read_vector_map(tmp_path / "map").quantised_hash() == built.made.quantised_hash()
+    assert read_vector_map(tmp_path / "map").quantised_hash() == built.fused.quantised_hash()
     assert len(read_observations(tmp_path / "observations").observations) == 20
-    assert MapFolder(tmp_path).cut() is not None and "A crossroads" in (tmp_path / "map.html").read_text()
+    assert MapFolder(tmp_path).read_cut_policy() is not None and "A crossroads" in (tmp_path / "map.html").read_text()
     assert cli.main(["map", "evaluate", str(tmp_path / "map")]) == 0
     held = json.loads((tmp_path / "map" / "quality.json").read_text())["result"]["ap"]
     exact = next(r for r in held if (r["way"], r["thresholds"]) == ("maptr", "narrow"))
-    assert exact["mean"] == pytest.approx(built.numbers.quality.mean_ap(), abs=0.02)
+    assert exact["mean"] == pytest.approx(built.stats.scores.mean_ap(), abs=0.02)
 
 
-def test_the_same_recording_is_the_same_map_and_errors_of_poses_move_claims_alone(built) -> None:
-    again = build_map(Crossroads(), CROSS, Building(None, every=4))
-    assert again.made.quantised_hash() == built.made.quantised_hash()
-    noisy = build_map(Crossroads(), CROSS, Building(None, every=4, pose_sigma_m=0.4))
-    for one, two in zip(noisy.cartographer.observations, built.cartographer.observations):
+def test_the_same_recording_is_the_same_map_and_pose_noise_moves_priors_only(built) -> None:
+    again = build_map(Crossroads(), CROSS, MapBuildConfig(None, frame_stride=4))
+    assert again.fused.quantised_hash() == built.fused.quantised_hash()
+    noisy = build_map(Crossroads(), CROSS, MapBuildConfig(None, frame_stride=4, pose_sigma_m=0.4))
+    for one, two in zip(noisy.map_server.observations, built.map_server.observations):
         np.testing.assert_array_equal(one.elements.points, two.elements.points)
         assert 0 < np.hypot(*(one.pose - two.pose)[:2]) < 2.0 and one.covariance[0, 0] == pytest.approx(0.1625, rel=0.1)
 
 
 def test_packets_that_are_lost_are_counted() -> None:
-    looked = []
-    lossy = build_map(Crossroads(), CROSS, Building(None, every=4, channel="its-g5", seed=3), lambda: looked.append(1))
-    assert len(looked) == instants(Crossroads(), CROSS, 4) == 5
-    assert lossy.numbers.lost == lossy.numbers.messages - lossy.numbers.observations
+    calls = []
+    lossy = build_map(
+        Crossroads(), CROSS, MapBuildConfig(None, frame_stride=4, channel="its-g5", seed=3), lambda: calls.append(1)
+    )
+    assert len(calls) == count_snapshots(Crossroads(), CROSS, 4) == 5
+    assert lossy.stats.num_lost == lossy.stats.num_messages - lossy.stats.num_observations
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     torch.manual_seed(0)
     path = tmp_path_factory.mktemp("weights") / "random.safetensors"
-    checkpoint.save(Mapper(replace(TOY, head=replace(TOY.head, threshold=0.0))), path, {"towns": []}, format=FORMAT)
+    checkpoint.save(
+        MapModel(replace(MAP_TINY, head=replace(MAP_TINY.head, score_threshold=0.0))),
+        path,
+        {"towns": []},
+        format=FORMAT,
+    )
     return path
 
 
-def test_a_model_draws_where_nobody_knows_what_is_true(weights, tmp_path) -> None:
-    mapper = pretrained.load_mapper(weights)
-    made = build_map(Crossroads(frames=9), NOWHERE, Building(mapper, "semi-global", every=8))
-    n = made.numbers
-    assert n.quality is None and n.union is None and made.truth is None
-    assert n.messages == 8 and n.bytes_per_look > 1000
-    assert made.cartographer.observations[0].model == mapper.fingerprint.hex()
-    np.testing.assert_allclose(made.cartographer.observations[0].pose, [-70.0, -20.0, 0.0], atol=1e-5)
-    write_built(made, tmp_path, "Nowhere")
+def test_a_model_predicts_where_no_truth_is_known(weights, tmp_path) -> None:
+    map_model = pretrained.load_map_model(weights)
+    made = build_map(Crossroads(frames=9), NOWHERE, MapBuildConfig(map_model, "semi-global", frame_stride=8))
+    stats = made.stats
+    assert stats.scores is None and stats.union_scores is None and made.truth is None
+    assert stats.num_messages == 8 and stats.bytes_per_frame > 1000
+    assert made.map_server.observations[0].model == map_model.fingerprint.hex()
+    np.testing.assert_allclose(made.map_server.observations[0].pose, [-70.0, -20.0, 0.0], atol=1e-5)
+    write_built_map(made, tmp_path, "Nowhere")
     assert not (tmp_path / "truth").exists() and (tmp_path / "map.png").exists()
 
 
 def test_the_demos_map_is_that_of_its_drive_where_a_model_ships(weights, tmp_path, monkeypatch) -> None:
     from rich.console import Console
 
-    from manyeyes.cli.demo import _map
+    from manyeyes.cli.demo import _make_map_chapters
 
-    monkeypatch.setattr(pretrained, "mappers", lambda: (pretrained.MAPPER,))
-    monkeypatch.setattr(pretrained, "load_mapper", lambda load=pretrained.load_mapper: load(weights))
-    (chapter,), said = _map(Crossroads(("elsewhere_0",), frames=11), tmp_path, 0, Console(quiet=True))
-    assert said.startswith("One map from 8 messages") and said.endswith("not judged.") and said in chapter.text
+    monkeypatch.setattr(pretrained, "list_map_models", lambda: (pretrained.DEFAULT_MAP_MODEL,))
+    monkeypatch.setattr(pretrained, "load_map_model", lambda load=pretrained.load_map_model: load(weights))
+    (chapter,), summary = _make_map_chapters(Crossroads(("elsewhere_0",), frames=11), tmp_path, 0, Console(quiet=True))
+    assert summary.startswith("One map from 8 messages") and summary.endswith("not judged.") and summary in chapter.text
     assert [p.path for p in chapter.pictures] == [tmp_path / "map.png"] and (tmp_path / "map.html").is_file()
 
 
-def test_the_map_of_a_drive_is_said_in_one_line(built) -> None:
-    said = drive_sentence(built.numbers)
-    assert f"mAP {built.numbers.quality.mean_ap():.2f}" in said and "unfused" in said and said.count("\n") == 0
+def test_the_map_of_a_drive_is_summarised_in_one_line(built) -> None:
+    summary = describe_drive_map(built.stats)
+    assert f"mAP {built.numbers.quality.mean_ap():.2f}" in summary and "unfused" in summary and summary.count("\n") == 0
 
 
 def test_the_oracle_needs_a_true_map() -> None:
     with pytest.raises(ConfigError, match="nowhere"):
-        build_map(Crossroads(), NOWHERE, Building(None))
+        build_map(Crossroads(), NOWHERE, MapBuildConfig(None))
     with pytest.raises(ConfigError, match="every n-th"):
-        Building(None, every=0)
+        MapBuildConfig(None, frame_stride=0)
 
 
 def test_scenarios_are_grouped_by_the_town_that_they_are_named_after() -> None:
     names = {"town05_0066": "Town05", "town10hd_3": "Town10HD", "generated-3_0": "generated-3"}
-    assert {name: town_named(name) for name in names} == names
-    assert town_named("2021_08_16_22_26_54") is None and town_named("generated-x_0") is None
+    assert {name: find_named_town(name) for name in names} == names
+    assert find_named_town("2021_08_16_22_26_54") is None and find_named_town("generated-x_0") is None
     drive = Crossroads(("town05_0001", "town05_0002", "elsewhere_1"))
-    one, two = grounds_of(drive, drive.scenarios, "mine")
+    one, two = group_by_town(drive, drive.scenarios, "mine")
     assert (one.name, one.town, one.scenarios) == ("town05", "Town05", ("town05_0001", "town05_0002"))
-    assert (two.name, two.town, two.first_xy) == ("mine", None, (-60.0, 0.0)) and two.place is None and two.cut is None
+    assert (
+        (two.name, two.town, two.start_xy) == ("mine", None, (-60.0, 0.0))
+        and two.place is None
+        and two.cut_policy is None
+    )
 
 
 @pytest.mark.parametrize(
@@ -168,12 +179,12 @@ def test_scenarios_are_grouped_by_the_town_that_they_are_named_after() -> None:
 )
 def test_what_is_wrong_is_one_line(words, named, tmp_path, capsys) -> None:
     assert cli.main(["map", "build", str(tmp_path), *words, "--out", str(tmp_path / "out")]) == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("manyeyes: ") and named in said
+    (output,) = capsys.readouterr().err.splitlines()
+    assert output.startswith("manyeyes: ") and named in output
 
 
 def test_without_shipped_weights_the_way_out_is_named(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(pretrained, "mappers", lambda: ())
+    monkeypatch.setattr(pretrained, "list_map_models", lambda: ())
     assert cli.main(["map", "build", str(tmp_path)]) == 1
     assert "--source truth" in capsys.readouterr().err
 
@@ -186,7 +197,7 @@ def test_pictures_are_read_of_opv2v_only(tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_the_verb_on_a_simulated_recording(tmp_path, capsys) -> None:
+def test_the_command_on_a_simulated_recording(tmp_path, capsys) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
     from manyeyes.simulator.presets import simulate
 
@@ -214,9 +225,9 @@ def test_a_real_maps_file_is_the_truth_where_no_town_is_named(tmp_path):
     }
     path = tmp_path / "yizhuang06.json"
     path.write_text(json.dumps({"LANE": lanes}))
-    ground = Ground("road", ("x",), None, (0.0, 0.0), path)
+    ground = TownMap("road", ("x",), None, (0.0, 0.0), path)
     assert ground.place is not None and ground.origin_xy == (30.0, 0.0)
     truth = ground.place.truth
     assert sorted(KINDS[kind] for kind in truth.kind) == ["boundary", "boundary", "divider"]
     # A town's own map stands, whatever file is given for elsewhere.
-    assert Ground("cross", ("cross_0",), "cross", (0.0, 0.0), path).origin_xy != (30.0, 0.0)
+    assert TownMap("cross", ("cross_0",), "cross", (0.0, 0.0), path).origin_xy != (30.0, 0.0)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -34,7 +34,7 @@ def street(scenario: str, index: int) -> Snapshot:
     center = torch.tensor([[8, 5, 0.8]], dtype=torch.float64)
     boxes = Boxes.of(center, 2 * half[None].double(), torch.tensor([0.4]).double(), id=torch.tensor([9]))
     return Snapshot(
-        scenario, index, tuple(frames), Truth(boxes, torch.ones(2, 1, dtype=torch.bool), Transform.stack(poses))
+        scenario, index, tuple(frames), GroundTruth(boxes, torch.ones(2, 1, dtype=torch.bool), Transform.stack(poses))
     )
 
 
@@ -64,8 +64,8 @@ def run(*words: object) -> int:
 
 def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_path, capsys) -> None:
     assert run("run", data, "--split", "test", "--weights", weights, "--out", tmp_path, "--score-min", 0.9) == 0
-    said = capsys.readouterr()
-    assert all(name in said.out for name in ("alone", "late", "intermediate", "early", "report.html"))
+    output = capsys.readouterr()
+    assert all(name in output.out for name in ("alone", "late", "intermediate", "early", "report.html"))
     made = {p.name for p in tmp_path.iterdir()}
     pictures = {f"{name}.png" for name in ("alone", "late", "intermediate", "early")}
     assert made == pictures | {"drive.gif", "report.html", "results.json", "results.md"}
@@ -80,7 +80,7 @@ def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_
     assert (tmp_path / "report.html").read_text().count("data:image/") == 5
 
 
-def test_two_runs_say_the_same_but_for_time(data, weights, tmp_path) -> None:
+def test_two_runs_agree_except_for_times(data, weights, tmp_path) -> None:
     results = []
     for name, workers in (("one", 1), ("two", 2)):
         words = ("--workers", workers, "--timed-frames", 0, "--out", tmp_path / name)
@@ -90,11 +90,11 @@ def test_two_runs_say_the_same_but_for_time(data, weights, tmp_path) -> None:
     assert (tmp_path / "one" / "results.md").read_text() == (tmp_path / "two" / "results.md").read_text()
 
 
-def test_evaluate_judges_pairs_over_scenarios(data, weights, tmp_path, capsys) -> None:
+def test_evaluate_compares_methods_over_scenarios(data, weights, tmp_path, capsys) -> None:
     words = ("--methods", "alone", "intermediate", "--workers", 1, "--out", tmp_path)
     assert run("evaluate", "--data", data, "--split", "test", "--weights", weights, *words) == 0
-    said = capsys.readouterr().out
-    assert "intermediate - alone" in said and "at most 131,072: reached" in said
+    output = capsys.readouterr().out
+    assert "intermediate - alone" in output and "at most 131,072: reached" in output
     held = json.loads((tmp_path / "results.json").read_text())["result"]
     (half, seven) = held["differences"]
     assert (half["bar"], seven["bar"]) == (0.12, None)
@@ -152,8 +152,8 @@ def test_a_spoilt_recording_is_one_line_that_names_the_thing(data, weights, tmp_
     folder = broken(data, tmp_path)
     spoil(folder)
     assert run("run", folder, "--weights", weights, "--out", tmp_path / "out") == 1
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and said[0].startswith("manyeyes: ") and named in said[0] and "broken" in said[0]
+    output = capsys.readouterr().err.splitlines()
+    assert len(output) == 1 and output[0].startswith("manyeyes: ") and named in output[0] and "broken" in output[0]
 
 
 @pytest.mark.parametrize(
@@ -171,8 +171,8 @@ def test_a_spoilt_recording_is_one_line_that_names_the_thing(data, weights, tmp_
 def test_an_unknown_name_is_one_line_that_lists_the_known(words, named, capsys, monkeypatch, tmp_path) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(*words) == 1
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and all(name in said[0] for name in named)
+    output = capsys.readouterr().err.splitlines()
+    assert len(output) == 1 and all(name in output[0] for name in named)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -198,8 +198,8 @@ def test_weights_of_another_shape_are_one_line(data, weights, tmp_path, capsys) 
     assert (
         run("run", data, "--split", "test", "--weights", tmp_path / "other.safetensors", "--out", tmp_path / "o") == 1
     )
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and name in said[0] and "other.safetensors" in said[0]
+    output = capsys.readouterr().err.splitlines()
+    assert len(output) == 1 and name in output[0] and "other.safetensors" in output[0]
 
 
 def test_train_writes_weights_log_picture_and_json(data, tmp_path, capsys) -> None:
@@ -214,4 +214,4 @@ def test_train_writes_weights_log_picture_and_json(data, tmp_path, capsys) -> No
 
 def test_the_recording_of_these_tests_is_read_as_it_was_made(data) -> None:
     recording = Opv2vRecording(data, "test", use_cache=False)
-    assert recording.judged("a") == range(1, 3) and recording.agents("a") == (5, -1)
+    assert recording.eval_indices("a") == range(1, 3) and recording.agents("a") == (5, -1)

@@ -6,7 +6,7 @@ import torch
 
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -21,7 +21,7 @@ def test_weights_gain_a_codebook_and_keep_their_card(tmp_path, half, capsys):
         time_ns = index * 100_000_000
         cloud = PointCloud.of(xyz, torch.full((500,), 0.5))
         frame = AgentFrame(5, time_ns, cloud, pose, torch.zeros(3, 3))
-        truth = Truth(Boxes.empty(torch.float64), torch.zeros(1, 0, dtype=torch.bool), Transform.stack([pose]))
+        truth = GroundTruth(Boxes.empty(torch.float64), torch.zeros(1, 0, dtype=torch.bool), Transform.stack([pose]))
         writer.write(Snapshot("a", index, (frame,), truth))
     writer.close({})
     weights, out = tmp_path / "plain.safetensors", tmp_path / "coded.safetensors"

@@ -13,22 +13,22 @@ import pytest
 from manyeyes.cli import main as cli
 
 
-def test_help_lists_every_verb_and_imports_nothing_heavy() -> None:
+def test_help_lists_every_command_and_imports_nothing_heavy() -> None:
     code = (
         "import sys; from manyeyes.cli import main; code = main.main(['--help']); "
         "heavy = {'torch', 'numpy', 'numba', 'tyro', 'rich'} & set(sys.modules); print('HEAVY', sorted(heavy), code)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "HEAVY [] 0"
-    assert all(f"  {verb} " in done.stdout for verb in cli.VERBS)
+    assert all(f"  {verb} " in done.stdout for verb in cli.COMMANDS)
 
 
-EVERY_VERB = [verb for verb in cli.VERBS if verb not in cli.GROUPS]
-EVERY_VERB += [f"{group} {verb}" for group, verbs in cli.GROUPS.items() for verb in verbs]
+ALL_COMMANDS = [verb for verb in cli.COMMANDS if verb not in cli.COMMAND_GROUPS]
+ALL_COMMANDS += [f"{group} {verb}" for group, verbs in cli.COMMAND_GROUPS.items() for verb in verbs]
 
 
-@pytest.mark.parametrize("verb", EVERY_VERB)
-def test_every_verb_has_options_with_help(verb, capsys) -> None:
+@pytest.mark.parametrize("verb", ALL_COMMANDS)
+def test_every_command_has_options_with_help(verb, capsys) -> None:
     module = importlib.import_module(cli.module_of(verb))
     assert module.__doc__ and callable(module.main)
     with pytest.raises(SystemExit) as stop:
@@ -43,7 +43,7 @@ def test_every_verb_has_options_with_help(verb, capsys) -> None:
     assert source.count('\n    """') == len(fields) + 1, "an option is without a line of help"
 
 
-def test_an_unknown_verb_says_which_are_known(capsys) -> None:
+def test_an_unknown_command_lists_the_known(capsys) -> None:
     assert cli.main(["demmo"]) == 2
     assert capsys.readouterr().err == (
         "manyeyes: there is no verb 'demmo'; did you mean demo? Known verbs: "
@@ -51,10 +51,10 @@ def test_an_unknown_verb_says_which_are_known(capsys) -> None:
     )
 
 
-def test_a_group_lists_its_verbs_and_knows_no_other(capsys) -> None:
+def test_a_group_lists_its_commands_and_no_other(capsys) -> None:
     assert cli.main(["map"]) == 0
-    said = capsys.readouterr().out
-    assert all(f"  {verb} " in said for verb in cli.GROUPS["map"]) and "usage: manyeyes map VERB" in said
+    output = capsys.readouterr().out
+    assert all(f"  {verb} " in output for verb in cli.COMMAND_GROUPS["map"]) and "usage: manyeyes map VERB" in output
     assert cli.main(["map", "fuze"]) == 2
     assert "did you mean fuse? Known verbs: build, simulate, import, fuse" in capsys.readouterr().err
 
@@ -101,14 +101,14 @@ def test_version(capsys) -> None:
     assert capsys.readouterr().out == "manyeyes 0.1.0\n"
 
 
-def test_doctor_says_as_json_what_a_bug_report_needs(capsys) -> None:
+def test_doctor_prints_json_for_a_bug_report(capsys) -> None:
     assert cli.main(["doctor", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    output = json.loads(capsys.readouterr().out)
     import torch
 
-    assert said["versions"]["torch"] == torch.__version__ and said["torch_threads"] == torch.get_num_threads()
-    assert {e["name"] for e in said["extras"]} == {"sim", "map", "view", "av2", "dask", "ray", "register"}
-    assert {"cpu", "cores", "system", "git_commit", "weights", "towns", "towns_from", "package"} <= set(said)
+    assert output["versions"]["torch"] == torch.__version__ and output["torch_threads"] == torch.get_num_threads()
+    assert {e["name"] for e in output["extras"]} == {"sim", "map", "view", "av2", "dask", "ray", "register"}
+    assert {"cpu", "cores", "system", "git_commit", "weights", "towns", "towns_from", "package"} <= set(output)
 
 
 def test_doctor_names_the_pip_line_of_a_missing_extra(monkeypatch, capsys) -> None:

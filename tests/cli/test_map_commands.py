@@ -31,7 +31,7 @@ def folder(tmp_path_factory) -> Path:
 def test_simulate_and_fuse_leave_observations_truth_and_a_map(folder) -> None:
     assert {p.name for p in folder.iterdir()} == {"observations", "truth", "cut.json", "simulate.json", "map"}
     made, truth = read_vector_map(folder / "map"), read_vector_map(folder / "truth")
-    assert len(truth) > 20 and len(made.published()) > 5 and made.frame == truth.frame
+    assert len(truth) > 20 and len(made.select_published()) > 5 and made.frame == truth.frame
     held = json.loads((folder / "map" / "fuse.json").read_text())
     assert held["result"]["observations"] == 24 and held["result"]["hash"] == made.quantised_hash()
     assert held["provenance"]["config"]["settings"]["ours"]["align"]["spacing_m"] == 1.0
@@ -43,10 +43,10 @@ def test_the_same_seed_is_the_same_map(folder, tmp_path) -> None:
     assert read_vector_map(tmp_path / "again").quantised_hash() == read_vector_map(folder / "map").quantised_hash()
 
 
-def test_evaluate_says_and_writes_what_the_map_is_worth(folder, capsys) -> None:
+def test_evaluate_prints_and_writes_the_metrics(folder, capsys) -> None:
     assert run("map", "evaluate", folder / "map") == 0
-    said = capsys.readouterr().out
-    assert "divider" in said and "mAP" in said
+    output = capsys.readouterr().out
+    assert "divider" in output and "mAP" in output
     held = json.loads((folder / "map" / "quality.json").read_text())["result"]
     exact = next(r for r in held["ap"] if (r["way"], r["thresholds"]) == ("exact", "narrow"))
     assert 0.3 < exact["mean"] <= 1.0
@@ -55,7 +55,7 @@ def test_evaluate_says_and_writes_what_the_map_is_worth(folder, capsys) -> None:
     assert {r["mean"] for r in perfect["ap"]} == {1.0}
 
 
-def test_a_rival_makes_a_map_beside_ours_and_diff_says_how_they_differ(folder, capsys) -> None:
+def test_a_baseline_map_is_written_and_diff_lists_the_differences(folder, capsys) -> None:
     assert run("map", "fuse", folder, "--method", "union") == 0
     page, numbers = folder / "change.html", folder / "change.json"
     assert run("map", "diff", folder / "map", folder / "union", "--out", numbers) == 0
@@ -69,7 +69,7 @@ def test_a_rival_makes_a_map_beside_ours_and_diff_says_how_they_differ(folder, c
     assert run("map", "diff", folder / "map", folder / "map", "--out", numbers) == 0
     rows = json.loads(numbers.read_text())["result"]["kinds"]
     assert all(r["changed"] == r["added"] == r["removed"] == 0 and r["new_m"] == r["gone_m"] == 0 for r in rows)
-    assert sum(r["kept"] for r in rows) == len(read_vector_map(folder / "map").published())
+    assert sum(r["kept"] for r in rows) == len(read_vector_map(folder / "map").select_published())
 
 
 def test_view_draws_a_page_and_a_picture(folder) -> None:
@@ -84,12 +84,12 @@ def test_view_draws_a_page_and_a_picture(folder) -> None:
 def test_export_writes_a_file_that_others_read(folder, tmp_path) -> None:
     assert run("map", "export", folder / "map", tmp_path / "map.geojson") == 0
     held = json.loads((tmp_path / "map.geojson").read_text())
-    assert len(held["features"]) == len(read_vector_map(folder / "map").published())
+    assert len(held["features"]) == len(read_vector_map(folder / "map").select_published())
     assert run("map", "export", folder / "map", tmp_path / "all.geojson", "--everything") == 0
     assert len(json.loads((tmp_path / "all.geojson").read_text())["features"]) >= len(held["features"])
 
 
-def test_a_store_takes_observations_in_and_other_verbs_read_its_last_release(folder, tmp_path, capsys) -> None:
+def test_a_store_takes_observations_and_other_commands_read_its_last_release(folder, tmp_path, capsys) -> None:
     store = tmp_path / "city"
     assert run("map", "fuse", folder, "--store", store, "--executor", "inline") == 0
     assert "release 1 after 24 new observations, 0 known, 0 put aside" in capsys.readouterr().out
@@ -110,8 +110,8 @@ def test_import_reads_results_of_a_model(tmp_path, capsys) -> None:
     )
     words = ("map", "import", tmp_path / "submission_vector.json", "--poses", tmp_path / "poses.csv")
     assert run(*words, "--origin", 49.0, 8.4, "--out", tmp_path / "in") == 0
-    said = capsys.readouterr().out
-    assert "2 observations of 2 elements" in said and "'c' has no pose" in said
+    output = capsys.readouterr().out
+    assert "2 observations of 2 elements" in output and "'c' has no pose" in output
     view = read_observations(tmp_path / "in" / "observations").observations[0].view
     assert (np.ptp(view[:, 0]), np.ptp(view[:, 1])) == (60.0, 30.0), "the models look farther ahead than to the sides"
     assert run("map", "fuse", tmp_path / "in") == 0
@@ -145,14 +145,14 @@ def spoil_cut(folder: Path) -> Path:
 def test_what_is_not_there_is_one_line_that_names_it(words, named, tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert run("map", *(word.format(here=tmp_path) for word in words)) == 1
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and said[0].startswith("manyeyes: ")
-    assert all(name.format(here=tmp_path) in said[0] for name in named)
+    output = capsys.readouterr().err.splitlines()
+    assert len(output) == 1 and output[0].startswith("manyeyes: ")
+    assert all(name.format(here=tmp_path) in output[0] for name in named)
 
 
 def test_a_damaged_cut_is_one_line(folder, capsys) -> None:
     before = (folder / "cut.json").read_text()
     assert run("map", "evaluate", spoil_cut(folder)) == 1
     (folder / "cut.json").write_text(before)
-    said = capsys.readouterr().err.splitlines()
-    assert said[-1].startswith("manyeyes: ") and "cut.json" in said[-1]
+    output = capsys.readouterr().err.splitlines()
+    assert output[-1].startswith("manyeyes: ") and "cut.json" in output[-1]

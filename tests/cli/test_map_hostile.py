@@ -135,19 +135,19 @@ def with_rows(honest: Path, folder: Path, changes: list[Callable[[dict], None]])
 def test_one_hostile_row_is_one_line_and_the_map_is_that_of_the_rest(name, honest, tmp_path, capsys) -> None:
     folder = with_rows(honest, tmp_path / "in", [CASES[name][1]])
     assert run("map", "fuse", folder) == 0
-    said = [text for text in capsys.readouterr().out.splitlines() if text.startswith("put aside")]
-    assert len(said) == 1 and f"{folder}/all.parquet row 0: Observation.{CASES[name][0]}: expected " in said[0]
-    assert "; got " in said[0] and said[0].endswith(".") and len(said[0]) < 400
+    output = [text for text in capsys.readouterr().out.splitlines() if text.startswith("put aside")]
+    assert len(output) == 1 and f"{folder}/all.parquet row 0: Observation.{CASES[name][0]}: expected " in output[0]
+    assert "; got " in output[0] and output[0].endswith(".") and len(output[0]) < 400
     assert content(folder / "map") == content(honest / "map")
 
 
 def test_every_hostile_row_of_a_file_is_named_and_the_map_is_that_of_the_rest(honest, tmp_path, capsys) -> None:
     folder = with_rows(honest, tmp_path / "in", [change for _, change in CASES.values()])
     assert run("map", "fuse", folder) == 0
-    said = [text for text in capsys.readouterr().out.splitlines() if text.startswith("put aside")]
-    assert len(said) == len(CASES) and max(map(len, said)) < 400
+    output = [text for text in capsys.readouterr().out.splitlines() if text.startswith("put aside")]
+    assert len(output) == len(CASES) and max(map(len, output)) < 400
     for row, (name, (field, _)) in enumerate(CASES.items()):
-        assert f" row {row}: Observation.{field}: expected " in said[row], name
+        assert f" row {row}: Observation.{field}: expected " in output[row], name
     assert content(folder / "map") == content(honest / "map")
 
 
@@ -164,16 +164,16 @@ def every_number(row: dict, value: float) -> list[Callable[[dict], None]]:
     return [*changes, setting("occluders", [shade])]
 
 
-def test_whatever_number_is_extreme_the_rest_is_fused(honest, tmp_path, capsys) -> None:
+def test_one_extreme_number_leaves_the_rest_fused(honest, tmp_path, capsys) -> None:
     row = read_rows(honest)[0]
     changes = [change for value in VALUES for change in every_number(row, value)]
     folder = with_rows(honest, tmp_path / "in", changes)
     assert run("map", "fuse", folder) == 0
-    said = capsys.readouterr().out
-    refused = said.count("put aside: ")
+    output = capsys.readouterr().out
+    refused = output.count("put aside: ")
     # 1 km is a variance, a sigma and a place; 100 km still is a place and a variance.
     assert len(changes) - 20 <= refused < len(changes)
-    assert f"from {NUM_HONEST + len(changes) - refused} observations" in said
+    assert f"from {NUM_HONEST + len(changes) - refused} observations" in output
     kept = {o.id for o in read_observations(folder).observations}
     assert {o.id for o in read_observations(honest / "observations").observations} <= kept
 
@@ -194,8 +194,8 @@ def test_a_file_of_model_results_with_extreme_numbers_is_imported_without_them(t
     (tmp_path / "poses.csv").write_text("\n".join([header, *rows]) + "\n")
     words = ("map", "import", tmp_path / "submission_vector.json", "--poses", tmp_path / "poses.csv")
     assert run(*words, "--origin", 49.0, 8.4, "--out", tmp_path / "in") == 0
-    said = capsys.readouterr().out
-    assert said.count("put aside: ") == 3 and "1 observations of 2 elements" in said
+    output = capsys.readouterr().out
+    assert output.count("put aside: ") == 3 and "1 observations of 2 elements" in output
 
 
 # Stores.
@@ -225,9 +225,9 @@ def store(honest_store, tmp_path) -> Path:
 def test_a_store_takes_in_the_rest_of_a_folder_with_hostile_rows(honest, tmp_path, capsys) -> None:
     folder = with_rows(honest, tmp_path / "in", [change for _, change in CASES.values()])
     assert fuse_into(tmp_path / "city", folder) == 0
-    said = capsys.readouterr().out
-    assert said.count("put aside: ") == len(CASES)
-    assert f"{NUM_HONEST} new observations, 0 known, {len(CASES)} put aside" in said
+    output = capsys.readouterr().out
+    assert output.count("put aside: ") == len(CASES)
+    assert f"{NUM_HONEST} new observations, 0 known, {len(CASES)} put aside" in output
     assert content(tmp_path / "city") == content(honest / "map")
 
 
@@ -282,20 +282,22 @@ def test_a_store_of_an_older_version_recovers_from_what_it_holds(indexed, store,
     capsys.readouterr()
     assert fuse_into(store, honest) == 0
     out = capsys.readouterr().out
-    said = [text for text in out.splitlines() if text.startswith("put aside")]
-    assert len(said) == 3 and f"0 new observations, {NUM_HONEST} known, 3 put aside" in out
+    output = [text for text in out.splitlines() if text.startswith("put aside")]
+    assert len(output) == 3 and f"0 new observations, {NUM_HONEST} known, 3 put aside" in out
     for row, (name, field) in enumerate(bad.items()):
-        assert f"parquet row {row}: Observation.{field}: expected" in said[row] and name in said[row]
+        assert f"parquet row {row}: Observation.{field}: expected" in output[row] and name in output[row]
     assert content(store) == content(honest / "map")
-    with MapStore(store).writing() as log:
-        assert [row[:3] for row in log.catalogue.quarantined()] == [
+    with MapStore(store).open_for_writing() as log:
+        assert [row[:3] for row in log.index.list_rejected()] == [
             ("00000007-0123456789abcdef.parquet", k, 1) for k in range(3)
         ]
     # What is known is not said again, and can be retracted.
     assert retract(store, "--agent", "hostile", "--reason", "made up") == 0
-    said = capsys.readouterr().out
-    assert "3 observations retracted now, 0 before; 12 count" in said and "release 2 is already without them" in said
-    assert "put aside" not in said
+    output = capsys.readouterr().out
+    assert (
+        "3 observations retracted now, 0 before; 12 count" in output and "release 2 is already without them" in output
+    )
+    assert "put aside" not in output
 
 
 def test_damage_of_a_segment_is_still_an_error_that_names_it(store, honest, capsys) -> None:
@@ -308,11 +310,11 @@ def test_damage_of_a_segment_is_still_an_error_that_names_it(store, honest, caps
     shutil.rmtree(store / "work")
     capsys.readouterr()
     assert fuse_into(store, honest) == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert segment.name in said and "from a copy" in said
+    (output,) = capsys.readouterr().err.splitlines()
+    assert segment.name in output and "from a copy" in output
 
 
-def test_a_row_that_is_not_what_its_id_says_is_damage(store, honest, capsys) -> None:
+def test_a_row_that_differs_from_its_id_is_damage(store, honest, capsys) -> None:
     (segment,) = (store / "log").glob("*.parquet")
     table = pq.read_table(segment)
     rows = table.to_pylist()
@@ -322,8 +324,8 @@ def test_a_row_that_is_not_what_its_id_says_is_damage(store, honest, capsys) -> 
         file.unlink()
     capsys.readouterr()
     assert fuse_into(store, honest) == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert segment.name in said and "row 0" in said and "from a copy" in said
+    (output,) = capsys.readouterr().err.splitlines()
+    assert segment.name in output and "row 0" in output and "from a copy" in output
 
 
 def map_without(honest: Path, folder: Path, left_out: set[str]) -> str:
@@ -339,13 +341,15 @@ def test_a_retracted_observation_is_not_in_the_next_release_and_stays_out(store,
     want = map_without(honest, tmp_path / "rest", {name})
     capsys.readouterr()
     assert retract(store, "--ids", name[:12].upper(), name, "--reason", "asked for") == 0
-    said = capsys.readouterr().out
-    assert "1 observations retracted now, 0 before; 11 count" in said and "release 2 is without them" in said
+    output = capsys.readouterr().out
+    assert "1 observations retracted now, 0 before; 11 count" in output and "release 2 is without them" in output
     assert content(store) == want != content(honest / "map")
     log = sorted(path.name for path in (store / "log").iterdir())
     assert retract(store, "--ids", name, "--reason", "asked for again") == 0
-    said = capsys.readouterr().out
-    assert "0 observations retracted now, 1 before; 11 count" in said and "release 2 is already without them" in said
+    output = capsys.readouterr().out
+    assert (
+        "0 observations retracted now, 1 before; 11 count" in output and "release 2 is already without them" in output
+    )
     assert sorted(path.name for path in (store / "log").iterdir()) == log and MapStore(store).releases() == (1, 2)
     assert fuse_into(store, honest) == 0
     assert content(store) == want
@@ -360,8 +364,8 @@ def test_an_agent_and_a_pass_can_be_retracted_and_published_later(store, honest,
     capsys.readouterr()
     assert 0 < len(first) < len(both) < NUM_HONEST
     assert retract(store, "--agent", agent, "--reason", "privacy", "--no-fuse") == 0
-    said = capsys.readouterr().out
-    assert f"{len(first)} observations retracted now" in said and "no new release; run this again" in said
+    output = capsys.readouterr().out
+    assert f"{len(first)} observations retracted now" in output and "no new release; run this again" in output
     assert MapStore(store).releases() == (1,)
     assert retract(store, "--pass-id", pass_id, "--agent", many[-1].agent, "--reason", "privacy") == 0
     assert content(store) == want
@@ -392,15 +396,15 @@ def test_what_cannot_be_retracted_is_one_line_and_changes_nothing(words, named, 
     before = sorted((store / "log").iterdir())
     capsys.readouterr()
     assert retract(store, "--reason", "x", *words) == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith("manyeyes: ") and all(name in said for name in named)
+    (output,) = capsys.readouterr().err.splitlines()
+    assert output.startswith("manyeyes: ") and all(name in output for name in named)
     assert sorted((store / "log").iterdir()) == before and MapStore(store).releases() == (1,)
 
 
 def test_retract_needs_a_store_and_a_reason(store, tmp_path, capsys) -> None:
     assert retract(tmp_path / "nowhere", "--ids", "ab", "--reason", "x") == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert "nowhere/store.json" in said and not (tmp_path / "nowhere").exists()
+    (output,) = capsys.readouterr().err.splitlines()
+    assert "nowhere/store.json" in output and not (tmp_path / "nowhere").exists()
     assert retract(store, "--ids", "ab", "--reason", " ") == 1
     assert "--reason" in capsys.readouterr().err
     with pytest.raises(SystemExit) as stop:

@@ -14,7 +14,7 @@ import torch
 from manyeyes.cli import main as cli
 from manyeyes.datasets.dair_writer import DairWriter, write_dair_index
 from manyeyes.datasets.opv2v import Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -45,7 +45,7 @@ def street(scenario: str, index: int, ids: tuple[int, ...] = (5, 7, -1)) -> Snap
         id=torch.arange(50, 50 + len(CARS)),
     )
     seen = torch.ones(len(ids), len(CARS), dtype=torch.bool)
-    return Snapshot(scenario, index, tuple(frames), Truth(boxes, seen, Transform.stack(poses)))
+    return Snapshot(scenario, index, tuple(frames), GroundTruth(boxes, seen, Transform.stack(poses)))
 
 
 def note_digests(folder: Path, each_file: bool) -> None:
@@ -162,8 +162,8 @@ def test_a_missing_or_replaced_file_is_one_line_and_no_result(
 ) -> None:
     path = damage(data)
     assert evaluate(data, weights, tmp_path / "out") == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert f"{path.parent.name}/{path.stem}" in said and "--allow-missing" in said
+    (output,) = capsys.readouterr().err.splitlines()
+    assert f"{path.parent.name}/{path.stem}" in output and "--allow-missing" in output
     assert not (tmp_path / "out").exists()
 
 
@@ -224,11 +224,11 @@ def test_many_files_are_counted_and_the_list_is_capped(
     assert "120 files missing or mismatched" in capsys.readouterr().out
 
 
-def align(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
+def run_pose(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
     return ("align", data, "--split", "test", "--weights", weights, "--correctors", "given", "--out", out)
 
 
-def play(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
+def run_replay(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
     words = (
         "run",
         data,
@@ -246,37 +246,37 @@ def play(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
     return (*words, "--no-animate")
 
 
-def quantise(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
+def run_fit_codebook(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
     words = ("quantise", "--data", data, "--split", "test", "--weights", weights, "--out", out / "coded.safetensors")
     return (*words, "--stages", 1, "--every", 1)
 
 
-def study(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
+def run_study(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
     words = ("evaluate", "--data", data, "--split", "test", "--weights", weights, "--study", "agents", "--workers", 1)
     return (*words, "--methods", "alone", "late", "--every", 2, "--out", out)
 
 
-def train(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
+def run_train(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
     words = ("train", "--data", data, "--split", "test", "--preset", "costr-tiny", "--steps", 1, "--batch", 1)
     return (*words, "--out", out)
 
 
-def held_in(path: str) -> Callable[[Path], dict]:
+def missing_in(path: str) -> Callable[[Path], dict]:
     return lambda out: json.loads((out / path).read_text())["result"]["missing"]
 
 
-def held_in_card(out: Path) -> dict:
+def missing_in_card(out: Path) -> dict:
     return checkpoint.read_card(out / "coded.safetensors")["codebook"]["missing"]
 
 
 @pytest.mark.parametrize(
     ("command", "held"),
     [
-        (align, held_in("align.json")),
-        (play, held_in("results.json")),
-        (quantise, held_in_card),
-        (study, held_in("agents.json")),
-        (train, held_in("train.json")),
+        (run_pose, missing_in("align.json")),
+        (run_replay, missing_in("results.json")),
+        (run_fit_codebook, missing_in_card),
+        (run_study, missing_in("agents.json")),
+        (run_train, missing_in("train.json")),
     ],
 )
 def test_every_command_refuses_and_counts(
@@ -295,32 +295,32 @@ def test_every_command_refuses_and_counts(
     assert str(path) in capsys.readouterr().err and not any(out.iterdir())
     assert run(*words, "--allow-missing") == 0
     assert held(out)["count"] == 1
-    if command is not quantise:
+    if command is not run_fit_codebook:
         assert "1 file missing or mismatched" in capsys.readouterr().out
 
 
-def test_a_study_of_the_map_model_refuses_before_it_looks_for_weights(
+def test_a_study_of_the_map_model_refuses_before_it_loads_weights(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data = shutil.copytree(whole, tmp_path / "data")
     path = no_record_of_the_ego(data)
     assert run("map", "evaluate", "--study", "local", "--data", data, "--weights", "none", "--out", tmp_path / "o") == 1
-    said = capsys.readouterr().err
-    assert str(path) in said and "--allow-missing" in said and not (tmp_path / "o").exists()
+    output = capsys.readouterr().err
+    assert str(path) in output and "--allow-missing" in output and not (tmp_path / "o").exists()
 
 
 def test_the_report_of_a_drive_has_the_footer(whole: Path, weights: Path, tmp_path: Path) -> None:
     data = shutil.copytree(whole, tmp_path / "data")
     no_record_of_the_ego(data)
-    assert run(*play(data, weights, tmp_path), "--allow-missing") == 0
+    assert run(*run_replay(data, weights, tmp_path), "--allow-missing") == 0
     assert FOOTER in (tmp_path / "report.html").read_text() and FOOTER in (tmp_path / "results.md").read_text()
 
 
 def test_a_drive_is_played_whatever_other_scenarios_lack(whole: Path, weights: Path, tmp_path: Path) -> None:
     data = shutil.copytree(whole, tmp_path / "data")
     no_record_of_the_ego(data)
-    assert run(*play(data, weights, tmp_path), "--scenario", "bb") == 0
-    assert run(*play(data, weights, tmp_path), "--scenario", "a") == 1
+    assert run(*run_replay(data, weights, tmp_path), "--scenario", "bb") == 0
+    assert run(*run_replay(data, weights, tmp_path), "--scenario", "a") == 1
 
 
 def test_cells_of_an_incomplete_recording_are_kept_apart(whole: Path, weights: Path, tmp_path: Path) -> None:
@@ -328,7 +328,7 @@ def test_cells_of_an_incomplete_recording_are_kept_apart(whole: Path, weights: P
     path = data / "test" / "a" / "7" / "000004.yaml"  # behind the first judged frame, which alone names a cell
     text = path.read_text()
     path.unlink()
-    words = (*study(data, weights, tmp_path / "out"), "--every", 1)
+    words = (*run_study(data, weights, tmp_path / "out"), "--every", 1)
     assert run(*words, "--allow-missing") == 0
     damaged = json.loads((tmp_path / "out" / "agents.json").read_text())["result"]
     path.write_text(text)
@@ -411,8 +411,8 @@ def test_pairs_of_dair_v2x_are_checked_alike(
     assert json.loads((tmp_path / "out" / "results.json").read_text())["result"]["missing"]["count"] == 0
     path = damage(pairs)
     assert evaluate(pairs, weights, tmp_path / "out") == 1
-    said = capsys.readouterr().err
-    assert str(path) in said and "--allow-missing" in said
+    output = capsys.readouterr().err
+    assert str(path) in output and "--allow-missing" in output
     if damage is not no_label:  # without its truth no pair is judged, allowed or not
         assert evaluate(pairs, weights, tmp_path / "out", "--allow-missing") == 0
         assert json.loads((tmp_path / "out" / "results.json").read_text())["result"]["missing"]["count"] == 1

@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from manyeyes.agents.perception_cache import Eyes
+from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.pose.registry import CLOUDS
-from manyeyes.pose.types import unanswered
+from manyeyes.pose.registry import CLOUD_CORRECTORS
+from manyeyes.pose.types import no_estimate
 
 PLACES = [
     (8, 5, 0.4),
@@ -48,16 +48,16 @@ def drive(tmp_path, monkeypatch):
             AgentFrame(i, time_ns, cloud, pose, torch.zeros(3, 3), is_infrastructure=i < 0)
             for i, pose in zip((5, -1), POSES)
         )
-        truth = Truth(cars(), torch.ones(2, len(PLACES), dtype=torch.bool), Transform.stack(POSES))
+        truth = GroundTruth(cars(), torch.ones(2, len(PLACES), dtype=torch.bool), Transform.stack(POSES))
         writer.write(Snapshot("a", index, frames, truth))
     writer.close({"history_frames": 0})
     path = tmp_path / "untrained.safetensors"
     checkpoint.save(Detector(COSTR_TINY), path, {})
 
-    def see(self, frame):
+    def process(self, frame):
         return SimpleNamespace(boxes=cars().transform(POSES[0 if frame.agent_id == 5 else 1].inverse()))
 
-    monkeypatch.setattr(Eyes, "see", see)
+    monkeypatch.setattr(PerceptionCache, "process", process)
     return tmp_path / "data", path, tmp_path
 
 
@@ -65,7 +65,7 @@ def run(*words):
     return cli.main(list(map(str, words)))
 
 
-def test_an_unknown_pose_is_found_and_a_noisy_claim_improved(drive, capsys) -> None:
+def test_an_unknown_pose_is_found_and_a_noisy_prior_improved(drive, capsys) -> None:
     data, weights, out = drive
     noise = ("--noise-xy-m", 0.4, "--noise-yaw-deg", 0.4)
     assert (
@@ -73,8 +73,10 @@ def test_an_unknown_pose_is_found_and_a_noisy_claim_improved(drive, capsys) -> N
         == 0
     )
     assert run("align", data, "--split", "test", "--weights", weights, "--out", out / "noisy", *noise) == 0
-    said = capsys.readouterr().out
-    assert "vote" in said and "given" in said and "align.json" in said and "agent -1: sound over 2 frames" in said
+    output = capsys.readouterr().out
+    assert (
+        "vote" in output and "given" in output and "align.json" in output and "agent -1: sound over 2 frames" in output
+    )
     free, noisy = (json.loads((p / "align.json").read_text())["result"] for p in (out, out / "noisy"))
     for answer in free["answers"]:
         assert answer["status"] == "corrected" and answer["inliers"] == len(PLACES) and answer["common"] == len(PLACES)
@@ -87,11 +89,11 @@ def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
     data, weights, out = drive
     sizes = []
 
-    def cloud(ego, other, claimed):
+    def cloud(ego, other, prior):
         sizes.append((len(ego), len(other)))
-        return unanswered(claimed)
+        return no_estimate(prior)
 
-    monkeypatch.setitem(CLOUDS, "register", cloud)
+    monkeypatch.setitem(CLOUD_CORRECTORS, "register", cloud)
     words = ("--split", "test", "--weights", weights, "--out", out, "--correctors", "register", "vote")
     assert run("align", data, *words) == 0
     answers = json.loads((out / "align.json").read_text())["result"]["answers"]

@@ -32,7 +32,7 @@ def small_presets():
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(SIMULATION_PRESETS, "small", SMALL)
         patch.setitem(SIMULATION_PRESETS, "smaller", replace(SMALL, splits=(SplitPreset("test", ("generated-1",), 1),)))
-        stand_in = replace(SMALL, splits=(SplitPreset("test", ("Town10HD",), 2),), stand_in="generated-1")
+        stand_in = replace(SMALL, splits=(SplitPreset("test", ("Town10HD",), 2),), fallback_town="generated-1")
         patch.setitem(SIMULATION_PRESETS, "stand-in", stand_in)
         yield
 
@@ -85,7 +85,7 @@ def test_another_seed_is_refused(folder: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize(
-    ("preset", "words", "says"),
+    ("preset", "words", "message"),
     [
         ("smaller", (), "preset 'smaller'"),
         ("tiny", (), "preset 'tiny'"),
@@ -94,9 +94,9 @@ def test_another_seed_is_refused(folder: Path, capsys: pytest.CaptureFixture[str
     ],
 )
 def test_other_settings_are_refused(
-    folder: Path, capsys: pytest.CaptureFixture[str], preset: str, words: tuple[str, ...], says: str
+    folder: Path, capsys: pytest.CaptureFixture[str], preset: str, words: tuple[str, ...], message: str
 ) -> None:
-    assert says in refused(folder, capsys, *words, preset=preset)
+    assert message in refused(folder, capsys, *words, preset=preset)
 
 
 def test_a_run_without_a_manifest_is_refused_by_its_specifications(
@@ -164,11 +164,11 @@ def test_an_interrupted_run_continues_and_is_known_by_its_seed(
     assert hashes(root) == hashes(made) and {p: p.stat().st_mtime_ns for p in kept} == kept
 
 
-def test_a_run_that_could_not_begin_leaves_no_claim(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_could_not_begin_leaves_no_marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing(*_: object) -> None:
         raise ConfigError("no scene")
 
-    monkeypatch.setattr(record, "first_scene", nothing)
+    monkeypatch.setattr(record, "make_first_scenario", nothing)
     assert simulate(tmp_path) == 1
     assert not hashes(tmp_path)
 

@@ -12,10 +12,10 @@ from manyeyes.cli.map import evaluate as map_evaluate
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import ConfigError
 from manyeyes.models import checkpoint
-from manyeyes.models.maps.map_model import Mapper, MapperConfig
+from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.simulator.presets import simulate
-from manyeyes.studies.map_recordings import true_maps
+from manyeyes.studies.map_recordings import load_true_maps
 from manyeyes.studies.maps import running
 
 
@@ -31,7 +31,7 @@ def test_train_then_judge(recorded, tmp_path, capsys):
     out = tmp_path / "run"
     train.main(train.Options(recorded, preset="map-toy", out=out, steps=2, batch=1))
     weights = out / "weights.safetensors"
-    model = checkpoint.load_as(weights, FORMAT, MapperConfig, Mapper)
+    model = checkpoint.load_as(weights, FORMAT, MapModelConfig, MapModel)
     assert model.config.tile.x_max == 60.0 and (out / "loss.png").exists() and (out / "train.json").exists()
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["generated-1"] and card["command"]
@@ -46,7 +46,7 @@ def test_train_then_judge(recorded, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_true_maps_are_those_of_the_scenarios_towns(recorded):
-    maps = true_maps(Opv2vRecording(recorded, "train"))
+    maps = load_true_maps(Opv2vRecording(recorded, "train"))
     assert list(maps) == ["generated-1"] and len(maps["generated-1"]) > 10
 
 
@@ -61,4 +61,4 @@ def test_a_model_with_cameras_needs_pictures(recorded, capsys):
         train.main(train.Options(recorded, preset="map-small-camera"))
     # Of the models that ship those are judged whose sensors the recording has.
     options = map_evaluate.Options(study="local", data=recorded, split="test")
-    assert [model.sensors for model in running.models(options)] == ["LiDAR"]
+    assert [model.sensors for model in running.resolve_models(options)] == ["LiDAR"]

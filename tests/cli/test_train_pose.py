@@ -9,7 +9,7 @@ import torch
 
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -31,7 +31,7 @@ def snapshot(index: int) -> Snapshot:
         id=torch.tensor([9]),
     )
     poses = Transform.stack([f.world_from_agent for f in frames])
-    return Snapshot("a", index, tuple(frames), Truth(boxes, torch.ones(2, 1, dtype=torch.bool), poses))
+    return Snapshot("a", index, tuple(frames), GroundTruth(boxes, torch.ones(2, 1, dtype=torch.bool), poses))
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_both_presets_train_on_the_same_kept_views(words, capsys):
     assert made == {"weights.safetensors", "last.pt", "log.jsonl", "loss.png", "train.json"}
     net = feakm.load(Path("small/weights.safetensors"))
     detector = checkpoint.load(Path("detector.safetensors"))
-    assert net.config.detector == detector.fingerprint.hex() and net.config.keypoints.inputs == 32
+    assert net.config.detector == detector.fingerprint.hex() and net.config.keypoints.in_channels == 32
     card = checkpoint.read_card(Path("small/weights.safetensors"), feakm.FORMAT)
     assert card["steps"] == 2 and card["command"]
     kept = {p: p.stat().st_mtime_ns for p in Path("runs/views").rglob("*.safetensors")}
@@ -69,4 +69,4 @@ def test_both_presets_train_on_the_same_kept_views(words, capsys):
 
 def test_an_unknown_preset_lists_these_too(words, capsys):
     assert cli.main([*words, "moon"]) == 1
-    assert "costr-small" in (said := capsys.readouterr().err) and "feakm-paper" in said
+    assert "costr-small" in (output := capsys.readouterr().err) and "feakm-paper" in output

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manyeyes.comms import wire
-from manyeyes.comms.entropy import TOTAL, CodeTables, coded_counts, pack_coded, unpack_coded
-from manyeyes.comms.inbox import Dropped, Inbox
+from manyeyes.comms.entropy import TOTAL, CodeTables, count_fitting_coded_cells, pack_coded, unpack_coded
+from manyeyes.comms.inbox import DropCounts, Inbox
 from manyeyes.comms.primitives import PacketError, pack_cells
-from manyeyes.comms.token_selection import within_budget
+from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.datatypes import BevGrid, ConfigError, Message, Sites, SparseBev, Transform, WireError
 
 torch.set_num_threads(1)
@@ -92,7 +92,7 @@ def test_cells_in_clusters_cost_less_than_as_gaps():
 
 @QUICK
 @given(cells.filter(len), st.integers(0, 10**6), st.data())
-def test_a_changed_stream_is_refused_or_says_something_else(key, seed, data):
+def test_a_changed_stream_is_refused_or_decodes_to_other_rows(key, seed, data):
     """Nothing crashes, nothing is read twice as the same: the stream is a bijection, so a change cannot be silent."""
     tables = skewed(3)
     rows = drawn(tables, len(key), seed)
@@ -139,9 +139,9 @@ def coded_message(count: int, seed: int, tables: CodeTables) -> Message:
 def test_packets_of_coded_tokens_decode_alone_and_cost_less():
     tables = skewed(20)
     message = coded_message(300, 1, tables)
-    packets = wire.encode(message, precision="codes", tables=tables)
+    packets = wire.encode(message, token_encoding="codes", tables=tables)
     assert len(packets) >= 2 and all(len(p) <= wire.DEFAULT_MTU for p in packets)
-    plain = wire.encode(message, precision="codes")
+    plain = wire.encode(message, token_encoding="codes")
     assert len(b"".join(packets)) < 0.9 * len(b"".join(plain))
     inbox = Inbox(MODEL, tables=tables)
     for packet in packets[::-1]:
@@ -162,11 +162,11 @@ def test_budgets_are_never_exceeded_and_nested(seed, count, budget, more, mtu):
     message = coded_message(count, seed, tables)
     kept = []
     for limit in (budget, budget + more):
-        bev, score = within_budget(message.tokens, message.token_score, limit, "codes", mtu, tables)
+        bev, score = select_within_budget(message.tokens, message.token_score, limit, "codes", mtu, tables)
         kept.append(set(bev.sites.key.tolist()))
         if len(score):
-            said = replace(message, tokens=bev, token_score=score)
-            assert len(b"".join(wire.encode(said, precision="codes", mtu=mtu, tables=tables))) <= limit
+            selected = replace(message, tokens=bev, token_score=score)
+            assert len(b"".join(wire.encode(selected, token_encoding="codes", mtu=mtu, tables=tables))) <= limit
     assert kept[0] <= kept[1]
 
 
@@ -174,9 +174,9 @@ def test_a_budget_is_used_up_but_for_a_row():
     tables = skewed(20)
     message = coded_message(400, 2, tables)
     for budget in (1398, 2000, 3000):
-        bev, score = within_budget(message.tokens, message.token_score, budget, "codes", tables=tables)
-        said = replace(message, tokens=bev, token_score=score)
-        sizes = [len(p) for p in wire.encode(said, precision="codes", tables=tables)]
+        bev, score = select_within_budget(message.tokens, message.token_score, budget, "codes", tables=tables)
+        selected = replace(message, tokens=bev, token_score=score)
+        sizes = [len(p) for p in wire.encode(selected, token_encoding="codes", tables=tables)]
         assert budget - 24 <= sum(sizes) <= budget
 
 
@@ -184,7 +184,7 @@ def test_counts_fill_each_body_before_the_next():
     tables = skewed(20)
     message = coded_message(400, 3, tables)
     key, rows = message.tokens.sites.key.numpy(), message.tokens.features.numpy()
-    counts = coded_counts(key, rows, SHAPE, tables, 20, 800, 0, -1).tolist()
+    counts = count_fitting_coded_cells(key, rows, SHAPE, tables, 20, 800, 0, -1).tolist()
     assert sum(counts) == 400
     ends = np.cumsum([0, *counts])
     for a, b in pairwise(ends):
@@ -193,19 +193,19 @@ def test_counts_fill_each_body_before_the_next():
             assert len(pack_coded(key[a : b + 1], rows[a : b + 1], SHAPE, tables)) > 780
 
 
-def test_coded_tokens_of_other_weights_are_told_from_garbage():
+def test_coded_tokens_of_other_weights_are_distinguished_from_garbage():
     tables, other = skewed(20), CodeTables(b"model-02", skewed(20, 5).frequencies)
     message = coded_message(50, 4, tables)
-    (packet,) = wire.encode(message, precision="codes", tables=tables)
+    (packet,) = wire.encode(message, token_encoding="codes", tables=tables)
     for reader in (None, other):
         inbox = Inbox(tables=reader)
         inbox.push(packet)
-        assert inbox.dropped == Dropped(wrong_model=1)
+        assert inbox.dropped == DropCounts(wrong_model=1)
     with pytest.raises(WireError, match="do not code"):
-        wire.encode(message, precision="codes", tables=other)
+        wire.encode(message, token_encoding="codes", tables=other)
     narrow = CodeTables(MODEL, skewed(19).frequencies)
     with pytest.raises(WireError, match="19 bytes"):
-        wire.encode(message, precision="codes", tables=narrow)
+        wire.encode(message, token_encoding="codes", tables=narrow)
     with pytest.raises(PacketError) as caught:
         wire.decode_packet(packet, narrow)
     assert caught.value.reason == "implausible"
@@ -215,7 +215,7 @@ def test_coded_tokens_of_other_weights_are_told_from_garbage():
 @given(st.integers(0, 1000), st.data())
 def test_a_faulty_sender_of_codes_never_crashes_the_reader(seed, data):
     tables = skewed(4)
-    (packet,) = wire.encode(coded_message(30, seed, tables), precision="codes", tables=tables)
+    (packet,) = wire.encode(coded_message(30, seed, tables), token_encoding="codes", tables=tables)
     at = data.draw(st.integers(64, len(packet) - 5))
     new = data.draw(st.binary(min_size=1, max_size=min(8, len(packet) - 4 - at)))
     changed = packet[:at] + new + packet[at + len(new) : -4]

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manyeyes.comms.inbox import Dropped, Inbox
+from manyeyes.comms.inbox import DropCounts, Inbox
 from manyeyes.comms.wire import encode
 from manyeyes.datatypes import BevGrid, Boxes, Message, Sites, SparseBev, Transform
 
@@ -19,7 +19,9 @@ MODEL, OTHER = b"model-01", b"model-02"
 QUICK = settings(max_examples=40, derandomize=True, deadline=None)
 
 
-def said(agent: int = 1, time: int = 0, cells: int = 60, objects: int = 2, fingerprint: bytes = MODEL) -> Message:
+def make_message(
+    agent: int = 1, time: int = 0, cells: int = 60, objects: int = 2, fingerprint: bytes = MODEL
+) -> Message:
     g = torch.Generator().manual_seed(agent * 1000 + time)
     key = torch.randperm(2112, generator=g)[:cells].sort().values
     boxes = Boxes.of(torch.rand(objects, 3, generator=g), torch.ones(objects, 3), torch.zeros(objects))
@@ -36,7 +38,7 @@ def said(agent: int = 1, time: int = 0, cells: int = 60, objects: int = 2, finge
 
 
 def packets_of(message: Message) -> list[bytes]:
-    return encode(message, precision="float32", mtu=400)
+    return encode(message, token_encoding="float32", mtu=400)
 
 
 def filled(packets, **options) -> Inbox:
@@ -48,37 +50,39 @@ def filled(packets, **options) -> Inbox:
 
 def written(inbox: Inbox) -> list[bytes]:
     """What an inbox holds, to the bit."""
-    return [p for m in inbox.messages() for p in encode(m, precision="float32", mtu=60000)]
+    return [p for m in inbox.messages() for p in encode(m, token_encoding="float32", mtu=60000)]
 
 
 def test_newest_of_each_agent_in_order_of_id():
-    packets = [p for agent, time in ((7, 5), (2, 9), (7, 6), (2, 8), (-3, 0)) for p in packets_of(said(agent, time))]
+    packets = [
+        p for agent, time in ((7, 5), (2, 9), (7, 6), (2, 8), (-3, 0)) for p in packets_of(make_message(agent, time))
+    ]
     inbox = filled(packets)
     assert [(m.agent_id, m.timestamp_ns) for m in inbox.messages()] == [(-3, 0), (2, 9), (7, 6)]
-    assert all(r.complete for r in inbox.receptions())
-    assert inbox.dropped == Dropped(expired=len(packets_of(said(2, 8))))
+    assert all(r.complete for r in inbox.received_messages())
+    assert inbox.dropped == DropCounts(expired=len(packets_of(make_message(2, 8))))
 
 
 def test_a_part_of_a_message_is_given_and_counted():
-    packets = packets_of(said())
+    packets = packets_of(make_message())
     inbox = filled(packets[:2])
-    (reception,) = inbox.receptions()
+    (reception,) = inbox.received_messages()
     assert (reception.received_packets, reception.expected_packets) == (2, len(packets))
     assert not reception.complete
     assert 0 < len(reception.message.tokens.sites) < 60
     assert len(reception.message.objects) == 2
     for packet in packets[2:]:
         inbox.push(packet)
-    assert inbox.receptions()[0].complete
+    assert inbox.received_messages()[0].complete
 
 
 def test_tokens_of_another_model_are_refused_and_the_objects_are_used():
-    packets = packets_of(said(fingerprint=OTHER))
+    packets = packets_of(make_message(fingerprint=OTHER))
     inbox = filled(packets, fingerprint=MODEL)
     (message,) = inbox.messages()
     assert message.tokens is None
     assert len(message.objects) == 2
-    assert inbox.dropped == Dropped(wrong_model=len(packets) - 1)
+    assert inbox.dropped == DropCounts(wrong_model=len(packets) - 1)
     assert filled(packets, fingerprint=None).messages()[0].tokens is not None
     assert filled(packets, fingerprint=OTHER).dropped.total == 0
 
@@ -86,7 +90,7 @@ def test_tokens_of_another_model_are_refused_and_the_objects_are_used():
 @QUICK
 @given(st.lists(st.binary(max_size=200), max_size=20), st.randoms(use_true_random=False))
 def test_garbage_copies_and_order_change_nothing(noise, random):
-    clean = [p for agent in (1, 2, 3) for p in packets_of(said(agent))]
+    clean = [p for agent in (1, 2, 3) for p in packets_of(make_message(agent))]
     mixed = clean + [b"ME\x02" + n for n in noise] + noise + random.choices(clean, k=5)
     mixed += [clean[0][: random.randrange(len(clean[0]))], clean[1] + b"!"]
     random.shuffle(mixed)
@@ -99,7 +103,7 @@ def test_garbage_copies_and_order_change_nothing(noise, random):
 @QUICK
 @given(st.data())
 def test_a_flipped_bit_is_never_taken(data):
-    packets = packets_of(said())
+    packets = packets_of(make_message())
     k = data.draw(st.integers(0, len(packets) - 1))
     bit = data.draw(st.integers(0, len(packets[k]) * 8 - 1))
     damaged = bytearray(packets[k])
@@ -110,25 +114,25 @@ def test_a_flipped_bit_is_never_taken(data):
 
 
 def test_each_reason_is_counted_under_its_name():
-    packet = packets_of(said())[0]
+    packet = packets_of(make_message())[0]
     old = bytearray(packet)
     old[2] = 9
     far = packet[:20] + b"\0\0\0\0\0\x80" + packet[26:-4]
     far += zlib.crc32(far).to_bytes(4, "little")
-    moved = packets_of(replace(said(), world_from_agent=Transform.identity()))[1]
+    moved = packets_of(replace(make_message(), world_from_agent=Transform.identity()))[1]
     inbox = filled([packet, b"", bytes(old), packet[:-1] + bytes([packet[-1] ^ 1]), far, moved, packet])
     wanted = {"garbage": 1, "version": 1, "checksum": 1, "implausible": 1, "contradiction": 1, "duplicate": 1}
-    assert inbox.dropped == Dropped(**wanted)
+    assert inbox.dropped == DropCounts(**wanted)
     assert inbox.dropped.total == 6
 
 
 def test_old_messages_are_neither_taken_nor_given():
     inbox = Inbox(expire_ns=100)
-    inbox.push(packets_of(said(1, 1000))[0], arrival_ns=1101)
+    inbox.push(packets_of(make_message(1, 1000))[0], arrival_ns=1101)
     assert inbox.messages() == ()
-    assert inbox.dropped == Dropped(expired=1)
-    inbox.push(packets_of(said(1, 1000))[0], arrival_ns=1100)
-    (reception,) = inbox.receptions(now_ns=1100)
+    assert inbox.dropped == DropCounts(expired=1)
+    inbox.push(packets_of(make_message(1, 1000))[0], arrival_ns=1100)
+    (reception,) = inbox.received_messages(now_ns=1100)
     assert reception.age_ns(1100) == 100
     assert reception.last_arrival_ns == 1100
     assert inbox.messages(now_ns=1101) == ()
@@ -136,16 +140,16 @@ def test_old_messages_are_neither_taken_nor_given():
 
 def test_a_stamp_from_the_future_does_not_silence_an_agent():
     inbox = Inbox()
-    inbox.push(packets_of(said(1, 10**15))[0], arrival_ns=10**9)
-    inbox.push(packets_of(said(1, 10**9))[0], arrival_ns=10**9)
+    inbox.push(packets_of(make_message(1, 10**15))[0], arrival_ns=10**9)
+    inbox.push(packets_of(make_message(1, 10**9))[0], arrival_ns=10**9)
     assert [m.timestamp_ns for m in inbox.messages()] == [10**9]
-    assert inbox.dropped == Dropped(implausible=1)
+    assert inbox.dropped == DropCounts(implausible=1)
 
 
 def test_a_flood_of_ids_is_bounded_and_the_stalest_gives_way():
     inbox = Inbox(max_agents=4)
     for agent in range(50):
-        inbox.push(packets_of(said(agent, 100 + agent % 2))[0])
+        inbox.push(packets_of(make_message(agent, 100 + agent % 2))[0])
     held = inbox.messages()
     assert len(held) == 4
     assert all(m.timestamp_ns == 101 for m in held)
@@ -153,12 +157,12 @@ def test_a_flood_of_ids_is_bounded_and_the_stalest_gives_way():
 
 
 def test_the_bytes_of_one_agent_are_bounded():
-    packets = packets_of(said(cells=600))
+    packets = packets_of(make_message(cells=600))
     inbox = filled(packets, max_agent_bytes=2000)
-    (reception,) = inbox.receptions()
+    (reception,) = inbox.received_messages()
     assert sum(sorted(map(len, packets))[: reception.received_packets]) <= 2000
     assert reception.received_packets > 3
-    assert inbox.dropped == Dropped(full=len(packets) - reception.received_packets)
+    assert inbox.dropped == DropCounts(full=len(packets) - reception.received_packets)
 
 
 @pytest.mark.parametrize("junk", [None, 3, "text"])

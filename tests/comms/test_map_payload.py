@@ -16,19 +16,19 @@ from manyeyes.comms.inbox import Inbox
 from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import Boxes, Message, ShapeError, Transform, WireError
 from manyeyes.datatypes.map_element import CROSSING, DASHED, DIVIDER, KINDS, STYLES, MapElements, Polygons
-from manyeyes.datatypes.message import SeenMap
+from manyeyes.datatypes.message import LocalMap
 
 QUICK = settings(max_examples=25, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 VIEW = np.array([[0.0, -15.0], [30.0, -15.0], [30.0, 15.0], [0.0, 15.0]])
 HALF_A_UNIT = elements.UNIT_M / 2 + 1e-9
 
 
-def message(seen: SeenMap | None, **fields) -> Message:
+def message(local_map: LocalMap | None, **fields) -> Message:
     pose = Transform.from_xyz_yaw(100.25, -200.5, 0.125, 1.0)
-    return Message(7, 1_000, pose, torch.zeros(3, 3, dtype=torch.float64), seen_map=seen, **fields)
+    return Message(7, 1_000, pose, torch.zeros(3, 3, dtype=torch.float64), local_map=local_map, **fields)
 
 
-def random_map(seed: int, count: int) -> SeenMap:
+def random_map(seed: int, count: int) -> LocalMap:
     """Lines of 2 to 30 points, no two of them nearer than the unit, of every kind and style; rings are stars about a point."""
     rng = np.random.default_rng(seed)
     kind = rng.integers(len(KINDS), size=count)
@@ -44,7 +44,7 @@ def random_map(seed: int, count: int) -> SeenMap:
     sigma = np.concatenate([np.full(len(line), rng.uniform(0.011, 19)) for line in lines]) if count else 0.1
     made = MapElements.of(lines, kind, rng.permutation(count) / max(count, 1), sigma, style)
     shadows = [VIEW[:3] * share for share in rng.uniform(0.1, 1.0, int(rng.integers(4)))]
-    return SeenMap(made, VIEW, Polygons.of(shadows))
+    return LocalMap(made, VIEW, Polygons.of(shadows))
 
 
 def through(sent: Message, **options) -> Message:
@@ -54,17 +54,17 @@ def through(sent: Message, **options) -> Message:
 @QUICK
 @given(st.integers(0, 10**6), st.integers(0, 120), st.integers(600, 3000))
 def test_round_trip(seed, count, mtu):
-    seen = random_map(seed, count)
-    packets = wire.encode(message(seen), mtu=mtu)
+    local_map = random_map(seed, count)
+    packets = wire.encode(message(local_map), mtu=mtu)
     assert all(len(p) <= mtu for p in packets)
-    back = wire.assemble(wire.decode_packet(p) for p in packets).seen_map
+    back = wire.assemble(wire.decode_packet(p) for p in packets).local_map
     assert back is not None and len(back.elements) == count
     np.testing.assert_allclose(back.view, VIEW, atol=HALF_A_UNIT)
-    assert len(back.occluders) == len(seen.occluders)
-    np.testing.assert_allclose(back.occluders.points, seen.occluders.points, atol=HALF_A_UNIT)
-    sent = seen.elements.take(np.argsort(-seen.elements.score, kind="stable"))
+    assert len(back.occluders) == len(local_map.occluders)
+    np.testing.assert_allclose(back.occluders.points, local_map.occluders.points, atol=HALF_A_UNIT)
+    sent = local_map.elements.take(np.argsort(-local_map.elements.score, kind="stable"))
     np.testing.assert_array_equal(back.elements.kind, sent.kind)
-    np.testing.assert_array_equal(back.elements.first, sent.first)
+    np.testing.assert_array_equal(back.elements.offsets, sent.offsets)
     np.testing.assert_allclose(back.elements.points, sent.points, atol=HALF_A_UNIT)
     np.testing.assert_allclose(back.elements.score, sent.score, atol=0.5 / 255 + 1e-9)
     np.testing.assert_allclose(np.log(back.elements.sigma / sent.sigma), 0, atol=np.log(2000) / 254 / 2 + 1e-6)
@@ -79,11 +79,11 @@ def test_round_trip(seed, count, mtu):
 @QUICK
 @given(st.integers(0, 10**6), st.integers(30, 120))
 def test_each_packet_decodes_alone_to_whole_elements_of_the_one_view(seed, count):
-    seen = random_map(seed, count)
-    packets = wire.encode(message(seen), mtu=700)
+    local_map = random_map(seed, count)
+    packets = wire.encode(message(local_map), mtu=700)
     assert len(packets) > 1
-    parts = [wire.assemble([wire.decode_packet(p)]).seen_map for p in packets]
-    whole = wire.assemble(wire.decode_packet(p) for p in packets[::-1]).seen_map
+    parts = [wire.assemble([wire.decode_packet(p)]).local_map for p in packets]
+    whole = wire.assemble(wire.decode_packet(p) for p in packets[::-1]).local_map
     assert whole is not None
     kept = MapElements.cat([part.elements for part in parts if part is not None])
     np.testing.assert_array_equal(kept.points, whole.elements.points)
@@ -95,56 +95,56 @@ def test_a_street_costs_few_bytes():
     lines = [np.array([[0.0, y], [15.0, y + 0.1], [30.0, y + 0.5]]) for y in (-7.0, -3.5, 0.0, 3.5, 7.0)]
     ring = np.array([[20.0, -7.0], [24.0, -7.0], [24.0, 7.0], [20.0, 7.0]])
     street = MapElements.of([*lines, ring], [DIVIDER] * 5 + [CROSSING], 0.9)
-    (packet,) = wire.encode(message(SeenMap(street, VIEW)))
+    (packet,) = wire.encode(message(LocalMap(street, VIEW)))
     # Header; rings: their number, points of the view, and its coordinates; each line: 3 bytes, its number of points, and those.
     view = 1 + 1 + (1 + 2) + (2 + 1) + (1 + 2) + (2 + 1)
     assert len(packet) - wire.HEADER_BYTES - view <= 5 * (4 + 3 + 3 + 3) + (4 + 4 + 3 + 3 + 3) + 8
 
 
-def test_an_empty_map_is_a_look_that_saw_nothing():
-    back = through(message(SeenMap(MapElements.empty(), VIEW)))
-    assert back.seen_map is not None and len(back.seen_map.elements) == 0
-    assert through(message(None)).seen_map is None
+def test_an_empty_map_keeps_its_view():
+    back = through(message(LocalMap(MapElements.empty(), VIEW)))
+    assert back.local_map is not None and len(back.local_map.elements) == 0
+    assert through(message(None)).local_map is None
 
 
 def test_a_map_and_objects_go_as_one_message():
     boxes = Boxes.of(torch.tensor([[1.0, -2.0, 0.8]]), torch.tensor([[4.5, 1.8, 1.6]]), torch.tensor([0.3]))
     back = through(message(random_map(3, 20), objects=boxes))
     assert back.objects is not None and len(back.objects) == 1
-    assert back.seen_map is not None and len(back.seen_map.elements) == 20
+    assert back.local_map is not None and len(back.local_map.elements) == 20
 
 
 def test_what_is_shorter_than_the_unit_is_left_out_and_no_point_stands_twice():
     close = np.array([[1.0, 1.0], [1.004, 1.0], [1.0, 1.004]])
     line = np.array([[0.0, 0.0], [0.001, 0.0], [5.0, 0.0], [5.0, 0.004]])
     closed = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 0.0]])
-    seen = SeenMap(MapElements.of([close, line, closed, close], [DIVIDER, DIVIDER, CROSSING, CROSSING]), VIEW)
-    back = through(message(seen)).seen_map
+    local_map = LocalMap(MapElements.of([close, line, closed, close], [DIVIDER, DIVIDER, CROSSING, CROSSING]), VIEW)
+    back = through(message(local_map)).local_map
     assert back is not None
     assert [back.elements.polyline(i).tolist() for i in range(2)] == [[[0, 0], [5, 0]], [[0, 0], [4, 0], [4, 4]]]
     assert len(back.elements) == 2
 
 
 @pytest.mark.parametrize(
-    ("seen", "says"),
+    ("local_map", "message_match"),
     [
-        (SeenMap(MapElements.of([[[0, 0], [400.0, 0]]], DIVIDER), VIEW), "within 327.66 m"),
-        (SeenMap(MapElements.of([[[0, 0], [np.nan, 0]]], DIVIDER), VIEW), "within 327.66 m"),
-        (SeenMap(MapElements.of([[[0, 0], [4.0, 0]]], DIVIDER, np.nan), VIEW), "NaN"),
-        (SeenMap(MapElements.of([np.arange(2000).reshape(-1, 2) % 97], DIVIDER), VIEW), "simplify it"),
-        (SeenMap(MapElements.empty(), VIEW * 1e-4), "rings of 3 points"),
-        (SeenMap(MapElements.empty(), VIEW, Polygons.of([VIEW] * elements.MOST_RINGS)), "rings of 3 points"),
-        (SeenMap(MapElements.empty(), np.random.default_rng(0).uniform(-9, 9, (900, 2))), "raise the mtu"),
+        (LocalMap(MapElements.of([[[0, 0], [400.0, 0]]], DIVIDER), VIEW), "within 327.66 m"),
+        (LocalMap(MapElements.of([[[0, 0], [np.nan, 0]]], DIVIDER), VIEW), "within 327.66 m"),
+        (LocalMap(MapElements.of([[[0, 0], [4.0, 0]]], DIVIDER, np.nan), VIEW), "NaN"),
+        (LocalMap(MapElements.of([np.arange(2000).reshape(-1, 2) % 97], DIVIDER), VIEW), "simplify it"),
+        (LocalMap(MapElements.empty(), VIEW * 1e-4), "rings of 3 points"),
+        (LocalMap(MapElements.empty(), VIEW, Polygons.of([VIEW] * elements.MAX_RINGS)), "rings of 3 points"),
+        (LocalMap(MapElements.empty(), np.random.default_rng(0).uniform(-9, 9, (900, 2))), "raise the mtu"),
     ],
 )
-def test_what_cannot_be_sent_says_so(seen, says):
-    with pytest.raises(WireError, match=says):
-        wire.encode(message(seen))
+def test_maps_that_do_not_fit_the_format_are_refused(local_map, message_match):
+    with pytest.raises(WireError, match=message_match):
+        wire.encode(message(local_map))
 
 
 def test_a_view_of_two_points_is_none():
     with pytest.raises(ShapeError, match="K >= 3"):
-        SeenMap(MapElements.empty(), VIEW[:2])
+        LocalMap(MapElements.empty(), VIEW[:2])
 
 
 def sealed(packet: bytes, body: bytes) -> bytes:
@@ -156,9 +156,9 @@ def sealed(packet: bytes, body: bytes) -> bytes:
 @QUICK
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_map_or_a_packet_error(body):
-    (packet,) = wire.encode(message(SeenMap(MapElements.empty(), VIEW)))
+    (packet,) = wire.encode(message(LocalMap(MapElements.empty(), VIEW)))
     try:
-        back = wire.assemble([wire.decode_packet(sealed(packet, body))]).seen_map
+        back = wire.assemble([wire.decode_packet(sealed(packet, body))]).local_map
     except PacketError as error:
         assert error.reason in ("garbage", "implausible")
         return
@@ -175,18 +175,18 @@ def test_a_damaged_body_is_a_map_or_a_packet_error(seed, data):
         body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
     body = body[: data.draw(st.integers(0, len(body)))]
     try:
-        back = wire.assemble([wire.decode_packet(sealed(packet, bytes(body)))]).seen_map
+        back = wire.assemble([wire.decode_packet(sealed(packet, bytes(body)))]).local_map
     except PacketError:
         return
     assert back is not None and (np.abs(back.elements.points) <= 327.67).all()
     # What was read can be said again: nothing of it is out of the format.
-    again = wire.assemble(wire.decode_packet(p) for p in wire.encode(message(back), mtu=65535)).seen_map
+    again = wire.assemble(wire.decode_packet(p) for p in wire.encode(message(back), mtu=65535)).local_map
     assert again is not None
     np.testing.assert_allclose(np.sort(again.elements.points, 0), np.sort(back.elements.points, 0), atol=1e-9)
 
 
 def test_a_line_that_announces_more_points_than_there_are_bytes_takes_no_room():
-    (packet,) = wire.encode(message(SeenMap(MapElements.empty(), VIEW)))
+    (packet,) = wire.encode(message(LocalMap(MapElements.empty(), VIEW)))
     body = packet[wire.HEADER_BYTES - 4 : -4] + bytes([0, 255, 255]) + bytes([255, 255, 255, 255, 127])
     with pytest.raises(PacketError, match="does not lie in"):
         wire.decode_packet(sealed(packet, body))
@@ -196,21 +196,21 @@ def test_a_line_that_announces_more_points_than_there_are_bytes_takes_no_room():
     "line", [[0, 0, 0, 0], [5, 5, 0, 0], [0, 0, 0xFE, 0xFF, 0x7F, 0]], ids=["still", "still later", "far"]
 )
 def test_lines_that_cannot_be_are_implausible(line):
-    (packet,) = wire.encode(message(SeenMap(MapElements.empty(), VIEW)))
+    (packet,) = wire.encode(message(LocalMap(MapElements.empty(), VIEW)))
     body = packet[wire.HEADER_BYTES - 4 : -4] + bytes([0, 255, 255, 2, *line])
     with pytest.raises(PacketError, match="stands still"):
         wire.decode_packet(sealed(packet, body))
 
 
 def test_two_views_in_one_message_are_a_contradiction():
-    seen = random_map(5, 60)
-    packets, others = (wire.encode(message(m), mtu=700) for m in (seen, replace(seen, view=VIEW + 1.0)))
+    local_map = random_map(5, 60)
+    packets, others = (wire.encode(message(m), mtu=700) for m in (local_map, replace(local_map, view=VIEW + 1.0)))
     inbox = Inbox()
     inbox.push(packets[0])
     inbox.push(others[1])
     assert inbox.dropped.contradiction == 1
-    (reception,) = inbox.receptions()
-    assert not reception.complete and reception.message.seen_map is not None
+    (reception,) = inbox.received_messages()
+    assert not reception.complete and reception.message.local_map is not None
 
 
 def test_golden_bytes_of_map_elements():
@@ -218,7 +218,7 @@ def test_golden_bytes_of_map_elements():
     style = np.eye(len(STYLES))[[DASHED, DASHED]] * 0.8 + 0.05
     line, ring = [[1.0, -2.0], [11.0, -2.5]], [[4.0, -1.0], [6.0, -1.0], [6.0, 1.0]]
     made = MapElements.of([line, ring], [DIVIDER, CROSSING], [0.5, 0.75], 0.12, style)
-    (packet,) = wire.encode(message(SeenMap(made, VIEW[:3])))
+    (packet,) = wire.encode(message(LocalMap(made, VIEW[:3])))
     assert packet[3] & 7 == 5
     assert packet[wire.HEADER_BYTES - 4 : -4].hex() == GOLDEN
 

@@ -77,7 +77,7 @@ def test_int8_is_within_half_a_step_that_is_at_most_nine_percent_coarse(seed, ro
     assert (np.abs(back - values) <= peak * 2**0.125 / 127 / 2 * 1.0001).all()
 
 
-def test_int8_says_where_it_ends():
+def test_int8_reports_values_out_of_range():
     with pytest.raises(WireError, match="int8 features reach"):
         primitives.quantise_int8(np.array([[1e6]], np.float32))
 

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manyeyes.comms.token_selection import within_budget
+from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import encode
 from manyeyes.datatypes import BevGrid, ConfigError, Message, Sites, SparseBev, Transform
 
@@ -26,7 +26,7 @@ def scene(seed: int, count: int, channels: int, levels: int = 10) -> tuple[Spars
 
 def cost(bev: SparseBev, score: torch.Tensor, precision, mtu) -> int:
     message = Message(1, 2, Transform.identity(), torch.zeros(3, 3), tokens=bev, token_score=score)
-    return len(b"".join(encode(message, precision=precision, mtu=mtu)))
+    return len(b"".join(encode(message, token_encoding=precision, mtu=mtu)))
 
 
 cases = (
@@ -42,7 +42,7 @@ cases = (
 @given(*cases, st.integers(0, 30000))
 def test_the_packets_never_exceed_the_budget(seed, count, channels, precision, mtu, budget):
     bev, score = scene(seed, count, channels)
-    kept, kept_score = within_budget(bev, score, budget, precision, mtu)
+    kept, kept_score = select_within_budget(bev, score, budget, precision, mtu)
     assert len(kept_score) == len(kept.sites)
     if len(kept.sites):
         assert cost(kept, kept_score, precision, mtu) <= budget
@@ -58,8 +58,8 @@ def test_the_packets_never_exceed_the_budget(seed, count, channels, precision, m
 @given(*cases, st.integers(0, 20000), st.integers(0, 5000))
 def test_a_larger_budget_keeps_all_that_a_smaller_one_keeps(seed, count, channels, precision, mtu, budget, more):
     bev, score = scene(seed, count, channels)
-    small, _ = within_budget(bev, score, budget, precision, mtu)
-    large, _ = within_budget(bev, score, budget + more, precision, mtu)
+    small, _ = select_within_budget(bev, score, budget, precision, mtu)
+    large, _ = select_within_budget(bev, score, budget + more, precision, mtu)
     assert set(small.sites.key.tolist()) <= set(large.sites.key.tolist())
 
 
@@ -68,21 +68,21 @@ def test_the_best_are_kept_and_ties_go_to_the_smaller_key():
     bev = SparseBev(torch.arange(5.0)[:, None].expand(5, 64).contiguous(), Sites(key, GRID))
     score = torch.tensor([0.5, 0.5, 0.9, 0.5, 0.1])
     three = cost(bev.keep(torch.tensor([True, True, True, False, False])), score[:3], "float32", 1398)
-    kept, kept_score = within_budget(bev, score, three, "float32")
+    kept, kept_score = select_within_budget(bev, score, three, "float32")
     assert kept.sites.key.tolist() == [3, 10, 20]
     assert kept_score.tolist() == pytest.approx([0.5, 0.5, 0.9])
     assert torch.equal(kept.features, bev.features[:3])
-    assert len(within_budget(bev, score, three - 1, "float32")[0].sites) == 2
+    assert len(select_within_budget(bev, score, three - 1, "float32")[0].sites) == 2
 
 
 def test_no_limit_keeps_all_and_no_bytes_keep_none():
     bev, score = scene(1, 100, 8)
-    assert within_budget(bev, score, None)[0] is bev
+    assert select_within_budget(bev, score, None)[0] is bev
     for budget in (-5, 0, 100):
-        kept, kept_score = within_budget(bev, score, budget)
+        kept, kept_score = select_within_budget(bev, score, budget)
         assert len(kept.sites) == len(kept_score) == 0
 
 
 def test_an_unknown_precision_is_refused():
     with pytest.raises(ConfigError, match="float16"):
-        within_budget(*scene(1, 5, 8), 100, "float64")
+        select_within_budget(*scene(1, 5, 8), 100, "float64")

@@ -24,7 +24,7 @@ from manyeyes.datatypes import (
     Transform,
     WireError,
 )
-from manyeyes.datatypes.message import DESCRIPTOR, RequestMap
+from manyeyes.datatypes.message import DESCRIPTOR_DIM, RequestMap
 
 torch.set_num_threads(1)
 QUICK = settings(max_examples=40, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -88,11 +88,11 @@ sizes = st.one_of(st.none(), st.integers(0, 300))
 
 
 @QUICK
-@given(st.integers(0, 10**6), sizes, sizes, sizes, st.sampled_from(payloads.PRECISIONS), st.integers(300, 3000))
+@given(st.integers(0, 10**6), sizes, sizes, sizes, st.sampled_from(payloads.TOKEN_ENCODINGS), st.integers(300, 3000))
 def test_round_trip(seed, tokens, objects, points, precision, mtu):
     message = random_message(seed, tokens, objects, points)
     message = with_codes(message) if precision == "codes" else message
-    packets = wire.encode(message, precision=precision, mtu=mtu)
+    packets = wire.encode(message, token_encoding=precision, mtu=mtu)
     assert all(len(p) <= mtu for p in packets)
     back = wire.assemble(wire.decode_packet(p) for p in packets)
 
@@ -118,7 +118,7 @@ def test_round_trip(seed, tokens, objects, points, precision, mtu):
         assert ((back.points.intensity - message.points.intensity).abs() <= 0.5 / 255 + 1e-6).all()
 
 
-def check_tokens(got: SparseBev, sent: SparseBev, precision: payloads.Precision) -> None:
+def check_tokens(got: SparseBev, sent: SparseBev, precision: payloads.TokenEncoding) -> None:
     assert got.grid == sent.grid
     assert torch.equal(got.sites.key, sent.sites.key)
     if precision == "codes":
@@ -142,7 +142,7 @@ def check_objects(got: Boxes, sent: Boxes) -> None:
     turn = torch.remainder(got.yaw - sent.yaw + math.pi, 2 * math.pi) - math.pi
     assert (turn.abs() <= math.radians(0.005) + 1e-5).all()
     assert ((got.score - sent.score).abs() <= 0.5 / 255 + 1e-6).all()
-    assert ((got.flip - sent.flip).abs() <= 0.5 / 31 + 1e-6).all()
+    assert ((got.p_flip - sent.p_flip).abs() <= 0.5 / 31 + 1e-6).all()
     assert ((got.sigma_xy / sent.sigma_xy).log().abs() <= math.log(20 / 0.01) / 254 / 2 + 1e-5).all()
     assert ((got.sigma_yaw / sent.sigma_yaw).log().abs() <= math.log(3.2 / 0.001) / 254 / 2 + 1e-5).all()
     assert ((got.velocity - sent.velocity).abs() <= 0.125 + 1e-5).all()
@@ -165,7 +165,7 @@ def test_golden_bytes():
         objects=Boxes.of(torch.tensor([[1.0, -2.0, 0.8]]), torch.tensor([[4.5, 1.8, 1.6]]), torch.tensor([math.pi])),
         points=PointCloud.of(torch.tensor([[0.01, -0.02, 300.0]]), torch.tensor([1.0])),
     )
-    packets = wire.encode(message, precision="float16")
+    packets = wire.encode(message, token_encoding="float16")
     assert [p.hex() for p in packets] == GOLDEN
     assert len(packets[0]) == wire.HEADER_BYTES + 1 + 13
     assert len(packets[2]) == wire.HEADER_BYTES + 7
@@ -194,14 +194,14 @@ def test_25_plain_objects_are_a_packet_of_394_bytes():
     assert len(packet) == wire.HEADER_BYTES + 1 + 25 * 13 == 394
     (moving,) = wire.encode(message)
     assert len(moving) == len(packet) + 25 * 2
-    (described,) = wire.encode(replace(message, objects=still, descriptors=torch.zeros(25, DESCRIPTOR)))
+    (described,) = wire.encode(replace(message, objects=still, descriptors=torch.zeros(25, DESCRIPTOR_DIM)))
     assert len(described) == len(packet) + 25 * 32
 
 
 def test_descriptors_stay_with_their_objects():
     message = random_message(12, None, 60, None)
     mixed = torch.randperm(60, generator=torch.Generator().manual_seed(0))
-    descriptors = torch.rand(60, DESCRIPTOR, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    descriptors = torch.rand(60, DESCRIPTOR_DIM, generator=torch.Generator().manual_seed(1)) * 2 - 1
     back = through(replace(message, objects=message.objects[mixed], descriptors=descriptors[mixed]), mtu=500)
     assert ((back.descriptors - descriptors).abs() <= 0.5 / 127 + 1e-6).all()
     check_objects(back.objects, message.objects)
@@ -218,12 +218,12 @@ def test_velocities_saturate():
 
 def test_a_request_is_a_byte_a_cell():
     grid = GRID.at(32)
-    sure = torch.rand(grid.shape, generator=torch.Generator().manual_seed(0))
-    message = replace(random_message(14, 20, 3, None), request=RequestMap(grid, sure))
+    confidence = torch.rand(grid.shape, generator=torch.Generator().manual_seed(0))
+    message = replace(random_message(14, 20, 3, None), request=RequestMap(grid, confidence))
     packets = wire.encode(message)
-    assert len(packets[1]) == wire.HEADER_BYTES + 15 + sure.numel()
+    assert len(packets[1]) == wire.HEADER_BYTES + 15 + confidence.numel()
     back = through(message).request
-    assert back.grid == grid and ((back.sure - sure).abs() <= 0.5 / 255 + 1e-6).all()
+    assert back.grid == grid and ((back.confidence - confidence).abs() <= 0.5 / 255 + 1e-6).all()
     assert wire.assemble([wire.decode_packet(packets[0])]).request is None
     second = forge(packets[1], 4, b"\2\0")
     with pytest.raises(wire.PacketError, match="second request"):
@@ -231,7 +231,7 @@ def test_a_request_is_a_byte_a_cell():
     with pytest.raises(WireError, match="coarser"):
         wire.encode(replace(message, request=RequestMap(GRID, torch.zeros(GRID.shape))))
     with pytest.raises(WireError, match="0 to 1"):
-        wire.encode(replace(message, request=RequestMap(grid, sure + 1)))
+        wire.encode(replace(message, request=RequestMap(grid, confidence + 1)))
 
 
 @pytest.mark.parametrize("spread", [(0, 0, 0), (1, 0, 2), (5, 5, 0)])
@@ -256,7 +256,7 @@ def test_a_message_without_sections_is_one_header():
 
 def test_most_important_first_and_any_prefix_is_a_message():
     message = random_message(3, 300, 5, None)
-    packets = wire.encode(message, precision="float32")
+    packets = wire.encode(message, token_encoding="float32")
     assert len(packets) > 5
     scores = dict(zip(message.tokens.sites.key.tolist(), message.token_score.tolist()))
     lowest_so_far = 1.0
@@ -285,7 +285,7 @@ def test_a_lost_packet_of_points_thins_the_cloud_evenly():
 @QUICK
 @given(st.integers(0, 10**6), st.randoms(use_true_random=False))
 def test_order_and_copies_do_not_matter(seed, random):
-    packets = wire.encode(random_message(seed, 120, 150, 300), precision="float32", mtu=600)
+    packets = wire.encode(random_message(seed, 120, 150, 300), token_encoding="float32", mtu=600)
     shuffled = packets + random.choices(packets, k=3)
     random.shuffle(shuffled)
     assert same(wire.assemble(map(wire.decode_packet, shuffled)), wire.assemble(map(wire.decode_packet, packets)))
@@ -293,7 +293,7 @@ def test_order_and_copies_do_not_matter(seed, random):
 
 def same(a: Message, b: Message) -> bool:
     """Equal to the bit: what a message is made of is what its own bytes say."""
-    return wire.encode(a, precision="float32", mtu=60000) == wire.encode(b, precision="float32", mtu=60000)
+    return wire.encode(a, token_encoding="float32", mtu=60000) == wire.encode(b, token_encoding="float32", mtu=60000)
 
 
 @QUICK
@@ -366,7 +366,7 @@ def test_a_faulty_sender_never_crashes_the_reader(seed, data):
         (64 + 22, b"\x00\x7c", "implausible"),
     ],
 )
-def test_what_a_faulty_sender_is_told(at, data, reason):
+def test_invalid_messages_are_refused_by_the_encoder(at, data, reason):
     """Cell 2000 of the 24 x 88 grid takes two bytes, cell 2112 is the first outside: 0xc0 0x10."""
     tokens = SparseBev(torch.ones(1, 3), Sites(torch.tensor([2000]), GRID))
     (packet,) = wire.encode(replace(random_message(5, None, None, None), tokens=tokens))
@@ -408,7 +408,7 @@ def test_contradictions_are_refused():
     changed = wire.encode(replace(one, tokens=one.tokens.with_features(one.tokens.features + 1)), mtu=400)
     turned = wire.encode(replace(one, world_from_agent=other.world_from_agent), mtu=400)
     reordered = wire.encode(replace(one, token_score=-one.token_score), mtu=400)
-    for intruder in (changed[0], turned[1], reordered[-1], wire.encode(one, mtu=400, precision="int8")[1]):
+    for intruder in (changed[0], turned[1], reordered[-1], wire.encode(one, mtu=400, token_encoding="int8")[1]):
         with pytest.raises(wire.PacketError) as caught:
             wire.assemble(map(wire.decode_packet, [first[0], intruder]))
         assert caught.value.reason == "contradiction"
@@ -429,8 +429,8 @@ def test_contradictions_are_refused():
         ({"objects": Boxes.of(torch.full((1, 3), 328.0), torch.ones(1, 3), torch.zeros(1))}, "crop them"),
         ({"points": PointCloud.of(torch.full((1, 3), -400.0))}, "crop them"),
         ({"pose_covariance": torch.eye(3) * 4e8}, "10 km"),
-        ({"descriptors": torch.zeros(4, DESCRIPTOR)}, "one an object"),
-        ({"descriptors": torch.full((5, DESCRIPTOR), 1.5)}, "one an object"),
+        ({"descriptors": torch.zeros(4, DESCRIPTOR_DIM)}, "one an object"),
+        ({"descriptors": torch.full((5, DESCRIPTOR_DIM), 1.5)}, "one an object"),
         (
             {"tokens": SparseBev(torch.full((1, 2), math.inf), Sites(torch.tensor([0]), GRID)), "token_score": None},
             "finite",
@@ -457,11 +457,11 @@ def test_what_does_not_fit_is_refused_by_the_sender(change, match):
 
 def test_unknown_settings_are_refused():
     with pytest.raises(ConfigError, match="float32, float16, int8, codes"):
-        wire.encode(random_message(9), precision="float8")
+        wire.encode(random_message(9), token_encoding="float8")
     with pytest.raises(WireError, match="only codes are"):
-        wire.encode(random_message(9), precision="codes")
+        wire.encode(random_message(9), token_encoding="codes")
     with pytest.raises(WireError, match="only codes are"):
-        wire.encode(with_codes(random_message(9)), precision="int8")
+        wire.encode(with_codes(random_message(9)), token_encoding="int8")
     with pytest.raises(ConfigError, match="mtu"):
         wire.encode(random_message(9), mtu=80)
 

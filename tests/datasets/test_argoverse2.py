@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from manyeyes.datasets.argoverse2 import Argoverse2Recording
-from manyeyes.datasets.base import points_in_listed_boxes
+from manyeyes.datasets.base import count_points_in_listed_boxes
 from manyeyes.datatypes import LABELS, MissingExtraError, RecordingError, Snapshot
 
 pyarrow = pytest.importorskip("pyarrow", reason="needs the 'av2' extra")
@@ -50,8 +50,8 @@ def test_points_in_each_of_the_81_boxes_are_as_many_as_av2_counted(
 @real
 def test_the_log_as_a_recording(recording: Argoverse2Recording, pair: Snapshot) -> None:
     assert recording.scenarios == (LOG,)
-    assert "3b3570b4" in recording.problems[0] and "0 sweeps" in recording.problems[0]
-    assert recording.length(LOG) == 1 and recording.judged(LOG) == range(1) and recording.agents(LOG) == (0, 1)
+    assert "3b3570b4" in recording.missing_summary[0] and "0 sweeps" in recording.missing_summary[0]
+    assert recording.length(LOG) == 1 and recording.eval_indices(LOG) == range(1) and recording.agents(LOG) == (0, 1)
     assert recording.sweeps(LOG) == SWEEPS
     assert [f.agent_id for f in pair.frames] == [0, 1] and tuple(f.timestamp_ns for f in pair.frames) == SWEEPS
     assert [len(f.points) for f in pair.frames] == [99_229, 99_466]
@@ -66,7 +66,7 @@ def test_the_truth_is_the_vehicles_and_who_met_them(recording: Argoverse2Recordi
     assert pair.truth is not None
     assert len(pair.truth.boxes) == len(pair.truth.boxes.id.unique()) == 47
     assert torch.bincount(pair.truth.boxes.label, minlength=4).tolist() == [44, 0, 3, 0]
-    counts = points_in_listed_boxes(pair, 0.1)
+    counts = count_points_in_listed_boxes(pair, 0.1)
     # Boxes are those of the ego's time; what drives on for 0.1 s still holds points of the second sweep, almost always.
     assert int((counts[0] == 0).sum()) == 0 and int((counts[1] == 0).sum()) <= 2
     assert counts.max() > 500 and pair.truth.seen.sum(1).tolist() == [40, 40]
@@ -155,7 +155,7 @@ def test_a_log_by_hand(log: Path) -> None:
     assert snapshot.truth.boxes.yaw.tolist() == pytest.approx([1.0, 1.0])
     wanted = 500 + 20 * np.cos(1.0) - 4 * np.sin(1.0), 300 + 20 * np.sin(1.0) + 4 * np.cos(1.0), 10.5
     assert snapshot.truth.boxes.center[1].tolist() == pytest.approx(wanted)
-    assert points_in_listed_boxes(snapshot).tolist() == [[1, 1], [1, 1]]
+    assert count_points_in_listed_boxes(snapshot).tolist() == [[1, 1], [1, 1]]
     # Two sweeps apart, and no label is no truth.
     assert Argoverse2Recording(log, gap=2).snapshot("abc", 0).frames[1].timestamp_ns == 1_200_000_000
     (log / "annotations.feather").unlink()
@@ -196,7 +196,7 @@ def _shift_poses(log: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "says"),
+    ("damage", "message_match"),
     [
         (lambda log: (log / "city_SE3_egovehicle.feather").unlink(), "city_SE3_egovehicle.feather: no such file"),
         (lambda log: _first(log).write_bytes(_first(log).read_bytes()[:90]), "1000000000.feather: expected a feather"),
@@ -206,14 +206,14 @@ def _shift_poses(log: Path) -> None:
         (_shift_poses, "no pose at the sweep's time 1000000000"),
     ],
 )
-def test_damage_is_named(log: Path, damage: Callable[[Path], object], says: str) -> None:
+def test_damage_is_named(log: Path, damage: Callable[[Path], object], message_match: str) -> None:
     damage(log)
     with pytest.raises(RecordingError) as caught:
         Argoverse2Recording(log.parent).snapshot("abc", 0)
-    assert says in str(caught.value) and "\n" not in str(caught.value)
+    assert message_match in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_root_without_logs_says_so(log: Path, tmp_path: Path) -> None:
+def test_a_root_without_logs_is_refused(log: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no such folder"):
         Argoverse2Recording(tmp_path / "nowhere")
     with pytest.raises(RecordingError, match=r"no usable Argoverse 2 log .*3 sweeps.*more than 3"):

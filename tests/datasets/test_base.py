@@ -6,8 +6,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from manyeyes.datasets.base import Recording, judged_frames, points_in_listed_boxes, require_index
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, RecordingError, Snapshot, Transform, Truth
+from manyeyes.datasets.base import Recording, count_points_in_listed_boxes, iter_eval_frames, require_index
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 
 class InMemory:
@@ -18,7 +18,7 @@ class InMemory:
     def length(self, scenario: str) -> int:
         return {"a": 3, "b": 2}[scenario]
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         return range(1, self.length(scenario))
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -31,15 +31,15 @@ class InMemory:
 
 def test_judged_frames_go_scenario_by_scenario() -> None:
     recording: Recording = InMemory()
-    assert list(judged_frames(recording)) == [("a", 1), ("a", 2), ("b", 1)]
+    assert list(iter_eval_frames(recording)) == [("a", 1), ("a", 2), ("b", 1)]
 
 
 @pytest.mark.parametrize(
-    ("scenario", "index", "says"),
+    ("scenario", "index", "message_match"),
     [("c", 0, "No scenario 'c'.*a, b"), ("b", 2, "index from 0 to 1"), ("a", -1, "index from 0 to 2")],
 )
-def test_what_is_not_there_is_refused(scenario: str, index: int, says: str) -> None:
-    with pytest.raises(RecordingError, match=says):
+def test_what_is_not_there_is_refused(scenario: str, index: int, message_match: str) -> None:
+    with pytest.raises(RecordingError, match=message_match):
         InMemory().snapshot(scenario, index)
 
 
@@ -55,9 +55,9 @@ def test_points_in_listed_boxes_by_hand() -> None:
     )
     frame = AgentFrame.of(PointCloud.of(points), world_from_agent)
     seen = torch.tensor([[True, False], [True, True]])
-    truth = Truth(boxes, seen, Transform.stack([world_from_agent, Transform.identity()]))
+    truth = GroundTruth(boxes, seen, Transform.stack([world_from_agent, Transform.identity()]))
     snapshot = Snapshot("a", 0, (frame, AgentFrame.of(PointCloud.of(points), Transform.identity())), truth)
-    assert points_in_listed_boxes(snapshot, 0.0).tolist() == [[2, -1], [0, 0]]
-    assert points_in_listed_boxes(snapshot, 0.1).tolist() == [[3, -1], [0, 0]]
+    assert count_points_in_listed_boxes(snapshot, 0.0).tolist() == [[2, -1], [0, 0]]
+    assert count_points_in_listed_boxes(snapshot, 0.1).tolist() == [[3, -1], [0, 0]]
     with pytest.raises(RecordingError, match="has no truth"):
-        points_in_listed_boxes(Snapshot("a", 0, (frame,)))
+        count_points_in_listed_boxes(Snapshot("a", 0, (frame,)))

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from manyeyes.datasets import dair_json, dair_v2x
-from manyeyes.datasets.base import judged_frames, points_in_listed_boxes
+from manyeyes.datasets.base import count_points_in_listed_boxes, iter_eval_frames
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.pcd import PcdCloud, PcdTable, write_table
 from manyeyes.datatypes import ConfigError, RecordingError, Transform
@@ -198,7 +198,7 @@ def faults(recording: DairRecording) -> list[str]:
             )
             for f, n in zip(snapshot.frames, ("a", "own"))
         ),
-        "points in boxes": points_in_listed_boxes(snapshot).max(1).values.tolist() == [60, 60],
+        "points in boxes": count_points_in_listed_boxes(snapshot).max(1).values.tolist() == [60, 60],
         "sides": all(torch.allclose(b.corners(), wanted[rows], atol=0.1, rtol=0) for b, rows in zip(sides, lists)),
         "seen": truth.seen.tolist() == [[i in rows for i in range(5)] for rows in lists],
     }
@@ -207,11 +207,11 @@ def faults(recording: DairRecording) -> list[str]:
 
 def test_the_scene_comes_out_as_it_was_put_in(dataset: Path) -> None:
     recording = DairRecording(dataset)
-    assert recording.problems == ()
+    assert recording.missing_summary == ()
     assert faults(recording) == []
     assert recording.scenarios == ("3", "12")
     assert [recording.length(s) for s in recording.scenarios] == [1, 2]
-    assert list(judged_frames(recording)) == [("3", 0), ("12", 0), ("12", 1)]
+    assert list(iter_eval_frames(recording)) == [("3", 0), ("12", 0), ("12", 1)]
     assert recording.agents("12") == (0, -1)
     truth = recording.snapshot("12", 0).truth
     assert truth is not None
@@ -317,7 +317,7 @@ def test_splits_are_those_of_the_users_file(dataset: Path, tmp_path: Path) -> No
     bare.write_text('["000011", "000099"]')
     recording = DairRecording(dataset, "mine", split_file=bare)
     assert recording.length("12") == 1
-    assert "1 of the split's 2 frames are not in it, the first is 000099" in recording.problems[0]
+    assert "1 of the split's 2 frames are not in it, the first is 000099" in recording.missing_summary[0]
     with pytest.raises(RecordingError, match=r"no split 'test'; it has train, val: choose"):
         DairRecording(dataset, "test")
     with pytest.raises(
@@ -336,10 +336,10 @@ def test_an_older_sweep_of_the_pole(dataset: Path) -> None:
     assert recording.scenarios == ("12",)
     vehicle, pole = recording.snapshot("12", 0).frames
     assert vehicle.timestamp_ns - pole.timestamp_ns == (100_000 + 17_749) * 1000
-    assert "2 of 3 pairs lack an infrastructure sweep 1 earlier" in recording.problems[0]
+    assert "2 of 3 pairs lack an infrastructure sweep 1 earlier" in recording.missing_summary[0]
 
 
-def test_the_poles_own_claim_lacks_the_correction(dataset: Path) -> None:
+def test_the_reported_roadside_pose_lacks_the_correction(dataset: Path) -> None:
     snapshot = DairRecording(dataset, native_pose_error=True).snapshot("12", 0)
     assert snapshot.truth is not None
     gap = snapshot.truth.world_from_agent.translation[1] - snapshot.frames[1].world_from_agent.translation
@@ -428,12 +428,12 @@ def test_v2x_seq_names_frames_and_corrects_in_the_vehicles_frame(root: Path) -> 
     torch.testing.assert_close(place, torch.from_numpy(POLE[1]), atol=0.02, rtol=0)
 
 
-def test_a_partial_download_is_usable_and_says_what_is_missing(root: Path) -> None:
+def test_a_partial_download_is_usable_and_reports_what_is_missing(root: Path) -> None:
     (root / "vehicle-side/velodyne/000011.pcd").unlink()
     (root / "cooperative/label_world/000015.json").unlink()
     recording = DairRecording(root)
     assert [recording.length(s) for s in ("3", "12")] == [1, 1]
-    lost, unlabelled = recording.problems
+    lost, unlabelled = recording.missing_summary
     assert "1 of 3 pairs lack their vehicle-side/velodyne file, the first is" in lost and "000011.pcd; left out" in lost
     assert "1 of 3 pairs lack their cooperative label and have no truth" in unlabelled
     assert recording.snapshot("3", 0).truth is None
@@ -445,7 +445,7 @@ def test_an_index_that_names_strange_frames(root: Path) -> None:
     edit(root / "infrastructure-side/data_info.json", lambda rows: rows[1:])
     recording = DairRecording(root)
     assert recording.length("12") == 1
-    assert "infrastructure-side/data_info.json has no frame 000021; left out" in recording.problems[0]
+    assert "infrastructure-side/data_info.json has no frame 000021; left out" in recording.missing_summary[0]
 
 
 def test_nothing_usable_is_an_error(root: Path, tmp_path: Path) -> None:
@@ -487,7 +487,7 @@ WORLD_LABEL = "cooperative/label_world/000010.json"
 
 
 @pytest.mark.parametrize(
-    ("file", "change", "says"),
+    ("file", "change", "message_match"),
     [
         (UNIT_LABEL, set_in(1, "rotation", to="north"), r"expected a number at '\[1\].rotation', found 'north'"),
         (UNIT_LABEL, set_in(0, "3d_location", "y", to="nan"), r"expected a number at '\[0\].3d_location.y', found 'nan'"),
@@ -509,9 +509,11 @@ WORLD_LABEL = "cooperative/label_world/000010.json"
         ("vehicle-side/data_info.json", set_in(1, "pointcloud_timestamp", to="noon"), "'000010.pointcloud_timestamp', found"),
     ],
 )  # fmt: skip
-def test_damaged_files_are_named_with_field_and_remedy(root: Path, file: str, change: Callable, says: str) -> None:
+def test_damaged_files_are_named_with_field_and_remedy(
+    root: Path, file: str, change: Callable, message_match: str
+) -> None:
     edit(root / file, change)
-    with pytest.raises(RecordingError, match=says) as caught:
+    with pytest.raises(RecordingError, match=message_match) as caught:
         DairRecording(root).snapshot("12", 0)
     assert file in str(caught.value) and "\n" not in str(caught.value)
     assert str(caught.value).endswith("copy or download the file again.")

@@ -14,7 +14,7 @@ import torch
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.dair_writer import DairWriter, write_dair_index
 from manyeyes.datasets.pcd import read_table
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, RecordingError, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 CAR, TRUCK, OWN, UNSEEN = 40, 41, 37, 50
 
@@ -38,7 +38,7 @@ def drive(moved_m: float = 0.0, time_ns: int = 200_000_000) -> Snapshot:
     yaw = torch.tensor([3.0, -1.1, 0.8, 0.0], dtype=torch.float64)
     boxes = Boxes.of(center, size, yaw, label=torch.tensor([0, 2, 0, 0]), id=torch.tensor([CAR, TRUCK, OWN, UNSEEN]))
     seen = torch.tensor([[True, True, False, False], [False, True, True, False]])
-    return Snapshot("drive", 0, tuple(frames), Truth(boxes, seen, Transform.stack(list(poses))))
+    return Snapshot("drive", 0, tuple(frames), GroundTruth(boxes, seen, Transform.stack(list(poses))))
 
 
 def written(root: Path, snapshot: Snapshot, unit: Snapshot | None = None) -> DairRecording:
@@ -134,14 +134,14 @@ def test_no_vehicle_at_all(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message_match"),
     [
         (lambda s: replace(s, truth=None), "1 frames of the kind vehicle and no truth"),
         (lambda s: replace(s, frames=s.frames[:1]), "0 frames of the kind infrastructure"),
         (lambda s: replace(s, frames=(s.frames[0], s.frames[0])), "2 frames of the kind vehicle"),
     ],
 )
-def test_what_the_format_cannot_hold_is_refused(tmp_path: Path, change, says: str) -> None:
-    with pytest.raises(RecordingError, match=says):
+def test_what_the_format_cannot_hold_is_refused(tmp_path: Path, change, message_match: str) -> None:
+    with pytest.raises(RecordingError, match=message_match):
         DairWriter(tmp_path, "7").write(change(drive()), 0)
     assert list(tmp_path.iterdir()) == []

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 
 from manyeyes.datasets.base import Recording
-from manyeyes.datasets.frame_reader import OutOfSnapshots, SingleFrames, single_frames
+from manyeyes.datasets.frame_reader import FrameReader, SnapshotFrameReader, as_frame_reader
 from manyeyes.datatypes import AgentFrame, PointCloud, Snapshot, Transform
 
 
@@ -18,7 +18,7 @@ class Apart:
     def length(self, scenario: str) -> int:
         return 2
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         return range(2)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -32,7 +32,7 @@ class Apart:
 
 def test_snapshots_are_taken_apart_where_a_recording_knows_nothing_else() -> None:
     recording: Recording = Apart()
-    frames: SingleFrames = single_frames(recording)
-    assert isinstance(frames, OutOfSnapshots)
-    assert [frames.present("a", i) for i in range(2)] == [(4, 7), (4,)]
+    frames: FrameReader = as_frame_reader(recording)
+    assert isinstance(frames, SnapshotFrameReader)
+    assert [frames.present_agents("a", i) for i in range(2)] == [(4, 7), (4,)]
     assert frames.frame("a", 0, 7).points.xyz.tolist() == [[7.0, 7.0, 7.0]]

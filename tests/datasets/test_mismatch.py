@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from manyeyes.datasets.mismatch import copied_files, mismatched_files
+from manyeyes.datasets.mismatch import find_copied_files, find_mismatched_files
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 
 
 def scene(index: int, cars: int = 8, hit: Callable[[int, int], bool] = lambda agent, car: True) -> Snapshot:
@@ -30,7 +30,7 @@ def scene(index: int, cars: int = 8, hit: Callable[[int, int], bool] = lambda ag
     boxes = Boxes.of(center, torch.tensor([[2.0, 2.0, 1.6]]).double().expand(cars, 3), torch.zeros(cars).double(),
                      id=torch.arange(10, 10 + cars))  # fmt: skip
     seen = torch.ones(2, cars, dtype=torch.bool)
-    return Snapshot("s", index, tuple(frames), Truth(boxes, seen, Transform.stack(poses)))
+    return Snapshot("s", index, tuple(frames), GroundTruth(boxes, seen, Transform.stack(poses)))
 
 
 def write(folder: Path, frames: int = 4, **changes: object) -> Path:
@@ -98,7 +98,7 @@ def test_small_files_of_equal_bytes_mean_nothing(tmp_path: Path) -> None:
     paths = [tmp_path / name for name in ("a", "b", "c", "d")]
     for path, content in zip(paths, (b"x" * 100, b"x" * 100, b"y" * 5000, b"y" * 5000)):
         path.write_bytes(content)
-    assert [problem.path.name for problem in copied_files(paths, "s")] == ["d"]
+    assert [problem.path.name for problem in find_copied_files(paths, "s")] == ["d"]
 
 
 def test_a_recording_without_truth_is_compared_by_bytes_alone(tmp_path: Path) -> None:
@@ -112,5 +112,5 @@ def test_a_recording_without_truth_is_compared_by_bytes_alone(tmp_path: Path) ->
         snapshot = recording.snapshot("s", index)
         return Snapshot(snapshot.scenario, snapshot.index, snapshot.frames, None)
 
-    (problem,) = mismatched_files(read, "s", clouds)
+    (problem,) = find_mismatched_files(read, "s", clouds)
     assert problem.path in (path, root / "s" / "1" / "000002.pcd")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from manyeyes.datasets.manifest import Digests, digest_files, read_manifest, scenario_files, total_digest
+from manyeyes.datasets.manifest import Digests, compute_total_digest, digest_files, list_scenario_files, read_manifest
 from manyeyes.datasets.missing import MAX_LISTED, FileProblem, MissingFiles
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
 from manyeyes.datatypes import AgentFrame, PointCloud, RecordingError, Snapshot, Transform
@@ -85,7 +85,7 @@ def test_a_scenario_without_files_is_missing_and_other_folders_are_not(root: Pat
     (root / "notes" / "plan.txt").write_text("")
     (root / "d.partial" / "3").mkdir(parents=True)
     recording = Opv2vRecording(root, use_cache=False)
-    assert recording.scenarios == ("a", "b") and recording.left_out == {"c", "d"}
+    assert recording.scenarios == ("a", "b") and recording.unreadable_scenarios == {"c", "d"}
     assert missing(root) == ["missing c", "missing d.partial"]
 
 
@@ -103,7 +103,7 @@ def test_a_verdict_is_kept_until_a_file_changes(root: Path, tmp_path: Path, monk
         calls.append(name)
         return []
 
-    monkeypatch.setattr("manyeyes.datasets.opv2v.mismatched_files", check)
+    monkeypatch.setattr("manyeyes.datasets.opv2v.find_mismatched_files", check)
     for _ in range(2):
         Opv2vRecording(root, cache_folder=tmp_path / "cache").verify()
     assert calls == ["a", "b"]
@@ -116,12 +116,12 @@ def test_a_verdict_is_kept_until_a_file_changes(root: Path, tmp_path: Path, monk
 def test_digests_compare_files_that_are_used(root: Path) -> None:
     folder = root / "a"
     (folder / "3" / "000000_camera0.png").write_bytes(b"picture")
-    by_path = digest_files(scenario_files(folder), folder)
-    digests = Digests(total_digest(by_path), len(by_path), 0, by_path)
+    by_path = digest_files(list_scenario_files(folder), folder)
+    digests = Digests(compute_total_digest(by_path), len(by_path), 0, by_path)
     (folder / "3" / "000000_camera0.png").write_bytes(b"another")
     (folder / "notes.txt").write_text("")
     (folder / "3" / "000006.pcd").write_bytes(b"")
-    files = scenario_files(folder)
+    files = list_scenario_files(folder)
     found = digests.check(folder, "a", files)
     assert [(p.path.name, p.kind) for p in found] == [
         ("000000_camera0.png", "mismatched"),
@@ -133,7 +133,7 @@ def test_digests_compare_files_that_are_used(root: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"entry": 1}', '{"entry": {"sha256": "0"}}', '{"entry": {}, "files": []}'])
-def test_a_file_without_digests_says_nothing(tmp_path: Path, text: str) -> None:
+def test_a_file_without_digests_is_ignored(tmp_path: Path, text: str) -> None:
     (tmp_path / "scenario.json").write_text(text)
     assert Digests.read(tmp_path / "scenario.json") is None and Digests.read(tmp_path / "nowhere.json") is None
 

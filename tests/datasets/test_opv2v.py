@@ -16,11 +16,11 @@ import torch
 import yaml
 
 from manyeyes.datasets import opv2v, opv2v_yaml
-from manyeyes.datasets.base import judged_frames, points_in_listed_boxes
-from manyeyes.datasets.frame_reader import single_frames
+from manyeyes.datasets.base import count_points_in_listed_boxes, iter_eval_frames
+from manyeyes.datasets.frame_reader import as_frame_reader
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
 from manyeyes.datasets.pcd import write_pcd
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, RecordingError, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 # CARLA's world, left-handed, degrees: [x, y, z, roll, yaw, pitch]. Nothing here is symmetric, so no sign can hide.
 LIDARS = {
@@ -159,11 +159,11 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 def test_the_scene_in_right_handed_terms(dataset: Path) -> None:
     recording = Opv2vRecording(dataset, "train")
-    assert recording.scenarios == ("2021_08_16_22_26_54",) and recording.problems == ()
+    assert recording.scenarios == ("2021_08_16_22_26_54",) and recording.missing_summary == ()
     name = recording.scenarios[0]
     # String order puts 1045 before 641; infrastructure is last although '-' sorts first.
     assert recording.agents(name) == (1045, 641, -1)
-    assert recording.length(name) == 2 and recording.judged(name) == range(2)
+    assert recording.length(name) == 2 and recording.eval_indices(name) == range(2)
     snapshot = recording.snapshot(name, 1)
     assert [f.agent_id for f in snapshot.frames] == [1045, 641, -1]
     assert [f.is_infrastructure for f in snapshot.frames] == [False, False, True]
@@ -195,7 +195,7 @@ def test_the_road_is_at_zero_in_every_agents_frame(dataset: Path) -> None:
 def test_every_listed_vehicles_points_lie_in_its_box_in_every_agents_frame(dataset: Path) -> None:
     snapshot = Opv2vRecording(dataset / "train").snapshot("2021_08_16_22_26_54", 0)
     assert snapshot.truth is not None
-    counts = points_in_listed_boxes(snapshot)
+    counts = count_points_in_listed_boxes(snapshot)
     assert bool((counts[snapshot.truth.seen] == 60).all())
     assert bool((counts[~snapshot.truth.seen] == -1).all())
 
@@ -222,7 +222,7 @@ def test_a_mirrored_reader_fails_that_test(
     monkeypatch.setattr(opv2v, name, wrong)
     snapshot = Opv2vRecording(dataset / "train").snapshot("2021_08_16_22_26_54", 0)
     assert snapshot.truth is not None
-    counts = points_in_listed_boxes(snapshot)
+    counts = count_points_in_listed_boxes(snapshot)
     for row in range(len(snapshot.frames)):
         assert (counts[row][snapshot.truth.seen[row]] < 60).all()
 
@@ -239,28 +239,28 @@ def test_scenario_split_and_folder_of_scenarios_are_all_roots(dataset: Path) -> 
     assert Opv2vRecording(dataset / "test").scenarios == two
     assert Opv2vRecording(dataset / "test" / two[1]).scenarios == two[1:]
     recording = Opv2vRecording(dataset / "test")
-    assert list(judged_frames(recording)) == [(two[0], 0), (two[0], 1), (two[1], 0)]
+    assert list(iter_eval_frames(recording)) == [(two[0], 0), (two[0], 1), (two[1], 0)]
     ascii_points = recording.snapshot(two[0], 0).frames[0].points.xyz
     assert recording.snapshot(two[1], 0).frames[0].points.xyz == pytest.approx(ascii_points, abs=2e-6)
 
 
 def test_history_frames_are_not_judged(scenario: Path) -> None:
     edit(scenario / "data_protocol.yaml", lambda c: c.update(history_frames=1))
-    assert Opv2vRecording(scenario).judged("drive") == range(1, 2)
+    assert Opv2vRecording(scenario).eval_indices("drive") == range(1, 2)
     edit(scenario / "data_protocol.yaml", lambda c: c.update(history_frames=9))
-    assert list(Opv2vRecording(scenario).judged("drive")) == []
+    assert list(Opv2vRecording(scenario).eval_indices("drive")) == []
     (scenario / "data_protocol.yaml").unlink()
-    assert Opv2vRecording(scenario).judged("drive") == range(2)
+    assert Opv2vRecording(scenario).eval_indices("drive") == range(2)
     (scenario / "data_protocol.yaml").write_text("world: {fixed_delta_seconds: quick}")
     with pytest.raises(RecordingError, match=r"data_protocol\.yaml: expected world\.fixed_delta_seconds.*'quick'"):
-        Opv2vRecording(scenario).judged("drive")
+        Opv2vRecording(scenario).eval_indices("drive")
 
 
 def test_opening_reads_no_cloud_and_no_yaml(scenario: Path) -> None:
     for path in scenario.rglob("0*"):
         path.write_bytes(b"")
     recording = Opv2vRecording(scenario)
-    assert recording.length("drive") == 2 and recording.judged("drive") == range(2)
+    assert recording.length("drive") == 2 and recording.eval_indices("drive") == range(2)
 
 
 def test_yaml_is_parsed_once_and_again_when_it_changes(scenario: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -292,7 +292,7 @@ def test_without_a_cache_nothing_is_written(scenario: Path, tmp_path: Path, monk
 
 
 @pytest.mark.parametrize(
-    ("root", "split", "says"),
+    ("root", "split", "message_match"),
     [
         ("nowhere", None, "nowhere: no such folder"),
         (".", "validate", "no split 'validate'; it has test, train"),
@@ -301,10 +301,10 @@ def test_without_a_cache_nothing_is_written(scenario: Path, tmp_path: Path, monk
         ("train/2021_08_16_22_26_54/641", None, "no scenario in it"),
     ],
 )
-def test_a_wrong_root_is_told_apart(dataset: Path, root: str, split: str | None, says: str) -> None:
+def test_a_wrong_root_is_refused_by_kind(dataset: Path, root: str, split: str | None, message_match: str) -> None:
     with pytest.raises(RecordingError) as caught:
         Opv2vRecording(dataset / root, split)
-    assert says in str(caught.value) and "\n" not in str(caught.value)
+    assert message_match in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_unknown_scenario_and_index(dataset: Path) -> None:
@@ -318,10 +318,10 @@ def test_unknown_scenario_and_index(dataset: Path) -> None:
 def test_a_frame_is_that_of_the_snapshot(dataset: Path) -> None:
     recording = Opv2vRecording(dataset, "train")
     name = recording.scenarios[0]
-    assert single_frames(recording) is recording
+    assert as_frame_reader(recording) is recording
     for index in range(2):
         frames = recording.snapshot(name, index).frames
-        assert recording.present(name, index) == tuple(frame.agent_id for frame in frames) == (1045, 641, -1)
+        assert recording.present_agents(name, index) == tuple(frame.agent_id for frame in frames) == (1045, 641, -1)
         for frame in frames:
             alone = recording.frame(name, index, frame.agent_id)
             assert (alone.agent_id, alone.timestamp_ns) == (frame.agent_id, frame.timestamp_ns)
@@ -340,7 +340,7 @@ def test_no_other_agents_files_are_read_for_a_frame(scenario: Path) -> None:
 def test_an_agent_without_the_frame_is_refused_by_name(scenario: Path) -> None:
     (scenario / "641" / "00068.pcd").unlink()
     recording = Opv2vRecording(scenario)
-    assert recording.present("drive", 0) == (1045, -1)
+    assert recording.present_agents("drive", 0) == (1045, -1)
     with pytest.raises(RecordingError, match="Agent 641 has no frame 0 of 'drive'; choose one of 1045, -1"):
         recording.frame("drive", 0, 641)
 
@@ -350,7 +350,7 @@ def _remove(*names: str) -> Callable[[Path], None]:
 
 
 @pytest.mark.parametrize(
-    ("damage", "says", "agents"),
+    ("damage", "message_match", "agents"),
     [
         (_remove("641/00068.pcd"), "641: 1 of 2 frames lack their pcd, the first is 00068", [1045, -1]),
         (_remove("641/00068.yaml"), "641: 1 of 2 frames lack their yaml, the first is 00068", [1045, -1]),
@@ -361,16 +361,16 @@ def _remove(*names: str) -> Callable[[Path], None]:
         (lambda folder: shutil.rmtree(folder / "641") or (folder / "641").mkdir(), "641: holds neither", [1045, -1]),
     ],
 )
-def test_a_partial_scenario_is_usable_and_says_what_is_missing(
-    scenario: Path, damage: Callable[[Path], None], says: str, agents: list[int]
+def test_a_partial_scenario_is_usable_and_reports_what_is_missing(
+    scenario: Path, damage: Callable[[Path], None], message_match: str, agents: list[int]
 ) -> None:
     damage(scenario)
     recording = Opv2vRecording(scenario)
-    assert any(says in line for line in recording.problems), recording.problems
+    assert any(message_match in line for line in recording.missing_summary), recording.missing_summary
     assert [f.agent_id for f in recording.snapshot("drive", 0).frames] == agents
     with pytest.raises(RecordingError) as caught:
         Opv2vRecording(scenario, strict=True)
-    assert recording.problems[0] in str(caught.value)
+    assert recording.missing_summary[0] in str(caught.value)
 
 
 def test_an_empty_scenario_among_whole_ones_is_reported(dataset: Path, tmp_path: Path) -> None:
@@ -378,7 +378,7 @@ def test_an_empty_scenario_among_whole_ones_is_reported(dataset: Path, tmp_path:
     (root / "2021_09_09_13_20_58").mkdir()
     recording = Opv2vRecording(root)
     assert len(recording.scenarios) == 2
-    assert "2021_09_09_13_20_58: no agent with a whole frame" in recording.problems[0]
+    assert "2021_09_09_13_20_58: no agent with a whole frame" in recording.missing_summary[0]
     for path in root.rglob("*.pcd"):
         path.unlink()
     with pytest.raises(RecordingError, match=r"expected whole scenarios; .* lack their pcd"):
@@ -386,7 +386,7 @@ def test_an_empty_scenario_among_whole_ones_is_reported(dataset: Path, tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message_match"),
     [
         (lambda c: c.pop("lidar_pose"), "expected the key 'lidar_pose' with 6 numbers, found none"),
         (lambda c: c.update(lidar_pose=[1, 2, 3]), "expected 6 finite numbers at 'lidar_pose', found [1, 2, 3]"),
@@ -399,7 +399,7 @@ def test_an_empty_scenario_among_whole_ones_is_reported(dataset: Path, tmp_path:
     ],
 )
 def test_a_faulty_yaml_names_file_and_key(
-    scenario: Path, change: Callable[[dict[str, Any]], object], says: str
+    scenario: Path, change: Callable[[dict[str, Any]], object], message_match: str
 ) -> None:
     path = scenario / "641" / "00070.yaml"
     edit(path, change)
@@ -407,7 +407,7 @@ def test_a_faulty_yaml_names_file_and_key(
     recording.snapshot("drive", 0)
     with pytest.raises(RecordingError) as caught:
         recording.snapshot("drive", 1)
-    assert says in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
+    assert message_match in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("text", ["lidar_pose: [1, 2", "- 1\n- 2\n", "", "lidar_pose: *nobody\n"])
@@ -438,7 +438,7 @@ def test_numbers_written_as_words_of_yaml_1_1_are_numbers(scenario: Path) -> Non
     assert Opv2vRecording(scenario).snapshot("drive", 0).frames[1].speed_mps == pytest.approx(1.0)
 
 
-def test_an_agent_that_lists_itself_is_not_believed(scenario: Path) -> None:
+def test_an_agents_own_box_is_ignored(scenario: Path) -> None:
     edit(scenario / "641" / "00068.yaml", lambda c: c["vehicles"].update({641: c["vehicles"][700]}))
     truth = Opv2vRecording(scenario).snapshot("drive", 0).truth
     assert truth is not None and truth.boxes.id.tolist()[0] == 641
@@ -447,7 +447,7 @@ def test_an_agent_that_lists_itself_is_not_believed(scenario: Path) -> None:
 
 
 @pytest.mark.parametrize("pose", [None, "sensor"])
-def test_the_height_of_a_pole_is_found_in_its_cloud_where_no_pose_tells(scenario: Path, pose: str | None) -> None:
+def test_the_height_of_a_pole_is_estimated_from_its_cloud_without_a_pose(scenario: Path, pose: str | None) -> None:
     for stem in ("00068", "00070"):
         edit(
             scenario / "-1" / f"{stem}.yaml",
@@ -455,7 +455,7 @@ def test_the_height_of_a_pole_is_found_in_its_cloud_where_no_pose_tells(scenario
         )
     recording = Opv2vRecording(scenario)
     assert recording.snapshot("drive", 0).frames[2].sensor_height_m == pytest.approx(4.3, abs=1e-4)
-    assert bool((points_in_listed_boxes(recording.snapshot("drive", 0)) != 0).all())
+    assert bool((count_points_in_listed_boxes(recording.snapshot("drive", 0)) != 0).all())
     # The first cloud decides for all frames, whichever is read first: else the road would jump.
     write_ascii(scenario / "-1" / "00070.pcd", scan(-1) + (0, 0, 1))
     assert Opv2vRecording(scenario).snapshot("drive", 1).frames[2].sensor_height_m == pytest.approx(4.3, abs=1e-4)
@@ -489,7 +489,7 @@ def drive_frame(index: int = 0, agents: tuple[int, ...] = (1, 10, 9, -2)) -> Sna
         poses.append(pose)
     seen = torch.from_numpy(rng.uniform(size=(len(agents), count)) < 0.5)
     seen[0, ~seen.any(0)] = True
-    return Snapshot("drive", index, tuple(frames), Truth(boxes, seen, Transform.stack(poses)))
+    return Snapshot("drive", index, tuple(frames), GroundTruth(boxes, seen, Transform.stack(poses)))
 
 
 def assert_same(one: Snapshot, other: Snapshot) -> None:
@@ -517,7 +517,7 @@ def test_what_the_writer_wrote_is_what_the_reader_reads(tmp_path: Path) -> None:
     writer.close({"history_frames": 1, "seed": np.int64(3), "towns": ("Town05",)})
     assert sorted(p.name for p in tmp_path.rglob("*.pcd"))[::4] == ["000020.pcd", "000022.pcd", "000024.pcd"]
     recording = Opv2vRecording(tmp_path / "drive", strict=True)
-    assert recording.judged("drive") == range(1, 3)
+    assert recording.eval_indices("drive") == range(1, 3)
     for index, snapshot in enumerate(snapshots):
         assert_same(snapshot, recording.snapshot("drive", index))
     protocol = yaml.safe_load((tmp_path / "drive" / "data_protocol.yaml").read_text())
@@ -569,10 +569,10 @@ def test_an_agent_never_lists_itself_but_others_list_it(tmp_path: Path) -> None:
     assert found.seen[0].all() and found.seen[1].tolist() == [id != 21 for id in range(20, 32)]
 
 
-def test_the_true_pose_is_written_and_the_claim_stands_beside_it(tmp_path: Path) -> None:
+def test_the_true_pose_and_the_reported_pose_are_written(tmp_path: Path) -> None:
     snapshot = drive_frame(agents=(1,))
-    claimed = replace(snapshot.frames[0], world_from_agent=Transform.from_xyz_yaw(7.0, 8.0, 9.0, 0.5))
-    Opv2vWriter(tmp_path / "drive").write(replace(snapshot, frames=(claimed,)))
+    reported = replace(snapshot.frames[0], world_from_agent=Transform.from_xyz_yaw(7.0, 8.0, 9.0, 0.5))
+    Opv2vWriter(tmp_path / "drive").write(replace(snapshot, frames=(reported,)))
     assert_same(snapshot, Opv2vRecording(tmp_path / "drive").snapshot("drive", 0))
     content = yaml.safe_load((tmp_path / "drive" / "1" / "000020.yaml").read_text())
     assert content["predicted_ego_pos"] == pytest.approx([7, -8, 9, 0, -math.degrees(0.5), 0])
@@ -585,7 +585,7 @@ def test_a_frame_without_truth_lists_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message_match"),
     [
         (lambda s: replace(s, frames=(replace(s.frames[0], timestamp_ns=1_010_000_000),)), "multiple of 0.05 s"),
         (lambda s: replace(s, frames=s.frames[:1] * 2), "ids that occur once"),
@@ -594,10 +594,10 @@ def test_a_frame_without_truth_lists_nothing(tmp_path: Path) -> None:
         (lambda s: replace(s, truth=replace(s.truth, boxes=replace(s.truth.boxes, id=s.truth.boxes.id * 0))), "once"),
     ],
 )
-def test_the_writer_refuses_what_the_format_cannot_say(
-    tmp_path: Path, change: Callable[[Snapshot], Snapshot], says: str
+def test_the_writer_refuses_what_the_format_cannot_hold(
+    tmp_path: Path, change: Callable[[Snapshot], Snapshot], message_match: str
 ) -> None:
-    with pytest.raises(RecordingError, match=says):
+    with pytest.raises(RecordingError, match=message_match):
         Opv2vWriter(tmp_path).write(change(drive_frame()))
 
 

@@ -9,7 +9,7 @@ import yaml
 
 pytest.importorskip("PIL", reason="pictures need the view extra")
 
-from manyeyes.datasets.image_io import read_picture, write_png
+from manyeyes.datasets.image_io import read_image, write_png
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
 from manyeyes.datasets.opv2v_camera import read_cameras
 from manyeyes.datatypes import AgentFrame, Camera, CameraImage, PointCloud, RecordingError, Snapshot, Transform
@@ -63,10 +63,10 @@ def test_pictures_and_cameras_come_back(root: Path, tmp_path_factory: pytest.Tem
                 torch.testing.assert_close(one.camera.intrinsic, two.camera.intrinsic)
                 place, wanted = one.camera.agent_from_camera, two.camera.agent_from_camera
                 torch.testing.assert_close(place.matrix(), wanted.matrix(), atol=1e-9, rtol=0)
-    assert recording.problems == ()
+    assert recording.missing_summary == ()
 
 
-def test_they_are_read_only_when_asked_for(root: Path) -> None:
+def test_images_are_read_only_on_demand(root: Path) -> None:
     assert all(frame.images == () for frame in Opv2vRecording(root, use_cache=False).snapshot("one", 0).frames)
 
 
@@ -110,10 +110,10 @@ def test_a_lost_picture_is_a_problem_and_a_damaged_one_an_error(root: Path) -> N
     folder = root / "one" / "3"
     (folder / "000002_camera1.png").unlink()
     recording = Opv2vRecording(root, images=True, use_cache=False)
-    (problem,) = recording.problems
+    (problem,) = recording.missing_summary
     assert "1 of 2 frames lack the picture of camera 1, the first is 000002" in problem
     assert [len(f.images) for f in recording.snapshot("one", 1).frames] == [1, 1]
-    assert Opv2vRecording(root, use_cache=False).problems == ()
+    assert Opv2vRecording(root, use_cache=False).missing_summary == ()
     (folder / "000000_camera0.png").write_bytes(b"no picture")
     with pytest.raises(RecordingError, match=r"000000_camera0\.png: expected a picture"):
         recording.snapshot("one", 0)
@@ -131,4 +131,4 @@ def test_a_camera_without_its_numbers_is_named(tmp_path: Path) -> None:
 def test_a_picture_comes_back_as_it_was(tmp_path: Path) -> None:
     rgb = torch.arange(3 * 5 * 7, dtype=torch.uint8).reshape(3, 5, 7)
     write_png(tmp_path / "a.png", rgb)
-    assert torch.equal(read_picture(tmp_path / "a.png"), rgb)
+    assert torch.equal(read_image(tmp_path / "a.png"), rgb)

@@ -203,7 +203,7 @@ def test_a_truncated_file_names_itself_what_was_expected_and_what_came(tmp_path:
     assert re.search(rf"truncated.*\b{expected}\b.*\b{found}\b", text)
 
 
-def test_more_points_than_the_header_says_are_refused_but_not_a_last_newline(tmp_path: Path) -> None:
+def test_more_points_than_the_header_declares_are_refused(tmp_path: Path) -> None:
     xyz, red = cloud(10)
     write_pcd(tmp_path / "a.pcd", xyz, red / 255)
     whole = (tmp_path / "a.pcd").read_bytes()
@@ -215,7 +215,7 @@ def test_more_points_than_the_header_says_are_refused_but_not_a_last_newline(tmp
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "message_match"),
     [
         (b"", "DATA line"),
         (b"VERSION 0.7\nFIELDS x y", "DATA line"),
@@ -233,11 +233,11 @@ def test_more_points_than_the_header_says_are_refused_but_not_a_last_newline(tmp
         ),
     ],
 )
-def test_damaged_headers_and_lines_say_what_is_wrong(tmp_path: Path, content: bytes, says: str) -> None:
+def test_damaged_headers_and_lines_are_reported(tmp_path: Path, content: bytes, message_match: str) -> None:
     (tmp_path / "a.pcd").write_bytes(content)
     with pytest.raises(RecordingError) as caught:
         read_pcd(tmp_path / "a.pcd")
-    assert says in str(caught.value)
+    assert message_match in str(caught.value)
     assert str(tmp_path / "a.pcd") in str(caught.value) and "\n" not in str(caught.value)
 
 

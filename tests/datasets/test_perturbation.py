@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from manyeyes.datasets.perturbation import LegacyStaleness, PoseNoise, legacy_draw
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datasets.perturbation import FrameDelay, PoseNoise, opencood_offset
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 
 
 def snapshot(index=0, agents=(7, -1, 30), scenario="town", speed=5.0):
@@ -15,7 +15,7 @@ def snapshot(index=0, agents=(7, -1, 30), scenario="town", speed=5.0):
     cloud = PointCloud.of(torch.ones(3, 3))
     frames = [AgentFrame.of(cloud, pose, a, 100_000_000 * index) for pose, a in zip(poses, agents, strict=True)]
     box = Boxes.of(torch.tensor([[20.0 + index, 5, 1]]).double(), torch.ones(1, 3).double(), torch.zeros(1).double())
-    truth = Truth(box, torch.ones(len(agents), 1).bool(), Transform.stack(poses))
+    truth = GroundTruth(box, torch.ones(len(agents), 1).bool(), Transform.stack(poses))
     return Snapshot(scenario, index, tuple(frames), truth)
 
 
@@ -32,9 +32,9 @@ def moved(before, after):
     ("seed", "xyz", "yaw"), [(20, (0.1768, 0.0392, 0.0715), -0.217), (25, (0.0457, 0.2054, -0.1679), -0.191)]
 )
 def test_legacy_draw_gives_the_published_codes_numbers(seed, xyz, yaw):
-    assert legacy_draw(seed, 0.2, 0.2) == pytest.approx((*xyz, yaw), abs=5e-4)
-    assert legacy_draw(seed, 0.8, 0.8) == pytest.approx([4 * v for v in legacy_draw(seed, 0.2, 0.2)])
-    assert legacy_draw(seed, 0.2, 0.2) == legacy_draw(seed, 0.2, 0.2)
+    assert opencood_offset(seed, 0.2, 0.2) == pytest.approx((*xyz, yaw), abs=5e-4)
+    assert opencood_offset(seed, 0.8, 0.8) == pytest.approx([4 * v for v in opencood_offset(seed, 0.2, 0.2)])
+    assert opencood_offset(seed, 0.2, 0.2) == opencood_offset(seed, 0.2, 0.2)
 
 
 def test_legacy_noise_is_one_offset_for_all_collaborators_and_frames_in_our_axes():
@@ -86,7 +86,7 @@ def test_noise_depends_on_the_key_alone():
     assert not torch.allclose(moved(snapshot(), replace(noise, seed=6).apply(snapshot(), 0))[1:], forward[1:])
 
 
-def test_only_the_claim_changes():
+def test_only_the_reported_pose_changes():
     before = snapshot()
     after = PoseNoise("all_agents_iid", 0.4, 0.02).apply(before, 0)
     assert after.truth is before.truth and after.index == before.index
@@ -128,23 +128,23 @@ def test_unknown_modes_and_negative_sigmas_are_refused():
     with pytest.raises(ConfigError, match="-1"):
         PoseNoise(sigma_xy_m=-1)
     with pytest.raises(ConfigError, match="at least 0"):
-        LegacyStaleness(-1)
+        FrameDelay(-1)
 
 
 def test_staleness_takes_collaborators_from_earlier_and_leaves_ego_and_truth():
     drive = [snapshot(k) for k in range(5)]
-    got = LegacyStaleness(2).apply(drive[4], 1, drive[:4])
+    got = FrameDelay(2).apply(drive[4], 1, drive[:4])
     assert got.frames[1] is drive[4].frames[1] and got.truth is drive[4].truth and got.index == 4
     assert got.frames[0] is drive[2].frames[0] and got.frames[2] is drive[2].frames[2]
-    assert LegacyStaleness(0).apply(drive[4], 1, drive[:4]).frames == drive[4].frames
+    assert FrameDelay(0).apply(drive[4], 1, drive[:4]).frames == drive[4].frames
 
 
 def test_staleness_is_clipped_at_the_start_of_the_scenario_and_of_an_agents_presence():
     drive = [snapshot(k) for k in range(3)]
-    assert LegacyStaleness(9).apply(drive[2], 0, drive[:2]).frames[1] is drive[0].frames[1]
-    assert LegacyStaleness(9).apply(drive[0], 0, []).frames == drive[0].frames
+    assert FrameDelay(9).apply(drive[2], 0, drive[:2]).frames[1] is drive[0].frames[1]
+    assert FrameDelay(9).apply(drive[0], 0, []).frames == drive[0].frames
     late = [replace(drive[0], frames=drive[0].frames[:2]), drive[1]]
-    got = LegacyStaleness(2).apply(drive[2], 0, late)
+    got = FrameDelay(2).apply(drive[2], 0, late)
     assert got.frames[1] is drive[0].frames[1] and got.frames[2] is drive[1].frames[2]
 
 
@@ -159,7 +159,7 @@ def test_the_stale_pose_still_places_what_stood_still():
         )
         for s in drive
     ]
-    got = LegacyStaleness(2).apply(drive[2], 0, drive[:2])
+    got = FrameDelay(2).apply(drive[2], 0, drive[:2])
     ego, other = got.frames[0], got.frames[1]
     assert other.timestamp_ns == 0 and ego.timestamp_ns == 200_000_000
     placed = (ego.world_from_agent.inverse() @ other.world_from_agent).apply(other.points.xyz)
@@ -171,6 +171,6 @@ def test_the_stale_pose_still_places_what_stood_still():
 def test_a_stale_message_carries_the_noisy_pose_of_its_own_instant():
     noise = PoseNoise("collaborators_iid", 0.5, 0.01)
     drive = [noise.apply(snapshot(k), 0) for k in range(3)]
-    got = LegacyStaleness(1).apply(drive[2], 0, drive[:2])
+    got = FrameDelay(1).apply(drive[2], 0, drive[:2])
     shift = got.frames[1].world_from_agent.translation - snapshot(1).frames[1].world_from_agent.translation
     assert torch.allclose(shift, noise.offset("town", 1, -1)[:3])

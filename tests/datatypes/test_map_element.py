@@ -44,7 +44,7 @@ def test_taken_rows_keep_their_points_scores_and_styles_in_the_order_asked() -> 
 
 def test_joined_tables_hold_the_elements_of_both_in_order() -> None:
     both = MapElements.cat([two(), MapElements.empty(), two().take([1])])
-    assert both.first.tolist() == [0, 3, 7, 11]
+    assert both.offsets.tolist() == [0, 3, 7, 11]
     assert both.polyline(2).tolist() == SQUARE
     assert len(MapElements.cat([])) == 0
 
@@ -71,7 +71,7 @@ def test_the_columns_cannot_be_written_but_the_callers_array_can() -> None:
 
 
 @pytest.mark.parametrize(
-    ("column", "value", "said"),
+    ("column", "value", "message_match"),
     [
         ("kind", [0, 4], "0 to 3"),
         ("first", [0, 3, 6], "end at 7"),
@@ -81,10 +81,10 @@ def test_the_columns_cannot_be_written_but_the_callers_array_can() -> None:
         ("style", [[1.0, 0.0]] * 2, r"style needs shape \(2, 4\)"),
     ],
 )
-def test_columns_that_do_not_fit_are_refused_by_name(column: str, value: list, said: str) -> None:
+def test_columns_that_do_not_fit_are_refused_by_name(column: str, value: list, message_match: str) -> None:
     good = two()
     columns = {name: getattr(good, name) for name in ("kind", "first", "points", "score", "sigma", "style")}
-    with pytest.raises(ShapeError, match=said):
+    with pytest.raises(ShapeError, match=message_match):
         MapElements(**(columns | {column: np.asarray(value)}))
 
 

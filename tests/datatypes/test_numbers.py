@@ -45,11 +45,11 @@ def test_two_agents_with_float32_poses_meet_in_one_frame() -> None:
     pose = torch.tensor(POSE, dtype=torch.float32)
     frame = AgentFrame.of(PointCloud.of(np.array(POINTS)), Transform(pose[:3, :3], pose[:3, 3]), agent_id=1)
     other = AgentFrame.of(PointCloud.of(np.array(POINTS)), Transform.from_xyz_yaw(12.0, 0.0), agent_id=2)
-    assert torch.allclose(frame.from_earlier(other).apply(torch.zeros(1, 3)), torch.tensor([[3.5, 0.0, -0.25]]))
+    assert torch.allclose(frame.now_from_earlier(other).apply(torch.zeros(1, 3)), torch.tensor([[3.5, 0.0, -0.25]]))
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message_match"),
     [
         (lambda: PointCloud.of(np.zeros((5, 4))), "xyz (N, 3); got (5, 4)"),
         (lambda: PointCloud.of(np.zeros(3)), "xyz (N, 3); got (3,)"),
@@ -64,7 +64,7 @@ def test_two_agents_with_float32_poses_meet_in_one_frame() -> None:
         (lambda: Transform.from_matrix(np.eye(4) * 1j), "real numbers"),
     ],
 )
-def test_what_cannot_be_points_or_a_pose_is_refused_by_name(make, said) -> None:
+def test_what_cannot_be_points_or_a_pose_is_refused_by_name(make, message_match) -> None:
     with pytest.raises(ShapeError) as error:
         make()
-    assert said in str(error.value)
+    assert message_match in str(error.value)

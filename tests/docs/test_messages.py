@@ -4,18 +4,18 @@
 from dataclasses import fields
 from pathlib import Path
 
-from manyeyes.agents.strategies.late import RETURNED_SCORE, SAME_PLACE_M, Late
-from manyeyes.comms.inbox import Dropped
+from manyeyes.agents.strategies.late import DISPLACED_SCORE_FACTOR, DUPLICATE_DISTANCE_M, LateFusion
+from manyeyes.comms.inbox import DropCounts
 from manyeyes.comms.token_format import MAX_TOKEN_VALUE
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "messages.md").read_text(encoding="utf-8")
 
 
 def test_every_reason_is_in_the_table() -> None:
-    assert [f.name for f in fields(Dropped) if f"`{f.name}`" not in TEXT] == []
+    assert [f.name for f in fields(DropCounts) if f"`{f.name}`" not in TEXT] == []
 
 
 def test_the_bounds_are_those_of_the_code() -> None:
     assert f"beyond ±{MAX_TOKEN_VALUE:g}" in TEXT
-    assert f"best {Late().max_boxes} of a message" in TEXT and f"within {SAME_PLACE_M:g} m" in TEXT
-    assert RETURNED_SCORE == 0.5 and "half its score" in TEXT
+    assert f"best {LateFusion().max_boxes} of a message" in TEXT and f"within {DUPLICATE_DISTANCE_M:g} m" in TEXT
+    assert DISPLACED_SCORE_FACTOR == 0.5 and "half its score" in TEXT

@@ -23,15 +23,15 @@ from manyeyes.agents.strategies import METHODS
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import Transform
-from manyeyes.evaluation.maps.experiment import Trial, carry_out
-from manyeyes.evaluation.maps.registry import map_of, tuned
+from manyeyes.evaluation.maps.experiment import FleetTrial, run_trial
+from manyeyes.evaluation.maps.registry import fuse_observations, make_tuned_settings
 from manyeyes.models import pretrained
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.registry import CORRECTORS
-from manyeyes.pose.types import PoseClaim
-from manyeyes.simulator.fleet.landmark_scenes import BoxError, LandmarkSpec, make_landmark_scene
-from manyeyes.training.detector.loop import Run, TrainConfig
+from manyeyes.pose.types import PosePrior
+from manyeyes.simulator.fleet.landmark_scenes import BoxNoise, LandmarkSpec, make_landmark_scene
+from manyeyes.training.detector.loop import DetectorRun, TrainConfig
 from manyeyes.training.detector.samples import AugmentConfig
 
 Arrays = Iterator[tuple[str, np.ndarray]]
@@ -80,7 +80,7 @@ def strategies(data: Path) -> Arrays:
         yield f"simulator/points/{number}", frame.points.xyz.numpy()
     for key, strategy in zip(STRATEGIES, METHODS.values(), strict=True):
         for precision in ("float32", "float16", "int8", "codes"):
-            agents = {f.agent_id: Agent(detector, strategy, precision=precision) for f in snapshots[0].frames}
+            agents = {f.agent_id: Agent(detector, strategy, token_encoding=precision) for f in snapshots[0].frames}
             for time, snapshot in enumerate(snapshots):
                 sent = {f.agent_id: agents[f.agent_id].share(f) for f in snapshot.frames}
                 yield f"packets/{key}/{precision}/{time}", content([p for packets in sent.values() for p in packets])
@@ -95,25 +95,25 @@ def strategies(data: Path) -> Arrays:
 
 def corrected_poses(data: Path) -> Arrays:
     """Answers of every pose corrector on 50 scenes of landmarks, with a prior and without."""
-    spec = LandmarkSpec(common=6, ego_extra=4, other_extra=4, error=BoxError(0.3, np.radians(2.0), 0.05, 0.1))
+    spec = LandmarkSpec(num_common=6, num_ego_only=4, num_other_only=4, noise=BoxNoise(0.3, np.radians(2.0), 0.05, 0.1))
     for number in range(50):
         scene = make_landmark_scene(spec, 7, number)
         ego, other = Landmarks.of_boxes(scene.ego[0]), Landmarks.of_boxes(scene.other[0])
         x, y, yaw = (scene.ego_from_other + np.array([0.8, -0.5, 0.02])).tolist()
         wrong = Transform.from_xyz_yaw(x, y, 0.0, yaw)
         for key, corrector in zip(POSE_CORRECTORS, CORRECTORS.values(), strict=True):
-            for prior_key, prior in (("prior", PoseClaim(wrong, np.diag([0.5, 0.5, 0.01]))), ("none", None)):
+            for prior_key, prior in (("prior", PosePrior(wrong, np.diag([0.5, 0.5, 0.01]))), ("none", None)):
                 found = corrector(ego, other, prior)
                 pose = np.full(3, np.nan) if found.pose is None else np.asarray(found.pose)
-                numbers = [found.inliers, found.runner_up, found.margin, found.distance]
+                numbers = [found.inliers, found.runner_up, found.margin, found.mahalanobis_squared]
                 yield f"pose/{key}/{prior_key}/{number}", np.concatenate((pose, found.covariance.ravel(), numbers))
 
 
 def fused_maps(data: Path) -> Arrays:
     """The fused map of two places."""
     for place in ("cross", "Town07"):
-        scene = carry_out(Trial(place, 24, 3, 150.0))
-        made = map_of("manyeyes", scene.observations, tuned(), scene.place.frame)
+        scene = run_trial(FleetTrial(place, 24, 3, 150.0))
+        made = fuse_observations("manyeyes", scene.observations, make_tuned_settings(), scene.place.frame)
         for field in ("points", "score", "sigma", "style", "kind", "first"):
             yield f"map/{place}/{field}", np.asarray(getattr(made.elements, field))
 
@@ -121,7 +121,7 @@ def fused_maps(data: Path) -> Arrays:
 def trained_weights(data: Path) -> Arrays:
     """Weights after 20 training steps, in the order of the state dictionary."""
     config = TrainConfig(COSTR_TINY, steps=20, batch=1, augment=AugmentConfig(max_agents=2))
-    run = Run(config, Opv2vRecording(data / "tiny", "train", use_cache=False), fresh(data / "run"), seed=5)
+    run = DetectorRun(config, Opv2vRecording(data / "tiny", "train", use_cache=False), fresh(data / "run"), seed=5)
     for step in range(20):
         yield f"training/loss/{step}", np.array([*flat(run.advance())][:2])
     for number, value in enumerate(run.state.model.state_dict().values()):

@@ -6,17 +6,26 @@ import numpy as np
 import pytest
 import torch
 
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, RecordingError, Snapshot, Transform, Truth
+from manyeyes.datatypes import (
+    AgentFrame,
+    Boxes,
+    ConfigError,
+    GroundTruth,
+    PointCloud,
+    RecordingError,
+    Snapshot,
+    Transform,
+)
 from manyeyes.evaluation.detection.average_precision import (
     PROTOCOLS,
     FrameResult,
     average_precision,
     average_precisions,
-    ego_truth,
-    kept_detections,
+    compute_frame_iou,
+    filter_detections,
+    get_protocol,
     match_frame,
-    overlap_frame,
-    protocol_named,
+    select_ego_truth,
 )
 from manyeyes.ops.box_iou import pairwise_iou
 
@@ -48,7 +57,7 @@ def test_three_frames_by_hand_sorted_and_concatenated():
     assert got.ap_legacy == pytest.approx(0.25 + 0.25 * 0.6 + 0.25 * 0.6, abs=1e-15)
     assert (got.recall, got.precision, got.n_gt, got.n_detections) == (0.75, 0.6, 4, 5)
     assert got.ap == got.ap_global
-    assert average_precision(three_frames(), 0.5, replace(MANYEYES, sort="concatenated")).ap == got.ap_legacy
+    assert average_precision(three_frames(), 0.5, replace(MANYEYES, ap_order="concatenated")).ap == got.ap_legacy
     assert [m.tp.tolist() for m in got.frames] == [[True, False], [False, True], [True]]
 
 
@@ -174,49 +183,49 @@ def test_the_first_recall_segment_can_be_dropped():
 
 def test_iou_equal_to_the_threshold_is_a_true_positive():
     frame = FrameResult("a", 0, cars((1, 0, 0.9)), cars((0, 0, 1)))
-    assert overlap_frame(frame, MANYEYES).iou.item() == 0.6
+    assert compute_frame_iou(frame, MANYEYES).iou.item() == 0.6
     assert match_frame(frame, 0.6, MANYEYES).tp.tolist() == [True]
     assert match_frame(frame, np.nextafter(0.6, 1), MANYEYES).tp.tolist() == [False]
 
 
 def test_a_bus_is_dropped_by_the_six_metre_filter_alone():
     bus = cars((10, 0, 0.9), size=(11.0, 2.5, 1.5))
-    assert len(kept_detections(bus, MANYEYES)) == 1
-    assert len(kept_detections(bus, protocol_named("opencood"))) == 0
+    assert len(filter_detections(bus, MANYEYES)) == 1
+    assert len(filter_detections(bus, get_protocol("opencood"))) == 0
     frame = FrameResult("a", 0, bus, bus)
     assert average_precision([frame], 0.5, MANYEYES).ap_global == 1.0
     assert average_precision([frame], 0.5, PROTOCOLS["opencood"]).ap_global == 0.0
     turned = replace(cars((10, 0, 0.9), size=(4.5, 1.9, 1.5)), yaw=torch.tensor([math.pi / 4]).double())
-    assert len(kept_detections(turned, PROTOCOLS["opencood"])) == 1
+    assert len(filter_detections(turned, PROTOCOLS["opencood"])) == 1
 
 
 def test_range_by_centre_and_by_corners():
     edge = cars((139.5, 0, 0.9))  # its front is at 141.5
     for name, kept in (("manyeyes", 1), ("opencood", 0), ("sparsealign", 1)):
-        assert len(kept_detections(edge, PROTOCOLS[name])) == kept, name
-        assert overlap_frame(FrameResult("a", 0, edge, edge), PROTOCOLS[name]).iou.shape == (kept, kept), name
-    assert len(kept_detections(cars((0, 40, 0.9)), MANYEYES)) == 1  # closed
-    assert len(kept_detections(cars((0, 40.001, 0.9)), MANYEYES)) == 0
-    near = MANYEYES.within((-70.4, -38.4, -3.0, 70.4, 38.4, 1.0))
-    assert len(kept_detections(cars((71, 20, 0.9), (70, 0, 0.8)), near)) == 1
+        assert len(filter_detections(edge, PROTOCOLS[name])) == kept, name
+        assert compute_frame_iou(FrameResult("a", 0, edge, edge), PROTOCOLS[name]).iou.shape == (kept, kept), name
+    assert len(filter_detections(cars((0, 40, 0.9)), MANYEYES)) == 1  # closed
+    assert len(filter_detections(cars((0, 40.001, 0.9)), MANYEYES)) == 0
+    near = MANYEYES.with_range((-70.4, -38.4, -3.0, 70.4, 38.4, 1.0))
+    assert len(filter_detections(cars((71, 20, 0.9), (70, 0, 0.8)), near)) == 1
 
 
 def test_z_is_judged_from_the_lidar_and_only_by_the_legacy_protocols():
     tall = cars((0, 0, 0.9), size=(5.0, 2.5, 3.2), z=1.6)  # 3.2 m over the road, 1.3 m over a roof of 1.9 m
     truth = cars((0, 0, 1), size=(5.0, 2.5, 3.2), z=1.6)
-    assert overlap_frame(FrameResult("a", 0, tall, truth), MANYEYES).iou.shape == (1, 1)
-    assert overlap_frame(FrameResult("a", 0, tall, truth), PROTOCOLS["opencood"]).iou.shape == (0, 0)
+    assert compute_frame_iou(FrameResult("a", 0, tall, truth), MANYEYES).iou.shape == (1, 1)
+    assert compute_frame_iou(FrameResult("a", 0, tall, truth), PROTOCOLS["opencood"]).iou.shape == (0, 0)
     low = cars((0, 0, 0.9), size=(5.0, 2.5, 2.8), z=1.4)
-    assert len(kept_detections(low, PROTOCOLS["opencood"])) == 1
+    assert len(filter_detections(low, PROTOCOLS["opencood"])) == 1
 
 
 def test_score_threshold_and_nms_of_each_protocol():
     weak = cars((0, 0, 0.2), (20, 0, 0.21), (40, 0, 0.05), (60, 0, 0.06))
-    assert kept_detections(weak, MANYEYES).score.tolist() == [0.21, 0.2, 0.06]
-    assert kept_detections(weak, PROTOCOLS["opencood"]).score.tolist() == [0.21]
+    assert filter_detections(weak, MANYEYES).score.tolist() == [0.21, 0.2, 0.06]
+    assert filter_detections(weak, PROTOCOLS["opencood"]).score.tolist() == [0.21]
     shifted = cars((0, 0, 0.9), (3.5, 0, 0.8))  # IoU 1/15
-    assert len(kept_detections(shifted, MANYEYES)) == 2
-    assert len(kept_detections(shifted, PROTOCOLS["sparsealign"])) == 1
+    assert len(filter_detections(shifted, MANYEYES)) == 2
+    assert len(filter_detections(shifted, PROTOCOLS["sparsealign"])) == 1
 
 
 def test_ties_keep_frame_and_row_order():
@@ -231,7 +240,7 @@ def test_ties_keep_frame_and_row_order():
 
 def test_unknown_protocol_lists_the_known():
     with pytest.raises(ConfigError, match="manyeyes, opencood, coalign, sparsealign, dair"):
-        protocol_named("opencod")
+        get_protocol("opencod")
     with pytest.raises(FrozenInstanceError):
         MANYEYES.score_threshold = 0.5  # pyright: ignore
 
@@ -239,7 +248,7 @@ def test_unknown_protocol_lists_the_known():
 # Truth of an ego.
 
 
-def crossing(order=(0, 1, 2), move=None, claimed_error=0.0):
+def crossing(order=(0, 1, 2), move=None, prior_error=0.0):
     """Three agents 10, 11, 12 at x = 0, 60, 80; boxes of the agents and of four others, one with a repeated id.
 
     The boxes, by id: 10, 11, 12 the agents' own bodies, 1 seen by agent 10, 2 by 11 and 12, 3 by 12 only,
@@ -265,23 +274,23 @@ def crossing(order=(0, 1, 2), move=None, claimed_error=0.0):
         PointCloud.of(p.inverse().apply(center[[3, 4, 4, 4, 4]]).float())
         for p in (Transform.from_xyz_yaw(a[1], 0, 0, a[2]) for a in agents)
     ]
-    wrong = [Transform.from_xyz_yaw((k + 1) * claimed_error, 0) for k in range(3)]
+    wrong = [Transform.from_xyz_yaw((k + 1) * prior_error, 0) for k in range(3)]
     frames = [AgentFrame.of(points[k], wrong[k] @ poses[k], agents[k][0]) for k in order]
-    truth = Truth(boxes.transform(move), seen[list(order)], Transform.stack([poses[k] for k in order]))
+    truth = GroundTruth(boxes.transform(move), seen[list(order)], Transform.stack([poses[k] for k in order]))
     return Snapshot("crossing", 0, tuple(frames), truth)
 
 
 def test_truth_is_the_union_of_agents_in_range_without_the_ego_and_without_repeats():
     """Agent 12 is 80 m from agent 10: what it alone sees (3) does not count for 10."""
-    assert ego_truth(crossing(), 0, MANYEYES).id.tolist() == [11, 12, 1, 2]
-    assert ego_truth(crossing(), 1, MANYEYES).id.tolist() == [10, 12, 1, 2, 3]
+    assert select_ego_truth(crossing(), 0, MANYEYES).id.tolist() == [11, 12, 1, 2]
+    assert select_ego_truth(crossing(), 1, MANYEYES).id.tolist() == [10, 12, 1, 2, 3]
     far = replace(MANYEYES, com_range_m=100.0)
-    assert ego_truth(crossing(), 0, far).id.tolist() == [11, 12, 1, 2, 3]
-    assert ego_truth(crossing(), 0, replace(MANYEYES, com_range_m=1.0)).id.tolist() == [11, 1]
+    assert select_ego_truth(crossing(), 0, far).id.tolist() == [11, 12, 1, 2, 3]
+    assert select_ego_truth(crossing(), 0, replace(MANYEYES, com_range_m=1.0)).id.tolist() == [11, 1]
 
 
 def test_truth_is_in_the_egos_true_frame():
-    got = ego_truth(crossing(), 0, MANYEYES)
+    got = select_ego_truth(crossing(), 0, MANYEYES)
     assert got.center.dtype == torch.float64
     at = got.id.tolist().index(1)
     c, s = math.cos(0.3), math.sin(0.3)
@@ -291,36 +300,39 @@ def test_truth_is_in_the_egos_true_frame():
 
 @pytest.mark.parametrize("order", [(2, 1, 0), (1, 2, 0), (0, 2, 1)])
 def test_truth_does_not_depend_on_the_order_of_agents(order):
-    one, other = ego_truth(crossing(), 1, MANYEYES), ego_truth(crossing(order), order.index(1), MANYEYES)
+    one, other = select_ego_truth(crossing(), 1, MANYEYES), select_ego_truth(crossing(order), order.index(1), MANYEYES)
     assert torch.equal(one.center, other.center) and torch.equal(one.id, other.id)
 
 
 def test_truth_does_not_depend_on_where_the_world_is():
-    one = ego_truth(crossing(), 1, MANYEYES)
-    other = ego_truth(crossing(move=Transform.from_xyz_yaw(3000, -500, 7, 2.2)), 1, MANYEYES)
+    one = select_ego_truth(crossing(), 1, MANYEYES)
+    other = select_ego_truth(crossing(move=Transform.from_xyz_yaw(3000, -500, 7, 2.2)), 1, MANYEYES)
     assert torch.equal(one.id, other.id)
     torch.testing.assert_close(one.center, other.center, atol=1e-9, rtol=0)
 
 
-def test_who_is_in_range_is_decided_by_true_poses():
+def test_agents_in_range_are_decided_by_true_poses():
     """Agent 12 is 80 m away and claims 50 m; agent 11 is 60 m away and claims 90 m."""
     for error in (-15.0, 30.0):
-        one, other = ego_truth(crossing(), 0, MANYEYES), ego_truth(crossing(claimed_error=error), 0, MANYEYES)
+        one, other = (
+            select_ego_truth(crossing(), 0, MANYEYES),
+            select_ego_truth(crossing(prior_error=error), 0, MANYEYES),
+        )
         assert torch.equal(one.id, other.id) and torch.equal(one.center, other.center)
 
 
 def test_truth_respects_range_and_points():
-    near = MANYEYES.within((-70.4, -38.4, -3.0, 25.0, 38.4, 1.0))
-    assert ego_truth(crossing(), 0, near).id.tolist() == [1]
+    near = MANYEYES.with_range((-70.4, -38.4, -3.0, 25.0, 38.4, 1.0))
+    assert select_ego_truth(crossing(), 0, near).id.tolist() == [1]
     # one point of box 1 and four of box 2 by each of the two agents in range; box 2's second row is its repeat
-    assert ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=2)).id.tolist() == [1, 2]
-    assert ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=3)).id.tolist() == [2]
-    assert ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=9)).id.tolist() == []
+    assert select_ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=2)).id.tolist() == [1, 2]
+    assert select_ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=3)).id.tolist() == [2]
+    assert select_ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=9)).id.tolist() == []
 
 
 def test_a_snapshot_without_truth_is_refused():
     with pytest.raises(RecordingError, match="crossing #0 has no truth"):
-        ego_truth(replace(crossing(), truth=None), 0, MANYEYES)
+        select_ego_truth(replace(crossing(), truth=None), 0, MANYEYES)
 
 
 def test_ranges_on_dair_differ_where_their_sources_do() -> None:
@@ -332,7 +344,7 @@ def test_ranges_on_dair_differ_where_their_sources_do() -> None:
     assert ranges["heal-dair"] == (-102.4, -51.2, -3.5, 102.4, 51.2, 1.5)
     for name in ("costr-dair", "costr-dair-centred"):
         x0, y0, _, x1, y1, _ = ranges[name]
-        assert (x1 - x0, y1 - y0) == (102.4, 102.4) and PROTOCOLS[name].sort == "concatenated"
+        assert (x1 - x0, y1 - y0) == (102.4, 102.4) and PROTOCOLS[name].ap_order == "concatenated"
     assert ranges["costr-dair"][0] == 0.0
     assert PROTOCOLS["sparsealign-dair"].com_range_m == 200.0
     assert PROTOCOLS["sparsealign-dair"].min_points_in_gt == PROTOCOLS["sparsealign"].min_points_in_gt == 4

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch, ap_of_matches
+from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch, compute_ap
 from manyeyes.evaluation.statistics.bootstrap import (
+    compare_to_margin,
+    draw_resamples,
     mean_interval,
     paired_difference,
-    resamples,
-    resolved,
     scenario_interval,
     weighted_recall,
 )
@@ -46,24 +46,24 @@ def slow_draws(matches, weights, protocol):
             for m in matches
             if m.scenario == name
         ]
-        yield ap_of_matches(copies, protocol).ap
+        yield compute_ap(copies, protocol).ap
 
 
 @pytest.mark.parametrize("protocol", [MANYEYES, replace(MANYEYES, drop_first_segment=True)])
 def test_interval_equals_the_slow_twin(protocol):
     matches = frames()
-    got = scenario_interval(matches, n=200, seed=3, level=0.9, protocol=protocol)
-    draws = np.array(list(slow_draws(matches, resamples(6, 200, 3), protocol)))
+    got = scenario_interval(matches, num_resamples=200, seed=3, confidence_level=0.9, protocol=protocol)
+    draws = np.array(list(slow_draws(matches, draw_resamples(6, 200, 3), protocol)))
     low, high = np.quantile(draws, [0.05, 0.95])
-    assert got.value == pytest.approx(ap_of_matches(matches, protocol).ap, abs=1e-12)
+    assert got.value == pytest.approx(compute_ap(matches, protocol).ap, abs=1e-12)
     assert (got.low, got.high) == (pytest.approx(low, abs=1e-9), pytest.approx(high, abs=1e-9))
-    assert got.low < got.value < got.high and got.scenarios == 6
+    assert got.low < got.value < got.high and got.num_scenarios == 6
 
 
 def test_the_order_of_frames_changes_nothing():
     matches = frames()
-    assert scenario_interval(matches[::-1], n=50) == scenario_interval(matches, n=50)
-    assert scenario_interval(matches, n=50, seed=1) != scenario_interval(matches, n=50, seed=2)
+    assert scenario_interval(matches[::-1], num_resamples=50) == scenario_interval(matches, num_resamples=50)
+    assert scenario_interval(matches, num_resamples=50, seed=1) != scenario_interval(matches, num_resamples=50, seed=2)
 
 
 def test_more_scenarios_give_a_narrower_interval():
@@ -99,39 +99,39 @@ def test_coverage_of_the_interval():
     inside = 0
     for trial in range(200):
         values = generator.normal(size=30)
-        got = mean_interval(values.tolist(), n=300, seed=trial, level=0.9)
+        got = mean_interval(values.tolist(), num_resamples=300, seed=trial, confidence_level=0.9)
         inside += got.low <= 0 <= got.high
     assert 0.82 < inside / 200 < 0.95
 
 
 def test_recall_and_empty_input():
     matches = frames(scenarios=4)
-    got = scenario_interval(matches, n=20, statistic=weighted_recall)
-    assert got.value == pytest.approx(ap_of_matches(matches, MANYEYES).recall)
-    empty = scenario_interval([], n=10)
-    assert math.isnan(empty.value) and math.isnan(empty.low) and empty.scenarios == 0
+    got = scenario_interval(matches, num_resamples=20, statistic=weighted_recall)
+    assert got.value == pytest.approx(compute_ap(matches, MANYEYES).recall)
+    empty = scenario_interval([], num_resamples=10)
+    assert math.isnan(empty.value) and math.isnan(empty.low) and empty.num_scenarios == 0
     no_truth = [replace(m, n_gt=0, truth_row=torch.full((10,), -1)) for m in matches]
-    assert math.isnan(scenario_interval(no_truth, n=10).value)
+    assert math.isnan(scenario_interval(no_truth, num_resamples=10).value)
 
 
 def test_scenarios_without_detections_or_without_truth():
     matches = frames(scenarios=4)
     silent = FrameMatch("silent", 0, torch.zeros(0).double(), torch.zeros(0).long(), 8)
-    got = scenario_interval([*matches, silent], n=100)
-    assert got.value == pytest.approx(ap_of_matches([*matches, silent], MANYEYES).ap)
-    assert got.value < scenario_interval(matches, n=10).value
+    got = scenario_interval([*matches, silent], num_resamples=100)
+    assert got.value == pytest.approx(compute_ap([*matches, silent], MANYEYES).ap)
+    assert got.value < scenario_interval(matches, num_resamples=10).value
 
 
 def test_resamples_are_multinomial_and_pure():
-    counts = resamples(7, 2000, 5)
+    counts = draw_resamples(7, 2000, 5)
     assert counts.shape == (2000, 7) and (counts.sum(1) == 7).all()
     assert np.abs(counts.mean(0) - 1).max() < 0.1 and counts.max() >= 4
-    assert np.array_equal(counts, resamples(7, 2000, 5))
+    assert np.array_equal(counts, draw_resamples(7, 2000, 5))
 
 
 def test_the_verdict():
-    assert resolved(0.12, 0.13, 0.2) == "reached"
-    assert resolved(0.12, 0.12, 0.2) == "reached"
-    assert resolved(0.12, 0.05, 0.11) == "missed"
-    assert resolved(0.12, 0.05, 0.12) == "not resolved"
-    assert resolved(0.12, math.nan, math.nan) == "not resolved"
+    assert compare_to_margin(0.12, 0.13, 0.2) == "reached"
+    assert compare_to_margin(0.12, 0.12, 0.2) == "reached"
+    assert compare_to_margin(0.12, 0.05, 0.11) == "missed"
+    assert compare_to_margin(0.12, 0.05, 0.12) == "not resolved"
+    assert compare_to_margin(0.12, math.nan, math.nan) == "not resolved"

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from manyeyes.agents.agent import Perception
-from manyeyes.agents.replay import Sent, Step
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
-from manyeyes.evaluation.detection.accumulator import MethodResult, Tally
+from manyeyes.agents.replay import ReplayStep, SentPackets
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
+from manyeyes.evaluation.detection.accumulator import MethodResult, MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS
-from manyeyes.evaluation.statistics.comparison import Bar, differences
+from manyeyes.evaluation.statistics.comparison import Margin, compare_methods
 
 PROTOCOL = PROTOCOLS["manyeyes"]
 SPOTS = ((10.0, 3.0), (20.0, -3.0), (30.0, 3.0), (40.0, -3.0))
@@ -24,65 +24,71 @@ def boxes(spots: tuple[tuple[float, float], ...]) -> Boxes:
     return Boxes.of(center, size, torch.zeros(len(spots)).double(), score, id=torch.arange(len(spots)))
 
 
-def step(method: str, scenario: str, index: int, found: int, sent_bytes: int, age_s: float = 0.1) -> Step:
+def step(method: str, scenario: str, index: int, found: int, sent_bytes: int, age_s: float = 0.1) -> ReplayStep:
     """Two agents at the origin, four cars, the first ``found`` of which are detected exactly."""
     cloud = PointCloud.of(torch.zeros(1, 3))
     frames = tuple(
         AgentFrame(100 + i, index, cloud, Transform.identity(), torch.zeros(3, 3, dtype=torch.float64))
         for i in range(2)
     )
-    truth = Truth(boxes(SPOTS), torch.ones(2, 4, dtype=torch.bool), Transform.identity(2))
+    truth = GroundTruth(boxes(SPOTS), torch.ones(2, 4, dtype=torch.bool), Transform.identity(2))
     # The ego's own message is on the air too, and must not be counted as one that it receives.
     sent = tuple(
-        Sent(a, (size,) if size else (), took)
+        SentPackets(a, (size,) if size else (), took)
         for a, size, took in ((100, 7 * sent_bytes, 0.01), (101, sent_bytes, 0.03))
     )
     ages = (age_s,) if sent_bytes else ()
-    return Step(
+    return ReplayStep(
         method, Snapshot(scenario, index, frames, truth), 0, Perception(boxes(SPOTS[:found]), ()), sent, ages, 0.05
     )
 
 
-def counted(method: str, found: list[int], sent_bytes: int = 1000) -> MethodResult:
+def accumulate(method: str, found: list[int], sent_bytes: int = 1000) -> MethodResult:
     """One scenario an entry of found, two frames each."""
-    tally = Tally(method, PROTOCOL)
+    tally = MetricAccumulator(method, PROTOCOL)
     for number, hits in enumerate(found):
         for index in range(2):
             tally.add(step(method, f"s{number}", index, hits, sent_bytes))
-    return tally.result()
+    return tally.compute_result()
 
 
 def test_ap_bytes_age_and_times_are_those_of_the_steps() -> None:
-    result = counted("late", [2, 4])
+    result = accumulate("late", [2, 4])
     assert result.ap[0].ap == pytest.approx(0.75) and result.ap[1].n_gt == 16
-    assert result.intervals[0].value == pytest.approx(0.75) and result.intervals[0].scenarios == 2
-    assert result.communication.bytes_per_message == 1000 and result.communication.messages == 4
+    assert result.intervals[0].value == pytest.approx(0.75) and result.intervals[0].num_scenarios == 2
+    assert result.communication.bytes_per_message == 1000 and result.communication.num_messages == 4
     assert (result.age_ms, result.share_ms, result.perceive_ms) == pytest.approx((100, 20, 50))
 
 
-def test_who_says_nothing_has_no_message_no_age_and_no_time_to_share() -> None:
-    result = counted("alone", [1], sent_bytes=0)
-    assert result.communication.messages == 0 and result.communication.ego_frames == 2
+def test_an_agent_that_sends_nothing_has_no_message_age_or_share_time() -> None:
+    result = accumulate("alone", [1], sent_bytes=0)
+    assert result.communication.num_messages == 0 and result.communication.num_ego_frames == 2
     assert math.isnan(result.age_ms) and math.isnan(result.share_ms) and result.perceive_ms == pytest.approx(50)
 
 
 @pytest.mark.parametrize(
-    ("fused", "bar", "verdict"),
+    ("fused", "margin", "verdict"),
     [([3] * 5, 0.25, "reached"), ([3] * 5, 0.26, "missed"), ([1, 1, 4, 1, 4], 0.25, "not resolved")],
 )
-def test_a_bar_is_judged_on_the_paired_difference(fused, bar, verdict) -> None:
-    results = [counted("alone", [2] * 5), counted("intermediate", fused)]
-    half, seven = differences(results, PROTOCOL, bars=(Bar("intermediate", "alone", bar),))
-    assert (half.method, half.rival, half.iou, half.bar, half.verdict) == ("intermediate", "alone", 0.5, bar, verdict)
+def test_a_margin_is_compared_with_the_paired_difference(fused, margin, verdict) -> None:
+    results = [accumulate("alone", [2] * 5), accumulate("intermediate", fused)]
+    half, seven = compare_methods(results, PROTOCOL, margins=(Margin("intermediate", "alone", margin),))
+    assert (half.method, half.baseline, half.iou, half.margin, half.verdict) == (
+        "intermediate",
+        "alone",
+        0.5,
+        margin,
+        verdict,
+    )
     assert half.interval.value == pytest.approx(sum(fused) / 20 - 0.5)
-    assert (seven.iou, seven.bar, seven.verdict) == (0.7, None, None)
+    assert (seven.iou, seven.margin, seven.verdict) == (0.7, None, None)
 
 
 def test_one_scenario_resolves_nothing() -> None:
-    results = [counted("alone", [0]), counted("intermediate", [4])]
-    assert differences(results, PROTOCOL)[0].verdict == "not resolved"
+    results = [accumulate("alone", [0]), accumulate("intermediate", [4])]
+    assert compare_methods(results, PROTOCOL)[0].verdict == "not resolved"
 
 
 def test_without_the_method_there_is_nothing_to_compare() -> None:
-    assert differences([counted("alone", [1]), counted("late", [2])], PROTOCOL) == ()
-    assert differences([counted("intermediate", [1])], PROTOCOL) == ()
+    assert compare_methods([accumulate("alone", [1]), accumulate("late", [2])], PROTOCOL) == ()
+    assert compare_methods([accumulate("intermediate", [1])], PROTOCOL) == ()

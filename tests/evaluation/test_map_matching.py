@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.maps.matching import (
-    WAYS,
+    MATCHING_PROTOCOLS,
     Lines,
-    area_under,
-    chamfer,
-    lines_of,
-    match,
-    ranking,
-    spaced,
-    way_named,
+    compute_all_point_ap,
+    compute_chamfer,
+    get_matching_protocol,
+    make_lines,
+    match_lines,
+    rank_lines,
+    resample_lines,
 )
 
 
@@ -56,78 +56,89 @@ def slow_chamfer(a: np.ndarray, b: np.ndarray, name: str) -> float:
     return 0.5 * float(table.min(1).mean() + table.min(0).mean())
 
 
-@pytest.mark.parametrize("name", WAYS)
-def test_every_way_measures_what_its_slow_twin_measures(name: str) -> None:
+@pytest.mark.parametrize("name", MATCHING_PROTOCOLS)
+def test_every_protocol_measures_what_its_slow_twin_measures(name: str) -> None:
     draw = np.random.default_rng(3)
     mine, theirs = wiggle(draw, 6), wiggle(draw, 5)
-    got = chamfer(lines_of(mine), lines_of(theirs), WAYS[name], 1e9)
+    got = compute_chamfer(make_lines(mine), make_lines(theirs), MATCHING_PROTOCOLS[name], 1e9)
     want = [[slow_chamfer(a, b, name) for b in theirs] for a in mine]
     np.testing.assert_allclose(got, want, atol=1e-9)
     assert np.isfinite(got).any() and (name != "maptr" or np.isinf(got).any())
 
 
 @given(seed=st.integers(0, 10**6))
-def test_a_reach_leaves_out_only_what_is_farther_than_it(seed: int) -> None:
+def test_max_distance_excludes_only_what_is_farther(seed: int) -> None:
     draw = np.random.default_rng(seed)
-    mine, theirs = lines_of(wiggle(draw, 4)), lines_of(wiggle(draw, 4))
-    whole, near = (chamfer(mine, theirs, WAYS["exact"], reach) for reach in (1e9, 2.0))
+    mine, theirs = make_lines(wiggle(draw, 4)), make_lines(wiggle(draw, 4))
+    whole, near = (compute_chamfer(mine, theirs, MATCHING_PROTOCOLS["exact"], reach) for reach in (1e9, 2.0))
     assert (whole[np.isinf(near)] > 2.0).all()
     np.testing.assert_array_equal(near[np.isfinite(near)], whole[np.isfinite(near)])
 
 
 def test_the_same_long_line_cut_a_little_shorter_has_a_floor_in_maptr_and_none_in_exact() -> None:
     """300 m, samples 3 m apart: an end shift of half a spacing puts every sample between two others."""
-    truth, mine = lines_of([straight(0, 0, 300, 0)]), lines_of([straight(1.5, 0, 298.5, 0)])
-    assert chamfer(mine, truth, WAYS["maptr"], 9.0)[0, 0] > 0.5
-    assert chamfer(mine, truth, WAYS["exact"], 9.0)[0, 0] == pytest.approx(0.5 * (2 * 4 * 0.75 / 601), abs=2e-3)
+    truth, mine = make_lines([straight(0, 0, 300, 0)]), make_lines([straight(1.5, 0, 298.5, 0)])
+    assert compute_chamfer(mine, truth, MATCHING_PROTOCOLS["maptr"], 9.0)[0, 0] > 0.5
+    assert compute_chamfer(mine, truth, MATCHING_PROTOCOLS["exact"], 9.0)[0, 0] == pytest.approx(
+        0.5 * (2 * 4 * 0.75 / 601), abs=2e-3
+    )
 
 
 def test_a_line_beside_another_is_as_far_as_it_lies_beside() -> None:
-    table = chamfer(lines_of([straight(0, 0.4, 20, 0.4)]), lines_of([straight(0, 0, 20, 0)]), WAYS["exact"], 9.0)
+    table = compute_chamfer(
+        make_lines([straight(0, 0.4, 20, 0.4)]), make_lines([straight(0, 0, 20, 0)]), MATCHING_PROTOCOLS["exact"], 9.0
+    )
     assert table[0, 0] == pytest.approx(0.4, abs=1e-12)
 
 
 def test_samples_keep_the_ends_and_are_never_farther_apart_than_the_spacing() -> None:
-    lines = lines_of([np.array([[0, 0], [0, 0], [3.3, 0], [3.3, 1.0]]), straight(5, 5, 5, 5.2)])
-    got = spaced(lines, WAYS["exact"])
-    assert np.diff(got.first).tolist() == [10, 2]
+    lines = make_lines([np.array([[0, 0], [0, 0], [3.3, 0], [3.3, 1.0]]), straight(5, 5, 5, 5.2)])
+    got = resample_lines(lines, MATCHING_PROTOCOLS["exact"])
+    assert np.diff(got.offsets).tolist() == [10, 2]
     assert got.line(0)[[0, -1]].tolist() == [[0, 0], [3.3, 1.0]] and got.line(1).tolist() == [[5, 5], [5, 5.2]]
     assert np.hypot(*np.diff(got.line(0), axis=0).T).max() <= 0.5
 
 
-def test_a_prediction_looks_only_at_its_nearest_truth() -> None:
+def test_a_prediction_is_compared_with_its_nearest_truth_only() -> None:
     """The second is nearest to a truth that is taken; the other truth within its threshold is no second choice."""
     table = np.array([[0.1, 0.9], [0.2, 0.3], [5.0, 0.4]])
-    assert match(table, np.array([0, 1, 2]), 0.5).tolist() == [0, -1, 1]
-    assert match(table, np.array([1, 0, 2]), 0.5).tolist() == [-1, 0, 1]
-    assert match(table, np.array([0, 1, 2]), 0.4).tolist() == [0, -1, 1], "equality counts"
-    assert match(table, np.array([0, 1, 2]), 0.39).tolist() == [0, -1, -1]
-    assert match(table[:, :0], np.array([0, 1, 2]), 0.5).tolist() == [-1, -1, -1]
+    assert match_lines(table, np.array([0, 1, 2]), 0.5).tolist() == [0, -1, 1]
+    assert match_lines(table, np.array([1, 0, 2]), 0.5).tolist() == [-1, 0, 1]
+    assert match_lines(table, np.array([0, 1, 2]), 0.4).tolist() == [0, -1, 1], "equality counts"
+    assert match_lines(table, np.array([0, 1, 2]), 0.39).tolist() == [0, -1, -1]
+    assert match_lines(table[:, :0], np.array([0, 1, 2]), 0.5).tolist() == [-1, -1, -1]
 
 
 def test_average_precision_by_hand() -> None:
     """T F T of four: precision 1, 1/2, 2/3; the envelope 1, 2/3, 2/3; AP = (1 + 2/3) / 4."""
-    assert area_under(np.array([True, False, True]), 4) == pytest.approx((1 + 2 / 3) / 4)
-    assert area_under(np.array([False, False]), 4) == 0.0 and area_under(np.zeros(0, dtype=bool), 4) == 0.0
-    assert math.isnan(area_under(np.array([False]), 0))
+    assert compute_all_point_ap(np.array([True, False, True]), 4) == pytest.approx((1 + 2 / 3) / 4)
+    assert (
+        compute_all_point_ap(np.array([False, False]), 4) == 0.0
+        and compute_all_point_ap(np.zeros(0, dtype=bool), 4) == 0.0
+    )
+    assert math.isnan(compute_all_point_ap(np.array([False]), 0))
 
 
 def test_equal_scores_go_by_length_then_by_place_whatever_the_order() -> None:
     parts = [straight(9, 0, 10, 0), straight(0, 0, 5, 0), straight(2, 0, 3, 0), straight(0, 9, 1, 9)]
     score = np.array([0.5, 0.5, 0.5, 0.9])
-    assert ranking(lines_of(parts, score)).tolist() == [3, 1, 2, 0]
-    back = ranking(lines_of(parts[::-1], score[::-1]))
+    assert rank_lines(make_lines(parts, score)).tolist() == [3, 1, 2, 0]
+    back = rank_lines(make_lines(parts[::-1], score[::-1]))
     assert (3 - back).tolist() == [3, 1, 2, 0]
 
 
 def test_lengths_and_bounds_are_per_line_and_nothing_is_nothing() -> None:
-    lines = lines_of([np.array([[0, 0], [3, 4], [3, 5]]), straight(-1, 0, 1, 0)])
+    lines = make_lines([np.array([[0, 0], [3, 4], [3, 5]]), straight(-1, 0, 1, 0)])
     assert lines.lengths().tolist() == [6, 2]
     assert lines.bounds().tolist() == [[0, 0, 3, 5], [-1, 0, 1, 0]]
-    none: Lines = lines_of([])
-    assert len(none) == 0 and none.lengths().shape == (0,) and chamfer(none, lines, WAYS["exact"], 1.0).shape == (0, 2)
+    none: Lines = make_lines([])
+    assert (
+        len(none) == 0
+        and none.lengths().shape == (0,)
+        and compute_chamfer(none, lines, MATCHING_PROTOCOLS["exact"], 1.0).shape == (0, 2)
+    )
 
 
-def test_an_unknown_way_lists_the_known() -> None:
+def test_an_unknown_protocol_lists_the_known() -> None:
     with pytest.raises(ConfigError, match="known: maptr, streammapnet, exact"):
-        way_named("raster")
+        get_matching_protocol("raster")

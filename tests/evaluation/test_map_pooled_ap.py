@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps.metrics import judge
+from manyeyes.evaluation.maps.metrics import evaluate_map
 from manyeyes.evaluation.maps.pooled_ap import (
-    Judged,
-    blocks_of,
-    claimed,
-    mean_of,
-    one_block,
-    pooled_ap,
-    pooled_mean_ap,
-    squares,
+    MapPair,
+    assign_to_scenario,
+    assign_to_squares,
+    average_samples,
+    bootstrap_pooled_ap,
+    bootstrap_pooled_mean_ap,
+    check_map_margin,
+    collect_blocks,
 )
-from manyeyes.evaluation.maps.tiles import side_by_side
-from manyeyes.evaluation.statistics.bootstrap import Interval, resamples
+from manyeyes.evaluation.maps.tiles import place_side_by_side
+from manyeyes.evaluation.statistics.bootstrap import Interval, draw_resamples
 
 RING = np.array([[0.0, 5.0], [4.0, 5.0], [4.0, 8.0], [0.0, 8.0]])
 
@@ -39,62 +39,77 @@ def rough(seed: int) -> tuple[MapElements, MapElements]:
 @pytest.mark.parametrize("way", ["maptr", "exact"])
 def test_the_value_is_that_of_all_maps_side_by_side(way) -> None:
     pairs = [rough(seed) for seed in range(4)]
-    judged = [Judged(mine, truth, one_block(str(k))) for k, (mine, truth) in enumerate(pairs)]
-    whole = judge(side_by_side([p[0] for p in pairs]), side_by_side([p[1] for p in pairs]))
+    judged = [MapPair(mine, truth, assign_to_scenario(str(k))) for k, (mine, truth) in enumerate(pairs)]
+    whole = evaluate_map(place_side_by_side([p[0] for p in pairs]), place_side_by_side([p[1] for p in pairs]))
     for kind in ("divider", "crossing"):
-        assert pooled_ap(judged, kind, way, n=5).value == pytest.approx(whole.ap(kind, way), abs=1e-12)
-    assert 0 < pooled_mean_ap(judged, way, n=5).value == pytest.approx(whole.mean_ap(way), abs=1e-12)
-    assert 0.1 < whole.ap("divider", way) < 0.9
+        assert bootstrap_pooled_ap(judged, kind, way, num_resamples=5).value == pytest.approx(
+            whole.get_ap(kind, way), abs=1e-12
+        )
+    assert (
+        0 < bootstrap_pooled_mean_ap(judged, way, num_resamples=5).value == pytest.approx(whole.mean_ap(way), abs=1e-12)
+    )
+    assert 0.1 < whole.get_ap("divider", way) < 0.9
 
 
 def test_a_draw_is_the_ap_of_the_maps_that_it_holds_as_often_as_it_holds_them() -> None:
-    judged = [Judged(*rough(seed), one_block(f"{seed}")) for seed in range(3)]
-    drawn, weights = pooled_ap(judged, "divider", n=8, seed=3), resamples(3, 8, 3)
-    for value, weight in zip(drawn.draws, weights):
+    judged = [MapPair(*rough(seed), assign_to_scenario(f"{seed}")) for seed in range(3)]
+    drawn, weights = bootstrap_pooled_ap(judged, "divider", num_resamples=8, seed=3), draw_resamples(3, 8, 3)
+    for value, weight in zip(drawn.samples, weights):
         held = [judged[k] for k in range(3) for _ in range(weight[k])]
-        again = [Judged(one.drawn, one.truth, one_block(f"{k}")) for k, one in enumerate(held)]
+        again = [MapPair(one.predicted, one.truth, assign_to_scenario(f"{k}")) for k, one in enumerate(held)]
         # Copies tie in score with their originals, and a copy may stand before or behind: hence not exactly equal.
-        assert value == pytest.approx(pooled_ap(again, "divider", n=0).value, abs=0.02)
+        assert value == pytest.approx(bootstrap_pooled_ap(again, "divider", num_resamples=0).value, abs=0.02)
 
 
 def test_seeds_of_one_scenario_are_drawn_together() -> None:
     """Scenario a is drawn right at both seeds, b wrong at both: with two blocks a draw has AP 0, .5 or 1; with four more."""
     truth = MapElements.of([[[0.0, 0.0], [20.0, 0.0]]], DIVIDER)
     wrong = truth.with_points(truth.points + [0.0, 9.0])
-    judged = [Judged(drawn, truth, one_block(name)) for name, drawn in (("a", truth), ("b", wrong)) for _ in range(2)]
-    got = pooled_ap(judged, "divider", n=200)
+    judged = [
+        MapPair(drawn, truth, assign_to_scenario(name))
+        for name, drawn in (("a", truth), ("b", wrong))
+        for _ in range(2)
+    ]
+    got = bootstrap_pooled_ap(judged, "divider", num_resamples=200)
     # Equal scores: a's and b's are ranked by place, b's nine metres above come last.
-    assert set(np.unique(got.draws)) == {0.0, 0.5, 1.0} and got.names == ("a/0/0", "b/0/0")
+    assert set(np.unique(got.samples)) == {0.0, 0.5, 1.0} and got.names == ("a/0/0", "b/0/0")
 
 
 def test_a_hit_is_never_without_its_truth() -> None:
     """The drawn line's middle lies in the next square: it counts where the truth is."""
     truth = MapElements.of([[[50.0, 5.0], [77.0, 5.0]], [[150.0, 5.0], [170.0, 5.0]]], DIVIDER)
     drawn = MapElements.of([[[51.0, 5.0], [78.0, 5.0]]], DIVIDER)
-    judged = [Judged(drawn, truth, squares("town", 64.0))]
-    got = pooled_ap(judged, "divider", "exact", n=300)
-    assert blocks_of([judged]) == [("town", 0, 0), ("town", 1, 0), ("town", 2, 0)]
-    assert np.nanmax(got.draws) == 1.0 and np.isnan(got.draws).any(), "a draw without truth has no number"
+    judged = [MapPair(drawn, truth, assign_to_squares("town", 64.0))]
+    got = bootstrap_pooled_ap(judged, "divider", "exact", num_resamples=300)
+    assert collect_blocks([judged]) == [("town", 0, 0), ("town", 1, 0), ("town", 2, 0)]
+    assert np.nanmax(got.samples) == 1.0 and np.isnan(got.samples).any(), "a draw without truth has no number"
 
 
 def test_differences_are_paired_and_equal_maps_do_not_differ() -> None:
-    judged = [Judged(*rough(seed), one_block(f"{seed}")) for seed in range(6)]
-    worse = [Judged(one.drawn.take(np.arange(4)), one.truth, one.blocks) for one in judged]
-    known = blocks_of([judged, worse])
-    all_of_it, less = (pooled_mean_ap(side, known=known, n=300) for side in (judged, worse))
-    nothing = all_of_it.less(all_of_it)
+    judged = [MapPair(*rough(seed), assign_to_scenario(f"{seed}")) for seed in range(6)]
+    worse = [MapPair(one.predicted.take(np.arange(4)), one.truth, one.assign_blocks) for one in judged]
+    known = collect_blocks([judged, worse])
+    all_of_it, less = (bootstrap_pooled_mean_ap(side, all_blocks=known, num_resamples=300) for side in (judged, worse))
+    nothing = all_of_it.paired_difference(all_of_it)
     assert (nothing.value, nothing.low, nothing.high) == (0.0, 0.0, 0.0)
-    gain = all_of_it.less(less)
+    gain = all_of_it.paired_difference(less)
     assert gain.low > 0 and gain.high - gain.low < all_of_it.interval().high - less.interval().low
 
 
 def test_a_mean_is_over_what_has_truth() -> None:
-    judged = [Judged(*rough(0), one_block("a")), Judged(*rough(1), one_block("b"))]
-    both = mean_of([pooled_ap(judged, "divider", n=5), pooled_ap(judged, "stop_line", n=5)])
-    assert both.value == pooled_ap(judged, "divider", n=5).value and not np.isnan(both.draws).any()
-    assert math.isnan(mean_of([pooled_ap(judged, "stop_line", n=5)]).value)
-    nothing = Judged(MapElements.empty(), judged[0].truth, one_block("a"))
-    assert pooled_ap([nothing], "divider", n=5).value == 0.0
+    judged = [MapPair(*rough(0), assign_to_scenario("a")), MapPair(*rough(1), assign_to_scenario("b"))]
+    both = average_samples(
+        [
+            bootstrap_pooled_ap(judged, "divider", num_resamples=5),
+            bootstrap_pooled_ap(judged, "stop_line", num_resamples=5),
+        ]
+    )
+    assert (
+        both.value == bootstrap_pooled_ap(judged, "divider", num_resamples=5).value and not np.isnan(both.samples).any()
+    )
+    assert math.isnan(average_samples([bootstrap_pooled_ap(judged, "stop_line", num_resamples=5)]).value)
+    nothing = MapPair(MapElements.empty(), judged[0].truth, assign_to_scenario("a"))
+    assert bootstrap_pooled_ap([nothing], "divider", num_resamples=5).value == 0.0
 
 
 @pytest.mark.parametrize(
@@ -106,5 +121,5 @@ def test_a_mean_is_over_what_has_truth() -> None:
         (0.25, 0.25, 1, "not resolved"),
     ],
 )
-def test_a_claim_holds_with_its_whole_interval(low, high, blocks, verdict) -> None:
-    assert claimed("gain", Interval((low + high) / 2, low, high, 0.95, blocks), 0.2).verdict == verdict
+def test_a_margin_is_met_by_the_whole_interval(low, high, blocks, verdict) -> None:
+    assert check_map_margin("gain", Interval((low + high) / 2, low, high, 0.95, blocks), 0.2).verdict == verdict

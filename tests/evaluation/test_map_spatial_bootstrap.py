@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
-from manyeyes.evaluation.maps.metrics import judge
-from manyeyes.evaluation.maps.spatial_bootstrap import ap_interval, f_interval
-from manyeyes.evaluation.statistics.bootstrap import resamples
+from manyeyes.evaluation.maps.metrics import evaluate_map
+from manyeyes.evaluation.maps.spatial_bootstrap import bootstrap_ap_interval, bootstrap_f1_interval
+from manyeyes.evaluation.statistics.bootstrap import draw_resamples
 
 
 def streets(good: int, bad: int, spare: int = 0, score=1.0) -> tuple[MapElements, MapElements]:
@@ -20,28 +20,28 @@ def streets(good: int, bad: int, spare: int = 0, score=1.0) -> tuple[MapElements
 def test_the_value_is_the_maps_own_number_and_lies_in_its_interval() -> None:
     draw = np.random.default_rng(4)
     mine, truth = streets(9, 5, 3, draw.uniform(0, 1, 14).round(1))
-    quality = judge(mine, truth)
+    quality = evaluate_map(mine, truth)
     for way in ("maptr", "streammapnet", "exact"):
-        got = ap_interval(mine, truth, "divider", way)
-        assert got.value == pytest.approx(quality.ap("divider", way), abs=1e-12)
-        assert 0 < got.low < got.value < got.high < 1 and got.scenarios == 17
-    got = f_interval(mine, truth, "divider")
-    assert got.value == pytest.approx(quality.length("divider").f) and got.low < got.value < got.high
+        got = bootstrap_ap_interval(mine, truth, "divider", way)
+        assert got.value == pytest.approx(quality.get_ap("divider", way), abs=1e-12)
+        assert 0 < got.low < got.value < got.high < 1 and got.num_scenarios == 17
+    got = bootstrap_f1_interval(mine, truth, "divider")
+    assert got.value == pytest.approx(quality.get_length_score("divider").f1) and got.low < got.value < got.high
 
 
 def test_recall_of_equal_squares_has_the_binomials_interval() -> None:
     """No inventions: AP is the share of found squares in the draw, whose mean over draws can be counted by hand."""
     mine, truth = streets(10, 0, 10)
-    got = ap_interval(mine, truth, "divider", n=400)
-    share = resamples(20, 400, 0)[:, :10].sum(1) / 20
+    got = bootstrap_ap_interval(mine, truth, "divider", num_resamples=400)
+    share = draw_resamples(20, 400, 0)[:, :10].sum(1) / 20
     assert (got.low, got.high) == pytest.approx(tuple(np.quantile(share, [0.025, 0.975])))
 
 
 def test_a_perfect_map_is_perfect_in_every_draw_and_without_truth_there_is_no_number() -> None:
     mine, truth = streets(5, 0)
-    assert ap_interval(mine, truth, "divider").low == f_interval(mine, truth, "divider").low == 1.0
-    assert math.isnan(ap_interval(mine, MapElements.empty(), "divider").value)
-    assert math.isnan(f_interval(mine, MapElements.empty(), "divider").value)
-    nothing = ap_interval(MapElements.empty(), truth, "divider")
+    assert bootstrap_ap_interval(mine, truth, "divider").low == bootstrap_f1_interval(mine, truth, "divider").low == 1.0
+    assert math.isnan(bootstrap_ap_interval(mine, MapElements.empty(), "divider").value)
+    assert math.isnan(bootstrap_f1_interval(mine, MapElements.empty(), "divider").value)
+    nothing = bootstrap_ap_interval(MapElements.empty(), truth, "divider")
     assert (nothing.value, nothing.high) == (0.0, 0.0)
-    assert math.isnan(ap_interval(MapElements.empty(), MapElements.empty(), "crossing").value)
+    assert math.isnan(bootstrap_ap_interval(MapElements.empty(), MapElements.empty(), "crossing").value)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps.tile_cells import Drawing, TileCell
+from manyeyes.evaluation.maps.tile_cells import TilePrediction, TileStudyResult
 from manyeyes.evaluation.maps.tile_metrics import TileTable
 
 LINES = [[[0.0, 12.0 * k], [30.0, 12.0 * k]] for k in range(4)]
@@ -13,14 +13,17 @@ RING = [[40.0, 0.0], [44.0, 0.0], [44.0, 3.0], [40.0, 3.0]]
 TRUTH = MapElements.of([*LINES, RING, [[0.0, 90.0], [30.0, 90.0]]], [DIVIDER] * 4 + [CROSSING, BOUNDARY])
 
 
-def cells() -> list[TileCell]:
+def cells() -> list[TileStudyResult]:
     """Four scenarios at two seeds: "all" draws everything; "half" two of the lines and, in two scenarios, the crossing."""
     out = []
     for k in range(4):
         half = TRUTH.take(np.array([0, 1, 4] if k < 2 else [0, 1]))
         for seed in (0, 1):
-            drawn = (Drawing("half", half, TRUTH, (100,)), Drawing("all", TRUTH, TRUTH, (100, 100 + 10 * k)))
-            out.append(TileCell(f"s{k}", seed, drawn))
+            drawn = (
+                TilePrediction("half", half, TRUTH, (100,)),
+                TilePrediction("all", TRUTH, TRUTH, (100, 100 + 10 * k)),
+            )
+            out.append(TileStudyResult(f"s{k}", seed, drawn))
     return out
 
 
@@ -30,27 +33,32 @@ def table():
 
 
 def test_a_row_holds_ap_by_kind_mean_and_bytes(table):
-    half, whole = table.row("half"), table.row("all")
+    half, whole = table.make_row("half"), table.make_row("all")
     assert table.names == ("half", "all") and (half.tiles, half.looks, half.bytes_per_tile) == (8, 1.0, 100.0)
-    assert (whole.looks, whole.bytes_per_look, whole.bytes_per_tile) == (2.0, 107.5, 215.0)
+    assert (whole.looks, whole.bytes_per_frame, whole.bytes_per_tile) == (2.0, 107.5, 215.0)
     for way in range(2):
         assert [i.value for i in half.ap[way]] == pytest.approx([0.5, 0.5, 0.0])
         assert half.mean[way].value == pytest.approx(0.5) and whole.mean[way].low == 1.0
-    assert half.by_seed == pytest.approx((0.5, 0.5)) and half.mean[0].scenarios == 4
+    assert half.mean_ap_by_seed == pytest.approx((0.5, 0.5)) and half.mean[0].scenarios == 4
     assert half.ap[0][1].low == half.ap[0][1].high == 0.5, "every scenario has half of the dividers"
     assert half.ap[0][0].low == 0.0 and half.ap[0][0].high == 1.0, "crossings differ among scenarios"
 
 
-def test_a_claim_is_a_paired_difference(table):
-    claim = table.claim("all - half", "all", "half", 0.2)
-    assert claim.difference.value == pytest.approx(0.5) and claim.difference.low == pytest.approx(0.25)
-    assert claim.verdict == "reached" and table.claim("all - half", "all", "half", 0.5).verdict == "not resolved"
-    assert table.claim("half - all", "half", "all", 0.2, "exact").verdict == "missed"
+def test_a_margin_test_is_a_paired_difference(table):
+    margin_test = table.check_margin("all - half", "all", "half", 0.2)
+    assert margin_test.difference.value == pytest.approx(0.5) and margin_test.difference.low == pytest.approx(0.25)
+    assert (
+        margin_test.verdict == "reached"
+        and table.check_margin("all - half", "all", "half", 0.5).verdict == "not resolved"
+    )
+    assert table.check_margin("half - all", "half", "all", 0.2, "exact").verdict == "missed"
 
 
 def test_what_has_no_truth_is_no_part_of_the_mean():
     lines = TRUTH.take(np.arange(4))
-    table = TileTable([TileCell("a", 0, (Drawing("row", lines, lines, ()),))])
-    row = table.row("row")
-    assert row.mean[0].value == 1.0 and np.isnan(row.ap[0][0].value) and row.bytes_per_look == 0.0
-    assert table.claim("row - row", "row", "row", 0.0).verdict == "not resolved", "one scenario says nothing of others"
+    table = TileTable([TileStudyResult("a", 0, (TilePrediction("row", lines, lines, ()),))])
+    row = table.make_row("row")
+    assert row.mean_ap[0].value == 1.0 and np.isnan(row.ap[0][0].value) and row.bytes_per_frame == 0.0
+    assert table.check_margin("row - row", "row", "row", 0.0).verdict == "not resolved", (
+        "one scenario says nothing of others"
+    )

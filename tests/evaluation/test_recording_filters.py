@@ -4,9 +4,9 @@
 import pytest
 import torch
 
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
-from manyeyes.evaluation.detection.average_precision import PROTOCOLS, ego_truth
-from manyeyes.evaluation.detection.recording_filters import EveryKth, NearestAgents
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
+from manyeyes.evaluation.detection.average_precision import PROTOCOLS, select_ego_truth
+from manyeyes.evaluation.detection.recording_filters import FrameStride, NearestAgents
 
 #      ego 7      12 m away      40 m away     5 m away
 PLACES = {7: (0.0, 0.0), 3: (12.0, 0.0), 9: (40.0, 0.0), 4: (0.0, 5.0)}
@@ -20,7 +20,7 @@ class Street:
     def length(self, scenario: str) -> int:
         return 16
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         return range(6, 16)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -34,20 +34,20 @@ class Street:
         center = torch.tensor([[PLACES[i][0] + 10.0, PLACES[i][1], 0.8] for i in ids], dtype=torch.float64)
         size = torch.tensor([4.5, 1.9, 1.6]).double().expand(len(ids), 3)
         boxes = Boxes.of(center, size, torch.zeros(len(ids)).double(), id=100 + torch.tensor(ids))
-        return Snapshot(scenario, index, frames, Truth(boxes, torch.eye(len(ids)).bool(), Transform.stack(poses)))
+        return Snapshot(scenario, index, frames, GroundTruth(boxes, torch.eye(len(ids)).bool(), Transform.stack(poses)))
 
 
 @pytest.mark.parametrize(
     ("every", "left"), [(1, [*range(6, 16)]), (3, [6, 9, 12, 15]), (5, [6, 11]), (10, [6]), (99, [6])]
 )
 def test_every_kth_judged_frame_and_nothing_is_played_behind_the_last(every, left) -> None:
-    judged = EveryKth(Street(), every).judged("many")
+    judged = FrameStride(Street(), every).eval_indices("many")
     assert list(judged) == left and judged.stop == left[-1] + 1
 
 
 def test_every_zeroth_is_refused() -> None:
     with pytest.raises(ConfigError, match="at least 1; got 0"):
-        EveryKth(Street(), 0)
+        FrameStride(Street(), 0)
 
 
 @pytest.mark.parametrize(("count", "left"), [(1, [7]), (2, [7, 4]), (3, [7, 3, 4]), (4, [7, 3, 9, 4])])
@@ -57,10 +57,10 @@ def test_the_nearest_are_left_in_their_order(count, left) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
-def test_the_truth_does_not_shrink_with_those_who_look(count) -> None:
-    whole = ego_truth(Street().snapshot("many", 9), 0, PROTOCOLS["manyeyes"])
+def test_the_truth_does_not_shrink_with_the_number_of_agents(count) -> None:
+    whole = select_ego_truth(Street().snapshot("many", 9), 0, PROTOCOLS["manyeyes"])
     less = NearestAgents(Street(), count).snapshot("many", 9)
-    got = ego_truth(less, 0, PROTOCOLS["manyeyes"])
+    got = select_ego_truth(less, 0, PROTOCOLS["manyeyes"])
     assert got.id.tolist() == whole.id.tolist() == [107, 103, 109, 104] and torch.equal(got.center, whole.center)
     for frame, pose in zip(less.frames, less.truth.world_from_agent.translation):
         assert pose[:2].tolist() == list(PLACES[frame.agent_id])

@@ -13,11 +13,11 @@ from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import AgentFrame, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
-from manyeyes.evaluation.detection.communication import summarise
+from manyeyes.evaluation.detection.communication import summarize_messages
 from manyeyes.evaluation.statistics.bootstrap import paired_difference, scenario_interval
-from manyeyes.evaluation.statistics.significance import claim
-from manyeyes.evaluation.study import Sweep, cell_path, recording_digest
-from manyeyes.evaluation.study_result import Cell, Volume
+from manyeyes.evaluation.statistics.significance import check_margin
+from manyeyes.evaluation.study import ResultGrid, hash_recording, result_path
+from manyeyes.evaluation.study_result import BusVolume, StudyResult
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -33,29 +33,29 @@ def weights(tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_cell_is_named_by_all_that_its_numbers_depend_on(weights, tmp_path) -> None:
+def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_path) -> None:
     base = BenchmarkConfig(str(weights / "0.safetensors"), ("alone", "late"))
     late = replace(channel_preset("ideal"), base_latency_s=0.1)
     others = [
         replace(base, weights=str(weights / "1.safetensors")),
         replace(base, protocol="opencood"),
-        replace(base, every=2),
-        replace(base, agents=2),
-        replace(base, noise=PoseNoise(sigma_xy_m=0.2)),
-        replace(base, noise=PoseNoise(sigma_xy_m=0.2, seed=1)),
+        replace(base, frame_stride=2),
+        replace(base, num_agents=2),
+        replace(base, pose_noise=PoseNoise(sigma_xy_m=0.2)),
+        replace(base, pose_noise=PoseNoise(sigma_xy_m=0.2, seed=1)),
         *(replace(base, replay=ReplayConfig(**changed)) for changed in (
             {"channel": late}, {"channel": late.with_loss(0.1)}, {"precision": "int8"}, {"budget_bytes": 99},
             {"channel_bytes": 999},
             {"seed": 1}, {"all_egos": True}, {"history": 3}, {"wait_s": 0.1},
         )),
     ]  # fmt: skip
-    paths = [cell_path(tmp_path, config, "late", "data") for config in (base, *others)]
-    paths += [cell_path(tmp_path, base, "alone", "data"), cell_path(tmp_path, base, "late", "other data")]
+    paths = [result_path(tmp_path, config, "late", "data") for config in (base, *others)]
+    paths += [result_path(tmp_path, base, "alone", "data"), result_path(tmp_path, base, "late", "other data")]
     assert len(set(paths)) == len(paths) == 18
     # Neither the company of other methods nor where the same weights lie makes a difference.
     (tmp_path / "copy.safetensors").write_bytes((weights / "0.safetensors").read_bytes())
     moved = replace(base, weights=str(tmp_path / "copy.safetensors"), methods=("late", "early"))
-    assert cell_path(tmp_path, moved, "late", "data") == paths[0]
+    assert result_path(tmp_path, moved, "late", "data") == paths[0]
 
 
 class OneFrame:
@@ -67,7 +67,7 @@ class OneFrame:
     def length(self, scenario: str) -> int:
         return 1
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         return range(1)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -79,40 +79,49 @@ class OneFrame:
 
 
 def test_another_recording_has_another_digest() -> None:
-    assert recording_digest(OneFrame()) == recording_digest(OneFrame())
-    digests = [recording_digest(r) for r in (OneFrame(), OneFrame(0.1), OneFrame(0.0, ("b",)), OneFrame(0, ("a", "b")))]
+    assert hash_recording(OneFrame()) == hash_recording(OneFrame())
+    digests = [hash_recording(r) for r in (OneFrame(), OneFrame(0.1), OneFrame(0.0, ("b",)), OneFrame(0, ("a", "b")))]
     assert len(set(digests)) == 4
 
 
-def cell(method: str, hits: tuple[int, ...]) -> Cell:
+def make_result(method: str, hits: tuple[int, ...]) -> StudyResult:
     """Four true boxes in a frame of each scenario, so many of them found, and one false alarm behind."""
     frames = []
     for number, found in enumerate(hits):
         rows = torch.tensor([*range(found), -1])
         frames.append(FrameMatch(f"s{number}", 0, torch.linspace(0.9, 0.5, found + 1).double(), rows, 4))
     speeds = tuple(torch.tensor([0.0, 0.0, 9.0, 9.0]) for _ in hits)
-    return Cell(method, (tuple(frames), tuple(frames)), speeds, summarise([], len(hits)), Volume(0, 0.0, 0), 0.0)
+    return StudyResult(
+        method, (tuple(frames), tuple(frames)), speeds, summarize_messages([], len(hits)), BusVolume(0, 0.0, 0), 0.0
+    )
 
 
 def test_differences_are_paired_and_may_be_over_some_scenarios_alone() -> None:
     protocol = PROTOCOLS["manyeyes"]
-    cells = {("x", "a"): cell("a", (4, 3, 2, 4)), ("x", "b"): cell("b", (2, 2, 1, 2))}
-    done = Sweep(cells, protocol)
-    a, b = (cells[place].matches[0] for place in cells)
-    assert done.less(("x", "a"), ("x", "b"), 0) == paired_difference(a, b, protocol=protocol)
-    assert done.ap(("x", "a"), 0, (5.0, 99.0)).value < done.ap(("x", "a"), 0, (0.0, 0.1)).value
+    results = {("x", "a"): make_result("a", (4, 3, 2, 4)), ("x", "b"): make_result("b", (2, 2, 1, 2))}
+    grid = ResultGrid(results, protocol)
+    a, b = (results[key].matches[0] for key in results)
+    assert grid.paired_difference(("x", "a"), ("x", "b"), 0) == paired_difference(a, b, protocol=protocol)
+    assert grid.bootstrap_ap(("x", "a"), 0, (5.0, 99.0)).value < grid.bootstrap_ap(("x", "a"), 0, (0.0, 0.1)).value
     some = {"s0", "s3"}
     kept = [match for match in a if match.scenario in some]
-    assert done.ap(("x", "a"), 1, scenarios=some) == scenario_interval(kept, protocol=protocol)
-    assert done.scenarios(("x", "a")) == {"s0", "s1", "s2", "s3"}
+    assert grid.bootstrap_ap(("x", "a"), 1, scenarios=some) == scenario_interval(kept, protocol=protocol)
+    assert grid.scenarios_of(("x", "a")) == {"s0", "s1", "s2", "s3"}
 
 
-def test_a_claim_holds_where_its_whole_interval_does() -> None:
-    cells = {("x", "a"): cell("a", (4, 4, 4)), ("x", "b"): cell("b", (2, 2, 2)), ("x", "c"): cell("c", (4, 4, 2))}
-    done = Sweep(cells, PROTOCOLS["manyeyes"])
+def test_a_margin_is_met_where_the_whole_interval_is() -> None:
+    results = {
+        ("x", "a"): make_result("a", (4, 4, 4)),
+        ("x", "b"): make_result("b", (2, 2, 2)),
+        ("x", "c"): make_result("c", (4, 4, 2)),
+    }
+    grid = ResultGrid(results, PROTOCOLS["manyeyes"])
     verdicts = [
-        claim("", done, ("x", "a"), ("x", other), 0, bar).verdict for other, bar in (("b", 0.4), ("b", 0.6), ("c", 0.1))
+        check_margin("", grid, ("x", "a"), ("x", other), 0, margin).verdict
+        for other, margin in (("b", 0.4), ("b", 0.6), ("c", 0.1))
     ]
     assert verdicts == ["reached", "missed", "not resolved"]
-    alone = Sweep({("x", m): cell(m, (h,)) for m, h in (("a", 4), ("b", 1))}, PROTOCOLS["manyeyes"])
-    assert claim("", alone, ("x", "a"), ("x", "b"), 0, 0.0).verdict == "not resolved"
+    single_scenario = ResultGrid(
+        {("x", m): make_result(m, (h,)) for m, h in (("a", 4), ("b", 1))}, PROTOCOLS["manyeyes"]
+    )
+    assert check_margin("", single_scenario, ("x", "a"), ("x", "b"), 0, 0.0).verdict == "not resolved"

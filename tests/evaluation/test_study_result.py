@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch, ap_of_matches
-from manyeyes.evaluation.detection.communication import summarise
-from manyeyes.evaluation.study_result import Cell, Volume, of_speed, read_cell, write_cell
+from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch, compute_ap
+from manyeyes.evaluation.detection.communication import summarize_messages
+from manyeyes.evaluation.study_result import BusVolume, StudyResult, filter_by_speed, read_result, write_result
 
 STILL, SLOW, FAST = (0.0, 0.1), (0.1, 5.0), (5.0, math.inf)
 
@@ -28,34 +28,39 @@ SPEED = torch.tensor([0.0, 4.9, 5.0], dtype=torch.float64)
     [(STILL, [-1, 0], [0.8, 0.7]), (SLOW, [-1, 1], [0.8, 0.6]), (FAST, [2, -1], [0.9, 0.8])],
 )
 def test_what_matched_another_class_is_left_out_and_what_matched_nothing_stays_false(speeds, rows, scores) -> None:
-    got = of_speed(frame(), SPEED, speeds)
+    got = filter_by_speed(frame(), SPEED, speeds)
     assert got.truth_row.tolist() == rows and got.score.tolist() == scores and got.n_gt == 1
 
 
 def test_ap_of_a_class_by_hand() -> None:
     # Fast: found first, precision 1 at recall 1. Still: behind one false positive, precision 1/2 at recall 1.
     ap = {
-        speeds: ap_of_matches([of_speed(frame(), SPEED, speeds)], PROTOCOLS["manyeyes"]).ap for speeds in (FAST, STILL)
+        speeds: compute_ap([filter_by_speed(frame(), SPEED, speeds)], PROTOCOLS["manyeyes"]).ap
+        for speeds in (FAST, STILL)
     }
     assert ap == {FAST: 1.0, STILL: 0.5}
 
 
 def test_a_frame_without_boxes_of_a_class_counts_its_false_alarms() -> None:
-    got = of_speed(frame(rows=(0, -1)), torch.zeros(3), FAST)
+    got = filter_by_speed(frame(rows=(0, -1)), torch.zeros(3), FAST)
     assert got.truth_row.tolist() == [-1] and got.n_gt == 0
-    empty = of_speed(FrameMatch("a", 0, torch.zeros(0), torch.zeros(0, dtype=torch.int64), 0), torch.zeros(0), FAST)
+    empty = filter_by_speed(
+        FrameMatch("a", 0, torch.zeros(0), torch.zeros(0, dtype=torch.int64), 0), torch.zeros(0), FAST
+    )
     assert len(empty.score) == empty.n_gt == 0
 
 
-def cell() -> Cell:
+def make_result() -> StudyResult:
     half = (frame("a", 6), frame("a", 7, ()), frame("b", 6, (-1, 1)))
     seven = (frame("a", 6, (2, -1, -1, -1)), frame("a", 7, ()), frame("b", 6, (-1, -1)))
-    return Cell("late", (half, seven), (SPEED, SPEED + 1, SPEED * 2), summarise([], 3), Volume(0, 0.0, 0), math.nan)
+    return StudyResult(
+        "late", (half, seven), (SPEED, SPEED + 1, SPEED * 2), summarize_messages([], 3), BusVolume(0, 0.0, 0), math.nan
+    )
 
 
-def test_a_cell_comes_back_from_its_file(tmp_path) -> None:
-    write_cell(tmp_path / "x.npz", cell())
-    got, wanted = read_cell(tmp_path / "x.npz"), cell()
+def test_a_result_round_trips_through_its_file(tmp_path) -> None:
+    write_result(tmp_path / "x.npz", make_result())
+    got, wanted = read_result(tmp_path / "x.npz"), make_result()
     assert got is not None and [p.name for p in tmp_path.iterdir()] == ["x.npz"]
     for one, other in zip(got.matches, wanted.matches, strict=True):
         for a, b in zip(one, other, strict=True):
@@ -67,21 +72,21 @@ def test_a_cell_comes_back_from_its_file(tmp_path) -> None:
 
 
 def test_scenarios_and_speeds_choose_frames() -> None:
-    assert [(m.scenario, m.index) for m in cell().frames(0)] == [("a", 6), ("a", 7), ("b", 6)]
-    assert [(m.scenario, m.n_gt) for m in cell().frames(1, {"b"}, FAST)] == [("b", 2)]
+    assert [(m.scenario, m.index) for m in make_result().select_matches(0)] == [("a", 6), ("a", 7), ("b", 6)]
+    assert [(m.scenario, m.n_gt) for m in make_result().select_matches(1, {"b"}, FAST)] == [("b", 2)]
 
 
 @pytest.mark.parametrize("cut", [0, 10, 200, -1])
-def test_a_spoilt_file_is_no_cell(tmp_path, cut) -> None:
+def test_a_damaged_file_is_no_result(tmp_path, cut) -> None:
     path = tmp_path / "x.npz"
-    assert read_cell(path) is None
-    write_cell(path, cell())
+    assert read_result(path) is None
+    write_result(path, make_result())
     whole = path.read_bytes()
     path.write_bytes(whole[:cut])
-    assert read_cell(path) is None
+    assert read_result(path) is None
 
 
-def test_a_cell_of_another_form_is_none(tmp_path) -> None:
-    one_threshold = dataclasses.replace(cell(), matches=cell().matches[:1])
-    write_cell(tmp_path / "x.npz", one_threshold)
-    assert read_cell(tmp_path / "x.npz") is None
+def test_a_result_of_another_layout_is_none(tmp_path) -> None:
+    one_threshold = dataclasses.replace(make_result(), matches=make_result().matches[:1])
+    write_result(tmp_path / "x.npz", one_threshold)
+    assert read_result(tmp_path / "x.npz") is None

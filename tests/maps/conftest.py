@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, SOLID, STOP_LINE, MapElements
-from manyeyes.maps.elements.observation import Frame
-from manyeyes.maps.elements.vector_map import Stations, Topology, VectorMap
+from manyeyes.maps.elements.observation import MapFrame
+from manyeyes.maps.elements.vector_map import PointEvidence, Topology, VectorMap
 
-FRAME = Frame(48.137, 11.575)
+FRAME = MapFrame(48.137, 11.575)
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def two_lanes():
     return make_two_lanes
 
 
-def make_two_lanes(x: float = 0.0, y: float = 0.0, frame: Frame = FRAME) -> VectorMap:
+def make_two_lanes(x: float = 0.0, y: float = 0.0, frame: MapFrame = FRAME) -> VectorMap:
     """A road of two 3.5 m lanes, 60 m eastwards from (x, y): two solid edges, a dashed divider, a crossing, a stop line."""
     along = np.arange(0.0, 61.0)
     lines = [np.stack((along, side + 0.3 * np.sin(along / 20)), 1) for side in (3.5, 0.0, -3.5)]
@@ -36,7 +36,7 @@ def make_two_lanes(x: float = 0.0, y: float = 0.0, frame: Frame = FRAME) -> Vect
     plain = VectorMap.of(elements, frame, seen, agents=2, times_ns=(10, 20), log_odds=np.linspace(2.5, 5.0, 5))
     rng = np.random.default_rng(3)
     p = len(elements.points)
-    stations = Stations(
+    stations = PointEvidence(
         support=rng.integers(1, 9, p),
         agents=rng.integers(1, 5, p),
         log_odds=rng.normal(3, 1, p),
@@ -51,4 +51,4 @@ def make_two_lanes(x: float = 0.0, y: float = 0.0, frame: Frame = FRAME) -> Vect
         branch=np.array([[0, 0], [0, 1], [1, 2]]),
         branch_xy=np.array([[x, y], [x + 60.0, y - 3.5]]),
     )
-    return replace(plain, state=np.array([1, 1, 1, 1, 0]), stations=stations, topology=topology)
+    return replace(plain, state=np.array([1, 1, 1, 1, 0]), point_evidence=stations, topology=topology)

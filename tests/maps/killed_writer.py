@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.store.store import MapStore, watermark_of
+from manyeyes.maps.store.store import MapStore, compute_watermark
 
-FRAME = Frame(48.0, 11.0)
-_WATCHED = ("open", "os.rename", "os.remove", "os.mkdir", "sqlite3.connect", "shutil.rmtree")
+FRAME = MapFrame(48.0, 11.0)
+_AUDITED_EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "sqlite3.connect", "shutil.rmtree")
 
 
 def batch(number: int) -> list[Observation]:
@@ -48,11 +48,11 @@ def fused(number: int) -> VectorMap:
 def write(folder: Path, number: int) -> None:
     """Append a batch, publish a release."""
     store = MapStore.create(folder, FRAME)
-    with store.writing() as log:
+    with store.open_for_writing() as log:
         log.append(batch(number))
-        standing = log.standing()
+        standing = log.active_observations()
     if len(store.releases()) < number:
-        store.publish(fused(number), "test", "", watermark_of(standing.ids, standing.time_ns))
+        store.publish(fused(number), "test", "", compute_watermark(standing.ids, standing.time_ns))
 
 
 def in_fork(work, kill_after_s: float | None = None) -> tuple[str, bool]:
@@ -81,24 +81,24 @@ def dying_write(folder: Path, at: int) -> None:
     """Write the second batch and release, and die at the ``at``-th operation on a file or folder of the store."""
     count = 0
 
-    def watch(event: str, about: tuple) -> None:
+    def audit(event: str, about: tuple) -> None:
         nonlocal count
-        if event in _WATCHED and str(about[0]).startswith(str(folder)):
+        if event in _AUDITED_EVENTS and str(about[0]).startswith(str(folder)):
             count += 1
             if count == at:
                 os.kill(os.getpid(), signal.SIGKILL)
 
-    sys.addaudithook(watch)
+    sys.addaudithook(audit)
     write(folder, 2)
 
 
-def seen(folder: Path) -> dict:
+def read_report(folder: Path) -> dict:
     """What a reader sees, without a lock; then what a new writer finds."""
     store = MapStore(folder)
     release = store.manifest().number
     content = store.read().quantised_hash()
-    with store.writing() as log:
-        ids = set(log.standing().ids)
+    with store.open_for_writing() as log:
+        ids = set(log.active_observations().ids)
     first, second = ({o.id for o in batch(k)} for k in (1, 2))
     return {
         "release": release,
@@ -148,7 +148,7 @@ def main(folder: Path, step: int, timed: int) -> None:
             pause = plans.pop(0)
             _, killed = in_fork(lambda case=case: write(case, 2), pause)
             name = f"{pause:.3f} s"
-        after, _ = in_fork(lambda case=case: json.dumps(seen(case)))
+        after, _ = in_fork(lambda case=case: json.dumps(read_report(case)))
         end, _ = in_fork(lambda case=case: json.dumps(finished(case)))
         report["cases"].append({"name": name, "killed": killed, "seen": after, "end": end})
         shutil.rmtree(case)

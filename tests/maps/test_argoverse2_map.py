@@ -100,7 +100,7 @@ def test_what_cannot_be_read_is_named(tmp_path, fields, text):
     assert text in str(caught.value) and str(path) in str(caught.value)
 
 
-def test_a_folder_without_a_map_says_what_was_looked_for(tmp_path):
+def test_missing_map_error_names_expected_file(tmp_path):
     with pytest.raises(Argoverse2MapError, match="found 0"):
         read_argoverse2_map(tmp_path)
     (tmp_path / "x.json").write_text("[1, 2]")

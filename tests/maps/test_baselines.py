@@ -20,10 +20,10 @@ from manyeyes.maps.baselines import (
     polymerge,
     union,
 )
-from manyeyes.maps.baselines._common import CLAMP, HIT, MISS, Rules, pool
-from manyeyes.maps.baselines._raster import components, longest_walks, thinned
+from manyeyes.maps.baselines._common import LOG_ODDS_HIT, LOG_ODDS_MISS, MAX_LOG_ODDS, BaselineRules, filter_elements
+from manyeyes.maps.baselines._raster import find_longest_walks, label_components, skeletonize
 from manyeyes.maps.baselines.assignment import assign
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, VectorMap
 
 VIEW = np.array([[-10.0, -20.0], [60.0, -20.0], [60.0, 20.0], [-10.0, 20.0]])
@@ -34,7 +34,7 @@ def line(y: float, x0: float = 0.0, x1: float = 40.0, n: int = 9) -> list[list[f
     return [[float(x), y] for x in np.linspace(x0, x1, n)]
 
 
-def seen(
+def make_observation(
     k: int, lines: list, kinds: int | list[int] = DIVIDER, score: float | list[float] = 0.8, view: np.ndarray = VIEW
 ) -> Observation:
     elements = MapElements.of(lines, kinds, score=score)
@@ -45,35 +45,39 @@ def lines_in(made: VectorMap, kind: int = DIVIDER) -> list[np.ndarray]:
     return [made.elements.polyline(i) for i in np.flatnonzero(made.elements.kind == kind)]
 
 
-RIVALS = [union, chamfer_nms, crowdmap_literal, polymerge, frechet_clustering, heatmap_buffer, global_map_builder]
+BASELINES = [union, chamfer_nms, crowdmap_literal, polymerge, frechet_clustering, heatmap_buffer, global_map_builder]
 
 
-@pytest.mark.parametrize("rival", RIVALS, ids=lambda r: r.__name__.split(".")[-1])
-def test_neither_order_nor_repetition_of_observations_changes_a_map(rival) -> None:
+@pytest.mark.parametrize("baseline", BASELINES, ids=lambda r: r.__name__.split(".")[-1])
+def test_neither_order_nor_repetition_of_observations_changes_a_map(baseline) -> None:
     many = [
-        seen(k, [line(0.1 * k), line(3.5 - 0.05 * k), SQUARE], [DIVIDER, BOUNDARY, CROSSING], 0.5 + 0.05 * k)
+        make_observation(
+            k, [line(0.1 * k), line(3.5 - 0.05 * k), SQUARE], [DIVIDER, BOUNDARY, CROSSING], 0.5 + 0.05 * k
+        )
         for k in range(5)
     ]
-    first = rival.fuse(many)
-    again = rival.fuse([*many[::-1], many[2]])
+    first = baseline.fuse(many)
+    again = baseline.fuse([*many[::-1], many[2]])
     assert first.quantised_hash() == again.quantised_hash() and len(first)
     assert np.array_equal(first.elements.score, again.elements.score)
 
 
-@pytest.mark.parametrize("rival", RIVALS, ids=lambda r: r.__name__.split(".")[-1])
-def test_nothing_seen_is_an_empty_map_in_the_frame(rival) -> None:
+@pytest.mark.parametrize("baseline", BASELINES, ids=lambda r: r.__name__.split(".")[-1])
+def test_nothing_seen_is_an_empty_map_in_the_frame(baseline) -> None:
     assert (
-        len(rival.fuse([], frame=Frame(49.0, 8.0))) == 0
-        and rival.fuse([], frame=Frame(49.0, 8.0)).frame.latitude == 49.0
+        len(baseline.fuse([], frame=MapFrame(49.0, 8.0))) == 0
+        and baseline.fuse([], frame=MapFrame(49.0, 8.0)).frame.latitude == 49.0
     )
-    assert len(rival.fuse([seen(0, [])])) == 0
+    assert len(baseline.fuse([make_observation(0, [])])) == 0
 
 
-@pytest.mark.parametrize("rival", RIVALS, ids=lambda r: r.__name__.split(".")[-1])
-def test_one_observation_is_mapped_at_its_pose_with_its_style_and_source(rival) -> None:
-    one = replace(seen(0, [line(2.0), SQUARE], [DIVIDER, CROSSING]), pose=np.array([100.0, 50.0, math.pi / 2]))
+@pytest.mark.parametrize("baseline", BASELINES, ids=lambda r: r.__name__.split(".")[-1])
+def test_one_observation_is_mapped_at_its_pose_with_its_style_and_source(baseline) -> None:
+    one = replace(
+        make_observation(0, [line(2.0), SQUARE], [DIVIDER, CROSSING]), pose=np.array([100.0, 50.0, math.pi / 2])
+    )
     one = replace(one, elements=replace(one.elements, style=np.eye(4)[[DASHED, 3]]))
-    made = rival.fuse([one])
+    made = baseline.fuse([one])
     (divider,), (crossing,) = lines_in(made), lines_in(made, CROSSING)
     ends = sorted([divider[0].tolist(), divider[-1].tolist()], key=lambda p: p[1])
     # A thinned picture ends a little before its line does.
@@ -84,49 +88,63 @@ def test_one_observation_is_mapped_at_its_pose_with_its_style_and_source(rival) 
 
 def test_the_pre_filter_drops_weak_and_short_elements_and_a_repeated_observation() -> None:
     many = [
-        seen(0, [line(0), line(1, 0, 3.9), line(2)], DIVIDER, [0.9, 0.9, 0.29]),
-        seen(1, [line(0, 0, 3), SQUARE], [3, 2]),
+        make_observation(0, [line(0), line(1, 0, 3.9), line(2)], DIVIDER, [0.9, 0.9, 0.29]),
+        make_observation(1, [line(0, 0, 3), SQUARE], [3, 2]),
     ]
-    kept = pool([*many, many[0]], Rules())
-    assert kept.elements.kind.tolist() == [0, 3, 2] and kept.observation.tolist() == [0, 1, 1]
+    kept = filter_elements([*many, many[0]], BaselineRules())
+    assert kept.elements.kind.tolist() == [0, 3, 2] and kept.observation_of_element.tolist() == [0, 1, 1]
 
 
 def test_scores_follow_who_saw_who_missed_and_how_long() -> None:
     far = VIEW + (400.0, 0.0)
-    many = [seen(0, [line(0.0)]), seen(1, []), seen(2, []), seen(3, [], view=far)]
+    many = [
+        make_observation(0, [line(0.0)]),
+        make_observation(1, []),
+        make_observation(2, []),
+        make_observation(3, [], view=far),
+    ]
     made = union.fuse(many)
-    assert made.log_odds[0] == pytest.approx(HIT + 2 * MISS, abs=1e-9)
-    assert made.elements.score[0] == pytest.approx(0.8 / (1 + math.exp(-(HIT + 2 * MISS) / 4)), abs=1e-9)
-    short = union.fuse([seen(0, [line(0.0, 0, 10)])])
-    assert short.elements.score[0] == pytest.approx(0.8 * 0.5 / (1 + math.exp(-HIT / 4)), abs=1e-9)
-    assert union.fuse([seen(0, [line(0.0)]), *(seen(k, []) for k in range(1, 30))]).log_odds[0] == -CLAMP
+    assert made.log_odds[0] == pytest.approx(LOG_ODDS_HIT + 2 * LOG_ODDS_MISS, abs=1e-9)
+    assert made.elements.score[0] == pytest.approx(
+        0.8 / (1 + math.exp(-(LOG_ODDS_HIT + 2 * LOG_ODDS_MISS) / 4)), abs=1e-9
+    )
+    short = union.fuse([make_observation(0, [line(0.0, 0, 10)])])
+    assert short.elements.score[0] == pytest.approx(0.8 * 0.5 / (1 + math.exp(-LOG_ODDS_HIT / 4)), abs=1e-9)
+    assert (
+        union.fuse([make_observation(0, [line(0.0)]), *(make_observation(k, []) for k in range(1, 30))]).log_odds[0]
+        == -MAX_LOG_ODDS
+    )
 
 
 def test_an_occluder_excuses_who_did_not_see() -> None:
     wall = Polygons.of([[[1.0, -30.0], [1.5, -30.0], [1.5, 30.0], [1.0, 30.0]]])
-    hidden = replace(seen(1, []), occluders=wall)
-    assert union.fuse([seen(0, [line(0.0, 5, 45)]), hidden]).log_odds[0] == pytest.approx(HIT, abs=1e-9)
+    hidden = replace(make_observation(1, []), occluders=wall)
+    assert union.fuse([make_observation(0, [line(0.0, 5, 45)]), hidden]).log_odds[0] == pytest.approx(
+        LOG_ODDS_HIT, abs=1e-9
+    )
 
 
 def test_what_too_few_saw_is_a_candidate() -> None:
-    rules = Rules(least_observations=2)
-    many = [seen(0, [line(0.0), line(9.0)]), seen(1, [line(0.2)])]
-    made = chamfer_nms.fuse(many, chamfer_nms.Config(rules=rules))
+    rules = BaselineRules(min_observations=2)
+    many = [make_observation(0, [line(0.0), line(9.0)]), make_observation(1, [line(0.2)])]
+    made = chamfer_nms.fuse(many, chamfer_nms.ChamferNmsConfig(rules=rules))
     assert made.state.tolist() == [PUBLISHED, CANDIDATE] and made.supporters.tolist() == [2, 1]
-    made = chamfer_nms.fuse(many, chamfer_nms.Config(rules=Rules(publish=2.0)))
+    made = chamfer_nms.fuse(many, chamfer_nms.ChamferNmsConfig(rules=BaselineRules(publish_log_odds=2.0)))
     assert made.state.tolist() == [PUBLISHED, CANDIDATE]
 
 
 def test_union_keeps_everything() -> None:
-    made = union.fuse([seen(0, [line(0.0), SQUARE], [0, 2]), seen(1, [line(0.2), line(0.2, 0, 5)])])
+    made = union.fuse(
+        [make_observation(0, [line(0.0), SQUARE], [0, 2]), make_observation(1, [line(0.2), line(0.2, 0, 5)])]
+    )
     assert len(made) == 4 and made.state.tolist() == [PUBLISHED, CANDIDATE, PUBLISHED, PUBLISHED]
 
 
 def test_nms_keeps_the_best_of_lines_on_each_other_and_all_others() -> None:
     many = [
-        seen(0, [line(0.0), line(3.5)], DIVIDER, [0.6, 0.9]),
-        seen(1, [line(0.6), line(0.3)], [DIVIDER, BOUNDARY], [0.8, 0.7]),
-        seen(2, [line(1.1), line(0.0, 0, 20)], DIVIDER, [0.7, 0.5]),
+        make_observation(0, [line(0.0), line(3.5)], DIVIDER, [0.6, 0.9]),
+        make_observation(1, [line(0.6), line(0.3)], [DIVIDER, BOUNDARY], [0.8, 0.7]),
+        make_observation(2, [line(1.1), line(0.0, 0, 20)], DIVIDER, [0.7, 0.5]),
     ]
     made = chamfer_nms.fuse(many)
     # 0.8 at 0.6 m takes 0.6 at 0.0 and 0.7 at 1.1; half the line is 5 m away by Chamfer and stays.
@@ -137,64 +155,78 @@ def test_nms_keeps_the_best_of_lines_on_each_other_and_all_others() -> None:
 
 def test_the_literal_pipeline_keeps_the_most_confident_or_takes_the_mean_after_registration() -> None:
     turned = [[x, y + 0.4 + 0.01 * x] for x, y in line(0.0)]
-    many = [seen(0, [line(0.0)], score=0.9), seen(1, [turned]), seen(2, [line(0.3)], score=0.7), seen(3, [line(3.5)])]
+    many = [
+        make_observation(0, [line(0.0)], score=0.9),
+        make_observation(1, [turned]),
+        make_observation(2, [line(0.3)], score=0.7),
+        make_observation(3, [line(3.5)]),
+    ]
     made = crowdmap_literal.fuse(many)
     assert [len(made), made.supporters.tolist()] == [2, [3, 1]]
     assert made.elements.polyline(0).tolist() == line(0.0)
-    mean = crowdmap_literal.fuse(many, crowdmap_literal.Config(merge="mean"))
+    mean = crowdmap_literal.fuse(many, crowdmap_literal.CrowdMapLiteralConfig(merge="mean"))
     # Registered onto it, the others lie on the anchor: the mean is the anchor, not the middle of the offsets.
     assert np.abs(mean.elements.polyline(0)[:, 1]).max() < 0.05 and len(mean.elements.polyline(0)) == 50
 
 
 def test_the_literal_pipeline_has_no_edge_between_a_line_and_its_part() -> None:
-    made = crowdmap_literal.fuse([seen(0, [line(0.0)]), seen(1, [line(0.0, 0, 15)])])
+    made = crowdmap_literal.fuse([make_observation(0, [line(0.0)]), make_observation(1, [line(0.0, 0, 15)])])
     assert len(made) == 2
 
 
 def test_lines_fold_into_middles_where_they_face_and_lengthen_each_other_beyond() -> None:
-    whole = polymerge.fold(np.array(line(0.0, 0, 10, 3)), np.array(line(1.0, 8, 20, 4)[::-1]))
+    whole = polymerge.merge_two_lines(np.array(line(0.0, 0, 10, 3)), np.array(line(1.0, 8, 20, 4)[::-1]))
     # At 5 m nothing faces the line; 8 and 10 face each other; 12 and on are beyond.
     assert whole.tolist() == [[0, 0], [5, 0], [8, 0.5], [10, 0.5], [12, 1], [16, 1], [20, 1]]
 
 
 def test_polymerge_chains_lines_that_touch_and_keeps_others_apart() -> None:
-    many = [seen(0, [line(0.0, 0, 20)]), seen(1, [line(0.5, 10, 40)]), seen(2, [line(3.5)])]
+    many = [
+        make_observation(0, [line(0.0, 0, 20)]),
+        make_observation(1, [line(0.5, 10, 40)]),
+        make_observation(2, [line(3.5)]),
+    ]
     first, second = lines_in(polymerge.fuse(many))
     assert sorted((first[0, 0], first[-1, 0])) == [0.0, 40.0] and second[0, 1] == 3.5
-    bridge = seen(3, [[[5.0, 0.0], [20.0, 3.5]]])
+    bridge = make_observation(3, [[[5.0, 0.0], [20.0, 3.5]]])
     assert len(lines_in(polymerge.fuse([*many, bridge]))) == 1
 
 
 def test_polymerge_draws_crossings_and_takes_what_most_agree_on() -> None:
     rings = [np.array(SQUARE) + (dx, 0.0) for dx in (-0.5, 0.0, 0.5)]
-    (ring,) = lines_in(polymerge.fuse([seen(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING)
+    (ring,) = lines_in(polymerge.fuse([make_observation(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING)
     assert np.allclose(ring.min(0), [20.0, -4.0], atol=0.15) and np.allclose(ring.max(0), [24.0, 4.0], atol=0.15)
 
 
 def test_frechet_clusters_are_means_of_what_runs_together_from_end_to_end() -> None:
-    many = [seen(0, [line(0.0)]), seen(1, [line(0.6)[::-1]]), seen(2, [line(0.9)]), seen(3, [line(0.3, 0, 20)])]
+    many = [
+        make_observation(0, [line(0.0)]),
+        make_observation(1, [line(0.6)[::-1]]),
+        make_observation(2, [line(0.9)]),
+        make_observation(3, [line(0.3, 0, 20)]),
+    ]
     made = frechet_clustering.fuse(many)
     assert made.supporters.tolist() == [1, 3]
     assert np.allclose(made.elements.polyline(1)[:, 1], 0.5) and len(made.elements.polyline(1)) == 20
-    medoid = frechet_clustering.fuse(many, frechet_clustering.Config(take="medoid"))
+    medoid = frechet_clustering.fuse(many, frechet_clustering.FrechetClusteringConfig(representative="medoid"))
     assert sorted(round(float(line[0, 1]), 6) for line in lines_in(medoid)) == [0.3, 0.6]
 
 
 def test_single_linkage_chains_where_average_linkage_does_not() -> None:
-    many = [seen(k, [line(1.5 * k)]) for k in range(4)]
-    assert len(frechet_clustering.fuse(many, frechet_clustering.Config(linkage="single"))) == 1
+    many = [make_observation(k, [line(1.5 * k)]) for k in range(4)]
+    assert len(frechet_clustering.fuse(many, frechet_clustering.FrechetClusteringConfig(linkage="single"))) == 1
     assert len(frechet_clustering.fuse(many)) == 2
 
 
 def test_complete_linkage_joins_nothing_that_has_two_members_too_far_apart() -> None:
-    many = [seen(k, [line(y)]) for k, y in enumerate((0.0, 0.9, 2.1))]
+    many = [make_observation(k, [line(y)]) for k, y in enumerate((0.0, 0.9, 2.1))]
     # The mean of 1.2 and 2.1 is within the gate of 1.75; the greater is not.
     assert len(frechet_clustering.fuse(many)) == 1
-    assert len(frechet_clustering.fuse(many, frechet_clustering.Config(linkage="complete"))) == 2
+    assert len(frechet_clustering.fuse(many, frechet_clustering.FrechetClusteringConfig(linkage="complete"))) == 2
 
 
 @pytest.mark.parametrize(
-    ("rival", "change"),
+    ("baseline", "change"),
     [
         (frechet_clustering, {"linkage": "ward"}),
         (frechet_clustering, {"take": "best"}),
@@ -202,29 +234,31 @@ def test_complete_linkage_joins_nothing_that_has_two_members_too_far_apart() -> 
         (heatmap_buffer, {"walks": "none"}),
     ],
 )
-def test_an_unknown_choice_is_refused(rival, change: dict) -> None:
+def test_an_unknown_choice_is_refused(baseline, change: dict) -> None:
     with pytest.raises(ConfigError, match=r"expected .*; got"):
-        rival.Config(**change)
+        baseline.Config(**change)
 
 
 def test_frechet_clusters_of_rings_do_not_mind_where_and_which_way_a_ring_begins() -> None:
     rings = [SQUARE, SQUARE[2:] + SQUARE[:2], [[x + 0.5, y] for x, y in SQUARE][::-1]]
-    (ring,) = lines_in(frechet_clustering.fuse([seen(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING)
+    (ring,) = lines_in(
+        frechet_clustering.fuse([make_observation(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING
+    )
     assert np.allclose(ring.mean(0), [22 + 0.5 / 3, 0.0], atol=0.02)
 
 
 def test_the_builder_replaces_what_the_newest_covers() -> None:
     old, new = np.array(line(0.0, 0, 40, 2)), np.array(line(0.5, 10, 50, 2)[::-1])
-    assert global_map_builder.replaced(old, new, 0.01).tolist() == [[0, 0], [10, 0.5], [50, 0.5]]
-    inner = global_map_builder.replaced(old, np.array(line(0.5, 10, 20, 2)), 0.01)
+    assert global_map_builder.replace_covered(old, new, 0.01).tolist() == [[0, 0], [10, 0.5], [50, 0.5]]
+    inner = global_map_builder.replace_covered(old, np.array(line(0.5, 10, 20, 2)), 0.01)
     assert inner.tolist() == [[0, 0], [10, 0.5], [20, 0.5], [40, 0]]
 
 
 def test_the_builder_matches_one_to_one_adds_the_rest_and_suppresses_what_lies_on_others() -> None:
     many = [
-        seen(0, [line(0.0), line(3.5)], score=0.6),
-        seen(1, [line(0.8), line(4.0), line(9.0)]),
-        seen(2, [line(0.5, 0, 20), line(10.5, 0, 40)], score=0.9),
+        make_observation(0, [line(0.0), line(3.5)], score=0.6),
+        make_observation(1, [line(0.8), line(4.0), line(9.0)]),
+        make_observation(2, [line(0.5, 0, 20), line(10.5, 0, 40)], score=0.9),
     ]
     made = global_map_builder.fuse(many)
     assert made.supporters.tolist() == [3, 2, 1]
@@ -249,9 +283,9 @@ def test_the_cheapest_assignment_agrees_with_scipy() -> None:
 
 def test_the_heat_map_joins_pieces_into_one_line_between_them() -> None:
     many = [
-        seen(0, [line(0.0, 0, 22), line(3.5)]),
-        seen(1, [line(0.4, 15, 40), line(3.5)]),
-        seen(2, [line(0.2, 5, 35), line(-8.0, 0, 5)]),
+        make_observation(0, [line(0.0, 0, 22), line(3.5)]),
+        make_observation(1, [line(0.4, 15, 40), line(3.5)]),
+        make_observation(2, [line(0.2, 5, 35), line(-8.0, 0, 5)]),
     ]
     first, second = sorted(lines_in(heatmap_buffer.fuse(many)), key=lambda points: points[0, 1])
     assert abs(first[:, 0].min()) < 1.5 and abs(first[:, 0].max() - 40) < 1.5
@@ -260,33 +294,33 @@ def test_the_heat_map_joins_pieces_into_one_line_between_them() -> None:
 
 def test_heat_that_few_of_those_who_could_see_it_made_is_no_line() -> None:
     many = [
-        seen(0, [line(0.0), line(8.0)]),
-        seen(1, [line(0.0), line(8.0)]),
-        *(seen(k, [line(0.0)]) for k in range(2, 12)),
+        make_observation(0, [line(0.0), line(8.0)]),
+        make_observation(1, [line(0.0), line(8.0)]),
+        *(make_observation(k, [line(0.0)]) for k in range(2, 12)),
     ]
     assert len(lines_in(heatmap_buffer.fuse(many))) == 1
-    assert len(lines_in(heatmap_buffer.fuse(many, heatmap_buffer.Config(share=0.05)))) == 2
+    assert len(lines_in(heatmap_buffer.fuse(many, heatmap_buffer.HeatmapBufferConfig(min_view_fraction=0.05)))) == 2
 
 
 def test_a_branch_is_a_walk_of_its_own_where_all_are_asked_for() -> None:
-    many = [seen(k, [line(0.0), [[20.0, 0.0], [20.0, 18.0]]]) for k in range(3)]
+    many = [make_observation(k, [line(0.0), [[20.0, 0.0], [20.0, 18.0]]]) for k in range(3)]
     assert len(heatmap_buffer.fuse(many)) == 2
-    assert len(heatmap_buffer.fuse(many, heatmap_buffer.Config(walks="longest"))) == 1
+    assert len(heatmap_buffer.fuse(many, heatmap_buffer.HeatmapBufferConfig(walks="longest"))) == 1
 
 
 def test_the_heat_map_refuses_a_raster_that_would_not_fit() -> None:
-    far = replace(seen(1, [line(0.0)]), pose=np.array([9000.0, 9000.0, 0.0]))
+    far = replace(make_observation(1, [line(0.0)]), pose=np.array([9000.0, 9000.0, 0.0]))
     with pytest.raises(ConfigError, match="larger cells"):
-        heatmap_buffer.fuse([seen(0, [line(0.0)]), far])
+        heatmap_buffer.fuse([make_observation(0, [line(0.0)]), far])
 
 
 def test_a_bar_thins_to_its_middle_and_components_are_numbered_by_rows() -> None:
     mask = np.zeros((9, 20), bool)
     mask[2:5, 2:18] = True
     mask[7, 3] = True
-    skeleton = thinned(mask)
+    skeleton = skeletonize(mask)
     assert skeleton[3, 5:15].all() and not skeleton[2].any() and not skeleton[4, :16].any()
-    label = components(mask)
+    label = label_components(mask)
     assert (label[mask] >= 0).all() and (label[~mask] == -1).all() and (label[3, 4], label[7, 3]) == (0, 1)
 
 
@@ -294,9 +328,9 @@ def test_walks_run_from_end_to_end_of_a_skeleton() -> None:
     skeleton = np.zeros((12, 20), bool)
     skeleton[5, 1:20] = True
     skeleton[6:12, 10] = True
-    cells, first = longest_walks(skeleton, 4, 1, True)
+    cells, first = find_longest_walks(skeleton, 4, 1, True)
     assert np.diff(first).tolist() == [19, 5]
     assert sorted(cells[:19, 1].tolist()) == list(range(1, 20)) and cells[19:, 1].tolist() == [10] * 5
-    assert len(longest_walks(skeleton, 4, 1, False)[1]) == 2
-    cells, first = longest_walks(skeleton, 20, 1, True)
+    assert len(find_longest_walks(skeleton, 4, 1, False)[1]) == 2
+    cells, first = find_longest_walks(skeleton, 20, 1, True)
     assert first.tolist() == [0] and len(cells) == 0

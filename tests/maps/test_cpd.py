@@ -28,7 +28,7 @@ def moved(points: np.ndarray, angle: float, shift: tuple[float, float], scale: f
 @pytest.mark.parametrize(("scaled", "scale"), [(False, 1.0), (True, 1.1)])
 def test_a_known_motion_is_found(origin: np.ndarray, scaled: bool, scale: float) -> None:
     target = moved(bend(), 0.05, (0.6, -0.4), scale) + origin
-    drift = register(target, bend() + origin, CpdConfig(scaled=scaled, tolerance=1e-12, iterations=500))
+    drift = register(target, bend() + origin, CpdConfig(estimate_scale=scaled, tolerance=1e-12, max_iterations=500))
     assert np.abs(drift.apply(bend() + origin) - target).max() < 1e-3
     assert drift.scale == pytest.approx(scale, abs=1e-4)
 
@@ -40,18 +40,22 @@ def test_pycpd_finds_the_same_similarity() -> None:
     for w in (0.0, 0.3):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            theirs, (scale, _, _) = pycpd.RigidRegistration(
+            reference, (scale, _, _) = pycpd.RigidRegistration(
                 X=target, Y=bend(), w=w, tolerance=1e-9, max_iterations=400
             ).register()
-        drift = register(target, bend(), CpdConfig(scaled=True, outlier=w, tolerance=1e-12, iterations=400))
+        drift = register(
+            target, bend(), CpdConfig(estimate_scale=True, outlier_fraction=w, tolerance=1e-12, max_iterations=400)
+        )
         assert drift.scale == pytest.approx(scale, abs=1e-3)
-        assert np.abs(drift.apply(bend()) - theirs).max() < 0.02
+        assert np.abs(drift.apply(bend()) - reference).max() < 0.02
 
 
 def test_as_published_it_slides_a_part_into_the_middle_of_the_whole_and_stretches_it() -> None:
     whole, part = bend(60), bend(60)[:20] + (0.0, 0.5)
-    free = register(whole, part, CpdConfig(scaled=True, tolerance=1e-9, iterations=300))
-    held = register(whole, part, CpdConfig(outlier=0.3, sigma_m=0.5, tolerance=1e-9, iterations=300))
+    free = register(whole, part, CpdConfig(estimate_scale=True, tolerance=1e-9, max_iterations=300))
+    held = register(
+        whole, part, CpdConfig(outlier_fraction=0.3, initial_sigma_m=0.5, tolerance=1e-9, max_iterations=300)
+    )
     assert free.scale > 1.5
     assert np.abs(held.apply(part) - bend(60)[:20]).max() < 0.6
     assert np.abs(free.apply(part) - bend(60)[:20]).max() > 3.0

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from manyeyes.datatypes import ConfigError, MissingExtraError
-from manyeyes.maps.store.executors import Inline, ProcessPool, map_blocks, named_executor
+from manyeyes.maps.store.executors import InlineExecutor, ProcessExecutor, make_executor, map_blocks
 
 
 def _square_late(value: int) -> tuple[int, int]:
@@ -29,12 +29,12 @@ def _run(executor, fn, blocks, progress=None):
 
 def test_a_process_pool_gives_the_inline_list_in_block_order_and_reports_every_block():
     seen: list[tuple[int, int]] = []
-    with ProcessPool(2, ahead=1).open() as runner:
+    with ProcessExecutor(2, queued_per_worker=1).open() as runner:
         results = map_blocks(_square_late, range(9), runner, lambda done, total: seen.append((done, total)))
         again = map_blocks(_square_late, range(3), runner)
         with pytest.raises(ValueError, match="block three"):
             map_blocks(_fails_at_three, range(6), runner)
-    assert [square for square, _ in results] == [square for square, _ in _run(Inline(), _square_late, range(9))]
+    assert [square for square, _ in results] == [square for square, _ in _run(InlineExecutor(), _square_late, range(9))]
     assert os.getpid() not in {pid for _, pid in results}
     assert {pid for _, pid in again} <= {pid for _, pid in results}
     assert seen == [(k, 9) for k in range(1, 10)]
@@ -42,7 +42,7 @@ def test_a_process_pool_gives_the_inline_list_in_block_order_and_reports_every_b
 
 def test_an_exception_of_a_block_reaches_the_caller_inline():
     with pytest.raises(ValueError, match="block three"):
-        _run(Inline(), _fails_at_three, range(6))
+        _run(InlineExecutor(), _fails_at_three, range(6))
 
 
 def test_without_a_runner_a_pool_of_its_own_runs_the_blocks():
@@ -63,9 +63,9 @@ def test_an_absent_engine_names_its_extra(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     for name in ("dask", "ray"):
         with pytest.raises(MissingExtraError, match=rf"manyeyes\[{name}\]"):
-            _run(named_executor(name), _fails_at_three, [1])
+            _run(make_executor(name), _fails_at_three, [1])
 
 
 def test_an_unknown_executor_lists_the_known_ones():
     with pytest.raises(ConfigError, match="inline, process, dask, ray"):
-        named_executor("spark")
+        make_executor("spark")

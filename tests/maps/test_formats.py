@@ -9,15 +9,15 @@ import pytest
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.maps.elements.observation import Frame
-from manyeyes.maps.elements.vector_map import Stations, VectorMap
+from manyeyes.maps.elements.observation import MapFrame
+from manyeyes.maps.elements.vector_map import PointEvidence, VectorMap
 from manyeyes.maps.formats.argoverse2_map import read_argoverse2_map
-from manyeyes.maps.formats.attributes import counter_clockwise, hex_ids
+from manyeyes.maps.formats.attributes import orient_counter_clockwise, to_hex_ids
 from manyeyes.maps.formats.export import FORMATS, export_map
 from manyeyes.maps.formats.geoparquet import MapFileError, projjson, read_map, write_map
-from manyeyes.maps.formats.lanes import lane_pairs
-from manyeyes.maps.formats.rings import long_sides
-from manyeyes.maps.fusion.simplify import simplified
+from manyeyes.maps.formats.lanes import find_lane_pairs
+from manyeyes.maps.formats.rings import split_long_sides
+from manyeyes.maps.fusion.simplify import simplify_map
 from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")
@@ -31,12 +31,12 @@ def _by_id(m: VectorMap) -> VectorMap:
 
 
 def _named_pairs(m: VectorMap, name: str) -> set[tuple[str, str]]:
-    ids = hex_ids(m.id)
+    ids = to_hex_ids(m.id)
     return {(ids[a], ids[b]) for a, b in getattr(m.topology, name).tolist()}
 
 
 def _branches(m: VectorMap) -> set[tuple[float, float, str]]:
-    ids = hex_ids(m.id)
+    ids = to_hex_ids(m.id)
     return {(*m.topology.branch_xy[node].tolist(), ids[row]) for node, row in m.topology.branch.tolist()}
 
 
@@ -47,8 +47,10 @@ def test_the_lossless_form_keeps_every_field_bit_by_bit(two_lanes, tmp_path):
     assert got.frame == want.frame
     for f in fields(MapElements):
         np.testing.assert_array_equal(getattr(got.elements, f.name), getattr(want.elements, f.name), err_msg=f.name)
-    for f in fields(Stations):
-        np.testing.assert_array_equal(getattr(got.stations, f.name), getattr(want.stations, f.name), err_msg=f.name)
+    for f in fields(PointEvidence):
+        np.testing.assert_array_equal(
+            getattr(got.point_evidence, f.name), getattr(want.point_evidence, f.name), err_msg=f.name
+        )
     for name in ("id", "state", "log_odds", "supporters", "agents", "t_first", "t_last"):
         np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
     assert [got.sources_of(k) for k in range(5)] == [want.sources_of(k) for k in range(5)]
@@ -61,7 +63,7 @@ def test_the_lossless_form_is_the_same_file_each_time_and_holds_an_empty_map(two
     for turn in "ab":
         write_map(two_lanes(), tmp_path / f"{turn}.parquet", tmp_path / f"{turn}c.parquet")
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
-    write_map(VectorMap.empty(Frame(1.0, 2.0)), tmp_path / "a.parquet", tmp_path / "b.parquet")
+    write_map(VectorMap.empty(MapFrame(1.0, 2.0)), tmp_path / "a.parquet", tmp_path / "b.parquet")
     assert len(read_map(tmp_path / "a.parquet", tmp_path / "b.parquet")) == 0
 
 
@@ -94,7 +96,7 @@ def test_geopandas_reads_all_elements_in_their_place_on_earth(two_lanes, tmp_pat
         layers = ("lines", "crossings") if format == "geopackage" else (None,)
         parts = [geopandas.read_file(path, **({"layer": layer} if layer else {})) for layer in layers]
     assert all(part.crs.to_epsg() == 4326 or part.crs.to_string() == "OGC:CRS84" for part in parts)
-    ids = hex_ids(m.id)
+    ids = to_hex_ids(m.id)
     found = {row.id: row for part in parts for row in part.itertuples()}
     assert set(found) == set(ids)
     for row, name in enumerate(ids):
@@ -118,7 +120,7 @@ def test_geojson_rings_close_and_run_counter_clockwise(two_lanes, tmp_path):
 def test_counter_clockwise_turns_only_rings_that_run_clockwise():
     square = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, 0.0]])
     e = MapElements.of([square, square[::-1], square], [CROSSING, CROSSING, DIVIDER])
-    turned = counter_clockwise(e)
+    turned = orient_counter_clockwise(e)
     np.testing.assert_array_equal(turned.polyline(0), square[[0, 3, 2, 1]])
     np.testing.assert_array_equal(turned.polyline(1), square[::-1])
     np.testing.assert_array_equal(turned.polyline(2), square)
@@ -138,13 +140,13 @@ def test_lanelet2_reads_lanes_crosswalk_and_styles_back(two_lanes, tmp_path):
         if lanelet.attributes["subtype"] == "road":
             assert min(abs(centre[0, 1] - 1.75), abs(centre[0, 1] + 1.75)) < 0.05
     lines = {line.attributes["manyeyes:id"]: line for line in read.lineStringLayer}
-    divider = lines[hex_ids(m.id)[1]]
+    divider = lines[to_hex_ids(m.id)[1]]
     assert (divider.attributes["type"], divider.attributes["subtype"]) == ("line_thin", "dashed")
     got = np.array([(p.x, p.y) for p in divider])
     # Lanelet2's local projection is a tangent plane, ours transverse Mercator: 60 m from the origin they agree to 1 mm.
     np.testing.assert_allclose(got, m.elements.polyline(1), atol=1e-3)
     # The stop line is a candidate: formats without a state hold what is published.
-    assert hex_ids(m.id)[4] not in lines
+    assert to_hex_ids(m.id)[4] not in lines
 
 
 def test_argoverse_2_form_is_read_by_the_reader_of_that_data_set(two_lanes, tmp_path):
@@ -192,14 +194,14 @@ def test_gdal_reads_the_vector_tiles_back(two_lanes, tmp_path):
     info = pyogrio.read_info(tmp_path / "m.pmtiles", layer="elements")
     assert info["crs"] == "EPSG:3857"
     tiles = pyogrio.read_dataframe(tmp_path / "m.pmtiles", layer="elements")
-    assert set(tiles["id"]) == set(hex_ids(m.id))
+    assert set(tiles["id"]) == set(to_hex_ids(m.id))
     metric = tiles.to_crs(m.frame.proj)
     divider = shapely.line_merge(shapely.union_all(metric.geometry[tiles["kind"] == "divider"].to_numpy()))
     # A step of zoom 16 is 10 cm at this latitude.
     assert shapely.hausdorff_distance(divider, shapely.LineString(m.elements.polyline(1))) < 0.2
 
 
-def test_an_unknown_format_or_a_doubtful_ending_lists_the_known_ones(two_lanes, tmp_path):
+def test_unknown_format_or_ambiguous_suffix_lists_known_formats(two_lanes, tmp_path):
     with pytest.raises(ConfigError, match=", ".join(FORMATS)):
         export_map(two_lanes(), tmp_path / "m.osm", "kml")
     with pytest.raises(ConfigError, match="nuscenes"):
@@ -240,7 +242,7 @@ def test_a_damaged_file_is_named_with_its_fault(two_lanes, tmp_path, damage):
 
 
 def test_files_of_two_frames_do_not_become_one_map(two_lanes, tmp_path):
-    for k, frame in enumerate((Frame(1.0, 1.0), Frame(1.0, 2.0))):
+    for k, frame in enumerate((MapFrame(1.0, 1.0), MapFrame(1.0, 2.0))):
         write_map(two_lanes(frame=frame), tmp_path / f"{k}.parquet", tmp_path / f"{k}c.parquet")
     with pytest.raises(MapFileError, match="one frame"):
         read_map(tmp_path / "0.parquet", tmp_path / "1.parquet")
@@ -251,18 +253,18 @@ def test_lanes_lie_between_lines_a_lane_apart_whichever_way_they_run(two_lanes):
     points = m.elements.points.copy()
     points[61:122] = points[61:122][::-1]
     turned = replace(m, elements=m.elements.with_points(points))
-    pairs = lane_pairs(turned)
-    assert [(p.left, p.right, p.turned) for p in pairs] == [(0, 1, True)]
+    pairs = find_lane_pairs(turned)
+    assert [(p.left, p.right, p.right_is_reversed) for p in pairs] == [(0, 1, True)]
     apart = m.elements.points.copy()
     apart[:61, 1] += 3.0
-    assert [(p.left, p.right) for p in lane_pairs(replace(m, elements=m.elements.with_points(apart)))] == [(1, 2)]
+    assert [(p.left, p.right) for p in find_lane_pairs(replace(m, elements=m.elements.with_points(apart)))] == [(1, 2)]
 
 
 def test_the_long_sides_of_a_ring_run_side_by_side_left_first():
     ring = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 10.0], [0.0, 10.0]])
     for shift in range(4):
         for line in (ring, ring[::-1]):
-            left, right = long_sides(np.roll(line, shift, axis=0))
+            left, right = split_long_sides(np.roll(line, shift, axis=0))
             assert len(left) == len(right) == 2
             heading = left[1] - left[0]
             np.testing.assert_allclose(np.abs(heading), (0, 10))
@@ -272,13 +274,13 @@ def test_the_long_sides_of_a_ring_run_side_by_side_left_first():
     many = np.array(
         [[0.0, 0.0], [1.5, -0.4], [3.0, 0.0], [3.0, 5.0], [3.0, 10.0], [1.5, 10.4], [0.0, 10.0], [0.0, 5.0]]
     )
-    left, right = long_sides(many)
+    left, right = split_long_sides(many)
     assert shapely.Polygon(np.concatenate((left, right[::-1]))).area == pytest.approx(shapely.Polygon(many).area)
 
 
 def test_simplified_lines_stay_within_the_tolerance_and_keep_their_evidence(two_lanes):
     m = two_lanes()
-    less = simplified(m, 0.05)
+    less = simplify_map(m, 0.05)
     assert len(less.elements.points) < 0.4 * len(m.elements.points)
     for row in range(len(m)):
         a, b = m.elements.polyline(row), less.elements.polyline(row)
@@ -288,5 +290,5 @@ def test_simplified_lines_stay_within_the_tolerance_and_keep_their_evidence(two_
         np.testing.assert_array_equal(a[0], b[0])
         assert ring or (a[-1] == b[-1]).all()
     kept = [np.flatnonzero((m.elements.points == p).all(1))[0] for p in less.elements.points[:10]]
-    np.testing.assert_array_equal(less.stations.support[:10], m.stations.support[kept])
-    np.testing.assert_array_equal(simplified(m, 0.0).elements.polyline(3), m.elements.polyline(3))
+    np.testing.assert_array_equal(less.point_evidence.support[:10], m.stations.support[kept])
+    np.testing.assert_array_equal(simplify_map(m, 0.0).elements.polyline(3), m.elements.polyline(3))

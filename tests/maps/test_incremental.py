@@ -13,14 +13,14 @@ from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapEleme
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.elements.vector_map import PUBLISHED, VectorMap
 from manyeyes.maps.fusion.fuse import fuse
-from manyeyes.maps.fusion.incremental import StreamingMap, drift
+from manyeyes.maps.fusion.incremental import IncrementalMap, compute_map_fscore
 
 VIEW = np.array([[-30.0, -15.0], [30.0, -15.0], [30.0, 15.0], [-30.0, 15.0]])
 SIDES = ((BOUNDARY, -5.25), (DIVIDER, -1.75), (DIVIDER, 1.75), (BOUNDARY, 5.25))
 RING = np.array([[20.0, -5.0], [24.0, -5.0], [24.0, 5.0], [20.0, 5.0]])
 
 
-def look(x, number, error=0.0, crossing=True, low=0.0, high=120.0):
+def make_observation(x, number, error=0.0, crossing=True, low=0.0, high=120.0):
     """A road along x from low to high, seen from (x, 0), without noise of points; the claimed pose is off sideways."""
     along = np.arange(max(low, x - 30.0), min(high, x + 30.0) + 0.1, 2.0)
     lines = [np.stack((along - x, np.full(len(along), y)), 1) for _, y in SIDES]
@@ -39,74 +39,74 @@ def look(x, number, error=0.0, crossing=True, low=0.0, high=120.0):
     )
 
 
-def several(count=8, sigma=0.3):
+def make_observations(count=8, sigma=0.3):
     rng = np.random.default_rng(4)
-    return [look(30.0 + 5.0 * k, k, rng.normal(0.0, sigma)) for k in range(count)]
+    return [make_observation(30.0 + 5.0 * k, k, rng.normal(0.0, sigma)) for k in range(count)]
 
 
 def test_it_comes_out_where_the_fold_does():
-    observations = several()
+    observations = make_observations()
     fold = fuse(observations)
-    live = StreamingMap(fuse(observations[:4]))
-    done = [live.assimilate(o) for o in observations[4:]]
-    fused = live.map()
-    assert drift(fused, fold) > 0.95
-    assert sorted(fused.published().elements.kind) == sorted(fold.published().elements.kind)
-    assert done[0].confirmed > 100 and done[0].begun > 0
+    live = IncrementalMap(fuse(observations[:4]))
+    done = [live.update(o) for o in observations[4:]]
+    fused = live.build_map()
+    assert compute_map_fscore(fused, fold) > 0.95
+    assert sorted(fused.select_published().elements.kind) == sorted(fold.select_published().elements.kind)
+    assert done[0].num_confirmed > 100 and done[0].num_created > 0
     last = {o.id for o in observations}
     assert {row.tobytes().hex() for row in fused.observations} == last
 
 
 def test_it_grows_a_map_from_nothing():
-    live = StreamingMap(VectorMap.empty())
-    for o in several(3, 0.0):
-        live.assimilate(o)
-    fused = live.map().published()
-    assert len(fused) == 5 and drift(fused, fuse(several(3, 0.0))) > 0.95
+    live = IncrementalMap(VectorMap.empty())
+    for o in make_observations(3, 0.0):
+        live.update(o)
+    fused = live.build_map().select_published()
+    assert len(fused) == 5 and compute_map_fscore(fused, fuse(make_observations(3, 0.0))) > 0.95
 
 
 def test_an_observation_counts_once():
-    observations = several(5)
-    live = StreamingMap(fuse(observations))
-    before = live.map().quantised_hash()
-    again = live.assimilate(observations[2])
-    assert (again.confirmed, again.missed, again.begun) == (0, 0, 0)
-    assert live.map().quantised_hash() == before
+    observations = make_observations(5)
+    live = IncrementalMap(fuse(observations))
+    before = live.build_map().quantised_hash()
+    again = live.update(observations[2])
+    assert (again.num_confirmed, again.num_missed, again.num_created) == (0, 0, 0)
+    assert live.build_map().quantised_hash() == before
 
 
 def test_a_pose_is_corrected_against_the_map():
-    live = StreamingMap(fuse([replace(look(30.0, k), trusted=True) for k in range(3)]))
+    live = IncrementalMap(fuse([replace(make_observation(30.0, k), trusted=True) for k in range(3)]))
     for error in (0.6, -0.9, 3.0):
-        assert abs(live.assimilate(look(32.0, 10 + round(error * 10), error)).pose[1]) < 0.1
+        assert abs(live.update(make_observation(32.0, 10 + round(error * 10), error)).pose[1]) < 0.1
 
 
 def test_what_is_gone_retires_and_what_is_new_is_published():
-    live = StreamingMap(fuse([look(30.0, k, high=40.0) for k in range(6)]))
+    live = IncrementalMap(fuse([make_observation(30.0, k, high=40.0) for k in range(6)]))
     for k in range(9):
-        live.assimilate(look(30.0, 10 + k, crossing=False))
-    fused = live.map().published()
+        live.update(make_observation(30.0, 10 + k, crossing=False))
+    fused = live.build_map().select_published()
     assert CROSSING not in fused.elements.kind.tolist()
     assert abs(fused.elements.lengths() - 60.0).max() < 2.0
 
 
 def test_drift_of_a_map_from_itself_and_from_another_street():
-    one = fuse(several(4))
+    one = fuse(make_observations(4))
     away = VectorMap.of(one.elements.transform(0.0, 30.0, 0.0))
-    assert drift(one, one) == 1.0 and drift(one, away) == 0.0
+    assert compute_map_fscore(one, one) == 1.0 and compute_map_fscore(one, away) == 0.0
 
 
 @pytest.mark.parametrize("elements", [400, 8000])
 def test_cost_does_not_grow_with_the_map(elements):
-    base = [look(30.0, k) for k in range(2)]
+    base = [make_observation(30.0, k) for k in range(2)]
     one = fuse(base).elements.take(np.arange(4))
     copies = [one.transform(0.0, 60.0 * k, 0.0) for k in range(elements // 4)]
     city = VectorMap.of(MapElements.cat(copies))
     assert (city.state == PUBLISHED).all()
-    small, large = StreamingMap(VectorMap.of(one)), StreamingMap(city)
+    small, large = IncrementalMap(VectorMap.of(one)), IncrementalMap(city)
     spent = {id(small): [], id(large): []}
     for k in range(12):
         for live in (small, large):
             begin = time.perf_counter()
-            live.assimilate(look(30.0, 50 + k))
+            live.update(make_observation(30.0, 50 + k))
             spent[id(live)].append(time.perf_counter() - begin)
     assert min(spent[id(large)]) < 5.0 * min(spent[id(small)])

@@ -18,8 +18,8 @@ def osm(tmp_path, ways, lanelets, extra=""):
     nodes, lines = {}, []
     for name, (points, tags) in ways.items():
         refs = "".join(f'<nd ref="{nodes.setdefault(tuple(p), len(nodes) + 1)}"/>' for p in points)
-        told = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
-        lines.append(f'<way id="{name}">{refs}{told}</way>')
+        tag_lines = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
+        lines.append(f'<way id="{name}">{refs}{tag_lines}</way>')
     degrees = degrees_from_metres(np.array(list(nodes), np.float64).reshape(-1, 2), ORIGIN)
     head = [f'<node id="{n}" lat="{a!r}" lon="{b!r}"/>' for n, (a, b) in zip(nodes.values(), degrees.tolist())]
     tail = [

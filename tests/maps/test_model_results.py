@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER
-from manyeyes.maps.elements.observation import Frame
+from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.formats.model_results import (
     RESULT_OPTIONS,
     ModelResultsError,
@@ -16,7 +16,7 @@ from manyeyes.maps.formats.model_results import (
     read_pose_csv,
 )
 
-FRAME = Frame(49.0, 8.4)
+FRAME = MapFrame(49.0, 8.4)
 RING = [[4.0, -3.0], [7.0, -3.0], [7.0, 3.0], [4.0, 3.0], [4.0, -3.0]]
 
 
@@ -51,13 +51,13 @@ def test_maptr_in_the_lidars_axes_is_turned_forward(tmp_path, poses):
     reading = read_model_results(path, poses, RESULT_OPTIONS["maptr-nuscenes"])
     (observation,) = reading.observations
     elements = observation.elements
-    assert reading.frame == FRAME and not reading.quarantined
+    assert reading.frame == FRAME and not reading.rejected
     assert elements.kind.tolist() == [DIVIDER, CROSSING]
     np.testing.assert_allclose(elements.polyline(0), [[5, 3], [5, -3]])
     assert elements.counts.tolist() == [2, 4]
     np.testing.assert_allclose(elements.score, [0.9, 0.4])
     # The vehicle looks along y of the map from (10, 20).
-    np.testing.assert_allclose(observation.in_map().polyline(0), [[7, 25], [13, 25]], atol=1e-12)
+    np.testing.assert_allclose(observation.elements_in_map().polyline(0), [[7, 25], [13, 25]], atol=1e-12)
     np.testing.assert_allclose(np.sqrt(np.diag(observation.covariance)), [0.5, 0.5, 0.01])
     assert (observation.agent, observation.pass_id, observation.time_ns) == ("car", "p1", 1000)
 
@@ -71,7 +71,7 @@ def test_streammapnet_counts_its_classes(tmp_path, poses):
     assert first.elements.kind.tolist() == [CROSSING, DIVIDER, BOUNDARY]
     np.testing.assert_allclose(np.ptp(first.view, axis=0), [100, 50])
     np.testing.assert_allclose(np.diag(first.covariance), [0.49, 0.49, math.radians(0.8) ** 2])
-    strict = dataclasses.replace(RESULT_OPTIONS["streammapnet"], least_score=0.4)
+    strict = dataclasses.replace(RESULT_OPTIONS["streammapnet"], min_score=0.4)
     assert read_model_results(path, poses, strict).observations[0].elements.kind.tolist() == [CROSSING, DIVIDER]
 
 
@@ -92,13 +92,13 @@ def test_what_cannot_be_used_is_put_aside_and_the_rest_is_read(tmp_path, poses, 
     path = write(tmp_path / "r.json", {"results": [bad, good]})
     reading = read_model_results(path, poses, RESULT_OPTIONS["maptr-av2"])
     assert [o.time_ns for o in reading.observations] == [1000]
-    assert [(q.row, q.count) for q in reading.quarantined] == [(0, 1)] and reason in reading.quarantined[0].reason
+    assert [(q.row, q.count) for q in reading.rejected] == [(0, 1)] and reason in reading.rejected[0].reason
     columns = {"results": {"b": {"vectors": [RING], "scores": [], "labels": [0]}}}
-    aside = read_model_results(write(path, columns), poses, RESULT_OPTIONS["streammapnet"]).quarantined
+    aside = read_model_results(write(path, columns), poses, RESULT_OPTIONS["streammapnet"]).rejected
     assert "layout" in aside[0].reason
 
 
-def test_a_sample_without_elements_is_a_look_that_saw_nothing(tmp_path, poses):
+def test_sample_without_elements_is_empty_observation(tmp_path, poses):
     path = write(tmp_path / "r.json", {"results": [{"sample_token": "a", "vectors": []}]})
     assert len(read_model_results(path, poses, RESULT_OPTIONS["maptr-av2"]).observations[0].elements) == 0
 
@@ -177,7 +177,7 @@ def test_nuscenes_poses_are_of_the_frame_that_the_results_are_in(nuscenes, tmp_p
     ahead = {"results": [{"sample_token": "s1", "vectors": [vector([[0, 5], [0, 9]], "divider", 0.5)]}]}
     path = write(tmp_path / "r.json", ahead)
     (observation,) = read_model_results(path, lidar, RESULT_OPTIONS["maptr-nuscenes"]).observations
-    np.testing.assert_allclose(observation.in_map().points, [[100, 205.9], [100, 209.9]], atol=1e-9)
+    np.testing.assert_allclose(observation.elements_in_map().points, [[100, 205.9], [100, 209.9]], atol=1e-9)
 
 
 def test_nuscenes_tables_that_do_not_fit_are_named(nuscenes):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import MapElements, Polygons
-from manyeyes.maps.elements.observation import Frame, Observation, ObservationError, is_simple_ring
+from manyeyes.maps.elements.observation import MapFrame, Observation, ObservationError, is_simple_ring
 from manyeyes.maps.elements.observation_limits import LIMITS
 
 VIEW = np.array([[0.0, -15.0], [60.0, -15.0], [60.0, 15.0], [0.0, 15.0]])
@@ -159,7 +159,7 @@ def test_rings_cross_or_only_touch() -> None:
     assert is_simple_ring(square), "points along one side touch, they do not cross"
 
 
-def test_rings_cross_where_shapely_says_so() -> None:
+def test_crossing_edges_agree_with_shapely() -> None:
     shapely = pytest.importorskip("shapely")
     generator = np.random.default_rng(4)
     rings = [generator.normal(size=(n, 2)) for n in generator.integers(3, 8, 300)]
@@ -196,13 +196,13 @@ def test_a_negative_zero_is_a_zero() -> None:
     assert turned.id == GOOD.id
 
 
-def test_elements_stand_in_the_map_where_the_pose_says() -> None:
+def test_elements_in_map_follow_pose() -> None:
     o = replace(GOOD, pose=np.array([10.0, 20.0, math.pi / 2]))
-    assert np.allclose(o.in_map().polyline(0), [[10, 20], [10, 50]])
-    assert np.allclose(o.in_map(np.array([0.0, 0.0, math.pi])).polyline(0), [[0, 0], [-30, 0]])
+    assert np.allclose(o.elements_in_map().polyline(0), [[10, 20], [10, 50]])
+    assert np.allclose(o.elements_in_map(np.array([0.0, 0.0, math.pi])).polyline(0), [[0, 0], [-30, 0]])
 
 
 def test_a_frame_is_a_scale_one_projection_about_its_origin() -> None:
-    assert Frame(49.5, 8.25).proj.startswith("+proj=tmerc +lat_0=49.5 +lon_0=8.25 +k=1 ")
+    assert MapFrame(49.5, 8.25).proj.startswith("+proj=tmerc +lat_0=49.5 +lon_0=8.25 +k=1 ")
     with pytest.raises(ObservationError, match="latitude"):
-        Frame(91.0, 0.0)
+        MapFrame(91.0, 0.0)

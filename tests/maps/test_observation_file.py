@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import MapElements, Polygons
-from manyeyes.maps.elements.observation import Frame, Observation, ObservationError
+from manyeyes.maps.elements.observation import MapFrame, Observation, ObservationError
 from manyeyes.maps.elements.observation_file import (
     METADATA_KEY,
-    metadata,
+    iterate_observations,
+    make_file_metadata,
     observation_table,
-    observations_of,
     read_observations,
     write_observations,
 )
@@ -26,7 +26,7 @@ from manyeyes.maps.elements.observation_file import (
 pa = pytest.importorskip("pyarrow", reason="the 'map' extra is not installed")
 pq = pytest.importorskip("pyarrow.parquet")
 
-FRAME = Frame(49.0, 8.4)
+FRAME = MapFrame(49.0, 8.4)
 VIEW = np.array([[0.0, -15.0], [60.0, -15.0], [60.0, 15.0], [0.0, 15.0]])
 ELEMENTS = MapElements.of(
     [[[0, 0], [30, 0.25]], [[10, -5], [14, -5], [14, 5], [10, 5]]], [0, 2], score=[0.5, 0.75], style=[1, 3]
@@ -66,7 +66,7 @@ def test_the_documented_example_is_read(tmp_path: Path, monkeypatch: pytest.Monk
     assert seen.elements.sigma.tolist() == [0.12, 0.3, 0.12, 0.12, 0.12, 0.12]
     assert seen.elements.style.tolist() == [[0.1, 0.9, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
     assert seen.covariance[2, 2] == 0.0002 and seen.covariance[0, 1] == 0.0
-    assert np.allclose(seen.in_map().polyline(0)[0], [120.5 - 1.75, -40.25], atol=1e-4)
+    assert np.allclose(seen.elements_in_map().polyline(0)[0], [120.5 - 1.75, -40.25], atol=1e-4)
 
 
 def test_what_was_written_is_read_back_bit_by_bit(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_what_was_written_is_read_back_bit_by_bit(tmp_path: Path) -> None:
     write_observations(tmp_path / "a.parquet", many, FRAME)
     reading = read_observations(tmp_path / "a.parquet")
     assert [o.id for o in reading.observations] == [o.id for o in many]
-    assert reading.frame == FRAME and reading.quarantined == ()
+    assert reading.frame == FRAME and reading.rejected == ()
     assert [p.name for p in tmp_path.iterdir()] == ["a.parquet"]
 
 
@@ -86,7 +86,7 @@ def test_no_observations_are_a_file_too(tmp_path: Path) -> None:
 
 def test_a_table_cut_out_of_another_gives_its_own_rows() -> None:
     many = crowd(6)
-    rows = list(observations_of(observation_table(many, FRAME).slice(2, 3)))
+    rows = list(iterate_observations(observation_table(many, FRAME).slice(2, 3)))
     assert [o.id for _, o in rows if isinstance(o, Observation)] == [o.id for o in many[2:5]]
 
 
@@ -138,7 +138,7 @@ def _moved(row: dict) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (_nan, "points: expected finite"),
         (_no_point, "points: expected finite"),
@@ -152,22 +152,22 @@ def _moved(row: dict) -> None:
         (_moved, "id: expected [0-9a-f]{32}, as its content says"),
     ],
 )
-def test_a_bad_row_is_put_aside_with_its_reason_and_the_rest_is_read(tmp_path: Path, change, said: str) -> None:
+def test_a_bad_row_is_put_aside_with_its_reason_and_the_rest_is_read(tmp_path: Path, change, message: str) -> None:
     many = crowd(6)
     pq.write_table(rewritten(observation_table(many, FRAME), 3, change), tmp_path / "a.parquet")
     reading = read_observations(tmp_path)
     assert [o.id for o in reading.observations] == [o.id for o in many if o is not many[3]]
-    (aside,) = reading.quarantined
+    (aside,) = reading.rejected
     assert (aside.row, aside.count) == (3, 1) and aside.file.endswith("a.parquet")
-    assert re.search(said, aside.reason)
+    assert re.search(message, aside.reason)
 
 
 def stated(change: dict) -> dict[bytes, str]:
-    return {METADATA_KEY: json.dumps(metadata(FRAME) | change)}
+    return {METADATA_KEY: json.dumps(make_file_metadata(FRAME) | change)}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"version": 2}, "version 2. Read a newer version"),
         ({"version": "1"}, "version '1'"),
@@ -178,14 +178,14 @@ def stated(change: dict) -> dict[bytes, str]:
         ({"format": "release"}, "got 'release'"),
     ],
 )
-def test_a_file_of_another_kind_version_or_frame_is_put_aside_whole(tmp_path: Path, change: dict, said: str) -> None:
+def test_a_file_of_another_kind_version_or_frame_is_put_aside_whole(tmp_path: Path, change: dict, message: str) -> None:
     many = crowd(4)
     write_observations(tmp_path / "a.parquet", many[:2], FRAME)
     pq.write_table(observation_table(many[2:], FRAME).replace_schema_metadata(stated(change)), tmp_path / "b.parquet")
     reading = read_observations(tmp_path)
     assert [o.id for o in reading.observations] == [o.id for o in many[:2]]
-    (aside,) = reading.quarantined
-    assert aside.row == -1 and re.search(said, aside.reason)
+    (aside,) = reading.rejected
+    assert aside.row == -1 and re.search(message, aside.reason)
 
 
 def test_files_without_our_metadata_or_columns_are_put_aside(tmp_path: Path) -> None:
@@ -193,7 +193,7 @@ def test_files_without_our_metadata_or_columns_are_put_aside(tmp_path: Path) -> 
     write_observations(tmp_path / "a.parquet", crowd(2), FRAME)
     pq.write_table(table.replace_schema_metadata({}), tmp_path / "b.parquet")
     pq.write_table(table.drop_columns(["yaw", "view"]), tmp_path / "c.parquet")
-    reasons = [q.reason for q in read_observations(tmp_path).quarantined]
+    reasons = [q.reason for q in read_observations(tmp_path).rejected]
     assert "expected metadata 'manyeyes'" in reasons[0] and "yaw, view missing" in reasons[1]
 
 
@@ -210,12 +210,12 @@ def test_a_cut_or_damaged_file_is_put_aside_and_never_read_wrong(tmp_path: Path)
     reading = read_observations(tmp_path)
     good = {o.id for o in many}
     assert {o.id for o in reading.observations} <= good
-    files = {Path(q.file).name for q in reading.quarantined}
+    files = {Path(q.file).name for q in reading.rejected}
     assert {"b.parquet", "c.parquet"} <= files and any(name.startswith("d") for name in files)
-    assert all("\n" not in q.reason for q in reading.quarantined)
+    assert all("\n" not in q.reason for q in reading.rejected)
 
 
-def test_nothing_to_read_is_said(tmp_path: Path) -> None:
+def test_empty_input_raises(tmp_path: Path) -> None:
     with pytest.raises(ObservationError, match="found none"):
         read_observations(tmp_path)
     (tmp_path / "a.parquet").write_bytes(b"no")
@@ -225,5 +225,5 @@ def test_nothing_to_read_is_said(tmp_path: Path) -> None:
 
 def test_the_frame_asked_for_is_the_frame_required(tmp_path: Path) -> None:
     write_observations(tmp_path / "a.parquet", crowd(1), FRAME)
-    reading = read_observations(tmp_path, Frame(48.0, 8.4))
-    assert reading.observations == () and "latitude 48.0" in reading.quarantined[0].reason
+    reading = read_observations(tmp_path, MapFrame(48.0, 8.4))
+    assert reading.observations == () and "latitude 48.0" in reading.rejected[0].reason

@@ -151,7 +151,7 @@ def test_lane_offset_jumps_at_a_section_without_moving_lanes():
         assert both[:, 1].max() == pytest.approx(0)
 
 
-def test_marks_have_kind_colour_width_and_change_where_the_file_says():
+def test_marks_have_kind_colour_width_and_change_at_stated_offsets():
     mark = '<roadMark sOffset="0" type="{}" color="{}" width="0.2"/>'
     right = lane(
         -1, mark=mark.format("broken", "white") + '<roadMark sOffset="6" type="solid" color="white" width="0.15"/>'
@@ -235,7 +235,7 @@ def test_height_takes_the_level_that_is_asked_for():
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         (b"not xml", "expected OpenDRIVE XML"),
         (gzip.compress(b"<OpenDRIVE/>")[:-6], "expected OpenDRIVE XML"),
@@ -250,12 +250,12 @@ def test_height_takes_the_level_that_is_asked_for():
         (road(geometry("<line/>", 5), 5, sections="").encode(), "holds no <laneSection>"),
     ],
 )
-def test_errors_name_file_and_element(tmp_path: Path, data: bytes, said: str):
+def test_errors_name_file_and_element(tmp_path: Path, data: bytes, message: str):
     path = tmp_path / "broken.xodr"
     path.write_bytes(data if data[:5] != b"<road" else b"<OpenDRIVE>" + data + b"</OpenDRIVE>")
     with pytest.raises(OpenDriveError) as error:
         read_opendrive(path)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert "broken.xodr" in str(error.value)
     assert "\n" not in str(error.value)
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 
 from manyeyes.maps.fusion.point_grid import (
-    bound_observations,
     build_grid,
-    content_priority,
+    hash_coordinates,
+    limit_observations,
     lower_bound,
     resample_lines,
 )
@@ -39,10 +39,10 @@ def test_a_cell_keeps_so_many_observations_and_agents_take_turns():
     observation = np.array([0, 0, 1, 2, 3, 4, 5, 0])
     key = np.array([7, 7, 7, 7, 7, 7, 7, 8])
     agent, rank = np.array([0, 0, 0, 0, 1, 1]), np.array([3, 0, 1, 2, 5, 4])
-    kept = bound_observations(key, observation, agent, rank, 3)
+    kept = limit_observations(key, observation, agent, rank, 3)
     assert set(observation[kept & (key == 7)]) == {1, 5, 2}
     assert kept[7]
-    assert bound_observations(key, observation, agent, rank, 6).all()
+    assert limit_observations(key, observation, agent, rank, 6).all()
 
 
 def test_the_grid_keeps_the_order_of_points_within_a_cell():
@@ -50,7 +50,7 @@ def test_the_grid_keeps_the_order_of_points_within_a_cell():
     xy = rng.uniform(-20.0, 20.0, (300, 2))
     grid = build_grid(xy[:, 0], xy[:, 1], np.arange(300) % 2, 2.5)
     assert sorted(grid.order) == list(range(300))
-    for begin, end in zip(grid.start[:-1], grid.start[1:]):
+    for begin, end in zip(grid.offsets[:-1], grid.offsets[1:]):
         rows = grid.order[begin:end]
         assert (np.diff(rows) > 0).all() and len(np.unique(np.floor(xy[rows] / 2.5), axis=0)) == 1
     assert [lower_bound(grid.keys, key) for key in grid.keys] == list(range(len(grid.keys)))
@@ -58,7 +58,7 @@ def test_the_grid_keeps_the_order_of_points_within_a_cell():
 
 def test_priorities_depend_on_coordinates_alone():
     xy = np.random.default_rng(1).normal(size=(1000, 2))
-    priority = content_priority(xy)
-    assert (content_priority(xy[::-1])[::-1] == priority).all() and len(np.unique(priority)) == 1000
-    assert (content_priority(np.array([[0.0, -0.0]])) == content_priority(np.zeros((1, 2)))).all()
+    priority = hash_coordinates(xy)
+    assert (hash_coordinates(xy[::-1])[::-1] == priority).all() and len(np.unique(priority)) == 1000
+    assert (hash_coordinates(np.array([[0.0, -0.0]])) == hash_coordinates(np.zeros((1, 2)))).all()
     assert abs(np.corrcoef(priority.astype(np.float64), xy[:, 0])[0, 1]) < 0.15

@@ -13,20 +13,20 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.observation_file import write_observations
 from manyeyes.maps.elements.observation_limits import LIMITS
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.formats.attributes import hex_ids
-from manyeyes.maps.store.map_diff import apply_delta, delta_between, home_tiles, with_ids_of
-from manyeyes.maps.store.observation_log import StoreError, locked, read_standing
-from manyeyes.maps.store.store import MapStore, watermark_of
+from manyeyes.maps.formats.attributes import to_hex_ids
+from manyeyes.maps.store.map_diff import apply_delta, compute_delta, compute_home_tiles, transfer_ids
+from manyeyes.maps.store.observation_log import StoreError, hold_lock, read_active
+from manyeyes.maps.store.store import MapStore, compute_watermark
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")
 pytest.importorskip("shapely", reason="the map extra is not installed")
 
-FRAME = Frame(48.137, 11.575)
-MARK = watermark_of((), np.zeros(0, np.int64))
+FRAME = MapFrame(48.137, 11.575)
+MARK = compute_watermark((), np.zeros(0, np.int64))
 
 
 def _observation(k: int, x: float | None = None) -> Observation:
@@ -45,28 +45,28 @@ def _lines(*ys: float, x: float = 0.0) -> VectorMap:
 def test_the_log_keeps_each_observation_once_and_gives_back_what_was_put_in(tmp_path):
     store = MapStore.create(tmp_path / "s", FRAME)
     many = [_observation(k) for k in range(300)]
-    with store.writing() as log:
+    with store.open_for_writing() as log:
         assert log.append(many[:200]) == (200, 0)
         assert log.append(many[150:]) == (100, 50)
         assert log.append(many[:10]) == (0, 10)
-        standing = log.standing()
+        standing = log.active_observations()
     assert len(list((tmp_path / "s/log").iterdir())) == 2
     assert standing.ids == tuple(sorted(o.id for o in many))
     rows = np.flatnonzero(standing.xy[:, 0] > 7000)
-    got = read_standing(tmp_path / "s/log", standing, rows)
+    got = read_active(tmp_path / "s/log", standing, rows)
     want = sorted((o for o in many if o.pose[0] > 7000), key=lambda o: o.id)
     assert [o.id for o in got] == [o.id for o in want] and len(want) == 124
-    assert standing.reach_m[0] == pytest.approx(np.hypot(30, 15))
+    assert standing.radius_m[0] == pytest.approx(np.hypot(30, 15))
 
 
 def test_a_retracted_observation_counts_no_more_and_does_not_come_back(tmp_path):
     store = MapStore.create(tmp_path, FRAME)
     many = [_observation(k) for k in range(5)]
-    with store.writing() as log:
+    with store.open_for_writing() as log:
         log.append(many)
         log.retract([many[2].id], "asked for by its driver")
         assert log.append([many[2]]) == (0, 1)
-        assert set(log.standing().ids) == {o.id for o in many} - {many[2].id}
+        assert set(log.active_observations().ids) == {o.id for o in many} - {many[2].id}
         with pytest.raises(StoreError, match=r"no observation 00+"):
             log.retract(["00" * 16], "unknown")
 
@@ -74,7 +74,7 @@ def test_a_retracted_observation_counts_no_more_and_does_not_come_back(tmp_path)
 def test_observations_are_found_by_the_start_of_an_id_and_by_agent_and_pass(tmp_path):
     store = MapStore.create(tmp_path, FRAME)
     many = [_observation(k) for k in range(40)]
-    with store.writing() as log:
+    with store.open_for_writing() as log:
         log.append(many)
         one = many[7]
         assert log.find([one.id]) == log.find([one.id[:9], one.id[:10].upper()]) == (one.id,)
@@ -93,41 +93,41 @@ def test_observations_are_found_by_the_start_of_an_id_and_by_agent_and_pass(tmp_
                 log.find(**words)
 
 
-def test_a_retraction_says_how_many_counted_and_appends_nothing_twice(tmp_path):
+def test_retraction_returns_count_and_appends_once(tmp_path):
     store = MapStore.create(tmp_path, FRAME)
     many = [_observation(k) for k in range(5)]
-    with store.writing() as log:
+    with store.open_for_writing() as log:
         log.append(many)
         assert log.retract([many[0].id, many[1].id], "test") == 2
         entries = sorted(log.folder.iterdir())
         assert log.retract([many[0].id], "again") == 0 and sorted(log.folder.iterdir()) == entries
         assert log.retract([many[0].id, many[2].id], "more") == 1
-        assert len(log.standing()) == 2
+        assert len(log.active_observations()) == 2
 
 
 def test_other_limits_make_the_index_again_and_rows_outside_are_quarantined(tmp_path, monkeypatch):
     store = MapStore.create(tmp_path, FRAME)
     many = [_observation(k) for k in range(300)]
     far = [o for o in many if o.pose[0] > 10_000.0]
-    with store.writing() as log:
+    with store.open_for_writing() as log:
         log.append(many)
-        before = log.standing()
+        before = log.active_observations()
         log.retract([many[0].id], "test")
     narrow = replace(LIMITS, max_position_m=10_000.0)
     for module in ("elements.observation", "store.observation_log"):
         monkeypatch.setattr(f"manyeyes.maps.{module}.LIMITS", narrow)
-    with MapStore(tmp_path).writing() as log:
-        assert len(log.refused) == len(log.catalogue.quarantined()) == len(far) == 49
-        assert set(log.standing().ids) == {o.id for o in many} - {o.id for o in (*far, many[0])}
-        rows = np.arange(len(log.standing()))
-        assert len(read_standing(log.folder, log.standing(), rows)) == len(rows)
+    with MapStore(tmp_path).open_for_writing() as log:
+        assert len(log.rejected) == len(log.index.list_rejected()) == len(far) == 49
+        assert set(log.active_observations().ids) == {o.id for o in many} - {o.id for o in (*far, many[0])}
+        rows = np.arange(len(log.active_observations()))
+        assert len(read_active(log.folder, log.active_observations(), rows)) == len(rows)
         assert log.find(agent=far[0].agent) == (far[0].id,) and log.retract([far[0].id], "far") == 1
-    with MapStore(tmp_path).writing() as log:
-        assert log.refused == () and len(log.catalogue.quarantined()) == len(far)
+    with MapStore(tmp_path).open_for_writing() as log:
+        assert log.rejected == () and len(log.index.list_rejected()) == len(far)
     monkeypatch.undo()
-    with MapStore(tmp_path).writing() as log:
-        assert set(log.standing().ids) == {o.id for o in many} - {far[0].id, many[0].id}
-        assert log.catalogue.quarantined() == []
+    with MapStore(tmp_path).open_for_writing() as log:
+        assert set(log.active_observations().ids) == {o.id for o in many} - {far[0].id, many[0].id}
+        assert log.index.list_rejected() == []
     assert len(before) == 300
 
 
@@ -135,36 +135,36 @@ def test_ingest_puts_aside_what_cannot_be_used_with_its_reason_and_keeps_the_res
     good = [_observation(k) for k in range(4)]
     (tmp_path / "in").mkdir()
     write_observations(tmp_path / "in/a.parquet", good, FRAME)
-    write_observations(tmp_path / "in/b.parquet", [_observation(9)], Frame(10.0, 10.0))
+    write_observations(tmp_path / "in/b.parquet", [_observation(9)], MapFrame(10.0, 10.0))
     (tmp_path / "in/c.parquet").write_bytes((tmp_path / "in/a.parquet").read_bytes()[:500])
     store = MapStore.create(tmp_path / "s", FRAME)
-    with store.writing() as log:
+    with store.open_for_writing() as log:
         done = log.ingest(tmp_path / "in")
-        rows = log.catalogue.quarantined()
-    assert (done.added, len(done.quarantined)) == (4, 2)
+        rows = log.index.list_rejected()
+    assert (done.num_added, len(done.rejected)) == (4, 2)
     reasons = {Path(file).name: reason for file, _, _, reason in rows}
     assert "origin" in reasons["b.parquet"] and "whole Parquet file" in reasons["c.parquet"]
 
 
 def test_the_index_is_made_again_from_the_log(tmp_path):
     store = MapStore.create(tmp_path, FRAME)
-    with store.writing() as log:
+    with store.open_for_writing() as log:
         log.append([_observation(k) for k in range(5)])
         log.retract([_observation(3).id], "test")
-        before = log.standing()
+        before = log.active_observations()
     for path in tmp_path.glob("catalogue.sqlite*"):
         path.unlink()
-    with MapStore(tmp_path).writing() as log:
-        after = log.standing()
+    with MapStore(tmp_path).open_for_writing() as log:
+        after = log.active_observations()
     assert after.ids == before.ids and len(after) == 4
     np.testing.assert_array_equal(after.xy, before.xy)
     np.testing.assert_array_equal(after.row_group, before.row_group)
 
 
-def test_a_release_is_read_back_and_says_what_it_was_made_of(two_lanes, tmp_path):
+def test_release_round_trip_keeps_watermark(two_lanes, tmp_path):
     store = MapStore.create(tmp_path, FRAME)
     first = VectorMap.cat([two_lanes(), two_lanes(1000.0, -700.0)])
-    mark = watermark_of(["ab" * 16], np.array([7]))
+    mark = compute_watermark(["ab" * 16], np.array([7]))
     manifest = store.publish(first, "union", "tau=1", mark)
     assert (manifest.number, manifest.parent, manifest.elements, manifest.watermark) == (1, 0, 10, mark)
     assert (manifest.algorithm, manifest.settings) == ("union", "tau=1")
@@ -175,7 +175,7 @@ def test_a_release_is_read_back_and_says_what_it_was_made_of(two_lanes, tmp_path
     # Neighbours in another tile are still known, as relations are stored by id.
     assert {tuple(p) for p in got.topology.right.tolist()} and len(got.topology.right) == len(first.topology.right)
     near = store.read(area=(900.0, -800.0, 1100.0, -600.0))
-    assert sorted(hex_ids(near.id)) == sorted(hex_ids(first.id[5:]))
+    assert sorted(to_hex_ids(near.id)) == sorted(to_hex_ids(first.id[5:]))
 
 
 def test_equal_tiles_are_stored_once_for_all_releases(two_lanes, tmp_path):
@@ -198,29 +198,29 @@ def test_a_delta_turns_the_parent_into_the_release_and_counts_by_tile(tmp_path):
     # The line that moved by half a metre keeps its id; the one at 30 m is gone; one is new, two tiles on.
     before, after = store.read(1), store.read(2)
     assert len(delta.added) == len(delta.modified) == len(delta.deleted) == 1
-    assert delta.modified[0] in hex_ids(before.id)
+    assert delta.modified[0] in to_hex_ids(before.id)
     assert delta.by_tile() == [((0, 0), 0, 1, 1), ((2, 1), 1, 0, 0)]
     made = apply_delta(before, delta)
-    assert made.quantised_hash() == after.quantised_hash() and hex_ids(made.id) == hex_ids(after.id)
+    assert made.quantised_hash() == after.quantised_hash() and to_hex_ids(made.id) == to_hex_ids(after.id)
     assert len(store.delta(1).added) == 3
 
 
 def test_ids_go_to_the_largest_overlap_and_only_once():
     before, after = _lines(10, 20), _lines(10.4, 10.8, 20.2)
-    got = with_ids_of(after, before)
-    assert hex_ids(got.id)[2] == hex_ids(before.id)[1]
-    inherited = [name for name in hex_ids(got.id)[:2] if name == hex_ids(before.id)[0]]
+    got = transfer_ids(after, before)
+    assert to_hex_ids(got.id)[2] == to_hex_ids(before.id)[1]
+    inherited = [name for name in to_hex_ids(got.id)[:2] if name == to_hex_ids(before.id)[0]]
     assert len(inherited) == 1
     other_kind = replace(before, elements=replace(before.elements, kind=np.array([1, 1])))
-    assert hex_ids(with_ids_of(after, other_kind).id) == hex_ids(after.id)
-    assert len(delta_between(after, after).changed) == 0
+    assert to_hex_ids(transfer_ids(after, other_kind).id) == to_hex_ids(after.id)
+    assert len(compute_delta(after, after).changed) == 0
 
 
 def test_an_element_lives_in_the_tile_of_its_lesser_end_whichever_way_it_runs(two_lanes):
     m = _lines(10, x=250.0)
     back = replace(m, elements=m.elements.with_points(m.elements.points[::-1]))
-    assert home_tiles(m).tolist() == home_tiles(back).tolist() == [[0, 0]]
-    assert home_tiles(two_lanes(250.0, 0.0)).tolist()[3] == [1, -1]
+    assert compute_home_tiles(m).tolist() == compute_home_tiles(back).tolist() == [[0, 0]]
+    assert compute_home_tiles(two_lanes(250.0, 0.0)).tolist()[3] == [1, -1]
 
 
 def test_damage_is_named(two_lanes, tmp_path):
@@ -231,7 +231,7 @@ def test_damage_is_named(two_lanes, tmp_path):
     with pytest.raises(StoreError, match="no release 3; there are 1"):
         store.read(3)
     with pytest.raises(StoreError, match="choose another folder"):
-        MapStore.create(tmp_path, Frame(1.0, 1.0))
+        MapStore.create(tmp_path, MapFrame(1.0, 1.0))
     with pytest.raises(StoreError, match=r"store\.json"):
         MapStore(tmp_path / "nowhere")
     path = next((tmp_path / "tiles").rglob("*.lines.parquet"))
@@ -247,9 +247,9 @@ def test_damage_is_named(two_lanes, tmp_path):
 
 def test_two_writers_do_not_meet(tmp_path):
     store = MapStore.create(tmp_path, FRAME)
-    with locked(tmp_path / "lock"), pytest.raises(StoreError, match="another program"), store.writing():
+    with hold_lock(tmp_path / "lock"), pytest.raises(StoreError, match="another program"), store.open_for_writing():
         pass
-    with store.writing():
+    with store.open_for_writing():
         pass
 
 

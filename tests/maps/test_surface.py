@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from manyeyes.maps.roads.surface import Surface
+from manyeyes.maps.roads.surface import RoadSurface
 
 
 def strips(random: np.random.Generator, count: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -23,7 +23,7 @@ def strips(random: np.random.Generator, count: int) -> tuple[list[np.ndarray], l
     return left, right
 
 
-def slow(surface: Surface, point: np.ndarray, near_z: float | None) -> tuple[float, float]:
+def slow(surface: RoadSurface, point: np.ndarray, near_z: float | None) -> tuple[float, float]:
     """Height and distance by looking at everything."""
     covering, best = [], (np.inf, 0.0)
     for corner in surface.triangles:
@@ -45,7 +45,7 @@ def slow(surface: Surface, point: np.ndarray, near_z: float | None) -> tuple[flo
 
 def test_height_and_distance_equal_the_slow_twin():
     random = np.random.default_rng(5)
-    surface = Surface.of_strips(*strips(random, 14))
+    surface = RoadSurface.of_strips(*strips(random, 14))
     points = random.uniform(-90, 90, (150, 2))
     for near_z in (None, 2.0):
         wanted = np.array([slow(surface, p, near_z) for p in points])
@@ -57,19 +57,19 @@ def test_height_and_distance_equal_the_slow_twin():
 def test_owner_names_the_strip():
     flat = np.array([[0.0, 1, 0], [10, 1, 0]]), np.array([[0.0, -1, 0], [10, -1, 0]])
     far = flat[0] + [0, 20, 3], flat[1] + [0, 20, 3]
-    surface = Surface.of_strips([flat[0], far[0]], [flat[1], far[1]])
-    assert surface.owner_at(np.array([[5.0, 0.5], [5.0, 19.5]])).tolist() == [0, 1]
+    surface = RoadSurface.of_strips([flat[0], far[0]], [flat[1], far[1]])
+    assert surface.strip_at(np.array([[5.0, 0.5], [5.0, 19.5]])).tolist() == [0, 1]
 
 
 def test_spread_is_the_gap_between_levels():
     low = np.array([[-10.0, 2, 0], [10, 2, 0]]), np.array([[-10.0, -2, 0], [10, -2, 0]])
     high = low[0][:, [1, 0, 2]] * [-1, 1, 1] + [0, 0, 5.0], low[1][:, [1, 0, 2]] * [-1, 1, 1] + [0, 0, 5.0]
-    surface = Surface.of_strips([low[0], high[0]], [low[1], high[1]])
-    np.testing.assert_allclose(surface.spread(np.array([[0.0, 0.0], [6.0, 0.0], [50.0, 0.0]])), [5, 0, 0])
+    surface = RoadSurface.of_strips([low[0], high[0]], [low[1], high[1]])
+    np.testing.assert_allclose(surface.height_range(np.array([[0.0, 0.0], [6.0, 0.0], [50.0, 0.0]])), [5, 0, 0])
 
 
 def test_nothing_is_infinitely_far():
-    surface = Surface.of_strips([], [])
+    surface = RoadSurface.of_strips([], [])
     assert np.isinf(surface.distance(np.zeros((2, 2)))).all()
     assert surface.height(np.zeros((2, 2))).tolist() == [0, 0]
-    assert surface.owner_at(np.zeros((2, 2))).tolist() == [-1, -1]
+    assert surface.strip_at(np.zeros((2, 2))).tolist() == [-1, -1]

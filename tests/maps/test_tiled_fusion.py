@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.maps.formats.attributes import hex_ids
-from manyeyes.maps.fusion.agent_weights import NOT_BELIEVED
-from manyeyes.maps.fusion.fuse import FuseConfig, fuse
-from manyeyes.maps.fusion.observation_arrays import gather
+from manyeyes.maps.formats.attributes import to_hex_ids
+from manyeyes.maps.fusion.agent_weights import REJECTED_WEIGHT
+from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
+from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.pose_optimization import solve_poses
 from manyeyes.maps.store.columns_file import load_columns, save_columns
-from manyeyes.maps.store.executors import Inline, named_executor
-from manyeyes.maps.store.observation_log import read_standing
+from manyeyes.maps.store.executors import InlineExecutor, make_executor
+from manyeyes.maps.store.observation_log import read_active
 from manyeyes.maps.store.store import MapStore
-from manyeyes.maps.store.tiled_fusion import TileConfig, fuse_tiles, make_blocks
-from manyeyes.simulator.fleet import CROWDS, place, simulate_crowd
+from manyeyes.maps.store.tiled_fusion import TiledFusionConfig, fuse_tiles, make_blocks
+from manyeyes.simulator.fleet import CROWDS, load_place, simulate_crowd
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")
 pytest.importorskip("shapely", reason="the map extra is not installed")
@@ -28,7 +28,7 @@ COUNT = 30
 @pytest.fixture(scope="module")
 def crowd():
     """Observations of one crossroads, whose arms reach about 150 m."""
-    return simulate_crowd(place("cross"), COUNT)
+    return simulate_crowd(load_place("cross"), COUNT)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def whole(crowd):
 @pytest.fixture
 def store(crowd, tmp_path):
     made = MapStore.create(tmp_path / "store", crowd.place.frame)
-    with made.writing() as log:
+    with made.open_for_writing() as log:
         log.append(crowd.observations)
     return made
 
@@ -51,17 +51,19 @@ def _tiled(store, work, tile_m, executor=None, progress=None):
         standing,
         store.frame,
         work,
-        FuseConfig(),
-        TileConfig(tile_m, 1),
-        executor or Inline(),
+        MapFusionConfig(),
+        TiledFusionConfig(tile_m, 1),
+        executor or InlineExecutor(),
         progress,
     )
 
 
 def test_four_tiles_that_meet_in_the_crossroads_give_the_map_of_one_piece(store, whole, tmp_path):
     assert len(whole) > 10
-    blocks = make_blocks(store.log.folder, store.log.standing(), tmp_path, FuseConfig(), TileConfig(256.0, 1))
-    assert len(blocks) == 4 and all(block.home for block in blocks)
+    blocks = make_blocks(
+        store.log.folder, store.log.standing(), tmp_path, MapFusionConfig(), TiledFusionConfig(256.0, 1)
+    )
+    assert len(blocks) == 4 and all(block.home_ids for block in blocks)
     assert _tiled(store, tmp_path / "work", 256.0).quantised_hash() == whole.quantised_hash()
 
 
@@ -71,14 +73,16 @@ def test_small_tiles_give_the_map_of_one_piece_and_no_line_is_cut_at_a_border(st
     assert got.elements.lengths().max() > 90.0
 
 
-def test_whom_nobody_believes_is_left_out_alike_in_tiles_and_in_one_piece(tmp_path):
-    lying = replace(CROWDS["local"], malicious_share=0.2, malicious="colluding", malicious_offset=(3.0, 3.0))
-    told = simulate_crowd(place("cross"), COUNT, lying, seed=6)
-    assert (solve_poses(told.observations).faith == NOT_BELIEVED).sum() > 3
-    made = MapStore.create(tmp_path / "store", told.place.frame)
-    with made.writing() as log:
-        log.append(told.observations)
-    one_piece = fuse(told.observations, frame=told.place.frame)
+def test_rejected_agents_are_rejected_alike_in_tiles_and_in_one_piece(tmp_path):
+    crowd_config = replace(
+        CROWDS["local"], malicious_fraction=0.2, attack_mode="colluding", malicious_offset_m=(3.0, 3.0)
+    )
+    simulated = simulate_crowd(load_place("cross"), COUNT, crowd_config, seed=6)
+    assert (solve_poses(simulated.observations).agent_weight == REJECTED_WEIGHT).sum() > 3
+    made = MapStore.create(tmp_path / "store", simulated.place.frame)
+    with made.open_for_writing() as log:
+        log.append(simulated.observations)
+    one_piece = fuse(simulated.observations, frame=simulated.place.frame)
     assert _tiled(made, tmp_path / "work", 90.0).quantised_hash() == one_piece.quantised_hash()
 
 
@@ -86,7 +90,7 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
     work = tmp_path / "work"
     seen = []
     _tiled(store, work, 256.0, progress=lambda name, done, total: seen.append((name, done, total)))
-    steps = FuseConfig().align.steps
+    steps = MapFusionConfig().pose_solver.num_steps
     assert [name for name, done, total in seen if done == total] == [
         "search", *(f"step {k + 1}" for k in range(steps)), "stations",
     ]  # fmt: skip
@@ -104,41 +108,41 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
 def test_engines_give_the_identical_map(store, whole, tmp_path, name):
     module = {"process": "concurrent.futures", "dask": "dask.distributed", "ray": "ray"}[name]
     pytest.importorskip(module, reason=f"the {name} extra is not installed")
-    got = _tiled(store, tmp_path / "work", 256.0, named_executor(name, workers=2))
+    got = _tiled(store, tmp_path / "work", 256.0, make_executor(name, workers=2))
     assert got.quantised_hash() == whole.quantised_hash()
 
 
 def test_a_store_fuses_and_publishes_what_it_holds_and_a_retraction_is_a_refold(store, crowd, whole):
-    first = store.fuse(executor=Inline())
+    first = store.fuse(executor=InlineExecutor())
     assert first.content == whole.quantised_hash() and first.watermark.observations == COUNT
     taken = [o.id for o in crowd.observations[:6]]
-    with store.writing() as log:
+    with store.open_for_writing() as log:
         log.retract(taken, "test")
-    second = store.fuse(executor=Inline())
+    second = store.fuse(executor=InlineExecutor())
     rest = [o for o in crowd.observations if o.id not in taken]
     assert second.content == fuse(rest, frame=crowd.place.frame).quantised_hash() != first.content
     assert second.watermark.observations == COUNT - 6 and second.parent == 1
-    assert set(store.delta(2).modified) & set(hex_ids(store.read(1).id))
+    assert set(store.delta(2).modified) & set(to_hex_ids(store.read(1).id))
 
 
 def test_every_block_reads_what_its_home_can_meet_and_nothing_from_far_away(store, tmp_path):
     standing = store.log.standing()
     blocks = make_blocks(
-        store.log.folder, standing, tmp_path, FuseConfig(), TileConfig(50.0, 1, halo_m=10.0, margin_m=5.0)
+        store.log.folder, standing, tmp_path, MapFusionConfig(), TiledFusionConfig(50.0, 1, halo_m=10.0, margin_m=5.0)
     )
-    assert sorted(name for block in blocks for name in block.home) == list(standing.ids)
+    assert sorted(name for block in blocks for name in block.home_ids) == list(standing.ids)
     for block in blocks:
         x0, y0, x1, y1 = block.area
         middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
-        far = np.hypot(*(block.standing.xy - middle).T)
-        assert set(block.home) <= set(block.standing.ids)
-        assert far.max() <= 36.0 + 2 * block.standing.reach_m.max() + 10.0
+        far = np.hypot(*(block.observations.xy - middle).T)
+        assert set(block.home_ids) <= set(block.observations.ids)
+        assert far.max() <= 36.0 + 2 * block.observations.radius_m.max() + 10.0
     assert len({block.key for block in blocks}) == len(blocks)
 
 
-def test_sightings_survive_the_work_folder_with_their_types_and_flags(store, tmp_path):
+def test_observation_arrays_round_trip_through_work_folder(store, tmp_path):
     standing = store.log.standing()
-    want = gather(read_standing(store.log.folder, standing, np.arange(5)), 1.0)
+    want = to_observation_arrays(read_active(store.log.folder, standing, np.arange(5)), 1.0)
     save_columns(tmp_path / "a.npz", want)
     got = load_columns(tmp_path / "a.npz", type(want))
     assert got is not None and got.ids == want.ids and got.agents == want.agents
@@ -155,4 +159,4 @@ def test_sightings_survive_the_work_folder_with_their_types_and_flags(store, tmp
 
 def test_sizes_that_make_no_sense_are_refused():
     with pytest.raises(ConfigError, match="TileConfig"):
-        TileConfig(tile_m=0.0)
+        TiledFusionConfig(tile_size_m=0.0)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.maps.fusion.topology import topology_of
+from manyeyes.maps.fusion.topology import build_topology
 
 
 def _line(x0, y0, x1, y1):
@@ -31,24 +31,24 @@ def _drawing():
 
 
 def test_successors_continue_straight_ahead():
-    pairs = topology_of(_drawing()).successor.tolist()
+    pairs = build_topology(_drawing()).successor.tolist()
     assert [0, 2] in pairs and [1, 3] in pairs
     assert all(pair[0] not in (2, 4, 5) for pair in pairs)
 
 
 def test_neighbours_have_sides():
-    t = topology_of(_drawing())
+    t = build_topology(_drawing())
     assert {(0, 1), (2, 3)} <= {tuple(p) for p in t.left.tolist()}
     assert {(1, 0), (3, 2)} <= {tuple(p) for p in t.right.tolist()}
     assert 6 not in np.concatenate((t.left, t.right))
 
 
 def test_three_ends_are_a_branch():
-    t = topology_of(_drawing())
+    t = build_topology(_drawing())
     assert len(t.branch_xy) == 1 and np.hypot(*(t.branch_xy[0] - (45.3, 3.5))) < 0.3
     assert t.branch.tolist() == [[0, 3], [0, 4], [0, 5]]
 
 
 def test_nothing_has_no_relations():
-    t = topology_of(MapElements.empty())
+    t = build_topology(MapElements.empty())
     assert len(t.successor) == len(t.left) == len(t.branch) == 0

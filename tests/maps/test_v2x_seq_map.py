@@ -8,20 +8,20 @@ import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, STOP_LINE
 from manyeyes.maps.formats.v2x_seq_map import V2xSeqMapError, read_v2x_seq_map
-from manyeyes.maps.roads.ground_truth import map_truth
+from manyeyes.maps.roads.ground_truth import build_ground_truth_map
 
 pytest.importorskip("shapely")
 
 
-def told(*points):
+def format_points(*points):
     return [f"({x}, {y})" for x, y in points]
 
 
 def lane(low, high, y_left, y_right, **fields):
     """From x = low to high (backwards where low is greater), its borders at these y."""
     base = {
-        "left_boundary": told((low, y_left), (high, y_left)),
-        "right_boundary": told((low, y_right), (high, y_right)),
+        "left_boundary": format_points((low, y_left), (high, y_left)),
+        "right_boundary": format_points((low, y_right), (high, y_right)),
     }
     return {**base, "lane_type": "CITY_DRIVING", **fields}
 
@@ -42,9 +42,9 @@ def crossing_map():
     bare = {"no-borders": {"lane_type": "CITY_DRIVING", "left_boundary": []}}
     return {
         "LANE": {**road(0, 60, "a"), **road(80, 140, "b"), **inner, **bare},
-        "JUNCTION": {"7": {"polygon": told((60, -8), (80, -8), (80, 8), (60, 8))}},
-        "CROSSWALK": {"3": {"polygon": told((54, -7), (58, -7), (58, 7), (54, 7))}},
-        "STOPLINE": {"5": {"centerline": told((52, -7), (52, 0))}},
+        "JUNCTION": {"7": {"polygon": format_points((60, -8), (80, -8), (80, 8), (60, 8))}},
+        "CROSSWALK": {"3": {"polygon": format_points((54, -7), (58, -7), (58, 7), (54, 7))}},
+        "STOPLINE": {"5": {"centerline": format_points((52, -7), (52, 0))}},
     }
 
 
@@ -59,7 +59,7 @@ def of_kind(truth, kind):
 
 
 def test_lines_between_lanes_are_dividers_and_outer_ones_edges_each_once(tmp_path):
-    truth = map_truth(read_v2x_seq_map(write(tmp_path, crossing_map())))
+    truth = build_ground_truth_map(read_v2x_seq_map(write(tmp_path, crossing_map())))
     dividers, edges = of_kind(truth, DIVIDER), of_kind(truth, BOUNDARY)
     # Three lines between four lanes, each one of the two that are stored, and two edges; on either side of the junction.
     for lines, heights in ((dividers, (-3.45, 0.05, 3.5)), (edges, (-7.0, 7.0))):
@@ -86,7 +86,7 @@ def test_lanes_know_their_junction_kind_and_successors(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "says"),
+    ("spoil", "message"),
     [
         (lambda root: root.pop("LANE"), "'LANE'"),
         (lambda root: root["LANE"]["a-1"].update(left_boundary=["(1, 2)", "(1"]), "LANE a-1 field 'left_boundary'"),
@@ -96,14 +96,14 @@ def test_lanes_know_their_junction_kind_and_successors(tmp_path):
     ],
     ids=["no lanes", "half a point", "one point", "no polygon", "a list"],
 )
-def test_bad_files_name_file_element_and_field(tmp_path, spoil, says):
+def test_bad_files_name_file_element_and_field(tmp_path, spoil, message):
     root = crossing_map()
     spoil(root)
-    with pytest.raises(V2xSeqMapError, match=says) as caught:
+    with pytest.raises(V2xSeqMapError, match=message) as caught:
         read_v2x_seq_map(write(tmp_path, root))
     assert "yizhuang06.json" in str(caught.value)
 
 
-def test_no_file_is_said_as_such(tmp_path):
+def test_missing_file_is_named(tmp_path):
     with pytest.raises(V2xSeqMapError, match=r"nowhere\.json"):
         read_v2x_seq_map(tmp_path / "nowhere.json")

@@ -10,8 +10,8 @@ import pytest
 
 from manyeyes.datatypes import ShapeError
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.maps.elements.observation import Frame
-from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, Stations, Topology, VectorMap
+from manyeyes.maps.elements.observation import MapFrame
+from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, PointEvidence, Topology, VectorMap
 
 LINES = [
     [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]],
@@ -23,9 +23,9 @@ A, B, C = ("0a" * 16, "0b" * 16, "0c" * 16)
 
 def small() -> VectorMap:
     whole = VectorMap.of(
-        MapElements.of(LINES, [0, 0, 2]), Frame(49.0, 8.0), [[B, A], [B], [C, B]], [2, 1, 2], ([1, 2, 3], [4, 5, 6])
+        MapElements.of(LINES, [0, 0, 2]), MapFrame(49.0, 8.0), [[B, A], [B], [C, B]], [2, 1, 2], ([1, 2, 3], [4, 5, 6])
     )
-    stations = replace(whole.stations, support=np.arange(9))
+    stations = replace(whole.point_evidence, support=np.arange(9))
     topology = Topology(
         successor=np.array([[0, 1]]),
         left=np.array([[0, 2]]),
@@ -33,7 +33,7 @@ def small() -> VectorMap:
         branch=np.array([[0, 0], [1, 1], [1, 2]]),
         branch_xy=np.array([[2.0, 0.0], [5.0, 5.0]]),
     )
-    return replace(whole, stations=stations, topology=topology)
+    return replace(whole, point_evidence=stations, topology=topology)
 
 
 def test_sources_are_found_by_element() -> None:
@@ -43,7 +43,7 @@ def test_sources_are_found_by_element() -> None:
 
 def test_a_part_keeps_its_points_evidence_sources_and_inner_relations() -> None:
     some = small().take([2, 1])
-    assert some.elements.kind.tolist() == [2, 0] and some.stations.support.tolist() == [5, 6, 7, 8, 3, 4]
+    assert some.elements.kind.tolist() == [2, 0] and some.point_evidence.support.tolist() == [5, 6, 7, 8, 3, 4]
     assert [some.sources_of(i) for i in range(2)] == [[B, C], [B]] and len(some.observations) == 2
     assert some.t_last.tolist() == [6, 5]
     assert some.topology.successor.tolist() == [] and some.topology.right.tolist() == [[0, 1]]
@@ -54,7 +54,7 @@ def test_maps_join_into_one_with_one_list_of_observations() -> None:
     one, two = small().take([0]), small().take([1, 2])
     both = VectorMap.cat([one, two])
     assert [both.sources_of(i) for i in range(3)] == [[A, B], [B], [B, C]] and len(both.observations) == 3
-    assert both.stations.support.tolist() == list(range(9)) and both.elements.first.tolist() == [0, 3, 5, 9]
+    assert both.point_evidence.support.tolist() == list(range(9)) and both.elements.offsets.tolist() == [0, 3, 5, 9]
     assert both.topology.right.tolist() == [[2, 1]]
     assert both.topology.branch_xy[both.topology.branch[:, 0]].tolist() == [[2, 0], [5, 5], [5, 5]]
     assert both.topology.branch[:, 1].tolist() == [0, 1, 2]
@@ -63,13 +63,13 @@ def test_maps_join_into_one_with_one_list_of_observations() -> None:
 
 def test_maps_of_two_frames_do_not_join() -> None:
     with pytest.raises(ShapeError, match="one frame"):
-        VectorMap.cat([small(), VectorMap.empty(Frame(1.0, 1.0))])
-    assert len(VectorMap.cat([], Frame(1.0, 1.0))) == 0
+        VectorMap.cat([small(), VectorMap.empty(MapFrame(1.0, 1.0))])
+    assert len(VectorMap.cat([], MapFrame(1.0, 1.0))) == 0
 
 
 def test_only_published_elements_remain() -> None:
     mixed = replace(small(), state=np.array([PUBLISHED, RETIRED, PUBLISHED]))
-    assert mixed.published().elements.kind.tolist() == [0, 2]
+    assert mixed.select_published().elements.kind.tolist() == [0, 2]
 
 
 def test_the_hash_knows_neither_order_nor_direction_nor_a_rings_start_nor_a_millimetre() -> None:
@@ -106,6 +106,6 @@ def test_columns_that_do_not_fit_are_refused_by_name() -> None:
     with pytest.raises(ShapeError, match=r"VectorMap.state needs shape \(3,\)"):
         replace(small(), state=np.zeros(2, np.int64))
     with pytest.raises(ShapeError, match="stations needs 9 rows"):
-        replace(small(), stations=Stations(*(np.zeros(8) for _ in range(6))))
+        replace(small(), point_evidence=PointEvidence(*(np.zeros(8) for _ in range(6))))
     with pytest.raises(ShapeError, match=r"sources\.first needs offsets"):
         replace(small(), sources=np.zeros(3, np.int64))

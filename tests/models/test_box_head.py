@@ -9,7 +9,7 @@ import torch
 from manyeyes.datatypes import LABELS, BevGrid, Boxes, Sites, SparseBev
 from manyeyes.models.detector.box_head import SPEED_UNIT, TYPICAL_SIZE, WIDTHS, BoxHead, DecodeConfig, RawBoxes, decode
 from manyeyes.ops.box_iou import pairwise_iou
-from manyeyes.training.detector.targets import TargetConfig, assign
+from manyeyes.training.detector.targets import TargetConfig, assign_targets
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0)
 
@@ -31,12 +31,12 @@ def some_boxes(n: int = 6, seed: int = 0) -> Boxes:
 
 def encode(boxes: Boxes, sites: Sites) -> RawBoxes:
     """The raw boxes that a perfect head would say: the inverse of decode."""
-    targets = assign(sites, [boxes], TargetConfig(reach_m=sites.grid.cell * 1.5))
+    targets = assign_targets(sites, [boxes], TargetConfig(assign_radius_m=sites.grid.cell_size_m * 1.5))
     n, at, truth = len(sites), targets.positive.nonzero()[:, 0], boxes[targets.box[targets.positive]]
     values = [torch.zeros(n, w) for w in WIDTHS]
     values[0][:] = -20.0
     values[0][at] = 20.0
-    values[1][at] = (truth.center[:, :2] - sites.xy[at]) / sites.grid.cell
+    values[1][at] = (truth.center[:, :2] - sites.xy[at]) / sites.grid.cell_size_m
     values[2][at] = truth.center[:, 2:]
     values[3][at] = (truth.size / torch.tensor(TYPICAL_SIZE)).log()
     values[4][at] = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1)
@@ -62,7 +62,7 @@ def test_decode_inverts_encode(stride):
     assert torch.equal(found.label, boxes.label)
     assert torch.allclose(found.velocity, boxes.velocity, atol=1e-4) and float(boxes.velocity.norm(dim=1).min()) > 1
     assert torch.allclose(found.sigma_xy, torch.full((len(boxes),), 0.25))
-    assert (found.flip < 1e-3).all() and (found.score > 0.99).all()
+    assert (found.p_flip < 1e-3).all() and (found.score > 0.99).all()
 
 
 def test_a_centre_half_a_cell_away_would_be_seen():
@@ -72,7 +72,7 @@ def test_a_centre_half_a_cell_away_would_be_seen():
     assert torch.allclose(wrong - sites.xy[:, 0], torch.full((len(sites),), 1.4), atol=1e-4)
 
 
-def test_the_opposite_heading_is_the_same_rectangle_and_says_so():
+def test_opposite_heading_gives_same_rectangle_and_flip_probability():
     boxes = some_boxes()
     raw = encode(boxes, every_site(4))
     turned = RawBoxes(**{**vars(raw), "direction": -raw.direction * 0.1})
@@ -81,8 +81,8 @@ def test_the_opposite_heading_is_the_same_rectangle_and_says_so():
     assert torch.allclose(overlap.max(1).values, torch.ones(len(found)).double(), atol=1e-5)
     twin = back.yaw[overlap.argmax(1)] - found.yaw
     assert torch.allclose(twin.cos(), -torch.ones(len(found)), atol=1e-5)
-    doubt = 1 - 1 / (1 + math.exp(-0.8))
-    assert torch.allclose(back.flip, torch.full((len(found),), doubt), atol=1e-5)
+    p_flip = 1 - 1 / (1 + math.exp(-0.8))
+    assert torch.allclose(back.p_flip, torch.full((len(found),), p_flip), atol=1e-5)
 
 
 def test_traffic_across_the_way_has_a_heading_without_a_seam():
@@ -95,7 +95,7 @@ def test_traffic_across_the_way_has_a_heading_without_a_seam():
             off = torch.stack((raw.axis[:, 0] * c - raw.axis[:, 1] * s, raw.axis[:, 0] * s + raw.axis[:, 1] * c), 1)
             (found,) = decode(RawBoxes(**{**vars(raw), "axis": off}), DecodeConfig())
             assert math.cos(float(found.yaw[0]) - yaw) > 0.999
-            assert float(found.flip[0]) < 1e-3
+            assert float(found.p_flip[0]) < 1e-3
 
 
 def test_grids_of_a_batch_may_hold_no_few_and_too_many_boxes():
@@ -121,11 +121,11 @@ def test_no_sites_no_boxes():
 def test_scores_fall_and_mix_heat_with_overlap():
     sites = every_site(8)
     raw = encode(some_boxes(), sites)
-    heat = torch.where(raw.heat > 0, torch.linspace(0.1, 2.0, len(sites)), raw.heat)
+    heat = torch.where(raw.heatmap_logit > 0, torch.linspace(0.1, 2.0, len(sites)), raw.heatmap_logit)
     raw = RawBoxes(**{**vars(raw), "heat": heat, "overlap": torch.zeros(len(sites))})
-    (found,) = decode(raw, DecodeConfig(overlap_power=0.5))
+    (found,) = decode(raw, DecodeConfig(iou_score_weight=0.5))
     assert (found.score[:-1] >= found.score[1:]).all()
-    best = torch.sigmoid(heat[raw.heat > 0]).max()
+    best = torch.sigmoid(heat[raw.heatmap_logit > 0]).max()
     assert float(found.score[0]) == pytest.approx(float((best * 0.5) ** 0.5), abs=1e-6)
 
 

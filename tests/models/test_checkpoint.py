@@ -20,7 +20,7 @@ from manyeyes.models.detector.presets import COSTR_TINY, DETECTORS
 def model() -> Detector:
     torch.manual_seed(0)
     model = Detector(COSTR_TINY)
-    model.train().see([cloud(), cloud()])
+    model.train().extract_features([cloud(), cloud()])
     return model.eval().requires_grad_(False)
 
 
@@ -55,7 +55,9 @@ def test_what_is_saved_is_loaded(model, path):
         if not name.endswith("num_batches_tracked"):
             assert torch.equal(loaded.state_dict()[name], value), name
     assert not any(p.requires_grad for p in loaded.parameters())
-    assert torch.equal(loaded.see([cloud()]).tokens.features, model.see([cloud()]).tokens.features)
+    assert torch.equal(
+        loaded.extract_features([cloud()]).tokens.features, model.extract_features([cloud()]).tokens.features
+    )
     assert loaded.fingerprint == fingerprint(model) != bytes(8)
     assert checkpoint.read_card(path) == {"seed": 7}
     assert [p.name for p in path.parent.iterdir()] == [path.name]
@@ -121,13 +123,14 @@ def test_another_format(path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("{", "not JSON"), ('{"grid": 3}', "has fields"), ("[1]", "has fields"), (None, "head_stride")]
+    ("text", "expected"),
+    [("{", "not JSON"), ('{"grid": 3}', "has fields"), ("[1]", "has fields"), (None, "head_stride")],
 )
-def test_a_damaged_configuration_names_the_file(model, path, text, said):
+def test_a_damaged_configuration_names_the_file(model, path, text, expected):
     config = json.loads(config_to_json(model.config))
     config["encoder"]["head_stride"] = 3
     rewrite(path, lambda _, metadata: metadata.update(config=json.dumps(config) if text is None else text))
-    assert said in error(path)
+    assert expected in error(path)
 
 
 @pytest.mark.parametrize("name", DETECTORS)
@@ -153,19 +156,19 @@ def test_a_path_is_loaded_as_it_is(model, path):
     assert pretrained.load(path).fingerprint == fingerprint(model)
 
 
-@pytest.mark.skipif(not pretrained.names(), reason="no weights are shipped yet")
-@pytest.mark.parametrize("name", pretrained.names())
+@pytest.mark.skipif(not pretrained.list_detectors(), reason="no weights are shipped yet")
+@pytest.mark.parametrize("name", pretrained.list_detectors())
 def test_shipped_weights_load_and_see(name):
     loaded = pretrained.load(name)
-    assert len(loaded.see([cloud()]).tokens.features) >= 0
+    assert len(loaded.extract_features([cloud()]).tokens.features) >= 0
     assert checkpoint.read_card(Path(pretrained.__file__).parent / "weights" / f"{name}.safetensors")
 
 
 def test_a_configuration_with_an_option_comes_back_and_an_older_one_gets_its_default():
     area = BevGrid(-10.0, -5.0, -3.0, 10.0, 5.0, 3.0)
-    config = DetectorConfig(BevGrid(-10.0, -10.0, -3.0, 10.0, 10.0, 3.0), answers=area)
+    config = DetectorConfig(BevGrid(-10.0, -10.0, -3.0, 10.0, 10.0, 3.0), output_range=area)
     text = config_to_json(config)
-    assert config_from_json(DetectorConfig, text) == config and config.range == area
+    assert config_from_json(DetectorConfig, text) == config and config.detection_range == area
     older = {k: v for k, v in json.loads(text).items() if k != "answers"}
     read = config_from_json(DetectorConfig, json.dumps(older))
     assert read.answers is None and read.range == read.grid

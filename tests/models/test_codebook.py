@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manyeyes.datatypes import LABELS, BevGrid, ConfigError, ShapeError, Sites
-from manyeyes.models.detector.box_head import RAW, DecodeConfig, RawBoxes, axis_yaw, decode, facing
-from manyeyes.models.detector.codebook import FREQUENCY_TOTAL, Codebook, CodebookConfig, nearest, residual_codes
-from manyeyes.models.detector.proposal import PROPOSAL, move_proposal, propose
+from manyeyes.models.detector.box_head import BOX_LAYOUT, DecodeConfig, RawBoxes, axis_yaw, decode, heading_logit
+from manyeyes.models.detector.codebook import FREQUENCY_TOTAL, Codebook, CodebookConfig, nearest_centre, residual_codes
+from manyeyes.models.detector.proposal import PROPOSAL_DIM, make_proposals, move_proposal
 from manyeyes.models.detector.proposal_codes import PROPOSAL_CODES, proposal_from_codes, proposal_to_codes
 
 torch.set_num_threads(1)
@@ -27,14 +27,18 @@ def proposals(seed: int, count: int = 200) -> torch.Tensor:
         return low + (high - low) * torch.rand(count, width, generator=g)
 
     yaw = uniform(-math.pi, math.pi)[:, 0]
-    rows = torch.zeros(count, PROPOSAL)
-    rows[:, RAW.heat], rows[:, RAW.offset], rows[:, RAW.z] = uniform(-7, 7), uniform(-2, 2, 2), uniform(-4, 4)
-    rows[:, RAW.log_size] = uniform(-1, 1, 3)
-    rows[:, RAW.axis] = torch.stack(((2 * yaw).cos(), (2 * yaw).sin()), 1)
-    rows[:, RAW.direction] = uniform(0.2, 10) * torch.stack((yaw.cos(), yaw.sin()), 1)
-    rows[:, RAW.kind] = uniform(-6, 6, len(LABELS))
-    rows[:, RAW.log_sigma_xy], rows[:, RAW.log_sigma_yaw] = uniform(-3.9, 1.9), uniform(-3.9, 1.9)
-    rows[:, RAW.overlap], rows[:, RAW.velocity] = uniform(-5, 5), uniform(-3, 3, 2)
+    rows = torch.zeros(count, PROPOSAL_DIM)
+    rows[:, BOX_LAYOUT.heatmap_logit], rows[:, BOX_LAYOUT.offset], rows[:, BOX_LAYOUT.z] = (
+        uniform(-7, 7),
+        uniform(-2, 2, 2),
+        uniform(-4, 4),
+    )
+    rows[:, BOX_LAYOUT.log_size] = uniform(-1, 1, 3)
+    rows[:, BOX_LAYOUT.axis] = torch.stack(((2 * yaw).cos(), (2 * yaw).sin()), 1)
+    rows[:, BOX_LAYOUT.direction] = uniform(0.2, 10) * torch.stack((yaw.cos(), yaw.sin()), 1)
+    rows[:, BOX_LAYOUT.class_logits] = uniform(-6, 6, len(LABELS))
+    rows[:, BOX_LAYOUT.log_sigma_xy], rows[:, BOX_LAYOUT.log_sigma_yaw] = uniform(-3.9, 1.9), uniform(-3.9, 1.9)
+    rows[:, BOX_LAYOUT.iou_logit], rows[:, BOX_LAYOUT.velocity] = uniform(-5, 5), uniform(-3, 3, 2)
     return rows
 
 
@@ -42,36 +46,41 @@ def proposals(seed: int, count: int = 200) -> torch.Tensor:
 @given(st.integers(0, 10**6))
 def test_a_box_comes_back_within_3_cm_and_half_a_degree(seed):
     """Centre in three dimensions, on the shipped models' lattice; sizes within 1 %; velocity within 0.125 m/s an axis."""
-    said = proposals(seed)
-    codes = proposal_to_codes(said)
+    original = proposals(seed)
+    codes = proposal_to_codes(original)
     assert codes.dtype == torch.uint8 and codes.shape == (200, PROPOSAL_CODES)
     back = proposal_from_codes(codes)
-    away = torch.cat(((back - said)[:, RAW.offset] * GRID.cell, (back - said)[:, RAW.z]), 1)
+    away = torch.cat(
+        ((back - original)[:, BOX_LAYOUT.offset] * GRID.cell_size_m, (back - original)[:, BOX_LAYOUT.z]), 1
+    )
     assert away.norm(dim=1).max() < 0.03
     turn = (
-        torch.remainder(axis_yaw(back[:, RAW.axis]) - axis_yaw(said[:, RAW.axis]) + math.pi / 2, math.pi) - math.pi / 2
+        torch.remainder(
+            axis_yaw(back[:, BOX_LAYOUT.axis]) - axis_yaw(original[:, BOX_LAYOUT.axis]) + math.pi / 2, math.pi
+        )
+        - math.pi / 2
     )
     assert turn.abs().max() <= math.radians(0.36)
-    assert ((back - said)[:, RAW.log_size].exp() - 1).abs().max() < 0.01
-    assert (back - said)[:, RAW.velocity].abs().max() * 10 <= 0.1251
-    for column in (RAW.heat, RAW.overlap):
-        assert (back - said)[:, column].abs().max() <= 1 / 32 + 1e-5
-    for column in (RAW.log_sigma_xy, RAW.log_sigma_yaw):
-        assert (back - said)[:, column].abs().max() <= 0.2001
-    assert torch.equal(back[:, RAW.kind].argmax(1), said[:, RAW.kind].argmax(1))
+    assert ((back - original)[:, BOX_LAYOUT.log_size].exp() - 1).abs().max() < 0.01
+    assert (back - original)[:, BOX_LAYOUT.velocity].abs().max() * 10 <= 0.1251
+    for column in (BOX_LAYOUT.heatmap_logit, BOX_LAYOUT.iou_logit):
+        assert (back - original)[:, column].abs().max() <= 1 / 32 + 1e-5
+    for column in (BOX_LAYOUT.log_sigma_xy, BOX_LAYOUT.log_sigma_yaw):
+        assert (back - original)[:, column].abs().max() <= 0.2001
+    assert torch.equal(back[:, BOX_LAYOUT.class_logits].argmax(1), original[:, BOX_LAYOUT.class_logits].argmax(1))
 
 
 @QUICK
 @given(st.integers(0, 10**6), st.floats(-3, 3))
 def test_what_is_decoded_is_the_same_box_facing_the_same_way_in_any_frame(seed, yaw):
     """Also after the receiver has turned it: the seams of axis and direction are nowhere."""
-    said = proposals(seed)
-    back = proposal_from_codes(proposal_to_codes(said))
+    original = proposals(seed)
+    back = proposal_from_codes(proposal_to_codes(original))
     turn, height = torch.tensor(yaw), torch.zeros(200)
     sites = Sites(torch.arange(200), GRID)
-    a, b = (RawBoxes.of(move_proposal(rows, turn, height), sites) for rows in (said, back))
+    a, b = (RawBoxes.of(move_proposal(rows, turn, height), sites) for rows in (original, back))
     ahead = [
-        torch.sign(facing(raw))[:, None] * torch.stack((axis_yaw(raw.axis).cos(), axis_yaw(raw.axis).sin()), 1)
+        torch.sign(heading_logit(raw))[:, None] * torch.stack((axis_yaw(raw.axis).cos(), axis_yaw(raw.axis).sin()), 1)
         for raw in (a, b)
     ]
     assert ((ahead[0] * ahead[1]).sum(1) > 0.99).all()
@@ -81,15 +90,15 @@ def test_what_is_decoded_is_the_same_box_facing_the_same_way_in_any_frame(seed, 
 
 
 def test_standing_still_is_written_as_it_is_and_fast_saturates():
-    rows = torch.zeros(2, PROPOSAL)
-    rows[:, RAW.axis] = torch.tensor([1.0, 0.0])
-    rows[1, RAW.velocity] = torch.tensor([9.0, -9.0])
-    rows[1, RAW.offset] = torch.tensor([7.0, -7.0])
+    rows = torch.zeros(2, PROPOSAL_DIM)
+    rows[:, BOX_LAYOUT.axis] = torch.tensor([1.0, 0.0])
+    rows[1, BOX_LAYOUT.velocity] = torch.tensor([9.0, -9.0])
+    rows[1, BOX_LAYOUT.offset] = torch.tensor([7.0, -7.0])
     back = proposal_from_codes(proposal_to_codes(rows))
-    assert back[0, RAW.velocity].tolist() == [0, 0] and back[0, RAW.offset].tolist() == [0, 0]
-    assert (back[1, RAW.velocity] * 10).tolist() == pytest.approx([31.75, -31.75])
+    assert back[0, BOX_LAYOUT.velocity].tolist() == [0, 0] and back[0, BOX_LAYOUT.offset].tolist() == [0, 0]
+    assert (back[1, BOX_LAYOUT.velocity] * 10).tolist() == pytest.approx([31.75, -31.75])
     # Beyond the reach of a vote before and after (fusion.settle.REACH_CELLS = 2).
-    assert back[1, RAW.offset].tolist() == pytest.approx([2.25, -2.25])
+    assert back[1, BOX_LAYOUT.offset].tolist() == pytest.approx([2.25, -2.25])
 
 
 def test_any_bytes_are_some_proposal_and_writing_it_again_keeps_it():
@@ -123,39 +132,42 @@ def test_nearest_is_the_nearest():
     g = torch.Generator().manual_seed(1)
     x, centres = torch.randn(300, 5, generator=g), torch.randn(40, 5, generator=g)
     slow = torch.stack([((row - centres) ** 2).sum(1).argmin() for row in x])
-    assert torch.equal(nearest(x, centres), slow)
+    assert torch.equal(nearest_centre(x, centres), slow)
 
 
 def test_each_stage_leaves_less_over_and_sums_of_centres_are_exact():
     g = torch.Generator().manual_seed(2)
     x = torch.cat((torch.randn(400, 8, generator=g), proposals(0, 400)), 1)
-    errors = [(filled(k).read(filled(k).write(x)) - x)[:, :8].square().mean() for k in (1, 2, 3, 4)]
+    errors = [(filled(k).decode(filled(k).encode(x)) - x)[:, :8].square().mean() for k in (1, 2, 3, 4)]
     assert errors == sorted(errors, reverse=True)
     book = filled(1)
     exact = torch.cat((book.centres[0], proposals(0, 256)), 1)
-    assert torch.equal(book.read(book.write(exact))[:, :8], book.centres[0])
+    assert torch.equal(book.decode(book.encode(exact))[:, :8], book.centres[0])
 
 
 def test_any_bytes_are_read_also_where_there_are_few_centres():
     book = filled(2, size=3)
     rows = torch.randint(0, 256, (100, book.width), generator=torch.Generator().manual_seed(3)).to(torch.uint8)
-    assert torch.isfinite(book.read(rows)).all()
-    assert book.read(rows[:0]).shape == (0, 8 + PROPOSAL) and book.write(book.read(rows[:0])).shape == (0, book.width)
+    assert torch.isfinite(book.decode(rows)).all()
+    assert book.decode(rows[:0]).shape == (0, 8 + PROPOSAL_DIM) and book.encode(book.decode(rows[:0])).shape == (
+        0,
+        book.width,
+    )
     assert int(book.frequencies.sum()) == FREQUENCY_TOTAL * book.width
 
 
 def test_rows_of_another_width_are_refused():
     book = filled(2)
     with pytest.raises(ShapeError, match="8 features; got 9"):
-        book.write(torch.zeros(1, 9 + PROPOSAL))
+        book.encode(torch.zeros(1, 9 + PROPOSAL_DIM))
     with pytest.raises(ShapeError, match="rows of"):
-        book.read(torch.zeros(1, 3, dtype=torch.uint8))
+        book.decode(torch.zeros(1, 3, dtype=torch.uint8))
     for config in ((0, 256), (4, 257), (4, 0)):
         with pytest.raises(ConfigError, match="256 centres"):
             CodebookConfig(*config)
 
 
-def test_a_told_proposal_fits_its_codes():
+def test_detector_proposals_fit_their_codes():
     sites = Sites(torch.arange(50), GRID)
     raw = RawBoxes.of(proposals(4, 50), sites)
-    assert proposal_to_codes(propose(raw)).shape == (50, PROPOSAL_CODES)
+    assert proposal_to_codes(make_proposals(raw)).shape == (50, PROPOSAL_CODES)

@@ -9,39 +9,39 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, SparseBev, Transform
-from manyeyes.models.detector.box_head import RAW, SPEED_UNIT
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.transformer import AttentionConfig
-from manyeyes.models.fusion.flow_aware import FlowAwareFusion, PastAttention
-from manyeyes.models.fusion.positional_encoding import Placement, temporal_encoding
+from manyeyes.models.fusion.flow_aware import FastFusion, PastAttention
+from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding, temporal_encoding
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
-from manyeyes.models.fusion.token_merge import DRIFT_MPS, settle
-from manyeyes.models.fusion.transform_tokens import FASTEST_MPS, Part, Tokens, gather
+from manyeyes.models.fusion.token_merge import DRIFT_MPS, assign_cells
+from manyeyes.models.fusion.transform_tokens import MAX_SPEED_MPS, AgentTokens, Tokens, to_ego_frame
 from manyeyes.ops.window_attention import sincos_encoding, window_ids, window_offsets
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 16
 CONFIG = AttentionConfig(heads=2)
-EDGE, ORIGIN = 8 * GRID.cell, (GRID.x_min, GRID.y_min)
+EDGE, ORIGIN = 8 * GRID.cell_size_m, (GRID.x_min, GRID.y_min)
 
 
-def told(seed: int, n: int = 60) -> SparseBev:
+def random_tokens(seed: int, n: int = 60) -> SparseBev:
     random = torch.Generator().manual_seed(seed)
     key = torch.randperm(GRID.shape[0] * GRID.shape[1], generator=random)[:n]
-    rows = torch.randn(n, CHANNELS + PROPOSAL, generator=random)
-    rows[:, CHANNELS:][:, RAW.velocity] = 0.0
+    rows = torch.randn(n, CHANNELS + PROPOSAL_DIM, generator=random)
+    rows[:, CHANNELS:][:, BOX_LAYOUT.velocity] = 0.0
     return SparseBev.from_cells(rows, torch.stack((key // GRID.shape[1], key % GRID.shape[1]), 1), GRID)
 
 
 def own(seed: int = 0, n: int = 60) -> Tokens:
-    some = told(seed, n)
-    return gather([Part(0, some.features, some.sites.xy)], GRID, 1)
+    some = random_tokens(seed, n)
+    return to_ego_frame([AgentTokens(0, some.features, some.sites.xy)], GRID, 1)
 
 
 def past(seed: int = 7, n: int = 60, x: float = -0.8, age_s: float = 0.1) -> Tokens:
     """What the ego told a moment ago, moved by its own drive."""
-    some = told(seed, n)
-    return gather([Part(0, some.features, some.sites.xy, Transform.from_xyz_yaw(x, 0.0), age_s)], GRID, 1)
+    some = random_tokens(seed, n)
+    return to_ego_frame([AgentTokens(0, some.features, some.sites.xy, Transform.from_xyz_yaw(x, 0.0), age_s)], GRID, 1)
 
 
 def attention() -> PastAttention:
@@ -55,7 +55,7 @@ def attention() -> PastAttention:
 # Eq. 9: when.
 
 
-def test_now_is_told_by_nothing_at_all():
+def test_encoding_of_zero_age_is_zero():
     assert not temporal_encoding(torch.zeros(3), 16).any()
 
 
@@ -70,7 +70,7 @@ def test_temporal_encoding_by_its_formula():
     assert 10000.0 ** (-2 * 7 / 16) > 1e-4
 
 
-def test_every_tenth_of_a_second_is_told_from_every_other():
+def test_every_tenth_of_a_second_has_distinct_encoding():
     """A9: in units of 100 ms; in seconds the same steps would hardly differ."""
     codes = temporal_encoding(torch.arange(5.0), 64)
     apart = torch.cdist(codes, codes) + 9 * torch.eye(5)
@@ -81,15 +81,15 @@ def test_every_tenth_of_a_second_is_told_from_every_other():
 def test_a_fresh_placement_is_the_literal_model():
     """A11: frame, doubt, age and proposal are told by ways that end in zeros."""
     tokens = past(age_s=0.3)
-    tokens = dataclasses.replace(tokens, cue=torch.randn_like(tokens.cue))
-    placed = Placement(CHANNELS)(tokens.features, tokens, torch.rand(len(tokens.xy), 2))
+    tokens = dataclasses.replace(tokens, pose_context=torch.randn_like(tokens.pose_context))
+    placed = SpatioTemporalEncoding(CHANNELS)(tokens.features, tokens, torch.rand(len(tokens.xy), 2))
     assert torch.equal(placed, tokens.features)
 
 
-def test_a_trained_placement_tells_ages_apart_by_their_own_way():
-    placement, tokens = Placement(CHANNELS), past(age_s=0.1)
+def test_trained_encoding_separates_ages():
+    placement, tokens = SpatioTemporalEncoding(CHANNELS), past(age_s=0.1)
     torch.nn.init.normal_(placement.temporal.weight)
-    older = dataclasses.replace(tokens, cue=tokens.cue.index_fill(1, torch.tensor([4]), 3.0))
+    older = dataclasses.replace(tokens, pose_context=tokens.pose_context.index_fill(1, torch.tensor([4]), 3.0))
     place = torch.zeros(len(tokens.xy), 2)
     one, other = (placement(t.features, t, place) for t in (tokens, older))
     wanted = placement.temporal(temporal_encoding(torch.tensor([3.0, 1.0]), CHANNELS))
@@ -102,7 +102,9 @@ def test_a_trained_placement_tells_ages_apart_by_their_own_way():
 def slow(model: PastAttention, features: Tensor, tokens: Tokens, remembered: Tensor, before: Tokens) -> Tensor:
     """A loop over tokens: attention to the past of the same window, and where there is none, nothing."""
     ids = [window_ids(t.xy, t.ego, ORIGIN, EDGE) for t in (tokens, before)]
-    here, there = (sincos_encoding(window_offsets(t.xy, ORIGIN, EDGE, GRID.cell), CHANNELS) for t in (tokens, before))
+    here, there = (
+        sincos_encoding(window_offsets(t.xy, ORIGIN, EDGE, GRID.cell_size_m), CHANNELS) for t in (tokens, before)
+    )
     query = model.query(model.norm(features) + here)
     known = model.norm_past(remembered)
     key, value, out = model.key(known + there), model.value(known), features.clone()
@@ -159,8 +161,8 @@ def test_windows_with_more_past_than_cells_lose_none_of_it():
 
     def crowd(n: int) -> Tokens:
         xy = torch.rand(n, 2, generator=random) * EDGE + GRID.x_min
-        rows = torch.randn(n, CHANNELS + PROPOSAL, generator=random)
-        return gather([Part(0, rows, xy)], GRID, 1)
+        rows = torch.randn(n, CHANNELS + PROPOSAL_DIM, generator=random)
+        return to_ego_frame([AgentTokens(0, rows, xy)], GRID, 1)
 
     tokens, before = crowd(100), crowd(100)
     with torch.no_grad():
@@ -172,9 +174,9 @@ def test_windows_with_more_past_than_cells_lose_none_of_it():
 
 
 def test_egos_of_a_batch_do_not_remember_for_each_other():
-    model, a, b = attention(), told(0), told(7)
-    tokens = gather([Part(0, a.features, a.sites.xy), Part(1, a.features, a.sites.xy)], GRID, 2)
-    before = gather([Part(1, b.features, b.sites.xy, Transform.identity(), 0.1)], GRID, 2)
+    model, a, b = attention(), random_tokens(0), random_tokens(7)
+    tokens = to_ego_frame([AgentTokens(0, a.features, a.sites.xy), AgentTokens(1, a.features, a.sites.xy)], GRID, 2)
+    before = to_ego_frame([AgentTokens(1, b.features, b.sites.xy, Transform.identity(), 0.1)], GRID, 2)
     with torch.no_grad():
         out = model(tokens.features, tokens, before.features, before)
     first, second = tokens.ego == 0, tokens.ego == 1
@@ -184,36 +186,36 @@ def test_egos_of_a_batch_do_not_remember_for_each_other():
 def test_a_fresh_fusion_with_a_past_is_self_attention():
     """T = I, one agent, whatever it remembers: before it has learned, FAST is DAST in its place."""
     torch.manual_seed(0)
-    flow = FlowAwareFusion(CHANNELS, CONFIG).eval()
+    flow = FastFusion(CHANNELS, CONFIG).eval()
     plain = SelfAttentionFusion(CHANNELS, CONFIG).eval()
     plain.load_state_dict({k: v for k, v in flow.state_dict().items() if not k.startswith("past.")})
     with torch.no_grad():
         a, b, c = flow(own(), past()), flow(own()), plain(own(), past())
     for other in (b, c):
         assert torch.equal(a.bev.features, other.bev.features) and torch.equal(a.given, other.given)
-    torch.nn.init.normal_(flow.past.out.weight)
+    torch.nn.init.normal_(flow.past_attention.out.weight)
     with torch.no_grad():
         assert not torch.allclose(flow(own(), past()).bev.features, a.bev.features, atol=1e-3)
         assert torch.equal(flow(own(), past(n=0)).bev.features, a.bev.features)
 
 
 def test_the_past_adds_no_sites_of_its_own():
-    fusion = FlowAwareFusion(CHANNELS, CONFIG).eval()
+    fusion = FastFusion(CHANNELS, CONFIG).eval()
     tokens = own()
     with torch.no_grad():
-        assert torch.equal(fusion(tokens, past(n=300)).bev.sites.key, settle(tokens)[0].unique())
+        assert torch.equal(fusion(tokens, past(n=300)).bev.sites.key, assign_cells(tokens)[0].unique())
 
 
 # Where, by now.
 
 
-def moving(x: float, y: float, vx: float, vy: float, age_s: float = 0.4, yaw: float = 0.0, **doubt: float) -> Tokens:
+def moving(x: float, y: float, vx: float, vy: float, age_s: float = 0.4, yaw: float = 0.0, **sigmas: float) -> Tokens:
     """One late token of a thing that drives so fast, in its sender's axes; the sender stands at the ego's, turned."""
-    row = torch.zeros(1, CHANNELS + PROPOSAL)
-    row[:, CHANNELS:][:, RAW.velocity] = torch.tensor([[vx, vy]]) / SPEED_UNIT
-    row[:, CHANNELS:][:, RAW.heat] = 3.0
+    row = torch.zeros(1, CHANNELS + PROPOSAL_DIM)
+    row[:, CHANNELS:][:, BOX_LAYOUT.velocity] = torch.tensor([[vx, vy]]) / SPEED_UNIT
+    row[:, CHANNELS:][:, BOX_LAYOUT.heatmap_logit] = 3.0
     sender = Transform.from_xyz_yaw(0.0, 0.0, 0.0, yaw)
-    return gather([Part(0, row, torch.tensor([[x, y]]), sender, age_s, **doubt)], GRID, 1)
+    return to_ego_frame([AgentTokens(0, row, torch.tensor([[x, y]]), sender, age_s, **sigmas)], GRID, 1)
 
 
 def test_a_late_token_stands_where_its_object_is_by_now():
@@ -223,10 +225,10 @@ def test_a_late_token_stands_where_its_object_is_by_now():
     assert moving(2.0, 1.0, 10.0, -5.0, age_s=0.0).xy[0].tolist() == pytest.approx([2.0, 1.0], abs=1e-6)
 
 
-def test_a_speed_that_no_car_has_is_not_believed():
-    assert moving(2.0, 1.0, FASTEST_MPS + 1, 0.0).xy[0].tolist() == pytest.approx([2.0, 1.0], abs=1e-6)
-    assert float(moving(-9.0, 1.0, FASTEST_MPS - 1, 0.0).xy[0, 0]) == pytest.approx(
-        -9 + 0.4 * (FASTEST_MPS - 1), abs=1e-5
+def test_implausible_speed_is_ignored():
+    assert moving(2.0, 1.0, MAX_SPEED_MPS + 1, 0.0).xy[0].tolist() == pytest.approx([2.0, 1.0], abs=1e-6)
+    assert float(moving(-9.0, 1.0, MAX_SPEED_MPS - 1, 0.0).xy[0, 0]) == pytest.approx(
+        -9 + 0.4 * (MAX_SPEED_MPS - 1), abs=1e-5
     )
 
 
@@ -242,34 +244,34 @@ def test_there_and_back_again():
     assert torch.allclose(motion.inverse().apply(there)[:, :2], xy, atol=1e-9)
 
 
-def meeting(x: float, **claim: float) -> float:
+def merged_x(x: float, **prior: float) -> float:
     """Where the merged box of two tokens on one cell lies: one at 0.2 that is certain, one that says x under a claim."""
-    rows = torch.zeros(2, CHANNELS + PROPOSAL)
+    rows = torch.zeros(2, CHANNELS + PROPOSAL_DIM)
     box = rows[:, CHANNELS:]
-    box[:, RAW.heat], box[:, RAW.log_sigma_xy] = 2.0, math.log(0.2)
-    box[:, RAW.axis] = torch.tensor([1.0, 0.0])
-    box[1, RAW.offset] = torch.tensor([(x - 0.2) / GRID.cell, 0.0])
+    box[:, BOX_LAYOUT.heatmap_logit], box[:, BOX_LAYOUT.log_sigma_xy] = 2.0, math.log(0.2)
+    box[:, BOX_LAYOUT.axis] = torch.tensor([1.0, 0.0])
+    box[1, BOX_LAYOUT.offset] = torch.tensor([(x - 0.2) / GRID.cell_size_m, 0.0])
     at = torch.tensor([[0.2, 0.2]])
-    parts = [Part(0, rows[:1], at), Part(0, rows[1:], at, Transform.identity(), **claim)]
-    fusion = FlowAwareFusion(CHANNELS, CONFIG).eval()
-    tokens = gather(parts, GRID, 1)
+    parts = [AgentTokens(0, rows[:1], at), AgentTokens(0, rows[1:], at, Transform.identity(), **prior)]
+    fusion = FastFusion(CHANNELS, CONFIG).eval()
+    tokens = to_ego_frame(parts, GRID, 1)
     with torch.no_grad():
-        fused = fusion.settle(tokens.features, tokens, *settle(tokens))
+        fused = fusion.merge(tokens.features, tokens, *assign_cells(tokens))
     assert len(fused.bev.sites) == 1
-    return 0.2 + float(fused.given[0, RAW.offset][0]) * GRID.cell
+    return 0.2 + float(fused.given[0, BOX_LAYOUT.offset][0]) * GRID.cell_size_m
 
 
-def test_doubt_and_age_lower_the_trust_in_a_box_by_what_it_may_be_off():
+def test_pose_sigma_and_age_lower_the_merge_weight():
     # Trust starts as a softmax of - log sigma: shares go as one over the standard deviations.
-    assert meeting(0.8) == pytest.approx(0.5, abs=1e-5)
-    for claim, moved in (({"doubt_xy_m": 0.6}, 0.6), ({"age_s": 0.4}, 0.4 * DRIFT_MPS)):
+    assert merged_x(0.8) == pytest.approx(0.5, abs=1e-5)
+    for prior, moved in (({"doubt_xy_m": 0.6}, 0.6), ({"age_s": 0.4}, 0.4 * DRIFT_MPS)):
         sigma = math.hypot(0.2, moved)
         share = (1 / sigma) / (1 / sigma + 1 / 0.2)
-        assert meeting(0.8, **claim) == pytest.approx(0.2 + 0.6 * share, abs=1e-4)
-    assert meeting(0.8, doubt_xy_m=0.6, age_s=0.4) < meeting(0.8, doubt_xy_m=0.6) < meeting(0.8, age_s=0.4) < 0.5
+        assert merged_x(0.8, **prior) == pytest.approx(0.2 + 0.6 * share, abs=1e-4)
+    assert merged_x(0.8, sigma_xy_m=0.6, age_s=0.4) < merged_x(0.8, sigma_xy_m=0.6) < merged_x(0.8, age_s=0.4) < 0.5
 
 
-def test_doubt_in_heading_grows_with_the_distance_from_its_sender():
-    near, far = (moving(x, 0.0, 0.0, 0.0, doubt_yaw_rad=0.02, doubt_xy_m=0.3).doubt for x in (1.0, 20.0))
+def test_heading_sigma_grows_with_distance_from_sender():
+    near, far = (moving(x, 0.0, 0.0, 0.0, sigma_yaw_rad=0.02, sigma_xy_m=0.3).sigma_m for x in (1.0, 20.0))
     assert float(near) == pytest.approx(math.hypot(0.3, 0.02), abs=1e-6)
     assert float(far) == pytest.approx(math.hypot(0.3, 0.4), abs=1e-6)

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from manyeyes.agents.perception_cache import Eyes
+from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.datatypes import PointCloud
 from manyeyes.models.detector.detector import Detector
-from manyeyes.models.detector.fold_norms import folded
+from manyeyes.models.detector.fold_norms import fold_norms
 from manyeyes.models.detector.layers import ActiveNorm
 from manyeyes.models.detector.presets import COSTR_TINY
 
@@ -26,20 +26,22 @@ def _model(head_stride: int) -> tuple[Detector, PointCloud]:
             norm.momentum = 0.5
             norm.weight.uniform_(0.5, 1.5)
             norm.bias.uniform_(-0.5, 0.5)
-        model.see([cloud])
+        model.extract_features([cloud])
     return model.eval(), cloud
 
 
 @pytest.mark.parametrize("head_stride", [2, 4, 8])
-def test_the_folded_copy_says_the_same(head_stride: int) -> None:
+def test_folded_copy_gives_same_outputs(head_stride: int) -> None:
     model, cloud = _model(head_stride)
     before = {k: v.clone() for k, v in model.state_dict().items()}
-    ours, theirs = Eyes(folded(model)).see_cloud(cloud), Eyes(model).see_cloud(cloud)
-    assert torch.equal(ours.told.sites.key, theirs.told.sites.key)
-    scale = theirs.told.features.abs().max()
+    ours, theirs = PerceptionCache(fold_norms(model)).run_detector(cloud), PerceptionCache(model).run_detector(cloud)
+    assert torch.equal(ours.shared_tokens.sites.key, theirs.shared_tokens.sites.key)
+    scale = theirs.shared_tokens.features.abs().max()
     assert scale > 0.1
-    assert torch.allclose(ours.told.features, theirs.told.features, atol=1e-5 * float(scale.clamp_min(1)))
-    assert torch.allclose(ours.raw.heat, theirs.raw.heat, atol=1e-5)
+    assert torch.allclose(
+        ours.shared_tokens.features, theirs.shared_tokens.features, atol=1e-5 * float(scale.clamp_min(1))
+    )
+    assert torch.allclose(ours.raw.heatmap_logit, theirs.raw.heatmap_logit, atol=1e-5)
     after = model.state_dict()
     assert before.keys() == after.keys()
     assert all(torch.equal(after[k], v) for k, v in before.items())
@@ -47,7 +49,7 @@ def test_the_folded_copy_says_the_same(head_stride: int) -> None:
 
 def test_no_norm_is_left_in_the_encoder_and_the_head_keeps_its_own() -> None:
     model, _ = _model(4)
-    copied = folded(model)
+    copied = fold_norms(model)
     assert not [m for m in copied.encoder.modules() if isinstance(m, ActiveNorm)]
     assert [m for m in model.encoder.modules() if isinstance(m, ActiveNorm)]
     assert [m for m in copied.head.modules() if isinstance(m, torch.nn.LayerNorm)]

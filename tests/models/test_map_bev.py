@@ -6,7 +6,7 @@ import torch
 
 from manyeyes.datatypes import BevGrid, ConfigError, PointCloud, Transform
 from manyeyes.datatypes.camera import Camera, CameraImage
-from manyeyes.models.maps.bev import BevConfig, CameraBev, LidarBev, rasterise
+from manyeyes.models.maps.bev import BevConfig, CameraBev, LidarBev, rasterise_clouds
 from manyeyes.models.maps.image_encoder import ImageEncoderConfig
 from manyeyes.models.maps.view_transform import DepthBins
 from manyeyes.ops.voxelize import MOMENTS
@@ -16,11 +16,11 @@ CONFIG = BevConfig(
     GRID,
     ("lidar", "camera"),
     channels=16,
-    raster_width=8,
+    raster_channels=8,
     raster_blocks=(1, 1),
-    image=ImageEncoderConfig((1, 1), 8, channels=16),
+    image_encoder=ImageEncoderConfig((1, 1), 8, channels=16),
     image_size=(48, 64),
-    depth=DepthBins(1.0, 13.0, 7),
+    depth_bins=DepthBins(1.0, 13.0, 7),
 )
 
 
@@ -33,7 +33,7 @@ def photo(value=100):
 
 def test_the_raster_holds_moments_where_there_are_returns():
     bright = PointCloud.of(torch.tensor([[0.1, 0.2, 0.0], [0.3, 0.2, 0.5]]), torch.tensor([0.2, 0.6]))
-    raster, hit = rasterise([PointCloud.of(torch.zeros(0, 3)), bright], GRID)
+    raster, hit = rasterise_clouds([PointCloud.of(torch.zeros(0, 3)), bright], GRID)
     assert raster.shape == (2, len(MOMENTS) + 1, 32, 32) and int(hit.sum()) == 1 and bool(hit[1, 16, 16])
     cell = dict(zip(MOMENTS, raster[1, :, 16, 16].tolist()))
     assert cell["mean_intensity"] == pytest.approx(4 * 0.4) and cell["max_intensity"] == pytest.approx(3 * 0.6)
@@ -50,7 +50,7 @@ def test_a_cell_is_seen_where_a_return_lies_in_or_beside_it():
     assert not bool(seen[1].any())
 
 
-def test_a_look_does_not_depend_on_the_others_of_its_batch():
+def test_frame_is_independent_of_the_rest_of_its_batch():
     generator = torch.Generator().manual_seed(1)
     clouds = [PointCloud.of(torch.randn(200, 3, generator=generator) * 3) for _ in range(3)]
     net = LidarBev(CONFIG).eval()
@@ -68,7 +68,7 @@ def test_pictures_reach_the_ground_ahead_and_learn(lift):
     assert first.grad is not None and float(first.grad.abs().max()) > 0
 
 
-def test_nobody_has_a_picture():
+def test_batch_without_images():
     features, seen = CameraBev(CONFIG)([[], []])
     assert features.shape == (2, 16, 16, 16) and not bool(seen.any())
 

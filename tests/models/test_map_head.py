@@ -16,11 +16,20 @@ from manyeyes.models.maps.head import (
     MapHeadConfig,
     RawMap,
     _SelfAttention,
-    decode,
-    waves,
+    decode_elements,
+    encode_position,
 )
 
-TINY = MapHeadConfig(elements=6, points=5, many=9, channels=16, feed=32, layers=2, heads=4, places=3)
+TINY = MapHeadConfig(
+    num_queries=6,
+    num_points=5,
+    num_one_to_many_queries=9,
+    channels=16,
+    feedforward_channels=32,
+    layers=2,
+    heads=4,
+    num_sampling_points=3,
+)
 THREE = torch.tensor([[2.0, 0.0], [8.0, 3.0], [5.0, 6.0]])
 TILE = BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=2.0)
 
@@ -42,12 +51,12 @@ def test_every_layer_answers_for_every_query_of_its_group():
 
 
 def test_one_group_knows_nothing_of_the_other():
-    few, more = MapHead(TINY).eval(), MapHead(dataclasses.replace(TINY, many=12)).eval()
+    few, more = MapHead(TINY).eval(), MapHead(dataclasses.replace(TINY, num_one_to_many_queries=12)).eval()
     more.load_state_dict(few.state_dict())
     ground = torch.randn(1, 16, 10, 20)
     assert torch.equal(drawn(few, ground)[-1].point, drawn(more, ground)[-1].point)
     # The best of all that were followed lead both groups; of the second, copies are as sure as they are.
-    one, many = few.begin(few.sketch(ground)), few.begin(few.sketch(ground), "many")
+    one, many = few.init_queries(few.line_field_head(ground)), few.init_queries(few.line_field_head(ground), "many")
     assert torch.equal(one[0][:, 0], many[0][:, 0]) and one[0].shape[1] == 6 and many[0].shape[1] == 9
     assert float(many[1].sigmoid().amax(2).min()) > 0.011
 
@@ -62,7 +71,7 @@ def test_self_attention_is_the_softmax_of_products():
     layer, x, place = _SelfAttention(8, 2), torch.randn(3, 4, 8), torch.randn(4, 8)
     out = torch.zeros(3, 4, 8)
     for b in range(3):
-        query, key = (layer.compare(x[b] + place)).chunk(2, -1)
+        query, key = (layer.query_key(x[b] + place)).chunk(2, -1)
         value = layer.value(x[b])
         for h in range(2):
             own = slice(4 * h, 4 * h + 4)
@@ -71,7 +80,7 @@ def test_self_attention_is_the_softmax_of_products():
     assert torch.allclose(layer(x, place), layer.out(out), atol=1e-5)
 
 
-def test_deformable_attention_looks_where_its_offsets_say():
+def test_deformable_attention_samples_at_its_offsets():
     torch.manual_seed(2)
     layer = DeformableAttention(8, 2, 2)
     ground = torch.zeros(1, 6, 9, 8)
@@ -89,10 +98,10 @@ def test_deformable_attention_looks_where_its_offsets_say():
 
 
 def test_answers_come_best_first_in_metres_and_only_those_sure_enough():
-    config = MapHeadConfig(elements=3, points=2, channels=8, keep=3, threshold=0.3)
+    config = MapHeadConfig(num_queries=3, num_points=2, channels=8, max_elements=3, score_threshold=0.3)
     logit = torch.logit(torch.tensor([[[0.1, 0.9, 0.4], [0.2, 0.1, 0.6], [0.35, 0.0, 0.0]]]), 1e-6)
     point = torch.tensor([[[0.0, 0.5], [1.0, 1.0]], [[0.25, 0.25], [0.5, 0.25]], [[0.5, 0.5], [0.75, 0.5]]])[None]
-    found = decode(RawMap(logit, point), TILE, config)[0]
+    found = decode_elements(RawMap(logit, point), TILE, config)[0]
     assert found.score.tolist() == pytest.approx([0.9, 0.6, 0.4])
     assert [KINDS[k] for k in found.kind] == ["boundary", "crossing", "crossing"]
     # The first query answers under two kinds; 0.35 is sure enough, but fourth.
@@ -102,14 +111,14 @@ def test_answers_come_best_first_in_metres_and_only_those_sure_enough():
 
 
 def test_points_beyond_the_tile_are_drawn_at_its_border():
-    config = MapHeadConfig(elements=1, points=3, channels=8)
+    config = MapHeadConfig(num_queries=1, num_points=3, channels=8)
     raw = RawMap(torch.full((1, 1, 3), 9.0), torch.tensor([[[[-0.2, 0.5], [0.5, 0.5], [1.1, 1.3]]]]))
-    np.testing.assert_allclose(decode(raw, TILE, config)[0].polyline(0), [[-20, 0], [0, 0], [20, 10]])
+    np.testing.assert_allclose(decode_elements(raw, TILE, config)[0].polyline(0), [[-20, 0], [0, 0], [20, 10]])
 
 
 def test_before_anything_is_learnt_every_layer_answers_with_the_lines_of_the_sketch():
     head, ground = MapHead(TINY), torch.randn(1, 16, 10, 20)
-    start, logit, kind = head.begin(head.sketch(ground))
+    start, logit, kind = head.init_queries(head.line_field_head(ground))
     for raw in drawn(head, ground):
         assert torch.equal(raw.point, start) and torch.equal(raw.logit, logit)
     own = logit.gather(2, kind[..., None])
@@ -118,35 +127,37 @@ def test_before_anything_is_learnt_every_layer_answers_with_the_lines_of_the_ske
 
 def test_queries_begin_without_gradients_and_the_sketch_learns_from_its_own_loss_alone():
     head, ground = MapHead(TINY), torch.randn(1, 16, 10, 20)
-    assert not any(part.requires_grad for part in head.begin(head.sketch(ground)))
+    assert not any(part.requires_grad for part in head.init_queries(head.line_field_head(ground)))
     raw = drawn(head, ground)[-1]
     (raw.point.sum() + raw.logit.sum()).backward()
-    assert all(p.grad is None for p in head.sketch.parameters())
+    assert all(p.grad is None for p in head.line_field_head.parameters())
 
 
 def test_learned_lines_follow_those_of_the_sketch_and_learn_where_they_begin():
-    config = dataclasses.replace(TINY, elements=10, learned=4)
+    config = dataclasses.replace(TINY, num_queries=10, num_learned_queries=4)
     head, ground = MapHead(config), torch.randn(2, 16, 10, 20)
-    sketch = head.sketch(ground)
-    start, logit, kind = head.begin(sketch)
-    plain = MapHead(TINY).begin(sketch)
+    sketch = head.line_field_head(ground)
+    start, logit, kind = head.init_queries(sketch)
+    plain = MapHead(TINY).init_queries(sketch)
     assert torch.equal(start[:, :6], plain[0]) and torch.equal(logit[:, :6], plain[1]) and kind.shape == (2, 6)
     # Of a probability of .01, somewhere on the tile, each elsewhere, the same in every tile.
     torch.testing.assert_close(logit[:, 6:].sigmoid(), torch.full((2, 4, 3), 0.01))
     lines = start[0, 6:].detach()
     assert torch.equal(start[1, 6:], start[0, 6:]) and float(lines.min()) >= 0 and float(lines.max()) <= 1
     assert float(torch.pdist(lines.mean(1)).min()) > 0.1
-    for move in head.moves:
+    for move in head.point_branches:
         torch.nn.init.normal_(list(move.parameters())[-2])  # untaught, nothing moves
     drawn(head, ground)[0].point.square().sum().backward()
-    assert all(part.grad is not None and float(part.grad.abs().max()) > 0 for part in (head.start, head.own))
+    assert all(
+        part.grad is not None and float(part.grad.abs().max()) > 0 for part in (head.start_points, head.query_embedding)
+    )
     # One-to-many queries are the sketch's alone.
     assert drawn(head, ground, "many")[0].point.shape[1] == 9
 
 
 def test_waves_tell_places_apart_to_a_hundredth_of_the_tile():
     x, y = torch.meshgrid(torch.linspace(0, 1, 101), torch.linspace(0, 1, 51), indexing="ij")
-    code = waves(torch.stack((x, y), -1)).flatten(0, 1)
+    code = encode_position(torch.stack((x, y), -1)).flatten(0, 1)
     assert code.shape == (5151, 32)
     some = torch.arange(0, 5151, 37)
     away = torch.cdist(code[some], code)
@@ -165,7 +176,7 @@ def at_three_places(monkeypatch, head, shift):
     return drawn(head, ground)[0], start
 
 
-def told(head):
+def with_random_branches(head):
     """The same head with branches that say something."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -174,14 +185,14 @@ def told(head):
     return head.eval().requires_grad_(False)
 
 
-def test_a_layer_is_told_where_its_points_lie(monkeypatch):
-    head = told(MapHead(TINY))
+def test_layer_depends_on_point_positions(monkeypatch):
+    head = with_random_branches(MapHead(TINY))
     before, after = (at_three_places(monkeypatch, head, shift)[0].logit for shift in (0.0, 0.05))
     assert not torch.allclose(before[0, 2], after[0, 2], atol=1e-6)
 
 
-def test_what_moves_a_point_is_told_where_it_lies(monkeypatch):
-    head = told(MapHead(TINY))
+def test_point_branch_depends_on_point_position(monkeypatch):
+    head = with_random_branches(MapHead(TINY))
     for layer in head.layers:
         for norm in layer.get_submodule(
             "norms"
@@ -196,7 +207,7 @@ def test_what_moves_a_point_is_told_where_it_lies(monkeypatch):
 
 def test_nothing_sure_is_an_empty_map():
     raw = RawMap(torch.full((2, 6, 3), -9.0), torch.rand(2, 6, 5, 2))
-    assert [len(found) for found in decode(raw, TILE, TINY)] == [0, 0]
+    assert [len(found) for found in decode_elements(raw, TILE, TINY)] == [0, 0]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.models.maps.image_encoder import ImageEncoder, ImageEncoderConfig, Residual, finer
+from manyeyes.models.maps.image_encoder import ImageEncoder, ImageEncoderConfig, ResidualBlock, upsample
 
 TINY = ImageEncoderConfig((1, 1, 1), 8, channels=16)
 
@@ -34,7 +34,7 @@ def test_one_picture_does_not_depend_on_the_others_of_its_batch():
 def test_a_finer_map_keeps_every_cell_where_the_stride_took_it(size):
     ramp = torch.arange(float(size[1])).expand(1, 1, *size) + 10 * torch.arange(float(size[0]))[:, None]
     coarse = ramp[..., ::2, ::2]
-    fine = finer(coarse, size)
+    fine = upsample(coarse, size)
     assert fine.shape == ramp.shape
     # A ramp comes back exactly, but for a last cell beyond the last that was taken.
     assert torch.allclose(fine[..., : size[0] - 1, : size[1] - 1], ramp[..., : size[0] - 1, : size[1] - 1], atol=1e-5)
@@ -46,7 +46,7 @@ def test_a_finer_map_keeps_every_cell_where_the_stride_took_it(size):
 def test_a_strided_block_takes_every_second_place_however_memory_lies(memory):
     # 12 channels innermost in memory, and a strided 1x1 convolution of them: its gradient overran its buffer in torch 2.13.
     x = torch.randn(2, 12, 9, 10).contiguous(memory_format=memory).requires_grad_()
-    block = Residual(12, 12, 2)
+    block = ResidualBlock(12, 12, 2)
     shortcut, norm = block.shortcut
     expected = torch.relu(norm(F.conv2d(x, shortcut.weight, stride=2)) + block.inner(x))
     assert torch.allclose(block(x), expected, atol=1e-5) and expected.shape == (2, 12, 5, 5)
@@ -67,9 +67,9 @@ def test_one_stage_is_refused():
         ImageEncoderConfig((2,))
 
 
-def test_what_is_computed_again_is_the_same_to_the_last_bit_and_told_to_running_statistics_once():
+def test_recomputation_is_bitwise_equal_and_updates_running_statistics_once():
     config = ImageEncoderConfig((2, 1), 8, True, 16)
-    kept, again = ImageEncoder(config), ImageEncoder(dataclasses.replace(config, recompute=True))
+    kept, again = ImageEncoder(config), ImageEncoder(dataclasses.replace(config, gradient_checkpointing=True))
     again.load_state_dict(kept.state_dict())
     rgb = torch.randint(0, 256, (3, 3, 40, 56), dtype=torch.uint8)
     outs = [net.train()(rgb) for net in (kept, again)]
@@ -92,7 +92,7 @@ def test_fewer_activations_are_kept_where_they_are_computed_again():
             sizes.append(x.nbytes)
             return x
 
-        net = ImageEncoder(ImageEncoderConfig((2, 2), 8, True, 16, recompute=recompute)).train()
+        net = ImageEncoder(ImageEncoderConfig((2, 2), 8, True, 16, gradient_checkpointing=recompute)).train()
         own = {p.data_ptr() for p in net.parameters()}
         with torch.autograd.graph.saved_tensors_hooks(lambda x: pack(x) if x.data_ptr() not in own else x, lambda x: x):
             net(torch.zeros(2, 3, 64, 64))

@@ -10,8 +10,15 @@ import torch
 
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.models.maps.line_field_head import UNSURE, Sketch, SketchHead, around, kept_once, propose
-from manyeyes.training.maps.line_field_targets import sketch_of
+from manyeyes.models.maps.line_field_head import (
+    DUPLICATE_SCORE,
+    LineFieldHead,
+    RawLineField,
+    outline_rectangles,
+    propose_lines,
+    suppress_duplicates,
+)
+from manyeyes.training.maps.line_field_targets import make_line_field_target
 
 TILE = BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=1.0)
 KINDS = ("divider", "boundary", "crossing")
@@ -28,18 +35,18 @@ TRUTH = MapElements.of(
 
 def perfect(truth=TRUTH):
     """What a sketch would be that says the truth."""
-    target = sketch_of(truth, TILE, KINDS)
-    ink, end = (torch.logit(share.clamp(0.001, 0.999))[None] for share in (target.ink, target.end))
-    return Sketch(ink, end, target.foot[None], target.way[None], target.half[None])
+    target = make_line_field_target(truth, TILE, KINDS)
+    ink, end = (torch.logit(share.clamp(0.001, 0.999))[None] for share in (target.line_prob, target.end_mask))
+    return RawLineField(ink, end, target.offset_to_line[None], target.direction[None], target.half_width[None])
 
 
 def proposed(sketch, count=5, seeds=40):
-    return propose(sketch, RINGS, count, 8, seeds, 0.3)
+    return propose_lines(sketch, RINGS, count, 8, seeds, 0.3)
 
 
 def test_every_line_of_a_true_sketch_is_proposed_once():
     found = proposed(perfect())
-    sure = found.sure[0] > 2 * UNSURE
+    sure = found.score[0] > 2 * DUPLICATE_SCORE
     assert sorted(found.kind[0, sure].tolist()) == [0, 1, 2]
     drawn = {int(kind): point for kind, point in zip(found.kind[0, sure], found.point[0, sure])}
     metres = {kind: point * torch.tensor([40.0, 20.0]) - torch.tensor([20.0, 10.0]) for kind, point in drawn.items()}
@@ -54,18 +61,18 @@ def test_every_line_of_a_true_sketch_is_proposed_once():
 
 def test_the_surest_and_longest_come_first_and_copies_are_held_unsure():
     found = proposed(perfect(), count=40)
-    sure = found.sure[0]
-    own = sure > 2 * UNSURE
-    assert bool(own[:3].all()) and not bool(own[3:].any()) and torch.equal(sure[3:], torch.full((37,), UNSURE))
+    sure = found.score[0]
+    own = sure > 2 * DUPLICATE_SCORE
+    assert bool(own[:3].all()) and not bool(own[3:].any()) and torch.equal(sure[3:], torch.full((37,), DUPLICATE_SCORE))
     assert found.kind[0, :2].tolist() == [0, 1]
-    every = propose(perfect(), RINGS, 10, 8, 40, 0.3, apart=0.0)
-    assert float(every.sure.min()) > 2 * UNSURE and set(every.kind[0].tolist()) <= {0, 1}
+    every = propose_lines(perfect(), RINGS, 10, 8, 40, 0.3, duplicate_distance=0.0)
+    assert float(every.score.min()) > 2 * DUPLICATE_SCORE and set(every.kind[0].tolist()) <= {0, 1}
 
 
 def test_two_lines_of_a_kind_that_meet_end_to_end_stay_two():
     lines = [np.array([[-20.0, 2.0], [0.0, 2.0]]), np.array([[0.0, 2.0], [20.0, 2.0]])]
     found = proposed(perfect(MapElements.of(lines, [BOUNDARY, BOUNDARY])))
-    sure = found.sure[0] > 2 * UNSURE
+    sure = found.score[0] > 2 * DUPLICATE_SCORE
     assert int(sure.sum()) == 2
     middles = sorted(float(p[:, 0].mean()) for p in found.point[0, sure])
     assert middles == pytest.approx([0.25, 0.75], abs=0.04)
@@ -74,7 +81,9 @@ def test_two_lines_of_a_kind_that_meet_end_to_end_stay_two():
 def test_tiles_of_a_batch_are_proposed_as_if_alone():
     other = perfect(TRUTH.take(np.array([2, 0])))
     one = perfect()
-    both = Sketch(*(torch.cat((getattr(one, f.name), getattr(other, f.name))) for f in dataclasses.fields(Sketch)))
+    both = RawLineField(
+        *(torch.cat((getattr(one, f.name), getattr(other, f.name))) for f in dataclasses.fields(RawLineField))
+    )
     together, alone = proposed(both), proposed(other)
     for name in ("point", "kind", "sure"):
         assert torch.allclose(getattr(together, name)[1].float(), getattr(alone, name)[0].float(), atol=1e-6)
@@ -82,13 +91,13 @@ def test_tiles_of_a_batch_are_proposed_as_if_alone():
 
 def test_a_rectangle_is_drawn_about_its_middle_line():
     first, last, half = torch.tensor([[1.0, 1.0]]), torch.tensor([[1.0, 5.0]]), torch.tensor([1.0])
-    points = around(first, last, half, 12)[0]
+    points = outline_rectangles(first, last, half, 12)[0]
     assert points.shape == (12, 2)
     # A perimeter of 12: a point a cell, all four corners among them, none twice.
     corners = {(0.0, 1.0), (2.0, 1.0), (2.0, 5.0), (0.0, 5.0)}
-    said = {(round(x, 3), round(y, 3)) for x, y in points.tolist()}
-    assert corners <= said and len(said) == 12
-    nothing = around(first, first, half, 8)
+    vertices = {(round(x, 3), round(y, 3)) for x, y in points.tolist()}
+    assert corners <= vertices and len(vertices) == 12
+    nothing = outline_rectangles(first, first, half, 8)
     assert bool(torch.isfinite(nothing).all())
 
 
@@ -103,12 +112,12 @@ def test_what_is_kept_is_what_a_loop_keeps():
             for later in ranks[place + 1 :]:
                 if slow[tile, first] and on[tile, first, later]:
                     slow[tile, later] = False
-    assert torch.equal(kept_once(on, order), slow)
+    assert torch.equal(suppress_duplicates(on, order), slow)
     assert 0 < int(slow.sum()) < slow.numel()
 
 
-def test_a_head_says_something_of_every_cell_and_begins_with_little_ink():
-    sketch = SketchHead(16, 3)(torch.randn(2, 16, 10, 20))
+def test_head_covers_every_cell_and_starts_with_low_line_probability():
+    sketch = LineFieldHead(16, 3)(torch.randn(2, 16, 10, 20))
     assert sketch.ink.shape == sketch.end.shape == sketch.half.shape == (2, 3, 10, 20)
     assert sketch.foot.shape == sketch.way.shape == (2, 3, 2, 10, 20)
     assert float(sketch.ink.detach().sigmoid().mean()) == pytest.approx(0.05, abs=0.03)

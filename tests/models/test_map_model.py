@@ -13,24 +13,26 @@ from manyeyes.models import checkpoint
 from manyeyes.models.maps.bev import BevConfig
 from manyeyes.models.maps.head import MapHeadConfig
 from manyeyes.models.maps.image_encoder import ImageEncoderConfig
-from manyeyes.models.maps.map_model import Mapper, MapperConfig
-from manyeyes.models.maps.presets import FORMAT, MAPPERS, mapper_config
+from manyeyes.models.maps.map_model import MapModel, MapModelConfig
+from manyeyes.models.maps.presets import FORMAT, MAP_MODELS, get_map_model_config
 from manyeyes.models.maps.view_transform import DepthBins
 
-TINY = MapperConfig(
+TINY = MapModelConfig(
     BevConfig(
         BevGrid(-8.0, -8.0, -2.0, 8.0, 8.0, 4.0, pillar=0.5),
         channels=16,
-        raster_width=8,
+        raster_channels=8,
         raster_blocks=(1, 1),
-        image=ImageEncoderConfig((1, 1), 8, channels=16),
+        image_encoder=ImageEncoderConfig((1, 1), 8, channels=16),
         image_size=(48, 64),
-        depth=DepthBins(1.0, 13.0, 7),
+        depth_bins=DepthBins(1.0, 13.0, 7),
     ),
     BevGrid(-16.0, -8.0, -1.0, 16.0, 8.0, 1.0, pillar=1.0),
     token_channels=8,
-    neck=(1, 1),
-    head=MapHeadConfig(elements=6, points=5, many=4, channels=16, feed=32, layers=2, heads=4),
+    neck_blocks=(1, 1),
+    head=MapHeadConfig(
+        num_queries=6, num_points=5, num_one_to_many_queries=4, channels=16, feedforward_channels=32, layers=2, heads=4
+    ),
 )
 
 
@@ -58,21 +60,25 @@ def photo():
 @pytest.fixture(scope="module")
 def mapper():
     torch.manual_seed(0)
-    net = Mapper(TINY).requires_grad_(False)
+    net = MapModel(TINY).requires_grad_(False)
     # Its norms know how features are spread, as after training; nothing else is learnt.
     for seed in range(30):
-        net.draw(net.fuse(net.see(clouds(4, seed)).tokens, FOUR, torch.tensor([0, 0, 1, 1]), 2))
+        net.predict_elements(
+            net.fuse(net.extract_features(clouds(4, seed)).tokens, FOUR, torch.tensor([0, 0, 1, 1]), 2)
+        )
     return net.eval()
 
 
 def test_tokens_lie_where_the_ground_was_seen(mapper):
-    look = mapper.see(clouds(2))
-    assert look.tokens.features.shape[1] == 8 and look.tokens.sites.batch_size == 2
-    assert look.tokens.grid == TINY.bev.token_grid and 20 < len(look.tokens.sites) < 2 * 256
-    assert look.ink.shape == (len(look.tokens.sites), 3) and bool(((look.worth > 0) & (look.worth < 1)).all())
+    features = mapper.see(clouds(2))
+    assert features.tokens.features.shape[1] == 8 and features.tokens.sites.batch_size == 2
+    assert features.tokens.grid == TINY.bev.token_grid and 20 < len(features.tokens.sites) < 2 * 256
+    assert features.ink.shape == (len(features.tokens.sites), 3) and bool(
+        ((features.worth > 0) & (features.worth < 1)).all()
+    )
 
 
-def test_looks_have_no_order(mapper):
+def test_fusion_is_invariant_to_frame_order(mapper):
     seen, tile = clouds(4), torch.zeros(4, dtype=torch.int64)
     order = [2, 0, 3, 1]
     a = mapper.fuse(mapper.see(seen).tokens, FOUR, tile, 1)
@@ -81,7 +87,7 @@ def test_looks_have_no_order(mapper):
     assert torch.allclose(a, b, atol=1e-5) and float(a.std()) > 0
 
 
-def test_a_look_that_sees_nothing_of_the_tile_changes_nothing(mapper):
+def test_frame_without_tile_coverage_changes_nothing(mapper):
     seen = clouds(3)
     a = mapper.fuse(mapper.see(seen[:2]).tokens, FOUR[:2], torch.zeros(2, dtype=torch.int64), 1)
     away = poses((0, 0, 0, 0.1), (4, 1, 0, math.pi), (500, 0, 0, 0))
@@ -91,7 +97,7 @@ def test_a_look_that_sees_nothing_of_the_tile_changes_nothing(mapper):
     assert not torch.allclose(a, mapper.fuse(mapper.see(seen).tokens, near, torch.zeros(3, dtype=torch.int64), 1))
 
 
-def test_looks_of_other_tiles_change_nothing(mapper):
+def test_frames_of_other_tiles_change_nothing(mapper):
     seen = clouds(4)
     both = mapper.fuse(mapper.see(seen).tokens, FOUR, torch.tensor([1, 0, 1, 0]), 3)
     one = mapper.fuse(
@@ -100,8 +106,8 @@ def test_looks_of_other_tiles_change_nothing(mapper):
     assert torch.allclose(both[0], one[0], atol=1e-5)
     # The last tile had no look: all of it is what nobody saw.
     blind = mapper.see([PointCloud.of(torch.zeros(0, 3))]).tokens
-    nobody = mapper.fuse(blind, FOUR[:1], torch.zeros(1, dtype=torch.int64), 1)
-    assert torch.allclose(both[2], nobody[0], atol=1e-5)
+    empty = mapper.fuse(blind, FOUR[:1], torch.zeros(1, dtype=torch.int64), 1)
+    assert torch.allclose(both[2], empty[0], atol=1e-5)
 
 
 def test_moving_everything_by_one_motion_changes_nothing(mapper):
@@ -121,29 +127,31 @@ def test_what_is_drawn_depends_on_what_was_seen(mapper):
 
 
 def test_scores_are_calibrated_when_drawing_and_not_when_learning():
-    net = Mapper(TINY).eval().requires_grad_(False)
+    net = MapModel(TINY).eval().requires_grad_(False)
     ground = torch.randn(1, TINY.head.channels, 16, 32)
-    plain = net.draw(ground)
-    net.scale.copy_(torch.tensor([1.0, 2.0, 0.5]))
-    net.shift.copy_(torch.tensor([0.0, 0.3, -1.0]))
-    *before, last = net.draw(ground)
-    assert torch.equal(last.logit, plain[-1].logit * net.scale + net.shift) and torch.equal(last.point, plain[-1].point)
+    plain = net.predict_elements(ground)
+    net.logit_scale.copy_(torch.tensor([1.0, 2.0, 0.5]))
+    net.logit_shift.copy_(torch.tensor([0.0, 0.3, -1.0]))
+    *before, last = net.predict_elements(ground)
+    assert torch.equal(last.logit, plain[-1].logit * net.logit_scale + net.logit_shift) and torch.equal(
+        last.point, plain[-1].point
+    )
     assert all(torch.equal(a.logit, b.logit) for a, b in zip(before, plain))
     # The net learns what it says uncalibrated. Its norms stay as they are, so that nothing else differs.
     net.training = True
-    assert torch.equal(net.draw(ground)[-1].logit, plain[-1].logit)
+    assert torch.equal(net.predict_elements(ground)[-1].logit, plain[-1].logit)
 
 
 def test_both_sensors_share_one_ground_and_either_alone_will_do(photo):
     torch.manual_seed(1)
-    both = Mapper(dataclasses.replace(TINY, bev=dataclasses.replace(TINY.bev, sensors=("lidar", "camera"))))
+    both = MapModel(dataclasses.replace(TINY, bev=dataclasses.replace(TINY.bev, sensors=("lidar", "camera"))))
     seen = clouds(1)
-    together = both.see(seen, [[photo]]).tokens.sites.key
-    lidar, camera = both.see(seen).tokens.sites.key, both.see((), [[photo]]).tokens.sites.key
+    together = both.extract_features(seen, [[photo]]).tokens.sites.key
+    lidar, camera = both.extract_features(seen).tokens.sites.key, both.extract_features((), [[photo]]).tokens.sites.key
     assert set(together.tolist()) == set(lidar.tolist()) | set(camera.tolist())
     assert len(camera) > 0 and len(together) > len(lidar)
     with pytest.raises(ConfigError, match="lidar, camera"):
-        both.see()
+        both.extract_features()
 
 
 @pytest.mark.slow
@@ -159,7 +167,7 @@ def test_the_tile_part_exports(mapper):
 def test_weights_come_back_from_disk_and_are_no_detector(mapper, tmp_path):
     path = tmp_path / "weights.safetensors"
     checkpoint.save(mapper, path, {"towns": ["Town01"]}, format=FORMAT)
-    again = checkpoint.load_as(path, FORMAT, MapperConfig, Mapper)
+    again = checkpoint.load_as(path, FORMAT, MapModelConfig, MapModel)
     assert again.config == TINY and checkpoint.fingerprint(again) == checkpoint.fingerprint(mapper)
     assert checkpoint.read_card(path, FORMAT)["towns"] == ["Town01"]
     with pytest.raises(CheckpointError, match="format"):
@@ -167,11 +175,11 @@ def test_weights_come_back_from_disk_and_are_no_detector(mapper, tmp_path):
 
 
 def test_presets_have_the_paper_s_sizes():
-    paper = mapper_config("paper", ("camera",))
-    assert paper.tile.shape == (100, 200) and (paper.head.elements, paper.head.points) == (100, 20)
-    assert paper.bev.image.blocks == (3, 4, 6, 3) and paper.bev.image.bottleneck
-    for config in MAPPERS.values():
+    paper = get_map_model_config("paper", ("camera",))
+    assert paper.tile.shape == (100, 200) and (paper.head.num_queries, paper.head.num_points) == (100, 20)
+    assert paper.bev.image_encoder.blocks == (3, 4, 6, 3) and paper.bev.image_encoder.bottleneck
+    for config in MAP_MODELS.values():
         tile = config.tile
         assert (tile.x_max - tile.x_min, tile.y_max - tile.y_min) == (120.0, 60.0)
     with pytest.raises(ConfigError, match="toy, small, paper"):
-        mapper_config("large")
+        get_map_model_config("large")

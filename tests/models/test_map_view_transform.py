@@ -54,8 +54,8 @@ def slowly(features, depth, cameras, heights):
                     if depth is not None:
                         if not BINS.near_m <= d <= BINS.far_m:
                             continue
-                        at = (d - BINS.near_m) / (BINS.far_m - BINS.near_m) * (BINS.count - 1)
-                        low = min(math.floor(at), BINS.count - 2)
+                        at = (d - BINS.near_m) / (BINS.far_m - BINS.near_m) * (BINS.num_bins - 1)
+                        low = min(math.floor(at), BINS.num_bins - 2)
                         mixed = depth[v, low] * (1 - (at - low)) + depth[v, low + 1] * (at - low)
                         value = value * bilinear(mixed[None], (px - 0.5) / STRIDE, (py - 0.5) / STRIDE)
                     total, any_height = total + value, True
@@ -71,7 +71,7 @@ def test_values_and_gradients_are_those_of_the_loop(way):
     generator = torch.Generator().manual_seed(5)
     cameras = [camera(), camera(yaw=0.7, height=1.6), camera(yaw=-0.5, x=1.0)]
     features = torch.randn(3, 2, *SIZE, generator=generator, requires_grad=True)
-    depth = torch.rand(3, BINS.count, *SIZE, generator=generator).softmax(1).requires_grad_()
+    depth = torch.rand(3, BINS.num_bins, *SIZE, generator=generator).softmax(1).requires_grad_()
     owner, heights = torch.zeros(3, dtype=torch.int64), (-0.3, 0.0, 0.8)
     if way == "ground":
         fast, seen = lift_ground(features, cameras, owner, 1, GRID, STRIDE)
@@ -109,7 +109,7 @@ def test_ground_of_which_a_pixel_covers_too_much_is_unseen():
     cam, owner = camera(pitch=0.0), torch.zeros(1, dtype=torch.int64)
     grid = BevGrid(0.0, -0.5, -1.0, 16.0, 0.5, 1.0, pillar=1.0)
     _, all_seen = lift_ground(torch.ones(1, 1, *SIZE), [cam], owner, 1, grid, STRIDE)
-    bev, seen = lift_ground(torch.ones(1, 1, *SIZE), [cam], owner, 1, grid, STRIDE, coarsest_m=1.0)
+    bev, seen = lift_ground(torch.ones(1, 1, *SIZE), [cam], owner, 1, grid, STRIDE, max_pixel_footprint_m=1.0)
     # 2 m of height at 45 degrees down at most: nothing nearer than 8 / 3 m; cells are centred on halves.
     assert all_seen[0, 0].nonzero()[:, 0].tolist() == list(range(3, 16))
     assert seen[0, 0].nonzero()[:, 0].tolist() == [3, 4, 5, 6, 7]  # 7.5 m: .94 m; 8.5 m: 1.19 m
@@ -117,7 +117,7 @@ def test_ground_of_which_a_pixel_covers_too_much_is_unseen():
 
 
 def test_a_certain_depth_puts_the_feature_there_and_nowhere_else():
-    features, depth = torch.ones(1, 1, *SIZE), torch.zeros(1, BINS.count, *SIZE)
+    features, depth = torch.ones(1, 1, *SIZE), torch.zeros(1, BINS.num_bins, *SIZE)
     depth[:, 3] = 1.0
     bev, seen = lift_depth(
         features, depth, [camera(pitch=0.0)], torch.zeros(1, dtype=torch.int64), 1, GRID, STRIDE, BINS, (0.0,)

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, ConfigError
-from manyeyes.models.detector.box_head import RAW
-from manyeyes.models.detector.proposal import PROPOSAL
-from manyeyes.models.fusion.max_fusion import MaximumFusion
-from manyeyes.models.fusion.multi_scale import MultiScaleFusion, Scale
-from manyeyes.models.fusion.token_merge import settle
-from manyeyes.models.fusion.transform_tokens import CUES, Tokens
+from manyeyes.models.detector.box_head import BOX_LAYOUT
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
+from manyeyes.models.fusion.max_fusion import MaxFusion
+from manyeyes.models.fusion.multi_scale import CoarseScale, MultiScaleFusion
+from manyeyes.models.fusion.token_merge import assign_cells
+from manyeyes.models.fusion.transform_tokens import POSE_CONTEXT_DIM, Tokens
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 8
@@ -21,12 +21,19 @@ CHANNELS = 8
 def tokens(n: int = 50, batch: int = 2, seed: int = 0) -> Tokens:
     """Tokens that stay where they are, several on one cell."""
     rng = torch.Generator().manual_seed(seed)
-    proposal = torch.randn(n, PROPOSAL, generator=rng)
-    proposal[:, RAW.heat] = -9.0
+    proposal = torch.randn(n, PROPOSAL_DIM, generator=rng)
+    proposal[:, BOX_LAYOUT.heatmap_logit] = -9.0
     xy = (torch.rand(n, 2, generator=rng) - 0.5) * 30
     ego = torch.randint(0, batch, (n,), generator=rng)
     return Tokens(
-        torch.randn(n, CHANNELS, generator=rng), xy, ego, torch.zeros(n, CUES), proposal, torch.ones(n), GRID, batch
+        torch.randn(n, CHANNELS, generator=rng),
+        xy,
+        ego,
+        torch.zeros(n, POSE_CONTEXT_DIM),
+        proposal,
+        torch.ones(n),
+        GRID,
+        batch,
     )
 
 
@@ -40,10 +47,10 @@ def fusion(levels: int = 3, trained: bool = True) -> MultiScaleFusion:
 
 def test_a_scale_is_the_maximum_over_its_wider_cells():
     torch.manual_seed(0)
-    scale, some = Scale(CHANNELS, 2).requires_grad_(False), tokens()
-    scale.around = torch.nn.Identity()
-    fine = MaximumFusion(CHANNELS).requires_grad_(False)(some).bev.sites
-    row = torch.searchsorted(fine.key, settle(some)[0])
+    scale, some = CoarseScale(CHANNELS, 2).requires_grad_(False), tokens()
+    scale.conv = torch.nn.Identity()
+    fine = MaxFusion(CHANNELS).requires_grad_(False)(some).bev.sites
+    row = torch.searchsorted(fine.key, assign_cells(some)[0])
     found = scale(some.features, row, fine)
     wide = GRID.at(8)
     place = torch.cat((fine.batch[:, None], wide.cells(fine.xy)), 1).tolist()
@@ -56,7 +63,7 @@ def test_a_scale_is_the_maximum_over_its_wider_cells():
 
 def test_it_starts_as_maximum_fusion():
     some, model = tokens(), fusion(trained=False)
-    plain = MaximumFusion(CHANNELS).eval().requires_grad_(False)
+    plain = MaxFusion(CHANNELS).eval().requires_grad_(False)
     plain.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith(("coarser", "out"))})
     torch.testing.assert_close(model(some).bev.features, plain(some).bev.features)
     assert torch.equal(model(some).given, plain(some).given)
@@ -88,20 +95,20 @@ def test_a_collaborator_a_cell_off_still_meets_the_ego_at_the_coarser_scale():
     apart = replace(some, xy=torch.cat((own, other)))
     met = replace(some, xy=torch.cat((own, own)))
     model = fusion(2)
-    told = []
+    coarse = []
     for case in (apart, met):
         sites = model(case).bev.sites
-        row = torch.searchsorted(sites.key, settle(case)[0])
-        told.append(model.coarser[0](case.features, row, sites)[0])
+        row = torch.searchsorted(sites.key, assign_cells(case)[0])
+        coarse.append(model.coarse_scales[0](case.features, row, sites)[0])
     assert len(model(apart).bev.sites) == 2 and len(model(met).bev.sites) == 1
-    torch.testing.assert_close(told[0], told[1])
+    torch.testing.assert_close(coarse[0], coarse[1])
 
 
 def test_gradients_reach_every_scale_and_empty_input_passes():
     model = fusion().requires_grad_(True)
     some = tokens()
     model(some).bev.features.square().sum().backward()
-    assert all(p.grad is not None for p in model.coarser.parameters())
+    assert all(p.grad is not None for p in model.coarse_scales.parameters())
     none = tokens(0)
     assert model(none).bev.features.shape == (0, CHANNELS)
 

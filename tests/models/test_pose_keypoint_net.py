@@ -8,36 +8,36 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, Boxes, ShapeError, SparseBev, Transform
-from manyeyes.models.detector.box_head import RAW
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.box_head import BOX_LAYOUT
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.fusion.transform_tokens import rotate_vectors
-from manyeyes.models.pose.box_descriptors import BoxKeypointNet, BoxKeypoints
-from manyeyes.models.pose.keypoint_net import DenseKeypointNet, DenseKeypoints, View, local_maxima
+from manyeyes.models.pose.box_descriptors import BoxKeypointConfig, BoxKeypointNet
+from manyeyes.models.pose.keypoint_net import DenseKeypointConfig, DenseKeypointNet, DetectorView, local_maxima
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=2)
 CHANNELS = 8
 
 
-def view(cells, confidence, boxes=None, grid=GRID, seed=0) -> View:
+def view(cells, confidence, boxes=None, grid=GRID, seed=0) -> DetectorView:
     """Tokens of random features at cells (row, column)."""
     yx = torch.tensor(cells)
     features = torch.rand(len(yx), CHANNELS, generator=torch.Generator().manual_seed(seed))
     both = SparseBev.from_cells(torch.cat((features, torch.tensor(confidence)[:, None]), 1), yx, grid)
-    return View(both.with_features(both.features[:, :-1]), both.features[:, -1], boxes or Boxes.empty())
+    return DetectorView(both.with_features(both.features[:, :-1]), both.features[:, -1], boxes or Boxes.empty())
 
 
 def dense(**more) -> DenseKeypointNet:
     torch.manual_seed(0)
-    return DenseKeypointNet(DenseKeypoints(CHANNELS, (8, 8, 8), 16, **more)).eval().requires_grad_(False)
+    return DenseKeypointNet(DenseKeypointConfig(CHANNELS, (8, 8, 8), 16, **more)).eval().requires_grad_(False)
 
 
 def boxed(**more) -> BoxKeypointNet:
     torch.manual_seed(0)
-    return BoxKeypointNet(BoxKeypoints(CHANNELS, 16, 32, **more)).eval().requires_grad_(False)
+    return BoxKeypointNet(BoxKeypointConfig(CHANNELS, 16, 32, **more)).eval().requires_grad_(False)
 
 
 def test_it_has_as_many_weights_as_the_published_extractor():
-    net = DenseKeypointNet(DenseKeypoints(inputs=128))
+    net = DenseKeypointNet(DenseKeypointConfig(in_channels=128))
     assert sum(p.numel() for p in net.parameters()) == 3_312_640  # specs/pose.md 0.2
 
 
@@ -52,7 +52,7 @@ def test_greedy_suppression_by_hand():
 def test_published_points_are_peaks_at_the_corners_of_their_cells_and_padding():
     cells = [(20, 30), (20, 31), (40, 12), (50, 50), (1, 30)]
     made = view(cells, [0.9, 0.8, 0.5, 0.1, 0.99])
-    (points,) = dense(most=6)([made])
+    (points,) = dense(num_keypoints=6)([made])
     # (20, 31) is suppressed, (50, 50) is unsure, (1, 30) lies at the edge.
     corner = [-25.6 + 0.4 / 2 - 0.4, -25.6 + 0.4 / 2 - 0.4]
     expected = torch.tensor([[c * 0.8 + corner[0], r * 0.8 + corner[1]] for r, c in [(20, 30), (40, 12)]])
@@ -65,16 +65,16 @@ def test_published_points_are_peaks_at_the_corners_of_their_cells_and_padding():
 
 def test_without_a_confidence_map_peaks_of_the_features_are_taken():
     made = view([(20, 30), (40, 12)], [0.0, 0.0])
-    (points,) = dense(most=4, saliency="feature")([made])
+    (points,) = dense(num_keypoints=4, saliency="feature")([made])
     assert int((points.boxes.score > 0).sum()) == 2
-    assert int((dense(most=4)([made])[0].boxes.score > 0).sum()) == 0
+    assert int((dense(num_keypoints=4)([made])[0].boxes.score > 0).sum()) == 0
 
 
 def test_a_published_descriptor_depends_on_the_other_agent_and_a_mended_one_does_not():
     boxes = Boxes.of(torch.tensor([[0.4, 1.2, 0.0]]), torch.tensor([[4.5, 1.9, 1.6]]), torch.tensor([0.3]))
     one = view([(32, 32), (33, 33)], [0.9, 0.1], boxes)
     loud = view([(20, 20)], [0.9])
-    loud = View(loud.tokens.with_features(loud.tokens.features * 50), loud.confidence, Boxes.empty())
+    loud = DetectorView(loud.tokens.with_features(loud.tokens.features * 50), loud.confidence, Boxes.empty())
     net = dense()
     for weight in net.trunk.parameters():
         weight.mul_(3)  # untrained convolutions hardly pass anything on
@@ -101,20 +101,20 @@ def test_a_mended_descriptor_turns_with_its_agent():
     turned = SparseBev.from_cells(rotate_vectors(features, quarter), turned_yx, grid)
     assert shift == pytest.approx(-float(grid.centers(torch.tensor([[0, 0]]))[0, 0]))
     move = Transform.from_xyz_yaw(0.0, 0.0, 0.0, math.pi / 2)
-    (here,) = boxed()([View(tokens, torch.ones(len(yx)), boxes)])
-    (there,) = boxed()([View(turned, torch.ones(len(yx)), boxes.transform(move))])
+    (here,) = boxed()([DetectorView(tokens, torch.ones(len(yx)), boxes)])
+    (there,) = boxed()([DetectorView(turned, torch.ones(len(yx)), boxes.transform(move))])
     torch.testing.assert_close(there.descriptor, here.descriptor, atol=1e-4, rtol=1e-4)
-    (unturned,) = boxed()([View(tokens, torch.ones(len(yx)), boxes.transform(move))])
+    (unturned,) = boxed()([DetectorView(tokens, torch.ones(len(yx)), boxes.transform(move))])
     assert float((unturned.descriptor - here.descriptor).norm(dim=1).min()) > 1e-2
 
 
 def test_mended_points_are_the_best_boxes():
     n = 5
     boxes = Boxes.of(torch.rand(n, 3) * 10, torch.ones(n, 3), torch.zeros(n), torch.tensor([0.9, 0.8, 0.5, 0.3, 0.1]))
-    (points,) = boxed(most=3)([view([(32, 32)], [0.5], boxes)])
+    (points,) = boxed(max_keypoints=3)([view([(32, 32)], [0.5], boxes)])
     assert torch.equal(points.xy, boxes.center[:3, :2])
     assert len(boxed()([view([(32, 32)], [0.5], boxes)])[0]) == 4
-    empty = View(
+    empty = DetectorView(
         SparseBev.from_cells(torch.zeros(0, CHANNELS), torch.zeros(0, 2, dtype=torch.int64), GRID),
         torch.zeros(0),
         boxes,
@@ -122,10 +122,10 @@ def test_mended_points_are_the_best_boxes():
     assert boxed()([empty])[0].descriptor.isfinite().all()
 
 
-def test_a_view_is_what_an_agent_tells():
-    told = SparseBev.from_cells(torch.zeros(2, CHANNELS + PROPOSAL), torch.tensor([[1, 1], [2, 2]]), GRID)
-    told.features[1, CHANNELS:][RAW.heat] = 3.0
-    made = View.of(told, Boxes.empty())
+def test_view_from_shared_tokens():
+    shared_tokens = SparseBev.from_cells(torch.zeros(2, CHANNELS + PROPOSAL_DIM), torch.tensor([[1, 1], [2, 2]]), GRID)
+    shared_tokens.features[1, CHANNELS:][BOX_LAYOUT.heatmap_logit] = 3.0
+    made = DetectorView.of(shared_tokens, Boxes.empty())
     assert made.tokens.features.shape == (2, CHANNELS)
     torch.testing.assert_close(made.confidence, torch.sigmoid(torch.tensor([0.0, 3.0])))
     with pytest.raises(ShapeError, match=r"needs confidence \(2,\)"):

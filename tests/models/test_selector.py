@@ -8,22 +8,22 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, Sites, SparseBev
-from manyeyes.models.detector.box_head import RAW
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.box_head import BOX_LAYOUT
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.selector import Selector, rank_in_group
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 8
 
 
-def told(*said: tuple[int, int, float, int], seed: int = 0) -> SparseBev:
+def make_tokens(*cells: tuple[int, int, float, int], seed: int = 0) -> SparseBev:
     """Tokens at (row, column) that say with a heat that the object's centre lies so many columns ahead."""
-    rows = torch.randn(len(said), CHANNELS + PROPOSAL, generator=torch.Generator().manual_seed(seed))
+    rows = torch.randn(len(cells), CHANNELS + PROPOSAL_DIM, generator=torch.Generator().manual_seed(seed))
     box = rows[:, CHANNELS:]
-    for i, (_, _, heat, ahead) in enumerate(said):
-        box[i, RAW.heat] = heat
-        box[i, RAW.offset] = torch.tensor([float(ahead), 0.0])
-    return SparseBev.from_cells(rows, torch.tensor([s[:2] for s in said], dtype=torch.int64).view(-1, 2), GRID)
+    for i, (_, _, heat, ahead) in enumerate(cells):
+        box[i, BOX_LAYOUT.heatmap_logit] = heat
+        box[i, BOX_LAYOUT.offset] = torch.tensor([float(ahead), 0.0])
+    return SparseBev.from_cells(rows, torch.tensor([s[:2] for s in cells], dtype=torch.int64).view(-1, 2), GRID)
 
 
 def test_rank_in_group_by_hand():
@@ -47,7 +47,7 @@ def test_rank_in_group_against_a_loop():
 
 def test_a_fresh_selector_is_confidence_less_repetition():
     # Two tokens mean the cell (5, 5), the surer from beside it; the third speaks of its own, the fourth believes nothing.
-    some = told((5, 4, 2.0, 1), (5, 5, 1.0, 0), (20, 20, 0.5, 0), (9, 9, -8.0, 0))
+    some = make_tokens((5, 4, 2.0, 1), (5, 5, 1.0, 0), (20, 20, 0.5, 0), (9, 9, -8.0, 0))
     score = Selector(CHANNELS)(some).detach()
     wanted = torch.tensor([2.0, 1.0 - 2.0 * math.log(2.0), -8.0, 0.5])
     order = some.sites.yx[:, 0].tolist()
@@ -58,7 +58,7 @@ def test_a_fresh_selector_is_confidence_less_repetition():
 
 
 def test_what_is_learned_is_added_and_senders_of_a_batch_do_not_repeat_each_other():
-    some = told((5, 4, 2.0, 1), (5, 5, 1.0, 0))
+    some = make_tokens((5, 4, 2.0, 1), (5, 5, 1.0, 0))
     selector = Selector(CHANNELS)
     fresh = selector(some).detach()
     torch.nn.init.normal_(selector.outer.weight)
@@ -69,9 +69,9 @@ def test_what_is_learned_is_added_and_senders_of_a_batch_do_not_repeat_each_othe
     assert torch.allclose(selector(batch), selector(some).repeat(2), atol=1e-6)
 
 
-def test_no_gradient_reaches_what_is_told_and_all_of_the_selector_learns():
+def test_no_gradient_reaches_the_tokens_and_every_selector_weight_learns():
     """M6."""
-    some = told((5, 4, 2.0, 1), (5, 5, 1.0, 0), (20, 20, 0.5, 0))
+    some = make_tokens((5, 4, 2.0, 1), (5, 5, 1.0, 0), (20, 20, 0.5, 0))
     features = some.features.requires_grad_()
     selector = Selector(CHANNELS)
     torch.nn.init.normal_(selector.outer.weight)
@@ -88,7 +88,7 @@ def kept(score: Tensor, n: int) -> set[int]:
 def test_the_same_tokens_get_the_same_scores_and_a_larger_budget_keeps_the_smaller_ones(seed):
     random = torch.Generator().manual_seed(seed)
     cells = torch.randperm(1024, generator=random)[:40].tolist()
-    some = told(*((c // 32, c % 32, float(h), 0) for c, h in zip(cells, torch.randn(40, generator=random))))
+    some = make_tokens(*((c // 32, c % 32, float(h), 0) for c, h in zip(cells, torch.randn(40, generator=random))))
     selector = Selector(CHANNELS).eval()
     torch.nn.init.normal_(selector.outer.weight)
     score = selector(some).detach()
@@ -97,4 +97,4 @@ def test_the_same_tokens_get_the_same_scores_and_a_larger_budget_keeps_the_small
 
 
 def test_nothing_to_choose_from():
-    assert Selector(CHANNELS)(told()).shape == (0,)
+    assert Selector(CHANNELS)(make_tokens()).shape == (0,)

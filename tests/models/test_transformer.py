@@ -55,7 +55,10 @@ def test_with_shared_weights_moving_the_thresholds_changes_nothing(gradients):
     xy, batch = places()
     x = features(len(xy))
     with torch.set_grad_enabled(gradients):
-        outs = [transformer(levels=levels)(x, xy, batch, GRID) for levels in ((0.125, 0.25), (0.0, 0.01), (0.6, 2.0))]
+        outs = [
+            transformer(density_thresholds=levels)(x, xy, batch, GRID)
+            for levels in ((0.125, 0.25), (0.0, 0.01), (0.6, 2.0))
+        ]
     assert all(torch.equal(outs[0], out) for out in outs[1:])
 
 
@@ -65,7 +68,7 @@ def test_three_levels_of_equal_weights_are_one(gradients):
     xy, batch = places()
     shared, x = transformer(), features(len(xy))
     for levels in ((0.125, 0.25), (0.05, 0.9)):
-        routed = transformer(separate_weights=True, levels=levels)
+        routed = transformer(separate_weights=True, density_thresholds=levels)
         for one, three in zip(shared.blocks, routed.blocks):
             assert isinstance(one, WindowBlock) and isinstance(three, RoutedBlock)
             for block in three.levels:
@@ -79,7 +82,7 @@ def test_each_windows_tokens_go_through_the_weights_of_its_level():
     x = features(len(xy))
     (block,) = transformer(separate_weights=True, blocks=1).blocks
     assert isinstance(block, RoutedBlock)
-    ids = window_ids(xy, batch, (GRID.x_min, GRID.y_min), 8 * GRID.cell)
+    ids = window_ids(xy, batch, (GRID.x_min, GRID.y_min), 8 * GRID.cell_size_m)
     level = density_levels(ids, 64, (0.125, 0.25))
     assert torch.bincount(level).tolist() == [2 * THIN, 12, DENSE + 80]
     with torch.no_grad():
@@ -95,7 +98,7 @@ def test_a_threshold_that_moves_sends_a_window_through_other_weights():
     x = features(len(xy))
     a, b = (
         transformer(separate_weights=True, blocks=1),
-        transformer(separate_weights=True, blocks=1, levels=(0.2, 0.25)),
+        transformer(separate_weights=True, blocks=1, density_thresholds=(0.2, 0.25)),
     )
     with torch.no_grad():
         moved = (a(x, xy, batch, GRID) - b(x, xy, batch, GRID)).abs().amax(1) > 1e-4
@@ -131,7 +134,7 @@ def test_tokens_may_be_permuted_and_moved_by_whole_windows(separate):
     with torch.no_grad():
         out = model(x, xy, batch, GRID)
         assert torch.allclose(model(x[order], xy[order], batch, GRID), out[order], atol=1e-5)
-        moved = xy + torch.tensor([3.0, -2.0]) * 8 * GRID.cell
+        moved = xy + torch.tensor([3.0, -2.0]) * 8 * GRID.cell_size_m
         assert torch.allclose(model(x, moved, batch, GRID), out, atol=1e-3)
         aside = xy + torch.tensor([1.0, 0.0])
         assert not torch.allclose(model(x, aside, batch, GRID), out, atol=1e-3)
@@ -148,7 +151,7 @@ def test_gradients_and_inference_agree():
 
 def test_the_counters_of_eq_14_order_as_they_must():
     xy, batch = places()
-    ids = window_ids(xy, batch, (GRID.x_min, GRID.y_min), 8 * GRID.cell)
+    ids = window_ids(xy, batch, (GRID.x_min, GRID.y_min), 8 * GRID.cell_size_m)
     cost = attention_cost(plan_windows(ids, ids), 8, math.prod(GRID.shape))
     assert cost.exact == 2 * THIN**2 + 12**2 + DENSE**2 + 80**2
     assert cost.exact <= cost.padded and cost.bound == 64 * len(xy) and cost.dense == 64 * 32 * 32
@@ -156,4 +159,4 @@ def test_the_counters_of_eq_14_order_as_they_must():
 
 def test_levels_that_fall_are_an_error():
     with pytest.raises(ConfigError, match=r"levels are two ascending shares of a window's cells; got \(0.3, 0.2\)"):
-        AttentionConfig(levels=(0.3, 0.2))
+        AttentionConfig(density_thresholds=(0.3, 0.2))

@@ -9,12 +9,12 @@ import torch
 from torch.nn import functional
 
 from manyeyes.datatypes import BevGrid, ConfigError
-from manyeyes.models.detector.box_head import RAW
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.box_head import BOX_LAYOUT
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.transformer import AttentionConfig
-from manyeyes.models.fusion.token_merge import Settle, settle
-from manyeyes.models.fusion.transform_tokens import CUES, Tokens
-from manyeyes.models.fusion.v2x_vit import AgentAttention, MultiScaleWindows, V2xVitFusion, kinds
+from manyeyes.models.fusion.token_merge import TokenMerge, assign_cells
+from manyeyes.models.fusion.transform_tokens import POSE_CONTEXT_DIM, Tokens
+from manyeyes.models.fusion.v2x_vit import AgentAttention, MultiScaleWindows, V2xVitFusion, agent_types
 from manyeyes.ops.window_attention import sincos_encoding
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
@@ -25,10 +25,10 @@ CONFIG = AttentionConfig(window=4, blocks=2, heads=HEADS)
 def tokens(n: int = 60, batch: int = 2, seed: int = 0, reach_m: float = 12.0) -> Tokens:
     """Tokens that stay where they are, several on one cell; of every ego's, half are its own."""
     rng = torch.Generator().manual_seed(seed)
-    proposal = torch.randn(n, PROPOSAL, generator=rng)
-    proposal[:, RAW.heat] = -9.0
+    proposal = torch.randn(n, PROPOSAL_DIM, generator=rng)
+    proposal[:, BOX_LAYOUT.heatmap_logit] = -9.0
     xy = (torch.rand(n, 2, generator=rng) - 0.5) * 2 * reach_m
-    ego, cue = torch.randint(0, batch, (n,), generator=rng), torch.randn(n, CUES, generator=rng)
+    ego, cue = torch.randint(0, batch, (n,), generator=rng), torch.randn(n, POSE_CONTEXT_DIM, generator=rng)
     cue[torch.rand(n, generator=rng) < 0.5] = 0
     cue[:, 3:] = cue[:, 3:].abs()
     return Tokens(torch.randn(n, CHANNELS, generator=rng), xy, ego, cue, proposal, torch.ones(n), GRID, batch)
@@ -45,7 +45,7 @@ def speaking(model: torch.nn.Module) -> torch.nn.Module:
 def test_agents_at_one_place_attend_by_kind_and_edge():
     """A loop over tokens with the paper's sums: softmax over j of q_i W_att k_j / sqrt(d), of the messages v_j W_msg."""
     model, some = speaking(AgentAttention(CHANNELS, HEADS)), tokens()
-    key, kind, d = settle(some)[0], kinds(some), CHANNELS // HEADS
+    key, kind, d = assign_cells(some)[0], agent_types(some), CHANNELS // HEADS
     assert len(key.unique()) < len(key) and 10 < int(kind.sum()) < 50
     found = model(some.features, key, kind)
     for i in range(len(key)):
@@ -53,24 +53,24 @@ def test_agents_at_one_place_attend_by_kind_and_edge():
         query = model.query.maps[ki](some.features[i]).view(HEADS, d)
         heads = []
         for h in range(HEADS):
-            logits, told = [], []
+            logits, messages = [], []
             for j in mates:
                 kj = int(kind[j])
-                known = model.key.maps[kj](some.features[j]).view(HEADS, d)[h] @ model.attends[ki, kj, h]
-                told.append(model.value.maps[kj](some.features[j]).view(HEADS, d)[h] @ model.tells[ki, kj, h])
+                known = model.key.maps[kj](some.features[j]).view(HEADS, d)[h] @ model.attention_matrix[ki, kj, h]
+                messages.append(model.value.maps[kj](some.features[j]).view(HEADS, d)[h] @ model.tells[ki, kj, h])
                 logits.append(query[h] @ known / math.sqrt(d))
-            heads.append(torch.stack(logits).softmax(0) @ torch.stack(told))
+            heads.append(torch.stack(logits).softmax(0) @ torch.stack(messages))
         torch.testing.assert_close(found[i], model.out.maps[ki](torch.cat(heads)), atol=1e-4, rtol=1e-4)
 
 
 def test_windows_of_three_sizes_are_weighed_by_split_attention():
     model, some = speaking(MultiScaleWindows(CHANNELS, CONFIG)), tokens()
-    agent = some.ego * 2 + kinds(some)
+    agent = some.ego * 2 + agent_types(some)
     found = model(some.features, some, agent, 4)
     assert [(s.heads, s.window) for s in model.scales] == [(4, 2), (2, 4), (1, 8)]
     branches = []
     for scale in model.scales:
-        edge, out = scale.window * GRID.cell, torch.zeros(len(agent), CHANNELS)
+        edge, out = scale.window * GRID.cell_size_m, torch.zeros(len(agent), CHANNELS)
         at = ((some.xy.double() + 25.6) / edge).floor()
         place = ((some.xy.double() + 25.6) / edge - at - 0.5).float() * scale.window
         q, k, _ = scale.qkv(some.features + sincos_encoding(place, CHANNELS)).chunk(3, 1)
@@ -89,24 +89,24 @@ def test_windows_of_three_sizes_are_weighed_by_split_attention():
 def test_it_starts_as_tokens_that_settle_by_trust():
     torch.manual_seed(0)
     some, model = tokens(), V2xVitFusion(CHANNELS, CONFIG).eval().requires_grad_(False)
-    plain = Settle(CHANNELS, "trust")
-    plain.load_state_dict(model.settle.state_dict())
-    key, place = settle(some)
+    plain = TokenMerge(CHANNELS, "trust")
+    plain.load_state_dict(model.merge.state_dict())
+    key, place = assign_cells(some)
     torch.testing.assert_close(model(some).bev.features, plain(some.features, some, key, place).bev.features)
     loud = speaking(V2xVitFusion(CHANNELS, CONFIG))
     assert len(loud.layers) == 2 and not torch.allclose(loud(some).bev.features, model(some).bev.features)
 
 
-def test_what_an_ego_hears_is_treated_otherwise_than_its_own():
+def test_received_tokens_use_their_own_weights():
     """The same two tokens on one cell, once both its own and once one heard from the ego's very place, 3 m below."""
     some, model = tokens(2, 1), speaking(AgentAttention(CHANNELS, HEADS))
     key = torch.zeros(2, dtype=torch.int64)
     own = model(some.features, key, torch.tensor([0, 0]))
-    heard = model(some.features, key, torch.tensor([0, 1]))
-    assert not torch.allclose(own[0], heard[0]) and not torch.allclose(own[1], heard[1])
-    cue = torch.zeros(2, CUES)
+    received = model(some.features, key, torch.tensor([0, 1]))
+    assert not torch.allclose(own[0], received[0]) and not torch.allclose(own[1], received[1])
+    cue = torch.zeros(2, POSE_CONTEXT_DIM)
     cue[1, 0] = -3.0
-    assert kinds(replace(some, cue=cue)).tolist() == [0, 1]
+    assert agent_types(replace(some, pose_context=cue)).tolist() == [0, 1]
 
 
 def test_egos_do_not_meet_and_gradients_reach_every_layer():

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, ShapeError, Transform
-from manyeyes.ops.bev_warp import SEEN_SHARE, masked_max, warp
+from manyeyes.ops.bev_warp import MIN_SEEN_FRACTION, masked_max, warp_bev
 
 SMALL = BevGrid(-4.0, -3.0, -1.0, 4.0, 3.0, 1.0, pillar=1.0)
 TILE = BevGrid(-8.0, -8.0, -1.0, 8.0, 8.0, 1.0, pillar=1.0)
@@ -36,7 +36,7 @@ def slowly(features, seen, source, target, motion):
                     if 0 <= i < source.shape[0] and 0 <= j < source.shape[1] and bool(seen[0, i, j]):
                         share = (1 - abs(row - i)) * (1 - abs(column - j))
                         total, weight = total + share * features[0, :, i, j], weight + share
-            if weight > SEEN_SHARE:
+            if weight > MIN_SEEN_FRACTION:
                 out[:, r, c], visible[r, c] = total / weight, True
     return out, visible
 
@@ -48,7 +48,7 @@ def test_values_and_gradients_are_those_of_the_loop(stride):
     features = torch.randn(1, 2, *source.shape, generator=generator, dtype=torch.float64, requires_grad=True)
     seen = torch.rand(1, *source.shape, generator=generator) > 0.3
     motion = Transform.from_xyz_yaw(1.3, -0.7, 4.0, 0.6)
-    fast, visible = warp(features, seen, source, TILE, Transform.stack([motion]))
+    fast, visible = warp_bev(features, seen, source, TILE, Transform.stack([motion]))
     slow, expected = slowly(features, seen, source, TILE, motion)
     assert torch.equal(visible[0], expected) and 10 < int(expected.sum()) < expected.numel()
     assert torch.allclose(fast[0], slow, atol=1e-6)
@@ -62,7 +62,9 @@ def test_a_quarter_turn_carries_each_cell_to_its_place():
     features = torch.zeros(1, 1, *SMALL.shape)
     # A cell centred on x = 3.5, y = 0.5 stands at x = -0.5 + 2, y = 3.5 after a turn to the left and 2 m ahead.
     features[0, 0, 3, 7] = 5.0
-    moved, seen = warp(features, torch.ones(1, *SMALL.shape, dtype=torch.bool), SMALL, TILE, one(2.0, 0.0, math.pi / 2))
+    moved, seen = warp_bev(
+        features, torch.ones(1, *SMALL.shape, dtype=torch.bool), SMALL, TILE, one(2.0, 0.0, math.pi / 2)
+    )
     row, column = TILE.cells(torch.tensor([[1.5, 3.5]]))[0].tolist()
     assert float(moved[0, 0, row, column]) == pytest.approx(5.0, abs=1e-5)
     assert float(moved.sum()) == pytest.approx(5.0, abs=1e-4) and int(seen.sum()) == 48
@@ -74,7 +76,7 @@ def test_height_and_tilt_do_not_move_the_ground():
     flat = Transform.from_xyz_yaw(1.0, 2.0, 0.0, 0.4)
     zero = torch.zeros((), dtype=torch.float64)
     tilted = Transform.from_rpy(torch.tensor([1.0, 2.0, 30.0], dtype=torch.float64), zero, zero + 0.02, zero + 0.4)
-    a, b = (warp(features, seen, SMALL, TILE, Transform.stack([t]))[0] for t in (flat, tilted))
+    a, b = (warp_bev(features, seen, SMALL, TILE, Transform.stack([t]))[0] for t in (flat, tilted))
     assert torch.allclose(a, b, atol=1e-5)
 
 
@@ -113,7 +115,7 @@ def test_the_maximum_is_that_of_the_loop_in_values_and_gradients():
         assert torch.allclose(one, other, atol=1e-12)
 
 
-def test_gradients_go_to_the_greatest_that_saw_and_to_null_where_nobody_did():
+def test_gradients_go_to_the_largest_seen_feature_else_to_null():
     features = torch.tensor([[1.0, 5.0, 2.0]]).T.view(1, 3, 1, 1, 1).repeat(1, 1, 1, 1, 2).requires_grad_()
     seen = torch.tensor([[True, False], [False, False], [True, False]]).view(1, 3, 1, 2)
     null = torch.zeros(1, requires_grad=True)
@@ -124,4 +126,4 @@ def test_gradients_go_to_the_greatest_that_saw_and_to_null_where_nobody_did():
 
 def test_features_of_another_grid_are_refused():
     with pytest.raises(ShapeError, match="warp needs features"):
-        warp(torch.zeros(1, 2, 3, 3), torch.ones(1, 3, 3, dtype=torch.bool), SMALL, TILE, one())
+        warp_bev(torch.zeros(1, 2, 3, 3), torch.ones(1, 3, 3, dtype=torch.bool), SMALL, TILE, one())

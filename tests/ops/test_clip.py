@@ -40,7 +40,7 @@ def test_a_ring_is_cut_as_a_ring():
     assert clip_ring(ring + (20, 0), BOX).shape == (0, 2) and ring_area(np.zeros((0, 2))) == 0.0
 
 
-def test_shapely_says_the_same():
+def test_shapely_agrees():
     shapely = pytest.importorskip("shapely", reason="the 'map' extra is not installed")
     rng = np.random.default_rng(2)
     for _ in range(60):

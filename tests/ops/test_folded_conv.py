@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, Sites, SparseBev
 from manyeyes.ops._sparse_conv_kernels import empty_rows, panels
-from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, takes
+from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, is_supported
 from manyeyes.ops.sparse_conv import same_sites_map, strided_conv, strided_map, submanifold_conv
 from manyeyes.ops.sparse_index import Window
 
@@ -39,7 +39,7 @@ def test_a_run_of_layers_equals_one_after_another(channels: int, layers: int) ->
     folded, wanted, before = FoldedConvs.of(*zip(*convs)), x, x.features.clone()
     for weight, bias in convs:
         wanted = wanted.with_features(torch.relu(submanifold_conv(wanted, weight.double(), bias.double()).features))
-    assert folded is not None and takes(x.features)
+    assert folded is not None and is_supported(x.features)
     got = folded(x.features, same_sites_map(x.sites, kernel=3))
     assert torch.equal(x.features, before) and float(wanted.features.abs().max()) > 0.5
     assert 0.2 < float((wanted.features == 0).float().mean()) < 0.8
@@ -93,10 +93,10 @@ def test_what_the_loops_do_not_know_is_left_to_the_layers() -> None:
     assert FoldedConvs.of(*zip(layer(16, 24, 3, seed=0))) is None
     assert FoldedConvs.of([], []) is None
     assert NormedConv.of(layer(16, 24, 3, seed=0)[0], nn.LayerNorm(24), is_skipped=False) is None
-    assert not takes(torch.zeros(1, 16))  # A gradient might be asked for.
+    assert not is_supported(torch.zeros(1, 16))  # A gradient might be asked for.
     with torch.no_grad():
-        assert takes(torch.zeros(1, 16))
-        assert not takes(torch.zeros(1, 16, dtype=torch.float64))
+        assert is_supported(torch.zeros(1, 16))
+        assert not is_supported(torch.zeros(1, 16, dtype=torch.float64))
 
 
 def test_panels_hold_every_column_once() -> None:

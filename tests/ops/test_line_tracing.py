@@ -8,7 +8,14 @@ import pytest
 import torch
 
 from manyeyes.datatypes import ShapeError
-from manyeyes.ops.line_tracing import HOME, SHARPEST, LineField, away_from, evenly_along, follow
+from manyeyes.ops.line_tracing import (
+    MIN_STRIDES_TO_CLOSE,
+    MIN_TURN_COSINE,
+    TracingField,
+    distance_to_lines,
+    resample_evenly,
+    trace_lines,
+)
 from manyeyes.ops.polyline import resample
 
 
@@ -24,14 +31,16 @@ def field_of(curve, rows, columns, reach=1.5):
     way = tangent / tangent.norm(dim=1, keepdim=True)
     # Cells say the direction with either sign.
     way = way * torch.where(torch.arange(len(way)) % 2 == 0, 1.0, -1.0)[:, None]
-    return LineField(sure.view(1, rows, columns), curve[near].view(1, rows, columns, 2), way.view(1, rows, columns, 2))
+    return TracingField(
+        sure.view(1, rows, columns), curve[near].view(1, rows, columns, 2), way.view(1, rows, columns, 2)
+    )
 
 
 def line(a, b, count=400):
     return torch.lerp(torch.tensor(a), torch.tensor(b), torch.linspace(0, 1, count)[:, None])
 
 
-def lone_walk(field, cell, least, stride, strides):
+def trace_one_line(field, cell, min_confidence, stride, strides):
     """One line, one stride at a time, in plain numbers."""
     rows, columns = field.sure.shape[1:]
     start = field.foot[0, cell[0], cell[1]].tolist()
@@ -46,7 +55,7 @@ def lone_walk(field, cell, least, stride, strides):
                 break
             way = field.way[0, r, c].tolist()
             turn = way[0] * heading[0] + way[1] * heading[1]
-            if float(field.sure[0, r, c]) < least or abs(turn) < SHARPEST:
+            if float(field.sure[0, r, c]) < min_confidence or abs(turn) < MIN_TURN_COSINE:
                 out.append([(at[0] + to[0]) / 2, (at[1] + to[1]) / 2])
                 break
             way = [-v for v in way] if turn < 0 else way
@@ -54,7 +63,7 @@ def lone_walk(field, cell, least, stride, strides):
             foot = field.foot[0, r, c].tolist()
             off = (foot[0] - to[0]) * side[0] + (foot[1] - to[1]) * side[1]
             at, heading = [to[0] + off * side[0], to[1] + off * side[1]], way
-            if k >= HOME and math.hypot(at[0] - start[0], at[1] - start[1]) < stride:
+            if k >= MIN_STRIDES_TO_CLOSE and math.hypot(at[0] - start[0], at[1] - start[1]) < stride:
                 out.append(start)
                 closed = True
                 break
@@ -81,20 +90,20 @@ CURVES = {
 def test_a_walk_is_the_walk_of_one_line_at_a_time(name):
     curve, cell = CURVES[name]
     field = field_of(curve, 12, 20)
-    assert float(field.sure[0, cell[0], cell[1]]) == 1
-    walks = follow(field, torch.zeros(2, dtype=torch.int64), torch.tensor([cell, cell]), 0.5, 1.2, 40)
-    slow = lone_walk(field, cell, 0.5, 1.2, 40)
+    assert float(field.confidence[0, cell[0], cell[1]]) == 1
+    walks = trace_lines(field, torch.zeros(2, dtype=torch.int64), torch.tensor([cell, cell]), 0.5, 1.2, 40)
+    slow = trace_one_line(field, cell, 0.5, 1.2, 40)
     assert torch.equal(walks.points[0], walks.points[1])
     np.testing.assert_allclose(unrepeated(walks.points[0].numpy()), unrepeated(slow), atol=1e-4)
 
 
 def test_walks_lie_on_their_lines_and_reach_their_ends():
     for name, (curve, cell) in CURVES.items():
-        walks = follow(field_of(curve, 12, 20), torch.tensor([0]), torch.tensor([cell]), 0.5, 1.2, 40)
+        walks = trace_lines(field_of(curve, 12, 20), torch.tensor([0]), torch.tensor([cell]), 0.5, 1.2, 40)
         inside = curve[((curve >= 0) & (curve <= torch.tensor([20.0, 12.0]))).all(1)]
         # Cells beyond an end are sure as far as the field reaches, so that a walk goes on for that and half a stride.
         assert float(torch.cdist(walks.points[0], inside).amin(1).max()) < 2.2, name
-        assert float(torch.cdist(inside, evenly_along(walks.points[0], 200)).amin(1).max()) < 0.12, name
+        assert float(torch.cdist(inside, resample_evenly(walks.points[0], 200)).amin(1).max()) < 0.12, name
         went = walks.points[0].diff(dim=0).norm(dim=1).sum()
         length = inside.diff(dim=0).norm(dim=1).sum()
         # Round a ring once, not twice.
@@ -103,24 +112,24 @@ def test_walks_lie_on_their_lines_and_reach_their_ends():
 
 def test_a_walk_ends_half_a_stride_beyond_the_last_cell_that_is_sure():
     field = field_of(line([0.0, 2.5], [20.0, 2.5]), 5, 20)
-    field.sure[0, :, 10:] = 0.1
-    walks = follow(field, torch.tensor([0]), torch.tensor([[2, 6]]), 0.5, 1.0, 30)
+    field.confidence[0, :, 10:] = 0.1
+    walks = trace_lines(field, torch.tensor([0]), torch.tensor([[2, 6]]), 0.5, 1.0, 30)
     # From the middle of column 6 to that of column 9, and half a cell on; the other way to the border.
     assert walks.points[0].amax(0).tolist() == pytest.approx([10.0, 2.5], abs=0.05)
     assert walks.points[0].amin(0).tolist() == pytest.approx([0.0, 2.5], abs=0.05)
-    assert float(walks.sure[0].sum()) == pytest.approx(10) and int((walks.sure[0] > 0).sum()) == 10
+    assert float(walks.confidence[0].sum()) == pytest.approx(10) and int((walks.confidence[0] > 0).sum()) == 10
 
 
 def test_a_cell_that_is_not_sure_begins_no_line():
     field = field_of(line([0.0, 2.5], [20.0, 2.5]), 8, 20)
-    walks = follow(field, torch.tensor([0]), torch.tensor([[6, 6]]), 0.5, 1.0, 30)
-    assert float((walks.points - walks.points[:, :1]).abs().max()) == 0 and float(walks.sure.sum()) == 0
+    walks = trace_lines(field, torch.tensor([0]), torch.tensor([[6, 6]]), 0.5, 1.0, 30)
+    assert float((walks.points - walks.points[:, :1]).abs().max()) == 0 and float(walks.confidence.sum()) == 0
 
 
 def test_pictures_do_not_mix():
     across, along = field_of(line([3.5, 0.0], [3.5, 8.0]), 8, 20), field_of(line([0.0, 2.5], [20.0, 2.5]), 8, 20)
-    field = LineField(*(torch.cat((getattr(across, f), getattr(along, f))) for f in ("sure", "foot", "way")))
-    walks = follow(field, torch.tensor([1, 0]), torch.tensor([[2, 3], [2, 3]]), 0.5, 1.0, 30)
+    field = TracingField(*(torch.cat((getattr(across, f), getattr(along, f))) for f in ("sure", "foot", "way")))
+    walks = trace_lines(field, torch.tensor([1, 0]), torch.tensor([[2, 3], [2, 3]]), 0.5, 1.0, 30)
     assert float((walks.points[0, :, 1] - 2.5).abs().max()) < 0.05
     assert float((walks.points[1, :, 0] - 3.5).abs().max()) < 0.05
 
@@ -130,10 +139,10 @@ def test_even_spacing_is_that_of_polylines():
     lines = rng.uniform(0, 20, (3, 9, 2))
     lines[1, 4:7] = lines[1, 4]  # stood still
     lines[2, :3] = lines[2, 0]
-    for own, even in zip(lines, evenly_along(torch.from_numpy(lines).float(), 13)):
+    for own, even in zip(lines, resample_evenly(torch.from_numpy(lines).float(), 13)):
         slow = resample(own, np.array([0, 9]), np.array([13]))[0]
         np.testing.assert_allclose(even.numpy(), slow, atol=1e-3)
-    nowhere = evenly_along(torch.full((1, 5, 2), 3.0), 4)
+    nowhere = resample_evenly(torch.full((1, 5, 2), 3.0), 4)
     assert torch.equal(nowhere, torch.full((1, 4, 2), 3.0))
 
 
@@ -143,9 +152,9 @@ def test_distances_are_to_the_nearest_of_all_edges():
     lines[0, 0, 2:] = lines[0, 0, 2]
     dense = torch.lerp(lines[:, :, :-1, None], lines[:, :, 1:, None], torch.linspace(0, 1, 400)[:, None]).flatten(2, 3)
     slow = (dense[:, :, None] - places[:, None, :, None]).norm(dim=-1).amin(-1)
-    assert torch.allclose(away_from(places, lines), slow, atol=5e-3)
+    assert torch.allclose(distance_to_lines(places, lines), slow, atol=5e-3)
 
 
 def test_a_field_of_other_shapes_is_refused():
     with pytest.raises(ShapeError, match="LineField needs"):
-        LineField(torch.zeros(1, 3, 4), torch.zeros(1, 3, 4), torch.zeros(1, 3, 4, 2))
+        TracingField(torch.zeros(1, 3, 4), torch.zeros(1, 3, 4), torch.zeros(1, 3, 4, 2))

@@ -25,7 +25,7 @@ def test_equals_its_slow_twin(seed, threshold):
     kept = rotated_nms(boxes, score, threshold)
     assert kept.dtype == torch.int64
     assert kept.tolist() == slow_nms(boxes, score, threshold)
-    assert rotated_nms(boxes, score, threshold, pre=7).tolist() == slow_nms(boxes, score, threshold, pre=7)
+    assert rotated_nms(boxes, score, threshold, max_candidates=7).tolist() == slow_nms(boxes, score, threshold, pre=7)
 
 
 def test_equal_boxes_of_equal_score_keep_the_first():
@@ -33,7 +33,7 @@ def test_equal_boxes_of_equal_score_keep_the_first():
     assert rotated_nms(boxes, torch.ones(5), 0.15).tolist() == [0]
 
 
-def test_a_suppressed_box_suppresses_nobody():
+def test_a_suppressed_box_suppresses_no_other():
     boxes = torch.tensor([[0.0, 0, 4, 2, 0], [2, 0, 4, 2, 0], [4, 0, 4, 2, 0]])  # IoU 1/3, 1/3, 0
     assert rotated_nms(boxes, torch.tensor([0.9, 0.8, 0.7]), 0.15).tolist() == [0, 2]
 

@@ -48,7 +48,7 @@ def test_equals_a_row_for_every_point(agents: int, sweeps: int, channels: int) -
     assert float(wanted.features.max()) > 1 and bool((wanted.features == 0).any())
 
 
-def test_age_tells_the_sweep_before_from_that_of_now() -> None:
+def test_age_separates_the_sweep_before_from_that_of_now() -> None:
     point = PointCloud.of(torch.tensor([[0.1, 0.1, 0.0]]))
     weight = torch.zeros(1, 11)
     weight[0, 10] = 3.0

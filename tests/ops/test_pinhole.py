@@ -81,7 +81,7 @@ def test_equals_every_ray_against_every_primitive(seed: int, ground: HeightField
     assert (fast.primitive != 4).all()
 
 
-def test_a_box_covers_the_pixels_that_arithmetic_says() -> None:
+def test_a_box_covers_the_pixels_of_the_formula() -> None:
     #   a wall 2 m wide and 1 m high, its face 10 m ahead, seen through f = 33.5 px: 6.7 x 3.35 px about the middle
     wall = solid(BOX, (10.5, 0, 0), (0.5, 1.0, 0.5))
     sight = cast_pinhole(wall, flat(-100.0), np.zeros(3), AHEAD, INTRINSIC, 80, 60, 50.0)
@@ -101,7 +101,7 @@ def test_a_box_that_reaches_behind_the_camera_is_seen_beside_it() -> None:
     assert (cast_pinhole(behind, flat(-100.0), np.zeros(3), AHEAD, INTRINSIC, 80, 60, 50.0).primitive == NOTHING).all()
 
 
-def test_foliage_lets_through_what_its_density_says() -> None:
+def test_foliage_transmission_follows_its_density() -> None:
     density, thick = 0.6, 2.0
     slab = turn(0.5, 0.3)
     crown = solid(ELLIPSOID, 20 * slab[:, 0], (thick / 2, 60.0, 60.0), slab, density)
@@ -123,6 +123,6 @@ def test_a_leaf_that_one_camera_sees_stops_the_ray_of_another() -> None:
         eye = np.array([3.0, -2.0, 1.5])
         ahead = (leaf - eye) / np.linalg.norm(leaf - eye)
         right = np.cross(ahead, (0.0, 0, 1)) / np.hypot(*ahead[:2])
-        looking = np.stack([right, np.cross(ahead, right), ahead], 1)
-        met = cast_pinhole(crown, flat(-100.0), eye, looking, one_pixel, 1, 1, 60.0, 5)
+        world_from_camera = np.stack([right, np.cross(ahead, right), ahead], 1)
+        met = cast_pinhole(crown, flat(-100.0), eye, world_from_camera, one_pixel, 1, 1, 60.0, 5)
         assert met.depth_m[0, 0] <= np.linalg.norm(leaf - eye) + LEAF_M

@@ -8,7 +8,15 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import Boxes
-from manyeyes.ops.point_alignment_cost import FEWEST, FLAT, MARGIN, MOST, REACH_M, ROAD_M, meeting_costs
+from manyeyes.ops.point_alignment_cost import (
+    BOX_MARGIN_M,
+    HEIGHT_SCALE,
+    MAX_DISTANCE_M,
+    MAX_POINTS,
+    MIN_POINTS,
+    ROAD_CLEARANCE_M,
+    compute_alignment_costs,
+)
 
 STEPS = 9
 
@@ -35,19 +43,22 @@ def plain(now: Tensor, then: Tensor, box: Boxes, back: Tensor, slack: float) -> 
         for x, y, z in cloud.double().numpy() - middle:
             dx, dy = x - away[0], y - away[1]
             u, v = dx * ahead[0] + dy * ahead[1], dy * ahead[0] - dx * ahead[1]
-            long, wide = abs(u) < size[0] / 2 + along, abs(v) < size[1] / 2 + MARGIN[1]
-            if long and wide and ROAD_M - size[2] / 2 < z < size[2] / 2 + MARGIN[2]:
-                found.append(np.array([u, v, FLAT * z]))
+            long, wide = abs(u) < size[0] / 2 + along, abs(v) < size[1] / 2 + BOX_MARGIN_M[1]
+            if long and wide and ROAD_CLEARANCE_M - size[2] / 2 < z < size[2] / 2 + BOX_MARGIN_M[2]:
+                found.append(np.array([u, v, HEIGHT_SCALE * z]))
         return found
 
-    mine, theirs = inside(now, np.zeros(2), MARGIN[0]), inside(then, -back.numpy(), MARGIN[0] + slack)
-    if min(len(mine), len(theirs)) < FEWEST:
+    mine, theirs = inside(now, np.zeros(2), BOX_MARGIN_M[0]), inside(then, -back.numpy(), BOX_MARGIN_M[0] + slack)
+    if min(len(mine), len(theirs)) < MIN_POINTS:
         return [0.0] * STEPS, 0
-    asked = min(len(mine), MOST)
+    asked = min(len(mine), MAX_POINTS)
     costs = []
     for d in np.linspace(-slack, slack, STEPS):
         worst = [
-            min(min(((mine[a * len(mine) // asked] - q - [d, 0, 0]) ** 2).sum() for q in theirs) / REACH_M**2, 1.0)
+            min(
+                min(((mine[a * len(mine) // asked] - q - [d, 0, 0]) ** 2).sum() for q in theirs) / MAX_DISTANCE_M**2,
+                1.0,
+            )
             for a in range(asked)
         ]
         costs.append(float(np.mean(worst)))
@@ -58,13 +69,13 @@ def test_costs_are_those_of_every_pair_of_points() -> None:
     now, then = scattered(0), scattered(1, 900)
     boxes = cars([(0.0, 0.5), (5.0, -1.0), (90.0, 0.0)], 0.4)
     back, slack = torch.tensor([[1.0, 0.3], [-0.5, 0.2], [0.0, 0.0]]), torch.tensor([0.8, 1.5, 1.0])
-    cost, count = meeting_costs(now, then, boxes, back, slack, STEPS)
+    cost, count = compute_alignment_costs(now, then, boxes, back, slack, STEPS)
     for n in range(3):
         want, asked = plain(now, then, boxes[n : n + 1], back[n].double(), float(slack[n]))
         np.testing.assert_allclose(cost[n].numpy(), want, atol=1e-5)
         assert int(count[n]) == asked
-    assert count.tolist()[2] == 0 and min(count.tolist()[:2]) >= FEWEST
-    assert MOST in count.tolist()
+    assert count.tolist()[2] == 0 and min(count.tolist()[:2]) >= MIN_POINTS
+    assert MAX_POINTS in count.tolist()
 
 
 def test_a_body_meets_itself_where_it_was() -> None:
@@ -78,15 +89,18 @@ def test_a_body_meets_itself_where_it_was() -> None:
     road = torch.cat((t * ahead, torch.full((15, 1), 0.05)), 1)
     was = torch.cat((2.0 * ahead + 0.6 * ahead, torch.zeros(1)))
     now, then = torch.cat((side, back_face, road)), torch.cat((side - was, back_face - was, road))
-    cost, _ = meeting_costs(now, then, cars([(0.0, 0.0)], yaw), 2.0 * ahead[None], torch.tensor([1.0]), 21)
+    cost, _ = compute_alignment_costs(now, then, cars([(0.0, 0.0)], yaw), 2.0 * ahead[None], torch.tensor([1.0]), 21)
     assert int(cost[0].argmin()) == 16
     assert float(cost[0, 16]) < 1e-6 and float(cost[0, 6]) > 0.1
 
 
 def test_no_boxes_and_no_points() -> None:
     none = cars([], 0.0)
-    assert meeting_costs(scattered(0), scattered(1), none, torch.zeros(0, 2), torch.zeros(0), 5)[0].shape == (0, 5)
-    cost, count = meeting_costs(
+    assert compute_alignment_costs(scattered(0), scattered(1), none, torch.zeros(0, 2), torch.zeros(0), 5)[0].shape == (
+        0,
+        5,
+    )
+    cost, count = compute_alignment_costs(
         torch.zeros(0, 3), scattered(1), cars([(0, 0)], 0.0), torch.zeros(1, 2), torch.ones(1), 5
     )
     assert cost.tolist() == [[0.0] * 5] and count.tolist() == [0]

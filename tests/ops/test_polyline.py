@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 
 from manyeyes.ops.polyline import (
-    at_stations,
     close_rings,
-    feet,
+    cut_line,
+    find_near_pairs,
+    find_near_pairs_between,
     headings,
     lengths,
-    near_pairs,
-    near_pairs_between,
-    part,
+    points_at_stations,
+    project_onto_line,
     resample,
     resample_spaced,
     simplify,
 )
-from manyeyes.ops.polyline_distance import chamfer, directed, frechet
+from manyeyes.ops.polyline_distance import chamfer_distance, directed_distance, frechet_distance
 
 shapely = pytest.importorskip("shapely")
 
@@ -57,7 +57,7 @@ def test_resampling_agrees_with_shapely(origin: np.ndarray) -> None:
             assert (got[got_first[i + 1] - 1] == line[-1]).all()
 
 
-def test_spaced_samples_keep_the_spacing_and_the_most() -> None:
+def test_spaced_samples_keep_the_spacing_and_the_maximum() -> None:
     points, first = np.array([[0.0, 0], [10, 0], [0, 5], [0, 5.2], [0, 0], [9000, 0]]), np.array([0, 2, 4, 6])
     _, got = resample_spaced(points, first, 0.5)
     assert np.diff(got).tolist() == [21, 2, 2000]
@@ -84,7 +84,7 @@ def test_rings_are_closed_where_marked() -> None:
     assert out.tolist() == [[0, 1], [2, 3], [4, 5], [0, 1], [6, 7], [8, 9]]
 
 
-def test_headings_look_from_the_point_before_to_the_point_after() -> None:
+def test_headings_point_from_the_point_before_to_the_point_after() -> None:
     points, first = np.array([[0.0, 0], [1, 0], [1, 1], [5, 5], [5, 4]]), np.array([0, 3, 5])
     want = [0.0, math.pi / 4, math.pi / 2, -math.pi / 2, -math.pi / 2]
     assert np.allclose(headings(points, first), want)
@@ -96,26 +96,26 @@ def test_feet_agree_with_shapely() -> None:
     for line in lines_of(points, first):
         queries = rng.normal(0, 15, (40, 2))
         string = shapely.LineString(line)
-        got = feet(queries, line)
-        assert np.allclose(got.distance, shapely.distance(string, shapely.points(queries)), atol=1e-9)
-        assert np.allclose(got.along, shapely.line_locate_point(string, shapely.points(queries)), atol=1e-9)
-        at = shapely.get_coordinates(shapely.line_interpolate_point(string, got.along))
-        assert np.allclose(at_stations(line, got.along), at, atol=1e-9)
-        assert (np.abs(got.side) == got.distance).all()
+        got = project_onto_line(queries, line)
+        assert np.allclose(got.distance_m, shapely.distance(string, shapely.points(queries)), atol=1e-9)
+        assert np.allclose(got.station_m, shapely.line_locate_point(string, shapely.points(queries)), atol=1e-9)
+        at = shapely.get_coordinates(shapely.line_interpolate_point(string, got.station_m))
+        assert np.allclose(points_at_stations(line, got.station_m), at, atol=1e-9)
+        assert (np.abs(got.lateral_m) == got.distance_m).all()
 
 
 def test_left_of_a_line_is_positive_and_beyond_its_ends_is_not_inside() -> None:
-    got = feet(
+    got = project_onto_line(
         np.array([[1.0, 2.0], [1.0, -2.0], [-1.0, 0.5], [3.0, 0.5], [2.0, 9.0]]), np.array([[0.0, 0], [2, 0], [2, 8]])
     )
-    assert got.side[:2].tolist() == [1.0, -2.0]
-    assert got.inside.tolist() == [True, True, False, True, False]
+    assert got.lateral_m[:2].tolist() == [1.0, -2.0]
+    assert got.is_interior.tolist() == [True, True, False, True, False]
 
 
 def test_a_part_keeps_the_vertices_between() -> None:
     line = np.array([[0.0, 0], [2, 0], [2, 8]])
-    assert part(line, 1.0, 5.0).tolist() == [[1, 0], [2, 0], [2, 3]]
-    assert part(line, -1.0, 99.0).tolist() == line.tolist()
+    assert cut_line(line, 1.0, 5.0).tolist() == [[1, 0], [2, 0], [2, 3]]
+    assert cut_line(line, -1.0, 99.0).tolist() == line.tolist()
 
 
 def test_simplified_lines_agree_with_shapely() -> None:
@@ -134,10 +134,10 @@ def test_near_pairs_are_those_of_all_boxes_compared() -> None:
     for reach in (0.0, 3.0):
         gap = np.maximum(boxes[:, None, :2] - boxes[None, :, 2:], boxes[None, :, :2] - boxes[:, None, 2:]).max(-1)
         want = np.argwhere(np.triu(gap <= reach, 1))
-        assert near_pairs(boxes, reach).tolist() == want.tolist()
+        assert find_near_pairs(boxes, reach).tolist() == want.tolist()
         across = want[(want[:, 0] < 60) & (want[:, 1] >= 60)] - (0, 60)
-        assert near_pairs_between(boxes[:60], boxes[60:], reach).tolist() == across.tolist()
-    assert near_pairs(boxes[:1], 1.0).shape == (0, 2)
+        assert find_near_pairs_between(boxes[:60], boxes[60:], reach).tolist() == across.tolist()
+    assert find_near_pairs(boxes[:1], 1.0).shape == (0, 2)
 
 
 @pytest.mark.parametrize("origin", [np.zeros(2), FAR])
@@ -146,7 +146,7 @@ def test_chamfer_agrees_with_scipy(origin: np.ndarray) -> None:
 
     points, first = crowd(6, origin=origin)
     lines, pairs = lines_of(points, first), all_pairs(12)
-    got = chamfer(points, first, points, first, pairs)
+    got = chamfer_distance(points, first, points, first, pairs)
     want = [0.5 * (cdist(lines[i], lines[j]).min(1).mean() + cdist(lines[i], lines[j]).min(0).mean()) for i, j in pairs]
     assert np.abs(got - want).max() < 1e-9
 
@@ -154,21 +154,23 @@ def test_chamfer_agrees_with_scipy(origin: np.ndarray) -> None:
 def test_directed_distances_agree_with_shapely() -> None:
     points, first = crowd(7)
     lines, pairs = lines_of(points, first), all_pairs(12)
-    mean, most = directed(points, first, points, first, pairs)
+    mean, max_distance = directed_distance(points, first, points, first, pairs)
     for k, (i, j) in enumerate(pairs):
         want = shapely.distance(shapely.points(lines[i]), shapely.LineString(lines[j]))
-        assert mean[k] == pytest.approx(want.mean(), abs=1e-9) and most[k] == pytest.approx(want.max(), abs=1e-9)
+        assert mean[k] == pytest.approx(want.mean(), abs=1e-9) and max_distance[k] == pytest.approx(
+            want.max(), abs=1e-9
+        )
 
 
 def test_directed_distance_to_a_line_of_one_point() -> None:
-    mean, most = directed(
+    mean, max_distance = directed_distance(
         np.array([[3.0, 4.0], [0.0, 0.0]]),
         np.array([0, 2]),
         np.zeros((1, 2)),
         np.array([0, 1]),
         np.zeros((1, 2), np.int64),
     )
-    assert (mean[0], most[0]) == (2.5, 5.0)
+    assert (mean[0], max_distance[0]) == (2.5, 5.0)
 
 
 def frechet_by_definition(a: np.ndarray, b: np.ndarray) -> float:
@@ -183,8 +185,8 @@ def frechet_by_definition(a: np.ndarray, b: np.ndarray) -> float:
 def test_frechet_agrees_with_its_definition_in_both_directions_and_with_shapely() -> None:
     points, first = crowd(8)
     lines, pairs = lines_of(points, first), all_pairs(12)
-    one = frechet(points, first, points, first, pairs, either_way=False)
-    both = frechet(points, first, points, first, pairs)
+    one = frechet_distance(points, first, points, first, pairs, either_way=False)
+    both = frechet_distance(points, first, points, first, pairs)
     want = [frechet_by_definition(lines[i], lines[j]) for i, j in pairs]
     back = [frechet_by_definition(lines[i], lines[j][::-1]) for i, j in pairs]
     assert np.allclose(one, want, atol=1e-9) and np.allclose(both, np.minimum(want, back), atol=1e-9)
@@ -197,4 +199,4 @@ def test_frechet_agrees_with_its_definition_in_both_directions_and_with_shapely(
 def test_frechet_sees_the_end_that_chamfer_averages_away() -> None:
     whole, half = np.array([[0.0, 0], [50, 0], [100, 0]]), np.array([[0.0, 0], [25, 0], [50, 0]])
     points, first = np.concatenate((whole, half)), np.array([0, 3, 6])
-    assert frechet(points, first, points, first, np.array([[0, 1]])).tolist() == [50.0]
+    assert frechet_distance(points, first, points, first, np.array([[0, 1]])).tolist() == [50.0]

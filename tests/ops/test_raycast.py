@@ -11,8 +11,8 @@ from manyeyes.ops.raycast import (
     NOTHING,
     HeightField,
     Primitives,
-    cast,
-    cast_reference,
+    cast_rays,
+    cast_rays_reference,
 )
 
 
@@ -73,7 +73,7 @@ def circle(n: int) -> np.ndarray:
 @pytest.mark.parametrize("tilt", [0.0, 0.12])
 def test_equals_every_ray_against_every_primitive(seed: int, tilt: float) -> None:
     args = (crowd(seed), flat(-20.0), ORIGIN, turn(0.4, tilt), BEAMS, circle(360), 360, 60.0, 7)
-    fast, slow = cast(*args), cast_reference(*args)
+    fast, slow = cast_rays(*args), cast_rays_reference(*args)
     assert (fast.primitive == slow.primitive).mean() > 0.9999
     same = (fast.primitive == slow.primitive) & (slow.primitive >= 0)
     assert same.sum() > 2000
@@ -84,7 +84,7 @@ def test_equals_every_ray_against_every_primitive(seed: int, tilt: float) -> Non
 @pytest.mark.parametrize("tilt", [0.0, 0.08])
 def test_ground_equals_small_steps(tilt: float) -> None:
     args = (crowd(3, 6), hills(), np.array([0.0, 0.0, 2.1]), turn(1.0, tilt), BEAMS, circle(90), 90, 55.0)
-    fast, slow = cast(*args), cast_reference(*args)
+    fast, slow = cast_rays(*args), cast_rays_reference(*args)
     both = (fast.primitive == GROUND) & (slow.primitive == GROUND)
     assert both.sum() > 800
     assert (fast.primitive == slow.primitive).mean() > 0.99  # crests narrower than a step may differ
@@ -93,7 +93,7 @@ def test_ground_equals_small_steps(tilt: float) -> None:
 
 
 def test_flat_ground_is_exact_and_carries_its_class() -> None:
-    hits = cast(Primitives.empty(), flat(), np.array([0.0, 0.0, 2.0]), np.eye(3), BEAMS, circle(360), 360, 40.0)
+    hits = cast_rays(Primitives.empty(), flat(), np.array([0.0, 0.0, 2.0]), np.eye(3), BEAMS, circle(360), 360, 40.0)
     reach = 2.0 / np.sin(-BEAMS, where=BEAMS < 0, out=np.full_like(BEAMS, 1e-9))
     expected = (reach > 0) & (reach < 39.9) & (BEAMS < 0)
     assert (hits.primitive[:, expected] == GROUND).all()
@@ -110,18 +110,22 @@ def test_flat_ground_is_exact_and_carries_its_class() -> None:
 
 def test_a_sector_sees_what_the_circle_sees_there() -> None:
     scene, beams = crowd(5), BEAMS
-    whole = cast(scene, flat(-20.0), ORIGIN, turn(0.3), beams, circle(360), 360, 60.0, 0)
-    part = cast(scene[scene.density == 0], flat(-20.0), ORIGIN, turn(0.3), beams, circle(360)[130:230], 360, 60.0, 0)
-    again = cast(scene[scene.density == 0], flat(-20.0), ORIGIN, turn(0.3), beams, circle(360), 360, 60.0, 0)
+    whole = cast_rays(scene, flat(-20.0), ORIGIN, turn(0.3), beams, circle(360), 360, 60.0, 0)
+    part = cast_rays(
+        scene[scene.density == 0], flat(-20.0), ORIGIN, turn(0.3), beams, circle(360)[130:230], 360, 60.0, 0
+    )
+    again = cast_rays(scene[scene.density == 0], flat(-20.0), ORIGIN, turn(0.3), beams, circle(360), 360, 60.0, 0)
     np.testing.assert_array_equal(part.range_m, again.range_m[130:230])
     assert whole.range_m.shape == (360, 24)
 
 
 def test_foliage_lets_some_rays_through_and_the_seed_decides_which() -> None:
     tree = solid(ELLIPSOID, (8, 0, 2), (2, 2, 2), density=0.5)
-    one = cast(tree, flat(-20.0), ORIGIN, np.eye(3), BEAMS, circle(720), 720, 60.0, 1)
-    two = cast(tree, flat(-20.0), ORIGIN, np.eye(3), BEAMS, circle(720), 720, 60.0, 2)
-    opaque = cast(solid(ELLIPSOID, (8, 0, 2), (2, 2, 2)), flat(-20.0), ORIGIN, np.eye(3), BEAMS, circle(720), 720, 60.0)
+    one = cast_rays(tree, flat(-20.0), ORIGIN, np.eye(3), BEAMS, circle(720), 720, 60.0, 1)
+    two = cast_rays(tree, flat(-20.0), ORIGIN, np.eye(3), BEAMS, circle(720), 720, 60.0, 2)
+    opaque = cast_rays(
+        solid(ELLIPSOID, (8, 0, 2), (2, 2, 2)), flat(-20.0), ORIGIN, np.eye(3), BEAMS, circle(720), 720, 60.0
+    )
     share = (one.primitive == 0).sum() / (opaque.primitive == 0).sum()
     assert 0.4 < share < 0.9
     assert (one.primitive != two.primitive).any()

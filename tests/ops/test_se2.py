@@ -7,7 +7,7 @@ import torch
 
 from manyeyes.datatypes import ConfigError, ShapeError, Transform, wrap_angle
 from manyeyes.ops.se2 import (
-    Edges,
+    PoseGraphEdges,
     adjoint,
     between,
     compose,
@@ -17,7 +17,7 @@ from manyeyes.ops.se2 import (
     inverse,
     log,
     right_jacobian_inverse,
-    solve,
+    solve_pose_graph,
 )
 
 F64 = torch.float64
@@ -85,7 +85,7 @@ def graph(n=6, extra=6, noise=0.0, seed=0):
     information = torch.diag_embed(
         torch.tensor([4.0, 9.0, 400.0], dtype=F64) * (1 + torch.rand(len(i), 1, generator=g, dtype=F64))
     )
-    return truth, Edges(i, j, compose(between(truth[i], truth[j]), exp(error)), information)
+    return truth, PoseGraphEdges(i, j, compose(between(truth[i], truth[j]), exp(error)), information)
 
 
 def anchored(n):
@@ -113,7 +113,7 @@ def test_an_exact_graph_is_recovered_from_a_bad_start():
     truth, edges = graph()
     start = compose(truth, exp(poses(6, 9, spread=1.0) / 4))
     start[0] = truth[0]
-    got = solve(start, edges, anchored(6))
+    got = solve_pose_graph(start, edges, anchored(6))
     assert got.converged and got.cost < 1e-18
     same(got.poses, truth, atol=1e-9)
     assert torch.equal(got.poses[0], truth[0])
@@ -125,13 +125,13 @@ def test_two_agents_six_objects():
     objects = poses(6, 3)
     truth = torch.cat((agents, objects))
     i, j = torch.arange(2).repeat_interleave(6), torch.arange(6).repeat(2) + 2
-    edges = Edges(
+    edges = PoseGraphEdges(
         i, j, between(truth[i], truth[j]), torch.diag(torch.tensor([16.0, 16, 400], dtype=F64)).expand(12, 3, 3)
     )
     start = truth.clone()
     start[1] += torch.tensor([0.8, -0.8, math.radians(0.8)], dtype=F64)
     start[2:] = compose(start[1].expand(6, 3), edges.measured[6:])
-    got = solve(start, edges, torch.arange(8) == 0)
+    got = solve_pose_graph(start, edges, torch.arange(8) == 0)
     assert (got.poses - truth).abs().max() < 1e-6
 
 
@@ -145,7 +145,7 @@ def test_a_noisy_graph_reaches_the_minimum_that_scipy_finds():
         return (root @ edge_error(at, edges)[..., None]).flatten().numpy()
 
     expected = optimize.least_squares(residual, truth[1:].flatten().numpy(), xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    got = solve(truth, edges, anchored(6))
+    got = solve_pose_graph(truth, edges, anchored(6))
     assert got.cost == pytest.approx(expected.cost, rel=1e-9)
     same(got.poses[1:], torch.from_numpy(expected.x).view(-1, 3), atol=1e-5)
     slope = torch.from_numpy(expected.jac)
@@ -161,56 +161,62 @@ def test_the_covariance_is_that_of_repeated_measurements():
     for _ in range(150):
         noise = (spread @ torch.randn(len(edges.i), 3, 1, generator=g, dtype=F64))[..., 0]
         measured = compose(edges.measured, exp(noise))
-        got = solve(truth, Edges(edges.i, edges.j, measured, 100 * edges.information), anchored(4))
+        got = solve_pose_graph(truth, PoseGraphEdges(edges.i, edges.j, measured, 100 * edges.information), anchored(4))
         delta = got.poses[3] - truth[3]
         delta[2] = wrap_angle(delta[2])
         errors.append(delta @ torch.linalg.inv(got.covariance[9:, 9:]) @ delta)
     assert torch.stack(errors).mean().item() == pytest.approx(3.0, abs=0.5)
 
 
-def test_huber_resists_a_lying_edge():
+def test_huber_resists_an_outlier_edge():
     truth, edges = graph(n=6, extra=14, noise=0.02, seed=5)
     measured = edges.measured.clone()
     measured[8] = compose(measured[8], torch.tensor([30.0, -20, 1.0], dtype=F64))
-    lying = replace(edges, measured=measured)
-    plain, robust = solve(truth, lying, anchored(6)), solve(truth, lying, anchored(6), huber=1.0)
+    with_outlier = replace(edges, measured=measured)
+    plain, robust = (
+        solve_pose_graph(truth, with_outlier, anchored(6)),
+        solve_pose_graph(truth, with_outlier, anchored(6), huber=1.0),
+    )
     assert (robust.poses - truth)[:, :2].norm(dim=-1).max() < 0.2 * (plain.poses - truth)[:, :2].norm(dim=-1).max()
-    clean = solve(truth, edges, anchored(6), huber=1e6)
-    torch.testing.assert_close(clean.poses, solve(truth, edges, anchored(6)).poses)
+    clean = solve_pose_graph(truth, edges, anchored(6), huber=1e6)
+    torch.testing.assert_close(clean.poses, solve_pose_graph(truth, edges, anchored(6)).poses)
 
 
 def test_the_robust_cost_grows_linearly_beyond_its_bound():
     """One edge, off by 3 standard deviations: 9 / 2 plain, (2 * 3 * 1 - 1) / 2 with a bound of 1."""
     at = torch.zeros(2, 3, dtype=F64)
-    edge = Edges(
+    edge = PoseGraphEdges(
         torch.tensor([0]), torch.tensor([1]), torch.tensor([[1.5, 0, 0]], dtype=F64), 4 * torch.eye(3, dtype=F64)[None]
     )
     everything = torch.ones(2).bool()
-    assert solve(at, edge, everything).cost == pytest.approx(4.5)
-    assert solve(at, edge, everything, huber=1.0).cost == pytest.approx(2.5)
-    assert solve(at, edge, everything, huber=4.0).cost == pytest.approx(4.5)
+    assert solve_pose_graph(at, edge, everything).cost == pytest.approx(4.5)
+    assert solve_pose_graph(at, edge, everything, huber=1.0).cost == pytest.approx(2.5)
+    assert solve_pose_graph(at, edge, everything, huber=4.0).cost == pytest.approx(4.5)
 
 
 def test_the_answer_moves_with_the_world():
     truth, edges = graph(noise=0.2, seed=6)
     world = torch.tensor([2500.0, -900.0, 2.0], dtype=F64)
-    here, there = solve(truth, edges, anchored(6)), solve(compose(world.expand(6, 3), truth), edges, anchored(6))
+    here, there = (
+        solve_pose_graph(truth, edges, anchored(6)),
+        solve_pose_graph(compose(world.expand(6, 3), truth), edges, anchored(6)),
+    )
     same(compose(world.expand(6, 3), here.poses), there.poses, atol=1e-6)
     turn = torch.block_diag(*[as_transform(world).rotation] * 6)  # x, y turn with the world; yaw does not
     torch.testing.assert_close(turn @ here.covariance @ turn.mT, there.covariance, atol=1e-9, rtol=1e-5)
 
 
-def test_what_the_graph_leaves_open_is_said():
+def test_an_unconstrained_pose_has_infinite_covariance():
     truth, edges = graph()
-    alone = solve(torch.cat((truth, truth[:1])), edges, anchored(7))
+    alone = solve_pose_graph(torch.cat((truth, truth[:1])), edges, anchored(7))
     assert torch.isinf(alone.covariance).all()
     same(alone.poses[:6], truth)
     with pytest.raises(ConfigError, match="at least one fixed"):
-        solve(truth, edges, torch.zeros(6).bool())
+        solve_pose_graph(truth, edges, torch.zeros(6).bool())
     with pytest.raises(ShapeError, match="there are 3"):
-        solve(truth[:3], edges, anchored(3))
+        solve_pose_graph(truth[:3], edges, anchored(3))
     with pytest.raises(ConfigError, match="finite"):
-        solve(truth / 0, edges, anchored(6))
+        solve_pose_graph(truth / 0, edges, anchored(6))
     with pytest.raises(ShapeError, match="edge 0 joins one to itself"):
         replace(edges, j=edges.i)
     with pytest.raises(ShapeError, match=r"Edges\.measured"):
@@ -219,10 +225,10 @@ def test_what_the_graph_leaves_open_is_said():
 
 def test_everything_fixed_and_no_edges():
     truth, edges = graph(noise=0.1)
-    got = solve(truth, edges, torch.ones(6).bool())
+    got = solve_pose_graph(truth, edges, torch.ones(6).bool())
     assert got.converged and torch.equal(got.poses, truth) and (got.covariance == 0).all()
-    nothing = Edges(torch.zeros(0).long(), torch.zeros(0).long(), torch.zeros(0, 3), torch.zeros(0, 3, 3))
-    assert torch.isinf(solve(truth, nothing, anchored(6)).covariance).all()
+    nothing = PoseGraphEdges(torch.zeros(0).long(), torch.zeros(0).long(), torch.zeros(0, 3), torch.zeros(0, 3, 3))
+    assert torch.isinf(solve_pose_graph(truth, nothing, anchored(6)).covariance).all()
 
 
 def test_gradients_flow_through_the_algebra_at_zero():

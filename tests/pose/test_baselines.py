@@ -18,13 +18,13 @@ from manyeyes.pose.baselines import coalign, feaco, fpv_rcnn, icp, mash, v2x_reg
 from manyeyes.pose.baselines import identity as given
 from manyeyes.pose.baselines.v2x_reg import V2xRegConfig
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim, PoseStatus, difference
+from manyeyes.pose.types import PosePrior, PoseStatus, pose_difference
 
 PLACES = np.array([(2, 10), (20, 0), (5, -15), (-12, 4), (16, -9)], float)
 YAW = np.array([0.3, 1.2, -0.4, 2.0, 0.0])
 TRUTH = np.array([0.6, -0.4, 0.02])
-ORIGIN = PoseClaim.of(Transform.identity(), 0.5, 0.02)
-NEEDS_A_CLAIM = {"coalign": coalign.correct, "fpv_rcnn": fpv_rcnn.correct, "feaco": feaco.correct, "icp": icp.correct}
+ORIGIN = PosePrior.of(Transform.identity(), 0.5, 0.02)
+NEEDS_A_PRIOR = {"coalign": coalign.correct, "fpv_rcnn": fpv_rcnn.correct, "feaco": feaco.correct, "icp": icp.correct}
 NEEDS_NONE = {
     "oDist": v2x_reg.correct,
     "oIoU": partial(v2x_reg.correct, config=V2xRegConfig("oIoU")),
@@ -45,33 +45,33 @@ def seen_from(pose, marks):
     return marks.moved(np.array([*back.translation[:2].tolist(), float(back.yaw)]))
 
 
-@pytest.mark.parametrize("name", [*NEEDS_A_CLAIM, *NEEDS_NONE])
+@pytest.mark.parametrize("name", [*NEEDS_A_PRIOR, *NEEDS_NONE])
 def test_the_drawn_case(name):
     ego = layout()
-    found = (NEEDS_A_CLAIM | NEEDS_NONE)[name](ego, seen_from(TRUTH, ego), ORIGIN)
+    found = (NEEDS_A_PRIOR | NEEDS_NONE)[name](ego, seen_from(TRUTH, ego), ORIGIN)
     assert found.status is PoseStatus.CORRECTED
-    np.testing.assert_allclose(difference(found.pose, TRUTH), 0, atol=1e-6)
+    np.testing.assert_allclose(pose_difference(found.pose, TRUTH), 0, atol=1e-6)
     assert (found.pairs[:, 0] == found.pairs[:, 1]).all() and found.inliers == 5
     # Five places at 0.25 m on both sides: the middle of them is known to 0.354 / sqrt(5) m.
     assert np.linalg.inv(found.covariance)[0, 0] == pytest.approx(5 / (2 * 0.25**2))
 
 
-@pytest.mark.parametrize("name", NEEDS_A_CLAIM)
+@pytest.mark.parametrize("name", NEEDS_A_PRIOR)
 def test_those_that_start_at_the_claim_need_one(name):
     ego = layout()
-    assert NEEDS_A_CLAIM[name](ego, seen_from(TRUTH, ego), None).status is PoseStatus.NO_MATCH
+    assert NEEDS_A_PRIOR[name](ego, seen_from(TRUTH, ego), None).status is PoseStatus.NO_MATCH
 
 
 @pytest.mark.parametrize("name", NEEDS_NONE)
 def test_those_without_a_claim_find_any_pose(name):
     ego, far = layout(), np.array([30.0, 12.0, 2.0])
     found = NEEDS_NONE[name](ego, seen_from(far, ego), None)
-    np.testing.assert_allclose(difference(found.pose, far), 0, atol=1e-6)
+    np.testing.assert_allclose(pose_difference(found.pose, far), 0, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", [*NEEDS_A_CLAIM, *NEEDS_NONE])
+@pytest.mark.parametrize("name", [*NEEDS_A_PRIOR, *NEEDS_NONE])
 def test_nothing_seen_is_no_answer(name):
-    found = (NEEDS_A_CLAIM | NEEDS_NONE)[name](layout(), Landmarks.empty(), ORIGIN)
+    found = (NEEDS_A_PRIOR | NEEDS_NONE)[name](layout(), Landmarks.empty(), ORIGIN)
     assert found.status is PoseStatus.NO_MATCH
     np.testing.assert_allclose(found.pose, 0, atol=1e-12)
 
@@ -98,7 +98,7 @@ def test_coalign_settles_between_two_equally_sure_agents():
 def test_coalign_takes_a_turned_box_for_the_same_object():
     ego = layout()
     turned = seen_from(TRUTH, layout(yaw=YAW + np.pi * np.array([1, 0, 0, 0, 0])))
-    np.testing.assert_allclose(difference(coalign.correct(ego, turned, ORIGIN).pose, TRUTH), 0, atol=1e-6)
+    np.testing.assert_allclose(pose_difference(coalign.correct(ego, turned, ORIGIN).pose, TRUTH), 0, atol=1e-6)
 
 
 def test_fpv_rcnn_cannot_leave_its_grid_and_wants_a_score_of_ten():
@@ -115,7 +115,7 @@ def test_feaco_cuts_by_the_median_deviation_and_answers_with_one_pair():
     pairs = feaco._assigned(ego.xy, ego.xy + shift, feaco.FeacoConfig())
     assert set(pairs[:, 0]) == {0, 1, 2, 3}
     one = ego[np.array([1])]
-    found = feaco.correct(one, one.moved(np.array([-2.0, 1.0, 0.0])), ORIGIN)
+    found = feaco.correct(one, one.transform(np.array([-2.0, 1.0, 0.0])), ORIGIN)
     np.testing.assert_allclose(found.pose, [2.0, -1.0, 0.0], atol=1e-9)
 
 
@@ -123,13 +123,13 @@ def test_v2x_reg_fails_where_headings_are_turned():
     ego = layout()
     turned = seen_from(TRUTH, layout(yaw=YAW + np.pi))
     found = v2x_reg.correct(ego, turned, None)
-    assert found.pose is None or abs(difference(found.pose, TRUTH)[2]) > 1.0
+    assert found.pose is None or abs(pose_difference(found.pose, TRUTH)[2]) > 1.0
 
 
 def test_vips_affinities_by_hand():
     ego = layout()[np.arange(2)]
     other = layout(PLACES + np.array([(0, 0), (3, 0), (0, 0), (0, 0), (0, 0)]))[np.arange(2)]
-    found = vips.affinities(ego, other, ORIGIN)
+    found = vips.compute_affinities(ego, other, ORIGIN)
     assert found[0, 0] == pytest.approx(1.0)
     assert found[3, 3] == pytest.approx(np.exp(-0.3))
     assert found[1, 1] == pytest.approx(np.exp(-0.5 * 0.49) * np.exp(-0.1 * np.hypot(21, 10)))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from manyeyes.datatypes import Boxes, ConfigError, ShapeError
-from manyeyes.pose.landmarks import DetectorError, Landmarks
+from manyeyes.pose.landmarks import DetectorUncertainty, Landmarks
 
 
 def marks(n=5, seed=0):
@@ -25,16 +25,16 @@ def test_no_field_can_carry_an_identity():
 def test_boxes_keep_their_stated_error_and_get_the_detectors_where_they_state_none():
     boxes = Boxes.of(torch.zeros(2, 3), torch.ones(2, 3), torch.tensor([0.1, 0.2]))
     boxes = replace(
-        boxes, sigma_xy=torch.tensor([0.0, 0.5]), sigma_yaw=torch.tensor([0.0, 0.1]), flip=torch.tensor([0, 0.2])
+        boxes, sigma_xy=torch.tensor([0.0, 0.5]), sigma_yaw=torch.tensor([0.0, 0.1]), p_flip=torch.tensor([0, 0.2])
     )
-    found = Landmarks.of_boxes(boxes, DetectorError(0.3, 0.05, 0.04))
+    found = Landmarks.of_boxes(boxes, DetectorUncertainty(0.3, 0.05, 0.04))
     np.testing.assert_allclose(found.sigma_xy, [0.3, 0.5])
     np.testing.assert_allclose(found.sigma_yaw, [0.05, 0.1], atol=1e-7)
-    np.testing.assert_allclose(found.flip, [0.04, 0.2], atol=1e-7)
+    np.testing.assert_allclose(found.p_flip, [0.04, 0.2], atol=1e-7)
 
 
 def test_moving_is_the_pose():
-    moved = marks(1).moved(np.array([1.0, 2.0, np.pi / 2]))
+    moved = marks(1).transform(np.array([1.0, 2.0, np.pi / 2]))
     (x, y), yaw = marks(1).xy[0], marks(1).yaw[0]
     np.testing.assert_allclose(moved.xy[0], [1.0 - y, 2.0 + x])
     assert moved.yaw[0] == pytest.approx(yaw + np.pi / 2)
@@ -45,13 +45,13 @@ def test_what_is_not_finite_not_a_vehicle_or_far_off_is_left_out():
     bad = replace(good, xy=good.xy.copy(), size=good.size.copy(), yaw=good.yaw.copy(), sigma_xy=good.sigma_xy.copy())
     bad.xy[0, 0], bad.xy[1, 1], bad.xy[2, 0] = np.nan, 1e9, 900.0
     bad.yaw[3], bad.size[4, 0], bad.sigma_xy[5] = np.inf, -1.0, 0.0
-    assert set(bad.usable(300.0, 100)) == {6, 7}
+    assert set(bad.select_indices(300.0, 100)) == {6, 7}
 
 
 def test_the_best_are_kept_whatever_the_order():
     all_ = marks(30)
     order = np.random.default_rng(1).permutation(30)
-    kept, other = all_.usable(1e3, 10), all_[order].usable(1e3, 10)
+    kept, other = all_.select_indices(1e3, 10), all_[order].select_indices(1e3, 10)
     assert set(kept) == set(np.argsort(-all_.score)[:10])
     np.testing.assert_array_equal(all_.xy[kept], all_[order].xy[other])
 
@@ -60,16 +60,16 @@ def test_shapes_and_errors_are_checked():
     with pytest.raises(ShapeError, match=r"Landmarks\.yaw"):
         replace(marks(3), yaw=np.zeros(2))
     with pytest.raises(ConfigError, match="sigma_xy_m > 0"):
-        DetectorError(sigma_xy_m=0.0)
+        DetectorUncertainty(sigma_xy_m=0.0)
     assert len(Landmarks.cat([])) == 0 and len(Landmarks.cat([marks(2), marks(3)])) == 5
 
 
-def test_looks_go_where_their_landmarks_go():
-    one, look = marks(3), np.arange(12.0).reshape(3, 4)
-    seen = replace(one, look=look)
-    np.testing.assert_array_equal(seen[np.array([2, 0])].look, look[[2, 0]])
-    np.testing.assert_array_equal(seen.moved(np.ones(3)).look, look)
-    np.testing.assert_array_equal(Landmarks.cat([seen, seen[:1]]).look, look[[0, 1, 2, 0]])
-    assert Landmarks.cat([seen, one]).look is None and one[:2].look is None
+def test_descriptors_go_where_their_landmarks_go():
+    one, descriptor = marks(3), np.arange(12.0).reshape(3, 4)
+    described = replace(one, descriptor=descriptor)
+    np.testing.assert_array_equal(described[np.array([2, 0])].descriptor, descriptor[[2, 0]])
+    np.testing.assert_array_equal(described.transform(np.ones(3)).descriptor, descriptor)
+    np.testing.assert_array_equal(Landmarks.cat([described, described[:1]]).descriptor, descriptor[[0, 1, 2, 0]])
+    assert Landmarks.cat([described, one]).descriptor is None and one[:2].descriptor is None
     with pytest.raises(ShapeError, match=r"Landmarks\.look"):
-        replace(one, look=look[:2])
+        replace(one, descriptor=descriptor[:2])

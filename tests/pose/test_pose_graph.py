@@ -8,96 +8,98 @@ import torch
 
 from manyeyes.datatypes import ConfigError, Transform
 from manyeyes.ops.se2 import between
-from manyeyes.pose.pose_graph import Link, consistent, cycle_distance, settle
-from manyeyes.pose.types import PoseClaim, difference
+from manyeyes.pose.pose_graph import RelativePoseEdge, cycle_distance, optimize_poses, reject_inconsistent_edges
+from manyeyes.pose.types import PosePrior, pose_difference
 
 PLACES = {0: (0, 0, 0.0), 1: (30, 5, 2.0), 2: (-10, 25, -1.0), 3: (12, -18, 0.5), 4: (40, -20, 3.0)}
 SIGMA = np.array([0.1, 0.1, 0.005])
 
 
-def link(i, j, noise=None, sigma=SIGMA):
+def make_edge(i, j, noise=None, sigma=SIGMA):
     pose = between(*(torch.tensor(PLACES[a], dtype=torch.float64) for a in (i, j))).numpy()
-    return Link(i, j, pose + (0 if noise is None else noise), np.diag(sigma**2))
+    return RelativePoseEdge(i, j, pose + (0 if noise is None else noise), np.diag(sigma**2))
 
 
-def links(agents=5, seed=None):
+def make_edges(agents=5, seed=None):
     rng = np.random.default_rng(seed or 0)
     return [
-        link(i, j, rng.standard_normal(3) * SIGMA if seed is not None else None)
+        make_edge(i, j, rng.standard_normal(3) * SIGMA if seed is not None else None)
         for i, j in itertools.combinations(range(agents), 2)
     ]
 
 
-def claim(agent, sigma=0.5):
+def make_prior(agent, sigma=0.5):
     x, y, yaw = PLACES[agent]
-    return PoseClaim.of(Transform.from_xyz_yaw(x, y, 0.0, yaw), sigma, 0.01)
+    return PosePrior.of(Transform.from_xyz_yaw(x, y, 0.0, yaw), sigma, 0.01)
 
 
 def test_exact_links_give_exact_poses_however_listed():
-    all_ = links()
+    all_ = make_edges()
     for listed in (all_, all_[::-1]):
-        found = settle(0, listed, {})
-        assert not found.refused and not found.isolated
+        found = optimize_poses(0, listed, {})
+        assert not found.rejected_edges and not found.isolated
         for agent, place in PLACES.items():
-            np.testing.assert_allclose(difference(found.pose[agent], np.array(place)), 0, atol=1e-9)
+            np.testing.assert_allclose(pose_difference(found.pose[agent], np.array(place)), 0, atol=1e-9)
 
 
 def test_going_round_is_measured_from_any_link_and_in_any_direction():
-    one, two, three = link(0, 1, np.array([0.5, 0.0, 0.0])), link(1, 2), link(0, 2)
+    one, two, three = make_edge(0, 1, np.array([0.5, 0.0, 0.0])), make_edge(1, 2), make_edge(0, 2)
     lengths = [cycle_distance(*order) for order in itertools.permutations((one, two, three))]
     assert max(lengths) == pytest.approx(min(lengths), rel=0.05) and min(lengths) > 1.0
-    assert cycle_distance(link(0, 1), link(1, 2), link(0, 2)) == pytest.approx(0.0, abs=1e-18)
+    assert cycle_distance(make_edge(0, 1), make_edge(1, 2), make_edge(0, 2)) == pytest.approx(0.0, abs=1e-18)
 
 
 def test_many_agents_are_surer_than_the_best_link():
-    found = settle(0, links(seed=3), {})
+    found = optimize_poses(0, make_edges(seed=3), {})
     for agent in range(1, 5):
         assert found.covariance[agent][0, 0] < SIGMA[0] ** 2
-        error = difference(found.pose[agent], np.array(PLACES[agent], float))
+        error = pose_difference(found.pose[agent], np.array(PLACES[agent], float))
         assert error @ np.linalg.solve(found.covariance[agent], error) < 16.3
 
 
-def test_one_lying_link_is_refused_and_the_rest_keep():
-    listed = [n for n in links(seed=1) if (n.i, n.j) != (1, 3)] + [link(1, 3, np.array([4.0, 0.0, 0.0]))]
-    found = settle(0, listed, {})
-    assert [(n.i, n.j) for n in found.refused] == [(1, 3)]
+def test_one_outlier_edge_is_rejected_and_the_rest_kept():
+    listed = [n for n in make_edges(seed=1) if (n.i, n.j) != (1, 3)] + [make_edge(1, 3, np.array([4.0, 0.0, 0.0]))]
+    found = optimize_poses(0, listed, {})
+    assert [(n.i, n.j) for n in found.rejected_edges] == [(1, 3)]
     np.testing.assert_allclose(found.pose[3][:2], PLACES[3][:2], atol=0.5)
 
 
 def test_a_colluding_pair_is_isolated_by_those_who_agree():
-    listed = [n for n in links(seed=2) if 4 not in (n.i, n.j)]
+    listed = [n for n in make_edges(seed=2) if 4 not in (n.i, n.j)]
     # Agent 4's links each say another place.
-    listed += [link(i, 4, np.array([3.0 * i + 3.0, -5.0 * (i % 2), 0.3 * i])) for i in range(4)]
-    found = settle(0, listed, {})
-    assert found.isolated == (4,) and {(n.i, n.j) for n in found.refused} == {(i, 4) for i in range(4)}
+    listed += [make_edge(i, 4, np.array([3.0 * i + 3.0, -5.0 * (i % 2), 0.3 * i])) for i in range(4)]
+    found = optimize_poses(0, listed, {})
+    assert found.isolated == (4,) and {(n.i, n.j) for n in found.rejected_edges} == {(i, 4) for i in range(4)}
     assert 4 not in found.pose
 
 
-@pytest.mark.parametrize("liar", [(0, 1), (0, 2), (1, 2)])
-def test_in_a_single_triangle_claims_tell_which_link_lies(liar):
-    listed = [link(i, j, np.array([3.0, 0.0, 0.1]) if (i, j) == liar else None) for i, j in ((0, 1), (0, 2), (1, 2))]
-    found = settle(0, listed, {1: claim(1), 2: claim(2)})
-    assert [(n.i, n.j) for n in found.refused] == [liar]
+@pytest.mark.parametrize("outlier", [(0, 1), (0, 2), (1, 2)])
+def test_in_a_single_triangle_priors_decide_which_edge_is_the_outlier(outlier):
+    listed = [
+        make_edge(i, j, np.array([3.0, 0.0, 0.1]) if (i, j) == outlier else None) for i, j in ((0, 1), (0, 2), (1, 2))
+    ]
+    found = optimize_poses(0, listed, {1: make_prior(1), 2: make_prior(2)})
+    assert [(n.i, n.j) for n in found.rejected_edges] == [outlier]
     for agent in (1, 2):
-        np.testing.assert_allclose(difference(found.pose[agent], np.array(PLACES[agent], float)), 0, atol=0.05)
+        np.testing.assert_allclose(pose_difference(found.pose[agent], np.array(PLACES[agent], float)), 0, atol=0.05)
 
 
-def test_claims_place_whom_no_link_reaches_and_weigh_little_where_links_do():
-    found = settle(0, [link(0, 1)], {1: claim(1, 5.0), 2: claim(2)})
+def test_priors_place_agents_that_no_edge_reaches_and_weigh_little_elsewhere():
+    found = optimize_poses(0, [make_edge(0, 1)], {1: make_prior(1, 5.0), 2: make_prior(2)})
     np.testing.assert_allclose(found.pose[2], PLACES[2], atol=1e-9)
     assert found.covariance[1][0, 0] == pytest.approx(1 / (1 / 0.1**2 + 1 / 5.0**2), rel=1e-3)
-    assert set(settle(0, [link(1, 2)], {}).pose) == {0}
-    assert set(settle(0, [link(1, 2)], {1: claim(1)}).pose) == {0, 1, 2}
+    assert set(optimize_poses(0, [make_edge(1, 2)], {}).pose) == {0}
+    assert set(optimize_poses(0, [make_edge(1, 2)], {1: make_prior(1)}).pose) == {0, 1, 2}
 
 
 def test_two_agents_have_no_cycle_to_fail():
-    kept, refused = consistent([link(0, 1, np.array([50.0, 0, 0]))], 16.3)
+    kept, refused = reject_inconsistent_edges([make_edge(0, 1, np.array([50.0, 0, 0]))], 16.3)
     assert len(kept) == 1 and not refused
 
 
 def test_gtsam_finds_the_same_poses():
     gtsam = pytest.importorskip("gtsam", reason="gtsam is a test oracle only")
-    listed = links(seed=5)
+    listed = make_edges(seed=5)
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(0, 0, 0), gtsam.noiseModel.Constrained.All(3)))
     for n in listed:
@@ -108,14 +110,14 @@ def test_gtsam_finds_the_same_poses():
     for a, p in PLACES.items():
         start.insert(a, gtsam.Pose2(*map(float, p)))
     found = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
-    ours = settle(0, listed, {}, huber=1e6)
+    ours = optimize_poses(0, listed, {}, huber=1e6)
     for a in PLACES:
         there = found.atPose2(a)
         np.testing.assert_allclose(
-            difference(ours.pose[a], np.array([there.x(), there.y(), there.theta()])), 0, atol=1e-6
+            pose_difference(ours.pose[a], np.array([there.x(), there.y(), there.theta()])), 0, atol=1e-6
         )
 
 
 def test_a_link_to_itself_is_refused():
     with pytest.raises(ConfigError, match="joins two agents"):
-        Link(1, 1, np.zeros(3), np.eye(3))
+        RelativePoseEdge(1, 1, np.zeros(3), np.eye(3))

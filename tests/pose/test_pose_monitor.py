@@ -5,24 +5,24 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes import ConfigError, Transform
-from manyeyes.pose.pose_monitor import Health, WatchConfig, WatchState, watch
-from manyeyes.pose.types import PoseClaim, PoseStatus, unanswered
+from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorConfig, PoseMonitorState, update_monitor
+from manyeyes.pose.types import PosePrior, PoseStatus, no_estimate
 
 SPREAD = np.diag([0.15**2, 0.15**2, 0.003**2])
-CLAIM = PoseClaim.of(Transform.from_xyz_yaw(20.0, -5.0, 0.0, 1.0), 0.5, 0.01)
+PRIOR = PosePrior.of(Transform.from_xyz_yaw(20.0, -5.0, 0.0, 1.0), 0.5, 0.01)
 
 
 def measured(offset):
-    seen = replace(
-        unanswered(CLAIM, PoseStatus.OK), measured=CLAIM.pose + offset, measured_covariance=SPREAD, inliers=6
+    estimate = replace(
+        no_estimate(PRIOR, PoseStatus.OK), measured=PRIOR.pose + offset, measured_covariance=SPREAD, inliers=6
     )
-    return seen
+    return estimate
 
 
 def run(offsets, every_s=0.1):
-    state, reports = WatchState.new(), []
+    state, reports = PoseMonitorState.new(), []
     for n, offset in enumerate(offsets):
-        state, report = watch(state, measured(offset), CLAIM, n * every_s)
+        state, report = update_monitor(state, measured(offset), PRIOR, n * every_s)
         reports.append(report)
     return reports
 
@@ -35,30 +35,30 @@ def test_a_sound_agent_with_a_constant_error_of_its_claim_is_left_alone():
     for seed in range(30):
         bias = np.random.default_rng(1000 + seed).standard_normal(3) * [0.4, 0.4, 0.008]
         health = [r.health for r in run(noise(40, seed) + bias)]
-        assert {Health.OFFSET, Health.DRIFTING}.isdisjoint(health) and health.count(Health.SOUND) >= 30
+        assert {PoseHealth.OFFSET, PoseHealth.DRIFTING}.isdisjoint(health) and health.count(PoseHealth.SOUND) >= 30
 
 
 def test_an_offset_of_five_sigma_is_flagged_in_its_first_frame():
     # 2.61 m are five times what the claim's 0.5 m and the measurement's 0.15 m are together.
     health = [run(noise(1, s) + [0.0, 2.61, 0.0])[0].health for s in range(200)]
-    assert np.mean([h in (Health.OFFSET, Health.DOUBTFUL) for h in health]) >= 0.98
-    assert np.mean([h is Health.OFFSET for h in health]) >= 0.95
+    assert np.mean([h in (PoseHealth.OFFSET, PoseHealth.SUSPECT) for h in health]) >= 0.98
+    assert np.mean([h is PoseHealth.OFFSET for h in health]) >= 0.95
     honest = [run(noise(1, s) * 3.5)[0].health for s in range(200)]
-    assert np.mean([h is Health.OFFSET for h in honest]) <= 0.005
+    assert np.mean([h is PoseHealth.OFFSET for h in honest]) <= 0.005
     # A few frames later hardly any is missed, though each single frame might be forgiven.
-    later = [run(noise(10, s) + [0.0, 2.61, 0.0])[-1].health is Health.OFFSET for s in range(100)]
+    later = [run(noise(10, s) + [0.0, 2.61, 0.0])[-1].health is PoseHealth.OFFSET for s in range(100)]
     assert np.mean(later) >= 0.98
 
 
-@pytest.mark.parametrize("every_s, share", [(1.0, 1.0), (0.5, 1.0)])
-def test_a_drift_of_a_tenth_of_a_metre_a_second_is_named_within_thirty_frames(every_s, share):
+@pytest.mark.parametrize("every_s, min_fraction", [(1.0, 1.0), (0.5, 1.0)])
+def test_a_drift_of_a_tenth_of_a_metre_a_second_is_named_within_thirty_frames(every_s, min_fraction):
     named = []
     for seed in range(30):
         time = np.arange(30) * every_s
         reports = run(noise(30, seed) + time[:, None] * [0.1, 0.0, 0.0], every_s)
-        named.append(any(r.health is Health.DRIFTING for r in reports))
+        named.append(any(r.health is PoseHealth.DRIFTING for r in reports))
         assert reports[-1].drift[0] == pytest.approx(0.1, abs=0.03)
-    assert np.mean(named) >= share
+    assert np.mean(named) >= min_fraction
 
 
 def test_a_drift_that_begins_after_ten_sound_seconds_is_named_within_thirty_frames_at_ten_hertz():
@@ -66,33 +66,33 @@ def test_a_drift_that_begins_after_ten_sound_seconds_is_named_within_thirty_fram
     named, fresh = [], []
     for seed in range(16):
         away = np.maximum(np.arange(130) - 99, 0)[:, None] * 0.01 * [np.cos(seed), np.sin(seed), 0.0]
-        named.append(any(r.health is Health.DRIFTING for r in run(noise(130, seed) + away)[100:]))
-        fresh.append(any(r.health is Health.DRIFTING for r in run(noise(30, seed) + away[100:])))
+        named.append(any(r.health is PoseHealth.DRIFTING for r in run(noise(130, seed) + away)[100:]))
+        fresh.append(any(r.health is PoseHealth.DRIFTING for r in run(noise(30, seed) + away[100:])))
     assert np.mean(named) >= 0.85 and np.mean(fresh) <= 0.5
 
 
-@pytest.mark.parametrize("claim_m, share", [(0.0, 0.0), (0.3, 0.2)])
-def test_a_sound_agent_is_hardly_ever_said_to_drift(claim_m, share):
+@pytest.mark.parametrize("prior_error_m, max_fraction", [(0.0, 0.0), (0.3, 0.2)])
+def test_a_sound_agent_is_hardly_ever_reported_as_drifting(prior_error_m, max_fraction):
     """Twenty seconds at 10 Hz, with claims that err by one and the same, or anew in each frame."""
     named = []
     for seed in range(6):
-        anew = np.random.default_rng(500 + seed).standard_normal((200, 3)) * [claim_m, claim_m, 0.0]
-        named += [any(r.health is Health.DRIFTING for r in run(noise(200, seed) + anew))]
-    assert np.mean(named) <= share
+        anew = np.random.default_rng(500 + seed).standard_normal((200, 3)) * [prior_error_m, prior_error_m, 0.0]
+        named += [any(r.health is PoseHealth.DRIFTING for r in run(noise(200, seed) + anew))]
+    assert np.mean(named) <= max_fraction
 
 
 def test_frames_without_a_pose_change_nothing():
-    state, report = watch(WatchState.new(), unanswered(CLAIM), CLAIM, 0.0)
-    assert report.health is Health.UNKNOWN and report.frames == 0
-    state, _ = watch(state, measured(np.zeros(3)), CLAIM, 1.0)
-    again, report = watch(state, unanswered(CLAIM), CLAIM, 2.0)
-    assert again is state and report.health is Health.SOUND and report.frames == 1
+    state, report = update_monitor(PoseMonitorState.new(), no_estimate(PRIOR), PRIOR, 0.0)
+    assert report.health is PoseHealth.UNKNOWN and report.num_frames == 0
+    state, _ = update_monitor(state, measured(np.zeros(3)), PRIOR, 1.0)
+    again, report = update_monitor(state, no_estimate(PRIOR), PRIOR, 2.0)
+    assert again is state and report.health is PoseHealth.SOUND and report.num_frames == 1
 
 
 def test_memory_is_bounded_and_time_must_grow():
-    state = WatchState.new()
+    state = PoseMonitorState.new()
     for n in range(50):
-        state, report = watch(state, measured(np.zeros(3)), CLAIM, float(n), WatchConfig(frames=30))
-    assert report.frames == 30 and state.time[0] == 20.0
+        state, report = update_monitor(state, measured(np.zeros(3)), PRIOR, float(n), PoseMonitorConfig(max_frames=30))
+    assert report.num_frames == 30 and state.time_s[0] == 20.0
     with pytest.raises(ConfigError, match="growing times"):
-        watch(state, measured(np.zeros(3)), CLAIM, 49.0)
+        update_monitor(state, measured(np.zeros(3)), PRIOR, 49.0)

@@ -9,13 +9,13 @@ import pytest
 from manyeyes.datasets.argoverse2 import Argoverse2Recording
 from manyeyes.datatypes import Transform
 from manyeyes.ops.keyed_random import keyed_normal, keyed_uniform
-from manyeyes.pose.corrector import correct
-from manyeyes.pose.landmarks import DetectorError, Landmarks
-from manyeyes.pose.types import PoseClaim, difference, planar, upright
+from manyeyes.pose.corrector import correct_pose
+from manyeyes.pose.landmarks import DetectorUncertainty, Landmarks
+from manyeyes.pose.types import PosePrior, lift_to_se3, pose_difference, project_to_se2
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 LOG = SHARED / "av2" / "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
-ERROR = DetectorError(0.25, 0.044, 0.01)
+ERROR = DetectorUncertainty(0.25, 0.044, 0.01)
 pytestmark = pytest.mark.skipif(not LOG.is_dir(), reason=f"{LOG} is absent: the real sweeps are not in this project")
 
 
@@ -26,8 +26,10 @@ def views():
     sweeps = recording.sweeps(scenario)[:2]
     marks = []
     for time in sweeps:
-        said = recording.annotations(scenario, time)
-        marks.append(Landmarks.of_boxes(said.boxes[said.is_vehicle & (said.interior_points > 0)], ERROR))
+        annotations = recording.annotations(scenario, time)
+        marks.append(
+            Landmarks.of_boxes(annotations.boxes[annotations.is_vehicle & (annotations.interior_points > 0)], ERROR)
+        )
     poses = [f.world_from_agent for f in recording.snapshot(scenario, 0).frames]
     return marks[0], marks[1], poses[0].inverse() @ poses[1]
 
@@ -49,13 +51,13 @@ def test_a_hundred_starts_of_any_yaw_and_up_to_twenty_metres():
         u = keyed_uniform((3,), 0, "start", start).tolist()
         turned = Transform.from_xyz_yaw(0.0, 0.0, 0.0, 2 * np.pi * u[0])
         # The other agent's frame is turned anywhere, and its claim is up to 20 m and any yaw off.
-        truth = planar(ego_from_other @ turned.inverse())
-        seen = disturbed(other, 0, "other", start).moved(planar(turned))
+        truth = project_to_se2(ego_from_other @ turned.inverse())
+        seen = disturbed(other, 0, "other", start).transform(project_to_se2(turned))
         far = np.array([20 * np.cos(2 * np.pi * u[1]), 20 * np.sin(2 * np.pi * u[1]), 2 * np.pi * u[2]])
-        claim = PoseClaim(upright(truth + far, None), np.diag([100.0, 100.0, 3.0]))
-        found = correct(disturbed(ego, 0, "ego", start), seen, claim)
-        if found.status.answered:
-            error = difference(found.pose, truth)
+        prior = PosePrior(lift_to_se3(truth + far, None), np.diag([100.0, 100.0, 3.0]))
+        found = correct_pose(disturbed(ego, 0, "ego", start), seen, prior)
+        if found.status.has_estimate:
+            error = pose_difference(found.pose, truth)
             good = np.hypot(error[0], error[1]) < 1.0 and abs(error[2]) < np.radians(1.0)
             right, wrong = right + good, wrong + (not good)
     assert right >= 95 and wrong == 0, (right, wrong)

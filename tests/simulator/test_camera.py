@@ -9,12 +9,12 @@ from scipy.spatial import ConvexHull
 from manyeyes.datatypes import LABELS, Boxes, Camera, ConfigError, Transform
 from manyeyes.ops.raycast import BOX, HeightField, Primitives
 from manyeyes.simulator.scene.scenario import true_boxes
-from manyeyes.simulator.scene.vehicle_shapes import place_bodies, vehicle_body
+from manyeyes.simulator.scene.vehicle_shapes import make_vehicle_shape, place_vehicle_shapes
 from manyeyes.simulator.scene.vehicles import VehicleStates
-from manyeyes.simulator.sensors.camera import CAMERA_RIGS, CameraSpec, Picture, Stage, camera_rig, take
-from manyeyes.simulator.sensors.lidar import ASPHALT, PAINT, LidarSpec, Scene, scan
+from manyeyes.simulator.sensors.camera import CAMERA_RIGS, CameraSpec, LitScene, RenderedImage, camera_rig, render_image
+from manyeyes.simulator.sensors.lidar import ASPHALT, PAINT, LidarSpec, RaycastScene, scan
 from manyeyes.simulator.sensors.lighting import Light
-from manyeyes.simulator.sensors.materials import Look, still_look, vehicle_look
+from manyeyes.simulator.sensors.materials import Materials, make_static_materials, make_vehicle_materials
 
 HERE = Transform.from_xyz_yaw(3.0, -2.0, 0.0, 0.3)
 RIG = CAMERA_RIGS["opv2v-small"]
@@ -41,15 +41,15 @@ def vehicles(*places: tuple[float, float, float], kind: int = 0, size=(4.4, 1.8,
     )  # fmt: skip
 
 
-def stage(states: VehicleStates, extra: Primitives | None = None, sun=(0.6, 0.0, 0.8)) -> Stage:
+def make_lit_scene(states: VehicleStates, extra: Primitives | None = None, sun=(0.6, 0.0, 0.8)) -> LitScene:
     bodies = {
-        int(i): vehicle_body(LABELS[int(k)], tuple(s), 0, int(i))
+        int(i): make_vehicle_shape(LABELS[int(k)], tuple(s), 0, int(i))
         for i, k, s in zip(states.id, states.kind, states.size)
     }
     still = Primitives.empty() if extra is None else extra
-    moving = place_bodies(list(bodies.values()), states.position, states.yaw, states.pitch, states.id)
-    look = Look.cat([still_look(still, 0), vehicle_look(states, bodies, 0)])
-    return Stage.of(Scene(Primitives.cat([still, moving]), ground()), look, light(sun))
+    moving = place_vehicle_shapes(list(bodies.values()), states.position, states.yaw, states.pitch, states.id)
+    materials = Materials.cat([make_static_materials(still, 0), make_vehicle_materials(states, bodies, 0)])
+    return LitScene.of(RaycastScene(Primitives.cat([still, moving]), ground()), materials, light(sun))
 
 
 def block(center, half, instance=0) -> Primitives:
@@ -76,7 +76,7 @@ def in_hull(hull: ConvexHull, points: np.ndarray) -> np.ndarray:
     return (points @ hull.equations[:, :2].T + hull.equations[:, 2]).max(1)
 
 
-def pixels_of(picture: Picture, instance: int) -> np.ndarray:
+def pixels_of(picture: RenderedImage, instance: int) -> np.ndarray:
     """(N, 2) middles of the pixels that show an instance, u and v. Of four rays the first one, a quarter before the middle."""
     rows, columns = np.nonzero(picture.instance == instance)
     return np.stack((columns, rows), -1) + 0.5
@@ -94,7 +94,9 @@ def test_corners_of_a_box_land_on_its_silhouette_within_a_pixel(number: int) -> 
         solid = block((0, 0, 0), (2.2, 0.9, 0.75), 1)
         c, s = np.cos(yaw), np.sin(yaw)
         solid = replace(solid, center=boxes.center.numpy(), rotation=np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]]]))
-        picture = take(Stage.of(Scene(solid, ground()), still_look(solid, 0), light()), HERE, spec)
+        picture = render_image(
+            LitScene.of(RaycastScene(solid, ground()), make_static_materials(solid, 0), light()), HERE, spec
+        )
         pixel, depth = picture.image.camera.project(HERE.inverse().apply(corners(whole)[0]))
         assert bool((depth > 0).all())
         hull, shown = ConvexHull(pixel.numpy()), pixels_of(picture, 1)
@@ -109,8 +111,8 @@ def test_corners_of_a_box_land_on_its_silhouette_within_a_pixel(number: int) -> 
     ("kind", "size"), [(0, (4.4, 1.8, 1.5)), (1, (5.5, 2.0, 2.3)), (2, (8.0, 2.5, 3.2)), (3, (11.0, 2.5, 3.1))]
 )
 def test_a_vehicle_is_shown_as_far_as_its_solids_reach_and_within_its_box(kind: int, size: tuple) -> None:
-    seen = stage(vehicles((18.0, 4.0, 1.0), kind=kind, size=size))
-    picture = take(seen, HERE, FRONT)
+    seen = make_lit_scene(vehicles((18.0, 4.0, 1.0), kind=kind, size=size))
+    picture = render_image(seen, HERE, FRONT)
     shown, camera = pixels_of(picture, 1), picture.image.camera
     box = corners(true_boxes(vehicles((18.0, 4.0, 1.0), kind=kind, size=size)))[0]
     assert in_hull(ConvexHull(camera.project(HERE.inverse().apply(box))[0].numpy()), shown).max() < 1.0
@@ -124,9 +126,9 @@ def test_a_vehicle_is_shown_as_far_as_its_solids_reach_and_within_its_box(kind: 
 
 def test_camera_and_lidar_of_one_place_meet_the_same() -> None:
     wall = block((20.0, 8.0, 1.0), (0.3, 4.0, 1.0))
-    scene = stage(vehicles((12.0, -3.0, 0.4), (26.0, 5.0, 0.0), (30.0, -6.0, 1.0)), wall)
+    scene = make_lit_scene(vehicles((12.0, -3.0, 0.4), (26.0, 5.0, 0.0), (30.0, -6.0, 1.0)), wall)
     spec = replace(FRONT, x_m=0.0, z_m=1.9, width=800, height=600, cx=400.0, cy=300.0, fx=335.6, fy=335.6)
-    picture = take(scene, HERE, spec)
+    picture = render_image(scene, HERE, spec)
     quiet = LidarSpec(per_turn=900, drop_general=0, drop_dark=0, drop_grazing=0, range_sigma_m=0)
     cloud, instance = scan(scene.scene, HERE, quiet, (0,))
     pixel, depth = picture.image.camera.project(cloud.xyz.double())
@@ -139,7 +141,7 @@ def test_camera_and_lidar_of_one_place_meet_the_same() -> None:
     assert near.mean() > 0.96
 
 
-def brightness(picture: Picture, *points: tuple[float, float, float]) -> list[float]:
+def brightness(picture: RenderedImage, *points: tuple[float, float, float]) -> list[float]:
     """Mean of nine pixels about points of the world."""
     world = torch.tensor(points, dtype=torch.float64)
     pixel, _ = picture.image.camera.project(HERE.inverse().apply(world))
@@ -151,35 +153,38 @@ def test_what_stands_before_the_sun_throws_a_shadow_away_from_it() -> None:
     # The sun stands to the left of the picture's wall, 37 degrees from the zenith: the shadow of its top falls 0.75 of its
     # height to the right.
     wall = block((12.0, 2.0, 2.0), (1.0, 0.1, 2.0))
-    to_the_right = take(stage(vehicles(), wall, (0.0, 0.6, 0.8)), HERE, FRONT)
+    to_the_right = render_image(make_lit_scene(vehicles(), wall, (0.0, 0.6, 0.8)), HERE, FRONT)
     shade, sunny = brightness(to_the_right, (12.0, 0.8, 0.0), (12.0, -1.6, 0.0))
     assert shade < 0.75 * sunny
-    to_the_left = take(stage(vehicles(), wall, (0.0, -0.6, 0.8)), HERE, FRONT)
+    to_the_left = render_image(make_lit_scene(vehicles(), wall, (0.0, -0.6, 0.8)), HERE, FRONT)
     assert brightness(to_the_left, (12.0, 0.8, 0.0))[0] == pytest.approx(sunny, rel=0.15)
 
 
 def test_the_carrier_is_not_seen_but_throws_its_shadow() -> None:
-    scene = stage(vehicles((3.0, -2.0, 0.3)), sun=(-0.8, 0.0, 0.6))
+    scene = make_lit_scene(vehicles((3.0, -2.0, 0.3)), sun=(-0.8, 0.0, 0.6))
     back = replace(RIG[3], samples=1)
-    carrier, nobody = take(scene, HERE, back, own=1), take(stage(vehicles()), HERE, back)
+    carrier, without_carrier = (
+        render_image(scene, HERE, back, own=1),
+        render_image(make_lit_scene(vehicles()), HERE, back),
+    )
     assert (carrier.instance == 0).all()
-    assert np.array_equal(carrier.depth_m, nobody.depth_m)
-    front = take(scene, HERE, replace(FRONT, x_m=0.0, pitch_rad=0.8), own=1)
+    assert np.array_equal(carrier.depth_m, without_carrier.depth_m)
+    front = render_image(scene, HERE, replace(FRONT, x_m=0.0, pitch_rad=0.8), own=1)
     shade, sunny = brightness(front, (5.58, -1.2, 0.0), (9.0, -0.2, 0.0))
     assert shade < 0.75 * sunny
 
 
 def test_paint_is_brighter_than_the_road_and_lies_where_the_raster_has_it() -> None:
-    picture = take(stage(vehicles()), HERE, FRONT)
+    picture = render_image(make_lit_scene(vehicles()), HERE, FRONT)
     line, left, right = brightness(picture, (7.625, -0.9, 0.0), (7.2, -0.9, 0.0), (8.1, -0.9, 0.0))
     assert line > 1.4 * max(left, right)
 
 
 def test_the_same_scene_gives_the_same_picture_and_finer_rays_nearly_the_same() -> None:
-    scene = stage(vehicles((12.0, -3.0, 0.4), (26.0, 5.0, 0.0)))
-    one, two = take(scene, HERE, FRONT), take(scene, HERE, FRONT)
+    scene = make_lit_scene(vehicles((12.0, -3.0, 0.4), (26.0, 5.0, 0.0)))
+    one, two = render_image(scene, HERE, FRONT), render_image(scene, HERE, FRONT)
     assert torch.equal(one.image.rgb, two.image.rgb)
-    fine = take(scene, HERE, RIG[0])
+    fine = render_image(scene, HERE, RIG[0])
     assert not torch.equal(one.image.rgb, fine.image.rgb)
     assert float((one.image.rgb.float() - fine.image.rgb.float()).abs().mean()) < 3.0
 

@@ -9,28 +9,28 @@ from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.observation_model import (
     CHUNK,
     STATION_M,
-    Noise,
+    MapModelNoise,
     _clip_ring,
     _emit_ring,
     _hidden,
     _resample,
-    normal,
-    scenery,
-    unit,
+    build_map_index,
+    hash_normal,
+    hash_uniform,
 )
-from manyeyes.simulator.fleet.place import place
-from manyeyes.simulator.fleet.routes import Routes, along
+from manyeyes.simulator.fleet.place import load_place
+from manyeyes.simulator.fleet.routes import Routes, sample_poses
 from manyeyes.simulator.fleet.simulate import _role, simulate_crowd
 
 shapely = pytest.importorskip("shapely")
-VIEW = Noise(-30.0, 30.0, -15.0, 15.0, *([0.0] * 9))
+VIEW = MapModelNoise(-30.0, 30.0, -15.0, 15.0, *([0.0] * 9))
 KEY = np.uint64(12345)
 
 
 def draws(count=2000, **at):
     where = {"element": 3, "run": 0, "purpose": 0} | at
     name = next(k for k in ("element", "run", "purpose") if k not in at)
-    return np.array([unit(KEY, *({**where, name: i}.values())) for i in range(count)])
+    return np.array([hash_uniform(KEY, *({**where, name: i}.values())) for i in range(count)])
 
 
 def test_draws_are_uniform_and_unlike_each_other_along_every_count():
@@ -39,12 +39,12 @@ def test_draws_are_uniform_and_unlike_each_other_along_every_count():
         assert 0.0 < u.min() < 0.01 and 0.99 < u.max() < 1.0
         assert np.histogram(u, 10, (0, 1))[0] == pytest.approx(200, abs=60)
         assert abs(np.corrcoef(u[:-1], u[1:])[0, 1]) < 0.08
-    assert unit(KEY, 1, 2, 3) == unit(KEY, 1, 2, 3) != unit(np.uint64(12346), 1, 2, 3)
-    assert len({unit(KEY, *p) for p in ((1, 2, 3), (3, 2, 1), (2, 1, 3), (1, 3, 2))}) == 4
+    assert hash_uniform(KEY, 1, 2, 3) == hash_uniform(KEY, 1, 2, 3) != hash_uniform(np.uint64(12346), 1, 2, 3)
+    assert len({hash_uniform(KEY, *p) for p in ((1, 2, 3), (3, 2, 1), (2, 1, 3), (1, 3, 2))}) == 4
 
 
 def test_normal_draws_have_mean_zero_and_variance_one():
-    n = np.array([normal(KEY, i, 0, 5) for i in range(4000)])
+    n = np.array([hash_normal(KEY, i, 0, 5) for i in range(4000)])
     assert abs(n.mean()) < 0.06 and n.std() == pytest.approx(1.0, abs=0.05)
     assert np.mean(np.abs(n) < 1.0) == pytest.approx(0.683, abs=0.03)
 
@@ -101,7 +101,7 @@ def test_scenery_covers_every_line_with_chunks_and_keeps_rings():
     line = np.array([[0.0, 0.0], [30.0, 0.0], [30.0, 50.0]])
     ring = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0]])
     kinds, styles = np.array([DIVIDER, CROSSING, BOUNDARY]), np.array([DOUBLE, NO_STYLE, NO_STYLE])
-    scene = scenery([line, ring, line + 100], kinds, styles, np.array([4, 8, 9]))
+    scene = build_map_index([line, ring, line + 100], kinds, styles, np.array([4, 8, 9]))
     counts = np.diff(scene.first)
     assert counts.tolist() == [161, 3, 161]
     np.testing.assert_array_equal(scene.points[scene.first[1] : scene.first[2]], ring)
@@ -119,30 +119,30 @@ def test_a_walk_follows_the_lanes_and_ends_with_them():
     assert routes.walk(0, 4.0, 100.0, lambda step, count: 1).tolist() == [[4, 0], [10, 0], [10, 9]]
     assert routes.walk(0, 0.0, 5.0, lambda step, count: 1).tolist() == [[0, 0], [10, 0]]
     np.testing.assert_allclose(routes.lengths, [10, 10, 9])
-    pose = along(routes.walk(0, 0.0, 100.0, lambda step, count: 0), np.array([0.0, 5.0, 20.0]))
+    pose = sample_poses(routes.walk(0, 0.0, 100.0, lambda step, count: 0), np.array([0.0, 5.0, 20.0]))
     np.testing.assert_allclose(pose, [[0, 0, 0], [5, 0, 0], [20, 0, 0]], atol=1e-9)
     inside = routes.within(np.array([5.0, -1.0]), np.array([12.0, 1.0]))
     assert len(inside) == 3 and inside.successor.tolist() == [1, 2]
     assert len(routes.within(np.array([15.0, -1.0]), np.array([25.0, 1.0]))) == 1
 
 
-def test_a_larger_share_of_liars_holds_the_smaller():
+def test_a_larger_malicious_fraction_holds_the_smaller():
     import dataclasses
 
     offsets = np.array([0.1, 0.5, 0.9])
-    few, many = (dataclasses.replace(CROWDS["local"], malicious_share=s) for s in (0.1, 0.3))
-    liars = [[_role(agent, config, offsets) == 2 for agent in range(200)] for config in (few, many)]
-    assert np.mean(liars, axis=1) == pytest.approx([0.1, 0.3], abs=0.01)
-    assert not (np.array(liars[0]) & ~np.array(liars[1])).any()
+    few, many = (dataclasses.replace(CROWDS["local"], malicious_fraction=s) for s in (0.1, 0.3))
+    malicious = [[_role(agent, config, offsets) == 2 for agent in range(200)] for config in (few, many)]
+    assert np.mean(malicious, axis=1) == pytest.approx([0.1, 0.3], abs=0.01)
+    assert not (np.array(malicious[0]) & ~np.array(malicious[1])).any()
 
 
 def test_recorded_drives_are_driven_where_a_place_has_them():
     import dataclasses
 
-    where = place("cross")
+    where = load_place("cross")
     log = np.column_stack((np.linspace(-80, 80, 321), np.full(321, -1.75), np.zeros(321)))
     crowd = simulate_crowd(
-        dataclasses.replace(where, logs=(log,)), 30, dataclasses.replace(CROWDS["perfect"], log_share=1.0)
+        dataclasses.replace(where, logs=(log,)), 30, dataclasses.replace(CROWDS["perfect"], recorded_drive_fraction=1.0)
     )
     assert np.abs(crowd.true_poses[:, 1] + 1.75).max() < 1.5
     assert np.abs(crowd.true_poses[:, 2]).max() < 0.1

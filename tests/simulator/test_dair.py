@@ -21,9 +21,9 @@ from manyeyes.datasets.pcd import PcdCloud, read_table
 from manyeyes.datatypes import ConfigError, RecordingError, Transform
 from manyeyes.simulator import dair
 from manyeyes.simulator.dair import record_dair
-from manyeyes.simulator.presets import jobs_of, simulation_preset
-from manyeyes.simulator.record import Job, Progress, first_scene
-from manyeyes.simulator.scene.scenario import Scenario, ScenarioSpec
+from manyeyes.simulator.presets import make_jobs, simulation_preset
+from manyeyes.simulator.record import Job, RecordingProgress, make_first_scenario
+from manyeyes.simulator.scene.scenario import ScenarioSpec, SimulatedScenario
 
 SPEC = ScenarioSpec(
     town="generated-1",
@@ -44,7 +44,7 @@ JOBS = [Job("train", SPEC), Job("val", replace(SPEC, name="two", frames=1))]
 def scenes_made_once() -> Iterator[None]:
     """Making a scene takes seconds; every test of this process shares them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dair, "first_scene", remembered)
+        patch.setattr(dair, "make_first_scenario", remembered)
         yield
 
 
@@ -54,8 +54,8 @@ def made(tmp_path_factory: pytest.TempPathFactory, scenes_made_once: None) -> Pa
 
 
 @lru_cache
-def remembered(spec: ScenarioSpec, towns: str | None, roadside: bool) -> Scenario:
-    return first_scene(spec, towns, roadside)
+def remembered(spec: ScenarioSpec, towns: str | None, roadside: bool) -> SimulatedScenario:
+    return make_first_scenario(spec, towns, roadside)
 
 
 def files(root: Path) -> dict[str, bytes]:
@@ -75,7 +75,7 @@ def test_the_simulators_own_truth_comes_back(made: Path) -> None:
     recording = DairRecording(made, strict=True)
     assert recording.scenarios == ("0", "1")
     assert DairRecording(made, "train").scenarios == ("0",) and DairRecording(made, "val").length("1") == 1
-    scenario = dair.first_scene(replace(SPEC, frames=10, rate_hz=50.0), None, roadside=True)
+    scenario = dair.make_first_scenario(replace(SPEC, frames=10, rate_hz=50.0), None, roadside=True)
     read = recording.snapshot("0", 1)
     assert read.truth is not None
     vehicle = scenario.snapshot(9)
@@ -157,7 +157,7 @@ def test_finished_drives_are_kept_and_lost_ones_made_again(made: Path) -> None:
     kept = (made / "batches/000000.json").stat().st_mtime_ns
     (made / "batches/000001.json").unlink()
     (made / "vehicle-side/velodyne/000002.pcd").unlink()
-    seen: list[Progress] = []
+    seen: list[RecordingProgress] = []
     record_dair(JOBS, made, workers=1, progress=seen.append)
     assert files(made) == before
     assert (made / "batches/000000.json").stat().st_mtime_ns == kept
@@ -206,7 +206,7 @@ def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
 
 
 def test_the_preset_is_one_vehicle_and_a_pole() -> None:
-    jobs = jobs_of(simulation_preset("dair-crossing"), 0)
+    jobs = make_jobs(simulation_preset("dair-crossing"), 0)
     assert {job.split: sum(j.split == job.split for j in jobs) for job in jobs} == {"train": 24, "val": 8, "test": 8}
     for job in jobs:
         assert (job.spec.vehicles, job.spec.roadside_chance) == (1, 1.0)
@@ -215,11 +215,11 @@ def test_the_preset_is_one_vehicle_and_a_pole() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "workers", "says"),
+    ("change", "workers", "message"),
     [(lambda s: s, 0, "workers >= 1"), (lambda s: replace(s, vehicles=2), 1, "one vehicle a drive")],
 )
 def test_misuse_is_named(
-    tmp_path: Path, change: Callable[[ScenarioSpec], ScenarioSpec], workers: int, says: str
+    tmp_path: Path, change: Callable[[ScenarioSpec], ScenarioSpec], workers: int, message: str
 ) -> None:
-    with pytest.raises(ConfigError, match=says):
+    with pytest.raises(ConfigError, match=message):
         record_dair([Job("train", change(SPEC))], tmp_path, workers=workers)

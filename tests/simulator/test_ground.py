@@ -49,8 +49,8 @@ def network(*roads: str):
 def test_height_follows_the_road_and_goes_on_smoothly_beside_it():
     ground = build_ground(network(street()), (3.0, 1.0), 40.0)
     x = np.linspace(-35, 38, 50)
-    np.testing.assert_allclose(ground.z(x, np.zeros(50)), 0.05 * x, atol=1e-5)
-    beside = ground.z(x, np.full(50, 20.0))
+    np.testing.assert_allclose(ground.height_at(x, np.zeros(50)), 0.05 * x, atol=1e-5)
+    beside = ground.height_at(x, np.full(50, 20.0))
     assert np.isfinite(ground.height).all()
     assert (np.diff(beside) > 0).all()
     assert abs(np.diff(ground.height, axis=0)).max() < 0.2
@@ -58,7 +58,7 @@ def test_height_follows_the_road_and_goes_on_smoothly_beside_it():
 
 def test_slope_is_the_normal_of_the_grade():
     ground = build_ground(network(street(0.1)), (0.0, 0.0), 20.0)
-    np.testing.assert_allclose(ground.slope(4.2, -0.7), np.array([-0.1, 0, 1]) / math.hypot(1, 0.1), atol=1e-5)
+    np.testing.assert_allclose(ground.normal_at(4.2, -0.7), np.array([-0.1, 0, 1]) / math.hypot(1, 0.1), atol=1e-5)
 
 
 def test_surface_classes_where_they_belong():
@@ -106,7 +106,7 @@ def test_widen_equals_the_slow_twin():
     np.testing.assert_array_equal(_widen(mask, 3), slow)
 
 
-def test_bridges_are_told():
+def test_bridges_are_detected():
     flat, bridge = street(0.0), street(0.0, math.pi / 2, lift=6.0, id="2")
     both = network(flat, bridge)
     assert is_multilevel(both, (0.0, 0.0), 30.0)
@@ -116,8 +116,8 @@ def test_bridges_are_told():
 
 def test_the_level_of_the_centre_is_taken():
     both = network(street(0.0), street(0.0, math.pi / 2, lift=6.0, id="2"))
-    assert build_ground(both, (20.0, 0.0), 30.0).z(0.0, 0.0) == pytest.approx(0.0, abs=1e-5)
-    assert build_ground(both, (0.0, 20.0), 30.0).z(0.0, 0.0) == pytest.approx(6.0, abs=1e-5)
+    assert build_ground(both, (20.0, 0.0), 30.0).height_at(0.0, 0.0) == pytest.approx(0.0, abs=1e-5)
+    assert build_ground(both, (0.0, 20.0), 30.0).height_at(0.0, 0.0) == pytest.approx(6.0, abs=1e-5)
 
 
 def test_no_road_in_sight_is_flat_grass():

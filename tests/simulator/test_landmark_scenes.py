@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.simulator.fleet.landmark_scenes import BoxError, LandmarkSpec, make_landmark_scene
+from manyeyes.simulator.fleet.landmark_scenes import BoxNoise, LandmarkSpec, make_landmark_scene
 
-EXACT = BoxError(1e-9, 1e-9, 0.0, 1e-9)
+EXACT = BoxNoise(1e-9, 1e-9, 0.0, 1e-9)
 
 
 def moved(xy, pose):
@@ -19,19 +19,19 @@ def test_common_rows_are_one_object_and_no_other_pair_is():
     there = moved(other, scene.ego_from_other)
     apart = np.hypot(*(ego[:, None] - there[None]).transpose(2, 0, 1))
     assert (len(ego), len(other)) == (11, 12)
-    assert set(zip(*np.nonzero(apart < 1e-6))) == set(map(tuple, scene.common)) and len(scene.common) == 5
-    np.testing.assert_allclose(scene.common_xy, ego[scene.common[:, 0]], atol=1e-6)
+    assert set(zip(*np.nonzero(apart < 1e-6))) == set(map(tuple, scene.common_pairs)) and len(scene.common_pairs) == 5
+    np.testing.assert_allclose(scene.common_xy, ego[scene.common_pairs[:, 0]], atol=1e-6)
 
 
 def test_strangers_share_nothing():
     scene = make_landmark_scene(LandmarkSpec(4, 15, 15, EXACT, disjoint=True), 0, 0)
     there = moved(scene.other[0].center[:, :2].numpy(), scene.ego_from_other)
     apart = np.hypot(*(scene.ego[0].center[:, None, :2].numpy() - there[None]).transpose(2, 0, 1))
-    assert apart.min() > 1e-3 and len(scene.common) == 0
+    assert apart.min() > 1e-3 and len(scene.common_pairs) == 0
 
 
 def test_motion_carries_earlier_frames_to_now():
-    scene = make_landmark_scene(LandmarkSpec(3, 4, 4, EXACT, instants=4), 1, 0)
+    scene = make_landmark_scene(LandmarkSpec(3, 4, 4, EXACT, num_instants=4), 1, 0)
     assert len(scene.ego) == len(scene.other) == 4
     np.testing.assert_allclose(scene.ego_from_then[0], 0, atol=1e-12)
     for n in range(4):
@@ -48,10 +48,10 @@ def test_a_scene_is_its_key():
 
 
 def test_dair_counts_have_half_of_frames_with_three_or_more():
-    counts = [len(make_landmark_scene(LandmarkSpec(None, 1, 1), 0, k).common) for k in range(60)]
+    counts = [len(make_landmark_scene(LandmarkSpec(None, 1, 1), 0, k).common_pairs) for k in range(60)]
     assert 0.35 < np.mean(np.array(counts) >= 3) < 0.75 and max(counts) <= 12
 
 
 def test_counts_below_zero_are_refused():
     with pytest.raises(ConfigError, match="at least 0"):
-        LandmarkSpec(ego_extra=-1)
+        LandmarkSpec(num_ego_only=-1)

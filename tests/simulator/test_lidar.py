@@ -8,8 +8,8 @@ import torch
 
 from manyeyes.datatypes import ConfigError, Transform
 from manyeyes.ops.raycast import HeightField, Primitives
-from manyeyes.simulator.scene.vehicle_shapes import place_bodies, vehicle_body
-from manyeyes.simulator.sensors.lidar import ASPHALT, LIDAR_PRESETS, PAINT, LidarSpec, Scene, lidar_spec, scan
+from manyeyes.simulator.scene.vehicle_shapes import make_vehicle_shape, place_vehicle_shapes
+from manyeyes.simulator.sensors.lidar import ASPHALT, LIDAR_PRESETS, PAINT, LidarSpec, RaycastScene, lidar_spec, scan
 
 QUIET = LidarSpec(per_turn=900, drop_general=0, drop_dark=0, drop_grazing=0, range_sigma_m=0)
 HERE = Transform.from_xyz_yaw(0, 0)
@@ -25,12 +25,12 @@ def ground(slope: float = 0.0) -> HeightField:
 def cars(*places: tuple[float, float]) -> Primitives:
     ids = np.arange(1, len(places) + 1)
     position = np.array([[*p, 0.0] for p in places])
-    bodies = [vehicle_body("car", (4.4, 1.8, 1.5), 0, int(i)) for i in ids]
-    return place_bodies(bodies, position, np.zeros(len(ids)), np.zeros(len(ids)), ids)
+    bodies = [make_vehicle_shape("car", (4.4, 1.8, 1.5), 0, int(i)) for i in ids]
+    return place_vehicle_shapes(bodies, position, np.zeros(len(ids)), np.zeros(len(ids)), ids)
 
 
 def test_the_road_is_at_zero_and_returns_carry_their_vehicle() -> None:
-    cloud, instance = scan(Scene(cars((10, 0), (0, -8)), ground()), HERE, QUIET, (0,))
+    cloud, instance = scan(RaycastScene(cars((10, 0), (0, -8)), ground()), HERE, QUIET, (0,))
     assert float(cloud.xyz[torch.from_numpy(instance == 0), 2].abs().max()) < 2e-3
     for id, (x, y) in ((1, (10, 0)), (2, (0, -8))):
         mine = cloud.xyz[torch.from_numpy(instance == id)]
@@ -45,16 +45,16 @@ def test_on_a_slope_the_road_under_a_pitched_agent_is_at_zero() -> None:
     pitch = -math.atan(0.08)
     zero, up = torch.zeros((), dtype=torch.float64), torch.tensor(pitch, dtype=torch.float64)
     pose = Transform.from_rpy(torch.tensor([4.0, 0.0, 0.32], dtype=torch.float64), zero, up, zero)
-    cloud, _ = scan(Scene(Primitives.empty(), ground(0.08)), pose, QUIET, (0,))
+    cloud, _ = scan(RaycastScene(Primitives.empty(), ground(0.08)), pose, QUIET, (0,))
     near = cloud.xyz[cloud.xyz[:, :2].norm(dim=1) < 30]
     assert len(near) > 10_000
     assert float(near[:, 2].abs().max()) < 5e-3
-    upright, _ = scan(Scene(Primitives.empty(), ground(0.08)), Transform.from_xyz_yaw(4, 0, 0.32), QUIET, (0,))
+    upright, _ = scan(RaycastScene(Primitives.empty(), ground(0.08)), Transform.from_xyz_yaw(4, 0, 0.32), QUIET, (0,))
     assert float(upright.xyz[upright.xyz[:, :2].norm(dim=1) < 30, 2].abs().max()) > 1.0
 
 
 def test_the_carrier_is_not_met() -> None:
-    scene = Scene(cars((0, 0), (12, 0)), ground())
+    scene = RaycastScene(cars((0, 0), (12, 0)), ground())
     _, with_own = scan(scene, HERE, QUIET, (0,))
     _, without = scan(scene, HERE, QUIET, (0,), own=1)
     assert (with_own == 1).any()
@@ -63,14 +63,14 @@ def test_the_carrier_is_not_met() -> None:
 
 
 def test_the_key_decides_noise_and_loss() -> None:
-    scene, spec = Scene(cars((10, 0)), ground()), lidar_spec("opv2v")
+    scene, spec = RaycastScene(cars((10, 0)), ground()), lidar_spec("opv2v")
     one, same, other = (scan(scene, HERE, spec, key)[0] for key in ((1, 2), (1, 2), (1, 3)))
     assert torch.equal(one.xyz, same.xyz)
     assert one.xyz.shape != other.xyz.shape or not torch.equal(one.xyz, other.xyz)
 
 
 def test_noise_lies_along_the_ray_and_has_the_stated_size() -> None:
-    scene = Scene(Primitives.empty(), ground())
+    scene = RaycastScene(Primitives.empty(), ground())
     clean, _ = scan(scene, HERE, QUIET, (0,))
     noisy, _ = scan(scene, HERE, replace(QUIET, range_sigma_m=0.05), (0,))
     sensor = torch.tensor([0.0, 0.0, QUIET.height_m])
@@ -80,7 +80,7 @@ def test_noise_lies_along_the_ray_and_has_the_stated_size() -> None:
 
 
 def test_loss_rises_with_range_and_grazing_incidence() -> None:
-    scene = Scene(Primitives.empty(), ground())
+    scene = RaycastScene(Primitives.empty(), ground())
     kept, _ = scan(scene, HERE, replace(QUIET, drop_dark=0.15, drop_grazing=0.3, drop_general=0.1), (0,))
     whole, _ = scan(scene, HERE, QUIET, (0,))
 
@@ -93,7 +93,7 @@ def test_loss_rises_with_range_and_grazing_incidence() -> None:
 
 
 def test_paint_is_bright_and_intensity_falls_with_range() -> None:
-    cloud, _ = scan(Scene(Primitives.empty(), ground()), HERE, QUIET, (0,))
+    cloud, _ = scan(RaycastScene(Primitives.empty(), ground()), HERE, QUIET, (0,))
     x, bright = cloud.xyz[:, 0], cloud.intensity
     near = cloud.xyz.norm(dim=1) < 25
     paint = near & (x > 10.1) & (x < 12.4)
@@ -107,13 +107,13 @@ def test_paint_is_bright_and_intensity_falls_with_range() -> None:
 def test_points_on_a_vehicle_fall_with_range() -> None:
     counts = []
     for distance in (8.0, 16.0, 32.0, 64.0):
-        _, instance = scan(Scene(cars((distance, 0)), ground()), HERE, lidar_spec("opv2v"), (0,))
+        _, instance = scan(RaycastScene(cars((distance, 0)), ground()), HERE, lidar_spec("opv2v"), (0,))
         counts.append(int((instance == 1).sum()))
     assert counts[0] > 2 * counts[1] > 4 * counts[2] > 8 * counts[3] > 0
 
 
-def test_the_presets_are_what_they_say() -> None:
-    scene = Scene(cars((10, 0), (-10, 0)), ground())
+def test_the_presets_match_their_names() -> None:
+    scene = RaycastScene(cars((10, 0), (-10, 0)), ground())
     for name, low, high in (("opv2v", 40_000, 60_000), ("opv2v-roadside", 40_000, 60_000)):
         cloud, _ = scan(scene, HERE, lidar_spec(name), (0,))
         assert low < len(cloud) < high, name

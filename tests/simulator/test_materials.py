@@ -2,9 +2,9 @@
 import numpy as np
 
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, Primitives
-from manyeyes.simulator.scene.vehicle_shapes import place_bodies, vehicle_body
+from manyeyes.simulator.scene.vehicle_shapes import make_vehicle_shape, place_vehicle_shapes
 from manyeyes.simulator.scene.vehicles import VehicleStates
-from manyeyes.simulator.sensors.lighting import develop, draw_light
+from manyeyes.simulator.sensors.lighting import draw_light, tone_map
 from manyeyes.simulator.sensors.materials import (
     BARK,
     FACADE,
@@ -20,9 +20,9 @@ from manyeyes.simulator.sensors.materials import (
     STEEL,
     TARPAULIN,
     WALL,
-    Look,
-    still_look,
-    vehicle_look,
+    Materials,
+    make_static_materials,
+    make_vehicle_materials,
 )
 
 
@@ -33,7 +33,7 @@ def as_built(kind: int, half: tuple[float, float, float], reflectivity: float, d
     )  # fmt: skip
 
 
-def test_what_stands_beside_the_road_is_told_by_its_shape() -> None:
+def test_static_solids_are_classified_by_their_shape() -> None:
     built = {
         FACADE: as_built(BOX, (5.0, 8.0, 6.0), 0.4),
         WALL: as_built(BOX, (0.12, 4.0, 0.9), 0.4),
@@ -44,35 +44,35 @@ def test_what_stands_beside_the_road_is_told_by_its_shape() -> None:
         PLATE: as_built(BOX, (0.3, 0.03, 0.3), 0.95),
         SIGNAL: as_built(BOX, (0.16, 0.16, 0.45), 0.1),
     }
-    look = still_look(Primitives.cat(list(built.values())), 3)
-    assert look.material.tolist() == list(built)
-    assert ((look.rgb > 0) & (look.rgb < 1)).all()
-    leaves = look.rgb[look.material == LEAVES][0]
+    materials = make_static_materials(Primitives.cat(list(built.values())), 3)
+    assert materials.material.tolist() == list(built)
+    assert ((materials.rgb > 0) & (materials.rgb < 1)).all()
+    leaves = materials.rgb[materials.material == LEAVES][0]
     assert leaves.argmax() != 2
-    assert not np.array_equal(look.rgb, still_look(Primitives.cat(list(built.values())), 4).rgb)
+    assert not np.array_equal(materials.rgb, make_static_materials(Primitives.cat(list(built.values())), 4).rgb)
 
 
 def test_vehicles_have_the_materials_of_their_parts_in_the_order_of_their_solids() -> None:
     kinds = ("car", "van", "truck", "bus")
     sizes = np.array([[4.4, 1.8, 1.5], [5.5, 2.0, 2.3], [8.0, 2.5, 3.2], [11.0, 2.5, 3.1]])
-    bodies = {i + 1: vehicle_body(kind, tuple(sizes[i]), 0, i + 1) for i, kind in enumerate(kinds)}
+    bodies = {i + 1: make_vehicle_shape(kind, tuple(sizes[i]), 0, i + 1) for i, kind in enumerate(kinds)}
     zero = np.zeros(4)
     states = VehicleStates(np.arange(1, 5), np.arange(4), np.zeros((4, 3)), zero, zero, zero, sizes)
-    look = vehicle_look(states, bodies, 5)
-    solids = place_bodies(list(bodies.values()), states.position, zero, zero, states.id)
-    assert len(look.material) == len(solids)
-    of = {kind: set(look.material[solids.instance == i + 1].tolist()) for i, kind in enumerate(kinds)}
+    materials = make_vehicle_materials(states, bodies, 5)
+    solids = place_vehicle_shapes(list(bodies.values()), states.position, zero, zero, states.id)
+    assert len(materials.material) == len(solids)
+    of = {kind: set(materials.material[solids.instance == i + 1].tolist()) for i, kind in enumerate(kinds)}
     assert of["car"] == {PAINTWORK, GLAZED, RUBBER}
     assert of["van"] == {PAINTWORK, GLASS, RUBBER}
     assert of["truck"] == {PAINTWORK, TARPAULIN, STEEL, RUBBER}
     assert of["bus"] == {PAINTWORK, GLAZED, RUBBER}
-    np.testing.assert_allclose(look.anchor, solids.center, atol=1e-6)  # they stand at the origin
-    axles = look.axles[solids.instance == 1][0]
+    np.testing.assert_allclose(materials.anchor, solids.center, atol=1e-6)  # they stand at the origin
+    axles = materials.axles[solids.instance == 1][0]
     np.testing.assert_allclose(axles[:2], [0.31 * 4.4, -0.29 * 4.4], rtol=1e-5)
     assert np.isinf(axles[2])
     assert axles[3] == np.float32(0.42 * 1.5 / 2)
-    assert len(vehicle_look(VehicleStates.empty(), {}, 0).material) == 0
-    assert isinstance(Look.cat([look, look]), Look)
+    assert len(make_vehicle_materials(VehicleStates.empty(), {}, 0).material) == 0
+    assert isinstance(Materials.cat([materials, materials]), Materials)
 
 
 def test_light_follows_from_its_key_and_stands_above_the_horizon() -> None:
@@ -84,7 +84,7 @@ def test_light_follows_from_its_key_and_stands_above_the_horizon() -> None:
         assert np.sin(np.deg2rad(17)) < light.sun[2] < np.sin(np.deg2rad(63))
         rays = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        for colour in (light.sky(rays), light.clear_sky(rays), light.ambient(rays)):
+        for colour in (light.sky_radiance(rays), light.clear_sky_radiance(rays), light.ambient(rays)):
             assert np.isfinite(colour).all()
             assert colour.min() >= 0
     overcast, clear = max(many, key=lambda one: one.cloud), min(many, key=lambda one: one.cloud)
@@ -93,8 +93,8 @@ def test_light_follows_from_its_key_and_stands_above_the_horizon() -> None:
 
 def test_haze_ends_at_the_horizons_colour_and_film_never_clips_below_or_above() -> None:
     light = draw_light(1, "x")
-    far = light.through_air(np.zeros((1, 3), np.float32), np.array([1e6], np.float32))
+    far = light.apply_haze(np.zeros((1, 3), np.float32), np.array([1e6], np.float32))
     np.testing.assert_allclose(far[0], light.horizon_rgb, rtol=1e-5)
-    tones = develop(np.linspace(0, 60, 1000, dtype=np.float32)[:, None])
+    tones = tone_map(np.linspace(0, 60, 1000, dtype=np.float32)[:, None])
     assert (np.diff(tones[:, 0]) >= 0).all()
     assert 0 <= tones.min() < 0.05 < 0.99 < tones.max() <= 1

@@ -9,7 +9,7 @@ from manyeyes.simulator.presets import (
     SIMULATION_PRESETS,
     SimulationPreset,
     SplitPreset,
-    jobs_of,
+    make_jobs,
     simulation_preset,
     with_cameras,
 )
@@ -25,7 +25,7 @@ def test_no_town_is_on_two_sides() -> None:
 
 
 def test_the_benchmark_has_the_scenes_it_promises() -> None:
-    jobs = jobs_of(simulation_preset("towns-small"), 0)
+    jobs = make_jobs(simulation_preset("towns-small"), 0)
     counts = {split: sum(job.split == split for job in jobs) for split in ("train", "validate", "test")}
     assert counts == {"train": 150, "validate": 22, "test": 84}
     towns = {job.split: set() for job in jobs}
@@ -41,13 +41,13 @@ def test_the_benchmark_has_the_scenes_it_promises() -> None:
 
 def test_the_seed_decides() -> None:
     preset = simulation_preset("towns-small")
-    assert jobs_of(preset, 3) == jobs_of(preset, 3)
-    assert jobs_of(preset, 3) != jobs_of(preset, 4)
+    assert make_jobs(preset, 3) == make_jobs(preset, 3)
+    assert make_jobs(preset, 3) != make_jobs(preset, 4)
 
 
 def test_cameras_see_the_same_scenes() -> None:
     preset = simulation_preset("tiny")
-    blind, seeing = jobs_of(preset, 3), jobs_of(with_cameras(preset), 3)
+    blind, seeing = make_jobs(preset, 3), make_jobs(with_cameras(preset), 3)
     assert [replace(job.spec, cameras="none", roadside_cameras="none") for job in seeing] == [j.spec for j in blind]
     assert {(job.spec.cameras, job.spec.roadside_cameras) for job in seeing} == {
         ("opv2v-small", "dair-infrastructure-small")
@@ -57,7 +57,7 @@ def test_cameras_see_the_same_scenes() -> None:
 
 
 def test_streets_with_pictures_are_the_same_streets() -> None:
-    blind, seeing = (jobs_of(simulation_preset(name), 0) for name in ("streets", "streets-pictures"))
+    blind, seeing = (make_jobs(simulation_preset(name), 0) for name in ("streets", "streets-pictures"))
     assert [replace(job.spec, cameras="none", roadside_cameras="none") for job in seeing] == [j.spec for j in blind]
     assert all(camera_rig(job.spec.cameras) and camera_rig(job.spec.roadside_cameras) for job in seeing)
 
@@ -67,7 +67,7 @@ def test_the_demo_runs_without_any_town(tmp_path: Path, monkeypatch: pytest.Monk
         raise ConfigError(f"no {name} in {path}")
 
     monkeypatch.setattr("manyeyes.simulator.presets.find_town", nowhere)
-    (job,) = jobs_of(simulation_preset("demo"), 0, str(tmp_path))
+    (job,) = make_jobs(simulation_preset("demo"), 0, str(tmp_path))
     assert job.spec.town.startswith("generated-")
     assert job.towns is None  # generated roads are in no folder
     assert job.spec.vehicles == 3

@@ -9,10 +9,10 @@ import torch
 
 pytest.importorskip("libsumo", reason="scenarios need the sim extra")
 
-from manyeyes.datasets.base import points_in_listed_boxes
+from manyeyes.datasets.base import count_points_in_listed_boxes
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import ConfigError
-from manyeyes.simulator.record import Job, Progress, record
+from manyeyes.simulator.record import Job, RecordingProgress, record
 from manyeyes.simulator.scene.scenario import ScenarioSpec, make_scenario
 from manyeyes.simulator.scene.towns import load_town
 
@@ -35,7 +35,7 @@ def files(root: Path) -> dict[str, bytes]:
 
 
 def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
-    seen: list[Progress] = []
+    seen: list[RecordingProgress] = []
     record(JOBS, tmp_path, workers=2, progress=seen.append)
     assert files(tmp_path) == files(made)
     assert [p.done for p in seen] == [1, 2]
@@ -44,7 +44,7 @@ def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
 def test_the_reader_returns_the_simulators_own_truth(made: Path) -> None:
     recording = Opv2vRecording(made, "train", strict=True, use_cache=False)
     assert recording.scenarios == ("one", "two")
-    assert list(recording.judged("one")) == [1]
+    assert list(recording.eval_indices("one")) == [1]
     scenario = make_scenario(SPEC, load_town("generated-1"))
     read, true = recording.snapshot("one", 1), scenario.snapshot(1)
     assert read.truth is not None
@@ -56,7 +56,7 @@ def test_the_reader_returns_the_simulators_own_truth(made: Path) -> None:
     for one, two in zip(read.frames, true.frames):
         torch.testing.assert_close(one.points.xyz, two.points.xyz, atol=1e-4, rtol=0)
         torch.testing.assert_close(one.points.intensity, two.points.intensity, atol=0.003, rtol=0)
-    assert int((points_in_listed_boxes(read) == 0).sum()) == 0
+    assert int((count_points_in_listed_boxes(read) == 0).sum()) == 0
 
 
 def test_pictures_lie_beside_the_clouds_as_they_were_taken(made: Path) -> None:

@@ -36,7 +36,7 @@ def test_distance_and_lane_under_a_point():
     assert [lane and lane.lane_id for lane in lane_at(network, xy)] == [1, -1, None, None]
 
 
-def test_roadside_points_look_at_the_road():
+def test_roadside_points_face_the_road():
     network = read_opendrive(STREET, "street")
     places = roadside_points(network, (0.0, 0.0), 30.0, 1.0, 10.0)
     assert len(places) > 50
@@ -64,7 +64,7 @@ def test_crossings_of_town05_avoid_its_bridges():
     stacked = {site.junction_id for site in everywhere if site.is_multilevel}
     assert len(stacked) == 4
     assert {site.junction_id for site in sites} == {site.junction_id for site in everywhere} - stacked
-    assert sum(site.arms == 4 for site in sites) >= 8
+    assert sum(site.num_arms == 4 for site in sites) >= 8
     for site in sites:
         for k in site.approaches:
             lane = network.lanes[k]

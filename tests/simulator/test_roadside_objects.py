@@ -4,12 +4,12 @@ from scipy.ndimage import distance_transform_edt
 
 from manyeyes.ops.raycast import BOX, ELLIPSOID, HeightField
 from manyeyes.simulator.scene.roadside_objects import (
-    ClutterSpec,
-    Plot,
-    corner_places,
+    PlacementGrid,
+    RoadsideObjectSpec,
     distance_transform,
-    place_clutter,
-    pole,
+    find_pole_sites,
+    make_pole,
+    place_roadside_objects,
 )
 
 MIDDLE = np.array([100.0, 50.0])
@@ -32,7 +32,7 @@ def test_distances_are_euclidean() -> None:
 
 
 def test_nothing_stands_on_a_road_and_something_stands_beside() -> None:
-    solids = place_clutter(Plot.of(crossing()), ClutterSpec(), MIDDLE, (0,))
+    solids = place_roadside_objects(PlacementGrid.of(crossing()), RoadsideObjectSpec(), MIDDLE, (0,))
     assert (solids.kind == BOX).sum() > 25
     assert (solids.kind == ELLIPSOID).sum() > 10
     for i in range(len(solids)):
@@ -47,31 +47,37 @@ def test_nothing_stands_on_a_road_and_something_stands_beside() -> None:
 
 
 def test_buildings_do_not_overlap_and_stand_at_the_corners() -> None:
-    solids = place_clutter(Plot.of(crossing()), ClutterSpec(walls=0, poles=0, trees=0, hedges=0), MIDDLE, (1,))
+    solids = place_roadside_objects(
+        PlacementGrid.of(crossing()), RoadsideObjectSpec(walls=0, poles=0, trees=0, hedges=0), MIDDLE, (1,)
+    )
     corners = {tuple(np.sign(c[:2] - MIDDLE)) for c in solids.center if np.abs(c[:2] - MIDDLE).max() < 40}
     assert len(corners) == 4
-    grid = Plot.of(crossing())
+    grid = PlacementGrid.of(crossing())
     for i in range(len(solids)):
         yaw = float(np.arctan2(solids.rotation[i, 1, 0], solids.rotation[i, 0, 0]))
         half = (float(solids.half[i, 0]) - 0.8, float(solids.half[i, 1]) - 0.8)
-        assert grid.take(solids.center[i, :2], half, yaw, 0.0), "two buildings overlap"
+        assert grid.occupy_if_free(solids.center[i, :2], half, yaw, 0.0), "two buildings overlap"
 
 
 def test_the_key_decides_and_parked_cars_are_kept_free() -> None:
-    one, same, other = (place_clutter(Plot.of(crossing()), ClutterSpec(), MIDDLE, (k,)) for k in (0, 0, 1))
+    one, same, other = (
+        place_roadside_objects(PlacementGrid.of(crossing()), RoadsideObjectSpec(), MIDDLE, (k,)) for k in (0, 0, 1)
+    )
     np.testing.assert_array_equal(one.center, same.center)
     assert one.center.shape != other.center.shape or (one.center != other.center).any()
-    plot = Plot.of(crossing())
-    plot.keep_out(MIDDLE + (20.0, 20.0), (16.0, 16.0), 0.0)
-    inside = np.abs(place_clutter(plot, ClutterSpec(), MIDDLE, (0,)).center[:, :2] - MIDDLE - 20).max(1) < 15
+    plot = PlacementGrid.of(crossing())
+    plot.occupy(MIDDLE + (20.0, 20.0), (16.0, 16.0), 0.0)
+    inside = (
+        np.abs(place_roadside_objects(plot, RoadsideObjectSpec(), MIDDLE, (0,)).center[:, :2] - MIDDLE - 20).max(1) < 15
+    )
     assert not inside.any()
 
 
 def test_a_roadside_pole_stands_beside_the_carriageway_near_the_crossing() -> None:
-    places = corner_places(Plot.of(crossing()), MIDDLE)
+    places = find_pole_sites(PlacementGrid.of(crossing()), MIDDLE)
     away = np.abs(places[:50] - MIDDLE)
     assert (away.min(1) > 3.5).all()
     assert (away.max(1) < 12).all()
-    mast = pole(places[0], 2.0, 5.0, -1)
+    mast = make_pole(places[0], 2.0, 5.0, -1)
     assert mast.instance.tolist() == [-1]
     assert mast.center[0, 2] + mast.half[0, 2] > 7.0

@@ -7,9 +7,16 @@ import torch
 
 pytest.importorskip("libsumo", reason="scenarios need the sim extra")
 
-from manyeyes.datasets.base import points_in_listed_boxes
+from manyeyes.datasets.base import count_points_in_listed_boxes
 from manyeyes.datatypes import ConfigError, PointCloud, Snapshot
-from manyeyes.simulator.scene.scenario import RSU_ID, NoSceneError, Scenario, ScenarioSpec, make_scenario, seen_boxes
+from manyeyes.simulator.scene.scenario import (
+    RSU_ID,
+    NoSceneError,
+    ScenarioSpec,
+    SimulatedScenario,
+    find_visible_boxes,
+    make_scenario,
+)
 from manyeyes.simulator.scene.towns import load_town
 
 SPEC = ScenarioSpec(
@@ -18,24 +25,24 @@ SPEC = ScenarioSpec(
 
 
 @pytest.fixture(scope="module")
-def scenario() -> Scenario:
+def scenario() -> SimulatedScenario:
     return make_scenario(SPEC, load_town("generated-1"))
 
 
 @pytest.fixture(scope="module")
-def snapshot(scenario: Scenario) -> Snapshot:
+def snapshot(scenario: SimulatedScenario) -> Snapshot:
     return scenario.snapshot(1)
 
 
 def test_points_lie_in_the_boxes_that_agents_list(snapshot: Snapshot) -> None:
-    counts = points_in_listed_boxes(snapshot)
+    counts = count_points_in_listed_boxes(snapshot)
     assert int((counts > 0).sum()) > 8
     assert int((counts == 0).sum()) == 0
     mirrored = []
     for frame in snapshot.frames:
         flip = frame.points.xyz * torch.tensor([1.0, -1.0, 1.0])
         mirrored.append(replace(frame, points=PointCloud(flip, frame.points.intensity, frame.points.time_s)))
-    assert int((points_in_listed_boxes(replace(snapshot, frames=tuple(mirrored))) == 0).sum()) > 5
+    assert int((count_points_in_listed_boxes(replace(snapshot, frames=tuple(mirrored))) == 0).sum()) > 5
 
 
 def test_a_box_is_seen_where_a_return_of_its_own_vehicle_lies_in_it(snapshot: Snapshot) -> None:
@@ -53,11 +60,13 @@ def test_a_box_is_seen_where_a_return_of_its_own_vehicle_lies_in_it(snapshot: Sn
         int(id) != own and bool(local[i : i + 1].contains(cloud.xyz[torch.from_numpy(named == int(id))], 0.05).any())
         for i, id in enumerate(boxes.id)
     ]
-    assert seen_boxes(cloud, named, pose, boxes, own).tolist() == slow and 0 < sum(slow) < len(slow)
-    assert not seen_boxes(cloud[:0], named[:0], pose, boxes, own).any()
+    assert find_visible_boxes(cloud, named, pose, boxes, own).tolist() == slow and 0 < sum(slow) < len(slow)
+    assert not find_visible_boxes(cloud[:0], named[:0], pose, boxes, own).any()
 
 
-def test_agents_are_vehicles_and_a_unit_on_a_pole_that_list_others(scenario: Scenario, snapshot: Snapshot) -> None:
+def test_agents_are_vehicles_and_a_unit_on_a_pole_that_list_others(
+    scenario: SimulatedScenario, snapshot: Snapshot
+) -> None:
     ids = [frame.agent_id for frame in snapshot.frames]
     assert ids == [*scenario.agents, RSU_ID]
     assert snapshot.truth is not None
@@ -79,8 +88,8 @@ def test_the_road_under_each_agent_is_at_zero(snapshot: Snapshot) -> None:
         assert abs(float(xyz[near, 2].median())) < 0.03
 
 
-def test_half_of_the_vehicles_move_and_positions_change(scenario: Scenario) -> None:
-    assert scenario.moving_share >= 0.5
+def test_half_of_the_vehicles_move_and_positions_change(scenario: SimulatedScenario) -> None:
+    assert scenario.moving_fraction >= 0.5
     first, last = scenario.states[0], scenario.states[-1]
     both = sorted(set(first.id.tolist()) & set(last.id.tolist()))
     assert len(both) > 10
@@ -95,9 +104,9 @@ def test_the_same_seed_gives_the_same_points(snapshot: Snapshot) -> None:
         assert torch.equal(one.points.intensity, two.points.intensity)
 
 
-def test_a_lead_comes_before_and_changes_nothing_after(scenario: Scenario) -> None:
+def test_a_lead_comes_before_and_changes_nothing_after(scenario: SimulatedScenario) -> None:
     longer = make_scenario(replace(SPEC, lead_frames=3), load_town("generated-1"))
-    assert (len(longer), longer.agents, longer.moving_share) == (6, scenario.agents, scenario.moving_share)
+    assert (len(longer), longer.agents, longer.moving_fraction) == (6, scenario.agents, scenario.moving_fraction)
     one, two = scenario.snapshot(1), longer.snapshot(4)
     for before, after in zip(one.frames, two.frames, strict=True):
         assert torch.equal(before.points.xyz, after.points.xyz)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, Primitives, reference_hit
-from manyeyes.simulator.sensors.shadow import daylight, index_shadows
+from manyeyes.simulator.sensors.shadow import build_shadow_index, sun_and_sky_visibility
 
 SUN = np.array([0.48, -0.36, 0.8])
 
@@ -29,7 +29,7 @@ def points(count: int) -> np.ndarray:
 
 def test_equals_every_point_against_every_solid() -> None:
     solids, at = crowd(60), points(300)
-    lit, _ = daylight(index_shadows(solids, SUN, 0.0), at, np.zeros(len(at), bool))
+    lit, _ = sun_and_sky_visibility(build_shadow_index(solids, SUN, 0.0), at, np.zeros(len(at), bool))
     slow = np.ones(len(at), bool)
     for i in range(len(solids)):
         o = (at - solids.center[i]) @ solids.rotation[i]
@@ -50,14 +50,14 @@ def test_a_crown_shades_by_its_leaves_and_dims_within() -> None:
     )  # fmt: skip
     x, y = np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60))
     below = np.stack((x.ravel(), y.ravel(), np.zeros(x.size)), -1)
-    shadows = index_shadows(crown, np.array([0.0, 0, 1]), 0.0)
-    lit, _ = daylight(shadows, below, np.ones(len(below), bool))
+    shadows = build_shadow_index(crown, np.array([0.0, 0, 1]), 0.0)
+    lit, _ = sun_and_sky_visibility(shadows, below, np.ones(len(below), bool))
     assert set(np.unique(lit)) == {0.0, 1.0}
     chord = 2 * np.sqrt(4 - x**2 - y**2)
     # Cubes of leaves are crossed straight, two thirds as often as by rays of any direction.
     assert lit.mean() == pytest.approx(np.exp(-0.5 * 2 / 3 * chord).mean(), abs=0.06)
     within = np.array([[0, 0, 5.0], [0, 0, 7.9]])
-    dim, bright = daylight(shadows, within, np.zeros(2, bool))[0]
+    dim, bright = sun_and_sky_visibility(shadows, within, np.zeros(2, bool))[0]
     assert (dim, bright) == pytest.approx((np.exp(-0.5 * 0.5 * 3.0), np.exp(-0.5 * 0.5 * 0.1)))
 
 
@@ -67,12 +67,14 @@ def test_the_ground_beside_a_wall_sees_less_of_the_sky() -> None:
         np.zeros(1, np.int64), np.array([0.5]),
     )  # fmt: skip
     at = np.array([[0.0, 0.5, 0], [0, 0.95, 0], [0, 1.5, 0], [0, 0.6, 3]])
-    _, open_sky = daylight(index_shadows(wall, SUN, 0.0), at, np.ones(4, bool))
+    _, open_sky = sun_and_sky_visibility(build_shadow_index(wall, SUN, 0.0), at, np.ones(4, bool))
     assert open_sky == pytest.approx([0.35, 0.675, 1.0, 1.0])
-    assert (daylight(index_shadows(wall, SUN, 0.0), at, np.zeros(4, bool))[1] == 1).all()
+    assert (sun_and_sky_visibility(build_shadow_index(wall, SUN, 0.0), at, np.zeros(4, bool))[1] == 1).all()
 
 
 def test_nothing_shades_nothing() -> None:
-    lit, open_sky = daylight(index_shadows(Primitives.empty(), SUN, 0.0), points(5), np.ones(5, bool))
+    lit, open_sky = sun_and_sky_visibility(
+        build_shadow_index(Primitives.empty(), SUN, 0.0), points(5), np.ones(5, bool)
+    )
     assert (lit == 1).all()
     assert (open_sky == 1).all()

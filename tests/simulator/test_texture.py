@@ -4,9 +4,9 @@ import pytest
 
 from manyeyes.ops.raycast import HeightField
 from manyeyes.simulator.scene.ground import ASPHALT, CROSSING, GRASS, PAINT, SIDEWALK
-from manyeyes.simulator.sensors.fractal_noise import noise
+from manyeyes.simulator.sensors.fractal_noise import fractal_noise
 from manyeyes.simulator.sensors.materials import FACADE, PAINTWORK, STEEL
-from manyeyes.simulator.sensors.texture import Spots, ground_cover, ground_rgb, smooth, solid_rgb
+from manyeyes.simulator.sensors.texture import SolidPoints, ground_cover, ground_rgb, smoothstep, solid_rgb
 
 
 def field(surface: np.ndarray) -> HeightField:
@@ -57,7 +57,7 @@ def test_worn_paint_is_darker_than_fresh_and_both_are_brighter_than_the_road() -
     assert road < walk < fresh
 
 
-def spots(count: int) -> Spots:
+def spots(count: int) -> SolidPoints:
     random = np.random.default_rng(4)
     half = random.uniform(0.3, 6, (count, 3))
     axis = random.integers(3, size=count)
@@ -70,7 +70,7 @@ def spots(count: int) -> Spots:
         np.stack((0.3 * half[:, 0], -0.3 * half[:, 0], np.full(count, np.inf), 0.2 * half[:, 2]), -1),
     ]  # fmt: skip
     real = [value.astype(np.float32) for value in real]
-    return Spots(real[0], axis, *real[1:])
+    return SolidPoints(real[0], axis, *real[1:])
 
 
 @pytest.mark.parametrize("material", range(FACADE, STEEL + 1))
@@ -88,7 +88,7 @@ def test_wheels_are_dark_and_flanks_have_the_lacquers_colour() -> None:
     count = 400
     x = np.linspace(-2.2, 2.2, count).astype(np.float32)
     one, zero = np.ones(count, np.float32), np.zeros(count, np.float32)
-    flank = Spots(
+    flank = SolidPoints(
         np.stack((x, 0.9 * one, -0.2 * one), -1), np.ones(count, np.int64), one,
         np.tile(np.float32([2.2, 0.9, 0.3]), (count, 1)), 0.005 * one, np.tile(np.float32([0.4, 0.03, 0.03]), (count, 1)),
         0.3 * one, np.stack((zero, zero, 0.6 * one), -1), np.tile(np.float32([4.4, 1.8, 1.5]), (count, 1)),
@@ -104,13 +104,13 @@ def test_wheels_are_dark_and_flanks_have_the_lacquers_colour() -> None:
 
 def test_noise_is_centred_smooth_and_shifted_by_its_seed() -> None:
     at = here(20_000, -80, 80)
-    one, two = noise(at, 1.0, 1), noise(at, 1.0, 2)
+    one, two = fractal_noise(at, 1.0, 1), fractal_noise(at, 1.0, 2)
     assert abs(one.mean()) < 0.05
     assert abs(one.std() - 1) < 0.1
     assert abs(np.corrcoef(one, two)[0, 1]) < 0.1
-    assert np.abs(noise(at + 1e-4, 1.0, 1) - one).max() < 0.02
-    np.testing.assert_allclose(noise(at + (16.0, 0.0), 1.0, 1), one, atol=1e-4)
+    assert np.abs(fractal_noise(at + 1e-4, 1.0, 1) - one).max() < 0.02
+    np.testing.assert_allclose(fractal_noise(at + (16.0, 0.0), 1.0, 1), one, atol=1e-4)
 
 
 def test_smooth_goes_from_nought_to_one() -> None:
-    assert smooth(1.0, 3.0, np.array([0.0, 1.0, 2.0, 3.0, 9.0])).tolist() == [0, 0, 0.5, 1, 1]
+    assert smoothstep(1.0, 3.0, np.array([0.0, 1.0, 2.0, 3.0, 9.0])).tolist() == [0, 0, 0.5, 1, 1]

@@ -72,7 +72,7 @@ def test_a_vehicle_s_motion_is_its_speed_along_its_heading(drive):
     assert moved > 50
 
 
-def test_nobody_appears_vanishes_or_touches(drive):
+def test_no_vehicle_appears_vanishes_or_touches(drive):
     ids = [set(states.id.tolist()) for states in drive]
     assert all(one == ids[0] for one in ids)
     for states in drive:
@@ -86,7 +86,7 @@ def test_same_seed_same_traffic_other_seed_other_traffic(town, drive):
     for one, two in zip(drive, again, strict=True):
         for field in fields(one):
             np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
-    led = simulate_traffic(town, 4, STEPS, vehicles_per_lane_km=12.0, warmup_s=20.0, lead=2)
+    led = simulate_traffic(town, 4, STEPS, vehicles_per_lane_km=12.0, warmup_s=20.0, lead_steps=2)
     assert len(led) == STEPS + 2
     np.testing.assert_array_equal(led[2].position, drive[0].position)
     both = np.isin(led[1].id, led[2].id)
@@ -110,7 +110,7 @@ def test_nonsense_is_refused(town):
     with pytest.raises(ConfigError, match="steps >= 1"):
         simulate_traffic(town, 1, 0)
     with pytest.raises(ConfigError, match="lead"):
-        simulate_traffic(town, 1, 2, warmup_s=1.0, lead=11)
+        simulate_traffic(town, 1, 2, warmup_s=1.0, lead_steps=11)
 
 
 def test_sizes_and_shares():

@@ -14,29 +14,39 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.cli import main as cli
 from manyeyes.datasets.missing import NONE_MISSING
-from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps.tile_cells import Drawing, TileCell
+from manyeyes.evaluation.maps.tile_cells import TilePrediction, TileStudyResult
 from manyeyes.evaluation.maps.tile_metrics import TileTable
-from manyeyes.evaluation.maps.tile_prediction import ALONE, CLEAN, CORRECTED, NOISY, ROADSIDE, UNHURT, VEHICLE
+from manyeyes.evaluation.maps.tile_prediction import (
+    CLEAN,
+    CLEAN_CORRECTED,
+    CORRECTED,
+    NOISY,
+    ROADSIDE,
+    SINGLE_VEHICLE,
+    VEHICLE,
+)
 from manyeyes.models import checkpoint, pretrained
 from manyeyes.models.maps.bev import BevConfig
 from manyeyes.models.maps.head import MapHeadConfig
-from manyeyes.models.maps.map_model import Mapper, MapperConfig
+from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
-from manyeyes.studies.map_pipeline import Building
+from manyeyes.studies.map_pipeline import MapBuildConfig
 from manyeyes.studies.maps import full_map as whole
 from manyeyes.studies.maps import local, running, semi_global
 from manyeyes.studies.maps import map_pose_noise as pose
 from manyeyes.studies.maps import recorded_fleet as crowd
-from manyeyes.studies.town_maps import Ground
+from manyeyes.studies.town_maps import TownMap
 
-CONFIG = MapperConfig(
-    BevConfig(BevGrid(-8.0, -8.0, -2.0, 8.0, 8.0, 4.0, pillar=0.5), channels=16, raster_width=8, raster_blocks=(1, 1)),
+CONFIG = MapModelConfig(
+    BevConfig(
+        BevGrid(-8.0, -8.0, -2.0, 8.0, 8.0, 4.0, pillar=0.5), channels=16, raster_channels=8, raster_blocks=(1, 1)
+    ),
     BevGrid(-10.0, -5.0, -1.0, 10.0, 5.0, 1.0, pillar=1.0),
     token_channels=8,
-    neck=(1, 1),
-    head=MapHeadConfig(elements=4, points=5, channels=16, feed=32, layers=1, heads=4),
+    neck_blocks=(1, 1),
+    head=MapHeadConfig(num_queries=4, num_points=5, channels=16, feedforward_channels=32, layers=1, heads=4),
 )
 RING = [[10.0, -4.0], [14.0, -4.0], [14.0, 4.0], [10.0, 4.0]]
 STREETS = MapElements.of(
@@ -55,7 +65,7 @@ class Crossroads:
     def length(self, scenario: str) -> int:
         return 8
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         return range(2, 8)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -67,22 +77,22 @@ class Crossroads:
         poses = [Transform.from_xyz_yaw(-away * np.cos(t), -away * np.sin(t), 0.0, t) for t in turns]
         cloud = PointCloud.of(torch.ones(4, 3))
         frames = [AgentFrame.of(cloud, at, 1 + k, index * 10**8) for k, at in enumerate(poses)]
-        truth = Truth(NOTHING, torch.zeros(4, 0, dtype=torch.bool), Transform.stack(poses))
+        truth = GroundTruth(NOTHING, torch.zeros(4, 0, dtype=torch.bool), Transform.stack(poses))
         return Snapshot(scenario, index, tuple(frames), truth)
 
 
 def save(path, sensors=("lidar",), towns=()):
     torch.manual_seed(0)
     config = replace(CONFIG, bev=replace(CONFIG.bev, sensors=sensors))
-    checkpoint.save(Mapper(config), path, {"towns": list(towns)}, format=FORMAT)
+    checkpoint.save(MapModel(config), path, {"towns": list(towns)}, format=FORMAT)
     return path
 
 
 @pytest.fixture
 def weights(tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "open_looks", lambda data, split, sensors: Crossroads())
-    monkeypatch.setattr(running, "true_maps", lambda recording: {"cross": STREETS})
-    monkeypatch.setattr(running, "missing_files", lambda options, console: NONE_MISSING)
+    monkeypatch.setattr(running, "open_sensor_recording", lambda data, split, sensors: Crossroads())
+    monkeypatch.setattr(running, "load_true_maps", lambda recording: {"cross": STREETS})
+    monkeypatch.setattr(running, "find_missing_files", lambda options, console: NONE_MISSING)
     return save(tmp_path / "random.safetensors")
 
 
@@ -110,78 +120,82 @@ def study(name, weights, out, *words, seeds=2):
 
 
 @dataclass(frozen=True)
-class Known:
+class FixedPredictor:
     """A study's drawing: by row, how many of the elements of STREETS come out, from the first."""
 
     parts: tuple[tuple[str, int], ...]
-    looks: tuple[int, ...] = (1, 2, 5, 10)
+    frame_counts: tuple[int, ...] = (1, 2, 5, 10)
     sigma_m: float = 0.5
     deg_per_m: float = 2.0
 
     @property
-    def key(self) -> str:
+    def cache_key(self) -> str:
         return repr(self)
 
-    def __call__(self, mapper, scenery, scenario, seed):
-        return [Drawing(row, STREETS.take(np.arange(n)), STREETS, (1000,) * n) for row, n in self.parts]
+    def __call__(self, map_model, source, scenario, seed):
+        return [TilePrediction(row, STREETS.take(np.arange(n)), STREETS, (1000,) * n) for row, n in self.parts]
 
 
-def drawing(parts):
-    return Known(tuple(parts.items()))
+def make_predictor(parts):
+    return FixedPredictor(tuple(parts.items()))
 
 
-def verdicts(result):
-    return {claim["what"]: claim["verdict"] for claim in result["claims"]}
+def get_verdicts(result):
+    return {margin_test["what"]: margin_test["verdict"] for margin_test in result["claims"]}
 
 
-def test_more_looks_against_one(weights, tmp_path, monkeypatch):
-    monkeypatch.setattr(semi_global, "DrawSemiGlobal", lambda: drawing({"1": 1, "2": 2, "5": 5, "10": 6}))
+def test_more_frames_against_one(weights, tmp_path, monkeypatch):
+    monkeypatch.setattr(semi_global, "SemiGlobalPredictor", lambda: make_predictor({"1": 1, "2": 2, "5": 5, "10": 6}))
     result, text = study("semi-global", weights, tmp_path)
     rows = {row["row"]: row for row in result["rows"]["LiDAR"]}
     # One of four dividers and no crossing: (0 + .25) / 2; with five elements all of both.
     assert [rows[name]["mean"][0]["value"] for name in ("1", "2", "5", "10")] == pytest.approx([0.125, 0.25, 1.0, 1.0])
     assert rows["1"]["ap"][0][2]["value"] == 0.0 and rows["10"]["ap"][0][2]["value"] == 1.0, "the boundary"
     assert rows["2"]["bytes_per_tile"] == 2000 and rows["2"]["tiles"] == 6 and len(rows["2"]["by_seed"]) == 2
-    assert verdicts(result)["LiDAR: 10 looks - one vehicle"] == "reached" and " +0.300 |" in text
+    assert get_verdicts(result)["LiDAR: 10 looks - one vehicle"] == "reached" and " +0.300 |" in text
     assert text.count("not run") == 2, "cameras, and both"
 
 
 def table(parts):
     """What a study would judge, of three scenarios."""
-    return TileTable([TileCell(name, 0, tuple(drawing(parts)(None, None, name, 0))) for name in Crossroads.scenarios])
+    return TileTable(
+        [TileStudyResult(name, 0, tuple(make_predictor(parts)(None, None, name, 0))) for name in Crossroads.scenarios]
+    )
 
 
-def test_claims_that_do_not_hold_are_said_to_be_missed():
-    held = semi_global.claims("LiDAR", table({"1": 3, "10": 4}), (1, 10))
-    assert [(c.bar, c.verdict) for c in held] == [(0.2, "missed"), (0.3, "missed"), (0.0, "reached")]
+def test_margins_that_are_not_met_are_missed():
+    held = semi_global.check_margins("LiDAR", table({"1": 3, "10": 4}), (1, 10))
+    assert [(c.margin, c.verdict) for c in held] == [(0.2, "missed"), (0.3, "missed"), (0.0, "reached")]
 
 
 def test_local_maps_have_a_row_for_each_kind_of_agent(weights, tmp_path, monkeypatch):
-    monkeypatch.setattr(local, "DrawLocal", lambda: drawing({VEHICLE: 6, ROADSIDE: 2}))
+    monkeypatch.setattr(local, "LocalPredictor", lambda: make_predictor({VEHICLE: 6, ROADSIDE: 2}))
     result, text = study("local", weights, tmp_path)
     assert [(r["row"], r["mean"][0]["value"]) for r in result["rows"]["LiDAR"]] == [(VEHICLE, 1.0), (ROADSIDE, 0.25)]
     assert "CrowdMap's Table 1" in text
 
 
 def test_the_corrector_is_held_against_half_of_the_loss(weights, tmp_path, monkeypatch):
-    rows = {ALONE: 1, CLEAN: 5, NOISY: 2, CORRECTED: 5, UNHURT: 5}
-    monkeypatch.setattr(pose, "DrawPose", lambda aligner: drawing(rows))
+    rows = {SINGLE_VEHICLE: 1, CLEAN: 5, NOISY: 2, CORRECTED: 5, CLEAN_CORRECTED: 5}
+    monkeypatch.setattr(pose, "PoseNoisePredictor", lambda aligner: make_predictor(rows))
     result, text = study("pose", weights, tmp_path)
     half = "LiDAR: corrected - (clean + noisy) / 2"
-    assert verdicts(result)[half] == verdicts(result)["LiDAR: corrected without errors - clean"] == "reached"
+    assert get_verdicts(result)[half] == get_verdicts(result)["LiDAR: corrected without errors - clean"] == "reached"
     assert "off by 0.5 m and 1 degrees" in text
     # Clean 1, noisy .25: half of it won back is .625; four lines have all dividers and no crossing, .5.
-    less = {c.what: c for c in pose.claims("LiDAR", table(rows | {CORRECTED: 4}))}[half]
+    less = {c.description: c for c in pose.check_margins("LiDAR", table(rows | {CORRECTED: 4}))}[half]
     assert less.verdict == "missed" and less.difference.value == pytest.approx(-0.125)
 
 
-def test_whole_maps_by_survey_and_method_against_one_truth(weights, tmp_path, monkeypatch):
+def test_full_maps_by_map_mode_and_method_against_one_truth(weights, tmp_path, monkeypatch):
     """The oracle draws: what follows is the fusion of what was said, over bytes, and its judging."""
-    ground = Ground("cross", Crossroads.scenarios, "cross", (0.0, 0.0))
-    monkeypatch.setattr(whole, "grounds_of", lambda *_: [ground])
+    town_map = TownMap("cross", Crossroads.scenarios, "cross", (0.0, 0.0))
+    monkeypatch.setattr(whole, "group_by_town", lambda *_: [town_map])
     made = []
     monkeypatch.setattr(
-        crowd, "Building", lambda mapper, survey, every: made.append(survey) or Building(None, survey, every)
+        crowd,
+        "MapBuildConfig",
+        lambda mapper, survey, every: made.append(survey) or MapBuildConfig(None, survey, every),
     )
     result, text = study("whole", weights, tmp_path, "--methods", "manyeyes", "union", "chamfer_nms", seeds=1)
     rows = {(row["survey"], row["method"]): row for row in result["rows"]}
@@ -191,9 +205,11 @@ def test_whole_maps_by_survey_and_method_against_one_truth(weights, tmp_path, mo
     assert ours["mean"]["value"] == pytest.approx(ours["in_own_view"]["value"])
     assert late["mean"]["value"] < late["in_own_view"]["value"], "a local map is held against what tiles see, too"
     assert ours["mean"]["value"] > late["mean"]["value"] + 0.1 and ours["mean"]["scenarios"] > 5
-    said = verdicts(result)
-    assert {"the whole - local + union", "the whole - local + chamfer_nms", "the whole - local + manyeyes"} <= set(said)
-    assert sum("the best of them, goal" in what for what in said) == 1 and "The map of cross" in text
+    verdicts_by_name = get_verdicts(result)
+    assert {"the whole - local + union", "the whole - local + chamfer_nms", "the whole - local + manyeyes"} <= set(
+        verdicts_by_name
+    )
+    assert sum("the best of them, goal" in what for what in verdicts_by_name) == 1 and "The map of cross" in text
     assert made == ["semi-global", "local"]
     study("whole", weights, tmp_path, "--methods", "manyeyes", "union", seeds=1)
     assert len(made) == 2, "what was seen is kept"
@@ -205,11 +221,11 @@ def test_what_is_missing_or_twice_is_one_line(weights, tmp_path, capsys, monkeyp
         return capsys.readouterr().err
 
     assert "--data" in refused("local")
-    monkeypatch.setattr(pretrained, "mappers", lambda: ())
+    monkeypatch.setattr(pretrained, "list_map_models", lambda: ())
     assert "--preset map-small" in refused("local", "--data", tmp_path)
     again = save(tmp_path / "again.safetensors")
     assert "One model a set of sensors" in refused("local", "--data", tmp_path, "--weights", weights, again)
     both = save(tmp_path / "both.safetensors", ("lidar", "camera"))
     assert "takes one model" in refused("whole", "--data", tmp_path, "--weights", weights, both)
-    taught = save(tmp_path / "taught.safetensors", towns=("Cross",))
-    assert "Split by place" in refused("pose", "--data", tmp_path, "--weights", taught)
+    trained = save(tmp_path / "taught.safetensors", towns=("Cross",))
+    assert "Split by place" in refused("pose", "--data", tmp_path, "--weights", trained)

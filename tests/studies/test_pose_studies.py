@@ -10,17 +10,17 @@ import pytest
 import torch
 from PIL import Image
 
-from manyeyes.agents.perception_cache import Eyes
+from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.models.pose.box_descriptors import BoxKeypoints
+from manyeyes.models.pose.box_descriptors import BoxKeypointConfig
 from manyeyes.models.pose.feakm import FORMAT, FeakmConfig, FeakmNet
 from manyeyes.models.pose.matcher import MatcherConfig
-from manyeyes.studies.detection.perturbations import Disturbance
+from manyeyes.studies.detection.perturbations import Perturbation
 from manyeyes.studies.pose import feakm
 from manyeyes.studies.pose import pose_estimation as pose_accuracy
 from manyeyes.studies.pose import pose_noise_ap as pose
@@ -61,7 +61,9 @@ def data(tmp_path_factory):
                 AgentFrame(i, index * 100_000_000, cloud, p, torch.zeros(3, 3), is_infrastructure=i < 0)
                 for i, p in POSES.items()
             )
-            truth = Truth(cars(), torch.ones(2, len(PLACES), dtype=torch.bool), Transform.stack(list(POSES.values())))
+            truth = GroundTruth(
+                cars(), torch.ones(2, len(PLACES), dtype=torch.bool), Transform.stack(list(POSES.values()))
+            )
             writer.write(Snapshot(name, index, frames, truth))
         writer.close({"history_frames": 1})
     with torch.random.fork_rng():
@@ -78,7 +80,7 @@ def evaluate(data, out, study, *words):
     return json.loads((out / f"{study}.json").read_text())["result"]
 
 
-def test_every_corrector_before_every_fusion_under_the_levels_asked_for(data, tmp_path) -> None:
+def test_every_corrector_with_every_fusion_under_the_requested_levels(data, tmp_path) -> None:
     words = ("--methods", "alone", "intermediate", "--every", 2, "--disturbances", "2°, 2 m", "0.8 m")
     held = evaluate(data, tmp_path, "pose", *words)
     assert [(r["corrector"], r["method"]) for r in held["rows"][::3]] == [
@@ -87,28 +89,30 @@ def test_every_corrector_before_every_fusion_under_the_levels_asked_for(data, tm
     ]
     assert held["frames"] == {"0 to 3": 0, "4 to 7": 0, "8 and more": 2}
     assert all(len(r["by_common"]) == 3 and r["over_alone"] for r in held["rows"])
-    said = [c["what"] for c in held["claims"]]
-    assert said[:3] == [
+    descriptions = [c["what"] for c in held["claims"]]
+    assert descriptions[:3] == [
         "vote, perfect: corrected - true claims",
         "vote, 0.8 m: corrected - true claims",
         "vote, 2°, 2 m, 8 and more in common: corrected - true claims",
     ]
-    assert said[3].startswith("vote, worst level (") and said[3].endswith("8 and more in common: corrected - alone")
+    assert descriptions[3].startswith("vote, worst level (") and descriptions[3].endswith(
+        "8 and more in common: corrected - alone"
+    )
     assert [c["bar"] for c in held["claims"]] == [-0.002, -0.044, -0.01, 0.0]
     assert {name: len(at5) for name, at5, _ in held["paper"]["rows"]}["FeaKM, 4 pairs"] == 11
 
 
 def test_the_levels_are_feakms_columns() -> None:
     assert len(pose.LEVELS) == 11 and all(len(ap) == 11 for _, *aps in pose.PAPER_AP for ap in aps)
-    assert pose.LEVELS[1] == Disturbance(heading_deg=0.2) and pose.LEVELS[-1].name == "2°, 2 m"
-    assert [c.x for p in pose.panels(()) for c in p.curves] == []
+    assert pose.LEVELS[1] == Perturbation(heading_sigma_deg=0.2) and pose.LEVELS[-1].name == "2°, 2 m"
+    assert [c.x for p in pose.make_panels(()) for c in p.curves] == []
 
 
-def test_rival_fusions_are_rows_by_the_claims_as_they_are(data, tmp_path) -> None:
+def test_baseline_fusions_are_rows_with_uncorrected_priors(data, tmp_path) -> None:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        rival = Detector(replace(COSTR_TINY, fusion="v2x_vit"))
-        checkpoint.save(rival, data / "rival.safetensors", {})
+        baseline = Detector(replace(COSTR_TINY, fusion="v2x_vit"))
+        checkpoint.save(baseline, data / "rival.safetensors", {})
     words = ("--methods", "intermediate", "--every", 2, "--correctors", "given", "--disturbances", "2°, 2 m")
     held = evaluate(data, tmp_path, "pose", *words, "--branches", f"V2X-ViT={data / 'rival.safetensors'}")
     assert [(r["corrector"], r["method"]) for r in held["rows"]] == 2 * [("given", "intermediate")] + 2 * [
@@ -118,17 +122,21 @@ def test_rival_fusions_are_rows_by_the_claims_as_they_are(data, tmp_path) -> Non
     assert "| given" in (tmp_path / "pose.md").read_text() and "V2X-ViT" in (tmp_path / "pose.md").read_text()
 
 
-def net_file(data, name: str, detector: str = "", most: int = 64) -> str:
+def write_net(data, name: str, detector: str = "", max_keypoints: int = 64) -> str:
     """An untrained net of FeaKM, for the untrained detector."""
     torch.manual_seed(0)
     channels = COSTR_TINY.encoder.channels[2]
-    config = FeakmConfig(BoxKeypoints(channels, 32, 8, score_min=0.0, most=most), MatcherConfig(32, 8, 1, 1), detector)
+    config = FeakmConfig(
+        BoxKeypointConfig(channels, 32, 8, min_score=0.0, max_keypoints=max_keypoints),
+        MatcherConfig(32, 8, 1, 1),
+        detector,
+    )
     checkpoint.save(FeakmNet(config), data / name, {}, format=FORMAT)
     return str(data / name)
 
 
-def test_the_ablation_of_feakm_has_a_row_a_branch_and_level_and_keeps_it(data, tmp_path, monkeypatch) -> None:
-    one, two = net_file(data, "one.safetensors"), net_file(data, "two.safetensors", most=3)
+def test_the_ablation_of_feakm_has_a_row_per_variant_and_level_and_stores_it(data, tmp_path, monkeypatch) -> None:
+    one, two = write_net(data, "one.safetensors"), write_net(data, "two.safetensors", max_keypoints=3)
     detector = data / "untrained.safetensors"
     words = ("--every", 2, "--branches", f"map={detector},{one}", f"three points={detector},{two}@8")
     held = evaluate(data, tmp_path, "feakm", *words)
@@ -137,34 +145,34 @@ def test_the_ablation_of_feakm_has_a_row_a_branch_and_level_and_keeps_it(data, t
     ]
     assert all(len(r["ap"]) == 2 and r["frames"] == r["asked"] == 2 for r in held["rows"])
     assert held["rows"][4]["answered"] == 0.0 and held["paper"]["rows"][3][1] == 0.768
-    monkeypatch.setattr(feakm, "ablation", None)
+    monkeypatch.setattr(feakm, "run_ablation", None)
     assert evaluate(data, tmp_path, "feakm", *words)["rows"] == held["rows"]
 
 
 def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path) -> None:
-    net = net_file(data, "few.safetensors", most=5)
-    asked = ("--every", 2, "--disturbances", "perfect", "--correctors", "given", net, f"{net}@8")
-    words = ("--methods", "intermediate", *asked)
+    net = write_net(data, "few.safetensors", max_keypoints=5)
+    options = ("--every", 2, "--disturbances", "perfect", "--correctors", "given", net, f"{net}@8")
+    words = ("--methods", "intermediate", *options)
     held = evaluate(data, tmp_path, "pose", *words)
     plain, four, eight = (r["bytes_per_message"] for r in held["rows"])
     # Five objects with a descriptor each; a section's own bytes and a packet more may come with them.
     assert 5 * 45 <= four - plain <= 5 * 49 + 100 and four == eight
     with torch.random.fork_rng():
-        wrong = net_file(data, "wrong.safetensors", detector="ab" * 8)
+        wrong = write_net(data, "wrong.safetensors", detector="ab" * 8)
     common = ("--data", data / "data", "--split", "test", "--weights", data / "untrained.safetensors", "--workers", 1)
     assert cli.main([str(w) for w in ("evaluate", *common, "--out", tmp_path, "--align", wrong)]) == 1
 
 
-def test_poses_are_judged_by_error_and_by_common_objects_and_kept(data, tmp_path, monkeypatch) -> None:
+def test_poses_are_evaluated_by_error_and_common_objects_and_stored(data, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(pose_accuracy, "SIGMAS", (0.0, 0.8))
-    monkeypatch.setattr(pose_accuracy, "FAMILIES", (("offset", 0.5), ("none", 0.0)))
+    monkeypatch.setattr(pose_accuracy, "NOISE_FAMILIES", (("offset", 0.5), ("none", 0.0)))
     calls = []
 
-    def see(self, frame):
+    def process(self, frame):
         calls.append(frame.agent_id)
         return SimpleNamespace(boxes=cars().transform(POSES[frame.agent_id].inverse()).to(torch.float32))
 
-    monkeypatch.setattr(Eyes, "see", see)
+    monkeypatch.setattr(PerceptionCache, "process", process)
     held = evaluate(data, tmp_path, "pose-accuracy", "--correctors", "given", "vote", "coalign")
     rows = {(r["trial"]["corrector"], r["trial"]["noise"]["kind"], r["trial"]["noise"]["sigma_m"]): r
             for r in held["rows"] if r["common"] is None}  # fmt: skip

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from manyeyes.studies import provenance
-from manyeyes.studies.provenance import git_commit, plain, write_json
+from manyeyes.studies.provenance import git_commit, to_plain, write_json
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def git(folder: Path, *words: str) -> str:
     ).stdout
 
 
-def test_the_commit_is_that_of_the_package_and_says_when_files_differ(tmp_path, monkeypatch) -> None:
+def test_the_commit_is_that_of_the_package_and_marks_changed_files(tmp_path, monkeypatch) -> None:
     if shutil.which("git") is None:
         pytest.skip("git is not installed")
     package = tmp_path / "manyeyes"
@@ -75,5 +75,5 @@ def test_the_commit_is_that_of_the_package_and_says_when_files_differ(tmp_path, 
 
 
 def test_plain_keeps_what_json_has_and_names_the_rest() -> None:
-    assert plain((None, True, 3, "x", 1.5, [Path("p")])) == [None, True, 3, "x", 1.5, ["p"]]
-    assert plain({1: -math.inf}) == {"1": None}
+    assert to_plain((None, True, 3, "x", 1.5, [Path("p")])) == [None, True, 3, "x", 1.5, ["p"]]
+    assert to_plain({1: -math.inf}) == {"1": None}

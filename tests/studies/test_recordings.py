@@ -13,12 +13,12 @@ from manyeyes.cli import main as cli
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.dair_writer import DairWriter, write_dair_index
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.studies.recordings import open_recording, suited_to
-from manyeyes.studies.replay_options import Playing
+from manyeyes.studies.recordings import adapt_to_dataset, open_recording
+from manyeyes.studies.replay_options import ReplayOptions
 
 
 def street(index: int, later_ns: int = 0) -> Snapshot:
@@ -36,7 +36,7 @@ def street(index: int, later_ns: int = 0) -> Snapshot:
         frames.append(AgentFrame(id, time_ns, cloud, pose, torch.zeros(3, 3), is_infrastructure=id < 0))
     center = torch.tensor([[8, 5, 0.8]], dtype=torch.float64)
     boxes = Boxes.of(center, 2 * half[None].double(), torch.tensor([0.4]).double(), id=torch.tensor([9]))
-    truth = Truth(boxes, torch.ones(2, 1, dtype=torch.bool), Transform.stack(poses))
+    truth = GroundTruth(boxes, torch.ones(2, 1, dtype=torch.bool), Transform.stack(poses))
     return Snapshot("street", index, tuple(frames), truth)
 
 
@@ -75,15 +75,19 @@ def test_the_layout_is_known_by_its_folders(data: Path, tmp_path: Path) -> None:
 
 def test_an_ego_waits_for_the_later_sweep_of_a_pair(data: Path, tmp_path: Path) -> None:
     recording = open_recording(data)
-    for playing, wait_s in ((Playing(), 0.05), (Playing(channel="its-g5"), 0.05), (Playing(wait_ms=7.0), 0.007)):
-        config = suited_to(playing.replay_config(0), playing, recording)
-        assert (config.wait_s, config.reach_m) == (wait_s, math.inf)
+    for playing, wait_s in (
+        (ReplayOptions(), 0.05),
+        (ReplayOptions(channel="its-g5"), 0.05),
+        (ReplayOptions(latency_budget_ms=7.0), 0.007),
+    ):
+        config = adapt_to_dataset(playing.make_replay_config(0), playing, recording)
+        assert (config.latency_budget_s, config.comm_range_m) == (wait_s, math.inf)
     Opv2vWriter(tmp_path / "drive").write(street(0))
-    config = Playing().replay_config(0)
-    assert suited_to(config, Playing(), open_recording(tmp_path)) == config
+    config = ReplayOptions().make_replay_config(0)
+    assert adapt_to_dataset(config, ReplayOptions(), open_recording(tmp_path)) == config
 
 
-def test_evaluate_judges_pairs_and_hears_the_pole(data: Path, weights: Path, tmp_path: Path) -> None:
+def test_evaluate_scores_pairs_with_infrastructure_messages(data: Path, weights: Path, tmp_path: Path) -> None:
     words = ("--methods", "alone", "late", "early", "--protocol", "dair", "--workers", 1, "--timed-frames", 0)
     assert run("evaluate", "--data", data, "--split", "test", "--weights", weights, *words, "--out", tmp_path) == 0
     held = json.loads((tmp_path / "results.json").read_text())["result"]
@@ -106,5 +110,5 @@ def test_run_and_view_take_the_layout(data: Path, weights: Path, tmp_path: Path)
 
 def test_an_unknown_split_is_one_line(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("view", data, "--split", "val", "--out", tmp_path / "x.png") == 1
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and "no split 'val'; it has test" in said[0]
+    output = capsys.readouterr().err.splitlines()
+    assert len(output) == 1 and "no split 'val'; it has test" in output[0]

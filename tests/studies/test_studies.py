@@ -11,17 +11,17 @@ from PIL import Image
 
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.detection import benchmark
-from manyeyes.evaluation.detection.accumulator import Tally
+from manyeyes.evaluation.detection.accumulator import MetricAccumulator
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, run_scenario
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.studies import running
 from manyeyes.studies.detection import robustness
-from manyeyes.studies.detection.perturbations import HARD, PERFECT, Disturbance, chosen
-from manyeyes.viz.curves import Panel
+from manyeyes.studies.detection.perturbations import CLEAN, COMBINED_SEVERE, Perturbation, select_perturbations
+from manyeyes.viz.curves import CurvePanel
 
 HALF = torch.tensor([2.3, 0.95, 0.8])
 
@@ -45,7 +45,7 @@ def crossing(scenario: str, index: int, agents: int) -> Snapshot:
     yaw, velocity = torch.tensor([0.4, 0.0]).double(), torch.tensor([[0.0, 0.0], [10.0, 0.0]]).double()
     boxes = Boxes.of(center, (2 * HALF).double().expand(2, 3), yaw, id=torch.tensor([90, 91]), velocity=velocity)
     seen = torch.ones(agents, 2, dtype=torch.bool)
-    return Snapshot(scenario, index, tuple(frames), Truth(boxes, seen, Transform.stack(poses)))
+    return Snapshot(scenario, index, tuple(frames), GroundTruth(boxes, seen, Transform.stack(poses)))
 
 
 @pytest.fixture(scope="module")
@@ -70,11 +70,11 @@ def weights(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def panels(monkeypatch) -> list[Panel]:
+def panels(monkeypatch) -> list[CurvePanel]:
     """What is to be drawn, instead of drawing it."""
-    last: list[Panel] = []
+    last: list[CurvePanel] = []
 
-    def keep(drawn: list[Panel], path: Path) -> None:
+    def keep(drawn: list[CurvePanel], path: Path) -> None:
         last[:] = drawn
         Image.new("RGB", (500, 10)).save(path)
 
@@ -93,20 +93,20 @@ def evaluate(data: Path, weights: Path, out: Path, study: str, *words: object) -
 
 
 @pytest.fixture
-def few(monkeypatch) -> tuple:
+def small_set(monkeypatch) -> tuple:
     """Six of the disturbances."""
-    assert len({d.name for d in robustness.ALL}) == len(robustness.ALL) == 21
+    assert len({d.name for d in robustness.ALL_PERTURBATIONS}) == len(robustness.ALL_PERTURBATIONS) == 21
     delay, position, lost = robustness.DELAYS[-1], robustness.POSITIONS[-1], robustness.LOSSES[-1]
-    kept = (robustness.PERFECT, robustness.DELAYS[0], delay, position, lost, list(robustness.ORACLES)[3])
-    monkeypatch.setattr(robustness, "ALL", kept)
+    kept = (robustness.CLEAN, robustness.DELAYS[0], delay, position, lost, list(robustness.ORACLES)[3])
+    monkeypatch.setattr(robustness, "ALL_PERTURBATIONS", kept)
     return kept
 
 
-def test_robustness_has_a_row_a_disturbance_and_method(data, weights, tmp_path, few, panels) -> None:
+def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_path, small_set, panels) -> None:
     held = evaluate(data, weights, tmp_path, "robustness", "--methods", "alone", "late", "intermediate", "--every", 2)
     rows, origin = held["result"]["rows"], held["provenance"]
     assert {"command", "seed", "versions", "git_commit", "config"} <= set(origin)
-    assert len(rows) == 1 + 2 * len(few)
+    assert len(rows) == 1 + 2 * len(small_set)
     late = [r for r in rows if r["method"] == "late"]
     assert [r["oracle"] for r in late] == ["", "true poses", "", "", "", "no delay"]
     # A message that is d old when it comes is d old when it is used; frame 4 alone is judged.
@@ -116,9 +116,9 @@ def test_robustness_has_a_row_a_disturbance_and_method(data, weights, tmp_path, 
     assert [speed["value"] is None for speed in late[0]["by_speed"]] == [False, True, False]
     assert late[0]["lost"][0]["value"] == 0 and late[0]["bytes_per_message"] > 0
     assert [r["paper"] for r in rows if r["method"] == "intermediate"][:3] == [0.946, 0.937, 0.909]
-    claims = held["result"]["claims"]
-    assert sum("intermediate - late" in c["what"] for c in claims) == 2 * len(few)
-    assert [c["bar"] for c in claims[-3:]] == [-0.037, -0.044, -0.03]
+    margin_tests = held["result"]["claims"]
+    assert sum("intermediate - late" in c["what"] for c in margin_tests) == 2 * len(small_set)
+    assert [c["bar"] for c in margin_tests[-3:]] == [-0.037, -0.044, -0.03]
     assert [p.title for p in panels] == ["Delay", "Heading", "Position", "Lost packets", "Together"]
     assert {c.label: c.x for c in panels[0].curves} == {
         "alone": (),
@@ -127,7 +127,7 @@ def test_robustness_has_a_row_a_disturbance_and_method(data, weights, tmp_path, 
     }
 
 
-def test_disturbances_are_played_by_name(data, weights, tmp_path, panels) -> None:
+def test_perturbations_are_selected_by_name(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "late", "intermediate", "--every", 2, "--disturbances", "0.4 s")
     held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
     assert [r["disturbance"]["delay_s"] for r in held["rows"]] == [0, 0, 0.4, 0.4]
@@ -135,10 +135,12 @@ def test_disturbances_are_played_by_name(data, weights, tmp_path, panels) -> Non
     text = (tmp_path / "robustness.md").read_text()
     assert "## Delay" in text and "## Position" not in text
     with pytest.raises(ConfigError, match=r"No disturbance '4 s'; choose from perfect, 0.1 s"):
-        chosen(["4 s"], robustness.ALL)
+        select_perturbations(["4 s"], robustness.ALL_PERTURBATIONS)
 
 
-def test_rival_fusions_are_held_against_ours_under_each_disturbance(data, weights, tmp_path, panels, capsys) -> None:
+def test_baseline_fusions_are_compared_with_ours_under_each_perturbation(
+    data, weights, tmp_path, panels, capsys
+) -> None:
     words = ("--methods", "intermediate", "--every", 2, "--disturbances", "0.4 s", "--branches", f"same={weights}")
     held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
     assert [(r["method"], r["disturbance"]["delay_s"]) for r in held["rows"]] == [
@@ -155,9 +157,9 @@ def test_rival_fusions_are_held_against_ours_under_each_disturbance(data, weight
 
 
 def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(
-    data, weights, tmp_path, monkeypatch, few, panels
+    data, weights, tmp_path, monkeypatch, small_set, panels
 ) -> None:
-    monkeypatch.setattr(robustness, "ALL", few[:4])
+    monkeypatch.setattr(robustness, "ALL_PERTURBATIONS", small_set[:4])
     words = ("--methods", "alone", "late", "--every", 2)
     first = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
     cells = sorted((tmp_path / "cells").iterdir())
@@ -175,7 +177,7 @@ def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(
     assert played == []
 
 
-def test_budgets_are_kept_and_small_ones_say_less(data, weights, tmp_path) -> None:
+def test_budgets_are_respected_and_small_ones_send_less(data, weights, tmp_path) -> None:
     words = ("--methods", "alone", "late", "--selectors", "intermediate", "--precisions", "float16", "int8")
     held = evaluate(data, weights, tmp_path, "budget", *words, "--budgets", 1398, 4096, "--every", 2)["result"]
     rows = held["rows"]
@@ -203,7 +205,7 @@ def test_agents_are_judged_on_the_scenarios_that_have_them(data, weights, tmp_pa
     ]  # fmt: skip
 
 
-def test_ablation_shows_each_branch_with_its_card(data, weights, tmp_path, panels) -> None:
+def test_ablation_shows_each_checkpoint_with_its_card(data, weights, tmp_path, panels) -> None:
     words = ("--every", 2, "--branches", f"first={weights}", f"again={weights}")
     rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
     assert [r["branch"] for r in rows] == ["first", "again"] and rows[0]["card"]["steps"] == 7
@@ -212,7 +214,7 @@ def test_ablation_shows_each_branch_with_its_card(data, weights, tmp_path, panel
     assert [p.ticks for p in panels] == 2 * [("first", "again")] and len(panels[0].curves) == 3
 
 
-def test_a_branch_of_the_ablation_may_have_a_budget(data, weights, tmp_path, panels, capsys) -> None:
+def test_a_checkpoint_of_the_ablation_may_have_a_budget(data, weights, tmp_path, panels, capsys) -> None:
     words = ("--every", 2, "--branches", f"all={weights}", f"masked={weights}@1398")
     rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
     assert 0 < rows[1]["bytes_per_message"] <= 1398 < rows[0]["bytes_per_message"]
@@ -222,7 +224,7 @@ def test_a_branch_of_the_ablation_may_have_a_budget(data, weights, tmp_path, pan
         assert "behind @ stands a number of bytes" in capsys.readouterr().err
 
 
-def test_in_the_system_everybody_is_ego_and_the_channel_has_one_budget(data, weights, tmp_path, panels) -> None:
+def test_with_shared_bandwidth_every_agent_is_ego_under_one_budget(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "alone", "--selectors", "intermediate", "--budgets", 6000, "--every", 2)
     rows = evaluate(data, weights, tmp_path, "system", *words)["result"]["rows"]
     bound, alone = rows
@@ -232,14 +234,14 @@ def test_in_the_system_everybody_is_ego_and_the_channel_has_one_budget(data, wei
     assert {c.label: len(c.x) for c in panels[0].curves} == {"intermediate": 1, "alone": 0}
 
 
-def test_the_picture_is_of_one_frame_with_the_most_agents(data, weights, tmp_path) -> None:
+def test_the_qualitative_study_shows_the_frame_with_max_agents(data, weights, tmp_path) -> None:
     held = evaluate(data, weights, tmp_path, "picture")["result"]
     assert (held["scenario"], held["frame"]) == ("b", 5)
     assert [r["method"] for r in held["rows"]] == ["alone", "late", "intermediate", "early"]
     assert all(r["true"] == 2 for r in held["rows"])
 
 
-def scores(tallies: list[Tally]) -> list[list[float]]:
+def scores(tallies: list[MetricAccumulator]) -> list[list[float]]:
     """What each method found."""
     return [[x for frame in tally.frames for x in frame.score.tolist()] for tally in tallies]
 
@@ -247,15 +249,17 @@ def scores(tallies: list[Tally]) -> list[list[float]]:
 def test_conditions_side_by_side_are_as_each_by_itself(data, weights) -> None:
     opener = partial(Opv2vRecording, data, "test")
     base = BenchmarkConfig(str(weights), ("late", "early"))
-    configs = [disturbance.on(base) for disturbance in (PERFECT, HARD, Disturbance(delay_s=0.1))]
+    configs = [disturbance.apply_to(base) for disturbance in (CLEAN, COMBINED_SEVERE, Perturbation(delay_s=0.1))]
     together = [scores(tallies) for tallies in run_scenario(opener, configs, "b")]
     apart = [scores(run_scenario(opener, [config], "b")[0]) for config in configs]
     assert together == apart and together[0] != together[1] != together[2]
 
 
-def test_ego_alone_is_the_same_under_every_disturbance(data, weights) -> None:
+def test_no_fusion_is_the_same_under_every_perturbation(data, weights) -> None:
     base = BenchmarkConfig(str(weights), ("alone",))
-    calm, rough = run_scenario(partial(Opv2vRecording, data, "test"), [PERFECT.on(base), HARD.on(base)], "b")
+    calm, rough = run_scenario(
+        partial(Opv2vRecording, data, "test"), [CLEAN.apply_to(base), COMBINED_SEVERE.apply_to(base)], "b"
+    )
     assert scores(calm) == scores(rough) and len(scores(calm)[0]) > 0
 
 
@@ -274,6 +278,6 @@ def test_ego_alone_is_the_same_under_every_disturbance(data, weights) -> None:
 def test_what_is_wrong_is_one_line_before_any_work(data, weights, tmp_path, capsys, words, named) -> None:
     common = ("--data", data, "--split", "test", "--weights", weights, "--out", tmp_path / "out")
     assert cli.main([str(word) for word in ("evaluate", *common, *words)]) == 1
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1 and all(name in said[0] for name in named)
+    output = capsys.readouterr().err.splitlines()
+    assert len(output) == 1 and all(name in output[0] for name in named)
     assert not (tmp_path / "out").exists()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_uniform
 
 
@@ -33,7 +33,7 @@ class ToyRecording:
     def length(self, scenario: str) -> int:
         return self.frames
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         return range(self.frames)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -55,7 +55,7 @@ class ToyRecording:
             for i, pose in enumerate(poses)
         )
         seen = torch.ones(self.agents_n, self.cars, dtype=torch.bool)
-        return Snapshot(scenario, index, frames, Truth(boxes, seen, Transform.stack(poses)))
+        return Snapshot(scenario, index, frames, GroundTruth(boxes, seen, Transform.stack(poses)))
 
     def _pose(self, agent: int, scenario: str, index: int) -> Transform:
         u = keyed_uniform((3,), "toy pose", agent, scenario, 0).tolist()

@@ -9,8 +9,15 @@ from manyeyes.models import checkpoint
 from manyeyes.models.detector.codebook import FREQUENCY_TOTAL, CodebookConfig
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.models.detector.proposal import PROPOSAL
-from manyeyes.training.detector.codebook import fit, fit_centres, fit_frequencies, k_means, told_tokens, with_codebook
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
+from manyeyes.training.detector.codebook import (
+    collect_shared_tokens,
+    fit_centres,
+    fit_codebook,
+    fit_frequencies,
+    k_means,
+    with_codebook,
+)
 
 torch.set_num_threads(1)
 
@@ -52,19 +59,24 @@ def test_frequencies_by_hand():
     assert int(table[1, 9]) == FREQUENCY_TOTAL - 255
 
 
-def test_a_fitted_detector_says_the_same_and_is_told_apart(detector, toy, tmp_path):
+def test_fitted_detector_shares_equal_tokens_and_has_another_fingerprint(detector, toy, tmp_path):
     recording = toy(agents_n=2, points_per_car=40, ground_points=100)
-    heard = []
-    fitted = fit(detector, recording, seed=3, config=CodebookConfig(2, 32), every=2, report=heard.append)
-    assert heard == sorted(heard) and heard[-1] > 100
+    reports = []
+    fitted = fit_codebook(
+        detector, recording, seed=3, config=CodebookConfig(2, 32), frame_stride=2, report=reports.append
+    )
+    assert reports == sorted(reports) and reports[-1] > 100
     assert fitted.fingerprint != checkpoint.fingerprint(detector)
-    told = torch.cat(list(told_tokens(detector, recording, 2)))
-    assert torch.equal(torch.cat(list(told_tokens(fitted, recording, 2))), told)
-    features, back = told[:, :-PROPOSAL], fitted.codebook.read(fitted.codebook.write(told))[:, :-PROPOSAL]
+    tokens = torch.cat(list(collect_shared_tokens(detector, recording, 2)))
+    assert torch.equal(torch.cat(list(collect_shared_tokens(fitted, recording, 2))), tokens)
+    features, back = (
+        tokens[:, :-PROPOSAL_DIM],
+        fitted.codebook.decode(fitted.codebook.encode(tokens))[:, :-PROPOSAL_DIM],
+    )
     assert (back - features).square().mean() < 0.8 * features.var(0).mean()
-    assert with_codebook(detector, told, 3, CodebookConfig(2, 32)).fingerprint == fitted.fingerprint
+    assert with_codebook(detector, tokens, 3, CodebookConfig(2, 32)).fingerprint == fitted.fingerprint
     # Fitted anew, the old book is gone.
-    assert with_codebook(fitted, told, 3, CodebookConfig(2, 32)).fingerprint == fitted.fingerprint
+    assert with_codebook(fitted, tokens, 3, CodebookConfig(2, 32)).fingerprint == fitted.fingerprint
     for half in (False, True):
         path = tmp_path / f"{half}.safetensors"
         checkpoint.save(fitted, path, {}, half)
@@ -75,10 +87,10 @@ def test_a_fitted_detector_says_the_same_and_is_told_apart(detector, toy, tmp_pa
         assert half or loaded.fingerprint == fitted.fingerprint
 
 
-def test_nothing_told_is_nothing_to_fit(detector, toy):
+def test_fit_without_tokens_is_refused(detector, toy):
     empty = toy(agents_n=1, cars=1, points_per_car=1, ground_points=1, frames=1)
     blind = Detector(detector.config)
     blind.load_state_dict(detector.state_dict())
     blind.eval().requires_grad_(False).token_prune.score.bias.fill_(-100.0)
     with pytest.raises(ConfigError, match="nothing to fit"):
-        fit(blind, empty)
+        fit_codebook(blind, empty)

@@ -18,15 +18,31 @@ import torch
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.presets import COSTR_OPV2V, COSTR_TINY
-from manyeyes.models.fusion.transform_tokens import Part, gather
-from manyeyes.training.detector.loop import Run, TrainConfig, _grown, learning_rate, prune_threshold, train
-from manyeyes.training.detector.samples import AugmentConfig, RoadConfig
+from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
+from manyeyes.training.detector.loop import (
+    DetectorRun,
+    TrainConfig,
+    _grow,
+    learning_rate,
+    prune_threshold,
+    train_detector,
+)
+from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig
 
-TINY = TrainConfig(COSTR_TINY, steps=6, batch=2, warm_up=2, save_every=2, augment=AugmentConfig(max_agents=2))
+TINY = TrainConfig(COSTR_TINY, steps=6, batch=2, warmup_steps=2, save_every=2, augment=AugmentConfig(max_agents=2))
 ROAD = dataclasses.replace(
     TINY,
-    augment=AugmentConfig(max_agents=99, early_share=0.0),
-    road=RoadConfig(2, said=1, late_share=0.5, late_frames=2, astray_share=0.5, lost_share=0.5, few_share=1.0, few=4),
+    augment=AugmentConfig(max_agents=99, early_fusion_prob=0.0),
+    degradation=DegradationConfig(
+        2,
+        sender_history=1,
+        delay_prob=0.5,
+        max_delay_frames=2,
+        pose_noise_prob=0.5,
+        packet_loss_prob=0.5,
+        budget_prob=1.0,
+        min_budget_tokens=4,
+    ),
 )
 
 
@@ -41,15 +57,15 @@ def same_state(a: torch.nn.Module, b: torch.nn.Module) -> bool:
 @pytest.mark.parametrize("config", (TINY, ROAD), ids=("plain", "road"))
 def test_a_run_that_was_killed_ends_as_if_it_had_not_been(toy, tmp_path, config):
     recording = dataclasses.replace(small(toy), frames=4)
-    whole = Run(config, recording, tmp_path / "whole", seed=3)
+    whole = DetectorRun(config, recording, tmp_path / "whole", seed=3)
     for _ in range(6):
         whole.advance()
-    broken = Run(config, recording, tmp_path / "broken", seed=3)
+    broken = DetectorRun(config, recording, tmp_path / "broken", seed=3)
     for _ in range(4):
         broken.advance()
         if broken.state.step == 2:
             broken.state.save()
-    resumed = Run(config, recording, tmp_path / "broken", seed=3)
+    resumed = DetectorRun(config, recording, tmp_path / "broken", seed=3)
     assert resumed.state.step == 2 and not same_state(resumed.state.model, broken.state.model)
     last = [resumed.advance() for _ in range(4)][-1]
     assert last.step == 6
@@ -59,10 +75,10 @@ def test_a_run_that_was_killed_ends_as_if_it_had_not_been(toy, tmp_path, config)
 
 
 def test_train_writes_weights_a_log_and_goes_on_where_it_stopped(toy, tmp_path):
-    heard = []
-    weights = train(TINY, small(toy), tmp_path, seed=1, card={"command": "x"}, report=heard.append)
+    reports = []
+    weights = train_detector(TINY, small(toy), tmp_path, seed=1, card={"command": "x"}, report=reports.append)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6] == [p.step for p in heard]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6] == [p.step for p in reports]
     assert all(math.isfinite(line["loss"]) for line in lines)
     card = checkpoint.read_card(weights)
     assert card["seed"] == 1 and card["steps"] == 6 and card["command"] == "x"
@@ -71,7 +87,7 @@ def test_train_writes_weights_a_log_and_goes_on_where_it_stopped(toy, tmp_path):
     with (tmp_path / "log.jsonl").open("a") as log:
         log.write(json.dumps({"step": 7, "loss": 0.0}) + "\n")
     before = weights.read_bytes()
-    train(TINY, small(toy), tmp_path, seed=1, card={"command": "x"})
+    train_detector(TINY, small(toy), tmp_path, seed=1, card={"command": "x"})
     assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [
         1,
         2,
@@ -85,62 +101,65 @@ def test_train_writes_weights_a_log_and_goes_on_where_it_stopped(toy, tmp_path):
 
 
 def test_a_log_line_cut_by_a_kill_is_dropped(toy, tmp_path):
-    train(dataclasses.replace(TINY, steps=2), small(toy), tmp_path, seed=1)
+    train_detector(dataclasses.replace(TINY, steps=2), small(toy), tmp_path, seed=1)
     with (tmp_path / "log.jsonl").open("a") as log:
         log.write('{"step": 3, "lo')
-    train(dataclasses.replace(TINY, steps=2), small(toy), tmp_path, seed=1)
+    train_detector(dataclasses.replace(TINY, steps=2), small(toy), tmp_path, seed=1)
     assert [json.loads(line)["step"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [1, 2]
 
 
 def test_a_second_stage_begins_where_the_first_ended(toy, tmp_path):
-    first = train(dataclasses.replace(TINY, steps=2), small(toy), tmp_path / "first", seed=1)
+    first = train_detector(dataclasses.replace(TINY, steps=2), small(toy), tmp_path / "first", seed=1)
     kept = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, prune_threshold=0.01))
-    second = Run(kept, small(toy), tmp_path / "second", 2, first)
+    second = DetectorRun(kept, small(toy), tmp_path / "second", 2, first)
     for name, value in checkpoint.load(first).state_dict().items():
         assert torch.equal(second.state.model.state_dict()[name], value), name
     narrower = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, head_channels=24))
     with pytest.raises(CheckpointError, match=r"head\.out\.weight does not fit"):
-        Run(narrower, small(toy), tmp_path / "third", 2, first)
+        DetectorRun(narrower, small(toy), tmp_path / "third", 2, first)
 
 
 def test_a_tensor_grows_at_its_ends_by_zeros_and_a_vector_keeps_its_own():
     old = torch.arange(6.0).view(2, 3) + 1
-    grown = _grown(torch.full((3, 4), 9.0), old)
+    grown = _grow(torch.full((3, 4), 9.0), old)
     assert grown is not None and grown.tolist() == [[1, 2, 3, 0], [4, 5, 6, 0], [0, 0, 0, 0]]
-    bias = _grown(torch.tensor([7.0, 8.0, 9.0]), torch.tensor([1.0, 2.0]))
+    bias = _grow(torch.tensor([7.0, 8.0, 9.0]), torch.tensor([1.0, 2.0]))
     assert bias is not None and bias.tolist() == [1, 2, 9]
-    assert _grown(torch.zeros(2, 2), old) is None and _grown(torch.zeros(6), old) is None
-    half = _grown(torch.zeros(2, 3), old.half())
+    assert _grow(torch.zeros(2, 2), old) is None and _grow(torch.zeros(6), old) is None
+    half = _grow(torch.zeros(2, 3), old.half())
     assert half is not None and half.dtype == torch.float32 and torch.equal(half, old)
 
 
 def test_what_a_model_has_grown_by_starts_as_if_it_were_not_there(toy, tmp_path):
     """From one sweep and plain self-attention to two sweeps and a past: the same boxes, before the first step."""
     plain = dataclasses.replace(COSTR_TINY, sweeps=1, fusion="self_attention", prune_threshold=0.0)
-    first = train(dataclasses.replace(TINY, detector=plain, steps=2), small(toy), tmp_path / "first", seed=1)
+    first = train_detector(dataclasses.replace(TINY, detector=plain, steps=2), small(toy), tmp_path / "first", seed=1)
     grown = dataclasses.replace(plain, sweeps=2, fusion="flow_aware")
-    run = Run(dataclasses.replace(TINY, detector=grown), small(toy), tmp_path / "second", 2, first)
+    run = DetectorRun(dataclasses.replace(TINY, detector=grown), small(toy), tmp_path / "second", 2, first)
     old, new = checkpoint.load(first), run.state.model.eval()
     now, before = (toy().snapshot("toy_0", i).frames[0].points for i in (1, 0))
     none = now[:0]
     with torch.no_grad():
         mine, theirs = (
-            m.tell(s, m.look(s)) for m, s in ((old, old.see([now]).tokens), (new, new.see([now], [none]).tokens))
+            m.make_tokens(s, m.predict(s))
+            for m, s in ((old, old.extract_features([now]).tokens), (new, new.extract_features([now], [none]).tokens))
         )
-        past = new.see([before], [none]).tokens
-        looked_back = gather([Part(0, new.tell(past, new.look(past)).features, past.sites.xy)], old.token_grid, 1)
-        tokens = gather([Part(0, mine.features, mine.sites.xy)], old.token_grid, 1)
-        fused = old.merge(tokens), new.merge(tokens, looked_back)
-        boxes = old.fuse(tokens), new.fuse(tokens, looked_back)
+        past = new.extract_features([before], [none]).tokens
+        ego_past = to_ego_frame(
+            [AgentTokens(0, new.make_tokens(past, new.predict(past)).features, past.sites.xy)], old.token_grid, 1
+        )
+        tokens = to_ego_frame([AgentTokens(0, mine.features, mine.sites.xy)], old.token_grid, 1)
+        fused = old.fuse_tokens(tokens), new.fuse_tokens(tokens, ego_past)
+        boxes = old.fuse(tokens), new.fuse(tokens, ego_past)
     assert torch.equal(mine.sites.key, theirs.sites.key)
     assert torch.allclose(mine.features, theirs.features, atol=1e-5)
-    assert len(looked_back.features) > 20 and torch.equal(boxes[0].sites.key, boxes[1].sites.key)
+    assert len(ego_past.features) > 20 and torch.equal(boxes[0].sites.key, boxes[1].sites.key)
     assert torch.allclose(fused[0].bev.features, fused[1].bev.features, atol=1e-5)
-    assert torch.allclose(boxes[0].columns(), boxes[1].columns(), atol=1e-6)
+    assert torch.allclose(boxes[0].to_rows(), boxes[1].to_rows(), atol=1e-6)
 
 
 def test_the_shipped_weights_are_the_average(toy, tmp_path):
-    train(dataclasses.replace(TINY, steps=3), small(toy), tmp_path, seed=1)
+    train_detector(dataclasses.replace(TINY, steps=3), small(toy), tmp_path, seed=1)
     state = torch.load(tmp_path / "last.pt", weights_only=True)
     loaded = checkpoint.load(tmp_path / "weights.safetensors").state_dict()
     assert torch.equal(loaded["head.out.weight"], state["average"]["head.out.weight"].half().float())
@@ -148,19 +167,19 @@ def test_the_shipped_weights_are_the_average(toy, tmp_path):
 
 
 def test_a_folder_of_another_run_or_a_cut_state_is_refused(toy, tmp_path):
-    run = Run(TINY, small(toy), tmp_path, seed=3)
+    run = DetectorRun(TINY, small(toy), tmp_path, seed=3)
     run.state.save()
     for config, seed in ((TINY, 4), (dataclasses.replace(TINY, learning_rate=1.0), 3)):
         with pytest.raises(CheckpointError, match=r"last\.pt: belongs to a run of another configuration or seed"):
-            Run(config, small(toy), tmp_path, seed)
+            DetectorRun(config, small(toy), tmp_path, seed)
     path = tmp_path / "last.pt"
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(CheckpointError, match=r"last\.pt: not a whole training state"):
-        Run(TINY, small(toy), tmp_path, 3)
+        DetectorRun(TINY, small(toy), tmp_path, 3)
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_names_the_step(toy, tmp_path):
-    run = Run(TINY, small(toy), tmp_path, seed=3)
+    run = DetectorRun(TINY, small(toy), tmp_path, seed=3)
     with torch.no_grad():
         run.state.model.head.out.bias.fill_(torch.nan)
     with pytest.raises(ConfigError, match="The loss is nan at step 0"):
@@ -168,7 +187,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_names_the_step(toy, tmp_path
 
 
 def test_schedules():
-    config = dataclasses.replace(TINY, learning_rate=1.0, warm_up=10, prune_from=0.1, prune_full=0.3)
+    config = dataclasses.replace(TINY, learning_rate=1.0, warmup_steps=10, prune_warmup_start=0.1, prune_warmup_end=0.3)
     rates = [learning_rate(config, step, 100) for step in range(101)]
     assert rates[0] == pytest.approx(0.1) and max(rates) == rates[9] and rates[100] == pytest.approx(0.0, abs=1e-9)
     assert all(a > b for a, b in itertools.pairwise(rates[9:]))
@@ -177,7 +196,7 @@ def test_schedules():
 
 
 def test_the_same_seed_is_the_same_run_and_another_is_not(toy, tmp_path):
-    runs = [Run(TINY, small(toy), tmp_path / str(i), seed) for i, seed in enumerate((5, 5, 6))]
+    runs = [DetectorRun(TINY, small(toy), tmp_path / str(i), seed) for i, seed in enumerate((5, 5, 6))]
     for run in runs:
         run.advance()
     assert same_state(runs[0].state.model, runs[1].state.model) and not same_state(
@@ -260,14 +279,14 @@ def test_a_batch_that_cannot_be_shared_is_refused(toy, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.distributed.get_rank", lambda: 0)
     monkeypatch.setattr("torch.distributed.get_world_size", lambda: 4)
     with pytest.raises(ConfigError, match="batch of 2 samples cannot be shared by 4"):
-        Run(TINY, small(toy), tmp_path, seed=0).advance()
+        DetectorRun(TINY, small(toy), tmp_path, seed=0).advance()
 
 
 def test_the_papers_preset_takes_a_step_and_resumes(toy, tmp_path):
     config = TrainConfig(COSTR_OPV2V, steps=2, batch=1, augment=AugmentConfig(max_agents=2))
-    run = Run(config, small(toy), tmp_path, seed=0)
+    run = DetectorRun(config, small(toy), tmp_path, seed=0)
     first = run.advance()
     run.state.save()
     assert math.isfinite(first.loss) and run.state.model.token_grid.stride == 8
-    resumed = Run(config, small(toy), tmp_path, seed=0)
+    resumed = DetectorRun(config, small(toy), tmp_path, seed=0)
     assert resumed.state.step == 1 and math.isfinite(resumed.advance().loss)

@@ -9,7 +9,7 @@ import torch
 
 from manyeyes.datatypes import BevGrid, Boxes, Sites
 from manyeyes.models.detector.box_head import SPEED_UNIT, WIDTHS, RawBoxes
-from manyeyes.models.detector.pruning import Pruned
+from manyeyes.models.detector.pruning import PruneOutput
 from manyeyes.training.detector.losses import (
     LossConfig,
     LossTerms,
@@ -18,7 +18,7 @@ from manyeyes.training.detector.losses import (
     head_terms,
     prune_focal,
 )
-from manyeyes.training.detector.targets import TargetConfig, Targets, assign
+from manyeyes.training.detector.targets import TargetConfig, Targets, assign_targets
 
 GRID = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0).at(4)
 SITES = Sites(torch.arange(GRID.shape[0] * GRID.shape[1]), GRID)
@@ -39,9 +39,11 @@ def one_box(yaw: float = 0.4) -> Boxes:
     return Boxes.of(place, size, torch.tensor([yaw]), velocity=velocity)
 
 
-def terms_of(some: RawBoxes, targets: Targets, prune: float = 0.0, kept: float = 0.0, told: float = 0.0) -> LossTerms:
+def terms_of(
+    some: RawBoxes, targets: Targets, prune: float = 0.0, kept: float = 0.0, information: float = 0.0
+) -> LossTerms:
     """All terms, where nothing is pruned or selected unless said."""
-    return head_terms(some, targets, *map(torch.tensor, (prune, kept, told)))
+    return head_terms(some, targets, *map(torch.tensor, (prune, kept, information)))
 
 
 def test_centre_focal_by_a_loop():
@@ -60,20 +62,20 @@ def test_centre_focal_by_a_loop():
 def test_prune_focal_by_a_loop():
     logit = torch.tensor([-2.0, 0.3, 1.5, -0.4, 0.9])
     near = [-1, 0, -1, 2, 2]
-    voice = {0: 3 / (2 * 1), 2: 3 / (2 * 2)}  # three cells, two objects: one of one cell, one of two
+    cell_weight = {0: 3 / (2 * 1), 2: 3 / (2 * 2)}  # three cells, two objects: one of one cell, one of two
     total = 0.0
     for s, box in zip(logit.tolist(), near):
         p = 1 / (1 + math.exp(-s))
-        pt, weight = (p, 0.25 * voice[box]) if box >= 0 else (1 - p, 0.75)
+        pt, weight = (p, 0.25 * cell_weight[box]) if box >= 0 else (1 - p, 0.75)
         total -= weight * (1 - pt) ** 2 * math.log(pt)
-    got = prune_focal(Pruned(Sites(torch.arange(5), GRID), logit), torch.tensor(near))
+    got = prune_focal(PruneOutput(Sites(torch.arange(5), GRID), logit), torch.tensor(near))
     assert float(got) == pytest.approx(total / 3, rel=1e-5)
 
 
 def test_prune_focal_gives_an_object_of_one_cell_no_more_than_eight_voices():
     near = torch.tensor([0] + [1] * 99)
     logit = torch.zeros(100, requires_grad=True)
-    prune_focal(Pruned(Sites(torch.arange(100), GRID), logit), near).backward()
+    prune_focal(PruneOutput(Sites(torch.arange(100), GRID), logit), near).backward()
     assert logit.grad is not None
     assert float(logit.grad[0] / logit.grad[1]) == pytest.approx(8 / (100 / (2 * 99)), rel=1e-5)
 
@@ -81,13 +83,17 @@ def test_prune_focal_gives_an_object_of_one_cell_no_more_than_eight_voices():
 @pytest.mark.parametrize("scale", (1.0, 1e4))
 def test_without_a_box_every_term_is_finite_and_gradients_flow(scale):
     some = raw()
-    some = dataclasses.replace(some, heat=(some.heat * scale).detach().requires_grad_())
-    targets = assign(SITES, [Boxes.empty()], TargetConfig())
-    prune = prune_focal(Pruned(SITES, some.heat), torch.full((len(SITES),), -1))
+    some = dataclasses.replace(some, heatmap_logit=(some.heatmap_logit * scale).detach().requires_grad_())
+    targets = assign_targets(SITES, [Boxes.empty()], TargetConfig())
+    prune = prune_focal(PruneOutput(SITES, some.heatmap_logit), torch.full((len(SITES),), -1))
     terms = head_terms(some, targets, prune, torch.zeros(()), torch.zeros(()))
     total = terms.total(LossConfig())
     total.backward()
-    assert bool(torch.isfinite(total)) and some.heat.grad is not None and bool(torch.isfinite(some.heat.grad).all())
+    assert (
+        bool(torch.isfinite(total))
+        and some.heatmap_logit.grad is not None
+        and bool(torch.isfinite(some.heatmap_logit.grad).all())
+    )
     assert not any(
         float(getattr(terms, n).detach()) for n in ("shape", "direction", "kind", "sigma", "overlap", "iou", "velocity")
     )
@@ -97,7 +103,7 @@ def test_without_a_box_every_term_is_finite_and_gradients_flow(scale):
 def test_no_sites_at_all():
     none = Sites(torch.zeros(0, dtype=torch.int64), GRID)
     empty = RawBoxes(none, *(torch.zeros(0, w).squeeze(1).requires_grad_() for w in WIDTHS))
-    terms = terms_of(empty, assign(none, [one_box()], TargetConfig()))
+    terms = terms_of(empty, assign_targets(none, [one_box()], TargetConfig()))
     assert float(terms.total(LossConfig()).detach()) == 0.0
 
 
@@ -115,7 +121,7 @@ def perfect(truth: Boxes) -> RawBoxes:
     """Every site says exactly the one box."""
     n = len(SITES)
     values = [torch.zeros(n, w) for w in WIDTHS]
-    values[1] = (truth.center[:, :2] - SITES.xy) / GRID.cell
+    values[1] = (truth.center[:, :2] - SITES.xy) / GRID.cell_size_m
     values[2] = truth.center[:, 2:].expand(n, 1)
     values[4] = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1).expand(n, 2)
     values[5] = (30.0 * torch.stack((truth.yaw.cos(), truth.yaw.sin()), 1)).expand(n, 2)
@@ -129,7 +135,7 @@ def perfect(truth: Boxes) -> RawBoxes:
 @pytest.mark.parametrize("yaw", (0.4, -1.5, 2.8, -2.9, math.pi / 2 - 1e-3))
 def test_a_perfect_answer_costs_nothing_and_its_opposite_only_direction(yaw):
     truth = one_box(yaw)
-    targets = assign(SITES, [truth], TargetConfig())
+    targets = assign_targets(SITES, [truth], TargetConfig())
     terms = terms_of(perfect(truth), targets)
     for name in ("shape", "direction", "kind", "overlap", "iou", "velocity"):
         assert float(getattr(terms, name)) == pytest.approx(0.0, abs=2e-3), name
@@ -141,7 +147,7 @@ def test_a_perfect_answer_costs_nothing_and_its_opposite_only_direction(yaw):
 
 def test_the_term_for_sigma_never_moves_the_box():
     some = raw()
-    terms = terms_of(some, assign(SITES, [one_box()], TargetConfig()))
+    terms = terms_of(some, assign_targets(SITES, [one_box()], TargetConfig()))
     terms.sigma.backward()
     assert not any(g is not None and bool(g.any()) for g in (some.offset.grad, some.axis.grad))
     assert some.log_sigma_xy.grad is not None and bool(some.log_sigma_xy.grad.any())
@@ -151,7 +157,7 @@ def test_the_iou_itself_pulls_a_box_that_nearly_fits_to_its_place():
     truth = one_box()
     aside = perfect(truth)
     offset = (aside.offset + torch.tensor([0.1, -0.1])).requires_grad_()
-    targets = assign(SITES, [truth], TargetConfig())
+    targets = assign_targets(SITES, [truth], TargetConfig())
     before = terms_of(dataclasses.replace(aside, offset=offset), targets).iou
     before.backward()
     assert offset.grad is not None and float(before.detach()) > 0.05
@@ -161,9 +167,10 @@ def test_the_iou_itself_pulls_a_box_that_nearly_fits_to_its_place():
 
 
 def test_the_total_is_the_weighted_sum():
-    terms = terms_of(raw(), assign(SITES, [one_box()], TargetConfig()), 2.0, 3.0, 4.0)
+    terms = terms_of(raw(), assign_targets(SITES, [one_box()], TargetConfig()), 2.0, 3.0, 4.0)
     weights = LossConfig(
-        heat=2.0, shape=0.0, direction=0.0, kind=0.0, sigma=0.0, overlap=0.0, iou=0.0, velocity=0.25, prune=0.5, kept=0.1,
+        heat=2.0, shape=0.0, direction=0.0, classification=0.0, sigma=0.0, iou_score=0.0, iou=0.0, velocity=0.25, prune=0.5,
+        mask_l1=0.1,
         information=0.01,
     )  # fmt: skip
     wanted = 2 * float(terms.heat.detach()) + 0.25 * float(terms.velocity.detach()) + 1.0 + 0.3 + 0.04

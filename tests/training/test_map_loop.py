@@ -21,29 +21,38 @@ from manyeyes.datatypes import (
 )
 from manyeyes.datatypes.camera import Camera, CameraImage
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps.metrics import judge
-from manyeyes.evaluation.maps.tiles import side_by_side
+from manyeyes.evaluation.maps.metrics import evaluate_map
+from manyeyes.evaluation.maps.tiles import place_side_by_side
 from manyeyes.models import checkpoint
 from manyeyes.models.maps.bev import BevConfig
-from manyeyes.models.maps.head import MapHeadConfig, decode
-from manyeyes.models.maps.map_model import Mapper, MapperConfig
+from manyeyes.models.maps.head import MapHeadConfig, decode_elements
+from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.ops.keyed_random import keyed_generator, keyed_uniform
-from manyeyes.training.maps.loop import MapRun, MapTrainConfig, train_mapper
-from manyeyes.training.maps.presets import MAP_TRAINING
-from manyeyes.training.maps.samples import MapSample, inked
-from manyeyes.training.maps.step import loss_terms, placed, see, thinned
+from manyeyes.training.maps.loop import MapRun, MapTrainConfig, train_map_model
+from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
+from manyeyes.training.maps.samples import MapSample, rasterise_elements
+from manyeyes.training.maps.step import extract_features, loss_terms, subsample_tokens, warp_tokens
 
-TINY = MapperConfig(
+TINY = MapModelConfig(
     BevConfig(
-        BevGrid(-12.0, -12.0, -2.0, 12.0, 12.0, 4.0, pillar=0.5), channels=24, raster_width=12, raster_blocks=(1, 1)
+        BevGrid(-12.0, -12.0, -2.0, 12.0, 12.0, 4.0, pillar=0.5), channels=24, raster_channels=12, raster_blocks=(1, 1)
     ),
     BevGrid(-16.0, -8.0, -1.0, 16.0, 8.0, 1.0, pillar=1.0),
     token_channels=16,
-    neck=(1, 1),
-    head=MapHeadConfig(elements=8, points=6, many=8, seeds=40, channels=32, feed=64, layers=2, heads=4),
+    neck_blocks=(1, 1),
+    head=MapHeadConfig(
+        num_queries=8,
+        num_points=6,
+        num_one_to_many_queries=8,
+        num_seeds=40,
+        channels=32,
+        feedforward_channels=64,
+        layers=2,
+        heads=4,
+    ),
 )
-CONFIG = MapTrainConfig(TINY, steps=4, batch=2, warm_up=2, save_every=2)
+CONFIG = MapTrainConfig(TINY, steps=4, batch=2, warmup_steps=2, save_every=2)
 
 
 class Streets:
@@ -62,7 +71,7 @@ class Streets:
         ring = np.array([[x, -3.0], [x + 3, -3], [x + 3, 3], [x, 3]]) @ turn + [0, y]
         lines = [np.array([[-12.0, o], [12.0, o]]) @ turn + [0, y] for o in (-3.0, 0.0, 3.0)]
         truth = MapElements.of([*lines, ring], [BOUNDARY, DIVIDER, BOUNDARY, CROSSING])
-        looks, poses, ink = [], [], []
+        frames, poses, ink = [], [], []
         for k, pose in enumerate((Transform.from_xyz_yaw(-5, 0, 0, 0.2), Transform.from_xyz_yaw(5, 0, 0, 3.0))):
             share = rng.uniform(size=(4, 150, 1))
             along = np.concatenate([line[0] + share[i] * (line[1] - line[0]) for i, line in enumerate(lines)])
@@ -77,12 +86,12 @@ class Streets:
             world = torch.from_numpy(np.concatenate((xy, z[:, None]), 1))
             cloud = PointCloud.of(pose.inverse().apply(world), torch.from_numpy(bright))
             frame = AgentFrame.of(cloud, pose, k)
-            looks.append(frame)
+            frames.append(frame)
             poses.append(pose)
             x_, y_, _ = pose.inverse().translation.tolist()
             there = truth.transform(x_, y_, -float(pose.yaw))
-            ink.append(inked(there, TINY.bev.token_grid, TINY.head.kinds))
-        return MapSample(tuple(looks), Transform.stack(poses), truth, torch.stack(ink))
+            ink.append(rasterise_elements(there, TINY.bev.token_grid, TINY.head.kinds))
+        return MapSample(tuple(frames), Transform.stack(poses), truth, torch.stack(ink))
 
 
 def same_state(a, b):
@@ -119,15 +128,15 @@ def test_a_run_remembers_the_weights_that_it_began_from(tmp_path):
 
 
 def test_a_batch_in_parts_goes_down_the_mean_of_its_parts(tmp_path):
-    config = dataclasses.replace(CONFIG, batch=4, at_once=3)
+    config = dataclasses.replace(CONFIG, batch=4, micro_batch=3)
     run = MapRun(config, Streets(), tmp_path, seed=3)
     losses, gradients = [], []
     for part in (range(3), range(3, 4)):
         model = MapRun(config, Streets(), tmp_path / "alone", seed=3).state.model.train()
         samples = [Streets().draw(number) for number in part]
-        looks = sum(len(sample.looks) for sample in samples)
-        thin = config.thin * keyed_uniform((looks,), "thin", 3, part.start).float()
-        loss = loss_terms(model, samples, config.loss, thin, config.sketch_steps == 0).total(config.loss)
+        num_frames = sum(len(sample.frames) for sample in samples)
+        thin = config.max_token_dropout * keyed_uniform((num_frames,), "thin", 3, part.start).float()
+        loss = loss_terms(model, samples, config.loss, thin, config.line_field_steps == 0).total(config.loss)
         loss.backward()
         losses.append(float(loss.detach()))
         gradients.append([torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()])
@@ -142,22 +151,22 @@ def test_a_batch_in_parts_goes_down_the_mean_of_its_parts(tmp_path):
     assert float(progress.terms.total(config.loss)) == pytest.approx(progress.loss, rel=1e-5)
     expected = [0.75 * a + 0.25 * b for a, b in zip(*gradients)]
     length = float(torch.stack([g.square().sum() for g in expected]).sum().sqrt())
-    shrink = min(1.0, config.clip / length)
+    shrink = min(1.0, config.max_grad_norm / length)
     assert all(torch.allclose(g, shrink * e, atol=1e-5, rtol=1e-4) for g, e in zip(seen, expected, strict=True))
 
 
 def shrunk_paper():
     """The paper's preset with every layer, block and point of an element that it has, but narrow, with a tenth of its queries,
     coarse cells and a batch of one: as it stands, a step takes minutes and gigabytes."""
-    paper = MAP_TRAINING["map-paper"]
-    bev, head = paper.mapper.bev, paper.mapper.head
-    image = dataclasses.replace(bev.image, width=8, channels=16)
-    grid, tile = (dataclasses.replace(g, pillar=6.4) for g in (bev.grid, paper.mapper.tile))
+    paper = MAP_TRAINING_PRESETS["map-paper"]
+    bev, head = paper.map_model.bev, paper.map_model.head
+    image = dataclasses.replace(bev.image_encoder, stem_channels=8, channels=16)
+    grid, tile = (dataclasses.replace(g, pillar=6.4) for g in (bev.grid, paper.map_model.tile))
     tile = dataclasses.replace(tile, pillar=6.0)
-    bev = dataclasses.replace(bev, grid=grid, channels=16, image=image, image_size=(48, 64))
-    head = dataclasses.replace(head, elements=10, many=30, channels=32, feed=64)
-    mapper = dataclasses.replace(paper.mapper, bev=bev, tile=tile, token_channels=16, head=head)
-    return dataclasses.replace(paper, mapper=mapper, batch=1, steps=3)
+    bev = dataclasses.replace(bev, grid=grid, channels=16, image_encoder=image, image_size=(48, 64))
+    head = dataclasses.replace(head, num_queries=10, num_one_to_many_queries=30, channels=32, feedforward_channels=64)
+    mapper = dataclasses.replace(paper.map_model, bev=bev, tile=tile, token_channels=16, head=head)
+    return dataclasses.replace(paper, map_model=mapper, batch=1, steps=3)
 
 
 class Photos:
@@ -165,8 +174,8 @@ class Photos:
 
     towns = ("Nowhere",)
 
-    def __init__(self, mapper):
-        self.mapper = mapper
+    def __init__(self, map_model):
+        self.map_model = map_model
 
     def draw(self, number):
         ahead = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
@@ -174,24 +183,27 @@ class Photos:
         camera = Camera(k, Transform(ahead, torch.tensor([0.0, 0.0, 1.5], dtype=torch.float64)), 64, 48)
         rgb = torch.randint(0, 256, (3, 48, 64), generator=torch.Generator().manual_seed(number), dtype=torch.uint8)
         pose = Transform.from_xyz_yaw(0, 0, 0, 0)
-        look = dataclasses.replace(
+        frame = dataclasses.replace(
             AgentFrame.of(PointCloud.of(torch.zeros(0, 3)), pose, 0), images=(CameraImage(camera, rgb),)
         )
         truth = MapElements.of(
             [np.array([[-40.0, y], [40.0, y]]) for y in (-4.0, 0.0, 4.0)], [BOUNDARY, DIVIDER, BOUNDARY]
         )
-        bev = self.mapper.bev
+        bev = self.map_model.bev
         return MapSample(
-            (look,), Transform.stack([pose]), truth, inked(truth, bev.token_grid, self.mapper.head.kinds)[None]
+            (frame,),
+            Transform.stack([pose]),
+            truth,
+            rasterise_elements(truth, bev.token_grid, self.map_model.head.kinds)[None],
         )
 
 
 def test_the_papers_model_takes_a_step_and_resumes(tmp_path):
     config = shrunk_paper()
-    samples = Photos(config.mapper)
+    samples = Photos(config.map_model)
     run = MapRun(config, samples, tmp_path, seed=0)
     first = run.advance()
-    assert math.isfinite(first.loss) and float(first.terms.many.detach()) > 0
+    assert math.isfinite(first.loss) and float(first.terms.one_to_many.detach()) > 0
     run.state.save()
     run.advance()
     resumed = MapRun(config, samples, tmp_path, seed=0)
@@ -201,10 +213,10 @@ def test_the_papers_model_takes_a_step_and_resumes(tmp_path):
 
 
 def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
-    heard = []
-    weights = train_mapper(CONFIG, Streets(), tmp_path, seed=1, card={"command": "x"}, report=heard.append)
+    reports = []
+    weights = train_map_model(CONFIG, Streets(), tmp_path, seed=1, card={"command": "x"}, report=reports.append)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [1, 2, 3, 4] == [p.step for p in heard]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4] == [p.step for p in reports]
     assert all(
         math.isfinite(line[name])
         for line in lines
@@ -212,22 +224,22 @@ def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
     )
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["Nowhere"] and card["steps"] == 4 and card["command"] == "x"
-    again = checkpoint.load_as(weights, FORMAT, MapperConfig, Mapper)
-    assert again.config == TINY and torch.equal(again.scale, torch.ones(3))
-    train_mapper(CONFIG, Streets(), tmp_path, seed=1)
+    again = checkpoint.load_as(weights, FORMAT, MapModelConfig, MapModel)
+    assert again.config == TINY and torch.equal(again.logit_scale, torch.ones(3))
+    train_map_model(CONFIG, Streets(), tmp_path, seed=1)
     assert len((tmp_path / "log.jsonl").read_text().splitlines()) == 4
 
 
 def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tmp_path):
     seeing = dataclasses.replace(
-        TINY, bev=dataclasses.replace(TINY.bev, sensors=("lidar", "camera"), image_size=(24, 32), raster_width=12)
+        TINY, bev=dataclasses.replace(TINY.bev, sensors=("lidar", "camera"), image_size=(24, 32), raster_channels=12)
     )
     lidar, camera = (
-        Mapper(TINY),
-        Mapper(dataclasses.replace(seeing, bev=dataclasses.replace(seeing.bev, sensors=("camera",)))),
+        MapModel(TINY),
+        MapModel(dataclasses.replace(seeing, bev=dataclasses.replace(seeing.bev, sensors=("camera",)))),
     )
-    lidar.scale.add_(1.0)
-    config = dataclasses.replace(CONFIG, mapper=seeing)
+    lidar.logit_scale.add_(1.0)
+    config = dataclasses.replace(CONFIG, map_model=seeing)
     random = MapRun(config, Streets(), tmp_path / "random", seed=0).state.model.state_dict()
     begun = MapRun(config, Streets(), tmp_path / "begun", 0, [lidar.state_dict(), camera.state_dict()]).state
     state, first, second = (m.state_dict() for m in (begun.model, lidar, camera))
@@ -242,34 +254,39 @@ def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tm
 
 def test_scores_are_calibrated_at_the_end_and_training_is_the_same(tmp_path):
     # Without a threshold even a model that has learnt nothing draws something.
-    mapper = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, threshold=0.0))
-    plain, told = (
-        train_mapper(dataclasses.replace(CONFIG, mapper=mapper, calibrated=count), Streets(), tmp_path / str(count))
+    mapper = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, score_threshold=0.0))
+    plain, calibrated = (
+        train_map_model(
+            dataclasses.replace(CONFIG, map_model=mapper, calibration_tiles=count), Streets(), tmp_path / str(count)
+        )
         for count in (0, 3)
     )
-    plain, told = (checkpoint.load_as(file, FORMAT, MapperConfig, Mapper) for file in (plain, told))
-    assert not torch.equal(told.scale, plain.scale) and bool((told.scale > 0).all())
-    same = {name for name, value in plain.state_dict().items() if torch.equal(value, told.state_dict()[name])}
+    plain, calibrated = (checkpoint.load_as(file, FORMAT, MapModelConfig, MapModel) for file in (plain, calibrated))
+    assert not torch.equal(calibrated.logit_scale, plain.logit_scale) and bool((calibrated.logit_scale > 0).all())
+    same = {name for name, value in plain.state_dict().items() if torch.equal(value, calibrated.state_dict()[name])}
     assert set(plain.state_dict()) - same <= {"scale", "shift"}
 
 
-def test_thinning_leaves_out_the_least_worth_of_each_look():
+def test_subsampling_drops_the_lowest_scores_of_each_frame():
     grid = TINY.bev.token_grid
     key = torch.cat((torch.arange(4), grid.shape[0] * grid.shape[1] + torch.arange(6)))
     tokens = SparseBev(torch.arange(10.0)[:, None], Sites(key, grid, 3))
     worth = torch.tensor([0.4, 0.1, 0.3, 0.2, 0.9, 0.5, 0.8, 0.6, 0.7, 0.05])
-    kept = thinned(tokens, worth, torch.tensor([0.5, 0.34, 0.9]))
+    kept = subsample_tokens(tokens, worth, torch.tensor([0.5, 0.34, 0.9]))
     assert kept.features[:, 0].tolist() == [0, 2, 4, 6, 7, 8]
-    assert torch.equal(thinned(tokens, worth, torch.zeros(3)).features, tokens.features)
+    assert torch.equal(subsample_tokens(tokens, worth, torch.zeros(3)).features, tokens.features)
 
 
 def test_the_decoder_is_taught_after_the_sketch(tmp_path):
-    run = MapRun(dataclasses.replace(CONFIG, sketch_steps=1), Streets(), tmp_path, seed=0)
+    run = MapRun(dataclasses.replace(CONFIG, line_field_steps=1), Streets(), tmp_path, seed=0)
     before = {name: p.clone() for name, p in run.state.model.named_parameters()}
     first, second = run.advance(), run.advance()
-    assert float(first.terms.kind) == 0 == float(first.terms.many) and float(first.terms.sketch.detach()) > 0
-    assert float(second.terms.kind.detach()) > 0 and float(second.terms.many.detach()) > 0
-    only = MapRun(dataclasses.replace(CONFIG, sketch_steps=1), Streets(), tmp_path / "only", seed=0)
+    assert (
+        float(first.terms.classification) == 0 == float(first.terms.one_to_many)
+        and float(first.terms.line_field.detach()) > 0
+    )
+    assert float(second.terms.classification.detach()) > 0 and float(second.terms.one_to_many.detach()) > 0
+    only = MapRun(dataclasses.replace(CONFIG, line_field_steps=1), Streets(), tmp_path / "only", seed=0)
     only.advance()
     same = {name for name, p in only.state.model.named_parameters() if torch.equal(p, before[name])}
     assert any(name.startswith("head.layers") for name in same)
@@ -277,13 +294,20 @@ def test_the_decoder_is_taught_after_the_sketch(tmp_path):
 
 
 def test_two_streets_are_learnt_by_heart(tmp_path):
-    mapper = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, many=0))
+    mapper = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, num_one_to_many_queries=0))
     config = MapTrainConfig(
-        mapper, steps=180, batch=2, learning_rate=6e-3, warm_up=10, ema=0.9, thin=0.0, sketch_steps=20
+        mapper,
+        steps=180,
+        batch=2,
+        learning_rate=6e-3,
+        warmup_steps=10,
+        ema_decay=0.9,
+        max_token_dropout=0.0,
+        line_field_steps=20,
     )
     run = MapRun(config, Streets(2), tmp_path, seed=0)
     streets = [Streets(2).draw(k) for k in range(2)]
-    truth = side_by_side([street.truth for street in streets])
+    truth = place_side_by_side([street.truth for street in streets])
     before = quality(run.state.average, streets, truth)
     for _ in range(config.steps):
         run.advance()
@@ -293,17 +317,17 @@ def test_two_streets_are_learnt_by_heart(tmp_path):
 
 @torch.no_grad()
 def quality(model, streets, truth):
-    raw = model.draw(model.merge(*placed(model, see(model, streets).tokens, streets)))[-1]
-    drawn = side_by_side(decode(raw, TINY.tile, TINY.head))
-    return judge(drawn, truth, ("exact",), TINY.head.kinds).mean_ap("exact", kinds=TINY.head.kinds)
+    raw = model.draw(model.merge(*warp_tokens(model, extract_features(model, streets).tokens, streets)))[-1]
+    drawn = place_side_by_side(decode_elements(raw, TINY.tile, TINY.head))
+    return evaluate_map(drawn, truth, ("exact",), TINY.head.kinds).mean_ap("exact", kinds=TINY.head.kinds)
 
 
 def test_every_weight_of_the_lidar_path_learns():
     torch.manual_seed(0)
-    model = Mapper(TINY)
+    model = MapModel(TINY)
     # Branches of the head begin by saying nothing, and what lies before a zero waits for one step.
     with torch.no_grad():
-        for branch in (*model.head.kinds, *model.head.moves):
+        for branch in (*model.head.class_branches, *model.head.point_branches):
             list(branch.parameters())[-2].normal_(std=0.1)
     terms = loss_terms(model, [Streets().draw(0), Streets().draw(1)], CONFIG.loss, torch.full((4,), 0.2))
     terms.total(CONFIG.loss).backward()

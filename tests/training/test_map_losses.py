@@ -14,21 +14,21 @@ from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.models.maps.head import RawMap
 from manyeyes.training.maps.losses import (
     MapLossConfig,
-    focal,
+    direction_loss,
+    focal_loss,
     head_terms,
-    ink_loss,
     map_terms,
-    match,
-    turned_away,
+    match_queries,
+    segmentation_loss,
 )
-from manyeyes.training.maps.targets import MapTarget, orders_of, target_of
+from manyeyes.training.maps.targets import MapTarget, enumerate_orders, make_map_target
 
 CONFIG = MapLossConfig()
 
 
 def targets(points, ring, kind):
     points, flags = torch.as_tensor(points, dtype=torch.float32), torch.tensor(ring)
-    return MapTarget(torch.tensor(kind), flags, orders_of(points, flags))
+    return MapTarget(torch.tensor(kind), flags, enumerate_orders(points, flags))
 
 
 def random_case(seed, elements=3, queries=5, points=6):
@@ -74,7 +74,7 @@ def test_the_loss_of_a_tile_is_the_same_however_its_map_is_stored():
     grads = []
     for drawn, turn, way in itertools.product((line, line[::-1]), range(4), (1, -1)):
         truth = MapElements.of([drawn, np.roll(ring, turn, 0)[::way]], [DIVIDER, CROSSING])
-        target = target_of(truth, tile, ("divider", "boundary", "crossing"), 6)
+        target = make_map_target(truth, tile, ("divider", "boundary", "crossing"), 6)
         loss = map_terms([raw], [], torch.zeros(()), torch.zeros(()), [target], CONFIG).total(CONFIG)
         grads.append((loss, *torch.autograd.grad(loss, (raw.logit, raw.point))))
     for case in grads[1:]:
@@ -84,14 +84,14 @@ def test_the_loss_of_a_tile_is_the_same_however_its_map_is_stored():
         )
 
 
-def test_nobody_answers_for_an_element_that_is_far_from_all():
+def test_element_far_from_every_query_stays_unmatched():
     ends = torch.tensor([[[0.0, 0.5], [1.0, 0.5]], [[0.0, 0.9], [1.0, 0.9]]])
     target = targets(ends, [False, False], [0, 0])
     # The first query is .1 from the first line and .3 from the second, at each of its points; the other is .3 from the second.
     raw = torch.stack((ends[0] + torch.tensor([0.0, 0.1]), ends[1] - torch.tensor([0.3, 0.0])))
-    found = match(torch.zeros(2, 3), raw, target, CONFIG)
+    found = match_queries(torch.zeros(2, 3), raw, target, CONFIG)
     assert (found.query.tolist(), found.element.tolist()) == ([0], [0])
-    near = match(torch.zeros(2, 3), torch.stack((raw[0], raw[1] + torch.tensor([0.15, 0.0]))), target, CONFIG)
+    near = match_queries(torch.zeros(2, 3), torch.stack((raw[0], raw[1] + torch.tensor([0.15, 0.0]))), target, CONFIG)
     assert near.query.tolist() == [0, 1] and near.element.tolist() == [0, 1]
 
 
@@ -99,14 +99,16 @@ def test_the_match_is_the_best_of_all_assignments():
     for seed in range(5):
         where, ring, raw = random_case(seed, elements=3, queries=4)
         target = targets(where, ring, [0, 2, 1])
-        found = match(raw.logit[0].detach(), raw.point[0].detach(), target, replace(CONFIG, far=math.inf))
+        found = match_queries(
+            raw.logit[0].detach(), raw.point[0].detach(), target, replace(CONFIG, max_match_distance=math.inf)
+        )
         logit, point = raw.logit[0].detach(), raw.point[0].detach()
 
         def cost(query, element, logit=logit, point=point, target=target):
             p = torch.sigmoid(logit[query, target.kind[element]])
-            said = -0.25 * (1 - p) ** 2 * p.log() + 0.75 * p**2 * (1 - p).log()
+            class_cost = -0.25 * (1 - p) ** 2 * p.log() + 0.75 * p**2 * (1 - p).log()
             away = min(float((point[query] - order).abs().sum()) for order in target.orders[element])
-            return CONFIG.kind * float(said) + CONFIG.point * away
+            return CONFIG.classification * float(class_cost) + CONFIG.point * away
 
         best = min(sum(cost(q, e) for e, q in enumerate(chosen)) for chosen in itertools.permutations(range(4), 3))
         pairs = list(zip(found.query.tolist(), found.element.tolist()))
@@ -114,7 +116,7 @@ def test_the_match_is_the_best_of_all_assignments():
         assert sum(cost(q, e) for q, e in pairs) == pytest.approx(best, abs=1e-4)
 
 
-def test_a_perfect_answer_costs_nothing_but_doubt():
+def test_perfect_prediction_leaves_only_the_classification_loss():
     where, ring, _ = random_case(3)
     kind = [0, 2, 1]
     logit = torch.full((1, 4, 3), -12.0)
@@ -140,17 +142,17 @@ def test_only_a_ring_has_a_closing_edge():
     # The last point lies off, so that the edge back to the first is turned by ninety degrees.
     mine = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]])
     theirs = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]]) + torch.tensor([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    assert turned_away(mine, theirs, torch.tensor([True])).tolist() == pytest.approx([0])
+    assert direction_loss(mine, theirs, torch.tensor([True])).tolist() == pytest.approx([0])
     bent = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]])
-    line, ring = (float(turned_away(mine, bent, torch.tensor([flag]))) for flag in (False, True))
+    line, ring = (float(direction_loss(mine, bent, torch.tensor([flag]))) for flag in (False, True))
     assert line == pytest.approx(1.0) and ring == pytest.approx(2 - math.cos(math.pi / 4), abs=1e-5)
 
 
 def test_focal_loss_is_its_formula():
     logit = torch.tensor([-2.0, 0.3, 1.5], dtype=torch.float64)
     p = logit.sigmoid()
-    torch.testing.assert_close(focal(logit, torch.ones_like(logit)), -0.25 * (1 - p) ** 2 * p.log())
-    torch.testing.assert_close(focal(logit, torch.zeros_like(logit)), -0.75 * p**2 * (1 - p).log())
+    torch.testing.assert_close(focal_loss(logit, torch.ones_like(logit)), -0.25 * (1 - p) ** 2 * p.log())
+    torch.testing.assert_close(focal_loss(logit, torch.zeros_like(logit)), -0.75 * p**2 * (1 - p).log())
 
 
 def test_a_tile_without_elements_teaches_silence_only():
@@ -165,7 +167,7 @@ def test_a_tile_without_elements_teaches_silence_only():
 def test_of_the_many_queries_each_element_has_several():
     where, ring, _ = random_case(1)
     target = targets(where, ring, [0, 2, 1])
-    config = MapLossConfig(repeat=2)
+    config = MapLossConfig(one_to_many_repeats=2)
     logit = torch.full((1, 6, 3), -12.0)
     point = torch.rand(1, 6, 6, 2)
     for query in range(6):
@@ -173,12 +175,12 @@ def test_of_the_many_queries_each_element_has_several():
         point[0, query] = where[query % 3]
     one, many = RawMap(logit[:, :3], point[:, :3]), RawMap(logit, point)
     terms = map_terms([one], [many], torch.zeros(()), torch.zeros(()), [target], config)
-    assert float(terms.many) == pytest.approx(0, abs=1e-4)
-    thrice = map_terms([one], [many], torch.zeros(()), torch.zeros(()), [target], MapLossConfig(repeat=3))
-    assert float(thrice.total(CONFIG)) == pytest.approx(float(thrice.many), abs=1e-4)
+    assert float(terms.one_to_many) == pytest.approx(0, abs=1e-4)
+    thrice = map_terms([one], [many], torch.zeros(()), torch.zeros(()), [target], MapLossConfig(one_to_many_repeats=3))
+    assert float(thrice.total(CONFIG)) == pytest.approx(float(thrice.one_to_many), abs=1e-4)
 
 
 def test_ink_weighs_what_is_drawn_four_times():
     logit = torch.zeros(2, 1)
-    on, off = (float(ink_loss(logit, torch.full((2, 1), v))) for v in (1.0, 0.0))
+    on, off = (float(segmentation_loss(logit, torch.full((2, 1), v))) for v in (1.0, 0.0))
     assert on == pytest.approx(4 * math.log(2)) and off == pytest.approx(math.log(2))

@@ -13,16 +13,22 @@ from manyeyes.datatypes.camera import Camera, CameraImage
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, KINDS, MapElements
 from manyeyes.models.maps.bev import BevConfig
 from manyeyes.models.maps.head import MapHeadConfig
-from manyeyes.models.maps.map_model import MapperConfig
+from manyeyes.models.maps.map_model import MapModelConfig
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.training.maps.samples import MapAugment, TileStream, inked, mirrored, mirrored_motion
+from manyeyes.training.maps.samples import (
+    MapAugmentConfig,
+    TileStream,
+    mirror_frame,
+    mirror_transform,
+    rasterise_elements,
+)
 
-CONFIG = MapperConfig(
+CONFIG = MapModelConfig(
     BevConfig(BevGrid(-12.0, -12.0, -2.0, 12.0, 12.0, 4.0, pillar=0.5)),
     BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=1.0),
     head=MapHeadConfig(channels=16, heads=4),
 )
-EXACT = MapAugment(1, 4, 0.0, 0.0, flip=False)
+EXACT = MapAugmentConfig(1, 4, 0.0, 0.0, flip=False)
 MAPS = {
     "Aton": MapElements.of([[[-50.0, 3.0], [50.0, 3.0]], [[2, -4], [6, -4], [6, 0], [2, 0]]], [DIVIDER, CROSSING]),
     "Bton": MapElements.of([[[1000.0, -50.0], [1000.0, 50.0]]], DIVIDER),
@@ -37,7 +43,7 @@ class Drives:
     def length(self, scenario):
         return 2
 
-    def judged(self, scenario):
+    def eval_indices(self, scenario):
         return range(2)
 
     def agents(self, scenario):
@@ -63,46 +69,48 @@ def stream(augment=EXACT, seed=0, **fields):
 
 AUGMENTS = {
     "none": EXACT,
-    "turn": dataclasses.replace(EXACT, turn_rad=0.5),
-    "shift": dataclasses.replace(EXACT, shift_m=4.0),
-    "all": MapAugment(1, 6, 0.5, 4.0, flip=True),
+    "turn": dataclasses.replace(EXACT, max_yaw_rad=0.5),
+    "shift": dataclasses.replace(EXACT, max_shift_m=4.0),
+    "all": MapAugmentConfig(1, 6, 0.5, 4.0, flip=True),
 }
 
 
 @pytest.mark.parametrize("name", AUGMENTS)
-def test_points_truth_and_ink_say_the_same(name):
+def test_points_truth_and_line_mask_agree(name):
     for number in range(12):
         sample = stream(AUGMENTS[name]).draw(number)
         line = next(sample.truth.polyline(i) for i in range(len(sample.truth)) if sample.truth.kind[i] == DIVIDER)
         along = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
-        for k, look in enumerate(sample.looks):
+        for k, frame in enumerate(sample.frames):
             # Every point of the cloud lies on the painted line, in the tile and in the ink of the look.
-            there = sample.tile_from_look[k].apply(look.points.xyz.double())[:, :2].numpy() - line[0]
+            there = sample.tile_from_agent[k].apply(frame.points.xyz.double())[:, :2].numpy() - line[0]
             np.testing.assert_allclose(there[:, 0] * along[1] - there[:, 1] * along[0], 0, atol=1e-4)
-            near = look.points.xyz[CONFIG.bev.grid.inside(look.points.xyz[:, :2]), :2]
+            near = frame.points.xyz[CONFIG.bev.grid.contains(frame.points.xyz[:, :2]), :2]
             # A cell's border may fall either way: some point within half a step is on an inked cell.
             yx = CONFIG.bev.token_grid.cells(near)
-            ink = torch.nn.functional.max_pool2d(sample.ink[k, :1].float(), 3, 1, 1)[0]
+            ink = torch.nn.functional.max_pool2d(sample.line_mask[k, :1].float(), 3, 1, 1)[0]
             assert len(near) and bool((ink[yx[:, 0], yx[:, 1]] > 0).all())
-            assert 0.005 < float(sample.ink[k, 0].float().mean()) < 0.1
+            assert 0.005 < float(sample.line_mask[k, 0].float().mean()) < 0.1
 
 
-def test_samples_are_keyed_and_their_looks_many():
-    augment = MapAugment(1, 6, 0.5, 4.0)
+def test_samples_are_keyed_and_have_several_frames():
+    augment = MapAugmentConfig(1, 6, 0.5, 4.0)
     a, b = stream(augment).draw(5), stream(augment).draw(5)
-    assert torch.equal(a.tile_from_look.translation, b.tile_from_look.translation) and torch.equal(a.ink, b.ink)
+    assert torch.equal(a.tile_from_agent.translation, b.tile_from_agent.translation) and torch.equal(
+        a.line_mask, b.line_mask
+    )
     assert not np.array_equal(a.truth.points, stream(augment, seed=1).draw(5).truth.points)
-    counts = {len(stream(augment).draw(number).looks) for number in range(30)}
+    counts = {len(stream(augment).draw(number).frames) for number in range(30)}
     assert counts == {1, 2, 3, 4, 5, 6}
 
 
-def test_errors_of_claimed_poses_move_looks_and_not_the_truth():
-    noisy = dataclasses.replace(EXACT, least=4, sigma_m=0.5, sigma_rad=0.02)
-    exact, moved = stream(dataclasses.replace(EXACT, least=4)).draw(3), stream(noisy).draw(3)
+def test_pose_errors_move_frames_and_not_the_truth():
+    noisy = dataclasses.replace(EXACT, min_frames=4, sigma_xy_m=0.5, sigma_yaw_rad=0.02)
+    exact, moved = stream(dataclasses.replace(EXACT, min_frames=4)).draw(3), stream(noisy).draw(3)
     np.testing.assert_array_equal(exact.truth.points, moved.truth.points)
-    away = (exact.tile_from_look.translation - moved.tile_from_look.translation).norm(dim=1)
+    away = (exact.tile_from_agent.translation - moved.tile_from_agent.translation).norm(dim=1)
     assert bool((away > 0).all()) and float(away.max()) < 3.0
-    assert torch.equal(exact.ink, moved.ink)
+    assert torch.equal(exact.line_mask, moved.line_mask)
 
 
 def test_a_town_that_judges_may_not_teach():
@@ -115,7 +123,7 @@ def test_ink_lies_on_the_cells_of_lines_and_fills_crossings():
     grid = BevGrid(-4.0, -4.0, -1.0, 4.0, 4.0, 1.0, pillar=0.5, stride=2)
     square = [[-1.4, -1.4], [1.4, -1.4], [1.4, 1.4], [-1.4, 1.4]]
     elements = MapElements.of([[[-9.0, 0.1], [9.0, 0.1]], square], [DIVIDER, CROSSING])
-    ink = inked(elements, grid, ("crossing", "divider"))
+    ink = rasterise_elements(elements, grid, ("crossing", "divider"))
     row = int(grid.cells(torch.tensor([[0.0, 0.1]]))[0, 0])
     assert ink[1].nonzero().tolist() == [[row, c] for c in range(8)]
     rows, columns = ink[0].nonzero().unbind(1)
@@ -126,15 +134,15 @@ def test_ink_lies_on_the_cells_of_lines_and_fills_crossings():
 
 
 def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_column():
-    look = Drives().snapshot("aton_0", 0).frames[0]
+    frame = Drives().snapshot("aton_0", 0).frames[0]
     zero = torch.zeros((), dtype=torch.float64)
     ahead = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
     turned = Transform.from_rpy(torch.tensor([1.0, 0.3, 1.5], dtype=torch.float64), zero + 0.02, zero + 0.1, zero + 0.6)
     pose = turned @ Transform(ahead, torch.zeros(3, dtype=torch.float64))
     camera = Camera(torch.tensor([[30.0, 0, 17], [0, 32, 12], [0, 0, 1]], dtype=torch.float64), pose, 40, 24)
     photo = CameraImage(camera, torch.randint(0, 256, (3, 24, 40), dtype=torch.uint8))
-    flipped = mirrored(dataclasses.replace(look, images=(photo,)))
-    assert torch.equal(flipped.points.xyz[:, 1], -look.points.xyz[:, 1])
+    flipped = mirror_frame(dataclasses.replace(frame, images=(photo,)))
+    assert torch.equal(flipped.points.xyz[:, 1], -frame.points.xyz[:, 1])
     other = flipped.images[0]
     assert float(torch.det(other.camera.agent_from_camera.rotation)) == pytest.approx(1.0)
     points = torch.tensor([[9.0, 4.0, 0.0], [12.0, 8.0, 0.5]], dtype=torch.float64)
@@ -144,11 +152,11 @@ def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_column():
     assert torch.allclose(mirror[:, 0], 40 - there[:, 0])
     u, v = there[0].long().tolist()
     assert torch.equal(other.rgb[:, v, 39 - u], photo.rgb[:, v, u])
-    again = mirrored(flipped).images[0]
+    again = mirror_frame(flipped).images[0]
     assert torch.equal(again.rgb, photo.rgb) and torch.allclose(again.camera.intrinsic, camera.intrinsic)
 
 
 def test_a_mirrored_turn_is_a_turn_the_other_way():
-    back = mirrored_motion(Transform.from_xyz_yaw(1.0, 2.0, 3.0, 0.4))
+    back = mirror_transform(Transform.from_xyz_yaw(1.0, 2.0, 3.0, 0.4))
     assert float(back.yaw) == pytest.approx(-0.4) and back.translation.tolist() == [1.0, -2.0, 3.0]
     assert math.isclose(float(torch.det(back.rotation)), 1.0)

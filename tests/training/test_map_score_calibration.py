@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.training.maps.score_calibration import FLATTEST, news_share, platt
+from manyeyes.training.maps.score_calibration import MIN_SLOPE, fit_platt, novel_fraction
 
 LINE = [[0.0, 0.0], [20.0, 0.0]]
 RING = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]]
@@ -17,35 +17,35 @@ def test_what_is_true_is_length_near_a_line_of_the_same_kind():
     beside, half = np.array(LINE) + [0.0, 0.9], np.array(LINE) + [11.0, 0.0]
     drawn = [MapElements.of([line], [DIVIDER]) for line in (beside, np.array(LINE) + [0.0, 1.1], half)]
     # The third begins 11 m along, 9 m and the metre beyond its end are true of 20.
-    assert [float(news_share(one, truth)[0]) for one in drawn] == pytest.approx([1.0, 0.0, 0.5], abs=0.03)
+    assert [float(novel_fraction(one, truth)[0]) for one in drawn] == pytest.approx([1.0, 0.0, 0.5], abs=0.03)
     rings = MapElements.of([np.array(RING) + [30.0, 0.5], RING], CROSSING)
-    np.testing.assert_allclose(news_share(rings, truth), [1, 0])
+    np.testing.assert_allclose(novel_fraction(rings, truth), [1, 0])
     empty = MapElements.of([], [])
-    assert not news_share(rings, empty).any() and news_share(empty, truth).shape == (0,)
+    assert not novel_fraction(rings, empty).any() and novel_fraction(empty, truth).shape == (0,)
 
 
 def test_what_is_drawn_twice_is_news_once():
     truth = MapElements.of([LINE], [DIVIDER])
     first_half, again = np.array([[0.0, 0.3], [10.0, 0.3]]), np.array(LINE) + [0.0, -0.3]
-    share = news_share(MapElements.of([first_half, again, LINE], [DIVIDER] * 3), truth)
+    share = novel_fraction(MapElements.of([first_half, again, LINE], [DIVIDER] * 3), truth)
     # Of the second, what lies beyond the first's reach; of the third, nothing.
     assert share == pytest.approx([1.0, 0.46, 0.0], abs=0.04)
     # A crossing along a divider tells nothing of the divider.
     both = MapElements.of([RING, LINE], [CROSSING, DIVIDER])
-    assert news_share(both, truth)[1] == 1.0
+    assert novel_fraction(both, truth)[1] == 1.0
 
 
 def test_shares_that_follow_a_line_of_logits_give_that_line():
     logit = torch.linspace(-4, 4, 2001, dtype=torch.float64)
     share = torch.sigmoid(1.7 * logit + 0.6)
-    scale, shift = platt(logit, share)
+    scale, shift = fit_platt(logit, share)
     assert scale == pytest.approx(1.7, abs=0.03) and shift == pytest.approx(0.6, abs=0.03)
 
 
 def test_few_or_none_change_little_and_the_ranking_stays():
-    nobody = torch.zeros(0, dtype=torch.float64)
-    assert platt(nobody, nobody) == pytest.approx((1.0, 0.0), abs=1e-6)
-    scale, shift = platt(torch.tensor([0.0], dtype=torch.float64), torch.tensor([1.0], dtype=torch.float64))
+    empty = torch.zeros(0, dtype=torch.float64)
+    assert fit_platt(empty, empty) == pytest.approx((1.0, 0.0), abs=1e-6)
+    scale, shift = fit_platt(torch.tensor([0.0], dtype=torch.float64), torch.tensor([1.0], dtype=torch.float64))
     assert scale == pytest.approx(1.0) and 0.0 < shift < 0.3
     logit = torch.linspace(-3, 3, 500, dtype=torch.float64)
-    assert platt(logit, torch.sigmoid(-2 * logit))[0] == FLATTEST
+    assert fit_platt(logit, torch.sigmoid(-2 * logit))[0] == MIN_SLOPE

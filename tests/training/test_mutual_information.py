@@ -15,13 +15,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from manyeyes.datatypes import BevGrid, SparseBev
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.training.detector.mutual_information import (
-    Meeting,
-    information_terms,
-    literal_information,
-    receiver_information,
-    window_information,
+    AgentPairTokens,
+    mutual_information_loss,
+    paper_mutual_information,
+    receiver_mutual_information,
+    window_mutual_information,
 )
 
 WINDOWS, SEEN, CHANNELS = 30, 15, 32
@@ -30,7 +30,7 @@ ROW = torch.arange(WINDOWS).repeat_interleave(6)
 SHARED = ROW < SEEN
 
 
-def looks() -> tuple[Tensor, Tensor]:
+def sender_receiver_features() -> tuple[Tensor, Tensor]:
     """Unit features (180, 32) of the sender and of the receiver: an object of its own a window, one ground everywhere."""
     random = torch.Generator().manual_seed(0)
     unit = [functional.normalize(torch.randn(n, 1, CHANNELS, generator=random), dim=2) for n in (WINDOWS, 1)]
@@ -40,9 +40,9 @@ def looks() -> tuple[Tensor, Tensor]:
     return sent, had
 
 
-def met(mask: Tensor) -> Meeting:
-    sent, had = looks()
-    return Meeting(sent, mask, ROW, had[SHARED], ROW[SHARED])
+def met(mask: Tensor) -> AgentPairTokens:
+    sent, had = sender_receiver_features()
+    return AgentPairTokens(sent, mask, ROW, had[SHARED], ROW[SHARED])
 
 
 def learned(loss: Callable[[Tensor], Tensor], price: float, steps: int = 150) -> list[float]:
@@ -59,22 +59,24 @@ def learned(loss: Callable[[Tensor], Tensor], price: float, steps: int = 150) ->
     return [float(mask[where & what].mean()) for where in (SHARED, ~SHARED) for what in (OBJECT, ~OBJECT)]
 
 
-def test_the_toy_own_task_keeps_what_matters_whoever_sees_it():
+def test_toy_own_task_keeps_relevant_tokens_for_any_receiver():
     """M4."""
-    sent, _ = looks()
-    shared, shared_ground, own, own_ground = learned(lambda m: window_information(sent, m, OBJECT.float(), ROW), 1.0)
+    sent, _ = sender_receiver_features()
+    shared, shared_ground, own, own_ground = learned(
+        lambda m: window_mutual_information(sent, m, OBJECT.float(), ROW), 1.0
+    )
     assert 0.5 < shared < 0.95 and 0.5 < own < 0.95
     assert shared_ground < 0.1 and own_ground < 0.1
 
 
 def test_the_toy_the_receivers_view_drops_what_the_sender_alone_sees():
-    shared, shared_ground, own, own_ground = learned(lambda m: receiver_information(met(m)), 1.0)
+    shared, shared_ground, own, own_ground = learned(lambda m: receiver_mutual_information(met(m)), 1.0)
     assert shared > 0.5 and own < 0.1 and own_ground < 0.1
     assert shared_ground < shared
 
 
 def test_the_toy_the_letter_drops_everything():
-    assert max(learned(lambda m: literal_information(met(m)), 1.0)) < 0.1
+    assert max(learned(lambda m: paper_mutual_information(met(m)), 1.0)) < 0.1
 
 
 @pytest.mark.parametrize("related", (True, False))
@@ -84,36 +86,36 @@ def test_the_letter_cannot_tell_related_from_unrelated(related):
     one = functional.normalize(torch.randn(WINDOWS, 64, generator=random), dim=1)
     other = one if related else functional.normalize(torch.randn(WINDOWS, 64, generator=random), dim=1)
     row = torch.arange(WINDOWS)
-    assert abs(float(literal_information(Meeting(one, torch.ones(WINDOWS), row, other, row)))) < 0.05
+    assert abs(float(paper_mutual_information(AgentPairTokens(one, torch.ones(WINDOWS), row, other, row)))) < 0.05
 
 
 def test_repaired_information_falls_when_windows_are_permuted_and_never_exceeds_log_m():
     """M2."""
-    sent, had = looks()
-    right = receiver_information(Meeting(sent, torch.ones(len(ROW)), ROW, had, ROW))
-    wrong = receiver_information(Meeting(sent, torch.ones(len(ROW)), ROW, had, (ROW + 7) % WINDOWS))
+    sent, had = sender_receiver_features()
+    right = receiver_mutual_information(AgentPairTokens(sent, torch.ones(len(ROW)), ROW, had, ROW))
+    wrong = receiver_mutual_information(AgentPairTokens(sent, torch.ones(len(ROW)), ROW, had, (ROW + 7) % WINDOWS))
     assert 0 <= float(right) < float(wrong) - 1
-    own = window_information(sent, OBJECT.float(), OBJECT.float(), ROW)
+    own = window_mutual_information(sent, OBJECT.float(), OBJECT.float(), ROW)
     assert 0 <= float(own) < 0.1
 
 
-def test_half_a_mask_says_less_and_to_a_cosine_as_much():
+def test_half_mask_lowers_the_product_but_not_the_cosine():
     """M3: what is normalised does not notice a mask that shrinks, and L1 shrinks it to nothing."""
-    sent, _ = looks()
+    sent, _ = sender_receiver_features()
     mask = 0.1 + 0.2 * OBJECT.float()
-    whole, half = (window_information(sent, m, OBJECT.float(), ROW) for m in (mask, mask / 2))
+    whole, half = (window_mutual_information(sent, m, OBJECT.float(), ROW) for m in (mask, mask / 2))
     assert float(half) > float(whole) + 0.1
-    said = [
+    losses = [
         functional.normalize(torch.zeros(WINDOWS, CHANNELS).index_add(0, ROW, m[:, None] * sent), dim=1)
         for m in (mask, mask / 2)
     ]
-    assert torch.allclose(*said, atol=1e-6)
+    assert torch.allclose(*losses, atol=1e-6)
 
 
 def test_two_windows_by_hand():
     # Unit axes; window 0 sends half of its object, window 1 the whole. Sums over sqrt(count) with one token each: x = m f.
     features, mask = torch.eye(2), torch.tensor([0.5, 1.0])
-    got = window_information(features, mask, torch.ones(2), torch.arange(2))
+    got = window_mutual_information(features, mask, torch.ones(2), torch.arange(2))
     a, b = math.exp(5.0), math.exp(10.0)
     rows = (math.log(1 + 1 / a) + math.log(1 + 1 / b)) / 2
     assert float(got) == pytest.approx(rows, abs=1e-5)
@@ -121,18 +123,18 @@ def test_two_windows_by_hand():
 
 def test_without_two_windows_to_compare_only_the_price_is_left():
     """M7: no NaN, and a gradient of zero."""
-    sent, had = looks()
+    sent, had = sender_receiver_features()
     mask = torch.full((len(ROW),), 0.5, requires_grad=True)
-    alone = Meeting(sent, mask, ROW, had, ROW + WINDOWS)
-    one = Meeting(sent, mask, ROW, had[:6], ROW[:6])
-    nothing = Meeting(sent[:0], mask[:0], ROW[:0], had[:0], ROW[:0])
+    alone = AgentPairTokens(sent, mask, ROW, had, ROW + WINDOWS)
+    one = AgentPairTokens(sent, mask, ROW, had[:6], ROW[:6])
+    nothing = AgentPairTokens(sent[:0], mask[:0], ROW[:0], had[:0], ROW[:0])
     for loss in (
-        receiver_information(alone),
-        receiver_information(one),
-        receiver_information(nothing),
-        literal_information(nothing),
-        window_information(sent, mask, torch.zeros(len(ROW)), ROW),
-        window_information(sent, mask, (ROW == 3).float(), ROW),
+        receiver_mutual_information(alone),
+        receiver_mutual_information(one),
+        receiver_mutual_information(nothing),
+        paper_mutual_information(nothing),
+        window_mutual_information(sent, mask, torch.zeros(len(ROW)), ROW),
+        window_mutual_information(sent, mask, (ROW == 3).float(), ROW),
     ):
         assert float(loss.detach()) == 0
         (grad,) = torch.autograd.grad(loss, mask)
@@ -142,13 +144,13 @@ def test_without_two_windows_to_compare_only_the_price_is_left():
 def test_windows_are_those_of_the_tokens_places_and_nothing_learns_but_the_mask():
     grid = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
     yx = torch.tensor([[0, 0], [7, 7], [8, 8], [31, 31]])
-    rows = torch.randn(4, 8 + PROPOSAL, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    told = SparseBev.from_cells(rows, yx, grid)
+    rows = torch.randn(4, 8 + PROPOSAL_DIM, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    tokens = SparseBev.from_cells(rows, yx, grid)
     mask, matters = torch.tensor([0.9, 0.2, 0.5, 0.7]).requires_grad_(), torch.tensor([1.0, 0.0, 1.0, 1.0])
-    price, information = information_terms(told, mask, matters)
+    price, information = mutual_information_loss(tokens, mask, matters)
     assert float(price.detach()) == pytest.approx(0.575)
     features = functional.normalize(rows[:, :8].detach(), dim=1)
-    wanted = window_information(features, mask, matters, torch.tensor([0, 0, 1, 2]))
+    wanted = window_mutual_information(features, mask, matters, torch.tensor([0, 0, 1, 2]))
     assert float(information.detach()) == pytest.approx(float(wanted.detach()), abs=1e-6) and float(wanted.detach()) > 0
     (price + information).backward()
     assert rows.grad is None and mask.grad is not None and bool(mask.grad.all())
@@ -156,5 +158,5 @@ def test_windows_are_those_of_the_tokens_places_and_nothing_learns_but_the_mask(
 
 def test_no_tokens_at_all():
     grid = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
-    told = SparseBev.from_cells(torch.zeros(0, 8 + PROPOSAL), torch.zeros(0, 2, dtype=torch.int64), grid)
-    assert [float(v) for v in information_terms(told, torch.zeros(0), torch.zeros(0))] == [0, 0]
+    tokens = SparseBev.from_cells(torch.zeros(0, 8 + PROPOSAL_DIM), torch.zeros(0, 2, dtype=torch.int64), grid)
+    assert [float(v) for v in mutual_information_loss(tokens, torch.zeros(0), torch.zeros(0))] == [0, 0]

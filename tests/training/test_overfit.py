@@ -6,7 +6,7 @@ import torch
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameResult, average_precision
 from manyeyes.models.detector.box_head import DecodeConfig, decode
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.training.detector.loop import Run, TrainConfig
+from manyeyes.training.detector.loop import DetectorRun, TrainConfig
 from manyeyes.training.detector.samples import AugmentConfig
 from manyeyes.training.detector.step import forward
 
@@ -14,7 +14,7 @@ from manyeyes.training.detector.step import forward
 def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):
     recording = toy(agents_n=2, scenarios=("toy_0",), frames=1, ground_points=100)
     schedule = {"steps": 160, "batch": 1, "learning_rate": 8e-3, "warm_up": 10, "ema": 0.9}
-    run = Run(TrainConfig(COSTR_TINY, augment=AugmentConfig.none(), **schedule), recording, tmp_path, seed=0)
+    run = DetectorRun(TrainConfig(COSTR_TINY, augment=AugmentConfig.none(), **schedule), recording, tmp_path, seed=0)
     losses = [run.advance() for _ in range(run.steps)]
     heats = [float(progress.terms.heat.detach()) for progress in (losses[0], losses[-1])]
     assert heats[1] < 0.01 * heats[0]
@@ -24,17 +24,17 @@ def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):
         for _ in range(100):
             forward(run.state.average.train(), [sample])
         outcome = forward(run.state.average.eval(), [sample])
-    together = decode(outcome.together, DecodeConfig())[0]
-    frame = FrameResult("toy_0", 0, together, sample.union)
+    together = decode(outcome.fused_boxes, DecodeConfig())[0]
+    frame = FrameResult("toy_0", 0, together, sample.merged_gt_boxes)
     for iou in (0.5, 0.7):
         assert average_precision([frame], iou, PROTOCOLS["manyeyes"]).ap == 1.0
     best = together[:6]
-    nearest = torch.cdist(best.center[:, :2], sample.union.center[:, :2].float()).argmin(1)
-    truth = sample.union[nearest]
+    nearest = torch.cdist(best.center[:, :2], sample.merged_gt_boxes.center[:, :2].float()).argmin(1)
+    truth = sample.merged_gt_boxes[nearest]
     assert sorted(nearest.tolist()) == [*range(6)]
     assert float(best.score.min()) > 0.3 and not (together.score[6:] > 0.5 * best.score.min()).any()
     # The heading too, and not only the axis, is right where the detector says that it knows; it knows most of them.
-    sure = best.flip < 0.3
+    sure = best.p_flip < 0.3
     assert int(sure.sum()) >= 4 and bool(((best.yaw - truth.yaw.float()).cos()[sure] > 0.95).all())
     error = (best.center[:, :2] - truth.center[:, :2].float()).norm(dim=1)
     assert float(error.max()) < 0.6 and float(best.sigma_xy.max()) < 0.5

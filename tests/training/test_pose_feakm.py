@@ -12,42 +12,50 @@ from manyeyes.datatypes import BevGrid, Boxes, CheckpointError, ConfigError, Rec
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.models.pose.box_descriptors import BoxKeypoints
+from manyeyes.models.pose.box_descriptors import BoxKeypointConfig
 from manyeyes.models.pose.feakm import FEAKM_PAPER, FeakmConfig, load
-from manyeyes.models.pose.keypoint_net import DenseKeypoints, View
+from manyeyes.models.pose.keypoint_net import DenseKeypointConfig, DetectorView
 from manyeyes.models.pose.matcher import Assignment, MatcherConfig
-from manyeyes.models.pose.neighbour_geometry import ConstellationConfig
+from manyeyes.models.pose.neighbour_geometry import NeighbourGeometryConfig
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.pose.feakm import Feakm
+from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import planar
+from manyeyes.pose.types import project_to_se2
 from manyeyes.training.pose.feakm import (
-    FEAKM_TRAINING,
+    FEAKM_TRAINING_PRESETS,
     FeakmRun,
     FeakmTrainConfig,
-    KeypointAugment,
+    KeypointAugmentConfig,
+    match_ground_truth,
     matching_loss,
     train_feakm,
-    true_matches,
 )
-from manyeyes.training.pose.feakm_cache import FeatureCache, Scene, build, pair, read_scene, wanted, write_scene
+from manyeyes.training.pose.feakm_cache import (
+    CachedSnapshot,
+    FeatureCache,
+    build_cache,
+    make_pair,
+    read_cached_snapshot,
+    select_snapshots,
+    write_cached_snapshot,
+)
 
 CHANNELS = 8
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=4)
 TINY = FeakmTrainConfig(
     FeakmConfig(
-        BoxKeypoints(CHANNELS, 16, 32),
-        MatcherConfig(16, 32, 2, 2, unit_m=10.0, constellation=ConstellationConfig(60.0, 16)),
+        BoxKeypointConfig(CHANNELS, 16, 32),
+        MatcherConfig(16, 32, 2, 2, position_unit_m=10.0, neighbour_geometry=NeighbourGeometryConfig(60.0, 16)),
     ),
     steps=4,
     batch=2,
-    warm_up=2,
+    warmup_steps=2,
     save_every=2,
-    near_m=1.5,
+    match_radius_m=1.5,
 )
 
 
-def scene(number: int, agents: int = 2, objects: int = 8) -> Scene:
+def scene(number: int, agents: int = 2, objects: int = 8) -> CachedSnapshot:
     """Objects on a circle's disc, listed by each agent in an order of its own, and tokens of noise around them."""
     rng = keyed_generator("toy scene", number)
     numbers = torch.from_numpy(rng.uniform(-15, 15, (objects, 2)))
@@ -63,15 +71,15 @@ def scene(number: int, agents: int = 2, objects: int = 8) -> Scene:
         yx = torch.stack(torch.meshgrid(torch.arange(10, 22), torch.arange(10, 22), indexing="ij"), -1).reshape(-1, 2)
         features = torch.from_numpy(rng.standard_normal((len(yx), CHANNELS))).float()
         tokens = SparseBev.from_cells(features, yx, GRID)
-        views.append(View(tokens, torch.rand(len(yx), generator=torch.Generator().manual_seed(i)), boxes))
-    return Scene(tuple(views), poses)
+        views.append(DetectorView(tokens, torch.rand(len(yx), generator=torch.Generator().manual_seed(i)), boxes))
+    return CachedSnapshot(tuple(views), poses)
 
 
 @pytest.fixture
 def cache(tmp_path) -> FeatureCache:
     made = FeatureCache(tmp_path / "views", (("toy", 0), ("toy", 1)))
     for number in range(2):
-        write_scene(tmp_path / "views" / "toy" / f"{number:06d}.safetensors", scene(number))
+        write_cached_snapshot(tmp_path / "views" / "toy" / f"{number:06d}.safetensors", scene(number))
     return made
 
 
@@ -86,20 +94,25 @@ def test_truth_by_hand():
     ego = points([[0.0, 0.0], [1.0, 0.0], [5.0, 5.0], [2.0, -8.0], [-9.0, 0.0]])
     other = points([[9.4, 0.0], [5.0, -3.0], [8.0, 8.0], [40.0, 0.0]])
     motion = Transform.from_xyz_yaw(10.0, 0.0, 0.0, math.pi)
-    truth = true_matches([ego], [other], [motion], 1.5, 2.4)
+    truth = match_ground_truth([ego], [other], [motion], 1.5, 2.4)
     # 0.6 m lies nearest to 1, not 0; (5, 3) is 2 m off, neither found nor alone; (2, -8) is met exactly.
     assert truth.pairs[0].nonzero().tolist() == [[1, 0], [3, 2]]
-    assert truth.alone_a[0].tolist() == [False, False, False, False, True]
-    assert truth.alone_b[0].tolist() == [False, False, False, True]
-    none = true_matches([ego[:0], ego], [other, other[:0]], [motion, motion], 1.5, 2.4)
-    assert not none.pairs.any() and none.alone_a[1].all() and none.alone_b[0].all() and not none.alone_b[1].any()
+    assert truth.unmatched_a[0].tolist() == [False, False, False, False, True]
+    assert truth.unmatched_b[0].tolist() == [False, False, False, True]
+    none = match_ground_truth([ego[:0], ego], [other, other[:0]], [motion, motion], 1.5, 2.4)
+    assert (
+        not none.pairs.any()
+        and none.unmatched_a[1].all()
+        and none.unmatched_b[0].all()
+        and not none.unmatched_b[1].any()
+    )
 
 
 def test_the_loss_by_hand():
     log_p = torch.tensor([[[0.5, 0.1], [0.2, 0.25]]]).log().requires_grad_(True)
     alone = torch.tensor([[0.5, 0.2]]).log(), torch.tensor([[0.5, 0.1]]).log()
     ego, other = points([[0.0, 0.0], [30.0, 0.0]]), points([[0.0, 0.0], [0.0, 30.0]])
-    truth = true_matches([ego], [other], [Transform.identity()], 1.0, 1.0)
+    truth = match_ground_truth([ego], [other], [Transform.identity()], 1.0, 1.0)
     layer = Assignment(log_p, *alone)
     wanted_loss = (-math.log(0.5) - (math.log(0.2) + math.log(0.1)) / 2) / 2
     loss = matching_loss([layer, layer], truth)
@@ -108,41 +121,41 @@ def test_the_loss_by_hand():
     assert log_p.grad is not None and (log_p.grad != 0).tolist() == [[[True, False], [False, False]]]
 
 
-def test_a_scene_comes_back_from_its_file_and_a_damaged_file_says_so(tmp_path):
+def test_cached_snapshot_round_trip_and_damaged_file_error(tmp_path):
     made, path = scene(3, agents=3), tmp_path / "a" / "s.safetensors"
-    write_scene(path, made)
-    read = read_scene(path)
+    write_cached_snapshot(path, made)
+    read = read_cached_snapshot(path)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
     for one, two in zip(read.views, made.views, strict=True):
         assert torch.equal(one.tokens.sites.key, two.tokens.sites.key) and one.tokens.grid == GRID
         torch.testing.assert_close(one.tokens.features, two.tokens.features, atol=2e-3, rtol=1e-3)
         assert torch.equal(one.boxes.center, two.boxes.center)
     assert torch.equal(read.world_from_agent.translation, made.world_from_agent.translation)
-    both = pair(read, 1, 2)
+    both = make_pair(read, 1, 2)
     moved = both.ego_from_other.apply(both.other.boxes.center.double())[:, :2]
     assert float(torch.cdist(both.ego.boxes.center[:, :2].double(), moved).amin(1).max()) < 1e-4
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(RecordingError, match="not a whole file of views"):
-        read_scene(path)
+        read_cached_snapshot(path)
 
 
 def test_views_are_kept_by_the_weights_that_made_them_and_made_once(toy, tmp_path, monkeypatch):
     recording = toy(agents_n=2, frames=3, points_per_car=20, ground_points=60)
-    assert wanted(recording, 2) == [("toy_0", 0), ("toy_0", 2), ("toy_1", 0), ("toy_1", 2)]
+    assert select_snapshots(recording, 2) == [("toy_0", 0), ("toy_0", 2), ("toy_1", 0), ("toy_1", 2)]
     torch.manual_seed(0)
     detector = Detector(COSTR_TINY).eval()
     detector.fingerprint = bytes(range(8))
-    first = next(build(recording, detector, tmp_path, 2))
+    first = next(build_cache(recording, detector, tmp_path, 2))
     assert first.folder.name == "0001020304050607" and len(first.snapshots) == 1
-    cache = list(build(recording, detector, tmp_path, 2))[-1]
-    seen = cache.scene(1)
+    cache = list(build_cache(recording, detector, tmp_path, 2))[-1]
+    seen = cache.load_snapshot(1)
     assert len(seen.views) == 2 and seen.views[0].tokens.features.shape[1] == 32
     truth = recording.snapshot("toy_0", 2).truth
     assert torch.equal(seen.world_from_agent.translation, truth.world_from_agent.translation)
-    monkeypatch.setattr("manyeyes.training.pose.feakm_cache.Eyes.see", None)
-    assert list(build(recording, detector, tmp_path, 2))[-1] == cache
+    monkeypatch.setattr("manyeyes.training.pose.feakm_cache.PerceptionCache.process", None)
+    assert list(build_cache(recording, detector, tmp_path, 2))[-1] == cache
     with pytest.raises(RecordingError, match="matching needs two"):
-        wanted(toy(agents_n=1))
+        select_snapshots(toy(agents_n=1))
 
 
 def test_a_run_that_was_killed_ends_as_if_it_had_not_been(cache, tmp_path):
@@ -170,10 +183,10 @@ def test_a_run_that_was_killed_ends_as_if_it_had_not_been(cache, tmp_path):
 
 
 def test_training_writes_weights_and_a_log(cache, tmp_path):
-    heard = []
-    path = train_feakm(TINY, cache, tmp_path / "run", 1, {"command": "x"}, heard.append)
+    reports = []
+    path = train_feakm(TINY, cache, tmp_path / "run", 1, {"command": "x"}, reports.append)
     lines = [json.loads(line) for line in (path.parent / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [1, 2, 3, 4] == [p.step for p in heard]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4] == [p.step for p in reports]
     assert set(lines[0]) == {"step", "loss", "lr", "recall", "precision"}
     assert load(path).config == TINY.net
     assert {p.name for p in path.parent.iterdir()} == {"last.pt", "log.jsonl", "weights.safetensors"}
@@ -181,47 +194,47 @@ def test_training_writes_weights_and_a_log(cache, tmp_path):
 
 def test_augmentation_moves_points_and_keeps_truth(cache, tmp_path):
     plain = FeakmRun(TINY, cache, tmp_path, 0)
-    config = replace(TINY, augment=KeypointAugment(drop=0.5))
+    config = replace(TINY, augment=KeypointAugmentConfig(max_drop_fraction=0.5))
     run = FeakmRun(config, cache, tmp_path, 0)
     pairs = [cache.draw(0, i) for i in range(2)]
     ego, other, motions = run._keypoints(pairs, 0)
     full = plain._keypoints(pairs, 0)[0]
     assert sum(map(len, ego)) < sum(map(len, full))
-    truth = true_matches(ego, other, motions, 1.5, 2.4)
-    assert truth.pairs.any() and truth.alone_a.any()
-    moved = run._disturbed(ego, "ego", 0)
+    truth = match_ground_truth(ego, other, motions, 1.5, 2.4)
+    assert truth.pairs.any() and truth.unmatched_a.any()
+    moved = run._perturb(ego, "ego", 0)
     assert float((moved[0].xy - ego[0].xy).abs().max()) > 1
     assert float((torch.cdist(moved[0].xy, moved[0].xy) - torch.cdist(ego[0].xy, ego[0].xy)).abs().max()) < 2
-    assert all(torch.equal(a.xy, b.xy) for a, b in zip(plain._disturbed(full, "ego", 0), full, strict=True))
+    assert all(torch.equal(a.xy, b.xy) for a, b in zip(plain._perturb(full, "ego", 0), full, strict=True))
 
 
 def test_a_batch_is_learnt_by_heart_and_gives_the_pose(cache, tmp_path):
-    config = replace(TINY, steps=150, batch=4, learning_rate=3e-3, warm_up=5, ema=0.9)
+    config = replace(TINY, steps=150, batch=4, learning_rate=3e-3, warmup_steps=5, ema_decay=0.9)
     run = FeakmRun(config, cache, tmp_path, 0)
     first, *_, last = [run.advance() for _ in range(150)]
     assert first.loss > 3 * last.loss and last.recall > 0.95 and last.precision > 0.95
     net = run.state.average.eval()
     for both in cache.pairs():
         ego, other = (Landmarks.of_keypoints(points) for points in net.describe([both.ego, both.other]))
-        estimate = Feakm.of(net)(ego, other, None)
-        assert estimate.status.answered
-        off = estimate.pose - planar(both.ego_from_other)
+        estimate = FeakmCorrector.of(net)(ego, other, None)
+        assert estimate.status.has_estimate
+        off = estimate.pose - project_to_se2(both.ego_from_other)
         assert math.hypot(off[0], off[1]) < 0.2
 
 
 def test_the_published_net_takes_a_step_and_resumes(cache, tmp_path):
     """All its layers and widths but the lists' length, which costs time alone."""
-    net = replace(FEAKM_PAPER, keypoints=DenseKeypoints(CHANNELS, most=12))
-    config = replace(FEAKM_TRAINING["feakm-paper"], net=net, batch=1, steps=2)
+    net = replace(FEAKM_PAPER, keypoints=DenseKeypointConfig(CHANNELS, num_keypoints=12))
+    config = replace(FEAKM_TRAINING_PRESETS["feakm-paper"], net=net, batch=1, steps=2)
     run = FeakmRun(config, cache, tmp_path, 0)
     assert sum(p.numel() for p in run.state.model.parameters()) > 14_900_000
-    before = run.state.model.matcher.within[0].qkv.weight.clone()
+    before = run.state.model.matcher.self_blocks[0].qkv.weight.clone()
     assert math.isfinite(run.advance().loss)
-    assert not torch.equal(before, run.state.model.matcher.within[0].qkv.weight)
+    assert not torch.equal(before, run.state.model.matcher.self_blocks[0].qkv.weight)
     run.state.save()
     assert FeakmRun(config, cache, tmp_path, 0).advance().step == 2
 
 
 def test_settings_that_contradict_each_other_are_refused():
     with pytest.raises(ConfigError, match="near_m <= far_m"):
-        replace(TINY, near_m=3.0)
+        replace(TINY, match_radius_m=3.0)

@@ -7,19 +7,19 @@ import math
 import pytest
 import torch
 
-from manyeyes.datatypes import BevGrid, Boxes, ConfigError, Snapshot, Transform, Truth
+from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, Snapshot, Transform
 from manyeyes.training.detector.samples import (
+    AgentView,
     AugmentConfig,
-    RoadConfig,
+    DegradationConfig,
     Sample,
     SampleStream,
-    View,
     epoch_length,
     make_sample,
 )
 
 GRID = BevGrid(-51.2, -51.2, -3.0, 51.2, 51.2, 5.0)
-TURN = AugmentConfig(turn_rad=0.8, scale=0.0, flip=False, thin=0.0, early_share=0.0)
+TURN = AugmentConfig(max_yaw_rad=0.8, max_scale_change=0.0, flip=False, max_point_dropout=0.0, early_fusion_prob=0.0)
 NONE = AugmentConfig.none()
 AUGMENTS = {
     "none": NONE,
@@ -28,7 +28,7 @@ AUGMENTS = {
     "flip": AugmentConfig(0.0, 0.0, True, 0.0, 0.0),
     "all": AugmentConfig(0.8, 0.1, True, 0.0, 0.0),
 }
-LATE = RoadConfig(past=2, late_share=1.0, late_frames=3)
+LATE = DegradationConfig(ego_history=2, delay_prob=1.0, max_delay_frames=3)
 
 
 def inside(boxes: Boxes, points: torch.Tensor) -> torch.Tensor:
@@ -40,7 +40,7 @@ def sample(recording, config: AugmentConfig, number: int = 0, ego: int = 0) -> S
 
 
 def driven(
-    recording, config: AugmentConfig = NONE, road: RoadConfig = LATE, number: int = 0, moments: int = 5
+    recording, config: AugmentConfig = NONE, road: DegradationConfig = LATE, number: int = 0, moments: int = 5
 ) -> Sample:
     """With a past: the toy's moments up to this many."""
     seen = [recording.snapshot("toy_0", i) for i in range(moments)]
@@ -52,8 +52,8 @@ def test_every_box_still_holds_its_points(toy, name):
     for number in range(6):
         some = sample(toy(), AUGMENTS[name], number)
         for view in some.views:
-            assert inside(view.seen, view.now.xyz).tolist() == [60] * 6, (name, number)
-        assert inside(some.union, some.views[0].now.xyz).tolist() == [60] * 6
+            assert inside(view.visible_boxes, view.cloud.xyz).tolist() == [60] * 6, (name, number)
+        assert inside(some.merged_gt_boxes, some.views[0].cloud.xyz).tolist() == [60] * 6
 
 
 @pytest.mark.parametrize("name", AUGMENTS)
@@ -61,7 +61,7 @@ def test_what_others_saw_lands_in_the_boxes_of_the_union(toy, name):
     for number in range(6):
         some = sample(toy(), AUGMENTS[name], number)
         for view in some.views:
-            assert inside(some.union, view.ego_from_view.apply(view.now.xyz.double())).tolist() == [60] * 6
+            assert inside(some.merged_gt_boxes, view.ego_from_view.apply(view.cloud.xyz.double())).tolist() == [60] * 6
 
 
 def test_a_pose_that_was_not_mirrored_is_caught(toy):
@@ -71,7 +71,7 @@ def test_a_pose_that_was_not_mirrored_is_caught(toy):
     for view in some.views[1:]:
         motion = view.ego_from_view
         wrong = Transform(mirror @ motion.rotation @ mirror, mirror @ motion.translation)
-        hits = [int(inside(some.union, m.apply(view.now.xyz.double())).sum()) for m in (motion, wrong)]
+        hits = [int(inside(some.merged_gt_boxes, m.apply(view.cloud.xyz.double())).sum()) for m in (motion, wrong)]
         assert hits[0] == 360 and hits[1] < 120
 
 
@@ -88,17 +88,17 @@ def test_turning_changes_relative_headings_and_scale_changes_sizes(toy):
     plain, turned = (sample(toy(), AUGMENTS[n], 3) for n in ("none", "turn"))
     yaw = [float(s.views[-1].ego_from_view.yaw) for s in (plain, turned)]
     assert len(turned.views) > 1 and abs(yaw[0] - yaw[1]) > 0.01
-    assert torch.allclose(plain.union.size, turned.union.size)
+    assert torch.allclose(plain.merged_gt_boxes.size, turned.merged_gt_boxes.size)
     larger = sample(toy(), AUGMENTS["scale"], 3)
-    ratio = larger.union.size / plain.union.size
+    ratio = larger.merged_gt_boxes.size / plain.merged_gt_boxes.size
     assert torch.allclose(ratio, ratio[0, 0].expand_as(ratio)) and abs(float(ratio[0, 0]) - 1) > 0.01
 
 
 def test_mirroring_happens_half_of_the_time(toy):
-    plain = sample(toy(), NONE).views[0].now.xyz
+    plain = sample(toy(), NONE).views[0].cloud.xyz
     flips = 0
     for number in range(40):
-        cloud = sample(toy(), AUGMENTS["flip"], number).views[0].now.xyz
+        cloud = sample(toy(), AUGMENTS["flip"], number).views[0].cloud.xyz
         same, mirrored = (torch.equal(cloud, plain * torch.tensor([1.0, s, 1.0])) for s in (1.0, -1.0))
         assert same != mirrored
         flips += mirrored
@@ -106,30 +106,30 @@ def test_mirroring_happens_half_of_the_time(toy):
 
 
 def test_thinning_drops_points_and_never_boxes(toy):
-    counts = [len(sample(toy(), AugmentConfig(0, 0, False, 0.3, 0.0), n).views[0].now) for n in range(10)]
+    counts = [len(sample(toy(), AugmentConfig(0, 0, False, 0.3, 0.0), n).views[0].cloud) for n in range(10)]
     assert max(counts) <= 660 and min(counts) < 640 and min(counts) > 400 and len(set(counts)) > 5
 
 
 def test_early_fusion_merges_the_clouds_in_the_ego_frame_now_and_before(toy):
-    early = driven(toy(), dataclasses.replace(TURN, early_share=1.0, max_agents=99))
+    early = driven(toy(), dataclasses.replace(TURN, early_fusion_prob=1.0, max_agents=99))
     (view,) = early.views
-    assert not early.past and len(view.now) == len(view.earlier) == 3 * 660
-    assert inside(view.seen, view.now.xyz).tolist() == [180] * 6
+    assert not early.ego_history and len(view.cloud) == len(view.previous_cloud) == 3 * 660
+    assert inside(view.visible_boxes, view.cloud.xyz).tolist() == [180] * 6
     # The sweeps of the moment before, moved by each agent's own drive: what moves lies a tenth of a second back.
-    assert inside(view.seen.after(-0.1), view.earlier.xyz).tolist() == [180] * 6
+    assert inside(view.visible_boxes.after(-0.1), view.previous_cloud.xyz).tolist() == [180] * 6
 
 
 def test_boxes_beyond_the_range_and_the_ego_itself_are_not_asked_for(toy):
     small = BevGrid(-8.0, -8.0, -3.0, 8.0, 8.0, 5.0)
     snapshot = toy().snapshot("toy_0", 0)
     some = make_sample([snapshot], 0, small, NONE, ("test", 0))
-    assert len(some.union) < 6 and bool((some.union.center[:, :2].abs() < 8).all())
+    assert len(some.merged_gt_boxes) < 6 and bool((some.merged_gt_boxes.center[:, :2].abs() < 8).all())
     ids = snapshot.truth.boxes.id.clone()
     ids[2] = 0
     truth = dataclasses.replace(snapshot.truth, boxes=dataclasses.replace(snapshot.truth.boxes, id=ids))
     mine = make_sample([dataclasses.replace(snapshot, truth=truth)], 0, GRID, NONE, ("test", 0))
-    assert 0 not in mine.union.id and len(mine.union) == 5
-    assert sorted(len(view.seen) for view in mine.views) == [5, 6, 6] and len(mine.views[0].seen) == 5
+    assert 0 not in mine.merged_gt_boxes.id and len(mine.merged_gt_boxes) == 5
+    assert sorted(len(view.visible_boxes) for view in mine.views) == [5, 6, 6] and len(mine.views[0].visible_boxes) == 5
 
 
 def test_the_union_is_what_any_chosen_agent_lists(toy):
@@ -138,9 +138,9 @@ def test_the_union_is_what_any_chosen_agent_lists(toy):
     seen[0, :2], seen[1, 1:4], seen[2, 5] = True, True, True
     snapshot = dataclasses.replace(snapshot, truth=dataclasses.replace(snapshot.truth, seen=seen))
     some = make_sample([snapshot], 0, GRID, NONE, ("test", 0))
-    assert sorted(some.union.id.tolist()) == [100, 101, 102, 103, 105]
+    assert sorted(some.merged_gt_boxes.id.tolist()) == [100, 101, 102, 103, 105]
     alone = make_sample([snapshot], 1, GRID, dataclasses.replace(TURN, max_agents=1), ("test", 0))
-    assert sorted(alone.union.id.tolist()) == [101, 102, 103] and len(alone.views) == 1
+    assert sorted(alone.merged_gt_boxes.id.tolist()) == [101, 102, 103] and len(alone.views) == 1
 
 
 def test_a_snapshot_without_truth_is_refused(toy):
@@ -152,18 +152,18 @@ def test_a_snapshot_without_truth_is_refused(toy):
 def test_the_stream_is_a_function_of_the_number_alone(toy):
     stream, again, other = (SampleStream(toy(frames=6), GRID, AugmentConfig(), seed, LATE) for seed in (5, 5, 6))
     drawn = [stream.draw(n) for n in range(5)]
-    clouds = [some.views[0].now.xyz for some in drawn]
-    assert torch.equal(again.draw(3).views[0].now.xyz, clouds[3])
+    clouds = [some.views[0].cloud.xyz for some in drawn]
+    assert torch.equal(again.draw(3).views[0].cloud.xyz, clouds[3])
     for mine, theirs in zip(again.draw(3).views, drawn[3].views, strict=True):
         assert torch.equal(mine.ego_from_view.matrix(), theirs.ego_from_view.matrix())
-        assert (mine.age_s, mine.lost, mine.keep, mine.doubt_xy_m) == (
+        assert (mine.age_s, mine.loss_fraction, mine.max_tokens, mine.sigma_xy_m) == (
             theirs.age_s,
-            theirs.lost,
-            theirs.keep,
-            theirs.doubt_xy_m,
+            theirs.loss_fraction,
+            theirs.max_tokens,
+            theirs.sigma_xy_m,
         )
     assert not any(torch.equal(a, b) for i, a in enumerate(clouds) for b in clouds[:i])
-    assert not torch.equal(other.draw(3).views[0].now.xyz, clouds[3])
+    assert not torch.equal(other.draw(3).views[0].cloud.xyz, clouds[3])
 
 
 def test_an_epoch_is_the_judged_frames(toy):
@@ -180,7 +180,7 @@ def test_claimed_poses_are_what_the_network_trains_with(toy):
     )
     right = make_sample([snapshot], 0, GRID, NONE, ("test", 0))
     wrong = make_sample([dataclasses.replace(snapshot, frames=frames)], 0, GRID, NONE, ("test", 0))
-    assert torch.equal(wrong.union.center, right.union.center)
+    assert torch.equal(wrong.merged_gt_boxes.center, right.merged_gt_boxes.center)
     gap = wrong.views[1].ego_from_view.translation - right.views[1].ego_from_view.translation
     assert float(gap.norm()) == pytest.approx(1.5)
 
@@ -189,43 +189,45 @@ def test_claimed_poses_are_what_the_network_trains_with(toy):
 
 
 @pytest.mark.parametrize("name", AUGMENTS)
-def test_a_late_look_is_one_whole_look_of_then(toy, name):
+def test_delayed_view_equals_the_view_at_that_time(toy, name):
     ages = []
     for number in range(6):
         some = driven(toy(), AUGMENTS[name], number=number)
         assert some.views[0].age_s == 0
         for view in some.views:
-            assert inside(view.seen, view.now.xyz).tolist() == [60] * 6
-            assert inside(view.seen.after(-0.1), view.earlier.xyz).tolist() == [60] * 6
+            assert inside(view.visible_boxes, view.cloud.xyz).tolist() == [60] * 6
+            assert inside(view.visible_boxes.after(-0.1), view.previous_cloud.xyz).tolist() == [60] * 6
         for view in some.views[1:]:
             ages.append(round(view.age_s, 6))
             # Boxes of then, driven on and moved, are those of now: velocities are mirrored and scaled as places are.
-            now = view.seen.after(view.age_s).transform(view.ego_from_view)
-            assert torch.allclose(now.center, some.union.center, atol=1e-6)
+            now = view.visible_boxes.after(view.age_s).transform(view.ego_from_view)
+            assert torch.allclose(now.center, some.merged_gt_boxes.center, atol=1e-6)
             assert not torch.allclose(
-                view.seen.transform(view.ego_from_view).center, some.union.center, atol=0.1 * view.age_s
+                view.visible_boxes.transform(view.ego_from_view).center,
+                some.merged_gt_boxes.center,
+                atol=0.1 * view.age_s,
             )
     assert set(ages) == {0.1, 0.2, 0.3}
 
 
 @pytest.mark.parametrize("name", ("none", "all"))
-def test_the_past_is_the_egos_own_newest_first_and_never_astray(toy, name):
-    road = dataclasses.replace(LATE, astray_share=1.0, xy_m=5.0)
+def test_ego_history_is_newest_first_and_without_pose_noise(toy, name):
+    road = dataclasses.replace(LATE, pose_noise_prob=1.0, max_sigma_xy_m=5.0)
     some = driven(toy(), AUGMENTS[name], road)
-    assert [round(view.age_s, 6) for view in some.past] == [0.1, 0.2]
-    for view in some.past:
-        assert inside(view.seen, view.now.xyz).tolist() == [60] * 6
-        now = view.seen.after(view.age_s).transform(view.ego_from_view)
-        assert torch.allclose(now.center, some.union.center, atol=1e-6)
-        assert (view.doubt_xy_m, view.doubt_yaw_rad, view.lost, view.keep) == (0, 0, 0, None)
+    assert [round(view.age_s, 6) for view in some.ego_history] == [0.1, 0.2]
+    for view in some.ego_history:
+        assert inside(view.visible_boxes, view.cloud.xyz).tolist() == [60] * 6
+        now = view.visible_boxes.after(view.age_s).transform(view.ego_from_view)
+        assert torch.allclose(now.center, some.merged_gt_boxes.center, atol=1e-6)
+        assert (view.sigma_xy_m, view.sigma_yaw_rad, view.loss_fraction, view.max_tokens) == (0, 0, 0, None)
 
 
-def test_where_the_recording_begins_the_past_is_shorter_and_nobody_is_late(toy):
+def test_history_is_shorter_and_undelayed_at_the_start_of_a_recording(toy):
     for moments, past, earlier in ((1, 0, False), (2, 1, True), (3, 2, True)):
         some = driven(toy(), moments=moments)
-        assert len(some.past) == past and (len(some.views[0].earlier) > 0) == earlier
+        assert len(some.ego_history) == past and (len(some.views[0].previous_cloud) > 0) == earlier
         assert all(view.age_s < 0.1 * moments - 0.05 for view in some.views)
-    assert not len(driven(toy(), moments=2).past[0].earlier)
+    assert not len(driven(toy(), moments=2).ego_history[0].previous_cloud)
 
 
 def without(snapshot: Snapshot, row: int) -> Snapshot:
@@ -233,7 +235,7 @@ def without(snapshot: Snapshot, row: int) -> Snapshot:
     keep = [i for i in range(len(snapshot.frames)) if i != row]
     truth = snapshot.truth
     assert truth is not None
-    left = Truth(truth.boxes, truth.seen[keep], truth.world_from_agent[torch.tensor(keep)])
+    left = GroundTruth(truth.boxes, truth.seen[keep], truth.world_from_agent[torch.tensor(keep)])
     return dataclasses.replace(snapshot, frames=tuple(snapshot.frames[i] for i in keep), truth=left)
 
 
@@ -241,48 +243,51 @@ def test_an_agent_that_was_not_there_yet_speaks_of_now(toy):
     moments = [without(toy().snapshot("toy_0", i), 1) for i in range(4)] + [toy().snapshot("toy_0", 4)]
     some = make_sample(moments, 0, GRID, NONE, ("test", 0), LATE)
     (fresh,) = (view for view in some.views[1:] if view.age_s == 0)
-    assert not len(fresh.earlier) and inside(fresh.seen, fresh.now.xyz).tolist() == [60] * 6
+    assert not len(fresh.previous_cloud) and inside(fresh.visible_boxes, fresh.cloud.xyz).tolist() == [60] * 6
     assert len(some.views) == 3 and any(view.age_s > 0 for view in some.views)
 
 
 def test_an_ego_that_was_not_there_yet_has_no_past(toy):
     moments = [without(toy().snapshot("toy_0", i), 0) for i in range(4)] + [toy().snapshot("toy_0", 4)]
     some = make_sample(moments, 0, GRID, NONE, ("test", 0), LATE)
-    assert some.past == () and not len(some.views[0].earlier)
+    assert some.ego_history == () and not len(some.views[0].previous_cloud)
 
 
-def astray(view: View, true: Transform) -> tuple[list[float], float]:
+def pose_error(view: AgentView, true: Transform) -> tuple[list[float], float]:
     """How far a claim of now lies from the truth, in the world's axes, and its error in heading."""
     gap = view.ego_from_view.translation - true.translation
     turn = view.ego_from_view.rotation @ true.rotation.mT
     return gap.tolist(), float(torch.atan2(turn[1, 0], turn[0, 0]))
 
 
-def test_claims_go_astray_as_far_as_their_doubt_says(toy):
+def test_pose_errors_match_their_reported_sigmas(toy):
     recording = toy(cars=1, points_per_car=1, ground_points=1)
-    snapshot, road = recording.snapshot("toy_0", 0), RoadConfig(astray_share=0.75, xy_m=0.8, yaw_rad=0.02)
+    snapshot, road = (
+        recording.snapshot("toy_0", 0),
+        DegradationConfig(pose_noise_prob=0.75, max_sigma_xy_m=0.8, max_sigma_yaw_rad=0.02),
+    )
     ego = snapshot.frames[0].world_from_agent
     true = [ego.inverse() @ frame.world_from_agent for frame in snapshot.frames]
-    place, turn, doubts = [], [], []
+    place, turn, sigmas = [], [], []
     for number in range(200):
         some = make_sample([snapshot], 0, GRID, NONE, ("test", number), road)
-        assert some.views[0].doubt_xy_m == some.views[0].doubt_yaw_rad == 0
-        spread = {(view.doubt_xy_m, view.doubt_yaw_rad) for view in some.views[1:]}
+        assert some.views[0].sigma_xy_m == some.views[0].sigma_yaw_rad == 0
+        spread = {(view.sigma_xy_m, view.sigma_yaw_rad) for view in some.views[1:]}
         assert len(spread) == 1
-        doubts.append(spread.pop())
+        sigmas.append(spread.pop())
         for view in some.views[1:]:
             nearest = min(true, key=lambda t: float((t.rotation - view.ego_from_view.rotation).abs().max()))
-            gap, angle = astray(view, nearest)
+            gap, angle = pose_error(view, nearest)
             assert abs(gap[2]) < 1e-9
-            for errors, error, doubt in ((place, gap[:2], view.doubt_xy_m), (turn, [angle], view.doubt_yaw_rad)):
-                if doubt:
-                    errors += [e / doubt for e in error]
+            for errors, error, sigma in ((place, gap[:2], view.sigma_xy_m), (turn, [angle], view.sigma_yaw_rad)):
+                if sigma:
+                    errors += [e / sigma for e in error]
                 else:
                     assert max(map(abs, error)) < 1e-9
     for errors in (place, turn):
         z = torch.tensor(errors)
         assert len(z) > 100 and abs(float(z.mean())) < 0.12 and float(z.std()) == pytest.approx(1, abs=0.08)
-    xy, yaw = torch.tensor(doubts).T
+    xy, yaw = torch.tensor(sigmas).T
     assert float(xy.max()) <= 0.8 and float(yaw.max()) <= 0.02 and float(xy.max()) > 0.75
     # A quarter claims well; of the others half are off in place, half in heading, and who would be off in neither is in place.
     assert float(((xy == 0) & (yaw == 0)).float().mean()) == pytest.approx(0.25, abs=0.06)
@@ -293,12 +298,22 @@ def test_claims_go_astray_as_far_as_their_doubt_says(toy):
 def test_shares_of_the_late_the_lost_and_the_few(toy):
     recording = toy(cars=1, points_per_car=1, ground_points=1)
     moments = [recording.snapshot("toy_0", i) for i in range(5)]
-    road = RoadConfig(late_share=0.4, late_frames=4, lost_share=0.25, lost=0.6, few_share=0.5, few=12)
+    road = DegradationConfig(
+        delay_prob=0.4,
+        max_delay_frames=4,
+        packet_loss_prob=0.25,
+        max_loss_fraction=0.6,
+        budget_prob=0.5,
+        min_budget_tokens=12,
+    )
     views = [
         view for number in range(300) for view in make_sample(moments, 0, GRID, NONE, ("test", number), road).views[1:]
     ]
     late = [view.age_s for view in views if view.age_s]
-    lost, few = [view.lost for view in views if view.lost], [view.keep for view in views if view.keep is not None]
+    lost, few = (
+        [view.loss_fraction for view in views if view.loss_fraction],
+        [view.max_tokens for view in views if view.max_tokens is not None],
+    )
     for got, share in ((late, 0.4), (lost, 0.25), (few, 0.5)):
         assert len(got) / len(views) == pytest.approx(share, abs=0.06)
     assert {round(age, 6) for age in late} == {0.1, 0.2, 0.3, 0.4}
@@ -310,6 +325,12 @@ def test_shares_of_the_late_the_lost_and_the_few(toy):
 
 
 def test_a_plain_road_leaves_everything_as_it_is(toy):
-    for view in driven(toy(), TURN, RoadConfig()).views:
-        assert (view.age_s, view.doubt_xy_m, view.doubt_yaw_rad, view.lost, view.keep) == (0, 0, 0, 0, None)
-    assert driven(toy(), TURN, RoadConfig()).past == ()
+    for view in driven(toy(), TURN, DegradationConfig()).views:
+        assert (view.age_s, view.sigma_xy_m, view.sigma_yaw_rad, view.loss_fraction, view.max_tokens) == (
+            0,
+            0,
+            0,
+            0,
+            None,
+        )
+    assert driven(toy(), TURN, DegradationConfig()).ego_history == ()

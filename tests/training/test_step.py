@@ -14,8 +14,15 @@ from manyeyes.datatypes import BevGrid
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.training.detector.losses import LossConfig
-from manyeyes.training.detector.samples import AugmentConfig, RoadConfig, Sample, View, make_sample
-from manyeyes.training.detector.step import PACKET_TOKENS, _arriving, _before, forward, loss_terms, meeting
+from manyeyes.training.detector.samples import AgentView, AugmentConfig, DegradationConfig, Sample, make_sample
+from manyeyes.training.detector.step import (
+    TOKENS_PER_PACKET,
+    _history_tokens,
+    _select_delivered,
+    forward,
+    loss_terms,
+    pair_agent_tokens,
+)
 from manyeyes.training.detector.targets import TargetConfig
 
 GRID: BevGrid = COSTR_TINY.grid
@@ -31,18 +38,20 @@ def detector() -> Detector:
 def sample(toy) -> Sample:
     recording = toy(agents_n=2, points_per_car=20, ground_points=60)
     moments = [recording.snapshot("toy_0", i) for i in range(4)]
-    return make_sample(moments, 0, GRID, AugmentConfig.none(), ("step",), RoadConfig(past=2, said=1))
+    return make_sample(
+        moments, 0, GRID, AugmentConfig.none(), ("step",), DegradationConfig(ego_history=2, sender_history=1)
+    )
 
 
 def limited(sample: Sample, keep: int | None = None, lost: float = 0.0) -> Sample:
     """The sample whose collaborator has that budget and those losses."""
-    return replace(sample, views=(sample.views[0], replace(sample.views[1], keep=keep, lost=lost)))
+    return replace(sample, views=(sample.views[0], replace(sample.views[1], max_tokens=keep, loss_fraction=lost)))
 
 
-def arriving(view: View, score: Tensor, number: int = 0) -> list[int]:
+def arriving(view: AgentView, score: Tensor, number: int = 0) -> list[int]:
     """Rows that arrive of a view whose tokens are the rows from 100 on."""
     rows = torch.arange(100, 100 + len(score))
-    return _arriving(rows, torch.cat((torch.full((100,), 99.0), score)), view, ("test", number)).tolist()
+    return _select_delivered(rows, torch.cat((torch.full((100,), 99.0), score)), view, ("test", number)).tolist()
 
 
 def test_a_budget_lets_the_best_through_and_near_ties_by_chance(sample):
@@ -70,17 +79,17 @@ def test_what_is_lost_is_lost_by_packets(sample):
     left = 0
     for number in range(20):
         rows = torch.tensor(arriving(view, score, number)) - 100
-        packets, counts = torch.unique(rows.div(PACKET_TOKENS, rounding_mode="floor"), return_counts=True)
-        assert bool((counts == PACKET_TOKENS).all())
+        packets, counts = torch.unique(rows.div(TOKENS_PER_PACKET, rounding_mode="floor"), return_counts=True)
+        assert bool((counts == TOKENS_PER_PACKET).all())
         left += len(packets)
     assert left / (20 * 50) == pytest.approx(0.6, abs=0.05)
 
 
-def test_with_a_budget_packets_are_filled_from_the_most_important_on(sample):
+def test_budget_fills_packets_by_descending_score(sample):
     # Scores so far apart that chance moves nothing: the order is falling, so is that of the packets.
     score = -100.0 * torch.arange(64)
     rows = arriving(replace(sample.views[1], keep=20, lost=0.5), score, 3)
-    packets = {(row - 100) // PACKET_TOKENS for row in rows}
+    packets = {(row - 100) // TOKENS_PER_PACKET for row in rows}
     assert 0 < len(rows) < 20 and all(row < 120 for row in rows)
     assert {row - 100 for row in rows} == {t for p in packets for t in range(8 * p, min(8 * p + 8, 20))}
 
@@ -96,47 +105,49 @@ def test_the_same_key_loses_the_same(sample):
 def test_selection_passes_its_gradient_straight_through_and_changes_no_value(detector, sample):
     """M6: under a budget the selector's weights learn from the boxes of the hearer; values are those of plain tokens."""
     model = detector.eval()
-    n = int((forward(model, [sample]).told.sites.batch == 1).sum())
+    n = int((forward(model, [sample]).shared_tokens.sites.batch == 1).sum())
     assert n > 40
     few, all_of_it, free = (forward(model, [limited(sample, keep)]) for keep in (n // 2, n, None))
-    assert torch.equal(all_of_it.together.columns(), free.together.columns())
-    assert len(few.together.sites) < len(free.together.sites)
+    assert torch.equal(all_of_it.fused_boxes.to_rows(), free.fused_boxes.to_rows())
+    assert len(few.fused_boxes.sites) < len(free.fused_boxes.sites)
     for outcome, flows in ((few, True), (free, False)):
         model.zero_grad()
-        outcome.together.columns().sum().backward()
+        outcome.fused_boxes.to_rows().sum().backward()
         grads = [p.grad for p in model.selector.parameters() if p.grad is not None]
         assert any(bool(g.any()) for g in grads) == flows
     model.zero_grad()
     detector.train()
 
 
-def test_the_past_is_looked_at_and_no_gradient_reaches_it(detector, sample):
+def test_ego_history_is_used_without_gradient(detector, sample):
     model = detector.eval()
-    past, said = (_before(model, [sample], which, 0.0) for which in ("past", "said"))
-    assert [round(part.age_s, 6) for part in past] == [0.1, 0.2] and [round(part.age_s, 6) for part in said] == [0.1]
-    assert all(len(part.told) > 20 and not part.told.requires_grad and not part.doubt_xy_m for part in past)
+    ego_history, sender_history = (_history_tokens(model, [sample], which, 0.0) for which in ("past", "said"))
+    assert [round(part.age_s, 6) for part in ego_history] == [0.1, 0.2] and [
+        round(part.age_s, 6) for part in sender_history
+    ] == [0.1]
+    assert all(len(part.tokens) > 20 and not part.tokens.requires_grad and not part.sigma_xy_m for part in ego_history)
     with torch.no_grad():
         for weight in (model.fusion.past.out.weight, model.refine.out.weight):
             torch.nn.init.normal_(weight)
-        with_past, without, nothing_said = (
+        with_past, without, no_sender_history = (
             forward(model, [s]) for s in (sample, replace(sample, past=()), replace(sample, said=()))
         )
         for weight in (model.fusion.past.out.weight, model.refine.out.weight):
             torch.nn.init.zeros_(weight)
-    assert torch.equal(with_past.alone.columns(), without.alone.columns())
-    for less in (without, nothing_said):
-        assert less.together.columns().shape != with_past.together.columns().shape or not torch.allclose(
-            with_past.together.columns(), less.together.columns(), atol=1e-3
+    assert torch.equal(with_past.single_agent_boxes.to_rows(), without.single_agent_boxes.to_rows())
+    for less in (without, no_sender_history):
+        assert less.fused_boxes.to_rows().shape != with_past.fused_boxes.to_rows().shape or not torch.allclose(
+            with_past.fused_boxes.to_rows(), less.fused_boxes.to_rows(), atol=1e-3
         )
     detector.train()
 
 
-def test_under_a_budget_and_losses_what_was_said_before_is_cut_like_what_is_said_now(detector, sample):
+def test_budget_and_packet_loss_also_apply_to_sender_history(detector, sample):
     model = detector.eval()
-    whole = _before(model, [sample], "said", 0.0)[0]
-    cut = replace(sample, said=tuple(replace(view, keep=5) for view in sample.said))
-    few = _before(model, [cut], "said", 0.0)[0]
-    assert len(few.told) == 5 < len(whole.told)
+    whole = _history_tokens(model, [sample], "said", 0.0)[0]
+    cut = replace(sample, said=tuple(replace(view, keep=5) for view in sample.sender_history))
+    few = _history_tokens(model, [cut], "said", 0.0)[0]
+    assert len(few.tokens) == 5 < len(whole.tokens)
     detector.train()
 
 
@@ -145,7 +156,7 @@ def test_every_part_of_the_model_learns_from_a_step_on_the_road(detector, sample
     past = detector.fusion.past
     torch.nn.init.normal_(past.out.weight, std=0.1)
     torch.nn.init.normal_(past.ffn[2].weight, std=0.1)
-    torch.nn.init.normal_(detector.fusion.placement.outer.weight, std=0.1)
+    torch.nn.init.normal_(detector.fusion.encoding.outer.weight, std=0.1)
     torch.nn.init.normal_(detector.refine.out.weight, std=0.1)
     torch.nn.init.normal_(detector.selector.outer.weight, std=0.1)
     late = replace(limited(sample, 60, 0.2), key=("late",))
@@ -164,11 +175,11 @@ def test_study_targets_meet_in_the_egos_windows_and_teach_the_selector_alone(det
     model.zero_grad()
     torch.nn.init.normal_(model.selector.outer.weight, std=0.1)
     out = forward(model, [sample], 0.0)
-    met, batch = meeting(out, [sample]), out.told.sites.batch
-    xy = out.told.sites.xy[batch == 1]
+    met, batch = pair_agent_tokens(out, [sample]), out.shared_tokens.sites.batch
+    xy = out.shared_tokens.sites.xy[batch == 1]
     moved = sample.views[1].ego_from_view.apply(functional.pad(xy, (0, 1)).double())[:, :2]
-    near = GRID.inside(moved)
-    assert len(met.had) == int((batch == 0).sum()) and 0 < int((~near).sum()) < 9
+    near = GRID.contains(moved)
+    assert len(met.own) == int((batch == 0).sum()) and 0 < int((~near).sum()) < 9
     assert torch.allclose(met.sent_mask, out.mask[batch == 1][near])
     assert torch.allclose(met.sent.norm(dim=1), torch.ones(len(met.sent)), atol=1e-5)
     # Windows of 12.8 m of the ego's frame.

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from manyeyes.datatypes import BevGrid, Boxes, Sites
-from manyeyes.training.detector.targets import TargetConfig, assign
+from manyeyes.training.detector.targets import TargetConfig, assign_targets
 
 GRID = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0)
 
@@ -26,7 +26,7 @@ def boxes_at(*xy: tuple[float, float]) -> Boxes:
 def test_the_nearest_token_is_the_centre_and_heat_falls_in_metres():
     sites = every()
     middle = sites.xy[37]
-    targets = assign(sites, [boxes_at((float(middle[0]) + 0.5, float(middle[1]) - 0.3))], TargetConfig())
+    targets = assign_targets(sites, [boxes_at((float(middle[0]) + 0.5, float(middle[1]) - 0.3))], TargetConfig())
     assert targets.positive.nonzero().flatten().tolist() == [37]
     assert float(targets.heat[37]) == 1.0 and float(targets.weight[37]) == 1.0
     distance = torch.hypot(*(sites.xy - middle - torch.tensor([0.5, -0.3])).T)
@@ -40,8 +40,8 @@ def test_the_nearest_token_is_the_centre_and_heat_falls_in_metres():
 def test_two_boxes_of_one_cell_get_a_token_each(stride):
     sites = every(stride)
     x, y = sites.xy[len(sites) // 2 + 2].tolist()
-    config = TargetConfig(reach_m=2 * GRID.at(stride).cell)
-    targets = assign(sites, [boxes_at((x, y), (x + 0.2, y + 0.1))], config)
+    config = TargetConfig(assign_radius_m=2 * GRID.at(stride).cell_size_m)
+    targets = assign_targets(sites, [boxes_at((x, y), (x + 0.2, y + 0.1))], config)
     centres = targets.positive.nonzero().flatten()
     assert len(centres) == 2 and sorted(targets.box[centres].tolist()) == [0, 1]
     assert targets.box[len(sites) // 2 + 2] == 0
@@ -51,9 +51,9 @@ def test_a_box_whose_cells_were_not_seen_takes_the_nearest_within_reach_or_none(
     grid = GRID.at(4)
     some = Sites(torch.tensor([0, 1]), grid)
     x, y = some.xy[1].tolist()
-    near = assign(some, [boxes_at((x + 2.0, y))], TargetConfig())
+    near = assign_targets(some, [boxes_at((x + 2.0, y))], TargetConfig())
     assert near.positive.tolist() == [False, True]
-    far = assign(some, [boxes_at((x + 2.5, y))], TargetConfig())
+    far = assign_targets(some, [boxes_at((x + 2.5, y))], TargetConfig())
     assert not far.positive.any() and not (far.box >= 0).any()
     assert float(far.heat.max()) < 0.01
 
@@ -63,7 +63,7 @@ def test_grids_of_a_batch_have_their_own_boxes_and_rows_count_through():
     n = len(sites) // 3
     at = [sites.xy[i].tolist() for i in (10, 20, 30)]
     truth = [boxes_at(tuple(at[0])), boxes_at(), boxes_at(tuple(at[1]), tuple(at[2]))]
-    targets = assign(sites, truth, TargetConfig())
+    targets = assign_targets(sites, truth, TargetConfig())
     assert targets.positive.nonzero().flatten().tolist() == [10, 2 * n + 20, 2 * n + 30]
     assert targets.box[targets.positive].tolist() == [0, 1, 2] and len(targets.boxes) == 3
     assert not targets.heat[n : 2 * n].any()
@@ -71,14 +71,14 @@ def test_grids_of_a_batch_have_their_own_boxes_and_rows_count_through():
 
 def test_no_sites_and_no_boxes():
     none = Sites(torch.zeros(0, dtype=torch.int64), GRID.at(4), 2)
-    targets = assign(none, [boxes_at((0.0, 0.0)), boxes_at()], TargetConfig())
+    targets = assign_targets(none, [boxes_at((0.0, 0.0)), boxes_at()], TargetConfig())
     assert len(targets.heat) == 0 and len(targets.boxes) == 1
-    assert not assign(every(), [boxes_at()], TargetConfig()).heat.any()
+    assert not assign_targets(every(), [boxes_at()], TargetConfig()).heat.any()
 
 
 def test_neighbours_learn_the_shape_of_the_nearest_box_with_less_weight():
     sites = every(2)
-    targets = assign(sites, [boxes_at((0.0, 0.0), (0.0, 3.0))], TargetConfig())
+    targets = assign_targets(sites, [boxes_at((0.0, 0.0), (0.0, 3.0))], TargetConfig())
     owned = targets.box >= 0
     distance = torch.cdist(sites.xy[owned], torch.tensor([[0.0, 0.0], [0.0, 3.0]]))
     assert torch.equal(targets.box[owned], distance.argmin(1))

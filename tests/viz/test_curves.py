@@ -12,14 +12,14 @@ from PIL import Image
 
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.viz import curves
-from manyeyes.viz.curves import Curve, Panel, save_curves
+from manyeyes.viz.curves import Curve, CurvePanel, save_curves
 
 
 def at(*values: float, half: float = 0.01) -> tuple[Interval, ...]:
     return tuple(Interval(v, v - half, v + half, 0.95, 5) for v in values)
 
 
-def drawn(panels: list[Panel], path) -> np.ndarray:
+def drawn(panels: list[CurvePanel], path) -> np.ndarray:
     save_curves(panels, path)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
     with Image.open(path) as image:
@@ -27,9 +27,9 @@ def drawn(panels: list[Panel], path) -> np.ndarray:
 
 
 def test_a_wider_interval_and_another_level_are_other_pictures(tmp_path) -> None:
-    def panel(half: float, level: float) -> list[Panel]:
+    def panel(half: float, level: float) -> list[CurvePanel]:
         curves = (Curve("late", at(0.8, 0.7, half=half), (0.0, 0.4)), Curve("alone", at(level)))
-        return [Panel("Delay", "seconds", "AP@0.5", curves)]
+        return [CurvePanel("Delay", "seconds", "AP@0.5", curves)]
 
     first, wider, other = (drawn(panel(*p), tmp_path / "x.png") for p in ((0.01, 0.75), (0.05, 0.75), (0.01, 0.72)))
     assert first.shape == wider.shape == other.shape
@@ -39,8 +39,8 @@ def test_a_wider_interval_and_another_level_are_other_pictures(tmp_path) -> None
 @pytest.mark.parametrize("values", [(0.5, 0.9), (math.nan, 0.9)])
 def test_bytes_have_their_logarithm_on_top_and_ticks_their_names(tmp_path, values) -> None:
     panels = [
-        Panel("Bytes", "bytes", "AP", (Curve("a", at(*values), (900.0, 40000.0)),), in_bytes=True),
-        Panel("Branches", "", "AP", (Curve("a", at(*values), (0.0, 1.0)),), ticks=("first", "second")),
+        CurvePanel("Bytes", "bytes", "AP", (Curve("a", at(*values), (900.0, 40000.0)),), in_bytes=True),
+        CurvePanel("Branches", "", "AP", (Curve("a", at(*values), (0.0, 1.0)),), ticks=("first", "second")),
     ]
     assert drawn(panels, tmp_path / "x.png").shape[1] > 1.5 * drawn(panels[:1], tmp_path / "x.png").shape[1]
 
@@ -50,7 +50,7 @@ def test_names_below_an_axis_stand_apart(names: tuple[str, ...]) -> None:
     figure = Figure(figsize=(6.4, 4.5), layout="constrained")
     axes = figure.add_subplot()
     curve = Curve("c", at(*[0.5] * len(names)), tuple(map(float, range(len(names)))))
-    curves._draw(axes, Panel("", "", "AP", (curve,), ticks=names), ["c"])
+    curves._draw(axes, CurvePanel("", "", "AP", (curve,), ticks=names), ["c"])
     FigureCanvasAgg(figure).draw()
     labels = axes.get_xticklabels()
     assert [label.get_text() for label in labels] == list(names)
@@ -64,5 +64,5 @@ def test_names_below_an_axis_stand_apart(names: tuple[str, ...]) -> None:
 
 def test_agents_are_counted_in_whole_numbers() -> None:
     axes = Figure().add_subplot()
-    curves._draw(axes, Panel("", "agents", "AP", (Curve("c", at(0.5, 0.6, 0.7), (1.0, 2.0, 3.0)),)), ["c"])
+    curves._draw(axes, CurvePanel("", "agents", "AP", (Curve("c", at(0.5, 0.6, 0.7), (1.0, 2.0, 3.0)),)), ["c"])
     assert all(float(tick).is_integer() for tick in axes.get_xticks())

@@ -15,10 +15,10 @@ import pytest
 from PIL import Image
 
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps.map_discrepancy import Disagreement
-from manyeyes.viz.map_page import MapPage, lonlat, render, save_map_page
+from manyeyes.evaluation.maps.map_discrepancy import MapDiscrepancy
+from manyeyes.viz.map_page import MapPage, render, save_map_page, to_lonlat
 
-SURE, UNSURE, MISSED = (12, 44, 132), (215, 48, 31), (243, 132, 186)
+CONFIDENT, UNCERTAIN, MISSED = (12, 44, 132), (215, 48, 31), (243, 132, 186)
 
 
 def made_page() -> MapPage:
@@ -32,8 +32,8 @@ def made_page() -> MapPage:
         origin=(49.0, 8.4),
         truth=truth,
         observed=truth.transform(0, 1, 0),
-        disagreement=Disagreement(missed=[np.array([(48.0, -30.0), (48.0, 30.0)])]),
-        about=["</script><b>one</b>", "two"],
+        discrepancy=MapDiscrepancy(false_negatives=[np.array([(48.0, -30.0), (48.0, 30.0)])]),
+        descriptions=["</script><b>one</b>", "two"],
         facts=[("Observations", "3")],
     )
 
@@ -58,7 +58,7 @@ def test_the_data_cannot_end_its_script_and_is_what_was_given() -> None:
 
 
 def test_north_is_up_east_is_right_and_a_metre_is_a_metre() -> None:
-    got = lonlat(np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]), (49.0, 8.4))
+    got = to_lonlat(np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]), (49.0, 8.4))
     assert got[0] == pytest.approx([8.4, 49.0], abs=1e-12)
     assert got[1] - got[0] == pytest.approx([100 / (111_319.49 * np.cos(np.radians(49)) * 1.001909), 0], abs=2e-7)
     assert got[2] - got[0] == pytest.approx([0, 100 / 111_207], abs=2e-7)
@@ -146,14 +146,14 @@ def test_chromium_draws_the_layers_where_they_belong_and_toggles_them(browser, t
     assert browser.value("document.body.dataset.error") is None
     assert int(browser.value("document.body.dataset.ready")) >= 2
     pixels = browser.photograph()[:, 300:]
-    assert count(pixels, SURE) > 500 and count(pixels, UNSURE) > 500 and count(pixels, MISSED) == 0
-    rows = {colour: np.argwhere(np.abs(pixels - colour).max(-1) < 12)[:, 0].mean() for colour in (SURE, UNSURE)}
-    assert rows[SURE] < rows[UNSURE], "north is up"
+    assert count(pixels, CONFIDENT) > 500 and count(pixels, UNCERTAIN) > 500 and count(pixels, MISSED) == 0
+    rows = {colour: np.argwhere(np.abs(pixels - colour).max(-1) < 12)[:, 0].mean() for colour in (CONFIDENT, UNCERTAIN)}
+    assert rows[CONFIDENT] < rows[UNCERTAIN], "north is up"
     browser.value("document.querySelector('input[name=fused]').click()")
     browser.value("document.querySelector('input[name=disagreement]').click()")
     time.sleep(1.5)
     pixels = browser.photograph()[:, 300:]
-    assert count(pixels, SURE) == 0 and count(pixels, MISSED) > 200
+    assert count(pixels, CONFIDENT) == 0 and count(pixels, MISSED) > 200
     assert (
         browser.value("performance.getEntriesByType('resource').filter((e) => !/^(blob|data):/.test(e.name)).length")
         == 0

@@ -11,14 +11,14 @@ import pytest
 import torch
 from PIL import Image
 
-from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.viz import birds_eye
-from manyeyes.viz.animation import save_animation, stack
-from manyeyes.viz.birds_eye import AGENTS, FOUND, TRUE, draw, save_png, scene_of, view_of
-from manyeyes.viz.canvas import View, splat
-from manyeyes.viz.report import Picture, Report, render, save_report
-from manyeyes.viz.table import HEADINGS, Row, cells, markdown, terminal
+from manyeyes.viz.animation import save_animation, stack_images
+from manyeyes.viz.birds_eye import AGENT_COLOURS, FOUND, TRUE, draw_scene, make_scene, make_viewport, save_png
+from manyeyes.viz.canvas import Viewport, draw_points
+from manyeyes.viz.report import HtmlReport, ReportImage, render, save_report
+from manyeyes.viz.table import HEADINGS, MethodRow, format_cells, format_markdown, make_terminal_table
 
 GRID = BevGrid(-40.0, -20.0, -3.0, 40.0, 20.0, 1.0)
 
@@ -47,7 +47,7 @@ def snapshot(ego_points: torch.Tensor | None = None) -> Snapshot:
         AgentFrame(i, 0, cloud, pose, torch.zeros(3, 3), is_infrastructure=i == 1)
         for i, (cloud, pose) in enumerate(zip(clouds, poses))
     )
-    truth = Truth(box(94, 62, math.pi / 2), torch.tensor([[False], [True]]), Transform.stack(poses))
+    truth = GroundTruth(box(94, 62, math.pi / 2), torch.tensor([[False], [True]]), Transform.stack(poses))
     return Snapshot("made", 0, frames, truth)
 
 
@@ -55,7 +55,7 @@ def near(
     image: Image.Image, x: float, y: float, colour: tuple[int, int, int], radius: int = 2, width: int = 1280
 ) -> bool:
     """Whether a pixel of about this colour lies within radius pixels of the metric place."""
-    column, row = view_of(GRID, width).pixels(np.array([x, y]))
+    column, row = make_viewport(GRID, width).to_pixels(np.array([x, y]))
     pixels = np.asarray(image)[
         int(row) - radius : int(row) + radius + 1, int(column) - radius : int(column) + radius + 1
     ]
@@ -63,7 +63,7 @@ def near(
 
 
 def test_a_true_box_is_drawn_where_it_stands_and_not_mirrored() -> None:
-    image = draw(scene_of(snapshot(), Boxes.empty()), GRID)
+    image = draw_scene(make_scene(snapshot(), Boxes.empty()), GRID)
     for x, y in ((12 + 2.3, 6), (12 - 2.3, 6), (12, 6 + 0.95), (12, 6 - 0.95)):
         assert near(image, x, y, TRUE)
     for x, y in ((12 + 2.3, -6), (-12 - 2.3, 6), (6, 12), (12, 6)):
@@ -71,73 +71,77 @@ def test_a_true_box_is_drawn_where_it_stands_and_not_mirrored() -> None:
 
 
 def test_left_of_the_ego_is_up_and_ahead_is_right() -> None:
-    view = View(-10, -5, 10, 5, width=200, top=30, bottom=10)
+    view = Viewport(-10, -5, 10, 5, width=200, top_margin=30, bottom_margin=10)
     assert view.size == (200, 140)
-    assert view.pixels(np.array([[-10.0, 5.0], [10.0, -5.0], [0.0, 0.0]])).tolist() == [[0, 30], [200, 130], [100, 80]]
+    assert view.to_pixels(np.array([[-10.0, 5.0], [10.0, -5.0], [0.0, 0.0]])).tolist() == [
+        [0, 30],
+        [200, 130],
+        [100, 80],
+    ]
 
 
 def test_a_detection_is_red_and_its_tick_points_ahead() -> None:
-    scene = scene_of(snapshot(), box(-15, -8, math.pi / 2, 0.7))
-    image = draw(scene, GRID)
+    scene = make_scene(snapshot(), box(-15, -8, math.pi / 2, 0.7))
+    image = draw_scene(scene, GRID)
     assert near(image, -15, -8 + 2.3, FOUND) and near(image, -15, -8 + 2.9, FOUND)
     assert not near(image, -15, -8 - 2.9, FOUND)
 
 
 def test_detections_below_the_score_are_left_out() -> None:
-    scene = scene_of(snapshot(), box(-15, -8, 0.0, 0.3))
-    assert near(draw(scene, GRID), -15 + 2.3, -8, FOUND)
-    assert not near(draw(scene, GRID, score_min=0.5), -15 + 2.3, -8, FOUND)
+    scene = make_scene(snapshot(), box(-15, -8, 0.0, 0.3))
+    assert near(draw_scene(scene, GRID), -15 + 2.3, -8, FOUND)
+    assert not near(draw_scene(scene, GRID, min_score=0.5), -15 + 2.3, -8, FOUND)
 
 
 def test_points_of_another_agent_are_moved_by_its_pose_and_have_its_colour() -> None:
     # The pole looks back: 3 m ahead of it is 17 m ahead of the ego, 2 m to its left is 8 m to the ego's left.
-    image = draw(scene_of(snapshot(), Boxes.empty()), GRID)
-    assert near(image, 17, 8, AGENTS[1])
-    assert not near(image, 23, 8, AGENTS[1]) and not near(image, 17, 12, AGENTS[1])
+    image = draw_scene(make_scene(snapshot(), Boxes.empty()), GRID)
+    assert near(image, 17, 8, AGENT_COLOURS[1])
+    assert not near(image, 23, 8, AGENT_COLOURS[1]) and not near(image, 17, 12, AGENT_COLOURS[1])
 
 
-def test_points_that_the_ego_never_heard_of_are_pale() -> None:
-    image = draw(scene_of(snapshot(), Boxes.empty(), unheard=[0, 1]), GRID)
-    assert not near(image, 17, 8, AGENTS[1])
-    column, row = view_of(GRID, 1280).pixels(np.array([17.0, 8.0]))
-    assert 255 > np.asarray(image)[int(row), int(column)].min() > AGENTS[1][0], "pale, but there"
+def test_points_of_agents_without_message_are_pale() -> None:
+    image = draw_scene(make_scene(snapshot(), Boxes.empty(), missing_ids=[0, 1]), GRID)
+    assert not near(image, 17, 8, AGENT_COLOURS[1])
+    column, row = make_viewport(GRID, 1280).to_pixels(np.array([17.0, 8.0]))
+    assert 255 > np.asarray(image)[int(row), int(column)].min() > AGENT_COLOURS[1][0], "pale, but there"
 
 
 def test_a_box_that_no_agent_met_is_not_drawn_as_seen() -> None:
     one = snapshot()
     assert one.truth is not None
-    hidden = Truth(one.truth.boxes, torch.zeros(2, 1, dtype=torch.bool), one.truth.world_from_agent)
-    image = draw(scene_of(Snapshot("made", 0, one.frames, hidden), Boxes.empty()), GRID)
+    hidden = GroundTruth(one.truth.boxes, torch.zeros(2, 1, dtype=torch.bool), one.truth.world_from_agent)
+    image = draw_scene(make_scene(Snapshot("made", 0, one.frames, hidden), Boxes.empty()), GRID)
     assert not near(image, 12 + 2.3, 6, TRUE)
 
 
 def test_a_recording_without_truth_is_drawn_too() -> None:
     one = snapshot()
-    assert draw(scene_of(Snapshot("made", 0, one.frames), box(5, 5)), GRID).size == view_of(GRID).size
+    assert draw_scene(make_scene(Snapshot("made", 0, one.frames), box(5, 5)), GRID).size == make_viewport(GRID).size
 
 
 def test_ink_of_two_agents_mixes_in_one_pixel_and_margins_stay_clean() -> None:
-    view = View(0, 0, 10, 10, width=10, top=2, bottom=2)
+    view = Viewport(0, 0, 10, 10, width=10, top_margin=2, bottom_margin=2)
     at, heavy = np.array([[4.5, 4.5]]), np.array([9.0])
-    image = splat(view, [(at, heavy, (200, 0, 0)), (at, heavy, (0, 0, 100))], (255, 255, 255))
+    image = draw_points(view, [(at, heavy, (200, 0, 0)), (at, heavy, (0, 0, 100))], (255, 255, 255))
     assert image[2 + 5, 4].tolist() == [100, 0, 50]
-    above = splat(view, [(np.array([[4.5, 11.0], [4.5, -1.0]]), np.ones(2), (0, 0, 0))], (255, 255, 255))
+    above = draw_points(view, [(np.array([[4.5, 11.0], [4.5, -1.0]]), np.ones(2), (0, 0, 0))], (255, 255, 255))
     assert (above == 255).all()
 
 
 def test_a_png_is_written_whole_and_leaves_no_temporary_file(tmp_path) -> None:
     path = tmp_path / "new" / "frame.png"
-    save_png(draw(scene_of(snapshot(), Boxes.empty()), GRID, "Title", "caption", width=640), path)
+    save_png(draw_scene(make_scene(snapshot(), Boxes.empty()), GRID, "Title", "caption", width=640), path)
     with Image.open(path) as image:
-        assert image.size == view_of(GRID, 640).size
+        assert image.size == make_viewport(GRID, 640).size
     assert [p.name for p in path.parent.iterdir()] == ["frame.png"]
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_an_animation_has_every_frame_and_repeats(tmp_path, suffix) -> None:
-    images = [draw(scene_of(snapshot(), box(x, 0)), GRID, width=320) for x in (-10, 0, 10)]
+    images = [draw_scene(make_scene(snapshot(), box(x, 0)), GRID, width=320) for x in (-10, 0, 10)]
     path = tmp_path / f"drive{suffix}"
-    assert save_animation((stack([i, i]) for i in images), path, 150) == 3
+    assert save_animation((stack_images([i, i]) for i in images), path, 150) == 3
     with Image.open(path) as film:
         assert film.n_frames == 3 and film.info["loop"] == 0
         assert film.size == (320, 2 * images[0].height)
@@ -163,21 +167,21 @@ def interval(value: float, low: float = math.nan, high: float = math.nan) -> Int
 
 
 ROWS = (
-    Row("alone", interval(0.612, 0.55, 0.66), interval(0.4), 0.0, None, None, 41.0),
-    Row("intermediate", interval(0.812, 0.75, 0.86), interval(0.66), 2.0**15, 104.2, 45.0, 53.0),
-    Row("early"),
+    MethodRow("alone", interval(0.612, 0.55, 0.66), interval(0.4), 0.0, None, None, 41.0),
+    MethodRow("intermediate", interval(0.812, 0.75, 0.86), interval(0.66), 2.0**15, 104.2, 45.0, 53.0),
+    MethodRow("early"),
 )
 
 
 def test_a_row_reads_as_numbers_and_what_is_absent_reads_not_run() -> None:
-    assert cells(ROWS[0]) == ("alone", "0.612 [0.550, 0.660]", "0.400", "0", "-", "-", "-", "41.0")
-    assert cells(ROWS[1])[3:6] == ("32,768", "15.00", "104")
-    assert cells(ROWS[2]) == ("early", *["not run"] * 7)
-    assert cells(Row("x", interval(math.nan)))[1] == "no object"
+    assert format_cells(ROWS[0]) == ("alone", "0.612 [0.550, 0.660]", "0.400", "0", "-", "-", "-", "41.0")
+    assert format_cells(ROWS[1])[3:6] == ("32,768", "15.00", "104")
+    assert format_cells(ROWS[2]) == ("early", *["not run"] * 7)
+    assert format_cells(MethodRow("x", interval(math.nan)))[1] == "no object"
 
 
 def test_the_markdown_table_is_aligned_and_complete() -> None:
-    lines = markdown(ROWS).splitlines()
+    lines = format_markdown(ROWS).splitlines()
     assert len({len(line) for line in lines}) == 1 and len(lines) == 5
     assert all(line.count("|") == len(HEADINGS) + 1 for line in lines)
 
@@ -186,20 +190,24 @@ def test_the_terminal_table_fits_80_columns() -> None:
     from rich.console import Console
 
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
-    console.print(terminal(ROWS, "title"))
+    console.print(make_terminal_table(ROWS, "title"))
     text = console.export_text()
     assert "…" not in text and ".750-.860" in text and "32,768" in text and "perceive" in text
 
 
-def make_report(tmp_path) -> Report:
+def make_report(tmp_path) -> HtmlReport:
     picture = tmp_path / "one.png"
-    save_png(draw(scene_of(snapshot(), box(5, 5)), GRID, width=640), picture)
-    return Report(
+    save_png(draw_scene(make_scene(snapshot(), box(5, 5)), GRID, width=640), picture)
+    return HtmlReport(
         "A <drive>",
         "Two agents & a box.",
         ROWS,
         (),
-        (Picture(picture, "all of it", wide=True), Picture(picture, "intermediate"), Picture(picture, "late")),
+        (
+            ReportImage(picture, "all of it", wide=True),
+            ReportImage(picture, "intermediate"),
+            ReportImage(picture, "late"),
+        ),
         (("Frames", "3"),),
         ("make demo",),
         provenance={"seed": 7},
@@ -217,7 +225,7 @@ def test_the_report_is_one_file_that_fetches_nothing(tmp_path) -> None:
 def test_a_picture_that_a_browser_cannot_show_is_refused(tmp_path) -> None:
     (tmp_path / "cloud.pcd").write_bytes(b"")
     with pytest.raises(ConfigError, match=r"cloud.pcd: a report embeds \.png"):
-        render(Report("t", "l", pictures=(Picture(tmp_path / "cloud.pcd", "c"),)))
+        render(HtmlReport("t", "l", pictures=(ReportImage(tmp_path / "cloud.pcd", "c"),)))
 
 
 def test_the_report_renders_in_a_browser(tmp_path) -> None:
@@ -239,8 +247,8 @@ def test_drawing_without_pillow_names_the_extra(monkeypatch) -> None:
     import sys
 
     from manyeyes.datatypes import MissingExtraError
-    from manyeyes.viz.canvas import pillow
+    from manyeyes.viz.canvas import import_pillow
 
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'manyeyes\[view\]'"):
-        pillow()
+        import_pillow()

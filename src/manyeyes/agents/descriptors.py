@@ -10,42 +10,44 @@ from dataclasses import replace
 
 import torch
 
-from manyeyes.agents.perception_cache import Eyes
+from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message
 from manyeyes.datatypes.keypoints import Keypoints
-from manyeyes.datatypes.message import DESCRIPTOR
-from manyeyes.models.pose.box_descriptors import BoxKeypoints
+from manyeyes.datatypes.message import DESCRIPTOR_DIM
+from manyeyes.models.pose.box_descriptors import BoxKeypointConfig
 from manyeyes.models.pose.feakm import FeakmNet
-from manyeyes.models.pose.keypoint_net import View
+from manyeyes.models.pose.keypoint_net import DetectorView
 
 
-def seen_points(net: FeakmNet, eyes: Eyes, frame: AgentFrame, boxes: Boxes | None = None) -> Keypoints:
+def extract_own_keypoints(
+    net: FeakmNet, cache: PerceptionCache, frame: AgentFrame, boxes: Boxes | None = None
+) -> Keypoints:
     """The agent's own boxes, or those of them that are given, as far as the net takes them for keypoints: best first."""
-    kind = net.config.keypoints
-    if not isinstance(kind, BoxKeypoints) or kind.descriptor != DESCRIPTOR:
+    keypoint_config = net.config.keypoints
+    if not isinstance(keypoint_config, BoxKeypointConfig) or keypoint_config.descriptor_dim != DESCRIPTOR_DIM:
         raise ConfigError(
-            f"A message carries objects with {DESCRIPTOR} numbers each; this net has {kind.descriptor} "
-            f"of {type(kind).__name__}. Nets of 'manyeyes train --preset feakm' can be sent; --study feakm takes any."
+            f"A message carries objects with {DESCRIPTOR_DIM} numbers each; this net has {keypoint_config.descriptor_dim} "
+            f"of {type(keypoint_config).__name__}. Nets of 'manyeyes train --preset feakm' can be sent; --study feakm takes any."
         )
-    net.check_views(eyes.detector.fingerprint)
-    sight = eyes.see(frame)
+    net.check_views(cache.detector.fingerprint)
+    output = cache.process(frame)
     with torch.inference_mode():
-        return net.describe([View.of(sight.told, sight.boxes if boxes is None else boxes)])[0]
+        return net.describe([DetectorView.of(output.shared_tokens, output.boxes if boxes is None else boxes)])[0]
 
 
-def described(net: FeakmNet, eyes: Eyes, frame: AgentFrame, message: Message) -> Message:
+def attach_descriptors(net: FeakmNet, cache: PerceptionCache, frame: AgentFrame, message: Message) -> Message:
     """The message of a frame with the descriptor of each of its objects, zeros for those that the net leaves out; a message
     without objects gets those that the net describes.
     """
-    points = seen_points(net, eyes, frame, message.objects)
+    points = extract_own_keypoints(net, cache, frame, message.objects)
     objects = points.boxes if message.objects is None else message.objects
-    descriptors = torch.zeros(len(objects), DESCRIPTOR)
+    descriptors = torch.zeros(len(objects), DESCRIPTOR_DIM)
     # Boxes are ordered by score, so that the net's are the first.
     descriptors[: len(points)] = points.descriptor
     return replace(message, objects=objects, descriptors=descriptors)
 
 
-def told_points(message: Message) -> Keypoints | None:
+def extract_message_keypoints(message: Message) -> Keypoints | None:
     """What a message describes; None where its sender describes nothing."""
     if message.objects is None or message.descriptors is None:
         return None

@@ -13,85 +13,88 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.agents.map_features import draw_tile, is_readable, receive, share_look
-from manyeyes.agents.strategies.message_header import header
+from manyeyes.agents.map_features import decode_map_features, encode_map_features, is_compatible, predict_tile
+from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.comms import wire
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, Transform
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.datatypes.message import SeenMap
+from manyeyes.datatypes.message import LocalMap
 from manyeyes.maps.elements.observation import is_simple_ring
-from manyeyes.maps.fusion.crossings import hulls_of
-from manyeyes.models.maps.map_model import Mapper
+from manyeyes.maps.fusion.crossings import compute_convex_hull
+from manyeyes.models.maps.map_model import MapModel
 from manyeyes.ops.clip import clip_line, clip_ring, ring_area
 from manyeyes.ops.polyline import simplify
 
 Floats = NDArray[np.float64]
 Window = tuple[float, float, float, float]
-Survey = Callable[[AgentFrame, Sequence[Message]], SeenMap | None]
+MapPredictor = Callable[[AgentFrame, Sequence[Message]], LocalMap | None]
 """An agent's frame, and messages with looks of others, to what it says of the map; None: nothing."""
 
 
 @dataclass(frozen=True)
-class SurveyConfig:
-    """vehicle, roadside: what is drawn, x_min, y_min, x_max, y_max metres in the agent's frame. together: also from others' looks.
+class MapShareConfig:
+    """vehicle_window, roadside_window: what is drawn, x_min, y_min, x_max, y_max metres in the agent's frame. use_neighbours: also
+    from others' looks.
 
-    least_score: of an element that is said; least_m, least_m2: length of a line and area of a crossing. simplify_m: how far what is
-    said may leave what was drawn.
+    min_score: of an element that is said; min_length_m, min_area_m2: length of a line and area of a crossing. simplify_tolerance_m:
+    how far what is said may leave what was drawn.
     """
 
-    vehicle: Window = (0.0, -15.0, 30.0, 15.0)
-    roadside: Window = (0.0, -15.0, 50.0, 15.0)
-    together: bool = False
-    least_score: float = 0.3
-    least_m: float = 2.0
-    least_m2: float = 4.0
-    simplify_m: float = 0.03
+    vehicle_window: Window = (0.0, -15.0, 30.0, 15.0)
+    roadside_window: Window = (0.0, -15.0, 50.0, 15.0)
+    use_neighbours: bool = False
+    min_score: float = 0.3
+    min_length_m: float = 2.0
+    min_area_m2: float = 4.0
+    simplify_tolerance_m: float = 0.03
 
     def window(self, frame: AgentFrame) -> Window:
         """What is drawn around this agent."""
-        return self.roadside if frame.is_infrastructure else self.vehicle
+        return self.roadside_window if frame.is_infrastructure else self.vehicle_window
 
 
 _TILE = (-60.0, -30.0, 60.0, 30.0)
-SURVEYS = {"local": SurveyConfig(), "semi-global": SurveyConfig(_TILE, _TILE, together=True)}
+MAP_MODES = {"local": MapShareConfig(), "semi-global": MapShareConfig(_TILE, _TILE, use_neighbours=True)}
 
 
-def survey_config(name: str) -> SurveyConfig:
+def get_map_share_config(name: str) -> MapShareConfig:
     """A way to survey by name; ConfigError lists the known ones."""
-    if name not in SURVEYS:
-        raise ConfigError(f"No survey is called {name!r}; known: {', '.join(SURVEYS)}.")
-    return SURVEYS[name]
+    if name not in MAP_MODES:
+        raise ConfigError(f"No survey is called {name!r}; known: {', '.join(MAP_MODES)}.")
+    return MAP_MODES[name]
 
 
 @dataclass(frozen=True)
-class Surveyor:
+class MapModelPredictor:
     """A map model that looks at frames; what it draws is cut to what looks could cover, and only what is sound is said."""
 
-    mapper: Mapper
-    config: SurveyConfig = SurveyConfig()
+    model: MapModel
+    config: MapShareConfig = MapShareConfig()
 
-    def __call__(self, frame: AgentFrame, heard: Sequence[Message] = ()) -> SeenMap | None:
+    def __call__(self, frame: AgentFrame, received: Sequence[Message] = ()) -> LocalMap | None:
         """The elements in the agent's frame; None where its own sensors, and those whose looks it heard, saw nothing."""
-        own = receive(share_look(self.mapper, frame), self.mapper)
-        others = [m for m in heard if is_readable(m, self.mapper)]
-        looks = [look for look in (own, *(others if self.config.together else ())) if look is not None]
-        if not looks:
+        own = decode_map_features(encode_map_features(self.model, frame), self.model)
+        others = [m for m in received if is_compatible(m, self.model)]
+        messages = [
+            message for message in (own, *(others if self.config.use_neighbours else ())) if message is not None
+        ]
+        if not messages:
             return None
         x, y, _ = frame.world_from_agent.translation.tolist()
         world_from_tile = Transform.from_xyz_yaw(x, y, 0.0, float(frame.world_from_agent.yaw))
-        view = self._view(frame, [world_from_tile.inverse() @ look.world_from_agent for look in looks])
-        drawn = draw_tile(self.mapper, looks, world_from_tile)
-        return SeenMap(said(drawn.take(drawn.score >= self.config.least_score), view, self.config), view)
+        view = self._view(frame, [world_from_tile.inverse() @ message.world_from_agent for message in messages])
+        predicted = predict_tile(self.model, messages, world_from_tile)
+        return LocalMap(clip_to_view(predicted.take(predicted.score >= self.config.min_score), view, self.config), view)
 
-    def _view(self, frame: AgentFrame, tile_from_look: Sequence[Transform]) -> Floats:
+    def _view(self, frame: AgentFrame, tile_from_sender: Sequence[Transform]) -> Floats:
         """The convex hull of the ground that looks cover, within the agent's window: an open ring, anticlockwise."""
-        grid = self.mapper.token_grid
+        grid = self.model.token_grid
         corners = rectangle((grid.x_min, grid.y_min, grid.x_max, grid.y_max))
-        placed = [corners @ _turn(float(m.yaw)).T + m.translation[:2].numpy() for m in tile_from_look]
-        return clip_ring(hulls_of(np.concatenate(placed)), rectangle(self.config.window(frame)))
+        placed = [corners @ _rotation_2d(float(m.yaw)).T + m.translation[:2].numpy() for m in tile_from_sender]
+        return clip_ring(compute_convex_hull(np.concatenate(placed)), rectangle(self.config.window(frame)))
 
 
-def said(elements: MapElements, view: Floats, config: SurveyConfig) -> MapElements:
+def clip_to_view(elements: MapElements, view: Floats, config: MapShareConfig) -> MapElements:
     """What of drawn elements is worth saying: cut to a view (K, 2), convex and anticlockwise, long enough, and with few points.
 
     A crossing whose ring crosses itself is no shape, and is left out.
@@ -102,24 +105,24 @@ def said(elements: MapElements, view: Floats, config: SurveyConfig) -> MapElemen
         points = elements.polyline(row)
         if elements.closed[row]:
             ring = clip_ring(points, view)
-            ring = simplify(np.concatenate((ring, ring[:1])), config.simplify_m)[:-1]
-            found = [ring] if abs(ring_area(ring)) >= config.least_m2 and is_simple_ring(ring) else []
+            ring = simplify(np.concatenate((ring, ring[:1])), config.simplify_tolerance_m)[:-1]
+            found = [ring] if abs(ring_area(ring)) >= config.min_area_m2 and is_simple_ring(ring) else []
         else:
-            cut = [simplify(part, config.simplify_m) for part in clip_line(points, view)]
-            found = [part for part in cut if np.hypot(*np.diff(part, axis=0).T).sum() >= config.least_m]
+            cut = [simplify(part, config.simplify_tolerance_m) for part in clip_line(points, view)]
+            found = [part for part in cut if np.hypot(*np.diff(part, axis=0).T).sum() >= config.min_length_m]
         rows += [row] * len(found)
         parts += found
     index = np.array(rows, np.int64)
-    mean = np.bincount(elements.owner, elements.sigma, len(elements)) / np.maximum(elements.counts, 1)
+    mean = np.bincount(elements.element_of_point, elements.sigma, len(elements)) / np.maximum(elements.counts, 1)
     sigma = np.repeat(mean[index], [len(part) for part in parts]) if parts else 0.0
     return MapElements.of(parts, elements.kind[index], elements.score[index], sigma, elements.style[index])
 
 
-def share_map(
-    frame: AgentFrame, seen: SeenMap, fingerprint: bytes = bytes(8), mtu: int = wire.DEFAULT_MTU
+def encode_map_message(
+    frame: AgentFrame, local_map: LocalMap, fingerprint: bytes = bytes(8), mtu: int = wire.DEFAULT_MTU
 ) -> list[bytes]:
     """The packets of a message that speaks of the map alone; fingerprint: of the weights that drew it."""
-    return wire.encode(replace(header(frame, fingerprint), seen_map=seen), mtu=mtu)
+    return wire.encode(replace(make_header(frame, fingerprint), local_map=local_map), mtu=mtu)
 
 
 def rectangle(window: Window) -> Floats:
@@ -128,5 +131,5 @@ def rectangle(window: Window) -> Floats:
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
 
 
-def _turn(yaw: float) -> Floats:
+def _rotation_2d(yaw: float) -> Floats:
     return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])

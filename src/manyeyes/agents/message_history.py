@@ -6,43 +6,54 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from itertools import islice
 
-from manyeyes.agents.perception_cache import REMEMBERED
+from manyeyes.agents.perception_cache import HISTORY_FRAMES
 from manyeyes.datatypes import Message
 
-KEPT_NS = 500_000_000
+MAX_AGE_NS = 500_000_000
 
 
-class Memory:
+class MessageHistory:
     """The last messages of each sender, as they were heard. What is older than keep_ns is forgotten."""
 
-    def __init__(self, keep_ns: int = KEPT_NS) -> None:
-        self._keep_ns = keep_ns
-        self._held: dict[int, tuple[Message, ...]] = {}
+    def __init__(self, max_age_ns: int = MAX_AGE_NS) -> None:
+        self._max_age_ns = max_age_ns
+        self._messages: dict[int, tuple[Message, ...]] = {}
         self._now_ns = 0
 
-    def recall(self, heard: Sequence[Message], now_ns: int, distrusted: Collection[int] = ()) -> list[Message]:
+    def update_and_get(
+        self, received: Sequence[Message], now_ns: int, untrusted: Collection[int] = ()
+    ) -> list[Message]:
         """Each message heard, and behind it up to REMEMBERED older ones of its sender, newest first; then the last ones of those
         who fell silent, or whose message of now nobody could place, while they are no older than keep_ns at now_ns.
 
-        A message heard again, with more of its packets, takes its own place; a time that goes back begins anew. distrusted:
+        A message heard again, with more of its packets, takes its own place; a time that goes back begins anew. untrusted:
         senders who are forgotten.
         """
         if now_ns < self._now_ns:
-            self._held = {}
+            self._messages = {}
         self._now_ns = now_ns
         found: list[Message] = []
-        held = {who: said for who, said in self._held.items() if who not in distrusted}
-        for message in heard:
-            known = held.get(message.agent_id, ())
-            if known and message.timestamp_ns < known[0].timestamp_ns:
-                known = ()
-            older = (m for m in known if m.timestamp_ns < message.timestamp_ns and self._near(m, message.timestamp_ns))
-            held[message.agent_id] = (message, *islice(older, REMEMBERED))
-            found += held[message.agent_id]
-        latest = max((message.timestamp_ns for message in heard), default=now_ns)
-        self._held = {who: said for who, said in held.items() if self._near(said[0], latest)}
-        silent = self._held.keys() - {message.agent_id for message in heard}
-        return found + [m for who in sorted(silent) for m in self._held[who][:REMEMBERED] if self._near(m, now_ns)]
+        by_sender = {sender: messages for sender, messages in self._messages.items() if sender not in untrusted}
+        for message in received:
+            earlier = by_sender.get(message.agent_id, ())
+            if earlier and message.timestamp_ns < earlier[0].timestamp_ns:
+                earlier = ()
+            older = (
+                m for m in earlier if m.timestamp_ns < message.timestamp_ns and self._is_recent(m, message.timestamp_ns)
+            )
+            by_sender[message.agent_id] = (message, *islice(older, HISTORY_FRAMES))
+            found += by_sender[message.agent_id]
+        latest = max((message.timestamp_ns for message in received), default=now_ns)
+        self._messages = {
+            sender: messages for sender, messages in by_sender.items() if self._is_recent(messages[0], latest)
+        }
+        silent = self._messages.keys() - {message.agent_id for message in received}
+        return found + [
+            m
+            for sender in sorted(silent)
+            for m in self._messages[sender][:HISTORY_FRAMES]
+            if self._is_recent(m, now_ns)
+        ]
 
-    def _near(self, message: Message, time_ns: int) -> bool:
-        return abs(time_ns - message.timestamp_ns) <= self._keep_ns
+    def _is_recent(self, message: Message, time_ns: int) -> bool:
+        return abs(time_ns - message.timestamp_ns) <= self._max_age_ns

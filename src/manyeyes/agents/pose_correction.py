@@ -22,45 +22,45 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from manyeyes.agents.descriptors import described, seen_points, told_points
-from manyeyes.agents.perception_cache import Eyes
+from manyeyes.agents.descriptors import attach_descriptors, extract_message_keypoints, extract_own_keypoints
+from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import age_s
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message, Transform
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.detector.box_head import RawBoxes
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.pose.feakm import FeakmNet
-from manyeyes.pose.corrector import inflated
-from manyeyes.pose.feakm import Feakm
+from manyeyes.pose.corrector import inflate_covariance
+from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.pose_graph import Link, settle
-from manyeyes.pose.pose_monitor import Health, Report, WatchConfig, WatchState, watch
-from manyeyes.pose.registry import corrector
-from manyeyes.pose.types import PoseClaim, PoseEstimate, PoseStatus, upright
+from manyeyes.pose.pose_graph import RelativePoseEdge, optimize_poses
+from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorConfig, PoseMonitorState, PoseReport, update_monitor
+from manyeyes.pose.registry import load_corrector
+from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3
 
 Floats = NDArray[np.float64]
 
-FORGET_S = 60.0
+MAX_SILENCE_S = 60.0
 """A sender that was silent for so long is judged anew."""
-_OFF = (Health.OFFSET, Health.DRIFTING)
-EGO = 0
+_FAULTY = (PoseHealth.OFFSET, PoseHealth.DRIFTING)
+EGO_NODE = 0
 """The ego's node in the graph; senders are 1, 2, ... in the order of their messages."""
 
 
-class Use(Enum):
-    """What became of a message. CLAIMED: fused where its sender says it is. CORRECTED: fused where objects and claim put
-    it. UNSURE: left out, since nobody knows well enough where it belongs. CONTRADICTED: left out, since what its sender
+class MessageUse(Enum):
+    """What became of a message. PRIOR: fused where its sender says it is. CORRECTED: fused where objects and claim put
+    it. UNCERTAIN: left out, since nobody knows well enough where it belongs. INCONSISTENT: left out, since what its sender
     sees fits nobody else's view in one way.
     """
 
-    CLAIMED = "claimed"
+    PRIOR = "claimed"
     CORRECTED = "corrected"
-    UNSURE = "unsure"
-    CONTRADICTED = "contradicted"
+    UNCERTAIN = "unsure"
+    INCONSISTENT = "contradicted"
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CorrectionOutcome:
     """One message: what objects say of its sender's pose, how far off what is used may be, and how its claims have been.
 
     sigma_m: one standard deviation of where the sender's cells land, see Aligner.reach_m. health: the watchman's report.
@@ -68,228 +68,261 @@ class Verdict:
 
     agent_id: int
     is_infrastructure: bool
-    use: Use
+    use: MessageUse
     estimate: PoseEstimate
     sigma_m: float
-    health: Report
+    health: PoseReport
 
     @property
-    def distrusted(self) -> bool:
+    def untrusted(self) -> bool:
         """Whether nothing that its sender said a moment ago is to be used either."""
-        return self.use is Use.CONTRADICTED or (self.use is Use.UNSURE and self.health.health in _OFF)
+        return self.use is MessageUse.INCONSISTENT or (
+            self.use is MessageUse.UNCERTAIN and self.health.health in _FAULTY
+        )
 
 
 @dataclass(frozen=True)
-class Known:
-    """What to remember of a sender. placed: its last message that objects put where it belongs, near what it claimed."""
+class SenderState:
+    """What to remember of a sender. last_corrected: its last message that objects put where it belongs, near what it claimed."""
 
-    watch: WatchState
-    placed: Message | None = None
+    monitor: PoseMonitorState
+    last_corrected: Message | None = None
 
 
 @dataclass(frozen=True)
-class Aligned:
-    """messages: those to be fused, corrected; verdicts: one for each that came; states: what to remember, by sender."""
+class CorrectedMessages:
+    """messages: those to be fused, corrected; corrections: one for each that came; states: what to remember, by sender."""
 
     messages: tuple[Message, ...]
-    verdicts: tuple[Verdict, ...]
-    states: Mapping[int, Known]
+    corrections: tuple[CorrectionOutcome, ...]
+    states: Mapping[int, SenderState]
 
 
 @dataclass(frozen=True)
-class Aligner:
+class PoseCorrection:
     """Settings. corrector: of two agents' landmarks, by name (pose/registry.py), read again where this is sent to
-    another process. score_min: boxes below it are no landmarks. unsure_m: a message whose cells may lie this far off (one
-    standard deviation, reach_m from its sender) is not fused. speed_sigma_mps: error of an object's stated velocity. follow_s: how
-    long ago a sender may have been placed to be followed from there, 0 for never; pace_mps, pace_rps: how fast it may have gone and
-    turned since, one standard deviation.
+    another process. min_score: boxes below it are no landmarks. max_sigma_m: a message whose cells may lie this far off (one
+    standard deviation, reach_m from its sender) is not fused. sigma_velocity_mps: error of an object's stated velocity.
+    propagate_s: how long ago a sender may have been placed to be followed from there, 0 for never; sigma_speed_mps,
+    sigma_yaw_rate_rps: how fast it may have gone and turned since, one standard deviation.
     """
 
     corrector: str = "vote"
-    score_min: float = 0.3
-    unsure_m: float = 0.5
-    reach_m: float = 20.0
-    speed_sigma_mps: float = 1.0
-    follow_s: float = 0.5
-    pace_mps: float = 15.0
-    pace_rps: float = 0.5
-    watch: WatchConfig = field(default_factory=WatchConfig)
+    min_score: float = 0.3
+    max_sigma_m: float = 0.5
+    lever_arm_m: float = 20.0
+    sigma_velocity_mps: float = 1.0
+    propagate_s: float = 0.5
+    sigma_speed_mps: float = 15.0
+    sigma_yaw_rate_rps: float = 0.5
+    monitor: PoseMonitorConfig = field(default_factory=PoseMonitorConfig)
 
     def __post_init__(self) -> None:
-        corrector(self.corrector)
-        if not (self.unsure_m > 0 and min(self.reach_m, self.speed_sigma_mps, self.follow_s) >= 0):
+        load_corrector(self.corrector)
+        if not (self.max_sigma_m > 0 and min(self.lever_arm_m, self.sigma_velocity_mps, self.propagate_s) >= 0):
             raise ConfigError("Aligner needs unsure_m > 0, and reach_m, speed_sigma_mps and follow_s of 0 or more.")
-        if not min(self.pace_mps, self.pace_rps) > 0:
+        if not min(self.sigma_speed_mps, self.sigma_yaw_rate_rps) > 0:
             raise ConfigError("Aligner needs pace_mps > 0 and pace_rps > 0.")
 
-    def align(self, frame: AgentFrame, eyes: Eyes, messages: Sequence[Message], states: Mapping[int, Known]) -> Aligned:
+    def correct(
+        self, frame: AgentFrame, cache: PerceptionCache, messages: Sequence[Message], states: Mapping[int, SenderState]
+    ) -> CorrectedMessages:
         """The messages that came for a frame, put where they belong. states: of the frame before, by sender."""
         now_s = frame.timestamp_ns * 1e-9
-        known = {a: s for a, s in states.items() if not len(s.watch.time) or abs(now_s - s.watch.time[-1]) <= FORGET_S}
+        new_states = {
+            a: s
+            for a, s in states.items()
+            if not len(s.monitor.time_s) or abs(now_s - s.monitor.time_s[-1]) <= MAX_SILENCE_S
+        }
         if not messages:
-            return Aligned((), (), known)
-        own = self.own_landmarks(frame, eyes)
-        marks = [self._told_landmarks(eyes, message, age_s(frame, message)) for message in messages]
-        claims = [PoseClaim.between(frame, message) for message in messages]
-        answers = [corrector(self.corrector)(own, theirs, claim) for theirs, claim in zip(marks, claims)]
-        health, placed = [], {a: s.placed for a, s in known.items()}
-        for message, claim, answer in zip(messages, claims, answers):
-            before = known.get(message.agent_id)
-            state, report = self._watched(before.watch if before else None, message, claim, answer)
-            known[message.agent_id] = Known(state)
+            return CorrectedMessages((), (), new_states)
+        own = self.extract_own_landmarks(frame, cache)
+        landmarks = [self._message_landmarks(cache, message, age_s(frame, message)) for message in messages]
+        priors = [PosePrior.between(frame, message) for message in messages]
+        pairwise_estimates = [
+            load_corrector(self.corrector)(own, theirs, prior) for theirs, prior in zip(landmarks, priors)
+        ]
+        health, last_corrected = [], {a: s.last_corrected for a, s in new_states.items()}
+        for message, prior, pairwise in zip(messages, priors, pairwise_estimates):
+            before = new_states.get(message.agent_id)
+            state, report = self._update_monitor(before.monitor if before else None, message, prior, pairwise)
+            new_states[message.agent_id] = SenderState(state)
             health.append(report)
-        followed = set[int]()
+        propagated = set[int]()
         for n, message in enumerate(messages):
-            last = placed.get(message.agent_id)
-            since = None if last is None or answers[n].status.answered else self._followed(frame, eyes, last, message)
-            if since is not None:
-                claims[n], answers[n] = since, corrector(self.corrector)(own, marks[n], since)
-                followed.add(n)
-        settled, contradicted = self._settled(messages, marks, claims, answers)
-        kept, verdicts = [], []
+            last = last_corrected.get(message.agent_id)
+            propagated_prior = (
+                None
+                if last is None or pairwise_estimates[n].status.has_estimate
+                else self._propagate_prior(frame, cache, last, message)
+            )
+            if propagated_prior is not None:
+                priors[n], pairwise_estimates[n] = (
+                    propagated_prior,
+                    load_corrector(self.corrector)(own, landmarks[n], propagated_prior),
+                )
+                propagated.add(n)
+        joint, inconsistent = self._optimize_jointly(messages, landmarks, priors, pairwise_estimates)
+        kept, corrections = [], []
         for n, message in enumerate(messages):
-            estimate = settled.get(n, answers[n])
-            use, sigma = self._use(estimate, answers[n], n in settled or n in followed, n in contradicted, health[n])
-            verdicts.append(Verdict(message.agent_id, message.is_infrastructure, use, estimate, sigma, health[n]))
-            if use is Use.CLAIMED:
+            estimate = joint.get(n, pairwise_estimates[n])
+            use, sigma = self._decide_use(
+                estimate, pairwise_estimates[n], n in joint or n in propagated, n in inconsistent, health[n]
+            )
+            corrections.append(
+                CorrectionOutcome(message.agent_id, message.is_infrastructure, use, estimate, sigma, health[n])
+            )
+            if use is MessageUse.PRIOR:
                 kept.append(message)
-            elif use is Use.CORRECTED:
-                kept.append(moved(message, frame, estimate))
+            elif use is MessageUse.CORRECTED:
+                kept.append(apply_correction(message, frame, estimate))
             # Whom objects put elsewhere than it says is not followed from there: were it a mistake, it would go on.
-            refuted = use is Use.CONTRADICTED or estimate.status is PoseStatus.CONFLICT
-            put = kept[-1] if use is Use.CORRECTED else placed.get(message.agent_id)
-            known[message.agent_id] = Known(known[message.agent_id].watch, None if refuted else put)
-        return Aligned(tuple(kept), tuple(verdicts), known)
+            refuted = use is MessageUse.INCONSISTENT or estimate.status is PoseStatus.CONFLICT
+            put = kept[-1] if use is MessageUse.CORRECTED else last_corrected.get(message.agent_id)
+            new_states[message.agent_id] = SenderState(new_states[message.agent_id].monitor, None if refuted else put)
+        return CorrectedMessages(tuple(kept), tuple(corrections), new_states)
 
     @property
     def net(self) -> FeakmNet | None:
         """Whose descriptors the corrector reads, if any."""
-        found = corrector(self.corrector)
-        return found.net if isinstance(found, Feakm) else None
+        found = load_corrector(self.corrector)
+        return found.net if isinstance(found, FeakmCorrector) else None
 
-    def describe(self, frame: AgentFrame, eyes: Eyes, message: Message) -> Message:
+    def attach_descriptors(self, frame: AgentFrame, cache: PerceptionCache, message: Message) -> Message:
         """An agent's own message with what the corrector needs beside; one that is dated otherwise than the frame stays."""
         if self.net is None or message.timestamp_ns != frame.timestamp_ns:
             return message
-        return described(self.net, eyes, frame, message)
+        return attach_descriptors(self.net, cache, frame, message)
 
-    def own_landmarks(self, frame: AgentFrame, eyes: Eyes) -> Landmarks:
+    def extract_own_landmarks(self, frame: AgentFrame, cache: PerceptionCache) -> Landmarks:
         """What an agent itself sees, as far as the corrector goes by it."""
         if self.net is None:
-            seen = self._landmarks(eyes.see(frame).boxes, None, 0.0)
-            return seen if frame.is_infrastructure else seen.with_body()
-        points = seen_points(self.net, eyes, frame)
-        return self._landmarks(points.boxes, points.descriptor, 0.0)
+            landmarks = self._select_landmarks(cache.process(frame).boxes, None, 0.0)
+            return landmarks if frame.is_infrastructure else landmarks.with_ego_body()
+        points = extract_own_keypoints(self.net, cache, frame)
+        return self._select_landmarks(points.boxes, points.descriptor, 0.0)
 
-    def _told_landmarks(self, eyes: Eyes, message: Message, seconds: float) -> Landmarks:
+    def _message_landmarks(self, cache: PerceptionCache, message: Message, seconds: float) -> Landmarks:
         """What a message says that left so long ago; nothing, where the corrector needs descriptors and none came."""
         if self.net is None:
-            told = self._landmarks(boxes_of(eyes, message), None, seconds)
+            landmarks = self._select_landmarks(extract_message_boxes(cache, message), None, seconds)
             # Where a sender was is not where it is: how fast it goes, it does not say.
-            return told if message.is_infrastructure or seconds else told.with_body()
-        points = told_points(message)
-        return Landmarks.empty() if points is None else self._landmarks(points.boxes, points.descriptor, seconds)
+            return landmarks if message.is_infrastructure or seconds else landmarks.with_ego_body()
+        points = extract_message_keypoints(message)
+        return Landmarks.empty() if points is None else self._select_landmarks(points.boxes, points.descriptor, seconds)
 
-    def _landmarks(self, boxes: Boxes, look: Tensor | None, seconds: float) -> Landmarks:
+    def _select_landmarks(self, boxes: Boxes, descriptor: Tensor | None, seconds: float) -> Landmarks:
         """Boxes that are sure enough, seen so long ago, where they are now."""
-        sure = boxes.score >= self.score_min
-        now = boxes[sure].after(seconds)
-        marks = Landmarks.of_boxes(now) if look is None else Landmarks.of_keypoints(Keypoints(now, look[sure]))
-        drifted = self.speed_sigma_mps * abs(seconds)
-        return replace(marks, sigma_xy=np.hypot(marks.sigma_xy, drifted)) if drifted else marks
+        confident = boxes.score >= self.min_score
+        now = boxes[confident].after(seconds)
+        landmarks = (
+            Landmarks.of_boxes(now)
+            if descriptor is None
+            else Landmarks.of_keypoints(Keypoints(now, descriptor[confident]))
+        )
+        sigma_motion_m = self.sigma_velocity_mps * abs(seconds)
+        return (
+            replace(landmarks, sigma_xy=np.hypot(landmarks.sigma_xy, sigma_motion_m)) if sigma_motion_m else landmarks
+        )
 
-    def _followed(self, frame: AgentFrame, eyes: Eyes, last: Message, message: Message) -> PoseClaim | None:
+    def _propagate_prior(
+        self, frame: AgentFrame, cache: PerceptionCache, last: Message, message: Message
+    ) -> PosePrior | None:
         """Where a sender is, by where it was placed when it said something before and what it saw then and sees now; None where
         that is too long ago, or does not fit.
         """
         seconds = (message.timestamp_ns - last.timestamp_ns) * 1e-9
-        if not 0 < seconds <= self.follow_s:
+        if not 0 < seconds <= self.propagate_s:
             return None
-        then, now = self._told_landmarks(eyes, last, seconds), self._told_landmarks(eyes, message, 0.0)
-        stayed = np.array([self.pace_mps, self.pace_mps, self.pace_rps]) * seconds
-        moved_on = corrector(self.corrector)(then, now, PoseClaim(Transform.identity(), np.diag(stayed**2)))
-        if not moved_on.status.answered or moved_on.ego_from_other is None:
+        then, now = self._message_landmarks(cache, last, seconds), self._message_landmarks(cache, message, 0.0)
+        sigma_motion = np.array([self.sigma_speed_mps, self.sigma_speed_mps, self.sigma_yaw_rate_rps]) * seconds
+        motion = load_corrector(self.corrector)(then, now, PosePrior(Transform.identity(), np.diag(sigma_motion**2)))
+        if not motion.status.has_estimate or motion.ego_from_other is None:
             return None
-        there = PoseClaim.between(frame, last)
-        x, y = (there.ego_from_other.rotation[:2, :2] @ moved_on.ego_from_other.translation[:2]).tolist()
+        previous = PosePrior.between(frame, last)
+        x, y = (previous.ego_from_other.rotation[:2, :2] @ motion.ego_from_other.translation[:2]).tolist()
         lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
         turn = np.eye(3)
-        turn[:2, :2] = there.ego_from_other.rotation[:2, :2].numpy()
-        covariance = lever @ there.covariance @ lever.T + turn @ moved_on.covariance @ turn.T
-        return PoseClaim(there.ego_from_other @ moved_on.ego_from_other, (covariance + covariance.T) / 2)
+        turn[:2, :2] = previous.ego_from_other.rotation[:2, :2].numpy()
+        covariance = lever @ previous.covariance @ lever.T + turn @ motion.covariance @ turn.T
+        return PosePrior(previous.ego_from_other @ motion.ego_from_other, (covariance + covariance.T) / 2)
 
-    def _watched(
-        self, state: WatchState | None, message: Message, claim: PoseClaim, answer: PoseEstimate
-    ) -> tuple[WatchState, Report]:
+    def _update_monitor(
+        self, state: PoseMonitorState | None, message: Message, prior: PosePrior, estimate: PoseEstimate
+    ) -> tuple[PoseMonitorState, PoseReport]:
         """The watchman's state and word after this message; one heard before says nothing new."""
-        state, time_s = state or WatchState.new(), message.timestamp_ns * 1e-9
+        state, time_s = state or PoseMonitorState.new(), message.timestamp_ns * 1e-9
         # Where time goes back, another drive has begun.
-        state = WatchState.new() if len(state.time) and time_s < state.time[-1] else state
-        again = bool(len(state.time)) and time_s == state.time[-1]
-        return watch(state, answer, None if again else claim, time_s, self.watch)
+        state = PoseMonitorState.new() if len(state.time_s) and time_s < state.time_s[-1] else state
+        again = bool(len(state.time_s)) and time_s == state.time_s[-1]
+        return update_monitor(state, estimate, None if again else prior, time_s, self.monitor)
 
-    def _settled(
+    def _optimize_jointly(
         self,
         messages: Sequence[Message],
-        marks: Sequence[Landmarks],
-        claims: Sequence[PoseClaim],
-        answers: Sequence[PoseEstimate],
+        landmarks: Sequence[Landmarks],
+        priors: Sequence[PosePrior],
+        pairwise_estimates: Sequence[PoseEstimate],
     ) -> tuple[dict[int, PoseEstimate], set[int]]:
         """What all agents say together of each sender's pose, where two senders also recognise each other's objects; and
         who contradicts the others.
         """
-        links = [_link(EGO, n + 1, answer) for n, answer in enumerate(answers)]
-        across = []
+        ego_edges = [_make_edge(EGO_NODE, n + 1, pairwise) for n, pairwise in enumerate(pairwise_estimates)]
+        sender_edges = []
         for i, j in itertools.combinations(range(len(messages)), 2):
-            said = corrector(self.corrector)(marks[i], marks[j], PoseClaim.between(messages[i], messages[j]))
-            across.append(_link(i + 1, j + 1, said))
-        if not any(across):
+            estimate = load_corrector(self.corrector)(
+                landmarks[i], landmarks[j], PosePrior.between(messages[i], messages[j])
+            )
+            sender_edges.append(_make_edge(i + 1, j + 1, estimate))
+        if not any(sender_edges):
             return {}, set()
-        given = {
-            n + 1: inflated(claim, answer.distance)
-            for n, (claim, answer) in enumerate(zip(claims, answers))
-            if answer.status is not PoseStatus.CONFLICT
+        prior_by_node = {
+            n + 1: inflate_covariance(prior, pairwise.mahalanobis_squared)
+            for n, (prior, pairwise) in enumerate(zip(priors, pairwise_estimates))
+            if pairwise.status is not PoseStatus.CONFLICT
         }
-        joint = settle(EGO, [link for link in (*links, *across) if link is not None], given)
-        joined = {agent for link in joint.kept for agent in (link.i, link.j)} - {EGO}
+        joint = optimize_poses(
+            EGO_NODE, [edge for edge in (*ego_edges, *sender_edges) if edge is not None], prior_by_node
+        )
+        connected = {agent for edge in joint.kept_edges for agent in (edge.i, edge.j)} - {EGO_NODE}
         poses = {
             n - 1: replace(
-                answers[n - 1],
-                ego_from_other=upright(joint.pose[n], claims[n - 1]),
+                pairwise_estimates[n - 1],
+                ego_from_other=lift_to_se3(joint.pose[n], priors[n - 1]),
                 covariance=joint.covariance[n],
             )
-            for n in joined & joint.pose.keys()
+            for n in connected & joint.pose.keys()
         }
         return poses, {n - 1 for n in joint.isolated}
 
-    def _use(
-        self, estimate: PoseEstimate, answer: PoseEstimate, joined: bool, contradicted: bool, health: Report
-    ) -> tuple[Use, float]:
-        """What to do with a message whose pose would be this; joined: others, if not the ego, recognise its objects."""
+    def _decide_use(
+        self, estimate: PoseEstimate, pairwise: PoseEstimate, connected: bool, inconsistent: bool, health: PoseReport
+    ) -> tuple[MessageUse, float]:
+        """What to do with a message whose pose would be this; connected: others, if not the ego, recognise its objects."""
         sigma = math.inf
         if np.isfinite(estimate.covariance).all():
-            across = np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]
-            sigma = math.sqrt(max(float(across + self.reach_m**2 * estimate.covariance[2, 2]), 0.0))
-        answered = joined or answer.status.answered
-        caught = not answered and health.health in _OFF
-        if contradicted:
-            return Use.CONTRADICTED, sigma
-        if estimate.ego_from_other is None or caught or not sigma <= self.unsure_m:
-            return Use.UNSURE, sigma
-        return Use.CORRECTED if answered else Use.CLAIMED, sigma
+            variance_xy = np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]
+            sigma = math.sqrt(max(float(variance_xy + self.lever_arm_m**2 * estimate.covariance[2, 2]), 0.0))
+        has_estimate = connected or pairwise.status.has_estimate
+        is_faulty = not has_estimate and health.health in _FAULTY
+        if inconsistent:
+            return MessageUse.INCONSISTENT, sigma
+        if estimate.ego_from_other is None or is_faulty or not sigma <= self.max_sigma_m:
+            return MessageUse.UNCERTAIN, sigma
+        return MessageUse.CORRECTED if has_estimate else MessageUse.PRIOR, sigma
 
 
-def boxes_of(eyes: Eyes, message: Message) -> Boxes:
+def extract_message_boxes(cache: PerceptionCache, message: Message) -> Boxes:
     """What a message says of objects, in its sender's frame: sent, proposed by its tokens, or found in its points."""
     if message.objects is not None:
         return message.objects
     tokens = message.tokens
-    if tokens is not None and tokens.features.is_floating_point() and tokens.features.shape[1] >= PROPOSAL:
-        return eyes.decode(RawBoxes.of(tokens.features[:, -PROPOSAL:].float(), tokens.sites))
-    return eyes.see_cloud(message.points).boxes if message.points is not None else Boxes.empty()
+    if tokens is not None and tokens.features.is_floating_point() and tokens.features.shape[1] >= PROPOSAL_DIM:
+        return cache.decode(RawBoxes.of(tokens.features[:, -PROPOSAL_DIM:].float(), tokens.sites))
+    return cache.run_detector(message.points).boxes if message.points is not None else Boxes.empty()
 
 
-def moved(message: Message, frame: AgentFrame, estimate: PoseEstimate) -> Message:
+def apply_correction(message: Message, frame: AgentFrame, estimate: PoseEstimate) -> Message:
     """The message from where the estimate puts its sender, as seen from the ego's claimed pose."""
     assert estimate.ego_from_other is not None
     world_from_ego = frame.world_from_agent
@@ -303,8 +336,8 @@ def moved(message: Message, frame: AgentFrame, estimate: PoseEstimate) -> Messag
     )
 
 
-def _link(i: int, j: int, answer: PoseEstimate) -> Link | None:
+def _make_edge(i: int, j: int, estimate: PoseEstimate) -> RelativePoseEdge | None:
     """What objects say of two agents, where they say it."""
-    if not answer.status.answered or answer.measured is None or answer.measured_covariance is None:
+    if not estimate.status.has_estimate or estimate.measured is None or estimate.measured_covariance is None:
         return None
-    return Link(i, j, answer.measured, answer.measured_covariance)
+    return RelativePoseEdge(i, j, estimate.measured, estimate.measured_covariance)

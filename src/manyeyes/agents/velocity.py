@@ -18,51 +18,53 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import Boxes
-from manyeyes.ops.point_alignment_cost import MOST, meeting_costs
+from manyeyes.ops.point_alignment_cost import MAX_POINTS, compute_alignment_costs
 
-AHEAD = torch.linspace(-3.0, 3.0, 31)
+LONGITUDINAL_SIGMAS = torch.linspace(-3.0, 3.0, 31)
 """Speeds along a box that are tried, in standard deviations of what the line leaves open."""
-ASIDE = torch.tensor([-2.0, -4 / 3, -2 / 3, 2 / 3, 4 / 3, 2.0])
+LATERAL_SIGMAS = torch.tensor([-2.0, -4 / 3, -2 / 3, 2 / 3, 4 / 3, 2.0])
 """Speeds across it, likewise: a heading that is off by a few degrees drives a vehicle aside."""
-DRIVES_MPS = 1.0
+MIN_LATERAL_SEARCH_MPS = 1.0
 """Only a box that is faster is asked about them."""
 
 
 @dataclass(frozen=True)
-class TrackConfig:
+class VelocityConfig:
     """Limits, and standard deviations of what they are named for.
 
-    gate_m: a box farther from where it should have been is another. place_m: of a centre from sweep to sweep, beside what the
-    detector says itself of its error. stated_mps: of the velocity that it states. sideways_mps: of motion across a vehicle's
-    length. compared_s: sweeps so old are compared with that of now; trust: what it weighs if no point of an object of many points
-    meets another there, in units of half a squared standard deviation. sure: a vehicle whose velocity is fewer standard deviations
-    from none stands, and so does one below still_mps.
+    gate_m: a box farther from where it should have been is another. sigma_position_m: of a centre from sweep to sweep, beside what
+    the detector says itself of its error. sigma_detected_velocity_mps: of the velocity that it states. sigma_lateral_velocity_mps:
+    of motion across a vehicle's length. point_match_window_s: sweeps so old are compared with that of now; point_match_weight: what
+    it weighs if no point of an object of many points meets another there, in units of half a squared standard deviation.
+    min_z_score: a vehicle whose velocity is fewer standard deviations from none stands, and so does one below still_mps.
     """
 
     gate_m: float = 2.0
-    place_m: float = 0.15
-    stated_mps: float = 3.0
-    sideways_mps: float = 0.2
-    compared_s: tuple[float, float] = (0.15, 0.35)
-    trust: float = 80.0
-    sure: float = 0.7
-    still_mps: float = 0.5
+    sigma_position_m: float = 0.15
+    sigma_detected_velocity_mps: float = 3.0
+    sigma_lateral_velocity_mps: float = 0.2
+    point_match_window_s: tuple[float, float] = (0.15, 0.35)
+    point_match_weight: float = 80.0
+    min_z_score: float = 0.7
+    min_speed_mps: float = 0.5
 
 
-FOLLOWING = TrackConfig()
+DEFAULT_VELOCITY_CONFIG = VelocityConfig()
 """How every agent follows its boxes; chosen on Town07."""
 
 
 @dataclass(frozen=True)
-class Earlier:
+class PastDetections:
     """What the agent saw some seconds ago, in its frame of now: boxes, and (Q, 3) float32 points, none where they are not asked."""
 
     boxes: Boxes
-    seconds_ago: float
+    age_s: float
     points: Tensor | None = None
 
 
-def followed(boxes: Boxes, earlier: Sequence[Earlier], config: TrackConfig, points: Tensor | None = None) -> Tensor:
+def estimate_velocities(
+    boxes: Boxes, past: Sequence[PastDetections], config: VelocityConfig, points: Tensor | None = None
+) -> Tensor:
     """(N, 2) m/s of boxes, in their frame, from where they were earlier, newest first; as stated where a box was not there.
 
     A box and one of an earlier sweep are the same where each is the nearest to where the other should be, within the gate.
@@ -70,100 +72,112 @@ def followed(boxes: Boxes, earlier: Sequence[Earlier], config: TrackConfig, poin
     """
     if not len(boxes):
         return boxes.velocity
-    line = _Line.through(boxes, config)
-    for then in earlier:
+    line = _LineFit.from_boxes(boxes, config)
+    for then in past:
         if len(then.boxes):
-            apart = torch.cdist(line.at(-then.seconds_ago), then.boxes.center[:, :2])
-            nearest = apart.argmin(1)
-            mutual = apart.argmin(0)[nearest] == torch.arange(len(boxes))
-            same = mutual & (apart.gather(1, nearest[:, None])[:, 0] <= config.gate_m)
-            line = line.plus(then.boxes[nearest], -then.seconds_ago, same)
-    known, velocity, there = line.known, line.velocity, line.sums[:, 2] > 0
+            distance = torch.cdist(line.position_at(-then.age_s), then.boxes.center[:, :2])
+            nearest = distance.argmin(1)
+            mutual = distance.argmin(0)[nearest] == torch.arange(len(boxes))
+            same = mutual & (distance.gather(1, nearest[:, None])[:, 0] <= config.gate_m)
+            line = line.add(then.boxes[nearest], -then.age_s, same)
+    information, velocity, associated = line.information, line.velocity, line.sums[:, 2] > 0
     if points is not None:
-        matched = _matched(boxes[there], velocity[there], known[there], earlier, points, config)
-        velocity = velocity.index_put((there,), matched)
-    sure = (velocity[:, None] @ known @ velocity[:, :, None])[:, 0, 0] >= config.sure**2
-    moves = sure & (velocity.norm(dim=1) >= config.still_mps)
-    return torch.where(there[:, None], velocity * moves[:, None], boxes.velocity)
+        matched = _match_points(boxes[associated], velocity[associated], information[associated], past, points, config)
+        velocity = velocity.index_put((associated,), matched)
+    significant = (velocity[:, None] @ information @ velocity[:, :, None])[:, 0, 0] >= config.min_z_score**2
+    moves = significant & (velocity.norm(dim=1) >= config.min_speed_mps)
+    return torch.where(associated[:, None], velocity * moves[:, None], boxes.velocity)
 
 
-def _matched(
-    boxes: Boxes, velocity: Tensor, known: Tensor, earlier: Sequence[Earlier], points: Tensor, config: TrackConfig
+def _match_points(
+    boxes: Boxes,
+    velocity: Tensor,
+    information: Tensor,
+    past: Sequence[PastDetections],
+    points: Tensor,
+    config: VelocityConfig,
 ) -> Tensor:
     """The velocities (N, 2), of those around them, at which sweeps meet best; known as in _Line."""
-    open_to = torch.linalg.inv(known)
-    along = torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
-    across = torch.stack((-along[:, 1], along[:, 0]), 1)
-    long, wide = ((axis[:, None] @ open_to @ axis[:, :, None])[:, 0, 0].sqrt() for axis in (along, across))
-    long = long.clamp_max(config.stated_mps)
+    velocity_covariance = torch.linalg.inv(information)
+    longitudinal = torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
+    lateral = torch.stack((-longitudinal[:, 1], longitudinal[:, 0]), 1)
+    sigma_longitudinal, sigma_lateral = (
+        (axis[:, None] @ velocity_covariance @ axis[:, :, None])[:, 0, 0].sqrt() for axis in (longitudinal, lateral)
+    )
+    sigma_longitudinal = sigma_longitudinal.clamp_max(config.sigma_detected_velocity_mps)
 
-    def best(rows: Tensor, aside: float) -> tuple[Tensor, Tensor]:
+    def search(rows: Tensor, lateral_sigmas: float) -> tuple[Tensor, Tensor]:
         """For some boxes, at one speed across them: the least cost, and its velocity."""
-        some, start = boxes[rows], velocity[rows] + aside * wide[rows, None] * across[rows]
-        cost = (AHEAD**2 + aside**2).to(start.dtype).expand(len(some), -1)
-        for then in earlier:
+        subset, start = boxes[rows], velocity[rows] + lateral_sigmas * sigma_lateral[rows, None] * lateral[rows]
+        cost = (LONGITUDINAL_SIGMAS**2 + lateral_sigmas**2).to(start.dtype).expand(len(subset), -1)
+        for then in past:
             if then.points is not None:
-                t = then.seconds_ago
-                slack = AHEAD[-1] * long[rows] * t
-                missed, asked = meeting_costs(points, then.points, some, start * t, slack, len(AHEAD))
-                cost = cost + config.trust * (asked / MOST)[:, None] * missed
-        least, at = cost.min(1)
-        return least, start + (long[rows] * AHEAD[at])[:, None] * along[rows]
+                t = then.age_s
+                slack = LONGITUDINAL_SIGMAS[-1] * sigma_longitudinal[rows] * t
+                missed, num_compared = compute_alignment_costs(
+                    points, then.points, subset, start * t, slack, len(LONGITUDINAL_SIGMAS)
+                )
+                cost = cost + config.point_match_weight * (num_compared / MAX_POINTS)[:, None] * missed
+        min_cost, at = cost.min(1)
+        return min_cost, start + (sigma_longitudinal[rows] * LONGITUDINAL_SIGMAS[at])[:, None] * longitudinal[rows]
 
-    least, found = best(torch.arange(len(boxes)), 0.0)
-    drives = (found.norm(dim=1) > DRIVES_MPS).nonzero()[:, 0]
+    min_cost, found = search(torch.arange(len(boxes)), 0.0)
+    drives = (found.norm(dim=1) > MIN_LATERAL_SEARCH_MPS).nonzero()[:, 0]
     if len(drives):
-        cost, other = zip((least[drives], found[drives]), *(best(drives, float(aside)) for aside in ASIDE))
+        cost, other = zip(
+            (min_cost[drives], found[drives]),
+            *(search(drives, float(lateral_sigmas)) for lateral_sigmas in LATERAL_SIGMAS),
+        )
         found[drives] = torch.stack(other)[torch.stack(cost).argmin(0), torch.arange(len(drives))]
     return found
 
 
 @dataclass(frozen=True)
-class _Line:
+class _LineFit:
     """N lines through places, as the sums that least squares needs. Seconds from now, metres from where each box is.
 
-    sums: (N, 3), over places, of w, w t, w t^2 with w the inverse variance of a place; moments: (N, 2, 2) of w p, w t p. prior:
-    (N, 2, 2), inverse covariance of the velocity beforehand; pull: (N, 2), it times the mean.
+    sums: (N, 3), over places, of w, w t, w t^2 with w the inverse variance of a place; moments: (N, 2, 2) of w p, w t p.
+    prior_information: (N, 2, 2), inverse covariance of the velocity beforehand; prior_vector: (N, 2), it times the mean.
     """
 
     origin: Tensor
     sums: Tensor
     moments: Tensor
-    prior: Tensor
-    pull: Tensor
-    place_m: float
+    prior_information: Tensor
+    prior_vector: Tensor
+    sigma_position_m: float
 
     @classmethod
-    def through(cls, boxes: Boxes, config: TrackConfig) -> _Line:
+    def from_boxes(cls, boxes: Boxes, config: VelocityConfig) -> _LineFit:
         """Through where the boxes are, with what is known beforehand."""
         n, ahead = len(boxes), torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
-        along = ahead[:, :, None] * ahead[:, None, :]
-        across = torch.eye(2) - along
-        prior = along / config.stated_mps**2 + across / config.sideways_mps**2
-        pull = (along @ boxes.velocity[:, :, None])[..., 0] / config.stated_mps**2
-        empty = cls(boxes.center[:, :2], torch.zeros(n, 3), torch.zeros(n, 2, 2), prior, pull, config.place_m)
-        return empty.plus(boxes, 0.0, torch.ones(n, dtype=torch.bool))
+        longitudinal = ahead[:, :, None] * ahead[:, None, :]
+        lateral = torch.eye(2) - longitudinal
+        prior = longitudinal / config.sigma_detected_velocity_mps**2 + lateral / config.sigma_lateral_velocity_mps**2
+        pull = (longitudinal @ boxes.velocity[:, :, None])[..., 0] / config.sigma_detected_velocity_mps**2
+        empty = cls(boxes.center[:, :2], torch.zeros(n, 3), torch.zeros(n, 2, 2), prior, pull, config.sigma_position_m)
+        return empty.add(boxes, 0.0, torch.ones(n, dtype=torch.bool))
 
-    def plus(self, boxes: Boxes, t: float, same: Tensor) -> _Line:
+    def add(self, boxes: Boxes, t: float, same: Tensor) -> _LineFit:
         """Through one more place each, where the box is the same, (N,) bool."""
-        weight = same / (self.place_m**2 + boxes.sigma_xy**2)
+        weight = same / (self.sigma_position_m**2 + boxes.sigma_xy**2)
         powers = weight[:, None] * torch.tensor([1.0, t, t * t])
         moments = powers[:, :2, None] * (boxes.center[:, :2] - self.origin)[:, None]
         return replace(self, sums=self.sums + powers, moments=self.moments + moments)
 
     @property
-    def known(self) -> Tensor:
+    def information(self) -> Tensor:
         """(N, 2, 2): the inverse covariance of the velocity."""
         w, wt, wtt = self.sums.unbind(1)
-        return self.prior + (wtt - wt * wt / w)[:, None, None] * torch.eye(2)
+        return self.prior_information + (wtt - wt * wt / w)[:, None, None] * torch.eye(2)
 
     @property
     def velocity(self) -> Tensor:
         """(N, 2) m/s."""
         slope = self.moments[:, 1] - self.moments[:, 0] * (self.sums[:, 1] / self.sums[:, 0])[:, None]
-        return torch.linalg.solve(self.known, self.pull + slope)
+        return torch.linalg.solve(self.information, self.prior_vector + slope)
 
-    def at(self, t: float) -> Tensor:
+    def position_at(self, t: float) -> Tensor:
         """(N, 2): where the boxes were."""
         w, wt = self.sums[:, 0, None], self.sums[:, 1, None]
         return self.origin + self.moments[:, 0] / w + self.velocity * (t - wt / w)

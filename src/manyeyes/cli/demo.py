@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.studies.replay_options import Playing, excerpt, weights_name
+from manyeyes.studies.replay_options import ReplayOptions, display_name, make_excerpt
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,9 +38,9 @@ class Options:
     """At most so many judged frames, instead of all."""
     animate: bool = True
     """Draw the animation of the drive."""
-    score_min: float = 0.4
+    min_score: float = 0.4
     """Detections below this score are not drawn; they count all the same."""
-    playing: Playing = field(default_factory=lambda: Playing(channel="its-g5-27"))
+    replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(channel="its-g5-27"))
     """How agents collaborate."""
 
 
@@ -51,35 +51,35 @@ def main(options: Options) -> None:
     from manyeyes.datasets.opv2v import Opv2vRecording
     from manyeyes.models import pretrained
     from manyeyes.simulator.presets import simulate
-    from manyeyes.simulator.record import Progress
-    from manyeyes.studies.replay_report import REPORT, Showing, play
-    from manyeyes.viz.progress import bars
+    from manyeyes.simulator.record import RecordingProgress
+    from manyeyes.studies.replay_report import REPORT, ReportSpec, replay_and_report
+    from manyeyes.viz.progress import make_progress_bars
     from manyeyes.viz.report import save_report
 
     console = Console()
-    replay = options.playing.replay_config(options.seed)
-    detector = pretrained.load(options.playing.weights)
+    replay = options.replay_options.make_replay_config(options.seed)
+    detector = pretrained.load(options.replay_options.weights)
     folder = options.out / "recording" / f"seed-{options.seed}"
-    with bars(console) as progress:
+    with make_progress_bars(console) as progress:
         task = progress.add_task("Simulating", total=None)
 
-        def report_scene(at: Progress) -> None:
+        def report_scene(at: RecordingProgress) -> None:
             progress.update(task, total=at.total, completed=at.done)
 
         simulate(PRESET, folder, options.seed, 1, report_scene, options.towns)
-    drive = excerpt(Opv2vRecording(folder, "test"), None, options.frames)
+    drive = make_excerpt(Opv2vRecording(folder, "test"), None, options.frames)
     town = drive.scenario.rpartition("_")[0]
-    if len(drive.judged(drive.scenario)) == 0:
+    if len(drive.eval_indices(drive.scenario)) == 0:
         raise ConfigError(f"{folder}: the drive has no judged frame; remove the folder and run the demo again.")
-    showing = Showing(
+    spec = ReportSpec(
         out=options.out,
         title="manyeyes demo: one drive, four ways to collaborate",
         lead=f"Simulated in {town}, which the shipped weights never saw. All that passes between agents is bytes.",
-        methods=options.playing.methods,
+        methods=options.replay_options.methods,
         replay=replay,
-        weights=weights_name(options.playing.weights),
+        weights=display_name(options.replay_options.weights),
         animate=options.animate,
-        score_min=options.score_min,
+        min_score=options.min_score,
         facts=(("Town", town),),
         commands=(
             f"manyeyes demo --seed {options.seed}",
@@ -88,28 +88,30 @@ def main(options: Options) -> None:
             f"manyeyes map fuse {options.out / 'map'}",
         ),
     )
-    report, place = play(drive, detector, showing, console), options.out / REPORT
+    report, report_path = replay_and_report(drive, detector, spec, console), options.out / REPORT
     # The report of the detections is on disk before the map begins, so that nothing of it is lost where the map fails.
-    chapters, said = _map(drive, options.out / "map", options.seed, console)
-    save_report(replace(report, chapters=(*chapters, *report.chapters)), place)
-    console.print(f"\n{said}", highlight=False, soft_wrap=True)
-    console.print(f"\nPictures, animation and JSON are in {options.out}; open {place}", highlight=False, soft_wrap=True)
+    chapters, summary = _make_map_chapters(drive, options.out / "map", options.seed, console)
+    save_report(replace(report, chapters=(*chapters, *report.chapters)), report_path)
+    console.print(f"\n{summary}", highlight=False, soft_wrap=True)
+    console.print(
+        f"\nPictures, animation and JSON are in {options.out}; open {report_path}", highlight=False, soft_wrap=True
+    )
 
 
-def _map(drive: Recording, out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
+def _make_map_chapters(drive: Recording, out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
     """The map part, or why there is none: it needs an extra of its own."""
     from manyeyes.datatypes import MissingExtraError
     from manyeyes.models import pretrained
 
     try:
-        from manyeyes.cli.demo_map import drive_map, sentence, small_map
+        from manyeyes.cli.demo_map import describe_crossing_map, map_crossing, map_drive
 
-        if pretrained.MAPPER in pretrained.mappers():
+        if pretrained.DEFAULT_MAP_MODEL in pretrained.list_map_models():
             with console.status("Mapping the drive"):
-                said, chapter = drive_map(drive, pretrained.load_mapper(), out, seed)
-            return (chapter,), said
+                summary, chapter = map_drive(drive, pretrained.load_map_model(), out, seed)
+            return (chapter,), summary
         with console.status("Mapping a crossroads"):
-            numbers, chapter = small_map(out, seed)
+            stats, chapter = map_crossing(out, seed)
     except MissingExtraError as error:
         return (), f"No map: {error}"
-    return (chapter,), sentence(numbers)
+    return (chapter,), describe_crossing_map(stats)

@@ -11,107 +11,122 @@ from numpy.typing import NDArray
 
 from manyeyes.datasets.base import Recording
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.maps.experiment import Scene, Trial, carry_out
-from manyeyes.evaluation.maps.metrics import MapQuality, judge
-from manyeyes.evaluation.maps.registry import OURS, make_map, map_of, tuned
+from manyeyes.evaluation.maps.experiment import FleetExperiment, FleetTrial, run_trial
+from manyeyes.evaluation.maps.metrics import MapMetrics, evaluate_map
+from manyeyes.evaluation.maps.registry import OURS, fuse_experiment, fuse_observations, make_tuned_settings
 from manyeyes.maps.elements.observation import Observation
-from manyeyes.maps.fusion.pose_optimization import Alignment, solve_poses
-from manyeyes.models.maps.map_model import Mapper
+from manyeyes.maps.fusion.pose_optimization import PoseSolution, solve_poses
+from manyeyes.models.maps.map_model import MapModel
 from manyeyes.simulator.fleet.config import crowd_config
 from manyeyes.studies.map_folder import MapFolder, write_vector_map
-from manyeyes.studies.map_pipeline import Building, Numbers, build_map, write_built
-from manyeyes.studies.town_maps import grounds_of
-from manyeyes.viz.map_figures import Panel, misalignment, save_figure
-from manyeyes.viz.map_page import page_of, save_map_page
-from manyeyes.viz.report import Chapter, Picture
+from manyeyes.studies.map_pipeline import MapBuildConfig, MapBuildStats, build_map, write_built_map
+from manyeyes.studies.town_maps import group_by_town
+from manyeyes.viz.map_figures import MapPanel, compute_misalignment, save_figure
+from manyeyes.viz.map_page import make_page, save_map_page
+from manyeyes.viz.report import Chapter, ReportImage
 
 Floats = NDArray[np.float64]
-PLACE, OBSERVATIONS, SIZE_M, NEAR_M = "cross", 60, 160.0, 15.0
-EVERY = 10
+PLACE, NUM_OBSERVATIONS, SIZE_M, MAX_PAIR_DISTANCE_M = "cross", 60, 160.0, 15.0
+FRAME_STRIDE = 10
 """Agents of the demo's drive draw a map once a second."""
 
 
-def drive_map(recording: Recording, mapper: Mapper, out: Path, seed: int = 0) -> tuple[str, Chapter]:
+def map_drive(recording: Recording, map_model: MapModel, out: Path, seed: int = 0) -> tuple[str, Chapter]:
     """The map of a drive of one scenario, from its agents' sensors by a map model, under out: in one line, and as a chapter."""
-    (ground,) = grounds_of(recording, recording.scenarios[:1], "drive")
-    built = build_map(recording, ground, Building(mapper, "semi-global", EVERY, seed=seed))
-    write_built(built, out, "One drive, one map")
-    said = drive_sentence(built.numbers)
+    (town_map,) = group_by_town(recording, recording.scenarios[:1], "drive")
+    built = build_map(recording, town_map, MapBuildConfig(map_model, "semi-global", FRAME_STRIDE, seed=seed))
+    write_built_map(built, out, "One drive, one map")
+    summary = describe_drive_map(built.stats)
     text = (
-        f"{said} Each agent draws a tile of 120 m by 60 m about itself from its own sensors and from the tokens that the others "
+        f"{summary} Each agent draws a tile of 120 m by 60 m about itself from its own sensors and from the tokens that the others "
         "send, and sends its lines; they are fused where several agree. The truth is pale. map/map.html beside this file has it as "
         "a web page with layers."
     )
-    picture = Picture(out / "map.png", "What all agents drew, and what is fused of it", wide=True)
-    return said, Chapter("One drive, one map", text, (picture,))
+    picture = ReportImage(out / "map.png", "What all agents drew, and what is fused of it", wide=True)
+    return summary, Chapter("One drive, one map", text, (picture,))
 
 
-def drive_sentence(n: Numbers) -> str:
+def describe_drive_map(stats: MapBuildStats) -> str:
     """The map of a drive in one line."""
-    judged = (
+    scores = (
         ""
-        if n.quality is None or n.union is None
+        if stats.scores is None or stats.union_scores is None
         else (
-            f" mAP {n.quality.mean_ap():.2f}, F of dividers at 0.5 m {n.quality.f('divider'):.2f}; "
-            f"all that was drawn, unfused, has {n.union.mean_ap():.2f} and {n.union.f('divider'):.2f}."
+            f" mAP {stats.scores.mean_ap():.2f}, F of dividers at 0.5 m {stats.scores.f1('divider'):.2f}; "
+            f"all that was drawn, unfused, has {stats.union_scores.mean_ap():.2f} and {stats.union_scores.f1('divider'):.2f}."
         )
     )
-    return f"One map from {n.messages} messages of {n.bytes_per_message:,.0f} bytes, drawn from sensors:{judged or ' not judged.'}"
+    return (
+        f"One map from {stats.num_messages} messages of {stats.bytes_per_message:,.0f} bytes, drawn from "
+        f"sensors:{scores or ' not judged.'}"
+    )
 
 
 @dataclass(frozen=True)
-class SmallMap:
+class DemoMapStats:
     """What the demo's map is worth: judged against the truth, beside the union of all observations."""
 
-    observations: int
-    elements: int
-    fused: MapQuality
-    union: MapQuality
+    num_observations: int
+    num_elements: int
+    fused: MapMetrics
+    union: MapMetrics
 
 
-def small_map(out: Path, seed: int = 0) -> tuple[SmallMap, Chapter]:
+def map_crossing(out: Path, seed: int = 0) -> tuple[DemoMapStats, Chapter]:
     """Simulates, fuses, judges and draws under out; the numbers, and a chapter for the report."""
-    scene = carry_out(Trial(PLACE, OBSERVATIONS, seed, SIZE_M, crowd=crowd_config("local")))
-    settings = tuned()
-    made = map_of(OURS, scene.observations, settings, scene.place.frame)
-    shown, union = scene.cut(made.published().elements), scene.cut(make_map("union", scene, settings))
-    numbers = SmallMap(len(scene.observations), len(shown), judge(shown, scene.truth), judge(union, scene.truth))
-    MapFolder(out).write(scene)
-    write_vector_map(made, out / "map")
-    observed = MapElements.cat([o.in_map() for o in scene.observations])
-    page = page_of("One map from many drives", made, scene.truth, observed, len(scene.observations), shown)
+    experiment = run_trial(FleetTrial(PLACE, NUM_OBSERVATIONS, seed, SIZE_M, fleet_config=crowd_config("local")))
+    settings = make_tuned_settings()
+    fused = fuse_observations(OURS, experiment.observations, settings, experiment.place.frame)
+    evaluated, union = (
+        experiment.cut_policy(fused.select_published().elements),
+        experiment.cut_policy(fuse_experiment("union", experiment, settings)),
+    )
+    stats = DemoMapStats(
+        len(experiment.observations),
+        len(evaluated),
+        evaluate_map(evaluated, experiment.truth),
+        evaluate_map(union, experiment.truth),
+    )
+    MapFolder(out).write(experiment)
+    write_vector_map(fused, out / "map")
+    observed = MapElements.cat([o.elements_in_map() for o in experiment.observations])
+    page = make_page(
+        "One map from many drives", fused, experiment.truth, observed, len(experiment.observations), evaluated
+    )
     save_map_page(page, out / "map.html")
     save_figure(
-        _two_observations(scene, solve_poses(scene.observations, settings.ours.align)), out / "misalignment.png"
+        _make_pair_panels(experiment, solve_poses(experiment.observations, settings.ours.pose_solver)),
+        out / "misalignment.png",
     )
-    area = scene.place.area
+    area = experiment.place.area
     panels = [
-        Panel(f"What {len(scene.observations)} observations say", observed, scene.truth, area=area),
-        Panel("Fused map, truth behind it", shown, scene.truth, area=area),
+        MapPanel(f"What {len(experiment.observations)} observations say", observed, experiment.truth, area=area),
+        MapPanel("Fused map, truth behind it", evaluated, experiment.truth, area=area),
     ]
     save_figure(panels, out / "map.png")
-    return numbers, _chapter(numbers, out)
+    return stats, _make_chapter(stats, out)
 
 
-def sentence(numbers: SmallMap) -> str:
+def describe_crossing_map(stats: DemoMapStats) -> str:
     """The map in one line."""
-    ours, union = numbers.fused, numbers.union
+    ours, union = stats.fused, stats.union
     return (
-        f"One map from {numbers.observations} local maps of a crossroads: mAP {ours.mean_ap():.2f}, "
-        f"F of dividers at 0.5 m {ours.length('divider').f:.2f}; "
-        f"their union has {union.mean_ap():.2f} and {union.length('divider').f:.2f}."
+        f"One map from {stats.num_observations} local maps of a crossroads: mAP {ours.mean_ap():.2f}, "
+        f"F of dividers at 0.5 m {ours.get_length_score('divider').f1:.2f}; "
+        f"their union has {union.mean_ap():.2f} and {union.get_length_score('divider').f1:.2f}."
     )
 
 
-def _chapter(numbers: SmallMap, out: Path) -> Chapter:
+def _make_chapter(stats: DemoMapStats, out: Path) -> Chapter:
     return Chapter(
         "One map from many drives",
-        f"{sentence(numbers)} Every local map is displaced, bent, cut, incomplete and partly invented, as those of real models "
+        f"{describe_crossing_map(stats)} Every local map is displaced, bent, cut, incomplete and partly invented, "
+        "as those of real models "
         "are; each one's pose is corrected once, then lines are fused where several agree. The truth is pale. map/map.html "
         "beside this file has it as a web page with layers.",
         (
-            Picture(out / "map.png", "All observations, and what is fused of them", wide=True),
-            Picture(
+            ReportImage(out / "map.png", "All observations, and what is fused of them", wide=True),
+            ReportImage(
                 out / "misalignment.png",
                 "Two observations as claimed, and after correction; arrows: misalignment",
                 wide=True,
@@ -120,30 +135,30 @@ def _chapter(numbers: SmallMap, out: Path) -> Chapter:
     )
 
 
-def _two_observations(scene: Scene, alignment: Alignment) -> list[Panel]:
+def _make_pair_panels(experiment: FleetExperiment, solution: PoseSolution) -> list[MapPanel]:
     """The two neighbouring observations that disagree most, before and after."""
-    before, after = _most_misaligned(scene.observations)
-    rows = alignment.rows([before.id, after.id])
+    before, after = _find_most_different_pair(experiment.observations)
+    rows = solution.row_indices([before.id, after.id])
     panels = []
     for title, poses in (
         ("As claimed", (before.pose, after.pose)),
-        ("After one correction an observation", alignment.pose[rows]),
+        ("After one correction an observation", solution.pose[rows]),
     ):
-        one, two = before.in_map(poses[0]), after.in_map(poses[1])
-        arrows = misalignment(two, one)
+        one, two = before.elements_in_map(poses[0]), after.elements_in_map(poses[1])
+        arrows = compute_misalignment(two, one)
         mean = float(np.hypot(arrows[:, 2], arrows[:, 3]).mean()) if len(arrows) else 0.0
-        panels.append(Panel(f"{title}: {mean:.2f} m apart on average", two, one, arrows))
+        panels.append(MapPanel(f"{title}: {mean:.2f} m apart on average", two, one, arrows))
     return panels
 
 
-def _most_misaligned(observations: tuple[Observation, ...]) -> tuple[Observation, Observation]:
+def _find_most_different_pair(observations: tuple[Observation, ...]) -> tuple[Observation, Observation]:
     """Of different agents, at most 15 m apart: the pair with the longest arrows in sum."""
-    best, found = -1.0, (observations[0], observations[-1])
+    best, pair = -1.0, (observations[0], observations[-1])
     for i, one in enumerate(observations):
         for two in observations[i + 1 :]:
-            if one.agent != two.agent and np.hypot(*(one.pose - two.pose)[:2]) <= NEAR_M:
-                arrows = misalignment(two.in_map(), one.in_map())
+            if one.agent != two.agent and np.hypot(*(one.pose - two.pose)[:2]) <= MAX_PAIR_DISTANCE_M:
+                arrows = compute_misalignment(two.elements_in_map(), one.elements_in_map())
                 total = float(np.hypot(arrows[:, 2], arrows[:, 3]).sum())
                 if total > best:
-                    best, found = total, (one, two)
-    return found
+                    best, pair = total, (one, two)
+    return pair

@@ -79,7 +79,7 @@ def diagnose(towns: Path | None = None) -> Diagnosis:
 
     found = find_towns(towns)
     return Diagnosis(
-        provenance.versions(),
+        provenance.installed_versions(),
         provenance.git_commit(),
         platform.platform(),
         provenance.cpu_name(),
@@ -98,10 +98,10 @@ def shipped_weights() -> tuple[Weights, ...]:
     """The weights inside the package, each loaded strictly."""
     from manyeyes.models import pretrained
 
-    return tuple(Weights(name, pretrained.load(name).fingerprint.hex()) for name in pretrained.names())
+    return tuple(Weights(name, pretrained.load(name).fingerprint.hex()) for name in pretrained.list_detectors())
 
 
-def find_towns(place: Path | None = None) -> tuple[tuple[str, ...], str]:
+def find_towns(folder: Path | None = None) -> tuple[tuple[str, ...], str]:
     """The CARLA towns that can be read, and where they lie; no town, and what to do, when there is none."""
     from manyeyes.simulator.scene.towns import TOWNS, find_town
 
@@ -110,7 +110,7 @@ def find_towns(place: Path | None = None) -> tuple[tuple[str, ...], str]:
     remedy = ""
     for town in TOWNS:
         try:
-            source = find_town(town, place)
+            source = find_town(town, folder)
         except ConfigError as error:
             remedy = str(error)
             continue
@@ -123,7 +123,7 @@ def main(options: Options) -> None:
     """The verb."""
     diagnosis = diagnose(options.towns)
     if options.json:
-        sys.stdout.write(json.dumps(provenance.plain(diagnosis), indent=2) + "\n")
+        sys.stdout.write(json.dumps(provenance.to_plain(diagnosis), indent=2) + "\n")
         return
     Console().print(_table(diagnosis))
 

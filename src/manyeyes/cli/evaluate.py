@@ -14,7 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from manyeyes.studies.options import Options
-from manyeyes.studies.replay_options import excerpt, weights_name
+from manyeyes.studies.replay_options import display_name, make_excerpt
 
 if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
@@ -29,70 +29,74 @@ def main(options: Options) -> None:
 
     from manyeyes._io import atomic_write_text
     from manyeyes.datasets.perturbation import PoseNoise
-    from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, benchmark, judging_protocol
+    from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, resolve_protocol, run_benchmark
     from manyeyes.models import pretrained
     from manyeyes.studies import provenance
-    from manyeyes.studies.recordings import check_files, open_recording, suited_to
-    from manyeyes.viz.progress import bars
-    from manyeyes.viz.results import outcome_of, show
-    from manyeyes.viz.table import DIFFERENCE_HEADINGS, difference_cells, markdown, markdown_lines
+    from manyeyes.studies.recordings import adapt_to_dataset, check_files, open_recording
+    from manyeyes.viz.progress import make_progress_bars
+    from manyeyes.viz.results import print_comparison, summarize_comparison
+    from manyeyes.viz.table import DIFFERENCE_HEADINGS, format_difference_cells, format_markdown, format_markdown_lines
 
     console = Console()
     if options.study is not None:
-        from manyeyes.studies import study
+        from manyeyes.studies import run_named_study
 
-        study(options, console)
+        run_named_study(options, console)
         return
-    disturbed = options.noise_xy_m > 0 or options.noise_yaw_deg > 0
+    has_pose_noise = options.noise_xy_m > 0 or options.noise_yaw_deg > 0
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
     config = BenchmarkConfig(
-        weights=options.playing.weights,
-        methods=options.playing.methods,
+        weights=options.replay_options.weights,
+        methods=options.replay_options.methods,
         protocol=options.protocol,
-        replay=options.playing.replay_config(options.seed, options.all_egos),
-        noise=noise if disturbed else None,
-        every=options.every,
+        replay=options.replay_options.make_replay_config(options.seed, options.all_egos),
+        pose_noise=noise if has_pose_noise else None,
+        frame_stride=options.frame_stride,
     )
-    protocol, detector = judging_protocol(config), pretrained.load(config.weights)
+    protocol, detector = resolve_protocol(config), pretrained.load(config.weights)
     opener = partial(open_recording, options.data, options.split)
     recording = opener()
-    config = replace(config, replay=suited_to(config.replay, options.playing, recording))
+    config = replace(config, replay=adapt_to_dataset(config.replay, options.replay_options, recording))
     missing = check_files(recording, options.checks, console)
-    with bars(console) as progress:
+    with make_progress_bars(console) as progress:
         task = progress.add_task("Judging", total=len(recording.scenarios))
-        results = benchmark(opener, config, options.workers, lambda done, total: progress.update(task, completed=done))
-    timed = [_timed(r, recording, detector, config.replay, options.timed_frames) for r in results]
-    outcome = outcome_of(timed, protocol, missing)
-    where = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
-    title = f"{weights_name(config.weights)} on {where}: {len(recording.scenarios)} scenarios, {protocol.name}"
-    show(console, outcome, title)
+        results = run_benchmark(
+            opener, config, options.workers, lambda done, total: progress.update(task, completed=done)
+        )
+    timed_results = [_measure_times(r, recording, detector, config.replay, options.timing_frames) for r in results]
+    comparison = summarize_comparison(timed_results, protocol, missing)
+    data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
+    title = f"{display_name(config.weights)} on {data_name}: {len(recording.scenarios)} scenarios, {protocol.name}"
+    print_comparison(console, comparison, title)
     provenance.write_json(
-        options.out / "results.json", outcome, {"options": options, "benchmark": config}, options.seed
+        options.out / "results.json", comparison, {"options": options, "benchmark": config}, options.seed
     )
-    text = f"{title}\n\n{markdown(outcome.rows)}"
-    if outcome.differences:
-        text += "\n" + markdown_lines([DIFFERENCE_HEADINGS, *map(difference_cells, outcome.differences)])
-    if outcome.footer:
-        text += f"\n{outcome.footer}\n"
+    text = f"{title}\n\n{format_markdown(comparison.rows)}"
+    if comparison.differences:
+        text += "\n" + format_markdown_lines(
+            [DIFFERENCE_HEADINGS, *map(format_difference_cells, comparison.differences)]
+        )
+    if comparison.footer:
+        text += f"\n{comparison.footer}\n"
     atomic_write_text(options.out / "results.md", text)
     console.print(
         f"\nNumbers, configuration and versions are in {options.out / 'results.json'}", highlight=False, soft_wrap=True
     )
 
 
-def _timed(
-    result: MethodResult, recording: Recording, detector: Detector, config: ReplayConfig, frames: int
+def _measure_times(
+    result: MethodResult, recording: Recording, detector: Detector, config: ReplayConfig, num_frames: int
 ) -> MethodResult:
     """The result with times of the method alone: while judging, methods look at each cloud once between them."""
     from manyeyes.agents.replay import replay
 
-    if frames == 0:
+    if num_frames == 0:
         return replace(result, share_ms=math.nan, perceive_ms=math.nan)
-    part = excerpt(recording, None, frames)
+    part = make_excerpt(recording, None, num_frames)
     steps = list(replay(part, part.scenario, detector, [result.method], config))
-    share = [s.seconds for step in steps[1:] for s in step.sent if s.packets]
-    perceive = [step.perceive_seconds for step in steps[1:]]
-    return replace(result, share_ms=_mean_ms(share), perceive_ms=_mean_ms(perceive))
+    share_s = [s.seconds for step in steps[1:] for s in step.sent if s.num_packets]
+    perceive_s = [step.perceive_seconds for step in steps[1:]]
+    return replace(result, share_ms=_mean_ms(share_s), perceive_ms=_mean_ms(perceive_s))
 
 
 def _mean_ms(seconds: list[float]) -> float:

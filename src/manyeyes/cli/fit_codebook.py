@@ -23,7 +23,7 @@ class Options:
     """Which split of a dataset: a folder inside it."""
     stages: int = 4
     """Bytes for the features of a token."""
-    every: int = 10
+    frame_stride: int = 10
     """Of how many judged frames one is looked at."""
     seed: int = 0
     """Of the first centres."""
@@ -40,7 +40,7 @@ def main(options: Options) -> None:
     from manyeyes.models.detector.codebook import CodebookConfig
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import check_files, open_recording
-    from manyeyes.training.detector.codebook import fit
+    from manyeyes.training.detector.codebook import fit_codebook
 
     torch.set_num_threads(1)
     detector, card = checkpoint.load(options.weights), checkpoint.read_card(options.weights)
@@ -55,11 +55,18 @@ def main(options: Options) -> None:
             tokens = count
             status.update(f"{count:,} tokens")
 
-        fitted = fit(detector, recording, options.seed, CodebookConfig(options.stages), options.every, report)
-    origin = provenance.provenance({"options": options}, options.seed)
-    made = {"command": origin["command"], "seed": options.seed, "tokens": tokens, "git_commit": origin["git_commit"]}
-    made["missing"] = provenance.plain(missing)
-    checkpoint.save(fitted, options.out, card | {"codebook": made}, half)
+        fitted = fit_codebook(
+            detector, recording, options.seed, CodebookConfig(options.stages), options.frame_stride, report
+        )
+    origin = provenance.collect_provenance({"options": options}, options.seed)
+    codebook_card = {
+        "command": origin["command"],
+        "seed": options.seed,
+        "tokens": tokens,
+        "git_commit": origin["git_commit"],
+    }
+    codebook_card["missing"] = provenance.to_plain(missing)
+    checkpoint.save(fitted, options.out, card | {"codebook": codebook_card}, half)
     width = fitted.codebook.width if fitted.codebook else 0
     console.print(
         f"{options.out}: a token is {width} bytes before entropy coding, fitted to {tokens:,}", soft_wrap=True

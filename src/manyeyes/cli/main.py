@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from manyeyes import __version__
 
-VERBS = {
+COMMANDS = {
     "demo": "make a drive, share bytes, perceive, judge: table, pictures, animation, report",
     "simulate": "make scenes from a seed, in OPV2V's layout",
     "train": "train a detector on a recording",
@@ -22,7 +22,7 @@ VERBS = {
     "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",
     "doctor": "print what a bug report needs",
 }
-GROUPS = {
+COMMAND_GROUPS = {
     "map": {
         "build": "a recording's sensors become elements, messages, and one map",
         "simulate": "send a crowd through a place: observations and truth from a seed",
@@ -37,37 +37,41 @@ GROUPS = {
 }
 MODULES = {"run": "replay", "align": "pose", "quantise": "fit_codebook", "map import": "map import_predictions"}
 """The modules of verbs that are called otherwise."""
-INTERRUPTED = 130
+INTERRUPTED_EXIT_CODE = 130
 
 
-def help_text(group: str = "") -> str:
+def make_help_text(group: str = "") -> str:
     """What ``manyeyes --help`` prints, or the help of a group of verbs."""
-    table, prog = (GROUPS[group], f"manyeyes {group}") if group else (VERBS, "manyeyes")
+    table, prog = (COMMAND_GROUPS[group], f"manyeyes {group}") if group else (COMMANDS, "manyeyes")
     width = max(map(len, table)) + 2
-    verbs = "\n".join(f"  {verb.ljust(width)}{what}" for verb, what in table.items())
+    command_lines = "\n".join(f"  {command.ljust(width)}{what}" for command, what in table.items())
     about = (
-        f"manyeyes {group}: {VERBS[group]}."
+        f"manyeyes {group}: {COMMANDS[group]}."
         if group
         else "manyeyes: many agents, each with its own eyes and few bytes to say what it sees."
     )
     return (
-        f"{about}\n\nusage: {prog} VERB [options]\n\n{verbs}\n\n"
+        f"{about}\n\nusage: {prog} VERB [options]\n\n{command_lines}\n\n"
         f"{prog} VERB --help lists the options of a verb; manyeyes --version prints the version.\n"
     )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one verb; the exit code is 0, 1 for a designed error, 2 for wrong arguments, 130 after Ctrl-C."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    if not words or words[0] in ("-h", "--help", "help"):
-        sys.stdout.write(help_text())
+    argument_list = list(sys.argv[1:] if arguments is None else arguments)
+    if not argument_list or argument_list[0] in ("-h", "--help", "help"):
+        sys.stdout.write(make_help_text())
         return 0
-    if words[0] in ("-V", "--version"):
+    if argument_list[0] in ("-V", "--version"):
         sys.stdout.write(f"manyeyes {__version__}\n")
         return 0
-    if words[0] in GROUPS:
-        return _group(words[0], words[1:])
-    return _run(words[0], words[1:]) if words[0] in VERBS else _unknown(words[0], VERBS)
+    if argument_list[0] in COMMAND_GROUPS:
+        return _run_group(argument_list[0], argument_list[1:])
+    return (
+        _run_command(argument_list[0], argument_list[1:])
+        if argument_list[0] in COMMANDS
+        else _report_unknown(argument_list[0], COMMANDS)
+    )
 
 
 def module_of(verb: str) -> str:
@@ -75,42 +79,46 @@ def module_of(verb: str) -> str:
     return f"manyeyes.cli.{MODULES.get(verb, verb).replace(' ', '.')}"
 
 
-def _group(group: str, words: Sequence[str]) -> int:
+def _run_group(group: str, arguments: Sequence[str]) -> int:
     """A verb of a group, such as ``map fuse``, lives in the module ``map.fuse``."""
-    if not words or words[0] in ("-h", "--help", "help"):
-        sys.stdout.write(help_text(group))
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        sys.stdout.write(make_help_text(group))
         return 0
-    known = GROUPS[group]
-    return _run(f"{group} {words[0]}", words[1:]) if words[0] in known else _unknown(words[0], known)
+    known = COMMAND_GROUPS[group]
+    return (
+        _run_command(f"{group} {arguments[0]}", arguments[1:])
+        if arguments[0] in known
+        else _report_unknown(arguments[0], known)
+    )
 
 
-def _unknown(word: str, known: Iterable[str]) -> int:
+def _report_unknown(word: str, known: Iterable[str]) -> int:
     close = difflib.get_close_matches(word, known, 1)
     hint = f"did you mean {close[0]}? " if close else ""
     return _fail(f"there is no verb {word!r}; {hint}Known verbs: {', '.join(known)}.", 2)
 
 
-def _run(verb: str, words: Sequence[str]) -> int:
+def _run_command(command: str, arguments: Sequence[str]) -> int:
     try:
         import tyro
 
         from manyeyes.datatypes.errors import ManyeyesError
 
-        module = importlib.import_module(module_of(verb))
+        module = importlib.import_module(module_of(command))
     except KeyboardInterrupt:
-        return _fail("stopped.", INTERRUPTED)
+        return _fail("stopped.", INTERRUPTED_EXIT_CODE)
     try:
         # Options of a nested dataclass keep their short names: --channel, not --playing.channel.
-        looks = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-        prog, about = f"manyeyes {verb}", module.__doc__
-        module.main(tyro.cli(module.Options, args=list(words), prog=prog, description=about, config=looks))
+        tyro_config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
+        prog, about = f"manyeyes {command}", module.__doc__
+        module.main(tyro.cli(module.Options, args=list(arguments), prog=prog, description=about, config=tyro_config))
     except ManyeyesError as error:
         return _fail(" ".join(str(error).split()), 1)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _fail(f"{where}{error.strerror or error}", 1)
     except KeyboardInterrupt:
-        return _fail("stopped.", INTERRUPTED)
+        return _fail("stopped.", INTERRUPTED_EXIT_CODE)
     return 0
 
 

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from manyeyes.studies.replay_options import FileChecks, excerpt, weights_name
+from manyeyes.studies.replay_options import FileChecks, display_name, make_excerpt
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from manyeyes.agents.perception_cache import Eyes
+    from manyeyes.agents.perception_cache import PerceptionCache
     from manyeyes.datasets.perturbation import PoseNoise
     from manyeyes.datatypes import Snapshot
-    from manyeyes.evaluation.pose.metrics import PoseFrame, PoseScore
-    from manyeyes.pose.pose_monitor import Report
-    from manyeyes.pose.types import PoseClaim, PoseEstimate
+    from manyeyes.evaluation.pose.metrics import PoseEvaluation, PoseScore
+    from manyeyes.pose.pose_monitor import PoseReport
+    from manyeyes.pose.types import PoseEstimate, PosePrior
     from manyeyes.studies.replay_options import Excerpt
 
 
@@ -44,9 +44,9 @@ class Options:
     """Standard deviation of errors of collaborators' claimed positions."""
     noise_yaw_deg: float = 0.0
     """Standard deviation of errors of collaborators' claimed headings, degrees."""
-    unknown: bool = False
+    no_prior: bool = False
     """Claim nothing: correctors get no pose to start from."""
-    score_min: float = 0.3
+    min_score: float = 0.3
     """Detections below this score are no landmarks."""
     weights: str = "costr-small"
     """Shipped weights by name, or a .safetensors file of 'manyeyes train'."""
@@ -59,61 +59,63 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Found:
-    """One corrector's answer about one agent in one frame; landmarks: how many each has, or points where clouds are compared;
+class CorrectorResult:
+    """One corrector's answer about one agent in one frame; num_landmarks: how many each has, or points where clouds are compared;
     judged is None where the recording has no truth.
     """
 
     frame: int
     time_s: float
-    agent: int
+    agent_id: int
     corrector: str
-    landmarks: tuple[int, int]
-    claimed: PoseClaim | None
+    num_landmarks: tuple[int, int]
+    prior: PosePrior | None
     estimate: PoseEstimate
-    judged: PoseFrame | None
+    evaluation: PoseEvaluation | None
 
 
 def main(options: Options) -> None:
     """The verb."""
     from rich.console import Console
 
-    from manyeyes.agents.perception_cache import Eyes
+    from manyeyes.agents.perception_cache import PerceptionCache
     from manyeyes.datasets.perturbation import PoseNoise
-    from manyeyes.evaluation.pose.metrics import score
+    from manyeyes.evaluation.pose.metrics import summarize_evaluations
     from manyeyes.models import pretrained
-    from manyeyes.pose.registry import CLOUDS, corrector
+    from manyeyes.pose.registry import CLOUD_CORRECTORS, load_corrector
     from manyeyes.studies import provenance
-    from manyeyes.studies.recordings import check_files, open_recording, played_scenarios
+    from manyeyes.studies.recordings import check_files, open_recording, select_checked_scenarios
     from manyeyes.viz.table import missing_footer
 
     console = Console()
     for name in options.correctors:
-        if name not in CLOUDS:
-            corrector(name)
+        if name not in CLOUD_CORRECTORS:
+            load_corrector(name)
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
     recording = open_recording(options.recording, options.split)
-    drive = excerpt(recording, options.scenario, options.frames)
-    played = played_scenarios(recording, drive.scenario, options.scenario)
-    missing = check_files(recording, options.checks, console, played)
-    eyes = Eyes(pretrained.load(options.weights))
-    found = list(_answers(drive, eyes, options, noise))
-    judged = {name: [f.judged for f in found if f.corrector == name and f.judged] for name in options.correctors}
-    scores = {name: score(frames) for name, frames in judged.items() if frames}
+    drive = make_excerpt(recording, options.scenario, options.frames)
+    scenarios = select_checked_scenarios(recording, drive.scenario, options.scenario)
+    missing = check_files(recording, options.checks, console, scenarios)
+    cache = PerceptionCache(pretrained.load(options.weights))
+    results = list(_run_correctors(drive, cache, options, noise))
+    evaluations = {
+        name: [f.evaluation for f in results if f.corrector == name and f.evaluation] for name in options.correctors
+    }
+    scores = {name: summarize_evaluations(frames) for name, frames in evaluations.items() if frames}
     if scores:
-        title = f"{weights_name(options.weights)} on {drive.scenario}: {len(found) // len(options.correctors)} pairs of agents"
-        console.print(_table(scores, title))
+        title = f"{display_name(options.weights)} on {drive.scenario}: {len(results) // len(options.correctors)} pairs of agents"
+        console.print(_make_table(scores, title))
     if missing.count:
         console.print(missing_footer(missing.count, "align.json"), highlight=False, soft_wrap=True)
-    health = watched([f for f in found if f.corrector == "vote"])
+    health = run_pose_monitor([f for f in results if f.corrector == "vote"])
     for agent, report in health.items():
-        console.print(f"agent {agent}: {report.health.value} over {report.frames} frames", highlight=False)
+        console.print(f"agent {agent}: {report.health.value} over {report.num_frames} frames", highlight=False)
     provenance.write_json(
         options.out / "align.json",
         {
             "scores": {name: asdict(s) for name, s in scores.items()},
             "health": {str(agent): report.health.value for agent, report in health.items()},
-            "answers": [_plain(f) for f in found],
+            "answers": [_to_json(f) for f in results],
             "missing": missing,
         },
         {"options": options},
@@ -122,34 +124,41 @@ def main(options: Options) -> None:
     console.print(f"\nEvery answer is in {options.out / 'align.json'}", highlight=False, soft_wrap=True)
 
 
-def _answers(drive: Excerpt, eyes: Eyes, options: Options, noise: PoseNoise) -> Iterator[Found]:
+def _run_correctors(
+    drive: Excerpt, cache: PerceptionCache, options: Options, noise: PoseNoise
+) -> Iterator[CorrectorResult]:
     """Every corrector's answer about every collaborator in every judged frame."""
-    from manyeyes.agents.pose_correction import Aligner
-    from manyeyes.pose.registry import CLOUDS, corrector
-    from manyeyes.pose.types import PoseClaim
+    from manyeyes.agents.pose_correction import PoseCorrection
+    from manyeyes.pose.registry import CLOUD_CORRECTORS, load_corrector
+    from manyeyes.pose.types import PosePrior
 
     names = options.correctors
-    aligners = {name: Aligner(name, options.score_min) for name in names if name not in CLOUDS}
-    correctors: dict[str, Any] = {name: CLOUDS[name] if name in CLOUDS else corrector(name) for name in names}
-    for index in drive.judged(drive.scenario):
+    aligners = {name: PoseCorrection(name, options.min_score) for name in names if name not in CLOUD_CORRECTORS}
+    correctors: dict[str, Any] = {
+        name: CLOUD_CORRECTORS[name] if name in CLOUD_CORRECTORS else load_corrector(name) for name in names
+    }
+    for index in drive.eval_indices(drive.scenario):
         snapshot = drive.snapshot(drive.scenario, index)
-        told = noise.apply(snapshot, 0)
-        seen: dict[str, list[Any]] = {
-            name: [aligners[name].own_landmarks(f, eyes) if name in aligners else f.points for f in snapshot.frames]
+        perturbed = noise.apply(snapshot, 0)
+        inputs: dict[str, list[Any]] = {
+            name: [
+                aligners[name].extract_own_landmarks(f, cache) if name in aligners else f.points
+                for f in snapshot.frames
+            ]
             for name in names
         }
-        for row in range(1, len(told.frames)):
-            claimed = None if options.unknown else PoseClaim.between(told.frames[0], told.frames[row])
-            for name, views in seen.items():
-                said = correctors[name](views[0], views[row], claimed)
-                counts, other = (len(views[0]), len(views[row])), told.frames[row]
-                judged, time_s = _judged(said, snapshot, row), other.timestamp_ns * 1e-9
-                yield Found(index, time_s, other.agent_id, name, counts, claimed, said, judged)
+        for row in range(1, len(perturbed.frames)):
+            prior = None if options.no_prior else PosePrior.between(perturbed.frames[0], perturbed.frames[row])
+            for name, agent_inputs in inputs.items():
+                estimate = correctors[name](agent_inputs[0], agent_inputs[row], prior)
+                counts, other = (len(agent_inputs[0]), len(agent_inputs[row])), perturbed.frames[row]
+                evaluation, time_s = _evaluate(estimate, snapshot, row), other.timestamp_ns * 1e-9
+                yield CorrectorResult(index, time_s, other.agent_id, name, counts, prior, estimate, evaluation)
 
 
-def _judged(said: PoseEstimate, snapshot: Snapshot, row: int) -> PoseFrame | None:
-    from manyeyes.evaluation.pose.metrics import judged
-    from manyeyes.pose.types import planar
+def _evaluate(estimate: PoseEstimate, snapshot: Snapshot, row: int) -> PoseEvaluation | None:
+    from manyeyes.evaluation.pose.metrics import evaluate_pose
+    from manyeyes.pose.types import project_to_se2
 
     truth = snapshot.truth
     if truth is None:
@@ -157,49 +166,51 @@ def _judged(said: PoseEstimate, snapshot: Snapshot, row: int) -> PoseFrame | Non
     ego_from_world = truth.world_from_agent[0].inverse()
     both = truth.boxes.center[truth.seen[0] & truth.seen[row]].double()
     common = ego_from_world.apply(both)[:, :2].numpy()
-    return judged(said, planar(ego_from_world @ truth.world_from_agent[row]), common)
+    return evaluate_pose(estimate, project_to_se2(ego_from_world @ truth.world_from_agent[row]), common)
 
 
-def watched(found: list[Found]) -> dict[int, Report]:
+def run_pose_monitor(results: list[CorrectorResult]) -> dict[int, PoseReport]:
     """What a watchman says of each agent after its last frame."""
-    from manyeyes.pose.pose_monitor import WatchState, watch
+    from manyeyes.pose.pose_monitor import PoseMonitorState, update_monitor
 
-    states: dict[int, WatchState] = {}
-    reports: dict[int, Report] = {}
-    for answer in found:
-        state = states.get(answer.agent, WatchState.new())
-        states[answer.agent], reports[answer.agent] = watch(state, answer.estimate, answer.claimed, answer.time_s)
+    states: dict[int, PoseMonitorState] = {}
+    reports: dict[int, PoseReport] = {}
+    for result in results:
+        state = states.get(result.agent_id, PoseMonitorState.new())
+        states[result.agent_id], reports[result.agent_id] = update_monitor(
+            state, result.estimate, result.prior, result.time_s
+        )
     return reports
 
 
-def _table(scores: dict[str, PoseScore], title: str) -> Table:
+def _make_table(scores: dict[str, PoseScore], title: str) -> Table:
     from rich.table import Table
 
     table = Table(title=title)
     for head in ("", "within 1 m, 1°", "2 m, 2°", "answered", "right", "wrong", "error m", "error °", "objects off m"):
         table.add_column(head, justify="right" if head else "left")
     for name, s in scores.items():
-        shares = (*s.success[:2], s.coverage, s.precision, s.wrong_accepts)
-        lengths = (s.median_metres, s.median_degrees, s.displacement)
+        shares = (*s.success_rate[:2], s.coverage, s.precision, s.false_accept_rate)
+        lengths = (s.median_translation_error_m, s.median_rotation_error_deg, s.mean_displacement_m)
         table.add_row(name, *(f"{100 * x:.1f} %" for x in shares), *(f"{x:.2f}" for x in lengths))
     return table
 
 
-def _plain(found: Found) -> dict[str, object]:
-    said, judged = found.estimate, found.judged
+def _to_json(result: CorrectorResult) -> dict[str, object]:
+    estimate, evaluation = result.estimate, result.evaluation
     return {
-        "frame": found.frame,
-        "agent": found.agent,
-        "corrector": found.corrector,
-        "landmarks": found.landmarks,
-        "status": said.status.value,
-        "ego_from_other": None if said.pose is None else said.pose.tolist(),
-        "covariance": said.covariance.tolist(),
-        "inliers": said.inliers,
-        "runner_up": said.runner_up,
-        "margin": said.margin,
-        "distance": said.distance,
-        "error_m": None if judged is None else judged.metres,
-        "error_deg": None if judged is None else judged.degrees,
-        "common": None if judged is None else judged.common,
+        "frame": result.frame,
+        "agent": result.agent_id,
+        "corrector": result.corrector,
+        "landmarks": result.num_landmarks,
+        "status": estimate.status.value,
+        "ego_from_other": None if estimate.pose is None else estimate.pose.tolist(),
+        "covariance": estimate.covariance.tolist(),
+        "inliers": estimate.inliers,
+        "runner_up": estimate.runner_up,
+        "margin": estimate.margin,
+        "distance": estimate.mahalanobis_squared,
+        "error_m": None if evaluation is None else evaluation.translation_error_m,
+        "error_deg": None if evaluation is None else evaluation.rotation_error_deg,
+        "common": None if evaluation is None else evaluation.num_common,
     }

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from manyeyes.studies.replay_options import FileChecks, Playing, excerpt, weights_name
+from manyeyes.studies.replay_options import FileChecks, ReplayOptions, display_name, make_excerpt
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Options:
     """Of the channel's losses and jitter."""
     animate: bool = True
     """Draw the animation of the drive."""
-    score_min: float = 0.4
+    min_score: float = 0.4
     """Detections below this score are not drawn; they count all the same."""
-    playing: Playing = field(default_factory=Playing)
+    replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""
@@ -44,30 +44,30 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.models import pretrained
-    from manyeyes.studies.recordings import check_files, open_recording, played_scenarios, suited_to
-    from manyeyes.studies.replay_report import REPORT, Showing, play
+    from manyeyes.studies.recordings import adapt_to_dataset, check_files, open_recording, select_checked_scenarios
+    from manyeyes.studies.replay_report import REPORT, ReportSpec, replay_and_report
 
     console = Console()
-    replay = options.playing.replay_config(options.seed)
+    replay = options.replay_options.make_replay_config(options.seed)
     recording = open_recording(options.recording, options.split)
-    drive = excerpt(recording, options.scenario, options.frames)
-    played = played_scenarios(recording, drive.scenario, options.scenario)
-    missing = check_files(recording, options.checks, console, played)
+    drive = make_excerpt(recording, options.scenario, options.frames)
+    scenarios = select_checked_scenarios(recording, drive.scenario, options.scenario)
+    missing = check_files(recording, options.checks, console, scenarios)
     split = f" --split {options.split}" if options.split else ""
-    showing = Showing(
+    spec = ReportSpec(
         out=options.out,
         title=f"{options.recording.name}: {drive.scenario}",
         lead="A recording, replayed: every agent shares bytes and perceives, as it would on the road.",
-        methods=options.playing.methods,
-        replay=suited_to(replay, options.playing, recording),
-        weights=weights_name(options.playing.weights),
+        methods=options.replay_options.methods,
+        replay=adapt_to_dataset(replay, options.replay_options, recording),
+        weights=display_name(options.replay_options.weights),
         frame=options.frame,
         animate=options.animate,
-        score_min=options.score_min,
+        min_score=options.min_score,
         missing=missing,
         commands=(f"manyeyes run {options.recording}{split} --scenario {drive.scenario}",),
     )
-    play(drive, pretrained.load(options.playing.weights), showing, console)
+    replay_and_report(drive, pretrained.load(options.replay_options.weights), spec, console)
     console.print(
         f"\nPictures, animation and JSON are in {options.out}; open {options.out / REPORT}",
         highlight=False,

@@ -33,18 +33,18 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.simulator.presets import simulate, simulation_preset
-    from manyeyes.simulator.record import Progress
+    from manyeyes.simulator.record import RecordingProgress
     from manyeyes.studies import provenance
-    from manyeyes.viz.progress import bars
+    from manyeyes.viz.progress import make_progress_bars
 
     preset = simulation_preset(options.preset)
     out = options.out or Path("data") / f"{options.preset}{'-cameras' if options.cameras else ''}"
     total = sum(part.count for part in preset.splits)
     console = Console()
-    with bars(console) as progress:
+    with make_progress_bars(console) as progress:
         task = progress.add_task("Simulating", total=total)
 
-        def report(at: Progress) -> None:
+        def report(at: RecordingProgress) -> None:
             progress.update(task, completed=at.done)
 
         manifest = simulate(options.preset, out, options.seed, options.workers, report, options.towns, options.cameras)

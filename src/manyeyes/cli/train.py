@@ -28,59 +28,59 @@ def main(options: Options) -> None:
     from manyeyes.datatypes import ConfigError
     from manyeyes.studies.recordings import check_files, open_recording
     from manyeyes.training.detector.presets import TRAINING_PRESETS
-    from manyeyes.training.maps.presets import MAP_TRAINING
-    from manyeyes.training.pose.feakm import FEAKM_TRAINING
+    from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
+    from manyeyes.training.pose.feakm import FEAKM_TRAINING_PRESETS
 
-    if len(options.weights) > 1 and options.preset not in MAP_TRAINING:
+    if len(options.weights) > 1 and options.preset not in MAP_TRAINING_PRESETS:
         raise ConfigError(f"--weights takes one file for {options.preset}; got {len(options.weights)}.")
-    if options.preset in FEAKM_TRAINING:
+    if options.preset in FEAKM_TRAINING_PRESETS:
         return train_feakm.main(options, Console())
-    if options.preset in MAP_TRAINING:
+    if options.preset in MAP_TRAINING_PRESETS:
         return train_map.main(options)
     if options.preset not in TRAINING_PRESETS:
-        known = ", ".join((*TRAINING_PRESETS, *FEAKM_TRAINING, *MAP_TRAINING))
+        known = ", ".join((*TRAINING_PRESETS, *FEAKM_TRAINING_PRESETS, *MAP_TRAINING_PRESETS))
         raise ConfigError(f"No training preset {options.preset!r}; choose one of {known}.")
-    asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
-    config = replace(TRAINING_PRESETS[options.preset], **{k: v for k, v in asked.items() if v is not None})
+    overrides = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
+    config = replace(TRAINING_PRESETS[options.preset], **{k: v for k, v in overrides.items() if v is not None})
     torch.set_num_threads(options.threads)
     recording = open_recording(options.data, options.split)
-    several = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    is_distributed = int(os.environ.get("WORLD_SIZE", "1")) > 1
     missing = check_files(recording, options.checks, Console(quiet=int(os.environ.get("RANK", "0")) > 0))
-    if several:
+    if is_distributed:
         dist.init_process_group("gloo")
     try:
-        _train(options, config, recording, missing, Console(quiet=several and dist.get_rank() > 0))
+        _train(options, config, recording, missing, Console(quiet=is_distributed and dist.get_rank() > 0))
     finally:
-        if several:
+        if is_distributed:
             dist.destroy_process_group()
 
 
 def _train(options: Options, config: Any, recording: Any, missing: MissingFiles, console: Any) -> None:
     from manyeyes.studies import provenance
-    from manyeyes.training.detector.loop import Progress, train
+    from manyeyes.training.detector.loop import DetectorProgress, train_detector
     from manyeyes.viz.loss_curve import save_loss_curve
-    from manyeyes.viz.progress import bars
+    from manyeyes.viz.progress import make_progress_bars
     from manyeyes.viz.table import missing_footer
 
     out = options.out or Path("runs") / options.preset
-    origin = provenance.provenance({"options": options, "training": config}, options.seed)
+    origin = provenance.collect_provenance({"options": options, "training": config}, options.seed)
     card = {"command": origin["command"], "versions": origin["versions"], "git_commit": origin["git_commit"]}
-    last: list[Progress] = []
-    with bars(console) as progress:
+    last_progress: list[DetectorProgress] = []
+    with make_progress_bars(console) as progress:
         task = progress.add_task("Training", total=None)
 
-        def report(at: Progress) -> None:
+        def report(at: DetectorProgress) -> None:
             progress.update(task, total=at.steps, completed=at.step, description=f"loss {at.loss:.3f}")
-            last[:] = [at]
+            last_progress[:] = [at]
 
-        weights = train(config, recording, out, options.seed, card, report, *options.weights)
+        weights = train_detector(config, recording, out, options.seed, card, report, *options.weights)
     if console.quiet:
         return
     save_loss_curve(out / "log.jsonl", out / "loss.png")
     result = {
         "weights": weights.name,
-        "loss": last[0].loss if last else None,
-        "seconds": last[0].seconds if last else None,
+        "loss": last_progress[0].loss if last_progress else None,
+        "seconds": last_progress[0].seconds if last_progress else None,
         "missing": missing,
     }
     provenance.write_json(out / "train.json", result, {"options": options, "training": config}, options.seed)

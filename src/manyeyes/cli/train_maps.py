@@ -18,14 +18,14 @@ def main(options: Options) -> None:
     import torch.distributed as dist
     from rich.console import Console
 
-    several = int(os.environ.get("WORLD_SIZE", "1")) > 1
+    is_distributed = int(os.environ.get("WORLD_SIZE", "1")) > 1
     torch.set_num_threads(options.threads)
-    if several:
+    if is_distributed:
         dist.init_process_group("gloo")
     try:
-        _train(options, Console(quiet=several and dist.get_rank() > 0))
+        _train(options, Console(quiet=is_distributed and dist.get_rank() > 0))
     finally:
-        if several:
+        if is_distributed:
             dist.destroy_process_group()
 
 
@@ -33,38 +33,38 @@ def _train(options: Options, console: Any) -> None:
     from manyeyes.models import pretrained
     from manyeyes.simulator.scene.towns import TOWN_SPLIT
     from manyeyes.studies import provenance
-    from manyeyes.studies.map_recordings import open_looks, true_maps
+    from manyeyes.studies.map_recordings import load_true_maps, open_sensor_recording
     from manyeyes.studies.recordings import check_files
-    from manyeyes.training.maps.loop import MapProgress, train_mapper
-    from manyeyes.training.maps.presets import MAP_TRAINING
+    from manyeyes.training.maps.loop import MapProgress, train_map_model
+    from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
     from manyeyes.training.maps.samples import TileStream
     from manyeyes.viz.loss_curve import save_loss_curve
-    from manyeyes.viz.progress import bars
+    from manyeyes.viz.progress import make_progress_bars
     from manyeyes.viz.table import missing_footer
 
-    asked = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
-    config = replace(MAP_TRAINING[options.preset], **{k: v for k, v in asked.items() if v is not None})
-    recording = open_looks(options.data, options.split, config.mapper.bev.sensors)
+    overrides = {"steps": options.steps, "batch": options.batch, "learning_rate": options.learning_rate}
+    config = replace(MAP_TRAINING_PRESETS[options.preset], **{k: v for k, v in overrides.items() if v is not None})
+    recording = open_sensor_recording(options.data, options.split, config.map_model.bev.sensors)
     missing = check_files(recording, options.checks, console)
     held_out = tuple(town for side, towns in TOWN_SPLIT.items() if side != "train" for town in towns)
-    samples = TileStream(recording, true_maps(recording), config.mapper, config.augment, options.seed, held_out)
-    start = [pretrained.mapper_state(weights) for weights in options.weights]
+    samples = TileStream(recording, load_true_maps(recording), config.map_model, config.augment, options.seed, held_out)
+    start = [pretrained.load_map_model_state(weights) for weights in options.weights]
     out = options.out or Path("runs") / options.preset
-    origin = provenance.provenance({"options": options, "training": config}, options.seed)
+    origin = provenance.collect_provenance({"options": options, "training": config}, options.seed)
     card = {name: origin[name] for name in ("command", "versions", "git_commit")}
-    last: list[MapProgress] = []
-    with bars(console) as progress:
+    last_progress: list[MapProgress] = []
+    with make_progress_bars(console) as progress:
         task = progress.add_task("Training", total=config.steps)
 
         def report(at: MapProgress) -> None:
             progress.update(task, completed=at.step, description=f"loss {at.loss:.3f}")
-            last[:] = [at]
+            last_progress[:] = [at]
 
-        weights = train_mapper(config, samples, out, options.seed, card, report, start)
+        weights = train_map_model(config, samples, out, options.seed, card, report, start)
     if console.quiet:
         return
     save_loss_curve(out / "log.jsonl", out / "loss.png")
-    result = {"weights": weights.name, "loss": last[0].loss if last else None, "missing": missing}
+    result = {"weights": weights.name, "loss": last_progress[0].loss if last_progress else None, "missing": missing}
     provenance.write_json(out / "train.json", result, {"options": options, "training": config}, options.seed)
     if missing.count:
         console.print(missing_footer(missing.count, "train.json"), highlight=False, soft_wrap=True)

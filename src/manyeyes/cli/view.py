@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from manyeyes.datatypes import BevGrid, Boxes, ConfigError, Snapshot
-from manyeyes.studies.replay_options import Playing, excerpt
+from manyeyes.studies.replay_options import ReplayOptions, make_excerpt
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -37,15 +37,15 @@ class Options:
     """At most so many frames of an animation."""
     out: Path = Path("out/view.png")
     """The file: .png for a frame, .gif or .webp for the drive."""
-    reach_m: tuple[float, float] = (70.4, 38.4)
+    half_extent_m: tuple[float, float] = (70.4, 38.4)
     """How far the picture reaches ahead and aside, metres; with --detect the detector's range counts."""
     width: int = 1280
     """Of the picture, pixels."""
     detect: str | None = None
     """Also draw what one method finds: alone, late, intermediate or early."""
-    score_min: float = 0.4
+    min_score: float = 0.4
     """Detections below this score are not drawn."""
-    playing: Playing = field(default_factory=Playing)
+    replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate, with --detect."""
 
 
@@ -60,14 +60,14 @@ def main(options: Options) -> None:
     if options.out.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"--out ends in {', '.join(SUFFIXES)}; got {options.out.name}.")
     recording = open_recording(options.recording, options.split)
-    drive = excerpt(recording, options.scenario)
+    drive = make_excerpt(recording, options.scenario)
     single = options.out.suffix.lower() == ".png"
-    first = drive.judged(drive.scenario).start if options.frame is None else options.frame
+    first = drive.eval_indices(drive.scenario).start if options.frame is None else options.frame
     last = min(drive.length(drive.scenario), first + (1 if single else options.frames))
     console = Console()
-    for problem in recording.problems:
+    for problem in recording.missing_summary:
         console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
-    images = _images(options, drive, range(first, last))
+    images = _draw_images(options, drive, range(first, last))
     if single:
         save_png(images[0], options.out)
     else:
@@ -75,33 +75,33 @@ def main(options: Options) -> None:
     console.print(f"{options.out}: {drive.scenario}, frames {first} to {last - 1}", highlight=False, soft_wrap=True)
 
 
-def _images(options: Options, drive: Excerpt, indices: range) -> list[Image]:
-    from manyeyes.viz.birds_eye import draw, scene_of
+def _draw_images(options: Options, drive: Excerpt, indices: range) -> list[Image]:
+    from manyeyes.viz.birds_eye import draw_scene, make_scene
 
     snapshots = [drive.snapshot(drive.scenario, i) for i in (indices or (indices.start,))]
-    grid = BevGrid(-options.reach_m[0], -options.reach_m[1], -5.0, *options.reach_m, 6.0)
-    found = [Boxes.empty()] * len(snapshots)
+    grid = BevGrid(-options.half_extent_m[0], -options.half_extent_m[1], -5.0, *options.half_extent_m, 6.0)
+    detections = [Boxes.empty()] * len(snapshots)
     if options.detect is not None:
-        grid, found = _detections(options, drive, snapshots)
+        grid, detections = _run_detector(options, drive, snapshots)
     images = []
-    for snapshot, boxes in zip(snapshots, found):
+    for snapshot, boxes in zip(snapshots, detections):
         caption = f"frame {snapshot.index} · {len(snapshot.frames)} agents"
-        caption += f" · {options.detect} with {options.playing.weights}" if options.detect else ""
-        scene = scene_of(snapshot, boxes)
-        images.append(draw(scene, grid, drive.scenario, caption, options.width, options.score_min))
+        caption += f" · {options.detect} with {options.replay_options.weights}" if options.detect else ""
+        scene = make_scene(snapshot, boxes)
+        images.append(draw_scene(scene, grid, drive.scenario, caption, options.width, options.min_score))
     return images
 
 
-def _detections(options: Options, drive: Excerpt, snapshots: list[Snapshot]) -> tuple[BevGrid, list[Boxes]]:
+def _run_detector(options: Options, drive: Excerpt, snapshots: list[Snapshot]) -> tuple[BevGrid, list[Boxes]]:
     """The detector's range, and what the ego finds at each instant."""
     from dataclasses import replace
 
-    from manyeyes.agents.replay import Team
+    from manyeyes.agents.replay import DetectionReplay
     from manyeyes.models import pretrained
-    from manyeyes.studies.recordings import suited_to
+    from manyeyes.studies.recordings import adapt_to_dataset
 
-    playing = replace(options.playing, methods=(str(options.detect),))
-    config: ReplayConfig = suited_to(playing.replay_config(0), playing, drive.recording)
-    detector = pretrained.load(playing.weights)
-    team = Team(playing.methods[0], detector, config)
-    return detector.config.range, [step.boxes for snapshot in snapshots for step in team.step(snapshot)]
+    replay_options = replace(options.replay_options, methods=(str(options.detect),))
+    config: ReplayConfig = adapt_to_dataset(replay_options.make_replay_config(0), replay_options, drive.recording)
+    detector = pretrained.load(replay_options.weights)
+    player = DetectionReplay(replay_options.methods[0], detector, config)
+    return detector.config.detection_range, [step.boxes for snapshot in snapshots for step in player.step(snapshot)]

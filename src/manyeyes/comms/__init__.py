@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bytes between agents: what to send, how it is written, what the air does to it, what is taken in."""
 
-from manyeyes.comms.bandwidth import equal_share, fair_shares
-from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, Delivery, Send, channel_preset
+from manyeyes.comms.bandwidth import allocate_equal_share, allocate_max_min_fair
+from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, Delivery, Transmission, channel_preset
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.inbox import Dropped, Inbox, Reception
+from manyeyes.comms.inbox import DropCounts, Inbox, ReceivedMessage
 from manyeyes.comms.local_bus import LocalBus
 from manyeyes.comms.primitives import PacketError
-from manyeyes.comms.request_map import need, request_map
-from manyeyes.comms.token_selection import within_budget
+from manyeyes.comms.request_map import build_request_map, compute_request_weights
+from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import Fragment, assemble, decode_packet, encode
 
 __all__ = [
@@ -17,20 +17,20 @@ __all__ = [
     "ChannelPreset",
     "CodeTables",
     "Delivery",
-    "Dropped",
+    "DropCounts",
     "Fragment",
     "Inbox",
     "LocalBus",
     "PacketError",
-    "Reception",
-    "Send",
+    "ReceivedMessage",
+    "Transmission",
+    "allocate_equal_share",
+    "allocate_max_min_fair",
     "assemble",
+    "build_request_map",
     "channel_preset",
+    "compute_request_weights",
     "decode_packet",
     "encode",
-    "equal_share",
-    "fair_shares",
-    "need",
-    "request_map",
-    "within_budget",
+    "select_within_budget",
 ]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_uniform
 
-NS = 1_000_000_000
+NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class ChannelPreset:
     def airtime_ns(self, packet_bytes: int) -> int:
         """How long one packet is on the air."""
         bits = 8 * (packet_bytes + self.per_packet_overhead_bytes)
-        return 0 if math.isinf(self.rate_bps) else math.ceil(bits * NS / self.rate_bps)
+        return 0 if math.isinf(self.rate_bps) else math.ceil(bits * NS_PER_S / self.rate_bps)
 
     def occupied_ns(self, packet_bytes: int) -> int:
         """After how long the next packet may begin: airtime and the idle time that the busy limit demands."""
@@ -141,7 +141,7 @@ def channel_preset(name: str) -> ChannelPreset:
 
 
 @dataclass(frozen=True)
-class Send:
+class Transmission:
     """One agent's packets, handed to its radio at one instant. position_xy: metres, world."""
 
     agent_id: int
@@ -151,13 +151,13 @@ class Send:
 
 
 @dataclass(frozen=True)
-class OnAir:
+class PacketInFlight:
     """One packet that has left its sender's antenna. number: its place among what the agent sent at sent_ns."""
 
-    send: Send
+    transmission: Transmission
     number: int
     packet: bytes
-    left_ns: int
+    departure_ns: int
 
 
 @dataclass(frozen=True)
@@ -165,38 +165,38 @@ class Delivery:
     """One packet at one receiver. arrival_ns - sent_ns is what the channel cost; ages count from the capture instead."""
 
     packet: bytes
-    sender: int
+    sender_id: int
     sent_ns: int
     arrival_ns: int
 
 
 @dataclass
 class _Queue:
-    send: Send
+    transmission: Transmission
     first_number: int
     at: int = 0
 
 
-class Medium:
+class SharedMedium:
     """The shared airtime: who sends when. What has been settled by :meth:`run` is not changed by later offers."""
 
     def __init__(self, preset: ChannelPreset) -> None:
         self.preset = preset
-        self.withdrawn = 0
+        self.dropped_in_queue = 0
         self._waiting: dict[int, _Queue] = {}
-        self._offered: list[tuple[Send, int]] = []
+        self._offered: list[tuple[Transmission, int]] = []
         self._numbered: dict[int, tuple[int, int]] = {}
         self._free_ns = -(1 << 63)
         self._last_served = -(1 << 63)
 
-    def offer(self, send: Send) -> None:
+    def offer(self, transmission: Transmission) -> None:
         """Hand packets to the medium; they begin no earlier than sent_ns. An agent's offers come in order of time."""
-        stamp, number = self._numbered.get(send.agent_id, (send.sent_ns, 0))
-        number = number if stamp == send.sent_ns else 0
-        self._numbered[send.agent_id] = (send.sent_ns, number + len(send.packets))
-        self._offered.append((send, number))
+        stamp, number = self._numbered.get(transmission.agent_id, (transmission.sent_ns, 0))
+        number = number if stamp == transmission.sent_ns else 0
+        self._numbered[transmission.agent_id] = (transmission.sent_ns, number + len(transmission.packets))
+        self._offered.append((transmission, number))
 
-    def run(self, until_ns: float) -> list[OnAir]:
+    def run(self, until_ns: float) -> list[PacketInFlight]:
         """Packets that begin before until_ns, in order of time.
 
         What begins at until_ns exactly cannot have arrived by then, and is left open because others may still offer at
@@ -204,7 +204,7 @@ class Medium:
         """
         self._offered.sort(key=lambda item: item[0].sent_ns)
         has_queue = not math.isinf(self.preset.rate_bps)
-        out: list[OnAir] = []
+        out: list[PacketInFlight] = []
         while self._waiting or self._offered:
             start = self._free_ns if self._waiting else max(self._free_ns, self._offered[0][0].sent_ns)
             if start > until_ns or (has_queue and start == until_ns):
@@ -215,26 +215,28 @@ class Medium:
                 out.append(self._serve(start))
         return out
 
-    def _enqueue(self, send: Send, first_number: int) -> None:
-        old = self._waiting.get(send.agent_id)
-        if old is not None and old.send.sent_ns == send.sent_ns:
-            merged = replace(send, packets=old.send.packets + send.packets)
-            self._waiting[send.agent_id] = _Queue(merged, old.first_number, old.at)
+    def _enqueue(self, transmission: Transmission, first_number: int) -> None:
+        old = self._waiting.get(transmission.agent_id)
+        if old is not None and old.transmission.sent_ns == transmission.sent_ns:
+            merged = replace(transmission, packets=old.transmission.packets + transmission.packets)
+            self._waiting[transmission.agent_id] = _Queue(merged, old.first_number, old.at)
             return
         if old is not None:
-            self.withdrawn += len(old.send.packets) - old.at
-            del self._waiting[send.agent_id]
-        if send.packets:
-            self._waiting[send.agent_id] = _Queue(send, first_number)
+            self.dropped_in_queue += len(old.transmission.packets) - old.at
+            del self._waiting[transmission.agent_id]
+        if transmission.packets:
+            self._waiting[transmission.agent_id] = _Queue(transmission, first_number)
 
-    def _serve(self, start: int) -> OnAir:
+    def _serve(self, start: int) -> PacketInFlight:
         """The next packet in turn: of the lowest id above the last one served, else of the lowest."""
         agent = min(self._waiting, key=lambda i: (i <= self._last_served, i))
         queue = self._waiting[agent]
-        packet = queue.send.packets[queue.at]
-        out = OnAir(queue.send, queue.first_number + queue.at, packet, start + self.preset.airtime_ns(len(packet)))
+        packet = queue.transmission.packets[queue.at]
+        out = PacketInFlight(
+            queue.transmission, queue.first_number + queue.at, packet, start + self.preset.airtime_ns(len(packet))
+        )
         queue.at += 1
-        if queue.at == len(queue.send.packets):
+        if queue.at == len(queue.transmission.packets):
             del self._waiting[agent]
         self._free_ns, self._last_served = start + self.preset.occupied_ns(len(packet)), agent
         return out
@@ -248,31 +250,31 @@ class Channel:
         self.seed = seed
 
     def transmit(
-        self, sends: Sequence[Send], receiver_id: int, receiver_xy: tuple[float, float]
+        self, transmissions: Sequence[Transmission], receiver_id: int, receiver_xy: tuple[float, float]
     ) -> tuple[Delivery, ...]:
         """What one receiver gets of everybody's sends, its own not included, in order of arrival."""
-        medium = Medium(self.preset)
-        for send in sorted(sends, key=lambda s: s.sent_ns):
+        medium = SharedMedium(self.preset)
+        for send in sorted(transmissions, key=lambda s: s.sent_ns):
             medium.offer(send)
         return self.receive(medium.run(math.inf), receiver_id, receiver_xy)
 
     def receive(
-        self, on_air: Sequence[OnAir], receiver_id: int, receiver_xy: tuple[float, float]
+        self, on_air: Sequence[PacketInFlight], receiver_id: int, receiver_xy: tuple[float, float]
     ) -> tuple[Delivery, ...]:
         """What one receiver gets of packets on the air, its own not included, in order of arrival."""
-        messages: dict[tuple[int, int], list[OnAir]] = {}
+        messages: dict[tuple[int, int], list[PacketInFlight]] = {}
         for item in on_air:
-            if item.send.agent_id != receiver_id:
-                messages.setdefault((item.send.agent_id, item.send.sent_ns), []).append(item)
+            if item.transmission.agent_id != receiver_id:
+                messages.setdefault((item.transmission.agent_id, item.transmission.sent_ns), []).append(item)
         got: list[tuple[int, int, int, Delivery]] = []
         for (sender, sent_ns), items in messages.items():
             count = 1 + max(item.number for item in items)
-            distance = math.dist(items[0].send.position_xy, receiver_xy)
+            distance = math.dist(items[0].transmission.position_xy, receiver_xy)
             lost = self._lost(sender, receiver_id, sent_ns, count, self.preset.loss(distance))
-            late = self._latency_ns(sender, receiver_id, sent_ns, count)
+            latency_ns = self._latency_ns(sender, receiver_id, sent_ns, count)
             for item in items:
                 if not lost[item.number]:
-                    arrival = item.left_ns + int(late[item.number])
+                    arrival = item.departure_ns + int(latency_ns[item.number])
                     delivery = Delivery(item.packet, sender, sent_ns, arrival)
                     got.append((arrival, sender, item.number, delivery))
         return tuple(delivery for *_, delivery in sorted(got, key=lambda row: row[:3]))
@@ -301,4 +303,4 @@ class Channel:
         spread = np.zeros(count)
         if self.preset.jitter_s:
             spread = keyed_uniform((count,), self.seed, "jitter", sender, receiver, sent_ns).numpy()
-        return np.rint((self.preset.base_latency_s + self.preset.jitter_s * spread) * NS).astype(np.int64)
+        return np.rint((self.preset.base_latency_s + self.preset.jitter_s * spread) * NS_PER_S).astype(np.int64)

@@ -24,9 +24,9 @@ from manyeyes.datatypes import ConfigError
 
 TOTAL_BITS = 12
 TOTAL = 1 << TOTAL_BITS
-_LOWEST = 1 << 16
+_MIN_STATE = 1 << 16
 STATE_BYTES = 3
-MOST_CELLS = 1 << 18
+MAX_CODED_CELLS = 1 << 18
 """Of a grid whose cells are coded: a forged packet costs its reader milliseconds, not more."""
 
 _CONTEXTS = 16
@@ -106,18 +106,20 @@ def unpack_coded(
     return key, rows
 
 
-def coded_counts(
+def count_fitting_coded_cells(
     key: NDArray[np.int64],
     rows: NDArray[np.uint8],
     shape: tuple[int, int],
     tables: CodeTables,
-    fixed: int,
+    fixed_bytes: int,
     capacity: int,
-    header: int,
-    left: int,
+    header_bytes: int,
+    bytes_left: int,
 ) -> NDArray[np.int64]:
-    """As ``codec.counts_in_room`` for coded tokens: how many of keys (N,) and rows (N, W), in the order given, each body takes."""
-    limits = _BodyLimits(fixed, capacity, header, left)
+    """As ``codec.count_fitting_cells`` for coded tokens: how many of keys (N,) and rows (N, W), in the order given, each body
+    takes.
+    """
+    limits = _BodyLimits(fixed_bytes, capacity, header_bytes, bytes_left)
     key, rows = np.ascontiguousarray(key, np.int64), np.ascontiguousarray(rows)
     return _counts(key, rows, shape[0], shape[1], _ByteTables.of(tables), limits)
 
@@ -170,16 +172,16 @@ def _context(named: Boolx1, at: int, row: int, column: int, height: int, width: 
 @njit(cache=True)
 def _prior(count: int, cells: int) -> I64x2:  # pragma: no cover
     """Counts (contexts, 2) to begin with of cells that are not and that are named."""
-    seen = np.ones((_CONTEXTS, 2), np.int64)
-    seen[0, 0] = 2 * max(1, cells // max(1, count))
-    seen[1:, 0] = 2
-    return seen
+    counts = np.ones((_CONTEXTS, 2), np.int64)
+    counts[0, 0] = 2 * max(1, cells // max(1, count))
+    counts[1:, 0] = 2
+    return counts
 
 
 @njit(cache=True)
-def _chance(seen: I64x2, context: int) -> int:  # pragma: no cover
+def _cell_frequency(counts: I64x2, context: int) -> int:  # pragma: no cover
     """Frequency, 1 to 4,095, that a cell in this context is named."""
-    chance = TOTAL * seen[context, 1] // (seen[context, 0] + seen[context, 1])
+    chance = TOTAL * counts[context, 1] // (counts[context, 0] + counts[context, 1])
     return min(max(chance, 1), TOTAL - 1)
 
 
@@ -192,19 +194,19 @@ def _symbols(
     n, at = key.shape[0], 0
     if n == 0:
         return 0
-    named, seen = np.zeros(key[-1] + 1, np.bool_), _prior(n, height * width)
+    named, counts = np.zeros(key[-1] + 1, np.bool_), _prior(n, height * width)
     found, row, column = 0, 0, 0
     for k in range(key[-1] + 1):
         context = _context(named, k, row, column, height, width)
-        chance = _chance(seen, context)
+        chance = _cell_frequency(counts, context)
         if k == key[found]:
             named[k] = True
             found += 1
             out[at, 0], out[at, 1] = 0, chance
-            seen[context, 1] += 2
+            counts[context, 1] += 2
         else:
             out[at, 0], out[at, 1] = chance, TOTAL - chance
-            seen[context, 0] += 2
+            counts[context, 0] += 2
         at += 1
         column += 1
         if column == width:
@@ -220,7 +222,7 @@ def _symbols(
 @njit(cache=True)
 def _size(symbols: I32x2) -> int:  # pragma: no cover
     """Bytes that _write makes."""
-    state, size = np.int64(_LOWEST), STATE_BYTES
+    state, size = np.int64(_MIN_STATE), STATE_BYTES
     for i in range(symbols.shape[0] - 1, -1, -1):
         start, frequency = np.int64(symbols[i, 0]), np.int64(symbols[i, 1])
         while state >= frequency << TOTAL_BITS:
@@ -233,7 +235,7 @@ def _size(symbols: I32x2) -> int:  # pragma: no cover
 @njit(cache=True)
 def _write(symbols: I32x2, out: U8x1) -> int:  # pragma: no cover
     """Fills the end of out, from back to front; how many bytes."""
-    state, at = np.int64(_LOWEST), out.shape[0]
+    state, at = np.int64(_MIN_STATE), out.shape[0]
     for i in range(symbols.shape[0] - 1, -1, -1):
         start, frequency = np.int64(symbols[i, 0]), np.int64(symbols[i, 1])
         while state >= frequency << TOTAL_BITS:
@@ -252,7 +254,7 @@ def _write(symbols: I32x2, out: U8x1) -> int:  # pragma: no cover
 def _take(state: int, frequency: int, offset: int, raw: U8x1, at: int) -> tuple[int, int]:  # pragma: no cover
     """State and place after a symbol; offset: how far the state lies above the symbol's start. Bytes beyond the end are 0."""
     state = frequency * (state >> TOTAL_BITS) + offset
-    while state < _LOWEST and at <= raw.shape[0]:
+    while state < _MIN_STATE and at <= raw.shape[0]:
         state = state << 8 | (np.int64(raw[at]) if at < raw.shape[0] else 0)
         at += 1
     return state, at
@@ -265,27 +267,27 @@ def _read(raw: U8x1, height: int, width: int, tables: _ByteTables, key: I64x1, r
     if raw.shape[0] < STATE_BYTES:
         return False
     state = np.int64(raw[0]) << 16 | np.int64(raw[1]) << 8 | np.int64(raw[2])
-    if state < _LOWEST:
+    if state < _MIN_STATE:
         return False
     n, at = key.shape[0], STATE_BYTES
     cells = height * width
-    named, seen = np.zeros(cells, np.bool_), _prior(n, cells)
+    named, counts = np.zeros(cells, np.bool_), _prior(n, cells)
     found, row, column, k = 0, 0, 0, 0
     while found < n:
         if k == cells or at > raw.shape[0]:
             return False
         context = _context(named, k, row, column, height, width)
-        chance = _chance(seen, context)
+        chance = _cell_frequency(counts, context)
         slot = state & TOTAL - 1
         if slot < chance:
             state, at = _take(state, chance, slot, raw, at)
             named[k] = True
             key[found] = k
             found += 1
-            seen[context, 1] += 2
+            counts[context, 1] += 2
         else:
             state, at = _take(state, TOTAL - chance, slot - chance, raw, at)
-            seen[context, 0] += 2
+            counts[context, 0] += 2
         k += 1
         column += 1
         if column == width:
@@ -298,4 +300,4 @@ def _read(raw: U8x1, height: int, width: int, tables: _ByteTables, key: I64x1, r
             value = values[j, slot]
             rows[i, j] = value
             state, at = _take(state, np.int64(frequencies[j, value]), slot - starts[j, value], raw, at)
-    return state == _LOWEST and at == raw.shape[0]
+    return state == _MIN_STATE and at == raw.shape[0]

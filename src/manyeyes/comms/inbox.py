@@ -19,7 +19,7 @@ _CLOCK_SLACK_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class Dropped:
+class DropCounts:
     """How many packets were not taken, by reason.
 
     garbage: not a packet, or cut. version: of another wire version. checksum: bytes were changed. implausible: values
@@ -47,7 +47,7 @@ class Dropped:
         """Packets not taken, for whatever reason."""
         return sum(getattr(self, f.name) for f in fields(self))
 
-    def plus(self, reason: DropReason) -> Dropped:
+    def increment(self, reason: DropReason) -> DropCounts:
         """One more packet of that reason."""
         return replace(self, **{reason: getattr(self, reason) + 1})
 
@@ -79,7 +79,7 @@ _TOKEN_TEXTS: dict[TokenRefusal, str] = {
 
 
 @dataclass(frozen=True)
-class Reception:
+class ReceivedMessage:
     """One agent's newest message as far as it came. last_arrival_ns is None where no arrival time was given."""
 
     message: Message
@@ -98,7 +98,7 @@ class Reception:
 
 
 @dataclass
-class _Held:
+class _PendingMessage:
     assembly: Assembly
     packet_bytes: int
     last_arrival_ns: int | None
@@ -130,12 +130,12 @@ class Inbox:
         self._max_agents = max_agents
         self._max_agent_bytes = max_agent_bytes
         self._tables = tables if token_format is None else token_format.tables
-        self._held: dict[int, _Held] = {}
-        self._dropped = Dropped()
+        self._held: dict[int, _PendingMessage] = {}
+        self._dropped = DropCounts()
         self._rejections: dict[int, Rejection] = {}
 
     @property
-    def dropped(self) -> Dropped:
+    def dropped(self) -> DropCounts:
         """Packets not taken so far, by reason."""
         return self._dropped
 
@@ -152,19 +152,19 @@ class Inbox:
         except PacketError as error:
             refusal = error.reason
         if refusal is not None:
-            self._dropped = self._dropped.plus(refusal)
+            self._dropped = self._dropped.increment(refusal)
 
-    def receptions(self, now_ns: int | None = None) -> tuple[Reception, ...]:
+    def received_messages(self, now_ns: int | None = None) -> tuple[ReceivedMessage, ...]:
         """The newest message of each agent with how much of it came, by agent id. Those expired by now_ns are let go."""
         if now_ns is not None:
             self._held = {
                 k: v for k, v in self._held.items() if not self._is_old(v.assembly.header.timestamp_ns, now_ns)
             }
         return tuple(
-            Reception(
+            ReceivedMessage(
                 message=held.assembly.message(),
                 received_packets=len(held.assembly.fragments),
-                expected_packets=held.assembly.header.packets,
+                expected_packets=held.assembly.header.num_packets,
                 last_arrival_ns=held.last_arrival_ns,
             )
             for _, held in sorted(self._held.items())
@@ -181,7 +181,7 @@ class Inbox:
 
     def messages(self, now_ns: int | None = None) -> tuple[Message, ...]:
         """The newest message of each agent, as far as it came, by agent id."""
-        return tuple(reception.message for reception in self.receptions(now_ns))
+        return tuple(reception.message for reception in self.received_messages(now_ns))
 
     def _is_old(self, timestamp_ns: int, now_ns: int) -> bool:
         return self._expire_ns is not None and now_ns - timestamp_ns > self._expire_ns
@@ -202,7 +202,7 @@ class Inbox:
         if not isinstance(fragment.body, TokenRows):
             return None
         if self._token_format is not None:
-            return self._token_format.refusal(fragment.header.fingerprint, fragment.body)
+            return self._token_format.check_packet(fragment.header.fingerprint, fragment.body)
         others = self._fingerprint is not None and fragment.header.fingerprint != self._fingerprint
         return "wrong_model" if others else None
 
@@ -222,7 +222,7 @@ class Inbox:
         if held is None or stamp > held.assembly.header.timestamp_ns:
             if held is None and not self._make_room(stamp):
                 return "full"
-            self._held[agent] = _Held(Assembly(fragment), size, arrival_ns)
+            self._held[agent] = _PendingMessage(Assembly(fragment), size, arrival_ns)
             return None
         if held.packet_bytes + size > self._max_agent_bytes:
             return "full"

@@ -6,14 +6,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from manyeyes.comms.channel import NS, Channel, Delivery, Medium, OnAir, Send
+from manyeyes.comms.channel import NS_PER_S, Channel, Delivery, PacketInFlight, SharedMedium, Transmission
 from manyeyes.datatypes import ConfigError
 
 
 @dataclass
 class _Receiver:
-    seen: int = 0
-    coming: list[Delivery] = field(default_factory=list)
+    num_seen: int = 0
+    pending: list[Delivery] = field(default_factory=list)
 
 
 class LocalBus:
@@ -25,17 +25,17 @@ class LocalBus:
 
     def __init__(self, channel: Channel, keep_s: float = 10.0) -> None:
         self.channel = channel
-        self._keep_ns = round(keep_s * NS)
-        self._medium = Medium(channel.preset)
+        self._keep_ns = round(keep_s * NS_PER_S)
+        self._medium = SharedMedium(channel.preset)
         self._clock_ns: int | None = None
-        self._on_air: list[OnAir] = []
-        self._forgotten = 0
+        self._on_air: list[PacketInFlight] = []
+        self._num_expired = 0
         self._receivers: dict[int, _Receiver] = {}
 
     @property
-    def withdrawn(self) -> int:
+    def dropped_in_queue(self) -> int:
         """Packets never sent, because their sender had newer ones before their turn came."""
-        return self._medium.withdrawn
+        return self._medium.dropped_in_queue
 
     def publish(self, agent_id: int, position_xy: tuple[float, float], packets: Sequence[bytes], now_ns: int) -> None:
         """Hand an agent's packets to its radio at now_ns."""
@@ -50,18 +50,18 @@ class LocalBus:
                 f"Channel {self.channel.preset.name} takes packets of at most {self.channel.preset.mtu} bytes; "
                 f"got {largest}: encode with mtu={self.channel.preset.mtu}."
             )
-        self._medium.offer(Send(agent_id, position_xy, tuple(packets), now_ns))
+        self._medium.offer(Transmission(agent_id, position_xy, tuple(packets), now_ns))
 
     def deliver(self, agent_id: int, position_xy: tuple[float, float], until_ns: int) -> list[Delivery]:
         """What has arrived at the agent by until_ns and was not given to it before, in order of arrival."""
         self._advance(until_ns)
         receiver = self._receivers.setdefault(agent_id, _Receiver())
-        new = self._on_air[max(0, receiver.seen - self._forgotten) :]
-        receiver.seen = self._forgotten + len(self._on_air)
-        receiver.coming += self.channel.receive(new, agent_id, position_xy)
-        receiver.coming.sort(key=lambda d: d.arrival_ns)
-        arrived = [d for d in receiver.coming if d.arrival_ns <= until_ns]
-        receiver.coming = receiver.coming[len(arrived) :]
+        new = self._on_air[max(0, receiver.num_seen - self._num_expired) :]
+        receiver.num_seen = self._num_expired + len(self._on_air)
+        receiver.pending += self.channel.receive(new, agent_id, position_xy)
+        receiver.pending.sort(key=lambda d: d.arrival_ns)
+        arrived = [d for d in receiver.pending if d.arrival_ns <= until_ns]
+        receiver.pending = receiver.pending[len(arrived) :]
         return arrived
 
     def _advance(self, until_ns: int) -> None:
@@ -71,7 +71,8 @@ class LocalBus:
         self._clock_ns = until_ns
         self._on_air += self._medium.run(until_ns)
         keep = next(
-            (i for i, p in enumerate(self._on_air) if p.send.sent_ns >= until_ns - self._keep_ns), len(self._on_air)
+            (i for i, p in enumerate(self._on_air) if p.transmission.sent_ns >= until_ns - self._keep_ns),
+            len(self._on_air),
         )
-        self._forgotten += keep
+        self._num_expired += keep
         del self._on_air[:keep]

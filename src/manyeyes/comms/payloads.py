@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from manyeyes.comms import primitives
-from manyeyes.comms.entropy import MOST_CELLS, CodeTables, coded_counts, pack_coded, unpack_coded
+from manyeyes.comms.entropy import MAX_CODED_CELLS, CodeTables, count_fitting_coded_cells, pack_coded, unpack_coded
 from manyeyes.comms.map_payload import ElementRows, read_elements
 from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import LABELS, BevGrid, Boxes, ConfigError, PointCloud, Sites, SparseBev, WireError
-from manyeyes.datatypes.message import DESCRIPTOR, RequestMap
+from manyeyes.datatypes.message import DESCRIPTOR_DIM, RequestMap
 
-Precision = Literal["float32", "float16", "int8", "codes"]
+TokenEncoding = Literal["float32", "float16", "int8", "codes"]
 
-PRECISIONS: tuple[Precision, ...] = ("float32", "float16", "int8", "codes")
+TOKEN_ENCODINGS: tuple[TokenEncoding, ...] = ("float32", "float16", "int8", "codes")
 # The middle of what drives in European cities.
 LABEL_HEIGHTS = (1.6, 2.3, 3.2, 3.2)
 NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS = range(6)
@@ -42,14 +42,14 @@ _OBJECT = np.dtype(
 _VELOCITY, _DESCRIPTOR = 1, 2
 _METRES_PER_S = 0.25
 _POINT = np.dtype([("xyz", "<i2", 3), ("intensity", "u1")])
-_FEATURE_TYPES: dict[Precision, np.dtype[Any]] = {
+_FEATURE_TYPES: dict[TokenEncoding, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),
     "float16": np.dtype("<f2"),
     "int8": np.dtype("i1"),
     "codes": np.dtype("u1"),
 }
 _CODED = 2
-_MOST_CELLS = 1 << 24
+_MAX_CELLS = 1 << 24
 _SIGMA_XY, _SIGMA_YAW = (0.01, 20.0), (0.001, 3.2)
 
 
@@ -60,7 +60,7 @@ class TokenRows:
     """
 
     grid: BevGrid
-    precision: Precision
+    encoding: TokenEncoding
     channels: int
     key: NDArray[np.int64]
     scales: bytes
@@ -103,10 +103,10 @@ def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int
 def _object_type(flags: int) -> np.dtype[Any]:
     """The row of an object, with what the flags of its body add."""
     velocity = [("velocity", "i1", 2)] if flags & _VELOCITY else []
-    return np.dtype(_OBJECT.descr + velocity + ([("descriptor", "i1", DESCRIPTOR)] if flags & _DESCRIPTOR else []))
+    return np.dtype(_OBJECT.descr + velocity + ([("descriptor", "i1", DESCRIPTOR_DIM)] if flags & _DESCRIPTOR else []))
 
 
-def object_bodies(boxes: Boxes, descriptors: Tensor | None, capacity: int) -> list[bytes]:
+def pack_object_bodies(boxes: Boxes, descriptors: Tensor | None, capacity: int) -> list[bytes]:
     """Bodies of whole objects, the highest score first; no objects are one body without rows.
 
     Velocities are sent where any of them is not 0, descriptors where there are any.
@@ -117,7 +117,7 @@ def object_bodies(boxes: Boxes, descriptors: Tensor | None, capacity: int) -> li
         [
             boxes.center,
             boxes.size,
-            torch.stack((boxes.yaw, boxes.score, boxes.sigma_xy, boxes.sigma_yaw, boxes.flip), -1),
+            torch.stack((boxes.yaw, boxes.score, boxes.sigma_xy, boxes.sigma_yaw, boxes.p_flip), -1),
             boxes.velocity,
         ],
         -1,
@@ -154,14 +154,14 @@ def object_bodies(boxes: Boxes, descriptors: Tensor | None, capacity: int) -> li
 
 def _descriptor_codes(descriptors: Tensor, count: int) -> NDArray[np.int8]:
     values = descriptors.detach().double().cpu()
-    if tuple(values.shape) != (count, DESCRIPTOR) or not bool((values.abs() <= 1).all()):
+    if tuple(values.shape) != (count, DESCRIPTOR_DIM) or not bool((values.abs() <= 1).all()):
         raise WireError(
-            f"Message.descriptors needs ({count}, {DESCRIPTOR}) in [-1, 1], one an object; got {tuple(values.shape)}."
+            f"Message.descriptors needs ({count}, {DESCRIPTOR_DIM}) in [-1, 1], one an object; got {tuple(values.shape)}."
         )
     return np.rint(values.numpy() * 127).astype(np.int8)
 
 
-def point_bodies(cloud: PointCloud, capacity: int) -> list[bytes]:
+def pack_point_bodies(cloud: PointCloud, capacity: int) -> list[bytes]:
     """Bodies of whole points, dealt out in turn; no points are one empty body."""
     rows = np.zeros(len(cloud), _POINT)
     rows["xyz"] = _centimetres(cloud.xyz.cpu().numpy(), "Points")
@@ -182,22 +182,22 @@ def token_order(tokens: SparseBev, score: Tensor | None) -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True)
-class Form:
+class TokenCodec:
     """How tokens are written: precision, and the tables by which codes are, or None where their bytes are sent as they are."""
 
-    precision: Precision
+    encoding: TokenEncoding
     tables: CodeTables | None = None
 
     def __post_init__(self) -> None:
-        if self.precision not in PRECISIONS:
-            raise ConfigError(f"precision is one of {', '.join(PRECISIONS)}; got {self.precision!r}.")
+        if self.encoding not in TOKEN_ENCODINGS:
+            raise ConfigError(f"precision is one of {', '.join(TOKEN_ENCODINGS)}; got {self.encoding!r}.")
 
-    def tables_of(self, tokens: SparseBev) -> CodeTables | None:
+    def select_tables(self, tokens: SparseBev) -> CodeTables | None:
         """The tables, where these tokens are to be coded by them; tokens of another kind than the form's are a WireError."""
         codes = tokens.features.dtype == torch.uint8
-        if codes != (self.precision == "codes"):
+        if codes != (self.encoding == "codes"):
             raise WireError(
-                f"Tokens of {tokens.features.dtype} are not sent as {self.precision}: codes are uint8 rows of the model's "
+                f"Tokens of {tokens.features.dtype} are not sent as {self.encoding}: codes are uint8 rows of the model's "
                 "codebook, and only codes are."
             )
         if not codes or self.tables is None:
@@ -207,13 +207,13 @@ class Form:
                 f"The tables are of rows of {self.tables.width} bytes; these have {tokens.features.shape[1]}."
             )
         rows, columns = tokens.grid.shape
-        return self.tables if rows * columns <= MOST_CELLS else None
+        return self.tables if rows * columns <= MAX_CODED_CELLS else None
 
 
-def packet_counts(
+def count_cells_per_packet(
     tokens: SparseBev,
     order: NDArray[np.int64],
-    form: Form,
+    token_codec: TokenCodec,
     capacity: int,
     header_bytes: int = 0,
     budget_bytes: int | None = None,
@@ -223,20 +223,24 @@ def packet_counts(
     Bodies with header_bytes each take at most budget_bytes altogether. Each packet is filled before the next is begun,
     so a smaller budget keeps a prefix of what a larger one keeps.
     """
-    channels, precision, tables = tokens.features.shape[1], form.precision, form.tables_of(tokens)
-    each = channels * _FEATURE_TYPES[precision].itemsize
-    fixed = TOKENS_BYTES + (channels if precision == "int8" else 0)
-    if channels < 1 or channels > 65535 or fixed + each + 5 > capacity:
+    channels, encoding, tables = tokens.features.shape[1], token_codec.encoding, token_codec.select_tables(tokens)
+    bytes_per_cell = channels * _FEATURE_TYPES[encoding].itemsize
+    fixed_bytes = TOKENS_BYTES + (channels if encoding == "int8" else 0)
+    if channels < 1 or channels > 65535 or fixed_bytes + bytes_per_cell + 5 > capacity:
         raise WireError(
-            f"One cell of {channels} channels as {precision} does not fit a body of {capacity} bytes: lower the "
+            f"One cell of {channels} channels as {encoding} does not fit a body of {capacity} bytes: lower the "
             "precision or raise the mtu."
         )
     key = np.ascontiguousarray(tokens.sites.key.cpu().numpy()[order], np.int64)
-    left = -1 if budget_bytes is None else max(0, budget_bytes)
+    bytes_left = -1 if budget_bytes is None else max(0, budget_bytes)
     if tables is None:
-        return primitives.counts_in_room(key, each, fixed, capacity, header_bytes, left).tolist()
+        return primitives.count_fitting_cells(
+            key, bytes_per_cell, fixed_bytes, capacity, header_bytes, bytes_left
+        ).tolist()
     rows = tokens.features.cpu().numpy()[order]
-    return coded_counts(key, rows, tokens.grid.shape, tables, fixed, capacity, header_bytes, left).tolist()
+    return count_fitting_coded_cells(
+        key, rows, tokens.grid.shape, tables, fixed_bytes, capacity, header_bytes, bytes_left
+    ).tolist()
 
 
 def _grid_fields(grid: BevGrid) -> tuple[int, ...]:
@@ -248,7 +252,7 @@ def _grid_fields(grid: BevGrid) -> tuple[int, ...]:
         any(abs(v) > 32767 for v in fields[:6])
         or fields[6] > 65535
         or _grid(fields) != grid
-        or rows * columns > _MOST_CELLS
+        or rows * columns > _MAX_CELLS
     ):
         raise WireError(
             "A grid is sent in whole centimetres within 327.67 m, a pillar in whole millimetres, at most 2^24 cells; "
@@ -270,23 +274,23 @@ def _grid_and_cells(fields: tuple[int, ...]) -> tuple[BevGrid, int]:
     return grid, rows * columns
 
 
-def token_bodies(tokens: SparseBev, score: Tensor | None, form: Form, capacity: int) -> list[bytes]:
+def pack_token_bodies(tokens: SparseBev, score: Tensor | None, token_codec: TokenCodec, capacity: int) -> list[bytes]:
     """The bodies of the tokens packets, the cells of highest score in the first."""
     order = token_order(tokens, score)
-    key, precision = tokens.sites.key.cpu().numpy()[order], form.precision
+    key, encoding = tokens.sites.key.cpu().numpy()[order], token_codec.encoding
     features = tokens.features.detach().cpu()
-    features = features if precision == "codes" else features.float()
-    largest, peak = 65504 if precision == "float16" else math.inf, 0.0
-    if features.numel() and precision != "codes":
+    features = features if encoding == "codes" else features.float()
+    largest, peak = 65504 if encoding == "float16" else math.inf, 0.0
+    if features.numel() and encoding != "codes":
         peak = float(features.abs().max())
     if not (math.isfinite(peak) and peak <= largest):
-        raise WireError(f"Features sent as {precision} must be finite and at most {largest:g}; these are not.")
+        raise WireError(f"Features sent as {encoding} must be finite and at most {largest:g}; these are not.")
     grid, channels = _GRID.pack(*_grid_fields(tokens.grid)), features.shape[1]
-    counts = packet_counts(tokens, order, form, capacity) or [0]
+    counts = count_cells_per_packet(tokens, order, token_codec, capacity) or [0]
     # All bodies at once, each with its cells in ascending order.
-    inner = np.argsort(np.repeat(np.arange(len(counts)) * _MOST_CELLS, counts) + key)
+    inner = np.argsort(np.repeat(np.arange(len(counts)) * _MAX_CELLS, counts) + key)
     key, features = key[inner], features.index_select(0, torch.from_numpy(order[inner]))
-    number, tables = PRECISIONS.index(precision), form.tables_of(tokens)
+    number, tables = TOKEN_ENCODINGS.index(encoding), token_codec.select_tables(tokens)
 
     def head(layout: int, count: int) -> bytes:
         return grid + _TOKENS.pack(number | layout << 2, channels, count)
@@ -298,8 +302,8 @@ def token_bodies(tokens: SparseBev, score: Tensor | None, form: Form, capacity: 
             for a, b in pairwise(ends.tolist())
         ]
     cells = primitives.pack_cell_runs(key, counts)
-    values, scales = _values(features, precision, counts)
-    each, bodies, at = channels * _FEATURE_TYPES[precision].itemsize, [], 0
+    values, scales = _values(features, encoding, counts)
+    each, bodies, at = channels * _FEATURE_TYPES[encoding].itemsize, [], 0
     for count, (layout, packed), scale in zip(counts, cells, scales):
         end = at + count * each
         bodies.append(b"".join((head(layout, count), packed, scale, values[at:end])))
@@ -307,28 +311,28 @@ def token_bodies(tokens: SparseBev, score: Tensor | None, form: Form, capacity: 
     return bodies
 
 
-def request_body(request: RequestMap, capacity: int) -> bytes:
+def pack_request_body(request: RequestMap, capacity: int) -> bytes:
     """The body of the one packet of a request map."""
-    sure = request.sure.detach().double().cpu()
-    if not bool(((sure >= 0) & (sure <= 1)).all()):
+    confidence = request.confidence.detach().double().cpu()
+    if not bool(((confidence >= 0) & (confidence <= 1)).all()):
         raise WireError("Message.request.sure is from 0 to 1; this is not.")
-    if _GRID.size + sure.numel() > capacity:
+    if _GRID.size + confidence.numel() > capacity:
         raise WireError(
-            f"A request map fits one packet, {capacity - _GRID.size} cells; got {sure.numel()}: coarser, please."
+            f"A request map fits one packet, {capacity - _GRID.size} cells; got {confidence.numel()}: coarser, please."
         )
-    return _GRID.pack(*_grid_fields(request.grid)) + np.rint(sure.numpy() * 255).astype(np.uint8).tobytes()
+    return _GRID.pack(*_grid_fields(request.grid)) + np.rint(confidence.numpy() * 255).astype(np.uint8).tobytes()
 
 
-def _values(features: Tensor, precision: Precision, counts: list[int]) -> tuple[bytes, list[bytes]]:
+def _values(features: Tensor, encoding: TokenEncoding, counts: list[int]) -> tuple[bytes, list[bytes]]:
     """Features (N, C) as the bytes of their rows, and the bytes of each body's scales; counts: the rows of each body."""
-    if precision == "int8":
+    if encoding == "int8":
         codes, steps = primitives.quantise_int8_runs(features.numpy(), counts)
         return steps.tobytes(), [code.tobytes() for code in codes]
-    if precision == "codes":
+    if encoding == "codes":
         return features.numpy().tobytes(), [b""] * len(counts)
     # Several times as fast here as numpy's conversion, to the same bits.
-    rows = (features.half() if precision == "float16" else features).numpy()
-    return rows.astype(_FEATURE_TYPES[precision], copy=False).tobytes(), [b""] * len(counts)
+    rows = (features.half() if encoding == "float16" else features).numpy()
+    return rows.astype(_FEATURE_TYPES[encoding], copy=False).tobytes(), [b""] * len(counts)
 
 
 def read_body(kind: int, body: bytes, fingerprint: bytes, tables: CodeTables | None) -> Body:
@@ -380,7 +384,7 @@ def _read_grid(body: bytes) -> tuple[BevGrid, int]:
         grid, cells = _grid_and_cells(_GRID.unpack_from(body))
     except ConfigError as error:
         raise PacketError("implausible", str(error)) from error
-    if cells > _MOST_CELLS:
+    if cells > _MAX_CELLS:
         raise PacketError("implausible", f"A grid of {cells} cells is huge.")
     return grid, cells
 
@@ -389,37 +393,37 @@ def _read_request(body: bytes) -> RequestMap:
     grid, cells = _read_grid(body)
     if len(body) != _GRID.size + cells:
         raise PacketError("garbage", f"A request of {cells} cells does not fill a body of {len(body)} bytes.")
-    sure = np.frombuffer(body, np.uint8, offset=_GRID.size).astype(np.float32) / 255
-    return RequestMap(grid, torch.from_numpy(sure).view(grid.shape))
+    confidence = np.frombuffer(body, np.uint8, offset=_GRID.size).astype(np.float32) / 255
+    return RequestMap(grid, torch.from_numpy(confidence).view(grid.shape))
 
 
 def _read_tokens(body: bytes, fingerprint: bytes, tables: CodeTables | None) -> TokenRows:
     if len(body) < TOKENS_BYTES:
         raise PacketError("garbage", f"A tokens body begins with {TOKENS_BYTES} bytes; got {len(body)}.")
     grid, cells = _read_grid(body)
-    form, channels, count = _TOKENS.unpack_from(body, _GRID.size)
-    precision, layout, data = PRECISIONS[form & 3], form >> 2, body[TOKENS_BYTES:]
-    if layout > (_CODED if precision == "codes" else primitives.BITMAP) or not channels:
-        raise PacketError("garbage", f"Unknown form of tokens: {form:#04x}, {channels} channels.")
+    layout_byte, channels, count = _TOKENS.unpack_from(body, _GRID.size)
+    encoding, layout, data = TOKEN_ENCODINGS[layout_byte & 3], layout_byte >> 2, body[TOKENS_BYTES:]
+    if layout > (_CODED if encoding == "codes" else primitives.BITMAP) or not channels:
+        raise PacketError("garbage", f"Unknown form of tokens: {layout_byte:#04x}, {channels} channels.")
     if layout == _CODED:
         if tables is None or tables.fingerprint != fingerprint:
             raise PacketError("wrong_model", "These tokens are coded by the tables of other weights.")
-        if tables.width != channels or cells > MOST_CELLS:
+        if tables.width != channels or cells > MAX_CODED_CELLS:
             raise PacketError("implausible", f"Coded rows of {channels} bytes on {cells} cells are not of this model.")
         key, rows = unpack_coded(data, count, grid.shape, tables)
-        return TokenRows(grid, precision, channels, key, b"", rows.tobytes())
+        return TokenRows(grid, encoding, channels, key, b"", rows.tobytes())
     key, used = primitives.unpack_cells(layout, data, count)
     if count and int(key[-1]) >= cells:
         raise PacketError("implausible", f"Cells lie outside a grid of {grid.shape} rows and columns.")
-    size = _FEATURE_TYPES[precision].itemsize
-    end = used + (channels if precision == "int8" else 0)
+    size = _FEATURE_TYPES[encoding].itemsize
+    end = used + (channels if encoding == "int8" else 0)
     if len(data) != end + count * channels * size:
         raise PacketError(
-            "garbage", f"{count} cells of {channels} channels as {precision} do not fill {len(body)} bytes."
+            "garbage", f"{count} cells of {channels} channels as {encoding} do not fill {len(body)} bytes."
         )
     if size > 1 and not primitives.are_finite(data, used, size):
         raise PacketError("implausible", "Features are NaN or infinite.")
-    return TokenRows(grid, precision, channels, key, data[used:end], data[end:])
+    return TokenRows(grid, encoding, channels, key, data[used:end], data[end:])
 
 
 def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
@@ -434,14 +438,14 @@ def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
 
 def _features(parts: list[TokenRows]) -> NDArray[Any]:
     """(n, C) float32, or uint8 of codes, of the rows of several packets of one form."""
-    dtype, channels = _FEATURE_TYPES[parts[0].precision], parts[0].channels
+    dtype, channels = _FEATURE_TYPES[parts[0].encoding], parts[0].channels
     # A copy that may be written to, in the machine's own order of bytes.
     values = np.frombuffer(b"".join(p.values for p in parts), dtype).astype(dtype.newbyteorder("="))
     values = values.reshape(-1, channels)
-    if parts[0].precision == "int8":
+    if parts[0].encoding == "int8":
         codes = np.frombuffer(b"".join(p.scales for p in parts), np.uint8).reshape(-1, channels)
         return primitives.dequantise_int8(np.repeat(codes, [len(p.key) for p in parts], axis=0), values)
-    if parts[0].precision == "codes":
+    if parts[0].encoding == "codes":
         return values
     return torch.from_numpy(values).float().numpy()
 
@@ -463,8 +467,8 @@ def merge_objects(parts: list[NDArray[Any]]) -> Boxes | None:
         id=torch.from_numpy(np.where(ids == 255, -1, ids)),
         sigma_xy=torch.from_numpy(primitives.log_values(rows["sigma_xy"], *_SIGMA_XY)),
         sigma_yaw=torch.from_numpy(primitives.log_values(rows["sigma_yaw"], *_SIGMA_YAW)),
-        flip=torch.from_numpy((rows["label_flip"] >> 3).astype(np.float32) / 31),
-        velocity=torch.from_numpy(_numbers(rows, "velocity", 2) * np.float32(_METRES_PER_S)),
+        p_flip=torch.from_numpy((rows["label_flip"] >> 3).astype(np.float32) / 31),
+        velocity=torch.from_numpy(_column_or_zeros(rows, "velocity", 2) * np.float32(_METRES_PER_S)),
     )
 
 
@@ -472,13 +476,13 @@ def merge_descriptors(parts: list[NDArray[Any]]) -> Tensor | None:
     """(N, DESCRIPTOR) of the objects of several packets, in that order; None where they have none."""
     if not parts or "descriptor" not in (parts[0].dtype.names or ()):
         return None
-    return torch.from_numpy(_numbers(np.concatenate(parts), "descriptor", DESCRIPTOR) / np.float32(127))
+    return torch.from_numpy(_column_or_zeros(np.concatenate(parts), "descriptor", DESCRIPTOR_DIM) / np.float32(127))
 
 
-def _numbers(rows: NDArray[Any], name: str, width: int) -> NDArray[np.float32]:
+def _column_or_zeros(rows: NDArray[Any], name: str, width: int) -> NDArray[np.float32]:
     """A column of small integers, zeros where the rows have none."""
-    known = name in (rows.dtype.names or ())
-    return rows[name].astype(np.float32) if known else np.zeros((len(rows), width), np.float32)
+    present = name in (rows.dtype.names or ())
+    return rows[name].astype(np.float32) if present else np.zeros((len(rows), width), np.float32)
 
 
 def merge_points(parts: list[NDArray[Any]]) -> PointCloud | None:

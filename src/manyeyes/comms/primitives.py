@@ -134,8 +134,8 @@ def cells_size(key: NDArray[np.int64]) -> int:
 
 
 @njit(cache=True)
-def counts_in_room(
-    key: I64x1, each: int, fixed: int, capacity: int, header: int, left: int
+def count_fitting_cells(
+    key: I64x1, bytes_per_cell: int, fixed_bytes: int, capacity: int, header_bytes: int, bytes_left: int
 ) -> I64x1:  # pragma: no cover
     """How many keys (N,), in the order given, each body takes: its cells, each bytes a cell, and fixed bytes.
 
@@ -146,20 +146,20 @@ def counts_in_room(
         widest = max(widest, _varint_bytes(int(k)))
     counts, bodies, at = np.empty(key.shape[0], np.int64), 0, 0
     while at < key.shape[0]:
-        room = max(0, (capacity if left < 0 else min(capacity, left - header)) - fixed)
-        most = min(key.shape[0] - at, 65535)
-        low, high = min(most, room // (each + widest)), min(most, room // each)
+        room = max(0, (capacity if bytes_left < 0 else min(capacity, bytes_left - header_bytes)) - fixed_bytes)
+        max_count = min(key.shape[0] - at, 65535)
+        low, high = min(max_count, room // (bytes_per_cell + widest)), min(max_count, room // bytes_per_cell)
         while low < high:
             middle = (low + high + 1) // 2
-            size = middle * each + min(_sizes(np.sort(key[at : at + middle])))
+            size = middle * bytes_per_cell + min(_sizes(np.sort(key[at : at + middle])))
             if size <= room:
                 low = middle
             else:
                 high = middle - 1
         if low == 0:
             break
-        if left >= 0:
-            left -= header + fixed + low * each + min(_sizes(np.sort(key[at : at + low])))
+        if bytes_left >= 0:
+            bytes_left -= header_bytes + fixed_bytes + low * bytes_per_cell + min(_sizes(np.sort(key[at : at + low])))
         counts[bodies] = low
         bodies += 1
         at += low
@@ -274,7 +274,7 @@ def _are_finite(raw: U8x1, at: int, size: int) -> bool:  # pragma: no cover
     return not bad
 
 
-def largest_magnitude(data: bytes, size: int) -> float:
+def max_magnitude(data: bytes, size: int) -> float:
     """The largest magnitude of little-endian floats of size bytes, 2 or 4, none of them NaN; at least one float."""
     # Without their signs, the bits of floats are in the order of their values.
     bits = np.frombuffer(data, f"<u{size}") & np.array((1 << 8 * size - 1) - 1, f"<u{size}")

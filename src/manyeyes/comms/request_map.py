@@ -17,39 +17,45 @@ from manyeyes.datatypes import BevGrid, ConfigError, Transform
 from manyeyes.datatypes.message import Message, RequestMap
 
 
-def request_map(xy: Tensor, sure: Tensor, windows: BevGrid) -> RequestMap:
+def build_request_map(xy: Tensor, confidence: Tensor, windows: BevGrid) -> RequestMap:
     """One agent's map over a coarse grid: in each window the least of sure (N,) in [0, 1], 0 where there is none.
 
-    xy: (N, 2) metres in the agent's frame, where it believes an object; sure: its score. The least: where one of two vehicles
+    xy: (N, 2) metres in the agent's frame, where it believes an object; confidence: its score. The least: where one of two vehicles
     is in doubt, help is wanted.
     """
-    if sure.shape != (len(xy),) or not bool(((sure >= 0) & (sure <= 1)).all()):
-        raise ConfigError(f"sure needs ({len(xy)},) in [0, 1]; got {tuple(sure.shape)}.")
+    if confidence.shape != (len(xy),) or not bool(((confidence >= 0) & (confidence <= 1)).all()):
+        raise ConfigError(f"sure needs ({len(xy)},) in [0, 1]; got {tuple(confidence.shape)}.")
     rows, columns = windows.shape
-    near = windows.inside(xy)
+    near = windows.contains(xy)
     yx = windows.cells(xy[near])
     cell = yx[:, 0] * columns + yx[:, 1]
-    least = torch.full((rows * columns,), torch.inf).scatter_reduce(0, cell, sure[near].float(), "amin")
-    return RequestMap(windows, torch.where(least.isinf(), 0.0, least).view(rows, columns))
+    min_confidence = torch.full((rows * columns,), torch.inf).scatter_reduce(0, cell, confidence[near].float(), "amin")
+    return RequestMap(windows, torch.where(min_confidence.isinf(), 0.0, min_confidence).view(rows, columns))
 
 
-def need(xy: Tensor, world_from_sender: Transform, requests: Sequence[Message], least: float = 0.1) -> Tensor:
+def compute_request_weights(
+    xy: Tensor, world_from_sender: Transform, requests: Sequence[Message], min_weight: float = 0.1
+) -> Tensor:
     """(N,) in [least, 1]: what to multiply the positive scores of tokens at xy (N, 2), metres in the sender's frame, with.
 
     requests: messages that have a request; without any, all is needed. To one receiver a token is worth 1 - sure of the window
-    where it falls, and nothing beyond its map; of several receivers the largest counts. ``least`` keeps an order among
+    where it falls, and nothing beyond its map; of several receivers the largest counts. ``min_weight`` keeps an order among
     tokens that nobody asks for: whoever does not broadcast a request may still hear them.
     """
-    asked = [m for m in requests if m.request is not None]
-    if not asked:
+    requesting = [m for m in requests if m.request is not None]
+    if not requesting:
         return torch.ones(len(xy))
-    needs = torch.stack([_need_of(xy, world_from_sender, m.world_from_agent, m.request) for m in asked if m.request])
-    return needs.amax(0).clamp_min(least)
+    weights = torch.stack(
+        [_request_weight(xy, world_from_sender, m.world_from_agent, m.request) for m in requesting if m.request]
+    )
+    return weights.amax(0).clamp_min(min_weight)
 
 
-def _need_of(xy: Tensor, world_from_sender: Transform, world_from_receiver: Transform, request: RequestMap) -> Tensor:
+def _request_weight(
+    xy: Tensor, world_from_sender: Transform, world_from_receiver: Transform, request: RequestMap
+) -> Tensor:
     flat = torch.cat((xy, xy.new_zeros(len(xy), 1)), 1).double()
     there = (world_from_receiver.inverse() @ world_from_sender).apply(flat)[:, :2]
     yx = request.grid.cells(there)
-    wanted = 1 - request.sure[yx[:, 0], yx[:, 1]]
-    return torch.where(request.grid.inside(there), wanted, 0.0).float()
+    weight = 1 - request.confidence[yx[:, 0], yx[:, 1]]
+    return torch.where(request.grid.contains(there), weight, 0.0).float()

@@ -39,19 +39,19 @@ class TokenFormat:
     channels: int
     tables: CodeTables | None = None
 
-    def refusal(self, fingerprint: bytes, rows: TokenRows) -> TokenRefusal | None:
+    def check_packet(self, fingerprint: bytes, rows: TokenRows) -> TokenRefusal | None:
         """Why the tokens of one packet are not of this form; None where they are."""
         if fingerprint != self.fingerprint:
             return "wrong_model"
         if rows.grid != self.grid:
             return "grid"
-        if rows.precision == "codes":
+        if rows.encoding == "codes":
             return None if self.tables is not None and rows.channels == self.tables.width else "width"
         if rows.channels != self.channels:
             return "width"
-        return None if largest_magnitude(rows) <= MAX_TOKEN_VALUE * _ROUNDING else "value"
+        return None if max_magnitude(rows) <= MAX_TOKEN_VALUE * _ROUNDING else "value"
 
-    def refusal_of(self, tokens: SparseBev) -> TokenRefusal | None:
+    def check_tokens(self, tokens: SparseBev) -> TokenRefusal | None:
         """The same of tokens that were read already, rows of floats (N, channels)."""
         if tokens.grid != self.grid:
             return "grid"
@@ -62,19 +62,19 @@ class TokenFormat:
         return None if bool(within.all()) else "value"
 
 
-def within_range(features: Tensor) -> Tensor:
+def clamp_features(features: Tensor) -> Tensor:
     """Features (N, C) as they may be sent: clamped to MAX_TOKEN_VALUE."""
     return features.clamp(-MAX_TOKEN_VALUE, MAX_TOKEN_VALUE)
 
 
-def largest_magnitude(rows: TokenRows) -> float:
+def max_magnitude(rows: TokenRows) -> float:
     """The largest magnitude among the float values of a packet; 0 of none."""
     if not len(rows.key):
         return 0.0
-    if rows.precision == "int8":
+    if rows.encoding == "int8":
         scale = primitives.dequantise_int8(
             np.frombuffer(rows.scales, np.uint8), np.full((1, rows.channels), 127, np.int8)
         )
         steps = np.frombuffer(rows.values, np.int8).reshape(-1, rows.channels)
         return float((np.abs(steps.astype(np.int16)).max(0) / 127 * scale[0]).max())
-    return primitives.largest_magnitude(rows.values, 4 if rows.precision == "float32" else 2)
+    return primitives.max_magnitude(rows.values, 4 if rows.encoding == "float32" else 2)

@@ -7,16 +7,16 @@ import torch
 from torch import Tensor
 
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.payloads import Form, Precision, packet_counts, token_order
+from manyeyes.comms.payloads import TokenCodec, TokenEncoding, count_cells_per_packet, token_order
 from manyeyes.comms.wire import DEFAULT_MTU, HEADER_BYTES
 from manyeyes.datatypes import SparseBev
 
 
-def within_budget(
+def select_within_budget(
     bev: SparseBev,
     score: Tensor,
     budget_bytes: int | None,
-    precision: Precision = "float16",
+    token_encoding: TokenEncoding = "float16",
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
 ) -> tuple[SparseBev, Tensor]:
@@ -26,11 +26,11 @@ def within_budget(
     never exceed the budget. A smaller budget keeps a subset. A budget that holds no cell keeps none: then the section
     is left out of the message (an empty section would still cost its header). Source: CoSTr Eq. 13 with real bytes.
     """
-    form = Form(precision, tables)
+    token_codec = TokenCodec(token_encoding, tables)
     order = token_order(bev, score)
     if budget_bytes is None:
         return bev, score
-    kept = sum(packet_counts(bev, order, form, mtu - HEADER_BYTES, HEADER_BYTES, budget_bytes))
+    kept = sum(count_cells_per_packet(bev, order, token_codec, mtu - HEADER_BYTES, HEADER_BYTES, budget_bytes))
     mask = torch.zeros(len(order), dtype=torch.bool)
     mask[torch.from_numpy(order[:kept])] = True
     mask = mask.to(score.device)

@@ -101,8 +101,8 @@ from numpy.typing import NDArray
 
 from manyeyes.comms import payloads
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.map_payload import ElementRows, element_bodies, merge_elements
-from manyeyes.comms.payloads import Body, Form, ObjectRows, PointRows, Precision, TokenRows
+from manyeyes.comms.map_payload import ElementRows, merge_elements, pack_element_bodies
+from manyeyes.comms.payloads import Body, ObjectRows, PointRows, TokenCodec, TokenEncoding, TokenRows
 from manyeyes.comms.primitives import PacketError, log_codes, log_values
 from manyeyes.datatypes import BevGrid, ConfigError, Message, Transform, WireError
 from manyeyes.datatypes.message import RequestMap
@@ -119,31 +119,31 @@ HEADER_BYTES = _BODY_AT + _CRC.size
 _QUATERNION_UNIT = 2.0**31 / math.sqrt(0.5)
 _POSITION_UNITS = 1 << 20
 _POSITION_BYTES = 6
-_FARTHEST_M = 1e8
+_MAX_POSITION_M = 1e8
 _SIGMA_M, _SIGMA_RAD = (1e-3, 1e4), (1e-5, 10.0)
 
 
 @dataclass(frozen=True)
-class Header:
+class MessageHeader:
     """What every packet of a message says alike, apart from its number.
 
-    pose: position, and quaternion w, x, y, z. spread: codes of three standard deviations, then of three entries of L.
+    pose: position, and quaternion w, x, y, z. covariance_codes: codes of three standard deviations, then of three entries of L.
     """
 
     agent_id: int
     timestamp_ns: int
-    packets: int
+    num_packets: int
     is_infrastructure: bool
     fingerprint: bytes
     pose: tuple[float, ...]
-    spread: tuple[int, ...]
+    covariance_codes: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Fragment:
     """One packet, read and checked. body is None where the message has no section."""
 
-    header: Header
+    header: MessageHeader
     number: int
     body: Body
     packet: bytes
@@ -152,7 +152,7 @@ class Fragment:
 def encode(
     message: Message,
     *,
-    precision: Precision = "float16",
+    token_encoding: TokenEncoding = "float16",
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
 ) -> list[bytes]:
@@ -160,27 +160,27 @@ def encode(
 
     tables: those of the weights that the message names; with them, codes are entropy-coded.
     """
-    form = Form(precision, tables)
+    token_codec = TokenCodec(token_encoding, tables)
     if not HEADER_BYTES + payloads.TOKENS_BYTES < mtu <= 65535:
         raise ConfigError(f"mtu is from {HEADER_BYTES + payloads.TOKENS_BYTES + 1} to 65535 bytes; got {mtu}.")
     capacity = mtu - HEADER_BYTES
     bodies: list[tuple[int, bytes]] = []
     if message.objects is not None:
-        rows = payloads.object_bodies(message.objects, message.descriptors, capacity)
+        rows = payloads.pack_object_bodies(message.objects, message.descriptors, capacity)
         bodies += [(payloads.OBJECTS, body) for body in rows]
     if message.request is not None:
-        bodies.append((payloads.REQUEST, payloads.request_body(message.request, capacity)))
+        bodies.append((payloads.REQUEST, payloads.pack_request_body(message.request, capacity)))
     if message.tokens is not None:
         if tables is not None and tables.fingerprint != message.fingerprint:
             raise WireError(
                 f"Tables of weights {tables.fingerprint.hex()} do not code tokens of {message.fingerprint.hex()}."
             )
-        rows = payloads.token_bodies(message.tokens, message.token_score, form, capacity)
+        rows = payloads.pack_token_bodies(message.tokens, message.token_score, token_codec, capacity)
         bodies += [(payloads.TOKENS, body) for body in rows]
-    if message.seen_map is not None:
-        bodies += [(payloads.ELEMENTS, body) for body in element_bodies(message.seen_map, capacity)]
+    if message.local_map is not None:
+        bodies += [(payloads.ELEMENTS, body) for body in pack_element_bodies(message.local_map, capacity)]
     if message.points is not None:
-        bodies += [(payloads.POINTS, body) for body in payloads.point_bodies(message.points, capacity)]
+        bodies += [(payloads.POINTS, body) for body in payloads.pack_point_bodies(message.points, capacity)]
     bodies = bodies or [(payloads.NONE, b"")]
     if len(bodies) > 65535:
         raise WireError(
@@ -211,10 +211,10 @@ def _common_fields(message: Message) -> _Common:
         raise WireError(f"Message.fingerprint has 8 bytes; got {len(message.fingerprint)}.")
     position = message.world_from_agent.translation.double().cpu().numpy()
     rotation = message.world_from_agent.rotation.double().cpu().numpy()
-    if position.shape != (3,) or not np.isfinite(rotation).all() or not (np.abs(position) <= _FARTHEST_M).all():
-        raise WireError(f"Message.world_from_agent is one finite pose within {_FARTHEST_M:.0e} m; got {position}.")
+    if position.shape != (3,) or not np.isfinite(rotation).all() or not (np.abs(position) <= _MAX_POSITION_M).all():
+        raise WireError(f"Message.world_from_agent is one finite pose within {_MAX_POSITION_M:.0e} m; got {position}.")
     largest, parts = _smallest_three(rotation)
-    spread = _spread(message.pose_covariance.double().cpu().numpy())
+    spread = _encode_covariance(message.pose_covariance.double().cpu().numpy())
     flags = (8 if message.is_infrastructure else 0) | largest << 4
     place = b"".join(
         round(v * _POSITION_UNITS).to_bytes(_POSITION_BYTES, "little", signed=True) for v in position.tolist()
@@ -251,7 +251,7 @@ def _rotation(q: tuple[float, ...]) -> list[list[float]]:
     ]
 
 
-def _spread(covariance: NDArray[np.float64]) -> list[int]:
+def _encode_covariance(covariance: NDArray[np.float64]) -> list[int]:
     """Codes of the standard deviations and of the factor of the correlations of a (3, 3), where zero rows are allowed."""
     if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
         raise WireError(f"Message.pose_covariance is a finite (3, 3); got {covariance.tolist()}.")
@@ -281,12 +281,12 @@ def _spread(covariance: NDArray[np.float64]) -> list[int]:
     return [int(v) for v in (*codes, *np.rint(lower[[1, 2, 2], [0, 0, 1]] * 127))]
 
 
-def _covariance(spread: tuple[int, ...]) -> NDArray[np.float64]:
+def _decode_covariance(covariance_codes: tuple[int, ...]) -> NDArray[np.float64]:
     """The inverse of _spread; any codes are some covariance."""
-    codes = np.array(spread[:3], np.uint8)
+    codes = np.array(covariance_codes[:3], np.uint8)
     sigma = np.concatenate((log_values(codes[:2], *_SIGMA_M), log_values(codes[2:], *_SIGMA_RAD))).astype(np.float64)
     lower = np.zeros((3, 3))
-    lower[[1, 2, 2], [0, 0, 1]] = np.array(spread[3:]) / 127
+    lower[[1, 2, 2], [0, 0, 1]] = np.array(covariance_codes[3:]) / 127
     lower /= np.maximum(np.linalg.norm(lower, axis=1, keepdims=True), 1)
     lower[range(3), range(3)] = np.sqrt(np.maximum(1 - np.square(lower).sum(1), 0))
     factor = sigma[:, None] * lower
@@ -323,17 +323,17 @@ def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
 
 # The packets of a message come one after another, and what they say alike is read once.
 @lru_cache(maxsize=64)
-def _header(common: bytes, flags: int, count: int) -> Header:
+def _header(common: bytes, flags: int, count: int) -> MessageHeader:
     """The fields from the agent id to the fingerprint, checked; flags without the kind of body."""
     agent_id, timestamp_ns, place, *rest = _COMMON.unpack(common)
     position = tuple(
         int.from_bytes(place[at : at + _POSITION_BYTES], "little", signed=True) / _POSITION_UNITS
         for at in range(0, 3 * _POSITION_BYTES, _POSITION_BYTES)
     )
-    if not all(abs(v) <= _FARTHEST_M for v in position):
+    if not all(abs(v) <= _MAX_POSITION_M for v in position):
         raise PacketError("implausible", f"Agent {agent_id} claims the position {position}.")
     pose = (*position, *_quaternion(flags >> 1, rest[:3]))
-    return Header(agent_id, timestamp_ns, count, bool(flags & 1), rest[9], pose, tuple(rest[3:9]))
+    return MessageHeader(agent_id, timestamp_ns, count, bool(flags & 1), rest[9], pose, tuple(rest[3:9]))
 
 
 def _quaternion(largest: int, codes: list[int]) -> list[float]:
@@ -353,9 +353,9 @@ class Assembly:
     def __init__(self, first: Fragment) -> None:
         self.header = first.header
         self.fragments: dict[int, Fragment] = {}
-        self._form: tuple[BevGrid, Precision, int] | None = None
+        self._token_layout: tuple[BevGrid, TokenEncoding, int] | None = None
         self._objects: np.dtype[Any] | None = None
-        self._requested = False
+        self._has_request = False
         self._rings: bytes | None = None
         self._cells: set[int] = set()
         self.add(first)
@@ -369,12 +369,12 @@ class Assembly:
             name = self._name(fragment)
             raise PacketError("contradiction", f"A second {name} differs from the first; both cannot be true.")
         if isinstance(fragment.body, TokenRows):
-            form = (fragment.body.grid, fragment.body.precision, fragment.body.channels)
+            form = (fragment.body.grid, fragment.body.encoding, fragment.body.channels)
             cells = fragment.body.key.tolist()
-            if (self._form or form) != form or not self._cells.isdisjoint(cells):
+            if (self._token_layout or form) != form or not self._cells.isdisjoint(cells):
                 name = self._name(fragment)
                 raise PacketError("contradiction", f"The cells in {name} do not go with those of the other packets.")
-            self._form = form
+            self._token_layout = form
             self._cells.update(cells)
         if isinstance(fragment.body, ObjectRows):
             if (self._objects or fragment.body.rows.dtype) != fragment.body.rows.dtype:
@@ -382,10 +382,10 @@ class Assembly:
                 raise PacketError("contradiction", f"The objects in {name} say other things than those before.")
             self._objects = fragment.body.rows.dtype
         if isinstance(fragment.body, RequestMap):
-            if self._requested:
+            if self._has_request:
                 name = self._name(fragment)
                 raise PacketError("contradiction", f"{name} is a second request; there is one a message.")
-            self._requested = True
+            self._has_request = True
         if isinstance(fragment.body, ElementRows):
             if (self._rings or fragment.body.rings) != fragment.body.rings:
                 name = self._name(fragment)
@@ -409,7 +409,7 @@ class Assembly:
                 torch.tensor(_rotation(head.pose[3:]), dtype=torch.float64),
                 torch.tensor(head.pose[:3], dtype=torch.float64),
             ),
-            pose_covariance=torch.from_numpy(_covariance(head.spread)),
+            pose_covariance=torch.from_numpy(_decode_covariance(head.covariance_codes)),
             fingerprint=head.fingerprint,
             is_infrastructure=head.is_infrastructure,
             tokens=payloads.merge_tokens([b for b in bodies if isinstance(b, TokenRows)]),
@@ -417,7 +417,7 @@ class Assembly:
             descriptors=payloads.merge_descriptors(objects),
             points=payloads.merge_points([b.rows for b in bodies if isinstance(b, PointRows)]),
             request=next((b for b in bodies if isinstance(b, RequestMap)), None),
-            seen_map=merge_elements([b for b in bodies if isinstance(b, ElementRows)]),
+            local_map=merge_elements([b for b in bodies if isinstance(b, ElementRows)]),
         )
 
 

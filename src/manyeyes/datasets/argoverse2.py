@@ -22,12 +22,12 @@ from manyeyes.datatypes import (
     LABELS,
     AgentFrame,
     Boxes,
+    GroundTruth,
     MissingExtraError,
     PointCloud,
     RecordingError,
     Snapshot,
     Transform,
-    Truth,
 )
 
 _AXLE_HEIGHT_M = 0.33
@@ -66,7 +66,7 @@ class Argoverse2Recording:
     """Logs under a root (or one log): snapshot i shows sweep i as agent 0, the ego, and sweep i + gap as agent 1.
 
     True boxes are the vehicles at the ego's time, and those that only the later sweep has; an agent has seen those that
-    hold a point of its sweep. Logs without enough sweeps are named in ``problems``.
+    hold a point of its sweep. Logs without enough sweeps are named in ``missing_summary``.
     """
 
     def __init__(self, root: Path | str, gap: int = 1) -> None:
@@ -86,7 +86,7 @@ class Argoverse2Recording:
                 self._folders[folder.name], self._sweeps[folder.name] = folder, sweeps
             else:
                 problems.append(f"{folder}: {len(sweeps)} sweeps in sensors/lidar, expected more than {gap}; left out")
-        self.problems = tuple(problems)
+        self.missing_summary = tuple(problems)
         if not self._folders:
             first = problems[0] if problems else "it is empty"
             raise RecordingError(f"{self.root}: no usable Argoverse 2 log ({first}); check the path or the download.")
@@ -101,7 +101,7 @@ class Argoverse2Recording:
         """How many pairs of sweeps the log has."""
         return len(self.sweeps(scenario)) - self._gap
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         """All of them."""
         return range(self.length(scenario))
 
@@ -196,7 +196,7 @@ class Argoverse2Recording:
         elapsed = float(span[1] - span[0]) * 1e-9
         return float(np.linalg.norm(np.diff(place))) / elapsed if elapsed > 0 else 0.0
 
-    def _truth(self, scenario: str, pair: tuple[int, int], frames: tuple[AgentFrame, ...]) -> Truth:
+    def _truth(self, scenario: str, pair: tuple[int, int], frames: tuple[AgentFrame, ...]) -> GroundTruth:
         """Vehicles in the city frame: the ego's copy of a track where it has one, in the order of ids."""
         boxes, met = [], []
         for time in pair:
@@ -207,7 +207,7 @@ class Argoverse2Recording:
         _, first = np.unique(both.id.numpy(), return_index=True)
         union = both[torch.from_numpy(first)]
         seen = torch.stack([torch.isin(union.id, ids) for ids in met])
-        return Truth(union, seen, Transform.stack([f.world_from_agent for f in frames]))
+        return GroundTruth(union, seen, Transform.stack([f.world_from_agent for f in frames]))
 
     def _table(self, path: Path, names: tuple[str, ...]) -> tuple[np.ndarray, ...]:
         """Columns that belong to the whole log; kept in memory."""

@@ -24,7 +24,7 @@ class Recording(Protocol):
         """How many snapshots the scenario has."""
         ...
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         """The indices that evaluation counts; those before them are history."""
         ...
 
@@ -37,10 +37,10 @@ class Recording(Protocol):
         ...
 
 
-def judged_frames(recording: Recording) -> Iterator[tuple[str, int]]:
+def iter_eval_frames(recording: Recording) -> Iterator[tuple[str, int]]:
     """Every (scenario, index) that evaluation counts, in order."""
     for scenario in recording.scenarios:
-        for index in recording.judged(scenario):
+        for index in recording.eval_indices(scenario):
             yield scenario, index
 
 
@@ -54,7 +54,7 @@ def require_index(recording: Recording, scenario: str, index: int) -> None:
         raise RecordingError(f"Scenario '{scenario}' has no snapshot {index}; choose an index from 0 to {last}.")
 
 
-def points_in_listed_boxes(snapshot: Snapshot, margin_m: float = 0.1) -> Tensor:
+def count_points_in_listed_boxes(snapshot: Snapshot, margin_m: float = 0.1) -> Tensor:
     """(agents, N) int64: how many of an agent's points lie in each true box that it lists; -1: not listed.
 
     Boxes are moved into each agent's frame and enlarged by margin_m. A vehicle that is listed was met by the agent's
@@ -69,13 +69,13 @@ def points_in_listed_boxes(snapshot: Snapshot, margin_m: float = 0.1) -> Tensor:
         boxes = truth.boxes[listed].transform(truth.world_from_agent[row].inverse())
         points = frame.points.xyz.to(boxes.center.dtype)
         points = points[points[:, 0].argsort()]  # a box then needs a slice of them
-        reach = boxes.size.norm(dim=-1) / 2 + margin_m
+        radius_m = boxes.size.norm(dim=-1) / 2 + margin_m
         x, ahead = boxes.center[:, 0], points[:, 0].contiguous()
         first, end = (
-            torch.searchsorted(ahead, x - reach).tolist(),
-            torch.searchsorted(ahead, x + reach, right=True).tolist(),
+            torch.searchsorted(ahead, x - radius_m).tolist(),
+            torch.searchsorted(ahead, x + radius_m, right=True).tolist(),
         )
-        for one, (column, radius) in enumerate(zip(listed.tolist(), reach.tolist())):
+        for one, (column, radius) in enumerate(zip(listed.tolist(), radius_m.tolist())):
             near = points[first[one] : end[one]]
             near = near[((near - boxes.center[one]).abs() <= radius).all(-1)]
             counts[row, column] = boxes[one : one + 1].contains(near, margin_m).sum()

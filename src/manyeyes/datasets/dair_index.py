@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from manyeyes.datasets.dair_json import REMEDY, load_json, load_list, number_of, offset_of, text_of
+from manyeyes.datasets.dair_json import REMEDY, get_number, get_offset, get_text, load_json, load_list
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datatypes import RecordingError
 
@@ -40,7 +40,7 @@ class SideFrame:
 
 
 @dataclass(frozen=True)
-class Pair:
+class DairPair:
     """A vehicle's sweep and an infrastructure's. label: the cooperative one, None where the file is not there.
 
     offset: the correction of the infrastructure's place in metres, None where nobody made one; offset_in_world: along the
@@ -56,15 +56,15 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Index:
+class DairIndex:
     """Usable pairs by drive, in order of time; one line for each kind of thing that is missing, and a record for each file."""
 
-    pairs: dict[str, tuple[Pair, ...]]
-    problems: tuple[str, ...]
-    missing: tuple[FileProblem, ...]
+    pairs: dict[str, tuple[DairPair, ...]]
+    missing_summary: tuple[str, ...]
+    missing_files: tuple[FileProblem, ...]
 
 
-def dair_root(path: Path) -> Path | None:
+def find_dair_root(path: Path) -> Path | None:
     """The folder that holds the two sides: path itself, the official archive's folder in it, or None."""
     return next((p for p in (path, path / ARCHIVE) if any((p / side).is_dir() for side in SIDES)), None)
 
@@ -84,7 +84,7 @@ class _Side:
     def read(cls, root: Path, name: str) -> _Side:
         path = root / name / "data_info.json"
         rows = enumerate(load_list(path))
-        return cls(root, name, path, {Path(text_of(path, e, "pointcloud_path", f"[{i}]")).stem: e for i, e in rows})
+        return cls(root, name, path, {Path(get_text(path, e, "pointcloud_path", f"[{i}]")).stem: e for i, e in rows})
 
     def frame(self, id: str) -> SideFrame:
         if id not in self._frames:
@@ -96,8 +96,8 @@ class _Side:
         label = next((entry[k] for k in _LABEL_KEYS if entry.get(k)), f"label/{_LABEL_FOLDER[self.name]}/{id}.json")
         motions = [entry.get(f"calib_{m}_path") or f"calib/{m}/{id}.json" for m in _MOTIONS[self.name]]
         batch = entry.get("batch_id", entry.get("sequence_id"))
-        stamp = number_of(self.path, entry, "pointcloud_timestamp", id)
-        height = None if entry.get("lidar_height_m") is None else number_of(self.path, entry, "lidar_height_m", id)
+        stamp = get_number(self.path, entry, "pointcloud_timestamp", id)
+        height = None if entry.get("lidar_height_m") is None else get_number(self.path, entry, "lidar_height_m", id)
         # Microseconds since 1970 are exact in float64, hundreds of nanoseconds are not.
         return SideFrame(
             id,
@@ -128,8 +128,8 @@ class Sides:
     """Both sides of a root: which sweep came before another."""
 
     def __init__(self, root: Path) -> None:
-        wanted = [f"{name}/data_info.json" for name in (*SIDES, "cooperative")]
-        missing = [name for name in wanted if not (root / name).is_file()]
+        expected = [f"{name}/data_info.json" for name in (*SIDES, "cooperative")]
+        missing = [name for name in expected if not (root / name).is_file()]
         if missing:
             raise RecordingError(
                 f"{root}: expected DAIR-V2X's vehicle-side, infrastructure-side and cooperative folders with a "
@@ -138,15 +138,15 @@ class Sides:
         self.vehicle, self.infrastructure = (_Side.read(root, name) for name in SIDES)
 
 
-def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frames: int, label_folder: str) -> Index:
+def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frames: int, label_folder: str) -> DairIndex:
     """The pairs whose files are all there; ids: of the vehicle's frames that count, None for all.
 
     delay_frames: the infrastructure's sweep is so many sweeps older than the paired one (vic-async).
     """
     path = root / "cooperative" / "data_info.json"
     there = _Listing()
-    lacking = _Lacking()
-    drives: dict[str, list[Pair]] = {}
+    missing_counts = _MissingCounts()
+    drives: dict[str, list[DairPair]] = {}
     missing: list[FileProblem] = []
     entries = load_list(path)
     named = set()
@@ -155,31 +155,33 @@ def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frame
         named.add(vehicle)
         if ids is not None and vehicle not in ids:
             continue
-        lacking.total += 1
+        missing_counts.total += 1
         absent = next(
             (f"{s.path} has no frame {i}" for s, i in _both(sides, vehicle, infrastructure) if i not in s.entries), None
         )
         if absent is not None:
-            lacking.note("an entry in the index of its side", absent)
+            missing_counts.note("an entry in the index of its side", absent)
             missing += _absent_entries(sides, vehicle, infrastructure)
             continue
         second: SideFrame | None = sides.infrastructure.frame(infrastructure)
         if delay_frames:
             second = sides.infrastructure.before(second, delay_frames)
             if second is None:
-                lacking.note(f"an infrastructure sweep {delay_frames} earlier", f"the first is frame {vehicle}")
+                missing_counts.note(f"an infrastructure sweep {delay_frames} earlier", f"the first is frame {vehicle}")
                 continue
         pair = _pair(root, path, entry, row, sides.vehicle.frame(vehicle), second, label_folder)
         missing += _absent_files(pair, there)
         gone = next((f for f in _needed(pair, there) if not there.has(f)), None)
         if gone is not None:
-            lacking.note(f"their {gone.parent.relative_to(root)} file", f"the first is {gone}")
+            missing_counts.note(f"their {gone.parent.relative_to(root)} file", f"the first is {gone}")
             continue
         if pair.label is not None and not there.has(pair.label):
-            lacking.note("their cooperative label and have no truth", f"the first is {pair.label}", left_out=False)
-            pair = Pair(pair.vehicle, pair.infrastructure, None, pair.offset, pair.offset_in_world, pair.i2v)
+            missing_counts.note(
+                "their cooperative label and have no truth", f"the first is {pair.label}", left_out=False
+            )
+            pair = DairPair(pair.vehicle, pair.infrastructure, None, pair.offset, pair.offset_in_world, pair.i2v)
         drives.setdefault(pair.vehicle.batch, []).append(pair)
-    problems = lacking.lines(path)
+    problems = missing_counts.lines(path)
     if ids is not None and ids - named:
         gone = sorted(ids - named)
         problems.append(
@@ -189,7 +191,7 @@ def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frame
         missing += (FileProblem(p, "missing", "", f"the split names this frame, {path.name} does not") for p in clouds)
     order = sorted(drives, key=lambda name: (not name.isdecimal(), int(name) if name.isdecimal() else 0, name))
     kept = {n: tuple(sorted(drives[n], key=lambda p: (p.vehicle.timestamp_ns, p.vehicle.id))) for n in order}
-    return Index(kept, tuple(problems), tuple(missing))
+    return DairIndex(kept, tuple(problems), tuple(missing))
 
 
 def _both(sides: Sides, vehicle: str, infrastructure: str) -> tuple[tuple[_Side, str], ...]:
@@ -211,25 +213,25 @@ def _absent_entries(sides: Sides, vehicle: str, infrastructure: str) -> list[Fil
 def _frame_id(path: Path, entry: Mapping[str, Any], side: str, row: int) -> str:
     """The frame's id: stated by V2X-Seq, the stem of the cloud in DAIR-V2X."""
     if f"{side}_frame" in entry:
-        return text_of(path, entry, f"{side}_frame", f"[{row}]")
-    return Path(text_of(path, entry, f"{side}_pointcloud_path", f"[{row}]")).stem
+        return get_text(path, entry, f"{side}_frame", f"[{row}]")
+    return Path(get_text(path, entry, f"{side}_pointcloud_path", f"[{row}]")).stem
 
 
 def _pair(
     root: Path, path: Path, entry: Mapping[str, Any], row: int, vehicle: SideFrame, second: SideFrame, folder: str
-) -> Pair:
+) -> DairPair:
     sequence = "vehicle_frame" in entry
     if sequence:
         label = root / "cooperative" / "label" / f"{vehicle.id}.json"
     else:
-        label = root / text_of(path, entry, "cooperative_label_path", f"[{row}]")
+        label = root / get_text(path, entry, "cooperative_label_path", f"[{row}]")
         label = label.parent.with_name(folder) / label.name
-    offset = offset_of(path, entry.get("system_error_offset"), f"[{row}].system_error_offset")
+    offset = get_offset(path, entry.get("system_error_offset"), f"[{row}].system_error_offset")
     i2v = root / "cooperative" / "calib" / "lidar_i2v" / f"{vehicle.id}.json"
-    return Pair(vehicle, second, label, offset, not sequence, i2v)
+    return DairPair(vehicle, second, label, offset, not sequence, i2v)
 
 
-def _needed(pair: Pair, there: _Listing) -> Iterable[Path]:
+def _needed(pair: DairPair, there: _Listing) -> Iterable[Path]:
     """Files without which there is no snapshot; lidar_i2v stands in for the infrastructure's own calibration."""
     yield pair.vehicle.cloud
     yield pair.infrastructure.cloud
@@ -238,7 +240,7 @@ def _needed(pair: Pair, there: _Listing) -> Iterable[Path]:
         yield from pair.infrastructure.motions
 
 
-def _absent_files(pair: Pair, there: _Listing) -> list[FileProblem]:
+def _absent_files(pair: DairPair, there: _Listing) -> list[FileProblem]:
     """The files of a pair that are not there.
 
     Labels and calibrations of the infrastructure are absent only where their folder has others: some releases have none.
@@ -272,7 +274,7 @@ class _Listing:
         return self._names[folder]
 
 
-class _Lacking:
+class _MissingCounts:
     """How many pairs lack what, and the first that does."""
 
     def __init__(self) -> None:
@@ -290,7 +292,7 @@ class _Lacking:
         ]
 
 
-def split_ids(root: Path, split: str, split_file: Path | None) -> frozenset[str]:
+def read_split_ids(root: Path, split: str, split_file: Path | None) -> frozenset[str]:
     """Ids of the vehicle's frames of a split: under ``cooperative_split`` of the official file, or a bare list of ids."""
     places = (split_file,) if split_file is not None else (root / SPLIT_FILE, root / f"{split}.json")
     path = next((p for p in places if p.is_file()), None)

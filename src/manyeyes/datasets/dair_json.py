@@ -44,34 +44,34 @@ def load_list(path: Path) -> list[Mapping[str, Any]]:
     return content
 
 
-def field_of(path: Path, content: Any, key: str, where: str = "") -> Any:
+def get_field(path: Path, content: Any, key: str, json_path: str = "") -> Any:
     """The value of a key that has to be there."""
     if not isinstance(content, Mapping) or key not in content:
-        raise RecordingError(f"{path}: expected the key '{_name(where, key)}', found none; {REMEDY}.")
+        raise RecordingError(f"{path}: expected the key '{_name(json_path, key)}', found none; {REMEDY}.")
     return content[key]
 
 
-def text_of(path: Path, content: Any, key: str, where: str = "") -> str:
+def get_text(path: Path, content: Any, key: str, json_path: str = "") -> str:
     """A value that has to be a text with something in it."""
-    found = field_of(path, content, key, where)
+    found = get_field(path, content, key, json_path)
     if not isinstance(found, str) or not found:
-        raise RecordingError(f"{path}: expected a text at '{_name(where, key)}', found {found!r}; {REMEDY}.")
+        raise RecordingError(f"{path}: expected a text at '{_name(json_path, key)}', found {found!r}; {REMEDY}.")
     return found
 
 
-def number_of(path: Path, content: Any, key: str, where: str = "", blank: float | None = None) -> float:
+def get_number(path: Path, content: Any, key: str, json_path: str = "", blank: float | None = None) -> float:
     """A finite number, written as such or as a string; blank: what an empty string stands for, None: an error."""
-    found = field_of(path, content, key, where)
+    found = get_field(path, content, key, json_path)
     if found == "" and blank is not None:
         return blank
     value = _number(found)
     if value is None:
-        raise RecordingError(f"{path}: expected a number at '{_name(where, key)}', found {found!r}; {REMEDY}.")
+        raise RecordingError(f"{path}: expected a number at '{_name(json_path, key)}', found {found!r}; {REMEDY}.")
     return value
 
 
-def _name(where: str, key: str) -> str:
-    return f"{where}.{key}" if where else key
+def _name(json_path: str, key: str) -> str:
+    return f"{json_path}.{key}" if json_path else key
 
 
 def _number(found: object) -> float | None:
@@ -113,13 +113,13 @@ def read_calibration(path: Path) -> Transform:
 
 def _motion(path: Path, content: Any) -> Transform:
     inner = content.get("transform", content) if isinstance(content, Mapping) else content
-    where = "transform" if inner is not content else ""
-    rotation = _array(path, field_of(path, inner, "rotation", where), (3, 3), _name(where, "rotation"))
-    translation = _array(path, field_of(path, inner, "translation", where), (3,), _name(where, "translation"))
+    json_path = "transform" if inner is not content else ""
+    rotation = _array(path, get_field(path, inner, "rotation", json_path), (3, 3), _name(json_path, "rotation"))
+    translation = _array(path, get_field(path, inner, "translation", json_path), (3,), _name(json_path, "translation"))
     left, scale, right = np.linalg.svd(rotation)
     if np.abs(scale - 1).max() > _NOT_A_ROTATION or np.linalg.det(rotation) < 0:
         raise RecordingError(
-            f"{path}: '{_name(where, 'rotation')}' is no rotation (singular values {np.round(scale, 3).tolist()}, "
+            f"{path}: '{_name(json_path, 'rotation')}' is no rotation (singular values {np.round(scale, 3).tolist()}, "
             f"determinant {np.linalg.det(rotation):.3f}), expected an orthonormal, right-handed matrix; {REMEDY}."
         )
     return Transform(torch.from_numpy(left @ right), torch.from_numpy(translation))
@@ -129,14 +129,14 @@ def read_infrastructure_calibration(path: Path) -> tuple[Transform, tuple[float,
     """world_from_virtuallidar, and its ``relative_error``: metres along the world's x and y, 0 where it is blank."""
     content = load_json(path)
     error = content.get("relative_error") if isinstance(content, Mapping) else None
-    return _motion(path, content), offset_of(path, error or None, "relative_error") or (0.0, 0.0)
+    return _motion(path, content), get_offset(path, error or None, "relative_error") or (0.0, 0.0)
 
 
-def offset_of(path: Path, found: Any, where: str) -> tuple[float, float] | None:
+def get_offset(path: Path, found: Any, json_path: str) -> tuple[float, float] | None:
     """``{delta_x, delta_y}`` in metres; None where there is none, or where an empty string stands for it."""
     if found is None or found == "":
         return None
-    return number_of(path, found, "delta_x", where, 0.0), number_of(path, found, "delta_y", where, 0.0)
+    return get_number(path, found, "delta_x", json_path, 0.0), get_number(path, found, "delta_y", json_path, 0.0)
 
 
 def read_side_labels(path: Path) -> Boxes:
@@ -147,9 +147,9 @@ def read_side_labels(path: Path) -> Boxes:
         size = _size(path, entry, row)
         if min(size) <= 0:
             continue
-        location = field_of(path, entry, "3d_location", f"[{row}]")
-        middle = [number_of(path, location, axis, f"[{row}].3d_location") for axis in "xyz"]
-        places.append([*middle, *size, number_of(path, entry, "rotation", f"[{row}]")])
+        location = get_field(path, entry, "3d_location", f"[{row}]")
+        middle = [get_number(path, location, axis, f"[{row}].3d_location") for axis in "xyz"]
+        places.append([*middle, *size, get_number(path, entry, "rotation", f"[{row}]")])
         kept.append((label, _track(path, entry, row)))
     table = torch.tensor(places, dtype=torch.float64).reshape(-1, 7)
     return _boxes(table[:, :3], table[:, 3:6], table[:, 6], kept)
@@ -165,7 +165,7 @@ def read_world_labels(path: Path) -> Boxes:
     kept: list[tuple[int, int]] = []
     for row, entry, label in _vehicles(path):
         where = f"[{row}].world_8_points"
-        found = _array(path, field_of(path, entry, "world_8_points", f"[{row}]"), (8, 3), where)
+        found = _array(path, get_field(path, entry, "world_8_points", f"[{row}]"), (8, 3), where)
         if not np.ptp(found, axis=0).any():
             continue
         corners.append(found)
@@ -203,22 +203,22 @@ def _vehicles(path: Path) -> list[tuple[int, Mapping[str, Any], int]]:
     """Row, entry and index into LABELS of every vehicle in a label file."""
     found = []
     for row, entry in enumerate(load_list(path)):
-        name = text_of(path, entry, "type", f"[{row}]").lower()
+        name = get_text(path, entry, "type", f"[{row}]").lower()
         if name in LABELS:
             found.append((row, entry, LABELS.index(name)))
     return found
 
 
 def _size(path: Path, entry: Mapping[str, Any], row: int) -> list[float]:
-    sizes = field_of(path, entry, "3d_dimensions", f"[{row}]")
-    return [number_of(path, sizes, axis, f"[{row}].3d_dimensions") for axis in "lwh"]
+    sizes = get_field(path, entry, "3d_dimensions", f"[{row}]")
+    return [get_number(path, sizes, axis, f"[{row}].3d_dimensions") for axis in "lwh"]
 
 
 def _track(path: Path, entry: Mapping[str, Any], row: int) -> int:
     """``track_id`` (V2X-Seq), or -1 where there is none."""
     if entry.get("track_id") in (None, ""):
         return -1
-    value = number_of(path, entry, "track_id", f"[{row}]")
+    value = get_number(path, entry, "track_id", f"[{row}]")
     if value < 0 or value != int(value):
         raise RecordingError(
             f"{path}: expected a whole number >= 0 at '[{row}].track_id', found {entry['track_id']!r}; {REMEDY}."

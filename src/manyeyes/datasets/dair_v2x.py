@@ -18,20 +18,37 @@ import torch
 from torch import Tensor
 
 from manyeyes.datasets.base import require_index
-from manyeyes.datasets.dair_index import Index, Pair, SideFrame, Sides, dair_root, read_index, split_ids
+from manyeyes.datasets.dair_index import (
+    DairIndex,
+    DairPair,
+    SideFrame,
+    Sides,
+    find_dair_root,
+    read_index,
+    read_split_ids,
+)
 from manyeyes.datasets.dair_json import (
     read_calibration,
     read_infrastructure_calibration,
     read_side_labels,
     read_world_labels,
 )
-from manyeyes.datasets.dair_writer import pair_files
-from manyeyes.datasets.ground_height import height_above_ground
+from manyeyes.datasets.dair_writer import list_pair_files
+from manyeyes.datasets.ground_height import estimate_sensor_height
 from manyeyes.datasets.manifest import BATCHES, Digests
-from manyeyes.datasets.mismatch import copied_files
+from manyeyes.datasets.mismatch import find_copied_files
 from manyeyes.datasets.missing import FileProblem, MissingFiles
 from manyeyes.datasets.pcd import PcdCloud, read_pcd
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, RecordingError, Snapshot, Transform, Truth
+from manyeyes.datatypes import (
+    AgentFrame,
+    Boxes,
+    ConfigError,
+    GroundTruth,
+    PointCloud,
+    RecordingError,
+    Snapshot,
+    Transform,
+)
 from manyeyes.ops.box_iou import pairwise_iou
 
 VEHICLE_ID, INFRASTRUCTURE_ID = 0, -1
@@ -39,8 +56,8 @@ VEHICLE_ID, INFRASTRUCTURE_ID = 0, -1
 _SAME_IOU = 0.05
 # Where the road is looked for: near, because a vehicle's LiDAR is tilted by a degree; farther, because a pole's does not see
 # the road below it.
-_VEHICLE_REACH_M, _POLE_REACH_M = 15.0, 40.0
-_KEPT_POSES = 20_000
+_VEHICLE_RANGE_M, _POLE_RANGE_M = 15.0, 40.0
+_MAX_CACHED_POSES = 20_000
 
 Labels = Literal["cooperative", "sides"]
 
@@ -52,7 +69,7 @@ class DairRecording:
     is the cooperative label, or the union of what the two sides list. label_folder: where the cooperative labels lie, such
     as ``label_world_backup`` of the complemented release. delay_frames: the infrastructure's sweep is so many sweeps older.
     native_pose_error: the infrastructure claims the pose of its calibration, without the correction by hand that the truth
-    keeps. A pair that lacks a file is left out and named in ``problems``, one line a kind; with strict it is an error.
+    keeps. A pair that lacks a file is left out and named in ``missing_summary``, one line a kind; with strict it is an error.
     ``verify`` names each file that is absent, and each whose content does not belong to its frame.
     """
 
@@ -69,7 +86,7 @@ class DairRecording:
         strict: bool = False,
         drop_nan: bool = False,
     ) -> None:
-        found = dair_root(Path(root))
+        found = find_dair_root(Path(root))
         if found is None:
             raise RecordingError(
                 f"{root}: expected a folder with vehicle-side and infrastructure-side; check the path."
@@ -84,12 +101,12 @@ class DairRecording:
         self._native_pose_error = native_pose_error
         self._drop_nan = drop_nan
         self._sides = Sides(found)
-        ids = None if split is None else split_ids(found, split, Path(split_file) if split_file else None)
-        self._index: Index = read_index(found, self._sides, ids, delay_frames, label_folder)
-        self.problems = self._index.problems
-        if not self._index.pairs or (strict and self.problems):
-            more = f" and {len(self.problems) - 1} more" if len(self.problems) > 1 else ""
-            first = f"{self.problems[0]}{more}" if self.problems else "no pair is listed"
+        ids = None if split is None else read_split_ids(found, split, Path(split_file) if split_file else None)
+        self._index: DairIndex = read_index(found, self._sides, ids, delay_frames, label_folder)
+        self.missing_summary = self._index.missing_summary
+        if not self._index.pairs or (strict and self.missing_summary):
+            more = f" and {len(self.missing_summary) - 1} more" if len(self.missing_summary) > 1 else ""
+            first = f"{self.missing_summary[0]}{more}" if self.missing_summary else "no pair is listed"
             raise RecordingError(f"{found}: expected whole pairs of sweeps; {first}. Download what is missing.")
         self._heights: dict[tuple[str, bool], float] = {}
         self._poses: dict[tuple[Path, ...], Transform] = {}
@@ -103,7 +120,7 @@ class DairRecording:
         """How many pairs the drive has."""
         return len(self._pairs(scenario))
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         """All of them."""
         return range(self.length(scenario))
 
@@ -113,9 +130,9 @@ class DairRecording:
         return (VEHICLE_ID, INFRASTRUCTURE_ID)
 
     @property
-    def left_out(self) -> frozenset[str]:
+    def unreadable_scenarios(self) -> frozenset[str]:
         """The names of the drives of which nothing can be read; the empty name stands for frames whose drive is not known."""
-        return frozenset(problem.scenario for problem in self._index.missing) - self._index.pairs.keys()
+        return frozenset(problem.scenario for problem in self._index.missing_files) - self._index.pairs.keys()
 
     def verify(
         self, scenarios: Collection[str] | None = None, progress: Callable[[int, int], None] | None = None
@@ -129,7 +146,7 @@ class DairRecording:
             progress: called with the number of drives that are verified, and of all.
         """
         names = [name for name in self.scenarios if scenarios is None or name in scenarios]
-        found = [p for p in self._index.missing if scenarios is None or p.scenario in scenarios]
+        found = [p for p in self._index.missing_files if scenarios is None or p.scenario in scenarios]
         for count, name in enumerate(names, 1):
             found += self._verify_contents(name)
             if progress is not None:
@@ -140,14 +157,14 @@ class DairRecording:
         pairs = self._index.pairs[name]
         number = f"{int(name):06d}.json" if name.isdecimal() else ""
         digests = Digests.read(self.root / BATCHES / number) if number else None
-        whole = not any(problem.scenario == name for problem in self._index.missing)
+        whole = not any(problem.scenario == name for problem in self._index.missing_files)
         if digests is not None and (digests.by_path is not None or whole):
-            files = sorted(path for pair in pairs for path in pair_files(self.root, pair.vehicle.id))
+            files = sorted(path for pair in pairs for path in list_pair_files(self.root, pair.vehicle.id))
             return digests.check(self.root, name, files, f"{BATCHES}/{number}")
         clouds = {path: None for pair in pairs for path in (pair.vehicle.cloud, pair.infrastructure.cloud)}
-        return copied_files(clouds, name)
+        return find_copied_files(clouds, name)
 
-    def pair(self, scenario: str, index: int) -> Pair:
+    def pair(self, scenario: str, index: int) -> DairPair:
         """Which files a snapshot comes from."""
         require_index(self, scenario, index)
         return self._index.pairs[scenario][index]
@@ -156,19 +173,19 @@ class DairRecording:
         """Both agents, each at its own time; the truth is that of the vehicle's time, None without a label."""
         pair = self.pair(scenario, index)
         poses = self.lidar_poses(pair)
-        claims = poses
+        reported_poses = poses
         if self._native_pose_error and pair.offset is not None:
-            claims = (poses[0], self._uncorrected(pair))
+            reported_poses = (poses[0], self._uncorrected(pair))
         sides = (pair.vehicle, pair.infrastructure)
         heights = [self._height(scenario, side, pole) for side, pole in zip(sides, (False, True))]
         frames = tuple(
-            self._frame(id, side, height, claim)
-            for id, side, height, claim in zip(self.agents(scenario), sides, heights, claims)
+            self._frame(id, side, height, reported_pose)
+            for id, side, height, reported_pose in zip(self.agents(scenario), sides, heights, reported_poses)
         )
         true = [pose @ Transform.from_xyz_yaw(0, 0, -height) for pose, height in zip(poses, heights)]
         return Snapshot(scenario, index, frames, self._truth(pair, poses, Transform.stack(true)))
 
-    def lidar_poses(self, pair: Pair) -> tuple[Transform, Transform]:
+    def lidar_poses(self, pair: DairPair) -> tuple[Transform, Transform]:
         """World from the vehicle's LiDAR and from the infrastructure's virtual one, as far as the recording knows."""
         vehicle = self._vehicle_pose(pair.vehicle)
         if not all(path.is_file() for path in pair.infrastructure.motions):
@@ -186,7 +203,7 @@ class DairRecording:
         pair = self.pair(scenario, index)
         return self._listed(pair, self.lidar_poses(pair))
 
-    def _pairs(self, scenario: str) -> tuple[Pair, ...]:
+    def _pairs(self, scenario: str) -> tuple[DairPair, ...]:
         if scenario not in self._index.pairs:
             require_index(self, scenario, 0)
         return self._index.pairs[scenario]
@@ -224,19 +241,19 @@ class DairRecording:
         if (scenario, pole) not in self._heights:
             first = self._index.pairs[scenario][0]
             cloud = self._cloud(first.infrastructure if pole else first.vehicle)
-            reach = _POLE_REACH_M if pole else _VEHICLE_REACH_M
-            self._heights[scenario, pole] = height_above_ground(cloud.xyz, reach)
+            max_range_m = _POLE_RANGE_M if pole else _VEHICLE_RANGE_M
+            self._heights[scenario, pole] = estimate_sensor_height(cloud.xyz, max_range_m)
         return self._heights[scenario, pole]
 
     def _vehicle_pose(self, side: SideFrame) -> Transform:
         if side.motions not in self._poses:
-            if len(self._poses) >= _KEPT_POSES:
+            if len(self._poses) >= _MAX_CACHED_POSES:
                 self._poses.clear()
             novatel, lidar = side.motions
             self._poses[side.motions] = read_calibration(novatel) @ read_calibration(lidar)
         return self._poses[side.motions]
 
-    def _uncorrected(self, pair: Pair) -> Transform:
+    def _uncorrected(self, pair: DairPair) -> Transform:
         """World from virtual LiDAR by its own calibration; ``relative_error`` counts where the pair states no offset."""
         if not all(path.is_file() for path in pair.infrastructure.motions):
             return self._vehicle_pose(pair.vehicle) @ read_calibration(pair.i2v)
@@ -254,11 +271,13 @@ class DairRecording:
         moved = self._vehicle_pose(side).translation - self._vehicle_pose(before).translation
         return float(moved.norm()) / seconds if 0 < seconds <= 0.5 else 0.0
 
-    def _listed(self, pair: Pair, poses: tuple[Transform, Transform]) -> tuple[Boxes, Boxes]:
+    def _listed(self, pair: DairPair, poses: tuple[Transform, Transform]) -> tuple[Boxes, Boxes]:
         vehicle, unit = (read_side_labels(side.label) for side in (pair.vehicle, pair.infrastructure))
         return vehicle.transform(poses[0]), unit.transform(poses[1])
 
-    def _truth(self, pair: Pair, poses: tuple[Transform, Transform], world_from_agent: Transform) -> Truth | None:
+    def _truth(
+        self, pair: DairPair, poses: tuple[Transform, Transform], world_from_agent: Transform
+    ) -> GroundTruth | None:
         have_sides = pair.vehicle.label.is_file() and pair.infrastructure.label.is_file()
         if (self._labels == "cooperative" and pair.label is None) or (self._labels == "sides" and not have_sides):
             return None
@@ -270,13 +289,13 @@ class DairRecording:
         else:
             assert pair.label is not None
             boxes = read_side_labels(pair.label).transform(poses[0])  # V2X-Seq: in the vehicle's LiDAR frame
-        seen = torch.stack([_partner(boxes, side) >= 0 for side in listed])
+        seen = torch.stack([_match_boxes(boxes, side) >= 0 for side in listed])
         # A label that neither side lists is in the truth all the same: it was given for the ego.
         seen[0] |= ~seen.any(0)
-        return Truth(_own_body_marked(boxes, poses[0]), seen, world_from_agent)
+        return GroundTruth(_mark_own_body(boxes, poses[0]), seen, world_from_agent)
 
 
-def _partner(boxes: Boxes, others: Boxes) -> Tensor:
+def _match_boxes(boxes: Boxes, others: Boxes) -> Tensor:
     """(N,) int64: the row of others that is the same vehicle, -1 for none; greatest overlaps first, each row once."""
     partner = torch.full((len(boxes),), -1, dtype=torch.int64)
     if not len(boxes) or not len(others):
@@ -294,12 +313,12 @@ def _partner(boxes: Boxes, others: Boxes) -> Tensor:
 
 def _union(vehicle: Boxes, unit: Boxes) -> Boxes:
     """Both lists, each vehicle once, as the vehicle's side has it; ids are rows from 1."""
-    both = Boxes.cat([vehicle, unit[_partner(unit, vehicle) < 0]])
+    both = Boxes.cat([vehicle, unit[_match_boxes(unit, vehicle) < 0]])
     id = torch.arange(1, len(both) + 1)
     return Boxes.of(both.center, both.size, both.yaw, label=both.label, id=id)
 
 
-def _own_body_marked(boxes: Boxes, world_from_lidar: Transform) -> Boxes:
+def _mark_own_body(boxes: Boxes, world_from_lidar: Transform) -> Boxes:
     """The box around the vehicle's own LiDAR gets the vehicle's id, so that nobody is asked to detect himself."""
     local = boxes.transform(world_from_lidar.inverse())
     around = Boxes.of(local.center * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64), local.size, local.yaw)

@@ -157,7 +157,7 @@ class DairWriter:
         )
 
 
-def pair_files(root: Path, stem: str) -> list[Path]:
+def list_pair_files(root: Path, stem: str) -> list[Path]:
     """The files that DairWriter writes of one pair."""
     vehicle, infrastructure, cooperative = (
         root / name for name in ("vehicle-side", "infrastructure-side", "cooperative")
@@ -175,7 +175,7 @@ def pair_files(root: Path, stem: str) -> list[Path]:
     ]
 
 
-def index_files(root: Path) -> list[Path]:
+def list_index_files(root: Path) -> list[Path]:
     """The files that write_dair_index writes."""
     return [root / SPLIT_FILE, *(root / f"{name}/data_info.json" for name in (*SIDES, "cooperative"))]
 

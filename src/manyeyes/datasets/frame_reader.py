@@ -11,10 +11,10 @@ from manyeyes.datatypes import AgentFrame
 
 
 @runtime_checkable
-class SingleFrames(Protocol):
+class FrameReader(Protocol):
     """A recording that reads frames one by one, as they stand in its snapshots."""
 
-    def present(self, scenario: str, index: int) -> tuple[int, ...]:
+    def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
         """The ids of the agents that have this frame, in the order of the snapshot's frames."""
         ...
 
@@ -24,12 +24,12 @@ class SingleFrames(Protocol):
 
 
 @dataclass(frozen=True)
-class OutOfSnapshots:
+class SnapshotFrameReader:
     """Single frames of a recording that knows snapshots alone: the whole one is read each time."""
 
     recording: Recording
 
-    def present(self, scenario: str, index: int) -> tuple[int, ...]:
+    def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
         """See SingleFrames."""
         return tuple(frame.agent_id for frame in self.recording.snapshot(scenario, index).frames)
 
@@ -39,6 +39,6 @@ class OutOfSnapshots:
         return next(frame for frame in frames if frame.agent_id == agent_id)
 
 
-def single_frames(recording: Recording) -> SingleFrames:
+def as_frame_reader(recording: Recording) -> FrameReader:
     """The recording itself where it reads frames one by one, else its snapshots taken apart."""
-    return recording if isinstance(recording, SingleFrames) else OutOfSnapshots(recording)
+    return recording if isinstance(recording, FrameReader) else SnapshotFrameReader(recording)

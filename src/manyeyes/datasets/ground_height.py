@@ -9,13 +9,13 @@ PLAUSIBLE_HEIGHT_M = (0.3, 20.0)
 _DEFAULT_HEIGHT_M = 1.9
 
 
-def height_above_ground(xyz: np.ndarray, reach_m: float = 25.0) -> float:
+def estimate_sensor_height(xyz: np.ndarray, max_range_m: float = 25.0) -> float:
     """The height that puts the road at z = 0: the lowest twentieth of what is below the sensor within reach_m.
 
     xyz: (N, 3) metres in the LiDAR's frame. 1.9 m where fewer than 100 points are below, or the answer is not plausible.
     """
     low, high = PLAUSIBLE_HEIGHT_M
-    near = xyz[(np.hypot(xyz[:, 0], xyz[:, 1]) < reach_m) & (xyz[:, 2] < -low), 2]
+    near = xyz[(np.hypot(xyz[:, 0], xyz[:, 1]) < max_range_m) & (xyz[:, 2] < -low), 2]
     if len(near) < 100:
         return _DEFAULT_HEIGHT_M
     height = -float(np.percentile(near, 5))

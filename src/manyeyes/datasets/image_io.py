@@ -15,7 +15,7 @@ from manyeyes._io import atomic_write
 from manyeyes.datatypes import MissingExtraError, RecordingError
 
 
-def read_picture(path: Path) -> Tensor:
+def read_image(path: Path) -> Tensor:
     """(3, height, width) uint8, sRGB, of any format that Pillow knows; transparency is dropped."""
     image = _pillow()
     try:

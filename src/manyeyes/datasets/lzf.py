@@ -9,8 +9,8 @@ from manyeyes._jit import njit
 
 _OVERRUN = -1
 # How far back a copy may reach, and how many bytes it may hold: 13 bits, and 3 + 8 bits of length on top of 2.
-_REACH = 8192
-_LONGEST = 264
+_MAX_OFFSET = 8192
+_MAX_LENGTH = 264
 
 
 @njit(cache=True)
@@ -57,7 +57,7 @@ def lzf_decompress(packed: bytes | memoryview, size: int) -> bytes | None:
 def _shrink(plain: np.ndarray, out: np.ndarray) -> int:
     """Fill ``out`` with the stream of ``plain``; the number of bytes written. Matches are found by a table of three bytes."""
     size, written = plain.size, 0
-    last = np.full(1 << 16, -_REACH - 1, np.int64)
+    last = np.full(1 << 16, -_MAX_OFFSET - 1, np.int64)
     at, start = 0, 0  # start: the first literal that is not written yet
     while at < size:
         length, before = 0, 0
@@ -65,8 +65,8 @@ def _shrink(plain: np.ndarray, out: np.ndarray) -> int:
             key = (plain[at] * 506832829 ^ plain[at + 1] * 2654435761 ^ plain[at + 2] * 40503) & 0xFFFF
             before = last[key]
             last[key] = at
-            if at - before <= _REACH:
-                while length < _LONGEST and at + length < size and plain[before + length] == plain[at + length]:
+            if at - before <= _MAX_OFFSET:
+                while length < _MAX_LENGTH and at + length < size and plain[before + length] == plain[at + length]:
                     length += 1
         if length < 3:
             at += 1

@@ -97,7 +97,7 @@ class Digests:
             reason = (
                 f"{len(present)} files of {num_bytes} bytes; {noted_in} counts {self.num_files} of {self.num_bytes}"
             )
-        elif total_digest(digest_files(present, folder)) != self.total:
+        elif compute_total_digest(digest_files(present, folder)) != self.total:
             reason = f"the SHA-256 of all files is not that in {noted_in}"
         else:
             return []
@@ -114,13 +114,13 @@ def digest_files(files: Iterable[Path], folder: Path) -> dict[str, str]:
     return {path.relative_to(folder).as_posix(): sha256_of(path) for path in files}
 
 
-def total_digest(by_path: Mapping[str, str]) -> str:
+def compute_total_digest(by_path: Mapping[str, str]) -> str:
     """SHA-256 of the lines ``<SHA-256 of a file>  <path>``."""
     lines = [f"{digest}  {name}" for name, digest in by_path.items()]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
-def scenario_files(folder: Path) -> list[Path]:
+def list_scenario_files(folder: Path) -> list[Path]:
     """The files of a scenario's folder in the order of paths, without scenario.json and without hidden files."""
     found = (Path(base) / name for base, _, names in os.walk(folder, followlinks=True) for name in names)
     return sorted(path for path in found if path.name != SCENARIO and not path.name.startswith("."))
@@ -146,7 +146,7 @@ def read_manifest(root: Path) -> dict[str, Any] | None:
     return content
 
 
-def listed_scenarios(root: Path, split: str) -> tuple[str, ...]:
+def list_scenarios(root: Path, split: str) -> tuple[str, ...]:
     """Names of the scenarios of a split by the root's manifest in OPV2V's layout; empty where there is none."""
     try:
         content = read_manifest(root)

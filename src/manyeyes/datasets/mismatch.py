@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from manyeyes.datasets.base import points_in_listed_boxes
+from manyeyes.datasets.base import count_points_in_listed_boxes
 from manyeyes.datasets.manifest import sha256_of
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datatypes import Snapshot
@@ -41,7 +41,7 @@ class _Fit:
         return 1 - self.unmet / self.listed if self.listed else math.nan
 
 
-def mismatched_files(
+def find_mismatched_files(
     read: Callable[[int], Snapshot], scenario: str, clouds: Sequence[Mapping[int, Path]]
 ) -> list[FileProblem]:
     """Find the clouds and metadata of a scenario that are copies of others or miss the listed boxes.
@@ -56,17 +56,19 @@ def mismatched_files(
         FileProblem(
             path, "mismatched", scenario, f"{fit.unmet} of {fit.listed} boxes that its frame lists hold no point of it"
         )
-        for path, fit in unfit_clouds(fits).items()
+        for path, fit in find_mismatched_clouds(fits).items()
     ]
-    by_fit = sorted((path for paths in clouds for path in paths.values()), key=lambda p: (_badness(fits.get(p)), p))
-    found += copied_files(by_fit, scenario, _same_metadata)
+    by_fit = sorted(
+        (path for paths in clouds for path in paths.values()), key=lambda p: (_unmet_fraction(fits.get(p)), p)
+    )
+    found += find_copied_files(by_fit, scenario, _same_metadata)
     metadata = [path.with_suffix(".yaml") for path in by_fit]
     # Metadata hold the agent's own pose: equal ones of two agents are wrong, of one agent they tell that it stands.
-    found += copied_files(metadata, scenario, lambda one, other: one.parent == other.parent, min_bytes=0)
+    found += find_copied_files(metadata, scenario, lambda one, other: one.parent == other.parent, min_bytes=0)
     return found
 
 
-def unfit_clouds(fits: Mapping[Path, _Fit]) -> dict[Path, _Fit]:
+def find_mismatched_clouds(fits: Mapping[Path, _Fit]) -> dict[Path, _Fit]:
     """The clouds that miss too many boxes, in a scenario where that is unusual."""
     fractions = sorted(fit.met_fraction for fit in fits.values() if fit.listed)
     if not fractions or fractions[len(fractions) // 2] < _MIN_USUAL_FRACTION:
@@ -78,15 +80,15 @@ def unfit_clouds(fits: Mapping[Path, _Fit]) -> dict[Path, _Fit]:
     }
 
 
-def copied_files(
+def find_copied_files(
     files: Iterable[Path],
     scenario: str,
-    standing: Callable[[Path, Path], bool] = lambda one, other: False,
+    may_be_equal: Callable[[Path, Path], bool] = lambda one, other: False,
     min_bytes: int = _MIN_BYTES,
 ) -> list[FileProblem]:
     """Find files whose bytes are those of an earlier file of the sequence.
 
-    standing: whether two files may be equal, because nothing moved between their frames. min_bytes: smaller files are skipped.
+    may_be_equal: whether two files may be equal, because nothing moved between their frames. min_bytes: smaller files are skipped.
     """
     by_size: dict[int, list[Path]] = {}
     for path in files:
@@ -96,7 +98,7 @@ def copied_files(
         first: dict[str, Path] = {}
         for path in group if size >= min_bytes and len(group) > 1 else ():
             original = first.setdefault(sha256_of(path), path)
-            if original is not path and not standing(original, path):
+            if original is not path and not may_be_equal(original, path):
                 found.append(FileProblem(path, "mismatched", scenario, f"its bytes are those of {original}"))
     return found
 
@@ -105,12 +107,12 @@ def _fits(snapshot: Snapshot, paths: Mapping[int, Path]) -> Iterator[tuple[Path,
     """The fit of each cloud that is a sweep, or is empty although vehicles are listed."""
     if snapshot.truth is None:
         return
-    for frame, counts in zip(snapshot.frames, points_in_listed_boxes(snapshot)):
+    for frame, counts in zip(snapshot.frames, count_points_in_listed_boxes(snapshot)):
         if len(frame.points) >= _MIN_POINTS or not len(frame.points):
             yield paths[frame.agent_id], _Fit(int((counts >= 0).sum()), int((counts == 0).sum()))
 
 
-def _badness(fit: _Fit | None) -> float:
+def _unmet_fraction(fit: _Fit | None) -> float:
     return 1.0 if fit is None or not fit.listed else 1 - fit.met_fraction
 
 

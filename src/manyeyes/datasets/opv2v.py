@@ -24,36 +24,36 @@ import torch
 from manyeyes.datasets.base import require_index
 from manyeyes.datasets.cache import ArrayCache, default_cache_folder
 from manyeyes.datasets.carla import carla_from_transform, mirror_points, transform_from_carla
-from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, height_above_ground
+from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, estimate_sensor_height
 from manyeyes.datasets.image_io import write_png
-from manyeyes.datasets.manifest import PARTIAL, SCENARIO, Digests, listed_scenarios, scenario_files
-from manyeyes.datasets.mismatch import mismatched_files
+from manyeyes.datasets.manifest import PARTIAL, SCENARIO, Digests, list_scenario_files, list_scenarios
+from manyeyes.datasets.mismatch import find_mismatched_files
 from manyeyes.datasets.missing import FileProblem, MissingFiles
 from manyeyes.datasets.opv2v_camera import (
     camera_yaml,
-    lacking_pictures,
-    missing_pictures,
-    picture_path,
+    describe_missing_images,
+    find_missing_images,
+    image_path,
     read_images,
 )
 from manyeyes.datasets.opv2v_yaml import (
     AgentRecord,
-    Protocol,
+    DataProtocol,
     read_protocol,
     read_record,
     write_protocol,
     write_record,
 )
 from manyeyes.datasets.pcd import PcdCloud, read_pcd, write_pcd
-from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, RecordingError, Snapshot, Transform, Truth
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 _AGENT = re.compile(r"-?\d+")
 _KMH = 3.6
-_KEPT_RECORDS = 20_000
+_MAX_CACHED_RECORDS = 20_000
 
 
 @dataclass(frozen=True)
-class _Agent:
+class _AgentFiles:
     """One agent's files. stems: of frames with a cloud and metadata; pictures: stems that a camera lacks, by its number."""
 
     id: int
@@ -68,9 +68,9 @@ class _Agent:
 
 
 @dataclass(frozen=True)
-class _Scenario:
+class _ScenarioFiles:
     folder: Path
-    agents: tuple[_Agent, ...]
+    agents: tuple[_AgentFiles, ...]
     stems: tuple[str, ...]
 
 
@@ -78,7 +78,7 @@ class Opv2vRecording:
     """Scenarios of OPV2V's layout under a root: a dataset (name the split), a folder of scenarios, or one scenario.
 
     The ego is the first agent by string order, infrastructure comes last, and the ego's frames are the snapshots; an
-    agent that lacks a frame is left out of that snapshot. What is missing stands in ``problems``, one line each; with
+    agent that lacks a frame is left out of that snapshot. What is missing stands in ``missing_summary``, one line each; with
     strict it is an error instead. Clouds are read when a snapshot is asked for; pictures too, with images=True.
     cache_folder: where parsed yaml and ascii clouds are kept (default: the user's cache folder); None with ``use_cache=False``.
 
@@ -110,14 +110,14 @@ class Opv2vRecording:
         self._scenarios = {s.folder.name: s for s in found if s is not None}
         if folders[0] not in (self.root, self.root / str(split)):  # one scenario may be opened by itself
             _compare_with_manifest(folders, problems, missing)
-        self.problems = tuple(problems)
+        self.missing_summary = tuple(problems)
         self._missing = tuple(missing)
         if not self._scenarios or (strict and problems):
             more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
             first = f"{problems[0]}{more}" if problems else "it is empty"
             raise RecordingError(f"{self.root}: expected whole scenarios; {first}. Download what is missing.")
         self._records: dict[Path, AgentRecord] = {}
-        self._protocols: dict[str, Protocol] = {}
+        self._protocols: dict[str, DataProtocol] = {}
         self._heights: dict[Path, float] = {}
 
     @property
@@ -129,7 +129,7 @@ class Opv2vRecording:
         """How many snapshots the scenario has."""
         return len(self._scenario(scenario).stems)
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         """All indices but the first ``history_frames`` of data_protocol.yaml."""
         return range(min(self._protocol(scenario).history_frames, self.length(scenario)), self.length(scenario))
 
@@ -138,7 +138,7 @@ class Opv2vRecording:
         return tuple(agent.id for agent in self._scenario(scenario).agents)
 
     @property
-    def left_out(self) -> frozenset[str]:
+    def unreadable_scenarios(self) -> frozenset[str]:
         """The names of the scenarios of which nothing can be read."""
         return frozenset(problem.scenario for problem in self._missing) - self._scenarios.keys()
 
@@ -147,7 +147,7 @@ class Opv2vRecording:
     ) -> MissingFiles:
         """Name the files that are missing, or whose content does not belong to their frame.
 
-        Scenarios of the simulator are compared with their digests, others by ``mismatched_files``. The verdict on a scenario
+        Scenarios of the simulator are compared with their digests, others by ``find_mismatched_files``. The verdict on a scenario
         is kept in the cache while its files stay as they are.
 
         Args:
@@ -172,7 +172,7 @@ class Opv2vRecording:
         records = [self._record(agent.folder / f"{stem}.yaml") for agent in present]
         return Snapshot(scenario, index, frames, _truth(frames, records))
 
-    def present(self, scenario: str, index: int) -> tuple[int, ...]:
+    def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
         """The ids of the agents that have this frame, in the order of the snapshot's frames."""
         return tuple(agent.id for agent in self._present(scenario, index)[1])
 
@@ -188,7 +188,7 @@ class Opv2vRecording:
     def _verify_contents(self, name: str) -> list[FileProblem]:
         """Compare the contents of a scenario's files, unless the cache has them as sound."""
         folder = self._scenarios[name].folder
-        files = scenario_files(folder)
+        files = list_scenario_files(folder)
         kind = f"sound1{'-pictures' if self._with_images else ''}"
         state = _state(files, folder)
         kept = self._cache.load(folder, kind) if self._cache is not None else None
@@ -202,7 +202,8 @@ class Opv2vRecording:
             found = digests.check(folder, name, files, used=lambda path: path.endswith(suffixes))
         if digests is None or (found and digests.by_path is None):
             found = (
-                mismatched_files(lambda index: self._snapshot(name, index, False), name, self._clouds(name)) or found
+                find_mismatched_files(lambda index: self._snapshot(name, index, False), name, self._clouds(name))
+                or found
             )
         if self._cache is not None and not found:
             self._cache.store(folder, kind, state)
@@ -216,33 +217,33 @@ class Opv2vRecording:
             for stem in scenario.stems
         ]
 
-    def _present(self, scenario: str, index: int) -> tuple[str, list[_Agent]]:
+    def _present(self, scenario: str, index: int) -> tuple[str, list[_AgentFiles]]:
         """The stem of an instant's files, and the agents that have them."""
         require_index(self, scenario, index)
         stem = self._scenarios[scenario].stems[index]
         return stem, [agent for agent in self._scenarios[scenario].agents if stem in agent.stems]
 
-    def _scenario(self, name: str) -> _Scenario:
+    def _scenario(self, name: str) -> _ScenarioFiles:
         if name not in self._scenarios:
             require_index(self, name, 0)
         return self._scenarios[name]
 
-    def _protocol(self, scenario: str) -> Protocol:
+    def _protocol(self, scenario: str) -> DataProtocol:
         if scenario not in self._protocols:
             self._protocols[scenario] = read_protocol(self._scenario(scenario).folder)
         return self._protocols[scenario]
 
     def _record(self, path: Path) -> AgentRecord:
         if path not in self._records:
-            if len(self._records) >= _KEPT_RECORDS:
+            if len(self._records) >= _MAX_CACHED_RECORDS:
                 self._records.clear()
             self._records[path] = read_record(path, self._cache)
         return self._records[path]
 
-    def _cloud(self, agent: _Agent, stem: str) -> PcdCloud:
+    def _cloud(self, agent: _AgentFiles, stem: str) -> PcdCloud:
         return read_pcd(agent.folder / f"{stem}.pcd", self._drop_nan, self._cache)
 
-    def _frame(self, scenario: str, agent: _Agent, stem: str, images: bool) -> AgentFrame:
+    def _frame(self, scenario: str, agent: _AgentFiles, stem: str, images: bool) -> AgentFrame:
         record, cloud = self._record(agent.folder / f"{stem}.yaml"), self._cloud(agent, stem)
         world_from_lidar = transform_from_carla(record.lidar_pose)
         height = self._sensor_height(agent, record, world_from_lidar)
@@ -262,7 +263,7 @@ class Opv2vRecording:
             images=read_images(yaml, world_from_agent, self._cache) if images else (),
         )
 
-    def _sensor_height(self, agent: _Agent, record: AgentRecord, world_from_lidar: Transform) -> float:
+    def _sensor_height(self, agent: _AgentFiles, record: AgentRecord, world_from_lidar: Transform) -> float:
         """Metres from the road up to the LiDAR along the LiDAR's z axis.
 
         By the two poses where they say something plausible. Where a pole's place is its sensor's own, the ground is
@@ -272,7 +273,7 @@ class Opv2vRecording:
         if stated is not None:
             return stated
         if agent.folder not in self._heights:
-            self._heights[agent.folder] = height_above_ground(self._cloud(agent, min(agent.stems)).xyz)
+            self._heights[agent.folder] = estimate_sensor_height(self._cloud(agent, min(agent.stems)).xyz)
         return self._heights[agent.folder]
 
 
@@ -286,7 +287,7 @@ def _stated_height(record: AgentRecord, world_from_lidar: Transform) -> float | 
     return height if low <= height <= high and float(offset.norm()) <= high else None
 
 
-def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> Truth:
+def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> GroundTruth:
     """The union of all lists by id, first agent's copy, in the order of ids."""
     listed = [np.where(r.id != f.agent_id)[0] for f, r in zip(frames, records)]
     id = np.concatenate([r.id[rows] for r, rows in zip(records, listed)])
@@ -301,7 +302,7 @@ def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> Truth:
     yaw = -column("angle")[:, 1] * (math.pi / 180)
     velocity = torch.stack((yaw.cos(), yaw.sin()), 1) * (column("speed") / _KMH)[:, None]
     boxes = Boxes.of(center, 2 * column("extent"), yaw, None, column("label"), torch.from_numpy(id[first]), velocity)
-    return Truth(boxes, torch.from_numpy(seen), Transform.stack([f.world_from_agent for f in frames]))
+    return GroundTruth(boxes, torch.from_numpy(seen), Transform.stack([f.world_from_agent for f in frames]))
 
 
 def _subfolders(folder: Path) -> list[Path]:
@@ -313,7 +314,7 @@ def _is_scenario(folder: Path) -> bool:
     return any(_AGENT.fullmatch(p.name) and not _is_scenario(p) for p in _subfolders(folder))
 
 
-def holds_frames(folder: Path) -> bool:
+def has_frames(folder: Path) -> bool:
     """Whether a folder has agents with clouds or metadata, that is, whether it is a scenario with anything in it."""
     agents = [p for p in _subfolders(folder) if _AGENT.fullmatch(p.name)]
     return any(p.suffix in (".pcd", ".yaml") and p.stem.isdecimal() for agent in agents for p in agent.iterdir())
@@ -342,7 +343,7 @@ def _scenario_folders(root: Path, split: str | None) -> list[Path]:
     )
 
 
-def _scan(folder: Path, problems: list[str], missing: list[FileProblem], images: bool) -> _Scenario | None:
+def _scan(folder: Path, problems: list[str], missing: list[FileProblem], images: bool) -> _ScenarioFiles | None:
     """What a scenario's folder holds, by names alone; what is missing is added to problems and to missing."""
     if folder.name.endswith(PARTIAL):
         reason = "an interrupted run of 'manyeyes simulate' left it unfinished"
@@ -369,10 +370,10 @@ def _scan(folder: Path, problems: list[str], missing: list[FileProblem], images:
         if surplus:
             text = f"has {len(surplus)} frames that the ego {agents[0].id} lacks, the first is {surplus[0]}; left out"
             problems.append(f"{agent.folder}: {text}")
-    return _Scenario(folder, tuple(agents), stems)
+    return _ScenarioFiles(folder, tuple(agents), stems)
 
 
-def _scan_agent(folder: Path, problems: list[str], images: bool) -> _Agent:
+def _scan_agent(folder: Path, problems: list[str], images: bool) -> _AgentFiles:
     everything = list(folder.iterdir())
     files = [p for p in everything if p.stem.isdecimal()]
     clouds = frozenset(p.stem for p in files if p.suffix == ".pcd")
@@ -385,11 +386,13 @@ def _scan_agent(folder: Path, problems: list[str], images: bool) -> _Agent:
             problems.append(f"{folder}: {count} lack their {suffix}, the first is {min(there, key=int)}; left out")
     stems = sorted(clouds & records, key=int)
     if images:
-        problems += [f"{folder}: {line}" for line in missing_pictures(everything, stems)]
-    return _Agent(int(folder.name), folder, clouds, records, lacking_pictures(everything, stems) if images else {})
+        problems += [f"{folder}: {line}" for line in describe_missing_images(everything, stems)]
+    return _AgentFiles(
+        int(folder.name), folder, clouds, records, find_missing_images(everything, stems) if images else {}
+    )
 
 
-def _absent_files(folder: Path, agents: Sequence[_Agent]) -> Iterator[FileProblem]:
+def _absent_files(folder: Path, agents: Sequence[_AgentFiles]) -> Iterator[FileProblem]:
     """The files that a scenario lacks: every stem of any agent is expected of all."""
     stems = frozenset[str]().union(*(agent.clouds | agent.records for agent in agents))
     # A folder of something else may stand beside the scenarios; an empty one was a scenario.
@@ -403,7 +406,7 @@ def _absent_files(folder: Path, agents: Sequence[_Agent]) -> Iterator[FileProble
                     yield FileProblem(agent.folder / f"{stem}.{suffix}", "missing", folder.name, reason)
         for number, lacking in agent.pictures.items():
             for stem in lacking:
-                path = picture_path(agent.folder, stem, number)
+                path = image_path(agent.folder, stem, number)
                 yield FileProblem(path, "missing", folder.name, "the camera has pictures of other frames")
 
 
@@ -411,7 +414,7 @@ def _compare_with_manifest(folders: Sequence[Path], problems: list[str], missing
     """Add the scenarios of a split that the manifest of the simulator lists and that are not there."""
     split = folders[0].parent
     root = split.absolute().parent
-    absent = set(listed_scenarios(root, split.absolute().name)) - {folder.name for folder in folders}
+    absent = set(list_scenarios(root, split.absolute().name)) - {folder.name for folder in folders}
     for name in sorted(absent - {problem.scenario for problem in missing}):
         reason = "the recording's manifest lists this scenario"
         problems.append(f"{split / name}: not there, and {reason}")
@@ -461,7 +464,7 @@ class Opv2vWriter:
             record, cameras = _record_of(snapshot, row, box_speed_mps), {}
             true_pose = transform_from_carla(record.ego_pose), transform_from_carla(record.lidar_pose)
             for number, image in enumerate(frame.images):
-                write_png(picture_path(folder, stem, number), image.rgb)
+                write_png(image_path(folder, stem, number), image.rgb)
                 cameras |= camera_yaml(number, image.camera, *true_pose)
             # Last, so that a yaml without its cloud never comes of an interrupted run.
             write_record(folder / f"{stem}.yaml", record, carla_from_transform(frame.world_from_agent), cameras)

@@ -17,7 +17,7 @@ import torch
 
 from manyeyes.datasets.cache import ArrayCache
 from manyeyes.datasets.carla import carla_from_transform, transform_from_carla
-from manyeyes.datasets.image_io import read_picture
+from manyeyes.datasets.image_io import read_image
 from manyeyes.datasets.opv2v_yaml import load_yaml
 from manyeyes.datatypes import Camera, CameraImage, RecordingError, Transform
 
@@ -38,7 +38,7 @@ class CameraRecord:
     intrinsic: np.ndarray
 
 
-def picture_path(folder: Path, stem: str, number: int) -> Path:
+def image_path(folder: Path, stem: str, number: int) -> Path:
     """Where a camera's picture of one instant lies."""
     return folder / f"{stem}_camera{number}.png"
 
@@ -62,10 +62,10 @@ def read_images(yaml: Path, world_from_agent: Transform, cache: ArrayCache | Non
     """What the agent's cameras took at the yaml's instant, in the order of their numbers; those without a file are left out."""
     images = []
     for record in read_cameras(yaml, cache):
-        path = picture_path(yaml.parent, yaml.stem, record.number)
+        path = image_path(yaml.parent, yaml.stem, record.number)
         if not path.is_file():
             continue
-        rgb = read_picture(path)
+        rgb = read_image(path)
         world_from_camera = transform_from_carla(record.cords) @ _BODY_FROM_CAMERA
         place = world_from_agent.inverse() @ world_from_camera
         intrinsic = torch.from_numpy(record.intrinsic)
@@ -100,7 +100,7 @@ def _row(path: Path, key: str, entry: object) -> list[float]:
     return values
 
 
-def lacking_pictures(files: Sequence[Path], stems: Sequence[str]) -> dict[int, list[str]]:
+def find_missing_images(files: Sequence[Path], stems: Sequence[str]) -> dict[int, list[str]]:
     """The stems that a camera lacks while it has pictures of others, by the camera's number; a camera without any is absent."""
     there = {p.name for p in files if p.suffix == ".png"}
     numbers = sorted(
@@ -110,10 +110,10 @@ def lacking_pictures(files: Sequence[Path], stems: Sequence[str]) -> dict[int, l
     return {number: found for number, found in lacking.items() if found}
 
 
-def missing_pictures(files: Sequence[Path], stems: Sequence[str]) -> list[str]:
+def describe_missing_images(files: Sequence[Path], stems: Sequence[str]) -> list[str]:
     """One line for each camera that has pictures of some of an agent's frames and lacks those of others."""
     return [
         f"{len(lacking)} of {len(stems)} frames lack the picture of camera {number}, the first is {lacking[0]}; "
         "it is left out there"
-        for number, lacking in lacking_pictures(files, stems).items()
+        for number, lacking in find_missing_images(files, stems).items()
     ]

@@ -46,7 +46,7 @@ class AgentRecord:
 
 
 @dataclass(frozen=True)
-class Protocol:
+class DataProtocol:
     """What is used of data_protocol.yaml: seconds between two stems, and how many first frames are history only."""
 
     fixed_delta_s: float = 0.05
@@ -67,18 +67,18 @@ def load_yaml(path: Path) -> Mapping[Any, Any]:
     return content
 
 
-def read_protocol(folder: Path) -> Protocol:
+def read_protocol(folder: Path) -> DataProtocol:
     """The scenario's protocol, with its defaults where the folder has none or it is silent."""
     path = folder / "data_protocol.yaml"
     if not path.is_file():
-        return Protocol()
+        return DataProtocol()
     content = load_yaml(path)
     world = content.get("world")
     delta = world.get("fixed_delta_seconds", 0.05) if isinstance(world, Mapping) else 0.05
     try:
-        protocol = Protocol(float(delta), int(content.get("history_frames") or 0))
+        protocol = DataProtocol(float(delta), int(content.get("history_frames") or 0))
     except (TypeError, ValueError):
-        protocol = Protocol(-1.0)
+        protocol = DataProtocol(-1.0)
     if not (protocol.fixed_delta_s > 0 and protocol.history_frames >= 0):
         raise RecordingError(
             f"{path}: expected world.fixed_delta_seconds > 0 and history_frames >= 0; got {delta!r} and "
@@ -122,16 +122,16 @@ def _parse(path: Path) -> np.ndarray:
     rows[0, 12] = _numbers(path, content, "ego_speed", 1)[0] if content.get("ego_speed") is not None else 0.0
     rows[0, 13] = bool(content.get("RSU", _below_zero(path.parent.name)))
     for row, (key, vehicle) in zip(rows[1:], (vehicles or {}).items()):
-        where = f"vehicles.{key}"
+        yaml_path = f"vehicles.{key}"
         if not isinstance(vehicle, Mapping):
-            raise RecordingError(f"{path}: expected a mapping at '{where}', found {vehicle!r}; {_REMEDY}.")
+            raise RecordingError(f"{path}: expected a mapping at '{yaml_path}', found {vehicle!r}; {_REMEDY}.")
         try:
             row[0] = int(key)
         except ValueError:
-            raise RecordingError(f"{path}: expected a whole number as id of '{where}'; {_REMEDY}.") from None
+            raise RecordingError(f"{path}: expected a whole number as id of '{yaml_path}'; {_REMEDY}.") from None
         for start, name in ((2, "location"), (5, "center"), (8, "extent"), (11, "angle")):
-            row[start : start + 3] = _numbers(path, vehicle, name, 3, where)
-        row[14] = _numbers(path, vehicle, "speed", 1, where)[0] if vehicle.get("speed") is not None else 0.0
+            row[start : start + 3] = _numbers(path, vehicle, name, 3, yaml_path)
+        row[14] = _numbers(path, vehicle, "speed", 1, yaml_path)[0] if vehicle.get("speed") is not None else 0.0
         row[1] = _label(vehicle, 2 * row[8:11])
     return rows
 
@@ -140,8 +140,8 @@ def _below_zero(agent: str) -> bool:
     return agent.startswith("-")
 
 
-def _numbers(path: Path, content: Mapping[Any, Any], key: str, count: int, where: str = "") -> Sequence[float]:
-    name = f"{where}.{key}" if where else key
+def _numbers(path: Path, content: Mapping[Any, Any], key: str, count: int, yaml_path: str = "") -> Sequence[float]:
+    name = f"{yaml_path}.{key}" if yaml_path else key
     found = content.get(key)
     if found is None:
         raise RecordingError(f"{path}: expected the key '{name}' with {count} numbers, found none; {_REMEDY}.")

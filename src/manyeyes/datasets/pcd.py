@@ -44,7 +44,7 @@ class PcdCloud:
 
 
 @dataclass(frozen=True)
-class _Header:
+class _PcdHeader:
     names: tuple[str, ...]
     dtypes: tuple[np.dtype, ...]
     counts: tuple[int, ...]
@@ -126,7 +126,7 @@ def write_table(path: Path, table: PcdTable) -> None:
     atomic_write(path, header.encode(), np.array([len(packed), len(plain)], "<u4").tobytes(), packed, durable=False)
 
 
-def _read(path: Path) -> tuple[_Header, PcdTable]:
+def _read(path: Path) -> tuple[_PcdHeader, PcdTable]:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -144,7 +144,7 @@ def _read(path: Path) -> tuple[_Header, PcdTable]:
     return header, _compressed(path, header, body)
 
 
-def _parse_header(path: Path, data: bytes) -> tuple[_Header, int]:
+def _parse_header(path: Path, data: bytes) -> tuple[_PcdHeader, int]:
     """The header and the offset of the first byte after its DATA line."""
     entries: dict[str, list[str]] = {}
     start = 0
@@ -170,7 +170,7 @@ def _parse_header(path: Path, data: bytes) -> tuple[_Header, int]:
     if not len(names) == len(dtypes) == len(counts) or points < 0 or encoding not in _ENCODINGS:
         got = f"{len(names)} FIELDS, {len(dtypes)} TYPE and SIZE, {len(counts)} COUNT, {points} POINTS, DATA {encoding}"
         raise RecordingError(f"{path}: the PCD header contradicts itself or PCD 0.7: {got}; {_REMEDY}.")
-    return _Header(tuple(names), dtypes, counts, points, encoding), start
+    return _PcdHeader(tuple(names), dtypes, counts, points, encoding), start
 
 
 def _truncated(path: Path, unit: str, expected: int, found: int) -> RecordingError:
@@ -178,7 +178,7 @@ def _truncated(path: Path, unit: str, expected: int, found: int) -> RecordingErr
     return RecordingError(f"{path}: {word}, expected {expected} {unit} by its header, found {found}; {_REMEDY}.")
 
 
-def _ascii(path: Path, header: _Header, body: memoryview) -> PcdTable:
+def _ascii(path: Path, header: _PcdHeader, body: memoryview) -> PcdTable:
     width = sum(header.counts)
     text = bytes(body)
     lines = sum(1 for line in text.splitlines() if line.strip())
@@ -218,7 +218,7 @@ def _colour_bits(values: np.ndarray) -> np.ndarray:
     return np.where(small, exact, np.where(small, 1.0, values).astype("<f4").view("<u4"))
 
 
-def _binary(path: Path, header: _Header, body: memoryview) -> PcdTable:
+def _binary(path: Path, header: _PcdHeader, body: memoryview) -> PcdTable:
     size = header.points * header.record.itemsize
     if len(body) < size or bytes(body[size:]).strip(b"\0\r\n "):
         raise _truncated(path, "bytes of points", size, len(body))
@@ -226,7 +226,7 @@ def _binary(path: Path, header: _Header, body: memoryview) -> PcdTable:
     return PcdTable(header.names, tuple(record[str(i)] for i in range(len(header.names))))
 
 
-def _compressed(path: Path, header: _Header, body: memoryview) -> PcdTable:
+def _compressed(path: Path, header: _PcdHeader, body: memoryview) -> PcdTable:
     size = header.points * header.record.itemsize
     if len(body) < 8:
         raise _truncated(path, "bytes of compressed points, at the least,", 8, len(body))

@@ -58,7 +58,7 @@ class PoseNoise:
         """The snapshot as agents claim it: poses displaced, their covariance grown by the noise; truth as it was."""
         everyone = self.mode.startswith("all_agents")
         frames = tuple(
-            self._displaced(frame, self.offset(snapshot.scenario, snapshot.index, frame.agent_id))
+            self._displace(frame, self.offset(snapshot.scenario, snapshot.index, frame.agent_id))
             if everyone or row != ego
             else frame
             for row, frame in enumerate(snapshot.frames)
@@ -68,14 +68,14 @@ class PoseNoise:
     def offset(self, scenario: str, index: int, agent_id: int) -> Tensor:
         """x, y, z (m) and yaw (rad) that an agent's claimed pose is off by in the world, (4,) float64."""
         if self.mode == "legacy_constant":
-            x, y, z, yaw = legacy_draw(self.seed, self.sigma_xy_m, self.sigma_yaw_rad)
+            x, y, z, yaw = opencood_offset(self.seed, self.sigma_xy_m, self.sigma_yaw_rad)
             # The draw is in CARLA's left-handed world: our y axis and our sense of turning are its opposites.
             return torch.tensor([x, -y, z, -yaw], dtype=torch.float64)
         frame = 0 if self.mode == "all_agents_sequence" else index
         x, y, yaw = keyed_normal((3,), self.seed, "pose noise", scenario, frame, agent_id)
         return torch.stack((self.sigma_xy_m * x, self.sigma_xy_m * y, torch.zeros_like(x), self.sigma_yaw_rad * yaw))
 
-    def _displaced(self, frame: AgentFrame, offset: Tensor) -> AgentFrame:
+    def _displace(self, frame: AgentFrame, offset: Tensor) -> AgentFrame:
         turn = Transform.from_xyz_yaw(0.0, 0.0, 0.0, float(offset[3])).rotation
         pose = frame.world_from_agent
         variance = torch.tensor([self.sigma_xy_m, self.sigma_xy_m, self.sigma_yaw_rad], dtype=torch.float64).square()
@@ -87,7 +87,7 @@ class PoseNoise:
         )
 
 
-def legacy_draw(seed: int, sigma_xyz: float, sigma_angle: float) -> tuple[float, float, float, float]:
+def opencood_offset(seed: int, sigma_xyz: float, sigma_angle: float) -> tuple[float, float, float, float]:
     """x, y, z and yaw of OpenCOOD's re-seeded draw, in CARLA's axes; the angle in the unit of its sigma.
 
     Three normals for the position, then three for angles of which the second is used, from NumPy's legacy generator.
@@ -98,7 +98,7 @@ def legacy_draw(seed: int, sigma_xyz: float, sigma_angle: float) -> tuple[float,
 
 
 @dataclass(frozen=True)
-class LegacyStaleness:
+class FrameDelay:
     """Everything that a collaborator says is a whole number of frames old (OpenCOOD's ``sim`` delay: one per 100 ms).
 
     Its cloud, pose and time stamp are those of the earlier frame; the ego and the truth are current; the motion of
@@ -111,16 +111,18 @@ class LegacyStaleness:
         if self.frames < 0:
             raise ConfigError(f"LegacyStaleness counts frames back in time, at least 0; got {self.frames}.")
 
-    def apply(self, snapshot: Snapshot, ego: int, earlier: Sequence[Snapshot]) -> Snapshot:
-        """The snapshot with its collaborators stale. earlier: the scenario's previous snapshots, oldest first."""
-        begin = max(0, len(earlier) - self.frames)
+    def apply(self, snapshot: Snapshot, ego: int, history: Sequence[Snapshot]) -> Snapshot:
+        """The snapshot with its collaborators stale. history: the scenario's previous snapshots, oldest first."""
+        begin = max(0, len(history) - self.frames)
         # A lazy sequence is read only where it is needed, oldest wanted frame first.
-        candidates = (earlier[k] if k < len(earlier) else snapshot for k in range(begin, len(earlier) + 1))
-        wanted = {frame.agent_id for row, frame in enumerate(snapshot.frames) if row != ego}
+        candidates = (history[k] if k < len(history) else snapshot for k in range(begin, len(history) + 1))
+        collaborator_ids = {frame.agent_id for row, frame in enumerate(snapshot.frames) if row != ego}
         stale: dict[int, AgentFrame] = {}
         for moment in candidates if self.frames else ():
-            stale |= {f.agent_id: f for f in moment.frames if f.agent_id in wanted and f.agent_id not in stale}
-            if len(stale) == len(wanted):
+            stale |= {
+                f.agent_id: f for f in moment.frames if f.agent_id in collaborator_ids and f.agent_id not in stale
+            }
+            if len(stale) == len(collaborator_ids):
                 break
         frames = tuple(f if row == ego else stale.get(f.agent_id, f) for row, f in enumerate(snapshot.frames))
         return replace(snapshot, frames=frames)

@@ -16,7 +16,7 @@ from manyeyes.datatypes.grid import BevGrid
 from manyeyes.datatypes.map_element import KINDS, STYLES, MapElements, Polygons
 from manyeyes.datatypes.message import Message
 from manyeyes.datatypes.point_cloud import PointCloud
-from manyeyes.datatypes.snapshot import AgentFrame, Snapshot, Truth
+from manyeyes.datatypes.snapshot import AgentFrame, GroundTruth, Snapshot
 from manyeyes.datatypes.sparse_bev import Sites, SparseBev
 from manyeyes.datatypes.transform import Transform
 
@@ -31,6 +31,7 @@ __all__ = [
     "CameraImage",
     "CheckpointError",
     "ConfigError",
+    "GroundTruth",
     "ManyeyesError",
     "MapElements",
     "Message",
@@ -43,7 +44,6 @@ __all__ = [
     "Snapshot",
     "SparseBev",
     "Transform",
-    "Truth",
     "WireError",
     "wrap_angle",
 ]

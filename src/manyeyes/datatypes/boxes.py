@@ -21,7 +21,7 @@ class Boxes:
 
     center: (N, 3) metres, the middle of the box; size: (N, 3) length, width, height; yaw: (N,) radians about +z,
     0 along +x. score: (N,) in [0, 1]; label: (N,) int64, index into LABELS; id: (N,) int64, -1 when unknown.
-    sigma_xy: (N,) metres, sigma_yaw: (N,) radians and flip: (N,) in [0, 1] are the detector's own word on its
+    sigma_xy: (N,) metres, sigma_yaw: (N,) radians and p_flip: (N,) in [0, 1] are the detector's own word on its
     error and on the chance that the heading is off by pi; zero for truth. velocity: (N, 2) m/s over the ground along the
     frame's x and y, zero where nobody knows it.
     """
@@ -34,16 +34,16 @@ class Boxes:
     id: Tensor
     sigma_xy: Tensor
     sigma_yaw: Tensor
-    flip: Tensor
+    p_flip: Tensor
     velocity: Tensor
 
     def __post_init__(self) -> None:
         n = self.center.shape[0]
-        wanted = {"center": (n, 3), "size": (n, 3), "velocity": (n, 2)}
+        expected = {"center": (n, 3), "size": (n, 3), "velocity": (n, 2)}
         for field in fields(self):
             shape = tuple(getattr(self, field.name).shape)
-            if shape != wanted.get(field.name, (n,)):
-                raise ShapeError(f"Boxes.{field.name} needs shape {wanted.get(field.name, (n,))}; got {shape}.")
+            if shape != expected.get(field.name, (n,)):
+                raise ShapeError(f"Boxes.{field.name} needs shape {expected.get(field.name, (n,))}; got {shape}.")
 
     @classmethod
     def of(

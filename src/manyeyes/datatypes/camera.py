@@ -53,7 +53,7 @@ class Camera:
         pixel = torch.stack((u, v, torch.ones_like(u)), -1)
         return pixel @ torch.linalg.inv(self.intrinsic.double()).mT @ self.agent_from_camera.rotation.double().mT
 
-    def resized(self, width: int, height: int) -> Camera:
+    def resize(self, width: int, height: int) -> Camera:
         """The same view on another number of pixels."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.intrinsic.dtype)
         return Camera(scale[:, None] * self.intrinsic, self.agent_from_camera, width, height)
@@ -67,6 +67,6 @@ class CameraImage:
     rgb: Tensor
 
     def __post_init__(self) -> None:
-        wanted = (3, self.camera.height, self.camera.width)
-        if self.rgb.shape != wanted or self.rgb.dtype != torch.uint8:
-            raise ShapeError(f"CameraImage.rgb needs {wanted} uint8; got {tuple(self.rgb.shape)} {self.rgb.dtype}.")
+        expected = (3, self.camera.height, self.camera.width)
+        if self.rgb.shape != expected or self.rgb.dtype != torch.uint8:
+            raise ShapeError(f"CameraImage.rgb needs {expected} uint8; got {tuple(self.rgb.shape)} {self.rgb.dtype}.")

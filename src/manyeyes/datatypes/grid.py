@@ -42,7 +42,7 @@ class BevGrid:
         return -(-rows // self.stride), -(-columns // self.stride)
 
     @property
-    def cell(self) -> float:
+    def cell_size_m(self) -> float:
         """Edge of a cell at this stride, metres."""
         return self.stride * self.pillar
 
@@ -56,12 +56,12 @@ class BevGrid:
         return (origin + (yx.flip(-1).double() * self.stride + 0.5) * self.pillar).float()
 
     def cells(self, xy: Tensor) -> Tensor:
-        """Row and column (N, 2) of the nearest cell centre of points (N, 2); clamped to the grid. See :meth:`inside`."""
+        """Row and column (N, 2) of the nearest cell centre of points (N, 2); clamped to the grid. See :meth:`contains`."""
         origin = torch.tensor([self.x_min, self.y_min], dtype=torch.float64)
         nearest = (((xy.double() - origin) / self.pillar - 0.5) / self.stride + 0.5).floor().long().flip(-1)
         return torch.minimum(nearest.clamp_min(0), torch.tensor(self.shape) - 1)
 
-    def inside(self, points: Tensor) -> Tensor:
+    def contains(self, points: Tensor) -> Tensor:
         """(N,) bool: which points (N, 2 or 3) lie within the range; half-open, [min, max)."""
         low = torch.tensor([self.x_min, self.y_min, self.z_min], dtype=points.dtype)[: points.shape[-1]]
         high = torch.tensor([self.x_max, self.y_max, self.z_max], dtype=points.dtype)[: points.shape[-1]]

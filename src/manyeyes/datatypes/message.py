@@ -12,12 +12,12 @@ from torch import Tensor
 from manyeyes.datatypes.boxes import Boxes
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.grid import BevGrid
-from manyeyes.datatypes.map_element import MapElements, Polygons, frozen
+from manyeyes.datatypes.map_element import MapElements, Polygons, freeze
 from manyeyes.datatypes.point_cloud import PointCloud
 from manyeyes.datatypes.sparse_bev import SparseBev
 from manyeyes.datatypes.transform import Transform
 
-DESCRIPTOR = 32
+DESCRIPTOR_DIM = 32
 """Numbers of an object's descriptor."""
 
 
@@ -29,15 +29,15 @@ class RequestMap:
     """
 
     grid: BevGrid
-    sure: Tensor
+    confidence: Tensor
 
     def __post_init__(self) -> None:
-        if tuple(self.sure.shape) != self.grid.shape:
-            raise ShapeError(f"RequestMap.sure needs shape {self.grid.shape}; got {tuple(self.sure.shape)}.")
+        if tuple(self.confidence.shape) != self.grid.shape:
+            raise ShapeError(f"RequestMap.sure needs shape {self.grid.shape}; got {tuple(self.confidence.shape)}.")
 
 
 @dataclass(frozen=True, eq=False)
-class SeenMap:
+class LocalMap:
     """What an agent sees of the map, in its own frame, metres: elements, and where it would have seen others.
 
     view: (K, 2), an open ring; occluders: open rings that hide parts of it. Nothing where nothing is said: there the agent
@@ -49,7 +49,7 @@ class SeenMap:
     occluders: Polygons = field(default_factory=Polygons.of)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "view", frozen(self.view, np.float64))
+        object.__setattr__(self, "view", freeze(self.view, np.float64))
         if self.view.ndim != 2 or self.view.shape[1] != 2 or len(self.view) < 3:
             raise ShapeError(f"SeenMap.view needs shape (K, 2), K >= 3; got {self.view.shape}.")
 
@@ -62,7 +62,7 @@ class Message:
     fingerprint: 8 bytes that name the weights which made the tokens; tokens of other weights are refused.
     tokens: one grid, in the sender's frame; features float, or uint8 rows of the weights' codebook. token_score: (N,), which
     cells matter most. objects and points: sender's frame. descriptors: (objects, DESCRIPTOR) in [-1, 1], of each object, for
-    matching. request: what the sender would hear. seen_map: what it sees of the map.
+    matching. request: what the sender would hear. local_map: what it sees of the map.
     """
 
     agent_id: int
@@ -77,4 +77,4 @@ class Message:
     points: PointCloud | None = None
     descriptors: Tensor | None = None
     request: RequestMap | None = None
-    seen_map: SeenMap | None = None
+    local_map: LocalMap | None = None

@@ -52,14 +52,14 @@ class AgentFrame:
         """A frame from a cloud and a pose that is believed to be exact."""
         return cls(agent_id, timestamp_ns, points, world_from_agent, torch.zeros(3, 3, dtype=torch.float64))
 
-    def from_earlier(self, earlier: AgentFrame) -> Transform:
+    def now_from_earlier(self, earlier: AgentFrame) -> Transform:
         """From the agent's own frame of an earlier instant to this one, by its odometry."""
         now, then = self.odometry or self.world_from_agent, earlier.odometry or earlier.world_from_agent
         return now.inverse() @ then
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """What was really there at one instant; seen by evaluation and training only.
 
     boxes: in the world frame, float64, ids set. seen: (agents, N) bool, whether an agent lists the box (its LiDAR met
@@ -83,4 +83,4 @@ class Snapshot:
     scenario: str
     index: int
     frames: tuple[AgentFrame, ...]
-    truth: Truth | None = None
+    truth: GroundTruth | None = None

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes._site_kernels import CellLattice, are_sites, middles
+from manyeyes.datatypes._site_kernels import CellLattice, are_valid_keys, compute_centers
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.grid import BevGrid
 
@@ -30,14 +30,14 @@ class Sites:
     def __post_init__(self) -> None:
         if self.key.dtype != torch.int64 or self.key.dim() != 1:
             raise ShapeError(f"Sites.key needs int64 (N,); got {self.key.dtype} {tuple(self.key.shape)}.")
-        if self.key.numel() and not self._are_sites():
+        if self.key.numel() and not self._has_valid_keys():
             raise ShapeError("Sites.key must be strictly ascending and inside the grid; use ops.sparse_conv.coalesce.")
 
-    def _are_sites(self) -> bool:
+    def _has_valid_keys(self) -> bool:
         rows, columns = self.grid.shape
         size = self.batch_size * rows * columns
         if self.key.device.type == "cpu":
-            return are_sites(self.key.numpy(), size)
+            return are_valid_keys(self.key.numpy(), size)
         return bool((self.key[1:] > self.key[:-1]).all()) and int(self.key[0]) >= 0 and int(self.key[-1]) < size
 
     def __len__(self) -> int:
@@ -62,7 +62,7 @@ class Sites:
         if self.key.device.type == "cpu":
             grid = self.grid
             lattice = CellLattice(*grid.shape, grid.stride, float(grid.pillar), float(grid.x_min), float(grid.y_min))
-            return torch.from_numpy(middles(self.key.numpy(), lattice))
+            return torch.from_numpy(compute_centers(self.key.numpy(), lattice))
         return self.grid.centers(self.yx)
 
 

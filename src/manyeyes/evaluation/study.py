@@ -16,10 +16,10 @@ from pathlib import Path
 
 from manyeyes._source import source_digest
 from manyeyes.datasets.base import Recording
-from manyeyes.evaluation.detection.average_precision import Protocol
-from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, judging_protocol, loaded, played
-from manyeyes.evaluation.statistics.bootstrap import Drawn, Interval, drawn
-from manyeyes.evaluation.study_result import Cell, Speeds, cell_of, read_cell, write_cell
+from manyeyes.evaluation.detection.average_precision import DetectionProtocol
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, resolve_protocol, run_benchmarks
+from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval, bootstrap
+from manyeyes.evaluation.study_result import SpeedRange, StudyResult, make_study_result, read_result, write_result
 from manyeyes.models.checkpoint import fingerprint
 
 COMPUTED_BY = "manyeyes.evaluation.detection.benchmark"
@@ -34,84 +34,94 @@ class Condition:
     config: BenchmarkConfig
 
 
-Place = tuple[str, str]
+ResultKey = tuple[str, str]
 """The names of a condition and of a method."""
 
 
 @dataclass(frozen=True)
-class Sweep:
+class ResultGrid:
     """The cells of a sweep by condition and method, and what follows from them. iou counts the thresholds of tally.IOUS."""
 
-    cells: dict[Place, Cell]
-    protocol: Protocol
-    _drawn: dict[object, Drawn] = field(default_factory=dict, repr=False, compare=False)
+    results: dict[ResultKey, StudyResult]
+    protocol: DetectionProtocol
+    _bootstraps: dict[object, BootstrapSamples] = field(default_factory=dict, repr=False, compare=False)
 
-    def ap(
-        self, place: Place, iou: int, speeds: Speeds | None = None, scenarios: Collection[str] | None = None
+    def bootstrap_ap(
+        self, key: ResultKey, iou: int, speeds: SpeedRange | None = None, scenarios: Collection[str] | None = None
     ) -> Interval:
         """AP of a cell with its interval, over some scenarios or one class of speeds alone."""
-        return self._draws(place, iou, speeds, scenarios).interval()
+        return self._bootstrap(key, iou, speeds, scenarios).interval()
 
-    def less(self, place: Place, other: Place, iou: int, scenarios: Collection[str] | None = None) -> Interval:
+    def paired_difference(
+        self, key: ResultKey, other: ResultKey, iou: int, scenarios: Collection[str] | None = None
+    ) -> Interval:
         """AP of a cell minus that of another, paired over scenarios."""
-        return self._draws(place, iou, None, scenarios).less(self._draws(other, iou, None, scenarios))
+        return self._bootstrap(key, iou, None, scenarios).paired_difference(
+            self._bootstrap(other, iou, None, scenarios)
+        )
 
-    def scenarios(self, place: Place) -> frozenset[str]:
+    def scenarios_of(self, key: ResultKey) -> frozenset[str]:
         """Those that a cell was played on."""
-        return frozenset(match.scenario for match in self.cells[place].matches[0])
+        return frozenset(match.scenario for match in self.results[key].matches[0])
 
-    def _draws(self, place: Place, iou: int, speeds: Speeds | None, scenarios: Collection[str] | None) -> Drawn:
-        key = (place, iou, speeds, None if scenarios is None else frozenset(scenarios))
-        if key not in self._drawn:
-            frames = self.cells[place].frames(iou, scenarios, speeds)
-            self._drawn[key] = drawn(frames, protocol=self.protocol)
-        return self._drawn[key]
+    def _bootstrap(
+        self, key: ResultKey, iou: int, speeds: SpeedRange | None, scenarios: Collection[str] | None
+    ) -> BootstrapSamples:
+        cache_key = (key, iou, speeds, None if scenarios is None else frozenset(scenarios))
+        if cache_key not in self._bootstraps:
+            frames = self.results[key].select_matches(iou, scenarios, speeds)
+            self._bootstraps[cache_key] = bootstrap(frames, protocol=self.protocol)
+        return self._bootstraps[cache_key]
 
 
-def sweep(
+def run_conditions(
     open_recording: Callable[[], Recording],
     conditions: Sequence[Condition],
     folder: Path,
     workers: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Sweep:
+) -> ResultGrid:
     """Every method of every condition: the cell kept in the folder, or played now and kept.
 
     progress counts scenarios of conditions that are still to be played. Conditions of one configuration but for its methods
     should be one: methods of one condition look at each cloud once between them.
     """
-    data = recording_digest(open_recording())
+    recording_hash = hash_recording(open_recording())
     paths = {
-        (c.name, method): cell_path(folder, c.config, method, data) for c in conditions for method in c.config.methods
+        (c.name, method): result_path(folder, c.config, method, recording_hash)
+        for c in conditions
+        for method in c.config.methods
     }
-    cells = {place: cell for place, path in paths.items() if (cell := read_cell(path)) is not None}
-    left = [(c, tuple(m for m in c.config.methods if (c.name, m) not in cells)) for c in conditions]
-    todo = [Condition(c.name, replace(c.config, methods=methods)) for c, methods in left if methods]
-    with closing(played(open_recording, [c.config for c in todo], workers, progress)) as results:
-        for condition, tallies in zip(todo, results):
-            for tally in tallies:
-                cell = cell_of(tally)
-                write_cell(paths[condition.name, tally.method], cell)
-                cells[condition.name, tally.method] = cell
-    return Sweep({place: cells[place] for place in paths}, judging_protocol(conditions[0].config))
+    stored = {key: result for key, path in paths.items() if (result := read_result(path)) is not None}
+    remaining = [(c, tuple(m for m in c.config.methods if (c.name, m) not in stored)) for c in conditions]
+    pending = [Condition(c.name, replace(c.config, methods=methods)) for c, methods in remaining if methods]
+    with closing(run_benchmarks(open_recording, [c.config for c in pending], workers, progress)) as results:
+        for condition, metrics_by_method in zip(pending, results):
+            for metrics in metrics_by_method:
+                result = make_study_result(metrics)
+                write_result(paths[condition.name, metrics.method], result)
+                stored[condition.name, metrics.method] = result
+    return ResultGrid({key: stored[key] for key in paths}, resolve_protocol(conditions[0].config))
 
 
-def cell_path(folder: Path, config: BenchmarkConfig, method: str, data: str) -> Path:
-    """The file of a cell, named by all that its numbers depend on. data: the recording's digest."""
-    alone = replace(config, methods=(method,), weights=loaded(config.weights).fingerprint.hex())
-    net = config.replay.aligner.net if config.replay.aligner is not None else None
-    eyes = "" if net is None else fingerprint(net).hex()
-    digest = hashlib.blake2b(repr((alone, eyes, data, source_digest(COMPUTED_BY))).encode(), digest_size=8)
+def result_path(folder: Path, config: BenchmarkConfig, method: str, recording_hash: str) -> Path:
+    """The file of a cell, named by all that its numbers depend on. recording_hash: the recording's digest."""
+    method_config = replace(config, methods=(method,), weights=load_detector(config.weights).fingerprint.hex())
+    net = config.replay.pose_correction.net if config.replay.pose_correction is not None else None
+    corrector_fingerprint = "" if net is None else fingerprint(net).hex()
+    digest = hashlib.blake2b(
+        repr((method_config, corrector_fingerprint, recording_hash, source_digest(COMPUTED_BY))).encode(), digest_size=8
+    )
     return folder / f"{method}-{digest.hexdigest()}.npz"
 
 
-def recording_digest(recording: Recording) -> str:
+def hash_recording(recording: Recording) -> str:
     """What a recording holds, as far as each scenario's first judged snapshot tells: agents, poses, clouds, truth."""
     digest = hashlib.blake2b(digest_size=8)
     for scenario in recording.scenarios:
-        judged = recording.judged(scenario)
-        digest.update(repr((scenario, recording.length(scenario), judged, recording.agents(scenario))).encode())
-        first = recording.snapshot(scenario, judged.start)
+        eval_indices = recording.eval_indices(scenario)
+        digest.update(repr((scenario, recording.length(scenario), eval_indices, recording.agents(scenario))).encode())
+        first = recording.snapshot(scenario, eval_indices.start)
         for frame in first.frames:
             digest.update(frame.points.xyz.numpy().tobytes())
             digest.update(frame.world_from_agent.matrix().numpy().tobytes())

@@ -13,27 +13,27 @@ from torch import Tensor
 from manyeyes.datatypes import CheckpointError
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
-from manyeyes.models.detector.fold_norms import folded
-from manyeyes.models.maps.map_model import Mapper, MapperConfig
+from manyeyes.models.detector.fold_norms import fold_norms
+from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.models.pose import feakm
 
-DEFAULT = "costr-small"
-FEAKM = "feakm"
+DEFAULT_DETECTOR = "costr-small"
+DEFAULT_FEAKM = "feakm"
 """The shipped net that recognises objects; no detector, so that it is not among the names."""
-MAPPER = "map-small"
+DEFAULT_MAP_MODEL = "map-small"
 """The map model of agents with LiDAR; those with cameras are map-small-camera and map-small-both."""
-_MAPPERS = "map-"
+_MAP_PREFIX = "map-"
 
 
-def names() -> tuple[str, ...]:
+def list_detectors() -> tuple[str, ...]:
     """The shipped detectors."""
-    return tuple(name for name in _shipped() if name != FEAKM and not name.startswith(_MAPPERS))
+    return tuple(name for name in _shipped() if name != DEFAULT_FEAKM and not name.startswith(_MAP_PREFIX))
 
 
-def mappers() -> tuple[str, ...]:
+def list_map_models() -> tuple[str, ...]:
     """The shipped map models."""
-    return tuple(name for name in _shipped() if name.startswith(_MAPPERS))
+    return tuple(name for name in _shipped() if name.startswith(_MAP_PREFIX))
 
 
 def _shipped() -> tuple[str, ...]:
@@ -42,27 +42,28 @@ def _shipped() -> tuple[str, ...]:
     return tuple(sorted(Path(f.name).stem for f in found if f.name.endswith(".safetensors")))
 
 
-def load(name_or_path: str | Path = DEFAULT) -> Detector:
+def load(name_or_path: str | Path = DEFAULT_DETECTOR) -> Detector:
     """A detector for inference, norms folded in: a shipped name, or a .safetensors file of 'manyeyes train'.
 
     To train on from a file, or to look at its weights as they are, use checkpoint.load.
     """
-    if str(name_or_path) in names():
+    if str(name_or_path) in list_detectors():
         with as_file(files("manyeyes.models") / "weights" / f"{name_or_path}.safetensors") as path:
-            return folded(checkpoint.load(path))
+            return fold_norms(checkpoint.load(path))
     path = Path(name_or_path)
     if path.suffix != ".safetensors":
         raise CheckpointError(
-            f"No weights are named {name_or_path!r}; shipped are {', '.join(names()) or 'none'}, or give a .safetensors file."
+            f"No weights are named {name_or_path!r}; shipped are {', '.join(list_detectors()) or 'none'}, or give "
+            "a .safetensors file."
         )
-    return folded(checkpoint.load(path))
+    return fold_norms(checkpoint.load(path))
 
 
-def load_feakm(name_or_path: str | Path = FEAKM) -> feakm.FeakmNet:
+def load_feakm(name_or_path: str | Path = DEFAULT_FEAKM) -> feakm.FeakmNet:
     """FeaKM's net: the shipped one by its name, or a .safetensors file of 'manyeyes train --preset feakm'."""
-    if str(name_or_path) != FEAKM:
+    if str(name_or_path) != DEFAULT_FEAKM:
         return feakm.load(Path(name_or_path))
-    shipped = files("manyeyes.models") / "weights" / f"{FEAKM}.safetensors"
+    shipped = files("manyeyes.models") / "weights" / f"{DEFAULT_FEAKM}.safetensors"
     if not shipped.is_file():
         raise CheckpointError(
             "No weights of FeaKM are shipped; train them (manyeyes train --preset feakm) and give the .safetensors file."
@@ -71,36 +72,36 @@ def load_feakm(name_or_path: str | Path = FEAKM) -> feakm.FeakmNet:
         return feakm.load(path)
 
 
-def load_mapper(name_or_path: str | Path = MAPPER) -> Mapper:
+def load_map_model(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> MapModel:
     """A map model for inference: a shipped name, or a .safetensors file of 'manyeyes train --preset map-small'."""
-    with _mapper_file(name_or_path) as path:
-        mapper = checkpoint.load_as(path, FORMAT, MapperConfig, Mapper)
-    mapper.fingerprint = checkpoint.fingerprint(mapper)
-    return mapper
+    with _map_model_file(name_or_path) as path:
+        model = checkpoint.load_as(path, FORMAT, MapModelConfig, MapModel)
+    model.fingerprint = checkpoint.fingerprint(model)
+    return model
 
 
-def mapper_towns(name_or_path: str | Path = MAPPER) -> tuple[str, ...]:
+def read_training_towns(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> tuple[str, ...]:
     """The towns whose maps taught a map model, as its card says."""
-    with _mapper_file(name_or_path) as path:
+    with _map_model_file(name_or_path) as path:
         return tuple(checkpoint.read_card(path, FORMAT)["towns"])
 
 
-def mapper_state(name_or_path: str | Path = MAPPER) -> dict[str, Tensor]:
+def load_map_model_state(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> dict[str, Tensor]:
     """The tensors of a map model by name, to begin a training from."""
-    with _mapper_file(name_or_path) as path:
+    with _map_model_file(name_or_path) as path:
         return checkpoint.read_state(path, FORMAT)
 
 
 @contextmanager
-def _mapper_file(name_or_path: str | Path) -> Iterator[Path]:
-    if str(name_or_path) in mappers():
+def _map_model_file(name_or_path: str | Path) -> Iterator[Path]:
+    if str(name_or_path) in list_map_models():
         with as_file(files("manyeyes.models") / "weights" / f"{name_or_path}.safetensors") as path:
             yield path
         return
     path = Path(name_or_path)
     if path.suffix != ".safetensors":
         raise CheckpointError(
-            f"No map weights are named {name_or_path!r}; shipped are {', '.join(mappers()) or 'none'}: train some "
+            f"No map weights are named {name_or_path!r}; shipped are {', '.join(list_map_models()) or 'none'}: train some "
             "(manyeyes train --preset map-small) and give the .safetensors file."
         )
     yield path

@@ -76,13 +76,13 @@ def attend(
     q: F32x1, k: F32x1, v: F32x1, out: F32x1, heads: int, width: int, order: I64x1, start: I64x1
 ) -> None:  # pragma: no cover
     """Window by window and head by head, as many queries at once as a tile holds."""
-    most = 4
+    max_keys = 4
     for w in range(start.shape[0] - 1):
-        most = max(most, (start[w + 1] - start[w] + 3) // 4 * 4)
-    rows = np.empty(most, np.uintp)
+        max_keys = max(max_keys, (start[w + 1] - start[w] + 3) // 4 * 4)
+    rows = np.empty(max_keys, np.uintp)
     # With a column for each query.
     queries, mixed = np.empty(width * _TILE, np.float32), np.empty(width * _TILE, np.float32)
-    weights, sums = np.empty(most * _TILE, np.float32), np.empty(2 * _TILE, np.float32)
+    weights, sums = np.empty(max_keys * _TILE, np.float32), np.empty(2 * _TILE, np.float32)
     for w in range(start.shape[0] - 1):
         n = start[w + 1] - start[w]
         padded = (n + 3) // 4 * 4

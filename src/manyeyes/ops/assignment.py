@@ -30,7 +30,7 @@ def _shortest_paths(cost: F64x2) -> I64x1:  # pragma: no cover - compiled
     owner, way = np.zeros(m + 1, np.int64), np.zeros(m + 1, np.int64)
     for i in range(1, n + 1):
         owner[0] = i
-        least = np.full(m + 1, np.inf)
+        min_reduced = np.full(m + 1, np.inf)
         done = np.zeros(m + 1, np.bool_)
         here = 0
         while owner[here] != 0:
@@ -40,16 +40,16 @@ def _shortest_paths(cost: F64x2) -> I64x1:  # pragma: no cover - compiled
                 if done[j]:
                     continue
                 reduced = cost[row - 1, j - 1] - u[row] - v[j]
-                if reduced < least[j]:
-                    least[j], way[j] = reduced, here
-                if least[j] < step:
-                    step, there = least[j], j
+                if reduced < min_reduced[j]:
+                    min_reduced[j], way[j] = reduced, here
+                if min_reduced[j] < step:
+                    step, there = min_reduced[j], j
             for j in range(m + 1):
                 if done[j]:
                     u[owner[j]] += step
                     v[j] -= step
                 else:
-                    least[j] -= step
+                    min_reduced[j] -= step
             here = there
         while here != 0:
             owner[here] = owner[way[here]]

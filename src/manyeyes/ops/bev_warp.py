@@ -14,11 +14,11 @@ from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ShapeError, Transform
 
-SEEN_SHARE = 0.5
+MIN_SEEN_FRACTION = 0.5
 """A place is seen where more than this share of the bilinear weight falls on seen cells."""
 
 
-def warp(
+def warp_bev(
     features: Tensor, seen: Tensor, source: BevGrid, target: BevGrid, target_from_source: Transform
 ) -> tuple[Tensor, Tensor]:
     """Features (N, C, h, w) on one grid to (N, C, H, W) on another, and which places (N, H, W) are seen there.
@@ -32,12 +32,12 @@ def warp(
             f"{tuple(features.shape)} and {tuple(seen.shape)}."
         )
     at = _places(source, target, target_from_source).to(features)
-    share = seen[:, None].to(features.dtype)
-    both = torch.cat((features * share, share), 1)
+    seen_weight = seen[:, None].to(features.dtype)
+    both = torch.cat((features * seen_weight, seen_weight), 1)
     moved = F.grid_sample(both, at, mode="bilinear", padding_mode="zeros", align_corners=False)
     weight = moved[:, -1:]
-    visible = weight > SEEN_SHARE
-    return moved[:, :-1] / weight.clamp_min(SEEN_SHARE) * visible, visible[:, 0]
+    visible = weight > MIN_SEEN_FRACTION
+    return moved[:, :-1] / weight.clamp_min(MIN_SEEN_FRACTION) * visible, visible[:, 0]
 
 
 def _places(source: BevGrid, target: BevGrid, target_from_source: Transform) -> Tensor:
@@ -57,5 +57,5 @@ def _places(source: BevGrid, target: BevGrid, target_from_source: Transform) -> 
 
 def masked_max(features: Tensor, seen: Tensor, null: Tensor) -> Tensor:
     """(B, C, H, W): the greatest of features (B, K, C, H, W) over those of K that see a place (B, K, H, W); else null (C,)."""
-    greatest = features.masked_fill(~seen[:, :, None], -torch.inf).amax(1)
-    return torch.where(seen.any(1)[:, None], greatest, null[:, None, None])
+    largest = features.masked_fill(~seen[:, :, None], -torch.inf).amax(1)
+    return torch.where(seen.any(1)[:, None], largest, null[:, None, None])

@@ -77,7 +77,7 @@ class NormedConv:
         return torch.from_numpy(_normed(rows, weight, norm, table.pairs, table.is_symmetric, table.n_out))
 
 
-def takes(x: Tensor) -> bool:
+def is_supported(x: Tensor) -> bool:
     """Whether the loops may take it: no gradient is asked for, and it is float32 in the CPU's memory."""
     return not torch.is_grad_enabled() and x.device.type == "cpu" and x.dtype == torch.float32
 

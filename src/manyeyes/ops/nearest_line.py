@@ -19,47 +19,47 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Nearest:
+class NearestLines:
     """For each query: distance (Q,) metres, inf beyond reach; line (Q,) its row, -1 beyond; heading (Q,) of its segment.
 
-    across: (Q,) metres from the straight line through that segment, left positive: beside a line's end, less than distance.
+    lateral_m: (Q,) metres from the straight line through that segment, left positive: beside a line's end, less than distance.
     """
 
     distance: Floats
     line: Ints
     heading: Floats
-    across: Floats
+    lateral_m: Floats
 
 
-def nearest_line(queries: Floats, points: Floats, first: Ints, reach_m: float) -> Nearest:
+def find_nearest_line(queries: Floats, points: Floats, offsets: Ints, max_distance_m: float) -> NearestLines:
     """The nearest line within reach of each query (Q, 2); of equally near ones the lowest row."""
     queries = np.ascontiguousarray(queries, dtype=np.float64).reshape(-1, 2)
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
-    first = np.ascontiguousarray(first, dtype=np.int64)
-    line, start = segments_of(first)
+    offsets = np.ascontiguousarray(offsets, dtype=np.int64)
+    line, start = segments_of(offsets)
     if len(queries) == 0 or len(start) == 0:
         nothing = np.full(len(queries), np.inf)
-        return Nearest(nothing, np.full(len(queries), -1, dtype=np.int64), np.zeros(len(queries)), nothing)
-    origin = points.min(0) - reach_m
+        return NearestLines(nothing, np.full(len(queries), -1, dtype=np.int64), np.zeros(len(queries)), nothing)
+    origin = points.min(0) - max_distance_m
     # A cell of the reach keeps the lists short; a segment is entered in every cell that its box, grown by the reach, meets.
-    size = max(reach_m, 1.0)
-    shape = np.floor((points.max(0) + reach_m - origin) / size).astype(np.int64) + 1
+    size = max(max_distance_m, 1.0)
+    shape = np.floor((points.max(0) + max_distance_m - origin) / size).astype(np.int64) + 1
     place = np.array([origin[0], origin[1], size])
-    offset, held = _enter(points, start, place, shape, reach_m)
-    return Nearest(*_look_up(queries, points, start, line, place, shape, offset, held, reach_m))
+    offset, held = _enter(points, start, place, shape, max_distance_m)
+    return NearestLines(*_look_up(queries, points, start, line, place, shape, offset, held, max_distance_m))
 
 
-def nearest_line_slow(queries: Floats, points: Floats, first: Ints, reach_m: float) -> Nearest:
-    """The slow twin of :func:`nearest_line`."""
-    distance, owner, heading, across = [], [], [], []
-    line, start = segments_of(first)
+def find_nearest_line_slow(queries: Floats, points: Floats, offsets: Ints, max_distance_m: float) -> NearestLines:
+    """The slow twin of :func:`find_nearest_line`."""
+    distance, owner, heading, lateral = [], [], [], []
+    line, start = segments_of(offsets)
     for query in np.asarray(queries, dtype=np.float64).reshape(-1, 2):
         best = (np.inf, -1, 0.0, np.inf)
         for row, s in zip(line, start):
             a, d = points[s], points[s + 1] - points[s]
             t = min(1.0, max(0.0, float((query - a) @ d) / float(d @ d))) if d @ d > 0 else 0.0
             away = float(np.hypot(*(query - a - t * d)))
-            if away <= reach_m and away < best[0]:
+            if away <= max_distance_m and away < best[0]:
                 beside = (
                     float(d[0] * (query - a)[1] - d[1] * (query - a)[0]) / float(np.hypot(*d)) if d @ d > 0 else away
                 )
@@ -67,17 +67,17 @@ def nearest_line_slow(queries: Floats, points: Floats, first: Ints, reach_m: flo
         distance.append(best[0])
         owner.append(best[1])
         heading.append(best[2])
-        across.append(best[3])
-    return Nearest(np.array(distance), np.array(owner, dtype=np.int64), np.array(heading), np.array(across))
+        lateral.append(best[3])
+    return NearestLines(np.array(distance), np.array(owner, dtype=np.int64), np.array(heading), np.array(lateral))
 
 
-def segments_of(first: Ints) -> tuple[Ints, Ints]:
+def segments_of(offsets: Ints) -> tuple[Ints, Ints]:
     """line (S,) and start (S,): which line each segment belongs to, and the row of points that it starts at."""
-    first = np.asarray(first, dtype=np.int64)
-    count = np.maximum(np.diff(first) - 1, 0)
+    offsets = np.asarray(offsets, dtype=np.int64)
+    count = np.maximum(np.diff(offsets) - 1, 0)
     line = np.repeat(np.arange(len(count), dtype=np.int64), count)
     within = np.arange(len(line), dtype=np.int64) - np.repeat(np.cumsum(count) - count, count)
-    return line, first[line] + within
+    return line, offsets[line] + within
 
 
 @njit(cache=True)
@@ -118,7 +118,7 @@ def _look_up(
     distance = np.full(len(queries), np.inf)
     owner = np.full(len(queries), -1, dtype=np.int64)
     heading = np.zeros(len(queries))
-    across = np.full(len(queries), np.inf)
+    lateral = np.full(len(queries), np.inf)
     for q in range(len(queries)):
         x, y = queries[q, 0], queries[q, 1]
         column, row = np.floor((x - place[0]) / size), np.floor((y - place[1]) / size)
@@ -137,5 +137,5 @@ def _look_up(
                 best = away
                 distance[q], owner[q], heading[q] = away, line[held[h]], np.arctan2(dy, dx)
                 beside = dx * (y - points[s, 1]) - dy * (x - points[s, 0])
-                across[q] = beside / np.sqrt(square) if square > 0 else away
-    return distance, owner, heading, across
+                lateral[q] = beside / np.sqrt(square) if square > 0 else away
+    return distance, owner, heading, lateral

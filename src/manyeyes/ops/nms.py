@@ -16,17 +16,17 @@ from manyeyes.datatypes import ShapeError
 
 
 @torch.no_grad()
-def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, pre: int = 1000) -> Tensor:
+def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, max_candidates: int = 1000) -> Tensor:
     """Rows (K,) int64 of boxes (N, 5: x, y, length, width, yaw) that survive, in descending score (N,).
 
-    The best `pre` boxes are walked from the highest score, equal scores in the order given; each that still stands
+    The best `max_candidates` boxes are walked from the highest score, equal scores in the order given; each that still stands
     suppresses those after it whose rotated IoU with it is *greater* than the threshold.
     """
     if boxes.ndim != 2 or boxes.shape[1] != 5 or score.shape != boxes.shape[:1]:
         raise ShapeError(
             f"rotated_nms needs boxes (N, 5) and score (N,); got {tuple(boxes.shape)}, {tuple(score.shape)}."
         )
-    order = score.argsort(descending=True, stable=True)[:pre]
+    order = score.argsort(descending=True, stable=True)[:max_candidates]
     standing = _standing(np.ascontiguousarray(boxes[order].double().cpu().numpy()), float(iou_threshold))
     return order[torch.from_numpy(standing).to(order.device)]
 

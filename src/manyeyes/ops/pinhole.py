@@ -59,7 +59,7 @@ class _Lens(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Sight:
+class PinholeHits:
     """What each pixel meets, all (height, width).
 
     depth_m: float64, along the optical axis, inf where nothing was met. primitive: int32 index, NOTHING or GROUND.
@@ -70,7 +70,7 @@ class Sight:
 
 
 @njit(cache=True)
-def lattice(i: int, j: int, k: int, seed: int) -> float:
+def lattice_hash(i: int, j: int, k: int, seed: int) -> float:
     """A number in [0, 1) of a point of the integer lattice (SplitMix64)."""
     x = np.uint64(seed) + np.uint64(i) * np.uint64(_A) + np.uint64(j) * np.uint64(_C) + np.uint64(k) * np.uint64(_D)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(_B)
@@ -93,7 +93,7 @@ def first_leaf(
         i = math.floor((o[0] + t * d0) / LEAF_M)
         j = math.floor((o[1] + t * d1) / LEAF_M)
         k = math.floor((o[2] + t * d2) / LEAF_M)
-        if lattice(i, j, k, seed) < chance:
+        if lattice_hash(i, j, k, seed) < chance:
             return t
         out = math.inf
         if d0 != 0:
@@ -107,7 +107,9 @@ def first_leaf(
 
 
 @njit(cache=True)
-def meet(kind: int, half: F64x1, density: float, o: F64x1, d0: float, d1: float, d2: float, seed: int) -> float:
+def intersect_primitive(
+    kind: int, half: F64x1, density: float, o: F64x1, d0: float, d1: float, d2: float, seed: int
+) -> float:
     """The t at which the ray o + t d, in a primitive's own frame, meets it from outside; inf where it does not."""
     if kind == BOX:
         t, _ = hit_box(o, half, d0, d1, d2)
@@ -121,7 +123,7 @@ def meet(kind: int, half: F64x1, density: float, o: F64x1, d0: float, d1: float,
 
 
 @njit(cache=True)
-def meet_ground(
+def intersect_ground(
     terrain: HeightRaster, highest: float, origin: F64x1, d0: float, d1: float, d2: float, limit: float
 ) -> float:
     """The t below limit at which the ray origin + t d first sinks under the height field; inf where it does not.
@@ -250,7 +252,7 @@ def _cast(
                 d0 = q[i, 0, 0] * x + q[i, 0, 1] * y + q[i, 0, 2]
                 d1 = q[i, 1, 0] * x + q[i, 1, 1] * y + q[i, 1, 2]
                 d2 = q[i, 2, 0] * x + q[i, 2, 1] * y + q[i, 2, 2]
-                t = meet(kind[i], half[i], density[i], o[i], d0, d1, d2, seed + i)
+                t = intersect_primitive(kind[i], half[i], density[i], o[i], d0, d1, d2, seed + i)
                 if t < depth[row, column] and t <= max_depth:
                     depth[row, column], owner[row, column] = t, i
 
@@ -269,7 +271,7 @@ def _ground(
             d0 = camera[0, 0] * x + camera[0, 1] * y + camera[0, 2]
             d1 = camera[1, 0] * x + camera[1, 1] * y + camera[1, 2]
             d2 = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2]
-            t = meet_ground(terrain, highest, origin, d0, d1, d2, min(depth[row, column], max_depth))
+            t = intersect_ground(terrain, highest, origin, d0, d1, d2, min(depth[row, column], max_depth))
             if t < depth[row, column]:
                 depth[row, column], owner[row, column] = t, GROUND
 
@@ -285,7 +287,7 @@ def cast_pinhole(
     max_depth: float,
     seed: int = 0,
     own: int = 0,
-) -> Sight:
+) -> PinholeHits:
     """One picture's depths.
 
     origin: (3,) and rotation: (3, 3) world_from_camera (x right, y down, z ahead); intrinsic: (3, 3) pixels.
@@ -297,7 +299,7 @@ def cast_pinhole(
     pose = SensorPose(np.ascontiguousarray(origin, np.float64), np.ascontiguousarray(rotation, np.float64))
     _cast(primitives.arrays, _own(primitives, own), pose, lens, float(max_depth), seed, depth, owner)
     _ground(ground.raster, float(ground.height.max()), pose, lens, float(max_depth), depth, owner)
-    return Sight(depth, owner)
+    return PinholeHits(depth, owner)
 
 
 def _own(primitives: Primitives, own: int) -> NDArray[np.bool_]:
@@ -315,7 +317,7 @@ def cast_pinhole_reference(
     max_depth: float,
     seed: int = 0,
     own: int = 0,
-) -> Sight:
+) -> PinholeHits:
     """The slow twin of :func:`cast_pinhole`: slabs and quadrics for every pixel, leaves and ground in small steps."""
     v, u = np.mgrid[0:height, 0:width] + 0.5
     ray = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(intrinsic).T @ rotation.T
@@ -329,7 +331,7 @@ def cast_pinhole_reference(
                 steps = np.arange(float(t[index]), float(leave[index]), 0.001)
                 cubes = np.floor((o + steps[:, None] * d[index]) / LEAF_M).astype(np.int64)
                 entered = np.flatnonzero(np.append(True, (cubes[1:] != cubes[:-1]).any(1)))
-                full = [k for k in entered if lattice(cubes[k, 0], cubes[k, 1], cubes[k, 2], seed + i) < chance]
+                full = [k for k in entered if lattice_hash(cubes[k, 0], cubes[k, 1], cubes[k, 2], seed + i) < chance]
                 t[index] = steps[full[0]] if full else np.inf
         closer = (t < depth) & (t <= max_depth)
         depth[closer], owner[closer] = t[closer], i
@@ -339,4 +341,4 @@ def cast_pinhole_reference(
         below = np.flatnonzero(path[:, 2] <= reference_height(ground, path[:, 0], path[:, 1]))
         if below.size:
             depth[index], owner[index] = t[below[0]], GROUND
-    return Sight(depth, owner)
+    return PinholeHits(depth, owner)

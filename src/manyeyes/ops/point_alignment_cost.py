@@ -16,19 +16,19 @@ from torch import Tensor
 from manyeyes._jit import F32x2, F64x1, F64x2, I64x1, njit
 from manyeyes.datatypes import Boxes
 
-REACH_M = 0.4
+MAX_DISTANCE_M = 0.4
 """A point whose nearest partner is farther has none."""
-FEWEST, MOST = 5, 32
+MIN_POINTS, MAX_POINTS = 5, 32
 """An object with fewer points says nothing; of more, so many are taken evenly."""
-MARGIN = (0.3, 0.25, 0.4)
+BOX_MARGIN_M = (0.3, 0.25, 0.4)
 """Metres that a box is taken longer and wider at each end and higher at the top, since it is an estimate."""
-ROAD_M = 0.25
+ROAD_CLEARANCE_M = 0.25
 """Points nearer to the bottom of a box are the road's."""
-FLAT = 0.5
+HEIGHT_SCALE = 0.5
 """Height counts so much: rings of a LiDAR meet a body at other heights as it drives away."""
 
 
-def meeting_costs(
+def compute_alignment_costs(
     now: Tensor, then: Tensor, boxes: Boxes, back: Tensor, slack: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
     """(N, steps), how badly points now and then meet, from 0 to 1, and (N,), the number of points that were asked.
@@ -59,10 +59,16 @@ class _Box(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _inside(points: F32x2, place: _Box, away_x: float, away_y: float, along: float) -> F64x2:  # pragma: no cover
+def _inside(
+    points: F32x2, place: _Box, away_x: float, away_y: float, longitudinal_margin: float
+) -> F64x2:  # pragma: no cover
     """(K, 3): points in a box moved by away and made longer at each end, from its middle, in its axes, heights scaled."""
     x0, y0 = place.x + away_x, place.y + away_y
-    length, width, height = place.half_length + along, place.half_width + MARGIN[1], place.half_height
+    length, width, height = (
+        place.half_length + longitudinal_margin,
+        place.half_width + BOX_MARGIN_M[1],
+        place.half_height,
+    )
     radius = (length * length + width * width) ** 0.5
     found, count = np.empty((len(points), 3)), 0
     for p in range(len(points)):
@@ -71,8 +77,8 @@ def _inside(points: F32x2, place: _Box, away_x: float, away_y: float, along: flo
             continue
         u, v = x * place.cos_yaw + y * place.sin_yaw, y * place.cos_yaw - x * place.sin_yaw
         z = points[p, 2] - place.z
-        if abs(u) < length and abs(v) < width and ROAD_M - height < z < height + MARGIN[2]:
-            found[count, 0], found[count, 1], found[count, 2] = u, v, FLAT * z
+        if abs(u) < length and abs(v) < width and ROAD_CLEARANCE_M - height < z < height + BOX_MARGIN_M[2]:
+            found[count, 0], found[count, 1], found[count, 2] = u, v, HEIGHT_SCALE * z
             count += 1
     return found[:count]
 
@@ -82,16 +88,16 @@ def _match(
     now: F32x2, then: F32x2, places: F64x2, back: F64x2, slack: F64x1, cost: F64x2, count: I64x1
 ) -> None:  # pragma: no cover
     """Fills cost (N, S) and count (N,); places (N, 8): the fields of a :class:`_Box`."""
-    steps, limit = cost.shape[1], REACH_M * REACH_M
+    steps, limit = cost.shape[1], MAX_DISTANCE_M * MAX_DISTANCE_M
     x, best = np.empty(steps), np.empty(steps)
     for n in range(len(places)):
         p = places[n]
         box = _Box(p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-        mine = _inside(now, box, 0.0, 0.0, MARGIN[0])
-        theirs = _inside(then, box, -back[n, 0], -back[n, 1], MARGIN[0] + slack[n])
-        if len(mine) < FEWEST or len(theirs) < FEWEST:
+        mine = _inside(now, box, 0.0, 0.0, BOX_MARGIN_M[0])
+        theirs = _inside(then, box, -back[n, 0], -back[n, 1], BOX_MARGIN_M[0] + slack[n])
+        if len(mine) < MIN_POINTS or len(theirs) < MIN_POINTS:
             continue
-        asked = min(len(mine), MOST)
+        asked = min(len(mine), MAX_POINTS)
         count[n] = asked
         apart = 2.0 * slack[n] / (steps - 1)
         for a in range(asked):
@@ -106,8 +112,8 @@ def _match(
                 # The candidates at which it may be within reach: one more on each side, for rounding.
                 gap, first, last = theirs[b, 0] - point[0] - slack[n], 0, steps - 1
                 if apart > 0.0:
-                    first = max(first, int((-REACH_M - gap) / apart) - 1)
-                    last = min(last, int((REACH_M - gap) / apart) + 1)
+                    first = max(first, int((-MAX_DISTANCE_M - gap) / apart) - 1)
+                    last = min(last, int((MAX_DISTANCE_M - gap) / apart) + 1)
                 for s in range(first, last + 1):
                     dx = theirs[b, 0] - x[s]
                     best[s] = min(best[s], dx * dx + dy + dz)

@@ -13,110 +13,112 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
-from manyeyes.datatypes.map_element import frozen, rows_of
+from manyeyes.datatypes.map_element import freeze, take_rows
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MOST_SAMPLES = 2000
+MAX_SAMPLES = 2000
 
 
-def close_rings(points: Floats, first: Ints, closed: NDArray[np.bool_]) -> tuple[Floats, Ints]:
+def close_rings(points: Floats, offsets: Ints, closed: NDArray[np.bool_]) -> tuple[Floats, Ints]:
     """The same lines, those marked closed (N,) with their first point repeated at the end."""
-    counts = np.diff(first)
+    counts = np.diff(offsets)
     more = (closed & (counts > 0)).astype(np.int64)
-    out_first = np.concatenate(([0], np.cumsum(counts + more))).astype(np.int64)
-    out = np.empty((int(out_first[-1]), 2))
-    _, places = rows_of(out_first, np.arange(len(counts)))
+    out_offsets = np.concatenate(([0], np.cumsum(counts + more))).astype(np.int64)
+    out = np.empty((int(out_offsets[-1]), 2))
+    _, places = take_rows(out_offsets, np.arange(len(counts)))
     row = np.repeat(np.arange(len(counts)), counts + more)
-    k = places - out_first[row]
-    out[places] = points[first[row] + np.where(k == counts[row], 0, k)]
-    return out, out_first
+    k = places - out_offsets[row]
+    out[places] = points[offsets[row] + np.where(k == counts[row], 0, k)]
+    return out, out_offsets
 
 
-def lengths(points: Floats, first: Ints) -> Floats:
+def lengths(points: Floats, offsets: Ints) -> Floats:
     """(N,) metres along each line."""
-    row = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    row = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     if len(points) < 2:
-        return np.zeros(len(first) - 1)
+        return np.zeros(len(offsets) - 1)
     step = np.hypot(*np.diff(points, axis=0).T)
     step[row[1:] != row[:-1]] = 0.0
-    return np.bincount(row[1:], step, len(first) - 1).astype(np.float64)
+    return np.bincount(row[1:], step, len(offsets) - 1).astype(np.float64)
 
 
-def resample(points: Floats, first: Ints, counts: ArrayLike) -> tuple[Floats, Ints]:
+def resample(points: Floats, offsets: Ints, counts: ArrayLike) -> tuple[Floats, Ints]:
     """Each line at so many points, one number or (N,), of equal arc length, both its ends included."""
-    wanted = np.broadcast_to(np.asarray(counts, np.int64), (len(first) - 1,))
-    wanted = np.where(np.diff(first) > 0, wanted, 0)
-    target = frozen(np.concatenate(([0], np.cumsum(wanted))), np.int64)
-    return _resample(frozen(points, np.float64), frozen(first, np.int64), target), target
+    wanted = np.broadcast_to(np.asarray(counts, np.int64), (len(offsets) - 1,))
+    wanted = np.where(np.diff(offsets) > 0, wanted, 0)
+    target = freeze(np.concatenate(([0], np.cumsum(wanted))), np.int64)
+    return _resample(freeze(points, np.float64), freeze(offsets, np.int64), target), target
 
 
-def resample_spaced(points: Floats, first: Ints, spacing_m: float, most: int = MOST_SAMPLES) -> tuple[Floats, Ints]:
+def resample_spaced(
+    points: Floats, offsets: Ints, spacing_m: float, max_samples: int = MAX_SAMPLES
+) -> tuple[Floats, Ints]:
     """Each line at equal steps of at most spacing_m, both ends included, but at no more than so many points."""
-    steps = np.ceil(lengths(points, first) / spacing_m - 1e-9).astype(np.int64)
-    return resample(points, first, np.clip(steps + 1, 2, most))
+    steps = np.ceil(lengths(points, offsets) / spacing_m - 1e-9).astype(np.int64)
+    return resample(points, offsets, np.clip(steps + 1, 2, max_samples))
 
 
-def headings(points: Floats, first: Ints) -> Floats:
+def headings(points: Floats, offsets: Ints) -> Floats:
     """(P,) radians in [-pi, pi], the direction from the point before to the point after; one-sided at the ends."""
     p = len(points)
     if p == 0:
         return np.zeros(0)
-    row = np.repeat(np.arange(len(first) - 1), np.diff(first))
-    before = np.maximum(np.arange(p) - 1, first[:-1][row])
-    after = np.minimum(np.arange(p) + 1, first[1:][row] - 1)
+    row = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+    before = np.maximum(np.arange(p) - 1, offsets[:-1][row])
+    after = np.minimum(np.arange(p) + 1, offsets[1:][row] - 1)
     step = points[after] - points[before]
     return np.arctan2(step[:, 1], step[:, 0])
 
 
 @dataclass(frozen=True)
-class Feet:
+class LineProjection:
     """The nearest place on a line to each query: along (Q,) metres from its start; side (Q,) metres, left of it positive.
 
-    distance: (Q,) metres to the foot; inside: (Q,) whether the foot is neither of the line's ends.
+    distance_m: (Q,) metres to the foot; is_interior: (Q,) whether the foot is neither of the line's ends.
     """
 
-    along: Floats
-    side: Floats
-    distance: Floats
-    inside: NDArray[np.bool_]
+    station_m: Floats
+    lateral_m: Floats
+    distance_m: Floats
+    is_interior: NDArray[np.bool_]
 
 
-def feet(queries: Floats, line: Floats) -> Feet:
+def project_onto_line(queries: Floats, line: Floats) -> LineProjection:
     """Where each query (Q, 2) stands beside one line (K, 2), K >= 2; of equally near places the first."""
-    return Feet(*_feet(frozen(queries, np.float64), frozen(line, np.float64)))
+    return LineProjection(*_project_onto_line(freeze(queries, np.float64), freeze(line, np.float64)))
 
 
-def at_stations(line: Floats, along: ArrayLike) -> Floats:
+def points_at_stations(line: Floats, station_m: ArrayLike) -> Floats:
     """(Q, 2) the points of a line (K, 2) at these metres from its start; beyond its ends, the ends."""
     passed = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
-    return np.stack([np.interp(np.asarray(along, np.float64), passed, line[:, k]) for k in range(2)], -1)
+    return np.stack([np.interp(np.asarray(station_m, np.float64), passed, line[:, k]) for k in range(2)], -1)
 
 
-def part(line: Floats, start_m: float, end_m: float) -> Floats:
+def cut_line(line: Floats, start_m: float, end_m: float) -> Floats:
     """(K', 2) the part of a line between two stations, its own vertices between them kept."""
     passed = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
     start_m, end_m = max(start_m, 0.0), min(end_m, float(passed[-1]))
     inner = line[(passed > start_m + 1e-9) & (passed < end_m - 1e-9)]
-    ends = at_stations(line, [start_m, end_m])
+    ends = points_at_stations(line, [start_m, end_m])
     return np.concatenate((ends[:1], inner, ends[1:]))
 
 
 def simplify(line: Floats, tolerance_m: float) -> Floats:
     """(K', 2) by Douglas and Peucker (1973): no point left out lies farther than the tolerance from what stays."""
-    return line[_simplify(frozen(line, np.float64), tolerance_m)]
+    return line[_simplify(freeze(line, np.float64), tolerance_m)]
 
 
-def near_pairs(bounds: Floats, reach_m: float) -> Ints:
+def find_near_pairs(bounds: Floats, max_gap_m: float) -> Ints:
     """(K, 2) pairs of rows i < j, ascending, whose boxes (N, 4) are at most reach_m apart along both axes."""
     boxes = np.array(bounds, np.float64)
-    boxes[:, :2] -= reach_m / 2
-    boxes[:, 2:] += reach_m / 2
+    boxes[:, :2] -= max_gap_m / 2
+    boxes[:, 2:] += max_gap_m / 2
     usable = np.flatnonzero(np.isfinite(boxes).all(1))
     if len(usable) < 2:
         return np.zeros((0, 2), np.int64)
-    boxes = frozen(boxes[usable], np.float64)
+    boxes = freeze(boxes[usable], np.float64)
     # A cell about as large as a usual box keeps both the entries a box and the boxes a cell few.
     size = max(float(np.median(boxes[:, 2:] - boxes[:, :2])), 1.0)
     low = np.floor(boxes[:, :2] / size).astype(np.int64)
@@ -129,23 +131,23 @@ def near_pairs(bounds: Floats, reach_m: float) -> Ints:
     row, cell = row[order], cell[order]
     starts = np.flatnonzero(np.concatenate(([True], (cell[1:] != cell[:-1]).any(1))))
     groups = np.append(starts, len(row))
-    pairs = _pairs_in_cells(row, cell, frozen(groups, np.int64), boxes, frozen(low, np.int64))
+    pairs = _pairs_in_cells(row, cell, freeze(groups, np.int64), boxes, freeze(low, np.int64))
     pairs = usable[pairs]
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
-def near_pairs_between(a_bounds: Floats, b_bounds: Floats, reach_m: float) -> Ints:
+def find_near_pairs_between(a_bounds: Floats, b_bounds: Floats, max_gap_m: float) -> Ints:
     """(K, 2) rows of a and of b, ascending, whose boxes are at most reach_m apart along both axes."""
-    pairs = near_pairs(np.concatenate((a_bounds, b_bounds)), reach_m)
-    across = pairs[(pairs[:, 0] < len(a_bounds)) & (pairs[:, 1] >= len(a_bounds))]
-    return across - (0, len(a_bounds))
+    pairs = find_near_pairs(np.concatenate((a_bounds, b_bounds)), max_gap_m)
+    between_sets = pairs[(pairs[:, 0] < len(a_bounds)) & (pairs[:, 1] >= len(a_bounds))]
+    return between_sets - (0, len(a_bounds))
 
 
 @njit(cache=True)
-def _resample(points: F64x2, first: I64x1, target: I64x1) -> F64x2:  # pragma: no cover - compiled
+def _resample(points: F64x2, offsets: I64x1, target: I64x1) -> F64x2:  # pragma: no cover - compiled
     out = np.empty((target[-1], 2))
-    for row in range(len(first) - 1):
-        begin, end = first[row], first[row + 1]
+    for row in range(len(offsets) - 1):
+        begin, end = offsets[row], offsets[row + 1]
         count = target[row + 1] - target[row]
         if count == 0:
             continue
@@ -161,19 +163,21 @@ def _resample(points: F64x2, first: I64x1, target: I64x1) -> F64x2:  # pragma: n
                 passed += step
                 k += 1
                 step = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
-            share = 0.0 if step == 0.0 else min((at - passed) / step, 1.0)
+            fraction = 0.0 if step == 0.0 else min((at - passed) / step, 1.0)
             after = min(k + 1, end - 1)
             for axis in range(2):
-                out[target[row] + j, axis] = points[k, axis] + share * (points[after, axis] - points[k, axis])
+                out[target[row] + j, axis] = points[k, axis] + fraction * (points[after, axis] - points[k, axis])
         if count > 1:
             out[target[row + 1] - 1] = points[end - 1]
     return out
 
 
 @njit(cache=True)
-def _feet(queries: F64x2, line: F64x2) -> tuple[F64x1, F64x1, F64x1, Boolx1]:  # pragma: no cover - compiled
+def _project_onto_line(
+    queries: F64x2, line: F64x2
+) -> tuple[F64x1, F64x1, F64x1, Boolx1]:  # pragma: no cover - compiled
     n = len(queries)
-    along, side, distance = np.empty(n), np.empty(n), np.empty(n)
+    station, lateral, distance = np.empty(n), np.empty(n), np.empty(n)
     inside = np.empty(n, np.bool_)
     for q in range(n):
         x, y = queries[q]
@@ -183,18 +187,18 @@ def _feet(queries: F64x2, line: F64x2) -> tuple[F64x1, F64x1, F64x1, Boolx1]:  #
             dx, dy = line[k + 1, 0] - ax, line[k + 1, 1] - ay
             squared = dx * dx + dy * dy
             length = np.sqrt(squared)
-            share = 0.0 if squared == 0.0 else ((x - ax) * dx + (y - ay) * dy) / squared
-            held = min(max(share, 0.0), 1.0)
+            fraction = 0.0 if squared == 0.0 else ((x - ax) * dx + (y - ay) * dy) / squared
+            held = min(max(fraction, 0.0), 1.0)
             ex, ey = x - ax - held * dx, y - ay - held * dy
             gap = ex * ex + ey * ey
             if gap < best:
                 best = gap
-                along[q] = passed + held * length
+                station[q] = passed + held * length
                 distance[q] = np.sqrt(gap)
-                side[q] = distance[q] if dx * (y - ay) - dy * (x - ax) >= 0.0 else -distance[q]
-                inside[q] = (share > 0.0 or k > 0) and (share < 1.0 or k < len(line) - 2)
+                lateral[q] = distance[q] if dx * (y - ay) - dy * (x - ax) >= 0.0 else -distance[q]
+                inside[q] = (fraction > 0.0 or k > 0) and (fraction < 1.0 or k < len(line) - 2)
             passed += length
-    return along, side, distance, inside
+    return station, lateral, distance, inside
 
 
 @njit(cache=True)
@@ -216,8 +220,8 @@ def _simplify(line: F64x2, tolerance: float) -> Boolx1:  # pragma: no cover - co
         worst, place = tolerance * tolerance, -1
         for k in range(a + 1, b):
             ex, ey = line[k, 0] - line[a, 0], line[k, 1] - line[a, 1]
-            share = 0.0 if squared == 0.0 else min(max((ex * dx + ey * dy) / squared, 0.0), 1.0)
-            gap = (ex - share * dx) ** 2 + (ey - share * dy) ** 2
+            fraction = 0.0 if squared == 0.0 else min(max((ex * dx + ey * dy) / squared, 0.0), 1.0)
+            gap = (ex - fraction * dx) ** 2 + (ey - fraction * dy) ** 2
             if gap > worst:
                 worst, place = gap, k
         if place >= 0:

@@ -12,35 +12,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import F64x1, F64x2, I64x1, I64x2, njit
-from manyeyes.datatypes.map_element import frozen
+from manyeyes.datatypes.map_element import freeze
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def chamfer(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> Floats:
+def chamfer_distance(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> Floats:
     """(K,) half the sum of both mean distances from a point to the nearest point of the other line."""
-    return _chamfer(*_columns(a, a_first, b, b_first), frozen(pairs, np.int64))
+    return _chamfer(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))
 
 
-def directed(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> tuple[Floats, Floats]:
+def directed_distance(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> tuple[Floats, Floats]:
     """(K,) the mean and (K,) the greatest distance from the points of a's line to the segments of b's."""
-    return _directed(*_columns(a, a_first, b, b_first), frozen(pairs, np.int64))[:2]
+    return _directed(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))[:2]
 
 
-def nearest(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> Floats:
+def min_distance(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> Floats:
     """(K,) the least distance from a point of a's line to a segment of b's."""
-    return _directed(*_columns(a, a_first, b, b_first), frozen(pairs, np.int64))[2]
+    return _directed(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))[2]
 
 
-def frechet(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints, either_way: bool = True) -> Floats:
+def frechet_distance(
+    a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints, either_way: bool = True
+) -> Floats:
     """(K,) discrete Frechet distance (Eiter and Mannila 1994) between vertices; the lesser of b's two directions if asked."""
-    return _frechet(*_columns(a, a_first, b, b_first), frozen(pairs, np.int64), either_way)
+    return _frechet(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64), either_way)
 
 
-def _columns(a: Floats, a_first: Ints, b: Floats, b_first: Ints) -> tuple[Floats, Ints, Floats, Ints]:
+def _columns(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints) -> tuple[Floats, Ints, Floats, Ints]:
     """All read-only and contiguous, so that one compiled form serves every caller."""
-    return frozen(a, np.float64), frozen(a_first, np.int64), frozen(b, np.float64), frozen(b_first, np.int64)
+    return freeze(a, np.float64), freeze(a_offsets, np.int64), freeze(b, np.float64), freeze(b_offsets, np.int64)
 
 
 @njit(cache=True)
@@ -57,38 +59,40 @@ def _nearest_points(a: F64x2, a0: int, a1: int, b: F64x2, b0: int, b1: int) -> f
 
 
 @njit(cache=True)
-def _chamfer(a: F64x2, a_first: I64x1, b: F64x2, b_first: I64x1, pairs: I64x2) -> F64x1:  # pragma: no cover - compiled
+def _chamfer(
+    a: F64x2, a_offsets: I64x1, b: F64x2, b_offsets: I64x1, pairs: I64x2
+) -> F64x1:  # pragma: no cover - compiled
     out = np.empty(len(pairs))
     for k in range(len(pairs)):
         i, j = int(pairs[k, 0]), int(pairs[k, 1])
-        a0, a1, b0, b1 = a_first[i], a_first[i + 1], b_first[j], b_first[j + 1]
+        a0, a1, b0, b1 = a_offsets[i], a_offsets[i + 1], b_offsets[j], b_offsets[j + 1]
         out[k] = 0.5 * (_nearest_points(a, a0, a1, b, b0, b1) + _nearest_points(b, b0, b1, a, a0, a1))
     return out
 
 
 @njit(cache=True)
 def _directed(
-    a: F64x2, a_first: I64x1, b: F64x2, b_first: I64x1, pairs: I64x2
+    a: F64x2, a_offsets: I64x1, b: F64x2, b_offsets: I64x1, pairs: I64x2
 ) -> tuple[F64x1, F64x1, F64x1]:  # pragma: no cover - compiled
-    mean, most, least = np.empty(len(pairs)), np.zeros(len(pairs)), np.full(len(pairs), np.inf)
+    mean, max_distance, smallest = np.empty(len(pairs)), np.zeros(len(pairs)), np.full(len(pairs), np.inf)
     for k in range(len(pairs)):
         i, j = int(pairs[k, 0]), int(pairs[k, 1])
         total = 0.0
-        for p in range(a_first[i], a_first[i + 1]):
+        for p in range(a_offsets[i], a_offsets[i + 1]):
             x, y = a[p, 0], a[p, 1]
             best = np.inf
-            for q in range(b_first[j], max(b_first[j + 1] - 1, b_first[j] + 1)):
-                r = min(q + 1, b_first[j + 1] - 1)
+            for q in range(b_offsets[j], max(b_offsets[j + 1] - 1, b_offsets[j] + 1)):
+                r = min(q + 1, b_offsets[j + 1] - 1)
                 dx, dy = b[r, 0] - b[q, 0], b[r, 1] - b[q, 1]
                 ex, ey = x - b[q, 0], y - b[q, 1]
                 squared = dx * dx + dy * dy
-                share = 0.0 if squared == 0.0 else min(max((ex * dx + ey * dy) / squared, 0.0), 1.0)
-                best = min(best, (ex - share * dx) ** 2 + (ey - share * dy) ** 2)
+                fraction = 0.0 if squared == 0.0 else min(max((ex * dx + ey * dy) / squared, 0.0), 1.0)
+                best = min(best, (ex - fraction * dx) ** 2 + (ey - fraction * dy) ** 2)
             total += np.sqrt(best)
-            most[k] = max(most[k], np.sqrt(best))
-            least[k] = min(least[k], np.sqrt(best))
-        mean[k] = total / max(a_first[i + 1] - a_first[i], 1)
-    return mean, most, least
+            max_distance[k] = max(max_distance[k], np.sqrt(best))
+            smallest[k] = min(smallest[k], np.sqrt(best))
+        mean[k] = total / max(a_offsets[i + 1] - a_offsets[i], 1)
+    return mean, max_distance, smallest
 
 
 @njit(cache=True)
@@ -118,12 +122,12 @@ def _frechet_one(
 
 @njit(cache=True)
 def _frechet(
-    a: F64x2, a_first: I64x1, b: F64x2, b_first: I64x1, pairs: I64x2, either_way: bool
+    a: F64x2, a_offsets: I64x1, b: F64x2, b_offsets: I64x1, pairs: I64x2, either_way: bool
 ) -> F64x1:  # pragma: no cover - compiled
     out = np.empty(len(pairs))
     for k in range(len(pairs)):
         i, j = int(pairs[k, 0]), int(pairs[k, 1])
-        a0, a1, b0, b1 = a_first[i], a_first[i + 1], b_first[j], b_first[j + 1]
+        a0, a1, b0, b1 = a_offsets[i], a_offsets[i + 1], b_offsets[j], b_offsets[j + 1]
         out[k] = _frechet_one(a, a0, a1, b, b0, b1, False)
         if either_way:
             out[k] = min(out[k], _frechet_one(a, a0, a1, b, b0, b1, True))

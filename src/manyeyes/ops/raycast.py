@@ -4,7 +4,7 @@
 The image of a scan is (azimuths, beams). Every primitive is drawn into the azimuth and elevation interval that it can
 cover, nearest first, against a depth buffer; the ground is walked once per azimuth, from the lowest beam upwards.
 One thread: the caller runs scans in parallel, and the result does not depend on how many.
-:func:`cast_reference` is the slow twin: every ray against every primitive, with other formulas.
+:func:`cast_rays_reference` is the slow twin: every ray against every primitive, with other formulas.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ class Hits:
 
 
 @njit(cache=True)
-def uniform_of(seed: np.uint64, primitive: int, ray: int) -> float:
+def hash_uniform(seed: np.uint64, primitive: int, ray: int) -> float:
     """A number in (0, 1] from a counter: the same for a ray and a primitive in whatever order they are met (SplitMix64)."""
     x = seed + np.uint64(_MIX_A) * np.uint64(primitive + 1) + np.uint64(_MIX_B) * np.uint64(ray + 1)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(_MIX_B)
@@ -315,7 +315,7 @@ def _draw(
                 t, leave = hit_ellipsoid(o, half, d0, d1, d2)
                 face = 0.7
                 if density > 0 and t < math.inf:
-                    t += -math.log(uniform_of(seed, index, a * beams + b)) / density
+                    t += -math.log(hash_uniform(seed, index, a * beams + b)) / density
                     if t >= leave:
                         t = math.inf
             if t < depth[a, b]:
@@ -441,7 +441,7 @@ def _finish(
                     surface[a, b] = surface_map[i, j]
 
 
-def cast(
+def cast_rays(
     primitives: Primitives,
     ground: HeightField,
     origin: Array,
@@ -469,7 +469,7 @@ def cast(
     return Hits(depth, owner, cosine, surface)
 
 
-def cast_reference(
+def cast_rays_reference(
     primitives: Primitives,
     ground: HeightField,
     origin: Array,
@@ -480,7 +480,7 @@ def cast_reference(
     max_range: float,
     seed: int = 0,
 ) -> Hits:
-    """The slow twin of :func:`cast`: every ray against every primitive by slabs and quadrics; the ground in 2 cm steps."""
+    """The slow twin of :func:`cast_rays`: every ray against every primitive by slabs and quadrics; the ground in 2 cm steps."""
     del per_turn
     ce, se = np.cos(elevation)[None], np.sin(elevation)[None]
     sensor = np.stack([ce * np.cos(azimuth)[:, None], ce * np.sin(azimuth)[:, None], se + 0 * azimuth[:, None]], -1)
@@ -492,7 +492,7 @@ def cast_reference(
         o, d = primitives.rotation[i].T @ (origin - primitives.center[i]), ray @ primitives.rotation[i]
         t, leave, face = reference_hit(int(primitives.kind[i]), o, d, primitives.half[i])
         if primitives.density[i] > 0:
-            draw = np.array([uniform_of(np.uint64(seed % 2**64), i, int(k)) for k in number.ravel()]).reshape(
+            draw = np.array([hash_uniform(np.uint64(seed % 2**64), i, int(k)) for k in number.ravel()]).reshape(
                 depth.shape
             )
             inside = t - np.log(draw) / primitives.density[i]

@@ -40,9 +40,11 @@ def between(a: Tensor, b: Tensor) -> Tensor:
 def exp(tangent: Tensor) -> Tensor:
     """The pose (..., 3) reached in unit time at constant body velocity vx, vy, omega (..., 3)."""
     vx, vy, omega = tangent.unbind(-1)
-    along = torch.sinc(omega / math.pi)
-    aside = omega / 2 * torch.sinc(omega / (2 * math.pi)).square()
-    return torch.stack((along * vx - aside * vy, aside * vx + along * vy, wrap_angle(omega)), -1)
+    sine_factor = torch.sinc(omega / math.pi)
+    cosine_factor = omega / 2 * torch.sinc(omega / (2 * math.pi)).square()
+    return torch.stack(
+        (sine_factor * vx - cosine_factor * vy, cosine_factor * vx + sine_factor * vy, wrap_angle(omega)), -1
+    )
 
 
 def log(pose: Tensor) -> Tensor:
@@ -81,7 +83,7 @@ def _matrix(rows: tuple[tuple[Tensor, ...], ...]) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Edges:
+class PoseGraphEdges:
     """E measurements of pose j seen from pose i.
 
     i, j: (E,) int64, rows of the poses, i != j. measured: (E, 3), i_from_j. information: (E, 3, 3), the inverse
@@ -107,7 +109,7 @@ class Edges:
 
 
 @dataclass(frozen=True)
-class Solution:
+class PoseGraphSolution:
     """Poses (N, 3) of least cost, and what is known of them.
 
     covariance: (3 N, 3 N) of x, y (m, in the axes of the poses' own frame) and yaw (rad), N blocks of 3; zero for fixed
@@ -122,7 +124,9 @@ class Solution:
 
 
 @torch.no_grad()
-def solve(initial: Tensor, edges: Edges, fixed: Tensor, huber: float | None = None, iterations: int = 50) -> Solution:
+def solve_pose_graph(
+    initial: Tensor, edges: PoseGraphEdges, fixed: Tensor, huber: float | None = None, iterations: int = 50
+) -> PoseGraphSolution:
     """Poses (N, 3) that fit the edges best, by Levenberg-Marquardt from `initial`; those `fixed` (N,) bool stay.
 
     Minimises 1/2 sum rho(r' information r) over r = log(measured^-1 i^-1 j), rho the identity or Huber's function at
@@ -130,7 +134,7 @@ def solve(initial: Tensor, edges: Edges, fixed: Tensor, huber: float | None = No
     """
     _check(initial, edges, fixed, huber)
     poses = initial.double()
-    edges = Edges(edges.i, edges.j, edges.measured.double(), edges.information.double())
+    edges = PoseGraphEdges(edges.i, edges.j, edges.measured.double(), edges.information.double())
     free = (~fixed).repeat_interleave(3).nonzero()[:, 0]
     cost, damping, done, round_ = _cost(poses, edges, huber), 1e-4, len(free) == 0, 0
     while not done and round_ < iterations:
@@ -150,23 +154,23 @@ def solve(initial: Tensor, edges: Edges, fixed: Tensor, huber: float | None = No
             damping *= 10
         if moved_cost <= cost:
             poses, cost, damping = moved, moved_cost, max(damping / 10, 1e-12)
-    return Solution(
+    return PoseGraphSolution(
         poses.to(initial.dtype), _covariance(poses, edges, free, huber).to(initial.dtype), cost, round_, done
     )
 
 
-def edge_error(poses: Tensor, edges: Edges) -> Tensor:
+def edge_error(poses: Tensor, edges: PoseGraphEdges) -> Tensor:
     """What each edge is off by, (E, 3): log(measured^-1 i^-1 j) for poses (N, 3). Differentiable."""
     return log(compose(inverse(edges.measured), between(poses[edges.i], poses[edges.j])))
 
 
-def edge_jacobians(poses: Tensor, edges: Edges) -> tuple[Tensor, Tensor]:
+def edge_jacobians(poses: Tensor, edges: PoseGraphEdges) -> tuple[Tensor, Tensor]:
     """Derivatives (E, 3, 3), (E, 3, 3) of :func:`edge_error` with respect to small motions on the right of i and of j."""
     by_j = right_jacobian_inverse(edge_error(poses, edges))
     return -by_j @ adjoint(between(poses[edges.j], poses[edges.i])), by_j
 
 
-def _check(initial: Tensor, edges: Edges, fixed: Tensor, huber: float | None) -> None:
+def _check(initial: Tensor, edges: PoseGraphEdges, fixed: Tensor, huber: float | None) -> None:
     n = initial.shape[0]
     if initial.shape != (n, 3) or fixed.shape != (n,) or fixed.dtype != torch.bool:
         raise ShapeError(
@@ -184,18 +188,18 @@ def _check(initial: Tensor, edges: Edges, fixed: Tensor, huber: float | None) ->
         raise ConfigError(f"huber is a number of standard deviations above 0, or None; got {huber}.")
 
 
-def _squared(error: Tensor, edges: Edges) -> Tensor:
+def _squared(error: Tensor, edges: PoseGraphEdges) -> Tensor:
     return torch.einsum("ea,eab,eb->e", error, edges.information, error)
 
 
-def _cost(poses: Tensor, edges: Edges, huber: float | None) -> float:
+def _cost(poses: Tensor, edges: PoseGraphEdges, huber: float | None) -> float:
     squared = _squared(edge_error(poses, edges), edges)
     if huber is not None:
         squared = torch.where(squared <= huber**2, squared, 2 * huber * squared.sqrt() - huber**2)
     return float(squared.sum()) / 2
 
 
-def _normal_equations(poses: Tensor, edges: Edges, huber: float | None) -> tuple[Tensor, Tensor]:
+def _normal_equations(poses: Tensor, edges: PoseGraphEdges, huber: float | None) -> tuple[Tensor, Tensor]:
     """Gradient (3 N,) and Gauss-Newton matrix (3 N, 3 N) of the cost."""
     n = len(poses)
     error, (by_i, by_j) = edge_error(poses, edges), edge_jacobians(poses, edges)
@@ -214,7 +218,7 @@ def _normal_equations(poses: Tensor, edges: Edges, huber: float | None) -> tuple
     return gradient.flatten(), curvature.view(n, n, 3, 3).transpose(1, 2).reshape(3 * n, 3 * n)
 
 
-def _covariance(poses: Tensor, edges: Edges, free: Tensor, huber: float | None) -> Tensor:
+def _covariance(poses: Tensor, edges: PoseGraphEdges, free: Tensor, huber: float | None) -> Tensor:
     """(3 N, 3 N) in x, y, yaw: the inverse of the curvature, turned from each pose's own axes to those of its frame."""
     out = torch.zeros(poses.numel(), poses.numel(), dtype=poses.dtype)
     curvature = _normal_equations(poses, edges, huber)[1][free][:, free]

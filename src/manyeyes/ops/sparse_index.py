@@ -70,7 +70,7 @@ class _TapSteps(NamedTuple):
     kernel: int
 
 
-class Block(NamedTuple):
+class PairBlock(NamedTuple):
     """Some consecutive pairs of one tap, and how many."""
 
     tap: int
@@ -90,7 +90,7 @@ class NeighbourMap:
     batch_size: int
     window: Window
     moved: dict[torch.device, NeighbourMap] = field(default_factory=dict, repr=False)
-    cut: dict[tuple[int, bool], tuple[int, tuple[Block, ...]]] = field(default_factory=dict, repr=False)
+    cut: dict[tuple[int, bool], tuple[int, tuple[PairBlock, ...]]] = field(default_factory=dict, repr=False)
 
     @property
     def n_in(self) -> int:
@@ -152,26 +152,26 @@ class NeighbourMap:
         met = by_tap < self.n_in
         return by_tap[met].long(), met.nonzero()[:, 1], met.sum(1)
 
-    def _cut(self, rows: int) -> list[Block]:
+    def _cut(self, rows: int) -> list[PairBlock]:
         """The pairs of every tap, from inputs to outputs, in blocks of so many rows at most, as views."""
         source, target, counts = self._met
         sizes = [(tap, min(rows, n - at)) for tap, n in enumerate(counts.tolist()) for at in range(0, n, rows)]
         lengths = [size for _, size in sizes]
         parts = zip(sizes, source.split(lengths), target.split(lengths))
-        blocks = [Block(tap, some, others, size) for (tap, size), some, others in parts]
+        blocks = [PairBlock(tap, some, others, size) for (tap, size), some, others in parts]
         if self.is_symmetric:
             last = self.window.kernel**2 - 1
-            turned = (Block(last - b.tap, b.target, b.source, b.size) for b in blocks)
+            turned = (PairBlock(last - b.tap, b.target, b.source, b.size) for b in blocks)
             # Within a tap inputs ascend as outputs do: the blocks of a tap turned round stand in the same order.
             blocks += sorted(turned, key=lambda block: block.tap)
         return blocks
 
-    def blocks(self, rows: int, reverse: bool = False) -> tuple[int, tuple[Block, ...]]:
+    def blocks(self, rows: int, reverse: bool = False) -> tuple[int, tuple[PairBlock, ...]]:
         """The pairs of every tap in blocks of so many rows at most, and the longest block's rows; cut once and kept."""
         if (rows, reverse) not in self.cut:
             found = self._cut(rows)
             if reverse:
-                found = [Block(b.tap, b.target, b.source, b.size) for b in found]
+                found = [PairBlock(b.tap, b.target, b.source, b.size) for b in found]
             self.cut[rows, reverse] = max((block.size for block in found), default=0), tuple(found)
         return self.cut[rows, reverse]
 
@@ -358,8 +358,8 @@ def _pairs(
     _place(in_key, in_shape[0], in_shape[1], rows, columns, padding, image)
     first, counts = np.empty(out_key.shape[0], np.int32), np.empty(taps, np.int64)
     _place_first(out_key, out_shape[0], out_shape[1], rows, columns, stride, first)
-    most = taps * out_key.shape[0] + 1
-    source, target = np.empty(most, np.int64), np.empty(most, np.int64)
+    max_pairs = taps * out_key.shape[0] + 1
+    source, target = np.empty(max_pairs, np.int64), np.empty(max_pairs, np.int64)
     steps = _TapSteps(columns * dilation, dilation, kernel)
     met = _meet(image, first, steps, in_key.shape[0], source, target, counts)
     return Pairs(source[:met], target[:met], counts)

@@ -29,6 +29,6 @@ def bilinear(x: SparseBev, xy: Tensor) -> Tensor:
         key = row * columns + column
         at = torch.searchsorted(keys, key).clamp_max(len(keys) - 1)
         found = (keys[at] == key) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        along, across = (share if right else 1 - share)[:, 0], (share if up else 1 - share)[:, 1]
-        total = total + x.features[at] * (along * across * found)[:, None]
+        offset_x, offset_y = (share if right else 1 - share)[:, 0], (share if up else 1 - share)[:, 1]
+        total = total + x.features[at] * (offset_x * offset_y * found)[:, None]
     return total

@@ -216,11 +216,11 @@ def window_attention(
 
 
 def _rows(x: Tensor, index: Tensor, inverse: Tensor) -> Tensor:
-    out: Tensor = _Rows.apply(x, index, inverse)  # pyright: ignore[reportAssignmentType]
+    out: Tensor = _GatherRows.apply(x, index, inverse)  # pyright: ignore[reportAssignmentType]
     return out
 
 
-class _Rows(torch.autograd.Function):
+class _GatherRows(torch.autograd.Function):
     """Rows by index, zeros where it names none; no row is taken twice, so that the inverse index is the gradient."""
 
     @staticmethod

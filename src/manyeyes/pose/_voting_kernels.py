@@ -76,13 +76,15 @@ class RefinedPose(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def fold(angle: float) -> float:  # pragma: no cover - compiled
+def wrap_half_turn(angle: float) -> float:  # pragma: no cover - compiled
     """An angle modulo pi, in [-pi/2, pi/2)."""
     return (angle + 0.5 * _PI) % _PI - 0.5 * _PI
 
 
 @njit(cache=True, nogil=True)
-def edge_table(xy: F64x2, yaw: F64x1, shortest: float, longest: float) -> Edges:  # pragma: no cover - compiled
+def build_edge_table(
+    xy: F64x2, yaw: F64x1, min_length: float, max_length: float
+) -> Edges:  # pragma: no cover - compiled
     """Edges between landmarks from shortest to longest metres apart."""
     n = len(xy)
     size = n * (n - 1) // 2
@@ -93,18 +95,18 @@ def edge_table(xy: F64x2, yaw: F64x1, shortest: float, longest: float) -> Edges:
         for j in range(i + 1, n):
             dx, dy = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
             length = np.hypot(dx, dy)
-            if length < shortest or length > longest:
+            if length < min_length or length > max_length:
                 continue
             along = np.arctan2(dy, dx)
             ends[count, 0], ends[count, 1] = i, j
             lengths[count], direction[count] = length, along
-            heading[count, 0], heading[count, 1] = fold(yaw[i] - along), fold(yaw[j] - along)
+            heading[count, 0], heading[count, 1] = wrap_half_turn(yaw[i] - along), wrap_half_turn(yaw[j] - along)
             count += 1
     return Edges(ends[:count], lengths[:count], direction[:count], heading[:count])
 
 
 @njit(cache=True, nogil=True)
-def compatible(
+def find_compatible(
     size_a: F64x2, size_b: F64x2, instant_a: I64x1, instant_b: I64x1, gate: float
 ) -> Boolx2:  # pragma: no cover - compiled
     """(N, M) bool: landmarks that may be one object: of one instant, widths within ``gate`` (m), lengths within about
@@ -123,18 +125,24 @@ def compatible(
 
 @njit(cache=True, nogil=True)
 def match_edges(
-    a: LandmarkArrays, b: LandmarkArrays, edges_a: Edges, edges_b: Edges, may: Boolx2, gate: float, at_most: int
+    a: LandmarkArrays,
+    b: LandmarkArrays,
+    edges_a: Edges,
+    edges_b: Edges,
+    is_compatible: Boolx2,
+    gate: float,
+    max_poses: int,
 ) -> tuple[F64x2, F64x1]:  # pragma: no cover - compiled
     """Poses (H, 3) a_from_b of edges that agree within ``gate`` standard deviations, and their misfit (H,).
 
-    edges_a, edges_b: by ascending length. may: (N, M) pairs that may be one object. Of more than at_most, the first.
+    edges_a, edges_b: by ascending length. is_compatible: (N, M) pairs that may be one object. Of more than at_most, the first.
     """
     xy_a, _, sxy_a, syaw_a = a
     xy_b, _, sxy_b, syaw_b = b
     ends_a, length_a, direction_a, heading_a = edges_a
     ends_b, length_b, direction_b, heading_b = edges_b
-    out = np.empty((at_most, 3))
-    misfit = np.empty(at_most)
+    out = np.empty((max_poses, 3))
+    misfit = np.empty(max_poses)
     count = 0
     largest = 0.0
     if len(sxy_a) and len(sxy_b):
@@ -149,21 +157,21 @@ def match_edges(
                 break
             for way in range(2):
                 k, m = ends_b[q, way], ends_b[q, 1 - way]
-                if not (may[i, k] and may[j, m]):
+                if not (is_compatible[i, k] and is_compatible[j, m]):
                     continue
                 spread = sxy_a[i] ** 2 + sxy_b[k] ** 2 + sxy_a[j] ** 2 + sxy_b[m] ** 2
                 cost = (length_a[p] - length_b[q]) ** 2 / spread
                 if cost > gate * gate:
                     continue
                 tilt = spread / (length_a[p] * length_b[q])
-                one = fold(heading_a[p, 0] - heading_b[q, way])
-                two = fold(heading_a[p, 1] - heading_b[q, 1 - way])
+                one = wrap_half_turn(heading_a[p, 0] - heading_b[q, way])
+                two = wrap_half_turn(heading_a[p, 1] - heading_b[q, 1 - way])
                 # Headings relative to the edge: one unknown turn of the edge, two measured angles.
                 v1, v2 = syaw_a[i] ** 2 + syaw_b[k] ** 2, syaw_a[j] ** 2 + syaw_b[m] ** 2
                 weight = 1.0 / tilt + 1.0 / v1 + 1.0 / v2
                 turn = (one / v1 + two / v2) / weight
                 cost += turn * turn / tilt + (one - turn) ** 2 / v1 + (two - turn) ** 2 / v2
-                if cost > gate * gate or count == at_most:
+                if cost > gate * gate or count == max_poses:
                     continue
                 yaw = direction_a[p] - direction_b[q] + turn + (_PI if way else 0.0)
                 c, s = np.cos(yaw), np.sin(yaw)
@@ -177,7 +185,7 @@ def match_edges(
 
 
 @njit(cache=True, nogil=True)
-def grid_of(xy: F64x2, cell: float) -> PointGrid:  # pragma: no cover - compiled
+def build_grid(xy: F64x2, cell: float) -> PointGrid:  # pragma: no cover - compiled
     """Points (N, 2) by square cells of edge cell; cells grow where there would be too many."""
     x0, y0, x1, y1 = xy[:, 0].min(), xy[:, 1].min(), xy[:, 0].max(), xy[:, 1].max()
     cell = max(cell, max(x1 - x0, y1 - y0) / 1000.0)
@@ -193,8 +201,8 @@ def grid_of(xy: F64x2, cell: float) -> PointGrid:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def support(
-    poses: F64x2, a: LandmarkArrays, b: LandmarkArrays, may: Boolx2, grid: PointGrid, tau: float, turn: float
+def compute_support(
+    poses: F64x2, a: LandmarkArrays, b: LandmarkArrays, is_compatible: Boolx2, grid: PointGrid, tau: float, turn: float
 ) -> F64x1:  # pragma: no cover - compiled
     """(H,) sum over landmarks of b of the best max(0, 1 - d^2 / tau^2) among a's; spec: specs/pose.md 4.2."""
     xy_a, yaw_a, _, _ = a
@@ -216,9 +224,9 @@ def support(
                 for m in range(start[i * ny + max(j0, 0)], start[i * ny + min(j1, ny - 1) + 1]):
                     r = order[m]
                     gain = 1.0 - ((x - xy_a[r, 0]) ** 2 + (y - xy_a[r, 1]) ** 2) / (tau * tau)
-                    if gain <= best or not may[r, k]:
+                    if gain <= best or not is_compatible[r, k]:
                         continue
-                    if abs(fold(yaw_a[r] - yaw_b[k] - poses[h, 2])) < turn:
+                    if abs(wrap_half_turn(yaw_a[r] - yaw_b[k] - poses[h, 2])) < turn:
                         best = gain
             total += best
         score[h] = total
@@ -226,14 +234,14 @@ def support(
 
 
 @njit(cache=True, nogil=True)
-def distinct(
-    poses: F64x2, order: I64x1, middle: F64x1, at_most: int, apart: float, turn: float
+def select_distinct(
+    poses: F64x2, order: I64x1, middle: F64x1, max_count: int, min_separation: float, turn: float
 ) -> I64x1:  # pragma: no cover - compiled
-    """Rows of poses, best first, of which no two agree within ``apart`` metres at the middle (2,) of b and ``turn``
+    """Rows of poses, best first, of which no two agree within ``min_separation`` metres at the middle (2,) of b and ``turn``
     radians.
     """
-    chosen = np.empty(at_most, np.int64)
-    place = np.empty((at_most, 2))
+    chosen = np.empty(max_count, np.int64)
+    place = np.empty((max_count, 2))
     count = 0
     for h in order:
         c, s = np.cos(poses[h, 2]), np.sin(poses[h, 2])
@@ -242,19 +250,19 @@ def distinct(
         new = True
         for m in range(count):
             angle = abs((poses[h, 2] - poses[chosen[m], 2] + _PI) % (2.0 * _PI) - _PI)
-            if angle < turn and np.hypot(x - place[m, 0], y - place[m, 1]) < apart:
+            if angle < turn and np.hypot(x - place[m, 0], y - place[m, 1]) < min_separation:
                 new = False
                 break
         if new:
             chosen[count], place[count, 0], place[count, 1] = h, x, y
             count += 1
-            if count == at_most:
+            if count == max_count:
                 break
     return chosen[:count]
 
 
 @njit(cache=True, nogil=True)
-def weight_of(
+def pair_information(
     error_a: F64x1, error_b: F64x1, c: float, s: float, slack: float
 ) -> InverseCovariance:  # pragma: no cover - compiled
     """xx, xy and yy of the inverse covariance, in a's axes, of where two landmarks are from each other: errors (3,) are xx, xy
@@ -269,8 +277,8 @@ def weight_of(
 
 
 @njit(cache=True, nogil=True)
-def pair_up(
-    pose: F64x1, a: OrientedLandmarks, b: OrientedLandmarks, may: Boolx2, slack: float, gate: float
+def match_one_to_one(
+    pose: F64x1, a: OrientedLandmarks, b: OrientedLandmarks, is_compatible: Boolx2, slack: float, gate: float
 ) -> tuple[I64x2, F64x1]:  # pragma: no cover - compiled
     """One-to-one pairs (P, 2), nearest first, and their squared misfits (P,) in standard deviations (3 numbers a
     pair).
@@ -287,10 +295,10 @@ def pair_up(
         for i in range(len(xy_a)):
             dx, dy = x - xy_a[i, 0], y - xy_a[i, 1]
             widest = error_a[i, _XX] + error_a[i, _YY] + error_b[k, _XX] + error_b[k, _YY] + slack * slack
-            if dx * dx + dy * dy > gate * widest or not may[i, k]:
+            if dx * dx + dy * dy > gate * widest or not is_compatible[i, k]:
                 continue
-            wxx, wxy, wyy = weight_of(error_a[i], error_b[k], c, s, slack)
-            turn = fold(yaw_a[i] - yaw_b[k] - pose[2])
+            wxx, wxy, wyy = pair_information(error_a[i], error_b[k], c, s, slack)
+            turn = wrap_half_turn(yaw_a[i] - yaw_b[k] - pose[2])
             square = wxx * dx * dx + 2.0 * wxy * dx * dy + wyy * dy * dy
             square += turn * turn / (syaw_a[i] ** 2 + syaw_b[k] ** 2 + (0.1 * slack) ** 2)
             if square < gate:
@@ -311,7 +319,7 @@ def pair_up(
 
 
 @njit(cache=True, nogil=True)
-def fit(
+def fit_pose(
     pose: F64x1, pairs: I64x2, a: OrientedLandmarks, b: OrientedLandmarks, rounds: int
 ) -> tuple[F64x1, F64x2]:  # pragma: no cover - compiled
     """Least squares on given pairs from a pose (3,): pose and the information matrix (3, 3) of x, y, yaw."""
@@ -325,7 +333,7 @@ def fit(
         gradient = np.zeros(3)
         for p in range(len(pairs)):
             i, k = pairs[p, 0], pairs[p, 1]
-            wxx, wxy, wyy = weight_of(error_a[i], error_b[k], c, s, 0.0)
+            wxx, wxy, wyy = pair_information(error_a[i], error_b[k], c, s, 0.0)
             v = 1.0 / (syaw_a[i] ** 2 + syaw_b[k] ** 2)
             ux, uy = c * xy_b[k, 0] - s * xy_b[k, 1], s * xy_b[k, 0] + c * xy_b[k, 1]
             rx, ry = xy_a[i, 0] - ux - pose[0], xy_a[i, 1] - uy - pose[1]
@@ -339,7 +347,7 @@ def fit(
             information[2, 2] += ux * ty - uy * tx + v
             gradient[0] += wxx * rx + wxy * ry
             gradient[1] += wxy * rx + wyy * ry
-            gradient[2] += tx * rx + ty * ry + v * fold(yaw_a[i] - yaw_b[k] - pose[2])
+            gradient[2] += tx * rx + ty * ry + v * wrap_half_turn(yaw_a[i] - yaw_b[k] - pose[2])
         information[1, 0], information[2, 0], information[2, 1] = (
             information[0, 1],
             information[0, 2],
@@ -356,20 +364,26 @@ def fit(
 
 
 @njit(cache=True, nogil=True)
-def refine(
-    pose: F64x1, a: OrientedLandmarks, b: OrientedLandmarks, may: Boolx2, slack: float, gate: float, rounds: int
+def refine_pose(
+    pose: F64x1,
+    a: OrientedLandmarks,
+    b: OrientedLandmarks,
+    is_compatible: Boolx2,
+    slack: float,
+    gate: float,
+    rounds: int,
 ) -> RefinedPose:  # pragma: no cover - compiled
     """Pairs and fit in turn until the pairs stay; wide at first, then as exact as stated."""
     information = np.zeros((3, 3))
     before = np.full((1, 2), -1, np.int64)
     for round_ in range(rounds):
         wide = slack * 0.5**round_ if round_ < 4 else 0.0
-        pairs, misfit = pair_up(pose, a, b, may, wide, gate)
+        pairs, misfit = match_one_to_one(pose, a, b, is_compatible, wide, gate)
         if len(pairs) == 0:
             return RefinedPose(pose, information, pairs, misfit)
         if wide == 0.0 and len(pairs) == len(before) and (pairs == before).all():
             break
         before = pairs
-        pose, information = fit(pose, pairs, a, b, 12)
-    pairs, misfit = pair_up(pose, a, b, may, 0.0, gate)
+        pose, information = fit_pose(pose, pairs, a, b, 12)
+    pairs, misfit = match_one_to_one(pose, a, b, is_compatible, 0.0, gate)
     return RefinedPose(pose, information, pairs, misfit)

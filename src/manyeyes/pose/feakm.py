@@ -2,10 +2,11 @@
 """FeaKM's corrector: keypoints that a net says are one object become a pose, and a rule compares it with what is claimed.
 
 FeaKM section 4.2.2 and Eq. 6, whose pseudo-inverse notation means the rigid fit of ops/rigid.py. Two solvers behind one
-interface. `published` is what the paper's public code does (specs/pose.md 1.7): RANSAC, and the computed pose is used in
-place of the claimed one wherever enough pairs agree; the comparison that the paper's text promises is a setting. `mended`
-tries every two pairs, weighs places and headings by their stated errors, asks how much likelier the best pose is than the
-best distinct other one, and leaves the comparison to chi^2 and to information, as the default corrector does (decide.py).
+interface. `solve_with_ransac` is what the paper's public code does (specs/pose.md 1.7): RANSAC, and the computed pose is used in
+place of the claimed one wherever enough pairs agree; the comparison that the paper's text promises is a setting.
+`solve_with_consensus` tries every two pairs, weighs places and headings by their stated errors, asks how much likelier the best
+pose is than the best distinct other one, and leaves the comparison to chi^2 and to information, as the default corrector does
+(decide.py).
 """
 
 from __future__ import annotations
@@ -22,78 +23,78 @@ from numpy.typing import NDArray
 from manyeyes.datatypes import ConfigError
 from manyeyes.models import pretrained
 from manyeyes.models.pose.feakm import FeakmNet
-from manyeyes.models.pose.keypoint_net import DenseKeypoints
-from manyeyes.models.pose.matcher import Points
+from manyeyes.models.pose.keypoint_net import DenseKeypointConfig
+from manyeyes.models.pose.matcher import KeypointBatch
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.rigid import fit_se2
-from manyeyes.pose.baselines._common import answered, information, pose_of
-from manyeyes.pose.corrector import Acceptance, decide
+from manyeyes.pose.baselines._common import fit_pose, make_estimate, pose_information
+from manyeyes.pose.corrector import AcceptanceTest, decide
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim, PoseEstimate, PoseStatus, difference, unanswered
-from manyeyes.pose.voting import Candidate, placed
+from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, no_estimate, pose_difference
+from manyeyes.pose.voting import Candidate, transform_point
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Solver = Callable[[Landmarks, Landmarks, Ints, "PoseClaim | None"], PoseEstimate]
+Solver = Callable[[Landmarks, Landmarks, Ints, "PosePrior | None"], PoseEstimate]
 """Landmarks of ego and other, rows (P, 2) that are one object by the net, and the claim, to an answer."""
 
 
 @dataclass(frozen=True)
 class RansacConfig:
-    """pairs: how many must agree, the paper's 4 or 8. sample, trials, residual_m: of RANSAC; seed: of its draws, which the
-    published code leaves open. significant_m, significant_deg: a claim that differs by less is kept; 0 as published.
+    """min_pairs: how many must agree, the paper's 4 or 8. sample_size, num_trials, max_residual_m: of RANSAC; seed: of its draws,
+    which the published code leaves open. significant_m, significant_deg: a claim that differs by less is kept; 0 as published.
     """
 
-    pairs: int = 4
-    sample: int = 3
-    trials: int = 200
-    residual_m: float = 0.8
+    min_pairs: int = 4
+    sample_size: int = 3
+    num_trials: int = 200
+    max_residual_m: float = 0.8
     seed: int = 0
     significant_m: float = 0.0
     significant_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.sample < 2 or self.pairs < self.sample or self.trials < 1:
+        if self.sample_size < 2 or self.min_pairs < self.sample_size or self.num_trials < 1:
             raise ConfigError("RansacConfig needs trials >= 1 and pairs >= sample >= 2.")
 
 
-def published(
-    ego: Landmarks, other: Landmarks, pairs: Ints, claimed: PoseClaim | None, config: RansacConfig | None = None
+def solve_with_ransac(
+    ego: Landmarks, other: Landmarks, pairs: Ints, prior: PosePrior | None, config: RansacConfig | None = None
 ) -> PoseEstimate:
     """The pose on which most pairs agree; the claim where too few do, or where it does not differ significantly."""
     config = config or RansacConfig()
-    if len(pairs) < config.pairs:
-        return unanswered(claimed)
+    if len(pairs) < config.min_pairs:
+        return no_estimate(prior)
     target, source = ego.xy[pairs[:, 0]], other.xy[pairs[:, 1]]
     agree = _ransac(target, source, config)
-    if agree.sum() < config.pairs:
-        return unanswered(claimed)
-    pose = pose_of(target[agree], source[agree])
-    estimate = answered(ego, other, pose, pairs[agree], claimed)
-    if claimed is None or max(config.significant_m, config.significant_deg) == 0:
+    if agree.sum() < config.min_pairs:
+        return no_estimate(prior)
+    pose = fit_pose(target[agree], source[agree])
+    estimate = make_estimate(ego, other, pose, pairs[agree], prior)
+    if prior is None or max(config.significant_m, config.significant_deg) == 0:
         return estimate
-    off = difference(pose, claimed.pose)
-    near = np.hypot(off[0], off[1]) < config.significant_m and abs(off[2]) < math.radians(config.significant_deg)
-    if near:
-        return replace(
-            estimate, ego_from_other=claimed.ego_from_other, covariance=claimed.covariance, status=PoseStatus.OK
-        )
+    off = pose_difference(pose, prior.pose)
+    is_insignificant = np.hypot(off[0], off[1]) < config.significant_m and abs(off[2]) < math.radians(
+        config.significant_deg
+    )
+    if is_insignificant:
+        return replace(estimate, ego_from_other=prior.ego_from_other, covariance=prior.covariance, status=PoseStatus.OK)
     return replace(estimate, status=PoseStatus.CONFLICT)
 
 
 def _ransac(target: Floats, source: Floats, config: RansacConfig) -> NDArray[np.bool_]:
     """(P,) which pairs agree with the best of the poses that random samples give."""
     rng = keyed_generator(config.seed, "feakm ransac", len(target))
-    drawn = rng.random((config.trials, len(target))).argsort(1)[:, : config.sample]
+    drawn = rng.random((config.num_trials, len(target))).argsort(1)[:, : config.sample_size]
     poses = fit_se2(torch.from_numpy(source[drawn]), torch.from_numpy(target[drawn])).numpy()
-    away = _away(poses, target, source)
-    agree = away < config.residual_m
+    away = _residuals_m(poses, target, source)
+    agree = away < config.max_residual_m
     # Most pairs first, and of equally many those that fit best.
-    worth = agree.sum(1) - np.where(agree, away, 0.0).sum(1) / (config.residual_m * (len(target) + 1))
-    return agree[worth.argmax()]
+    fit_score = agree.sum(1) - np.where(agree, away, 0.0).sum(1) / (config.max_residual_m * (len(target) + 1))
+    return agree[fit_score.argmax()]
 
 
-def _away(poses: Floats, target: Floats, source: Floats) -> Floats:
+def _residuals_m(poses: Floats, target: Floats, source: Floats) -> Floats:
     """(H, P) metres by which poses (H, 3) miss pairs of places (P, 2)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x = c * source[:, 0] - s * source[:, 1] + poses[:, :1] - target[:, 0]
@@ -103,46 +104,53 @@ def _away(poses: Floats, target: Floats, source: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """pairs: how many must agree. shortest_m: two pairs nearer than this give no hypothesis. gate: largest squared misfit of
-    a pair (3 degrees of freedom), area_m2: see vote.py. refined: at most so many hypotheses are refined, the best distinct
-    ones, which bounds the time where no two fit. apart_m, apart_rad: answers that differ by less are one. accept: how much
-    likelier than chance and than the best distinct other pose an answer must be; with the net that ships, 0.5 % of 600 pairs of
-    views of different scenes of the validation town score more.
+    """min_pairs: how many must agree. min_pair_distance_m: two pairs nearer than this give no hypothesis. pair_gate: largest
+    squared misfit of a pair (3 degrees of freedom), area_m2: see vote.py. max_refined: at most so many hypotheses are refined, the
+    best distinct ones, which bounds the time where no two fit. min_separation_m, min_separation_rad: answers that differ by less
+    are one. accept: how much likelier than chance and than the best distinct other pose an answer must be; with the net that ships,
+    0.5 % of 600 pairs of views of different scenes of the validation town score more.
     """
 
-    pairs: int = 4
-    shortest_m: float = 3.0
-    gate: float = 14.16
-    area_m2: float = 330.0
-    refined: int = 16
-    apart_m: float = 2.0
-    apart_rad: float = 0.105
-    accept: Acceptance = field(default_factory=lambda: Acceptance(least_score=18.0))
+    min_pairs: int = 4
+    min_pair_distance_m: float = 3.0
+    pair_gate: float = 14.16
+    chance_area_m2: float = 330.0
+    max_refined: int = 16
+    min_separation_m: float = 2.0
+    min_separation_rad: float = 0.105
+    accept: AcceptanceTest = field(default_factory=lambda: AcceptanceTest(min_score=18.0))
 
     def __post_init__(self) -> None:
-        limits = self.shortest_m, self.gate, self.area_m2, self.refined, self.apart_m, self.apart_rad
-        if self.pairs < 2 or min(limits) <= 0:
+        limits = (
+            self.min_pair_distance_m,
+            self.pair_gate,
+            self.chance_area_m2,
+            self.max_refined,
+            self.min_separation_m,
+            self.min_separation_rad,
+        )
+        if self.min_pairs < 2 or min(limits) <= 0:
             raise ConfigError("ConsensusConfig needs pairs >= 2 and limits above 0.")
 
 
-def mended(
-    ego: Landmarks, other: Landmarks, pairs: Ints, claimed: PoseClaim | None, config: ConsensusConfig | None = None
+def solve_with_consensus(
+    ego: Landmarks, other: Landmarks, pairs: Ints, prior: PosePrior | None, config: ConsensusConfig | None = None
 ) -> PoseEstimate:
     """What the pairs and the claim say together; see decide.py."""
     config = config or ConsensusConfig()
-    if len(pairs) < config.pairs:
-        return unanswered(claimed)
+    if len(pairs) < config.min_pairs:
+        return no_estimate(prior)
     found = _candidates(ego, other, pairs, config)
-    if not found or len(found[0].pairs) < config.pairs:
-        return replace(unanswered(claimed), inliers=len(found[0].pairs) if found else 0)
-    return decide(found, claimed, config.accept)
+    if not found or len(found[0].pairs) < config.min_pairs:
+        return replace(no_estimate(prior), inliers=len(found[0].pairs) if found else 0)
+    return decide(found, prior, config.accept)
 
 
 def _candidates(ego: Landmarks, other: Landmarks, pairs: Ints, config: ConsensusConfig) -> list[Candidate]:
     """The best pose and the best distinct other one, refined; every two pairs are a hypothesis."""
     a, b = ego[pairs[:, 0]], other[pairs[:, 1]]
     i, k = np.triu_indices(len(pairs), 1)
-    long = np.minimum(*(np.hypot(*(x.xy[i] - x.xy[k]).T) for x in (a, b))) >= config.shortest_m
+    long = np.minimum(*(np.hypot(*(x.xy[i] - x.xy[k]).T) for x in (a, b))) >= config.min_pair_distance_m
     i, k = i[long], k[long]
     if not len(i):
         return []
@@ -150,7 +158,7 @@ def _candidates(ego: Landmarks, other: Landmarks, pairs: Ints, config: Consensus
     poses = fit_se2(torch.from_numpy(b.xy[ends]), torch.from_numpy(a.xy[ends])).numpy()
     scores = _gains(poses, a, b, config).sum(1)
     middle, found = b.xy.mean(0), list[Candidate]()
-    for _ in range(config.refined):
+    for _ in range(config.max_refined):
         best = int(scores.argmax())
         if len(found) == 2 or not scores[best] > 0:
             break
@@ -164,22 +172,22 @@ def _candidates(ego: Landmarks, other: Landmarks, pairs: Ints, config: Consensus
 
 def _alike(poses: Floats, pose: Floats, middle: Floats, config: ConsensusConfig) -> NDArray[np.bool_]:
     """(H,) which poses (H, 3) say the same as one where the objects are."""
-    apart = np.hypot(*(placed(poses, middle) - placed(pose[None], middle)).T)
+    apart = np.hypot(*(transform_point(poses, middle) - transform_point(pose[None], middle)).T)
     turn = np.abs(np.remainder(poses[:, 2] - pose[2] + np.pi, 2 * np.pi) - np.pi)
-    return (apart < config.apart_m) & (turn < config.apart_rad)
+    return (apart < config.min_separation_m) & (turn < config.min_separation_rad)
 
 
 def _misfits(poses: Floats, a: Landmarks, b: Landmarks) -> Floats:
     """(H, P) squared misfit of each pair's place and heading (modulo pi), 3 degrees of freedom."""
-    place = np.square(_away(poses, a.xy, b.xy)) / (a.sigma_xy**2 + b.sigma_xy**2)
+    place = np.square(_residuals_m(poses, a.xy, b.xy)) / (a.sigma_xy**2 + b.sigma_xy**2)
     turn = np.remainder(a.yaw - b.yaw - poses[:, 2:] + np.pi / 2, np.pi) - np.pi / 2
     return place + np.square(turn) / (a.sigma_yaw**2 + b.sigma_yaw**2)
 
 
 def _gains(poses: Floats, a: Landmarks, b: Landmarks, config: ConsensusConfig) -> Floats:
     """(H, P) log-likelihood ratios against chance, never negative."""
-    most = np.log(config.area_m2 / (2 * np.pi * (a.sigma_xy**2 + b.sigma_xy**2)))
-    return np.maximum(most - _misfits(poses, a, b) / 2, 0.0)
+    max_gain = np.log(config.chance_area_m2 / (2 * np.pi * (a.sigma_xy**2 + b.sigma_xy**2)))
+    return np.maximum(max_gain - _misfits(poses, a, b) / 2, 0.0)
 
 
 def _refined(pose: Floats, a: Landmarks, b: Landmarks, pairs: Ints, config: ConsensusConfig) -> Candidate | None:
@@ -187,24 +195,24 @@ def _refined(pose: Floats, a: Landmarks, b: Landmarks, pairs: Ints, config: Cons
     weight = 1 / (a.sigma_xy**2 + b.sigma_xy**2)
     agree = np.zeros(len(pairs), bool)
     for _ in range(10):
-        now = _misfits(pose[None], a, b)[0] < config.gate
+        now = _misfits(pose[None], a, b)[0] < config.pair_gate
         if now.sum() < 2:
             return None
         if (now == agree).all():
             break
         agree = now
-        pose = pose_of(a.xy[agree], b.xy[agree], weight[agree])
+        pose = fit_pose(a.xy[agree], b.xy[agree], weight[agree])
     misfit = _misfits(pose[None], a, b)[0, agree]
-    freedom = 3 * int(agree.sum()) - 3
+    dof = 3 * int(agree.sum()) - 3
     rows = np.flatnonzero(agree)
-    spread = np.linalg.inv(information(a, b, pose, np.stack((rows, rows), 1)))
-    covariance = np.asarray(spread * max(1.0, misfit.sum() / freedom), np.float64)
+    spread = np.linalg.inv(pose_information(a, b, pose, np.stack((rows, rows), 1)))
+    covariance = np.asarray(spread * max(1.0, misfit.sum() / dof), np.float64)
     score = float(_gains(pose[None], a, b, config)[0, agree].sum())
-    return Candidate(pose, (covariance + covariance.T) / 2, pairs[agree], score, float(misfit.sum()), freedom)
+    return Candidate(pose, (covariance + covariance.T) / 2, pairs[agree], score, float(misfit.sum()), dof)
 
 
 @dataclass(frozen=True)
-class Feakm:
+class FeakmCorrector:
     """A corrector on landmarks that a net described: which are one object it knows by their looks, a pose is what they give.
 
     Landmarks without looks, of an agent that sends no descriptors, are recognised by nobody.
@@ -214,28 +222,28 @@ class Feakm:
     solver: Solver
 
     @classmethod
-    def of(cls, net: FeakmNet, pairs: int = 4) -> Feakm:
+    def of(cls, net: FeakmNet, min_pairs: int = 4) -> FeakmCorrector:
         """With the solver of the net's own kind and the paper's least number of pairs, 4 or 8."""
-        if isinstance(net.config.keypoints, DenseKeypoints):
-            return cls(net, partial(published, config=RansacConfig(pairs)))
-        return cls(net, partial(mended, config=ConsensusConfig(pairs)))
+        if isinstance(net.config.keypoints, DenseKeypointConfig):
+            return cls(net, partial(solve_with_ransac, config=RansacConfig(min_pairs)))
+        return cls(net, partial(solve_with_consensus, config=ConsensusConfig(min_pairs)))
 
-    def __call__(self, ego: Landmarks, other: Landmarks, claimed: PoseClaim | None) -> PoseEstimate:
+    def __call__(self, ego: Landmarks, other: Landmarks, prior: PosePrior | None) -> PoseEstimate:
         """Where the other agent is."""
-        if ego.look is None or other.look is None:
-            return unanswered(claimed)
-        pairs = self.net.match(_points(ego, ego.look), _points(other, other.look)).pairs.numpy()
-        return self.solver(ego, other, pairs, claimed)
+        if ego.descriptor is None or other.descriptor is None:
+            return no_estimate(prior)
+        pairs = self.net.match(_points(ego, ego.descriptor), _points(other, other.descriptor)).pairs.numpy()
+        return self.solver(ego, other, pairs, prior)
 
 
-def _points(marks: Landmarks, look: Floats) -> Points:
+def _points(landmarks: Landmarks, descriptors: Floats) -> KeypointBatch:
     """One view's landmarks as the matcher takes them."""
-    columns = (look, marks.xy, marks.yaw, marks.size, np.ones(len(marks)))
+    columns = (descriptors, landmarks.xy, landmarks.yaw, landmarks.size, np.ones(len(landmarks)))
     descriptor, xy, yaw, size, mask = (torch.from_numpy(c).float()[None] for c in columns)
-    return Points(descriptor, xy, yaw, size, mask.bool())
+    return KeypointBatch(descriptor, xy, yaw, size, mask.bool())
 
 
 @cache
-def learned(where: str, pairs: int = 4) -> Feakm:
+def load_feakm_corrector(weights: str, min_pairs: int = 4) -> FeakmCorrector:
     """The corrector with the weights of that shipped name or file; read once in a process."""
-    return Feakm.of(pretrained.load_feakm(where), pairs)
+    return FeakmCorrector.of(pretrained.load_feakm(weights), min_pairs)

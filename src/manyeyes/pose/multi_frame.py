@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sighting:
+class TimedLandmarks:
     """What one agent saw at one instant: landmarks in its frame of then. instant: how many frames ago, by a clock
     that both agents share. now_from_then: (3,) its own motion since; sigma_xy_m, sigma_yaw_rad: how well it knows
     that motion.
@@ -40,17 +40,17 @@ class Sighting:
             )
 
 
-def accumulated(sightings: Sequence[Sighting]) -> Landmarks:
+def accumulate(timed_landmarks: Sequence[TimedLandmarks]) -> Landmarks:
     """All landmarks in the agent's frame of now, each with the instant that it was seen in."""
-    return Landmarks.cat([_carried(s) for s in sightings])
+    return Landmarks.cat([_transform_to_now(s) for s in timed_landmarks])
 
 
-def _carried(sighting: Sighting) -> Landmarks:
-    here = sighting.landmarks
-    reach = np.hypot(*here.xy.T)
+def _transform_to_now(timed: TimedLandmarks) -> Landmarks:
+    here = timed.landmarks
+    range_m = np.hypot(*here.xy.T)
     return replace(
-        here.moved(sighting.now_from_then),
-        sigma_xy=np.sqrt(here.sigma_xy**2 + sighting.sigma_xy_m**2 + (reach * sighting.sigma_yaw_rad) ** 2),
-        sigma_yaw=np.hypot(here.sigma_yaw, sighting.sigma_yaw_rad),
-        instant=np.full(len(here), sighting.instant, np.int64),
+        here.transform(timed.now_from_then),
+        sigma_xy=np.sqrt(here.sigma_xy**2 + timed.sigma_xy_m**2 + (range_m * timed.sigma_yaw_rad) ** 2),
+        sigma_yaw=np.hypot(here.sigma_yaw, timed.sigma_yaw_rad),
+        instant=np.full(len(here), timed.instant, np.int64),
     )

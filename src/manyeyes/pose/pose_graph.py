@@ -19,15 +19,15 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError, Transform
-from manyeyes.ops.se2 import Edges, between, compose, inverse, log, solve
-from manyeyes.pose.corrector import REFUTED
-from manyeyes.pose.types import PoseClaim, difference
+from manyeyes.ops.se2 import PoseGraphEdges, between, compose, inverse, log, solve_pose_graph
+from manyeyes.pose.corrector import CHI2_3DOF_P001
+from manyeyes.pose.types import PosePrior, pose_difference
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Link:
+class RelativePoseEdge:
     """What was measured between two agents: pose (3,) of j in i's frame, covariance (3, 3) in i's axes."""
 
     i: int
@@ -41,83 +41,91 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Settled:
-    """pose: each connected agent's (3,) in the ego's frame; covariance: (3, 3) each, in the ego's axes. kept: the
-    links that were used. refused: links that contradict the others. isolated: agents that no kept link joins to the
+class PoseGraphResult:
+    """pose: each connected agent's (3,) in the ego's frame; covariance: (3, 3) each, in the ego's axes. kept_edges: the
+    links that were used. rejected_edges: links that contradict the others. isolated: agents that no kept link joins to the
     rest while a refused one would.
     """
 
     pose: Mapping[int, Floats]
     covariance: Mapping[int, Floats]
-    kept: tuple[Link, ...]
-    refused: tuple[Link, ...]
+    kept_edges: tuple[RelativePoseEdge, ...]
+    rejected_edges: tuple[RelativePoseEdge, ...]
     isolated: tuple[int, ...]
 
 
-def settle(
-    ego: int, links: Sequence[Link], claims: Mapping[int, PoseClaim], limit: float = REFUTED, huber: float = 3.0
-) -> Settled:
-    """Poses of all agents that links or claims join to the ego. claims: ego_from_agent as claimed.
+def optimize_poses(
+    ego: int,
+    edges: Sequence[RelativePoseEdge],
+    priors: Mapping[int, PosePrior],
+    max_cycle_chi2: float = CHI2_3DOF_P001,
+    huber: float = 3.0,
+) -> PoseGraphResult:
+    """Poses of all agents that links or claims join to the ego. priors: ego_from_agent as claimed.
 
-    limit: squared Mahalanobis length (3 degrees of freedom) of a cycle that still closes. The order of links has no
+    max_cycle_chi2: squared Mahalanobis length (3 degrees of freedom) of a cycle that still closes. The order of links has no
     part.
     """
-    ordered = sorted(links, key=lambda n: (n.i, n.j, *n.pose))
-    kept, refused = consistent(ordered, limit, [_doubt(ego, n, claims) for n in ordered])
-    agents = sorted({ego, *claims, *(a for n in ordered for a in (n.i, n.j))})
-    reached = _reached(ego, kept, claims)
-    poses, covariance = _solve(ego, [a for a in agents if a in reached], kept, claims, huber)
+    ordered = sorted(edges, key=lambda n: (n.i, n.j, *n.pose))
+    kept, rejected = reject_inconsistent_edges(
+        ordered, max_cycle_chi2, [_prior_distance(ego, n, priors) for n in ordered]
+    )
+    agents = sorted({ego, *priors, *(a for n in ordered for a in (n.i, n.j))})
+    reached = _reached(ego, kept, priors)
+    poses, covariance = _solve(ego, [a for a in agents if a in reached], kept, priors, huber)
     joined = {a for n in kept for a in (n.i, n.j)}
-    isolated = tuple(sorted({a for n in refused for a in (n.i, n.j)} - joined - {ego}))
-    return Settled(poses, covariance, tuple(kept), tuple(refused), isolated)
+    isolated = tuple(sorted({a for n in rejected for a in (n.i, n.j)} - joined - {ego}))
+    return PoseGraphResult(poses, covariance, tuple(kept), tuple(rejected), isolated)
 
 
-def consistent(links: Sequence[Link], limit: float, doubts: Sequence[float] = ()) -> tuple[list[Link], list[Link]]:
+def reject_inconsistent_edges(
+    edges: Sequence[RelativePoseEdge], max_cycle_chi2: float, prior_distances: Sequence[float] = ()
+) -> tuple[list[RelativePoseEdge], list[RelativePoseEdge]]:
     """The links without those that no triangle agrees with, and those: the link in most failing triangles goes first.
 
-    doubts: how badly each link agrees with what is claimed; it decides where triangles do not, as in a single one.
+    prior_distances: how badly each link agrees with what is claimed; it decides where triangles do not, as in a single one.
     """
-    kept, refused = list(links), []
-    doubt = list(doubts) or [0.0] * len(kept)
+    kept, rejected = list(edges), []
+    kept_distances = list(prior_distances) or [0.0] * len(kept)
     while True:
         failing = [0.0] * len(kept)
         closing = [0] * len(kept)
         for triple in _triangles(kept):
             excess = cycle_distance(*(kept[n] for n in triple))
             for n in triple:
-                failing[n] += min(excess / limit, 1e3) if excess > limit else 0.0
-                closing[n] += excess <= limit
+                failing[n] += min(excess / max_cycle_chi2, 1e3) if excess > max_cycle_chi2 else 0.0
+                closing[n] += excess <= max_cycle_chi2
         bad = [n for n in range(len(kept)) if failing[n] > 0]
         if not bad:
             break
         # A link that some triangle confirms is trusted before one that none does.
-        worst = max(bad, key=lambda n: (-closing[n], round(failing[n], 9), doubt[n], -n))
-        refused.append(kept.pop(worst))
-        doubt.pop(worst)
+        worst = max(bad, key=lambda n: (-closing[n], round(failing[n], 9), kept_distances[n], -n))
+        rejected.append(kept.pop(worst))
+        kept_distances.pop(worst)
     # Whoever contradicted more than one other and is confirmed by no triangle is not believed for its last link either.
     confirmed = {a for n, count in enumerate(closing) if count for a in (kept[n].i, kept[n].j)}
-    contradicted = [a for n in refused for a in (n.i, n.j)]
-    alone = {a for a in contradicted if contradicted.count(a) > 1} - confirmed
-    refused += [n for n in kept if {n.i, n.j} & alone]
-    return [n for n in kept if not {n.i, n.j} & alone], refused
+    contradicted = [a for n in rejected for a in (n.i, n.j)]
+    unconfirmed = {a for a in contradicted if contradicted.count(a) > 1} - confirmed
+    rejected += [n for n in kept if {n.i, n.j} & unconfirmed]
+    return [n for n in kept if not {n.i, n.j} & unconfirmed], rejected
 
 
-def _doubt(ego: int, link: Link, claims: Mapping[int, PoseClaim]) -> float:
+def _prior_distance(ego: int, edge: RelativePoseEdge, priors: Mapping[int, PosePrior]) -> float:
     """Squared Mahalanobis distance of a link from what both its agents claim; 0 where one of them claims nothing."""
-    known = {**claims, ego: PoseClaim.of(Transform.identity(), 0.0, 0.0)}
-    if link.i not in known or link.j not in known:
+    known = {**priors, ego: PosePrior.of(Transform.identity(), 0.0, 0.0)}
+    if edge.i not in known or edge.j not in known:
         return 0.0
-    one, two = known[link.i], known[link.j]
-    said = between(torch.from_numpy(one.pose), torch.from_numpy(two.pose)).numpy()
+    one, two = known[edge.i], known[edge.j]
+    expected = between(torch.from_numpy(one.pose), torch.from_numpy(two.pose)).numpy()
     c, s = np.cos(one.pose[2]), np.sin(one.pose[2])
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    lever = np.array([[1.0, 0.0, -said[1]], [0.0, 1.0, said[0]], [0.0, 0.0, 1.0]]) @ turn
-    spread = link.covariance + lever @ one.covariance @ lever.T + turn @ two.covariance @ turn.T
-    delta = difference(link.pose, said)
+    lever = np.array([[1.0, 0.0, -expected[1]], [0.0, 1.0, expected[0]], [0.0, 0.0, 1.0]]) @ turn
+    spread = edge.covariance + lever @ one.covariance @ lever.T + turn @ two.covariance @ turn.T
+    delta = pose_difference(edge.pose, expected)
     return float(delta @ np.linalg.solve(spread, delta))
 
 
-def cycle_distance(one: Link, two: Link, three: Link) -> float:
+def cycle_distance(one: RelativePoseEdge, two: RelativePoseEdge, three: RelativePoseEdge) -> float:
     """Squared Mahalanobis length of going once around three links that join three agents."""
     first = one
     second = two if first.j in (two.i, two.j) else three
@@ -134,23 +142,23 @@ def cycle_distance(one: Link, two: Link, three: Link) -> float:
     return float(error @ np.linalg.solve(spread, error))
 
 
-def _triangles(links: Sequence[Link]) -> list[tuple[int, int, int]]:
+def _triangles(edges: Sequence[RelativePoseEdge]) -> list[tuple[int, int, int]]:
     found = []
-    for triple in itertools.combinations(range(len(links)), 3):
-        ends = [frozenset((links[n].i, links[n].j)) for n in triple]
+    for triple in itertools.combinations(range(len(edges)), 3):
+        ends = [frozenset((edges[n].i, edges[n].j)) for n in triple]
         if len(set(ends)) == 3 and len(frozenset().union(*ends)) == 3:
             found.append(triple)
     return found
 
 
-def _from(link: Link, agent: int) -> tuple[Floats, Floats]:
+def _from(edge: RelativePoseEdge, agent: int) -> tuple[Floats, Floats]:
     """The link's pose and covariance, seen from one of its agents."""
-    if link.i == agent:
-        return link.pose, link.covariance
-    back = inverse(torch.from_numpy(link.pose)).numpy()
-    c, s = np.cos(link.pose[2]), np.sin(link.pose[2])
+    if edge.i == agent:
+        return edge.pose, edge.covariance
+    back = inverse(torch.from_numpy(edge.pose)).numpy()
+    c, s = np.cos(edge.pose[2]), np.sin(edge.pose[2])
     by = np.array([[-c, -s, back[1]], [s, -c, -back[0]], [0.0, 0.0, -1.0]])
-    return back, by @ link.covariance @ by.T
+    return back, by @ edge.covariance @ by.T
 
 
 def _compose_jacobians(a: Floats, b: Floats) -> tuple[Floats, Floats]:
@@ -161,33 +169,39 @@ def _compose_jacobians(a: Floats, b: Floats) -> tuple[Floats, Floats]:
     return by_a, by_b
 
 
-def _reached(ego: int, links: Sequence[Link], claims: Mapping[int, PoseClaim]) -> set[int]:
+def _reached(ego: int, edges: Sequence[RelativePoseEdge], priors: Mapping[int, PosePrior]) -> set[int]:
     """Agents that links or claims join to the ego."""
-    reached = {ego, *claims}
+    reached = {ego, *priors}
     while True:
-        more = {a for n in links if {n.i, n.j} & reached for a in (n.i, n.j)} - reached
+        more = {a for n in edges if {n.i, n.j} & reached for a in (n.i, n.j)} - reached
         if not more:
             return reached
         reached |= more
 
 
 def _solve(
-    ego: int, agents: list[int], links: Sequence[Link], claims: Mapping[int, PoseClaim], huber: float
+    ego: int,
+    agents: list[int],
+    relative_edges: Sequence[RelativePoseEdge],
+    agent_priors: Mapping[int, PosePrior],
+    huber: float,
 ) -> tuple[dict[int, Floats], dict[int, Floats]]:
     row = {a: n for n, a in enumerate(agents)}
-    start = _start(ego, agents, links, claims)
-    used = [n for n in links if n.i in row and n.j in row]
-    priors = [(ego, a, claims[a].pose, claims[a].covariance) for a in agents if a in claims and a != ego]
+    start = _initial_poses(ego, agents, relative_edges, agent_priors)
+    used = [n for n in relative_edges if n.i in row and n.j in row]
+    priors = [
+        (ego, a, agent_priors[a].pose, agent_priors[a].covariance) for a in agents if a in agent_priors and a != ego
+    ]
     rows = [(n.i, n.j, n.pose, n.covariance) for n in used] + priors
     if not rows:
         return {ego: np.zeros(3)}, {ego: np.zeros((3, 3))}
-    edges = Edges(
+    edges = PoseGraphEdges(
         torch.tensor([row[r[0]] for r in rows]),
         torch.tensor([row[r[1]] for r in rows]),
         torch.from_numpy(np.array([r[2] for r in rows])),
         torch.from_numpy(np.array([_information(r[2], r[3]) for r in rows])),
     )
-    found = solve(start, edges, torch.tensor([a == ego for a in agents]), huber)
+    found = solve_pose_graph(start, edges, torch.tensor([a == ego for a in agents]), huber)
     covariance = found.covariance.numpy()
     poses = {a: found.poses[n].numpy() for a, n in row.items()}
     return poses, {a: covariance[3 * n : 3 * n + 3, 3 * n : 3 * n + 3] for a, n in row.items()}
@@ -202,23 +216,25 @@ def _information(pose: Floats, covariance: Floats) -> Floats:
     return np.linalg.inv(turn @ covariance @ turn.T + 1e-8 * np.eye(3))
 
 
-def _start(ego: int, agents: list[int], links: Sequence[Link], claims: Mapping[int, PoseClaim]) -> torch.Tensor:
+def _initial_poses(
+    ego: int, agents: list[int], edges: Sequence[RelativePoseEdge], priors: Mapping[int, PosePrior]
+) -> torch.Tensor:
     """Where to start: along the links from the ego, else as claimed."""
     known = {ego: torch.zeros(3, dtype=torch.float64)}
-    pending = list(links)
+    pending = list(edges)
     while pending:
         usable = [n for n in pending if (n.i in known) != (n.j in known)]
         if not usable:
-            rest = [a for a in agents if a not in known and a in claims and any(a in (n.i, n.j) for n in pending)]
+            rest = [a for a in agents if a not in known and a in priors and any(a in (n.i, n.j) for n in pending)]
             if not rest:
                 break
-            known[rest[0]] = torch.from_numpy(claims[rest[0]].pose)
+            known[rest[0]] = torch.from_numpy(priors[rest[0]].pose)
             continue
-        link = usable[0]
-        pose = torch.from_numpy(link.pose)
-        if link.i in known:
-            known[link.j] = compose(known[link.i], pose)
+        edge = usable[0]
+        pose = torch.from_numpy(edge.pose)
+        if edge.i in known:
+            known[edge.j] = compose(known[edge.i], pose)
         else:
-            known[link.i] = compose(known[link.j], inverse(pose))
+            known[edge.i] = compose(known[edge.j], inverse(pose))
         pending = [n for n in pending if n.i not in known or n.j not in known]
-    return torch.stack([known[a] if a in known else torch.from_numpy(claims[a].pose) for a in agents])
+    return torch.stack([known[a] if a in known else torch.from_numpy(priors[a].pose) for a in agents])

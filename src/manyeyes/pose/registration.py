@@ -19,8 +19,8 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError, PointCloud
-from manyeyes.pose.corrector import mahalanobis
-from manyeyes.pose.types import PoseClaim, PoseEstimate, PoseStatus, difference, unanswered, upright
+from manyeyes.pose.corrector import mahalanobis_squared
+from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3, no_estimate, pose_difference
 
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.float32]
@@ -28,55 +28,63 @@ Pixels = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class RegistrationConfig:
-    """reach_m: columns farther from the sensor are left out. column_m: edge of a column, and least_m: by how much its points
-    differ in height. cell_m, turns: of the search over all poses; fine_m, blur_m: cell and Gaussian of the field that refines.
-    candidates: answers that are refined; those within apart_m and apart_rad of a better one are the same. least_share: of
-    columns on the ego's, weighed by how near, and least_margin: more than the runner-up's. sigma_m, sigma_yaw_rad: the error
-    that an answer states, one standard deviation.
+    """max_range_m: columns farther from the sensor are left out. column_m: edge of a column, and least_m: by how much its points
+    differ in height. cell_m, num_yaw_steps: of the search over all poses; fine_step_m, blur_m: cell and Gaussian of the field that
+    refines. num_candidates: answers that are refined; those within apart_m and apart_rad of a better one are the same.
+    min_inlier_fraction: of columns on the ego's, weighed by how near, and least_margin: more than the runner-up's. sigma_m,
+    sigma_yaw_rad: the error that an answer states, one standard deviation.
     """
 
-    reach_m: float = 60.0
+    max_range_m: float = 60.0
     column_m: float = 0.3
-    least_m: float = 0.6
+    min_height_m: float = 0.6
     cell_m: float = 1.0
-    turns: int = 120
-    fine_m: float = 0.2
+    num_yaw_steps: int = 120
+    fine_step_m: float = 0.2
     blur_m: float = 0.4
-    candidates: int = 6
-    apart_m: float = 3.0
-    apart_rad: float = 0.12
-    least_share: float = 0.3
-    least_margin: float = 0.1
+    num_candidates: int = 6
+    min_separation_m: float = 3.0
+    min_separation_rad: float = 0.12
+    min_inlier_fraction: float = 0.3
+    min_margin: float = 0.1
     sigma_m: float = 0.1
     sigma_yaw_rad: float = 0.005
 
     def __post_init__(self) -> None:
-        lengths = (self.reach_m, self.column_m, self.least_m, self.cell_m, self.fine_m, self.blur_m, self.sigma_m)
-        if min(lengths) <= 0 or self.turns < 1 or self.candidates < 2:
+        lengths = (
+            self.max_range_m,
+            self.column_m,
+            self.min_height_m,
+            self.cell_m,
+            self.fine_step_m,
+            self.blur_m,
+            self.sigma_m,
+        )
+        if min(lengths) <= 0 or self.num_yaw_steps < 1 or self.num_candidates < 2:
             raise ConfigError("RegistrationConfig needs lengths above 0, turns >= 1 and candidates >= 2.")
 
 
 @dataclass(frozen=True)
-class Field:
+class LikelihoodField:
     """How near to something upright each place is, 1 on it: (rows, columns) over the square of reach_m around the sensor."""
 
     value: Pixels
-    reach_m: float
+    half_size_m: float
     cell_m: float
 
     @classmethod
-    def of(cls, xy: Floats, reach_m: float, cell_m: float, blur_m: float) -> Field:
+    def of(cls, xy: Floats, half_size_m: float, cell_m: float, blur_m: float) -> LikelihoodField:
         """The field of columns at (N, 2)."""
-        side = 2 * math.ceil(reach_m / cell_m)
+        side = 2 * math.ceil(half_size_m / cell_m)
         value = np.zeros((side, side), np.float32)
-        at = np.floor((xy + reach_m) / cell_m).astype(int)
+        at = np.floor((xy + half_size_m) / cell_m).astype(int)
         at = at[((at >= 0) & (at < side)).all(1)]
         value[at[:, 1], at[:, 0]] = 1
-        return cls(_spread(value, blur_m / cell_m), reach_m, cell_m)
+        return cls(_dilate_gaussian(value, blur_m / cell_m), half_size_m, cell_m)
 
-    def at(self, xy: Floats) -> Floats:
+    def sample(self, xy: Floats) -> Floats:
         """Values at places (..., 2), bilinear, 0 outside."""
-        place = (xy + self.reach_m) / self.cell_m - 0.5
+        place = (xy + self.half_size_m) / self.cell_m - 0.5
         low = np.floor(place).astype(int)
         part = place - low
         total = np.zeros(xy.shape[:-1])
@@ -89,36 +97,36 @@ class Field:
         return total
 
 
-def register(
-    ego: PointCloud, other: PointCloud, claimed: PoseClaim | None, config: RegistrationConfig | None = None
+def register_clouds(
+    ego: PointCloud, other: PointCloud, prior: PosePrior | None, config: RegistrationConfig | None = None
 ) -> PoseEstimate:
     """ego_from_other from two clouds; the claim has no part in it but for what it says of height and tilt."""
     config = config or RegistrationConfig()
-    here, there = (columns(cloud, config) for cloud in (ego, other))
+    here, there = (extract_vertical_structures(cloud, config) for cloud in (ego, other))
     if min(len(here), len(there)) < 3:
-        return unanswered(claimed)
-    field = Field.of(here, config.reach_m, config.fine_m, config.blur_m)
+        return no_estimate(prior)
+    field = LikelihoodField.of(here, config.max_range_m, config.fine_step_m, config.blur_m)
     refined = [_climbed(pose, there, field) for pose in _peaks(here, there, config)]
     refined.sort(key=lambda found: -found[1])
-    (pose, share), *others = refined
-    rivals = [s for p, s in others if not _alike(p, pose, config)]
-    margin = share - max(rivals, default=0.0)
-    if share < config.least_share:
-        return unanswered(claimed)
-    if margin < config.least_margin:
-        return unanswered(claimed, PoseStatus.AMBIGUOUS)
+    (pose, inlier_fraction), *others = refined
+    other_scores = [s for p, s in others if not _alike(p, pose, config)]
+    margin = inlier_fraction - max(other_scores, default=0.0)
+    if inlier_fraction < config.min_inlier_fraction:
+        return no_estimate(prior)
+    if margin < config.min_margin:
+        return no_estimate(prior, PoseStatus.AMBIGUOUS)
     covariance = np.diag([config.sigma_m**2, config.sigma_m**2, config.sigma_yaw_rad**2])
-    distance = float("nan") if claimed is None else mahalanobis(pose, covariance, claimed)
-    none, count = np.zeros((0, 2), np.int64), round(share * len(there))
+    distance = float("nan") if prior is None else mahalanobis_squared(pose, covariance, prior)
+    none, count = np.zeros((0, 2), np.int64), round(inlier_fraction * len(there))
     return PoseEstimate(
-        upright(pose, claimed), covariance, PoseStatus.CORRECTED, count, 0, margin, none, pose, covariance, distance
+        lift_to_se3(pose, prior), covariance, PoseStatus.CORRECTED, count, 0, margin, none, pose, covariance, distance
     )
 
 
-def columns(cloud: PointCloud, config: RegistrationConfig) -> Floats:
+def extract_vertical_structures(cloud: PointCloud, config: RegistrationConfig) -> Floats:
     """(N, 2) middles of the columns within reach whose points differ enough in height."""
     xyz = cloud.xyz.double().numpy()
-    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) < config.reach_m]
+    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) < config.max_range_m]
     cell = np.floor(xyz[:, :2] / config.column_m).astype(np.int64)
     _, column = np.unique((cell[:, 0] << 32) + cell[:, 1], return_inverse=True)
     order = np.lexsort((xyz[:, 2], column))
@@ -128,20 +136,20 @@ def columns(cloud: PointCloud, config: RegistrationConfig) -> Floats:
     ends = np.append(starts[1:], len(order)) - 1
     z, count = xyz[order, 2], np.diff(np.append(starts, len(order)))
     middle = np.add.reduceat(xyz[order, :2], starts) / count[:, None]
-    return middle[z[ends] - z[starts] >= config.least_m]
+    return middle[z[ends] - z[starts] >= config.min_height_m]
 
 
 def _peaks(here: Floats, there: Floats, config: RegistrationConfig) -> list[Floats]:
     """Poses (3,) of the best distinct overlaps among all turns and all shifts of whole cells."""
-    side = 2 * math.ceil(config.reach_m / config.cell_m)
-    own = Field.of(here, config.reach_m, config.cell_m, config.cell_m).value
+    side = 2 * math.ceil(config.max_range_m / config.cell_m)
+    own = LikelihoodField.of(here, config.max_range_m, config.cell_m, config.cell_m).value
     # Twice the side, so that no shift wraps around.
     spectrum = torch.fft.rfft2(torch.from_numpy(own), s=(2 * side, 2 * side))
     found: list[tuple[float, Floats]] = []
-    for k in range(config.turns):
-        yaw = 2 * math.pi * k / config.turns
+    for k in range(config.num_yaw_steps):
+        yaw = 2 * math.pi * k / config.num_yaw_steps
         drawn = np.zeros((side, side), np.float32)
-        at = np.floor((_turned(there, yaw) + config.reach_m) / config.cell_m).astype(int)
+        at = np.floor((_turned(there, yaw) + config.max_range_m) / config.cell_m).astype(int)
         at = at[((at >= 0) & (at < side)).all(1)]
         drawn[at[:, 1], at[:, 0]] = 1
         drawn /= max(float(drawn.sum()), 1.0)
@@ -155,19 +163,19 @@ def _peaks(here: Floats, there: Floats, config: RegistrationConfig) -> list[Floa
             overlap[near[0][:, None], near[1]] = -1
     kept: list[Floats] = []
     for _, pose in sorted(found, key=lambda f: -f[0]):
-        if len(kept) < config.candidates and not any(_alike(pose, other, config) for other in kept):
+        if len(kept) < config.num_candidates and not any(_alike(pose, other, config) for other in kept):
             kept.append(pose)
     return kept
 
 
-def _climbed(pose: Floats, there: Floats, field: Field) -> tuple[Floats, float]:
+def _climbed(pose: Floats, there: Floats, field: LikelihoodField) -> tuple[Floats, float]:
     """The pose uphill from one, by steps that halve, and the mean of the field at the columns there."""
     step = np.array([1.0, 1.0, 0.03])
-    best, height = pose, float(field.at(_moved(there, pose)).mean())
+    best, height = pose, float(field.sample(_moved(there, pose)).mean())
     moves = np.concatenate((np.eye(3), -np.eye(3)))
     while step[0] > 0.01:
         tried = best + moves * step
-        heights = [float(field.at(_moved(there, p)).mean()) for p in tried]
+        heights = [float(field.sample(_moved(there, p)).mean()) for p in tried]
         top = int(np.argmax(heights))
         if heights[top] > height:
             best, height = tried[top], heights[top]
@@ -186,18 +194,18 @@ def _moved(xy: Floats, pose: Floats) -> Floats:
 
 
 def _alike(a: Floats, b: Floats, config: RegistrationConfig) -> bool:
-    apart = difference(a, b)
-    return bool(np.hypot(apart[0], apart[1]) < config.apart_m and abs(apart[2]) < config.apart_rad)
+    apart = pose_difference(a, b)
+    return bool(np.hypot(apart[0], apart[1]) < config.min_separation_m and abs(apart[2]) < config.min_separation_rad)
 
 
-def _spread(value: Pixels, sigma: float) -> Pixels:
+def _dilate_gaussian(value: Pixels, sigma: float) -> Pixels:
     """The greatest of Gaussians around every set cell, to three sigma: 1 where set."""
-    reach = math.ceil(3 * sigma)
+    radius = math.ceil(3 * sigma)
     out = torch.from_numpy(value)[None, None]
-    for across in ((1, 0), (0, 1)):
+    for axis_step in ((1, 0), (0, 1)):
         shifted = []
-        for k in range(-reach, reach + 1):
-            moved = torch.roll(out, (k * across[0], k * across[1]), (2, 3))
+        for k in range(-radius, radius + 1):
+            moved = torch.roll(out, (k * axis_step[0], k * axis_step[1]), (2, 3))
             shifted.append(moved * math.exp(-(k**2) / (2 * sigma**2)))
         out = torch.stack(shifted).amax(0)
     return out[0, 0].numpy()

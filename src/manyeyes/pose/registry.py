@@ -14,14 +14,14 @@ from manyeyes.datatypes import ConfigError, PointCloud
 from manyeyes.pose.baselines import coalign, feaco, fpv_rcnn, gicp, icp, mash, v2x_reg, vips
 from manyeyes.pose.baselines import identity as given
 from manyeyes.pose.baselines.v2x_reg import V2xRegConfig
-from manyeyes.pose.corrector import DETECTED, correct
-from manyeyes.pose.feakm import learned
-from manyeyes.pose.registration import register
-from manyeyes.pose.types import Corrector, PoseClaim, PoseEstimate
+from manyeyes.pose.corrector import DETECTOR_BOXES_CONFIG, correct_pose
+from manyeyes.pose.feakm import load_feakm_corrector
+from manyeyes.pose.registration import register_clouds
+from manyeyes.pose.types import PoseCorrector, PoseEstimate, PosePrior
 
 FEAKM = "feakm"
-CORRECTORS: dict[str, Corrector] = {
-    "vote": partial(correct, config=DETECTED),
+CORRECTORS: dict[str, PoseCorrector] = {
+    "vote": partial(correct_pose, config=DETECTOR_BOXES_CONFIG),
     "given": given.correct,
     "coalign": coalign.correct,
     "fpv-rcnn": fpv_rcnn.correct,
@@ -33,19 +33,19 @@ CORRECTORS: dict[str, Corrector] = {
     "mash": mash.correct,
 }
 
-CLOUDS: dict[str, Callable[[PointCloud, PointCloud, PoseClaim | None], PoseEstimate]] = {
-    "register": register,
+CLOUD_CORRECTORS: dict[str, Callable[[PointCloud, PointCloud, PosePrior | None], PoseEstimate]] = {
+    "register": register_clouds,
     "gicp": gicp.correct,
 }
 
 
-def corrector(name: str) -> Corrector:
+def load_corrector(name: str) -> PoseCorrector:
     """The corrector of that name; an unknown name lists the known ones."""
-    where, _, pairs = name.partition("@")
-    if where == FEAKM or where.endswith(".safetensors"):
-        if pairs and not pairs.isdecimal():
+    weights, _, min_pairs = name.partition("@")
+    if weights == FEAKM or weights.endswith(".safetensors"):
+        if min_pairs and not min_pairs.isdecimal():
             raise ConfigError(f"{name!r}: behind @ stands how many pairs must agree, the paper's 4 or 8.")
-        return learned(where, int(pairs or 4))
+        return load_feakm_corrector(weights, int(min_pairs or 4))
     if name not in CORRECTORS:
         raise ConfigError(
             f"No corrector is called {name!r}; known: {', '.join(CORRECTORS)}, {FEAKM}, or a .safetensors file of FeaKM."

@@ -14,37 +14,39 @@ from dataclasses import replace
 import numpy as np
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.pose.corrector import Acceptance, CorrectorConfig, rank
+from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, rank_candidates
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.voting import candidates
+from manyeyes.pose.voting import find_candidates
 
 
-def calibrated(
-    nulls: Iterable[tuple[Landmarks, Landmarks]], wrong_accepts: float, config: CorrectorConfig | None = None
-) -> Acceptance:
-    """The acceptance whose rate of answers on null scenes is at most ``wrong_accepts``, its other limits as
+def calibrate_acceptance(
+    null_scenes: Iterable[tuple[Landmarks, Landmarks]],
+    max_false_accept_rate: float,
+    config: CorrectorConfig | None = None,
+) -> AcceptanceTest:
+    """The acceptance whose rate of answers on null scenes is at most ``max_false_accept_rate``, its other limits as
     configured.
 
-    nulls: what two agents see that have no object in common, without a claim. At least 2 / wrong_accepts scenes are
+    null_scenes: what two agents see that have no object in common, without a claim. At least 2 / wrong_accepts scenes are
     needed.
     """
     config = config or CorrectorConfig()
-    scores = sorted((_accepted_from(*pair, config) for pair in nulls), reverse=True)
-    allowed = math.floor(wrong_accepts * len(scores))
-    if not 0 < wrong_accepts < 1 or len(scores) * wrong_accepts < 2:
+    scores = sorted((_required_min_score(*pair, config) for pair in null_scenes), reverse=True)
+    allowed = math.floor(max_false_accept_rate * len(scores))
+    if not 0 < max_false_accept_rate < 1 or len(scores) * max_false_accept_rate < 2:
         raise ConfigError(
-            f"A rate of {wrong_accepts} needs at least {math.ceil(2 / max(wrong_accepts, 1e-9))} null scenes; "
+            f"A rate of {max_false_accept_rate} needs at least {math.ceil(2 / max(max_false_accept_rate, 1e-9))} null scenes; "
             f"got {len(scores)}. Give more scenes or allow more."
         )
     # Just above the best scene that may no longer be answered.
-    least = math.nextafter(max(scores[allowed], 0.0), math.inf)
-    return replace(config.accept, least_score=least)
+    min_score = math.nextafter(max(scores[allowed], 0.0), math.inf)
+    return replace(config.accept, min_score=min_score)
 
 
-def _accepted_from(ego: Landmarks, other: Landmarks, config: CorrectorConfig) -> float:
+def _required_min_score(ego: Landmarks, other: Landmarks, config: CorrectorConfig) -> float:
     """The least_score above which this scene gets no answer; minus infinity where other limits already refuse it."""
-    more = config.accept.per_instant * max(len(np.unique(ego.instant)) - 1, 0)
-    ranked = rank(candidates(ego, other, config.vote), None, config.accept.anywhere)
-    if ranked is None or ranked.margin < config.accept.least_margin:
+    extra_score = config.accept.extra_score_per_instant * max(len(np.unique(ego.instant)) - 1, 0)
+    ranked = rank_candidates(find_candidates(ego, other, config.vote), None, config.accept.prior_volume)
+    if ranked is None or ranked.margin < config.accept.min_margin:
         return -math.inf
-    return ranked.score - more if len(ranked.best.pairs) >= config.accept.least_pairs else -math.inf
+    return ranked.score - extra_score if len(ranked.best.pairs) >= config.accept.min_pairs else -math.inf

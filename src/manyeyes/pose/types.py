@@ -33,13 +33,13 @@ class PoseStatus(Enum):
     NO_MATCH = "no match"
 
     @property
-    def answered(self) -> bool:
+    def has_estimate(self) -> bool:
         """Whether objects gave the pose."""
         return self in (PoseStatus.OK, PoseStatus.CORRECTED, PoseStatus.CONFLICT)
 
 
 @dataclass(frozen=True)
-class PoseClaim:
+class PosePrior:
     """ego_from_other as claimed; covariance: (3, 3) of x, y (m) and yaw (rad) in the ego's axes, what is said of its
     error.
     """
@@ -61,15 +61,15 @@ class PoseClaim:
             )
 
     @classmethod
-    def of(cls, ego_from_other: Transform, sigma_xy_m: float, sigma_yaw_rad: float) -> PoseClaim:
+    def of(cls, ego_from_other: Transform, sigma_xy_m: float, sigma_yaw_rad: float) -> PosePrior:
         """A claim whose errors in x, y and yaw are independent."""
         return cls(ego_from_other, np.diag([sigma_xy_m**2, sigma_xy_m**2, sigma_yaw_rad**2]))
 
     @classmethod
-    def between(cls, ego: AgentFrame | Message, other: AgentFrame | Message) -> PoseClaim:
+    def between(cls, ego: AgentFrame | Message, other: AgentFrame | Message) -> PosePrior:
         """What two agents' claimed poses say together: errors of both, and the ego's yaw error at the other's distance."""
         ego_from_other = ego.world_from_agent.inverse() @ other.world_from_agent
-        x, y, _ = planar(ego_from_other)
+        x, y, _ = project_to_se2(ego_from_other)
         c, s = float(ego.world_from_agent.yaw.cos()), float(ego.world_from_agent.yaw.sin())
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]]) @ turn
@@ -79,7 +79,7 @@ class PoseClaim:
     @property
     def pose(self) -> Floats:
         """(3,) x, y (m), yaw (rad)."""
-        return planar(self.ego_from_other)
+        return project_to_se2(self.ego_from_other)
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class PoseEstimate:
     the claim. covariance: (3, 3) of x, y (m), yaw (rad) in the ego's axes. inliers: pairs that agree with it;
     runner_up: pairs that agree with the best *distinct* other answer; margin: by how much the answer is likelier than
     that one (log-likelihood). pairs: (inliers, 2) rows of ego's and other's landmarks. measured, measured_covariance:
-    (3,), (3, 3) what objects alone say, where they say one thing. distance: squared Mahalanobis distance of that from
+    (3,), (3, 3) what objects alone say, where they say one thing. mahalanobis_squared: squared Mahalanobis distance of that from
     the claim (3 degrees of freedom), NaN without both.
     """
 
@@ -103,44 +103,44 @@ class PoseEstimate:
     pairs: Ints
     measured: Floats | None
     measured_covariance: Floats | None
-    distance: float
+    mahalanobis_squared: float
 
     @property
     def pose(self) -> Floats | None:
         """(3,) x, y (m), yaw (rad) of ego_from_other."""
-        return None if self.ego_from_other is None else planar(self.ego_from_other)
+        return None if self.ego_from_other is None else project_to_se2(self.ego_from_other)
 
 
-class Corrector(Protocol):
+class PoseCorrector(Protocol):
     """The one interface of the default corrector and of its rivals."""
 
-    def __call__(self, ego: Landmarks, other: Landmarks, claimed: PoseClaim | None) -> PoseEstimate:
+    def __call__(self, ego: Landmarks, other: Landmarks, prior: PosePrior | None) -> PoseEstimate:
         """Where the other agent is, from what both see and what is claimed."""
         ...
 
 
-def planar(transform: Transform) -> Floats:
+def project_to_se2(transform: Transform) -> Floats:
     """(3,) x, y (m), yaw (rad) of one transform."""
     x, y = transform.translation[:2].tolist()
     return np.array([x, y, float(transform.yaw)])
 
 
-def upright(pose: Floats, claimed: PoseClaim | None) -> Transform:
+def lift_to_se3(pose: Floats, prior: PosePrior | None) -> Transform:
     """A pose (3,) in the plane as a transform, with the height and tilt of what was claimed."""
     flat = Transform.from_xyz_yaw(float(pose[0]), float(pose[1]), 0.0, float(pose[2]))
-    if claimed is None:
+    if prior is None:
         return flat
-    was = claimed.ego_from_other
-    turn = Transform.from_xyz_yaw(0.0, 0.0, 0.0, float(pose[2]) - float(was.yaw)).rotation
-    lifted = torch.stack((flat.translation[0], flat.translation[1], was.translation[2].double()))
-    return Transform(turn @ was.rotation.double(), lifted)
+    reported = prior.ego_from_other
+    turn = Transform.from_xyz_yaw(0.0, 0.0, 0.0, float(pose[2]) - float(reported.yaw)).rotation
+    lifted = torch.stack((flat.translation[0], flat.translation[1], reported.translation[2].double()))
+    return Transform(turn @ reported.rotation.double(), lifted)
 
 
-def unanswered(claimed: PoseClaim | None, status: PoseStatus = PoseStatus.NO_MATCH) -> PoseEstimate:
+def no_estimate(prior: PosePrior | None, status: PoseStatus = PoseStatus.NO_MATCH) -> PoseEstimate:
     """What a corrector says where objects give no pose: the claim as it was, or nothing."""
     return PoseEstimate(
-        None if claimed is None else claimed.ego_from_other,
-        np.full((3, 3), np.inf) if claimed is None else claimed.covariance,
+        None if prior is None else prior.ego_from_other,
+        np.full((3, 3), np.inf) if prior is None else prior.covariance,
         status,
         0,
         0,
@@ -152,11 +152,11 @@ def unanswered(claimed: PoseClaim | None, status: PoseStatus = PoseStatus.NO_MAT
     )
 
 
-def wrapped(angle: float) -> float:
+def wrap_angle(angle: float) -> float:
     """An angle in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def difference(a: Floats, b: Floats) -> Floats:
+def pose_difference(a: Floats, b: Floats) -> Floats:
     """a - b of two poses (3,), the yaw in [-pi, pi)."""
-    return np.array([a[0] - b[0], a[1] - b[1], wrapped(a[2] - b[2])])
+    return np.array([a[0] - b[0], a[1] - b[1], wrap_angle(a[2] - b[2])])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from manyeyes.datatypes import ConfigError
 from manyeyes.pose import _voting_kernels as loops
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim
+from manyeyes.pose.types import PosePrior
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -29,42 +29,45 @@ Ints = NDArray[np.int64]
 class VoteConfig:
     """How poses are found.
 
-    reach_m: landmarks farther than this from the middle of all are left out; landmarks: at most so many, those of
-    highest score. shortest_m, longest_m: lengths of edges; edges: at most so many an agent, the shortest. hypotheses:
+    max_range_m: landmarks farther than this from the middle of all are left out; max_landmarks: at most so many, those of
+    highest score. min_edge_m, max_edge_m: lengths of edges; max_edges: at most so many an agent, the shortest. max_hypotheses:
     at most so many, those that agree best. Together the caps bound the time. edge_gate: how many standard deviations
-    edges may differ. size_gate_m: difference of widths (twice that and a tenth of it for lengths). tau_m, turn_rad:
-    reach of the coarse support. refined: how many of the best are refined. pair_gate: largest squared misfit of a
-    pair (3 degrees of freedom; 14.16 is p = 0.003). area_m2: see the module, fitted on simulated crossings. apart_m,
-    apart_rad: answers that differ by less are one. still_m: what moved less between instants counts once. trust: degrees
-    of freedom that stated errors are worth against those that the pairs show. shared: the part of a box's variance that
-    all boxes of one view have in common, which no number of pairs averages out. across: error of a place across its heading, as a
-    share of that along it, which is the one that landmarks state.
+    edges may differ. size_gate_m: difference of widths (twice that and a tenth of it for lengths). support_radius_m,
+    support_yaw_rad: reach of the coarse support. max_refined: how many of the best are refined. pair_gate: largest squared misfit
+    of a pair (3 degrees of freedom; 14.16 is p = 0.003). chance_area_m2: see the module, fitted on simulated crossings. apart_m,
+    min_separation_rad: answers that differ by less are one. static_radius_m: what moved less between instants counts once.
+    prior_dof: degrees of freedom that stated errors are worth against those that the pairs show. common_variance_fraction: the part
+    of a box's variance that all boxes of one view have in common, which no number of pairs averages out. lateral_sigma_ratio: error
+    of a place across its heading, as a share of that along it, which is the one that landmarks state.
     """
 
-    reach_m: float = 300.0
-    landmarks: int = 200
-    shortest_m: float = 3.0
-    longest_m: float = 150.0
-    edges: int = 6000
-    hypotheses: int = 8000
+    max_range_m: float = 300.0
+    max_landmarks: int = 200
+    min_edge_m: float = 3.0
+    max_edge_m: float = 150.0
+    max_edges: int = 6000
+    max_hypotheses: int = 8000
     edge_gate: float = 3.5
     size_gate_m: float = 0.5
-    tau_m: float = 1.5
-    turn_rad: float = 0.26
-    refined: int = 32
+    support_radius_m: float = 1.5
+    support_yaw_rad: float = 0.26
+    max_refined: int = 32
     pair_gate: float = 14.16
-    area_m2: float = 330.0
-    apart_m: float = 2.0
-    apart_rad: float = 0.105
-    still_m: float = 1.5
-    trust: float = 10.0
-    shared: float = 0.0
-    across: float = 1.0
+    chance_area_m2: float = 330.0
+    min_separation_m: float = 2.0
+    min_separation_rad: float = 0.105
+    static_radius_m: float = 1.5
+    prior_dof: float = 10.0
+    common_variance_fraction: float = 0.0
+    lateral_sigma_ratio: float = 1.0
 
     def __post_init__(self) -> None:
-        if min(self.landmarks, self.edges, self.hypotheses, self.refined) < 1 or not self.shortest_m < self.longest_m:
+        if (
+            min(self.max_landmarks, self.max_edges, self.max_hypotheses, self.max_refined) < 1
+            or not self.min_edge_m < self.max_edge_m
+        ):
             raise ConfigError("VoteConfig needs caps of at least 1 and shortest_m < longest_m.")
-        if not (self.trust > 0 and 0 <= self.shared < 1 and 0 < self.across <= 1):
+        if not (self.prior_dof > 0 and 0 <= self.common_variance_fraction < 1 and 0 < self.lateral_sigma_ratio <= 1):
             raise ConfigError("VoteConfig needs trust > 0, shared in [0, 1) and across in (0, 1].")
 
 
@@ -78,19 +81,19 @@ class Candidate:
     covariance: Floats
     pairs: Ints
     score: float
-    misfit: float
-    freedom: int
+    chi2: float
+    dof: int
 
 
-def candidates(
-    ego: Landmarks, other: Landmarks, config: VoteConfig, claimed: PoseClaim | None = None
+def find_candidates(
+    ego: Landmarks, other: Landmarks, config: VoteConfig, prior: PosePrior | None = None
 ) -> list[Candidate]:
     """Distinct poses ego_from_other, the likeliest first. A claim is one more hypothesis; it has no say in the score."""
-    rows_e, rows_o = (x.usable(config.reach_m, config.landmarks) for x in (ego, other))
+    rows_e, rows_o = (x.select_indices(config.max_range_m, config.max_landmarks) for x in (ego, other))
     if not len(rows_e) or not len(rows_o):
         return []
     a, b = ego[rows_e], other[rows_o]
-    start = None if claimed is None else claimed.pose
+    start = None if prior is None else prior.pose
     # From the smaller set to the larger, so that exchanging the agents gives the inverse to the last digit but rounding.
     swapped = _rank(a) < _rank(b)
     if swapped:
@@ -99,13 +102,13 @@ def candidates(
         found = _search(a, b, config, start)
     out = []
     for pose, information, pairs, misfit, score in found:
-        freedom = 3 * len(pairs) - 3
+        dof = 3 * len(pairs) - 3
         total = float(misfit.sum())
-        covariance = _covariance(information, len(pairs), total, freedom, config)
+        covariance = _covariance(information, len(pairs), total, dof, config)
         if swapped:
             pose, covariance, pairs = *_inverted(pose, covariance), pairs[:, ::-1]
         rows = np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1)
-        out.append(Candidate(pose, (covariance + covariance.T) / 2, rows[np.lexsort(rows.T)], score, total, freedom))
+        out.append(Candidate(pose, (covariance + covariance.T) / 2, rows[np.lexsort(rows.T)], score, total, dof))
     return out
 
 
@@ -115,56 +118,67 @@ _Found = tuple[Floats, Floats, Ints, Floats, float]
 def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None) -> list[_Found]:
     """Distinct refined poses a_from_b, best first."""
     numbers_a, numbers_b = _numbers(a), _numbers(b)
-    exact_a, exact_b = _exact(a, config.across), _exact(b, config.across)
-    may = loops.compatible(a.size, b.size, a.instant, b.instant, config.size_gate_m)
-    poses = _hypotheses(a, b, may, config)
-    grid = loops.grid_of(numbers_a.xy, config.tau_m)
-    support = loops.support(poses, numbers_a, numbers_b, may, grid, config.tau_m, config.turn_rad)
+    exact_a, exact_b = (
+        _with_place_covariance(a, config.lateral_sigma_ratio),
+        _with_place_covariance(b, config.lateral_sigma_ratio),
+    )
+    is_compatible = loops.find_compatible(a.size, b.size, a.instant, b.instant, config.size_gate_m)
+    poses = _hypotheses(a, b, is_compatible, config)
+    grid = loops.build_grid(numbers_a.xy, config.support_radius_m)
+    support = loops.compute_support(
+        poses, numbers_a, numbers_b, is_compatible, grid, config.support_radius_m, config.support_yaw_rad
+    )
     # Equal support is ordered by the pose itself, never by where it stands in a list.
     order = np.lexsort((*poses.T, -np.round(support, 9)))
     middle = b.xy.mean(0)
-    best = poses[loops.distinct(poses, order, middle, config.refined, config.apart_m / 2, config.apart_rad / 2)]
+    best = poses[
+        loops.select_distinct(
+            poses, order, middle, config.max_refined, config.min_separation_m / 2, config.min_separation_rad / 2
+        )
+    ]
     if start is not None:
         best = np.concatenate((best, start[None]))
     found = []
     for pose in best:
-        pose, information, pairs, misfit = loops.refine(pose, exact_a, exact_b, may, 1.0, config.pair_gate, 14)
+        pose, information, pairs, misfit = loops.refine_pose(
+            pose, exact_a, exact_b, is_compatible, 1.0, config.pair_gate, 14
+        )
         if len(pairs):
             found.append((pose, information, pairs, misfit, _score(a, b, pose, pairs, misfit, config)))
     found.sort(key=lambda f: (-f[4], *f[0]))
-    return _merged(found, b, config)
+    return _merge_alike(found, b, config)
 
 
 def _numbers(x: Landmarks) -> loops.LandmarkArrays:
     return loops.LandmarkArrays(*(np.ascontiguousarray(v) for v in (x.xy, x.yaw, x.sigma_xy, x.sigma_yaw)))
 
 
-def _exact(x: Landmarks, across: float) -> loops.OrientedLandmarks:
+def _with_place_covariance(x: Landmarks, lateral_sigma_ratio: float) -> loops.OrientedLandmarks:
     """As ``_numbers``, with the places' covariances (N, 3): xx, xy and yy, less across the heading than along it."""
     xy, yaw, sigma_xy, sigma_yaw = _numbers(x)
     c, s = np.cos(yaw), np.sin(yaw)
-    share = across * across
-    shape = np.stack((c * c + share * s * s, (1 - share) * c * s, s * s + share * c * c), 1)
+    variance_ratio = lateral_sigma_ratio * lateral_sigma_ratio
+    shape = np.stack((c * c + variance_ratio * s * s, (1 - variance_ratio) * c * s, s * s + variance_ratio * c * c), 1)
     return loops.OrientedLandmarks(xy, yaw, shape * sigma_xy[:, None] ** 2, sigma_yaw)
 
 
-def _hypotheses(a: Landmarks, b: Landmarks, may: NDArray[np.bool_], config: VoteConfig) -> Floats:
-    most = 100 * config.hypotheses
+def _hypotheses(a: Landmarks, b: Landmarks, is_compatible: NDArray[np.bool_], config: VoteConfig) -> Floats:
+    max_poses = 100 * config.max_hypotheses
     poses, misfit = loops.match_edges(
-        _numbers(a), _numbers(b), _edges(a, config), _edges(b, config), may, config.edge_gate, most
+        _numbers(a), _numbers(b), _edges(a, config), _edges(b, config), is_compatible, config.edge_gate, max_poses
     )
-    if len(poses) > config.hypotheses:
+    if len(poses) > config.max_hypotheses:
         # Sorting all of them, of which most are not kept, would cost as much as finding them.
-        near = misfit <= np.partition(misfit, config.hypotheses - 1)[config.hypotheses - 1]
+        near = misfit <= np.partition(misfit, config.max_hypotheses - 1)[config.max_hypotheses - 1]
         poses, misfit = poses[near], misfit[near]
-        poses = poses[np.lexsort((*poses.T, misfit))[: config.hypotheses]]
+        poses = poses[np.lexsort((*poses.T, misfit))[: config.max_hypotheses]]
     return poses
 
 
 def _edges(x: Landmarks, config: VoteConfig) -> loops.Edges:
     """The edges, by length."""
-    edges = loops.edge_table(np.ascontiguousarray(x.xy), x.yaw, config.shortest_m, config.longest_m)
-    order = np.argsort(edges.length, kind="stable")[: config.edges]
+    edges = loops.build_edge_table(np.ascontiguousarray(x.xy), x.yaw, config.min_edge_m, config.max_edge_m)
+    order = np.argsort(edges.length, kind="stable")[: config.max_edges]
     return loops.Edges(edges.ends[order], edges.length[order], edges.direction[order], edges.heading[order])
 
 
@@ -173,22 +187,22 @@ def _score(a: Landmarks, b: Landmarks, pose: Floats, pairs: Ints, misfit: Floats
     heading.
     """
     i, k = pairs.T
-    gain = np.log(config.area_m2 / (2 * np.pi * (a.sigma_xy[i] ** 2 + b.sigma_xy[k] ** 2))) - misfit / 2
-    flip_a, flip_b = np.clip(a.flip[i], 0.01, 0.5), np.clip(b.flip[k], 0.01, 0.5)
+    gain = np.log(config.chance_area_m2 / (2 * np.pi * (a.sigma_xy[i] ** 2 + b.sigma_xy[k] ** 2))) - misfit / 2
+    flip_a, flip_b = np.clip(a.p_flip[i], 0.01, 0.5), np.clip(b.p_flip[k], 0.01, 0.5)
     agree = (1 - flip_a) * (1 - flip_b) + flip_a * flip_b
     same = np.cos(a.yaw[i] - b.yaw[k] - pose[2]) > 0
     gain = np.maximum(gain, 0.0) + np.log(2 * np.where(same, agree, 1 - agree))
-    return float(gain[_once(a.xy[i], a.instant[i], gain, config.still_m)].sum())
+    return float(gain[_keep_static_once(a.xy[i], a.instant[i], gain, config.static_radius_m)].sum())
 
 
-def _once(xy: Floats, instant: Ints, gain: Floats, still_m: float) -> NDArray[np.bool_]:
+def _keep_static_once(xy: Floats, instant: Ints, gain: Floats, static_radius_m: float) -> NDArray[np.bool_]:
     """(P,) which pairs count: of those at one place in several instants the best, since what stands still is no new
     evidence.
     """
     if not instant.any():
         return np.ones(len(gain), bool)
     order = np.lexsort((instant, xy[:, 1], xy[:, 0], -gain))
-    near = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1)) < still_m
+    near = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1)) < static_radius_m
     near &= instant[:, None] != instant[None]
     counts = np.zeros(len(gain), bool)
     for p in order:
@@ -196,7 +210,7 @@ def _once(xy: Floats, instant: Ints, gain: Floats, still_m: float) -> NDArray[np
     return counts
 
 
-def _merged(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[_Found]:
+def _merge_alike(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[_Found]:
     """The found poses, best first, without those that say the same as a better one where that one's objects are."""
     poses = np.array([f[0] for f in found]).reshape(-1, 3)
     kept, gone = [], np.zeros(len(found), bool)
@@ -204,26 +218,28 @@ def _merged(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[_Foun
         if gone[n]:
             continue
         kept.append(one)
-        apart = placed(poses, b.xy[one[2][:, 1]].mean(0)) - placed(one[0][None], b.xy[one[2][:, 1]].mean(0))
+        apart = transform_point(poses, b.xy[one[2][:, 1]].mean(0)) - transform_point(
+            one[0][None], b.xy[one[2][:, 1]].mean(0)
+        )
         turn = np.abs(np.remainder(poses[:, 2] - one[0][2] + np.pi, 2 * np.pi) - np.pi)
-        gone |= (turn < config.apart_rad) & (np.hypot(apart[:, 0], apart[:, 1]) < config.apart_m)
+        gone |= (turn < config.min_separation_rad) & (np.hypot(apart[:, 0], apart[:, 1]) < config.min_separation_m)
     return kept
 
 
-def placed(poses: Floats, point: Floats) -> Floats:
+def transform_point(poses: Floats, point: Floats) -> Floats:
     """(N, 2) where poses (N, 3) put a point (2,)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return poses[:, :2] + np.stack((c * point[0] - s * point[1], s * point[0] + c * point[1]), 1)
 
 
-def _covariance(information: Floats, pairs: int, misfit: float, freedom: int, config: VoteConfig) -> Floats:
+def _covariance(information: Floats, pairs: int, misfit: float, dof: int, config: VoteConfig) -> Floats:
     """(3, 3): what the pairs' stated errors give, scaled by what they show (the mean of an inverse gamma prior on the
     scale), and what all boxes of a view have in common.
     """
-    scale = (config.trust + misfit) / (config.trust + freedom)
+    scale = (config.prior_dof + misfit) / (config.prior_dof + dof)
     covariance = np.asarray(np.linalg.inv(information) * scale, np.float64)
     # The first two of the diagonal sum the pairs' inverse variances along an axis.
-    covariance[[0, 1], [0, 1]] += config.shared * pairs * 2 / (information[0, 0] + information[1, 1])
+    covariance[[0, 1], [0, 1]] += config.common_variance_fraction * pairs * 2 / (information[0, 0] + information[1, 1])
     return covariance
 
 

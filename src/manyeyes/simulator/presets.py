@@ -11,7 +11,7 @@ from typing import Literal
 from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.simulator.dair import record_dair
-from manyeyes.simulator.record import Job, Progress, record
+from manyeyes.simulator.record import Job, RecordingProgress, record
 from manyeyes.simulator.scene.scenario import ScenarioSpec
 from manyeyes.simulator.scene.towns import GENERATED, TOWN_SPLIT, assert_disjoint_split, find_town
 
@@ -36,7 +36,7 @@ class SimulationPreset:
     vehicles: least and most connected vehicles of a scene. roadside_chance: of a unit on a pole, which always takes part
     where there is one vehicle only. lead_frames: before the frames of a scene (ScenarioSpec): whoever hears a message of 0.4 s ago
     then hears a sender that had looked for half a second by the time it spoke. density, clutter: of traffic and of what stands
-    beside the road (ScenarioSpec), drawn evenly between these for each scene. stand_in: generated roads where a town is not
+    beside the road (ScenarioSpec), drawn evenly between these for each scene. fallback_town: generated roads where a town is not
     found; None makes that an error. layout: of the files; dair takes one vehicle and the unit, and judges every pair.
     cameras, roadside_cameras: as in ScenarioSpec.
     """
@@ -53,7 +53,7 @@ class SimulationPreset:
     min_vehicles: int = 16
     density: tuple[float, float] = (3.5, 7.0)
     clutter: tuple[float, float] = (0.4, 1.0)
-    stand_in: str | None = None
+    fallback_town: str | None = None
     layout: Literal["opv2v", "dair"] = "opv2v"
     cameras: str = "none"
     roadside_cameras: str = "none"
@@ -115,7 +115,7 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
         frames=56,
         vehicles=(3, 3),
         roadside_chance=1.0,
-        stand_in="generated-5",
+        fallback_town="generated-5",
     ),
     # The split's names are DAIR-V2X's own. Generated roads: it needs no file.
     "dair-crossing": SimulationPreset(
@@ -163,24 +163,24 @@ def with_cameras(preset: SimulationPreset) -> SimulationPreset:
     return replace(preset, cameras="opv2v-small", roadside_cameras="dair-infrastructure-small")
 
 
-def _town(name: str, towns: str | None, stand_in: str | None) -> str:
+def _town_or_fallback(name: str, towns: str | None, fallback_town: str | None) -> str:
     """The town, or its stand-in where its roads are not found."""
-    if stand_in is None:
+    if fallback_town is None:
         return name
     try:
         find_town(name, towns)
     except ConfigError:
-        return stand_in
+        return fallback_town
     return name
 
 
-def jobs_of(preset: SimulationPreset, seed: int, towns: str | None = None) -> list[Job]:
+def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> list[Job]:
     """The scenarios of a preset; each depends on seed, split and its number alone."""
     jobs = []
     for part in preset.splits:
         for index in range(part.count):
             random = keyed_generator(seed, "preset", part.split, index)
-            town = _town(part.towns[index % len(part.towns)], towns, preset.stand_in)
+            town = _town_or_fallback(part.towns[index % len(part.towns)], towns, preset.fallback_town)
             beams = part.beams[index % len(part.beams)] if part.beams else ""
             vehicles = int(random.integers(preset.vehicles[0], preset.vehicles[1] + 1))
             spec = ScenarioSpec(
@@ -210,13 +210,13 @@ def simulate(
     out: Path | str,
     seed: int = 0,
     workers: int = 1,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[RecordingProgress], None] | None = None,
     towns: Path | str | None = None,
     cameras: bool = False,
 ) -> Path:
     """Make a preset's recording under a folder; the path of its manifest. towns: where roads are looked for first."""
     place = None if towns is None else str(towns)
     wanted = with_cameras(simulation_preset(preset)) if cameras else simulation_preset(preset)
-    jobs = jobs_of(wanted, seed, place)
+    jobs = make_jobs(wanted, seed, place)
     write = record_dair if wanted.layout == "dair" else record
     return write(jobs, out, workers, progress, {"preset": preset, "seed": seed})

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 import torch
 
 from manyeyes._io import atomic_write_text
-from manyeyes.datasets.dair_index import dair_root
+from manyeyes.datasets.dair_index import find_dair_root
 from manyeyes.datasets.manifest import (
     BATCHES,
     MANIFEST,
@@ -32,16 +32,16 @@ from manyeyes.datasets.manifest import (
     SCENARIO,
     UNFINISHED_MANIFEST,
     Digests,
+    compute_total_digest,
     digest_files,
+    list_scenario_files,
     read_manifest,
-    scenario_files,
-    total_digest,
 )
 from manyeyes.datasets.missing import FileProblem
-from manyeyes.datasets.opv2v import Opv2vWriter, holds_frames
+from manyeyes.datasets.opv2v import Opv2vWriter, has_frames
 from manyeyes.datatypes import ConfigError, ManyeyesError, RecordingError
 from manyeyes.maps.roads.road_network import RoadNetwork
-from manyeyes.simulator.scene.scenario import NoSceneError, Scenario, ScenarioSpec, make_scenario
+from manyeyes.simulator.scene.scenario import NoSceneError, ScenarioSpec, SimulatedScenario, make_scenario
 from manyeyes.simulator.scene.towns import load_town
 from manyeyes.simulator.sensors.lidar import lidar_spec
 
@@ -61,7 +61,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Entry:
+class ManifestEntry:
     """What the manifest says of one scenario.
 
     seed: the one that gave a scene, which is the wanted one plus as many as failed. moving: share of the vehicles near it
@@ -85,7 +85,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Progress:
+class RecordingProgress:
     """How far a recording is: scenarios done of all, and the one that was just finished."""
 
     done: int
@@ -94,21 +94,21 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RecordingPlan:
     """What a run writes.
 
-    layout: OPV2V or DAIR-V2X. settings: what names the run (preset, seed). asked: the specification of each scenario as plain
-    JSON, by the place of the file that marks it as finished, relative to the root. names: split and name of each scenario.
+    layout: OPV2V or DAIR-V2X. settings: what names the run (preset, seed). requested_specs: the specification of each scenario as
+    plain JSON, by the place of the file that marks it as finished, relative to the root. names: split and name of each scenario.
     """
 
     layout: str
     settings: Mapping[str, str | int]
-    asked: Mapping[str, Mapping[str, Any]]
+    requested_specs: Mapping[str, Mapping[str, Any]]
     names: Sequence[tuple[str, str]]
 
     def manifest(self) -> dict[str, Any]:
         """The manifest of the run while it is unfinished."""
-        digest = hashlib.sha256(json.dumps(self.asked, sort_keys=True).encode()).hexdigest()
+        digest = hashlib.sha256(json.dumps(self.requested_specs, sort_keys=True).encode()).hexdigest()
         scenarios = [{"split": split, "name": name} for split, name in self.names]
         return {"format": self.layout, "settings": dict(self.settings), "asked": digest, "scenarios": scenarios}
 
@@ -117,7 +117,7 @@ def record(
     jobs: list[Job],
     out: Path | str,
     workers: int = 1,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[RecordingProgress], None] | None = None,
     settings: dict[str, str | int] | None = None,
 ) -> Path:
     """Write all jobs under ``out/<split>/<name>`` and ``out/manifest.json``; the manifest's path.
@@ -136,12 +136,12 @@ def record(
     if len(set(names)) < len(names):
         raise ConfigError("Two scenarios of one split have one name; give each its own.")
     asked = {f"{job.split}/{job.spec.name}/{SCENARIO}": _plain(asdict(job.spec)) for job in jobs}
-    plan = Plan("OPV2V", settings or {}, asked, names)
+    plan = RecordingPlan("OPV2V", settings or {}, asked, names)
     found = sorted(p for p in root.glob(f"*/*/{SCENARIO}") if p.parent.suffix != PARTIAL)
     finished = {path.relative_to(root).as_posix(): read_finished(path) for path in found}
     require_own_folder(root, plan, {place: content["spec"] for place, content in finished.items()})
     require_sound(root, {place: _check(root / place) for place in finished})
-    kept = {name: entry_of(finished[place]) for name, place in zip(names, asked) if place in finished}
+    kept = {name: parse_entry(finished[place]) for name, place in zip(names, asked) if place in finished}
     require_listed(root, {place: content["entry"] for place, content in finished.items()})
     entries = kept | run_unfinished(
         record_scenario,
@@ -158,28 +158,28 @@ def record(
 
 
 def run_unfinished(
-    work: Callable[[JobT, Path], Entry],
+    work: Callable[[JobT, Path], ManifestEntry],
     jobs: Mapping[tuple[str, str], JobT],
     root: Path,
     workers: int,
-    plan: Plan,
-    progress: Callable[[Progress], None] | None,
-) -> dict[tuple[str, str], Entry]:
+    plan: RecordingPlan,
+    progress: Callable[[RecordingProgress], None] | None,
+) -> dict[tuple[str, str], ManifestEntry]:
     """Run the jobs of scenarios that are not finished, by split and name, while the root is marked as unfinished."""
     total, kept = len(plan.names), [name for name in plan.names if name not in jobs]
     if progress is not None:
         for count, (split, name) in enumerate(kept, 1):
-            progress(Progress(count, total, f"{split}/{name}"))
+            progress(RecordingProgress(count, total, f"{split}/{name}"))
     if not jobs:
         return {}
     root.mkdir(parents=True, exist_ok=True)
     write_json(root / UNFINISHED_MANIFEST, plan.manifest())
-    entries: dict[tuple[str, str], Entry] = {}
+    entries: dict[tuple[str, str], ManifestEntry] = {}
     try:
         for _, entry in run_jobs(work, list(jobs.values()), root, workers):
             entries[entry.split, entry.name] = entry
             if progress is not None:
-                progress(Progress(len(kept) + len(entries), total, f"{entry.split}/{entry.name}"))
+                progress(RecordingProgress(len(kept) + len(entries), total, f"{entry.split}/{entry.name}"))
     except ManyeyesError:
         if not kept and not entries:
             (root / UNFINISHED_MANIFEST).unlink(missing_ok=True)  # nothing was made that another run could damage
@@ -187,18 +187,18 @@ def run_unfinished(
     return entries
 
 
-def write_manifest(root: Path, plan: Plan, scenarios: Sequence[Mapping[str, Any]]) -> None:
+def write_manifest(root: Path, plan: RecordingPlan, scenarios: Sequence[Mapping[str, Any]]) -> None:
     """Write the manifest of a finished run."""
     content = {
         "format": plan.layout,
         "settings": dict(plan.settings),
-        "versions": versions(),
+        "versions": package_versions(),
         "scenarios": list(scenarios),
     }
     write_json(root / MANIFEST, content)
 
 
-def require_own_folder(root: Path, plan: Plan, finished: Mapping[str, Mapping[str, Any]]) -> None:
+def require_own_folder(root: Path, plan: RecordingPlan, finished: Mapping[str, Mapping[str, Any]]) -> None:
     """Refuse a folder that holds another recording than that of the plan.
 
     Args:
@@ -219,7 +219,7 @@ def require_own_folder(root: Path, plan: Plan, finished: Mapping[str, Mapping[st
             f"{root} holds {_count(len(foreign), 'scenario folder')} that no run of 'manyeyes simulate' for this layout "
             f"wrote, the first is {foreign[0]}. {_UNCHANGED}"
         )
-    other = [place for place, asked in finished.items() if plan.asked.get(place) != asked]
+    other = [place for place, asked in finished.items() if plan.requested_specs.get(place) != asked]
     there = "of a run without a manifest" if content is None else _described(content)
     if same_run and not other:
         if content is None or content.get("asked", wanted["asked"]) == wanted["asked"]:
@@ -233,16 +233,16 @@ def require_own_folder(root: Path, plan: Plan, finished: Mapping[str, Mapping[st
     )
 
 
-def _foreign_scenarios(root: Path, plan: Plan, finished: Mapping[str, Any]) -> list[Path]:
+def _foreign_scenarios(root: Path, plan: RecordingPlan, finished: Mapping[str, Any]) -> list[Path]:
     """Folders with frames that no finished scenario of the layout accounts for; unfinished ones end in PARTIAL."""
     folders = [root, *_folders(root), *(inner for folder in _folders(root) for inner in _folders(folder))]
     own = {(root / place).parent for place in finished} if plan.layout == "OPV2V" else set()
-    foreign = [f for f in folders if f not in own and (holds_frames(f) or (f / SCENARIO).is_file())]
+    foreign = [f for f in folders if f not in own and (has_frames(f) or (f / SCENARIO).is_file())]
     if plan.layout == "OPV2V":
-        taken = [(root / place).parent for place in plan.asked]
+        taken = [(root / place).parent for place in plan.requested_specs]
         foreign += [f for f in taken if f not in own and f not in foreign and f.is_dir() and any(f.iterdir())]
     begun = finished or (root / UNFINISHED_MANIFEST).is_file() or (root / MANIFEST).is_file()
-    dair = dair_root(root)
+    dair = find_dair_root(root)
     if dair is not None and not (plan.layout == "DAIR-V2X" and dair == root and begun):
         foreign.append(dair)
     return foreign
@@ -259,13 +259,13 @@ def _described(content: Mapping[str, Any]) -> str:
     return f"of {settings} in the layout of {content['format']}"
 
 
-def _difference(place: str, finished: Mapping[str, Mapping[str, Any]], plan: Plan) -> str:
+def _difference(place: str, finished: Mapping[str, Mapping[str, Any]], plan: RecordingPlan) -> str:
     """What of a finished scenario is not that of the plan."""
-    if place not in plan.asked:
-        only = next((other for other in plan.asked if other not in finished), "")
+    if place not in plan.requested_specs:
+        only = next((other for other in plan.requested_specs if other not in finished), "")
         instead = f", which has {_shown(only)}" if only else ""
         return f"{_shown(place)} is not one of this run{instead}; do both runs find the roads of the same towns?"
-    there, wanted = _flat(finished[place]), _flat(plan.asked[place])
+    there, wanted = _flat(finished[place]), _flat(plan.requested_specs[place])
     name = next(name for name in {**there, **wanted} if there.get(name) != wanted.get(name))
     return f"{_shown(place)} has {name} {there.get(name)!r} instead of {wanted.get(name)!r}"
 
@@ -322,8 +322,8 @@ def _removable(root: Path, place: str) -> Path:
 
 
 def run_jobs(
-    work: Callable[[JobT, Path], Entry], jobs: Sequence[JobT], root: Path, workers: int
-) -> Iterator[tuple[JobT, Entry]]:
+    work: Callable[[JobT, Path], ManifestEntry], jobs: Sequence[JobT], root: Path, workers: int
+) -> Iterator[tuple[JobT, ManifestEntry]]:
     """Finished jobs, in whatever order; work is a function of its module, for it is sent to other processes."""
     if workers == 1:
         for job in jobs:
@@ -331,7 +331,7 @@ def run_jobs(
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, max(1, len(jobs))), context, _start_worker) as pool:
-        running: dict[Future[Entry], JobT] = {pool.submit(work, job, root): job for job in jobs}
+        running: dict[Future[ManifestEntry], JobT] = {pool.submit(work, job, root): job for job in jobs}
         try:
             while running:
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -351,18 +351,18 @@ def _network(town: str, towns: str | None) -> RoadNetwork:
     return load_town(town, towns)
 
 
-def record_scenario(job: Job, root: Path) -> Entry:
+def record_scenario(job: Job, root: Path) -> ManifestEntry:
     """Write one scenario; a folder without the suffix .partial is whole."""
     folder = root / job.split / job.spec.name
     partial = folder.with_name(f"{folder.name}{PARTIAL}")
     if partial.exists():
         shutil.rmtree(partial)
-    scenario = first_scene(job.spec, job.towns)
+    scenario = make_first_scenario(job.spec, job.towns)
     points = _write(scenario, partial)
-    files = scenario_files(partial)
+    files = list_scenario_files(partial)
     digests = digest_files(files, partial)
     agents = (*scenario.agents, *((-1,) if scenario.roadside is not None else ()))
-    entry = Entry(
+    entry = ManifestEntry(
         split=job.split,
         name=job.spec.name,
         town=job.spec.town,
@@ -371,19 +371,19 @@ def record_scenario(job: Job, root: Path) -> Entry:
         frames=len(scenario),
         history_frames=job.spec.lead_frames + job.spec.history_frames,
         vehicles=len(scenario.states[0].id),
-        moving=round(scenario.moving_share, 4),
+        moving=round(scenario.moving_fraction, 4),
         points=points,
         returns=points // (len(agents) * len(scenario)),
         files=len(files),
         bytes=sum(p.stat().st_size for p in files),
-        sha256=total_digest(digests),
+        sha256=compute_total_digest(digests),
     )
     write_json(partial / SCENARIO, {"spec": asdict(job.spec), "entry": asdict(entry), "files": digests})
     partial.rename(folder)
     return entry
 
 
-def first_scene(spec: ScenarioSpec, towns: str | None, roadside: bool = False) -> Scenario:
+def make_first_scenario(spec: ScenarioSpec, towns: str | None, roadside: bool = False) -> SimulatedScenario:
     """The scenario of the first of the seeds s, s + 1, … whose traffic offers one; roadside: with a unit on a pole."""
     network = _network(spec.town, towns)
     reason = ""
@@ -399,7 +399,7 @@ def first_scene(spec: ScenarioSpec, towns: str | None, roadside: bool = False) -
     raise NoSceneError(f"{spec.name}: none of {_ATTEMPTS} seeds gives a scene in {spec.town}; last: {reason}")
 
 
-def _write(scenario: Scenario, folder: Path) -> int:
+def _write(scenario: SimulatedScenario, folder: Path) -> int:
     """All frames and the protocol; the number of points."""
     spec, points = scenario.spec, 0
     writer = Opv2vWriter(folder, _STEP_S)
@@ -425,15 +425,15 @@ def read_finished(path: Path) -> dict[str, Any]:
     """The content of scenario.json, its specification with the defaults of fields that an older version did not have."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        entry_of(content)
+        parse_entry(content)
         return {**content, "spec": _plain(asdict(ScenarioSpec(**content["spec"])))}
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{path}: expected what a recording run writes; {error}: remove the folder.") from error
 
 
-def entry_of(content: Mapping[str, Any]) -> Entry:
+def parse_entry(content: Mapping[str, Any]) -> ManifestEntry:
     """The entry of a finished scenario."""
-    return Entry(**{**content["entry"], "agents": tuple(content["entry"]["agents"])})
+    return ManifestEntry(**{**content["entry"], "agents": tuple(content["entry"]["agents"])})
 
 
 def _check(path: Path) -> list[FileProblem]:
@@ -441,7 +441,7 @@ def _check(path: Path) -> list[FileProblem]:
     digests, folder = Digests.read(path), path.parent
     if digests is None:
         return [FileProblem(path, "mismatched", folder.name, "it has no digests")]
-    return digests.check(folder, f"{folder.parent.name}/{folder.name}", scenario_files(folder))
+    return digests.check(folder, f"{folder.parent.name}/{folder.name}", list_scenario_files(folder))
 
 
 def _plain(content: Any) -> Any:
@@ -449,7 +449,7 @@ def _plain(content: Any) -> Any:
     return json.loads(json.dumps(content))
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Of Python and of the packages that a recording depends on."""
     found = {"python": platform.python_version()}
     for package in ("manyeyes", "numpy", "numba", "torch", "libsumo"):

@@ -44,7 +44,7 @@ def check_study(name: str) -> None:
         raise ConfigError(f"No study is called {name!r}; known: {', '.join(STUDIES)}.")
 
 
-def study(options: Options, console: Console) -> None:
+def run_named_study(options: Options, console: Console) -> None:
     """Run the named study; cells that are kept are not made again."""
     check_study(options.study or "")
     importlib.import_module(f"manyeyes.studies.{MODULES[str(options.study)]}").run(options, console)

@@ -12,239 +12,252 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.agents.map_features import share_look
-from manyeyes.agents.map_perception import Survey, Surveyor, survey_config
-from manyeyes.agents.map_replay import MapTeam, Said
-from manyeyes.agents.map_server import Cartographer
+from manyeyes.agents.map_features import encode_map_features
+from manyeyes.agents.map_perception import MapModelPredictor, MapPredictor, get_map_share_config
+from manyeyes.agents.map_replay import MapReplay, SentRecord
+from manyeyes.agents.map_server import MapServer
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, Transform
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.datatypes.message import SeenMap
-from manyeyes.evaluation.maps.map_cells import ApRow, KindRow, judge_maps
-from manyeyes.evaluation.maps.registry import tuned
+from manyeyes.datatypes.message import LocalMap
+from manyeyes.evaluation.maps.map_cells import ApRow, KindRow, evaluate_map_rows
+from manyeyes.evaluation.maps.registry import make_tuned_settings
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.fusion.incremental import StreamConfig, drift
+from manyeyes.maps.fusion.incremental import IncrementalConfig, compute_map_fscore
 from manyeyes.studies.map_folder import MapFolder, write_vector_map
-from manyeyes.studies.town_maps import Ground
-from manyeyes.viz.map_figures import Panel, save_figure
-from manyeyes.viz.map_page import page_of, save_map_page
+from manyeyes.studies.town_maps import TownMap
+from manyeyes.viz.map_figures import MapPanel, save_figure
+from manyeyes.viz.map_page import make_page, save_map_page
 
 if TYPE_CHECKING:
-    from manyeyes.models.maps.map_model import Mapper
+    from manyeyes.models.maps.map_model import MapModel
 
 Floats = NDArray[np.float64]
 MARGIN_M = 20.0
 
 
 @dataclass(frozen=True)
-class Building:
-    """How a recording becomes a map. mapper: draws; None: the true map does, seen with the errors of a simulated crowd.
+class MapBuildConfig:
+    """How a recording becomes a map. map_model: draws; None: the true map does, seen with the errors of a simulated crowd.
 
-    survey: local or semi-global. every: agents look at every n-th frame. channel: a preset's name. pose_sigma_m: of errors added to
-    claimed positions, anew at each look; headings err in proportion, 1 degree a metre.
+    map_mode: local or semi-global. frame_stride: agents look at every n-th frame. channel: a preset's name. pose_sigma_m: of errors
+    added to claimed positions, anew at each look; headings err in proportion, 1 degree a metre.
     """
 
-    mapper: Mapper | None
-    survey: str = "local"
-    every: int = 5
+    map_model: MapModel | None
+    map_mode: str = "local"
+    frame_stride: int = 5
     channel: str = "ideal"
     pose_sigma_m: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
-        survey_config(self.survey)
-        if self.every < 1:
-            raise ConfigError(f"Agents look at every n-th frame, n of 1 or more; got {self.every}.")
+        get_map_share_config(self.map_mode)
+        if self.frame_stride < 1:
+            raise ConfigError(f"Agents look at every n-th frame, n of 1 or more; got {self.frame_stride}.")
 
 
 @dataclass(frozen=True)
-class Quality:
+class MapScores:
     """What a map is worth against the truth in view."""
 
-    true_elements: int
-    ap: tuple[ApRow, ...]
-    kinds: tuple[KindRow, ...]
+    num_true_elements: int
+    ap_rows: tuple[ApRow, ...]
+    kind_rows: tuple[KindRow, ...]
 
-    def mean_ap(self, way: str = "maptr", thresholds: str = "narrow") -> float:
+    def mean_ap(self, protocol: str = "maptr", thresholds: str = "narrow") -> float:
         """mAP over crossings and dividers."""
-        return next(row.mean for row in self.ap if (row.way, row.thresholds) == (way, thresholds))
+        return next(row.mean_ap for row in self.ap_rows if (row.protocol, row.thresholds) == (protocol, thresholds))
 
-    def f(self, kind: str) -> float:
+    def f1(self, kind: str) -> float:
         """F by length of one kind at 0.5 m."""
-        return next(row.f[1] for row in self.kinds if row.kind == kind)
+        return next(row.f1[1] for row in self.kind_rows if row.kind == kind)
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """What came of one ground. messages: with a map; bytes of them, and of looks, a message. lost: sent and never whole there.
+class MapBuildStats:
+    """What came of one ground. num_messages: with a map; bytes of them, and of looks, a message. num_lost: sent and never whole
+    there.
 
-    drift: F of published lines at 0.5 m between the map as it grew, observation by observation, and the fold over all.
-    quality, union: of the map, and of all observations as they are; None where the true map is not known. missing: files of
+    incremental_fscore: F of published lines at 0.5 m between the map as it grew, observation by observation, and the fold over all.
+    scores, union_scores: of the map, and of all observations as they are; None where the true map is not known. missing: files of
     the recording.
     """
 
     name: str
-    scenarios: int
-    messages: int
+    num_scenarios: int
+    num_messages: int
     bytes_per_message: float
-    bytes_per_look: float
-    lost: int
-    refused: int
-    observations: int
-    observed_elements: int
-    elements: int
-    published: int
-    drift: float
-    quality: Quality | None
-    union: Quality | None
+    bytes_per_frame: float
+    num_lost: int
+    num_rejected: int
+    num_observations: int
+    num_observed_elements: int
+    num_elements: int
+    num_published: int
+    incremental_fscore: float
+    scores: MapScores | None
+    union_scores: MapScores | None
     missing: MissingFiles = NONE_MISSING
 
 
 @dataclass(frozen=True, eq=False)
-class Built:
+class BuiltMap:
     """A map and what it was made of; truth: in view and cut, shown: what of the map the truth can speak about."""
 
-    ground: Ground
-    cartographer: Cartographer
-    made: VectorMap
+    town_map: TownMap
+    map_server: MapServer
+    fused: VectorMap
     truth: MapElements | None
-    shown: MapElements
+    evaluated: MapElements
     observed: MapElements
-    numbers: Numbers
+    stats: MapBuildStats
 
 
 @dataclass
-class _Log:
+class _BuildLog:
     """What was sent, and where everybody truly was: by agent's pseudonym and time, poses (3,) in the map's frame."""
 
-    said: list[Said] = field(default_factory=list)
-    true: dict[tuple[str, int], Floats] = field(default_factory=dict)
+    sent_records: list[SentRecord] = field(default_factory=list)
+    true_poses: dict[tuple[str, int], Floats] = field(default_factory=dict)
 
 
 def build_map(
-    recording: Recording, ground: Ground, building: Building, looked: Callable[[], None] = lambda: None
-) -> Built:
+    recording: Recording, town_map: TownMap, config: MapBuildConfig, on_snapshot: Callable[[], None] = lambda: None
+) -> BuiltMap:
     """The map of one ground; looked is called after each instant."""
-    cartographer = Cartographer(ground.frame, ground.origin_xy, config=StreamConfig(fuse=tuned().ours))
-    log = _Log()
-    for scenario in ground.scenarios:
-        team = _team(building, ground, scenario, cartographer, log.true)
+    map_server = MapServer(
+        town_map.frame, town_map.origin_xy, config=IncrementalConfig(fusion=make_tuned_settings().ours)
+    )
+    log = _BuildLog()
+    for scenario in town_map.scenarios:
+        player = _make_replay(config, town_map, scenario, map_server, log.true_poses)
         frames: tuple[AgentFrame, ...] = ()
-        for frames, true in _instants(recording, scenario, building):
-            for frame, pose in zip(frames, true):
-                log.true[f"{scenario}/{frame.agent_id}", frame.timestamp_ns] = pose - [*ground.origin_xy, 0.0]
-            log.said += team.step(frames)
-            looked()
-        team.finish(frames)
-    return _judged(ground, cartographer, log)
+        for frames, true_poses in _iterate_snapshots(recording, scenario, config):
+            for frame, pose in zip(frames, true_poses):
+                log.true_poses[f"{scenario}/{frame.agent_id}", frame.timestamp_ns] = pose - [*town_map.origin_xy, 0.0]
+            log.sent_records += player.step(frames)
+            on_snapshot()
+        player.finish(frames)
+    return _evaluate(town_map, map_server, log)
 
 
-def instants(recording: Recording, ground: Ground, every: int) -> int:
+def count_snapshots(recording: Recording, town_map: TownMap, frame_stride: int) -> int:
     """How many instants are looked at."""
-    return sum(len(range(0, recording.length(s), every)) for s in ground.scenarios)
+    return sum(len(range(0, recording.length(s), frame_stride)) for s in town_map.scenarios)
 
 
-def _instants(
-    recording: Recording, scenario: str, building: Building
+def _iterate_snapshots(
+    recording: Recording, scenario: str, config: MapBuildConfig
 ) -> Iterator[tuple[tuple[AgentFrame, ...], Floats]]:
     """Frames with the poses that are claimed, and where they truly are: (N, 3) world, as far as the recording knows."""
-    sigma = building.pose_sigma_m
-    noise = PoseNoise("all_agents_iid", sigma, float(np.radians(sigma)), building.seed)
-    for index in range(0, recording.length(scenario), building.every):
+    sigma = config.pose_sigma_m
+    noise = PoseNoise("all_agents_iid", sigma, float(np.radians(sigma)), config.seed)
+    for index in range(0, recording.length(scenario), config.frame_stride):
         snapshot = recording.snapshot(scenario, index)
-        claimed = Transform.stack([frame.world_from_agent for frame in snapshot.frames])
-        poses = claimed if snapshot.truth is None else snapshot.truth.world_from_agent
+        reported = Transform.stack([frame.world_from_agent for frame in snapshot.frames])
+        poses = reported if snapshot.truth is None else snapshot.truth.world_from_agent
         yaw = poses.yaw.double().numpy()
-        true = np.concatenate((poses.translation[:, :2].double().numpy(), yaw[:, None]), 1)
-        yield (noise.apply(snapshot, 0) if sigma else snapshot).frames, true
+        true_poses = np.concatenate((poses.translation[:, :2].double().numpy(), yaw[:, None]), 1)
+        yield (noise.apply(snapshot, 0) if sigma else snapshot).frames, true_poses
 
 
-def _team(
-    building: Building,
-    ground: Ground,
+def _make_replay(
+    config: MapBuildConfig,
+    town_map: TownMap,
     scenario: str,
-    cartographer: Cartographer,
-    true: Mapping[tuple[str, int], Floats],
-) -> MapTeam:
-    config, mapper = survey_config(building.survey), building.mapper
-    if mapper is None:
-        survey = _oracle(ground, scenario, building, true)
-        return MapTeam(survey, cartographer, scenario, channel=building.channel, seed=building.seed)
-    tell = partial(share_look, mapper) if config.together else None
-    survey = Surveyor(mapper, config)
-    return MapTeam(survey, cartographer, scenario, tell, mapper.fingerprint, building.channel, building.seed)
+    map_server: MapServer,
+    true_poses: Mapping[tuple[str, int], Floats],
+) -> MapReplay:
+    share_config, map_model = get_map_share_config(config.map_mode), config.map_model
+    if map_model is None:
+        map_predictor = _make_simulated_predictor(town_map, scenario, config, true_poses)
+        return MapReplay(map_predictor, map_server, scenario, channel=config.channel, seed=config.seed)
+    encode_features = partial(encode_map_features, map_model) if share_config.use_neighbours else None
+    map_predictor = MapModelPredictor(map_model, share_config)
+    return MapReplay(
+        map_predictor, map_server, scenario, encode_features, map_model.fingerprint, config.channel, config.seed
+    )
 
 
-def _oracle(ground: Ground, scenario: str, building: Building, true: Mapping[tuple[str, int], Floats]) -> Survey:
+def _make_simulated_predictor(
+    town_map: TownMap, scenario: str, config: MapBuildConfig, true_poses: Mapping[tuple[str, int], Floats]
+) -> MapPredictor:
     """Agents that draw the true map with a crowd's errors."""
     from manyeyes.simulator.fleet.config import crowd_config
-    from manyeyes.simulator.fleet.map_predictor import Eyewitness
+    from manyeyes.simulator.fleet.map_predictor import SimulatedMapPredictor
 
-    if ground.place is None:
-        raise ConfigError(f"{ground.name}: no true map is known by its name, so none can be seen; use a map model.")
-    config = survey_config(building.survey)
-    witness = Eyewitness(ground.place.truth, crowd_config(building.survey), building.seed)
+    if town_map.place is None:
+        raise ConfigError(f"{town_map.name}: no true map is known by its name, so none can be seen; use a map model.")
+    share_config = get_map_share_config(config.map_mode)
+    simulated = SimulatedMapPredictor(town_map.place.truth, crowd_config(config.map_mode), config.seed)
 
-    def survey(frame: AgentFrame, heard: Sequence[Message]) -> SeenMap:
-        who = f"{scenario}/{frame.agent_id}"
-        return witness.see(true[who, frame.timestamp_ns], config.window(frame), who, frame.timestamp_ns)
+    def predict(frame: AgentFrame, received: Sequence[Message]) -> LocalMap:
+        agent_key = f"{scenario}/{frame.agent_id}"
+        return simulated.predict(
+            true_poses[agent_key, frame.timestamp_ns], share_config.window(frame), agent_key, frame.timestamp_ns
+        )
 
-    return survey
+    return predict
 
 
-def _judged(ground: Ground, cartographer: Cartographer, log: _Log) -> Built:
-    seen, made = cartographer.observations, cartographer.fold()
-    observed = MapElements.cat([o.in_map() for o in seen])
-    published = made.published().elements
-    truth = ground.truth(seen, np.array([log.true[o.agent, o.time_ns] for o in seen])) if seen else None
-    cut = ground.cut
-    shown = published if cut is None else cut(published)
-    sent = [one for one in log.said if one.map_packets]
-    looks = [one.look_bytes for one in log.said if one.look_bytes]
-    numbers = Numbers(
-        name=ground.name,
-        scenarios=len(ground.scenarios),
-        messages=len(sent),
-        bytes_per_message=float(np.mean([one.map_bytes for one in sent])) if sent else 0.0,
-        bytes_per_look=float(np.mean(looks)) if looks else 0.0,
-        lost=len(sent) - len(seen) - len(cartographer.refused),
-        refused=len(cartographer.refused),
-        observations=len(seen),
-        observed_elements=len(observed),
-        elements=len(made),
-        published=len(published),
-        drift=drift(cartographer.map(), made),
-        quality=None if truth is None else _quality(shown, truth),
-        union=None if truth is None or cut is None else _quality(cut(observed), truth),
+def _evaluate(town_map: TownMap, map_server: MapServer, log: _BuildLog) -> BuiltMap:
+    observations, fused = map_server.observations, map_server.rebuild()
+    observed = MapElements.cat([o.elements_in_map() for o in observations])
+    published = fused.select_published().elements
+    truth = (
+        town_map.observed_truth(observations, np.array([log.true_poses[o.agent, o.time_ns] for o in observations]))
+        if observations
+        else None
     )
-    return Built(ground, cartographer, made, truth, shown, observed, numbers)
+    cut_policy = town_map.cut_policy
+    evaluated = published if cut_policy is None else cut_policy(published)
+    map_records = [record for record in log.sent_records if record.map_packets]
+    feature_bytes = [record.feature_bytes for record in log.sent_records if record.feature_bytes]
+    stats = MapBuildStats(
+        name=town_map.name,
+        num_scenarios=len(town_map.scenarios),
+        num_messages=len(map_records),
+        bytes_per_message=float(np.mean([record.map_bytes for record in map_records])) if map_records else 0.0,
+        bytes_per_frame=float(np.mean(feature_bytes)) if feature_bytes else 0.0,
+        num_lost=len(map_records) - len(observations) - len(map_server.rejected),
+        num_rejected=len(map_server.rejected),
+        num_observations=len(observations),
+        num_observed_elements=len(observed),
+        num_elements=len(fused),
+        num_published=len(published),
+        incremental_fscore=compute_map_fscore(map_server.map(), fused),
+        scores=None if truth is None else _compute_scores(evaluated, truth),
+        union_scores=None if truth is None or cut_policy is None else _compute_scores(cut_policy(observed), truth),
+    )
+    return BuiltMap(town_map, map_server, fused, truth, evaluated, observed, stats)
 
 
-def _quality(elements: MapElements, truth: MapElements) -> Quality:
-    return Quality(len(truth), *judge_maps(elements, truth))
+def _compute_scores(elements: MapElements, truth: MapElements) -> MapScores:
+    return MapScores(len(truth), *evaluate_map_rows(elements, truth))
 
 
-def write_built(built: Built, out: Path, title: str) -> None:
+def write_built_map(built: BuiltMap, out: Path, title: str) -> None:
     """The map's folder, as 'map simulate' and 'map fuse' leave one, its page and its picture."""
-    ground, seen = built.ground, built.cartographer.observations
+    town_map, observations = built.town_map, built.map_server.observations
     folder = MapFolder(out)
-    folder.write_observations(seen, ground.frame)
-    if built.truth is not None and ground.cut is not None:
-        folder.write_truth(built.truth, ground.frame, ground.cut)
-    write_vector_map(built.made, out / "map")
-    page = page_of(title, built.made, built.truth, built.observed, len(seen), built.shown)
+    folder.write_observations(observations, town_map.frame)
+    if built.truth is not None and town_map.cut_policy is not None:
+        folder.write_truth(built.truth, town_map.frame, town_map.cut_policy)
+    write_vector_map(built.fused, out / "map")
+    page = make_page(title, built.fused, built.truth, built.observed, len(observations), built.evaluated)
     save_map_page(page, out / "map.html")
-    area = _around(built.observed, built.truth)
+    area = _bounding_area(built.observed, built.truth)
     panels = [
-        Panel(f"What {len(seen)} observations say", built.observed, built.truth, area=area),
-        Panel("Fused map" + (", truth behind it" if built.truth else ""), built.shown, built.truth, area=area),
+        MapPanel(f"What {len(observations)} observations say", built.observed, built.truth, area=area),
+        MapPanel("Fused map" + (", truth behind it" if built.truth else ""), built.evaluated, built.truth, area=area),
     ]
     save_figure(panels, out / "map.png")
 
 
-def _around(observed: MapElements, truth: MapElements | None) -> tuple[float, float, float, float] | None:
+def _bounding_area(observed: MapElements, truth: MapElements | None) -> tuple[float, float, float, float] | None:
     points = np.concatenate([e.points for e in (observed, truth) if e is not None])
     if not len(points):
         return None

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from manyeyes.datatypes.map_element import MapElements
 
 
-def open_looks(data: Path, split: str | None, sensors: Sequence[str]) -> Opv2vRecording | DairRecording:
+def open_sensor_recording(data: Path, split: str | None, sensors: Sequence[str]) -> Opv2vRecording | DairRecording:
     """The recording with what these sensors took: pictures are read where a model has cameras, and must then be there."""
     from manyeyes.datatypes import ConfigError
     from manyeyes.studies.recordings import open_recording
 
     recording = open_recording(data, split, images="camera" in sensors)
-    if "camera" in sensors and not has_pictures(recording):
+    if "camera" in sensors and not has_images(recording):
         raise ConfigError(
             f"{data}: no pictures in {recording.scenarios[0]}, and the model has cameras; give a recording of 'manyeyes simulate "
             "--preset streets-pictures' (or any preset with --cameras), or a model of agents with LiDAR."
@@ -28,17 +28,17 @@ def open_looks(data: Path, split: str | None, sensors: Sequence[str]) -> Opv2vRe
     return recording
 
 
-def has_pictures(recording: Recording) -> bool:
+def has_images(recording: Recording) -> bool:
     """Whether any agent of the first snapshot has; the recording reads them."""
     return any(frame.images for frame in recording.snapshot(recording.scenarios[0], 0).frames)
 
 
-def true_maps(recording: Recording) -> dict[str, MapElements]:
+def load_true_maps(recording: Recording) -> dict[str, MapElements]:
     """The true map of every town that the recording's scenarios are named after, in its world frame; edges are the pavement's."""
-    from manyeyes.maps.roads.ground_truth import TruthPolicy, map_truth
+    from manyeyes.maps.roads.ground_truth import GroundTruthPolicy, build_ground_truth_map
     from manyeyes.simulator.scene.towns import GENERATED, TOWNS, load_town
 
-    lower = {town.lower(): town for town in TOWNS}
+    town_by_lower_name = {town.lower(): town for town in TOWNS}
     named = sorted({scenario.rsplit("_", 1)[0] for scenario in recording.scenarios})
-    towns = [name if name.startswith(GENERATED) else lower.get(name, name) for name in named]
-    return {town: map_truth(load_town(town), TruthPolicy(boundary="pavement")) for town in towns}
+    towns = [name if name.startswith(GENERATED) else town_by_lower_name.get(name, name) for name in named]
+    return {town: build_ground_truth_map(load_town(town), GroundTruthPolicy(boundary="pavement")) for town in towns}

@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from manyeyes.studies.replay_options import FileChecks, Playing
+from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 
 
 @dataclass(frozen=True)
@@ -32,27 +32,27 @@ class Options:
     """Of losses, jitter and pose errors."""
     workers: int = os.cpu_count() or 1
     """How many processes share the scenarios; results do not depend on it."""
-    timed_frames: int = 10
+    timing_frames: int = 10
     """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""
-    playing: Playing = field(default_factory=Playing)
+    replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate."""
-    every: int = 1
+    frame_stride: int = 1
     """Judge each so many-th frame of those that the recording judges."""
     study: str | None = None
     """robustness, budget, agents, ablation, system, pose, pose-accuracy, feakm or picture; what is finished is kept under --out."""
-    disturbances: tuple[str, ...] = ()
+    perturbations: tuple[str, ...] = ()
     """Those that the studies 'robustness' and 'pose' play, by the names of their tables, such as "0.4 s" "30 % lost"
     or "2°, 2 m" "0.8 m"; by default all."""
     budgets: tuple[int, ...] = ()
     """Bytes: of a message in the study 'budget', of all messages of an instant in 'system'; by default the study's own."""
-    selectors: tuple[str, ...] = ()
+    token_selection: tuple[str, ...] = ()
     """Methods that choose tokens, in the studies 'budget' and 'system'; by default intermediate, confidence, random."""
-    precisions: tuple[str, ...] = ()
+    token_encodings: tuple[str, ...] = ()
     """Ways to write tokens, in the study 'budget'; by default all."""
     correctors: tuple[str, ...] = ()
     """Who corrects claimed poses, in the studies 'pose' and 'pose-accuracy', feakm or a file of its weights among them; by
     default the study's own."""
-    branches: tuple[str, ...] = ()
+    checkpoints: tuple[str, ...] = ()
     """Weights that the study 'ablation' compares, and rival fusions of 'robustness' and 'pose', each as name=weights.safetensors;
     of 'feakm' each as name=detector.safetensors,net.safetensors."""
     checks: FileChecks = field(default_factory=FileChecks)

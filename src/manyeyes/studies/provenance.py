@@ -20,16 +20,16 @@ from typing import Any
 from manyeyes import __version__
 from manyeyes._io import atomic_write_text
 
-PACKAGES = (
+RECORDED_PACKAGES = (
     "torch", "numpy", "numba", "safetensors", "tyro", "rich", "PyYAML", "zstandard", "eclipse-sumo", "libsumo",
     "shapely", "pyarrow", "matplotlib", "pillow",
 )  # fmt: skip
 
 
-def versions() -> dict[str, str | None]:
+def installed_versions() -> dict[str, str | None]:
     """Installed versions of everything that may change a number; None for what is absent."""
     found: dict[str, str | None] = {"manyeyes": __version__, "python": platform.python_version()}
-    for name in PACKAGES:
+    for name in RECORDED_PACKAGES:
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
@@ -67,27 +67,27 @@ def cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
-def provenance(config: object, seed: int | None) -> dict[str, Any]:
+def collect_provenance(config: object, seed: int | None) -> dict[str, Any]:
     """What a reader needs to get the same numbers again. config: a dataclass or plain values."""
     return {
         "command": shlex.join(["manyeyes", *sys.argv[1:]]),
-        "config": plain(config),
+        "config": to_plain(config),
         "seed": seed,
-        "versions": versions(),
+        "versions": installed_versions(),
         "git_commit": git_commit(),
         "machine": {"system": platform.platform(), "cpu": cpu_name(), "cores": os.cpu_count()},
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
 
 
-def plain(value: object) -> Any:
+def to_plain(value: object) -> Any:
     """A value as JSON can hold it: dataclasses become objects, paths text, NaN and infinity null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): to_plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [plain(v) for v in value]
+        return [to_plain(v) for v in value]
     if isinstance(value, Enum):
         return value.name
     if isinstance(value, float):
@@ -95,13 +95,13 @@ def plain(value: object) -> Any:
     if value is None or isinstance(value, (bool, int, str)):
         return value
     if hasattr(value, "tolist"):
-        return plain(value.tolist())  # type: ignore[union-attr]
+        return to_plain(value.tolist())  # type: ignore[union-attr]
     return str(value)
 
 
 def write_json(path: Path, payload: object, config: object, seed: int | None) -> dict[str, Any]:
     """Writes ``{"provenance": …, "result": payload}``, whole or not at all, and returns the provenance."""
-    origin = provenance(config, seed)
-    text = json.dumps({"provenance": origin, "result": plain(payload)}, indent=2, ensure_ascii=False)
+    origin = collect_provenance(config, seed)
+    text = json.dumps({"provenance": origin, "result": to_plain(payload)}, indent=2, ensure_ascii=False)
     atomic_write_text(path, text + "\n")
     return origin

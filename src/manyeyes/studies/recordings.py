@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from manyeyes.datasets.dair_index import dair_root
+from manyeyes.datasets.dair_index import find_dair_root
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.missing import MissingFiles
 from manyeyes.datasets.opv2v import Opv2vRecording
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
     from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.base import Recording
-    from manyeyes.studies.replay_options import FileChecks, Playing
+    from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 
 # Half of DAIR-V2X's period: a pair's later sweep is heard, and the next pair has not begun.
-PAIRS_WAIT_S = 0.05
+PAIRS_LATENCY_BUDGET_S = 0.05
 _MAX_NOTES = 8
 
 
@@ -33,7 +33,7 @@ def open_recording(root: Path, split: str | None = None, images: bool = False) -
 
     images: with what cameras took, which is read of OPV2V's layout only.
     """
-    if dair_root(root) is None:
+    if find_dair_root(root) is None:
         return Opv2vRecording(root, split, images=images)
     if images:
         raise ConfigError(f"{root}: pictures are read in OPV2V's layout only; choose a model of agents with LiDAR.")
@@ -66,12 +66,12 @@ def check_files(
             "go on and have them counted."
         )
     mismatched = [str(problem) for problem in missing.files if problem.kind == "mismatched"]
-    for line in (*recording.problems, *mismatched[:_MAX_NOTES]):
+    for line in (*recording.missing_summary, *mismatched[:_MAX_NOTES]):
         console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
     return missing
 
 
-def cells_folder(out: Path, missing: MissingFiles) -> Path:
+def choose_results_folder(out: Path, missing: MissingFiles) -> Path:
     """The folder under out for the kept results of a study, another one for each set of missing files."""
     if not missing.count:
         return out / "cells"
@@ -79,12 +79,14 @@ def cells_folder(out: Path, missing: MissingFiles) -> Path:
     return out / f"cells-missing-{digest}"
 
 
-def played_scenarios(recording: Opv2vRecording | DairRecording, played: str, named: str | None) -> frozenset[str]:
+def select_checked_scenarios(
+    recording: Opv2vRecording | DairRecording, replayed: str, chosen_name: str | None
+) -> frozenset[str]:
     """The scenarios whose files count where one is played; those that are left out count if it was not chosen by name."""
-    return frozenset({played}) | (recording.left_out if named is None else frozenset())
+    return frozenset({replayed}) | (recording.unreadable_scenarios if chosen_name is None else frozenset())
 
 
-def suited_to(config: ReplayConfig, playing: Playing, recording: Recording) -> ReplayConfig:
+def adapt_to_dataset(config: ReplayConfig, options: ReplayOptions, recording: Recording) -> ReplayConfig:
     """The configuration with the wait and the reach that suit the recording; a wait that the user chose stays.
 
     The two sweeps of a DAIR-V2X pair are some ten milliseconds apart, either way: an ego that does not wait would never
@@ -92,4 +94,8 @@ def suited_to(config: ReplayConfig, playing: Playing, recording: Recording) -> R
     """
     if not isinstance(recording, DairRecording):
         return config
-    return replace(config, reach_m=math.inf, wait_s=config.wait_s if playing.wait_ms is not None else PAIRS_WAIT_S)
+    return replace(
+        config,
+        comm_range_m=math.inf,
+        latency_budget_s=config.latency_budget_s if options.latency_budget_ms is not None else PAIRS_LATENCY_BUDGET_S,
+    )

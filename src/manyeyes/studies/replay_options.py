@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from manyeyes.datasets.base import Recording
 
 ALL_METHODS = ("alone", "late", "intermediate", "early")
-PERIOD_MS = 100.0
-IDEAL_WAIT_MS = 0.0
+FRAME_PERIOD_MS = 100.0
+IDEAL_LATENCY_BUDGET_MS = 0.0
 
 
 @dataclass(frozen=True)
-class Playing:
+class ReplayOptions:
     """How agents collaborate while a recording is played."""
 
     weights: str = "costr-small"
@@ -28,43 +28,47 @@ class Playing:
     """What is compared: any of alone, late, intermediate, early."""
     channel: str = "ideal"
     """The air between agents: ideal, its-g5, its-g5-27, lte-v2x, nr-sidelink, cellular."""
-    wait_ms: float | None = None
+    latency_budget_ms: float | None = None
     """How long an ego waits for messages after its own sweep; by default 0 on the ideal channel, else one period, 100."""
     budget_bytes: int = 1 << 17
     """The most that a message of tokens may weigh."""
-    precision: Literal["float32", "float16", "int8", "codes"] | None = None
+    token_encoding: Literal["float32", "float16", "int8", "codes"] | None = None
     """How tokens are written: their features as numbers, or all of them as the codes of the weights' codebook; by default as
     codes where the weights have one, else as float16."""
-    requests: bool = False
+    request_maps: bool = False
     """Messages of tokens say where their sender needs no help; what came lately weighs what is sent."""
-    align: str | None = None
+    pose_correction: str | None = None
     """Correct where others say they are before fusing, by the objects that both see; leave out whom nobody can place. By whom:
     vote, feakm, a .safetensors file of FeaKM, or a rival: given, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist,
     v2x-reg-oiou, mash."""
 
-    def replay_config(self, seed: int, all_egos: bool = False) -> ReplayConfig:
+    def make_replay_config(self, seed: int, all_egos: bool = False) -> ReplayConfig:
         """The same as the player takes it; unknown names are refused here, before any work."""
-        from manyeyes.agents.pose_correction import Aligner
-        from manyeyes.agents.replay import STEADY, ReplayConfig
-        from manyeyes.agents.strategies import method
+        from manyeyes.agents.pose_correction import PoseCorrection
+        from manyeyes.agents.replay import WARMUP_FRAMES, ReplayConfig
+        from manyeyes.agents.strategies import get_strategy
         from manyeyes.comms.channel import channel_preset
 
         channel_preset(self.channel)
         if not self.methods or len(set(self.methods)) < len(self.methods):
             raise ConfigError(f"--methods takes each name once, at least one; got {' '.join(self.methods) or 'none'}.")
         for name in self.methods:
-            method(name)
-        wait_ms = (IDEAL_WAIT_MS if self.channel == "ideal" else PERIOD_MS) if self.wait_ms is None else self.wait_ms
+            get_strategy(name)
+        latency_budget_ms = (
+            (IDEAL_LATENCY_BUDGET_MS if self.channel == "ideal" else FRAME_PERIOD_MS)
+            if self.latency_budget_ms is None
+            else self.latency_budget_ms
+        )
         return ReplayConfig(
             channel=self.channel,
-            precision=self.precision,
+            token_encoding=self.token_encoding,
             budget_bytes=self.budget_bytes,
-            wait_s=wait_ms / 1e3,
+            latency_budget_s=latency_budget_ms / 1e3,
             all_egos=all_egos,
-            requests=self.requests,
-            history=STEADY,
+            send_request_map=self.request_maps,
+            warmup_frames=WARMUP_FRAMES,
             seed=seed,
-            aligner=None if self.align is None else Aligner(self.align),
+            pose_correction=None if self.pose_correction is None else PoseCorrection(self.pose_correction),
         )
 
 
@@ -83,7 +87,7 @@ class Excerpt:
 
     recording: Recording
     scenario: str
-    frames: int | None
+    max_frames: int | None
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -94,9 +98,9 @@ class Excerpt:
         """As in the recording."""
         return self.recording.length(scenario)
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         """The first of those that the recording judges."""
-        return self.recording.judged(scenario)[: self.frames]
+        return self.recording.eval_indices(scenario)[: self.max_frames]
 
     def agents(self, scenario: str) -> tuple[int, ...]:
         """As in the recording."""
@@ -107,17 +111,17 @@ class Excerpt:
         return self.recording.snapshot(scenario, index)
 
 
-def excerpt(recording: Recording, scenario: str | None, frames: int | None = None) -> Excerpt:
+def make_excerpt(recording: Recording, scenario: str | None, max_frames: int | None = None) -> Excerpt:
     """The named scenario, or the first; a name that is not there lists those that are."""
     names = recording.scenarios
     if scenario is not None and scenario not in names:
         more = f" and {len(names) - 8} more" if len(names) > 8 else ""
         raise ConfigError(f"There is no scenario {scenario!r} in the recording; it has {', '.join(names[:8])}{more}.")
-    if frames is not None and frames < 1:
-        raise ConfigError(f"--frames is at least 1; got {frames}.")
-    return Excerpt(recording, scenario or names[0], frames)
+    if max_frames is not None and max_frames < 1:
+        raise ConfigError(f"--frames is at least 1; got {max_frames}.")
+    return Excerpt(recording, scenario or names[0], max_frames)
 
 
-def weights_name(weights: str) -> str:
+def display_name(weights: str) -> str:
     """How tables call the weights: a shipped name, or the file's."""
     return Path(weights).stem if weights.endswith(".safetensors") else weights

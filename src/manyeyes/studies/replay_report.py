@@ -11,21 +11,21 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from manyeyes._io import atomic_write_text
-from manyeyes.agents.replay import ReplayConfig, Step, replay
+from manyeyes.agents.replay import ReplayConfig, ReplayStep, replay
 from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datatypes import BevGrid, ConfigError
-from manyeyes.evaluation.detection.accumulator import Tally
-from manyeyes.evaluation.detection.average_precision import Protocol, protocol_named
+from manyeyes.evaluation.detection.accumulator import MetricAccumulator
+from manyeyes.evaluation.detection.average_precision import DetectionProtocol, get_protocol
 from manyeyes.models.detector.detector import Detector
 from manyeyes.studies import provenance
 from manyeyes.studies.replay_options import Excerpt
-from manyeyes.viz.animation import save_animation, stack
-from manyeyes.viz.birds_eye import draw, save_png, scene_of
-from manyeyes.viz.pose_summary import HEADINGS, Whereabouts
-from manyeyes.viz.progress import bars
-from manyeyes.viz.report import Chapter, Picture, Report, save_report
-from manyeyes.viz.results import Outcome, outcome_of, show
-from manyeyes.viz.table import markdown
+from manyeyes.viz.animation import save_animation, stack_images
+from manyeyes.viz.birds_eye import draw_scene, make_scene, save_png
+from manyeyes.viz.pose_summary import HEADINGS, PoseCorrectionSummary
+from manyeyes.viz.progress import make_progress_bars
+from manyeyes.viz.report import Chapter, HtmlReport, ReportImage, save_report
+from manyeyes.viz.results import MethodComparison, print_comparison, summarize_comparison
+from manyeyes.viz.table import format_markdown
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -42,7 +42,7 @@ TITLES = {
 
 
 @dataclass(frozen=True)
-class Showing:
+class ReportSpec:
     """What is shown and where it goes. frame: index of the pictured instant, None: the middle one. missing: files of the drive."""
 
     out: Path
@@ -51,7 +51,7 @@ class Showing:
     methods: tuple[str, ...]
     replay: ReplayConfig
     weights: str
-    score_min: float = 0.4
+    min_score: float = 0.4
     frame: int | None = None
     animate: bool = True
     facts: tuple[tuple[str, str], ...] = ()
@@ -71,96 +71,99 @@ class _Film:
         """One method's picture; the last method's completes an instant."""
         self.pending[method] = image
         if len(self.pending) == len(self.methods):
-            self.images.append(stack([self.pending[name] for name in self.methods]))
+            self.images.append(stack_images([self.pending[name] for name in self.methods]))
             self.pending = {}
 
 
-def play(drive: Excerpt, detector: Detector, showing: Showing, console: Console) -> Report:
+def replay_and_report(drive: Excerpt, detector: Detector, spec: ReportSpec, console: Console) -> HtmlReport:
     """Play the drive and write everything under showing.out; the report as it was saved, to which chapters can be added."""
-    judged = drive.judged(drive.scenario)
-    instant = judged[len(judged) // 2] if showing.frame is None else showing.frame
-    if instant not in judged:
-        known = f"{judged.start} to {judged[-1]}"
-        raise ConfigError(f"Frame {instant} of {drive.scenario} is not judged; choose one of {known}.")
-    grid, protocol = detector.config.range, judging(detector)
-    tallies = {name: Tally(name, protocol) for name in showing.methods}
-    film = _Film(_filmed(showing.methods) if showing.animate else ())
-    kept: list[Step] = []
-    places = {name: Whereabouts() for name in showing.methods}
-    with bars(console) as progress:
-        task = progress.add_task("Playing", total=len(judged) * len(showing.methods))
-        for step in replay(drive, drive.scenario, detector, showing.methods, showing.replay):
-            tallies[step.method].add(step)
-            places[step.method].add(step.snapshot.index, step.perception.verdicts)
-            if step.snapshot.index == instant:
-                kept.append(step)
+    eval_indices = drive.eval_indices(drive.scenario)
+    pictured_index = eval_indices[len(eval_indices) // 2] if spec.frame is None else spec.frame
+    if pictured_index not in eval_indices:
+        valid_range = f"{eval_indices.start} to {eval_indices[-1]}"
+        raise ConfigError(f"Frame {pictured_index} of {drive.scenario} is not judged; choose one of {valid_range}.")
+    grid, protocol = detector.config.detection_range, make_protocol(detector)
+    metrics = {name: MetricAccumulator(name, protocol) for name in spec.methods}
+    film = _Film(_select_animated(spec.methods) if spec.animate else ())
+    pictured_steps: list[ReplayStep] = []
+    pose_summaries = {name: PoseCorrectionSummary() for name in spec.methods}
+    with make_progress_bars(console) as progress:
+        task = progress.add_task("Playing", total=len(eval_indices) * len(spec.methods))
+        for step in replay(drive, drive.scenario, detector, spec.methods, spec.replay):
+            metrics[step.method].add(step)
+            pose_summaries[step.method].add(step.snapshot.index, step.perception.corrections)
+            if step.snapshot.index == pictured_index:
+                pictured_steps.append(step)
             if step.method in film.methods:
-                film.add(step.method, _picture(step, grid, _caption_of(step), showing.score_min, FILM_WIDTH))
+                film.add(step.method, _draw_step(step, grid, _make_caption(step), spec.min_score, FILM_WIDTH))
             progress.advance(task)
-    outcome = outcome_of([tally.result() for tally in tallies.values()], protocol, showing.missing)
-    show(console, outcome, showing.title)
-    where = _where(places)
-    for chapter, found in zip(where, (p for p in places.values() if p.senders)):
-        for warning in found.warnings():
-            console.print(f"{chapter.title}: {warning}", highlight=False, soft_wrap=True)
-    pictures = _film_picture(film, showing.out) + _still_pictures(kept, outcome, grid, showing)
-    config = {"showing": showing, "detector": detector.config}
-    origin = provenance.write_json(showing.out / "results.json", outcome, config, showing.replay.seed)
-    atomic_write_text(
-        showing.out / "results.md", markdown(outcome.rows) + (f"\n{outcome.footer}\n" if outcome.footer else "")
+    comparison = summarize_comparison(
+        [accumulator.compute_result() for accumulator in metrics.values()], protocol, spec.missing
     )
-    report = Report(
-        title=showing.title,
-        lead=showing.lead,
-        rows=outcome.rows,
+    print_comparison(console, comparison, spec.title)
+    pose_chapters = _make_pose_chapters(pose_summaries)
+    for chapter, summary in zip(pose_chapters, (p for p in pose_summaries.values() if p.senders)):
+        for warning in summary.make_warnings():
+            console.print(f"{chapter.title}: {warning}", highlight=False, soft_wrap=True)
+    pictures = _save_animation(film, spec.out) + _save_pictures(pictured_steps, comparison, grid, spec)
+    config = {"showing": spec, "detector": detector.config}
+    origin = provenance.write_json(spec.out / "results.json", comparison, config, spec.replay.seed)
+    atomic_write_text(
+        spec.out / "results.md",
+        format_markdown(comparison.rows) + (f"\n{comparison.footer}\n" if comparison.footer else ""),
+    )
+    report = HtmlReport(
+        title=spec.title,
+        lead=spec.lead,
+        rows=comparison.rows,
         pictures=pictures,
-        facts=_facts(drive, detector, showing),
-        commands=showing.commands,
-        notes=(*((outcome.footer,) if outcome.footer else ()), *_notes(protocol)),
-        chapters=where,
+        facts=_make_facts(drive, detector, spec),
+        commands=spec.commands,
+        notes=(*((comparison.footer,) if comparison.footer else ()), *_make_notes(protocol)),
+        chapters=pose_chapters,
         provenance=origin,
     )
-    save_report(report, showing.out / REPORT)
+    save_report(report, spec.out / REPORT)
     return report
 
 
-def _where(places: Mapping[str, Whereabouts]) -> tuple[Chapter, ...]:
+def _make_pose_chapters(pose_summaries: Mapping[str, PoseCorrectionSummary]) -> tuple[Chapter, ...]:
     """What was found of senders' claimed poses, for each method that aligns."""
     text = (
         "Before it fuses, the ego compares where others say they are with what both detect. Claims that objects refute are "
         "replaced; messages that nobody can place are left out; a claim that moves off is named."
     )
     return tuple(
-        Chapter(f"Who is where, {name}", text, table=(HEADINGS, *found.lines()))
-        for name, found in places.items()
-        if found.senders
+        Chapter(f"Who is where, {name}", text, table=(HEADINGS, *summary.make_rows()))
+        for name, summary in pose_summaries.items()
+        if summary.senders
     )
 
 
-def judging(detector: Detector) -> Protocol:
+def make_protocol(detector: Detector) -> DetectionProtocol:
     """The project's own protocol over the range that the detector sees."""
-    grid = detector.config.range
-    return protocol_named("manyeyes").within((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
+    grid = detector.config.detection_range
+    return get_protocol("manyeyes").with_range((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
 
 
-def _filmed(methods: Sequence[str]) -> tuple[str, ...]:
+def _select_animated(methods: Sequence[str]) -> tuple[str, ...]:
     """The two methods whose difference is the point, or as many of them as were run."""
-    wanted = tuple(name for name in ("alone", "intermediate") if name in methods)
-    return wanted or tuple(methods[:1])
+    preferred = tuple(name for name in ("alone", "intermediate") if name in methods)
+    return preferred or tuple(methods[:1])
 
 
-def _picture(step: Step, grid: BevGrid, caption: str, score_min: float, width: int) -> Image:
+def _draw_step(step: ReplayStep, grid: BevGrid, caption: str, min_score: float, width: int) -> Image:
     title = TITLES.get(step.method, step.method)
-    heard = {reception.message.agent_id for reception in step.perception.heard}
-    unheard = {frame.agent_id for frame in step.snapshot.frames} - heard
-    scene = scene_of(step.snapshot, step.boxes, step.ego, unheard)
-    return draw(scene, grid, title, caption, width, score_min)
+    received_ids = {reception.message.agent_id for reception in step.perception.received}
+    missing_ids = {frame.agent_id for frame in step.snapshot.frames} - received_ids
+    view = make_scene(step.snapshot, step.boxes, step.ego, missing_ids)
+    return draw_scene(view, grid, title, caption, width, min_score)
 
 
-def _caption_of(step: Step) -> str:
+def _make_caption(step: ReplayStep) -> str:
     """What one instant cost."""
     ego = step.snapshot.frames[step.ego].agent_id
-    sent = [s.bytes for s in step.sent if s.packets and s.agent_id != ego]
+    sent = [s.num_bytes for s in step.sent if s.num_packets and s.agent_id != ego]
     moment = f"frame {step.snapshot.index}"
     if not sent:
         return f"{moment} · nothing is sent"
@@ -168,40 +171,42 @@ def _caption_of(step: Step) -> str:
     return f"{moment} · {len(sent)} messages of {sum(sent) / len(sent) / 1e3:,.1f} kB{age}"
 
 
-def _film_picture(film: _Film, out: Path) -> tuple[Picture, ...]:
+def _save_animation(film: _Film, out: Path) -> tuple[ReportImage, ...]:
     if not film.images:
         return ()
     save_animation(film.images, out / "drive.gif", FILM_FRAME_MS)
     names = ", below it ".join(TITLES.get(name, name).split(":")[0].lower() for name in film.methods)
-    return (Picture(out / "drive.gif", f"The drive at half speed: {names}.", wide=True),)
+    return (ReportImage(out / "drive.gif", f"The drive at half speed: {names}.", wide=True),)
 
 
-def _still_pictures(steps: Sequence[Step], outcome: Outcome, grid: BevGrid, showing: Showing) -> tuple[Picture, ...]:
+def _save_pictures(
+    steps: Sequence[ReplayStep], comparison: MethodComparison, grid: BevGrid, spec: ReportSpec
+) -> tuple[ReportImage, ...]:
     """One bird's-eye picture a method, of the same instant."""
-    rows = {row.method: row for row in outcome.rows}
+    rows = {row.method: row for row in comparison.rows}
     out = []
     for step in steps:
         ap = rows[step.method].ap50
-        caption = f"{_caption_of(step)} · AP@0.5 of the drive {ap.value:.3f}" if ap else _caption_of(step)
-        path = showing.out / f"{step.method}.png"
-        save_png(_picture(step, grid, caption, showing.score_min, WIDTH), path)
-        out.append(Picture(path, f"{TITLES.get(step.method, step.method)}; {caption}"))
+        caption = f"{_make_caption(step)} · AP@0.5 of the drive {ap.value:.3f}" if ap else _make_caption(step)
+        path = spec.out / f"{step.method}.png"
+        save_png(_draw_step(step, grid, caption, spec.min_score, WIDTH), path)
+        out.append(ReportImage(path, f"{TITLES.get(step.method, step.method)}; {caption}"))
     return tuple(out)
 
 
-def _facts(drive: Excerpt, detector: Detector, showing: Showing) -> tuple[tuple[str, str], ...]:
+def _make_facts(drive: Excerpt, detector: Detector, spec: ReportSpec) -> tuple[tuple[str, str], ...]:
     return (
-        *showing.facts,
+        *spec.facts,
         ("Scenario", drive.scenario),
-        ("Judged frames", str(len(drive.judged(drive.scenario)))),
+        ("Judged frames", str(len(drive.eval_indices(drive.scenario)))),
         ("Agents", str(len(drive.agents(drive.scenario)))),
-        ("Channel", showing.replay.radio.name),
-        ("The ego waits", f"{1e3 * showing.replay.wait_s:.0f} ms"),
-        ("Weights", f"{showing.weights} · {detector.fingerprint.hex()}"),
+        ("Channel", spec.replay.radio.name),
+        ("The ego waits", f"{1e3 * spec.replay.latency_budget_s:.0f} ms"),
+        ("Weights", f"{spec.weights} · {detector.fingerprint.hex()}"),
     )
 
 
-def _notes(protocol: Protocol) -> tuple[str, ...]:
+def _make_notes(protocol: DetectionProtocol) -> tuple[str, ...]:
     x0, y0, _, x1, y1, _ = protocol.gt_range
     place = f"x from {x0:g} to {x1:g} m, y from {y0:g} to {y1:g} m around the ego"
     text = (

@@ -25,7 +25,7 @@ Model = TypeVar("Model", bound=nn.Module)
 class LogLine(Protocol):
     """What a step tells: one line of the log."""
 
-    def line(self) -> dict[str, float]:
+    def to_record(self) -> dict[str, float]:
         """By name; "step" is one of them."""
         ...
 
@@ -48,14 +48,14 @@ class RunState(Generic[Model]):
         folder: Path,
         weight_decay: float,
         beta2: float = 0.999,
-        given: bool = False,
+        from_weights: bool = False,
     ) -> None:
         self.model, self.folder = model, folder
-        self.rank, self.world = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
+        self.rank, self.world_size = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
         self.average = copy.deepcopy(model).requires_grad_(False)
         self.optimiser = torch.optim.AdamW(parameter_groups(model, weight_decay), betas=(0.9, beta2))
         self.step, self.seconds = 0, 0.0
-        begun = fingerprint(model).hex() if given else ""
+        begun = fingerprint(model).hex() if from_weights else ""
         self._name = {"config": config_to_json(config), "seed": seed, "begun": begun}
         self._since = time.monotonic()
         if self.path.exists():
@@ -68,12 +68,12 @@ class RunState(Generic[Model]):
         """Where the run is kept between saves."""
         return self.folder / "last.pt"
 
-    def numbers(self, batch: int) -> range:
+    def sample_numbers(self, batch: int) -> range:
         """The samples of the coming step that this process takes, of a run's endless stream; it starts the step's clock."""
-        if batch % self.world:
-            raise ConfigError(f"A batch of {batch} samples cannot be shared by {self.world} processes evenly.")
+        if batch % self.world_size:
+            raise ConfigError(f"A batch of {batch} samples cannot be shared by {self.world_size} processes evenly.")
         self._since = time.monotonic()
-        share = batch // self.world
+        share = batch // self.world_size
         first = self.step * batch + self.rank * share
         return range(first, first + share)
 
@@ -87,43 +87,45 @@ class RunState(Generic[Model]):
         (loss * share).backward()
         return value * share
 
-    def descend(self, rate: float, clip: float, decay: float) -> None:
+    def optimiser_step(self, rate: float, clip: float, decay: float) -> None:
         """One step down the mean loss of all processes; the average follows with this decay, faster at the start."""
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        self._share()
+        self._average_gradients()
         nn.utils.clip_grad_norm_(self.model.parameters(), clip)
         self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
-        self._follow(min(decay, (1 + self.step) / (10 + self.step)))
+        self._update_average(min(decay, (1 + self.step) / (10 + self.step)))
         self.step += 1
         self.seconds += time.monotonic() - self._since
 
-    def _share(self) -> None:
+    def _average_gradients(self) -> None:
         """The mean over processes of gradients and of running statistics: one flat exchange each."""
-        if self.world == 1:
+        if self.world_size == 1:
             return
         for p in self.model.parameters():
             p.grad = torch.zeros_like(p) if p.grad is None else p.grad
-        _mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world)
-        _mean_in_place([b for b in self.model.buffers() if b.is_floating_point()], self.world)
+        _mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world_size)
+        _mean_in_place([b for b in self.model.buffers() if b.is_floating_point()], self.world_size)
 
     @torch.no_grad()
-    def _follow(self, decay: float) -> None:
+    def _update_average(self, decay: float) -> None:
         for mean, value in zip(self.average.state_dict().values(), self.model.state_dict().values()):
             if mean.is_floating_point():
                 mean.lerp_(value, 1 - decay)
             else:
                 mean.copy_(value)
 
-    def finish(self, steps: int, save_every: int, advance: Callable[[], Line], report: Callable[[Line], None]) -> None:
+    def run_to_end(
+        self, steps: int, save_every: int, advance: Callable[[], Line], report: Callable[[Line], None]
+    ) -> None:
         """Advance to the end, a line of log.jsonl and a word to report for every step, both by the first process alone."""
         while self.step < steps:
             progress = advance()
             if not self.rank:
                 self.folder.mkdir(parents=True, exist_ok=True)
                 with (self.folder / "log.jsonl").open("a") as log:
-                    log.write(json.dumps(progress.line()) + "\n")
+                    log.write(json.dumps(progress.to_record()) + "\n")
                 report(progress)
             if self.step % save_every == 0 or self.step == steps:
                 self.save()
@@ -162,9 +164,9 @@ def parameter_groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
     return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
 
 
-def warm_cosine(warm_up: int, step: int, steps: int) -> float:
+def warmup_cosine(warmup_steps: int, step: int, steps: int) -> float:
     """A share of the peak: linear growth over warm_up steps, and a cosine to zero over all."""
-    return min(1.0, (step + 1) / max(1, warm_up)) * 0.5 * (1 + math.cos(math.pi * step / steps))
+    return min(1.0, (step + 1) / max(1, warmup_steps)) * 0.5 * (1 + math.cos(math.pi * step / steps))
 
 
 def _mean_in_place(tensors: list[Tensor], world: int) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from manyeyes._io import atomic_replace
 from manyeyes.datatypes import ConfigError
-from manyeyes.viz.canvas import pillow
+from manyeyes.viz.canvas import import_pillow
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 FORMATS = {".gif": "GIF", ".webp": "WEBP"}
 
 
-def stack(images: Sequence[Image]) -> Image:
+def stack_images(images: Sequence[Image]) -> Image:
     """Several pictures of one width above each other."""
-    out = pillow().Image.new("RGB", (images[0].width, sum(i.height for i in images)), "white")
+    out = import_pillow().Image.new("RGB", (images[0].width, sum(i.height for i in images)), "white")
     top = 0
     for image in images:
         out.paste(image, (0, top))
@@ -32,7 +32,7 @@ def save_animation(images: Iterable[Image], path: Path, frame_ms: int = 200) -> 
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         raise ConfigError(f"An animation is one of {', '.join(FORMATS)}; got {path.name}.")
-    frames = _one_palette(images) if kind == "GIF" else list(images)
+    frames = _quantise_to_one_palette(images) if kind == "GIF" else list(images)
     if not frames:
         raise ConfigError(f"{path.name}: an animation needs at least one picture; got none.")
     quality = {"method": 0, "quality": 80} if kind == "WEBP" else {"optimize": False}
@@ -41,9 +41,9 @@ def save_animation(images: Iterable[Image], path: Path, frame_ms: int = 200) -> 
     return len(frames)
 
 
-def _one_palette(images: Iterable[Image]) -> list[Image]:
+def _quantise_to_one_palette(images: Iterable[Image]) -> list[Image]:
     """All pictures in the colours of the first: quick, and nothing flickers from one frame to the next."""
-    pil = pillow()
+    pil = import_pillow()
     palette, out = None, []
     for image in images:
         if palette is None:

@@ -19,7 +19,7 @@ Colour = tuple[int, int, int]
 SUPERSAMPLE = 2
 
 
-def pillow() -> Any:
+def import_pillow() -> Any:
     """The Pillow package with its drawing modules, or the error that names the extra."""
     try:
         import PIL.Image
@@ -31,16 +31,16 @@ def pillow() -> Any:
 
 
 @lru_cache(maxsize=16)
-def font(size: int) -> Any:
+def load_font(size: int) -> Any:
     """Pillow's own typeface; it has Latin letters and the middle dot, no arrows."""
-    return pillow().ImageFont.load_default(size)
+    return import_pillow().ImageFont.load_default(size)
 
 
 @dataclass(frozen=True)
-class View:
+class Viewport:
     """A window over the ground: x right, y up, in the metres of one frame, drawn width pixels wide.
 
-    top and bottom: pixels of margin above and below the window, for text.
+    top_margin and bottom_margin: pixels of margin above and below the window, for text.
     """
 
     x_min: float
@@ -48,8 +48,8 @@ class View:
     x_max: float
     y_max: float
     width: int = 1280
-    top: int = 0
-    bottom: int = 0
+    top_margin: int = 0
+    bottom_margin: int = 0
 
     @property
     def scale(self) -> float:
@@ -59,26 +59,33 @@ class View:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the whole image, pixels."""
-        return self.width, self.top + round((self.y_max - self.y_min) * self.scale) + self.bottom
+        return self.width, self.top_margin + round((self.y_max - self.y_min) * self.scale) + self.bottom_margin
 
-    def pixels(self, xy: np.ndarray) -> np.ndarray:
+    def to_pixels(self, xy: np.ndarray) -> np.ndarray:
         """Image coordinates (..., 2), column and row from the upper left corner, of points (..., 2) in metres."""
         column = (xy[..., 0] - self.x_min) * self.scale
-        row = self.top + (self.y_max - xy[..., 1]) * self.scale
+        row = self.top_margin + (self.y_max - xy[..., 1]) * self.scale
         return np.stack((column, row), -1)
 
 
-def splat(view: View, layers: Sequence[tuple[np.ndarray, np.ndarray, Colour]], background: Colour) -> np.ndarray:
+def draw_points(
+    viewport: Viewport, layers: Sequence[tuple[np.ndarray, np.ndarray, Colour]], background: Colour
+) -> np.ndarray:
     """An image (H, W, 3) uint8 of points: each layer is xy (N, 2), ink (N,) and a colour.
 
     Ink adds up in a pixel and saturates; where layers meet, their colours mix by ink.
     """
-    width, height = view.size
+    width, height = viewport.size
     total = np.zeros(width * height, np.float32)
     mixed = np.zeros((width * height, 3), np.float32)
     for xy, ink, colour in layers:
-        at = np.floor(view.pixels(xy)).astype(np.int64)
-        inside = (at[:, 0] >= 0) & (at[:, 0] < width) & (at[:, 1] >= view.top) & (at[:, 1] < height - view.bottom)
+        at = np.floor(viewport.to_pixels(xy)).astype(np.int64)
+        inside = (
+            (at[:, 0] >= 0)
+            & (at[:, 0] < width)
+            & (at[:, 1] >= viewport.top_margin)
+            & (at[:, 1] < height - viewport.bottom_margin)
+        )
         cell = at[inside, 1] * width + at[inside, 0]
         amount = np.bincount(cell, ink[inside], width * height).astype(np.float32)
         total += amount
@@ -96,7 +103,7 @@ class Pen:
     """Draws on an image at SUPERSAMPLE times its size, so that lines are smooth; coordinates are final pixels."""
 
     def __init__(self, image: np.ndarray) -> None:
-        pil = pillow()
+        pil = import_pillow()
         height, width = image.shape[:2]
         small = pil.Image.fromarray(image)
         self._big = small.resize((width * SUPERSAMPLE, height * SUPERSAMPLE), pil.Image.Resampling.NEAREST)
@@ -135,11 +142,11 @@ class Pen:
         """One line of text; anchor as in Pillow (``la``: its upper left corner). A halo keeps it legible on points."""
         place = (at[0] * SUPERSAMPLE, at[1] * SUPERSAMPLE)
         edge = {"stroke_width": SUPERSAMPLE + 1, "stroke_fill": (255, 255, 255)} if halo else {}
-        self._draw.text(place, text, fill=colour, font=font(size * SUPERSAMPLE), anchor=anchor, **edge)
+        self._draw.text(place, text, fill=colour, font=load_font(size * SUPERSAMPLE), anchor=anchor, **edge)
 
     def width(self, text: str, size: int = 13) -> float:
         """How wide a line of text will be, pixels."""
-        return self._draw.textlength(text, font=font(size * SUPERSAMPLE)) / SUPERSAMPLE
+        return self._draw.textlength(text, font=load_font(size * SUPERSAMPLE)) / SUPERSAMPLE
 
     def finish(self) -> Image:
         """The image at its final size."""

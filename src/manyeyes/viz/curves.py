@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLUMNS = 2
-_ABREAST = 40
+_MAX_UPRIGHT_LETTERS = 40
 """Letters below an axis beyond which names are written aslant."""
 _BYTES_TICKS = (1 << 9, 1 << 11, 1 << 13, 1 << 15, 1 << 17, 1 << 19)
 
@@ -32,7 +32,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Panel:
+class CurvePanel:
     """Curves on common axes. in_bytes: x is logarithmic, with its base-2 logarithm, the papers' "AB", on top.
 
     ticks: names of the places 0, 1, 2, … on the x axis, for what is no number.
@@ -46,7 +46,7 @@ class Panel:
     ticks: tuple[str, ...] = ()
 
 
-def save_curves(panels: Sequence[Panel], path: Path) -> None:
+def save_curves(panels: Sequence[CurvePanel], path: Path) -> None:
     """The panels as one PNG, whole or not at all."""
     try:
         from matplotlib.figure import Figure
@@ -59,16 +59,21 @@ def save_curves(panels: Sequence[Panel], path: Path) -> None:
     for place, panel in enumerate(panels):
         _draw(figure.add_subplot(rows, columns, place + 1), panel, labels)
     handles = {h.get_label(): h for axes in figure.axes for h in axes.get_legend_handles_labels()[0]}
-    known = [name for name in labels if name in handles]
+    shown_labels = [name for name in labels if name in handles]
     figure.legend(
-        [handles[name] for name in known], known, frameon=False, fontsize=9, loc="outside lower center", ncols=6
+        [handles[name] for name in shown_labels],
+        shown_labels,
+        frameon=False,
+        fontsize=9,
+        loc="outside lower center",
+        ncols=6,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_replace(path, durable=False) as temporary:
         figure.savefig(temporary, format="png", dpi=130)
 
 
-def _draw(axes: Axes, panel: Panel, labels: Sequence[str]) -> None:
+def _draw(axes: Axes, panel: CurvePanel, labels: Sequence[str]) -> None:
     from matplotlib.ticker import MaxNLocator
 
     for curve in panel.curves:
@@ -79,7 +84,7 @@ def _draw(axes: Axes, panel: Panel, labels: Sequence[str]) -> None:
         order = sorted(range(len(curve.x)), key=lambda i: curve.x[i])
         x, y = [curve.x[i] for i in order], [curve.y[i] for i in order]
         axes.plot(x, [v.value for v in y], color=colour, marker="o", ms=4, lw=1.6, label=curve.label)
-        if any(v.scenarios > 1 for v in y):
+        if any(v.num_scenarios > 1 for v in y):
             axes.fill_between(x, [v.low for v in y], [v.high for v in y], color=colour, alpha=0.15, lw=0)
     axes.set(xlabel=panel.xlabel, ylabel=panel.ylabel)
     axes.set_title(panel.title, fontsize=10, loc="left")
@@ -87,7 +92,9 @@ def _draw(axes: Axes, panel: Panel, labels: Sequence[str]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     if panel.ticks:
         slant = (
-            {"rotation": 25, "ha": "right", "rotation_mode": "anchor"} if sum(map(len, panel.ticks)) > _ABREAST else {}
+            {"rotation": 25, "ha": "right", "rotation_mode": "anchor"}
+            if sum(map(len, panel.ticks)) > _MAX_UPRIGHT_LETTERS
+            else {}
         )
         axes.set_xticks(range(len(panel.ticks)), panel.ticks, **slant)
     elif not panel.in_bytes and all(float(x).is_integer() for curve in panel.curves for x in curve.x):

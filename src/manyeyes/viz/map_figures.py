@@ -14,46 +14,48 @@ from numpy.typing import NDArray
 from manyeyes._io import atomic_replace
 from manyeyes.datatypes import MissingExtraError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
-from manyeyes.evaluation.maps.matching import Way, spaced
-from manyeyes.evaluation.maps.metrics import lines_of_kind
-from manyeyes.ops.nearest_line import nearest_line
+from manyeyes.evaluation.maps.matching import MatchingProtocol, resample_lines
+from manyeyes.evaluation.maps.metrics import select_lines
+from manyeyes.ops.nearest_line import find_nearest_line
 from manyeyes.viz.map_page import KIND_COLOURS
 
 Floats = NDArray[np.float64]
-ARROW_EVERY_M, ARROW_WITHIN_M = 2.0, 3.0
+ARROW_SPACING_M, MAX_ARROW_M = 2.0, 3.0
 TRUTH_COLOUR, ARROW_COLOUR = "#b9c3c8", "#d50000"
 
 
 @dataclass(frozen=True)
-class Panel:
-    """One picture of a figure. behind: drawn pale below; arrows: (K, 4) x, y, dx, dy metres."""
+class MapPanel:
+    """One picture of a figure. background: drawn pale below; arrows: (K, 4) x, y, dx, dy metres."""
 
     title: str
     elements: MapElements
-    behind: MapElements | None = None
+    background: MapElements | None = None
     arrows: Floats | None = None
     area: tuple[float, float, float, float] | None = None
 
 
-def misalignment(of: MapElements, to: MapElements) -> Floats:
+def compute_misalignment(source: MapElements, target: MapElements) -> Floats:
     """(K, 4) x, y, dx, dy: from the lines of one observation, every 2 m, to the nearest point of the other's, within 3 m."""
     arrows = []
     for kind in KINDS:
-        mine = spaced(lines_of_kind(of, kind), Way("arrows", spacing_m=ARROW_EVERY_M))
-        fine = spaced(lines_of_kind(to, kind), Way("fine", spacing_m=0.05))
-        near = nearest_line(mine.points, fine.points, fine.first, ARROW_WITHIN_M)
+        source_points = resample_lines(
+            select_lines(source, kind), MatchingProtocol("arrows", spacing_m=ARROW_SPACING_M)
+        )
+        target_points = resample_lines(select_lines(target, kind), MatchingProtocol("fine", spacing_m=0.05))
+        near = find_nearest_line(source_points.points, target_points.points, target_points.offsets, MAX_ARROW_M)
         for row in np.flatnonzero(near.line >= 0):
-            line = fine.line(int(near.line[row]))
-            step = line - mine.points[row]
-            arrows.append([*mine.points[row], *step[np.hypot(*step.T).argmin()]])
+            line = target_points.line(int(near.line[row]))
+            step = line - source_points.points[row]
+            arrows.append([*source_points.points[row], *step[np.hypot(*step.T).argmin()]])
     return np.array(arrows).reshape(-1, 4)
 
 
-def save_figure(panels: Sequence[Panel], path: Path, columns: int = 2, width_in: float = 6.0) -> None:
+def save_figure(panels: Sequence[MapPanel], path: Path, columns: int = 2, width_in: float = 6.0) -> None:
     """The panels as one PNG, whole or not at all."""
-    pyplot = _pyplot()
+    pyplot = _import_pyplot()
     rows = -(-len(panels) // columns)
-    ratio = np.mean([_ratio(panel) for panel in panels])
+    ratio = np.mean([_aspect_ratio(panel) for panel in panels])
     size = (width_in * columns, (width_in * ratio + 0.5) * rows)
     figure, axes = pyplot.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
     for axis in axes.ravel()[len(panels) :]:
@@ -68,23 +70,25 @@ def save_figure(panels: Sequence[Panel], path: Path, columns: int = 2, width_in:
     pyplot.close(figure)
 
 
-def _draw(panel: Panel, axis: Any) -> None:
+def _draw(panel: MapPanel, axis: Any) -> None:
     axis.set_title(panel.title, fontsize=11, loc="left")
     axis.set_aspect("equal")
     axis.set_xticks([])
     axis.set_yticks([])
     for spine in axis.spines.values():
         spine.set_color("#e3e8eb")
-    if panel.behind is not None:
-        for row in range(len(panel.behind)):
-            axis.plot(*_closed(panel.behind, row).T, color=TRUTH_COLOUR, lw=3.0, solid_capstyle="round", zorder=1)
+    if panel.background is not None:
+        for row in range(len(panel.background)):
+            axis.plot(
+                *_close_rings(panel.background, row).T, color=TRUTH_COLOUR, lw=3.0, solid_capstyle="round", zorder=1
+            )
     for row in range(len(panel.elements)):
         colour = KIND_COLOURS[KINDS[int(panel.elements.kind[row])]]
-        axis.plot(*_closed(panel.elements, row).T, color=colour, lw=1.2, solid_capstyle="round", zorder=2)
+        axis.plot(*_close_rings(panel.elements, row).T, color=colour, lw=1.2, solid_capstyle="round", zorder=2)
     if panel.arrows is not None and len(panel.arrows):
         x, y, dx, dy = panel.arrows.T
         axis.quiver(x, y, dx, dy, angles="xy", scale_units="xy", scale=1.0, width=0.003, color=ARROW_COLOUR, zorder=3)
-    x0, y0, x1, y1 = _area(panel)
+    x0, y0, x1, y1 = _get_area(panel)
     axis.set_xlim(x0, x1)
     axis.set_ylim(y0, y1)
     bar = 10.0 ** np.floor(np.log10(max(x1 - x0, 1e-3) / 3))
@@ -92,28 +96,28 @@ def _draw(panel: Panel, axis: Any) -> None:
     axis.annotate(f"{bar:g} m", (x0 + 0.03 * (x1 - x0), y0 + 0.045 * (y1 - y0)), fontsize=8, color="#263238")
 
 
-def _closed(elements: MapElements, row: int) -> Floats:
+def _close_rings(elements: MapElements, row: int) -> Floats:
     points = elements.polyline(row)
     return np.vstack((points, points[:1])) if elements.kind[row] == CROSSING else points
 
 
-def _area(panel: Panel) -> tuple[float, float, float, float]:
+def _get_area(panel: MapPanel) -> tuple[float, float, float, float]:
     """The panel's area, or everything in it with a margin."""
     if panel.area is not None:
         return panel.area
-    held = [e.points for e in (panel.elements, panel.behind) if e is not None and len(e.points)]
-    points = np.concatenate(held) if held else np.array([[-10.0, -10.0], [10.0, 10.0]])
+    point_sets = [e.points for e in (panel.elements, panel.background) if e is not None and len(e.points)]
+    points = np.concatenate(point_sets) if point_sets else np.array([[-10.0, -10.0], [10.0, 10.0]])
     low, high = points.min(0), points.max(0)
     margin = 0.03 * float((high - low).max()) + 1.0
     return float(low[0]) - margin, float(low[1]) - margin, float(high[0]) + margin, float(high[1]) + margin
 
 
-def _ratio(panel: Panel) -> float:
-    x0, y0, x1, y1 = _area(panel)
+def _aspect_ratio(panel: MapPanel) -> float:
+    x0, y0, x1, y1 = _get_area(panel)
     return min(2.0, max(0.3, (y1 - y0) / (x1 - x0)))
 
 
-def _pyplot() -> Any:
+def _import_pyplot() -> Any:
     try:
         import matplotlib
     except ImportError as error:

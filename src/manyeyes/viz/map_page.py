@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from manyeyes._io import atomic_write_text
 from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.evaluation.maps.change_summary import MapChange
-from manyeyes.evaluation.maps.map_discrepancy import Disagreement, disagreement
+from manyeyes.evaluation.maps.map_discrepancy import MapDiscrepancy, find_discrepancies
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 
@@ -30,7 +30,7 @@ _DEGREES = 7
 
 KIND_COLOURS = {"divider": "#e07b00", "boundary": "#2e7d32", "crossing": "#1565c0", "stop_line": "#8e24aa"}
 CONFIDENCE_STOPS = ((0.0, "#d7301f"), (0.5, "#fdae61"), (0.8, "#41b6c4"), (1.0, "#0c2c84"))
-DISAGREEMENT_COLOURS = {"invented": "#d50000", "missed": "#ff6fae", "unexplained": "#9e9d24"}
+DISCREPANCY_COLOURS = {"invented": "#d50000", "missed": "#ff6fae", "unexplained": "#9e9d24"}
 LAYERS = {"truth": "Truth", "observed": "Observations", "fused": "Fused map", "disagreement": "Disagreement"}
 CHANGE_NAMES = (
     ("truth", "Old map"),
@@ -45,8 +45,8 @@ CHANGE_NAMES = (
 class MapPage:
     """What the page shows; elements in the map's metric frame, whose origin lies at (latitude, longitude) degrees.
 
-    about: one line of text a fused element, shown when it is clicked. facts: (name, value) pairs under the title. names: other
-    words for layers and disagreements, as (the page's own, the shown) pairs.
+    descriptions: one line of text a fused element, shown when it is clicked. facts: (name, value) pairs under the title. names:
+    other words for layers and disagreements, as (the page's own, the shown) pairs.
     """
 
     title: str
@@ -54,50 +54,50 @@ class MapPage:
     origin: tuple[float, float]
     truth: MapElements | None = None
     observed: MapElements | None = None
-    disagreement: Disagreement = Disagreement()
-    about: Sequence[str] = ()
+    discrepancy: MapDiscrepancy = MapDiscrepancy()
+    descriptions: Sequence[str] = ()
     facts: Sequence[tuple[str, str]] = ()
     names: Sequence[tuple[str, str]] = ()
 
 
-def page_of(
+def make_page(
     title: str,
-    made: VectorMap,
+    vector_map: VectorMap,
     truth: MapElements | None,
     observed: MapElements | None,
-    observations: int,
-    judged: MapElements | None = None,
+    num_observations: int,
+    evaluated: MapElements | None = None,
 ) -> MapPage:
-    """The page of what a map publishes. judged: what of it the truth can speak about, where that is not all."""
-    shown = made.published()
-    elements = shown.elements
-    facts = [("Elements", str(len(shown))), ("Length", f"{elements.lengths().sum() / 1000:.2f} km")]
-    facts += [("Observations", str(observations))] if observations else []
-    about = [
-        f"{KINDS[int(elements.kind[k])].replace('_', ' ')}, confidence {elements.score[k]:.2f}, {int(shown.supporters[k])} "
-        f"observations by {int(shown.agents[k])} agents, id {shown.id[k].tobytes().hex()[:12]}"
-        for k in range(len(shown))
+    """The page of what a map publishes. evaluated: what of it the truth can speak about, where that is not all."""
+    published = vector_map.select_published()
+    elements = published.elements
+    facts = [("Elements", str(len(published))), ("Length", f"{elements.lengths().sum() / 1000:.2f} km")]
+    facts += [("Observations", str(num_observations))] if num_observations else []
+    descriptions = [
+        f"{KINDS[int(elements.kind[k])].replace('_', ' ')}, confidence {elements.score[k]:.2f}, {int(published.supporters[k])} "
+        f"observations by {int(published.agents[k])} agents, id {published.id[k].tobytes().hex()[:12]}"
+        for k in range(len(published))
     ]
-    origin = (made.frame.latitude, made.frame.longitude)
-    odd = disagreement(elements, truth, observed)
-    if judged is not None and truth is not None:
-        odd = replace(odd, invented=disagreement(judged, truth).invented)
-    return MapPage(title, elements, origin, truth, observed, odd, about, facts)
+    origin = (vector_map.frame.latitude, vector_map.frame.longitude)
+    discrepancy = find_discrepancies(elements, truth, observed)
+    if evaluated is not None and truth is not None:
+        discrepancy = replace(discrepancy, false_positives=find_discrepancies(evaluated, truth).false_positives)
+    return MapPage(title, elements, origin, truth, observed, discrepancy, descriptions, facts)
 
 
-def page_of_change(title: str, old: VectorMap, new: VectorMap, change: MapChange) -> MapPage:
+def make_change_page(title: str, old: VectorMap, new: VectorMap, change: MapChange) -> MapPage:
     """The page of a difference: the new map, the old one as its background, what is new and what is gone."""
-    page = page_of(title, new, old.published().elements, None, 0)
+    page = make_page(title, new, old.select_published().elements, None, 0)
     facts = [
-        (c.kind.replace("_", " "), f"+{c.new_m:.0f} m, -{c.gone_m:.0f} m")
+        (c.kind.replace("_", " "), f"+{c.added_length_m:.0f} m, -{c.removed_length_m:.0f} m")
         for c in change.kinds
-        if c.new_m + c.gone_m > 0
+        if c.added_length_m + c.removed_length_m > 0
     ]
-    odd = Disagreement(invented=change.new, missed=change.gone)
-    return replace(page, disagreement=odd, facts=facts, names=CHANGE_NAMES)
+    discrepancy = MapDiscrepancy(false_positives=change.added, false_negatives=change.removed)
+    return replace(page, discrepancy=discrepancy, facts=facts, names=CHANGE_NAMES)
 
 
-def lonlat(points: Floats, origin: tuple[float, float]) -> Floats:
+def to_lonlat(points: Floats, origin: tuple[float, float]) -> Floats:
     """(N, 2) longitude and latitude in degrees of metres east and north of an origin (latitude, longitude)."""
     return degrees_from_metres(points, origin)[:, ::-1]
 
@@ -107,8 +107,8 @@ def render(page: MapPage) -> str:
     layers = {
         "truth": _features(page.truth, page.origin),
         "observed": _features(page.observed, page.origin),
-        "fused": _features(page.fused, page.origin, page.about),
-        "disagreement": _pieces(page.disagreement, page.origin),
+        "fused": _features(page.fused, page.origin, page.descriptions),
+        "disagreement": _pieces(page.discrepancy, page.origin),
     }
     names = dict(page.names)
     data = {
@@ -116,7 +116,7 @@ def render(page: MapPage) -> str:
         "bounds": _bounds(page),
         "kinds": KIND_COLOURS,
         "confidence": CONFIDENCE_STOPS,
-        "disagreement": DISAGREEMENT_COLOURS,
+        "disagreement": DISCREPANCY_COLOURS,
         "titles": {name: names.get(name, title) for name, title in LAYERS.items()},
     }
     facts = "".join(f"<li><b>{_text(n)}</b>{_text(v)}</li>" for n, v in page.facts)
@@ -125,12 +125,12 @@ def render(page: MapPage) -> str:
             '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">',
             f"<title>{_text(page.title)}</title>",
-            f"<style>{_file('vendor/maplibre-gl.css')}</style><style>{_file('web/map_page.css')}</style></head><body>",
+            f"<style>{_read_asset('vendor/maplibre-gl.css')}</style><style>{_read_asset('web/map_page.css')}</style></head><body>",
             f'<div id="map"></div><div id="panel"><h1>{_text(page.title)}</h1><ul class="facts">{facts}</ul>',
             f'<div id="layers"></div>{_legend(names)}</div>',
-            f'<script type="application/json" id="data">{_json(data)}</script>',
-            f"<script>{_file('vendor/maplibre-gl.js')}</script>",
-            f"<script>{_file('web/map_page.js')}</script></body></html>\n",
+            f'<script type="application/json" id="data">{_to_safe_json(data)}</script>',
+            f"<script>{_read_asset('vendor/maplibre-gl.js')}</script>",
+            f"<script>{_read_asset('web/map_page.js')}</script></body></html>\n",
         )
     )
 
@@ -140,7 +140,9 @@ def save_map_page(page: MapPage, path: Path) -> None:
     atomic_write_text(path, render(page))
 
 
-def _features(elements: MapElements | None, origin: tuple[float, float], about: Sequence[str] = ()) -> dict[str, Any]:
+def _features(
+    elements: MapElements | None, origin: tuple[float, float], descriptions: Sequence[str] = ()
+) -> dict[str, Any]:
     """GeoJSON of elements: rings closed as lines, so that one style draws them all."""
     features = []
     for row in range(0 if elements is None else len(elements)):
@@ -149,23 +151,23 @@ def _features(elements: MapElements | None, origin: tuple[float, float], about: 
         points = np.asarray(elements.polyline(row))
         points = np.vstack((points, points[:1])) if kind == "crossing" else points
         properties = {"kind": kind, "score": round(float(elements.score[row]), 3)}
-        if row < len(about):
-            properties["about"] = about[row]
+        if row < len(descriptions):
+            properties["about"] = descriptions[row]
         features.append(_feature(points, origin, properties))
     return {"type": "FeatureCollection", "features": features}
 
 
-def _pieces(disagreement: Disagreement, origin: tuple[float, float]) -> dict[str, Any]:
+def _pieces(discrepancy: MapDiscrepancy, origin: tuple[float, float]) -> dict[str, Any]:
     features = [
-        _feature(piece, origin, {"what": what})
-        for what in DISAGREEMENT_COLOURS
-        for piece in getattr(disagreement, what)
+        _feature(piece, origin, {"what": category})
+        for category in DISCREPANCY_COLOURS
+        for piece in getattr(discrepancy, category)
     ]
     return {"type": "FeatureCollection", "features": features}
 
 
 def _feature(points: Floats, origin: tuple[float, float], properties: dict[str, Any]) -> dict[str, Any]:
-    line = np.round(lonlat(points, origin), _DEGREES).tolist()
+    line = np.round(to_lonlat(points, origin), _DEGREES).tolist()
     return {"type": "Feature", "properties": properties, "geometry": {"type": "LineString", "coordinates": line}}
 
 
@@ -173,7 +175,7 @@ def _bounds(page: MapPage) -> list[list[float]]:
     """South-west and north-east corner of what is fused and true, or of a hundred metres where nothing is."""
     known = [e.points for e in (page.fused, page.truth) if e is not None and len(e.points)]
     points = np.concatenate(known) if known else np.array([[-50.0, -50.0], [50.0, 50.0]])
-    return lonlat(np.stack((points.min(0), points.max(0))), page.origin).tolist()
+    return to_lonlat(np.stack((points.min(0), points.max(0))), page.origin).tolist()
 
 
 def _legend(names: dict[str, str]) -> str:
@@ -181,24 +183,24 @@ def _legend(names: dict[str, str]) -> str:
     kinds = "".join(
         f'<span><i style="background:{c}"></i>{k.replace("_", " ")}</span>' for k, c in KIND_COLOURS.items()
     )
-    odd = "".join(
-        f'<span><i style="background:{c}"></i>{names.get(k, k)}</span>' for k, c in DISAGREEMENT_COLOURS.items()
+    discrepancy_items = "".join(
+        f'<span><i style="background:{c}"></i>{names.get(k, k)}</span>' for k, c in DISCREPANCY_COLOURS.items()
     )
     return (
         f'<div class="legend"><b>Confidence of fused elements</b><div class="bar" style="background:linear-gradient(90deg, '
         f'{stops})"></div><div class="ends"><span>0</span><span>1</span></div><b>Truth and observations</b>'
-        f"<div>{kinds}</div><b>Disagreement</b><div>{odd}</div></div>"
+        f"<div>{kinds}</div><b>Disagreement</b><div>{discrepancy_items}</div></div>"
     )
 
 
-def _file(name: str) -> str:
+def _read_asset(name: str) -> str:
     """A file beside this one, without MapLibre's comment that points to a source map."""
     text = (resources.files("manyeyes.viz") / name).read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if not line.startswith("//# sourceMappingURL=")]
     return "\n".join(lines).replace("</script", "<\\/script")
 
 
-def _json(value: object) -> str:
+def _to_safe_json(value: object) -> str:
     """JSON that cannot end the script element that holds it."""
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 

@@ -9,73 +9,88 @@ from collections.abc import Sequence
 from rich import box
 from rich.table import Table
 
-from manyeyes.evaluation.maps.adversarial import Malice
+from manyeyes.evaluation.maps.adversarial import AdversarialResult
 from manyeyes.evaluation.maps.change_summary import KindChange
 from manyeyes.evaluation.maps.map_cells import ApRow, KindRow
-from manyeyes.evaluation.maps.study import Line, Verdict
-from manyeyes.viz.table import markdown_lines
+from manyeyes.evaluation.maps.study import MethodSummary, StudyMarginTest
+from manyeyes.viz.table import format_markdown_lines
 
 HEADINGS = (
     "method", "AP ped", "AP div", "mAP exact", "mAP maptr", "mAP smn, wide", "F@0.5 div", "dup", "frag", "lat m", "end m", "s",
 )  # fmt: skip
-VERDICT_HEADINGS = ("bar", "rival", "value", "95 % interval", "at least", "verdict")
+MARGIN_HEADINGS = ("bar", "rival", "value", "95 % interval", "at least", "verdict")
 
 
-def kinds_terminal(ap: Sequence[ApRow], kinds: Sequence[KindRow], title: str) -> Table:
+def make_kinds_table(ap: Sequence[ApRow], kinds: Sequence[KindRow], title: str) -> Table:
     """One map: a row a kind that is predicted or true."""
-    table = _table(
+    table = _make_table(
         title, ("kind", "AP exact", "AP maptr", "AP smn", "F .3", "F .5", "F 1", "dup", "frag", "lat m", "n")
     )
-    by_way = {row.way: row for row in ap if row.thresholds == "narrow"}
+    by_protocol = {row.protocol: row for row in ap if row.thresholds == "narrow"}
     for k in kinds:
         if k.n_predicted or k.n_truth:
-            aps = [_number(getattr(by_way[way], k.kind)) for way in ("exact", "maptr", "streammapnet")]
-            rest = [_number(k.duplication, 2), _number(k.fragmentation, 2), _number(k.lateral_median_m, 2)]
-            table.add_row(k.kind, *aps, *(_number(f) for f in k.f), *rest, f"{k.n_predicted}/{k.n_truth}")
-    table.add_row("mAP", *(_number(by_way[way].mean) for way in ("exact", "maptr", "streammapnet")), *[""] * 7)
+            aps = [
+                _format_number(getattr(by_protocol[protocol], k.kind))
+                for protocol in ("exact", "maptr", "streammapnet")
+            ]
+            rest = [
+                _format_number(k.duplication, 2),
+                _format_number(k.fragmentation, 2),
+                _format_number(k.lateral_median_m, 2),
+            ]
+            table.add_row(k.kind, *aps, *(_format_number(f) for f in k.f1), *rest, f"{k.n_predicted}/{k.n_truth}")
+    table.add_row(
+        "mAP",
+        *(_format_number(by_protocol[protocol].mean_ap) for protocol in ("exact", "maptr", "streammapnet")),
+        *[""] * 7,
+    )
     return table
 
 
-def change_terminal(changes: Sequence[KindChange], title: str) -> Table:
+def make_change_table(changes: Sequence[KindChange], title: str) -> Table:
     """What changed, a row a kind that changed or stayed."""
-    table = _table(title, ("kind", "kept", "changed", "added", "removed", "new m", "gone m"))
+    table = _make_table(title, ("kind", "kept", "changed", "added", "removed", "new m", "gone m"))
     for c in changes:
-        counts = (c.kept, c.changed, c.added, c.removed)
+        counts = (c.num_unchanged, c.num_changed, c.num_added, c.num_removed)
         if any(counts):
-            table.add_row(c.kind, *map(str, counts), f"{c.new_m:.0f}", f"{c.gone_m:.0f}")
+            table.add_row(c.kind, *map(str, counts), f"{c.added_length_m:.0f}", f"{c.removed_length_m:.0f}")
     return table
 
 
-def study_terminal(lines: Sequence[Line], group: str) -> Table:
+def make_study_table(summaries: Sequence[MethodSummary], group: str) -> Table:
     """One group of a study."""
-    table = _table(group, HEADINGS)
-    for line in lines:
-        if line.group == group:
-            table.add_row(*_cells(line))
+    table = _make_table(group, HEADINGS)
+    for summary in summaries:
+        if summary.group == group:
+            table.add_row(*_summary_cells(summary))
     return table
 
 
-def verdicts_terminal(verdicts: Sequence[Verdict]) -> Table:
+def make_margin_table(margin_tests: Sequence[StudyMarginTest]) -> Table:
     """The bars."""
-    table = _table("Bars", ("group", *VERDICT_HEADINGS))
-    for verdict in verdicts:
-        table.add_row(verdict.group, *_verdict(verdict))
+    table = _make_table("Bars", ("group", *MARGIN_HEADINGS))
+    for margin_test in margin_tests:
+        table.add_row(margin_test.group, *_margin_cells(margin_test))
     return table
 
 
-def study_markdown(title: str, lines: Sequence[Line], verdicts: Sequence[Verdict]) -> str:
+def format_study(title: str, summaries: Sequence[MethodSummary], margin_tests: Sequence[StudyMarginTest]) -> str:
     """A study as a document."""
     out = [f"# {title}", ""]
-    for group in dict.fromkeys(line.group for line in lines):
-        own = [line for line in lines if line.group == group]
-        out += [f"## {group}, {own[0].cells} cells", "", markdown_lines([HEADINGS, *map(_cells, own)])]
-        bars = [v for v in verdicts if v.group == group]
-        if bars:
-            out += [markdown_lines([VERDICT_HEADINGS, *map(_verdict, bars)])]
+    for group in dict.fromkeys(summary.group for summary in summaries):
+        group_summaries = [summary for summary in summaries if summary.group == group]
+        out += [
+            f"## {group}, {group_summaries[0].num_results} cells",
+            "",
+            format_markdown_lines([HEADINGS, *map(_summary_cells, group_summaries)]),
+        ]
+        group_tests = [test for test in margin_tests if test.group == group]
+        if group_tests:
+            out += [format_markdown_lines([MARGIN_HEADINGS, *map(_margin_cells, group_tests)])]
     return "\n".join(out)
 
 
-MALICE_HEADINGS = (
+ADVERSARIAL_HEADINGS = (
     "place",
     "seed",
     "liars",
@@ -89,52 +104,72 @@ MALICE_HEADINGS = (
 )
 
 
-def malice_terminal(found: Sequence[Malice]) -> Table:
+def make_adversarial_table(results: Sequence[AdversarialResult]) -> Table:
     """What liars moved."""
-    table = _table("Stations that five or more agents saw, with liars against without", MALICE_HEADINGS)
-    for trial in found:
-        table.add_row(*_malice(trial))
+    table = _make_table("Stations that five or more agents saw, with liars against without", ADVERSARIAL_HEADINGS)
+    for result in results:
+        table.add_row(*_adversarial_cells(result))
     return table
 
 
-def malice_markdown(found: Sequence[Malice]) -> str:
+def format_adversarial(results: Sequence[AdversarialResult]) -> str:
     """The same as a document."""
-    return "# Malicious agents\n\n" + markdown_lines([MALICE_HEADINGS, *map(_malice, found)])
+    return "# Malicious agents\n\n" + format_markdown_lines([ADVERSARIAL_HEADINGS, *map(_adversarial_cells, results)])
 
 
-def _malice(m: Malice) -> tuple[str, ...]:
-    counts = (str(m.stations), str(m.moved), str(m.lost), str(m.by_truth))
-    liars = f"{m.malicious} of {m.observations}, {m.manner}"
-    return m.place, str(m.seed), liars, f"{m.offset_m:g}", *counts, _number(m.p99_m), _number(m.largest_m)
-
-
-def _cells(line: Line) -> tuple[str, ...]:
-    mean = f"{line.mean.value:.3f} [{line.mean.low:.3f}, {line.mean.high:.3f}]"
-    numbers = (line.maptr, line.streammapnet, line.f)
-    rest = (line.duplication, line.fragmentation, line.lateral_m, line.end_error_m)
+def _adversarial_cells(result: AdversarialResult) -> tuple[str, ...]:
+    counts = (
+        str(result.num_stations),
+        str(result.num_displaced),
+        str(result.num_lost),
+        str(result.num_displaced_without_attack),
+    )
+    attackers = f"{result.num_malicious} of {result.num_observations}, {result.attack}"
     return (
-        line.method,
-        _number(line.crossing),
-        _number(line.divider),
-        mean,
-        *map(_number, numbers),
-        *(_number(value, 2) for value in rest),
-        _number(line.seconds, 1),
+        result.place,
+        str(result.seed),
+        attackers,
+        f"{result.offset_m:g}",
+        *counts,
+        _format_number(result.p99_m),
+        _format_number(result.max_m),
     )
 
 
-def _verdict(v: Verdict) -> tuple[str, ...]:
-    interval = f"[{v.low:.3f}, {v.high:.3f}]"
-    return v.what, v.rival, f"{v.value:.3f}", interval, f"{v.bar:.3f}", v.word
+def _summary_cells(summary: MethodSummary) -> tuple[str, ...]:
+    mean = f"{summary.mean_ap.value:.3f} [{summary.mean_ap.low:.3f}, {summary.mean_ap.high:.3f}]"
+    numbers = (summary.maptr, summary.streammapnet, summary.f1)
+    rest = (summary.duplication, summary.fragmentation, summary.lateral_error_m, summary.endpoint_error_m)
+    return (
+        summary.method,
+        _format_number(summary.crossing),
+        _format_number(summary.divider),
+        mean,
+        *map(_format_number, numbers),
+        *(_format_number(value, 2) for value in rest),
+        _format_number(summary.seconds, 1),
+    )
 
 
-def _table(title: str, headings: Sequence[str]) -> Table:
+def _margin_cells(margin_test: StudyMarginTest) -> tuple[str, ...]:
+    interval = f"[{margin_test.low:.3f}, {margin_test.high:.3f}]"
+    return (
+        margin_test.description,
+        margin_test.baseline,
+        f"{margin_test.value:.3f}",
+        interval,
+        f"{margin_test.margin:.3f}",
+        margin_test.verdict,
+    )
+
+
+def _make_table(title: str, headings: Sequence[str]) -> Table:
     table = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.padding = (0, 1, 0, 0)
-    for place, heading in enumerate(headings):
-        table.add_column(heading.replace(" ", "\n"), justify="right" if place else "left", no_wrap=True)
+    for column, heading in enumerate(headings):
+        table.add_column(heading.replace(" ", "\n"), justify="right" if column else "left", no_wrap=True)
     return table
 
 
-def _number(value: float, digits: int = 3) -> str:
+def _format_number(value: float, digits: int = 3) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"

@@ -7,71 +7,71 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from manyeyes.agents.pose_correction import Use, Verdict
-from manyeyes.pose.pose_monitor import Health, Report
+from manyeyes.agents.pose_correction import CorrectionOutcome, MessageUse
+from manyeyes.pose.pose_monitor import PoseHealth, PoseReport
 
 HEADINGS = ("agent", "claimed pose", "first seen so at", "corrected", "as claimed", "left out", "drift m/s")
-WORST = (Health.DRIFTING, Health.OFFSET)
+FAULTS = (PoseHealth.DRIFTING, PoseHealth.OFFSET)
 
 
 @dataclass
-class _Sender:
+class _SenderSummary:
     name: str
-    uses: Counter[Use] = field(default_factory=Counter[Use])
-    last: Report | None = None
-    first: dict[Health, int] = field(default_factory=dict[Health, int])
+    use_counts: Counter[MessageUse] = field(default_factory=Counter[MessageUse])
+    last_report: PoseReport | None = None
+    first_frame: dict[PoseHealth, int] = field(default_factory=dict[PoseHealth, int])
 
 
 @dataclass
-class Whereabouts:
+class PoseCorrectionSummary:
     """Verdicts of one method's egos, by sender."""
 
-    senders: dict[int, _Sender] = field(default_factory=dict[int, _Sender])
+    senders: dict[int, _SenderSummary] = field(default_factory=dict[int, _SenderSummary])
 
-    def add(self, index: int, verdicts: Iterable[Verdict]) -> None:
+    def add(self, index: int, corrections: Iterable[CorrectionOutcome]) -> None:
         """Those of one ego at one instant of the drive."""
-        for verdict in verdicts:
-            name = f"{verdict.agent_id}{' (roadside unit)' if verdict.is_infrastructure else ''}"
-            sender = self.senders.setdefault(verdict.agent_id, _Sender(name))
-            sender.uses[verdict.use] += 1
-            sender.last = verdict.health
-            sender.first.setdefault(verdict.health.health, index)
+        for correction in corrections:
+            name = f"{correction.agent_id}{' (roadside unit)' if correction.is_infrastructure else ''}"
+            sender = self.senders.setdefault(correction.agent_id, _SenderSummary(name))
+            sender.use_counts[correction.use] += 1
+            sender.last_report = correction.health
+            sender.first_frame.setdefault(correction.health.health, index)
 
-    def lines(self) -> tuple[tuple[str, ...], ...]:
+    def make_rows(self) -> tuple[tuple[str, ...], ...]:
         """A line for each sender under HEADINGS: the worst that was seen of it, and when first."""
-        return tuple(_line(self.senders[agent]) for agent in sorted(self.senders))
+        return tuple(_make_row(self.senders[agent]) for agent in sorted(self.senders))
 
-    def warnings(self) -> tuple[str, ...]:
+    def make_warnings(self) -> tuple[str, ...]:
         """A sentence for each sender whose claims were found wrong."""
         out = []
         for agent in sorted(self.senders):
             sender = self.senders[agent]
-            worst = _worst(sender)
-            if worst in WORST:
+            worst = _worst_health(sender)
+            if worst in FAULTS:
                 out.append(
-                    f"agent {sender.name}: its claimed pose is {worst.value}, first in frame {sender.first[worst]}"
+                    f"agent {sender.name}: its claimed pose is {worst.value}, first in frame {sender.first_frame[worst]}"
                 )
         return tuple(out)
 
 
-def _worst(sender: _Sender) -> Health:
+def _worst_health(sender: _SenderSummary) -> PoseHealth:
     """What is worst and lasting: a doubtful frame now and then is honest."""
-    for health in (*WORST, Health.SOUND, Health.DOUBTFUL):
-        if health in sender.first:
+    for health in (*FAULTS, PoseHealth.SOUND, PoseHealth.SUSPECT):
+        if health in sender.first_frame:
             return health
-    return Health.UNKNOWN
+    return PoseHealth.UNKNOWN
 
 
-def _line(sender: _Sender) -> tuple[str, ...]:
-    worst, report = _worst(sender), sender.last
-    left_out = sender.uses[Use.UNSURE] + sender.uses[Use.CONTRADICTED]
-    speed = float((report.drift[0] ** 2 + report.drift[1] ** 2) ** 0.5) if report else 0.0
+def _make_row(sender: _SenderSummary) -> tuple[str, ...]:
+    worst, report = _worst_health(sender), sender.last_report
+    left_out = sender.use_counts[MessageUse.UNCERTAIN] + sender.use_counts[MessageUse.INCONSISTENT]
+    speed = float((report.drift_per_s[0] ** 2 + report.drift_per_s[1] ** 2) ** 0.5) if report else 0.0
     return (
         sender.name,
         worst.value,
-        str(sender.first.get(worst, "")) if worst in WORST else "",
-        str(sender.uses[Use.CORRECTED]),
-        str(sender.uses[Use.CLAIMED]),
+        str(sender.first_frame.get(worst, "")) if worst in FAULTS else "",
+        str(sender.use_counts[MessageUse.CORRECTED]),
+        str(sender.use_counts[MessageUse.PRIOR]),
         str(left_out),
-        f"{speed:.2f}" if worst is Health.DRIFTING else "",
+        f"{speed:.2f}" if worst is PoseHealth.DRIFTING else "",
     )

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
-def bars(console: Console) -> Progress:
+def make_progress_bars(console: Console) -> Progress:
     """Progress bars, on the same console as everything else."""
     columns = TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     return Progress(*columns, console=console)

@@ -13,8 +13,8 @@ from typing import Any
 
 from manyeyes._io import atomic_write_text
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.statistics.comparison import Difference
-from manyeyes.viz.table import DIFFERENCE_HEADINGS, HEADINGS, NOT_RUN, Row, cells, difference_cells
+from manyeyes.evaluation.statistics.comparison import PairedDifference
+from manyeyes.viz.table import DIFFERENCE_HEADINGS, HEADINGS, NOT_RUN, MethodRow, format_cells, format_difference_cells
 
 MIME = {".png": "image/png", ".gif": "image/gif", ".webp": "image/webp", ".svg": "image/svg+xml"}
 
@@ -49,7 +49,7 @@ dt { font-weight: 600; } dd { margin: 0; color: var(--soft); }
 @media print { main { padding: 0; } }
 """
 
-COLUMNS = (
+COLUMN_DESCRIPTIONS = (
     ("AP@0.5, AP@0.7", "average precision at rotated bird's-eye IoU 0.5 and 0.7, all frames sorted together by score, "
      "with the 95 % interval over scenarios where there is more than one"),
     ("bytes/message", "the mean length of what one agent sent at one instant, all packets and headers counted"),
@@ -60,7 +60,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Picture:
+class ReportImage:
     """An image file for the report; wide ones take the whole width, the others stand in pairs."""
 
     path: Path
@@ -74,19 +74,19 @@ class Chapter:
 
     title: str
     text: str
-    pictures: tuple[Picture, ...] = ()
+    pictures: tuple[ReportImage, ...] = ()
     table: tuple[tuple[str, ...], ...] = ()
 
 
 @dataclass(frozen=True)
-class Report:
+class HtmlReport:
     """All that the page shows. facts: short (name, value) pairs; provenance: what write_json wrote beside it."""
 
     title: str
     lead: str
-    rows: tuple[Row, ...] = ()
-    differences: tuple[Difference, ...] = ()
-    pictures: tuple[Picture, ...] = ()
+    rows: tuple[MethodRow, ...] = ()
+    differences: tuple[PairedDifference, ...] = ()
+    pictures: tuple[ReportImage, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
     commands: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -94,69 +94,71 @@ class Report:
     provenance: dict[str, Any] = field(default_factory=dict)
 
 
-def render(report: Report) -> str:
+def render(report: HtmlReport) -> str:
     """The page as text; images are read and embedded."""
-    parts = [f"<h1>{_text(report.title)}</h1>", f'<p class="lead">{_text(report.lead)}</p>']
+    parts = [f"<h1>{_escape(report.title)}</h1>", f'<p class="lead">{_escape(report.lead)}</p>']
     if report.facts:
-        items = "".join(f"<li><b>{_text(name)}</b>{_text(value)}</li>" for name, value in report.facts)
+        items = "".join(f"<li><b>{_escape(name)}</b>{_escape(value)}</li>" for name, value in report.facts)
         parts.append(f'<ul class="facts">{items}</ul>')
     if report.rows:
-        columns = "".join(f"<dt>{_text(name)}</dt><dd>{_text(what)}</dd>" for name, what in COLUMNS)
+        columns = "".join(f"<dt>{_escape(name)}</dt><dd>{_escape(what)}</dd>" for name, what in COLUMN_DESCRIPTIONS)
         parts += [
             "<h2>Results</h2>",
-            _table(HEADINGS, [cells(row) for row in report.rows]),
+            _table(HEADINGS, [format_cells(row) for row in report.rows]),
             f"<details><summary>What the columns mean</summary><dl>{columns}</dl></details>",
         ]
     if report.differences:
-        parts += [_table(DIFFERENCE_HEADINGS, [difference_cells(d) for d in report.differences])]
-    parts += [f"<p>{_text(note)}</p>" for note in report.notes]
+        parts += [_table(DIFFERENCE_HEADINGS, [format_difference_cells(d) for d in report.differences])]
+    parts += [f"<p>{_escape(note)}</p>" for note in report.notes]
     wide, pairs = [p for p in report.pictures if p.wide], [p for p in report.pictures if not p.wide]
     if wide:
         parts += ["<h2>The drive</h2>", *(_figure(p) for p in wide)]
     if pairs:
         parts += ["<h2>One instant, from above</h2>", f'<div class="pair">{"".join(_figure(p) for p in pairs)}</div>']
     for chapter in report.chapters:
-        parts += [f"<h2>{_text(chapter.title)}</h2>", f"<p>{_text(chapter.text)}</p>", *map(_figure, chapter.pictures)]
+        parts += [
+            f"<h2>{_escape(chapter.title)}</h2>",
+            f"<p>{_escape(chapter.text)}</p>",
+            *map(_figure, chapter.pictures),
+        ]
         if chapter.table:
             parts.append(_table(chapter.table[0], chapter.table[1:]))
     if report.commands:
-        parts += ["<h2>Again, on your machine</h2>", f"<pre>{_text(chr(10).join(report.commands))}</pre>"]
+        parts += ["<h2>Again, on your machine</h2>", f"<pre>{_escape(chr(10).join(report.commands))}</pre>"]
     if report.provenance:
-        dump = _text(json.dumps(report.provenance, indent=2, default=str))
+        dump = _escape(json.dumps(report.provenance, indent=2, default=str))
         parts += ["<h2>Where these numbers come from</h2>"]
         parts += [f"<details><summary>Configuration, seed, versions, commit</summary><pre>{dump}</pre></details>"]
-    head = (
-        f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_text(report.title)}</title>'
-    )
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_escape(report.title)}</title>'
     body = "\n".join(parts)
     style = f"<style>{STYLE}</style>"
     page = f'<html lang="en"><head>{head}{style}</head><body><main>\n{body}\n</main></body></html>'
     return f"<!doctype html>\n{page}\n"
 
 
-def save_report(report: Report, path: Path) -> None:
+def save_report(report: HtmlReport, path: Path) -> None:
     """The page as a file, whole or not at all."""
     atomic_write_text(path, render(report))
 
 
-def _text(value: str) -> str:
+def _escape(value: str) -> str:
     return html.escape(value, quote=True)
 
 
 def _table(headings: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{_text(heading)}</th>" for heading in headings)
+    head = "".join(f"<th>{_escape(heading)}</th>" for heading in headings)
     body = "".join(f"<tr>{''.join(_cell(c) for c in line)}</tr>" for line in lines)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _cell(text: str) -> str:
-    return f'<td class="absent">{_text(text)}</td>' if text in ("-", NOT_RUN) else f"<td>{_text(text)}</td>"
+    return f'<td class="absent">{_escape(text)}</td>' if text in ("-", NOT_RUN) else f"<td>{_escape(text)}</td>"
 
 
-def _figure(picture: Picture) -> str:
+def _figure(picture: ReportImage) -> str:
     mime = MIME.get(picture.path.suffix.lower())
     if mime is None:
         raise ConfigError(f"{picture.path.name}: a report embeds {', '.join(MIME)}; convert the picture first.")
     data = base64.b64encode(picture.path.read_bytes()).decode()
-    caption = _text(picture.caption)
+    caption = _escape(picture.caption)
     return f'<figure><img alt="{caption}" src="data:{mime};base64,{data}"><figcaption>{caption}</figcaption></figure>'

@@ -9,19 +9,19 @@ from dataclasses import dataclass
 from rich.console import Console
 
 from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
-from manyeyes.evaluation.detection.accumulator import IOUS, MethodResult
-from manyeyes.evaluation.detection.average_precision import Protocol
+from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult
+from manyeyes.evaluation.detection.average_precision import DetectionProtocol
 from manyeyes.evaluation.detection.communication import Communication
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.statistics.comparison import Difference, differences
-from manyeyes.viz.table import Row, differences_terminal, missing_footer, row_of, terminal
+from manyeyes.evaluation.statistics.comparison import PairedDifference, compare_methods
+from manyeyes.viz.table import MethodRow, make_differences_table, make_row, make_terminal_table, missing_footer
 
-LARGEST_MESSAGE = 1 << 17
-ALONE_BETWEEN = (0.50, 0.85)
+MAX_MESSAGE_BYTES = 1 << 17
+NO_FUSION_AP_RANGE = (0.50, 0.85)
 
 
 @dataclass(frozen=True)
-class Precision:
+class ApSummary:
     """AP at one IoU threshold. ap is the protocol's own; recall and precision stand at its score threshold."""
 
     iou: float
@@ -35,11 +35,11 @@ class Precision:
 
 
 @dataclass(frozen=True)
-class Numbers:
+class MethodStats:
     """All numbers of one method, without the frames behind them."""
 
     method: str
-    precision: tuple[Precision, ...]
+    ap_summaries: tuple[ApSummary, ...]
     communication: Communication
     age_ms: float
     share_ms: float
@@ -47,13 +47,13 @@ class Numbers:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class MethodComparison:
     """A comparison, ready to be shown. protocol: whose rules AP follows, over which range. missing: files of the recording."""
 
-    protocol: Protocol
-    numbers: tuple[Numbers, ...]
-    rows: tuple[Row, ...]
-    differences: tuple[Difference, ...]
+    protocol: DetectionProtocol
+    stats: tuple[MethodStats, ...]
+    rows: tuple[MethodRow, ...]
+    differences: tuple[PairedDifference, ...]
     checks: tuple[str, ...]
     missing: MissingFiles = NONE_MISSING
 
@@ -63,52 +63,56 @@ class Outcome:
         return missing_footer(self.missing.count)
 
     @property
-    def several(self) -> bool:
+    def has_several_scenarios(self) -> bool:
         """Whether there are scenarios enough to compare over; one drive resolves nothing."""
-        return any(number.precision[0].ap.scenarios > 1 for number in self.numbers)
+        return any(number.ap_summaries[0].ap.num_scenarios > 1 for number in self.stats)
 
 
-def outcome_of(results: Sequence[MethodResult], protocol: Protocol, missing: MissingFiles = NONE_MISSING) -> Outcome:
+def summarize_comparison(
+    results: Sequence[MethodResult], protocol: DetectionProtocol, missing: MissingFiles = NONE_MISSING
+) -> MethodComparison:
     """The outcome of measured methods."""
-    numbers = []
+    stats = []
     for result in results:
-        columns = zip(IOUS, result.intervals, result.ap)
-        precision = tuple(
-            Precision(iou, interval, ap.ap_global, ap.ap_legacy, ap.recall, ap.precision, ap.n_gt, ap.n_detections)
+        columns = zip(IOU_THRESHOLDS, result.intervals, result.ap)
+        ap_summaries = tuple(
+            ApSummary(iou, interval, ap.ap_global, ap.ap_legacy, ap.recall, ap.precision, ap.n_gt, ap.n_detections)
             for iou, interval, ap in columns
         )
         sent = result.communication
-        numbers.append(Numbers(result.method, precision, sent, result.age_ms, result.share_ms, result.perceive_ms))
-    rows = tuple(row_of(result) for result in results)
-    return Outcome(protocol, tuple(numbers), rows, differences(results, protocol), _checks(rows), missing)
+        stats.append(MethodStats(result.method, ap_summaries, sent, result.age_ms, result.share_ms, result.perceive_ms))
+    rows = tuple(make_row(result) for result in results)
+    return MethodComparison(
+        protocol, tuple(stats), rows, compare_methods(results, protocol), _check_targets(rows), missing
+    )
 
 
-def show(console: Console, outcome: Outcome, title: str) -> None:
+def print_comparison(console: Console, comparison: MethodComparison, title: str) -> None:
     """Table, differences and checks in the terminal."""
-    console.print(terminal(outcome.rows, title))
-    if outcome.footer:
-        console.print(outcome.footer, highlight=False, soft_wrap=True)
-    if not outcome.several:
+    console.print(make_terminal_table(comparison.rows, title))
+    if comparison.footer:
+        console.print(comparison.footer, highlight=False, soft_wrap=True)
+    if not comparison.has_several_scenarios:
         return
-    if outcome.differences:
+    if comparison.differences:
         console.print()
-        console.print(differences_terminal(outcome.differences))
-    for check in outcome.checks:
+        console.print(make_differences_table(comparison.differences))
+    for check in comparison.checks:
         console.print(check, highlight=False, soft_wrap=True)
 
 
-def _checks(rows: Sequence[Row]) -> tuple[str, ...]:
+def _check_targets(rows: Sequence[MethodRow]) -> tuple[str, ...]:
     """Whether messages are small enough, and whether the drives are neither too easy nor too hard to tell methods apart."""
     by_name = {row.method: row for row in rows}
     out = []
-    fused, alone = by_name.get("intermediate"), by_name.get("alone")
+    fused, no_fusion = by_name.get("intermediate"), by_name.get("alone")
     if fused and fused.bytes_per_message is not None:
-        verdict = "reached" if fused.bytes_per_message <= LARGEST_MESSAGE else "missed"
+        verdict = "reached" if fused.bytes_per_message <= MAX_MESSAGE_BYTES else "missed"
         out.append(
-            f"intermediate: {fused.bytes_per_message:,.0f} bytes a message, at most {LARGEST_MESSAGE:,}: {verdict}"
+            f"intermediate: {fused.bytes_per_message:,.0f} bytes a message, at most {MAX_MESSAGE_BYTES:,}: {verdict}"
         )
-    if alone and alone.ap50 is not None:
-        low, high = ALONE_BETWEEN
-        verdict = "reached" if low <= alone.ap50.value <= high else "missed"
-        out.append(f"alone: AP@0.5 {alone.ap50.value:.3f} between {low:.2f} and {high:.2f}: {verdict}")
+    if no_fusion and no_fusion.ap50 is not None:
+        low, high = NO_FUSION_AP_RANGE
+        verdict = "reached" if low <= no_fusion.ap50.value <= high else "missed"
+        out.append(f"alone: AP@0.5 {no_fusion.ap50.value:.3f} between {low:.2f} and {high:.2f}: {verdict}")
     return tuple(out)

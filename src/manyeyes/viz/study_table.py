@@ -10,13 +10,13 @@ from rich import box
 from rich.table import Table
 
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.viz.table import NOT_RUN, markdown_lines
+from manyeyes.viz.table import NOT_RUN, format_markdown_lines
 
-_NARROW = 6
+_MAX_NARROW_COLUMNS = 6
 
 
 @dataclass(frozen=True)
-class Sheet:
+class StudyTable:
     """One table: a title, headings, and lines of text as wide as the headings."""
 
     title: str
@@ -24,52 +24,54 @@ class Sheet:
     lines: tuple[tuple[str, ...], ...]
 
 
-def terminal(sheet: Sheet) -> Table:
+def make_terminal_table(study_table: StudyTable) -> Table:
     """The sheet for a terminal; a wide one leaves the intervals to the document."""
     table = Table(
-        title=sheet.title,
+        title=study_table.title,
         title_justify="left",
         box=box.SIMPLE_HEAD,
         pad_edge=False,
         show_edge=False,
         padding=(0, 1, 0, 0),
     )
-    for column, heading in enumerate(sheet.headings):
+    for column, heading in enumerate(study_table.headings):
         table.add_column(heading, justify="left" if column < 2 else "right", no_wrap=column < 2)
-    wide = len(sheet.headings) > _NARROW
-    for line in sheet.lines:
+    wide = len(study_table.headings) > _MAX_NARROW_COLUMNS
+    for line in study_table.lines:
         table.add_row(*(cell.partition(" [")[0] if wide else cell for cell in line))
     return table
 
 
-def markdown(sheet: Sheet) -> str:
+def format_markdown(study_table: StudyTable) -> str:
     """The sheet for a document."""
-    return f"## {sheet.title}\n\n{markdown_lines([sheet.headings, *sheet.lines])}"
+    return f"## {study_table.title}\n\n{format_markdown_lines([study_table.headings, *study_table.lines])}"
 
 
-def value(of: Interval | None) -> str:
+def format_interval(interval: Interval | None) -> str:
     """A number with its interval: ``0.912 [0.900, 0.923]``."""
-    return _text(of, ".3f")
+    return _format_text(interval, ".3f")
 
 
-def change(of: Interval | None) -> str:
+def format_difference(interval: Interval | None) -> str:
     """A difference with its interval, signs shown."""
-    return _text(of, "+.3f")
+    return _format_text(interval, "+.3f")
 
 
-def number(of: float | None, digits: int = 0) -> str:
+def format_number(number: float | None, digits: int = 0) -> str:
     """A plain number; nothing for none."""
-    return "" if of is None or math.isnan(of) else f"{of:,.{digits}f}"
+    return "" if number is None or math.isnan(number) else f"{number:,.{digits}f}"
 
 
-def log2(of: float) -> str:
+def format_log2(num_bytes: float) -> str:
     """The papers' "AB" of so many bytes; nothing for silence."""
-    return f"{math.log2(of):.2f}" if of > 0 else ""
+    return f"{math.log2(num_bytes):.2f}" if num_bytes > 0 else ""
 
 
-def _text(of: Interval | None, form: str) -> str:
-    if of is None:
+def _format_text(interval: Interval | None, format_spec: str) -> str:
+    if interval is None:
         return ""
-    if math.isnan(of.value):
-        return NOT_RUN if of.scenarios == 0 else "no object"
-    return f"{of.value:{form}}" + (f" [{of.low:{form}}, {of.high:{form}}]" if of.scenarios > 1 else "")
+    if math.isnan(interval.value):
+        return NOT_RUN if interval.num_scenarios == 0 else "no object"
+    return f"{interval.value:{format_spec}}" + (
+        f" [{interval.low:{format_spec}}, {interval.high:{format_spec}}]" if interval.num_scenarios > 1 else ""
+    )

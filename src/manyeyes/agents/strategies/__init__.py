@@ -6,18 +6,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from manyeyes.agents.perception_cache import REMEMBERED, Eyes
-from manyeyes.agents.strategies.early import Early
-from manyeyes.agents.strategies.intermediate import Intermediate, at_random, confidence, learned
-from manyeyes.agents.strategies.late import Late
-from manyeyes.agents.strategies.multi_hop import Fused
-from manyeyes.agents.strategies.no_fusion import Alone
+from manyeyes.agents.perception_cache import HISTORY_FRAMES, PerceptionCache
+from manyeyes.agents.strategies.early import EarlyFusion
+from manyeyes.agents.strategies.intermediate import IntermediateFusion, confidence_score, mask_score, random_score
+from manyeyes.agents.strategies.late import LateFusion
+from manyeyes.agents.strategies.multi_hop import MultiHopFusion
+from manyeyes.agents.strategies.no_fusion import NoFusion
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message
 
-__all__ = ["METHODS", "Alone", "Collaboration", "Early", "Intermediate", "Late", "method"]
+__all__ = ["METHODS", "EarlyFusion", "FusionStrategy", "IntermediateFusion", "LateFusion", "NoFusion", "get_strategy"]
 
 
-class Collaboration(Protocol):
+class FusionStrategy(Protocol):
     """The two halves of one way to collaborate."""
 
     @property
@@ -26,36 +26,36 @@ class Collaboration(Protocol):
         ...
 
     @property
-    def remembers(self) -> bool:
+    def uses_history(self) -> bool:
         """Whether it also hears what was said a moment ago: older messages, and the last of those who fell silent."""
         ...
 
-    def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
+    def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
         """The message of this frame, before selection and encoding; None says nothing."""
         ...
 
-    def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
+    def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes in the agent's frame, from its own cloud and what the others said."""
         ...
 
 
-METHODS: dict[str, Collaboration] = {
+METHODS: dict[str, FusionStrategy] = {
     m.name: m
     for m in (
-        Alone(),
-        Late(),
-        Late("late-remembering", instants=REMEMBERED),
-        Intermediate(),
-        Intermediate("learned", learned),
-        Intermediate("confidence", confidence),
-        Intermediate("random", at_random),
-        Fused(),
-        Early(),
+        NoFusion(),
+        LateFusion(),
+        LateFusion("late-remembering", history_frames=HISTORY_FRAMES),
+        IntermediateFusion(),
+        IntermediateFusion("learned", mask_score),
+        IntermediateFusion("confidence", confidence_score),
+        IntermediateFusion("random", random_score),
+        MultiHopFusion(),
+        EarlyFusion(),
     )
 }
 
 
-def method(name: str) -> Collaboration:
+def get_strategy(name: str) -> FusionStrategy:
     """The method of that name."""
     if name not in METHODS:
         raise ConfigError(f"There is no method {name!r}; known are {', '.join(METHODS)}.")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from manyeyes.datatypes import AgentFrame, Message, Transform
 
 
-def header(frame: AgentFrame, fingerprint: bytes) -> Message:
+def make_header(frame: AgentFrame, fingerprint: bytes) -> Message:
     """A message of this frame with no section yet."""
     return Message(
         agent_id=frame.agent_id,
@@ -20,7 +20,7 @@ def header(frame: AgentFrame, fingerprint: bytes) -> Message:
     )
 
 
-def behind_s(messages: Sequence[Message]) -> list[float]:
+def lag_behind_newest_s(messages: Sequence[Message]) -> list[float]:
     """Seconds that each message lies behind the newest of its sender: 0 for what is news, more for what is remembered."""
     newest = {m.agent_id: m.timestamp_ns for m in sorted(messages, key=lambda m: m.timestamp_ns)}
     return [(newest[m.agent_id] - m.timestamp_ns) / 1e9 for m in messages]

@@ -11,33 +11,35 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from manyeyes.agents.perception_cache import Eyes, follows
-from manyeyes.agents.strategies.intermediate import Intermediate, tokens_around
-from manyeyes.agents.strategies.message_header import header
+from manyeyes.agents.perception_cache import PerceptionCache, is_consecutive
+from manyeyes.agents.strategies.intermediate import IntermediateFusion, gather_ego_tokens
+from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 
 
 @dataclass(frozen=True)
-class Fused:
+class MultiHopFusion:
     """Sends the tokens of its last perception, dated as that was; before it has perceived, its own."""
 
     name: str = "fused"
-    remembers: bool = True
+    uses_history: bool = True
 
-    def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
+    def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
         """What the agent perceived at its last instant, if that was just before; else what it sees."""
-        eyes.see(frame)
-        if eyes.perceived is None or not follows(frame, eyes.perceived[0]):
-            return Intermediate().say(eyes, frame)
-        then, told = eyes.perceived
-        worth = torch.sigmoid(eyes.detector.choose(told))
-        return replace(header(then, eyes.detector.fingerprint), tokens=told, token_score=worth)
+        cache.process(frame)
+        if cache.last_fused is None or not is_consecutive(frame, cache.last_fused[0]):
+            return IntermediateFusion().compose_message(cache, frame)
+        then, tokens = cache.last_fused
+        score = torch.sigmoid(cache.detector.score_tokens(tokens))
+        return replace(make_header(then, cache.detector.fingerprint), tokens=tokens, token_score=score)
 
-    def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
+    def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the fused tokens, which are kept to be said."""
         with torch.inference_mode():
-            around = tokens_around(frame, eyes.see(frame).told, eyes.past(frame), messages)
-            fused = eyes.detector.merge(*around)
-            raw = eyes.detector.refine(fused.bev, fused.given)
-            eyes.perceived = frame, eyes.detector.tell(fused.bev, raw)
-        return eyes.decode(raw)
+            around = gather_ego_tokens(
+                frame, cache.process(frame).shared_tokens, cache.previous_tokens(frame), messages
+            )
+            fused = cache.detector.fuse_tokens(*around)
+            raw = cache.detector.refine(fused.bev, fused.merged_proposals)
+            cache.last_fused = frame, cache.detector.make_tokens(fused.bev, raw)
+        return cache.decode(raw)

@@ -6,21 +6,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from manyeyes.agents.perception_cache import Eyes
+from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 
 
 @dataclass(frozen=True)
-class Alone:
+class NoFusion:
     """No collaboration."""
 
     name: str = "alone"
-    remembers: bool = False
+    uses_history: bool = False
 
-    def say(self, eyes: Eyes, frame: AgentFrame) -> Message | None:
+    def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
         """Nothing."""
         return None
 
-    def hear(self, eyes: Eyes, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
+    def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """What the agent's own cloud shows."""
-        return eyes.see(frame).boxes
+        return cache.process(frame).boxes

@@ -13,36 +13,38 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from manyeyes.agents.perception_cache import Eyes
+from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.datatypes import AgentFrame, SparseBev
-from manyeyes.models.detector.proposal import PROPOSAL, proposed_heat, proposed_offset, proposed_velocity
+from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat, proposed_offset, proposed_velocity
 
-AGAIN = 0.7
+REDUNDANCY_DECAY = 0.7
 """What a word on an object leaves of the worth of the next; chosen on Town07 (0.5 to 0.85 do about as well)."""
 SAME_OBJECT_M = 2.0
 """Tokens speak of one object where the centres that they propose are nearer."""
 
 
-def unsaid(eyes: Eyes, frame: AgentFrame) -> Tensor:
+def novelty_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
     """(N,) in [0, 1], of the tokens that the agent tells of this frame: sigmoid(heat) * AGAIN^(words before it)."""
-    told = eyes.see(frame).told
-    place, heat = centres(told), proposed_heat(told.features[:, -PROPOSAL:])
-    turn = heat.argsort(descending=True, stable=True).argsort()
-    surer = turn[None, :] < turn[:, None]
-    words = (surer & (torch.cdist(place, place) < SAME_OBJECT_M)).sum(1)
-    known = torch.cat([place.new_empty(0, 2), *(_now(frame, then, said) for then, said in eyes.said_before(frame))])
-    words += (torch.cdist(place, known) < SAME_OBJECT_M).any(1)
-    return torch.sigmoid(heat) * AGAIN**words
+    tokens = cache.process(frame).shared_tokens
+    place, heat = proposed_centres(tokens), proposed_heat(tokens.features[:, -PROPOSAL_DIM:])
+    rank = heat.argsort(descending=True, stable=True).argsort()
+    more_confident = rank[None, :] < rank[:, None]
+    num_earlier = (more_confident & (torch.cdist(place, place) < SAME_OBJECT_M)).sum(1)
+    sent_centres = torch.cat(
+        [place.new_empty(0, 2), *(_propagate_centres(frame, then, sent) for then, sent in cache.recently_sent(frame))]
+    )
+    num_earlier += (torch.cdist(place, sent_centres) < SAME_OBJECT_M).any(1)
+    return torch.sigmoid(heat) * REDUNDANCY_DECAY**num_earlier
 
 
-def centres(told: SparseBev) -> Tensor:
+def proposed_centres(tokens: SparseBev) -> Tensor:
     """(N, 2) metres: the centre of the object that each token (N, C + PROPOSAL) proposes."""
-    return told.sites.xy + proposed_offset(told.features[:, -PROPOSAL:]) * told.grid.cell
+    return tokens.sites.xy + proposed_offset(tokens.features[:, -PROPOSAL_DIM:]) * tokens.grid.cell_size_m
 
 
-def _now(frame: AgentFrame, then: AgentFrame, said: SparseBev) -> Tensor:
+def _propagate_centres(frame: AgentFrame, then: AgentFrame, sent: SparseBev) -> Tensor:
     """(N, 2): where the objects of tokens of an earlier frame should be by now, in this one."""
     seconds = (frame.timestamp_ns - then.timestamp_ns) / 1e9
-    xy = centres(said) + proposed_velocity(said.features[:, -PROPOSAL:]) * seconds
-    moved = frame.from_earlier(then).apply(torch.cat((xy, xy.new_zeros(len(xy), 1)), 1).double())
+    xy = proposed_centres(sent) + proposed_velocity(sent.features[:, -PROPOSAL_DIM:]) * seconds
+    moved = frame.now_from_earlier(then).apply(torch.cat((xy, xy.new_zeros(len(xy), 1)), 1).double())
     return moved[:, :2].to(xy.dtype)

@@ -9,32 +9,32 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from manyeyes.agents.perception_cache import Sight
+from manyeyes.agents.perception_cache import AgentOutput
 from manyeyes.datatypes import AgentFrame, Boxes
 from manyeyes.ops.nms import rotated_nms
 
-FADE = 0.95
+SCORE_DECAY_PER_100MS = 0.95
 """What a tenth of a second leaves of a score; chosen on Town07 for late fusion."""
-SAME_IOU = 0.15
+DUPLICATE_IOU = 0.15
 """Boxes that overlap more are one object."""
 
 
-def faded(boxes: Boxes, seconds: float) -> Boxes:
+def decay_scores(boxes: Boxes, seconds: float) -> Boxes:
     """The same boxes, as sure as so many seconds leave them."""
-    return replace(boxes, score=boxes.score * FADE ** (10 * seconds))
+    return replace(boxes, score=boxes.score * SCORE_DECAY_PER_100MS ** (10 * seconds))
 
 
-def moved(frame: AgentFrame, seen: Iterable[tuple[AgentFrame, Sight]]) -> list[Boxes]:
+def propagate_boxes(frame: AgentFrame, outputs: Iterable[tuple[AgentFrame, AgentOutput]]) -> list[Boxes]:
     """The boxes of an agent's views before this frame, in it, each where its velocity has taken it."""
     found = []
-    for before, sight in seen:
+    for before, output in outputs:
         seconds = (frame.timestamp_ns - before.timestamp_ns) / 1e9
-        boxes = sight.boxes.after(seconds).transform(frame.from_earlier(before))
-        found.append(faded(boxes.to(frame.points.xyz.dtype), seconds))
+        boxes = output.boxes.after(seconds).transform(frame.now_from_earlier(before))
+        found.append(decay_scores(boxes.to(frame.points.xyz.dtype), seconds))
     return found
 
 
-def strongest(boxes: list[Boxes], iou: float = SAME_IOU) -> Boxes:
+def merge_boxes_nms(boxes: list[Boxes], iou: float = DUPLICATE_IOU) -> Boxes:
     """All boxes, best first, without those that overlap a better one."""
     all_of_them = Boxes.cat(boxes)
-    return all_of_them[rotated_nms(all_of_them.bev().double(), all_of_them.score, iou, pre=len(all_of_them))]
+    return all_of_them[rotated_nms(all_of_them.bev().double(), all_of_them.score, iou, max_candidates=len(all_of_them))]

@@ -19,8 +19,8 @@ from manyeyes.studies.replay_options import FileChecks
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from manyeyes.models.maps.map_model import Mapper
-    from manyeyes.studies.map_pipeline import Numbers
+    from manyeyes.models.maps.map_model import MapModel
+    from manyeyes.studies.map_pipeline import MapBuildStats
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class Options:
     """What draws: a map model; or, as an oracle for all that follows, the true map with the errors of a simulated crowd."""
     weights: str | None = None
     """Of the map model: a shipped name or a .safetensors file of 'manyeyes train --preset map-small'."""
-    survey: Literal["local", "semi-global"] = "local"
+    map_mode: Literal["local", "semi-global"] = "local"
     """local: what lies ahead, 30 x 30 m of a vehicle, 50 x 30 m of a roadside unit, each by its own look. semi-global: 120 x 60 m
     about each agent, together with the looks of the others."""
-    every: int = 5
+    frame_stride: int = 5
     """Agents look at every n-th frame."""
     channel: str = "ideal"
     """The air between all: ideal, its-g5, its-g5-27, lte-v2x, nr-sidelink, cellular."""
@@ -63,50 +63,54 @@ def main(options: Options) -> None:
 
     from manyeyes.comms.channel import channel_preset
     from manyeyes.studies import provenance
-    from manyeyes.studies.map_pipeline import Building, build_map, instants, write_built
+    from manyeyes.studies.map_pipeline import MapBuildConfig, build_map, count_snapshots, write_built_map
     from manyeyes.studies.recordings import check_files, open_recording
-    from manyeyes.studies.town_maps import grounds_of
-    from manyeyes.viz.progress import bars
+    from manyeyes.studies.town_maps import group_by_town
+    from manyeyes.viz.progress import make_progress_bars
     from manyeyes.viz.table import missing_footer
 
     console = Console()
     channel_preset(options.channel)
-    mapper = _mapper(options)
-    building = Building(mapper, options.survey, options.every, options.channel, options.pose_sigma, options.seed)
-    sensors = () if mapper is None else mapper.config.bev.sensors
+    map_model = _load_map_model(options)
+    config = MapBuildConfig(
+        map_model, options.map_mode, options.frame_stride, options.channel, options.pose_sigma, options.seed
+    )
+    sensors = () if map_model is None else map_model.config.bev.sensors
     recording = open_recording(options.recording, options.split, images="camera" in sensors)
     mapped = recording.scenarios[: options.scenarios]
-    left_out = recording.left_out if options.scenarios is None else frozenset[str]()
+    left_out = recording.unreadable_scenarios if options.scenarios is None else frozenset[str]()
     missing = check_files(recording, options.checks, console, {*mapped, *left_out})
     name = options.recording.resolve().name
-    grounds = grounds_of(recording, mapped, name, options.map)
-    if options.map is not None and all(ground.map is None for ground in grounds):
+    town_maps = group_by_town(recording, mapped, name, options.map)
+    if options.map is not None and all(town_map.map_file is None for town_map in town_maps):
         raise ConfigError(
             f"--map {options.map}: every scenario is named after a town, whose own map is known; leave it out."
         )
-    all_numbers = []
-    for ground in grounds:
-        with bars(console) as progress:
-            task = progress.add_task(ground.name, total=instants(recording, ground, options.every))
-            built = build_map(recording, ground, building, partial(progress.advance, task))
-            built = replace(built, numbers=replace(built.numbers, missing=missing))
-        write_built(built, options.out / ground.name, f"A map of {ground.name} from sensors")
-        _say(console, built.numbers, options.out / ground.name)
-        for refused in built.cartographer.refused:
-            where = f"agent {refused.agent} at {refused.time_ns} ns"
-            console.print(f"put aside: {where}: {refused.reason}", highlight=False, markup=False, soft_wrap=True)
-        all_numbers.append(built.numbers)
-    config = {
+    all_stats = []
+    for town_map in town_maps:
+        with make_progress_bars(console) as progress:
+            task = progress.add_task(town_map.name, total=count_snapshots(recording, town_map, options.frame_stride))
+            built = build_map(recording, town_map, config, partial(progress.advance, task))
+            built = replace(built, stats=replace(built.stats, missing=missing))
+        write_built_map(built, options.out / town_map.name, f"A map of {town_map.name} from sensors")
+        _print_summary(console, built.stats, options.out / town_map.name)
+        for rejected in built.map_server.rejected:
+            sender = f"agent {rejected.agent} at {rejected.time_ns} ns"
+            console.print(f"put aside: {sender}: {rejected.reason}", highlight=False, markup=False, soft_wrap=True)
+        all_stats.append(built.stats)
+    provenance_config = {
         "options": options,
-        "model": None if mapper is None else {"fingerprint": mapper.fingerprint.hex(), "config": mapper.config},
+        "model": None
+        if map_model is None
+        else {"fingerprint": map_model.fingerprint.hex(), "config": map_model.config},
     }
-    provenance.write_json(options.out / "build.json", all_numbers, config, options.seed)
+    provenance.write_json(options.out / "build.json", all_stats, provenance_config, options.seed)
     if missing.count:
         console.print(missing_footer(missing.count, "build.json"), highlight=False, soft_wrap=True)
     console.print(f"All numbers are in {options.out / 'build.json'}", highlight=False, soft_wrap=True)
 
 
-def _mapper(options: Options) -> Mapper | None:
+def _load_map_model(options: Options) -> MapModel | None:
     """The map model; None where the truth draws."""
     from manyeyes.models import pretrained
 
@@ -114,25 +118,28 @@ def _mapper(options: Options) -> Mapper | None:
         if options.weights is not None:
             raise ConfigError("--source truth draws without a model; leave --weights out.")
         return None
-    if options.weights is None and pretrained.MAPPER not in pretrained.mappers():
+    if options.weights is None and pretrained.DEFAULT_MAP_MODEL not in pretrained.list_map_models():
         raise ConfigError(
             "No map model ships with this version: give --weights FILE of 'manyeyes train --preset map-small', or "
             "--source truth to see what follows from a model with the errors of a simulated crowd."
         )
-    return pretrained.load_mapper(options.weights or pretrained.MAPPER)
+    return pretrained.load_map_model(options.weights or pretrained.DEFAULT_MAP_MODEL)
 
 
-def _say(console: Console, numbers: Numbers, out: Path) -> None:
-    from manyeyes.viz.map_table import kinds_terminal
+def _print_summary(console: Console, stats: MapBuildStats, out: Path) -> None:
+    from manyeyes.viz.map_table import make_kinds_table
 
-    n = numbers
-    if n.quality is not None:
-        console.print(kinds_terminal(n.quality.ap, n.quality.kinds, f"{n.name}: the map against the truth in view"))
+    s = stats
+    if s.scores is not None:
+        console.print(
+            make_kinds_table(s.scores.ap_rows, s.scores.kind_rows, f"{s.name}: the map against the truth in view")
+        )
     else:
-        console.print(f"{n.name}: no true map is known by this name, so the map is not judged.", highlight=False)
+        console.print(f"{s.name}: no true map is known by this name, so the map is not judged.", highlight=False)
     console.print(
-        f"{n.messages} messages of {n.bytes_per_message:,.0f} bytes, {n.lost} lost, {n.refused} put aside: {n.published} "
-        f"published elements of {n.elements}; open {out / 'map.html'}",
+        f"{s.num_messages} messages of {s.bytes_per_message:,.0f} bytes, {s.num_lost} lost, {s.num_rejected} put "
+        f"aside: {s.num_published} "
+        f"published elements of {s.num_elements}; open {out / 'map.html'}",
         highlight=False,
         soft_wrap=True,
     )

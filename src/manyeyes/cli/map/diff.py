@@ -26,22 +26,22 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.datatypes import ConfigError
-    from manyeyes.evaluation.maps.change_summary import map_change
+    from manyeyes.evaluation.maps.change_summary import compare_maps
     from manyeyes.studies import provenance
     from manyeyes.studies.map_folder import read_vector_map
-    from manyeyes.viz.map_page import page_of_change, save_map_page
-    from manyeyes.viz.map_table import change_terminal
+    from manyeyes.viz.map_page import make_change_page, save_map_page
+    from manyeyes.viz.map_table import make_change_table
 
     if options.out is not None and options.out.suffix.lower() not in (".json", ".html"):
         raise ConfigError(f"--out ends in .json or .html; got {options.out.name}.")
     console = Console()
     old, new = read_vector_map(options.old), read_vector_map(options.new)
-    change = map_change(old, new)
-    console.print(change_terminal(change.kinds, f"From {options.old} to {options.new}"))
+    change = compare_maps(old, new)
+    console.print(make_change_table(change.kinds, f"From {options.old} to {options.new}"))
     if options.out is None:
         return
     if options.out.suffix.lower() == ".json":
         provenance.write_json(options.out, change, options, None)
     else:
-        save_map_page(page_of_change(f"{options.old.name} to {options.new.name}", old, new, change), options.out)
+        save_map_page(make_change_page(f"{options.old.name} to {options.new.name}", old, new, change), options.out)
     console.print(f"{options.out} holds it", highlight=False, soft_wrap=True)

@@ -32,45 +32,50 @@ def main(options: Options) -> None:
         raise ConfigError(f"Give a map's folder, or --study with one of {', '.join(STUDIES)}.")
     console = Console()
     if options.folder is not None:
-        _judge_one(options, options.folder, console)
+        _evaluate_map(options, options.folder, console)
         return
     if options.study in MODEL_STUDIES:
-        from manyeyes.studies.maps import model_study
+        from manyeyes.studies.maps import run_model_study
 
-        model_study(options, console)
+        run_model_study(options, console)
         return
-    from manyeyes.studies.maps.fleet import study
+    from manyeyes.studies.maps.fleet import run_study_command
 
-    study(options, console)
+    run_study_command(options, console)
 
 
-def _judge_one(options: Options, path: Path, console: Console) -> None:
-    from manyeyes.evaluation.maps.map_cells import judge_maps
-    from manyeyes.evaluation.maps.spatial_bootstrap import Sureness, ap_interval, f_interval
+def _evaluate_map(options: Options, path: Path, console: Console) -> None:
+    from manyeyes.evaluation.maps.map_cells import evaluate_map_rows
+    from manyeyes.evaluation.maps.spatial_bootstrap import MetricIntervals, bootstrap_ap_interval, bootstrap_f1_interval
     from manyeyes.studies import provenance
     from manyeyes.studies.map_folder import MapFolder, read_vector_map
-    from manyeyes.viz.map_table import kinds_terminal
+    from manyeyes.viz.map_table import make_kinds_table
 
     truth_folder = options.truth or path.parent / "truth"
     if not truth_folder.is_dir():
         raise ConfigError(f"{truth_folder}: no truth there; name one with --truth.")
-    made, truth = read_vector_map(path).published().elements, read_vector_map(truth_folder).elements
-    cut = MapFolder(truth_folder.parent).cut()
-    judged = cut(made) if cut else made
-    ap, kinds = judge_maps(judged, truth)
-    console.print(kinds_terminal(ap, kinds, f"{path} against {truth_folder}"))
-    sure = tuple(
-        Sureness(row.kind, ap_interval(judged, truth, row.kind), f_interval(judged, truth, row.kind))
+    vector_map, truth = read_vector_map(path).select_published().elements, read_vector_map(truth_folder).elements
+    cut_policy = MapFolder(truth_folder.parent).read_cut_policy()
+    evaluated = cut_policy(vector_map) if cut_policy else vector_map
+    ap, kinds = evaluate_map_rows(evaluated, truth)
+    console.print(make_kinds_table(ap, kinds, f"{path} against {truth_folder}"))
+    intervals = tuple(
+        MetricIntervals(
+            row.kind,
+            bootstrap_ap_interval(evaluated, truth, row.kind),
+            bootstrap_f1_interval(evaluated, truth, row.kind),
+        )
         for row in kinds
         if row.n_truth
     )
-    for s in sure:
+    for interval in intervals:
         console.print(
-            f"{s.kind}: AP exact {s.ap.value:.3f} [{s.ap.low:.3f}, {s.ap.high:.3f}], "
-            f"F@0.5 m {s.f.value:.3f} [{s.f.low:.3f}, {s.f.high:.3f}] over {s.ap.scenarios} squares of 64 m",
+            f"{interval.kind}: AP exact {interval.ap.value:.3f} [{interval.ap.low:.3f}, {interval.ap.high:.3f}], "
+            f"F@0.5 m {interval.f1.value:.3f} [{interval.f1.low:.3f}, {interval.f1.high:.3f}] over "
+            f"{interval.ap.num_scenarios} squares of 64 m",
             highlight=False,
             soft_wrap=True,
         )
     out = path / "quality.json"
-    provenance.write_json(out, {"ap": ap, "kinds": kinds, "intervals": sure}, options, None)
+    provenance.write_json(out, {"ap": ap, "kinds": kinds, "intervals": intervals}, options, None)
     console.print(f"All numbers are in {out}", highlight=False, soft_wrap=True)

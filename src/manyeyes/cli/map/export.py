@@ -19,9 +19,9 @@ class Options:
     """The file; .geojson, .gpkg, .parquet, .osm and .pmtiles name their format, .json needs --format."""
     format: str | None = None
     """geojson, geopackage, geoparquet, lanelet2, argoverse2, nuscenes or pmtiles, where the file's ending does not say it."""
-    simplify: float = 0.05
+    simplify_m: float = 0.05
     """Lines may leave their stations by so much, metres; 0 writes every station."""
-    everything: bool = False
+    include_unpublished: bool = False
     """Also what is not published: candidates, deprecated and retired elements."""
 
 
@@ -32,8 +32,8 @@ def main(options: Options) -> None:
     from manyeyes.maps.formats.export import export_map
     from manyeyes.studies.map_folder import read_vector_map
 
-    made = read_vector_map(options.folder)
-    chosen = made if options.everything else made.published()
+    vector_map = read_vector_map(options.folder)
+    selected = vector_map if options.include_unpublished else vector_map.select_published()
     options.file.parent.mkdir(parents=True, exist_ok=True)
-    export_map(chosen, options.file, options.format, options.simplify)
-    Console().print(f"{options.file}: {len(chosen)} elements", highlight=False, soft_wrap=True)
+    export_map(selected, options.file, options.format, options.simplify_m)
+    Console().print(f"{options.file}: {len(selected)} elements", highlight=False, soft_wrap=True)

@@ -43,59 +43,60 @@ def main(options: Options) -> None:
 
     from rich.console import Console
 
-    from manyeyes.evaluation.maps.registry import Settings, check_method, map_of
+    from manyeyes.evaluation.maps.registry import MethodSettings, check_method, fuse_observations
     from manyeyes.studies import provenance
-    from manyeyes.studies.map_folder import observations_in, write_vector_map
+    from manyeyes.studies.map_folder import load_observations, write_vector_map
 
     check_method(options.method)
     console = Console()
     if options.store is not None:
-        _into_store(options, options.store, console)
+        _fuse_into_store(options, options.store, console)
         return
-    reading = observations_in(options.observations, console)
+    loaded = load_observations(options.observations, console)
     base = options.observations if options.observations.is_dir() else options.observations.parent
     out = options.out or base / ("map" if options.method == "manyeyes" else options.method)
     start = time.perf_counter()
-    with console.status(f"Fusing {len(reading.observations)} observations"):
-        made = map_of(options.method, reading.observations, Settings(), reading.frame)
+    with console.status(f"Fusing {len(loaded.observations)} observations"):
+        fused = fuse_observations(options.method, loaded.observations, MethodSettings(), loaded.frame)
     seconds = time.perf_counter() - start
-    write_vector_map(made, out)
-    published = len(made.published())
+    write_vector_map(fused, out)
+    published = len(fused.select_published())
     payload = {
-        "observations": len(reading.observations),
-        "put_aside": len(reading.quarantined),
-        "elements": len(made),
+        "observations": len(loaded.observations),
+        "put_aside": len(loaded.rejected),
+        "elements": len(fused),
         "published": published,
-        "hash": made.quantised_hash(),
+        "hash": fused.quantised_hash(),
         "seconds": seconds,
     }
-    provenance.write_json(out / "fuse.json", payload, {"options": options, "settings": Settings()}, None)
+    provenance.write_json(out / "fuse.json", payload, {"options": options, "settings": MethodSettings()}, None)
     console.print(
-        f"{out}: {published} published elements of {len(made)} from {len(reading.observations)} observations in {seconds:.1f} s",
+        f"{out}: {published} published elements of {len(fused)} from {len(loaded.observations)} observations in {seconds:.1f} s",
         highlight=False,
         soft_wrap=True,
     )
 
 
-def _into_store(options: Options, folder: Path, console: Console) -> None:
+def _fuse_into_store(options: Options, folder: Path, console: Console) -> None:
     """Takes the observations into a store's log and publishes a release, tile by tile."""
     from manyeyes.maps.elements.observation_file import read_observations
-    from manyeyes.maps.store.executors import named_executor
+    from manyeyes.maps.store.executors import make_executor
     from manyeyes.maps.store.store import MapStore
-    from manyeyes.studies.map_folder import observation_files, say_put_aside
+    from manyeyes.studies.map_folder import find_observation_files, report_rejected
 
     if options.method != "manyeyes":
         raise ConfigError(f"A store is fused by manyeyes' own method; fuse without --store for {options.method}.")
-    executor, source = named_executor(options.executor, options.workers), observation_files(options.observations)
-    there = (folder / "store.json").exists()
-    store = MapStore(folder) if there else MapStore.create(folder, read_observations(source).frame)
-    with store.writing() as log:
-        done = log.ingest(source)
-    put_aside = (*log.refused, *done.quarantined)
-    say_put_aside(put_aside, console)
+    executor, source = make_executor(options.executor, options.workers), find_observation_files(options.observations)
+    store_exists = (folder / "store.json").exists()
+    store = MapStore(folder) if store_exists else MapStore.create(folder, read_observations(source).frame)
+    with store.open_for_writing() as log:
+        ingested = log.ingest(source)
+    rejected = (*log.rejected, *ingested.rejected)
+    report_rejected(rejected, console)
     number = publish_release(store, executor, console)
     console.print(
-        f"{folder}: release {number} after {done.added} new observations, {done.known} known, {len(put_aside)} put aside",
+        f"{folder}: release {number} after {ingested.num_added} new observations, {ingested.num_known} known, "
+        f"{len(rejected)} put aside",
         highlight=False,
         soft_wrap=True,
     )
@@ -103,9 +104,9 @@ def _into_store(options: Options, folder: Path, console: Console) -> None:
 
 def publish_release(store: MapStore, executor: Executor, console: Console) -> int:
     """Fuse all observations of a store that count, publish the map, and return the release's number."""
-    from manyeyes.viz.progress import bars
+    from manyeyes.viz.progress import make_progress_bars
 
-    with bars(console) as progress:
+    with make_progress_bars(console) as progress:
         tasks: dict[str, TaskID] = {}
 
         def report(step: str, finished: int, total: int) -> None:

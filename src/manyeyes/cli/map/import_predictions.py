@@ -32,7 +32,7 @@ class Options:
     """The model's view ahead of the vehicle, metres."""
     range_y: tuple[float, float] = (-15.0, 15.0)
     """The model's view to the left of the vehicle, metres."""
-    least_score: float = 0.1
+    min_score: float = 0.1
     """Elements below this score are left out."""
     model: str = "imported"
     """What the observations say made them."""
@@ -44,15 +44,15 @@ def main(options: Options) -> None:
     """The verb."""
     from rich.console import Console
 
-    from manyeyes.maps.elements.observation import Frame
+    from manyeyes.maps.elements.observation import MapFrame
     from manyeyes.maps.formats.model_results import (
-        ResultOptions,
+        ModelResultOptions,
         read_model_results,
         read_nuscenes_poses,
         read_pose_csv,
     )
     from manyeyes.studies import provenance
-    from manyeyes.studies.map_folder import MapFolder, say_put_aside
+    from manyeyes.studies.map_folder import MapFolder, report_rejected
 
     if (options.poses is None) == (options.nuscenes is None):
         raise ConfigError(
@@ -62,21 +62,23 @@ def main(options: Options) -> None:
         raise ConfigError("--poses needs --origin LATITUDE LONGITUDE, degrees: where x = y = 0 lies on the earth.")
     console = Console()
     if options.poses is not None and options.origin is not None:
-        table = read_pose_csv(options.poses, Frame(*options.origin))
+        poses = read_pose_csv(options.poses, MapFrame(*options.origin))
     else:
         assert options.nuscenes is not None
-        table = read_nuscenes_poses(options.nuscenes, options.location, options.axes)
-    asked = ResultOptions(options.axes, options.range_x, options.range_y, options.least_score, model=options.model)
-    reading = read_model_results(options.results, table, asked)
-    say_put_aside(reading.quarantined, console)
-    if not reading.observations:
+        poses = read_nuscenes_poses(options.nuscenes, options.location, options.axes)
+    result_options = ModelResultOptions(
+        options.axes, options.range_x, options.range_y, options.min_score, model=options.model
+    )
+    loaded = read_model_results(options.results, poses, result_options)
+    report_rejected(loaded.rejected, console)
+    if not loaded.observations:
         raise ConfigError(f"{options.results}: no sample could be used; the reasons stand above.")
-    MapFolder(options.out).write_observations(reading.observations, reading.frame)
-    elements = sum(len(o.elements) for o in reading.observations)
-    payload = {"observations": len(reading.observations), "elements": elements, "put_aside": len(reading.quarantined)}
+    MapFolder(options.out).write_observations(loaded.observations, loaded.frame)
+    elements = sum(len(o.elements) for o in loaded.observations)
+    payload = {"observations": len(loaded.observations), "elements": elements, "put_aside": len(loaded.rejected)}
     provenance.write_json(options.out / "import.json", payload, options, None)
     console.print(
-        f"{len(reading.observations)} observations of {elements} elements in {options.out}",
+        f"{len(loaded.observations)} observations of {elements} elements in {options.out}",
         highlight=False,
         soft_wrap=True,
     )

@@ -41,31 +41,33 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.cli.map.fuse import publish_release
-    from manyeyes.maps.store.executors import named_executor
-    from manyeyes.maps.store.store import MapStore, watermark_of
-    from manyeyes.studies.map_folder import say_put_aside
+    from manyeyes.maps.store.executors import make_executor
+    from manyeyes.maps.store.store import MapStore, compute_watermark
+    from manyeyes.studies.map_folder import report_rejected
 
-    named = options.agent is not None or options.pass_id is not None
-    if bool(options.ids) == named:
+    selects_by_sender = options.agent is not None or options.pass_id is not None
+    if bool(options.ids) == selects_by_sender:
         raise ConfigError("Name the observations: --ids ID ..., or --agent NAME, --pass-id NAME or both.")
     if not options.reason.strip():
         raise ConfigError("--reason is empty; the log records why observations are retracted.")
-    executor = named_executor(options.executor, options.workers)
+    executor = make_executor(options.executor, options.workers)
     store, console = MapStore(options.store), Console()
 
-    def say(text: str) -> None:
+    def print_status(text: str) -> None:
         console.print(f"{options.store}: {text}", highlight=False, markup=False, soft_wrap=True)
 
-    with store.writing() as log:
-        say_put_aside(log.refused, console)
-        chosen = log.find(options.ids, options.agent, options.pass_id)
-        count = log.retract(chosen, options.reason)
-        standing = log.standing()
-    say(f"{count} observations retracted now, {len(chosen) - count} before; {len(standing)} count")
+    with store.open_for_writing() as log:
+        report_rejected(log.rejected, console)
+        selected = log.find(options.ids, options.agent, options.pass_id)
+        count = log.retract(selected, options.reason)
+        active = log.active_observations()
+    print_status(f"{count} observations retracted now, {len(selected) - count} before; {len(active)} count")
     last = store.manifest() if store.releases() else None
-    if last is not None and last.watermark == watermark_of(standing.ids, standing.time_ns):
-        say(f"release {last.number} is already without them")
+    if last is not None and last.watermark == compute_watermark(active.ids, active.time_ns):
+        print_status(f"release {last.number} is already without them")
     elif options.fuse:
-        say(f"release {publish_release(store, executor, console)} is without them")
+        print_status(f"release {publish_release(store, executor, console)} is without them")
     else:
-        say("no new release; run this again without --no-fuse, or 'manyeyes map fuse OBSERVATIONS --store' this folder")
+        print_status(
+            "no new release; run this again without --no-fuse, or 'manyeyes map fuse OBSERVATIONS --store' this folder"
+        )

@@ -35,35 +35,45 @@ def main(options: Options) -> None:
 
     from rich.console import Console
 
-    from manyeyes.evaluation.maps.experiment import Scene, Trial
+    from manyeyes.evaluation.maps.experiment import FleetExperiment, FleetTrial
     from manyeyes.simulator.fleet.config import crowd_config
-    from manyeyes.simulator.fleet.place import place
+    from manyeyes.simulator.fleet.place import load_place
     from manyeyes.simulator.fleet.simulate import simulate_crowd
     from manyeyes.studies import provenance
     from manyeyes.studies.map_folder import MapFolder
-    from manyeyes.viz.progress import bars
+    from manyeyes.viz.progress import make_progress_bars
 
-    trial = Trial(
+    trial = FleetTrial(
         options.place, options.observations, options.seed, options.size, options.crowd, crowd_config(options.crowd)
     )
-    trial = trial if options.pose_sigma is None else trial.noisy(options.pose_sigma)
+    trial = trial if options.pose_sigma is None else trial.with_pose_noise(options.pose_sigma)
     out = options.out or Path("out/map") / options.place
     console = Console()
-    with bars(console) as progress:
-        task = progress.add_task("Driving", total=trial.count)
-        where = place(trial.place, trial.size_m)
-        crowd = simulate_crowd(
-            where, trial.count, trial.crowd, trial.seed, (), lambda done, _: progress.update(task, completed=done)
+    with make_progress_bars(console) as progress:
+        task = progress.add_task("Driving", total=trial.num_observations)
+        map_place = load_place(trial.place, trial.size_m)
+        fleet = simulate_crowd(
+            map_place,
+            trial.num_observations,
+            trial.fleet_config,
+            trial.seed,
+            (),
+            lambda done, _: progress.update(task, completed=done),
         )
-    scene = Scene(trial, crowd)
-    MapFolder(out).write(scene)
-    elements = sum(len(o.elements) for o in scene.observations)
-    payload = {"observations": len(scene.observations), "elements": elements, "true_elements": len(scene.truth)}
+    experiment = FleetExperiment(trial, fleet)
+    MapFolder(out).write(experiment)
+    elements = sum(len(o.elements) for o in experiment.observations)
+    payload = {
+        "observations": len(experiment.observations),
+        "elements": elements,
+        "true_elements": len(experiment.truth),
+    }
     provenance.write_json(
         out / "simulate.json", payload, {"options": replace(options, out=out), "trial": trial}, options.seed
     )
     console.print(
-        f"{len(scene.observations)} observations of {elements} elements, and {len(scene.truth)} true ones in view, in {out}",
+        f"{len(experiment.observations)} observations of {elements} elements, and {len(experiment.truth)} true "
+        f"ones in view, in {out}",
         highlight=False,
         soft_wrap=True,
     )

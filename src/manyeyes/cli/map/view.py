@@ -23,7 +23,7 @@ class Options:
     """Observations to draw behind it; a folder 'observations' beside the map is found by itself."""
     out: Path | None = None
     """The page (.html) or picture (.png); map.html in the map's folder by default."""
-    most: int = 500
+    max_observations: int = 500
     """At most so many observations are drawn: a page of a million lines helps nobody."""
 
 
@@ -32,30 +32,34 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.datatypes.map_element import MapElements
-    from manyeyes.studies.map_folder import MapFolder, observations_in, read_vector_map
-    from manyeyes.viz.map_figures import Panel, save_figure
-    from manyeyes.viz.map_page import page_of, save_map_page
+    from manyeyes.studies.map_folder import MapFolder, load_observations, read_vector_map
+    from manyeyes.viz.map_figures import MapPanel, save_figure
+    from manyeyes.viz.map_page import make_page, save_map_page
 
     out = options.out or options.folder / "map.html"
     if out.suffix.lower() not in (".html", ".png"):
         raise ConfigError(f"--out ends in .html or .png; got {out.name}.")
     console = Console()
-    beside = options.folder.parent
-    made = read_vector_map(options.folder)
-    truth_folder = options.truth or _if_there(beside / "truth")
+    parent = options.folder.parent
+    vector_map = read_vector_map(options.folder)
+    truth_folder = options.truth or _existing(parent / "truth")
     truth = read_vector_map(truth_folder).elements if truth_folder and truth_folder != options.folder else None
-    seen_in = options.observations or _if_there(beside / "observations")
-    seen = observations_in(seen_in, console).observations if seen_in else ()
-    observed = MapElements.cat([o.in_map() for o in seen[: options.most]]) if seen else None
+    observations_path = options.observations or _existing(parent / "observations")
+    observations = load_observations(observations_path, console).observations if observations_path else ()
+    observed = (
+        MapElements.cat([o.elements_in_map() for o in observations[: options.max_observations]])
+        if observations
+        else None
+    )
     title = options.folder.stem
     if out.suffix.lower() == ".png":
-        save_figure([Panel(title, made.published().elements, truth)], out, columns=1, width_in=10.0)
+        save_figure([MapPanel(title, vector_map.select_published().elements, truth)], out, columns=1, width_in=10.0)
     else:
-        cut = MapFolder(truth_folder.parent).cut() if truth_folder and truth is not None else None
-        judged = cut(made.published().elements) if cut else None
-        save_map_page(page_of(title, made, truth, observed, len(seen), judged), out)
-    console.print(f"{out}: {len(made.published())} published elements", highlight=False, soft_wrap=True)
+        cut_policy = MapFolder(truth_folder.parent).read_cut_policy() if truth_folder and truth is not None else None
+        evaluated = cut_policy(vector_map.select_published().elements) if cut_policy else None
+        save_map_page(make_page(title, vector_map, truth, observed, len(observations), evaluated), out)
+    console.print(f"{out}: {len(vector_map.select_published())} published elements", highlight=False, soft_wrap=True)
 
 
-def _if_there(path: Path) -> Path | None:
+def _existing(path: Path) -> Path | None:
     return path if path.exists() else None

@@ -9,22 +9,22 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from manyeyes.agents.replay import Step
+from manyeyes.agents.replay import ReplayStep
 from manyeyes.evaluation.detection.average_precision import (
     ApResult,
+    DetectionProtocol,
+    FrameIou,
     FrameMatch,
-    FrameOverlap,
     FrameResult,
-    Protocol,
-    ap_of_matches,
-    ego_truth,
+    compute_ap,
+    compute_frame_iou,
     match_frame,
-    overlap_frame,
+    select_ego_truth,
 )
-from manyeyes.evaluation.detection.communication import Communication, MessageRecord, summarise
+from manyeyes.evaluation.detection.communication import Communication, MessageRecord, summarize_messages
 from manyeyes.evaluation.statistics.bootstrap import Interval, paired_difference, scenario_interval
 
-IOUS = (0.5, 0.7)
+IOU_THRESHOLDS = (0.5, 0.7)
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class MethodResult:
     share_ms: float
     perceive_ms: float
 
-    def less(self, other: MethodResult, iou: int, protocol: Protocol) -> Interval:
+    def paired_difference(self, other: MethodResult, iou: int, protocol: DetectionProtocol) -> Interval:
         """AP of this method minus that of another, paired over scenarios. iou: index into IOUS."""
         return paired_difference(self.ap[iou].frames, other.ap[iou].frames, protocol=protocol)
 
 
 @dataclass
-class Tally:
+class MetricAccumulator:
     """What one method did so far, in the little that judging needs: no cloud is kept.
 
     speeds: (G,) m/s of each frame's true boxes. Messages are those that other agents sent for an ego's frame, arrived or not.
@@ -53,36 +53,36 @@ class Tally:
     """
 
     method: str
-    protocol: Protocol
-    frames: list[FrameOverlap] = field(default_factory=list)
+    protocol: DetectionProtocol
+    frames: list[FrameIou] = field(default_factory=list)
     speeds: list[Tensor] = field(default_factory=list)
     messages: list[MessageRecord] = field(default_factory=list)
     ages_s: list[float] = field(default_factory=list)
     share_s: list[float] = field(default_factory=list)
     perceive_s: list[float] = field(default_factory=list)
 
-    def add(self, step: Step) -> None:
+    def add(self, step: ReplayStep) -> None:
         """Count one ego at one instant."""
         snapshot, ego = step.snapshot, step.snapshot.frames[step.ego].agent_id
-        truth = ego_truth(snapshot, step.ego, self.protocol)
+        truth = select_ego_truth(snapshot, step.ego, self.protocol)
         result = FrameResult(snapshot.scenario, snapshot.index, step.boxes, truth)
-        self.frames.append(overlap_frame(result, self.protocol))
+        self.frames.append(compute_frame_iou(result, self.protocol))
         self.speeds.append(truth.velocity.norm(dim=1))
-        heard = (h.message for h in step.perception.heard)
-        arrived = {m.agent_id: tuple(m.tokens.features.shape) for m in heard if m.tokens is not None}
+        received = (h.message for h in step.perception.received)
+        arrived = {m.agent_id: tuple(m.tokens.features.shape) for m in received if m.tokens is not None}
         for sent in step.sent:
-            if sent.packets:
+            if sent.num_packets:
                 self.share_s.append(sent.seconds)
-            if sent.packets and sent.agent_id != ego:
+            if sent.num_packets and sent.agent_id != ego:
                 cells, channels = arrived.get(sent.agent_id, (0, 0))
                 record = MessageRecord(
-                    snapshot.scenario, snapshot.index, sent.agent_id, sent.bytes, cells, channels, ego=ego
+                    snapshot.scenario, snapshot.index, sent.agent_id, sent.num_bytes, cells, channels, ego=ego
                 )
                 self.messages.append(record)
         self.ages_s += step.ages_s
         self.perceive_s.append(step.perceive_seconds)
 
-    def extend(self, other: Tally) -> None:
+    def extend(self, other: MetricAccumulator) -> None:
         """Count what another tally of this method counted."""
         self.frames += other.frames
         self.speeds += other.speeds
@@ -91,27 +91,27 @@ class Tally:
         self.share_s += other.share_s
         self.perceive_s += other.perceive_s
 
-    def matches(self) -> tuple[tuple[FrameMatch, ...], ...]:
+    def match_frames(self) -> tuple[tuple[FrameMatch, ...], ...]:
         """The frames matched at each of IOUS, in the order they came in."""
-        return tuple(tuple(match_frame(frame, iou, self.protocol) for frame in self.frames) for iou in IOUS)
+        return tuple(tuple(match_frame(frame, iou, self.protocol) for frame in self.frames) for iou in IOU_THRESHOLDS)
 
-    def communication(self) -> Communication:
+    def summarize_communication(self) -> Communication:
         """What was sent."""
-        return summarise(self.messages, len(self.frames))
+        return summarize_messages(self.messages, len(self.frames))
 
-    def age_ms(self) -> float:
+    def mean_age_ms(self) -> float:
         """The mean age of what took part, when it was used; NaN where nothing did."""
         return _mean_ms(self.ages_s)
 
-    def result(self) -> MethodResult:
+    def compute_result(self) -> MethodResult:
         """The numbers of everything counted so far."""
-        matches = self.matches()
+        matches = self.match_frames()
         return MethodResult(
             self.method,
-            tuple(ap_of_matches(m, self.protocol) for m in matches),
+            tuple(compute_ap(m, self.protocol) for m in matches),
             tuple(scenario_interval(m, protocol=self.protocol) for m in matches),
-            self.communication(),
-            self.age_ms(),
+            self.summarize_communication(),
+            self.mean_age_ms(),
             _mean_ms(self.share_s),
             _mean_ms(self.perceive_s),
         )

@@ -4,11 +4,11 @@
 **Frame.** Detections and truth are in the ego's own, physical frame (x forward, y left, z = 0 on the road). Errors of
 claimed poses displace what collaborators said; they never move the truth.
 
-**Truth of an ego** (:func:`ego_truth`): the union of the boxes listed by every agent whose *true* position lies within
+**Truth of an ego** (:func:`select_ego_truth`): the union of the boxes listed by every agent whose *true* position lies within
 ``com_range_m`` of the ego's (in the plane, the ego included), one box per id, without the ego's own body, moved into the
 ego's frame by its *true* pose, within the range.
 
-**Detections that count** (:func:`kept_detections`), in this order: score > ``score_threshold``; optionally dropped when
+**Detections that count** (:func:`filter_detections`), in this order: score > ``score_threshold``; optionally dropped when
 their axis-aligned extent exceeds ``drop_large_axis_aligned_m``; optionally all corners within ``z_filter``; greedy
 rotated NMS that suppresses IoU > ``nms_iou`` among the best ``nms_pre``; within the range.
 
@@ -54,18 +54,18 @@ RangeMode = Literal["center_xy", "center", "corners_xy", "corners"]
 
 
 @dataclass(frozen=True)
-class Protocol:
+class DetectionProtocol:
     """How a detection AP is computed; the module's text defines each field.
 
     gt_range: x, y, z minimum, then maximum, metres. *_range_mode: box centre or all corners, in the plane or with z.
-    sort: which of the two APs is this protocol's own. z_origin_m: height above the road of the origin that the z values
+    ap_order: which of the two APs is this protocol's own. z_origin_m: height above the road of the origin that the z values
     of gt_range and z_filter are relative to. min_points_in_gt: LiDAR returns of all agents in range that a truth box
     needs. count_frames_without_det: false leaves out the truth of frames without a detection (a known defect).
     drop_first_segment: the sum for AP starts at the first detection's recall (DAIR-V2X).
     """
 
     name: str
-    sort: Literal["global", "concatenated"] = "global"
+    ap_order: Literal["global", "concatenated"] = "global"
     score_threshold: float = 0.05
     nms_iou: float = 0.15
     nms_pre: int = 1000
@@ -81,14 +81,14 @@ class Protocol:
     matching: Literal["remaining", "best", "truth_first"] = "remaining"
     drop_first_segment: bool = False
 
-    def within(self, gt_range: tuple[float, float, float, float, float, float]) -> Protocol:
+    def with_range(self, gt_range: tuple[float, float, float, float, float, float]) -> DetectionProtocol:
         """The same rules over another range."""
         return replace(self, gt_range=gt_range)
 
 
-_OPENCOOD = Protocol(
+_OPENCOOD = DetectionProtocol(
     name="opencood",
-    sort="concatenated",
+    ap_order="concatenated",
     score_threshold=0.20,
     gt_range_mode="corners",
     pred_range_mode="corners_xy",
@@ -107,7 +107,7 @@ _COALIGN = replace(
     com_range_m=100.0,
 )
 
-_SPARSEALIGN = Protocol(
+_SPARSEALIGN = DetectionProtocol(
     name="sparsealign",
     score_threshold=0.20,
     nms_iou=0.01,
@@ -118,14 +118,14 @@ _SPARSEALIGN = Protocol(
     min_points_in_gt=4,
 )
 
-PROTOCOLS: dict[str, Protocol] = {
+PROTOCOLS: dict[str, DetectionProtocol] = {
     p.name: p
     for p in (
-        Protocol(name="manyeyes"),
+        DetectionProtocol(name="manyeyes"),
         _OPENCOOD,
         _COALIGN,
         _SPARSEALIGN,
-        Protocol(
+        DetectionProtocol(
             name="dair",
             score_threshold=0.20,
             gt_range=(0.0, -39.68, -3.0, 100.0, 39.68, 1.0),
@@ -137,9 +137,9 @@ PROTOCOLS: dict[str, Protocol] = {
             drop_first_segment=True,
         ),
         replace(_COALIGN, name="heal-dair", gt_range=(-102.4, -51.2, -3.5, 102.4, 51.2, 1.5)),
-        replace(_COALIGN, name="costr-dair", sort="concatenated", gt_range=(0.0, -51.2, -3.5, 102.4, 51.2, 1.5)),
+        replace(_COALIGN, name="costr-dair", ap_order="concatenated", gt_range=(0.0, -51.2, -3.5, 102.4, 51.2, 1.5)),
         replace(
-            _COALIGN, name="costr-dair-centred", sort="concatenated", gt_range=(-51.2, -51.2, -3.5, 51.2, 51.2, 1.5)
+            _COALIGN, name="costr-dair-centred", ap_order="concatenated", gt_range=(-51.2, -51.2, -3.5, 51.2, 51.2, 1.5)
         ),
         replace(
             _SPARSEALIGN, name="sparsealign-dair", gt_range=(-100.0, -40.0, -3.0, 100.0, 40.0, 1.0), com_range_m=200.0
@@ -148,7 +148,7 @@ PROTOCOLS: dict[str, Protocol] = {
 }
 
 
-def protocol_named(name: str) -> Protocol:
+def get_protocol(name: str) -> DetectionProtocol:
     """The protocol of that name."""
     if name not in PROTOCOLS:
         raise ConfigError(f"No evaluation protocol is called {name!r}; known: {', '.join(PROTOCOLS)}.")
@@ -166,7 +166,7 @@ class FrameResult:
 
 
 @dataclass(frozen=True)
-class FrameOverlap:
+class FrameIou:
     """A frame ready to be matched at any threshold: score (D,) descending, iou (D, G), both float64."""
 
     scenario: str
@@ -205,7 +205,7 @@ class ApResult:
     frames: tuple[FrameMatch, ...]
 
 
-def ego_truth(snapshot: Snapshot, ego: int, protocol: Protocol) -> Boxes:
+def select_ego_truth(snapshot: Snapshot, ego: int, protocol: DetectionProtocol) -> Boxes:
     """The truth that frames[ego] is judged by, in its true frame, float64; the rule is in the module's text."""
     truth = snapshot.truth
     if truth is None:
@@ -216,13 +216,13 @@ def ego_truth(snapshot: Snapshot, ego: int, protocol: Protocol) -> Boxes:
     near = (position - position[ego]).norm(dim=-1) <= protocol.com_range_m
     listed = truth.seen[near].any(0) & (truth.boxes.id != snapshot.frames[ego].agent_id)
     if protocol.min_points_in_gt > 0:
-        listed &= _points_inside(snapshot, near) >= protocol.min_points_in_gt
-    boxes = truth.boxes[_first_of_each_id(truth.boxes.id, listed)]
+        listed &= _count_points(snapshot, near) >= protocol.min_points_in_gt
+    boxes = truth.boxes[_select_unique_ids(truth.boxes.id, listed)]
     boxes = boxes.to(torch.float64).transform(truth.world_from_agent[ego].inverse())
-    return boxes[in_range(boxes, protocol, protocol.gt_range_mode)]
+    return boxes[is_in_range(boxes, protocol, protocol.gt_range_mode)]
 
 
-def _points_inside(snapshot: Snapshot, near: Tensor) -> Tensor:
+def _count_points(snapshot: Snapshot, near: Tensor) -> Tensor:
     """(N,) int64: the returns of the agents that are near (agents,) in each truth box."""
     assert snapshot.truth is not None
     count = torch.zeros(len(snapshot.truth.boxes), dtype=torch.int64)
@@ -232,20 +232,20 @@ def _points_inside(snapshot: Snapshot, near: Tensor) -> Tensor:
     return count
 
 
-def _first_of_each_id(ids: Tensor, listed: Tensor) -> Tensor:
+def _select_unique_ids(ids: Tensor, listed: Tensor) -> Tensor:
     """Rows (K,) that are listed (N,), the first of each id; -1 names nobody and is always kept."""
-    known: set[int] = set()
+    seen_ids: set[int] = set()
     rows: list[int] = []
     for row in listed.nonzero()[:, 0].tolist():
-        name = int(ids[row])
-        if name not in known:
+        box_id = int(ids[row])
+        if box_id not in seen_ids:
             rows.append(row)
-        if name != -1:
-            known.add(name)
+        if box_id != -1:
+            seen_ids.add(box_id)
     return torch.tensor(rows, dtype=torch.int64)
 
 
-def in_range(boxes: Boxes, protocol: Protocol, mode: RangeMode) -> Tensor:
+def is_in_range(boxes: Boxes, protocol: DetectionProtocol, mode: RangeMode) -> Tensor:
     """(N,) bool: which boxes lie in the protocol's range by centre or by all corners, with or without z; closed."""
     axes = 2 if mode.endswith("_xy") else 3
     shift = torch.tensor([0.0, 0.0, protocol.z_origin_m], dtype=torch.float64)
@@ -254,7 +254,7 @@ def in_range(boxes: Boxes, protocol: Protocol, mode: RangeMode) -> Tensor:
     return ((points >= low[:axes]) & (points <= high[:axes])).all(-1).all(-1)
 
 
-def kept_detections(boxes: Boxes, protocol: Protocol) -> Boxes:
+def filter_detections(boxes: Boxes, protocol: DetectionProtocol) -> Boxes:
     """The detections that count, in descending score (ties in the order given), float64."""
     boxes = boxes.to(torch.float64)
     boxes = boxes[boxes.score > protocol.score_threshold]
@@ -268,71 +268,71 @@ def kept_detections(boxes: Boxes, protocol: Protocol) -> Boxes:
         keep &= ((z >= low) & (z <= high)).all(-1)
     boxes = boxes[keep]
     boxes = boxes[rotated_nms(boxes.bev(), boxes.score, protocol.nms_iou, protocol.nms_pre)]
-    return boxes[in_range(boxes, protocol, protocol.pred_range_mode)]
+    return boxes[is_in_range(boxes, protocol, protocol.pred_range_mode)]
 
 
-def overlap_frame(result: FrameResult, protocol: Protocol) -> FrameOverlap:
+def compute_frame_iou(result: FrameResult, protocol: DetectionProtocol) -> FrameIou:
     """Filters both sides by the protocol (truth by range) and computes their IoU once, for every threshold."""
-    found = kept_detections(result.detections, protocol)
+    found = filter_detections(result.detections, protocol)
     truth = result.truth.to(torch.float64)
-    truth = truth[in_range(truth, protocol, protocol.gt_range_mode)]
-    return FrameOverlap(result.scenario, result.index, found.score, pairwise_iou(found.bev(), truth.bev()))
+    truth = truth[is_in_range(truth, protocol, protocol.gt_range_mode)]
+    return FrameIou(result.scenario, result.index, found.score, pairwise_iou(found.bev(), truth.bev()))
 
 
-def match_frame(frame: FrameResult | FrameOverlap, iou: float, protocol: Protocol) -> FrameMatch:
+def match_frame(frame: FrameResult | FrameIou, iou: float, protocol: DetectionProtocol) -> FrameMatch:
     """Which detections of a frame are true positives at an IoU threshold."""
     if isinstance(frame, FrameResult):
-        frame = overlap_frame(frame, protocol)
+        frame = compute_frame_iou(frame, protocol)
     table = frame.iou.numpy()
     truth_row = np.full(table.shape[0], -1)
     if protocol.matching == "truth_first":
-        pairs = _greedy(table.T, iou, again=False)
+        pairs = _match_greedily(table.T, iou, allow_taken=False)
         truth_row[pairs[:, 1]] = pairs[:, 0]
     else:
-        pairs = _greedy(table, iou, again=protocol.matching == "best")
+        pairs = _match_greedily(table, iou, allow_taken=protocol.matching == "best")
         truth_row[pairs[:, 0]] = pairs[:, 1]
     return FrameMatch(frame.scenario, frame.index, frame.score, torch.from_numpy(truth_row), table.shape[1])
 
 
-def _greedy(table: np.ndarray, threshold: float, again: bool) -> np.ndarray:
+def _match_greedily(table: np.ndarray, threshold: float, allow_taken: bool) -> np.ndarray:
     """Pairs (K, 2) of row and column: each row in turn takes its best free column, where that is >= the threshold.
 
-    again: a row looks at taken columns too, and gets nothing when its best is one of them.
+    allow_taken: a row looks at taken columns too, and gets nothing when its best is one of them.
     """
     pairs: list[tuple[int, int]] = []
     free = np.ones(table.shape[1], dtype=bool)
     for row, overlap in enumerate(table if table.shape[1] else table[:0]):
-        column = int(np.argmax(overlap if again else np.where(free, overlap, -1.0)))
+        column = int(np.argmax(overlap if allow_taken else np.where(free, overlap, -1.0)))
         if free[column] and overlap[column] >= threshold:
             free[column] = False
             pairs.append((row, column))
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def average_precision(frames: Sequence[FrameResult | FrameOverlap], iou: float, protocol: Protocol) -> ApResult:
+def average_precision(frames: Sequence[FrameResult | FrameIou], iou: float, protocol: DetectionProtocol) -> ApResult:
     """AP of the frames at an IoU threshold."""
-    return ap_of_matches([match_frame(frame, iou, protocol) for frame in frames], protocol)
+    return compute_ap([match_frame(frame, iou, protocol) for frame in frames], protocol)
 
 
 def average_precisions(
-    frames: Sequence[FrameResult | FrameOverlap], ious: Sequence[float], protocol: Protocol
+    frames: Sequence[FrameResult | FrameIou], ious: Sequence[float], protocol: DetectionProtocol
 ) -> tuple[ApResult, ...]:
     """AP of the frames at each IoU threshold; boxes are filtered and overlapped once."""
-    ready = [overlap_frame(frame, protocol) if isinstance(frame, FrameResult) else frame for frame in frames]
+    ready = [compute_frame_iou(frame, protocol) if isinstance(frame, FrameResult) else frame for frame in frames]
     return tuple(average_precision(ready, iou, protocol) for iou in ious)
 
 
-def ap_of_matches(matches: Sequence[FrameMatch], protocol: Protocol) -> ApResult:
+def compute_ap(matches: Sequence[FrameMatch], protocol: DetectionProtocol) -> ApResult:
     """AP of frames that are already matched."""
-    matches = in_dataset_order(matches)
-    n_gt = sum(counted_truth(match, protocol) for match in matches)
+    matches = sort_by_frame(matches)
+    n_gt = sum(count_truth(match, protocol) for match in matches)
     score = np.concatenate([m.score.numpy() for m in matches]) if matches else np.zeros(0)
     tp = np.concatenate([m.tp.numpy() for m in matches]) if matches else np.zeros(0, dtype=bool)
     ranked = tp[np.argsort(-score, kind="stable")]
-    ap_global = _area(ranked, n_gt, protocol.drop_first_segment)
-    ap_legacy = _area(tp, n_gt, protocol.drop_first_segment)
+    ap_global = _compute_area(ranked, n_gt, protocol.drop_first_segment)
+    ap_legacy = _compute_area(tp, n_gt, protocol.drop_first_segment)
     return ApResult(
-        ap=ap_global if protocol.sort == "global" else ap_legacy,
+        ap=ap_global if protocol.ap_order == "global" else ap_legacy,
         ap_global=ap_global,
         ap_legacy=ap_legacy,
         recall=float(tp.sum() / n_gt) if n_gt else math.nan,
@@ -343,17 +343,17 @@ def ap_of_matches(matches: Sequence[FrameMatch], protocol: Protocol) -> ApResult
     )
 
 
-def in_dataset_order(matches: Sequence[FrameMatch]) -> list[FrameMatch]:
+def sort_by_frame(matches: Sequence[FrameMatch]) -> list[FrameMatch]:
     """Frames by (scenario, index); stable."""
     return sorted(matches, key=lambda match: (match.scenario, match.index))
 
 
-def counted_truth(match: FrameMatch, protocol: Protocol) -> int:
+def count_truth(match: FrameMatch, protocol: DetectionProtocol) -> int:
     """How many truth boxes of a frame the protocol counts."""
     return match.n_gt if len(match.score) or protocol.count_frames_without_det else 0
 
 
-def _area(tp: np.ndarray, n_gt: int, drop_first_segment: bool) -> float:
+def _compute_area(tp: np.ndarray, n_gt: int, drop_first_segment: bool) -> float:
     """Area under precision made monotone over recall, for detections (D,) in their order."""
     if n_gt == 0:
         return math.nan

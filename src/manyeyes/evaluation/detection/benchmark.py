@@ -14,17 +14,17 @@ from pathlib import Path
 
 import torch
 
-from manyeyes.agents.replay import ReplayConfig, Step, Views, replay
+from manyeyes.agents.replay import CachedOutputs, ReplayConfig, ReplayStep, replay
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import Snapshot
-from manyeyes.evaluation.detection.accumulator import MethodResult, Tally
-from manyeyes.evaluation.detection.average_precision import Protocol, protocol_named
-from manyeyes.evaluation.detection.recording_filters import EveryKth, KeptSnapshots, NearestAgents
+from manyeyes.evaluation.detection.accumulator import MethodResult, MetricAccumulator
+from manyeyes.evaluation.detection.average_precision import DetectionProtocol, get_protocol
+from manyeyes.evaluation.detection.recording_filters import CachedRecording, FrameStride, NearestAgents
 from manyeyes.models import pretrained
 from manyeyes.models.detector.detector import Detector
 
-TOGETHER = 8
+CONDITIONS_PER_GROUP = 8
 """Conditions that are played side by side: more of them see each sweep once, fewer of them are lost when a study is stopped."""
 
 
@@ -32,137 +32,140 @@ TOGETHER = 8
 class BenchmarkConfig:
     """What is compared, and how it is judged. weights: a name or a path. protocol: by name, over the detector's own range.
 
-    every: judge each so many-th frame. agents: the nearest so many, in scenarios that have them; None: all of all scenarios.
+    frame_stride: judge each so many-th frame. num_agents: the nearest so many, in scenarios that have them; None: all of all
+    scenarios.
     """
 
-    weights: str = pretrained.DEFAULT
+    weights: str = pretrained.DEFAULT_DETECTOR
     methods: tuple[str, ...] = ("alone", "late", "intermediate", "early")
     protocol: str = "manyeyes"
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    noise: PoseNoise | None = None
-    every: int = 1
-    agents: int | None = None
+    pose_noise: PoseNoise | None = None
+    frame_stride: int = 1
+    num_agents: int | None = None
 
-    def view(self, recording: Recording) -> Recording:
+    def filter_recording(self, recording: Recording) -> Recording:
         """What is judged of a recording."""
-        seen = recording if self.agents is None else NearestAgents(recording, self.agents)
-        return seen if self.every == 1 else EveryKth(seen, self.every)
+        filtered = recording if self.num_agents is None else NearestAgents(recording, self.num_agents)
+        return filtered if self.frame_stride == 1 else FrameStride(filtered, self.frame_stride)
 
 
-def judging_protocol(config: BenchmarkConfig) -> Protocol:
+def resolve_protocol(config: BenchmarkConfig) -> DetectionProtocol:
     """The named protocol; our own one judges over the range that the detector answers for."""
-    protocol, grid = protocol_named(config.protocol), loaded(config.weights).config.range
+    protocol, grid = get_protocol(config.protocol), load_detector(config.weights).config.detection_range
     if config.protocol != "manyeyes":
         return protocol
-    return protocol.within((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
+    return protocol.with_range((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
 
 
-def loaded(weights: str) -> Detector:
+def load_detector(weights: str) -> Detector:
     """The weights of that name or path, read once by each process for as long as the file stays as it is."""
     path = Path(weights)
-    return _load(weights, path.stat().st_mtime_ns if path.is_file() else 0)
+    return _load_cached(weights, path.stat().st_mtime_ns if path.is_file() else 0)
 
 
 @lru_cache(maxsize=2)
-def _load(weights: str, changed_ns: int) -> Detector:
+def _load_cached(weights: str, modified_ns: int) -> Detector:
     return pretrained.load(weights)
 
 
 def run_scenario(
     open_recording: Callable[[], Recording], configs: Sequence[BenchmarkConfig], scenario: str
-) -> list[list[Tally]]:
+) -> list[list[MetricAccumulator]]:
     """All methods of each configuration on one scenario; a function of its arguments alone.
 
     The configurations have the same weights, view and history: each sweep is read and looked at once between them.
     """
     torch.set_num_threads(1)
     first = configs[0]
-    detector, known = loaded(first.weights), {}
-    apart = 2 * first.every + first.replay.history + 1
-    recording = KeptSnapshots(first.view(open_recording()), apart)
-    tallies = [{name: Tally(name, judging_protocol(config)) for name in config.methods} for config in configs]
-    plays = [_instants(recording, scenario, detector, config, known) for config in configs]
-    for instants in zip(*plays):
-        for (_, steps), counts in zip(instants, tallies):
+    detector, feature_cache = load_detector(first.weights), {}
+    max_snapshots = 2 * first.frame_stride + first.replay.warmup_frames + 1
+    recording = CachedRecording(first.filter_recording(open_recording()), max_snapshots)
+    accumulators_by_config = [
+        {name: MetricAccumulator(name, resolve_protocol(config)) for name in config.methods} for config in configs
+    ]
+    replays = [_iterate_snapshots(recording, scenario, detector, config, feature_cache) for config in configs]
+    for instants in zip(*replays):
+        for (_, steps), accumulators in zip(instants, accumulators_by_config):
             for step in steps:
-                counts[step.method].add(step)
-    return [list(counts.values()) for counts in tallies]
+                accumulators[step.method].add(step)
+    return [list(accumulators.values()) for accumulators in accumulators_by_config]
 
 
-def _instants(
-    recording: Recording, scenario: str, detector: Detector, config: BenchmarkConfig, known: Views
-) -> Iterator[tuple[int, Iterator[Step]]]:
+def _iterate_snapshots(
+    recording: Recording, scenario: str, detector: Detector, config: BenchmarkConfig, feature_cache: CachedOutputs
+) -> Iterator[tuple[int, Iterator[ReplayStep]]]:
     """The steps of one configuration, judged snapshot by judged snapshot."""
-    disturb = partial(_disturb, config.noise)
-    steps = replay(recording, scenario, detector, config.methods, config.replay, disturb, known)
+    perturb = partial(_perturb, config.pose_noise)
+    steps = replay(recording, scenario, detector, config.methods, config.replay, perturb, feature_cache)
     return groupby(steps, lambda step: step.snapshot.index)
 
 
-def _disturb(noise: PoseNoise | None, snapshot: Snapshot) -> Snapshot:
+def _perturb(noise: PoseNoise | None, snapshot: Snapshot) -> Snapshot:
     return noise.apply(snapshot, 0) if noise else snapshot
 
 
-def played(
+def run_benchmarks(
     open_recording: Callable[[], Recording],
     configs: Sequence[BenchmarkConfig],
     workers: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Generator[tuple[Tally, ...]]:
+) -> Generator[tuple[MetricAccumulator, ...]]:
     """The tallies of each configuration in turn, as soon as they are there.
 
     open_recording must be picklable when workers > 1; results do not depend on workers. progress counts scenarios played by
     a configuration.
     """
-    recording, groups = open_recording(), _together(configs)
-    jobs = [(group, name) for group in groups for name in group[0].view(recording).scenarios]
-    work, total = partial(_job, open_recording), sum(len(group) for group, _ in jobs)
+    recording, groups = open_recording(), _group_configs(configs)
+    jobs = [(group, name) for group in groups for name in group[0].filter_recording(recording).scenarios]
+    work, total = partial(_run_job, open_recording), sum(len(group) for group, _ in jobs)
 
     def report(done: int) -> None:
         progress(done, total)
 
     if workers == 1:
-        yield from _gathered(map(work, jobs), groups, jobs, report)
+        yield from _gather(map(work, jobs), groups, jobs, report)
         return
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        yield from _gathered(pool.imap(work, jobs), groups, jobs, report)
+        yield from _gather(pool.imap(work, jobs), groups, jobs, report)
 
 
-def _together(configs: Sequence[BenchmarkConfig]) -> list[tuple[BenchmarkConfig, ...]]:
+def _group_configs(configs: Sequence[BenchmarkConfig]) -> list[tuple[BenchmarkConfig, ...]]:
     """Neighbours that can be played together, at most TOGETHER of them: what is finished is handed out group by group."""
-    alike = groupby(configs, lambda c: (c.weights, c.every, c.agents, c.replay.history))
-    runs = [tuple(run) for _, run in alike]
-    return [run[k : k + TOGETHER] for run in runs for k in range(0, len(run), TOGETHER)]
+    comparable = groupby(configs, lambda c: (c.weights, c.frame_stride, c.num_agents, c.replay.warmup_frames))
+    runs = [tuple(run) for _, run in comparable]
+    return [run[k : k + CONDITIONS_PER_GROUP] for run in runs for k in range(0, len(run), CONDITIONS_PER_GROUP)]
 
 
-def _job(open_recording: Callable[[], Recording], job: tuple[tuple[BenchmarkConfig, ...], str]) -> bytes:
+def _run_job(open_recording: Callable[[], Recording], job: tuple[tuple[BenchmarkConfig, ...], str]) -> bytes:
     """As bytes: between processes, torch would hand over every tensor as an open file, and a study has more than may be open."""
     return pickle.dumps(run_scenario(open_recording, *job))
 
 
-def _gathered(
+def _gather(
     found: Iterable[bytes],
     groups: Sequence[tuple[BenchmarkConfig, ...]],
     jobs: Sequence[tuple[tuple[BenchmarkConfig, ...], str]],
     progress: Callable[[int], None],
-) -> Generator[tuple[Tally, ...]]:
+) -> Generator[tuple[MetricAccumulator, ...]]:
     """The tallies of jobs, added up over the scenarios of each group."""
     results, done = iter(found), 0
     for group in groups:
-        whole = [[Tally(name, judging_protocol(config)) for name in config.methods] for config in group]
-        for played_one in islice(results, sum(of is group for of, _ in jobs)):
-            for all_of_it, one in zip(chain(*whole), chain(*pickle.loads(played_one))):
-                all_of_it.extend(one)
+        totals = [[MetricAccumulator(name, resolve_protocol(config)) for name in config.methods] for config in group]
+        for pickled in islice(results, sum(job_group is group for job_group, _ in jobs)):
+            for total, part in zip(chain(*totals), chain(*pickle.loads(pickled))):
+                total.extend(part)
             done += len(group)
             progress(done)
-        yield from map(tuple, whole)
+        yield from map(tuple, totals)
 
 
-def benchmark(
+def run_benchmark(
     open_recording: Callable[[], Recording],
     config: BenchmarkConfig,
     workers: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[MethodResult, ...]:
     """Every method on every scenario. open_recording must be picklable when workers > 1; results do not depend on workers."""
-    with closing(played(open_recording, [config], workers, progress)) as tallies:
-        return tuple(tally.result() for tally in next(tallies))
+    with closing(run_benchmarks(open_recording, [config], workers, progress)) as accumulators:
+        return tuple(accumulator.compute_result() for accumulator in next(accumulators))

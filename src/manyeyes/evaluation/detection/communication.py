@@ -6,7 +6,7 @@ empty message counts as 0 bytes in every mean. ``ab_log2_of_mean`` is the papers
 bytes of a message; ``ab_mean_of_log2`` averages the logarithms and is smaller (Jensen), and is over non-empty messages
 only, since an empty one has no logarithm. Rates suppose ten frames a second unless told otherwise.
 
-:func:`paper_bytes` is CoSTr's Eq. 13: float32 features and two float32 indices for each token; no header, no pose.
+:func:`compute_paper_bytes` is CoSTr's Eq. 13: float32 features and two float32 indices for each token; no header, no pose.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ class MessageRecord:
     scenario: str
     index: int
     sender: int
-    bytes: int
-    tokens: int = 0
-    channels: int = 0
-    objects: int = 0
-    points: int = 0
+    num_bytes: int
+    num_tokens: int = 0
+    num_channels: int = 0
+    num_objects: int = 0
+    num_points: int = 0
     ego: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.bytes, self.tokens, self.channels, self.objects, self.points) < 0:
+        if min(self.num_bytes, self.num_tokens, self.num_channels, self.num_objects, self.num_points) < 0:
             raise ConfigError(f"A MessageRecord counts bytes and contents, none below 0; got {self}.")
 
 
@@ -45,9 +45,9 @@ class Communication:
     frames. megabits_per_s: the latter at the frame rate. paper_ab: log2 of the mean of Eq. 13 over the same messages.
     """
 
-    messages: int
-    empty_messages: int
-    ego_frames: int
+    num_messages: int
+    num_empty_messages: int
+    num_ego_frames: int
     bytes_per_message: float
     bytes_per_ego_frame: float
     megabits_per_s: float
@@ -57,31 +57,33 @@ class Communication:
     tokens_per_message: float
 
 
-def paper_bytes(n_tokens: int, channels: int) -> int:
+def compute_paper_bytes(num_tokens: int, num_channels: int) -> int:
     """Bytes of n tokens of c channels by the papers' formula: n (c + 2) 4. Source: CoSTr, Eq. 13."""
-    return n_tokens * (channels + 2) * 4
+    return num_tokens * (num_channels + 2) * 4
 
 
-def summarise(records: Sequence[MessageRecord], ego_frames: int | None = None, rate_hz: float = 10.0) -> Communication:
-    """The volume of a run. ego_frames: how many (ego, frame) there were; without it, those that have a record."""
-    heard = len({(r.scenario, r.index, r.ego) for r in records})
-    if ego_frames is not None and ego_frames < heard:
-        raise ConfigError(f"ego_frames is {ego_frames}, but the records alone name {heard}.")
-    frames = heard if ego_frames is None else ego_frames
-    total = sum(r.bytes for r in records)
+def summarize_messages(
+    records: Sequence[MessageRecord], num_ego_frames: int | None = None, rate_hz: float = 10.0
+) -> Communication:
+    """The volume of a run. num_ego_frames: how many (ego, frame) there were; without it, those that have a record."""
+    num_recorded_frames = len({(r.scenario, r.index, r.ego) for r in records})
+    if num_ego_frames is not None and num_ego_frames < num_recorded_frames:
+        raise ConfigError(f"ego_frames is {num_ego_frames}, but the records alone name {num_recorded_frames}.")
+    num_frames = num_recorded_frames if num_ego_frames is None else num_ego_frames
+    total = sum(r.num_bytes for r in records)
     mean = _ratio(total, len(records))
-    logarithms = [math.log2(r.bytes) for r in records if r.bytes > 0]
+    logarithms = [math.log2(r.num_bytes) for r in records if r.num_bytes > 0]
     return Communication(
-        messages=len(records),
-        empty_messages=len(records) - len(logarithms),
-        ego_frames=frames,
+        num_messages=len(records),
+        num_empty_messages=len(records) - len(logarithms),
+        num_ego_frames=num_frames,
         bytes_per_message=mean,
-        bytes_per_ego_frame=_ratio(total, frames),
-        megabits_per_s=_ratio(total, frames) * 8 * rate_hz / 1e6,
+        bytes_per_ego_frame=_ratio(total, num_frames),
+        megabits_per_s=_ratio(total, num_frames) * 8 * rate_hz / 1e6,
         ab_log2_of_mean=_log2(mean),
         ab_mean_of_log2=_ratio(sum(logarithms), len(logarithms)),
-        paper_ab=_log2(_ratio(sum(paper_bytes(r.tokens, r.channels) for r in records), len(records))),
-        tokens_per_message=_ratio(sum(r.tokens for r in records), len(records)),
+        paper_ab=_log2(_ratio(sum(compute_paper_bytes(r.num_tokens, r.num_channels) for r in records), len(records))),
+        tokens_per_message=_ratio(sum(r.num_tokens for r in records), len(records)),
     )
 
 

@@ -11,7 +11,7 @@ from manyeyes.ops.keyed_random import keyed_generator
 
 
 @dataclass(frozen=True)
-class OneInstant:
+class SingleFramePerScenario:
     """The recording with one of its judged snapshots a scenario, which is the scenario's first and last."""
 
     recording: Recording
@@ -26,7 +26,7 @@ class OneInstant:
         """One."""
         return 1
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         """The one there is."""
         return range(1)
 
@@ -37,4 +37,6 @@ class OneInstant:
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         """The one there is, counted as 0."""
         rng = keyed_generator("one instant", self.seed, scenario)
-        return replace(self.recording.snapshot(scenario, int(rng.choice(self.recording.judged(scenario)))), index=0)
+        return replace(
+            self.recording.snapshot(scenario, int(rng.choice(self.recording.eval_indices(scenario)))), index=0
+        )

@@ -9,19 +9,19 @@ from functools import lru_cache
 import torch
 
 from manyeyes.datasets.base import Recording
-from manyeyes.datatypes import ConfigError, Snapshot, Transform, Truth
+from manyeyes.datatypes import ConfigError, GroundTruth, Snapshot, Transform
 
 
 @dataclass(frozen=True)
-class EveryKth:
+class FrameStride:
     """Every K-th judged frame of each scenario is judged, the first one always; all frames are still there to be played."""
 
     recording: Recording
-    every: int
+    stride: int
 
     def __post_init__(self) -> None:
-        if self.every < 1:
-            raise ConfigError(f"Every K-th frame is judged, K at least 1; got {self.every}.")
+        if self.stride < 1:
+            raise ConfigError(f"Every K-th frame is judged, K at least 1; got {self.stride}.")
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -32,10 +32,10 @@ class EveryKth:
         """As in the recording."""
         return self.recording.length(scenario)
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         """The indices K apart; the range ends behind the last of them, so that nothing is played in vain."""
-        kept = self.recording.judged(scenario)[:: self.every]
-        return range(kept.start, kept[-1] + 1, kept.step) if kept else kept
+        indices = self.recording.eval_indices(scenario)[:: self.stride]
+        return range(indices.start, indices[-1] + 1, indices.step) if indices else indices
 
     def agents(self, scenario: str) -> tuple[int, ...]:
         """As in the recording."""
@@ -46,12 +46,12 @@ class EveryKth:
         return self.recording.snapshot(scenario, index)
 
 
-class KeptSnapshots:
+class CachedRecording:
     """The last so many snapshots that were asked for are kept, for several who play a recording side by side."""
 
-    def __init__(self, recording: Recording, count: int) -> None:
+    def __init__(self, recording: Recording, max_snapshots: int) -> None:
         self._recording = recording
-        self._read = lru_cache(maxsize=count)(recording.snapshot)
+        self._read = lru_cache(maxsize=max_snapshots)(recording.snapshot)
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -62,9 +62,9 @@ class KeptSnapshots:
         """As in the recording."""
         return self._recording.length(scenario)
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         """As in the recording."""
-        return self._recording.judged(scenario)
+        return self._recording.eval_indices(scenario)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
         """As in the recording."""
@@ -76,62 +76,62 @@ class KeptSnapshots:
 
 
 class NearestAgents:
-    """The ego and the agents that are truly nearest to it when a scenario's first judged frame comes, ``count`` in all.
+    """The ego and the agents that are truly nearest to it when a scenario's first judged frame comes, ``num_agents`` in all.
 
     Scenarios that have fewer are left out. The choice holds for the whole scenario, so that nobody comes and goes. The truth
     stays that of everybody: what is to be found does not shrink with the number of those who look. Its rows of agents that
     are left out stand behind those of the frames.
     """
 
-    def __init__(self, recording: Recording, count: int) -> None:
-        if count < 1:
-            raise ConfigError(f"At least one agent looks; got {count}.")
-        self._recording, self._count = recording, count
+    def __init__(self, recording: Recording, num_agents: int) -> None:
+        if num_agents < 1:
+            raise ConfigError(f"At least one agent looks; got {num_agents}.")
+        self._recording, self._num_agents = recording, num_agents
         self._chosen: dict[str, frozenset[int]] = {}
 
     @property
     def scenarios(self) -> tuple[str, ...]:
         """Those with agents enough."""
-        return tuple(s for s in self._recording.scenarios if len(self._recording.agents(s)) >= self._count)
+        return tuple(s for s in self._recording.scenarios if len(self._recording.agents(s)) >= self._num_agents)
 
     def length(self, scenario: str) -> int:
         """As in the recording."""
         return self._recording.length(scenario)
 
-    def judged(self, scenario: str) -> range:
+    def eval_indices(self, scenario: str) -> range:
         """As in the recording."""
-        return self._recording.judged(scenario)
+        return self._recording.eval_indices(scenario)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
         """The ids of those that are left, in their order."""
-        return tuple(agent for agent in self._recording.agents(scenario) if agent in self._nearest(scenario))
+        return tuple(agent for agent in self._recording.agents(scenario) if agent in self._select_nearest(scenario))
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         """The frames of those that are left."""
-        whole, chosen = self._recording.snapshot(scenario, index), self._nearest(scenario)
-        left = [row for row, frame in enumerate(whole.frames) if frame.agent_id in chosen]
-        out = [row for row in range(len(whole.frames)) if row not in left]
+        full, selected = self._recording.snapshot(scenario, index), self._select_nearest(scenario)
+        kept_rows = [row for row, frame in enumerate(full.frames) if frame.agent_id in selected]
+        removed_rows = [row for row in range(len(full.frames)) if row not in kept_rows]
         return replace(
-            whole,
-            frames=tuple(whole.frames[row] for row in left),
-            truth=whole.truth and _rows(whole.truth, [*left, *out]),
+            full,
+            frames=tuple(full.frames[row] for row in kept_rows),
+            truth=full.truth and _reorder_agents(full.truth, [*kept_rows, *removed_rows]),
         )
 
-    def _nearest(self, scenario: str) -> frozenset[int]:
+    def _select_nearest(self, scenario: str) -> frozenset[int]:
         if scenario not in self._chosen:
-            first = self._recording.snapshot(scenario, self._recording.judged(scenario).start)
+            first = self._recording.snapshot(scenario, self._recording.eval_indices(scenario).start)
             poses = (
                 first.truth.world_from_agent
                 if first.truth
                 else Transform.stack([frame.world_from_agent for frame in first.frames])
             )
-            away = (poses.translation[:, :2] - poses.translation[0, :2]).norm(dim=1).tolist()
-            order = sorted(range(len(first.frames)), key=lambda row: (away[row], row))
-            self._chosen[scenario] = frozenset(first.frames[row].agent_id for row in order[: self._count])
+            distance = (poses.translation[:, :2] - poses.translation[0, :2]).norm(dim=1).tolist()
+            order = sorted(range(len(first.frames)), key=lambda row: (distance[row], row))
+            self._chosen[scenario] = frozenset(first.frames[row].agent_id for row in order[: self._num_agents])
         return self._chosen[scenario]
 
 
-def _rows(truth: Truth, order: list[int]) -> Truth:
+def _reorder_agents(truth: GroundTruth, order: list[int]) -> GroundTruth:
     """The truth with its agents in another order."""
     rows = torch.tensor(order, dtype=torch.int64)
     return replace(truth, seen=truth.seen[rows], world_from_agent=truth.world_from_agent[rows])

@@ -6,7 +6,7 @@ way) is fused three times: without the malicious agents' observations, with them
 lie. Judged are the stations of published lines of the honest map that five or more agents saw: how far across the nearest
 published line of its kind in the other map each lies (along a line there is no place to be moved from). Where no such line is
 within 2 m the station is lost, which counts as moved. More observations move a map even when they are true, since it lies where
-claims that scatter have their mode: ``by_truth`` counts that, and is what ``moved`` is to be held against.
+claims that scatter have their mode: ``num_displaced_without_attack`` counts that, and is what ``moved`` is to be held against.
 """
 
 from __future__ import annotations
@@ -22,135 +22,155 @@ import numpy as np
 
 from manyeyes._io import atomic_write
 from manyeyes.datatypes.map_element import KINDS
-from manyeyes.evaluation.maps.experiment import Trial, carry_out
-from manyeyes.evaluation.maps.map_cells import Unit, cell_path, numbers, plain
-from manyeyes.evaluation.maps.metrics import lines_of_kind
-from manyeyes.evaluation.maps.registry import OURS, Settings, map_of
+from manyeyes.evaluation.maps.experiment import FleetTrial, run_trial
+from manyeyes.evaluation.maps.map_cells import MapStudyJob, map_result_path, restore_row, to_plain
+from manyeyes.evaluation.maps.metrics import select_lines
+from manyeyes.evaluation.maps.registry import OURS, MethodSettings, fuse_observations
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.store.executors import Executor, map_blocks
-from manyeyes.ops.nearest_line import nearest_line
+from manyeyes.ops.nearest_line import find_nearest_line
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.simulate import MALICIOUS
 
-COUNT, SHARE, AGENTS, BAR_M, LOST_M = 200, 0.2, 5, 0.1, 2.0
+NUM_OBSERVATIONS, MALICIOUS_FRACTION, MIN_AGENTS, MIN_DISPLACEMENT_M, MAX_DISPLACEMENT_M = 200, 0.2, 5, 0.1, 2.0
 OFFSETS_M = (1.0, 2.0, 3.0, 4.0)
-MANNERS = ("independent", "colluding")
+ATTACKS = ("independent", "colluding")
 
 
 @dataclass(frozen=True)
-class Malice:
-    """One crowd with liars. stations: judged; lost: with no line near; moved: beyond the bar, lost included.
+class AdversarialResult:
+    """One crowd with liars. num_stations: judged; num_lost: with no line near; num_displaced: beyond the bar, lost included.
 
-    by_truth: as moved, when the same agents say the same without their lie.
+    num_displaced_without_attack: as moved, when the same agents say the same without their lie.
     """
 
     place: str
     seed: int
-    manner: str
+    attack: str
     offset_m: float
-    observations: int
-    malicious: int
-    stations: int
-    moved: int
-    lost: int
-    by_truth: int
+    num_observations: int
+    num_malicious: int
+    num_stations: int
+    num_displaced: int
+    num_lost: int
+    num_displaced_without_attack: int
     p99_m: float
-    largest_m: float
+    max_m: float
 
 
 @dataclass(frozen=True)
-class MaliceUnit:
-    """What one process does at a time. folder: where trials that are done are kept."""
+class AdversarialJob:
+    """What one process does at a time. results_folder: where trials that are done are kept."""
 
-    trial: Trial
-    settings: Settings
-    folder: Path
+    trial: FleetTrial
+    settings: MethodSettings
+    results_folder: Path
 
 
-def malice_units(
+def make_adversarial_jobs(
     places: Sequence[str],
     seeds: Sequence[int],
-    settings: Settings,
-    folder: Path,
+    settings: MethodSettings,
+    results_folder: Path,
     offsets_m: Sequence[float] = OFFSETS_M,
-) -> list[MaliceUnit]:
+) -> list[AdversarialJob]:
     """The trials: places, seeds, both manners, and every size of lie."""
-    units = []
+    jobs = []
     for place in places:
         for seed in seeds:
-            for manner in ("independent", "colluding"):
+            for attack in ("independent", "colluding"):
                 for offset in offsets_m:
-                    crowd = replace(
-                        CROWDS["local"], malicious_share=SHARE, malicious=manner, malicious_offset=(offset, offset)
+                    fleet_config = replace(
+                        CROWDS["local"],
+                        malicious_fraction=MALICIOUS_FRACTION,
+                        attack_mode=attack,
+                        malicious_offset_m=(offset, offset),
                     )
-                    units.append(MaliceUnit(Trial(place, COUNT, seed, window=manner, crowd=crowd), settings, folder))
-    return units
+                    jobs.append(
+                        AdversarialJob(
+                            FleetTrial(place, NUM_OBSERVATIONS, seed, view_label=attack, fleet_config=fleet_config),
+                            settings,
+                            results_folder,
+                        )
+                    )
+    return jobs
 
 
-def run_malice(
-    units: Sequence[MaliceUnit], executor: Executor, progress: Callable[[int, int], None] | None = None
-) -> tuple[Malice, ...]:
+def run_adversarial_jobs(
+    jobs: Sequence[AdversarialJob], executor: Executor, progress: Callable[[int, int], None] | None = None
+) -> tuple[AdversarialResult, ...]:
     """All trials, in order."""
-    with executor.open() as runner:
-        return tuple(map_blocks(kept_malice, units, runner, progress))
+    with executor.open() as session:
+        return tuple(map_blocks(load_or_run_job, jobs, session, progress))
 
 
-def kept_malice(unit: MaliceUnit) -> Malice:
+def load_or_run_job(job: AdversarialJob) -> AdversarialResult:
     """One trial, found where it was done before with the same code and settings, else done and kept."""
-    path = cell_path(Unit(unit.trial, (OURS,), unit.settings, unit.folder / "malicious"), OURS)
+    path = map_result_path(MapStudyJob(job.trial, (OURS,), job.settings, job.results_folder / "malicious"), OURS)
     try:
-        return Malice(**numbers(json.loads(path.read_text(encoding="utf-8"))))
+        return AdversarialResult(**restore_row(json.loads(path.read_text(encoding="utf-8"))))
     except (OSError, ValueError, TypeError):
-        found = malice(unit)
+        result = run_adversarial_job(job)
     path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, (json.dumps(plain(found), indent=1) + "\n").encode())
-    return found
+    atomic_write(path, (json.dumps(to_plain(result), indent=1) + "\n").encode())
+    return result
 
 
-def malice(unit: MaliceUnit) -> Malice:
+def run_adversarial_job(job: AdversarialJob) -> AdversarialResult:
     """One trial."""
-    trial, scene = unit.trial, carry_out(unit.trial)
-    alone, by_truth = _without_lies(_truthful(trial), unit.settings)
-    away = displacement(alone, map_of(OURS, scene.observations, unit.settings, scene.place.frame))
-    finite = away[np.isfinite(away)]
-    return Malice(
+    trial, experiment = job.trial, run_trial(job.trial)
+    honest_map, num_displaced_without_attack = _fuse_without_attack(_without_attack(trial), job.settings)
+    displacement_m = measure_displacement(
+        honest_map, fuse_observations(OURS, experiment.observations, job.settings, experiment.place.frame)
+    )
+    finite = displacement_m[np.isfinite(displacement_m)]
+    return AdversarialResult(
         place=trial.place,
         seed=trial.seed,
-        manner=trial.window,
-        offset_m=trial.crowd.malicious_offset[0],
-        observations=len(scene.observations),
-        malicious=sum(int(role == MALICIOUS) for role in scene.crowd.roles),
-        stations=len(away),
-        moved=int((away > BAR_M).sum()),
-        lost=int(np.isinf(away).sum()),
-        by_truth=by_truth,
+        attack=trial.view_label,
+        offset_m=trial.fleet_config.malicious_offset_m[0],
+        num_observations=len(experiment.observations),
+        num_malicious=sum(int(role == MALICIOUS) for role in experiment.fleet.roles),
+        num_stations=len(displacement_m),
+        num_displaced=int((displacement_m > MIN_DISPLACEMENT_M).sum()),
+        num_lost=int(np.isinf(displacement_m).sum()),
+        num_displaced_without_attack=num_displaced_without_attack,
         p99_m=float(np.quantile(finite, 0.99)) if len(finite) else math.nan,
-        largest_m=float(finite.max()) if len(finite) else math.nan,
+        max_m=float(finite.max()) if len(finite) else math.nan,
     )
 
 
-def _truthful(trial: Trial) -> Trial:
+def _without_attack(trial: FleetTrial) -> FleetTrial:
     """The trial whose malicious agents say what they saw: one and the same for every manner and size of lie."""
-    crowd = replace(trial.crowd, malicious="independent", malicious_offset=(0.0, 0.0))
-    return replace(trial, window="truthful", crowd=crowd)
+    fleet_config = replace(trial.fleet_config, attack_mode="independent", malicious_offset_m=(0.0, 0.0))
+    return replace(trial, view_label="truthful", fleet_config=fleet_config)
 
 
 @lru_cache(maxsize=1)
-def _without_lies(trial: Trial, settings: Settings) -> tuple[VectorMap, int]:
+def _fuse_without_attack(trial: FleetTrial, settings: MethodSettings) -> tuple[VectorMap, int]:
     """The map of the honest agents alone, and how many of its stations the others move by telling the truth."""
-    scene = carry_out(trial)
-    honest = [o for o, role in zip(scene.observations, scene.crowd.roles) if role != MALICIOUS]
-    alone, told = (map_of(OURS, seen, settings, scene.place.frame) for seen in (honest, scene.observations))
-    return alone, int((displacement(alone, told) > BAR_M).sum())
+    experiment = run_trial(trial)
+    honest_observations = [o for o, role in zip(experiment.observations, experiment.fleet.roles) if role != MALICIOUS]
+    honest_map, full_map = (
+        fuse_observations(OURS, observations, settings, experiment.place.frame)
+        for observations in (honest_observations, experiment.observations)
+    )
+    return honest_map, int((measure_displacement(honest_map, full_map) > MIN_DISPLACEMENT_M).sum())
 
 
-def displacement(alone: VectorMap, together: VectorMap, agents: int = AGENTS) -> np.ndarray:
+def measure_displacement(reference: VectorMap, other: VectorMap, min_agents: int = MIN_AGENTS) -> np.ndarray:
     """(S,) metres across the nearest line of its kind in another map, of each well-seen station; inf where there is none near."""
-    before, after = alone.published(), together.published()
-    kind = before.elements.kind[before.elements.owner]
+    before, after = reference.select_published(), other.select_published()
+    kind = before.elements.kind[before.elements.element_of_point]
     out = []
     for code, name in enumerate(KINDS):
-        chosen = (kind == code) & (before.stations.agents >= agents)
-        lines = lines_of_kind(after.elements, name)
-        out.append(np.abs(nearest_line(before.elements.points[chosen], lines.points, lines.first, LOST_M).across))
+        selected = (kind == code) & (before.point_evidence.agents >= min_agents)
+        lines = select_lines(after.elements, name)
+        out.append(
+            np.abs(
+                find_nearest_line(
+                    before.elements.points[selected], lines.points, lines.offsets, MAX_DISPLACEMENT_M
+                ).lateral_m
+            )
+        )
     return np.concatenate(out)

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
-from manyeyes.evaluation.maps.observed_area import SHORTEST_PART_M, clip, observed_area
+from manyeyes.evaluation.maps.observed_area import MIN_PART_LENGTH_M, clip_to_area, compute_observed_area
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.roads.ground_truth import cut_elements
 from manyeyes.simulator.fleet.config import CrowdConfig
-from manyeyes.simulator.fleet.place import Place, clip_to_box, place
+from manyeyes.simulator.fleet.place import Place, clip_to_box, load_place
 from manyeyes.simulator.fleet.simulate import Crowd, simulate_crowd
 
 if TYPE_CHECKING:
@@ -28,24 +28,26 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Trial:
-    """Which crowd, where. size_m: side of the place's square area. window: what the study calls the crowd's views."""
+class FleetTrial:
+    """Which crowd, where. size_m: side of the place's square area. view_label: what the study calls the crowd's views."""
 
     place: str
-    count: int
+    num_observations: int
     seed: int
     size_m: float = 300.0
-    window: str = "local"
-    crowd: CrowdConfig = field(default_factory=CrowdConfig)
+    view_label: str = "local"
+    fleet_config: CrowdConfig = field(default_factory=CrowdConfig)
 
-    def noisy(self, pose_sigma_m: float) -> Trial:
+    def with_pose_noise(self, pose_sigma_m: float) -> FleetTrial:
         """The same trial with other pose errors, the heading's in proportion (1° a metre)."""
-        crowd = replace(self.crowd, pose_sigma=pose_sigma_m, yaw_sigma=float(np.radians(pose_sigma_m)))
-        return replace(self, crowd=crowd)
+        fleet_config = replace(
+            self.fleet_config, pose_sigma_m=pose_sigma_m, yaw_sigma_rad=float(np.radians(pose_sigma_m))
+        )
+        return replace(self, fleet_config=fleet_config)
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class CutPolicy:
     """The cut policy of this module at one place: the ground of its junctions, and its area (x_min, y_min, x_max, y_max)."""
 
     junctions: BaseGeometry
@@ -53,48 +55,51 @@ class Cut:
 
     def __call__(self, elements: MapElements) -> MapElements:
         """Anybody's elements, cut."""
-        cut = clip_to_box(cut_elements(elements, self.junctions, SHORTEST_PART_M), self.area, SHORTEST_PART_M)
+        cut = clip_to_box(cut_elements(elements, self.junctions, MIN_PART_LENGTH_M), self.area, MIN_PART_LENGTH_M)
         return cut.take(~((cut.kind == DIVIDER) & _inside(cut, self.junctions)))
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class FleetExperiment:
     """A trial carried out: the crowd, and what its maps are held against."""
 
-    trial: Trial
-    crowd: Crowd
+    trial: FleetTrial
+    fleet: Crowd
 
     @property
     def place(self) -> Place:
         """Where it is."""
-        return self.crowd.place
+        return self.fleet.place
 
     @property
     def observations(self) -> tuple[Observation, ...]:
         """All that a method is told."""
-        return self.crowd.observations
+        return self.fleet.observations
 
     @cached_property
     def truth(self) -> MapElements:
         """The true elements that were in somebody's view, at the time of the last observation."""
         last = max((o.time_ns for o in self.observations), default=0)
-        whole = self.place.in_area(self.crowd.world.at(last), min_line_m=SHORTEST_PART_M)
-        area = observed_area([o.view for o in self.observations], self.crowd.true_poses)
-        return self.cut(clip(whole, area))
+        full_map = self.place.clip_to_area(self.fleet.changing_map.at(last), min_line_m=MIN_PART_LENGTH_M)
+        area = compute_observed_area([o.view for o in self.observations], self.fleet.true_poses)
+        return self.cut_policy(clip_to_area(full_map, area))
 
     @property
-    def cut(self) -> Cut:
+    def cut_policy(self) -> CutPolicy:
         """The cut policy here."""
-        return Cut(self.place.junctions, self.place.area)
+        return CutPolicy(self.place.junctions, self.place.area)
 
 
 @lru_cache(maxsize=2)
-def carry_out(trial: Trial) -> Scene:
+def run_trial(trial: FleetTrial) -> FleetExperiment:
     """The trial's crowd, driven; the last two are kept, as a study asks for one trial with many settings in turn."""
-    return Scene(trial, simulate_crowd(place(trial.place, trial.size_m), trial.count, trial.crowd, trial.seed))
+    return FleetExperiment(
+        trial,
+        simulate_crowd(load_place(trial.place, trial.size_m), trial.num_observations, trial.fleet_config, trial.seed),
+    )
 
 
-def at_poses(observations: Sequence[Observation], poses: np.ndarray, sigma_m: float = 0.02) -> list[Observation]:
+def replace_poses(observations: Sequence[Observation], poses: np.ndarray, sigma_m: float = 0.02) -> list[Observation]:
     """The same observations with other poses (N, 3), claimed with a small sigma (m, and rad): an oracle's."""
     covariance = np.diag([sigma_m**2, sigma_m**2, (sigma_m / 10) ** 2])
     return [replace(o, pose=pose, covariance=covariance) for o, pose in zip(observations, poses)]
@@ -113,5 +118,5 @@ def _inside(elements: MapElements, ground: BaseGeometry) -> np.ndarray:
 
 def _middle(line: np.ndarray) -> np.ndarray:
     """The point halfway along."""
-    along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
-    return np.array([np.interp(along[-1] / 2, along, line[:, axis]) for axis in (0, 1)])
+    arc_length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
+    return np.array([np.interp(arc_length[-1] / 2, arc_length, line[:, axis]) for axis in (0, 1)])

@@ -16,24 +16,24 @@ from typing import Any
 
 import numpy as np
 
-from manyeyes.evaluation.maps.experiment import Trial
-from manyeyes.evaluation.maps.map_cells import Unit, run_unit
-from manyeyes.evaluation.maps.registry import OURS, Settings, configured, defaults
+from manyeyes.evaluation.maps.experiment import FleetTrial
+from manyeyes.evaluation.maps.map_cells import MapStudyJob, run_study_job
+from manyeyes.evaluation.maps.registry import OURS, MethodSettings, apply_changes, make_default_config
 from manyeyes.maps.store.executors import Executor, map_blocks
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.fleet.config import CROWDS
 
-BUDGET, SEED = 8, 1000
-PLACES, COUNTS = ("Town07", "cross"), (20, 60)
+NUM_CONFIGS, SEED = 8, 1000
+PLACES, OBSERVATION_COUNTS = ("Town07", "cross"), (20, 60)
 
-Choices = dict[str, tuple[Any, ...]]
-_GATES = (0.5, 0.75, 1.0, 1.5, 2.0)
-_RULES: Choices = {
+SearchSpace = dict[str, tuple[Any, ...]]
+_DISTANCES_M = (0.5, 0.75, 1.0, 1.5, 2.0)
+_RULES: SearchSpace = {
     "rules.min_score": (0.0, 0.2, 0.3, 0.4, 0.5),
     "rules.publish": (-6.0, 0.0, 1.0, 2.2),
     "rules.least_observations": (1, 2, 3),
 }
-CHOICES: dict[str, Choices] = {
+SEARCH_SPACE: dict[str, SearchSpace] = {
     OURS: {
         "align.sigma_m": (0.1, 0.2, 0.3),
         "align.correlation": (4.0, 8.0, 16.0),
@@ -47,15 +47,15 @@ CHOICES: dict[str, Choices] = {
         "link.lateral_m": (0.25, 0.4, 0.6),
     },
     "union": _RULES,
-    "chamfer_nms": {"gate_m": _GATES, **_RULES},
+    "chamfer_nms": {"gate_m": _DISTANCES_M, **_RULES},
     "crowdmap_literal": {
-        "gate_m": _GATES,
-        "accept_m": _GATES,
+        "gate_m": _DISTANCES_M,
+        "accept_m": _DISTANCES_M,
         "merge": ("keep", "mean"),
         "cpd.outlier": (0.0, 0.1, 0.3),
         **_RULES,
     },
-    "polymerge": {"gate_m": _GATES, "share": (0.3, 0.5), **_RULES},
+    "polymerge": {"gate_m": _DISTANCES_M, "share": (0.3, 0.5), **_RULES},
     "frechet_clustering": {
         "gate_m": (1.0, 1.5, 1.75, 2.0, 3.0),
         "linkage": ("average", "single", "complete"),
@@ -73,55 +73,57 @@ CHOICES: dict[str, Choices] = {
 
 
 @dataclass(frozen=True)
-class Attempt:
-    """One configuration and its worth; changed: the drawn fields that differ from the defaults."""
+class SearchTrial:
+    """One configuration and its worth; changes: the drawn fields that differ from the defaults."""
 
     method: str
-    number: int
-    changed: tuple[tuple[str, Any], ...]
-    worth: float
+    config_index: int
+    changes: tuple[tuple[str, Any], ...]
+    mean_ap: float
 
 
-def drawn(method: str, number: int) -> tuple[tuple[str, Any], ...]:
+def sample_changes(method: str, config_index: int) -> tuple[tuple[str, Any], ...]:
     """The fields of one configuration; number 0 is the defaults."""
-    if number == 0:
+    if config_index == 0:
         return ()
-    known = [item for item in CHOICES[method].items() if _has(defaults(method), item[0])]
-    unit = keyed_uniform((len(known),), SEED, "map-tuning", method, number).numpy()
-    return tuple((name, values[int(u * len(values))]) for (name, values), u in zip(known, unit))
+    applicable = [item for item in SEARCH_SPACE[method].items() if _has_field(make_default_config(method), item[0])]
+    unit = keyed_uniform((len(applicable),), SEED, "map-tuning", method, config_index).numpy()
+    return tuple((name, values[int(u * len(values))]) for (name, values), u in zip(applicable, unit))
 
 
-def settings_with(method: str, config: Any) -> Settings:
+def make_settings(method: str, config: Any) -> MethodSettings:
     """Settings in which one method is configured so."""
-    return Settings(ours=config) if method == OURS else Settings(chosen=((method, config),))
+    return MethodSettings(ours=config) if method == OURS else MethodSettings(baseline_configs=((method, config),))
 
 
-def tune(
+def run_random_search(
     methods: Sequence[str],
-    folder: Path,
+    results_folder: Path,
     executor: Executor,
     progress: Callable[[int, int], None] | None = None,
-    budget: int = BUDGET,
-) -> tuple[Attempt, ...]:
+    num_configs: int = NUM_CONFIGS,
+) -> tuple[SearchTrial, ...]:
     """Every method's configurations with their worth, the best of each method first."""
-    asked = [(method, number) for method in methods for number in range(budget)]
-    units = []
+    candidates = [(method, config_index) for method in methods for config_index in range(num_configs)]
+    jobs = []
     for place in PLACES:
-        for count in COUNTS:
-            trial = Trial(place, count, SEED, crowd=CROWDS["local"])
-            for method, number in asked:
-                config = configured(defaults(method), drawn(method, number))
-                units.append(Unit(trial, (method,), settings_with(method, config), folder))
-    with executor.open() as runner:
-        cells = [cell for held in map_blocks(run_unit, units, runner, progress) for cell in held]
-    worth = np.array([cell.ap_of() for cell in cells]).reshape(-1, len(asked))
-    attempts = [
-        Attempt(method, number, drawn(method, number), float(np.nanmean(worth[:, k])))
-        for k, (method, number) in enumerate(asked)
+        for num_observations in OBSERVATION_COUNTS:
+            trial = FleetTrial(place, num_observations, SEED, fleet_config=CROWDS["local"])
+            for method, config_index in candidates:
+                config = apply_changes(make_default_config(method), sample_changes(method, config_index))
+                jobs.append(MapStudyJob(trial, (method,), make_settings(method, config), results_folder))
+    with executor.open() as session:
+        results = [
+            result for job_results in map_blocks(run_study_job, jobs, session, progress) for result in job_results
+        ]
+    mean_ap = np.array([result.get_ap() for result in results]).reshape(-1, len(candidates))
+    search_trials = [
+        SearchTrial(method, config_index, sample_changes(method, config_index), float(np.nanmean(mean_ap[:, k])))
+        for k, (method, config_index) in enumerate(candidates)
     ]
-    return tuple(sorted(attempts, key=lambda a: (methods.index(a.method), -a.worth, a.number)))
+    return tuple(sorted(search_trials, key=lambda a: (methods.index(a.method), -a.mean_ap, a.config_index)))
 
 
-def _has(config: Any, name: str) -> bool:
+def _has_field(config: Any, name: str) -> bool:
     head, _, rest = name.partition(".")
-    return hasattr(config, head) and (not rest or _has(getattr(config, head), rest))
+    return hasattr(config, head) and (not rest or _has_field(getattr(config, head), rest))

@@ -16,22 +16,22 @@ from typing import Any
 from manyeyes._io import atomic_write
 from manyeyes._source import source_digest
 from manyeyes.datatypes.map_element import KINDS, MapElements
-from manyeyes.evaluation.maps.experiment import Scene, Trial, carry_out
-from manyeyes.evaluation.maps.metrics import THRESHOLDS, MapQuality, judge
-from manyeyes.evaluation.maps.registry import RIVALS, Settings, make_map
+from manyeyes.evaluation.maps.experiment import FleetExperiment, FleetTrial, run_trial
+from manyeyes.evaluation.maps.metrics import THRESHOLDS, MapMetrics, evaluate_map
+from manyeyes.evaluation.maps.registry import BASELINES, MethodSettings, fuse_experiment
 
 
 @dataclass(frozen=True)
 class ApRow:
-    """AP of one way at one set of thresholds; NaN for a kind without truth. mean: crossing and divider, as in the paper."""
+    """AP of one way at one set of thresholds; NaN for a kind without truth. mean_ap: crossing and divider, as in the paper."""
 
-    way: str
+    protocol: str
     thresholds: str
     crossing: float
     divider: float
     boundary: float
     stop_line: float
-    mean: float
+    mean_ap: float
 
 
 @dataclass(frozen=True)
@@ -41,164 +41,169 @@ class KindRow:
     kind: str
     n_predicted: int
     n_truth: int
-    f: tuple[float, ...]
+    f1: tuple[float, ...]
     precision: tuple[float, ...]
     recall: tuple[float, ...]
     duplication: float
     fragmentation: float
     lateral_median_m: float
     lateral_p95_m: float
-    order_m: float
-    end_error_m: float
+    frechet_m: float
+    endpoint_error_m: float
     branch_f1: float
 
 
 @dataclass(frozen=True)
-class Cell:
+class MapStudyResult:
     """A method's numbers on a trial. seconds: of the method alone."""
 
     place: str
     size_m: float
-    window: str
-    count: int
+    view_label: str
+    num_observations: int
     seed: int
     pose_sigma_m: float
     method: str
     seconds: float
-    ap: tuple[ApRow, ...]
-    kinds: tuple[KindRow, ...]
+    ap_rows: tuple[ApRow, ...]
+    kind_rows: tuple[KindRow, ...]
 
-    def ap_of(self, what: str = "mean", way: str = "exact", thresholds: str = "narrow") -> float:
+    def get_ap(self, kind: str = "mean", protocol: str = "exact", thresholds: str = "narrow") -> float:
         """One AP: what is a kind, or mean."""
-        return next(getattr(row, what) for row in self.ap if (row.way, row.thresholds) == (way, thresholds))
+        return next(
+            getattr(row, kind) for row in self.ap_rows if (row.protocol, row.thresholds) == (protocol, thresholds)
+        )
 
-    def kind(self, name: str) -> KindRow:
+    def get_kind(self, name: str) -> KindRow:
         """The other numbers of a kind."""
-        return next(row for row in self.kinds if row.kind == name)
+        return next(row for row in self.kind_rows if row.kind == name)
 
 
 @dataclass(frozen=True)
-class Unit:
-    """One trial and all methods on it: what one process does at a time. folder: where cells are kept."""
+class MapStudyJob:
+    """One trial and all methods on it: what one process does at a time. results_folder: where cells are kept."""
 
-    trial: Trial
+    trial: FleetTrial
     methods: tuple[str, ...]
-    settings: Settings
-    folder: Path
+    settings: MethodSettings
+    results_folder: Path
 
 
-def cell_path(unit: Unit, method: str) -> Path:
+def map_result_path(job: MapStudyJob, method: str) -> Path:
     """The file of a cell; its name holds a digest of the trial, the method's configuration and the code that they run."""
-    said = repr((unit.trial, method, unit.settings.of(method), code_digest(method)))
-    digest = hashlib.blake2b(said.encode(), digest_size=6).hexdigest()
-    trial = unit.trial
-    return unit.folder / f"{trial.place}-{trial.window}-{trial.count:04d}-{trial.seed}-{method}-{digest}.json"
+    content = repr((job.trial, method, job.settings.config_of(method), hash_map_sources(method)))
+    digest = hashlib.blake2b(content.encode(), digest_size=6).hexdigest()
+    trial = job.trial
+    return (
+        job.results_folder
+        / f"{trial.place}-{trial.view_label}-{trial.num_observations:04d}-{trial.seed}-{method}-{digest}.json"
+    )
 
 
-def code_digest(method: str) -> str:
+def hash_map_sources(method: str) -> str:
     """A hash of the code that a cell of a method follows from."""
     return source_digest(
-        "manyeyes.evaluation.maps.map_cells", *((f"manyeyes.maps.baselines.{method}",) if method in RIVALS else ())
+        "manyeyes.evaluation.maps.map_cells", *((f"manyeyes.maps.baselines.{method}",) if method in BASELINES else ())
     )
 
 
-def run_unit(unit: Unit) -> list[Cell]:
+def run_study_job(job: MapStudyJob) -> list[MapStudyResult]:
     """The cells of a unit: found, or made and kept."""
-    cells: dict[str, Cell] = {}
-    scene: Scene | None = None
-    for method in unit.methods:
-        path = cell_path(unit, method)
-        found = read_cell(path)
-        if found is None:
-            scene = scene or carry_out(unit.trial)
-            found = run_cell(scene, method, unit.settings)
+    results: dict[str, MapStudyResult] = {}
+    experiment: FleetExperiment | None = None
+    for method in job.methods:
+        path = map_result_path(job, method)
+        result = read_map_result(path)
+        if result is None:
+            experiment = experiment or run_trial(job.trial)
+            result = run_method(experiment, method, job.settings)
             path.parent.mkdir(parents=True, exist_ok=True)
-            atomic_write(path, (json.dumps(plain(found), indent=1) + "\n").encode())
-        cells[method] = found
-    return list(cells.values())
+            atomic_write(path, (json.dumps(to_plain(result), indent=1) + "\n").encode())
+        results[method] = result
+    return list(results.values())
 
 
-def run_cell(scene: Scene, method: str, settings: Settings) -> Cell:
+def run_method(experiment: FleetExperiment, method: str, settings: MethodSettings) -> MapStudyResult:
     """One method on a scene, judged."""
     start = time.perf_counter()
-    elements = make_map(method, scene, settings)
+    elements = fuse_experiment(method, experiment, settings)
     seconds = time.perf_counter() - start
-    quality = judge(scene.cut(elements), scene.truth)
-    trial = scene.trial
-    return Cell(
+    metrics = evaluate_map(experiment.cut_policy(elements), experiment.truth)
+    trial = experiment.trial
+    return MapStudyResult(
         place=trial.place,
         size_m=trial.size_m,
-        window=trial.window,
-        count=trial.count,
+        view_label=trial.view_label,
+        num_observations=trial.num_observations,
         seed=trial.seed,
-        pose_sigma_m=trial.crowd.pose_sigma,
+        pose_sigma_m=trial.fleet_config.pose_sigma_m,
         method=method,
         seconds=seconds,
-        ap=tuple(ap_rows(quality)),
-        kinds=tuple(kind_rows(quality)),
+        ap_rows=tuple(make_ap_rows(metrics)),
+        kind_rows=tuple(make_kind_rows(metrics)),
     )
 
 
-def ap_rows(quality: MapQuality) -> Iterable[ApRow]:
+def make_ap_rows(metrics: MapMetrics) -> Iterable[ApRow]:
     """Every AP of a judged map."""
-    for way in dict.fromkeys(p.way for p in quality.kinds[0].precision):
+    for protocol in dict.fromkeys(p.protocol for p in metrics.kinds[0].ap_scores):
         for thresholds in THRESHOLDS:
-            kinds = {kind: quality.ap(kind, way, thresholds) for kind in KINDS}
-            yield ApRow(way, thresholds, mean=quality.mean_ap(way, thresholds), **kinds)
+            kinds = {kind: metrics.get_ap(kind, protocol, thresholds) for kind in KINDS}
+            yield ApRow(protocol, thresholds, mean_ap=metrics.mean_ap(protocol, thresholds), **kinds)
 
 
-def kind_rows(quality: MapQuality) -> Iterable[KindRow]:
+def make_kind_rows(metrics: MapMetrics) -> Iterable[KindRow]:
     """The numbers of every kind of a judged map."""
-    for k in quality.kinds:
+    for k in metrics.kinds:
         yield KindRow(
             kind=k.kind,
             n_predicted=k.n_predicted,
             n_truth=k.n_truth,
-            f=tuple(s.f for s in k.length),
-            precision=tuple(s.precision for s in k.length),
-            recall=tuple(s.recall for s in k.length),
+            f1=tuple(s.f1 for s in k.length_scores),
+            precision=tuple(s.precision for s in k.length_scores),
+            recall=tuple(s.recall for s in k.length_scores),
             duplication=k.duplication,
             fragmentation=k.fragmentation,
             lateral_median_m=k.lateral_median_m,
             lateral_p95_m=k.lateral_p95_m,
-            order_m=k.order_m,
-            end_error_m=k.end_error_m,
+            frechet_m=k.frechet_m,
+            endpoint_error_m=k.endpoint_error_m,
             branch_f1=k.branch_f1,
         )
 
 
-def read_cell(path: Path) -> Cell | None:
+def read_map_result(path: Path) -> MapStudyResult | None:
     """A kept cell; None where there is none, or one of another form."""
     try:
-        held = json.loads(path.read_text(encoding="utf-8"), parse_constant=float)
-        ap = tuple(ApRow(**numbers(row)) for row in held.pop("ap"))
-        kinds = tuple(KindRow(**numbers(row)) for row in held.pop("kinds"))
-        return Cell(ap=ap, kinds=kinds, **held)
+        stored = json.loads(path.read_text(encoding="utf-8"), parse_constant=float)
+        ap = tuple(ApRow(**restore_row(row)) for row in stored.pop("ap"))
+        kinds = tuple(KindRow(**restore_row(row)) for row in stored.pop("kinds"))
+        return MapStudyResult(ap_rows=ap, kind_rows=kinds, **stored)
     except (OSError, ValueError, TypeError, KeyError):
         return None
 
 
-def judge_maps(elements: MapElements, truth: MapElements) -> tuple[tuple[ApRow, ...], tuple[KindRow, ...]]:
+def evaluate_map_rows(elements: MapElements, truth: MapElements) -> tuple[tuple[ApRow, ...], tuple[KindRow, ...]]:
     """The numbers of a map that is no cell: somebody's own, against somebody's own truth."""
-    quality = judge(elements, truth)
-    return tuple(ap_rows(quality)), tuple(kind_rows(quality))
+    metrics = evaluate_map(elements, truth)
+    return tuple(make_ap_rows(metrics)), tuple(make_kind_rows(metrics))
 
 
-def plain(value: object) -> object:
+def to_plain(value: object) -> object:
     """A cell as JSON holds it; NaN is null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [plain(v) for v in value]
+        return [to_plain(v) for v in value]
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def numbers(row: dict[str, Any]) -> dict[str, Any]:
+def restore_row(row: dict[str, Any]) -> dict[str, Any]:
     """A row as it was: null is NaN, lists are tuples."""
 
-    def back(value: Any) -> Any:
+    def restore(value: Any) -> Any:
         if value is None:
             return math.nan
-        return tuple(back(v) for v in value) if isinstance(value, list) else value
+        return tuple(restore(v) for v in value) if isinstance(value, list) else value
 
-    return {name: back(value) for name, value in row.items()}
+    return {name: restore(value) for name, value in row.items()}

@@ -17,39 +17,41 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 BUFFER_M = 2.0
-MOST_SAMPLES = 2000
+MAX_SAMPLES = 2000
 
 
 @dataclass(frozen=True)
-class Way:
+class MatchingProtocol:
     """How two elements are held against each other.
 
-    samples: points a line at equal arc length, or None: as many as keep spacing_m. buffered: pairs whose flat-capped
-    2 m buffers do not meet are no pairs. to_segments: distances go to the other line itself, not to its samples.
+    num_samples: points a line at equal arc length, or None: as many as keep spacing_m. buffered: pairs whose flat-capped
+    2 m buffers do not meet are no pairs. measure_to_segments: distances go to the other line itself, not to its samples.
     """
 
     name: str
-    samples: int | None = None
+    num_samples: int | None = None
     spacing_m: float = 0.5
     buffered: bool = False
-    to_segments: bool = False
+    measure_to_segments: bool = False
 
 
-WAYS = {
+MATCHING_PROTOCOLS = {
     way.name: way
     for way in (
-        Way("maptr", samples=100, buffered=True),
-        Way("streammapnet", samples=200),
-        Way("exact", to_segments=True),
+        MatchingProtocol("maptr", num_samples=100, buffered=True),
+        MatchingProtocol("streammapnet", num_samples=200),
+        MatchingProtocol("exact", measure_to_segments=True),
     )
 }
 
 
-def way_named(name: str) -> Way:
+def get_matching_protocol(name: str) -> MatchingProtocol:
     """The way of that name."""
-    if name not in WAYS:
-        raise ConfigError(f"No way to measure a Chamfer distance is called {name!r}; known: {', '.join(WAYS)}.")
-    return WAYS[name]
+    if name not in MATCHING_PROTOCOLS:
+        raise ConfigError(
+            f"No way to measure a Chamfer distance is called {name!r}; known: {', '.join(MATCHING_PROTOCOLS)}."
+        )
+    return MATCHING_PROTOCOLS[name]
 
 
 @dataclass(frozen=True)
@@ -57,49 +59,49 @@ class Lines:
     """Polylines as columns, rings closed: points (P, 2) metres, first (N+1,); score (N,). All of one kind."""
 
     points: Floats
-    first: Ints
+    offsets: Ints
     score: Floats
 
     def __len__(self) -> int:
-        return len(self.first) - 1
+        return len(self.offsets) - 1
 
     def line(self, row: int) -> Floats:
         """(n, 2) points of one line."""
-        return self.points[self.first[row] : self.first[row + 1]]
+        return self.points[self.offsets[row] : self.offsets[row + 1]]
 
     def lengths(self) -> Floats:
         """(N,) metres."""
         step = np.hypot(*np.diff(self.points, axis=0).T) if len(self.points) > 1 else np.zeros(0)
-        line, start = segments_of(self.first)
+        line, start = segments_of(self.offsets)
         return np.bincount(line, weights=step[start], minlength=len(self)).astype(np.float64)
 
     def bounds(self) -> Floats:
         """(N, 4) x_min, y_min, x_max, y_max."""
         if len(self) == 0:
             return np.zeros((0, 4))
-        low = np.minimum.reduceat(self.points, self.first[:-1], axis=0)
-        return np.hstack((low, np.maximum.reduceat(self.points, self.first[:-1], axis=0)))
+        low = np.minimum.reduceat(self.points, self.offsets[:-1], axis=0)
+        return np.hstack((low, np.maximum.reduceat(self.points, self.offsets[:-1], axis=0)))
 
 
-def lines_of(parts: list[Floats], score: Floats | None = None) -> Lines:
+def make_lines(parts: list[Floats], score: Floats | None = None) -> Lines:
     """Lines of a list of (n, 2) arrays; scores are 1 where none are given."""
-    first = np.concatenate(([0], np.cumsum([len(p) for p in parts], dtype=np.int64))).astype(np.int64)
+    offsets = np.concatenate(([0], np.cumsum([len(p) for p in parts], dtype=np.int64))).astype(np.int64)
     points = np.concatenate(parts).astype(np.float64) if parts else np.zeros((0, 2))
-    return Lines(points, first, np.ones(len(parts)) if score is None else np.asarray(score, dtype=np.float64))
+    return Lines(points, offsets, np.ones(len(parts)) if score is None else np.asarray(score, dtype=np.float64))
 
 
-def spaced(lines: Lines, way: Way) -> Lines:
+def resample_lines(lines: Lines, protocol: MatchingProtocol) -> Lines:
     """The samples of each line: equal arc length, both ends included."""
     lengths = lines.lengths()
-    if way.samples is not None:
-        count = np.full(len(lines), way.samples, dtype=np.int64)
+    if protocol.num_samples is not None:
+        num_samples = np.full(len(lines), protocol.num_samples, dtype=np.int64)
     else:
-        count = np.clip(np.ceil(lengths / way.spacing_m - 1e-9).astype(np.int64) + 1, 2, MOST_SAMPLES)
-    first = np.concatenate(([0], np.cumsum(count))).astype(np.int64)
-    return Lines(_resample(lines.points, lines.first, first), first, lines.score)
+        num_samples = np.clip(np.ceil(lengths / protocol.spacing_m - 1e-9).astype(np.int64) + 1, 2, MAX_SAMPLES)
+    offsets = np.concatenate(([0], np.cumsum(num_samples))).astype(np.int64)
+    return Lines(_resample(lines.points, lines.offsets, offsets), offsets, lines.score)
 
 
-def chamfer(predicted: Lines, truth: Lines, way: Way, reach_m: float) -> Floats:
+def compute_chamfer(predicted: Lines, truth: Lines, protocol: MatchingProtocol, max_distance_m: float) -> Floats:
     """(N, M) Chamfer distances; inf where the bounding boxes are farther apart than reach_m, or the way sees no pair.
 
     No Chamfer distance is below the gap between the boxes, so that thresholds up to reach_m are judged exactly.
@@ -107,29 +109,37 @@ def chamfer(predicted: Lines, truth: Lines, way: Way, reach_m: float) -> Floats:
     table = np.full((len(predicted), len(truth)), np.inf)
     if table.size == 0:
         return table
-    mine, theirs = spaced(predicted, way), spaced(truth, way)
-    pairs = _near(predicted.bounds(), truth.bounds(), reach_m)
-    if way.buffered:
-        pairs = pairs[_buffers_meet(mine, theirs, pairs)]
-    if way.to_segments:
-        there = _directed_to_segments(mine.points, mine.first, truth.points, truth.first, pairs)
-        back = _directed_to_segments(theirs.points, theirs.first, predicted.points, predicted.first, pairs[:, ::-1])
-        table[pairs[:, 0], pairs[:, 1]] = 0.5 * (there + back)
+    predicted_samples, truth_samples = resample_lines(predicted, protocol), resample_lines(truth, protocol)
+    pairs = _find_nearby_pairs(predicted.bounds(), truth.bounds(), max_distance_m)
+    if protocol.buffered:
+        pairs = pairs[_buffers_intersect(predicted_samples, truth_samples, pairs)]
+    if protocol.measure_to_segments:
+        predicted_to_truth = _directed_to_segments(
+            predicted_samples.points, predicted_samples.offsets, truth.points, truth.offsets, pairs
+        )
+        truth_to_predicted = _directed_to_segments(
+            truth_samples.points, truth_samples.offsets, predicted.points, predicted.offsets, pairs[:, ::-1]
+        )
+        table[pairs[:, 0], pairs[:, 1]] = 0.5 * (predicted_to_truth + truth_to_predicted)
     else:
         table[pairs[:, 0], pairs[:, 1]] = _point_chamfer(
-            mine.points, mine.first, theirs.points, theirs.first, np.ascontiguousarray(pairs)
+            predicted_samples.points,
+            predicted_samples.offsets,
+            truth_samples.points,
+            truth_samples.offsets,
+            np.ascontiguousarray(pairs),
         )
     return table
 
 
-def ranking(lines: Lines) -> Ints:
+def rank_lines(lines: Lines) -> Ints:
     """Rows by descending score; ties by descending length, then by the smallest x, then y, of the element."""
     low = lines.bounds()[:, :2].reshape(-1, 2)
     # Lengths that differ by rounding alone must not decide before the place does.
     return np.lexsort((low[:, 1], low[:, 0], -np.round(lines.lengths(), 6), -lines.score)).astype(np.int64)
 
 
-def match(table: Floats, order: Ints, threshold_m: float) -> Ints:
+def match_lines(table: Floats, order: Ints, threshold_m: float) -> Ints:
     """(N,) the truth row that each prediction takes, -1 for a false positive.
 
     Predictions in their order look only at their nearest truth (of equally near ones the first), and take it when it is
@@ -148,7 +158,7 @@ def match(table: Floats, order: Ints, threshold_m: float) -> Ints:
     return taken
 
 
-def area_under(ranked: NDArray[np.bool_], n_truth: int) -> float:
+def compute_all_point_ap(ranked: NDArray[np.bool_], n_truth: int) -> float:
     """All-point AP of true positives (N,) in ranked order; NaN without truth."""
     if n_truth == 0:
         return math.nan
@@ -158,60 +168,60 @@ def area_under(ranked: NDArray[np.bool_], n_truth: int) -> float:
     return float(envelope[ranked].sum() / n_truth)
 
 
-def _near(a: Floats, b: Floats, reach_m: float) -> Ints:
+def _find_nearby_pairs(a: Floats, b: Floats, max_distance_m: float) -> Ints:
     """(K, 2) pairs of rows whose boxes are at most reach_m apart."""
     gap_x = np.maximum(np.maximum(a[:, None, 0] - b[None, :, 2], b[None, :, 0] - a[:, None, 2]), 0.0)
     gap_y = np.maximum(np.maximum(a[:, None, 1] - b[None, :, 3], b[None, :, 1] - a[:, None, 3]), 0.0)
-    return np.argwhere(np.hypot(gap_x, gap_y) <= reach_m).astype(np.int64)
+    return np.argwhere(np.hypot(gap_x, gap_y) <= max_distance_m).astype(np.int64)
 
 
-def _buffers_meet(mine: Lines, theirs: Lines, pairs: Ints) -> NDArray[np.bool_]:
+def _buffers_intersect(predicted: Lines, truth: Lines, pairs: Ints) -> NDArray[np.bool_]:
     """(K,) whether the buffers of each pair meet."""
     try:
         import shapely
     except ImportError as error:
         raise MissingExtraError("map", "the Chamfer distance 'maptr'") from error
 
-    def buffers(lines: Lines) -> NDArray[np.object_]:
-        rows = np.repeat(np.arange(len(lines)), np.diff(lines.first))
+    def make_buffers(lines: Lines) -> NDArray[np.object_]:
+        rows = np.repeat(np.arange(len(lines)), np.diff(lines.offsets))
         strings = shapely.linestrings(lines.points, indices=rows)
         return np.asarray(shapely.buffer(strings, BUFFER_M, cap_style="flat", join_style="mitre"), dtype=object)
 
-    return shapely.intersects(buffers(mine)[pairs[:, 0]], buffers(theirs)[pairs[:, 1]])
+    return shapely.intersects(make_buffers(predicted)[pairs[:, 0]], make_buffers(truth)[pairs[:, 1]])
 
 
 @njit(cache=True)
-def _resample(points: Floats, first: Ints, target: Ints) -> Floats:
+def _resample(points: Floats, offsets: Ints, target_offsets: Ints) -> Floats:
     """Each line at target[i + 1] - target[i] points of equal arc length."""
-    out = np.empty((target[-1], 2))
-    for row in range(len(first) - 1):
-        begin, end = first[row], first[row + 1]
+    out = np.empty((target_offsets[-1], 2))
+    for row in range(len(offsets) - 1):
+        begin, end = offsets[row], offsets[row + 1]
         total = 0.0
         for k in range(begin, end - 1):
             total += np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
-        count = target[row + 1] - target[row]
-        k, passed = begin, 0.0
+        count = target_offsets[row + 1] - target_offsets[row]
+        k, walked = begin, 0.0
         step = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]) if end - begin > 1 else 0.0
         for j in range(count):
             at = total * j / (count - 1)
-            while k < end - 2 and passed + step < at:
-                passed += step
+            while k < end - 2 and walked + step < at:
+                walked += step
                 k += 1
                 step = np.hypot(points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1])
-            share = min(1.0, max(0.0, (at - passed) / step)) if step > 0 else 0.0
+            share = min(1.0, max(0.0, (at - walked) / step)) if step > 0 else 0.0
             after = min(k + 1, end - 1)
-            out[target[row] + j, 0] = points[k, 0] + share * (points[after, 0] - points[k, 0])
-            out[target[row] + j, 1] = points[k, 1] + share * (points[after, 1] - points[k, 1])
+            out[target_offsets[row] + j, 0] = points[k, 0] + share * (points[after, 0] - points[k, 0])
+            out[target_offsets[row] + j, 1] = points[k, 1] + share * (points[after, 1] - points[k, 1])
     return out
 
 
 @njit(cache=True)
-def _point_chamfer(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> Floats:
+def _point_chamfer(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> Floats:
     """Half the sum of both mean distances from samples to the nearest samples, for pairs (K, 2)."""
     out = np.empty(len(pairs))
     for p in range(len(pairs)):
-        i0, i1 = a_first[pairs[p, 0]], a_first[pairs[p, 0] + 1]
-        j0, j1 = b_first[pairs[p, 1]], b_first[pairs[p, 1] + 1]
+        i0, i1 = a_offsets[pairs[p, 0]], a_offsets[pairs[p, 0] + 1]
+        j0, j1 = b_offsets[pairs[p, 1]], b_offsets[pairs[p, 1] + 1]
         back = np.full(j1 - j0, np.inf)
         there = 0.0
         for i in range(i0, i1):
@@ -226,12 +236,12 @@ def _point_chamfer(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: In
 
 
 @njit(cache=True)
-def _directed_to_segments(a: Floats, a_first: Ints, b: Floats, b_first: Ints, pairs: Ints) -> Floats:
+def _directed_to_segments(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> Floats:
     """The mean distance from the samples of a to the line b itself, for pairs (K, 2)."""
     out = np.empty(len(pairs))
     for p in range(len(pairs)):
-        i0, i1 = a_first[pairs[p, 0]], a_first[pairs[p, 0] + 1]
-        j0, j1 = b_first[pairs[p, 1]], b_first[pairs[p, 1] + 1]
+        i0, i1 = a_offsets[pairs[p, 0]], a_offsets[pairs[p, 0] + 1]
+        j0, j1 = b_offsets[pairs[p, 1]], b_offsets[pairs[p, 1] + 1]
         total = 0.0
         for i in range(i0, i1):
             best = np.inf

@@ -49,141 +49,160 @@ from numpy.typing import NDArray
 from manyeyes._jit import njit
 from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.evaluation.maps.matching import (
-    WAYS,
+    MATCHING_PROTOCOLS,
     Lines,
-    area_under,
-    chamfer,
-    lines_of,
-    match,
-    ranking,
-    spaced,
-    way_named,
+    compute_all_point_ap,
+    compute_chamfer,
+    get_matching_protocol,
+    make_lines,
+    match_lines,
+    rank_lines,
+    resample_lines,
 )
-from manyeyes.ops.nearest_line import nearest_line
+from manyeyes.ops.nearest_line import find_nearest_line
 
 Floats = NDArray[np.float64]
 Thresholds = Literal["narrow", "wide"]
 
 THRESHOLDS: dict[Thresholds, tuple[float, ...]] = {"narrow": (0.5, 1.0, 1.5), "wide": (1.0, 1.5, 2.0)}
 PAPER_KINDS = ("crossing", "divider")
-LENGTH_WITHIN_M = (0.3, 0.5, 1.0)
-PIECE_M, LATERAL_WITHIN_M = 0.25, 1.5
-END_CAP_M, BRANCH_JOIN_M, BRANCH_MATCH_M = 10.0, 1.0, 3.0
+LENGTH_DISTANCES_M = (0.3, 0.5, 1.0)
+MAX_PIECE_M, MAX_LATERAL_M = 0.25, 1.5
+MAX_END_ERROR_M, MAX_BRANCH_SPREAD_M, MAX_BRANCH_DISTANCE_M = 10.0, 1.0, 3.0
 
 
 @dataclass(frozen=True)
-class Precision:
-    """AP of one kind in one way: at each threshold, and their mean; hits: true positives at the largest threshold."""
+class KindAp:
+    """AP of one kind in one way: at each threshold, and their mean; num_true_positives: true positives at the largest threshold."""
 
-    way: str
+    protocol: str
     thresholds: tuple[float, ...]
-    at: tuple[float, ...]
+    ap_at_threshold: tuple[float, ...]
     ap: float
-    hits: int
+    num_true_positives: int
 
 
 @dataclass(frozen=True)
 class LengthScore:
     """Precision, recall and F by length within a distance; NaN where there is nothing to take a share of."""
 
-    within_m: float
+    max_distance_m: float
     precision: float
     recall: float
-    f: float
+    f1: float
 
 
 @dataclass(frozen=True)
-class KindQuality:
+class KindMetrics:
     """Everything about one kind; the module's text defines each number."""
 
     kind: str
     n_predicted: int
     n_truth: int
-    precision: tuple[Precision, ...]
-    length: tuple[LengthScore, ...]
+    ap_scores: tuple[KindAp, ...]
+    length_scores: tuple[LengthScore, ...]
     duplication: float
     fragmentation: float
     lateral_median_m: float
     lateral_p95_m: float
-    order_m: float
-    end_error_m: float
+    frechet_m: float
+    endpoint_error_m: float
     branch_f1: float
 
 
 @dataclass(frozen=True)
-class MapQuality:
+class MapMetrics:
     """A map judged against the truth, one entry a kind in the order of KINDS."""
 
-    kinds: tuple[KindQuality, ...]
+    kinds: tuple[KindMetrics, ...]
 
-    def of(self, kind: str) -> KindQuality:
+    def get_kind(self, kind: str) -> KindMetrics:
         """The numbers of one kind."""
         return next(k for k in self.kinds if k.kind == kind)
 
-    def ap(self, kind: str, way: str = "exact", thresholds: Thresholds = "narrow") -> float:
+    def get_ap(self, kind: str, protocol: str = "exact", thresholds: Thresholds = "narrow") -> float:
         """The AP of one kind, mean over the thresholds."""
-        wanted = THRESHOLDS[thresholds]
-        return next(p.ap for p in self.of(kind).precision if p.way == way and p.thresholds == wanted)
+        distances_m = THRESHOLDS[thresholds]
+        return next(
+            p.ap for p in self.get_kind(kind).ap_scores if p.protocol == protocol and p.thresholds == distances_m
+        )
 
     def mean_ap(
-        self, way: str = "exact", thresholds: Thresholds = "narrow", kinds: Sequence[str] = PAPER_KINDS
+        self, protocol: str = "exact", thresholds: Thresholds = "narrow", kinds: Sequence[str] = PAPER_KINDS
     ) -> float:
         """mAP: the mean over those of the kinds that have truth."""
-        found = [self.ap(kind, way, thresholds) for kind in kinds if self.of(kind).n_truth > 0]
-        return sum(found) / len(found) if found else math.nan
+        ap_values = [self.get_ap(kind, protocol, thresholds) for kind in kinds if self.get_kind(kind).n_truth > 0]
+        return sum(ap_values) / len(ap_values) if ap_values else math.nan
 
-    def length(self, kind: str, within_m: float = 0.5) -> LengthScore:
+    def get_length_score(self, kind: str, max_distance_m: float = 0.5) -> LengthScore:
         """The length score of one kind."""
-        return next(s for s in self.of(kind).length if s.within_m == within_m)
+        return next(s for s in self.get_kind(kind).length_scores if s.max_distance_m == max_distance_m)
 
 
-def judge(
-    predicted: MapElements, truth: MapElements, ways: Sequence[str] = tuple(WAYS), kinds: Sequence[str] = KINDS
-) -> MapQuality:
+def evaluate_map(
+    predicted: MapElements,
+    truth: MapElements,
+    protocols: Sequence[str] = tuple(MATCHING_PROTOCOLS),
+    kinds: Sequence[str] = KINDS,
+) -> MapMetrics:
     """All numbers of a map (elements with scores) against the truth, both in one metric frame."""
-    for name in ways:
-        way_named(name)
-    return MapQuality(tuple(_judge_kind(k, lines_of_kind(predicted, k), lines_of_kind(truth, k), ways) for k in kinds))
+    for name in protocols:
+        get_matching_protocol(name)
+    return MapMetrics(
+        tuple(_evaluate_kind(k, select_lines(predicted, k), select_lines(truth, k), protocols) for k in kinds)
+    )
 
 
-def _judge_kind(kind: str, mine: Lines, theirs: Lines, ways: Sequence[str]) -> KindQuality:
-    order = ranking(mine)
-    precision: list[Precision] = []
-    frechet = math.nan
-    reach = max(max(t) for t in THRESHOLDS.values())
-    for name in ways:
-        table = chamfer(mine, theirs, WAYS[name], reach)
+def _evaluate_kind(kind: str, predicted: Lines, truth: Lines, protocols: Sequence[str]) -> KindMetrics:
+    order = rank_lines(predicted)
+    ap_scores: list[KindAp] = []
+    frechet_m = math.nan
+    max_distance_m = max(max(t) for t in THRESHOLDS.values())
+    for name in protocols:
+        table = compute_chamfer(predicted, truth, MATCHING_PROTOCOLS[name], max_distance_m)
         for thresholds in THRESHOLDS.values():
-            hits = [match(table, order, threshold) for threshold in thresholds]
-            at = tuple(area_under(taken[order] >= 0, len(theirs)) for taken in hits)
-            precision.append(Precision(name, thresholds, at, sum(at) / len(at), int((hits[-1] >= 0).sum())))
+            matches = [match_lines(table, order, threshold) for threshold in thresholds]
+            ap_at_threshold = tuple(
+                compute_all_point_ap(matched_row[order] >= 0, len(truth)) for matched_row in matches
+            )
+            ap_scores.append(
+                KindAp(
+                    name,
+                    thresholds,
+                    ap_at_threshold,
+                    sum(ap_at_threshold) / len(ap_at_threshold),
+                    int((matches[-1] >= 0).sum()),
+                )
+            )
         if name == "exact" and kind != "crossing":
-            frechet = _order(mine, theirs, match(table, order, THRESHOLDS["narrow"][-1]))
-    there, back = pieces_of(mine), pieces_of(theirs)
-    near_truth = nearest_line(there.middle, theirs.points, theirs.first, LATERAL_WITHIN_M)
-    near_mine = nearest_line(back.middle, mine.points, mine.first, max(LENGTH_WITHIN_M))
-    lateral = _quantiles(near_truth.distance, there.length, (0.5, 0.95))
-    ends = (math.nan, math.nan) if kind == "crossing" else topology(mine, theirs)
-    return KindQuality(
+            frechet_m = _median_frechet(predicted, truth, match_lines(table, order, THRESHOLDS["narrow"][-1]))
+    predicted_pieces, truth_pieces = split_into_pieces(predicted), split_into_pieces(truth)
+    near_truth = find_nearest_line(predicted_pieces.center, truth.points, truth.offsets, MAX_LATERAL_M)
+    near_predicted = find_nearest_line(
+        truth_pieces.center, predicted.points, predicted.offsets, max(LENGTH_DISTANCES_M)
+    )
+    lateral = _quantiles(near_truth.distance, predicted_pieces.length, (0.5, 0.95))
+    ends = (math.nan, math.nan) if kind == "crossing" else compute_topology(predicted, truth)
+    return KindMetrics(
         kind=kind,
-        n_predicted=len(mine),
-        n_truth=len(theirs),
-        precision=tuple(precision),
-        length=tuple(
-            _length_score(d, near_truth.distance, there.length, near_mine.distance, back.length)
-            for d in LENGTH_WITHIN_M
+        n_predicted=len(predicted),
+        n_truth=len(truth),
+        ap_scores=tuple(ap_scores),
+        length_scores=tuple(
+            _length_score(d, near_truth.distance, predicted_pieces.length, near_predicted.distance, truth_pieces.length)
+            for d in LENGTH_DISTANCES_M
         ),
-        duplication=_ratio(there.length.sum(), back.length.sum()),
-        fragmentation=_fragmentation(there, near_truth.line, len(theirs)),
+        duplication=_ratio(predicted_pieces.length.sum(), truth_pieces.length.sum()),
+        fragmentation=_fragmentation(predicted_pieces, near_truth.line, len(truth)),
         lateral_median_m=lateral[0],
         lateral_p95_m=lateral[1],
-        order_m=frechet,
-        end_error_m=ends[0],
+        frechet_m=frechet_m,
+        endpoint_error_m=ends[0],
         branch_f1=ends[1],
     )
 
 
-def lines_of_kind(elements: MapElements, kind: str) -> Lines:
+def select_lines(elements: MapElements, kind: str) -> Lines:
     """The elements of one kind that have length, rings closed."""
     parts, scores = [], []
     for row in np.flatnonzero(elements.kind == KINDS.index(kind)):
@@ -191,39 +210,47 @@ def lines_of_kind(elements: MapElements, kind: str) -> Lines:
         if len(points) > 1 and np.ptp(points, axis=0).any():
             parts.append(np.vstack((points, points[:1])) if kind == "crossing" else points)
             scores.append(float(elements.score[row]))
-    return lines_of(parts, np.array(scores))
+    return make_lines(parts, np.array(scores))
 
 
 @dataclass(frozen=True)
 class Pieces:
     """Lines in short pieces: middle (P, 2), length (P,), owner (P,) row of the line."""
 
-    middle: Floats
+    center: Floats
     length: Floats
-    owner: NDArray[np.int64]
+    line_of_piece: NDArray[np.int64]
 
 
-def pieces_of(lines: Lines) -> Pieces:
+def split_into_pieces(lines: Lines) -> Pieces:
     """Every segment in equal pieces of at most PIECE_M."""
-    start = np.delete(np.arange(len(lines.points)), lines.first[1:] - 1) if len(lines) else np.zeros(0, dtype=np.int64)
-    owner = np.repeat(np.arange(len(lines)), np.diff(lines.first) - 1)
+    start = (
+        np.delete(np.arange(len(lines.points)), lines.offsets[1:] - 1) if len(lines) else np.zeros(0, dtype=np.int64)
+    )
+    owner = np.repeat(np.arange(len(lines)), np.diff(lines.offsets) - 1)
     step = lines.points[start + 1] - lines.points[start] if len(start) else np.zeros((0, 2))
     length = np.hypot(step[:, 0], step[:, 1])
-    count = np.maximum(np.ceil(length / PIECE_M - 1e-9).astype(np.int64), 1)
+    count = np.maximum(np.ceil(length / MAX_PIECE_M - 1e-9).astype(np.int64), 1)
     segment = np.repeat(np.arange(len(start)), count)
     within = np.arange(len(segment)) - np.repeat(np.cumsum(count) - count, count)
     share = ((within + 0.5) / count[segment])[:, None]
     return Pieces(lines.points[start[segment]] + share * step[segment], (length / count)[segment], owner[segment])
 
 
-def _length_score(within_m: float, there: Floats, mine: Floats, back: Floats, theirs: Floats) -> LengthScore:
-    precision = _ratio(mine[there <= within_m].sum(), mine.sum())
-    recall = _ratio(theirs[back <= within_m].sum(), theirs.sum())
+def _length_score(
+    max_distance_m: float,
+    predicted_distance: Floats,
+    predicted_length: Floats,
+    truth_distance: Floats,
+    truth_length: Floats,
+) -> LengthScore:
+    precision = _ratio(predicted_length[predicted_distance <= max_distance_m].sum(), predicted_length.sum())
+    recall = _ratio(truth_length[truth_distance <= max_distance_m].sum(), truth_length.sum())
     if math.isnan(recall):
-        return LengthScore(within_m, precision, recall, math.nan)
+        return LengthScore(max_distance_m, precision, recall, math.nan)
     # Without a prediction there is no precision, but F is plainly 0.
-    both = (0.0 if math.isnan(precision) else precision) + recall
-    return LengthScore(within_m, precision, recall, 2 * precision * recall / both if both > 0 else 0.0)
+    total = (0.0 if math.isnan(precision) else precision) + recall
+    return LengthScore(max_distance_m, precision, recall, 2 * precision * recall / total if total > 0 else 0.0)
 
 
 def _ratio(part: float, whole: float) -> float:
@@ -245,23 +272,24 @@ def _fragmentation(pieces: Pieces, nearest: NDArray[np.int64], n_truth: int) -> 
     near = nearest >= 0
     if n_truth == 0 or not near.any():
         return math.nan
-    shared = np.zeros((int(pieces.owner.max()) + 1, n_truth))
-    np.add.at(shared, (pieces.owner[near], nearest[near]), pieces.length[near])
-    belongs = shared.argmax(1)[shared.sum(1) > 0]
-    count = np.bincount(belongs, minlength=n_truth)
+    shared = np.zeros((int(pieces.line_of_piece.max()) + 1, n_truth))
+    np.add.at(shared, (pieces.line_of_piece[near], nearest[near]), pieces.length[near])
+    truth_row = shared.argmax(1)[shared.sum(1) > 0]
+    count = np.bincount(truth_row, minlength=n_truth)
     return float(count[count > 0].mean())
 
 
-def _order(mine: Lines, theirs: Lines, taken: NDArray[np.int64]) -> float:
+def _median_frechet(predicted: Lines, truth: Lines, matched_row: NDArray[np.int64]) -> float:
     """The median discrete Frechet distance of matched lines."""
-    a, b = spaced(mine, WAYS["exact"]), spaced(theirs, WAYS["exact"])
-    found = [
+    a, b = resample_lines(predicted, MATCHING_PROTOCOLS["exact"]), resample_lines(truth, MATCHING_PROTOCOLS["exact"])
+    distances = [
         min(
-            frechet(a.line(int(row)), b.line(int(taken[row]))), frechet(a.line(int(row))[::-1], b.line(int(taken[row])))
+            frechet(a.line(int(row)), b.line(int(matched_row[row]))),
+            frechet(a.line(int(row))[::-1], b.line(int(matched_row[row]))),
         )
-        for row in np.flatnonzero(taken >= 0)
+        for row in np.flatnonzero(matched_row >= 0)
     ]
-    return float(np.median(found)) if found else math.nan
+    return float(np.median(distances)) if distances else math.nan
 
 
 @njit(cache=True)
@@ -283,35 +311,39 @@ def frechet(a: Floats, b: Floats) -> float:
     return row[-1]
 
 
-def topology(mine: Lines, theirs: Lines) -> tuple[float, float]:
+def compute_topology(predicted: Lines, truth: Lines) -> tuple[float, float]:
     """The endpoint error, and F1 of branches."""
-    ours, true = _ends(mine), _ends(theirs)
+    predicted_ends, truth_ends = _line_ends(predicted), _line_ends(truth)
     end_error = math.nan
-    if len(true):
-        gap = np.full(len(true), END_CAP_M)
-        if len(ours):
-            gap = np.hypot(true[:, None, 0] - ours[None, :, 0], true[:, None, 1] - ours[None, :, 1]).min(1)
-        end_error = float(np.median(np.minimum(gap, END_CAP_M)))
-    found, wanted = branches(ours), branches(true)
-    if len(found) + len(wanted) == 0:
+    if len(truth_ends):
+        gap = np.full(len(truth_ends), MAX_END_ERROR_M)
+        if len(predicted_ends):
+            gap = np.hypot(
+                truth_ends[:, None, 0] - predicted_ends[None, :, 0], truth_ends[:, None, 1] - predicted_ends[None, :, 1]
+            ).min(1)
+        end_error = float(np.median(np.minimum(gap, MAX_END_ERROR_M)))
+    predicted_branches, truth_branches = find_branches(predicted_ends), find_branches(truth_ends)
+    if len(predicted_branches) + len(truth_branches) == 0:
         return end_error, math.nan
-    hits = _mutual(found, wanted, BRANCH_MATCH_M)
-    return end_error, 2 * hits / (len(found) + len(wanted))
+    hits = _count_matches(predicted_branches, truth_branches, MAX_BRANCH_DISTANCE_M)
+    return end_error, 2 * hits / (len(predicted_branches) + len(truth_branches))
 
 
-def _ends(lines: Lines) -> Floats:
+def _line_ends(lines: Lines) -> Floats:
     """(2 N, 2): both ends of every line."""
     return (
-        np.vstack((lines.points[lines.first[:-1]], lines.points[lines.first[1:] - 1]))
+        np.vstack((lines.points[lines.offsets[:-1]], lines.points[lines.offsets[1:] - 1]))
         if len(lines)
         else np.zeros((0, 2))
     )
 
 
-def branches(ends: Floats) -> Floats:
+def find_branches(ends: Floats) -> Floats:
     """(B, 2) centres of groups of three or more ends, joined within 1 m; by x, then y."""
     ordered = ends[np.lexsort((ends[:, 1], ends[:, 0]))] if len(ends) else ends
-    names, label, count = np.unique(_groups(ordered, BRANCH_JOIN_M), return_inverse=True, return_counts=True)
+    names, label, count = np.unique(
+        _group_points(ordered, MAX_BRANCH_SPREAD_M), return_inverse=True, return_counts=True
+    )
     total = np.zeros((len(names), 2))
     np.add.at(total, label, ordered)
     centres = (total / count[:, None])[count >= 3]
@@ -319,14 +351,14 @@ def branches(ends: Floats) -> Floats:
 
 
 @njit(cache=True)
-def _groups(ordered: Floats, join: float) -> NDArray[np.int64]:
+def _group_points(ordered: Floats, max_gap_m: float) -> NDArray[np.int64]:
     """(N,) single-linkage groups of points (N, 2) sorted by x: each is named after one of its members."""
     parent = np.arange(len(ordered))
     for i in range(len(ordered)):
         for j in range(i + 1, len(ordered)):
-            if ordered[j, 0] - ordered[i, 0] > join:
+            if ordered[j, 0] - ordered[i, 0] > max_gap_m:
                 break
-            if np.hypot(ordered[j, 0] - ordered[i, 0], ordered[j, 1] - ordered[i, 1]) <= join:
+            if np.hypot(ordered[j, 0] - ordered[i, 0], ordered[j, 1] - ordered[i, 1]) <= max_gap_m:
                 a, b = i, j
                 while parent[a] != a:
                     a = parent[a]
@@ -341,11 +373,11 @@ def _groups(ordered: Floats, join: float) -> NDArray[np.int64]:
     return parent
 
 
-def _mutual(a: Floats, b: Floats, within_m: float) -> int:
+def _count_matches(a: Floats, b: Floats, max_distance_m: float) -> int:
     """How many pairs match one to one, nearest first."""
     gap = np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1])
     hits = 0
-    while gap.size and gap.min() <= within_m:
+    while gap.size and gap.min() <= max_distance_m:
         row, column = np.unravel_index(int(gap.argmin()), gap.shape)
         gap[row, :], gap[:, column] = np.inf, np.inf
         hits += 1

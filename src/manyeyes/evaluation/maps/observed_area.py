@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 Floats = NDArray[np.float64]
-SHORTEST_PART_M, CROSSING_SHARE = 2.0, 0.5
+MIN_PART_LENGTH_M, MIN_CROSSING_FRACTION = 2.0, 0.5
 
 
-def observed_area(views: Sequence[Floats], poses: Floats) -> BaseGeometry:
+def compute_observed_area(views: Sequence[Floats], poses: Floats) -> BaseGeometry:
     """The union of field-of-view polygons (K, 2), agents' frames, at true poses (N, 3) of x, y, yaw."""
-    shapely = _shapely()
-    placed = []
+    shapely = _import_shapely()
+    polygons = []
     for view, (x, y, yaw) in zip(views, np.asarray(poses, dtype=np.float64)):
         c, s = np.cos(yaw), np.sin(yaw)
-        placed.append(shapely.polygons(np.asarray(view) @ np.array([[c, s], [-s, c]]) + [x, y]))
-    return shapely.union_all(placed)
+        polygons.append(shapely.polygons(np.asarray(view) @ np.array([[c, s], [-s, c]]) + [x, y]))
+    return shapely.union_all(polygons)
 
 
-def clip(elements: MapElements, area: BaseGeometry) -> MapElements:
+def clip_to_area(elements: MapElements, area: BaseGeometry) -> MapElements:
     """The elements inside an area; scores and styles are kept."""
-    shapely = _shapely()
+    shapely = _import_shapely()
     shapely.prepare(area)
     rows: list[int] = []
     parts: list[Floats] = []
@@ -44,7 +44,9 @@ def clip(elements: MapElements, area: BaseGeometry) -> MapElements:
         points = elements.polyline(row)
         if elements.kind[row] == CROSSING:
             ring = shapely.polygons(points)
-            if ring.is_valid and shapely.area(shapely.intersection(ring, area)) >= CROSSING_SHARE * shapely.area(ring):
+            if ring.is_valid and shapely.area(shapely.intersection(ring, area)) >= MIN_CROSSING_FRACTION * shapely.area(
+                ring
+            ):
                 rows.append(row)
                 parts.append(points)
             continue
@@ -55,21 +57,21 @@ def clip(elements: MapElements, area: BaseGeometry) -> MapElements:
             continue
         inside = shapely.line_merge(shapely.intersection(line, area))
         for piece in shapely.get_parts(inside):
-            if piece.geom_type == "LineString" and piece.length >= SHORTEST_PART_M:
+            if piece.geom_type == "LineString" and piece.length >= MIN_PART_LENGTH_M:
                 rows.append(row)
                 parts.append(shapely.get_coordinates(piece))
-    return with_geometry(elements, rows, parts)
+    return replace_geometry(elements, rows, parts)
 
 
-def with_geometry(elements: MapElements, rows: Sequence[int], parts: Sequence[Floats]) -> MapElements:
+def replace_geometry(elements: MapElements, rows: Sequence[int], parts: Sequence[Floats]) -> MapElements:
     """Elements like those at the rows, each with another geometry (n, 2); sigma is the mean of the old points'."""
     index = np.asarray(rows, dtype=np.int64)
-    mean = np.add.reduceat(elements.sigma, elements.first[:-1]) / elements.counts if len(elements) else np.zeros(0)
+    mean = np.add.reduceat(elements.sigma, elements.offsets[:-1]) / elements.counts if len(elements) else np.zeros(0)
     sigma = np.repeat(mean[index], [len(part) for part in parts]) if len(parts) else np.zeros(0)
     return MapElements.of(parts, elements.kind[index], elements.score[index], sigma, elements.style[index])
 
 
-def _shapely() -> Any:
+def _import_shapely() -> Any:
     try:
         import shapely
     except ImportError as error:

@@ -13,27 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import CROSSING, MapElements
-from manyeyes.evaluation.maps.experiment import Scene, at_poses
-from manyeyes.evaluation.maps.matching import Way, lines_of, spaced
-from manyeyes.evaluation.maps.observed_area import with_geometry
-from manyeyes.maps.fusion.fuse import FuseConfig, fuse
+from manyeyes.evaluation.maps.experiment import FleetExperiment, replace_poses
+from manyeyes.evaluation.maps.matching import MatchingProtocol, make_lines, resample_lines
+from manyeyes.evaluation.maps.observed_area import replace_geometry
+from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 
 Floats = NDArray[np.float64]
 ORACLES = ("oracle-cuts", "oracle-pose", "oracle-association")
-_WIDEST_GAP_M = 6.0
+_MAX_GAP_M = 6.0
 
 
-def oracle(name: str, scene: Scene, config: FuseConfig) -> MapElements:
+def run_oracle(name: str, experiment: FleetExperiment, config: MapFusionConfig) -> MapElements:
     """The elements of an oracle's map, before the common cut."""
     if name == "oracle-cuts":
-        return halves(scene.truth)
+        return split_in_half(experiment.truth)
     if name == "oracle-pose":
-        observations = at_poses(scene.observations, scene.crowd.true_poses)
-        return fuse(observations, config, scene.place.frame).published().elements
-    return associated(scene)
+        observations = replace_poses(experiment.observations, experiment.fleet.true_poses)
+        return fuse(observations, config, experiment.place.frame).select_published().elements
+    return fuse_with_true_association(experiment)
 
 
-def halves(elements: MapElements) -> MapElements:
+def split_in_half(elements: MapElements) -> MapElements:
     """Every line as two of half its length; crossings as they are."""
     rows, parts = [], []
     for row in range(len(elements)):
@@ -42,44 +42,50 @@ def halves(elements: MapElements) -> MapElements:
             rows.append(row)
             parts.append(line)
             continue
-        along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
-        half = along[-1] / 2
-        middle = np.array([[np.interp(half, along, line[:, axis]) for axis in (0, 1)]])
+        arc_length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
+        half = arc_length[-1] / 2
+        middle = np.array([[np.interp(half, arc_length, line[:, axis]) for axis in (0, 1)]])
         rows += [row, row]
-        parts += [np.vstack((line[along < half], middle)), np.vstack((middle, line[along > half]))]
-    return with_geometry(elements, rows, parts)
+        parts += [np.vstack((line[arc_length < half], middle)), np.vstack((middle, line[arc_length > half]))]
+    return replace_geometry(elements, rows, parts)
 
 
-def associated(scene: Scene) -> MapElements:
+def fuse_with_true_association(experiment: FleetExperiment) -> MapElements:
     """Every true element that somebody saw, moved by the mean of what the claimed poses say about it."""
-    truth = scene.place.truth
-    seen: dict[int, list[Floats]] = {}
-    for k, (observation, pose) in enumerate(zip(scene.observations, scene.crowd.true_poses)):
-        true, claimed = observation.in_map(pose), observation.in_map()
-        origins = scene.crowd.origin[scene.crowd.origin_first[k] : scene.crowd.origin_first[k + 1]]
+    truth = experiment.place.truth
+    points_by_element: dict[int, list[Floats]] = {}
+    for k, (observation, pose) in enumerate(zip(experiment.observations, experiment.fleet.true_poses)):
+        true, reported = observation.elements_in_map(pose), observation.elements_in_map()
+        origins = experiment.fleet.origin[experiment.fleet.origin_offsets[k] : experiment.fleet.origin_offsets[k + 1]]
         for row, origin in enumerate(origins.tolist()):
             if 0 <= origin < len(truth):
-                seen.setdefault(origin, []).append(np.hstack((true.polyline(row), claimed.polyline(row))))
+                points_by_element.setdefault(origin, []).append(np.hstack((true.polyline(row), reported.polyline(row))))
     rows: list[int] = []
     parts: list[Floats] = []
-    for origin in sorted(seen):
-        both = np.concatenate(seen[origin])
+    for origin in sorted(points_by_element):
+        point_pairs = np.concatenate(points_by_element[origin])
         line = truth.polyline(origin)
-        moved = [line + (both[:, 2:] - both[:, :2]).mean(0)] if truth.kind[origin] == CROSSING else _moved(line, both)
-        rows += [origin] * len(moved)
-        parts += moved
-    return with_geometry(truth, rows, parts)
+        shifted = (
+            [line + (point_pairs[:, 2:] - point_pairs[:, :2]).mean(0)]
+            if truth.kind[origin] == CROSSING
+            else _shift_line(line, point_pairs)
+        )
+        rows += [origin] * len(shifted)
+        parts += shifted
+    return replace_geometry(truth, rows, parts)
 
 
-def _moved(line: Floats, both: Floats) -> list[Floats]:
+def _shift_line(line: Floats, point_pairs: Floats) -> list[Floats]:
     """The seen parts of a line, at 1 m, across it at the mean of the claimed points (K, 4): true x, y, claimed x, y."""
-    stations = spaced(lines_of([line]), Way("stations", spacing_m=1.0)).points
+    stations = resample_lines(make_lines([line]), MatchingProtocol("stations", spacing_m=1.0)).points
     step = np.gradient(stations, axis=0)
     normal = np.stack((-step[:, 1], step[:, 0]), 1) / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
-    nearest = np.hypot(both[:, None, 0] - stations[None, :, 0], both[:, None, 1] - stations[None, :, 1]).argmin(1)
-    across = ((both[:, 2:] - stations[nearest]) * normal[nearest]).sum(1)
+    nearest = np.hypot(
+        point_pairs[:, None, 0] - stations[None, :, 0], point_pairs[:, None, 1] - stations[None, :, 1]
+    ).argmin(1)
+    lateral_m = ((point_pairs[:, 2:] - stations[nearest]) * normal[nearest]).sum(1)
     count = np.bincount(nearest, minlength=len(stations))
-    mean = np.bincount(nearest, across, len(stations)) / np.maximum(count, 1)
+    mean = np.bincount(nearest, lateral_m, len(stations)) / np.maximum(count, 1)
     known = np.flatnonzero(count)
-    breaks = np.flatnonzero(np.diff(known) > _WIDEST_GAP_M) + 1
+    breaks = np.flatnonzero(np.diff(known) > _MAX_GAP_M) + 1
     return [stations[part] + mean[part, None] * normal[part] for part in np.split(known, breaks) if len(part) > 1]

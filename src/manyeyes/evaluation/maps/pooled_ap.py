@@ -17,137 +17,174 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.maps.matching import WAYS, Lines, chamfer, lines_of, match, ranking
-from manyeyes.evaluation.maps.metrics import PAPER_KINDS, THRESHOLDS, Thresholds, lines_of_kind
-from manyeyes.evaluation.maps.tiles import APART_M
-from manyeyes.evaluation.statistics.bootstrap import Drawn, Interval, Pooled, Verdict, resamples, resolved, weighted_ap
+from manyeyes.evaluation.maps.matching import (
+    MATCHING_PROTOCOLS,
+    Lines,
+    compute_chamfer,
+    make_lines,
+    match_lines,
+    rank_lines,
+)
+from manyeyes.evaluation.maps.metrics import PAPER_KINDS, THRESHOLDS, Thresholds, select_lines
+from manyeyes.evaluation.maps.tiles import MAP_SPACING_M
+from manyeyes.evaluation.statistics.bootstrap import (
+    BootstrapSamples,
+    Interval,
+    MarginVerdict,
+    PooledMatches,
+    compare_to_margin,
+    draw_resamples,
+    weighted_ap,
+)
 
 Floats = NDArray[np.float64]
 Block = tuple[str, int, int]
-Blocks = Callable[[Floats], list[Block]]
+BlockAssignment = Callable[[Floats], list[Block]]
 """From the middles (N, 2) of lines to the block of each."""
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class MapPair:
     """One map and its truth in one frame, and how their lines fall into blocks."""
 
-    drawn: MapElements
+    predicted: MapElements
     truth: MapElements
-    blocks: Blocks
+    assign_blocks: BlockAssignment
 
 
-def one_block(name: str) -> Blocks:
+def assign_to_scenario(name: str) -> BlockAssignment:
     """Everything belongs to the scenario of that name."""
     return lambda middles: [(name, 0, 0)] * len(middles)
 
 
-def squares(name: str, size_m: float) -> Blocks:
+def assign_to_squares(name: str, square_size_m: float) -> BlockAssignment:
     """Lines belong to the square, of so many metres a side, in which their middles lie."""
 
-    def of(middles: Floats) -> list[Block]:
-        return [(name, *cell) for cell in np.floor(middles / size_m).astype(np.int64).tolist()]
+    def assign(middles: Floats) -> list[Block]:
+        return [(name, *cell) for cell in np.floor(middles / square_size_m).astype(np.int64).tolist()]
 
-    return of
+    return assign
 
 
-def pooled_ap(
-    judged: Sequence[Judged],
+def bootstrap_pooled_ap(
+    pairs: Sequence[MapPair],
     kind: str,
-    way: str = "maptr",
+    protocol: str = "maptr",
     thresholds: Thresholds = "narrow",
-    known: Sequence[Block] | None = None,
-    n: int = 1000,
+    all_blocks: Sequence[Block] | None = None,
+    num_resamples: int = 1000,
     seed: int = 0,
-    level: float = 0.95,
-) -> Drawn:
+    confidence_level: float = 0.95,
+) -> BootstrapSamples:
     """AP of one kind, mean over the thresholds, of all maps as one list, and on n draws of the blocks.
 
-    known: all blocks, where other lists are to be compared that may have some more; otherwise those that have a line.
+    all_blocks: all blocks, where other lists are to be compared that may have some more; otherwise those that have a line.
     """
-    pairs = [(lines_of_kind(one.drawn, kind), lines_of_kind(one.truth, kind)) for one in judged]
-    own = [one.blocks(_middles(mine)) for one, (mine, _) in zip(judged, pairs)]
-    true = [one.blocks(_middles(theirs)) for one, (_, theirs) in zip(judged, pairs)]
-    names = tuple(known if known is not None else sorted({block for part in (*own, *true) for block in part}))
+    line_pairs = [(select_lines(one.predicted, kind), select_lines(one.truth, kind)) for one in pairs]
+    predicted_blocks = [one.assign_blocks(_line_centers(predicted)) for one, (predicted, _) in zip(pairs, line_pairs)]
+    truth_blocks = [one.assign_blocks(_line_centers(truth)) for one, (_, truth) in zip(pairs, line_pairs)]
+    names = tuple(
+        all_blocks
+        if all_blocks is not None
+        else sorted({block for part in (*predicted_blocks, *truth_blocks) for block in part})
+    )
     row = {block: k for k, block in enumerate(names)}
-    own_row, true_row = ([np.array([row[b] for b in part], np.int64) for part in side] for side in (own, true))
-    n_gt = np.bincount(np.concatenate([np.zeros(0, np.int64), *true_row]), minlength=len(names))
-    order = _ranked([mine for mine, _ in pairs])
-    within = [(ranking(mine), chamfer(mine, theirs, WAYS[way], max(THRESHOLDS[thresholds]))) for mine, theirs in pairs]
-    weights = np.vstack((np.ones((1, len(names)), np.int64), resamples(len(names), n, seed)))
-    found = []
+    predicted_rows, truth_rows = (
+        [np.array([row[b] for b in part], np.int64) for part in side] for side in (predicted_blocks, truth_blocks)
+    )
+    n_gt = np.bincount(np.concatenate([np.zeros(0, np.int64), *truth_rows]), minlength=len(names))
+    order = _rank_pooled([predicted for predicted, _ in line_pairs])
+    rankings_and_distances = [
+        (
+            rank_lines(predicted),
+            compute_chamfer(predicted, truth, MATCHING_PROTOCOLS[protocol], max(THRESHOLDS[thresholds])),
+        )
+        for predicted, truth in line_pairs
+    ]
+    weights = np.vstack((np.ones((1, len(names)), np.int64), draw_resamples(len(names), num_resamples, seed)))
+    ap_by_threshold = []
     for threshold in THRESHOLDS[thresholds]:
-        hit, where = [np.zeros(0, bool)], [np.zeros(0, np.int64)]
-        for (ranks, table), mine, theirs in zip(within, own_row, true_row):
-            taken = match(table, ranks, threshold)
+        hit, block_parts = [np.zeros(0, bool)], [np.zeros(0, np.int64)]
+        for (ranks, table), predicted, truth in zip(rankings_and_distances, predicted_rows, truth_rows):
+            taken = match_lines(table, ranks, threshold)
             hit.append(taken >= 0)
-            where.append(np.where(taken >= 0, theirs[taken], mine) if len(theirs) else mine)
-        tp, block = np.concatenate(hit)[order], np.concatenate(where)[order]
-        found.append(weighted_ap(Pooled((), tp, block, n_gt, False), weights))
-    values = np.mean(found, axis=0)
-    return Drawn(tuple("/".join(map(str, b)) for b in names), n_gt, float(values[0]), values[1:], level, True)
+            block_parts.append(np.where(taken >= 0, truth[taken], predicted) if len(truth) else predicted)
+        tp, block = np.concatenate(hit)[order], np.concatenate(block_parts)[order]
+        ap_by_threshold.append(weighted_ap(PooledMatches((), tp, block, n_gt, False), weights))
+    values = np.mean(ap_by_threshold, axis=0)
+    return BootstrapSamples(
+        tuple("/".join(map(str, b)) for b in names), n_gt, float(values[0]), values[1:], confidence_level, True
+    )
 
 
-def pooled_mean_ap(
-    judged: Sequence[Judged],
-    way: str = "maptr",
+def bootstrap_pooled_mean_ap(
+    pairs: Sequence[MapPair],
+    protocol: str = "maptr",
     kinds: Sequence[str] = PAPER_KINDS,
-    known: Sequence[Block] | None = None,
-    n: int = 1000,
-) -> Drawn:
+    all_blocks: Sequence[Block] | None = None,
+    num_resamples: int = 1000,
+) -> BootstrapSamples:
     """mAP: the mean over those kinds that have truth, draw by draw."""
-    blocks = known if known is not None else blocks_of([judged])
-    return mean_of([pooled_ap(judged, kind, way, known=blocks, n=n) for kind in kinds])
+    blocks = all_blocks if all_blocks is not None else collect_blocks([pairs])
+    return average_samples(
+        [bootstrap_pooled_ap(pairs, kind, protocol, all_blocks=blocks, num_resamples=num_resamples) for kind in kinds]
+    )
 
 
-def blocks_of(several: Sequence[Sequence[Judged]]) -> list[Block]:
+def collect_blocks(pair_lists: Sequence[Sequence[MapPair]]) -> list[Block]:
     """All blocks that have an element on any side of several lists."""
     found: set[Block] = set()
-    for judged in several:
-        for one in judged:
-            for elements in (one.drawn, one.truth):
-                found.update(one.blocks(np.array([_middle(elements.polyline(k)) for k in range(len(elements))])))
+    for pairs in pair_lists:
+        for one in pairs:
+            for elements in (one.predicted, one.truth):
+                found.update(
+                    one.assign_blocks(np.array([_bounds_center(elements.polyline(k)) for k in range(len(elements))]))
+                )
     return sorted(found)
 
 
-def mean_of(several: Sequence[Drawn]) -> Drawn:
+def average_samples(bootstraps: Sequence[BootstrapSamples]) -> BootstrapSamples:
     """The mean of those that have truth, draw by draw; of lists over other blocks each is drawn by itself."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a draw in which nothing has truth stays NaN
-        value = float(np.nanmean([one.value for one in several]))
-        draws = np.nanmean([one.draws for one in several], axis=0)
-    names = tuple(dict.fromkeys(name for one in several for name in one.names))
-    return Drawn(names, np.zeros(len(names), np.int64), value, draws, several[0].level, False)
+        value = float(np.nanmean([one.value for one in bootstraps]))
+        samples = np.nanmean([one.samples for one in bootstraps], axis=0)
+    names = tuple(dict.fromkeys(name for one in bootstraps for name in one.names))
+    return BootstrapSamples(
+        names, np.zeros(len(names), np.int64), value, samples, bootstraps[0].confidence_level, False
+    )
 
 
 @dataclass(frozen=True)
-class MapClaim:
+class MapMarginTest:
     """A paired difference of mAP and a bar; the verdict says whether the whole interval is at or above it."""
 
-    what: str
+    description: str
     difference: Interval
-    bar: float
-    verdict: Verdict
+    margin: float
+    verdict: MarginVerdict
 
 
-def claimed(what: str, difference: Interval, bar: float) -> MapClaim:
+def check_map_margin(description: str, difference: Interval, margin: float) -> MapMarginTest:
     """The claim that a difference is at least the bar; of a single block nothing is resolved."""
-    several = difference.scenarios > 1
-    verdict = resolved(bar, difference.low, difference.high) if several else "not resolved"
-    return MapClaim(what, difference, bar, verdict)
+    has_several_blocks = difference.num_scenarios > 1
+    verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_blocks else "not resolved"
+    return MapMarginTest(description, difference, margin, verdict)
 
 
-def _ranked(many: Sequence[Lines]) -> NDArray[np.int64]:
+def _rank_pooled(lines_of_maps: Sequence[Lines]) -> NDArray[np.int64]:
     """The ranking of the lines of all maps as one list, ties as if the maps lay side by side."""
-    parts = [lines.line(row) + [APART_M * k, 0.0] for k, lines in enumerate(many) for row in range(len(lines))]
-    return ranking(lines_of(parts, np.concatenate([np.zeros(0), *(lines.score for lines in many)])))
+    parts = [
+        lines.line(row) + [MAP_SPACING_M * k, 0.0] for k, lines in enumerate(lines_of_maps) for row in range(len(lines))
+    ]
+    return rank_lines(make_lines(parts, np.concatenate([np.zeros(0), *(lines.score for lines in lines_of_maps)])))
 
 
-def _middles(lines: Lines) -> Floats:
+def _line_centers(lines: Lines) -> Floats:
     """(N, 2) the middle of each line's bounding box."""
     bounds = lines.bounds()
     return (bounds[:, :2] + bounds[:, 2:]) / 2
 
 
-def _middle(points: Floats) -> Floats:
+def _bounds_center(points: Floats) -> Floats:
     return (points.min(0) + points.max(0)) / 2

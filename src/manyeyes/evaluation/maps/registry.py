@@ -13,14 +13,14 @@ from typing import Any
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.maps.experiment import Scene
-from manyeyes.evaluation.maps.oracles import ORACLES, oracle
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.evaluation.maps.experiment import FleetExperiment
+from manyeyes.evaluation.maps.oracles import ORACLES, run_oracle
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.fusion.fuse import FuseConfig, fuse
+from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 
 OURS = "manyeyes"
-RIVALS = (
+BASELINES = (
     "union",
     "chamfer_nms",
     "crowdmap_literal",
@@ -29,28 +29,28 @@ RIVALS = (
     "heatmap_buffer",
     "global_map_builder",
 )
-METHODS = (OURS, *RIVALS)
+METHODS = (OURS, *BASELINES)
 
 
 @dataclass(frozen=True)
-class Settings:
+class MethodSettings:
     """Configurations by method's name; a method that is not listed runs with its defaults."""
 
-    chosen: tuple[tuple[str, Any], ...] = ()
-    ours: FuseConfig = field(default_factory=FuseConfig)
+    baseline_configs: tuple[tuple[str, Any], ...] = ()
+    ours: MapFusionConfig = field(default_factory=MapFusionConfig)
 
-    def of(self, method: str) -> Any:
+    def config_of(self, method: str) -> Any:
         """The configuration of a method; None: its defaults."""
         if method == OURS or method in ORACLES:
             return self.ours
-        return dict(self.chosen).get(method)
+        return dict(self.baseline_configs).get(method)
 
 
-Changes = tuple[tuple[str, Any], ...]
+ConfigChanges = tuple[tuple[str, Any], ...]
 # What ``manyeyes map evaluate --study tuning`` found, as changes of the defaults; a method that is not here stays with its own.
 # Ours: one agent's word publishes, as it does for every rival, since average precision ranks: a line that one agent saw costs
 # nothing behind those that many saw.
-TUNED: dict[str, Changes] = {
+TUNED_CHANGES: dict[str, ConfigChanges] = {
     OURS: (
         ("stations.evidence.publish", 1.0),
         ("stations.evidence.publish_ring", 0.5),
@@ -64,23 +64,25 @@ TUNED: dict[str, Changes] = {
 }
 
 
-def tuned() -> Settings:
+def make_tuned_settings() -> MethodSettings:
     """The settings that studies use."""
-    chosen = {method: configured(defaults(method), changes) for method, changes in TUNED.items()}
-    ours = chosen.pop(OURS)
-    return Settings(tuple(sorted(chosen.items())), ours)
+    configs = {method: apply_changes(make_default_config(method), changes) for method, changes in TUNED_CHANGES.items()}
+    ours = configs.pop(OURS)
+    return MethodSettings(tuple(sorted(configs.items())), ours)
 
 
-def defaults(method: str) -> Any:
+def make_default_config(method: str) -> Any:
     """A method's configuration as it comes."""
-    return FuseConfig() if method == OURS else importlib.import_module(f"manyeyes.maps.baselines.{method}").Config()
+    return (
+        MapFusionConfig() if method == OURS else importlib.import_module(f"manyeyes.maps.baselines.{method}").Config()
+    )
 
 
-def configured(config: Any, changed: Changes) -> Any:
+def apply_changes(config: Any, changes: ConfigChanges) -> Any:
     """A configuration with fields replaced; a dotted name goes into the part of that name."""
-    for name, value in changed:
+    for name, value in changes:
         head, _, rest = name.partition(".")
-        config = replace(config, **{head: configured(getattr(config, head), ((rest, value),)) if rest else value})
+        config = replace(config, **{head: apply_changes(getattr(config, head), ((rest, value),)) if rest else value})
     return config
 
 
@@ -90,20 +92,22 @@ def check_method(method: str) -> None:
         raise ConfigError(f"No method is called {method!r}; known: {', '.join((*METHODS, *ORACLES))}.")
 
 
-def map_of(
-    method: str, observations: Sequence[Observation], settings: Settings, frame: Frame | None = None
+def fuse_observations(
+    method: str, observations: Sequence[Observation], settings: MethodSettings, frame: MapFrame | None = None
 ) -> VectorMap:
     """The map that a method makes of observations."""
     if method == OURS:
         return fuse(observations, settings.ours, frame)
-    if method not in RIVALS:
+    if method not in BASELINES:
         raise ConfigError(f"{method!r} is told more than observations; known: {', '.join(METHODS)}.")
-    rival, config = importlib.import_module(f"manyeyes.maps.baselines.{method}"), settings.of(method)
-    return rival.fuse(observations, rival.Config() if config is None else config, frame)
+    baseline, config = importlib.import_module(f"manyeyes.maps.baselines.{method}"), settings.config_of(method)
+    return baseline.fuse(observations, baseline.Config() if config is None else config, frame)
 
 
-def make_map(method: str, scene: Scene, settings: Settings) -> MapElements:
+def fuse_experiment(method: str, experiment: FleetExperiment, settings: MethodSettings) -> MapElements:
     """The published elements of a method's map of a scene."""
     if method in ORACLES:
-        return oracle(method, scene, settings.ours)
-    return map_of(method, scene.observations, settings, scene.place.frame).published().elements
+        return run_oracle(method, experiment, settings.ours)
+    return (
+        fuse_observations(method, experiment.observations, settings, experiment.place.frame).select_published().elements
+    )

@@ -17,84 +17,95 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.maps.metrics import LATERAL_WITHIN_M, Thresholds, lines_of_kind, pieces_of
-from manyeyes.evaluation.maps.pooled_ap import Judged, pooled_ap, squares
-from manyeyes.evaluation.statistics.bootstrap import Interval, resamples
-from manyeyes.ops.nearest_line import nearest_line
+from manyeyes.evaluation.maps.metrics import MAX_LATERAL_M, Thresholds, select_lines, split_into_pieces
+from manyeyes.evaluation.maps.pooled_ap import MapPair, assign_to_squares, bootstrap_pooled_ap
+from manyeyes.evaluation.statistics.bootstrap import Interval, draw_resamples
+from manyeyes.ops.nearest_line import find_nearest_line
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-BLOCK_M = 64.0
+BLOCK_SIZE_M = 64.0
 
 
 @dataclass(frozen=True)
-class Sureness:
+class MetricIntervals:
     """The intervals of one kind: of its AP (exact, narrow) and of its F at 0.5 m."""
 
     kind: str
     ap: Interval
-    f: Interval
+    f1: Interval
 
 
-def ap_interval(
+def bootstrap_ap_interval(
     predicted: MapElements,
     truth: MapElements,
     kind: str,
-    way: str = "exact",
+    protocol: str = "exact",
     thresholds: Thresholds = "narrow",
-    n: int = 1000,
+    num_resamples: int = 1000,
     seed: int = 0,
-    level: float = 0.95,
+    confidence_level: float = 0.95,
 ) -> Interval:
     """The AP of one kind, mean over the thresholds, with its interval."""
-    judged = Judged(predicted, truth, squares("", BLOCK_M))
-    return pooled_ap([judged], kind, way, thresholds, n=n, seed=seed, level=level).interval()
+    pair = MapPair(predicted, truth, assign_to_squares("", BLOCK_SIZE_M))
+    return bootstrap_pooled_ap(
+        [pair], kind, protocol, thresholds, num_resamples=num_resamples, seed=seed, confidence_level=confidence_level
+    ).interval()
 
 
-def f_interval(
+def bootstrap_f1_interval(
     predicted: MapElements,
     truth: MapElements,
     kind: str,
-    within_m: float = 0.5,
-    n: int = 1000,
+    max_distance_m: float = 0.5,
+    num_resamples: int = 1000,
     seed: int = 0,
-    level: float = 0.95,
+    confidence_level: float = 0.95,
 ) -> Interval:
     """F by length of one kind with its interval."""
-    mine, theirs = lines_of_kind(predicted, kind), lines_of_kind(truth, kind)
-    there, back = pieces_of(mine), pieces_of(theirs)
-    reach = max(within_m, LATERAL_WITHIN_M)
-    near = nearest_line(there.middle, theirs.points, theirs.first, reach).distance <= within_m
-    seen = nearest_line(back.middle, mine.points, mine.first, reach).distance <= within_m
-    known, block = _blocks(np.vstack((there.middle, back.middle)))
+    predicted_lines, truth_lines = select_lines(predicted, kind), select_lines(truth, kind)
+    predicted_pieces, truth_pieces = split_into_pieces(predicted_lines), split_into_pieces(truth_lines)
+    max_search_m = max(max_distance_m, MAX_LATERAL_M)
+    is_matched = (
+        find_nearest_line(predicted_pieces.center, truth_lines.points, truth_lines.offsets, max_search_m).distance
+        <= max_distance_m
+    )
+    is_recalled = (
+        find_nearest_line(truth_pieces.center, predicted_lines.points, predicted_lines.offsets, max_search_m).distance
+        <= max_distance_m
+    )
+    num_blocks, block = _assign_blocks(np.vstack((predicted_pieces.center, truth_pieces.center)))
     sums = [
-        np.bincount(where, length, known)
-        for where, length in (
-            (block[: len(near)], there.length * near),
-            (block[: len(near)], there.length),
-            (block[len(near) :], back.length * seen),
-            (block[len(near) :], back.length),
+        np.bincount(rows, length, num_blocks)
+        for rows, length in (
+            (block[: len(is_matched)], predicted_pieces.length * is_matched),
+            (block[: len(is_matched)], predicted_pieces.length),
+            (block[len(is_matched) :], truth_pieces.length * is_recalled),
+            (block[len(is_matched) :], truth_pieces.length),
         )
     ]
-    weights = np.vstack((np.ones((1, known), dtype=np.int64), resamples(known, n, seed)))
-    hit, said, held, true = (weights @ s for s in sums)
+    weights = np.vstack((np.ones((1, num_blocks), dtype=np.int64), draw_resamples(num_blocks, num_resamples, seed)))
+    matched_m, predicted_m, recalled_m, truth_m = (weights @ s for s in sums)
     with np.errstate(invalid="ignore", divide="ignore"):
-        precision, recall = np.where(said > 0, hit / said, 0.0), np.where(true > 0, held / true, np.nan)
-        f = np.where(precision + recall > 0, 2 * precision * recall / (precision + recall), recall * 0.0)
-    return _interval(f, level, known)
+        precision, recall = (
+            np.where(predicted_m > 0, matched_m / predicted_m, 0.0),
+            np.where(truth_m > 0, recalled_m / truth_m, np.nan),
+        )
+        f1 = np.where(precision + recall > 0, 2 * precision * recall / (precision + recall), recall * 0.0)
+    return _make_interval(f1, confidence_level, num_blocks)
 
 
-def _blocks(places: Floats) -> tuple[int, Ints]:
+def _assign_blocks(points: Floats) -> tuple[int, Ints]:
     """How many squares hold any of the places (N, 2), and which of them each is in (N,)."""
-    cells = np.floor(places / BLOCK_M).astype(np.int64)
-    known, block = np.unique(cells, axis=0, return_inverse=True)
-    return len(known), block.reshape(-1)
+    cells = np.floor(points / BLOCK_SIZE_M).astype(np.int64)
+    blocks, block = np.unique(cells, axis=0, return_inverse=True)
+    return len(blocks), block.reshape(-1)
 
 
-def _interval(values: Floats, level: float, blocks: int) -> Interval:
+def _make_interval(values: Floats, confidence_level: float, num_blocks: int) -> Interval:
     """The first value, and quantiles of the others that are numbers."""
     draws = values[1:][~np.isnan(values[1:])]
     if not len(draws) or math.isnan(values[0]):
-        return Interval(float(values[0]), math.nan, math.nan, level, blocks)
-    low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2])
-    return Interval(float(values[0]), float(low), float(high), level, blocks)
+        return Interval(float(values[0]), math.nan, math.nan, confidence_level, num_blocks)
+    low, high = np.quantile(draws, [(1 - confidence_level) / 2, (1 + confidence_level) / 2])
+    return Interval(float(values[0]), float(low), float(high), confidence_level, num_blocks)

@@ -16,208 +16,256 @@ from pathlib import Path
 import numpy as np
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.maps.experiment import Trial
-from manyeyes.evaluation.maps.map_cells import Cell, Unit, run_unit
+from manyeyes.evaluation.maps.experiment import FleetTrial
+from manyeyes.evaluation.maps.map_cells import MapStudyJob, MapStudyResult, run_study_job
 from manyeyes.evaluation.maps.oracles import ORACLES
-from manyeyes.evaluation.maps.registry import OURS, RIVALS, Settings
-from manyeyes.evaluation.statistics.bootstrap import Interval, mean_interval, resolved
-from manyeyes.evaluation.statistics.bootstrap import Verdict as Word
+from manyeyes.evaluation.maps.registry import BASELINES, OURS, MethodSettings
+from manyeyes.evaluation.statistics.bootstrap import Interval, compare_to_margin, mean_interval
+from manyeyes.evaluation.statistics.bootstrap import MarginVerdict as Word
 from manyeyes.maps.store.executors import Executor, map_blocks
 from manyeyes.simulator.fleet.config import CROWDS
 
 TEST_PLACES = ("Town03", "Town05", "av2-miami", "av2-pittsburgh")
 TUNING_PLACES = ("Town01", "Town02", "Town07")
-COUNTS, SEEDS = (20, 60, 200), (0, 1, 2)
-NOISE_M = (0.0, 0.4, 0.8, 1.2, 1.5)
-NOISE_COUNT = 100
+OBSERVATION_COUNTS, SEEDS = (20, 60, 200), (0, 1, 2)
+NOISE_SIGMAS_M = (0.0, 0.4, 0.8, 1.2, 1.5)
+NOISE_NUM_OBSERVATIONS = 100
 TABLE3 = (("Town05", 300.0), ("Town03", 250.0))
-TABLE3_COUNT = 60
+TABLE3_NUM_OBSERVATIONS = 60
 
 
 @dataclass(frozen=True)
-class StudyConfig:
+class MapStudyConfig:
     """Which trials and methods. counts and noise are used by the studies that have them."""
 
     name: str
     places: tuple[str, ...] = TEST_PLACES
-    counts: tuple[int, ...] = COUNTS
+    observation_counts: tuple[int, ...] = OBSERVATION_COUNTS
     seeds: tuple[int, ...] = SEEDS
-    noise_m: tuple[float, ...] = NOISE_M
-    methods: tuple[str, ...] = (OURS, *RIVALS)
-    settings: Settings = field(default_factory=Settings)
+    noise_sigmas_m: tuple[float, ...] = NOISE_SIGMAS_M
+    methods: tuple[str, ...] = (OURS, *BASELINES)
+    settings: MethodSettings = field(default_factory=MethodSettings)
 
 
-def trials(config: StudyConfig) -> list[Trial]:
+def make_trials(config: MapStudyConfig) -> list[FleetTrial]:
     """The trials of a study, places together: a place is read once a process."""
-    local = CROWDS["local"]
+    fleet_config = CROWDS["local"]
     if config.name == "fusion":
-        return [Trial(p, n, s, crowd=local) for p in config.places for n in config.counts for s in config.seeds]
-    if config.name == "noise":
-        made = [Trial(p, NOISE_COUNT, s, crowd=local) for p in config.places for s in config.seeds]
-        return [trial.noisy(sigma) for trial in made for sigma in config.noise_m]
-    if config.name == "table3":
-        windows = ("local", "semi-global")
         return [
-            Trial(p, TABLE3_COUNT, s, size, window, CROWDS[window])
+            FleetTrial(p, n, s, fleet_config=fleet_config)
+            for p in config.places
+            for n in config.observation_counts
+            for s in config.seeds
+        ]
+    if config.name == "noise":
+        noise_free = [
+            FleetTrial(p, NOISE_NUM_OBSERVATIONS, s, fleet_config=fleet_config)
+            for p in config.places
+            for s in config.seeds
+        ]
+        return [trial.with_pose_noise(sigma) for trial in noise_free for sigma in config.noise_sigmas_m]
+    if config.name == "table3":
+        view_labels = ("local", "semi-global")
+        return [
+            FleetTrial(p, TABLE3_NUM_OBSERVATIONS, s, size, view_label, CROWDS[view_label])
             for p, size in TABLE3
-            for window in windows
+            for view_label in view_labels
             for s in config.seeds
         ]
     raise ConfigError(f"No study is called {config.name!r}; known: fusion, noise, table3, malicious, tuning.")
 
 
-def run_study(
-    config: StudyConfig, folder: Path, executor: Executor, progress: Callable[[int, int], None] | None = None
-) -> tuple[Cell, ...]:
+def run_map_study(
+    config: MapStudyConfig, results_folder: Path, executor: Executor, progress: Callable[[int, int], None] | None = None
+) -> tuple[MapStudyResult, ...]:
     """All cells of a study, in its own order whatever the executor; those kept in the folder are not made again."""
-    units = [Unit(trial, config.methods, config.settings, folder) for trial in trials(config)]
-    with executor.open() as runner:
-        done = map_blocks(run_unit, units, runner, progress)
-    return tuple(cell for cells in done for cell in cells)
+    jobs = [MapStudyJob(trial, config.methods, config.settings, results_folder) for trial in make_trials(config)]
+    with executor.open() as session:
+        results_by_job = map_blocks(run_study_job, jobs, session, progress)
+    return tuple(result for job_results in results_by_job for result in job_results)
 
 
 @dataclass(frozen=True)
-class Line:
+class MethodSummary:
     """A method's means over cells, with the interval of its mAP (exact, narrow)."""
 
     group: str
     method: str
-    cells: int
+    num_results: int
     crossing: float
     divider: float
-    mean: Interval
+    mean_ap: Interval
     maptr: float
     streammapnet: float
-    f: float
+    f1: float
     duplication: float
     fragmentation: float
-    lateral_m: float
-    end_error_m: float
+    lateral_error_m: float
+    endpoint_error_m: float
     seconds: float
 
 
 @dataclass(frozen=True)
-class Verdict:
+class StudyMarginTest:
     """A bar of the study, what was measured against it, and the word on it: reached, missed or not resolved."""
 
     group: str
-    what: str
-    rival: str
+    description: str
+    baseline: str
     value: float
     low: float
     high: float
-    bar: float
-    word: Word
+    margin: float
+    verdict: Word
 
 
-def group_of(config: StudyConfig, cell: Cell) -> str:
+def group_name(config: MapStudyConfig, result: MapStudyResult) -> str:
     """Which table a cell belongs to."""
     if config.name == "noise":
-        return f"{cell.pose_sigma_m:g} m"
+        return f"{result.pose_sigma_m:g} m"
     if config.name == "table3":
-        return f"{cell.size_m:g} m {cell.place}, {cell.window}"
-    return f"{cell.count} observations"
+        return f"{result.size_m:g} m {result.place}, {result.view_label}"
+    return f"{result.num_observations} observations"
 
 
-def lines(config: StudyConfig, cells: Sequence[Cell]) -> tuple[Line, ...]:
+def summarize_methods(config: MapStudyConfig, results: Sequence[MapStudyResult]) -> tuple[MethodSummary, ...]:
     """The table: a group after the other, methods in the order of the study."""
     out = []
-    for group in dict.fromkeys(group_of(config, cell) for cell in cells):
+    for group in dict.fromkeys(group_name(config, result) for result in results):
         for method in config.methods:
-            own = [c for c in cells if group_of(config, c) == group and c.method == method]
-            if own:
-                out.append(_line(group, method, own))
+            method_results = [c for c in results if group_name(config, c) == group and c.method == method]
+            if method_results:
+                out.append(_summarize(group, method, method_results))
     return tuple(out)
 
 
-def _line(group: str, method: str, cells: Sequence[Cell]) -> Line:
-    dividers = [c.kind("divider") for c in cells]
-    return Line(
+def _summarize(group: str, method: str, results: Sequence[MapStudyResult]) -> MethodSummary:
+    dividers = [c.get_kind("divider") for c in results]
+    return MethodSummary(
         group=group,
         method=method,
-        cells=len(cells),
-        crossing=_mean([c.ap_of("crossing") for c in cells]),
-        divider=_mean([c.ap_of("divider") for c in cells]),
-        mean=mean_interval([c.ap_of() for c in cells]),
-        maptr=_mean([c.ap_of(way="maptr") for c in cells]),
-        streammapnet=_mean([c.ap_of(way="streammapnet", thresholds="wide") for c in cells]),
-        f=_mean([d.f[1] for d in dividers]),
+        num_results=len(results),
+        crossing=_mean([c.get_ap("crossing") for c in results]),
+        divider=_mean([c.get_ap("divider") for c in results]),
+        mean_ap=mean_interval([c.get_ap() for c in results]),
+        maptr=_mean([c.get_ap(protocol="maptr") for c in results]),
+        streammapnet=_mean([c.get_ap(protocol="streammapnet", thresholds="wide") for c in results]),
+        f1=_mean([d.f1[1] for d in dividers]),
         duplication=_mean([d.duplication for d in dividers]),
         fragmentation=_mean([d.fragmentation for d in dividers]),
-        lateral_m=_mean([d.lateral_median_m for d in dividers]),
-        end_error_m=_mean([d.end_error_m for d in dividers]),
-        seconds=_mean([c.seconds for c in cells]),
+        lateral_error_m=_mean([d.lateral_median_m for d in dividers]),
+        endpoint_error_m=_mean([d.endpoint_error_m for d in dividers]),
+        seconds=_mean([c.seconds for c in results]),
     )
 
 
-def verdicts(config: StudyConfig, cells: Sequence[Cell]) -> tuple[Verdict, ...]:
+def check_margins(config: MapStudyConfig, results: Sequence[MapStudyResult]) -> tuple[StudyMarginTest, ...]:
     """The bars of the fusion study, at each count; nothing for other studies."""
     if config.name != "fusion" or OURS not in config.methods:
         return ()
     out = []
-    for group in dict.fromkeys(group_of(config, cell) for cell in cells):
-        own = [c for c in cells if group_of(config, c) == group]
-        for way, thresholds in (("exact", "narrow"), ("maptr", "narrow"), ("streammapnet", "wide")):
-            out += _against_best(group, own, config.methods, way, thresholds)
+    for group in dict.fromkeys(group_name(config, result) for result in results):
+        group_results = [c for c in results if group_name(config, c) == group]
+        for protocol, thresholds in (("exact", "narrow"), ("maptr", "narrow"), ("streammapnet", "wide")):
+            out += _check_best_baseline(group, group_results, config.methods, protocol, thresholds)
         if group.startswith("60 "):
-            out += _dividers(group, own, config.methods)
+            out += _check_dividers(group, group_results, config.methods)
         if group.startswith("200 "):
-            ours = [c.kind("divider") for c in own if c.method == OURS]
-            f, duplication = mean_interval([k.f[1] for k in ours]), mean_interval([k.duplication for k in ours])
+            ours = [c.get_kind("divider") for c in group_results if c.method == OURS]
+            f1, duplication = mean_interval([k.f1[1] for k in ours]), mean_interval([k.duplication for k in ours])
             out.append(
-                Verdict(group, "F@0.5 m of dividers", "", f.value, f.low, f.high, 0.97, resolved(0.97, f.low, f.high))
+                StudyMarginTest(
+                    group,
+                    "F@0.5 m of dividers",
+                    "",
+                    f1.value,
+                    f1.low,
+                    f1.high,
+                    0.97,
+                    compare_to_margin(0.97, f1.low, f1.high),
+                )
             )
             low, high = duplication.low, duplication.high
             # Within both sides: the worse of two words.
-            words = resolved(0.95, low, high), resolved(-1.05, -high, -low)
-            word: Word = "reached" if words == ("reached",) * 2 else "missed" if "missed" in words else "not resolved"
-            what = "duplication of dividers, 0.95 to 1.05"
-            out.append(Verdict(group, what, "", duplication.value, low, high, 1.0, word))
+            verdicts = compare_to_margin(0.95, low, high), compare_to_margin(-1.05, -high, -low)
+            verdict: Word = (
+                "reached" if verdicts == ("reached",) * 2 else "missed" if "missed" in verdicts else "not resolved"
+            )
+            description = "duplication of dividers, 0.95 to 1.05"
+            out.append(StudyMarginTest(group, description, "", duplication.value, low, high, 1.0, verdict))
     return tuple(out)
 
 
-def _against_best(
-    group: str, cells: Sequence[Cell], methods: Sequence[str], way: str, thresholds: str
-) -> list[Verdict]:
-    rival = best_rival(cells, methods, "mean", way, thresholds)
-    if rival is None:
+def _check_best_baseline(
+    group: str, results: Sequence[MapStudyResult], methods: Sequence[str], protocol: str, thresholds: str
+) -> list[StudyMarginTest]:
+    baseline = find_best_baseline(results, methods, "mean", protocol, thresholds)
+    if baseline is None:
         return []
-    gain = difference(cells, OURS, rival, "mean", way, thresholds)
-    what = f"mAP ({way}, {thresholds}) above the best rival"
-    return [Verdict(group, what, rival, gain.value, gain.low, gain.high, 0.10, resolved(0.10, gain.low, gain.high))]
+    gain = compute_paired_difference(results, OURS, baseline, "mean", protocol, thresholds)
+    description = f"mAP ({protocol}, {thresholds}) above the best rival"
+    return [
+        StudyMarginTest(
+            group,
+            description,
+            baseline,
+            gain.value,
+            gain.low,
+            gain.high,
+            0.10,
+            compare_to_margin(0.10, gain.low, gain.high),
+        )
+    ]
 
 
-def _dividers(group: str, cells: Sequence[Cell], methods: Sequence[str]) -> list[Verdict]:
+def _check_dividers(group: str, results: Sequence[MapStudyResult], methods: Sequence[str]) -> list[StudyMarginTest]:
     """AP of dividers: twice the best rival's, or half of its remaining error."""
-    rival = best_rival(cells, methods, "divider", "exact", "narrow")
-    if rival is None:
+    baseline = find_best_baseline(results, methods, "divider", "exact", "narrow")
+    if baseline is None:
         return []
-    theirs = _mean([c.ap_of("divider") for c in cells if c.method == rival])
-    bar = min(2 * theirs, theirs + 0.5 * (1 - theirs))
-    ours = mean_interval([c.ap_of("divider") for c in cells if c.method == OURS])
-    what = f"AP of dividers; {rival} has {theirs:.3f}"
-    return [Verdict(group, what, rival, ours.value, ours.low, ours.high, bar, resolved(bar, ours.low, ours.high))]
+    baseline_ap = _mean([c.get_ap("divider") for c in results if c.method == baseline])
+    margin = min(2 * baseline_ap, baseline_ap + 0.5 * (1 - baseline_ap))
+    ours = mean_interval([c.get_ap("divider") for c in results if c.method == OURS])
+    description = f"AP of dividers; {baseline} has {baseline_ap:.3f}"
+    return [
+        StudyMarginTest(
+            group,
+            description,
+            baseline,
+            ours.value,
+            ours.low,
+            ours.high,
+            margin,
+            compare_to_margin(margin, ours.low, ours.high),
+        )
+    ]
 
 
-def best_rival(cells: Sequence[Cell], methods: Sequence[str], what: str, way: str, thresholds: str) -> str | None:
+def find_best_baseline(
+    results: Sequence[MapStudyResult], methods: Sequence[str], kind: str, protocol: str, thresholds: str
+) -> str | None:
     """The rival with the greatest mean AP; of equal ones the first. Oracles are no rivals."""
-    rivals = [m for m in methods if m != OURS and m not in ORACLES]
-    means = [_mean([c.ap_of(what, way, thresholds) for c in cells if c.method == m]) for m in rivals]
+    baselines = [m for m in methods if m != OURS and m not in ORACLES]
+    means = [_mean([c.get_ap(kind, protocol, thresholds) for c in results if c.method == m]) for m in baselines]
     known = [(-mean, k) for k, mean in enumerate(means) if not math.isnan(mean)]
-    return rivals[min(known)[1]] if known else None
+    return baselines[min(known)[1]] if known else None
 
 
-def difference(cells: Sequence[Cell], a: str, b: str, what: str, way: str, thresholds: str) -> Interval:
+def compute_paired_difference(
+    results: Sequence[MapStudyResult], first_method: str, second_method: str, kind: str, protocol: str, thresholds: str
+) -> Interval:
     """AP of one method less that of another, paired over the cells that both have."""
 
-    def of(method: str) -> dict[tuple[object, ...], float]:
+    def ap_by_key(method: str) -> dict[tuple[object, ...], float]:
         return {
-            (c.place, c.size_m, c.window, c.count, c.seed, c.pose_sigma_m): c.ap_of(what, way, thresholds)
-            for c in cells
+            (c.place, c.size_m, c.view_label, c.num_observations, c.seed, c.pose_sigma_m): c.get_ap(
+                kind, protocol, thresholds
+            )
+            for c in results
             if c.method == method
         }
 
-    one, other = of(a), of(b)
+    one, other = ap_by_key(first_method), ap_by_key(second_method)
     gains = [one[key] - other[key] for key in sorted(one.keys() & other.keys())]
     return mean_interval([g for g in gains if not math.isnan(g)])
 
@@ -228,11 +276,13 @@ def _mean(values: Sequence[float]) -> float:
     return float(np.mean(known)) if known else math.nan
 
 
-def smaller(config: StudyConfig, places: Sequence[str] | None, counts: Sequence[int] | None, seeds: int) -> StudyConfig:
+def restrict_study(
+    config: MapStudyConfig, places: Sequence[str] | None, observation_counts: Sequence[int] | None, num_seeds: int
+) -> MapStudyConfig:
     """A study over fewer places, counts or seeds."""
     return replace(
         config,
         places=tuple(places or config.places),
-        counts=tuple(counts or config.counts),
-        seeds=tuple(range(seeds)),
+        counts=tuple(observation_counts or config.observation_counts),
+        seeds=tuple(range(num_seeds)),
     )

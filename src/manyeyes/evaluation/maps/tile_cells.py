@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from manyeyes._source import source_digest
 from manyeyes.datasets.base import Recording
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.maps.tile_sampling import Scenery, stands_of
-from manyeyes.evaluation.study import recording_digest
+from manyeyes.evaluation.maps.tile_sampling import TileSource, collect_observer_poses
+from manyeyes.evaluation.study import hash_recording
 from manyeyes.maps.store.columns_file import load_columns, save_columns
 from manyeyes.maps.store.executors import Executor, map_blocks
 from manyeyes.models import pretrained
-from manyeyes.models.maps.map_model import Mapper
+from manyeyes.models.maps.map_model import MapModel
 
 Ints = NDArray[np.int64]
 
@@ -33,143 +33,157 @@ COMPUTED_BY = (__name__, "manyeyes.evaluation.maps.tile_prediction")
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
-    """One tile as one row of a table draws it. drawn, truth: in the tile's frame; sent: bytes of each look that came to it."""
+class TilePrediction:
+    """One tile as one row of a table draws it. predicted, truth: in the tile's frame; frame_bytes: bytes of each look that came
+    to it.
+    """
 
-    row: str
-    drawn: MapElements
+    row_name: str
+    predicted: MapElements
     truth: MapElements
-    sent: tuple[int, ...]
+    frame_bytes: tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class World:
+class RecordingSource:
     """Where drawings come from: opens the recording, and gives the true maps of its towns. Both are sent to other processes."""
 
-    open: Callable[[], Recording]
-    maps: Callable[[Recording], Mapping[str, MapElements]]
+    open_recording: Callable[[], Recording]
+    load_maps: Callable[[Recording], Mapping[str, MapElements]]
 
 
-class Draw(Protocol):
+class TilePredictor(Protocol):
     """What a study draws of a scenario at a seed."""
 
     @property
-    def key(self) -> str:
+    def cache_key(self) -> str:
         """Its whole setting, other weights than the map model's by what is in them: equal keys, equal drawings."""
         ...
 
-    def __call__(self, mapper: Mapper, scenery: Scenery, scenario: str, seed: int) -> Sequence[Drawing]:
+    def __call__(self, map_model: MapModel, source: TileSource, scenario: str, seed: int) -> Sequence[TilePrediction]:
         """The drawings, row by row."""
         ...
 
 
 @dataclass(frozen=True)
-class TileUnit:
-    """One cell to be made. data: the recording's digest."""
+class TileStudyJob:
+    """One cell to be made. recording_hash: the recording's digest."""
 
-    world: World
+    recording_source: RecordingSource
     weights: str
-    draw: Draw
+    predictor: TilePredictor
     scenario: str
     seed: int
-    folder: Path
-    data: str
+    results_folder: Path
+    recording_hash: str
 
 
 @dataclass(frozen=True, eq=False)
-class TileCell:
+class TileStudyResult:
     """The drawings of one scenario at one seed."""
 
     scenario: str
     seed: int
-    drawings: tuple[Drawing, ...]
+    predictions: tuple[TilePrediction, ...]
 
 
-def run_tiles(
-    world: World,
+def run_tile_study(
+    recording_source: RecordingSource,
     weights: str,
-    draw: Draw,
+    predictor: TilePredictor,
     seeds: Sequence[int],
     folder: Path,
     executor: Executor,
     progress: Callable[[int, int], None] | None = None,
-    every: int = 1,
-) -> tuple[TileCell, ...]:
+    scenario_stride: int = 1,
+) -> tuple[TileStudyResult, ...]:
     """The cells of every n-th scenario at each seed, in that order on any executor; those in the folder are not made again."""
-    recording = world.open()
-    data = recording_digest(recording)
-    chosen = recording.scenarios[::every]
-    units = [TileUnit(world, weights, draw, name, seed, folder, data) for name in chosen for seed in seeds]
-    with executor.open() as runner:
-        return tuple(map_blocks(run_unit, units, runner, progress))
+    recording = recording_source.open_recording()
+    recording_hash = hash_recording(recording)
+    selected = recording.scenarios[::scenario_stride]
+    jobs = [
+        TileStudyJob(recording_source, weights, predictor, name, seed, folder, recording_hash)
+        for name in selected
+        for seed in seeds
+    ]
+    with executor.open() as session:
+        return tuple(map_blocks(run_tile_job, jobs, session, progress))
 
 
-def run_unit(unit: TileUnit) -> TileCell:
+def run_tile_job(job: TileStudyJob) -> TileStudyResult:
     """A cell: found, or made and kept."""
-    path = cell_path(unit)
-    kept = load_columns(path, _Columns)
-    if kept is None:
-        drawings = unit.draw(_mapper(unit.weights), _scenery(unit.world), unit.scenario, unit.seed)
-        kept = _Columns.of(drawings)
-        save_columns(path, kept)
-    return TileCell(unit.scenario, unit.seed, kept.drawings())
+    path = tile_result_path(job)
+    stored = load_columns(path, _PredictionColumns)
+    if stored is None:
+        predictions = job.predictor(
+            _load_map_model(job.weights), _load_source(job.recording_source), job.scenario, job.seed
+        )
+        stored = _PredictionColumns.of(predictions)
+        save_columns(path, stored)
+    return TileStudyResult(job.scenario, job.seed, stored.to_predictions())
 
 
-def cell_path(unit: TileUnit) -> Path:
+def tile_result_path(job: TileStudyJob) -> Path:
     """The file of a cell, named by all that it depends on."""
-    said = repr(
-        (_mapper(unit.weights).fingerprint.hex(), unit.draw.key, unit.seed, unit.data, source_digest(*COMPUTED_BY))
+    content = repr(
+        (
+            _load_map_model(job.weights).fingerprint.hex(),
+            job.predictor.cache_key,
+            job.seed,
+            job.recording_hash,
+            source_digest(*COMPUTED_BY),
+        )
     )
-    digest = hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
-    return unit.folder / f"{unit.scenario}-{unit.seed}-{digest}.npz"
+    digest = hashlib.blake2b(content.encode(), digest_size=8).hexdigest()
+    return job.results_folder / f"{job.scenario}-{job.seed}-{digest}.npz"
 
 
 @dataclass(frozen=True, eq=False)
-class _Columns:
+class _PredictionColumns:
     """Drawings as arrays: elements of all rows one after the other, first (R + 1,) where those of each row begin."""
 
-    row: tuple[str, ...]
-    drawn: MapElements
-    drawn_first: Ints
+    row_name: tuple[str, ...]
+    predicted: MapElements
+    predicted_offsets: Ints
     truth: MapElements
-    truth_first: Ints
-    sent: Ints
-    sent_first: Ints
+    truth_offsets: Ints
+    frame_bytes: Ints
+    frame_bytes_offsets: Ints
 
     @classmethod
-    def of(cls, drawings: Sequence[Drawing]) -> _Columns:
+    def of(cls, predictions: Sequence[TilePrediction]) -> _PredictionColumns:
         return cls(
-            tuple(one.row for one in drawings),
-            MapElements.cat([one.drawn for one in drawings]),
-            _firsts([one.drawn for one in drawings]),
-            MapElements.cat([one.truth for one in drawings]),
-            _firsts([one.truth for one in drawings]),
-            np.array([size for one in drawings for size in one.sent], np.int64),
-            _firsts([one.sent for one in drawings]),
+            tuple(one.row_name for one in predictions),
+            MapElements.cat([one.predicted for one in predictions]),
+            _make_offsets([one.predicted for one in predictions]),
+            MapElements.cat([one.truth for one in predictions]),
+            _make_offsets([one.truth for one in predictions]),
+            np.array([size for one in predictions for size in one.frame_bytes], np.int64),
+            _make_offsets([one.frame_bytes for one in predictions]),
         )
 
-    def drawings(self) -> tuple[Drawing, ...]:
+    def to_predictions(self) -> tuple[TilePrediction, ...]:
         return tuple(
-            Drawing(
+            TilePrediction(
                 row,
-                self.drawn.take(np.arange(self.drawn_first[k], self.drawn_first[k + 1])),
-                self.truth.take(np.arange(self.truth_first[k], self.truth_first[k + 1])),
-                tuple(self.sent[self.sent_first[k] : self.sent_first[k + 1]].tolist()),
+                self.predicted.take(np.arange(self.predicted_offsets[k], self.predicted_offsets[k + 1])),
+                self.truth.take(np.arange(self.truth_offsets[k], self.truth_offsets[k + 1])),
+                tuple(self.frame_bytes[self.frame_bytes_offsets[k] : self.frame_bytes_offsets[k + 1]].tolist()),
             )
-            for k, row in enumerate(self.row)
+            for k, row in enumerate(self.row_name)
         )
 
 
-def _firsts(parts: Sequence[Sequence[int] | MapElements]) -> Ints:
+def _make_offsets(parts: Sequence[Sequence[int] | MapElements]) -> Ints:
     return np.cumsum([0, *(len(part) for part in parts)], dtype=np.int64)
 
 
 @lru_cache(maxsize=4)
-def _mapper(weights: str) -> Mapper:
-    return pretrained.load_mapper(weights)
+def _load_map_model(weights: str) -> MapModel:
+    return pretrained.load_map_model(weights)
 
 
 @lru_cache(maxsize=2)
-def _scenery(world: World) -> Scenery:
-    recording = world.open()
-    return Scenery(recording, world.maps(recording), stands_of(recording))
+def _load_source(recording_source: RecordingSource) -> TileSource:
+    recording = recording_source.open_recording()
+    return TileSource(recording, recording_source.load_maps(recording), collect_observer_poses(recording))

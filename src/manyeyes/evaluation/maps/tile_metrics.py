@@ -13,82 +13,101 @@ from dataclasses import dataclass
 import numpy as np
 
 from manyeyes.evaluation.maps.metrics import PAPER_KINDS
-from manyeyes.evaluation.maps.pooled_ap import Judged, MapClaim, blocks_of, claimed, mean_of, one_block, pooled_ap
-from manyeyes.evaluation.maps.tile_cells import Drawing, TileCell
-from manyeyes.evaluation.statistics.bootstrap import Drawn, Interval
+from manyeyes.evaluation.maps.pooled_ap import (
+    MapMarginTest,
+    MapPair,
+    assign_to_scenario,
+    average_samples,
+    bootstrap_pooled_ap,
+    check_map_margin,
+    collect_blocks,
+)
+from manyeyes.evaluation.maps.tile_cells import TilePrediction, TileStudyResult
+from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval
 
-KINDS = ("crossing", "divider", "boundary")
-WAYS = ("maptr", "exact")
+TABLE_KINDS = ("crossing", "divider", "boundary")
+TABLE_PROTOCOLS = ("maptr", "exact")
 
 
 @dataclass(frozen=True)
 class TileRow:
-    """One row. ap, by kind as in KINDS, and mean: in the ways of WAYS; by_seed: mAP (maptr) of each seed by itself.
+    """One row. ap, by kind as in KINDS, and mean: in the ways of WAYS; mean_ap_by_seed: mAP (maptr) of each seed by itself.
 
-    looks: that a tile was drawn from, mean; bytes_per_look, bytes_per_tile: packets with their headers.
+    frames_per_tile: that a tile was drawn from, mean; bytes_per_frame, bytes_per_tile: packets with their headers.
     """
 
-    row: str
-    tiles: int
+    name: str
+    num_tiles: int
     ap: tuple[tuple[Interval, ...], ...]
-    mean: tuple[Interval, ...]
-    by_seed: tuple[float, ...]
-    looks: float
-    bytes_per_look: float
+    mean_ap: tuple[Interval, ...]
+    mean_ap_by_seed: tuple[float, ...]
+    frames_per_tile: float
+    bytes_per_frame: float
     bytes_per_tile: float
 
 
 class TileTable:
     """The cells of a study by row; each number is made once and kept, since differences ask for it again."""
 
-    def __init__(self, cells: Sequence[TileCell]) -> None:
-        self.cells = tuple(cells)
-        self.names = tuple(dict.fromkeys(one.row for cell in cells for one in cell.drawings))
-        self.known = blocks_of([self._judged(name) for name in self.names])
-        self._made: dict[tuple[str, str, str], Drawn] = {}
+    def __init__(self, results: Sequence[TileStudyResult]) -> None:
+        self.results = tuple(results)
+        self.names = tuple(dict.fromkeys(one.row_name for result in results for one in result.predictions))
+        self.blocks = collect_blocks([self._map_pairs(name) for name in self.names])
+        self._bootstraps: dict[tuple[str, str, str], BootstrapSamples] = {}
 
-    def row(self, name: str) -> TileRow:
+    def make_row(self, name: str) -> TileRow:
         """All numbers of one row."""
-        own = [one for cell in self.cells for one in cell.drawings if one.row == name]
-        sent = [size for one in own for size in one.sent]
+        predictions = [one for result in self.results for one in result.predictions if one.row_name == name]
+        frame_bytes = [size for one in predictions for size in one.frame_bytes]
         return TileRow(
             name,
-            len(own),
-            tuple(tuple(self.ap(name, kind, way).interval() for kind in KINDS) for way in WAYS),
-            tuple(self.mean(name, way).interval() for way in WAYS),
-            tuple(self._of_seed(name, seed) for seed in sorted({cell.seed for cell in self.cells})),
-            len(sent) / max(1, len(own)),
-            float(np.mean(sent)) if sent else 0.0,
-            sum(sent) / max(1, len(own)),
+            len(predictions),
+            tuple(
+                tuple(self.bootstrap_ap(name, kind, protocol).interval() for kind in TABLE_KINDS)
+                for protocol in TABLE_PROTOCOLS
+            ),
+            tuple(self.bootstrap_mean_ap(name, protocol).interval() for protocol in TABLE_PROTOCOLS),
+            tuple(self._mean_ap_of_seed(name, seed) for seed in sorted({result.seed for result in self.results})),
+            len(frame_bytes) / max(1, len(predictions)),
+            float(np.mean(frame_bytes)) if frame_bytes else 0.0,
+            sum(frame_bytes) / max(1, len(predictions)),
         )
 
-    def ap(self, name: str, kind: str, way: str) -> Drawn:
+    def bootstrap_ap(self, name: str, kind: str, protocol: str) -> BootstrapSamples:
         """AP of one kind of a row, over draws of scenarios."""
-        key = name, kind, way
-        if key not in self._made:
-            self._made[key] = pooled_ap(self._judged(name), kind, way, known=self.known)
-        return self._made[key]
+        key = name, kind, protocol
+        if key not in self._bootstraps:
+            self._bootstraps[key] = bootstrap_pooled_ap(self._map_pairs(name), kind, protocol, all_blocks=self.blocks)
+        return self._bootstraps[key]
 
-    def mean(self, name: str, way: str = WAYS[0]) -> Drawn:
+    def bootstrap_mean_ap(self, name: str, protocol: str = TABLE_PROTOCOLS[0]) -> BootstrapSamples:
         """mAP of a row, over draws of scenarios."""
-        return mean_of([self.ap(name, kind, way) for kind in PAPER_KINDS])
+        return average_samples([self.bootstrap_ap(name, kind, protocol) for kind in PAPER_KINDS])
 
-    def claim(self, what: str, name: str, other: str, bar: float, way: str = WAYS[0]) -> MapClaim:
+    def check_margin(
+        self, description: str, name: str, baseline: str, margin: float, protocol: str = TABLE_PROTOCOLS[0]
+    ) -> MapMarginTest:
         """mAP of one row less that of another is at least the bar."""
-        return claimed(what, self.mean(name, way).less(self.mean(other, way)), bar)
+        return check_map_margin(
+            description,
+            self.bootstrap_mean_ap(name, protocol).paired_difference(self.bootstrap_mean_ap(baseline, protocol)),
+            margin,
+        )
 
-    def _of_seed(self, name: str, seed: int) -> float:
-        judged = self._judged(name, seed)
-        return mean_of([pooled_ap(judged, kind, known=self.known, n=0) for kind in PAPER_KINDS]).value
+    def _mean_ap_of_seed(self, name: str, seed: int) -> float:
+        pairs = self._map_pairs(name, seed)
+        return average_samples(
+            [bootstrap_pooled_ap(pairs, kind, all_blocks=self.blocks, num_resamples=0) for kind in PAPER_KINDS]
+        ).value
 
-    def _judged(self, name: str, seed: int | None = None) -> list[Judged]:
+    def _map_pairs(self, name: str, seed: int | None = None) -> list[MapPair]:
         return [
-            _judged(cell.scenario, one)
-            for cell in self.cells
-            for one in cell.drawings
-            if one.row == name and seed in (None, cell.seed)
+            _make_map_pair(result.scenario, one)
+            for result in self.results
+            for one in result.predictions
+            if one.row_name == name and seed in (None, result.seed)
         ]
 
 
-def _judged(scenario: str, drawing: Drawing) -> Judged:
-    return Judged(drawing.drawn, drawing.truth, one_block(scenario))
+def _make_map_pair(scenario: str, prediction: TilePrediction) -> MapPair:
+    return MapPair(prediction.predicted, prediction.truth, assign_to_scenario(scenario))

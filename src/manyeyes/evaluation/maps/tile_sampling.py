@@ -15,21 +15,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.agents.map_perception import SURVEYS
+from manyeyes.agents.map_perception import MAP_MODES
 from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import AgentFrame, BevGrid, Snapshot, Transform
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.maps.tiles import Tile, cut_to, planar, town_of
+from manyeyes.evaluation.maps.tiles import Tile, crop_to_tile, find_town, to_xy_yaw
 from manyeyes.ops.keyed_random import keyed_generator
 
 Floats = NDArray[np.float64]
 
-LEAST_COVER, RASTER_M = 0.1, 2.0
+MIN_COVERAGE, RASTER_SIZE_M = 0.1, 2.0
 """The share of a tile below which a look is none at it, and the raster on which shares are counted."""
 
 
 @dataclass(frozen=True)
-class Stand:
+class ObserverPose:
     """Where an agent is when its scenario's first judged frame comes: x, y, yaw in the world. row: among the agents."""
 
     scenario: str
@@ -37,103 +37,117 @@ class Stand:
     pose: tuple[float, float, float]
 
 
-def stands_of(recording: Recording) -> tuple[Stand, ...]:
+def collect_observer_poses(recording: Recording) -> tuple[ObserverPose, ...]:
     """Every agent of every scenario."""
     return tuple(
-        Stand(scenario, row, planar(frame.world_from_agent))
+        ObserverPose(scenario, row, to_xy_yaw(frame.world_from_agent))
         for scenario in recording.scenarios
-        for row, frame in enumerate(recording.snapshot(scenario, recording.judged(scenario)[0]).frames)
+        for row, frame in enumerate(recording.snapshot(scenario, recording.eval_indices(scenario)[0]).frames)
     )
 
 
 @dataclass(frozen=True, eq=False)
-class Scenery:
+class TileSource:
     """A recording, the true map of each town in its world frame, and where everybody stands."""
 
     recording: Recording
     maps: Mapping[str, MapElements]
-    stands: tuple[Stand, ...]
+    observer_poses: tuple[ObserverPose, ...]
 
-    def truth(self, scenario: str, world_from_tile: Transform, tile: BevGrid) -> MapElements:
+    def crop_truth(self, scenario: str, world_from_tile: Transform, tile: BevGrid) -> MapElements:
         """What truly lies in a tile, in its frame."""
-        return cut_to(self.maps[town_of(scenario, tuple(self.maps))], world_from_tile, tile)
+        return crop_to_tile(self.maps[find_town(scenario, tuple(self.maps))], world_from_tile, tile)
 
-    def instant(self, scenario: str, rng: np.random.Generator) -> Snapshot:
+    def sample_snapshot(self, scenario: str, rng: np.random.Generator) -> Snapshot:
         """A judged snapshot of a scenario, each as likely as any."""
-        return self.recording.snapshot(scenario, int(rng.choice(self.recording.judged(scenario))))
+        return self.recording.snapshot(scenario, int(rng.choice(self.recording.eval_indices(scenario))))
 
 
-def crowd_tile(scenery: Scenery, scenario: str, seed: int, looks: int, tile: BevGrid, view: BevGrid) -> Tile:
+def sample_fleet_tile(
+    source: TileSource, scenario: str, seed: int, max_frames: int, tile: BevGrid, view_area: BevGrid
+) -> Tile:
     """The tile about a scenario's first agent at an instant of the seed, and at most so many looks at it.
 
-    view: the ground that a look covers, in its agent's frame.
+    view_area: the ground that a look covers, in its agent's frame.
     """
     rng = keyed_generator("crowd", seed, scenario)
-    own = scenery.instant(scenario, rng).frames[0]
-    world_from_tile = upright(own)
-    town = town_of(scenario, tuple(scenery.maps))
+    own_frame = source.sample_snapshot(scenario, rng).frames[0]
+    world_from_tile = make_world_from_tile(own_frame)
+    town = find_town(scenario, tuple(source.maps))
     others = [
-        stand
-        for stand in scenery.stands
-        if (stand.scenario, stand.row) != (scenario, 0) and town_of(stand.scenario, tuple(scenery.maps)) == town
+        observer
+        for observer in source.observer_poses
+        if (observer.scenario, observer.row) != (scenario, 0)
+        and find_town(observer.scenario, tuple(source.maps)) == town
     ]
-    frames = [own]
-    for k in covering(covers([planar(own.world_from_agent), *(s.pose for s in others)], own, tile, view), looks, rng):
-        seen = scenery.instant(others[k].scenario, rng).frames
-        frames.append(seen[min(others[k].row, len(seen) - 1)])
-    return Tile(scenario, world_from_tile, tuple(frames), scenery.truth(scenario, world_from_tile, tile))
+    frames = [own_frame]
+    for k in select_by_coverage(
+        compute_coverage(
+            [to_xy_yaw(own_frame.world_from_agent), *(s.pose for s in others)], own_frame, tile, view_area
+        ),
+        max_frames,
+        rng,
+    ):
+        snapshot_frames = source.sample_snapshot(others[k].scenario, rng).frames
+        frames.append(snapshot_frames[min(others[k].row, len(snapshot_frames) - 1)])
+    return Tile(scenario, world_from_tile, tuple(frames), source.crop_truth(scenario, world_from_tile, tile))
 
 
-def meeting(scenery: Scenery, scenario: str, seed: int) -> Snapshot:
+def sample_meeting(source: TileSource, scenario: str, seed: int) -> Snapshot:
     """The instant of a seed at which the agents of one scenario meet."""
-    return scenery.instant(scenario, keyed_generator("meeting", seed, scenario))
+    return source.sample_snapshot(scenario, keyed_generator("meeting", seed, scenario))
 
 
-def local_tile(scenery: Scenery, snapshot: Snapshot, row: int) -> tuple[Tile, BevGrid]:
+def make_local_tile(source: TileSource, snapshot: Snapshot, row: int) -> tuple[Tile, BevGrid]:
     """What lies ahead of one agent, from its own look alone: 30 m by 30 m of a vehicle, 50 m by 30 m of a roadside unit."""
     frame = snapshot.frames[row]
-    x0, y0, x1, y1 = SURVEYS["local"].window(frame)
+    x0, y0, x1, y1 = MAP_MODES["local"].window(frame)
     window = BevGrid(x0, y0, -5.0, x1, y1, 5.0, pillar=1.0)
-    world_from_tile = upright(frame)
-    truth = scenery.truth(snapshot.scenario, world_from_tile, window)
+    world_from_tile = make_world_from_tile(frame)
+    truth = source.crop_truth(snapshot.scenario, world_from_tile, window)
     return Tile(snapshot.scenario, world_from_tile, (frame,), truth), window
 
 
-def upright(frame: AgentFrame) -> Transform:
+def make_world_from_tile(frame: AgentFrame) -> Transform:
     """The tile's frame about an agent: where it claims to be, on the ground, along its heading."""
-    x, y, yaw = planar(frame.world_from_agent)
+    x, y, yaw = to_xy_yaw(frame.world_from_agent)
     return Transform.from_xyz_yaw(x, y, 0.0, yaw)
 
 
-def covers(poses: Sequence[tuple[float, float, float]], about: AgentFrame, tile: BevGrid, view: BevGrid) -> np.ndarray:
+def compute_coverage(
+    poses: Sequence[tuple[float, float, float]], center_frame: AgentFrame, tile: BevGrid, view_area: BevGrid
+) -> np.ndarray:
     """(N, raster) bool: which places of the tile about an agent lie in the view from each pose."""
-    axes = [np.arange(a + RASTER_M / 2, b, RASTER_M) for a, b in ((tile.x_min, tile.x_max), (tile.y_min, tile.y_max))]
-    x0, y0, yaw0 = planar(about.world_from_agent)
-    at = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2) @ _turn(yaw0).T + [x0, y0]
-    out = np.zeros((len(poses), len(at)), bool)
+    axes = [
+        np.arange(a + RASTER_SIZE_M / 2, b, RASTER_SIZE_M)
+        for a, b in ((tile.x_min, tile.x_max), (tile.y_min, tile.y_max))
+    ]
+    x0, y0, yaw0 = to_xy_yaw(center_frame.world_from_agent)
+    raster_xy = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2) @ _rotation_matrix(yaw0).T + [x0, y0]
+    out = np.zeros((len(poses), len(raster_xy)), bool)
     for k, (x, y, yaw) in enumerate(poses):
-        local = (at - [x, y]) @ _turn(yaw)
-        out[k] = ((local >= [view.x_min, view.y_min]) & (local <= [view.x_max, view.y_max])).all(1)
+        local = (raster_xy - [x, y]) @ _rotation_matrix(yaw)
+        out[k] = ((local >= [view_area.x_min, view_area.y_min]) & (local <= [view_area.x_max, view_area.y_max])).all(1)
     return out
 
 
-def covering(seen: np.ndarray, looks: int, rng: np.random.Generator) -> list[int]:
+def select_by_coverage(coverage: np.ndarray, max_frames: int, rng: np.random.Generator) -> list[int]:
     """Which others join the first row of views (1 + N, raster), in order: the more likely the more they newly cover.
 
     When nothing is left to cover, each is as likely as any. Those that cover less than LEAST_COVER never come.
     """
-    covered, views = seen[0].copy(), seen[1:]
-    left = np.flatnonzero(views.mean(1) >= LEAST_COVER) if len(views) else np.zeros(0, np.int64)
+    covered, candidates = coverage[0].copy(), coverage[1:]
+    remaining = np.flatnonzero(candidates.mean(1) >= MIN_COVERAGE) if len(candidates) else np.zeros(0, np.int64)
     order: list[int] = []
-    while len(left) and len(order) < looks - 1:
-        gain = (views[left] & ~covered).sum(1).astype(np.float64)
-        share = gain / gain.sum() if gain.any() else None
-        k = int(rng.choice(left, p=share))
+    while len(remaining) and len(order) < max_frames - 1:
+        gain = (candidates[remaining] & ~covered).sum(1).astype(np.float64)
+        probability = gain / gain.sum() if gain.any() else None
+        k = int(rng.choice(remaining, p=probability))
         order.append(k)
-        covered |= views[k]
-        left = left[left != k]
+        covered |= candidates[k]
+        remaining = remaining[remaining != k]
     return order
 
 
-def _turn(yaw: float) -> Floats:
+def _rotation_matrix(yaw: float) -> Floats:
     return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])

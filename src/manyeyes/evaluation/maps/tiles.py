@@ -17,31 +17,31 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, MissingExtraError, Transform
 from manyeyes.datatypes.map_element import CROSSING, MapElements
-from manyeyes.evaluation.maps.observed_area import SHORTEST_PART_M, with_geometry
+from manyeyes.evaluation.maps.observed_area import MIN_PART_LENGTH_M, replace_geometry
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 Floats = NDArray[np.float64]
 
-LEAST_RING_M2 = 3.0
-APART_M = 1000.0
+MIN_RING_AREA_M2 = 3.0
+MAP_SPACING_M = 1000.0
 
 
 @dataclass(frozen=True)
 class Tile:
-    """A tile of one scenario's town. world_from_tile: upright, float64. looks: who looked, in the order in which they are taken.
+    """A tile of one scenario's town. world_from_tile: upright, float64. frames: who looked, in the order in which they are taken.
 
     truth: in the tile's frame, cut to it.
     """
 
     scenario: str
     world_from_tile: Transform
-    looks: tuple[AgentFrame, ...]
+    frames: tuple[AgentFrame, ...]
     truth: MapElements
 
 
-def town_of(scenario: str, towns: Sequence[str]) -> str:
+def find_town(scenario: str, towns: Sequence[str]) -> str:
     """The town that a scenario is named after: ``town05_0066`` was driven in Town05."""
     for town in sorted(towns, key=len, reverse=True):
         if scenario.lower().startswith(town.lower()):
@@ -51,17 +51,17 @@ def town_of(scenario: str, towns: Sequence[str]) -> str:
     )
 
 
-def assert_split(taught: Sequence[str], judged: Sequence[str]) -> None:
+def check_town_split(training_towns: Sequence[str], evaluation_towns: Sequence[str]) -> None:
     """ConfigError where a town is on both sides: the map of a town is one sample, however many frames were driven there."""
-    shared = sorted({town.lower() for town in taught} & {town.lower() for town in judged})
+    shared = sorted({town.lower() for town in training_towns} & {town.lower() for town in evaluation_towns})
     if shared:
         raise ConfigError(f"Split by place: {', '.join(shared)} may not both teach and judge; leave one side out.")
 
 
-def cut_to(truth: MapElements, world_from_tile: Transform, tile: BevGrid) -> MapElements:
+def crop_to_tile(truth: MapElements, world_from_tile: Transform, tile: BevGrid) -> MapElements:
     """What of the elements (world) lies in the tile, in the tile's frame."""
-    shapely = _shapely()
-    x, y, yaw = planar(world_from_tile.inverse())
+    shapely = _import_shapely()
+    x, y, yaw = to_xy_yaw(world_from_tile.inverse())
     local = truth.transform(x, y, yaw)
     box = shapely.box(tile.x_min, tile.y_min, tile.x_max, tile.y_max)
     rows: list[int] = []
@@ -70,35 +70,35 @@ def cut_to(truth: MapElements, world_from_tile: Transform, tile: BevGrid) -> Map
         points = local.polyline(row)
         if (points.max(0) < [tile.x_min, tile.y_min]).any() or (points.min(0) > [tile.x_max, tile.y_max]).any():
             continue
-        for part in _inside(points, bool(local.kind[row] == CROSSING), box):
+        for part in _clip_to_box(points, bool(local.kind[row] == CROSSING), box):
             rows.append(row)
             parts.append(part)
-    return with_geometry(local, rows, parts)
+    return replace_geometry(local, rows, parts)
 
 
-def side_by_side(maps: Sequence[MapElements]) -> MapElements:
+def place_side_by_side(maps: Sequence[MapElements]) -> MapElements:
     """Maps of many tiles in one frame, so far apart that none is near another: so one list is ranked over all of them."""
-    return MapElements.cat([elements.transform(APART_M * i, 0.0, 0.0) for i, elements in enumerate(maps)])
+    return MapElements.cat([elements.transform(MAP_SPACING_M * i, 0.0, 0.0) for i, elements in enumerate(maps)])
 
 
-def _inside(points: Floats, ring: bool, box: BaseGeometry) -> list[Floats]:
-    shapely = _shapely()
+def _clip_to_box(points: Floats, ring: bool, box: BaseGeometry) -> list[Floats]:
+    shapely = _import_shapely()
     if ring:
         shape = shapely.make_valid(shapely.polygons(points))
         found = shapely.get_parts(shapely.intersection(shape, box))
-        polygons = [p for p in found if p.geom_type == "Polygon" and p.area >= LEAST_RING_M2]
+        polygons = [p for p in found if p.geom_type == "Polygon" and p.area >= MIN_RING_AREA_M2]
         return [shapely.get_coordinates(p.exterior)[:-1] for p in polygons]
     found = shapely.get_parts(shapely.line_merge(shapely.intersection(shapely.linestrings(points), box)))
-    return [shapely.get_coordinates(p) for p in found if p.geom_type == "LineString" and p.length >= SHORTEST_PART_M]
+    return [shapely.get_coordinates(p) for p in found if p.geom_type == "LineString" and p.length >= MIN_PART_LENGTH_M]
 
 
-def planar(motion: Transform) -> tuple[float, float, float]:
+def to_xy_yaw(transform: Transform) -> tuple[float, float, float]:
     """x, y and yaw of a motion."""
-    x, y, _ = motion.translation.tolist()
-    return x, y, float(motion.yaw)
+    x, y, _ = transform.translation.tolist()
+    return x, y, float(transform.yaw)
 
 
-def _shapely() -> Any:
+def _import_shapely() -> Any:
     try:
         import shapely
     except ImportError as error:

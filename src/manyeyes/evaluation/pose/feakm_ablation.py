@@ -15,135 +15,139 @@ from dataclasses import dataclass
 
 import torch
 
-from manyeyes.agents.agent import OWN_BODY_M
-from manyeyes.agents.perception_cache import Eyes, Sight
+from manyeyes.agents.agent import EGO_HALF_SIZE_M
+from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Snapshot
-from manyeyes.evaluation.detection.accumulator import IOUS
+from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS
 from manyeyes.evaluation.detection.average_precision import (
     PROTOCOLS,
+    DetectionProtocol,
     FrameMatch,
     FrameResult,
-    Protocol,
-    ap_of_matches,
-    ego_truth,
+    compute_ap,
+    compute_frame_iou,
     match_frame,
-    overlap_frame,
+    select_ego_truth,
 )
 from manyeyes.models.detector.detector import Detector
-from manyeyes.models.fusion.transform_tokens import Part, gather
-from manyeyes.models.pose.keypoint_net import View
-from manyeyes.pose.feakm import Feakm
+from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
+from manyeyes.models.pose.keypoint_net import DetectorView
+from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim
+from manyeyes.pose.types import PosePrior
 
 SIGMAS = (0.0, 0.4, 0.8, 1.2)
 """Of the paper's Table 3, metres and degrees."""
 
 
 @dataclass(frozen=True)
-class Branch:
+class FeakmVariant:
     """A line of the ablation: who sees and fuses, and who corrects."""
 
     name: str
     detector: Detector
-    corrector: Feakm
+    corrector: FeakmCorrector
 
     def __post_init__(self) -> None:
         self.corrector.net.check_views(self.detector.fingerprint)
 
 
 @dataclass(frozen=True)
-class BranchRow:
-    """One branch at one level. ap: at each of IOUS. frames: judged; asked: collaborators in them; answered: the share of
-    these whose pose was found.
+class FeakmVariantRow:
+    """One branch at one level. ap: at each of IOUS. num_frames: judged; num_collaborators: collaborators in them; found_fraction:
+    the share of these whose pose was found.
     """
 
-    branch: str
+    variant: str
     sigma: float
     ap: tuple[float, ...]
-    frames: int
-    asked: int
-    answered: float
+    num_frames: int
+    num_collaborators: int
+    found_fraction: float
 
 
-def ablation(
+def run_ablation(
     recording: Recording,
-    branches: Sequence[Branch],
+    variants: Sequence[FeakmVariant],
     sigmas: Sequence[float] = SIGMAS,
-    every: int = 1,
-    protocol: Protocol = PROTOCOLS["manyeyes"],
+    frame_stride: int = 1,
+    protocol: DetectionProtocol = PROTOCOLS["manyeyes"],
     seed: int = 0,
     report: Callable[[str, int], None] = lambda scenario, index: None,
-) -> tuple[BranchRow, ...]:
+) -> tuple[FeakmVariantRow, ...]:
     """The rows, branch by branch, over every so many judged frames of the recording; the first agent is the ego."""
-    lines = {(branch.name, sigma): _Line() for branch in branches for sigma in sigmas}
-    if len(lines) < len(branches) * len(sigmas):
-        raise ConfigError(f"Branches have names of their own; got {', '.join(b.name for b in branches)}.")
+    accumulators = {(variant.name, sigma): _VariantAccumulator() for variant in variants for sigma in sigmas}
+    if len(accumulators) < len(variants) * len(sigmas):
+        raise ConfigError(f"Branches have names of their own; got {', '.join(b.name for b in variants)}.")
     for scenario in recording.scenarios:
-        for index in recording.judged(scenario)[::every]:
+        for index in recording.eval_indices(scenario)[::frame_stride]:
             snapshots = [recording.snapshot(scenario, i) for i in range(max(0, index - 1), index + 1)]
-            truth = ego_truth(snapshots[-1], 0, protocol)
-            for branch in branches:
-                scene = _Scene(branch, snapshots)
+            truth = select_ego_truth(snapshots[-1], 0, protocol)
+            for variant in variants:
+                views = _CachedViews(variant, snapshots)
                 for sigma in sigmas:
                     noise = PoseNoise("all_agents_iid", sigma, math.radians(sigma), seed)
-                    boxes, answers = scene.perceive(noise.apply(snapshots[-1], 0).frames)
-                    overlap = overlap_frame(FrameResult(scenario, index, boxes, truth), protocol)
-                    line = lines[branch.name, sigma]
-                    line.matches.append(tuple(match_frame(overlap, iou, protocol) for iou in IOUS))
-                    line.answers += answers
+                    boxes, is_found = views.fuse_with_poses(noise.apply(snapshots[-1], 0).frames)
+                    overlap = compute_frame_iou(FrameResult(scenario, index, boxes, truth), protocol)
+                    accumulator = accumulators[variant.name, sigma]
+                    accumulator.matches.append(tuple(match_frame(overlap, iou, protocol) for iou in IOU_THRESHOLDS))
+                    accumulator.is_found += is_found
             report(scenario, index)
-    return tuple(line.row(*name, protocol) for name, line in lines.items())
+    return tuple(accumulator.make_row(*name, protocol) for name, accumulator in accumulators.items())
 
 
-class _Line:
+class _VariantAccumulator:
     """What a row is made of."""
 
     def __init__(self) -> None:
         self.matches: list[tuple[FrameMatch, ...]] = []
-        self.answers: list[bool] = []
+        self.is_found: list[bool] = []
 
-    def row(self, branch: str, sigma: float, protocol: Protocol) -> BranchRow:
-        columns = list(zip(*self.matches)) or [()] * len(IOUS)
-        share = sum(self.answers) / len(self.answers) if self.answers else math.nan
-        ap = tuple(ap_of_matches(column, protocol).ap for column in columns)
-        return BranchRow(branch, sigma, ap, len(self.matches), len(self.answers), share)
+    def make_row(self, variant: str, sigma: float, protocol: DetectionProtocol) -> FeakmVariantRow:
+        columns = list(zip(*self.matches)) or [()] * len(IOU_THRESHOLDS)
+        found_fraction = sum(self.is_found) / len(self.is_found) if self.is_found else math.nan
+        ap = tuple(compute_ap(column, protocol).ap for column in columns)
+        return FeakmVariantRow(variant, sigma, ap, len(self.matches), len(self.is_found), found_fraction)
 
 
-class _Scene:
+class _CachedViews:
     """What does not depend on the claimed poses: every agent's view of the last snapshot, and its keypoints with the ego's.
 
     Of the others nothing is remembered: each would stand where another correction put it.
     """
 
-    def __init__(self, branch: Branch, snapshots: Sequence[Snapshot]) -> None:
-        self.branch = branch
-        eyes = {frame.agent_id: Eyes(branch.detector) for snapshot in snapshots for frame in snapshot.frames}
-        sights: list[Sight] = []
+    def __init__(self, variant: FeakmVariant, snapshots: Sequence[Snapshot]) -> None:
+        self.variant = variant
+        caches = {
+            frame.agent_id: PerceptionCache(variant.detector) for snapshot in snapshots for frame in snapshot.frames
+        }
+        outputs: list[AgentOutput] = []
         for snapshot in snapshots:
-            sights = [eyes[frame.agent_id].see(frame) for frame in snapshot.frames]
-        self.ego_eyes, self.sights = eyes[snapshots[-1].frames[0].agent_id], sights
-        self.past = self.ego_eyes.past(snapshots[-1].frames[0])
-        views = [View.of(sight.told, sight.boxes) for sight in sights]
+            outputs = [caches[frame.agent_id].process(frame) for frame in snapshot.frames]
+        self.ego_cache, self.outputs = caches[snapshots[-1].frames[0].agent_id], outputs
+        self.past_tokens = self.ego_cache.previous_tokens(snapshots[-1].frames[0])
+        views = [DetectorView.of(sight.shared_tokens, sight.boxes) for sight in outputs]
         with torch.no_grad():
-            self.points = [branch.corrector.net.describe([views[0], view]) for view in views[1:]]
+            self.keypoints = [variant.corrector.net.describe([views[0], view]) for view in views[1:]]
 
-    def perceive(self, frames: Sequence[AgentFrame]) -> tuple[Boxes, list[bool]]:
+    def fuse_with_poses(self, frames: Sequence[AgentFrame]) -> tuple[Boxes, list[bool]]:
         """Boxes around the ego, and of which collaborators the pose was found."""
-        own = self.sights[0].told
-        parts, answers = [Part(0, own.features, own.sites.xy)], []
-        for sight, frame, points in zip(self.sights[1:], frames[1:], self.points):
+        own = self.outputs[0].shared_tokens
+        parts, is_found = [AgentTokens(0, own.features, own.sites.xy)], []
+        for output, frame, points in zip(self.outputs[1:], frames[1:], self.keypoints):
             ego, other = map(Landmarks.of_keypoints, points)
-            said = self.branch.corrector(ego, other, PoseClaim.between(frames[0], frame))
-            answers.append(said.status.answered)
-            if said.ego_from_other is not None:
-                doubt = said.covariance.diagonal().clip(0)
-                told, xy = sight.told.features, sight.told.sites.xy
-                across, turn = math.sqrt(doubt[:2].mean()), math.sqrt(doubt[2])
-                parts.append(Part(0, told, xy, said.ego_from_other, 0.0, across, turn))
-        looked_back = gather(self.past, own.grid, 1) if self.past else None
-        boxes = self.ego_eyes.decode(self.ego_eyes.fuse(gather([*parts, *self.past], own.grid, 1), looked_back))
-        apart = (boxes.center[:, 0].abs() > OWN_BODY_M[0]) | (boxes.center[:, 1].abs() > OWN_BODY_M[1])
-        return boxes if frames[0].is_infrastructure else boxes[apart], answers
+            estimate = self.variant.corrector(ego, other, PosePrior.between(frames[0], frame))
+            is_found.append(estimate.status.has_estimate)
+            if estimate.ego_from_other is not None:
+                variances = estimate.covariance.diagonal().clip(0)
+                features, xy = output.shared_tokens.features, output.shared_tokens.sites.xy
+                sigma_xy_m, sigma_yaw_rad = math.sqrt(variances[:2].mean()), math.sqrt(variances[2])
+                parts.append(AgentTokens(0, features, xy, estimate.ego_from_other, 0.0, sigma_xy_m, sigma_yaw_rad))
+        past_cells = to_ego_frame(self.past_tokens, own.grid, 1) if self.past_tokens else None
+        boxes = self.ego_cache.decode(
+            self.ego_cache.fuse(to_ego_frame([*parts, *self.past_tokens], own.grid, 1), past_cells)
+        )
+        outside_ego = (boxes.center[:, 0].abs() > EGO_HALF_SIZE_M[0]) | (boxes.center[:, 1].abs() > EGO_HALF_SIZE_M[1])
+        return boxes if frames[0].is_infrastructure else boxes[outside_ego], is_found

@@ -9,43 +9,43 @@ import torch
 
 from manyeyes.datatypes import Transform
 from manyeyes.datatypes.keypoints import Keypoints
-from manyeyes.evaluation.pose.metrics import ClaimNoise, PoseFrame, judged
+from manyeyes.evaluation.pose.metrics import PoseEvaluation, PriorNoise, evaluate_pose
 from manyeyes.models.pose.feakm import FeakmNet
-from manyeyes.models.pose.keypoint_net import View
+from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import Corrector, planar
+from manyeyes.pose.types import PoseCorrector, project_to_se2
 
 
-def pose_frames(
-    described: Iterable[tuple[Keypoints, Keypoints, Transform]],
-    correctors: Mapping[str, Corrector],
-    noise: ClaimNoise,
-    near_m: float = 1.5,
-) -> dict[str, list[PoseFrame]]:
+def evaluate_correctors(
+    pairs: Iterable[tuple[Keypoints, Keypoints, Transform]],
+    correctors: Mapping[str, PoseCorrector],
+    noise: PriorNoise,
+    max_distance_m: float = 1.5,
+) -> dict[str, list[PoseEvaluation]]:
     """Every corrector's answers on the same pairs of views (ego, other, true ego_from_other), judged (evaluation/pose/metrics.py).
 
     Objects in common are those that both detect: mutual nearest within near_m under the true pose.
     """
-    found: dict[str, list[PoseFrame]] = {name: [] for name in correctors}
-    for scene, (ego, other, truth) in enumerate(described):
-        claimed, pose = noise.claim(planar(truth), scene), planar(truth)
-        common = ego.xy[_common(ego, other, truth, near_m)].double().numpy()
-        marks = Landmarks.of_keypoints(ego), Landmarks.of_keypoints(other)
+    evaluations: dict[str, list[PoseEvaluation]] = {name: [] for name in correctors}
+    for scene, (ego, other, truth) in enumerate(pairs):
+        prior, pose = noise.make_prior(project_to_se2(truth), scene), project_to_se2(truth)
+        common = ego.xy[_find_common(ego, other, truth, max_distance_m)].double().numpy()
+        landmarks = Landmarks.of_keypoints(ego), Landmarks.of_keypoints(other)
         for name, correct in correctors.items():
-            found[name].append(judged(correct(*marks, claimed), pose, common))
-    return found
+            evaluations[name].append(evaluate_pose(correct(*landmarks, prior), pose, common))
+    return evaluations
 
 
-def _common(ego: Keypoints, other: Keypoints, ego_from_other: Transform, near_m: float) -> torch.Tensor:
+def _find_common(ego: Keypoints, other: Keypoints, ego_from_other: Transform, max_distance_m: float) -> torch.Tensor:
     if not len(ego) or not len(other):
         return torch.zeros(len(ego), dtype=torch.bool)
-    away = torch.cdist(ego.xy.double(), ego_from_other.apply(other.boxes.center.double())[:, :2])
-    back = away.argmin(0)[away.argmin(1)] == torch.arange(len(ego))
-    return back & (away.amin(1) < near_m)
+    distance = torch.cdist(ego.xy.double(), ego_from_other.apply(other.boxes.center.double())[:, :2])
+    is_mutual = distance.argmin(0)[distance.argmin(1)] == torch.arange(len(ego))
+    return is_mutual & (distance.amin(1) < max_distance_m)
 
 
-def described(
-    net: FeakmNet, pairs: Iterable[tuple[View, View, Transform]]
+def describe_pairs(
+    net: FeakmNet, pairs: Iterable[tuple[DetectorView, DetectorView, Transform]]
 ) -> Iterator[tuple[Keypoints, Keypoints, Transform]]:
     """Pairs of views as keypoints."""
     for ego, other, truth in pairs:

@@ -24,62 +24,62 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_normal, keyed_uniform
-from manyeyes.pose.types import PoseClaim, PoseEstimate, PoseStatus, difference, unanswered, upright
+from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3, no_estimate, pose_difference
 
 Floats = NDArray[np.float64]
 
-BUCKETS = ((0, 0), (1, 1), (2, 2), (3, 4), (5, 7), (8, 10**9))
+COMMON_OBJECT_BUCKETS = ((0, 0), (1, 1), (2, 2), (3, 4), (5, 7), (8, 10**9))
 """Numbers of common objects by which results are listed (specs/pose.md 3.2)."""
-WITHIN_95 = 7.815
+CHI2_3DOF_95 = 7.815
 
 
 @dataclass(frozen=True)
-class PoseFrame:
-    """One frame judged. common: objects in common. metres, degrees: error of the pose used, infinite where there is
-    none.
+class PoseEvaluation:
+    """One frame judged. num_common: objects in common. translation_error_m, rotation_error_deg: error of the pose used, infinite
+    where there is none.
 
-    displacement: of the objects in common (m), NaN without any. nees: NaN where objects gave no pose. confidence: by
+    displacement_m: of the objects in common (m), NaN without any. nees: NaN where objects gave no pose. confidence: by
     which an estimator ranks its own answers, minus infinity where it gave none. status: its name.
     """
 
     status: PoseStatus
-    common: int
-    metres: float
-    degrees: float
-    displacement: float
+    num_common: int
+    translation_error_m: float
+    rotation_error_deg: float
+    displacement_m: float
     nees: float
     confidence: float
 
-    def right(self, limit: float) -> bool:
+    def is_within(self, limit: float) -> bool:
         """Whether the pose used is within so many metres and degrees."""
-        return self.metres < limit and self.degrees < limit
+        return self.translation_error_m < limit and self.rotation_error_deg < limit
 
 
 @dataclass(frozen=True)
 class PoseScore:
-    """Numbers over frames, defined in the module; NaN where there is nothing to take a mean of. nees_error: one standard
+    """Numbers over frames, defined in the module; NaN where there is nothing to take a mean of. nees_standard_error: one standard
     error of nees.
     """
 
-    frames: int
-    success: tuple[float, float, float]
+    num_frames: int
+    success_rate: tuple[float, float, float]
     coverage: float
     precision: float
-    wrong_accepts: float
-    null_accepts: float
-    mean_metres: float
-    median_metres: float
-    p95_metres: float
-    median_degrees: float
-    displacement: float
+    false_accept_rate: float
+    no_overlap_accept_rate: float
+    mean_translation_error_m: float
+    median_translation_error_m: float
+    p95_translation_error_m: float
+    median_rotation_error_deg: float
+    mean_displacement_m: float
     nees: float
-    nees_error: float
-    inside: float
+    nees_standard_error: float
+    within_95_fraction: float
     aurc: float
-    conflicts: float
+    conflict_rate: float
 
 
-def judged(estimate: PoseEstimate, truth: Floats, common_xy: Floats) -> PoseFrame:
+def evaluate_pose(estimate: PoseEstimate, truth: Floats, common_xy: Floats) -> PoseEvaluation:
     """One answer against the true ego_from_other (3,), with the true places (K, 2) of common objects in the ego's
     frame.
     """
@@ -87,84 +87,89 @@ def judged(estimate: PoseEstimate, truth: Floats, common_xy: Floats) -> PoseFram
         raise ConfigError(f"judged needs a pose (3,) and places (K, 2); got {truth.shape} and {common_xy.shape}.")
     pose = estimate.pose
     if pose is None:
-        return PoseFrame(estimate.status, len(common_xy), math.inf, math.inf, math.nan, math.nan, -math.inf)
-    error = difference(pose, truth)
-    answered = estimate.status.answered
+        return PoseEvaluation(estimate.status, len(common_xy), math.inf, math.inf, math.nan, math.nan, -math.inf)
+    error = pose_difference(pose, truth)
+    has_estimate = estimate.status.has_estimate
     # A claim that states no error at all leaves nothing to measure its error by.
-    stated = answered and estimate.inliers > 0 and np.linalg.eigvalsh(estimate.covariance).min() > 1e-14
-    nees = float(error @ np.linalg.solve(estimate.covariance, error)) if stated else math.nan
-    return PoseFrame(
+    has_covariance = has_estimate and estimate.inliers > 0 and np.linalg.eigvalsh(estimate.covariance).min() > 1e-14
+    nees = float(error @ np.linalg.solve(estimate.covariance, error)) if has_covariance else math.nan
+    return PoseEvaluation(
         estimate.status,
         len(common_xy),
         float(np.hypot(error[0], error[1])),
         math.degrees(abs(float(error[2]))),
-        displacement(pose, truth, common_xy),
+        compute_displacement(pose, truth, common_xy),
         nees,
-        estimate.margin if answered else -math.inf,
+        estimate.margin if has_estimate else -math.inf,
     )
 
 
-def displacement(pose: Floats, truth: Floats, places: Floats) -> float:
+def compute_displacement(pose: Floats, truth: Floats, points_xy: Floats) -> float:
     """Mean distance (m) by which a pose misplaces objects at true places (K, 2) in the ego's frame; NaN without any."""
-    if not len(places):
+    if not len(points_xy):
         return math.nan
-    turn = pose[2] - truth[2]
-    c, s = math.cos(turn), math.sin(turn)
-    arm = places - truth[:2]
+    yaw_error = pose[2] - truth[2]
+    c, s = math.cos(yaw_error), math.sin(yaw_error)
+    arm = points_xy - truth[:2]
     moved = np.stack((c * arm[:, 0] - s * arm[:, 1], s * arm[:, 0] + c * arm[:, 1]), 1) + pose[:2]
-    return float(np.hypot(*(moved - places).T).mean())
+    return float(np.hypot(*(moved - points_xy).T).mean())
 
 
-def score(frames: Sequence[PoseFrame]) -> PoseScore:
+def summarize_evaluations(evaluations: Sequence[PoseEvaluation]) -> PoseScore:
     """All numbers over some frames."""
-    n = len(frames)
-    answers = [f for f in frames if f.status.answered]
-    metres, degrees = np.array([f.metres for f in answers]), np.array([f.degrees for f in answers])
-    nees = np.array([f.nees for f in answers if f.right(2.0) and not math.isnan(f.nees)])
-    shift = np.array([f.displacement for f in frames if not math.isnan(f.displacement)])
-    nulls = [f for f in frames if f.common == 0]
+    n = len(evaluations)
+    estimates = [f for f in evaluations if f.status.has_estimate]
+    translation_errors_m, rotation_errors_deg = (
+        np.array([f.translation_error_m for f in estimates]),
+        np.array([f.rotation_error_deg for f in estimates]),
+    )
+    nees = np.array([f.nees for f in estimates if f.is_within(2.0) and not math.isnan(f.nees)])
+    displacements_m = np.array([f.displacement_m for f in evaluations if not math.isnan(f.displacement_m)])
+    without_overlap = [f for f in evaluations if f.num_common == 0]
     return PoseScore(
         n,
-        (_success(frames, 1.0), _success(frames, 2.0), _success(frames, 3.0)),
-        _share(len(answers), n),
-        _share(sum(f.right(2.0) for f in answers), len(answers)),
-        _share(sum(not f.right(2.0) for f in answers), n),
-        _share(sum(f.status.answered for f in nulls), len(nulls)),
-        _mean(metres),
-        float(np.median(metres)) if len(metres) else math.nan,
-        float(np.percentile(metres, 95)) if len(metres) else math.nan,
-        float(np.median(degrees)) if len(degrees) else math.nan,
-        _mean(shift),
+        (_success(evaluations, 1.0), _success(evaluations, 2.0), _success(evaluations, 3.0)),
+        _fraction(len(estimates), n),
+        _fraction(sum(f.is_within(2.0) for f in estimates), len(estimates)),
+        _fraction(sum(not f.is_within(2.0) for f in estimates), n),
+        _fraction(sum(f.status.has_estimate for f in without_overlap), len(without_overlap)),
+        _mean(translation_errors_m),
+        float(np.median(translation_errors_m)) if len(translation_errors_m) else math.nan,
+        float(np.percentile(translation_errors_m, 95)) if len(translation_errors_m) else math.nan,
+        float(np.median(rotation_errors_deg)) if len(rotation_errors_deg) else math.nan,
+        _mean(displacements_m),
         _mean(nees),
         float(nees.std(ddof=1) / math.sqrt(len(nees))) if len(nees) > 1 else math.nan,
-        _mean((nees <= WITHIN_95).astype(np.float64)),
-        _mean(risk_coverage(frames)[1]),
-        _share(sum(f.status is PoseStatus.CONFLICT for f in frames), n),
+        _mean((nees <= CHI2_3DOF_95).astype(np.float64)),
+        _mean(compute_risk_coverage(evaluations)[1]),
+        _fraction(sum(f.status is PoseStatus.CONFLICT for f in evaluations), n),
     )
 
 
-def by_common(frames: Sequence[PoseFrame]) -> list[tuple[tuple[int, int], PoseScore]]:
+def summarize_by_common_objects(evaluations: Sequence[PoseEvaluation]) -> list[tuple[tuple[int, int], PoseScore]]:
     """The numbers for each bucket of common objects that has a frame."""
-    split = [(b, [f for f in frames if b[0] <= f.common <= b[1]]) for b in BUCKETS]
-    return [(b, score(part)) for b, part in split if part]
+    evaluations_by_bucket = [
+        (b, [f for f in evaluations if b[0] <= f.num_common <= b[1]]) for b in COMMON_OBJECT_BUCKETS
+    ]
+    return [(b, summarize_evaluations(part)) for b, part in evaluations_by_bucket if part]
 
 
-def risk_coverage(frames: Sequence[PoseFrame], limit: float = 2.0) -> tuple[Floats, Floats]:
+def compute_risk_coverage(evaluations: Sequence[PoseEvaluation], limit: float = 2.0) -> tuple[Floats, Floats]:
     """Coverages 1/n, 2/n, ..., and the share not right among the so many most confident frames.
 
     Frames of equal confidence come in as one: their risk is shared, so that no order of the list can improve the
     curve.
     """
-    n = len(frames)
-    wrong = np.array([not (f.status.answered and f.right(limit)) for f in frames], np.float64)
-    _, group = np.unique(-np.array([f.confidence for f in frames]), return_inverse=True)
+    n = len(evaluations)
+    wrong = np.array([not (f.status.has_estimate and f.is_within(limit)) for f in evaluations], np.float64)
+    _, group = np.unique(-np.array([f.confidence for f in evaluations]), return_inverse=True)
     shared = (np.bincount(group, wrong) / np.maximum(np.bincount(group), 1))[group] if n else wrong
     order = np.argsort(group, kind="stable")
-    places = np.arange(1, n + 1)
-    return places / max(n, 1), np.cumsum(shared[order]) / places
+    ranks = np.arange(1, n + 1)
+    return ranks / max(n, 1), np.cumsum(shared[order]) / ranks
 
 
-def confusion(pairs: Sequence[tuple[PoseStatus, PoseStatus]]) -> NDArray[np.int64]:
+def count_confusion(pairs: Sequence[tuple[PoseStatus, PoseStatus]]) -> NDArray[np.int64]:
     """(5, 5) counts of (injected, reported) statuses, in the order of PoseStatus."""
     order = list(PoseStatus)
     table = np.zeros((len(order), len(order)), np.int64)
@@ -173,32 +178,32 @@ def confusion(pairs: Sequence[tuple[PoseStatus, PoseStatus]]) -> NDArray[np.int6
     return table
 
 
-def oracle(truth: Floats, claimed: PoseClaim | None) -> PoseEstimate:
+def make_oracle_estimate(truth: Floats, prior: PosePrior | None) -> PoseEstimate:
     """The row that knows: the true pose as an answer. It lives here because nothing below may see truth."""
-    said = unanswered(claimed, PoseStatus.OK)
+    template = no_estimate(prior, PoseStatus.OK)
     return PoseEstimate(
-        upright(truth, claimed),
+        lift_to_se3(truth, prior),
         np.eye(3) * 1e-6,
-        said.status,
+        template.status,
         0,
         0,
         0.0,
-        said.pairs,
+        template.pairs,
         None,
         None,
-        said.distance,
+        template.mahalanobis_squared,
     )
 
 
 @dataclass(frozen=True)
-class ClaimNoise:
+class PriorNoise:
     """Errors of a claimed relative pose (specs/pose.md 3.2). sigma_m, sigma_deg: their size; drawn by (seed, scene,
     frame), the same unit draw at every size.
 
     kind: ``gaussian`` (of the other agent); ``gaussian_all`` (of both, in the world, so that the ego's yaw moves the
     other by its distance); ``laplace`` (scale sigma, so sqrt 2 as wide); ``bias`` (one offset a scene); ``walk``
     (each frame adds a tenth); ``latency`` (along the other's heading, sigma_m at most); ``heavy`` (one claim in ten
-    is ten times as far off); ``offset`` (five sigma_m off in any direction); ``unknown`` (anywhere within 100 m, any
+    is ten times as far off); ``offset`` (five sigma_m off in any direction); ``no_prior`` (anywhere within 100 m, any
     yaw, and says so); ``none`` (no claim).
     """
 
@@ -211,53 +216,53 @@ class ClaimNoise:
         if self.kind not in NOISE_KINDS:
             raise ConfigError(f"No noise of claims is called {self.kind!r}; known: {', '.join(NOISE_KINDS)}.")
 
-    def claim(self, truth: Floats, scene: int | str, frame: int = 0) -> PoseClaim | None:
+    def make_prior(self, truth: Floats, scene: int | str, frame: int = 0) -> PosePrior | None:
         """ego_from_other as claimed in a frame of a scene, from the true one (3,); None where nothing is claimed."""
         if self.kind == "none":
             return None
         sigma = np.array([self.sigma_m, self.sigma_m, math.radians(self.sigma_deg)])
         if self.kind == "unknown":
-            drawn = keyed_uniform((3,), self.seed, "claim", self.kind, scene, frame).numpy()
-            radius, angle = 100.0 * math.sqrt(drawn[0]), 2 * math.pi * drawn[1]
-            pose = np.array([radius * math.cos(angle), radius * math.sin(angle), 2 * math.pi * drawn[2] - math.pi])
-            return PoseClaim(upright(pose, None), np.diag([5e3, 5e3, math.pi**2 / 3]))
-        offset, variance = self._offset(truth, sigma, scene, frame)
+            uniform = keyed_uniform((3,), self.seed, "claim", self.kind, scene, frame).numpy()
+            radius, angle = 100.0 * math.sqrt(uniform[0]), 2 * math.pi * uniform[1]
+            pose = np.array([radius * math.cos(angle), radius * math.sin(angle), 2 * math.pi * uniform[2] - math.pi])
+            return PosePrior(lift_to_se3(pose, None), np.diag([5e3, 5e3, math.pi**2 / 3]))
+        offset, variance = self._sample_offset(truth, sigma, scene, frame)
         moved = truth + offset
-        return PoseClaim(upright(moved, None), np.diag(variance))
+        return PosePrior(lift_to_se3(moved, None), np.diag(variance))
 
-    def _offset(self, truth: Floats, sigma: Floats, scene: int | str, frame: int) -> tuple[Floats, Floats]:
+    def _sample_offset(self, truth: Floats, sigma: Floats, scene: int | str, frame: int) -> tuple[Floats, Floats]:
         """What the claim is off by (3,), and the variances (3,) that it states."""
         unit = keyed_normal((6,), self.seed, "claim", scene, 0 if self.kind == "bias" else frame).numpy()
         if self.kind == "gaussian_all":
             lever = np.array([-truth[1], truth[0], 0.0])
             return sigma * (unit[:3] - unit[3:]) - lever * sigma[2] * unit[5], 2 * sigma**2 + (lever * sigma[2]) ** 2
         if self.kind == "laplace":
-            drawn = keyed_uniform((3,), self.seed, "claim", self.kind, scene, frame).numpy() - 0.5
-            return -sigma * np.sign(drawn) * np.log1p(-2 * np.abs(drawn)), 2 * sigma**2
+            uniform = keyed_uniform((3,), self.seed, "claim", self.kind, scene, frame).numpy() - 0.5
+            return -sigma * np.sign(uniform) * np.log1p(-2 * np.abs(uniform)), 2 * sigma**2
         if self.kind == "walk":
             steps = [keyed_normal((6,), self.seed, "claim", scene, n).numpy()[:3] for n in range(frame + 1)]
             return sigma * (steps[0] + 0.1 * np.sum(steps[1:], 0)), sigma**2 * (1 + 0.01 * frame)
         if self.kind == "latency":
-            late = keyed_uniform((1,), self.seed, "claim", self.kind, scene, frame).item() * self.sigma_m
-            along = np.array([math.cos(truth[2]), math.sin(truth[2]), 0.0])
-            return -late * along, np.array([sigma[0], sigma[1], max(sigma[2], 1e-3)]) ** 2
+            lag_m = keyed_uniform((1,), self.seed, "claim", self.kind, scene, frame).item() * self.sigma_m
+            heading = np.array([math.cos(truth[2]), math.sin(truth[2]), 0.0])
+            return -lag_m * heading, np.array([sigma[0], sigma[1], max(sigma[2], 1e-3)]) ** 2
         if self.kind == "offset":
             angle = 2 * math.pi * keyed_uniform((1,), self.seed, "claim", self.kind, scene, frame).item()
             return 5 * self.sigma_m * np.array([math.cos(angle), math.sin(angle), 0.0]), sigma**2
         if self.kind == "heavy":
-            far = keyed_uniform((1,), self.seed, "claim", self.kind, scene, frame).item() < 0.1
-            return sigma * unit[:3] * (10.0 if far else 1.0), sigma**2
+            is_outlier = keyed_uniform((1,), self.seed, "claim", self.kind, scene, frame).item() < 0.1
+            return sigma * unit[:3] * (10.0 if is_outlier else 1.0), sigma**2
         return sigma * unit[:3], sigma**2
 
 
 NOISE_KINDS = ("gaussian", "gaussian_all", "laplace", "bias", "walk", "latency", "heavy", "offset", "unknown", "none")
 
 
-def _success(frames: Sequence[PoseFrame], limit: float) -> float:
-    return _share(sum(f.status.answered and f.right(limit) for f in frames), len(frames))
+def _success(evaluations: Sequence[PoseEvaluation], limit: float) -> float:
+    return _fraction(sum(f.status.has_estimate and f.is_within(limit) for f in evaluations), len(evaluations))
 
 
-def _share(part: int, whole: int) -> float:
+def _fraction(part: int, whole: int) -> float:
     return part / whole if whole else math.nan
 
 

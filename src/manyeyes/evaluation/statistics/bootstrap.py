@@ -24,14 +24,14 @@ import numpy as np
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.average_precision import (
     PROTOCOLS,
+    DetectionProtocol,
     FrameMatch,
-    Protocol,
-    counted_truth,
-    in_dataset_order,
+    count_truth,
+    sort_by_frame,
 )
 from manyeyes.ops.keyed_random import keyed_uniform
 
-Verdict = Literal["reached", "missed", "not resolved"]
+MarginVerdict = Literal["reached", "missed", "not resolved"]
 _CHUNK_ROWS = 4_000_000
 
 
@@ -42,36 +42,36 @@ class Interval:
     value: float
     low: float
     high: float
-    level: float
-    scenarios: int
+    confidence_level: float
+    num_scenarios: int
 
 
 @dataclass(frozen=True)
-class Pooled:
+class PooledMatches:
     """Detections of many scenarios as one list in the protocol's order.
 
-    tp: (D,) bool; scenario: (D,) row of names; n_gt: (S,) truth boxes of each scenario.
+    tp: (D,) bool; scenario_row: (D,) row of names; n_gt: (S,) truth boxes of each scenario.
     """
 
     names: tuple[str, ...]
     tp: np.ndarray
-    scenario: np.ndarray
+    scenario_row: np.ndarray
     n_gt: np.ndarray
     drop_first_segment: bool
 
 
-Statistic = Callable[[Pooled, np.ndarray], np.ndarray]
+Statistic = Callable[[PooledMatches, np.ndarray], np.ndarray]
 """(pool, weights (R, S)) -> (R,): the statistic on R resamples, given how often each scenario was drawn."""
 
 
-def weighted_ap(pool: Pooled, weights: np.ndarray) -> np.ndarray:
+def weighted_ap(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
     """AP (R,) of each resample (R, S); NaN where it holds no truth. Weights of one give the plain AP."""
     ap = np.full(len(weights), np.nan)
     n_gt = weights @ pool.n_gt
     step = max(1, _CHUNK_ROWS // max(1, len(pool.tp)))
     for begin in range(0, len(weights), step):
         rows = slice(begin, begin + step)
-        weight = weights[rows][:, pool.scenario].astype(np.float64)
+        weight = weights[rows][:, pool.scenario_row].astype(np.float64)
         gain = weight * pool.tp
         seen = np.cumsum(weight, 1)
         precision = np.cumsum(gain, 1) / np.maximum(seen, 1)
@@ -83,128 +83,136 @@ def weighted_ap(pool: Pooled, weights: np.ndarray) -> np.ndarray:
     return ap
 
 
-def weighted_recall(pool: Pooled, weights: np.ndarray) -> np.ndarray:
+def weighted_recall(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
     """Recall (R,) of each resample (R, S) at the protocol's score threshold."""
-    hits = np.bincount(pool.scenario, weights=pool.tp, minlength=len(pool.names))
+    hits = np.bincount(pool.scenario_row, weights=pool.tp, minlength=len(pool.names))
     with np.errstate(invalid="ignore", divide="ignore"):
         return (weights @ hits) / (weights @ pool.n_gt)
 
 
 @dataclass(frozen=True)
-class Drawn:
+class BootstrapSamples:
     """A statistic of matched frames on all scenarios and on every resample of them, draws (R,); n_gt (S,) is their truth."""
 
     names: tuple[str, ...]
     n_gt: np.ndarray
     value: float
-    draws: np.ndarray
-    level: float
+    samples: np.ndarray
+    confidence_level: float
     same_truth: bool
 
     def interval(self) -> Interval:
         """The value and its interval."""
-        return _interval(self.value, self.draws, self.level, len(self.names))
+        return _make_interval(self.value, self.samples, self.confidence_level, len(self.names))
 
-    def less(self, other: Drawn) -> Interval:
+    def paired_difference(self, other: BootstrapSamples) -> Interval:
         """This statistic minus the other on the same resamples, of the same scenarios with equal truth."""
         if self.names != other.names:
-            odd = sorted(set(self.names) ^ set(other.names))
+            unpaired = sorted(set(self.names) ^ set(other.names))
             raise ConfigError(
-                f"A paired difference needs the same scenarios on both sides; {', '.join(odd[:5])} are on one only."
+                f"A paired difference needs the same scenarios on both sides; {', '.join(unpaired[:5])} are on one only."
             )
         if self.same_truth and not np.array_equal(self.n_gt, other.n_gt):
-            odd = self.names[int(np.argmax(self.n_gt != other.n_gt))]
-            raise ConfigError(f"A paired difference needs the same truth on both sides; scenario {odd} differs.")
-        return _interval(self.value - other.value, self.draws - other.draws, self.level, len(self.names))
+            unpaired = self.names[int(np.argmax(self.n_gt != other.n_gt))]
+            raise ConfigError(f"A paired difference needs the same truth on both sides; scenario {unpaired} differs.")
+        return _make_interval(
+            self.value - other.value, self.samples - other.samples, self.confidence_level, len(self.names)
+        )
 
 
-def drawn(
+def bootstrap(
     matches: Sequence[FrameMatch],
-    n: int = 1000,
+    num_resamples: int = 1000,
     seed: int = 0,
-    level: float = 0.95,
-    protocol: Protocol = PROTOCOLS["manyeyes"],
+    confidence_level: float = 0.95,
+    protocol: DetectionProtocol = PROTOCOLS["manyeyes"],
     statistic: Statistic = weighted_ap,
-) -> Drawn:
+) -> BootstrapSamples:
     """The AP (or another statistic) of matched frames on n resamples, made once for any number of differences."""
-    pool = _pooled(matches, protocol)
+    pool = _pool_matches(matches, protocol)
     value = float(statistic(pool, np.ones((1, len(pool.names)), dtype=np.int64))[0])
-    draws = statistic(pool, resamples(len(pool.names), n, seed))
-    return Drawn(pool.names, pool.n_gt, value, draws, level, protocol.count_frames_without_det)
+    samples = statistic(pool, draw_resamples(len(pool.names), num_resamples, seed))
+    return BootstrapSamples(pool.names, pool.n_gt, value, samples, confidence_level, protocol.count_frames_without_det)
 
 
 def scenario_interval(
     matches: Sequence[FrameMatch],
-    n: int = 1000,
+    num_resamples: int = 1000,
     seed: int = 0,
-    level: float = 0.95,
-    protocol: Protocol = PROTOCOLS["manyeyes"],
+    confidence_level: float = 0.95,
+    protocol: DetectionProtocol = PROTOCOLS["manyeyes"],
     statistic: Statistic = weighted_ap,
 ) -> Interval:
     """The AP (or another statistic) of matched frames and its interval over scenarios."""
-    return drawn(matches, n, seed, level, protocol, statistic).interval()
+    return bootstrap(matches, num_resamples, seed, confidence_level, protocol, statistic).interval()
 
 
 def paired_difference(
     a: Sequence[FrameMatch],
     b: Sequence[FrameMatch],
-    n: int = 1000,
+    num_resamples: int = 1000,
     seed: int = 0,
-    level: float = 0.95,
-    protocol: Protocol = PROTOCOLS["manyeyes"],
+    confidence_level: float = 0.95,
+    protocol: DetectionProtocol = PROTOCOLS["manyeyes"],
     statistic: Statistic = weighted_ap,
 ) -> Interval:
     """Statistic of a minus that of b, both on the same resampled scenarios, which must be the same with equal truth."""
-    ours, theirs = (drawn(matches, n, seed, level, protocol, statistic) for matches in (a, b))
-    return ours.less(theirs)
+    ours, theirs = (
+        bootstrap(matches, num_resamples, seed, confidence_level, protocol, statistic) for matches in (a, b)
+    )
+    return ours.paired_difference(theirs)
 
 
-def mean_interval(values: Sequence[float], n: int = 1000, seed: int = 0, level: float = 0.95) -> Interval:
+def mean_interval(
+    values: Sequence[float], num_resamples: int = 1000, seed: int = 0, confidence_level: float = 0.95
+) -> Interval:
     """The mean of one number per scenario (bytes, milliseconds, a difference) and its interval; NaN values are refused."""
     numbers = np.asarray(values, dtype=np.float64)
     if np.isnan(numbers).any():
         raise ConfigError(f"mean_interval needs a number per scenario; {int(np.isnan(numbers).sum())} are NaN.")
-    draws = resamples(len(numbers), n, seed) @ numbers / max(1, len(numbers))
-    return _interval(float(numbers.mean()) if len(numbers) else math.nan, draws, level, len(numbers))
+    samples = draw_resamples(len(numbers), num_resamples, seed) @ numbers / max(1, len(numbers))
+    return _make_interval(float(numbers.mean()) if len(numbers) else math.nan, samples, confidence_level, len(numbers))
 
 
-def resolved(bar: float, low: float, high: float) -> Verdict:
+def compare_to_margin(margin: float, low: float, high: float) -> MarginVerdict:
     """The verdict on a bar: reached when the whole interval is at or above it, missed when it is below, else undecided."""
-    if low >= bar:
+    if low >= margin:
         return "reached"
-    return "missed" if high < bar else "not resolved"
+    return "missed" if high < margin else "not resolved"
 
 
-def resamples(scenarios: int, n: int, seed: int) -> np.ndarray:
+def draw_resamples(num_scenarios: int, num_resamples: int, seed: int) -> np.ndarray:
     """(n, scenarios) int64: how often each scenario is drawn in each resample; a function of its arguments alone."""
-    if scenarios == 0:
-        return np.zeros((n, 0), dtype=np.int64)
-    drawn = (keyed_uniform((n, scenarios), seed, "bootstrap").numpy() * scenarios).astype(np.int64)
-    flat = drawn + scenarios * np.arange(n)[:, None]
-    return np.bincount(flat.ravel(), minlength=n * scenarios).reshape(n, scenarios)
+    if num_scenarios == 0:
+        return np.zeros((num_resamples, 0), dtype=np.int64)
+    chosen = (keyed_uniform((num_resamples, num_scenarios), seed, "bootstrap").numpy() * num_scenarios).astype(np.int64)
+    flat = chosen + num_scenarios * np.arange(num_resamples)[:, None]
+    return np.bincount(flat.ravel(), minlength=num_resamples * num_scenarios).reshape(num_resamples, num_scenarios)
 
 
-def _pooled(matches: Sequence[FrameMatch], protocol: Protocol) -> Pooled:
-    matches = in_dataset_order(matches)
+def _pool_matches(matches: Sequence[FrameMatch], protocol: DetectionProtocol) -> PooledMatches:
+    matches = sort_by_frame(matches)
     names = tuple(dict.fromkeys(match.scenario for match in matches))
     row = {name: k for k, name in enumerate(names)}
     n_gt = np.zeros(len(names), dtype=np.int64)
     for match in matches:
-        n_gt[row[match.scenario]] += counted_truth(match, protocol)
+        n_gt[row[match.scenario]] += count_truth(match, protocol)
     if not matches:
-        return Pooled(names, np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64), n_gt, protocol.drop_first_segment)
+        return PooledMatches(
+            names, np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64), n_gt, protocol.drop_first_segment
+        )
     tp = np.concatenate([match.tp.numpy() for match in matches])
     scenario = np.repeat([row[match.scenario] for match in matches], [len(match.score) for match in matches])
     score = np.concatenate([match.score.numpy() for match in matches])
-    order = np.argsort(-score, kind="stable") if protocol.sort == "global" else np.arange(len(score))
-    return Pooled(names, tp[order], scenario[order], n_gt, protocol.drop_first_segment)
+    order = np.argsort(-score, kind="stable") if protocol.ap_order == "global" else np.arange(len(score))
+    return PooledMatches(names, tp[order], scenario[order], n_gt, protocol.drop_first_segment)
 
 
-def _interval(value: float, draws: np.ndarray, level: float, scenarios: int) -> Interval:
-    if not 0 < level < 1:
-        raise ConfigError(f"The level of an interval lies between 0 and 1; got {level}.")
-    draws = draws[~np.isnan(draws)]
-    if not len(draws):
-        return Interval(value, math.nan, math.nan, level, scenarios)
-    low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2])
-    return Interval(value, float(low), float(high), level, scenarios)
+def _make_interval(value: float, samples: np.ndarray, confidence_level: float, num_scenarios: int) -> Interval:
+    if not 0 < confidence_level < 1:
+        raise ConfigError(f"The level of an interval lies between 0 and 1; got {confidence_level}.")
+    samples = samples[~np.isnan(samples)]
+    if not len(samples):
+        return Interval(value, math.nan, math.nan, confidence_level, num_scenarios)
+    low, high = np.quantile(samples, [(1 - confidence_level) / 2, (1 + confidence_level) / 2])
+    return Interval(value, float(low), float(high), confidence_level, num_scenarios)

@@ -10,58 +10,63 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from manyeyes.evaluation.detection.accumulator import IOUS, MethodResult
-from manyeyes.evaluation.detection.average_precision import Protocol
-from manyeyes.evaluation.statistics.bootstrap import Interval, Verdict, resolved
+from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult
+from manyeyes.evaluation.detection.average_precision import DetectionProtocol
+from manyeyes.evaluation.statistics.bootstrap import Interval, MarginVerdict, compare_to_margin
 
 
 @dataclass(frozen=True)
-class Bar:
+class Margin:
     """What a method is to be better than a rival by, in AP at an IoU threshold."""
 
     method: str
-    rival: str
-    at_least: float
+    baseline: str
+    min_difference: float
     iou: float = 0.5
 
 
-BARS = (
-    Bar("intermediate", "alone", 0.12),
-    Bar("intermediate", "late", 0.02),
-    Bar("intermediate", "late-remembering", 0.02),
+MARGINS = (
+    Margin("intermediate", "alone", 0.12),
+    Margin("intermediate", "late", 0.02),
+    Margin("intermediate", "late-remembering", 0.02),
 )
 
 
 @dataclass(frozen=True)
-class Difference:
+class PairedDifference:
     """AP of a method less that of a rival, on the same resampled scenarios; bar and verdict are None where none is set."""
 
     method: str
-    rival: str
+    baseline: str
     iou: float
     interval: Interval
-    bar: float | None
-    verdict: Verdict | None
+    margin: float | None
+    verdict: MarginVerdict | None
 
 
-def differences(
-    results: Sequence[MethodResult], protocol: Protocol, method: str = "intermediate", bars: Sequence[Bar] = BARS
-) -> tuple[Difference, ...]:
+def compare_methods(
+    results: Sequence[MethodResult],
+    protocol: DetectionProtocol,
+    method: str = "intermediate",
+    margins: Sequence[Margin] = MARGINS,
+) -> tuple[PairedDifference, ...]:
     """One method against every other, at every IoU threshold; nothing where the method was not run."""
-    known = {(bar.method, bar.rival, bar.iou): bar.at_least for bar in bars}
+    min_differences = {(margin.method, margin.baseline, margin.iou): margin.min_difference for margin in margins}
     by_name = {result.method: result for result in results}
     if method not in by_name:
         return ()
     out = []
-    for rival in (r for r in results if r.method != method):
-        for column, iou in enumerate(IOUS):
-            interval = by_name[method].less(rival, column, protocol)
-            bar = known.get((method, rival.method, iou))
-            out.append(Difference(method, rival.method, iou, interval, bar, _verdict(bar, interval)))
+    for baseline in (r for r in results if r.method != method):
+        for column, iou in enumerate(IOU_THRESHOLDS):
+            interval = by_name[method].paired_difference(baseline, column, protocol)
+            margin = min_differences.get((method, baseline.method, iou))
+            out.append(
+                PairedDifference(method, baseline.method, iou, interval, margin, _check_margin(margin, interval))
+            )
     return tuple(out)
 
 
-def _verdict(bar: float | None, interval: Interval) -> Verdict | None:
-    if bar is None:
+def _check_margin(margin: float | None, interval: Interval) -> MarginVerdict | None:
+    if margin is None:
         return None
-    return resolved(bar, interval.low, interval.high) if interval.scenarios > 1 else "not resolved"
+    return compare_to_margin(margin, interval.low, interval.high) if interval.num_scenarios > 1 else "not resolved"

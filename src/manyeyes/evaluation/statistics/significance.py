@@ -5,25 +5,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from manyeyes.evaluation.detection.accumulator import IOUS
-from manyeyes.evaluation.statistics.bootstrap import Interval, Verdict, resolved
-from manyeyes.evaluation.study import Place, Sweep
+from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS
+from manyeyes.evaluation.statistics.bootstrap import Interval, MarginVerdict, compare_to_margin
+from manyeyes.evaluation.study import ResultGrid, ResultKey
 
 
 @dataclass(frozen=True)
-class Claim:
+class MarginTest:
     """AP of one cell minus that of another; the verdict says whether the whole interval is at or above the bar."""
 
-    what: str
+    description: str
     iou: float
     difference: Interval
-    bar: float
-    verdict: Verdict
+    margin: float
+    verdict: MarginVerdict
 
 
-def claim(what: str, sweep: Sweep, place: Place, other: Place, iou: int, bar: float) -> Claim:
+def check_margin(
+    description: str, results: ResultGrid, key: ResultKey, baseline_key: ResultKey, iou: int, margin: float
+) -> MarginTest:
     """The claim that a cell's AP minus another's is at least the bar. iou counts the thresholds of IOUS."""
-    difference = sweep.less(place, other, iou)
-    several = difference.scenarios > 1
-    verdict = resolved(bar, difference.low, difference.high) if several else "not resolved"
-    return Claim(what, IOUS[iou], difference, bar, verdict)
+    difference = results.paired_difference(key, baseline_key, iou)
+    has_several_scenarios = difference.num_scenarios > 1
+    verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_scenarios else "not resolved"
+    return MarginTest(description, IOU_THRESHOLDS[iou], difference, margin, verdict)

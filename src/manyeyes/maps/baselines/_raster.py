@@ -15,25 +15,27 @@ Mask = NDArray[np.bool_]
 
 @njit(cache=True)
 def draw_lines(
-    heat: F64x2, points: F64x2, first: I64x1, score: F64x1, low: F64x1, cell: float, radius: float
+    heat: F64x2, points: F64x2, offsets: I64x1, score: F64x1, origin: F64x1, cell: float, radius: float
 ) -> None:  # pragma: no cover - compiled
-    """Add each line's score once to every cell of heat (H, W) whose middle lies within radius of it; low: corner of cell 0, 0."""
+    """Add each line's score once to every cell of heat (H, W) whose middle lies within radius of it; origin: corner of cell 0,
+    0.
+    """
     stamp = np.full(heat.shape, -1, np.int32)
-    for k in range(len(first) - 1):
-        for p in range(first[k], first[k + 1] - 1):
+    for k in range(len(offsets) - 1):
+        for p in range(offsets[k], offsets[k + 1] - 1):
             ax, ay = points[p]
             dx, dy = points[p + 1, 0] - ax, points[p + 1, 1] - ay
             squared = dx * dx + dy * dy
-            i0 = max(int((min(ax, ax + dx) - radius - low[0]) / cell), 0)
-            i1 = min(int((max(ax, ax + dx) + radius - low[0]) / cell) + 1, heat.shape[0])
-            j0 = max(int((min(ay, ay + dy) - radius - low[1]) / cell), 0)
-            j1 = min(int((max(ay, ay + dy) + radius - low[1]) / cell) + 1, heat.shape[1])
+            i0 = max(int((min(ax, ax + dx) - radius - origin[0]) / cell), 0)
+            i1 = min(int((max(ax, ax + dx) + radius - origin[0]) / cell) + 1, heat.shape[0])
+            j0 = max(int((min(ay, ay + dy) - radius - origin[1]) / cell), 0)
+            j1 = min(int((max(ay, ay + dy) + radius - origin[1]) / cell) + 1, heat.shape[1])
             for i in range(i0, i1):
-                x = low[0] + (i + 0.5) * cell - ax
+                x = origin[0] + (i + 0.5) * cell - ax
                 for j in range(j0, j1):
                     if stamp[i, j] == k:
                         continue
-                    y = low[1] + (j + 0.5) * cell - ay
+                    y = origin[1] + (j + 0.5) * cell - ay
                     t = 0.0 if squared == 0.0 else min(max((x * dx + y * dy) / squared, 0.0), 1.0)
                     if (x - t * dx) ** 2 + (y - t * dy) ** 2 <= radius * radius:
                         heat[i, j] += score[k]
@@ -42,19 +44,19 @@ def draw_lines(
 
 @njit(cache=True)
 def draw_rings(
-    heat: F64x2, points: F64x2, first: I64x1, score: F64x1, low: F64x1, cell: float
+    heat: F64x2, points: F64x2, offsets: I64x1, score: F64x1, origin: F64x1, cell: float
 ) -> None:  # pragma: no cover - compiled
     """Add each open ring's score to every cell of heat (H, W) whose middle lies inside it."""
-    for k in range(len(first) - 1):
-        a, b = first[k], first[k + 1]
+    for k in range(len(offsets) - 1):
+        a, b = offsets[k], offsets[k + 1]
         if b - a < 3:
             continue
         x0, x1 = points[a:b, 0].min(), points[a:b, 0].max()
         y0, y1 = points[a:b, 1].min(), points[a:b, 1].max()
-        for i in range(max(int((x0 - low[0]) / cell), 0), min(int((x1 - low[0]) / cell) + 1, heat.shape[0])):
-            x = low[0] + (i + 0.5) * cell
-            for j in range(max(int((y0 - low[1]) / cell), 0), min(int((y1 - low[1]) / cell) + 1, heat.shape[1])):
-                y = low[1] + (j + 0.5) * cell
+        for i in range(max(int((x0 - origin[0]) / cell), 0), min(int((x1 - origin[0]) / cell) + 1, heat.shape[0])):
+            x = origin[0] + (i + 0.5) * cell
+            for j in range(max(int((y0 - origin[1]) / cell), 0), min(int((y1 - origin[1]) / cell) + 1, heat.shape[1])):
+                y = origin[1] + (j + 0.5) * cell
                 inside = False
                 before = b - 1
                 for p in range(a, b):
@@ -67,7 +69,7 @@ def draw_rings(
 
 
 @njit(cache=True)
-def _around(mask: Boolx2, i: int, j: int) -> Boolx1:  # pragma: no cover - compiled
+def _get_neighbours(mask: Boolx2, i: int, j: int) -> Boolx1:  # pragma: no cover - compiled
     """The eight neighbours of a cell from above on, clockwise; beyond the border is nothing."""
     out = np.zeros(8, np.bool_)
     for k in range(8):
@@ -78,7 +80,7 @@ def _around(mask: Boolx2, i: int, j: int) -> Boolx1:  # pragma: no cover - compi
 
 
 @njit(cache=True)
-def thinned(mask: Boolx2) -> Boolx2:  # pragma: no cover - compiled
+def skeletonize(mask: Boolx2) -> Boolx2:  # pragma: no cover - compiled
     """The skeleton of a mask (H, W) by Zhang and Suen (Communications of the ACM 27(3), 1984)."""
     out = mask.copy()
     cells = np.argwhere(mask)
@@ -88,7 +90,7 @@ def thinned(mask: Boolx2) -> Boolx2:  # pragma: no cover - compiled
         for half in range(2):
             gone = np.zeros(len(cells), np.bool_)
             for k in range(len(cells)):
-                n = _around(out, cells[k, 0], cells[k, 1])
+                n = _get_neighbours(out, cells[k, 0], cells[k, 1])
                 count, rises = 0, 0
                 for a in range(8):
                     count += n[a]
@@ -110,13 +112,13 @@ def thinned(mask: Boolx2) -> Boolx2:  # pragma: no cover - compiled
 
 @njit(cache=True)
 def _flood(
-    mask: Boolx2, label: I64x2, number: int, start: int, queue: I64x1, came: I64x2
+    mask: Boolx2, label: I64x2, number: int, start: int, queue: I64x1, predecessor: I64x2
 ) -> int:  # pragma: no cover - compiled
     """Walk from start (flat place) over cells of the mask, label them, note where each came from; how many were reached."""
     height, width = mask.shape
     queue[0] = start
     label[start // width, start % width] = number
-    came[start // width, start % width] = -1
+    predecessor[start // width, start % width] = -1
     done, held = 0, 1
     while done < held:
         i, j = queue[done] // width, queue[done] % width
@@ -126,7 +128,7 @@ def _flood(
             v = j + (0, 1, 0, -1, 1, 1, -1, -1)[k]
             if 0 <= u < height and 0 <= v < width and mask[u, v] and label[u, v] != number:
                 label[u, v] = number
-                came[u, v] = queue[done]
+                predecessor[u, v] = queue[done]
                 queue[held] = u * width + v
                 held += 1
         done += 1
@@ -134,58 +136,58 @@ def _flood(
 
 
 @njit(cache=True)
-def components(mask: Boolx2) -> I64x2:  # pragma: no cover - compiled
+def label_components(mask: Boolx2) -> I64x2:  # pragma: no cover - compiled
     """(H, W) the number of each cell's component from 0 on, in the order of rows; -1 outside."""
     label = np.full(mask.shape, -1, np.int64)
-    came = np.empty(mask.shape, np.int64)
+    predecessor = np.empty(mask.shape, np.int64)
     cells = np.argwhere(mask)
     queue = np.empty(len(cells) + 1, np.int64)
     number = 0
     for k in range(len(cells)):
         if label[cells[k, 0], cells[k, 1]] < 0:
-            _flood(mask, label, number, cells[k, 0] * mask.shape[1] + cells[k, 1], queue, came)
+            _flood(mask, label, number, cells[k, 0] * mask.shape[1] + cells[k, 1], queue, predecessor)
             number += 1
     return label
 
 
 @njit(cache=True)
-def longest_walks(
-    skeleton: Boolx2, least: int, clear: int, every: bool
+def find_longest_walks(
+    skeleton: Boolx2, min_cells: int, clear_cells: int, find_all: bool
 ) -> tuple[I64x2, I64x1]:  # pragma: no cover - compiled
-    """Cells (K, 2) and offsets of the longest walks of at least so many cells; every: what a component has besides its longest.
+    """Cells (K, 2) and offsets of the longest walks of at least so many cells; find_all: what a component has besides its longest.
 
     A walk found clears the cells within clear steps of it, so that spurs along it are no walks.
     """
     mask = skeleton.copy()
     height, width = skeleton.shape
     label = np.full(skeleton.shape, -1, np.int64)
-    came = np.empty(skeleton.shape, np.int64)
+    predecessor = np.empty(skeleton.shape, np.int64)
     todo = np.argwhere(mask)
     queue = np.empty(len(todo) + 1, np.int64)
-    cells, first = np.empty((len(todo), 2), np.int64), np.zeros(len(todo) + 1, np.int64)
+    cells, offsets = np.empty((len(todo), 2), np.int64), np.zeros(len(todo) + 1, np.int64)
     number, held, walks = 0, 0, 0
     for k in range(len(todo)):
         while mask[todo[k, 0], todo[k, 1]]:
-            reached = _flood(mask, label, number, todo[k, 0] * width + todo[k, 1], queue, came)
-            reached = _flood(mask, label, number + 1, queue[reached - 1], queue, came)
+            reached = _flood(mask, label, number, todo[k, 0] * width + todo[k, 1], queue, predecessor)
+            reached = _flood(mask, label, number + 1, queue[reached - 1], queue, predecessor)
             number += 2
             place, start = queue[reached - 1], held
             while place >= 0:
                 cells[held, 0], cells[held, 1] = place // width, place % width
-                place = came[place // width, place % width]
+                place = predecessor[place // width, place % width]
                 held += 1
             found = held - start
-            if not every or found < least:
+            if not find_all or found < min_cells:
                 # Nothing longer is left in this component.
                 for q in range(reached):
                     mask[queue[q] // width, queue[q] % width] = False
             for c in range(start, held):
-                for u in range(max(cells[c, 0] - clear, 0), min(cells[c, 0] + clear + 1, height)):
-                    for v in range(max(cells[c, 1] - clear, 0), min(cells[c, 1] + clear + 1, width)):
+                for u in range(max(cells[c, 0] - clear_cells, 0), min(cells[c, 0] + clear_cells + 1, height)):
+                    for v in range(max(cells[c, 1] - clear_cells, 0), min(cells[c, 1] + clear_cells + 1, width)):
                         mask[u, v] = False
-            if found < least:
+            if found < min_cells:
                 held = start
             else:
                 walks += 1
-                first[walks] = held
-    return cells[:held], first[: walks + 1]
+                offsets[walks] = held
+    return cells[:held], offsets[: walks + 1]

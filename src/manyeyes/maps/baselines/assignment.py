@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import F64x2, I64x1, njit
-from manyeyes.datatypes.map_element import frozen
+from manyeyes.datatypes.map_element import freeze
 
 
 def assign(cost: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -16,11 +16,11 @@ def assign(cost: NDArray[np.float64]) -> NDArray[np.int64]:
     if rows == 0 or columns == 0:
         return np.full(rows, -1, np.int64)
     if rows > columns:
-        taken = assign(cost.T)
+        columns_of_rows = assign(cost.T)
         out = np.full(rows, -1, np.int64)
-        out[taken] = np.arange(columns)
+        out[columns_of_rows] = np.arange(columns)
         return out
-    return _assign(frozen(cost, np.float64))
+    return _assign(freeze(cost, np.float64))
 
 
 @njit(cache=True)

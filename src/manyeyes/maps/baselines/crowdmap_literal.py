@@ -18,80 +18,85 @@ import numpy as np
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING
-from manyeyes.maps.baselines._common import Floats, Ints, Merged, Rules, as_map, pool
-from manyeyes.maps.baselines.chamfer_nms import overlaps
+from manyeyes.maps.baselines._common import BaselineRules, Floats, Ints, MergedElement, filter_elements, to_vector_map
+from manyeyes.maps.baselines.chamfer_nms import find_overlaps
 from manyeyes.maps.baselines.cpd import CpdConfig, register
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.ops.polyline import feet, resample
-from manyeyes.ops.polyline_distance import chamfer
+from manyeyes.ops.polyline import project_onto_line, resample
+from manyeyes.ops.polyline_distance import chamfer_distance
 
 
 @dataclass(frozen=True)
-class Config:
-    """gate_m: Chamfer distance of an overlap before, accept_m: after registration. samples: points a line for both.
+class CrowdMapLiteralConfig:
+    """max_overlap_chamfer_m: Chamfer distance of an overlap before, accept_m: after registration. num_samples: points a line for
+    both.
 
     cpd: settings of the registration. merge: what becomes of registered elements. rules: pre-filter, score and state.
     """
 
-    gate_m: float = 1.5
-    accept_m: float = 1.5
-    samples: int = 50
+    max_overlap_chamfer_m: float = 1.5
+    max_registered_chamfer_m: float = 1.5
+    num_samples: int = 50
     cpd: CpdConfig = field(default_factory=CpdConfig)
     merge: Literal["keep", "mean"] = "keep"
-    rules: Rules = field(default_factory=Rules)
+    rules: BaselineRules = field(default_factory=BaselineRules)
 
     def __post_init__(self) -> None:
         if self.merge not in ("keep", "mean"):
             raise ConfigError(f"crowdmap_literal.merge: expected keep or mean; got {self.merge!r}. Choose one of them.")
 
 
-def fuse(observations: Sequence[Observation], config: Config = Config(), frame: Frame | None = None) -> VectorMap:
+def fuse(
+    observations: Sequence[Observation],
+    config: CrowdMapLiteralConfig = CrowdMapLiteralConfig(),
+    frame: MapFrame | None = None,
+) -> VectorMap:
     """The literal pipeline's map."""
-    seen = pool(observations, config.rules)
-    elements = seen.elements
-    line = resample(*seen.lines(), config.samples)[0].reshape(-1, config.samples, 2)
-    pairs = overlaps(seen, config.gate_m, config.samples)
-    pairs = pairs[seen.observation[pairs[:, 0]] != seen.observation[pairs[:, 1]]]
+    element_pool = filter_elements(observations, config.rules)
+    elements = element_pool.elements
+    line = resample(*element_pool.closed_lines(), config.num_samples)[0].reshape(-1, config.num_samples, 2)
+    pairs = find_overlaps(element_pool, config.max_overlap_chamfer_m, config.num_samples)
+    pairs = pairs[element_pool.observation_of_element[pairs[:, 0]] != element_pool.observation_of_element[pairs[:, 1]]]
     both = np.concatenate((pairs, pairs[:, ::-1]))
     both = both[np.lexsort((both[:, 1], both[:, 0]))]
     start = np.searchsorted(both[:, 0], np.arange(len(elements) + 1))
     free = np.ones(len(elements), bool)
     merged = []
-    for row in seen.order(np.arange(len(elements))).tolist():
+    for row in element_pool.sort_by_plausibility(np.arange(len(elements))).tolist():
         if not free[row]:
             continue
         free[row] = False
         partners = both[start[row] : start[row + 1], 1]
-        partners = seen.order(partners[free[partners]])
+        partners = element_pool.sort_by_plausibility(partners[free[partners]])
         moved = np.array([register(line[row], line[k], config.cpd).apply(line[k]) for k in partners])
-        fits = _fits(line[row], moved.reshape(-1, config.samples, 2), config.accept_m)
+        fits = _fits(line[row], moved.reshape(-1, config.num_samples, 2), config.max_registered_chamfer_m)
         free[partners[fits]] = False
         shape = elements.polyline(row)
         if config.merge == "mean" and fits.any():
-            shape = mean_line(line[row], moved[fits])
+            shape = average_lines(line[row], moved[fits])
             shape = shape[:-1] if elements.kind[row] == CROSSING else shape
-        merged.append(Merged(shape, int(elements.kind[row]), np.array([row, *partners[fits]])))
-    return as_map(seen, merged, config.rules, frame)
+        merged.append(MergedElement(shape, int(elements.kind[row]), np.array([row, *partners[fits]])))
+    return to_vector_map(element_pool, merged, config.rules, frame)
 
 
-def _fits(anchor: Floats, moved: Floats, accept_m: float) -> np.ndarray:
+def _fits(anchor: Floats, moved: Floats, max_chamfer_m: float) -> np.ndarray:
     """(K,) which of the registered lines (K, S, 2) lie on the anchor (S, 2)."""
     count, samples = moved.shape[:2]
     rows: Ints = np.arange(count)
     pairs = np.stack((rows, np.zeros(count, np.int64)), 1)
     ends = np.arange(count + 1) * samples
-    return chamfer(moved.reshape(-1, 2), ends, anchor, np.array([0, samples]), pairs) <= accept_m
+    return chamfer_distance(moved.reshape(-1, 2), ends, anchor, np.array([0, samples]), pairs) <= max_chamfer_m
 
 
-def mean_line(anchor: Floats, others: Floats) -> Floats:
+def average_lines(anchor: Floats, others: Floats) -> Floats:
     """(S, 2) the anchor's points, each the mean of itself and of its feet on those of the other lines (K, S, 2) that reach it."""
     total, count = anchor.copy(), np.ones(len(anchor))
     for other in others:
-        near = feet(anchor, other)
+        near = project_onto_line(anchor, other)
         passed = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(other, axis=0).T))))
-        foot = np.stack([np.interp(near.along, passed, other[:, axis]) for axis in range(2)], 1)
-        whole = near.inside | (other[0] == other[-1]).all()
+        foot = np.stack([np.interp(near.station_m, passed, other[:, axis]) for axis in range(2)], 1)
+        whole = near.is_interior | (other[0] == other[-1]).all()
         total[whole] += foot[whole]
         count[whole] += 1
     return total / count[:, None]

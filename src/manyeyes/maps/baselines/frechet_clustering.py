@@ -17,96 +17,111 @@ import numpy as np
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING
-from manyeyes.maps.baselines._common import Floats, Ints, Merged, Pool, Rules, as_map, pool
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.baselines._common import (
+    BaselineRules,
+    ElementPool,
+    Floats,
+    Ints,
+    MergedElement,
+    filter_elements,
+    to_vector_map,
+)
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.roads.lane_links import components
-from manyeyes.ops.polyline import near_pairs, resample
-from manyeyes.ops.polyline_distance import frechet
+from manyeyes.maps.roads.lane_links import connected_components
+from manyeyes.ops.polyline import find_near_pairs, resample
+from manyeyes.ops.polyline_distance import frechet_distance
 
 
 @dataclass(frozen=True)
-class Config:
-    """gate_m: greatest distance that joins. samples: points a line. linkage: how clusters measure. take: what a cluster becomes.
+class FrechetClusteringConfig:
+    """max_frechet_m: greatest distance that joins. num_samples: points a line. linkage: how clusters measure. representative: what
+    a cluster becomes.
 
     rules: pre-filter, score and state.
     """
 
-    gate_m: float = 1.75
-    samples: int = 20
+    max_frechet_m: float = 1.75
+    num_samples: int = 20
     linkage: Literal["single", "average", "complete"] = "average"
-    take: Literal["mean", "medoid"] = "mean"
-    rules: Rules = field(default_factory=Rules)
+    representative: Literal["mean", "medoid"] = "mean"
+    rules: BaselineRules = field(default_factory=BaselineRules)
 
     def __post_init__(self) -> None:
-        if self.linkage not in ("single", "average", "complete") or self.take not in ("mean", "medoid"):
+        if self.linkage not in ("single", "average", "complete") or self.representative not in ("mean", "medoid"):
             raise ConfigError(
                 "frechet_clustering.Config: expected linkage single, average or complete and take mean or medoid; "
-                f"got {self.linkage!r} and {self.take!r}. Choose of those."
+                f"got {self.linkage!r} and {self.representative!r}. Choose of those."
             )
 
 
-def fuse(observations: Sequence[Observation], config: Config = Config(), frame: Frame | None = None) -> VectorMap:
+def fuse(
+    observations: Sequence[Observation],
+    config: FrechetClusteringConfig = FrechetClusteringConfig(),
+    frame: MapFrame | None = None,
+) -> VectorMap:
     """The map of clusters."""
-    seen = pool(observations, config.rules)
-    line = _samples(seen, config.samples)
+    element_pool = filter_elements(observations, config.rules)
+    line = _sample_elements(element_pool, config.num_samples)
     # A Frechet distance is never below the gap between two boxes along an axis; means may hold distances beyond the gate.
-    pairs = near_pairs(seen.elements.bounds(), 2 * config.gate_m)
-    pairs = pairs[seen.elements.kind[pairs[:, 0]] == seen.elements.kind[pairs[:, 1]]]
-    gap = distances(line, pairs, seen.elements.kind == CROSSING)
-    close = gap <= config.gate_m
-    label = components(len(line), pairs[close])
+    pairs = find_near_pairs(element_pool.elements.bounds(), 2 * config.max_frechet_m)
+    pairs = pairs[element_pool.elements.kind[pairs[:, 0]] == element_pool.elements.kind[pairs[:, 1]]]
+    gap = compute_frechet_distances(line, pairs, element_pool.elements.kind == CROSSING)
+    close = gap <= config.max_frechet_m
+    label = connected_components(len(line), pairs[close])
     if config.linkage != "single":
-        label = _linked(label, pairs, gap, config)
+        label = _link_clusters(label, pairs, gap, config)
     merged = []
-    for rows, inner in _members(label, pairs):
-        kind = int(seen.elements.kind[rows[0]])
-        best = _medoid(rows, pairs[inner], gap[inner])
-        if config.take == "medoid" or len(rows) == 1:
-            shape = seen.elements.polyline(best)
+    for rows, inner in _iterate_clusters(label, pairs):
+        kind = int(element_pool.elements.kind[rows[0]])
+        best = _find_medoid(rows, pairs[inner], gap[inner])
+        if config.representative == "medoid" or len(rows) == 1:
+            shape = element_pool.elements.polyline(best)
         else:
-            shape = np.mean([_brought(line[k], line[best], kind == CROSSING) for k in rows], axis=0)
-        merged.append(Merged(shape, kind, rows))
-    return as_map(seen, merged, config.rules, frame)
+            shape = np.mean([_align_direction(line[k], line[best], kind == CROSSING) for k in rows], axis=0)
+        merged.append(MergedElement(shape, kind, rows))
+    return to_vector_map(element_pool, merged, config.rules, frame)
 
 
-def distances(line: Floats, pairs: Ints, ring: np.ndarray) -> Floats:
+def compute_frechet_distances(line: Floats, pairs: Ints, ring: np.ndarray) -> Floats:
     """(K,) Frechet distances of pairs of sampled lines (N, S, 2); rings (N,) are turned to start beside each other."""
     count, samples = len(line), line.shape[1]
-    first = np.arange(count + 1) * samples
-    out = frechet(line.reshape(-1, 2), first, line.reshape(-1, 2), first, pairs)
+    offsets = np.arange(count + 1) * samples
+    out = frechet_distance(line.reshape(-1, 2), offsets, line.reshape(-1, 2), offsets, pairs)
     for k in np.flatnonzero(ring[pairs[:, 0]]).tolist():
         one, two = line[pairs[k]]
         ends = np.array([0, samples])
         # A closed walk ends where it began.
-        out[k] = frechet(one, ends, _brought(two, one, True), ends, np.zeros((1, 2), np.int64), either_way=False)[0]
+        out[k] = frechet_distance(
+            one, ends, _align_direction(two, one, True), ends, np.zeros((1, 2), np.int64), either_way=False
+        )[0]
     return out
 
 
-def _samples(of: Pool, samples: int) -> Floats:
+def _sample_elements(pool: ElementPool, num_samples: int) -> Floats:
     """(N, S, 2) equally spaced samples; a ring's stand for its corners from its first on, without the repeated one."""
-    closed = of.elements.closed
-    counts = np.where(closed, samples + 1, samples)
-    points, first = resample(*of.lines(), counts)
+    closed = pool.elements.closed
+    counts = np.where(closed, num_samples + 1, num_samples)
+    points, offsets = resample(*pool.closed_lines(), counts)
     keep = np.ones(len(points), bool)
-    keep[first[1:][closed] - 1] = False
-    return points[keep].reshape(-1, samples, 2)
+    keep[offsets[1:][closed] - 1] = False
+    return points[keep].reshape(-1, num_samples, 2)
 
 
-def _brought(line: Floats, onto: Floats, ring: bool) -> Floats:
+def _align_direction(line: Floats, onto: Floats, ring: bool) -> Floats:
     """The samples (S, 2) in the direction of another's, a ring's from the sample nearest to the other's first on."""
     if not ring:
-        straight, turned = (np.square(way - onto).sum() for way in (line, line[::-1]))
+        straight, turned = (np.square(candidate - onto).sum() for candidate in (line, line[::-1]))
         return line if straight <= turned else line[::-1]
     best = line
-    for way in (line, line[::-1]):
-        rolled = np.roll(way, -int(np.square(way - onto[0]).sum(1).argmin()), axis=0)
+    for candidate in (line, line[::-1]):
+        rolled = np.roll(candidate, -int(np.square(candidate - onto[0]).sum(1).argmin()), axis=0)
         if np.square(rolled - onto).sum() < np.square(best - onto).sum():
             best = rolled
     return best
 
 
-def _members(label: Ints, pairs: Ints) -> Iterator[tuple[Ints, Ints]]:
+def _iterate_clusters(label: Ints, pairs: Ints) -> Iterator[tuple[Ints, Ints]]:
     """For each label: its rows, ascending, and which of the pairs lie within it."""
     order = np.argsort(label, kind="stable")
     within = np.flatnonzero(label[pairs[:, 0]] == label[pairs[:, 1]])
@@ -117,22 +132,22 @@ def _members(label: Ints, pairs: Ints) -> Iterator[tuple[Ints, Ints]]:
         yield rows, within[first[k] : last[k]]
 
 
-def _linked(label: Ints, pairs: Ints, gap: Floats, config: Config) -> Ints:
+def _link_clusters(label: Ints, pairs: Ints, gap: Floats, config: FrechetClusteringConfig) -> Ints:
     """(N,) labels after average or complete linkage within each component; what was not measured counts as twice the gate."""
-    gate_m = config.gate_m
+    max_frechet_m = config.max_frechet_m
     out = label.copy()
-    for rows, inner in _members(label, pairs):
+    for rows, inner in _iterate_clusters(label, pairs):
         if len(rows) < 3:
             continue
-        apart = np.full((len(rows), len(rows)), 2 * gate_m)
+        apart = np.full((len(rows), len(rows)), 2 * max_frechet_m)
         a, b = np.searchsorted(rows, pairs[inner]).T
-        apart[a, b] = apart[b, a] = np.minimum(gap[inner], 2 * gate_m)
+        apart[a, b] = apart[b, a] = np.minimum(gap[inner], 2 * max_frechet_m)
         np.fill_diagonal(apart, np.inf)
         size = np.ones(len(rows))
         own = np.arange(len(rows))
         while True:
             i, j = np.divmod(int(apart.argmin()), len(rows))
-            if not apart[i, j] <= gate_m:
+            if not apart[i, j] <= max_frechet_m:
                 break
             i, j = min(i, j), max(i, j)
             if config.linkage == "complete":
@@ -147,10 +162,10 @@ def _linked(label: Ints, pairs: Ints, gap: Floats, config: Config) -> Ints:
     return out
 
 
-def _medoid(rows: Ints, pairs: Ints, gap: Floats) -> int:
+def _find_medoid(rows: Ints, pairs: Ints, gap: Floats) -> int:
     """The row with the least sum of distances to its cluster; a pair that was not measured costs more than any that was."""
-    most = float(gap.max()) + 1.0 if len(gap) else 0.0
-    total = np.full(len(rows), most * (len(rows) - 1))
+    unmeasured = float(gap.max()) + 1.0 if len(gap) else 0.0
+    total = np.full(len(rows), unmeasured * (len(rows) - 1))
     for side in range(2):
-        np.add.at(total, np.searchsorted(rows, pairs[:, side]), gap - most)
+        np.add.at(total, np.searchsorted(rows, pairs[:, side]), gap - unmeasured)
     return int(rows[total.argmin()])

@@ -20,127 +20,147 @@ import numpy as np
 
 from manyeyes.datatypes import MissingExtraError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements, Polygons
-from manyeyes.maps.baselines._common import Floats, Ints, Merged, Pool, Rules, as_map, pool
+from manyeyes.maps.baselines._common import (
+    BaselineRules,
+    ElementPool,
+    Floats,
+    Ints,
+    MergedElement,
+    filter_elements,
+    to_vector_map,
+)
 from manyeyes.maps.baselines.assignment import assign
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.ops.polyline import close_rings, feet, part, resample, simplify
-from manyeyes.ops.polyline_distance import directed
+from manyeyes.ops.polyline import close_rings, cut_line, project_onto_line, resample, simplify
+from manyeyes.ops.polyline_distance import directed_distance
 
 _FAR_M = 1e4
 
 
 @dataclass(frozen=True)
-class Config:
+class GlobalMapBuilderConfig:
     """By kind (divider, boundary, crossing, stop line): match_m, distance of a match, and buffer_m, of the suppression.
 
-    samples: of a line for the distances. simplify_m: before and after a replacement. overlap: greatest share of the union of two
-    buffers. every: observations used, one of so many. rules: pre-filter, score and state.
+    num_samples: of a line for the distances. simplify_m: before and after a replacement. max_buffer_iou: greatest share of the
+    union of two buffers. observation_stride: observations used, one of so many. rules: pre-filter, score and state.
     """
 
-    match_m: tuple[float, float, float, float] = (1.0, 2.0, 0.5, 1.0)
+    max_match_m: tuple[float, float, float, float] = (1.0, 2.0, 0.5, 1.0)
     buffer_m: tuple[float, float, float, float] = (1.0, 2.0, 0.5, 1.0)
-    samples: int = 100
+    num_samples: int = 100
     simplify_m: float = 1.0
-    overlap: float = 0.1
-    every: int = 1
-    rules: Rules = field(default_factory=Rules)
+    max_buffer_iou: float = 0.1
+    observation_stride: int = 1
+    rules: BaselineRules = field(default_factory=BaselineRules)
 
 
 @dataclass(frozen=True, eq=False)
-class _Built:
+class _BuiltElement:
     """An element of the growing map: its points, kind, score, length behind the score, and rows of the pool."""
 
     points: Floats
     kind: int
     score: float
-    weight: float
-    rows: tuple[int, ...]
+    total_length: float
+    source_rows: tuple[int, ...]
 
 
-def fuse(observations: Sequence[Observation], config: Config = Config(), frame: Frame | None = None) -> VectorMap:
+def fuse(
+    observations: Sequence[Observation],
+    config: GlobalMapBuilderConfig = GlobalMapBuilderConfig(),
+    frame: MapFrame | None = None,
+) -> VectorMap:
     """The map after the last observation."""
-    seen = pool(observations, config.rules)
-    start = np.searchsorted(seen.observation, np.arange(len(seen.observations) + 1))
-    built: list[_Built] = []
-    for k in range(0, len(seen.observations), config.every):
-        built = _grown(built, seen, np.arange(start[k], start[k + 1]), _view(seen.observations[k]), config)
-    kept = _suppressed(built, config)
-    return as_map(seen, [Merged(b.points, b.kind, np.array(b.rows)) for b in kept], config.rules, frame)
+    element_pool = filter_elements(observations, config.rules)
+    start = np.searchsorted(element_pool.observation_of_element, np.arange(len(element_pool.observations) + 1))
+    built: list[_BuiltElement] = []
+    for k in range(0, len(element_pool.observations), config.observation_stride):
+        built = _add_observation(
+            built, element_pool, np.arange(start[k], start[k + 1]), _view_polygon(element_pool.observations[k]), config
+        )
+    kept = _suppress_overlapping(built, config)
+    return to_vector_map(
+        element_pool, [MergedElement(b.points, b.kind, np.array(b.source_rows)) for b in kept], config.rules, frame
+    )
 
 
-def _grown(built: list[_Built], of: Pool, rows: Ints, view: Any, config: Config) -> list[_Built]:
+def _add_observation(
+    built: list[_BuiltElement], pool: ElementPool, rows: Ints, view: Any, config: GlobalMapBuilderConfig
+) -> list[_BuiltElement]:
     """The map after one observation, whose elements are rows of the pool."""
     shapely = _shapely()
-    lengths = of.elements.lengths()
+    lengths = pool.elements.lengths()
     out = list(built)
     for kind in range(len(KINDS)):
-        local = rows[of.elements.kind[rows] == kind]
+        local = rows[pool.elements.kind[rows] == kind]
         if not len(local):
             continue
-        known = [
+        known_rows = [
             k for k, b in enumerate(built) if b.kind == kind and shapely.intersects(view, shapely.LineString(b.points))
         ]
-        shapes = [of.elements.polyline(r) for r in local]
-        cost = _costs(shapes, [built[k].points for k in known], kind, config)
-        taken = assign(cost)
-        for shape, row, column in zip(shapes, local.tolist(), taken.tolist()):
-            score, weight = float(of.elements.score[row]), float(lengths[row])
-            if column < 0 or cost[local.tolist().index(row), column] > config.match_m[kind]:
-                out.append(_Built(shape, kind, score, weight, (row,)))
+        shapes = [pool.elements.polyline(r) for r in local]
+        cost = _match_costs(shapes, [built[k].points for k in known_rows], kind, config)
+        matched_column = assign(cost)
+        for shape, row, column in zip(shapes, local.tolist(), matched_column.tolist()):
+            score, weight = float(pool.elements.score[row]), float(lengths[row])
+            if column < 0 or cost[local.tolist().index(row), column] > config.max_match_m[kind]:
+                out.append(_BuiltElement(shape, kind, score, weight, (row,)))
                 continue
-            old = built[known[column]]
-            points = shape if kind == CROSSING else replaced(old.points, shape, config.simplify_m)
+            old = built[known_rows[column]]
+            points = shape if kind == CROSSING else replace_covered(old.points, shape, config.simplify_m)
             mean = (old.score * old.weight + score * weight) / (old.weight + weight)
-            out[known[column]] = _Built(points, kind, mean, old.weight + weight, (*old.rows, row))
+            out[known_rows[column]] = _BuiltElement(points, kind, mean, old.weight + weight, (*old.rows, row))
     return out
 
 
-def _costs(local: Sequence[Floats], known: Sequence[Floats], kind: int, config: Config) -> Floats:
+def _match_costs(
+    local: Sequence[Floats], known_lines: Sequence[Floats], kind: int, config: GlobalMapBuilderConfig
+) -> Floats:
     """(N, M) the lesser directed mean distance between each local and each known element."""
-    if not known:
+    if not known_lines:
         return np.zeros((len(local), 0))
-    elements = MapElements.of([*local, *known], kind)
-    points, first = close_rings(elements.points, elements.first, elements.closed)
-    dense, dense_first = resample(points, first, config.samples)
-    a, b = np.divmod(np.arange(len(local) * len(known)), len(known))
+    elements = MapElements.of([*local, *known_lines], kind)
+    points, offsets = close_rings(elements.points, elements.offsets, elements.closed)
+    dense, dense_first = resample(points, offsets, config.num_samples)
+    a, b = np.divmod(np.arange(len(local) * len(known_lines)), len(known_lines))
     pairs = np.stack((a, b + len(local)), 1)
-    there = directed(dense, dense_first, points, first, pairs)[0]
-    back = directed(dense, dense_first, points, first, pairs[:, ::-1])[0]
-    return np.minimum(np.minimum(there, back), _FAR_M).reshape(len(local), len(known))
+    there = directed_distance(dense, dense_first, points, offsets, pairs)[0]
+    back = directed_distance(dense, dense_first, points, offsets, pairs[:, ::-1])[0]
+    return np.minimum(np.minimum(there, back), _FAR_M).reshape(len(local), len(known_lines))
 
 
-def replaced(old: Floats, new: Floats, simplify_m: float) -> Floats:
+def replace_covered(old: Floats, new: Floats, simplify_m: float) -> Floats:
     """(K, 2) the old line with the stretch that the new one covers replaced by it, in the old one's direction."""
     old, new = simplify(old, simplify_m), simplify(new, simplify_m)
-    along = feet(new[[0, -1]], old).along
+    along = project_onto_line(new[[0, -1]], old).station_m
     if along[0] > along[1] or (along[0] == along[1] and np.dot(new[-1] - new[0], old[-1] - old[0]) < 0):
         new, along = new[::-1], along[::-1]
     length = float(np.hypot(*np.diff(old, axis=0).T).sum())
     pieces = [new]
     if along[0] > 0.0:
-        pieces.insert(0, part(old, 0.0, float(along[0]))[:-1])
+        pieces.insert(0, cut_line(old, 0.0, float(along[0]))[:-1])
     if along[1] < length:
-        pieces.append(part(old, float(along[1]), length)[1:])
+        pieces.append(cut_line(old, float(along[1]), length)[1:])
     return simplify(np.concatenate(pieces), simplify_m)
 
 
-def _suppressed(built: Sequence[_Built], config: Config) -> list[_Built]:
+def _suppress_overlapping(built: Sequence[_BuiltElement], config: GlobalMapBuilderConfig) -> list[_BuiltElement]:
     """What stays of the map: by descending score, ties by length, without those that lie on a kept one."""
     shapely = _shapely()
-    kept: list[_Built] = []
+    kept: list[_BuiltElement] = []
     buffers: list[Any] = []
-    for b in sorted(built, key=lambda b: (-b.score, -b.weight, b.points.tolist())):
+    for b in sorted(built, key=lambda b: (-b.score, -b.total_length, b.points.tolist())):
         shape = shapely.Polygon(b.points) if b.kind == CROSSING and len(b.points) > 2 else shapely.LineString(b.points)
         buffer = shape.buffer(config.buffer_m[b.kind])
         same = [other for other, k in zip(buffers, kept) if k.kind == b.kind and other.intersects(buffer)]
-        if all(o.intersection(buffer).area <= config.overlap * o.union(buffer).area for o in same):
+        if all(o.intersection(buffer).area <= config.max_buffer_iou * o.union(buffer).area for o in same):
             kept.append(b)
             buffers.append(buffer)
     return kept
 
 
-def _view(observation: Observation) -> Any:
+def _view_polygon(observation: Observation) -> Any:
     """What an observation could see, as a polygon in the map's frame."""
     view = Polygons.of([observation.view])
     ring = MapElements.of([view.ring(0)], CROSSING).transform(*observation.pose.tolist())

@@ -18,32 +18,40 @@ import numpy as np
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
-from manyeyes.maps.baselines._common import Floats, Ints, Merged, Pool, Rules, as_map, pool
-from manyeyes.maps.baselines._raster import components, draw_lines, draw_rings, longest_walks, thinned
-from manyeyes.maps.baselines.polymerge import blurred, rectangle
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.baselines._common import (
+    BaselineRules,
+    ElementPool,
+    Floats,
+    Ints,
+    MergedElement,
+    filter_elements,
+    to_vector_map,
+)
+from manyeyes.maps.baselines._raster import draw_lines, draw_rings, find_longest_walks, label_components, skeletonize
+from manyeyes.maps.baselines.polymerge import blur_image, fit_rectangle
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.ops.polyline import feet, near_pairs_between, resample_spaced, simplify
+from manyeyes.ops.polyline import find_near_pairs_between, project_onto_line, resample_spaced, simplify
 
-_MOST_CELLS = 64_000_000
+_MAX_CELLS = 64_000_000
 
 
 @dataclass(frozen=True)
-class Config:
-    """cell_m: of the raster. buffer_m: half a line's drawn width. smooth_m: of the Gaussian. share: of the views of a cell, and
-    least_heat, summed scores, that the heat must reach. shortest_m: of a walk. simplify_m: of lines. walks: of a component.
-    rules: pre-filter, score and state.
+class HeatmapBufferConfig:
+    """cell_m: of the raster. buffer_m: half a line's drawn width. smoothing_sigma_m: of the Gaussian. min_view_fraction: of the
+    views of a cell, and least_heat, summed scores, that the heat must reach. min_walk_length_m: of a walk. simplify_m: of lines.
+    walks: of a component. rules: pre-filter, score and state.
     """
 
     cell_m: float = 0.2
     buffer_m: float = 0.75
-    smooth_m: float = 0.4
-    share: float = 0.2
-    least_heat: float = 0.5
-    shortest_m: float = 8.0
+    smoothing_sigma_m: float = 0.4
+    min_view_fraction: float = 0.2
+    min_heat: float = 0.5
+    min_walk_length_m: float = 8.0
     simplify_m: float = 0.25
     walks: Literal["longest", "all"] = "all"
-    rules: Rules = field(default_factory=Rules)
+    rules: BaselineRules = field(default_factory=BaselineRules)
 
     def __post_init__(self) -> None:
         if self.walks not in ("longest", "all"):
@@ -51,86 +59,94 @@ class Config:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sheet:
+class _RasterGrid:
     """Where the raster lies: its corner (2,), its shape, its cell in metres."""
 
-    low: Floats
+    origin: Floats
     shape: tuple[int, int]
     cell_m: float
 
-    def middles(self, cells: Ints) -> Floats:
+    def cell_centers(self, cells: Ints) -> Floats:
         """(K, 2) metres of cells (K, 2)."""
-        return self.low + (cells + 0.5) * self.cell_m
+        return self.origin + (cells + 0.5) * self.cell_m
 
 
-def fuse(observations: Sequence[Observation], config: Config = Config(), frame: Frame | None = None) -> VectorMap:
+def fuse(
+    observations: Sequence[Observation],
+    config: HeatmapBufferConfig = HeatmapBufferConfig(),
+    frame: MapFrame | None = None,
+) -> VectorMap:
     """The map of the picture."""
-    seen = pool(observations, config.rules)
-    if not len(seen.elements):
-        return as_map(seen, [], config.rules, frame)
-    sheet = _sheet(seen, config)
-    views = _views(seen.observations, sheet)
+    element_pool = filter_elements(observations, config.rules)
+    if not len(element_pool.elements):
+        return to_vector_map(element_pool, [], config.rules, frame)
+    raster = _make_raster(element_pool, config)
+    views = _count_views(element_pool.observations, raster)
     merged = []
     for kind in range(len(KINDS)):
-        rows = np.flatnonzero(seen.elements.kind == kind)
+        rows = np.flatnonzero(element_pool.elements.kind == kind)
         if len(rows):
             shapes = (
-                _crossings(seen, rows, sheet, views, config)
+                _extract_crossings(element_pool, rows, raster, views, config)
                 if kind == CROSSING
-                else _lines(seen, rows, sheet, views, config)
+                else _extract_lines(element_pool, rows, raster, views, config)
             )
-            merged += _supported(seen, rows, shapes, kind, config)
-    return as_map(seen, merged, config.rules, frame)
+            merged += _attach_sources(element_pool, rows, shapes, kind, config)
+    return to_vector_map(element_pool, merged, config.rules, frame)
 
 
-def _sheet(of: Pool, config: Config) -> _Sheet:
-    margin = config.buffer_m + 4 * config.smooth_m
-    low = of.elements.points.min(0) - margin
+def _make_raster(pool: ElementPool, config: HeatmapBufferConfig) -> _RasterGrid:
+    margin = config.buffer_m + 4 * config.smoothing_sigma_m
+    low = pool.elements.points.min(0) - margin
     # Anchored at whole cells of the map, so that a farther observation does not shift the picture.
     low = np.floor(low / config.cell_m) * config.cell_m
-    wide, high = np.ceil((of.elements.points.max(0) + margin - low) / config.cell_m).astype(int) + 1
-    if wide * high > _MOST_CELLS:
+    wide, high = np.ceil((pool.elements.points.max(0) + margin - low) / config.cell_m).astype(int) + 1
+    if wide * high > _MAX_CELLS:
         raise ConfigError(
-            f"heatmap_buffer.cell_m: expected a raster of at most {_MOST_CELLS} cells; got {wide} x {high}. Use larger cells."
+            f"heatmap_buffer.cell_m: expected a raster of at most {_MAX_CELLS} cells; got {wide} x {high}. Use larger cells."
         )
-    return _Sheet(low, (int(wide), int(high)), config.cell_m)
+    return _RasterGrid(low, (int(wide), int(high)), config.cell_m)
 
 
-def _views(observations: Sequence[Observation], sheet: _Sheet) -> Floats:
+def _count_views(observations: Sequence[Observation], raster: _RasterGrid) -> Floats:
     """(H, W) how many observations' views hold each cell."""
     rings = [MapElements.of([o.view], CROSSING).transform(*o.pose.tolist()).points for o in observations]
-    first = np.concatenate(([0], np.cumsum([len(r) for r in rings]))).astype(np.int64)
-    views = np.zeros(sheet.shape)
-    draw_rings(views, np.concatenate(rings), first, np.ones(len(rings)), sheet.low, sheet.cell_m)
+    offsets = np.concatenate(([0], np.cumsum([len(r) for r in rings]))).astype(np.int64)
+    views = np.zeros(raster.shape)
+    draw_rings(views, np.concatenate(rings), offsets, np.ones(len(rings)), raster.origin, raster.cell_m)
     return views
 
 
-def _hot(heat: Floats, views: Floats, config: Config) -> np.ndarray:
+def _threshold_heat(heat: Floats, views: Floats, config: HeatmapBufferConfig) -> np.ndarray:
     """(H, W) where the smoothed heat reaches the threshold."""
-    smooth = blurred(heat, config.smooth_m / config.cell_m)
-    return smooth >= np.maximum(config.least_heat, config.share * views)
+    smooth = blur_image(heat, config.smoothing_sigma_m / config.cell_m)
+    return smooth >= np.maximum(config.min_heat, config.min_view_fraction * views)
 
 
-def _lines(of: Pool, rows: Ints, sheet: _Sheet, views: Floats, config: Config) -> list[Floats]:
+def _extract_lines(
+    pool: ElementPool, rows: Ints, raster: _RasterGrid, views: Floats, config: HeatmapBufferConfig
+) -> list[Floats]:
     """The lines of one kind in the picture."""
-    part = of.elements.take(rows)
-    heat = np.zeros(sheet.shape)
-    columns = (np.array(part.points), np.array(part.first), np.array(part.score))
-    draw_lines(heat, *columns, sheet.low, sheet.cell_m, config.buffer_m)
-    skeleton = thinned(_hot(heat, views, config))
-    least = max(int(config.shortest_m / config.cell_m), 2)
-    clear = int(np.ceil(config.buffer_m / config.cell_m))
-    cells, first = longest_walks(skeleton, least, clear, config.walks == "all")
-    walks = np.split(sheet.middles(cells), first[1:-1]) if len(first) > 1 else []
+    part = pool.elements.take(rows)
+    heat = np.zeros(raster.shape)
+    columns = (np.array(part.points), np.array(part.offsets), np.array(part.score))
+    draw_lines(heat, *columns, raster.origin, raster.cell_m, config.buffer_m)
+    skeleton = skeletonize(_threshold_heat(heat, views, config))
+    min_cells = max(int(config.min_walk_length_m / config.cell_m), 2)
+    clear_cells = int(np.ceil(config.buffer_m / config.cell_m))
+    cells, offsets = find_longest_walks(skeleton, min_cells, clear_cells, config.walks == "all")
+    walks = np.split(raster.cell_centers(cells), offsets[1:-1]) if len(offsets) > 1 else []
     return [simplify(walk, config.simplify_m) for walk in walks]
 
 
-def _crossings(of: Pool, rows: Ints, sheet: _Sheet, views: Floats, config: Config) -> list[Floats]:
+def _extract_crossings(
+    pool: ElementPool, rows: Ints, raster: _RasterGrid, views: Floats, config: HeatmapBufferConfig
+) -> list[Floats]:
     """The rectangles of the crossings in the picture."""
-    part = of.elements.take(rows)
-    heat = np.zeros(sheet.shape)
-    draw_rings(heat, np.array(part.points), np.array(part.first), np.array(part.score), sheet.low, sheet.cell_m)
-    label = components(_hot(heat, views, config))
+    part = pool.elements.take(rows)
+    heat = np.zeros(raster.shape)
+    draw_rings(heat, np.array(part.points), np.array(part.offsets), np.array(part.score), raster.origin, raster.cell_m)
+    label = label_components(_threshold_heat(heat, views, config))
     cells = np.argwhere(label >= 0)
     cells = cells[np.argsort(label[cells[:, 0], cells[:, 1]], kind="stable")]
     number = label[cells[:, 0], cells[:, 1]]
@@ -138,26 +154,29 @@ def _crossings(of: Pool, rows: Ints, sheet: _Sheet, views: Floats, config: Confi
     found = []
     for group in np.split(cells, np.flatnonzero(np.diff(number)) + 1) if len(cells) else []:
         if len(group) * config.cell_m**2 >= 1.0:
-            found.append(rectangle(sheet.middles((group[:, None] + corners).reshape(-1, 2))))
+            found.append(fit_rectangle(raster.cell_centers((group[:, None] + corners).reshape(-1, 2))))
     return found
 
 
-def _supported(of: Pool, rows: Ints, shapes: Sequence[Floats], kind: int, config: Config) -> list[Merged]:
+def _attach_sources(
+    pool: ElementPool, rows: Ints, shapes: Sequence[Floats], kind: int, config: HeatmapBufferConfig
+) -> list[MergedElement]:
     """Each shape with the rows that lie along it for half of their length or more; without any it is left out."""
-    part = of.elements.take(rows)
+    part = pool.elements.take(rows)
     drawn = MapElements.of(shapes, kind)
-    samples, first = resample_spaced(part.points, part.first, 1.0)
-    reach = config.buffer_m + 0.5
-    pairs = near_pairs_between(drawn.bounds(), part.bounds(), reach)
+    samples, offsets = resample_spaced(part.points, part.offsets, 1.0)
+    max_distance = config.buffer_m + 0.5
+    pairs = find_near_pairs_between(drawn.bounds(), part.bounds(), max_distance)
     start = np.searchsorted(pairs[:, 0], np.arange(len(shapes) + 1))
     out = []
     for k, shape in enumerate(shapes):
         line = np.concatenate((shape, shape[:1])) if kind == CROSSING else shape
-        own = [
+        supporting_rows = [
             row
             for row in pairs[start[k] : start[k + 1], 1].tolist()
-            if (feet(samples[first[row] : first[row + 1]], line).distance <= reach).mean() >= 0.5
+            if (project_onto_line(samples[offsets[row] : offsets[row + 1]], line).distance_m <= max_distance).mean()
+            >= 0.5
         ]
-        if own:
-            out.append(Merged(shape, kind, rows[np.array(own)]))
+        if supporting_rows:
+            out.append(MergedElement(shape, kind, rows[np.array(supporting_rows)]))
     return out

@@ -8,21 +8,23 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from manyeyes.maps.baselines._common import Merged, Rules, as_map, pool
-from manyeyes.maps.elements.observation import Frame, Observation
+from manyeyes.maps.baselines._common import BaselineRules, MergedElement, filter_elements, to_vector_map
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
 
 
 @dataclass(frozen=True)
-class Config:
+class UnionConfig:
     """rules: pre-filter, score and state."""
 
-    rules: Rules = field(default_factory=Rules)
+    rules: BaselineRules = field(default_factory=BaselineRules)
 
 
-def fuse(observations: Sequence[Observation], config: Config = Config(), frame: Frame | None = None) -> VectorMap:
+def fuse(
+    observations: Sequence[Observation], config: UnionConfig = UnionConfig(), frame: MapFrame | None = None
+) -> VectorMap:
     """The union of all elements."""
-    seen = pool(observations, config.rules)
-    kinds = seen.elements.kind.tolist()
-    merged = [Merged(seen.elements.polyline(k), kind, np.array([k])) for k, kind in enumerate(kinds)]
-    return as_map(seen, merged, config.rules, frame)
+    element_pool = filter_elements(observations, config.rules)
+    kinds = element_pool.elements.kind.tolist()
+    merged = [MergedElement(element_pool.elements.polyline(k), kind, np.array([k])) for k, kind in enumerate(kinds)]
+    return to_vector_map(element_pool, merged, config.rules, frame)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from manyeyes._jit import F64x2, I64x1, njit
 from manyeyes.datatypes import ManyeyesError
-from manyeyes.datatypes.map_element import CROSSING, MapElements, Polygons, frozen
+from manyeyes.datatypes.map_element import CROSSING, MapElements, Polygons, freeze
 from manyeyes.maps.elements.observation_limits import LIMITS
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,7 @@ class ObservationError(ManyeyesError, ValueError):
 
 
 @dataclass(frozen=True)
-class Frame:
+class MapFrame:
     """The local metric frame of a map: transverse Mercator on WGS 84 about an origin, scale 1, x east, y north, metres.
 
     latitude, longitude: degrees, EPSG:4326, of the point that is x = y = 0.
@@ -74,7 +74,7 @@ class ObservationContent:
 
     def __post_init__(self) -> None:
         for name in ("pose", "covariance", "view"):
-            object.__setattr__(self, name, frozen(getattr(self, name), np.float64))
+            object.__setattr__(self, name, freeze(getattr(self, name), np.float64))
 
     @cached_property
     def id(self) -> str:
@@ -100,7 +100,7 @@ class ObservationContent:
             e.style,
         ):
             out.append(struct.pack("<I", array.size) + (array + 0.0).astype("<f8", copy=False).tobytes())
-        for array in (self.occluders.first, e.kind, e.first):
+        for array in (self.occluders.offsets, e.kind, e.offsets):
             out.append(struct.pack("<I", array.size) + array.astype("<i8", copy=False).tobytes())
         return b"".join(out)
 
@@ -119,7 +119,7 @@ class Observation(ObservationContent):
         super().__post_init__()
         _check(self)
 
-    def in_map(self, pose: Floats | None = None) -> MapElements:
+    def elements_in_map(self, pose: Floats | None = None) -> MapElements:
         """The elements in the map's frame, at the claimed pose or at another (3,)."""
         x, y, yaw = (float(v) for v in (self.pose if pose is None else pose))
         return self.elements.transform(x, y, yaw)
@@ -138,11 +138,13 @@ def _check(o: Observation) -> None:
         _require(value.shape == shape, name, f"shape {shape}", value.shape)
         _require_finite(name, value)
     remedy = "State it in metres of the map's frame, or choose an origin nearby."
-    _require_near("pose", o.pose[:2], LIMITS.max_position_m, "m from the origin along x and y", remedy)
-    _require_near("pose", o.pose[2:], LIMITS.max_yaw_rad, "rad of yaw")
-    variance, least = np.diag(o.covariance), LIMITS.min_pose_std**2
-    _require_between("covariance", variance[:2], least, LIMITS.max_position_std_m**2, "variances of x and y (m²)")
-    _require_between("covariance", variance[2:], least, LIMITS.max_yaw_std_rad**2, "a variance of yaw (rad²)")
+    _require_max_abs("pose", o.pose[:2], LIMITS.max_position_m, "m from the origin along x and y", remedy)
+    _require_max_abs("pose", o.pose[2:], LIMITS.max_yaw_rad, "rad of yaw")
+    variance, min_variance = np.diag(o.covariance), LIMITS.min_pose_std**2
+    _require_between(
+        "covariance", variance[:2], min_variance, LIMITS.max_position_std_m**2, "variances of x and y (m²)"
+    )
+    _require_between("covariance", variance[2:], min_variance, LIMITS.max_yaw_std_rad**2, "a variance of yaw (rad²)")
     _require(_is_covariance(o.covariance), "covariance", "a symmetric, positive definite matrix", o.covariance)
     _require(
         o.view.ndim == 2 and o.view.shape[1] == 2 and len(o.view) >= 3, "view", "a ring (K, 2), K >= 3", o.view.shape
@@ -151,15 +153,15 @@ def _check(o: Observation) -> None:
     _require(is_simple_ring(o.view), "view", "a ring that does not cross itself", "one that does")
     _require_count("occluders", "rings", len(o.occluders), LIMITS.max_occluders)
     if len(o.occluders):
-        _check_rings("occluders", o.occluders.points, np.diff(o.occluders.first))
+        _check_rings("occluders", o.occluders.points, np.diff(o.occluders.offsets))
     if len(o.elements):
         _check_elements(o.elements)
 
 
 def _check_rings(name: str, points: Floats, counts: NDArray[np.int64]) -> None:
     """Raise ObservationError unless each ring has a usable number of points, all within reach."""
-    least = int(counts.min())
-    _require(least >= 3, name, "rings of 3 points or more", least)
+    min_points = int(counts.min())
+    _require(min_points >= 3, name, "rings of 3 points or more", min_points)
     _require_count(name, "points a ring", int(counts.max()), LIMITS.max_ring_points)
     _require_reach(name, points)
 
@@ -186,13 +188,13 @@ def _check_elements(e: MapElements) -> None:
     )
     total = float(lengths.sum())
     _require(total <= LIMITS.max_length_m, "points", f"at most {LIMITS.max_length_m:g} m of elements", f"{total:g} m")
-    bad = int(_first_crossed_ring(e.kind, e.first, e.points, CROSSING))
+    bad = int(_first_crossed_ring(e.kind, e.offsets, e.points, CROSSING))
     _require(bad < 0, "points", "crossings whose ring does not cross itself", f"element {bad}, whose ring does")
 
 
-def _require(holds: bool, name: str, expected: str, came: object, remedy: str = _REMEDY) -> None:
+def _require(holds: bool, name: str, expected: str, actual: object, remedy: str = _REMEDY) -> None:
     if not holds:
-        raise ObservationError(f"Observation.{name}: expected {expected}; got {shortened(came)}. {remedy}")
+        raise ObservationError(f"Observation.{name}: expected {expected}; got {shorten(actual)}. {remedy}")
 
 
 def _require_finite(name: str, values: Floats) -> None:
@@ -200,17 +202,17 @@ def _require_finite(name: str, values: Floats) -> None:
         _require(False, name, "finite numbers", "NaN or infinity")
 
 
-def _require_near(name: str, values: Floats, most: float, what: str, remedy: str = _REMEDY) -> None:
-    """Require that no value exceeds ``most`` on either side of zero."""
-    far = np.abs(values) > most
+def _require_max_abs(name: str, values: Floats, max_abs: float, what: str, remedy: str = _REMEDY) -> None:
+    """Require that no value exceeds ``max_abs`` on either side of zero."""
+    far = np.abs(values) > max_abs
     if far.any():
-        _require(False, name, f"at most {most:g} {what}", f"{values[far].flat[0]:g}", remedy)
+        _require(False, name, f"at most {max_abs:g} {what}", f"{values[far].flat[0]:g}", remedy)
 
 
 def _require_reach(name: str, points: Floats) -> None:
     """Require finite points (P, 2) within the reach of an agent."""
     _require_finite(name, points)
-    _require_near(name, points, LIMITS.max_reach_m, "m from the agent along x and y")
+    _require_max_abs(name, points, LIMITS.max_reach_m, "m from the agent along x and y")
 
 
 def _require_between(name: str, values: Floats, low: float, high: float, what: str = "values") -> None:
@@ -220,8 +222,8 @@ def _require_between(name: str, values: Floats, low: float, high: float, what: s
         _require(False, name, f"{what} in [{low:g}, {high:g}]", f"{values[~inside].flat[0]:g}")
 
 
-def _require_count(name: str, what: str, count: int, most: int) -> None:
-    _require(count <= most, name, f"at most {most} {what}", count)
+def _require_count(name: str, what: str, count: int, max_count: int) -> None:
+    _require(count <= max_count, name, f"at most {max_count} {what}", count)
 
 
 def _require_all(holds: NDArray[np.bool_], values: NDArray, expected: str) -> None:
@@ -231,7 +233,7 @@ def _require_all(holds: NDArray[np.bool_], values: NDArray, expected: str) -> No
         _require(False, "points", expected, f"{values[row]:g} in element {row}")
 
 
-def shortened(value: object) -> str:
+def shorten(value: object) -> str:
     """Format a value on one line, cut where it is long."""
     text = " ".join(str(value).split())
     return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]} ..."
@@ -251,11 +253,11 @@ def _is_covariance(m: Floats) -> bool:
 
 def is_simple_ring(ring: Floats) -> bool:
     """Whether no two edges of the open ring (K, 2) cross; edges that only touch at a shared end do not."""
-    return not ring_crosses(ring)
+    return not has_crossing_edges(ring)
 
 
 @njit(cache=True)
-def ring_crosses(ring: F64x2) -> bool:  # pragma: no cover - compiled
+def has_crossing_edges(ring: F64x2) -> bool:  # pragma: no cover - compiled
     """Whether two edges of the open ring (K, 2) cross; for other compiled loops, :func:`is_simple_ring` for the rest."""
     n = len(ring)
     for i in range(n):
@@ -278,6 +280,6 @@ def ring_crosses(ring: F64x2) -> bool:  # pragma: no cover - compiled
 @njit(cache=True)
 def _first_crossed_ring(kind: I64x1, first: I64x1, points: F64x2, ring_kind: int) -> int:  # pragma: no cover - compiled
     for i in range(len(kind)):
-        if kind[i] == ring_kind and ring_crosses(points[first[i] : first[i + 1]]):
+        if kind[i] == ring_kind and has_crossing_edges(points[first[i] : first[i + 1]]):
             return i
     return -1

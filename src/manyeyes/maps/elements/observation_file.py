@@ -17,11 +17,11 @@ from manyeyes.datatypes import MissingExtraError, ShapeError
 from manyeyes.datatypes.map_element import DEFAULT_SIGMA_M, KINDS, NO_STYLE, STYLES, MapElements, Polygons
 from manyeyes.maps.elements.observation import (
     FORMAT_VERSION,
-    Frame,
+    MapFrame,
     Observation,
     ObservationContent,
     ObservationError,
-    shortened,
+    shorten,
 )
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 METADATA_KEY = b"manyeyes"
 CRS = "local transverse Mercator, WGS 84, scale 1"
-ROWS_A_GROUP = 1024
+ROW_GROUP_SIZE = 1024
 # Origins closer than a tenth of a millimetre are one.
 _SAME_DEGREES = 1e-9
 _UPPER = np.triu_indices(3)
@@ -38,7 +38,7 @@ _REQUIRED = ("agent", "pass_id", "time_ns", "x", "y", "yaw", "covariance", "view
 
 
 @dataclass(frozen=True)
-class Quarantined:
+class RejectedRows:
     """What was put aside: the file, its first row (-1: the file as a whole), how many rows, and why, on one line."""
 
     file: str
@@ -48,7 +48,7 @@ class Quarantined:
 
 
 @dataclass(frozen=True)
-class RefusedRow:
+class InvalidRow:
     """A row that is no observation, and why.
 
     id: of its content, "" where the content has none or the row states another; agent, pass_id: as the row states them.
@@ -61,15 +61,15 @@ class RefusedRow:
 
 
 @dataclass(frozen=True)
-class Reading:
+class LoadedObservations:
     """What a file or folder held: the frame of its poses, the observations in file and row order, and what was put aside."""
 
-    frame: Frame
+    frame: MapFrame
     observations: tuple[Observation, ...]
-    quarantined: tuple[Quarantined, ...]
+    rejected: tuple[RejectedRows, ...]
 
 
-def write_observations(path: Path | str, observations: Sequence[Observation], frame: Frame) -> None:
+def write_observations(path: Path | str, observations: Sequence[Observation], frame: MapFrame) -> None:
     """Write observations as one Parquet file: whole under that name, or not there."""
     pq = _parquet()
     path = Path(path)
@@ -78,38 +78,38 @@ def write_observations(path: Path | str, observations: Sequence[Observation], fr
             observation_table(observations, frame),
             temporary,
             compression="zstd",
-            row_group_size=ROWS_A_GROUP,
+            row_group_size=ROW_GROUP_SIZE,
             use_dictionary=["agent", "pass_id", "model", "elements.list.element.kind"],
             write_page_checksum=True,
         )
 
 
-def read_observations(source: Path | str, frame: Frame | None = None) -> Reading:
+def read_observations(source: Path | str, frame: MapFrame | None = None) -> LoadedObservations:
     """Read a file, or every ``*.parquet`` of a folder by name; without a frame, the first file that states one decides."""
     source = Path(source)
     files = sorted(source.glob("*.parquet")) if source.is_dir() else [source]
     if not files or not files[0].exists():
         raise ObservationError(f"{source}: expected a Parquet file of observations or a folder of them; found none.")
     kept: list[Observation] = []
-    aside: list[Quarantined] = []
+    rejected: list[RejectedRows] = []
     for file in files:
         try:
             stored, groups = _open(file, frame)
         except ObservationError as error:
-            aside.append(Quarantined(str(file), -1, 1, str(error)))
+            rejected.append(RejectedRows(str(file), -1, 1, str(error)))
             continue
         frame = frame or stored
         for row, item in groups:
             if isinstance(item, Observation):
                 kept.append(item)
             else:
-                aside.append(Quarantined(str(file), row, *item))
+                rejected.append(RejectedRows(str(file), row, *item))
     if frame is None:
-        raise ObservationError(f"{source}: no file could be read; the first: {aside[0].reason}")
-    return Reading(frame, tuple(kept), tuple(aside))
+        raise ObservationError(f"{source}: no file could be read; the first: {rejected[0].reason}")
+    return LoadedObservations(frame, tuple(kept), tuple(rejected))
 
 
-def observation_table(observations: Sequence[Observation], frame: Frame) -> pa.Table:
+def observation_table(observations: Sequence[Observation], frame: MapFrame) -> pa.Table:
     """Observations as an Arrow table whose metadata name the format, its version and the frame."""
     pa = _arrow()
     elements = MapElements.cat([o.elements for o in observations])
@@ -122,13 +122,13 @@ def observation_table(observations: Sequence[Observation], frame: Frame) -> pa.T
             pa.DictionaryArray.from_arrays(pa.array(elements.kind.astype(np.int32)), pa.array(KINDS)).cast(pa.string()),
             pa.array(elements.score),
             _list(pa, styles, pa.array(elements.style.reshape(-1))),
-            _list(pa, elements.first, at_point),
+            _list(pa, elements.offsets, at_point),
         ],
         ["kind", "score", "style", "points"],
     )
     rings = [o.occluders for o in observations]
     starts = np.cumsum([0, *(len(r.points) for r in rings)])
-    ring_first = np.concatenate([r.first[:-1] + start for r, start in zip(rings, starts)] + [starts[-1:]])
+    ring_first = np.concatenate([r.offsets[:-1] + start for r, start in zip(rings, starts)] + [starts[-1:]])
     poses = np.array([o.pose for o in observations]).reshape(-1, 3)
     columns = {
         "agent": pa.array([o.agent for o in observations], pa.string()),
@@ -149,65 +149,71 @@ def observation_table(observations: Sequence[Observation], frame: Frame) -> pa.T
             pa, _offsets([len(r) for r in rings]), _list(pa, ring_first, _xy(pa, [r.points for r in rings]))
         ),
     }
-    return pa.table(columns).cast(_schema(pa)).replace_schema_metadata({METADATA_KEY: json.dumps(metadata(frame))})
+    return (
+        pa.table(columns)
+        .cast(_schema(pa))
+        .replace_schema_metadata({METADATA_KEY: json.dumps(make_file_metadata(frame))})
+    )
 
 
-def metadata(frame: Frame) -> dict[str, Any]:
+def make_file_metadata(frame: MapFrame) -> dict[str, Any]:
     """What the file's key-value metadata say under the key ``manyeyes``, as JSON."""
     origin = {"crs": "EPSG:4326", "latitude": frame.latitude, "longitude": frame.longitude}
     return {"format": "observation", "version": FORMAT_VERSION, "crs": CRS, "origin": origin}
 
 
-def observations_of(table: pa.Table) -> Iterator[tuple[int, Observation | str]]:
+def iterate_observations(table: pa.Table) -> Iterator[tuple[int, Observation | str]]:
     """Each row of a table as an observation, or as the reason why it cannot be one."""
-    for row, item in enumerate(rows_of(table)):
-        yield row, item.reason if isinstance(item, RefusedRow) else item
+    for row, item in enumerate(iterate_rows(table)):
+        yield row, item.reason if isinstance(item, InvalidRow) else item
 
 
-def rows_of(table: pa.Table) -> Iterator[Observation | RefusedRow]:
+def iterate_rows(table: pa.Table) -> Iterator[Observation | InvalidRow]:
     """Each row of a table as an observation, or as one that is refused."""
-    columns = _Columns(table)
+    columns = _ObservationColumns(table)
     for row in range(table.num_rows):
         try:
-            yield columns.observation(row)
+            yield columns.make_observation(row)
         except (ObservationError, ShapeError) as error:
-            yield columns.refused(row, str(error))
+            yield columns.make_invalid_row(row, str(error))
 
 
-def _open(file: Path, expected: Frame | None) -> tuple[Frame, Iterator[tuple[int, Observation | tuple[int, str]]]]:
+def _open(
+    file: Path, expected: MapFrame | None
+) -> tuple[MapFrame, Iterator[tuple[int, Observation | tuple[int, str]]]]:
     """The frame that a file states and its rows; raises ObservationError where the file as a whole cannot be used."""
     pa, pq = _arrow(), _parquet()
     try:
         opened = pq.ParquetFile(file, page_checksum_verification=True)
     except (pa.ArrowException, OSError) as error:
         raise ObservationError(f"{file}: expected a whole Parquet file; got {_line(error)}. Fetch it again.") from error
-    frame = _stated_frame(file, opened.schema_arrow.metadata or {}, expected)
+    frame = _read_frame(file, opened.schema_arrow.metadata or {}, expected)
     missing = [name for name in _REQUIRED if name not in opened.schema_arrow.names]
     if missing:
         raise ObservationError(f"{file}: expected the columns of docs/observation.md; {', '.join(missing)} missing.")
-    return frame, _rows(opened)
+    return frame, _iterate_file_rows(opened)
 
 
-def _rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[int, str]]]:
+def _iterate_file_rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[int, str]]]:
     """Row by row; a group of rows that cannot be decoded is put aside as one."""
     pa = _arrow()
     start = 0
     for group in range(opened.num_row_groups):
         count = opened.metadata.row_group(group).num_rows
         try:
-            for row, item in observations_of(opened.read_row_group(group)):
+            for row, item in iterate_observations(opened.read_row_group(group)):
                 yield start + row, (1, item) if isinstance(item, str) else item
         except (pa.ArrowException, OSError, ObservationError) as error:
             yield start, (count, f"rows {start} to {start + count - 1} cannot be decoded: {_line(error)}")
         start += count
 
 
-def _stated_frame(file: Path, stored: dict[bytes, bytes], expected: Frame | None) -> Frame:
+def _read_frame(file: Path, stored: dict[bytes, bytes], expected: MapFrame | None) -> MapFrame:
     """The frame in a file's metadata, once format, version and CRS are known to be ours."""
     try:
-        stated = json.loads(stored[METADATA_KEY])
-        kind, version, crs, origin = (stated[key] for key in ("format", "version", "crs", "origin"))
-        frame = Frame(float(origin["latitude"]), float(origin["longitude"]))
+        metadata = json.loads(stored[METADATA_KEY])
+        kind, version, crs, origin = (metadata[key] for key in ("format", "version", "crs", "origin"))
+        frame = MapFrame(float(origin["latitude"]), float(origin["longitude"]))
         geographic = origin["crs"]
     except (KeyError, ValueError, TypeError) as error:
         raise ObservationError(
@@ -233,7 +239,7 @@ def _stated_frame(file: Path, stored: dict[bytes, bytes], expected: Frame | None
     return expected
 
 
-class _Columns:
+class _ObservationColumns:
     """A table's nested columns, taken apart once; rows are cut out of them as views."""
 
     def __init__(self, table: pa.Table) -> None:
@@ -252,75 +258,78 @@ class _Columns:
         self.text = {name: self.columns[name].fill_null("").to_pylist() for name in ("agent", "pass_id", "model", "id")}
         self.trusted = self.columns["trusted"].fill_null(False).to_pylist()
         self.time = self.columns["time_ns"].fill_null(-1).to_pylist()
-        self.pose = np.stack([_numbers(self.columns[name]) for name in ("x", "y", "yaw")], 1)
-        self.covariance_first, covariance = _opened(self.columns["covariance"])
-        self.covariance = _numbers(covariance)
-        self.view_first, view = _opened(self.columns["view"])
-        self.view = np.stack([_numbers(axis) for axis in view.flatten()], 1)
-        self.ring_first, rings = _opened(self.columns["occluders"])
-        self.ring_point, corners = _opened(rings)
-        self.corners = np.stack([_numbers(axis) for axis in corners.flatten()], 1)
-        self.first, elements = _opened(self.columns["elements"])
+        self.pose = np.stack([_to_floats(self.columns[name]) for name in ("x", "y", "yaw")], 1)
+        self.covariance_offsets, covariance = _split_list(self.columns["covariance"])
+        self.covariance = _to_floats(covariance)
+        self.view_offsets, view = _split_list(self.columns["view"])
+        self.view = np.stack([_to_floats(axis) for axis in view.flatten()], 1)
+        self.ring_offsets, rings = _split_list(self.columns["occluders"])
+        self.ring_point_offsets, corners = _split_list(rings)
+        self.corners = np.stack([_to_floats(axis) for axis in corners.flatten()], 1)
+        self.element_offsets, elements = _split_list(self.columns["elements"])
         kind, score, style, points = elements.flatten()
-        self.kind = _codes(kind)
-        self.kind_text, self.score = kind, _numbers(score)
+        self.kind = _to_kind_indices(kind)
+        self.kind_text, self.score = kind, _to_floats(score)
         self.style = _styles(style)
-        self.point_first, at_point = _opened(points)
+        self.point_offsets, at_point = _split_list(points)
         x, y, sigma = at_point.flatten()
-        self.points = np.stack((_numbers(x), _numbers(y)), 1)
-        self.sigma = _numbers(sigma.fill_null(DEFAULT_SIGMA_M))
+        self.points = np.stack((_to_floats(x), _to_floats(y)), 1)
+        self.sigma = _to_floats(sigma.fill_null(DEFAULT_SIGMA_M))
 
-    def observation(self, row: int) -> Observation:
+    def make_observation(self, row: int) -> Observation:
         """The observation of one row; raises ObservationError or ShapeError where it is none."""
-        content = self.content(row)
+        content = self.make_content(row)
         made = Observation(**{f.name: getattr(content, f.name) for f in fields(ObservationContent)})
         stated = self.text["id"][row]
         if stated and stated != made.id:
             raise ObservationError(
-                f"Observation.id: expected {made.id}, as its content says; got {shortened(stated)}. Fetch it again."
+                f"Observation.id: expected {made.id}, as its content says; got {shorten(stated)}. Fetch it again."
             )
         return made
 
-    def refused(self, row: int, reason: str) -> RefusedRow:
+    def make_invalid_row(self, row: int, reason: str) -> InvalidRow:
         """The record of a row that is no observation."""
         try:
-            name = self.content(row).id
+            content_id = self.make_content(row).id
         except (ObservationError, ShapeError):
-            name = ""
+            content_id = ""
         stated = self.text["id"][row]
-        return RefusedRow(
-            reason, "" if stated and stated != name else name, self.text["agent"][row], self.text["pass_id"][row]
+        return InvalidRow(
+            reason,
+            "" if stated and stated != content_id else content_id,
+            self.text["agent"][row],
+            self.text["pass_id"][row],
         )
 
-    def content(self, row: int) -> ObservationContent:
+    def make_content(self, row: int) -> ObservationContent:
         """The fields of one row, unchecked; raises ObservationError or ShapeError where they have no such form."""
-        a, b = self.first[row], self.first[row + 1]
-        p, q = self.point_first[a], self.point_first[b]
+        a, b = self.element_offsets[row], self.element_offsets[row + 1]
+        p, q = self.point_offsets[a], self.point_offsets[b]
         kind = self.kind[a:b]
         if (kind < 0).any():
-            wrong = shortened(self.kind_text[int(a + np.argmin(kind))])
+            wrong = shorten(self.kind_text[int(a + np.argmin(kind))])
             raise ObservationError(f"Observation.kind: expected one of {', '.join(KINDS)}; got {wrong}.")
         elements = MapElements(
             kind,
-            self.point_first[a : b + 1] - p,
+            self.point_offsets[a : b + 1] - p,
             self.points[p:q],
             self.score[a:b],
             self.sigma[p:q],
             self.style[a:b],
         )
-        r, s = self.ring_first[row], self.ring_first[row + 1]
-        u, v = self.ring_point[r], self.ring_point[s]
+        r, s = self.ring_offsets[row], self.ring_offsets[row + 1]
+        u, v = self.ring_point_offsets[r], self.ring_point_offsets[s]
         return ObservationContent(
             agent=self.text["agent"][row],
             pass_id=self.text["pass_id"][row],
             time_ns=self.time[row],
             pose=self.pose[row],
-            covariance=_square(self.covariance[self.covariance_first[row] : self.covariance_first[row + 1]]),
-            view=self.view[self.view_first[row] : self.view_first[row + 1]],
+            covariance=_square(self.covariance[self.covariance_offsets[row] : self.covariance_offsets[row + 1]]),
+            view=self.view[self.view_offsets[row] : self.view_offsets[row + 1]],
             elements=elements,
             model=self.text["model"][row],
             trusted=self.trusted[row],
-            occluders=Polygons(self.corners[u:v], self.ring_point[r : s + 1] - u),
+            occluders=Polygons(self.corners[u:v], self.ring_point_offsets[r : s + 1] - u),
         )
 
 
@@ -335,27 +344,27 @@ def _square(upper: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _styles(style: Any) -> NDArray[np.float64]:
     """(N, S) style probabilities; where none are stated: no style for certain; a wrong number of them: NaN."""
-    first, values = _opened(style)
-    counts = np.diff(first)
+    offsets, values = _split_list(style)
+    counts = np.diff(offsets)
     out = np.full((len(counts), len(STYLES)), np.nan)
     out[counts == 0] = np.eye(len(STYLES))[NO_STYLE]
     whole = counts == len(STYLES)
-    places = first[:-1][whole][:, None] + np.arange(len(STYLES))
-    out[whole] = _numbers(values)[places]
+    places = offsets[:-1][whole][:, None] + np.arange(len(STYLES))
+    out[whole] = _to_floats(values)[places]
     return out
 
 
-def _opened(column: Any) -> tuple[NDArray[np.int64], Any]:
+def _split_list(column: Any) -> tuple[NDArray[np.int64], Any]:
     """Offsets and contents of a list column; a null list is an empty one."""
     return column.offsets.to_numpy().astype(np.int64), column.values
 
 
-def _numbers(column: Any) -> NDArray[np.float64]:
+def _to_floats(column: Any) -> NDArray[np.float64]:
     """A column of numbers as float64, null as NaN."""
     return column.to_numpy(zero_copy_only=False).astype(np.float64, copy=False)
 
 
-def _codes(kind: Any) -> NDArray[np.int64]:
+def _to_kind_indices(kind: Any) -> NDArray[np.int64]:
     """The place of each name in KINDS; -1 for a null or another name."""
     coded = kind.dictionary_encode()
     known = [KINDS.index(name) if name in KINDS else -1 for name in coded.dictionary.to_pylist()]

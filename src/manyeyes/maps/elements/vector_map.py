@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from manyeyes.datatypes import ShapeError
-from manyeyes.datatypes.map_element import MapElements, check_offsets, frozen, rows_of
-from manyeyes.maps.elements.observation import Frame
+from manyeyes.datatypes.map_element import MapElements, check_offsets, freeze, take_rows
+from manyeyes.maps.elements.observation import MapFrame
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -23,7 +23,7 @@ CANDIDATE, PUBLISHED, DEPRECATED, RETIRED = range(len(STATES))
 
 
 @dataclass(frozen=True, eq=False)
-class Stations:
+class PointEvidence:
     """Evidence at each point of a map, row by row with ``elements.points``.
 
     support: (P,) int64 observations that saw it. agents: (P,) int64 distinct agents. log_odds: (P,). sigma: (P,) metres
@@ -48,9 +48,9 @@ class Stations:
     def __len__(self) -> int:
         return len(self.support)
 
-    def take(self, rows: Ints) -> Stations:
+    def take(self, rows: Ints) -> PointEvidence:
         """The chosen points, in the order given."""
-        return Stations(*(getattr(self, f.name)[rows] for f in fields(self)))
+        return PointEvidence(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,15 +75,17 @@ class Topology:
                 raise ShapeError(f"Topology.{f.name} needs shape (K, 2); got {getattr(self, f.name).shape}.")
 
     @classmethod
-    def none(cls) -> Topology:
+    def empty(cls) -> Topology:
         """No relations."""
         pairs = np.zeros((0, 2), np.int64)
         return cls(pairs, pairs, pairs, pairs, np.zeros((0, 2)))
 
-    def renumbered(self, new: Ints) -> Topology:
+    def renumber(self, new_rows: Ints) -> Topology:
         """Row k becomes new[k]; pairs with a row that becomes -1 are left out, and nodes without elements too."""
-        successor, left, right = (_kept(new[pairs]) for pairs in (self.successor, self.left, self.right))
-        ends = _kept(np.stack((self.branch[:, 0], new[self.branch[:, 1]]), 1))
+        successor, left, right = (
+            _drop_invalid_pairs(new_rows[pairs]) for pairs in (self.successor, self.left, self.right)
+        )
+        ends = _drop_invalid_pairs(np.stack((self.branch[:, 0], new_rows[self.branch[:, 1]]), 1))
         nodes, ends[:, 0] = np.unique(ends[:, 0], return_inverse=True)
         return Topology(successor, left, right, ends, self.branch_xy[nodes])
 
@@ -94,11 +96,11 @@ class VectorMap:
 
     elements: in the map's frame, lines with stations about 1 m apart. id: (N, 16) uint8, stable from release to release.
     state: (N,) int64, index into STATES. log_odds: (N,). supporters: (N,) int64 observations; agents: (N,) int64 distinct
-    agents. t_first, t_last: (N,) int64 ns. stations: evidence per point. topology: pairs of rows. observations: (U, 16)
+    agents. t_first, t_last: (N,) int64 ns. point_evidence: evidence per point. topology: pairs of rows. observations: (U, 16)
     uint8 ids, ascending; element i came from ``observations[sources[sources_first[i]:sources_first[i + 1]]]``.
     """
 
-    frame: Frame
+    frame: MapFrame
     elements: MapElements
     id: Digests
     state: Ints
@@ -107,10 +109,10 @@ class VectorMap:
     agents: Ints
     t_first: Ints
     t_last: Ints
-    stations: Stations
+    point_evidence: PointEvidence
     topology: Topology
     observations: Digests
-    sources_first: Ints
+    source_offsets: Ints
     sources: Ints
 
     def __post_init__(self) -> None:
@@ -124,17 +126,19 @@ class VectorMap:
             raise ShapeError(
                 f"VectorMap needs id {(n, 16)}, observations (U, 16); got {self.id.shape}, {self.observations.shape}."
             )
-        if len(self.stations) != len(self.elements.points):
-            raise ShapeError(f"VectorMap.stations needs {len(self.elements.points)} rows; got {len(self.stations)}.")
-        check_offsets("VectorMap.sources", self.sources_first, len(self.sources))
-        if len(self.sources_first) != n + 1:
-            raise ShapeError(f"VectorMap.sources_first needs shape {(n + 1,)}; got {self.sources_first.shape}.")
+        if len(self.point_evidence) != len(self.elements.points):
+            raise ShapeError(
+                f"VectorMap.stations needs {len(self.elements.points)} rows; got {len(self.point_evidence)}."
+            )
+        check_offsets("VectorMap.sources", self.source_offsets, len(self.sources))
+        if len(self.source_offsets) != n + 1:
+            raise ShapeError(f"VectorMap.sources_first needs shape {(n + 1,)}; got {self.source_offsets.shape}.")
 
     @classmethod
     def of(
         cls,
         elements: MapElements,
-        frame: Frame | None = None,
+        frame: MapFrame | None = None,
         sources: Sequence[Sequence[str]] | None = None,
         agents: ArrayLike = 1,
         times_ns: tuple[ArrayLike, ArrayLike] = (0, 0),
@@ -142,35 +146,37 @@ class VectorMap:
     ) -> VectorMap:
         """A published map of elements with the same evidence at all their points; sources: ids of each one's observations."""
         n = len(elements)
-        listed = [sorted(set(s)) for s in sources] if sources is not None else [[] for _ in range(n)]
-        known = sorted({s for one in listed for s in one})
-        place = {s: k for k, s in enumerate(known)}
-        counts = np.array([len(one) for one in listed], np.int64)
-        first, last = (np.broadcast_to(np.asarray(t, np.int64), (n,)) for t in times_ns)
+        sorted_sources = [sorted(set(s)) for s in sources] if sources is not None else [[] for _ in range(n)]
+        observation_ids = sorted({s for one in sorted_sources for s in one})
+        place = {s: k for k, s in enumerate(observation_ids)}
+        counts = np.array([len(one) for one in sorted_sources], np.int64)
+        t_first, t_last = (np.broadcast_to(np.asarray(t, np.int64), (n,)) for t in times_ns)
         columns = {
             "log_odds": np.broadcast_to(np.asarray(log_odds, np.float64), (n,)),
             "agents": np.broadcast_to(np.asarray(agents, np.int64), (n,)),
-            "t_first": first,
-            "t_last": last,
+            "t_first": t_first,
+            "t_last": t_last,
         }
         supporters = counts if sources is not None else np.ones(n, np.int64)
         at_points = {name: np.repeat(column, elements.counts) for name, column in columns.items()}
         return cls(
-            frame=frame or Frame(),
+            frame=frame or MapFrame(),
             elements=elements,
-            id=content_ids(elements),
+            id=compute_content_ids(elements),
             state=np.full(n, PUBLISHED),
             supporters=supporters,
-            stations=Stations(support=np.repeat(supporters, elements.counts), sigma=elements.sigma, **at_points),
-            topology=Topology.none(),
-            observations=np.frombuffer(bytes.fromhex("".join(known)), np.uint8).reshape(-1, 16),
-            sources_first=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-            sources=np.array([place[s] for one in listed for s in one], np.int64),
+            point_evidence=PointEvidence(
+                support=np.repeat(supporters, elements.counts), sigma=elements.sigma, **at_points
+            ),
+            topology=Topology.empty(),
+            observations=np.frombuffer(bytes.fromhex("".join(observation_ids)), np.uint8).reshape(-1, 16),
+            source_offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+            sources=np.array([place[s] for one in sorted_sources for s in one], np.int64),
             **columns,
         )
 
     @classmethod
-    def empty(cls, frame: Frame | None = None) -> VectorMap:
+    def empty(cls, frame: MapFrame | None = None) -> VectorMap:
         """A map of nothing."""
         return cls.of(MapElements.empty(), frame)
 
@@ -179,14 +185,14 @@ class VectorMap:
 
     def sources_of(self, i: int) -> list[str]:
         """The ids of the observations that element i came from, in hexadecimal."""
-        rows = self.sources[self.sources_first[i] : self.sources_first[i + 1]]
+        rows = self.sources[self.source_offsets[i] : self.source_offsets[i + 1]]
         return [row.tobytes().hex() for row in self.observations[rows]]
 
     def with_state(self, state: ArrayLike) -> VectorMap:
         """The same map with other states (N,)."""
         return replace(self, state=np.asarray(state))
 
-    def published(self) -> VectorMap:
+    def select_published(self) -> VectorMap:
         """Only what is published."""
         return self.take(self.state == PUBLISHED)
 
@@ -194,60 +200,62 @@ class VectorMap:
         """The chosen elements, by index in the order given (each once) or by a mask; relations to others are left out."""
         index = np.asarray(rows)
         index = np.flatnonzero(index) if index.dtype == np.bool_ else index.astype(np.int64)
-        new = np.full(len(self), -1, np.int64)
-        new[index] = np.arange(len(index))
-        _, points = rows_of(self.elements.first, index)
-        sources_first, places = rows_of(self.sources_first, index)
+        new_rows = np.full(len(self), -1, np.int64)
+        new_rows[index] = np.arange(len(index))
+        _, points = take_rows(self.elements.offsets, index)
+        sources_first, places = take_rows(self.source_offsets, index)
         used, sources = np.unique(self.sources[places], return_inverse=True)
         return VectorMap(
             frame=self.frame,
             elements=self.elements.take(index),
             id=self.id[index],
             log_odds=self.log_odds[index],
-            stations=self.stations.take(points),
-            topology=self.topology.renumbered(new),
+            point_evidence=self.point_evidence.take(points),
+            topology=self.topology.renumber(new_rows),
             observations=self.observations[used],
-            sources_first=sources_first,
+            source_offsets=sources_first,
             sources=sources,
             **{name: getattr(self, name)[index] for name in _COUNTS},
         )
 
     @classmethod
-    def cat(cls, many: Sequence[VectorMap], frame: Frame | None = None) -> VectorMap:
+    def cat(cls, maps: Sequence[VectorMap], frame: MapFrame | None = None) -> VectorMap:
         """Maps of one frame as one, in order; an element that stands in two of them stands twice."""
-        if not many:
+        if not maps:
             return cls.empty(frame)
-        if any(m.frame != many[0].frame for m in many):
+        if any(m.frame != maps[0].frame for m in maps):
             raise ShapeError("VectorMap.cat needs maps of one frame; got several: move them into one first.")
-        starts = np.cumsum([0, *(len(m) for m in many)])
-        nodes = np.cumsum([0, *(len(m.topology.branch_xy) for m in many)])
-        ids = np.concatenate([m.observations for m in many])
-        known, place = np.unique(ids, axis=0, return_inverse=True)
-        seen = np.cumsum([0, *(len(m.observations) for m in many)])
-        counts = np.concatenate([np.diff(m.sources_first) for m in many])
+        starts = np.cumsum([0, *(len(m) for m in maps)])
+        nodes = np.cumsum([0, *(len(m.topology.branch_xy) for m in maps)])
+        ids = np.concatenate([m.observations for m in maps])
+        digests, place = np.unique(ids, axis=0, return_inverse=True)
+        seen = np.cumsum([0, *(len(m.observations) for m in maps)])
+        counts = np.concatenate([np.diff(m.source_offsets) for m in maps])
         successor, left, right = (
-            np.concatenate([getattr(m.topology, name) + start for m, start in zip(many, starts)])
+            np.concatenate([getattr(m.topology, name) + start for m, start in zip(maps, starts)])
             for name in ("successor", "left", "right")
         )
-        branch = [m.topology.branch + (node, start) for m, node, start in zip(many, nodes, starts)]
+        branch = [m.topology.branch + (node, start) for m, node, start in zip(maps, nodes, starts)]
         return cls(
-            frame=many[0].frame,
-            elements=MapElements.cat([m.elements for m in many]),
-            id=np.concatenate([m.id for m in many]),
-            log_odds=np.concatenate([m.log_odds for m in many]),
-            stations=Stations(*(np.concatenate([getattr(m.stations, f.name) for m in many]) for f in fields(Stations))),
-            topology=Topology(
-                successor, left, right, np.concatenate(branch), np.concatenate([m.topology.branch_xy for m in many])
+            frame=maps[0].frame,
+            elements=MapElements.cat([m.elements for m in maps]),
+            id=np.concatenate([m.id for m in maps]),
+            log_odds=np.concatenate([m.log_odds for m in maps]),
+            point_evidence=PointEvidence(
+                *(np.concatenate([getattr(m.point_evidence, f.name) for m in maps]) for f in fields(PointEvidence))
             ),
-            observations=known,
-            sources_first=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-            sources=np.concatenate([place.reshape(-1)[start + m.sources] for m, start in zip(many, seen)]),
-            **{name: np.concatenate([getattr(m, name) for m in many]) for name in _COUNTS},
+            topology=Topology(
+                successor, left, right, np.concatenate(branch), np.concatenate([m.topology.branch_xy for m in maps])
+            ),
+            observations=digests,
+            source_offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+            sources=np.concatenate([place.reshape(-1)[start + m.sources] for m, start in zip(maps, seen)]),
+            **{name: np.concatenate([getattr(m, name) for m in maps]) for name in _COUNTS},
         )
 
-    def quantised_hash(self, cm: float = 1.0) -> str:
+    def quantised_hash(self, cell_cm: float = 1.0) -> str:
         """BLAKE2b-128 over kind, state and geometry on a grid of cm; neither order nor direction nor a ring's start counts."""
-        digests = element_digests(self.elements, self.state, cm)
+        digests = compute_element_digests(self.elements, self.state, cell_cm)
         order = np.lexsort(digests.T[::-1])
         return hashlib.blake2b(digests[order].tobytes(), digest_size=16).hexdigest()
 
@@ -255,16 +263,16 @@ class VectorMap:
 _COUNTS = ("state", "supporters", "agents", "t_first", "t_last")
 
 
-def content_ids(elements: MapElements) -> Digests:
+def compute_content_ids(elements: MapElements) -> Digests:
     """(N, 16) an id from kind and geometry at 1 cm; equal elements get different ids by their order."""
-    digests = element_digests(elements, np.zeros(len(elements), np.int64), 1.0)
+    digests = compute_element_digests(elements, np.zeros(len(elements), np.int64), 1.0)
     _, place, counts = np.unique(digests, axis=0, return_inverse=True, return_counts=True)
     rank = np.zeros(len(elements), np.int64)
-    again: dict[int, int] = {}
+    next_rank: dict[int, int] = {}
     for row in np.flatnonzero(counts[place.reshape(-1)] > 1).tolist():
-        twin = int(place.reshape(-1)[row])
-        rank[row] = again.get(twin, 0)
-        again[twin] = int(rank[row]) + 1
+        group = int(place.reshape(-1)[row])
+        rank[row] = next_rank.get(group, 0)
+        next_rank[group] = int(rank[row]) + 1
     ids = digests.copy()
     for row in np.flatnonzero(rank).tolist():
         salted = digests[row].tobytes() + int(rank[row]).to_bytes(8, "little")
@@ -272,16 +280,16 @@ def content_ids(elements: MapElements) -> Digests:
     return ids
 
 
-def element_digests(elements: MapElements, state: Ints, cm: float) -> Digests:
+def compute_element_digests(elements: MapElements, state: Ints, cell_cm: float) -> Digests:
     """(N, 16) BLAKE2b-128 of each element's kind, state and points on a grid of cm, the same for a line read backwards."""
     # Neat coordinates (0.5 cm) would sit on the edge of a cell, where the last bit decides; the odd shift moves them off it.
-    cells = np.floor(elements.points * (100.0 / cm) + 0.5137).astype("<i8")
+    cells = np.floor(elements.points * (100.0 / cell_cm) + 0.5137).astype("<i8")
     out = np.zeros((len(elements), 16), np.uint8)
-    kinds, closed, first = elements.kind.tolist(), elements.closed.tolist(), elements.first.tolist()
+    kinds, closed, offsets = elements.kind.tolist(), elements.closed.tolist(), elements.offsets.tolist()
     for i, (kind, ring, here) in enumerate(zip(kinds, closed, state.tolist())):
-        line = cells[first[i] : first[i + 1]]
+        line = cells[offsets[i] : offsets[i + 1]]
         if ring and len(line):
-            line = _ring_from_least(line)
+            line = _ring_from_min_point(line)
         elif len(line) and line.tolist() > line[::-1].tolist():
             line = line[::-1]
         head = kind.to_bytes(4, "little") + here.to_bytes(4, "little")
@@ -289,7 +297,7 @@ def element_digests(elements: MapElements, state: Ints, cm: float) -> Digests:
     return out
 
 
-def _ring_from_least(ring: NDArray) -> NDArray:
+def _ring_from_min_point(ring: NDArray) -> NDArray:
     """The ring from its least point (x, then y) on, towards the lesser of its two neighbours."""
     start = int(np.lexsort((ring[:, 1], ring[:, 0]))[0])
     ahead = np.roll(ring, -start, axis=0)
@@ -297,11 +305,11 @@ def _ring_from_least(ring: NDArray) -> NDArray:
     return ahead if len(ring) < 3 or tuple(ahead[1]) <= tuple(back[1]) else back
 
 
-def _kept(pairs: Ints) -> Ints:
+def _drop_invalid_pairs(pairs: Ints) -> Ints:
     return pairs[(pairs >= 0).all(1)]
 
 
-def _freeze(value: object, other: dict[str, type[np.generic]], names: Sequence[str] | None = None) -> None:
+def _freeze(value: object, dtypes: dict[str, type[np.generic]], names: Sequence[str] | None = None) -> None:
     """Make the named array fields (all, if none are named) contiguous and read-only: int64 but for those in other."""
     for name in names or [f.name for f in fields(value)]:  # pyright: ignore[reportArgumentType]
-        object.__setattr__(value, name, frozen(getattr(value, name), other.get(name, np.int64)))
+        object.__setattr__(value, name, freeze(getattr(value, name), dtypes.get(name, np.int64)))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
-from manyeyes.maps.roads.lane_links import components, equal_stations, junctions_of_lanes, link_neighbors
+from manyeyes.maps.roads.lane_links import build_junctions, complete_lane_links, connected_components, resample_borders
 from manyeyes.maps.roads.road_network import Crossing, Lane, RoadMark, RoadNetwork
 
 Array = NDArray[np.float64]
@@ -43,12 +43,12 @@ def read_argoverse2_map(source: Path | str) -> RoadNetwork:
         raise Argoverse2MapError(f"{path}: expected an Argoverse 2 vector map in JSON; {error}.") from error
     if not isinstance(root, dict) or not isinstance(root.get("lane_segments"), dict) or not root["lane_segments"]:
         raise Argoverse2MapError(f"{path}: expected an object with 'lane_segments'; download the map again.")
-    reader = _Reader(path)
+    reader = _Argoverse2Reader(path)
     lanes, marks = reader.lanes(list(root["lane_segments"].values()))
     crossings = tuple(reader.crossing(item) for item in root.get("pedestrian_crossings", {}).values())
     edges = reader.edges(list(root.get("drivable_areas", {}).values()))
     name = path.name.removeprefix("log_map_archive_").split("____")[0]
-    return RoadNetwork(name, (), lanes, (*marks, *edges), crossings, (), junctions_of_lanes(lanes))
+    return RoadNetwork(name, (), lanes, (*marks, *edges), crossings, (), build_junctions(lanes))
 
 
 def read_argoverse2_poses(log: Path | str) -> tuple[NDArray[np.int64], Array]:
@@ -71,21 +71,21 @@ def read_argoverse2_poses(log: Path | str) -> tuple[NDArray[np.int64], Array]:
     return time[order].astype(np.int64), np.stack((x, y, yaw), 1)[order]
 
 
-class _Reader:
+class _Argoverse2Reader:
     """One file on its way to a RoadNetwork; holds its name for error texts."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def points(self, item: dict, field: str, at_least: int = 2) -> Array:
+    def points(self, item: dict, field: str, min_points: int = 2) -> Array:
         """A list of x, y, z as (M, 3); an error that names file, element and field otherwise."""
-        where = f"{self.path}: element {item.get('id')} field '{field}'"
+        context = f"{self.path}: element {item.get('id')} field '{field}'"
         try:
             points = np.array([[p["x"], p["y"], p.get("z", 0.0)] for p in item[field]], np.float64).reshape(-1, 3)
         except (KeyError, TypeError, ValueError, AttributeError):
-            raise Argoverse2MapError(f"{where}: expected a list of points x, y, z; download the map again.") from None
-        if len(points) < at_least or not np.isfinite(points).all():
-            raise Argoverse2MapError(f"{where}: expected {at_least} or more finite points; got {len(points)}.")
+            raise Argoverse2MapError(f"{context}: expected a list of points x, y, z; download the map again.") from None
+        if len(points) < min_points or not np.isfinite(points).all():
+            raise Argoverse2MapError(f"{context}: expected {min_points} or more finite points; got {len(points)}.")
         return points
 
     def lanes(self, items: Sequence[dict]) -> tuple[tuple[Lane, ...], tuple[RoadMark, ...]]:
@@ -95,10 +95,10 @@ class _Reader:
         lefts = [self.points(item, "left_lane_boundary") for item in items]
         rights = [self.points(item, "right_lane_boundary") for item in items]
         inside = [bool(item.get("is_intersection", False)) for item in items]
-        junction = _junction_of(inside, lefts, rights)
+        junction = _group_junctions(inside, lefts, rights)
         lanes, marks = [], []
         for k, item in enumerate(items):
-            left, right = equal_stations(lefts[k], rights[k])
+            left, right = resample_borders(lefts[k], rights[k])
             near = [item.get(side) for side in ("left_neighbor_id", "right_neighbor_id")]
             lanes.append(
                 Lane(
@@ -119,8 +119,8 @@ class _Reader:
                 )
             )
             for side, line in (("left", lefts[k]), ("right", rights[k])):
-                marks += _paint(line, str(item.get(f"{side}_lane_mark_type", "NONE")), str(item.get("id")), side)
-        return link_neighbors(lanes), tuple(marks)
+                marks += _make_marks(line, str(item.get(f"{side}_lane_mark_type", "NONE")), str(item.get("id")), side)
+        return complete_lane_links(lanes), tuple(marks)
 
     def crossing(self, item: dict) -> Crossing:
         """A crossing between two edges, turned so that the ring does not cross itself."""
@@ -138,7 +138,7 @@ class _Reader:
             from shapely.ops import orient
         except ImportError:
             raise MissingExtraError("map", "Reading Argoverse 2 maps") from None
-        rings = [self.points(item, "area_boundary", at_least=3)[:, :2] for item in areas]
+        rings = [self.points(item, "area_boundary", min_points=3)[:, :2] for item in areas]
         # Neighbouring areas touch along edges that are equal to a centimetre only.
         merged = unary_union([make_valid(Polygon(ring)).buffer(0.05, join_style="mitre") for ring in rings])
         merged = merged.buffer(-0.05, join_style="mitre")
@@ -163,7 +163,7 @@ def _map_file(path: Path) -> Path:
     return found[0]
 
 
-def _junction_of(inside: Sequence[bool], lefts: Sequence[Array], rights: Sequence[Array]) -> list[str | None]:
+def _group_junctions(inside: Sequence[bool], lefts: Sequence[Array], rights: Sequence[Array]) -> list[str | None]:
     """Names of junctions: lanes marked as inside an intersection, joined where their surfaces overlap."""
     try:
         import shapely
@@ -173,12 +173,12 @@ def _junction_of(inside: Sequence[bool], lefts: Sequence[Array], rights: Sequenc
     rings = [shapely.Polygon(np.concatenate((lefts[k], rights[k][::-1]))[:, :2]).buffer(0.1) for k in own]
     pairs = shapely.STRtree(rings).query(rings, predicate="intersects") if rings else np.zeros((2, 0), np.int64)
     names: list[str | None] = [None] * len(inside)
-    for k, label in zip(own, components(len(own), pairs.T)):
+    for k, label in zip(own, connected_components(len(own), pairs.T)):
         names[k] = str(label)
     return names
 
 
-def _paint(line: Array, kind: str, lane: str, side: str) -> list[RoadMark]:
+def _make_marks(line: Array, kind: str, lane: str, side: str) -> list[RoadMark]:
     """One mark, or two 0.24 m apart for a double line, of a boundary whose paint Argoverse names e.g. DOUBLE_SOLID_YELLOW."""
     words = kind.split("_")
     color = words[-1].lower()

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from manyeyes._io import atomic_write
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, DOUBLE, SOLID
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.formats.lanes import lane_pairs
-from manyeyes.maps.formats.rings import long_sides
+from manyeyes.maps.formats.lanes import find_lane_pairs
+from manyeyes.maps.formats.rings import split_long_sides
 
 Floats = NDArray[np.float64]
 
@@ -32,24 +32,24 @@ _CLOSED_M = 1.0
 
 def write_argoverse2(vector_map: VectorMap, path: Path | str) -> None:
     """Write the published elements as one JSON file."""
-    m = vector_map.published()
+    m = vector_map.select_published()
     e = m.elements
     lanes: list[dict[str, Any]] = []
     used: set[int] = set()
-    for pair in lane_pairs(m):
+    for pair in find_lane_pairs(m):
         right = e.polyline(pair.right)
         lanes.append(
-            _lane(len(lanes) + 1, e.polyline(pair.left), _paint(m, pair.left), right[::-1] if pair.turned else right,
-                  _paint(m, pair.right))
+            _lane(len(lanes) + 1, e.polyline(pair.left), _paint_name(m, pair.left),
+                  right[::-1] if pair.right_is_reversed else right, _paint_name(m, pair.right))
         )  # fmt: skip
         used |= {pair.left, pair.right}
     for row in np.flatnonzero(e.kind == DIVIDER).tolist():
         if row not in used:
             line = e.polyline(row)
-            lanes.append(_lane(len(lanes) + 1, line, _paint(m, row), _offset(line, -_LANE_M), "NONE"))
+            lanes.append(_lane(len(lanes) + 1, line, _paint_name(m, row), _offset(line, -_LANE_M), "NONE"))
     boundaries = [e.polyline(row) for row in np.flatnonzero(e.kind == BOUNDARY).tolist()]
     rings = [line for line in boundaries if len(line) > 3 and np.hypot(*(line[0] - line[-1])) <= _CLOSED_M]
-    sides = [long_sides(e.polyline(row)) for row in np.flatnonzero(e.kind == CROSSING).tolist()]
+    sides = [split_long_sides(e.polyline(row)) for row in np.flatnonzero(e.kind == CROSSING).tolist()]
     root = {
         "pedestrian_crossings": {
             str(k): {"id": k, "edge1": _points(one), "edge2": _points(two)} for k, (one, two) in enumerate(sides, 1)
@@ -61,7 +61,7 @@ def write_argoverse2(vector_map: VectorMap, path: Path | str) -> None:
     atomic_write(Path(path), json.dumps(root, separators=(",", ":"), allow_nan=False).encode())
 
 
-def _paint(m: VectorMap, row: int) -> str:
+def _paint_name(m: VectorMap, row: int) -> str:
     return _PAINT.get(int(m.elements.style[row].argmax()), "NONE") if m.elements.kind[row] == DIVIDER else "NONE"
 
 

@@ -43,7 +43,7 @@ class Attributes:
         e = vector_map.elements
         count = np.maximum(e.counts, 1)
         return cls(
-            id=np.array(hex_ids(vector_map.id), dtype=np.str_).reshape(-1),
+            id=np.array(to_hex_ids(vector_map.id), dtype=np.str_).reshape(-1),
             kind=np.array(KINDS)[e.kind],
             state=np.array(STATES)[vector_map.state],
             style=np.array(STYLES)[e.style.argmax(1)] if len(e) else np.zeros(0, np.str_),
@@ -51,7 +51,7 @@ class Attributes:
             confidence=np.round(1.0 / (1.0 + np.exp(-vector_map.log_odds)), 6),
             supporters=vector_map.supporters,
             agents=vector_map.agents,
-            sigma_m=np.round(np.bincount(e.owner, vector_map.stations.sigma, len(e)) / count, 4),
+            sigma_m=np.round(np.bincount(e.element_of_point, vector_map.point_evidence.sigma, len(e)) / count, 4),
             length_m=np.round(e.lengths(), 3),
             t_first=vector_map.t_first,
             t_last=vector_map.t_last,
@@ -63,20 +63,20 @@ class Attributes:
             yield f.name, getattr(self, f.name)
 
 
-def hex_ids(digests: NDArray[np.uint8]) -> list[str]:
+def to_hex_ids(digests: NDArray[np.uint8]) -> list[str]:
     """The rows of (N, 16) bytes as hexadecimal."""
     text = np.ascontiguousarray(digests).tobytes().hex()
     return [text[k : k + 32] for k in range(0, len(text), 32)]
 
 
-def in_degrees(vector_map: VectorMap) -> MapElements:
+def to_degrees(vector_map: VectorMap) -> MapElements:
     """The map's elements with points as longitude, latitude (degrees, WGS 84); rings run counter-clockwise."""
-    elements = counter_clockwise(vector_map.elements)
+    elements = orient_counter_clockwise(vector_map.elements)
     origin = (vector_map.frame.latitude, vector_map.frame.longitude)
     return elements.with_points(degrees_from_metres(elements.points, origin)[:, ::-1])
 
 
-def counter_clockwise(elements: MapElements) -> MapElements:
+def orient_counter_clockwise(elements: MapElements) -> MapElements:
     """The same elements with every ring counter-clockwise, from the same first point on."""
     rings = np.flatnonzero(elements.closed)
     if not len(rings):
@@ -86,6 +86,6 @@ def counter_clockwise(elements: MapElements) -> MapElements:
     area = np.bincount(owner, a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1], len(elements))
     points = elements.points.copy()
     for row in rings[area[rings] < 0].tolist():
-        first, last = elements.first[row], elements.first[row + 1]
+        first, last = elements.offsets[row], elements.offsets[row + 1]
         points[first + 1 : last] = points[first + 1 : last][::-1]
     return elements.with_points(points)

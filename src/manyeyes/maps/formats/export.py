@@ -15,7 +15,7 @@ from manyeyes.maps.formats.geoparquet import write_geoparquet
 from manyeyes.maps.formats.lanelet2_writer import write_lanelet2
 from manyeyes.maps.formats.nuscenes_writer import write_nuscenes
 from manyeyes.maps.formats.pmtiles import write_pmtiles
-from manyeyes.maps.fusion.simplify import simplified
+from manyeyes.maps.fusion.simplify import simplify_map
 
 Writer = Callable[[VectorMap, Path], None]
 
@@ -36,7 +36,7 @@ def export_map(vector_map: VectorMap, path: Path | str, format: str | None = Non
     """Write a map to a file; without a format the file's ending decides. Lines leave theirs by at most simplify_m."""
     path = Path(path)
     if simplify_m > 0:
-        vector_map = simplified(vector_map, simplify_m)
+        vector_map = simplify_map(vector_map, simplify_m)
     _writer(path, format)(vector_map, path)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from manyeyes._io import atomic_write
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.formats.attributes import Attributes, in_degrees
+from manyeyes.maps.formats.attributes import Attributes, to_degrees
 
 # 1e-8 degrees are 1.1 mm on a meridian.
 _DIGITS = 8
@@ -23,10 +23,10 @@ def write_geojson(vector_map: VectorMap, path: Path | str) -> None:
 
 def geojson_features(vector_map: VectorMap) -> list[str]:
     """One JSON text a feature, row by row with the map's elements."""
-    degrees = in_degrees(vector_map)
+    degrees = to_degrees(vector_map)
     columns = [(name, values.tolist()) for name, values in Attributes.of(vector_map).columns()]
     places = degrees.points.round(_DIGITS).tolist()
-    closed, first = degrees.closed.tolist(), degrees.first.tolist()
+    closed, first = degrees.closed.tolist(), degrees.offsets.tolist()
     out = []
     for row in range(len(degrees)):
         line = places[first[row] : first[row + 1]]

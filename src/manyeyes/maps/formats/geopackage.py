@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps as an OGC GeoPackage on WGS 84 (EPSG:4326), for editing in QGIS: layers ``lines`` and ``crossings``."""
+"""Maps as an OGC GeoPackage on WGS 84 (EPSG:4326), for editing in QGIS: layers ``summarize_methods`` and ``crossings``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from manyeyes._io import atomic_replace
 from manyeyes.datatypes import MissingExtraError
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.formats.attributes import Attributes, in_degrees
-from manyeyes.maps.formats.geoparquet import geometries
+from manyeyes.maps.formats.attributes import Attributes, to_degrees
+from manyeyes.maps.formats.geoparquet import to_shapely
 
 # GeoPackages hold the time of their last change; a fixed one makes equal maps equal files.
 _NO_DATE = "1970-01-01T00:00:00.000Z"
@@ -24,8 +24,8 @@ def write_geopackage(vector_map: VectorMap, path: Path | str) -> None:
         import shapely
     except ImportError:
         raise MissingExtraError("map", "Maps as GeoPackage") from None
-    degrees = in_degrees(vector_map)
-    geometry = shapely.to_wkb(geometries(shapely, degrees))
+    degrees = to_degrees(vector_map)
+    geometry = shapely.to_wkb(to_shapely(shapely, degrees))
     columns = list(Attributes.of(vector_map).columns())
     fields = [name for name, _ in columns]
     with atomic_replace(Path(path), keep_suffix=True) as temporary:

@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 
 from manyeyes._io import atomic_replace
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
-from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, rows_of
-from manyeyes.maps.elements.observation import Frame
-from manyeyes.maps.elements.vector_map import STATES, Stations, Topology, VectorMap
-from manyeyes.maps.formats.attributes import Attributes, hex_ids, in_degrees
+from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, take_rows
+from manyeyes.maps.elements.observation import MapFrame
+from manyeyes.maps.elements.vector_map import STATES, PointEvidence, Topology, VectorMap
+from manyeyes.maps.formats.attributes import Attributes, to_degrees, to_hex_ids
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 FORMAT_VERSION = 1
-_GROUP_ROWS = 8192
+_ROW_GROUP_SIZE = 8192
 _FRAME_KEY, _GEO_KEY, _VERSION_KEY = b"manyeyes:frame", b"geo", b"manyeyes:version"
 
 
@@ -39,8 +39,8 @@ def write_geoparquet(vector_map: VectorMap, path: Path | str) -> None:
     """Write all elements to one WGS 84 GeoParquet file with WKB geometry (lines and polygons) and plain attributes."""
     pyarrow = _pyarrow()
     shapely = _shapely()
-    degrees = in_degrees(vector_map)
-    geometry = geometries(shapely, degrees)
+    degrees = to_degrees(vector_map)
+    geometry = to_shapely(shapely, degrees)
     columns = [("geometry", pyarrow.array(shapely.to_wkb(geometry, flavor="iso"), pyarrow.binary()))]
     columns += [("bbox", _bbox(pyarrow, degrees.bounds()))]
     columns += [(name, pyarrow.array(values)) for name, values in Attributes.of(vector_map).columns()]
@@ -49,18 +49,18 @@ def write_geoparquet(vector_map: VectorMap, path: Path | str) -> None:
     _write(table.replace_schema_metadata({_GEO_KEY: json.dumps(geo).encode()}), Path(path))
 
 
-def geometries(shapely: Any, elements: MapElements) -> NDArray[np.object_]:
+def to_shapely(shapely: Any, elements: MapElements) -> NDArray[np.object_]:
     """(N,) shapely lines and polygons of elements."""
     out = np.empty(len(elements), object)
     for rows, make in ((~elements.closed, shapely.linestrings), (elements.closed, shapely.linearrings)):
         part = elements.take(rows)
         if len(part):
-            made = make(part.points, indices=part.owner)
+            made = make(part.points, indices=part.element_of_point)
             out[rows] = shapely.polygons(made) if make is shapely.linearrings else made
     return out
 
 
-def map_tables(vector_map: VectorMap, rows: NDArray[np.int64] | None = None) -> tuple[pa.Table, pa.Table]:
+def map_to_tables(vector_map: VectorMap, rows: NDArray[np.int64] | None = None) -> tuple[pa.Table, pa.Table]:
     """The map, or these rows of it, as two Arrow tables, lines and crossings, with GeoParquet metadata; nothing is lost.
 
     Rows keep their relations to rows that are left out, by id: those may stand in another file.
@@ -70,9 +70,9 @@ def map_tables(vector_map: VectorMap, rows: NDArray[np.int64] | None = None) -> 
     return _table(vector_map, rows[~closed], False), _table(vector_map, rows[closed], True)
 
 
-def map_of_tables(tables: list[pa.Table], frame: Frame) -> VectorMap:
+def tables_to_map(tables: list[pa.Table], frame: MapFrame) -> VectorMap:
     """The map whose elements stand in the tables, in their order; relations to elements of other tables are left out."""
-    parts = [_Part(table) for table in tables if len(table)]
+    parts = [_TableColumns(table) for table in tables if len(table)]
     if not parts:
         return VectorMap.empty(frame)
     return _assemble(parts, frame)
@@ -80,21 +80,21 @@ def map_of_tables(tables: list[pa.Table], frame: Frame) -> VectorMap:
 
 def write_map(vector_map: VectorMap, lines: Path, crossings: Path, rows: NDArray[np.int64] | None = None) -> None:
     """Write the lossless form of a map or of some rows: one file of lines, one of crossings (empty ones too)."""
-    for table, path in zip(map_tables(vector_map, rows), (lines, crossings)):
+    for table, path in zip(map_to_tables(vector_map, rows), (lines, crossings)):
         _write(table, path)
 
 
 def read_map(*paths: Path | str) -> VectorMap:
     """The map of files in the lossless form, elements by ascending id; one map may stand in many files."""
     tables = [read_table(Path(path)) for path in paths]
-    frames = {frame_of(table) for table in tables}
+    frames = {read_frame(table) for table in tables}
     if len(frames) > 1:
         names = ", ".join(Path(p).name for p in paths[:4])
         raise MapFileError(
             f"{names}: expected files of one frame; got {len(frames)} origins: move them into one first."
         )
-    together = map_of_tables(tables, frames.pop() if frames else Frame())
-    return together.take(np.lexsort(together.id.T[::-1]))
+    whole = tables_to_map(tables, frames.pop() if frames else MapFrame())
+    return whole.take(np.lexsort(whole.id.T[::-1]))
 
 
 def read_table(path: Path) -> pa.Table:
@@ -123,13 +123,13 @@ def read_table(path: Path) -> pa.Table:
     return table.combine_chunks()
 
 
-def frame_of(table: pa.Table) -> Frame:
+def read_frame(table: pa.Table) -> MapFrame:
     """The frame that a table's metadata names."""
     frame = json.loads((table.schema.metadata or {})[_FRAME_KEY])
-    return Frame(frame["latitude"], frame["longitude"])
+    return MapFrame(frame["latitude"], frame["longitude"])
 
 
-_POINT_COLUMNS = ("sigma", *(f.name if f.name != "sigma" else "station_sigma" for f in fields(Stations)))
+_POINT_COLUMNS = ("sigma", *(f.name if f.name != "sigma" else "station_sigma" for f in fields(PointEvidence)))
 _ROW_COLUMNS = ("log_odds", "supporters", "agents", "t_first", "t_last")
 _PAIR_COLUMNS = ("successor", "left", "right")
 # Names that stand both for an element and for its points are told apart by a prefix.
@@ -154,26 +154,26 @@ def _table(m: VectorMap, rows: NDArray[np.int64], closed: bool) -> pa.Table:
     """The rows of a map that are lines, or rings."""
     pyarrow = _pyarrow()
     e = m.elements.take(rows)
-    _, places = rows_of(m.elements.first, rows)
-    stations = m.stations.take(places)
-    per_point = [e.sigma, *(getattr(stations, f.name) for f in fields(Stations))]
-    first, sources = rows_of(m.sources_first, rows)
+    _, places = take_rows(m.elements.offsets, rows)
+    stations = m.point_evidence.take(places)
+    per_point = [e.sigma, *(getattr(stations, f.name) for f in fields(PointEvidence))]
+    offsets, sources = take_rows(m.source_offsets, rows)
     columns: dict[str, pa.Array] = {
         "geometry": _geoarrow(pyarrow, e, closed),
         "bbox": _bbox(pyarrow, e.bounds()),
-        "id": pyarrow.array(hex_ids(m.id[rows]), pyarrow.string()),
+        "id": pyarrow.array(to_hex_ids(m.id[rows]), pyarrow.string()),
         "kind": pyarrow.array([KINDS[k] for k in e.kind.tolist()], pyarrow.string()),
         "state": pyarrow.array([STATES[k] for k in m.state[rows].tolist()], pyarrow.string()),
         "score": pyarrow.array(e.score),
         "style": pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(e.style.reshape(-1)), len(STYLES)),
     }
     columns |= {name: pyarrow.array(getattr(m, name)[rows]) for name in _ROW_COLUMNS}
-    columns |= {_AT_POINT + n: _lists(pyarrow, e.first, v) for n, v in zip(_POINT_COLUMNS, per_point)}
+    columns |= {_AT_POINT + n: _lists(pyarrow, e.offsets, v) for n, v in zip(_POINT_COLUMNS, per_point)}
     for name in _PAIR_COLUMNS:
-        columns[name] = _related(pyarrow, getattr(m.topology, name), rows, m.id)
+        columns[name] = _related_ids(pyarrow, getattr(m.topology, name), rows, m.id)
     columns["branch"] = _branches(pyarrow, m.topology, rows, len(m))
-    named = pyarrow.array(hex_ids(m.observations[m.sources[sources]]), pyarrow.string())
-    columns["sources"] = pyarrow.ListArray.from_arrays(pyarrow.array(first, pyarrow.int32()), named)
+    named = pyarrow.array(to_hex_ids(m.observations[m.sources[sources]]), pyarrow.string())
+    columns["sources"] = pyarrow.ListArray.from_arrays(pyarrow.array(offsets, pyarrow.int32()), named)
     geo = _geo("polygon" if closed else "linestring", ["Polygon" if closed else "LineString"], e, m.frame)
     metadata = {
         _GEO_KEY: json.dumps(geo).encode(),
@@ -185,10 +185,10 @@ def _table(m: VectorMap, rows: NDArray[np.int64], closed: bool) -> pa.Table:
 
 def _geoarrow(pyarrow: Any, e: MapElements, closed: bool) -> pa.Array:
     """Native GeoArrow geometry: lists of struct<x, y>; a ring gets its first point again at its end."""
-    points, first = e.points, e.first
+    points, first = e.points, e.offsets
     if closed:
-        first = e.first + np.arange(len(e) + 1)
-        points = np.insert(e.points, e.first[1:], e.points[e.first[:-1]], axis=0) if len(e) else e.points
+        first = e.offsets + np.arange(len(e) + 1)
+        points = np.insert(e.points, e.offsets[1:], e.points[e.offsets[:-1]], axis=0) if len(e) else e.points
     x, y = (pyarrow.array(np.ascontiguousarray(points[:, k])) for k in (0, 1))
     vertex = pyarrow.StructArray.from_arrays([x, y], fields=[_required(pyarrow, n, pyarrow.float64()) for n in "xy"])
     out = pyarrow.ListArray.from_arrays(
@@ -211,16 +211,16 @@ def _bbox(pyarrow: Any, bounds: NDArray[np.float64]) -> pa.Array:
     )
 
 
-def _lists(pyarrow: Any, first: NDArray[np.int64], values: NDArray) -> pa.Array:
-    return pyarrow.ListArray.from_arrays(pyarrow.array(first, pyarrow.int32()), pyarrow.array(values))
+def _lists(pyarrow: Any, offsets: NDArray[np.int64], values: NDArray) -> pa.Array:
+    return pyarrow.ListArray.from_arrays(pyarrow.array(offsets, pyarrow.int32()), pyarrow.array(values))
 
 
-def _related(pyarrow: Any, pairs: NDArray[np.int64], rows: NDArray[np.int64], ids: NDArray[np.uint8]) -> pa.Array:
+def _related_ids(pyarrow: Any, pairs: NDArray[np.int64], rows: NDArray[np.int64], ids: NDArray[np.uint8]) -> pa.Array:
     """Per row the ids of its partners, in the order of the pairs."""
     order = np.argsort(pairs[:, 0], kind="stable")
     first = np.searchsorted(pairs[order, 0], np.arange(len(ids) + 1))
-    chosen, places = rows_of(first, rows)
-    values = pyarrow.array(hex_ids(ids[pairs[order[places], 1]]), pyarrow.string())
+    chosen, places = take_rows(first, rows)
+    values = pyarrow.array(to_hex_ids(ids[pairs[order[places], 1]]), pyarrow.string())
     return pyarrow.ListArray.from_arrays(pyarrow.array(chosen, pyarrow.int32()), values)
 
 
@@ -228,7 +228,7 @@ def _branches(pyarrow: Any, topology: Topology, rows: NDArray[np.int64], total: 
     """Per row the points of the branch nodes where it ends."""
     order = np.argsort(topology.branch[:, 1], kind="stable")
     first = np.searchsorted(topology.branch[order, 1], np.arange(total + 1))
-    chosen, places = rows_of(first, rows)
+    chosen, places = take_rows(first, rows)
     nodes = topology.branch_xy[topology.branch[order[places], 0]]
     x, y = (pyarrow.array(np.ascontiguousarray(nodes[:, k])) for k in (0, 1))
     return pyarrow.ListArray.from_arrays(
@@ -236,7 +236,7 @@ def _branches(pyarrow: Any, topology: Topology, rows: NDArray[np.int64], total: 
     )
 
 
-class _Part:
+class _TableColumns:
     """The columns of one table as arrays, relations still by id."""
 
     def __init__(self, table: pa.Table) -> None:
@@ -253,8 +253,8 @@ class _Part:
         kind = np.array([KINDS.index(k) for k in _column(table, "kind").to_pylist()], np.int64)
         style = _column(table, "style").flatten().to_numpy().reshape(-1, len(STYLES))
         self.elements = MapElements(kind, first, points, _column(table, "score").to_numpy(), at["sigma"], style)
-        self.stations = Stations(
-            **{f.name: at["station_sigma" if f.name == "sigma" else f.name] for f in fields(Stations)}
+        self.stations = PointEvidence(
+            **{f.name: at["station_sigma" if f.name == "sigma" else f.name] for f in fields(PointEvidence)}
         )
         self.state = np.array([STATES.index(k) for k in _column(table, "state").to_pylist()], np.int64)
         self.rows = {name: _column(table, name).to_numpy() for name in _ROW_COLUMNS}
@@ -282,7 +282,7 @@ def _ragged(table: pa.Table, name: str) -> tuple[NDArray[np.int64], NDArray[np.u
     return column.value_lengths().to_numpy().astype(np.int64), _digests(column.flatten())
 
 
-def _assemble(parts: list[_Part], frame: Frame) -> VectorMap:
+def _assemble(parts: list[_TableColumns], frame: MapFrame) -> VectorMap:
     """One map of the parts' elements, in order."""
     ids = np.concatenate([p.id for p in parts])
     n = len(ids)
@@ -306,10 +306,12 @@ def _assemble(parts: list[_Part], frame: Frame) -> VectorMap:
         elements=MapElements.cat([p.elements for p in parts]),
         id=ids,
         state=np.concatenate([p.state for p in parts]),
-        stations=Stations(*(np.concatenate([getattr(p.stations, f.name) for p in parts]) for f in fields(Stations))),
+        point_evidence=PointEvidence(
+            *(np.concatenate([getattr(p.stations, f.name) for p in parts]) for f in fields(PointEvidence))
+        ),
         topology=Topology(pairs("successor"), pairs("left"), pairs("right"), branch, xy),
         observations=observations.reshape(-1, 16),
-        sources_first=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        source_offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
         sources=sources.reshape(-1).astype(np.int64),
         **{name: np.concatenate([p.rows[name] for p in parts]) for name in _ROW_COLUMNS},
     )
@@ -319,7 +321,7 @@ def _types_of(e: MapElements) -> list[str]:
     return sorted({"Polygon" if kind == CROSSING else "LineString" for kind in np.unique(e.kind).tolist()})
 
 
-def _geo(encoding: str, types: list[str], e: MapElements, frame: Frame | None) -> dict[str, Any]:
+def _geo(encoding: str, types: list[str], e: MapElements, frame: MapFrame | None) -> dict[str, Any]:
     """The ``geo`` metadata of GeoParquet 1.1.0; without a frame the coordinates are OGC:CRS84, the default."""
     column: dict[str, Any] = {"encoding": encoding, "geometry_types": types}
     if frame is not None:
@@ -330,7 +332,7 @@ def _geo(encoding: str, types: list[str], e: MapElements, frame: Frame | None) -
     return {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}}
 
 
-def projjson(frame: Frame) -> dict[str, Any]:
+def projjson(frame: MapFrame) -> dict[str, Any]:
     """The frame's coordinate reference system as PROJJSON 0.7."""
 
     def axis(name: str, short: str, direction: str, unit: str) -> dict[str, str]:
@@ -381,7 +383,7 @@ def _write(table: pa.Table, path: Path) -> None:
     from pyarrow import parquet
 
     with atomic_replace(path) as temporary:
-        parquet.write_table(table, temporary, compression="zstd", row_group_size=_GROUP_ROWS, store_schema=True)
+        parquet.write_table(table, temporary, compression="zstd", row_group_size=_ROW_GROUP_SIZE, store_schema=True)
 
 
 def _pyarrow() -> Any:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
-from manyeyes.maps.roads.lane_links import components, equal_stations, junctions_of_lanes, link_neighbors
+from manyeyes.maps.roads.lane_links import build_junctions, complete_lane_links, connected_components, resample_borders
 from manyeyes.maps.roads.road_network import Crossing, Lane, RoadMark, RoadNetwork
 from manyeyes.maps.roads.transverse_mercator import metres_from_degrees
 
@@ -54,7 +54,7 @@ class Lanelet2Error(ManyeyesError):
 
 
 @dataclass(frozen=True, eq=False)
-class _Way:
+class _OsmWay:
     """A linestring: points (M, 3), ids of its two end nodes, its tags."""
 
     points: Array
@@ -70,7 +70,7 @@ def read_lanelet2(source: Path | str, origin: tuple[float, float] | None = None)
     ways = _ways(root, path, origin)
     lanes, crossings = _lanelets(root, path, ways)
     marks = [mark for name in sorted(ways, key=int) for mark in _marks(ways[name], name)]
-    return RoadNetwork(path.stem, (), lanes, tuple(marks), crossings, (), junctions_of_lanes(lanes))
+    return RoadNetwork(path.stem, (), lanes, tuple(marks), crossings, (), build_junctions(lanes))
 
 
 def lanelet2_origin(source: Path | str) -> tuple[float, float]:
@@ -114,7 +114,7 @@ def _tags(element: ET.Element) -> dict[str, str]:
     return {tag.get("k", ""): tag.get("v", "") for tag in element.findall("tag")}
 
 
-def _ways(root: ET.Element, path: Path, origin: tuple[float, float]) -> dict[str, _Way]:
+def _ways(root: ET.Element, path: Path, origin: tuple[float, float]) -> dict[str, _OsmWay]:
     """All linestrings of two or more different points, in metres."""
     nodes = [node for node in root.findall("node") if node.get("action") != "delete"]
     names = [node.get("id", "") for node in nodes]
@@ -131,11 +131,11 @@ def _ways(root: ET.Element, path: Path, origin: tuple[float, float]) -> dict[str
         points = xyz[[place[m] for m in members]]
         fresh = np.concatenate(([True], np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1) > 1e-3))
         if fresh.sum() >= 2:
-            ways[way.get("id", "")] = _Way(points[fresh], (members[0], members[-1]), _tags(way))
+            ways[way.get("id", "")] = _OsmWay(points[fresh], (members[0], members[-1]), _tags(way))
     return ways
 
 
-def _marks(way: _Way, name: str) -> list[RoadMark]:
+def _marks(way: _OsmWay, name: str) -> list[RoadMark]:
     """The paint or the edge that a linestring is; nothing for virtual ones and symbols."""
     kind, subtype = way.tags.get("type", ""), way.tags.get("subtype", "")
     color = way.tags.get("color", "white")
@@ -158,7 +158,7 @@ def _marks(way: _Way, name: str) -> list[RoadMark]:
     return marks
 
 
-def _lanelets(root: ET.Element, path: Path, ways: dict[str, _Way]) -> tuple[tuple[Lane, ...], tuple[Crossing, ...]]:
+def _lanelets(root: ET.Element, path: Path, ways: dict[str, _OsmWay]) -> tuple[tuple[Lane, ...], tuple[Crossing, ...]]:
     """Lanes in the order of their ids, linked and grouped into junctions, and crossings."""
     lanes: list[Lane] = []
     crossings: list[Crossing] = []
@@ -167,15 +167,15 @@ def _lanelets(root: ET.Element, path: Path, ways: dict[str, _Way]) -> tuple[tupl
         tags = _tags(relation)
         if tags.get("type") != "lanelet":
             continue
-        where = f"{path}: lanelet {relation.get('id')}"
-        left, left_ends = _border(relation, "left", ways, where)
-        right, right_ends = _border(relation, "right", ways, where)
+        context = f"{path}: lanelet {relation.get('id')}"
+        left, left_ends = _border(relation, "left", ways, context)
+        right, right_ends = _border(relation, "right", ways, context)
         left, right, left_ends, right_ends = _aligned(left, right, left_ends, right_ends)
         if tags.get("subtype") == "crosswalk":
             crossings.append(Crossing(np.concatenate((left, right[::-1])), "", "crosswalk"))
             continue
         kind = _KIND_OF_SUBTYPE.get(tags.get("subtype", ""), "none")
-        left, right = equal_stations(left, right)
+        left, right = resample_borders(left, right)
         number, name = len(lanes), str(relation.get("id"))
         lanes.append(Lane(number, name, 0, -1, kind, None, _SPEED_MPS, left, right, (left + right) / 2))
         ends.append(((left_ends[0], right_ends[0]), (left_ends[1], right_ends[1])))
@@ -183,18 +183,18 @@ def _lanelets(root: ET.Element, path: Path, ways: dict[str, _Way]) -> tuple[tupl
     for k, (begin, _) in enumerate(ends):
         starts.setdefault(begin, []).append(k)
     linked = [replace(lane, successors=tuple(starts.get(end, ()))) for lane, (_, end) in zip(lanes, ends)]
-    linked = link_neighbors(linked)
+    linked = complete_lane_links(linked)
     names = _junctions(linked)
     return tuple(replace(lane, junction_id=name) for lane, name in zip(linked, names)), tuple(crossings)
 
 
-def _border(relation: ET.Element, role: str, ways: dict[str, _Way], where: str) -> tuple[Array, tuple[str, str]]:
+def _border(relation: ET.Element, role: str, ways: dict[str, _OsmWay], context: str) -> tuple[Array, tuple[str, str]]:
     """One border of a lanelet: its ways of a role, joined where they share a node."""
     members = [m.get("ref", "") for m in relation.findall("member") if m.get("role") == role and m.get("type") == "way"]
     missing = [m for m in members if m not in ways]
     if not members or missing:
         got = f"the unknown way {missing[0]}" if missing else "none"
-        raise Lanelet2Error(f"{where}: expected member ways with the role '{role}'; got {got}.")
+        raise Lanelet2Error(f"{context}: expected member ways with the role '{role}'; got {got}.")
     points, ends = ways[members[0]].points, ways[members[0]].ends
     for name in members[1:]:
         other, other_ends = ways[name].points, ways[name].ends
@@ -235,15 +235,15 @@ def _junctions(lanes: Sequence[Lane]) -> list[str | None]:
     grounds = shapely.make_valid([shapely.Polygon(ring) for ring in rings])
     one, two = shapely.STRtree(grounds).query(grounds, predicate="intersects")
     area = shapely.area(shapely.intersection(grounds[one], grounds[two]))
-    both_ways = np.array([_same_ground(own[a], own[b]) for a, b in zip(one.tolist(), two.tolist())], bool)
+    both_ways = np.array([_share_ground(own[a], own[b]) for a, b in zip(one.tolist(), two.tolist())], bool)
     overlap = (one != two) & (area > _MIN_OVERLAP_M2) & ~both_ways
-    for k, label in enumerate(components(len(own), np.stack((one[overlap], two[overlap]), 1)).tolist()):
+    for k, label in enumerate(connected_components(len(own), np.stack((one[overlap], two[overlap]), 1)).tolist()):
         if overlap[one == k].any():
             names[own[k].id] = own[label].road_id
     return names
 
 
-def _same_ground(one: Lane, two: Lane) -> bool:
+def _share_ground(one: Lane, two: Lane) -> bool:
     """Whether two lanes are the two directions of one strip, or a strip and its copy for other traffic."""
     width = float(np.median(one.width_m))
     middle = np.linalg.norm(one.center[len(one.center) // 2] - two.center[len(two.center) // 2])

@@ -18,8 +18,8 @@ from manyeyes._io import atomic_write
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, DOUBLE, SOLID, STOP_LINE, STYLES
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.attributes import Attributes
-from manyeyes.maps.formats.lanes import lane_pairs
-from manyeyes.maps.formats.rings import long_sides
+from manyeyes.maps.formats.lanes import find_lane_pairs
+from manyeyes.maps.formats.rings import split_long_sides
 from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 
 Tags = tuple[tuple[str, str], ...]
@@ -44,15 +44,15 @@ _CROSSWALK: Tags = (
 
 def write_lanelet2(vector_map: VectorMap, path: Path | str) -> None:
     """Write the published elements as an OSM file; ``local_x`` and ``local_y`` of a node are metres in the map's frame."""
-    m = vector_map.published()
+    m = vector_map.select_published()
     writer = _Writer(m)
     e = m.elements
     way_of = {row: writer.way(e.polyline(row), _line_tags(m, row)) for row in np.flatnonzero(~e.closed).tolist()}
-    for pair in lane_pairs(m):
+    for pair in find_lane_pairs(m):
         writer.lanelet(way_of[pair.left], way_of[pair.right], _ROAD)
     for row in np.flatnonzero(e.kind == CROSSING).tolist():
         marking: Tags = (("type", "pedestrian_marking"), ("manyeyes:id", writer.ids[row]))
-        left, right = (writer.way(side, marking) for side in long_sides(e.polyline(row)))
+        left, right = (writer.way(side, marking) for side in split_long_sides(e.polyline(row)))
         writer.lanelet(left, right, _CROSSWALK)
     atomic_write(Path(path), writer.text().encode())
 

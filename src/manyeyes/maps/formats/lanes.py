@@ -13,22 +13,22 @@ from manyeyes.maps.elements.vector_map import VectorMap
 
 Floats = NDArray[np.float64]
 
-_NARROWEST_M, _WIDEST_M = 2.5, 4.5
+_MIN_WIDTH_M, _MAX_WIDTH_M = 2.5, 4.5
 _SPACING_M = 2.0
 # Of the shorter line, so much must lie beside the other.
-_BESIDE = 0.8
+_MIN_OVERLAP = 0.8
 
 
 @dataclass(frozen=True, eq=False)
 class LanePair:
-    """Two rows of a map that bound one lane: ``left`` as it runs, ``right`` backwards if ``turned``."""
+    """Two rows of a map that bound one lane: ``left`` as it runs, ``right`` backwards if ``right_is_reversed``."""
 
     left: int
     right: int
-    turned: bool
+    right_is_reversed: bool
 
 
-def lane_pairs(vector_map: VectorMap) -> list[LanePair]:
+def find_lane_pairs(vector_map: VectorMap) -> list[LanePair]:
     """Dividers and boundaries whose right neighbour runs 2.5 to 4.5 m beside at least 80 % of the shorter one's length.
 
     Neighbours are those of the map's topology, so a line bounds at most one lane on each hand. Ascending by rows.
@@ -52,17 +52,17 @@ def lane_pairs(vector_map: VectorMap) -> list[LanePair]:
 def _is_lane(a: Floats, b: Floats) -> bool:
     """Whether b lies to the right of a, at a lane's distance nearly everywhere, along most of the shorter one."""
     shorter, other, side = (a, b, 1.0) if _length(a) <= _length(b) else (b, a, -1.0)
-    offset = side * _offsets_to_left(_at_spacing(shorter), other)
+    offset = side * _offsets_to_left(_resample(shorter), other)
     beside = np.isfinite(offset)
-    inside = (offset[beside] >= _NARROWEST_M) & (offset[beside] <= _WIDEST_M)
-    return bool(beside.mean() >= _BESIDE and inside.mean() >= 0.9)
+    inside = (offset[beside] >= _MIN_WIDTH_M) & (offset[beside] <= _MAX_WIDTH_M)
+    return bool(beside.mean() >= _MIN_OVERLAP and inside.mean() >= 0.9)
 
 
 def _length(line: Floats) -> float:
     return float(np.hypot(*np.diff(line, axis=0).T).sum())
 
 
-def _at_spacing(line: Floats) -> Floats:
+def _resample(line: Floats) -> Floats:
     """Points on a line about 2 m apart, its ends among them."""
     along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
     at = np.linspace(0.0, along[-1], max(int(along[-1] / _SPACING_M), 1) + 1)

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, STOP_LINE, MapElements
-from manyeyes.maps.elements.observation import Frame, Observation, ObservationError
-from manyeyes.maps.elements.observation_file import Quarantined, Reading
+from manyeyes.maps.elements.observation import MapFrame, Observation, ObservationError
+from manyeyes.maps.elements.observation_file import LoadedObservations, RejectedRows
 
 Array = NDArray[np.float64]
 
@@ -77,35 +77,35 @@ class SamplePose:
 class PoseTable:
     """Poses of samples, by token, in one frame."""
 
-    frame: Frame
+    frame: MapFrame
     tokens: tuple[str, ...]
     poses: tuple[SamplePose, ...]
 
 
 @dataclass(frozen=True)
-class ResultOptions:
+class ModelResultOptions:
     """What a result file does not say. range_x, range_y: the model's view, metres forward and left of the vehicle.
 
-    axes: of the points, "vehicle" (x forward, y left) or "lidar" (x right, y forward). least_score: elements below are left out.
+    axes: of the points, "vehicle" (x forward, y left) or "lidar" (x right, y forward). min_score: elements below are left out.
     """
 
     axes: Literal["vehicle", "lidar"] = "vehicle"
     range_x: tuple[float, float] = (-30.0, 30.0)
     range_y: tuple[float, float] = (-15.0, 15.0)
-    least_score: float = 0.0
+    min_score: float = 0.0
     sigma_m: float = _SIGMA_M
     model: str = ""
 
 
 RESULT_OPTIONS = {
-    "maptr-nuscenes": ResultOptions(axes="lidar", model="maptr"),
-    "maptr-av2": ResultOptions(model="maptr"),
-    "streammapnet": ResultOptions(model="streammapnet"),
-    "streammapnet-100x50": ResultOptions(range_x=(-50.0, 50.0), range_y=(-25.0, 25.0), model="streammapnet"),
+    "maptr-nuscenes": ModelResultOptions(axes="lidar", model="maptr"),
+    "maptr-av2": ModelResultOptions(model="maptr"),
+    "streammapnet": ModelResultOptions(model="streammapnet"),
+    "streammapnet-100x50": ModelResultOptions(range_x=(-50.0, 50.0), range_y=(-25.0, 25.0), model="streammapnet"),
 }
 
 
-def read_model_results(source: Path | str, poses: PoseTable, options: ResultOptions) -> Reading:
+def read_model_results(source: Path | str, poses: PoseTable, options: ModelResultOptions) -> LoadedObservations:
     """The samples of a result file of MapTR or StreamMapNet (told apart by their layout) as observations, by token."""
     path = Path(source)
     root = _json(path)
@@ -114,16 +114,16 @@ def read_model_results(source: Path | str, poses: PoseTable, options: ResultOpti
         raise ModelResultsError(
             f"{path}: expected an object with 'results', a list (MapTR) or an object (StreamMapNet)."
         )
-    where = dict(zip(poses.tokens, poses.poses))
-    kept, aside = [], []
+    pose_of_token = dict(zip(poses.tokens, poses.poses))
+    kept, rejected = [], []
     for row, (token, vectors) in enumerate(_samples(results)):
         try:
-            if token not in where:
+            if token not in pose_of_token:
                 raise ModelResultsError(f"{path}: sample '{token}' has no pose; add it to the table of poses.")
-            kept.append(_observation(where[token], vectors, options, f"{path}: sample '{token}'"))
+            kept.append(_observation(pose_of_token[token], vectors, options, f"{path}: sample '{token}'"))
         except (ModelResultsError, ObservationError) as error:
-            aside.append(Quarantined(str(path), row, 1, str(error)))
-    return Reading(poses.frame, tuple(kept), tuple(aside))
+            rejected.append(RejectedRows(str(path), row, 1, str(error)))
+    return LoadedObservations(poses.frame, tuple(kept), tuple(rejected))
 
 
 @dataclass(frozen=True)
@@ -155,16 +155,20 @@ def _samples(results: list[Any] | dict[str, Any]) -> Iterator[tuple[str, list[_V
         yield token, [_Vector(*row) for row in zip(*columns)] if fits else None
 
 
-def _observation(at: SamplePose, vectors: list[_Vector] | None, options: ResultOptions, where: str) -> Observation:
+def _observation(
+    sample_pose: SamplePose, vectors: list[_Vector] | None, options: ModelResultOptions, context: str
+) -> Observation:
     if vectors is None:
-        raise ModelResultsError(f"{where}: expected vectors with a class, a score and points each; got another layout.")
+        raise ModelResultsError(
+            f"{context}: expected vectors with a class, a score and points each; got another layout."
+        )
     lines, kinds, scores = [], [], []
     for number, vector in enumerate(vectors):
         kind = _kind(vector.name)
-        score = _score(vector.score, f"{where} vector {number}")
-        if kind is None or score < options.least_score:
+        score = _score(vector.score, f"{context} vector {number}")
+        if kind is None or score < options.min_score:
             continue
-        points = _points(vector.points, f"{where} vector {number}")
+        points = _points(vector.points, f"{context} vector {number}")
         if options.axes == "lidar":
             points = np.stack((points[:, 1], -points[:, 0]), 1)
         if kind == CROSSING and len(points) > 3 and math.dist(points[0], points[-1]) < _CLOSED_M:
@@ -176,11 +180,11 @@ def _observation(at: SamplePose, vectors: list[_Vector] | None, options: ResultO
             scores.append(score)
     (x0, x1), (y0, y1) = options.range_x, options.range_y
     return Observation(
-        agent=at.agent,
-        pass_id=at.pass_id,
-        time_ns=at.time_ns,
-        pose=np.array(at.pose),
-        covariance=np.diag([sigma * sigma for sigma in at.sigma]),
+        agent=sample_pose.agent,
+        pass_id=sample_pose.pass_id,
+        time_ns=sample_pose.time_ns,
+        pose=np.array(sample_pose.pose),
+        covariance=np.diag([sigma * sigma for sigma in sample_pose.sigma]),
         view=np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]),
         elements=MapElements.of(lines, np.array(kinds, np.int64), np.array(scores), options.sigma_m),
         model=options.model,
@@ -194,24 +198,24 @@ def _kind(name: Any) -> int | None:
     return _KIND_OF_NAME.get(str(name))
 
 
-def _score(value: Any, where: str) -> float:
+def _score(value: Any, context: str) -> float:
     if isinstance(value, int | float) and 0.0 <= value <= 1.0:
         return float(value)
-    raise ModelResultsError(f"{where}: expected a score in [0, 1]; got {value!r}.")
+    raise ModelResultsError(f"{context}: expected a score in [0, 1]; got {value!r}.")
 
 
-def _points(value: Any, where: str) -> Array:
+def _points(value: Any, context: str) -> Array:
     """(M, 2) points; a third coordinate is left out."""
     try:
         points = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         points = np.zeros(0)
     if points.ndim != 2 or points.shape[-1] not in (2, 3) or not np.isfinite(points).all():
-        raise ModelResultsError(f"{where}: expected a list of points [x, y] of finite numbers; got another value.")
+        raise ModelResultsError(f"{context}: expected a list of points [x, y] of finite numbers; got another value.")
     return points[:, :2]
 
 
-def read_pose_csv(source: Path | str, frame: Frame) -> PoseTable:
+def read_pose_csv(source: Path | str, frame: MapFrame) -> PoseTable:
     """Poses from a CSV with the columns token, agent, pass_id, time_ns, x, y, yaw and, if there are, sigma_x, sigma_y, sigma_yaw.
 
     x, y in metres and yaw in radians in the frame; without sigmas 0.7 m and 0.8°.
@@ -282,7 +286,7 @@ def read_nuscenes_poses(folder: Path | str, location: str, axes: Literal["vehicl
         raise ModelResultsError(
             f"{root}: no LiDAR key frame at '{location}'; give the folder with the tables of the data set."
         )
-    return PoseTable(Frame(*_NUSCENES_ORIGIN[location]), tuple(tokens), tuple(found))
+    return PoseTable(MapFrame(*_NUSCENES_ORIGIN[location]), tuple(tokens), tuple(found))
 
 
 def _planar(row: dict[str, Any]) -> tuple[float, float, float]:
@@ -310,9 +314,9 @@ def _json(path: Path) -> Any:
 
 __all__ = [
     "RESULT_OPTIONS",
+    "ModelResultOptions",
     "ModelResultsError",
     "PoseTable",
-    "ResultOptions",
     "SamplePose",
     "read_model_results",
     "read_nuscenes_poses",

@@ -40,7 +40,7 @@ _HALF_STRIP_M = 0.2
 
 def write_nuscenes(vector_map: VectorMap, path: Path | str) -> None:
     """Write the published elements as one JSON file."""
-    m = vector_map.published()
+    m = vector_map.select_published()
     e = m.elements
     tables = _Tables()
     for row in range(len(e)):

@@ -18,7 +18,7 @@ import numpy as np
 
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.maps.formats.opendrive_geometry import Array, Cubics, Primitive, ReferenceLine
-from manyeyes.maps.formats.opendrive_links import connect, junctions_of
+from manyeyes.maps.formats.opendrive_links import link_lanes, read_junctions
 from manyeyes.maps.roads.road_network import Crossing, Lane, ParkingSpace, Road, RoadMark, RoadNetwork
 
 STEP_M = 1.0
@@ -73,10 +73,10 @@ def read_opendrive(source: Path | str | bytes, name: str | None = None, step_m: 
     if root.tag != "OpenDRIVE":
         raise OpenDriveError(f"{label}: expected the root element <OpenDRIVE>; got <{root.tag}>.")
     stem = name or Path(label).name.split(".")[0]
-    return _Reader(label, min(step_m, TIGHT_STEP_M * 2), root).network(stem, data)
+    return _OpenDriveReader(label, min(step_m, TIGHT_STEP_M * 2), root).network(stem, data)
 
 
-class _Reader:
+class _OpenDriveReader:
     """One file on its way to a RoadNetwork; holds what is wanted for error texts and the lanes made so far."""
 
     def __init__(self, label: str, step_m: float, root: ET.Element) -> None:
@@ -100,13 +100,13 @@ class _Reader:
                 else:
                     self.marks.append(item)
         left_hand = {record.id for record in records if record.left_hand}
-        lanes = connect(self.root, self.lanes, left_hand)
-        junctions = junctions_of(self.root, lanes)
+        lanes = link_lanes(self.root, self.lanes, left_hand)
+        junctions = read_junctions(self.root, lanes)
         return RoadNetwork(
             name, tuple(roads), lanes, tuple(self.marks), tuple(crossings), tuple(parking), junctions, xodr=data
         )
 
-    def number(self, element: ET.Element, attribute: str, where: str, default: float | None = None) -> float:
+    def number(self, element: ET.Element, attribute: str, context: str, default: float | None = None) -> float:
         """An attribute as a finite number; an error that names file, element and attribute otherwise."""
         text = element.get(attribute)
         if text is None and default is not None:
@@ -117,13 +117,13 @@ class _Reader:
             value = math.nan
         if not math.isfinite(value):
             raise OpenDriveError(
-                f"{self.label}: {where} <{element.tag}> needs a number in '{attribute}'; got {text!r}."
+                f"{self.label}: {context} <{element.tag}> needs a number in '{attribute}'; got {text!r}."
             )
         return value
 
-    def cubics(self, elements: Iterable[ET.Element], where: str, start: str = "s") -> Cubics:
+    def cubics(self, elements: Iterable[ET.Element], context: str, start: str = "s") -> Cubics:
         """Records a, b, c, d over s (or sOffset) as one function; zero everywhere when there are none."""
-        rows = [(self.number(e, start, where, 0.0), *(self.number(e, c, where) for c in "abcd")) for e in elements]
+        rows = [(self.number(e, start, context, 0.0), *(self.number(e, c, context) for c in "abcd")) for e in elements]
         if not rows:
             return Cubics.constant(0.0)
         table = np.array(sorted(rows, key=lambda row: row[0]))
@@ -134,15 +134,15 @@ class _Reader:
         road_id = road.get("id")
         if road_id is None:
             raise OpenDriveError(f"{self.label}: a <road> has no 'id'.")
-        where = f"road {road_id}:"
-        pieces = tuple(self.primitive(g, where) for g in road.findall("planView/geometry"))
+        context = f"road {road_id}:"
+        pieces = tuple(self.primitive(g, context) for g in road.findall("planView/geometry"))
         if not pieces:
-            raise OpenDriveError(f"{self.label}: {where} <planView> holds no <geometry>.")
+            raise OpenDriveError(f"{self.label}: {context} <planView> holds no <geometry>.")
         line = ReferenceLine(
             tuple(sorted(pieces, key=lambda piece: piece.s)),
-            self.cubics(road.findall("elevationProfile/elevation"), where),
-            self.cubics(road.findall("lateralProfile/superelevation"), where),
-            self.number(road, "length", where),
+            self.cubics(road.findall("elevationProfile/elevation"), context),
+            self.cubics(road.findall("lateralProfile/superelevation"), context),
+            self.number(road, "length", context),
         )
         junction = road.get("junction", "-1")
         return _Record(
@@ -150,29 +150,29 @@ class _Reader:
             road_id,
             None if junction in ("-1", "") else junction,
             line,
-            self.cubics(road.findall("lanes/laneOffset"), where),
-            self.speed(road.find("type/speed"), where),
+            self.cubics(road.findall("lanes/laneOffset"), context),
+            self.speed(road.find("type/speed"), context),
             road.get("rule", "RHT") == "LHT",
         )
 
-    def speed(self, element: ET.Element | None, where: str, default: float = _DEFAULT_SPEED_MPS) -> float:
+    def speed(self, element: ET.Element | None, context: str, default: float = _DEFAULT_SPEED_MPS) -> float:
         """A speed limit in m/s; 'no limit' and 'undefined' give the default."""
         if element is None or element.get("max", "undefined") in ("no limit", "undefined"):
             return default
-        return self.number(element, "max", where) * _SPEED_UNITS.get(element.get("unit", "m/s"), 1.0)
+        return self.number(element, "max", context) * _SPEED_UNITS.get(element.get("unit", "m/s"), 1.0)
 
-    def primitive(self, geometry: ET.Element, where: str) -> Primitive:
+    def primitive(self, geometry: ET.Element, context: str) -> Primitive:
         """One <geometry> of the plan view (1.4H §5.3.4)."""
         shape = next((child for child in geometry if child.tag in _PARAMETERS), None)
         if shape is None:
             got = ", ".join(f"<{child.tag}>" for child in geometry) or "nothing"
             raise OpenDriveError(
-                f"{self.label}: {where} <geometry> needs one of {', '.join(_PARAMETERS)}; it holds {got}."
+                f"{self.label}: {context} <geometry> needs one of {', '.join(_PARAMETERS)}; it holds {got}."
             )
-        values = tuple(self.number(shape, key, where) for key in _PARAMETERS[shape.tag])
+        values = tuple(self.number(shape, key, context) for key in _PARAMETERS[shape.tag])
         if shape.tag == "paramPoly3":
             values = (*values, 0.0 if shape.get("pRange") == "arcLength" else 1.0)
-        s, x, y, heading, length = (self.number(geometry, key, where) for key in ("s", "x", "y", "hdg", "length"))
+        s, x, y, heading, length = (self.number(geometry, key, context) for key in ("s", "x", "y", "hdg", "length"))
         return Primitive(s, x, y, heading, length, shape.tag, values)
 
     def road(self, record: _Record) -> Road:
@@ -212,20 +212,20 @@ class _Reader:
             inner_points = record.line.points(s, inner)
             for lane_id in sorted((i for i in elements if i * side > 0), key=abs):
                 element = elements[lane_id]
-                where = f"road {record.id} section {index} lane {lane_id}:"
-                outer = self.outer_border(element, where, s - start, inner, middle, side)
+                context = f"road {record.id} section {index} lane {lane_id}:"
+                outer = self.outer_border(element, context, s - start, inner, middle, side)
                 outer_points = record.line.points(s, outer)
                 self.add_lane(record, element, index, lane_id, inner_points, outer_points)
                 self.border_marks(record, element, index, s, outer, start)
                 inner, inner_points = outer, outer_points
 
     def outer_border(
-        self, element: ET.Element, where: str, along: Array, inner: Array, middle: Array, side: int
+        self, element: ET.Element, context: str, along: Array, inner: Array, middle: Array, side: int
     ) -> Array:
         """t (M,) of a lane's outer border from its <width> records, or from its <border> records."""
         if element.find("width") is None and element.find("border") is not None:
-            return middle + self.cubics(element.findall("border"), where, "sOffset")(along)
-        return inner + side * np.maximum(self.cubics(element.findall("width"), where, "sOffset")(along), 0.0)
+            return middle + self.cubics(element.findall("border"), context, "sOffset")(along)
+        return inner + side * np.maximum(self.cubics(element.findall("width"), context, "sOffset")(along), 0.0)
 
     def add_lane(
         self, record: _Record, element: ET.Element, section: int, lane_id: int, inner: Array, outer: Array
@@ -255,10 +255,10 @@ class _Reader:
         self, record: _Record, element: ET.Element, section: int, s: Array, t: Array, start: float
     ) -> None:
         """The lines along one border, cut where the <roadMark> changes (1.4H §5.3.7.2.1.1.4)."""
-        where = f"road {record.id} section {section}:"
+        context = f"road {record.id} section {section}:"
         lane_id = int(element.get("id", "0"))
         found = sorted(
-            ((start + self.number(e, "sOffset", where, 0.0), e) for e in element.findall("roadMark")),
+            ((start + self.number(e, "sOffset", context, 0.0), e) for e in element.findall("roadMark")),
             key=lambda pair: pair[0],
         )
         for k, (low, mark) in enumerate(found):
@@ -266,17 +266,17 @@ class _Reader:
             within = (s >= low - 1e-3) & (s <= high + 1e-3)
             if within.sum() < 2:
                 continue
-            for offset, kind, width, dash, gap in self.lines(mark, where, lane_id):
+            for offset, kind, width, dash, gap in self.lines(mark, context, lane_id):
                 line = record.line.points(s[within], t[within] + offset)
                 color = {"standard": "white"}.get(mark.get("color", "standard"), mark.get("color", "white"))
                 self.marks.append(RoadMark(line, kind, color, width, dash, gap, record.id, section, lane_id))
 
-    def lines(self, mark: ET.Element, where: str, lane_id: int) -> list[tuple[float, str, float, float, float]]:
+    def lines(self, mark: ET.Element, context: str, lane_id: int) -> list[tuple[float, str, float, float, float]]:
         """(lateral offset, kind, width, dash, gap) of each physical line of a <roadMark>.
 
         Of a pair, the first named is the inner one; on the centre lane the left one (1.4H §5.3.7.2.1.1.4).
         """
-        width = self.number(mark, "width", where, _MARK_WIDTH_M) or _MARK_WIDTH_M
+        width = self.number(mark, "width", context, _MARK_WIDTH_M) or _MARK_WIDTH_M
         kind = mark.get("type", "none")
         if kind == "curb":
             return [(0.0, "curb", width, 0.0, 0.0)]
@@ -284,8 +284,8 @@ class _Reader:
         if not kinds:
             return []
         child = mark.find("type/line")
-        dash = self.number(child, "length", where, _DASH_M) if child is not None else _DASH_M
-        gap = self.number(child, "space", where, _GAP_M) if child is not None else _GAP_M
+        dash = self.number(child, "length", context, _DASH_M) if child is not None else _DASH_M
+        gap = self.number(child, "space", context, _GAP_M) if child is not None else _GAP_M
         outward = -1.0 if lane_id <= 0 else 1.0
         spread = [0.0] if len(kinds) == 1 else [-width * outward, width * outward]
         return [
@@ -314,22 +314,22 @@ class _Reader:
 
     def outline(self, record: _Record, element: ET.Element) -> Array:
         """World points (M, 3) of an object's outline, not closed; its length × width rectangle when it has none."""
-        where = f"road {record.id} object {element.get('id')}:"
-        s, t = self.number(element, "s", where), self.number(element, "t", where)
+        context = f"road {record.id} object {element.get('id')}:"
+        s, t = self.number(element, "s", context), self.number(element, "t", context)
         corners = [e for e in element.iter() if e.tag == "cornerRoad"]
         if corners:
-            st = np.array([[self.number(e, key, where) for key in ("s", "t")] for e in corners])
+            st = np.array([[self.number(e, key, context) for key in ("s", "t")] for e in corners])
             points = record.line.points(st[:, 0], st[:, 1])
-            points[:, 2] += [self.number(e, "dz", where, 0.0) for e in corners]
+            points[:, 2] += [self.number(e, "dz", context, 0.0) for e in corners]
             return _open(points)
         origin = record.line.points(np.array([s]), np.array([t]))[0]
-        origin[2] += self.number(element, "zOffset", where, 0.0)
-        angle = record.line.pose(np.array([s]))[2][0] + self.number(element, "hdg", where, 0.0)
+        origin[2] += self.number(element, "zOffset", context, 0.0)
+        angle = record.line.pose(np.array([s]))[2][0] + self.number(element, "hdg", context, 0.0)
         local = [e for e in element.iter() if e.tag == "cornerLocal"]
         if local:
-            uvz = np.array([[self.number(e, key, where) for key in ("u", "v", "z")] for e in local])
+            uvz = np.array([[self.number(e, key, context) for key in ("u", "v", "z")] for e in local])
         else:
-            half_u, half_v = self.number(element, "length", where) / 2, self.number(element, "width", where) / 2
+            half_u, half_v = self.number(element, "length", context) / 2, self.number(element, "width", context) / 2
             uvz = np.array([[x * half_u, y * half_v, 0.0] for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
         c, n = math.cos(angle), math.sin(angle)
         turned = np.stack((c * uvz[:, 0] - n * uvz[:, 1], n * uvz[:, 0] + c * uvz[:, 1], uvz[:, 2]), -1)

@@ -15,7 +15,7 @@ _End = tuple[int, bool]
 """A lane and whether its end at the road's larger s is meant."""
 
 
-def connect(root: ET.Element, lanes: Sequence[Lane], left_hand: Set[str]) -> tuple[Lane, ...]:
+def link_lanes(root: ET.Element, lanes: Sequence[Lane], left_hand: Set[str]) -> tuple[Lane, ...]:
     """The lanes with predecessors, successors and neighbours filled in; left_hand: ids of roads with left-hand traffic."""
     place = {(lane.road_id, lane.section, lane.lane_id): lane.id for lane in lanes}
     last = {}
@@ -101,7 +101,7 @@ def _with_links(lanes: Sequence[Lane], touching: set[tuple[_End, _End]], left_ha
     return tuple(linked)
 
 
-def junctions_of(root: ET.Element, lanes: Sequence[Lane]) -> tuple[Junction, ...]:
+def read_junctions(root: ET.Element, lanes: Sequence[Lane]) -> tuple[Junction, ...]:
     """Junctions with the extent of their drivable lanes; those without any are left out."""
     members: dict[str, list[Lane]] = {}
     for lane in lanes:

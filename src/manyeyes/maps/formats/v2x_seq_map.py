@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
-from manyeyes.maps.roads.lane_links import equal_stations, junctions_of_lanes, link_neighbors
+from manyeyes.maps.roads.lane_links import build_junctions, complete_lane_links, resample_borders
 from manyeyes.maps.roads.road_network import PAVED, Crossing, Lane, RoadMark, RoadNetwork
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ def read_v2x_seq_map(path: Path | str, offset_xy: tuple[float, float] = (0.0, 0.
         raise V2xSeqMapError(f"{path}: expected a V2X-Seq vector map in JSON; {error}.") from error
     if not isinstance(root, dict) or not isinstance(root.get("LANE"), dict) or not root["LANE"]:
         raise V2xSeqMapError(f"{path}: expected an object with 'LANE'; download the map again.")
-    reader = _Reader(path, np.array([*offset_xy, 0.0]))
+    reader = _V2xSeqReader(path, np.array([*offset_xy, 0.0]))
     lanes = reader.lanes(root["LANE"], reader.layer(root, "JUNCTION"))
     crossings = tuple(
         Crossing(reader.points("CROSSWALK", name, item, "polygon", 3), "", "polygon")
@@ -62,10 +62,10 @@ def read_v2x_seq_map(path: Path | str, offset_xy: tuple[float, float] = (0.0, 0.
         RoadMark(reader.points("STOPLINE", name, item, "centerline", 2), "stop", "", 0.3)
         for name, item in sorted(reader.layer(root, "STOPLINE").items())
     )
-    return RoadNetwork(path.stem, (), lanes, (*_borders(lanes), *stops), crossings, (), junctions_of_lanes(lanes))
+    return RoadNetwork(path.stem, (), lanes, (*_borders(lanes), *stops), crossings, (), build_junctions(lanes))
 
 
-class _Reader:
+class _V2xSeqReader:
     """One file on its way to a RoadNetwork; holds its name for error texts."""
 
     def __init__(self, path: Path, offset: Array) -> None:
@@ -80,16 +80,16 @@ class _Reader:
             )
         return found
 
-    def points(self, layer: str, name: str, item: Any, field: str, at_least: int) -> Array:
+    def points(self, layer: str, name: str, item: Any, field: str, min_points: int) -> Array:
         """Points (M, 3), height 0; an error that names file, element and field otherwise."""
-        where = f"{self.path}: {layer} {name} field '{field}'"
+        context = f"{self.path}: {layer} {name} field '{field}'"
         try:
             rows = [_point(one) for one in item[field]]
             points = np.array(rows, np.float64).reshape(-1, 2)
         except (KeyError, TypeError, ValueError):
-            raise V2xSeqMapError(f'{where}: expected a list of points "(x, y)"; download the map again.') from None
-        if len(points) < at_least or not np.isfinite(points).all():
-            raise V2xSeqMapError(f"{where}: expected {at_least} or more finite points; got {len(points)}.")
+            raise V2xSeqMapError(f'{context}: expected a list of points "(x, y)"; download the map again.') from None
+        if len(points) < min_points or not np.isfinite(points).all():
+            raise V2xSeqMapError(f"{context}: expected {min_points} or more finite points; got {len(points)}.")
         return np.pad(points, ((0, 0), (0, 1))) + self.offset
 
     def lanes(self, items: Mapping[str, Any], junctions: Mapping[str, Any]) -> tuple[Lane, ...]:
@@ -100,7 +100,7 @@ class _Reader:
         lanes = []
         for k, name in enumerate(names):
             item = items[name]
-            left, right = equal_stations(
+            left, right = resample_borders(
                 self.points("LANE", name, item, "left_boundary", 2),
                 self.points("LANE", name, item, "right_boundary", 2),
             )
@@ -114,7 +114,7 @@ class _Reader:
                 junction = f"lane {name}"
             kind = _KIND_OF_LANE.get(str(item.get("lane_type")), "none")
             lanes.append(Lane(k, name, 0, -1, kind, junction, _SPEED_MPS, left, right, center, before, after))
-        return link_neighbors(lanes)
+        return complete_lane_links(lanes)
 
     def _junctions(self, items: Mapping[str, Any]) -> Any:
         """From a lane's centreline (M, 3) to the name of the junction that holds most of it, None of the open road."""
@@ -131,11 +131,11 @@ class _Reader:
         return held
 
 
-def _point(told: Any) -> tuple[float, float]:
+def _point(text: Any) -> tuple[float, float]:
     """From "(x, y)" or [x, y]."""
-    values = _NUMBER.findall(told) if isinstance(told, str) else list(told)
+    values = _NUMBER.findall(text) if isinstance(text, str) else list(text)
     if len(values) < 2:
-        raise ValueError(told)
+        raise ValueError(text)
     return float(values[0]), float(values[1])
 
 

@@ -15,98 +15,98 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F32x3, F64x1, F64x2, I64x1, njit
-from manyeyes.maps.fusion.observation_arrays import Sightings
-from manyeyes.maps.fusion.point_grid import build_grid, span
+from manyeyes.maps.fusion.observation_arrays import ObservationArrays
+from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class GrossConfig:
-    """reach_m: largest shift tried along x and y; cell_m: its step; gain: mean value a point must win; least_m: smaller
-    shifts are left to the sweeps; price: value a metre of shift costs; yaws: turns tried (rad); stride: every n-th
-    point is looked up.
+class CoarseSearchConfig:
+    """max_shift_m: largest shift tried along x and y; cell_m: its step; min_score_gain: mean value a point must win; min_shift_m:
+    smaller shifts are left to the sweeps; cost_per_m: value a metre of shift costs; yaw_steps_rad: turns tried (rad); point_stride:
+    every n-th point is looked up.
     """
 
-    reach_m: float = 4.5
+    max_shift_m: float = 4.5
     cell_m: float = 0.5
-    gain: float = 0.06
-    least_m: float = 1.2
-    price: float = 0.012
-    yaws: tuple[float, ...] = (0.0,)
-    stride: int = 2
+    min_score_gain: float = 0.06
+    min_shift_m: float = 1.2
+    cost_per_m: float = 0.012
+    yaw_steps_rad: tuple[float, ...] = (0.0,)
+    point_stride: int = 2
 
 
-def gross_search(sightings: Sightings, keep: NDArray[np.bool_], home: Ints, config: GrossConfig) -> Floats:
+def search_coarse(arrays: ObservationArrays, keep: NDArray[np.bool_], home: Ints, config: CoarseSearchConfig) -> Floats:
     """Poses (H, 3) of the home observations after the search; ``keep`` (P,) are the points that others may be compared
     with.
 
     Trusted observations stay where they are.
     """
-    xy, tangent = sightings.world(np.asarray(sightings.pose))
+    xy, tangent = arrays.to_world(np.asarray(arrays.pose))
     chosen = np.flatnonzero(keep)
-    grid = build_grid(xy[chosen, 0], xy[chosen, 1], sightings.kind[chosen], 8.0)
+    grid = build_grid(xy[chosen, 0], xy[chosen, 1], arrays.kind_of_point[chosen], 8.0)
     rows = chosen[grid.order]
-    moves = best_moves(
+    shifts = find_best_shifts(
         home,
-        np.asarray(sightings.pose),
-        np.asarray(sightings.trusted),
-        (sightings.first, sightings.xy, sightings.tangent, sightings.kind),
+        np.asarray(arrays.pose),
+        np.asarray(arrays.trusted),
+        (arrays.observation_offsets, arrays.xy, arrays.tangent, arrays.kind_of_point),
         (
             grid.keys,
-            grid.start,
+            grid.offsets,
             xy[rows],
             tangent[rows],
-            sightings.agent[sightings.observation[rows]],
+            arrays.agent[arrays.observation_of_point[rows]],
         ),
-        np.asarray(sightings.agent),
-        np.array(config.yaws),
-        (config.reach_m, config.cell_m, config.gain, config.least_m, config.price),
-        config.stride,
+        np.asarray(arrays.agent),
+        np.array(config.yaw_steps_rad),
+        (config.max_shift_m, config.cell_m, config.min_score_gain, config.min_shift_m, config.cost_per_m),
+        config.point_stride,
     )
-    return moved_by(sightings, home, moves)
+    return apply_shifts(arrays, home, shifts)
 
 
-def moved_by(sightings: Sightings, home: Ints, moves: Floats) -> Floats:
+def apply_shifts(arrays: ObservationArrays, home: Ints, shifts: Floats) -> Floats:
     """Claimed poses (H, 3) moved by moves (H, 3) of their own frames."""
-    start = np.asarray(sightings.pose)[home]
+    start = np.asarray(arrays.pose)[home]
     c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
-    x, y = moves[:, 0], moves[:, 1]
-    return np.stack((start[:, 0] + c * x - s * y, start[:, 1] + s * x + c * y, start[:, 2] + moves[:, 2]), 1)
+    x, y = shifts[:, 0], shifts[:, 1]
+    return np.stack((start[:, 0] + c * x - s * y, start[:, 1] + s * x + c * y, start[:, 2] + shifts[:, 2]), 1)
 
 
 @njit(cache=True, nogil=True)
-def best_moves(
+def find_best_shifts(
     home: I64x1,
     pose: F64x2,
     trusted: Boolx1,
-    own: tuple[I64x1, F64x2, F64x2, I64x1],
-    others: tuple[I64x1, I64x1, F64x2, F64x2, I64x1],
+    own_points: tuple[I64x1, F64x2, F64x2, I64x1],
+    other_points: tuple[I64x1, I64x1, F64x2, F64x2, I64x1],
     agent: I64x1,
-    yaws: F64x1,
-    numbers: tuple[float, float, float, float, float],
+    yaw_steps: F64x1,
+    params: tuple[float, float, float, float, float],
     stride: int,
 ) -> F64x2:  # pragma: no cover - compiled
     """The move (H, 3) of each home observation's own frame that fits it best to the points of others, all zero for
     none.
     """
-    first, xy, tangent, kind = own
-    reach, cell, gain, least, price = numbers
-    moves = np.zeros((len(home), 3))
-    radius = int(np.floor(reach / cell))
+    first, xy, tangent, kind = own_points
+    max_shift, cell, min_gain, min_shift, cost_per_m = params
+    shifts = np.zeros((len(home), 3))
+    radius = int(np.floor(max_shift / cell))
     for h in range(len(home)):
         o = home[h]
         a, b = first[o], first[o + 1]
         if trusted[o] or b - a < 8:
             continue
-        x0, y0 = xy[a:b, 0].min() - reach - 2.0, xy[a:b, 1].min() - reach - 2.0
-        nx = int((xy[a:b, 0].max() + reach + 2.0 - x0) / cell) + 1
-        ny = int((xy[a:b, 1].max() + reach + 2.0 - y0) / cell) + 1
-        picture = _draw(pose[o], int(agent[o]), others, x0, y0, nx, ny, cell)
+        x0, y0 = xy[a:b, 0].min() - max_shift - 2.0, xy[a:b, 1].min() - max_shift - 2.0
+        nx = int((xy[a:b, 0].max() + max_shift + 2.0 - x0) / cell) + 1
+        ny = int((xy[a:b, 1].max() + max_shift + 2.0 - y0) / cell) + 1
+        picture = _draw_layers(pose[o], int(agent[o]), other_points, x0, y0, nx, ny, cell)
         best, bx, by, bt = 0.0, 0, 0, 0.0
         at_rest = 0.0
-        for turn in yaws:
+        for turn in yaw_steps:
             score = _correlate(picture, xy[a:b], tangent[a:b], kind[a:b], turn, x0, y0, cell, radius, stride)
             if turn == 0.0:
                 at_rest = score[radius, radius]
@@ -114,23 +114,23 @@ def best_moves(
             for i in range(2 * radius + 1):
                 for j in range(2 * radius + 1):
                     shift = np.hypot(i - radius, j - radius) * cell
-                    value = score[i, j] - price * shift
+                    value = score[i, j] - cost_per_m * shift
                     if value > best:
                         best, bx, by, bt = value, i - radius, j - radius, turn
-        if best > at_rest + gain and np.hypot(bx, by) * cell > least:
+        if best > at_rest + min_gain and np.hypot(bx, by) * cell > min_shift:
             c, s = np.cos(bt), np.sin(bt)
             mx, my = xy[a:b, 0].mean(), xy[a:b, 1].mean()
-            moves[h, 0] = bx * cell + mx - (c * mx - s * my)
-            moves[h, 1] = by * cell + my - (s * mx + c * my)
-            moves[h, 2] = bt
-    return moves
+            shifts[h, 0] = bx * cell + mx - (c * mx - s * my)
+            shifts[h, 1] = by * cell + my - (s * mx + c * my)
+            shifts[h, 2] = bt
+    return shifts
 
 
 @njit(cache=True, nogil=True)
-def _draw(
+def _draw_layers(
     pose: F64x1,
     agent: int,
-    others: tuple[I64x1, I64x1, F64x2, F64x2, I64x1],
+    other_points: tuple[I64x1, I64x1, F64x2, F64x2, I64x1],
     x0: float,
     y0: float,
     nx: int,
@@ -138,7 +138,7 @@ def _draw(
     cell: float,
 ) -> F32x3:  # pragma: no cover - compiled
     """What other agents saw, in the frame of a pose: (layers, nx, ny) of s."""
-    keys, start, rxy, rtangent, ragent = others
+    keys, start, rxy, rtangent, ragent = other_points
     picture = np.zeros((24, nx, ny), np.float32)
     stamp = np.empty((5, 5), np.float32)
     for i in range(5):
@@ -153,7 +153,7 @@ def _draw(
     iy0, iy1 = int(np.floor((wy - half) / 8.0)), int(np.floor((wy + half) / 8.0))
     for k in range(4):
         for ix in range(ix0, ix1 + 1):
-            low, high = span(keys, start, k, ix, iy0, iy1)
+            low, high = find_cell_range(keys, start, k, ix, iy0, iy1)
             for q in range(low, high):
                 if ragent[q] == agent:
                     continue
@@ -164,9 +164,9 @@ def _draw(
                     continue
                 u = c * rtangent[q, 0] + s * rtangent[q, 1]
                 v = -s * rtangent[q, 0] + c * rtangent[q, 1]
-                where = (np.arctan2(v, u) / np.pi % 1.0) * 6.0
-                one = int(np.floor(where)) % 6
-                two = (one + (1 if where - np.floor(where) > 0.5 else 5)) % 6
+                heading_bin = (np.arctan2(v, u) / np.pi % 1.0) * 6.0
+                one = int(np.floor(heading_bin)) % 6
+                two = (one + (1 if heading_bin - np.floor(heading_bin) > 0.5 else 5)) % 6
                 for layer in (6 * k + one, 6 * k + two):
                     for di in range(5):
                         for dj in range(5):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x2, I64x1, I64x2, njit
-from manyeyes.maps.fusion.observation_arrays import Sightings
+from manyeyes.maps.fusion.observation_arrays import ObservationArrays
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -21,46 +21,48 @@ Ints = NDArray[np.int64]
 CELL_M = 1.0
 
 
-def looked_at(sightings: Sightings, pose: Floats, area: tuple[float, float, float, float] | None = None) -> Ints:
+def find_observed_cells(
+    arrays: ObservationArrays, pose: Floats, area: tuple[float, float, float, float] | None = None
+) -> Ints:
     """The ground in the views of agents at pose (O, 3), inside area (x0, y0, x1, y1; sides are whole metres) or everywhere.
 
     Runs (R, 3): row and first and last column of cells, ascending, none touching another.
     """
-    runs = _filled(sightings.world_view(pose), sightings.view.first)
+    runs = _fill_rings(arrays.view_corners_in_world(pose), arrays.view.ring_offsets)
     if area is not None:
         x0, y0, x1, y1 = np.floor(np.array(area) / CELL_M + 0.5).astype(np.int64)
         runs = runs[(runs[:, 0] >= y0) & (runs[:, 0] < y1) & (runs[:, 1] < x1) & (runs[:, 2] >= x0)]
         runs = np.stack((runs[:, 0], np.maximum(runs[:, 1], x0), np.minimum(runs[:, 2], x1 - 1)), 1)
-    return merged(runs)
+    return merge_runs(runs)
 
 
-def along(points: Floats, first: Ints) -> Ints:
-    """The ground under lines (N): points (P, 2) metres, line i from first[i] on; runs as of :func:`looked_at`."""
+def find_cells_under_lines(points: Floats, offsets: Ints) -> Ints:
+    """The ground under lines (N): points (P, 2) metres, line i from first[i] on; runs as of :func:`find_observed_cells`."""
     if not len(points):
         return np.zeros((0, 3), np.int64)
-    return merged(_under(np.ascontiguousarray(points), first))
+    return merge_runs(_trace_lines(np.ascontiguousarray(points), offsets))
 
 
-def merged(runs: Ints) -> Ints:
+def merge_runs(runs: Ints) -> Ints:
     """Runs (R, 3) in any order as ascending ones, those that touch or overlap as one."""
     if not len(runs):
         return np.zeros((0, 3), np.int64)
-    return _merged(runs[np.lexsort((runs[:, 1], runs[:, 0]))])
+    return _merge_runs(runs[np.lexsort((runs[:, 1], runs[:, 0]))])
 
 
-def cut_unseen(points: Floats, first: Ints, inferred: NDArray[np.bool_], runs: Ints) -> tuple[Ints, Ints]:
+def cut_unobserved(points: Floats, offsets: Ints, inferred: NDArray[np.bool_], runs: Ints) -> tuple[Ints, Ints]:
     """Lines (L,) cut where nobody looked: offsets (M + 1,) of the parts, and which points they keep, in order.
 
     points (P, 2), inferred (P,): places nobody saw, which go where nobody looked. A line is cut between two points where a cell of
     the way from one to the other, half a metre at a time, is in no run (R, 3). Without runs nothing is known and nothing is cut.
     """
     if not len(runs) or not len(points):
-        return first, np.arange(len(points))
-    return _cut(np.ascontiguousarray(points), first, inferred, runs)
+        return offsets, np.arange(len(points))
+    return _cut(np.ascontiguousarray(points), offsets, inferred, runs)
 
 
 @njit(cache=True, nogil=True)
-def _filled(corners: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
+def _fill_rings(corners: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
     """Runs of cells whose middle lies in a ring, by the even-odd rule, ring by ring."""
     rows, n = np.empty((1024, 3), np.int64), 0
     for r in range(len(first) - 1):
@@ -95,15 +97,15 @@ def _filled(corners: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compil
 
 
 @njit(cache=True, nogil=True)
-def _under(points: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
+def _trace_lines(points: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
     total = len(points)
     for c in range(len(first) - 1):
         for i in range(first[c], first[c + 1] - 1):
-            total += _steps(points, i)
+            total += _count_steps(points, i)
     rows, n = np.empty((total, 3), np.int64), 0
     for c in range(len(first) - 1):
         for i in range(first[c], first[c + 1]):
-            steps = _steps(points, i) if i + 1 < first[c + 1] else 1
+            steps = _count_steps(points, i) if i + 1 < first[c + 1] else 1
             after = i + 1 if i + 1 < first[c + 1] else i
             for k in range(steps):
                 x = points[i, 0] + (points[after, 0] - points[i, 0]) * k / steps
@@ -115,7 +117,7 @@ def _under(points: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _steps(points: F64x2, i: int) -> int:  # pragma: no cover - compiled
+def _count_steps(points: F64x2, i: int) -> int:  # pragma: no cover - compiled
     """How many steps of half a cell it takes from a point to the next."""
     return max(
         1, int(np.ceil(2.0 * np.hypot(points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]) / CELL_M))
@@ -123,7 +125,7 @@ def _steps(points: F64x2, i: int) -> int:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _merged(runs: I64x2) -> I64x2:  # pragma: no cover - compiled
+def _merge_runs(runs: I64x2) -> I64x2:  # pragma: no cover - compiled
     out, n = runs.copy(), 0
     for k in range(1, len(runs)):
         if runs[k, 0] == out[n, 0] and runs[k, 1] <= out[n, 2] + 1:
@@ -141,11 +143,11 @@ def _cut(
     offsets, kept, n = [0], np.empty(len(points), np.int64), 0
     for c in range(len(first) - 1):
         for i in range(first[c], first[c + 1]):
-            if inferred[i] and not _seen(runs, points[i, 0], points[i, 1]):
+            if inferred[i] and not _is_observed(runs, points[i, 0], points[i, 1]):
                 if n > offsets[-1]:
                     offsets.append(n)
                 continue
-            if n > offsets[-1] and not _whole(points, kept[n - 1], i, runs):
+            if n > offsets[-1] and not _is_observed_between(points, kept[n - 1], i, runs):
                 offsets.append(n)
             kept[n] = i
             n += 1
@@ -155,7 +157,7 @@ def _cut(
 
 
 @njit(cache=True, nogil=True)
-def _whole(points: F64x2, i: int, j: int, runs: I64x2) -> bool:  # pragma: no cover - compiled
+def _is_observed_between(points: F64x2, i: int, j: int, runs: I64x2) -> bool:  # pragma: no cover - compiled
     """Whether somebody looked at all of the way between two points; of neighbours less than a metre and a half apart, always."""
     dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
     length = np.hypot(dx, dy)
@@ -163,13 +165,13 @@ def _whole(points: F64x2, i: int, j: int, runs: I64x2) -> bool:  # pragma: no co
         return True
     steps = int(np.ceil(2.0 * length / CELL_M))
     k = 1
-    while k < steps and _seen(runs, points[i, 0] + dx * k / steps, points[i, 1] + dy * k / steps):
+    while k < steps and _is_observed(runs, points[i, 0] + dx * k / steps, points[i, 1] + dy * k / steps):
         k += 1
     return k == steps
 
 
 @njit(cache=True, nogil=True)
-def _seen(runs: I64x2, x: float, y: float) -> bool:  # pragma: no cover - compiled
+def _is_observed(runs: I64x2, x: float, y: float) -> bool:  # pragma: no cover - compiled
     """Whether the cell of a place is in a run."""
     ix, iy = int(np.floor(x / CELL_M)), int(np.floor(y / CELL_M))
     low, high = 0, len(runs)

@@ -27,14 +27,14 @@ from manyeyes.maps.fusion.existence import (
     EvidenceParameters,
     MatchedObservations,
     ObservationScene,
+    build_visibility_index,
     doubled,
-    fold_looks,
-    looks,
+    gather_observers,
+    gather_visibility_rings,
     new_agent_scratch,
-    sights,
-    witnesses,
+    update_existence,
 )
-from manyeyes.maps.fusion.observation_arrays import FieldsOfView, Sightings, sight
+from manyeyes.maps.fusion.observation_arrays import FieldsOfView, ObservationArrays, compute_visibility
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,26 +44,26 @@ _MIN_AREA_M2 = 0.5  # of a ring that is used
 
 
 @dataclass(frozen=True)
-class PolygonConfig:
-    """overlap: least mean share of the smaller ring in common within a group. most: rings that decide a group's shape.
+class CrossingConfig:
+    """min_overlap: least mean share of the smaller ring in common within a group. max_rings: rings that decide a group's shape.
 
-    rectangle: share of its rectangle that a ring fills to become it. cut_m: a corner this near the border of the view
-    is cut off.
+    min_rectangle_fill: share of its rectangle that a ring fills to become it. view_border_m: a corner this near the border of the
+    view is cut off.
     """
 
-    overlap: float = 0.3
-    most: int = 64
-    rectangle: float = 0.85
-    cut_m: float = 1.0
+    min_overlap: float = 0.3
+    max_rings: int = 64
+    min_rectangle_fill: float = 0.85
+    view_border_m: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Crossings:
+class FusedCrossings:
     """K fused crossings: ring k is ``xy[start[k]:start[k + 1]]``; the rest as in evidence.Witness; sigma: (K,) metres
     of its sides.
     """
 
-    start: Ints
+    ring_offsets: Ints
     xy: Floats
     sigma: Floats
     log_odds: Floats
@@ -74,46 +74,51 @@ class Crossings:
     t_first: Ints
     t_last: Ints
     style: Floats
-    first: Ints
+    source_offsets: Ints
     sources: Ints
 
 
-def find_crossings(
-    sightings: Sightings,
+def fuse_crossings(
+    arrays: ObservationArrays,
     pose: Floats,
     weight: Floats,
     rank: Ints,
-    config: PolygonConfig,
+    config: CrossingConfig,
     evidence: EvidenceConfig,
-) -> Crossings:
+) -> FusedCrossings:
     """Crossings from all sightings with agents at pose (O, 3); ``weight`` (O,) of each observation, ``rank`` (O,) lower
     for better ones.
     """
-    rows = np.flatnonzero(np.asarray(sightings.elements.kind) == CROSSING)
-    owner = sightings.element_observation[rows]
-    seen = _OpenRings(*_placed(sightings, rows, owner, pose))
+    rows = np.flatnonzero(np.asarray(arrays.elements.kind) == CROSSING)
+    owner = arrays.observation_of_element[rows]
+    seen = _OpenRings(*_transform_rings(arrays, rows, owner, pose))
     hulls = _hulls(*seen)
     area = _areas(*hulls)
     usable = area > _MIN_AREA_M2
-    label = _groups(*hulls, area, usable, np.argsort(rank[owner], kind="stable"), config.overlap, config.most)
+    label = _group_rings(
+        *hulls, area, usable, np.argsort(rank[owner], kind="stable"), config.min_overlap, config.max_rings
+    )
     count = int(label.max(initial=-1)) + 1
-    cut = _own_reach(*seen, owner, pose, sights(sightings), config.cut_m)
+    cut = _mark_cut_points(*seen, owner, pose, gather_visibility_rings(arrays), config.view_border_m)
     rings = [
-        _shape(np.flatnonzero(label == g), *hulls, *seen, cut, weight[owner], config.rectangle) for g in range(count)
+        _fuse_shape(np.flatnonzero(label == g), *hulls, *seen, cut, weight[owner], config.min_rectangle_fill)
+        for g in range(count)
     ]
     start = np.concatenate(([0], np.cumsum([len(r) for r in rings], dtype=np.int64))).astype(np.int64)
     xy = np.concatenate(rings) if rings else np.zeros((0, 2))
-    out = _evidence(
+    out = _accumulate_evidence(
         _OpenRings(start, xy),
         _CrossingHulls(*hulls, area, owner, rows),
-        ObservationScene(looks(sightings, pose), witnesses(sightings, pose), sights(sightings)),
-        ElementStyles(np.asarray(sightings.elements.style), evidence.worth(sightings.elements.score)),
-        replace(evidence, publish=evidence.publish_ring).numbers,
-        evidence.decay_s[CROSSING],
-        config.overlap,
+        ObservationScene(
+            build_visibility_index(arrays, pose), gather_observers(arrays, pose), gather_visibility_rings(arrays)
+        ),
+        ElementStyles(np.asarray(arrays.elements.style), evidence.score_weight(arrays.elements.score)),
+        replace(evidence, publish_log_odds=evidence.publish_crossing_log_odds).kernel_params,
+        evidence.decay_time_s[CROSSING],
+        config.min_overlap,
     )
-    sigma = np.sqrt(0.2**2 / np.maximum(1, out.agents) + evidence.bias_m**2)
-    return Crossings(start, xy, sigma, *out)
+    sigma = np.sqrt(0.2**2 / np.maximum(1, out.agents) + evidence.bias_sigma_m**2)
+    return FusedCrossings(start, xy, sigma, *out)
 
 
 class _OpenRings(NamedTuple):
@@ -134,7 +139,7 @@ class _CrossingHulls(NamedTuple):
 
 
 class _CrossingEvidence(NamedTuple):
-    """The columns of :class:`Crossings` from log_odds on."""
+    """The columns of :class:`FusedCrossings` from log_odds on."""
 
     log_odds: F64x1
     coverage: F64x1
@@ -148,21 +153,21 @@ class _CrossingEvidence(NamedTuple):
     sources: I64x1
 
 
-def _placed(sightings: Sightings, rows: Ints, owner: Ints, pose: Floats) -> tuple[Ints, Floats]:
+def _transform_rings(arrays: ObservationArrays, rows: Ints, owner: Ints, pose: Floats) -> tuple[Ints, Floats]:
     """Rings of elements ``rows`` in the map's frame: offsets and points."""
-    elements = sightings.elements.take(rows)
+    elements = arrays.elements.take(rows)
     at = pose[np.repeat(owner, elements.counts)]
     c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
     x, y = elements.points[:, 0], elements.points[:, 1]
-    return np.asarray(elements.first), np.stack((c * x - s * y + at[:, 0], s * x + c * y + at[:, 1]), 1)
+    return np.asarray(elements.offsets), np.stack((c * x - s * y + at[:, 0], s * x + c * y + at[:, 1]), 1)
 
 
-def hulls_of(ring: Floats) -> Floats:
+def compute_convex_hull(ring: Floats) -> Floats:
     """The convex hull (K, 2) of one ring, anticlockwise."""
     return _hulls(np.array([0, len(ring)]), np.ascontiguousarray(ring)).points
 
 
-def overlap_of(one: Floats, two: Floats) -> float:
+def compute_overlap(one: Floats, two: Floats) -> float:
     """The share of the smaller of two convex anticlockwise rings that they have in common."""
     if min(len(one), len(two)) < 3:
         return 0.0
@@ -253,13 +258,13 @@ def _half_plane(ring: F64x2, px: float, py: float, nx: float, ny: float) -> F64x
 
 
 @njit(cache=True, nogil=True)
-def _groups(
-    first: I64x1, points: F64x2, area: F64x1, usable: Boolx1, walk: I64x1, overlap: float, most: int
+def _group_rings(
+    first: I64x1, points: F64x2, area: F64x1, usable: Boolx1, walk: I64x1, min_overlap: float, max_rings: int
 ) -> I64x1:  # pragma: no cover - compiled
     """(R,) the group of each ring, -1 for those that are too many or too small; groups numbered by their best ring.
 
-    Rings whose boxes touch form a block; a block's best ``most`` rings are joined by average linkage while the best
-    pair of groups has at least ``overlap`` in common. Ties go to the better ranks.
+    Rings whose boxes touch form a block; a block's best ``max_rings`` rings are joined by average linkage while the best
+    pair of groups has at least ``min_overlap`` in common. Ties go to the better ranks.
     """
     count = len(area)
     label = np.full(count, -1, np.int64)
@@ -284,12 +289,12 @@ def _groups(
                     block[q], stack[n] = seed, q
                     n += 1
                     members += 1
-        chosen, n = np.empty(min(members, most), np.int64), 0
+        chosen, n = np.empty(min(members, max_rings), np.int64), 0
         for r in walk:
             if block[r] == seed and n < len(chosen):
                 chosen[n] = r
                 n += 1
-        groups = _average_linkage(chosen, first, points, area, overlap, label, groups)
+        groups = _average_linkage(chosen, first, points, area, min_overlap, label, groups)
     return label
 
 
@@ -302,7 +307,7 @@ def _touch(low: F64x2, high: F64x2, q: int, r: int) -> bool:  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def _average_linkage(
-    chosen: I64x1, first: I64x1, points: F64x2, area: F64x1, overlap: float, label: I64x1, groups: int
+    chosen: I64x1, first: I64x1, points: F64x2, area: F64x1, min_overlap: float, label: I64x1, groups: int
 ) -> int:  # pragma: no cover - compiled
     """Write the groups of the chosen rings to label, numbered from ``groups`` on; the number after the last."""
     n = len(chosen)
@@ -314,7 +319,7 @@ def _average_linkage(
             share[i, j] = share[j, i] = common / min(area[a], area[b])
     size, into = np.ones(n), np.arange(n)
     while True:
-        best, bi, bj = overlap, -1, -1
+        best, bi, bj = min_overlap, -1, -1
         for i in range(n):
             if into[i] != i:
                 continue
@@ -343,8 +348,8 @@ def _average_linkage(
 
 
 @njit(cache=True, nogil=True)
-def _own_reach(
-    first: I64x1, points: F64x2, owner: I64x1, pose: F64x2, seen: FieldsOfView, cut: float
+def _mark_cut_points(
+    first: I64x1, points: F64x2, owner: I64x1, pose: F64x2, rings: FieldsOfView, cut: float
 ) -> Boolx1:  # pragma: no cover - compiled
     """(P,) whether each ring point, in the map's frame, lies at the border of its observation's view."""
     out = np.zeros(len(points), np.bool_)
@@ -353,12 +358,12 @@ def _own_reach(
         c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
         for p in range(first[r], first[r + 1]):
             dx, dy = points[p, 0] - pose[o, 0], points[p, 1] - pose[o, 1]
-            out[p] = sight(c * dx + s * dy, -s * dx + c * dy, o, seen.views, seen.occluders, cut) < 1.0
+            out[p] = compute_visibility(c * dx + s * dy, -s * dx + c * dy, o, rings.views, rings.occluders, cut) < 1.0
     return out
 
 
 @njit(cache=True, nogil=True)
-def _shape(
+def _fuse_shape(
     members: I64x1,
     hull_first: I64x1,
     hulls: F64x2,
@@ -440,18 +445,18 @@ def _places_in(ring: F64x2) -> F64x2:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _evidence(
+def _accumulate_evidence(
     fused: _OpenRings,
     rings: _CrossingHulls,
     scene: ObservationScene,
-    told: ElementStyles,
-    numbers: EvidenceParameters,
-    decay: float,
-    overlap: float,
+    element_columns: ElementStyles,
+    params: EvidenceParameters,
+    decay_time_s: float,
+    min_overlap: float,
 ) -> _CrossingEvidence:  # pragma: no cover - compiled
-    """The evidence of each fused ring from the hulls that have a share of at least ``overlap`` in common with it."""
+    """The evidence of each fused ring from the hulls that have a share of at least ``min_overlap`` in common with it."""
     start, xy = fused
-    style, worth = told
+    style, score_weight = element_columns
     hull_first, hulls, area, owner, rows = rings
     time_ns = scene.observers.time_ns
     count, observations = len(start) - 1, len(time_ns)
@@ -459,7 +464,7 @@ def _evidence(
     support, agents, state = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
     t_first, t_last, votes = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, style.shape[1]))
     first, found, filled = np.zeros(count + 1, np.int64), np.empty(max(16, len(area)), np.int64), 0
-    aside_of, gain = np.full(observations, UNMATCHED, np.int64), np.zeros(observations)
+    overlap_state, gain = np.full(observations, UNMATCHED, np.int64), np.zeros(observations)
     by_agent = new_agent_scratch(scene.observers.num_agents)
     for k in range(count):
         ring = xy[start[k] : start[k + 1]]
@@ -474,30 +479,30 @@ def _evidence(
             ):
                 continue
             share = _common(hulls[hull_first[r] : hull_first[r + 1]], ring) / min(area[r], size)
-            if share >= overlap:
-                if aside_of[owner[r]] != MATCHED:
+            if share >= min_overlap:
+                if overlap_state[owner[r]] != MATCHED:
                     votes[k] += style[rows[r]]
                     gain[owner[r]] = 0.0
-                gain[owner[r]] = max(gain[owner[r]], worth[rows[r]])
-                aside_of[owner[r]] = MATCHED
-            elif share > 0.05 and aside_of[owner[r]] == UNMATCHED:
-                aside_of[owner[r]] = NEARBY
+                gain[owner[r]] = max(gain[owner[r]], score_weight[rows[r]])
+                overlap_state[owner[r]] = MATCHED
+            elif share > 0.05 and overlap_state[owner[r]] == UNMATCHED:
+                overlap_state[owner[r]] = NEARBY
         begin = filled
         for o in range(observations):
-            if aside_of[o] == MATCHED:
+            if overlap_state[o] == MATCHED:
                 if filled == len(found):
                     found = doubled(found)
                 found[filled] = o
                 filled += 1
         hits = found[begin:filled]
-        odds[k], coverage[k], agents[k], state[k] = fold_looks(
-            places, k, MatchedObservations(hits, aside_of, gain), scene, numbers, decay, by_agent
+        odds[k], coverage[k], agents[k], state[k] = update_existence(
+            places, k, MatchedObservations(hits, overlap_state, gain), scene, params, decay_time_s, by_agent
         )
         support[k] = len(hits)
         if len(hits) > 0:
             t_first[k], t_last[k] = time_ns[hits[0]], time_ns[hits[-1]]
         first[k + 1] = filled
-        aside_of[:] = UNMATCHED
+        overlap_state[:] = UNMATCHED
     return _CrossingEvidence(
         odds, coverage, support, agents, state, t_first, t_last, votes, first, found[:filled].copy()
     )

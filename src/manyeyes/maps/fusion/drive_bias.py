@@ -21,25 +21,33 @@ _ROUNDS = 5
 _FREE = 0.02
 
 
-def drive_error(heard: Floats, urge: Floats, claim: Floats, drive: Ints, alike: float, scale: float) -> Floats:
+def estimate_drive_bias(
+    information_matrix: Floats,
+    information_vector: Floats,
+    prior_covariance: Floats,
+    drive: Ints,
+    drive_correlation: float,
+    robust_scale: float,
+) -> Floats:
     """(O, 3) metres, metres, radians: by how much the claims of each look's drive are off alike, to be added to them.
 
-    heard: (O, 3, 3) information L of the lines on each look's pose, which may be singular; urge: (O, 3) L d, where d is
-    the correction of the claim that the lines ask for. claim: (O, 3, 3) covariance P. drive: (O,) which drive, from 0.
+    information_matrix: (O, 3, 3) information L of the lines on each look's pose, which may be singular; information_vector: (O, 3)
+    L d, where d is the correction of the claim that the lines ask for. prior_covariance: (O, 3, 3) covariance P. drive: (O,) which
+    drive, from 0.
     """
     count = int(drive.max(initial=-1)) + 1
-    blurred = np.eye(3) + (1.0 - alike) * heard @ claim
-    weight, pull, usual = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3))
-    np.add.at(weight, drive, np.linalg.solve(blurred, heard))
-    np.add.at(pull, drive, np.linalg.solve(blurred, urge[:, :, None])[:, :, 0])
-    np.add.at(usual, drive, claim)
-    prior = np.linalg.inv(alike * usual / np.bincount(drive, minlength=count)[:, None, None])
+    blurred = np.eye(3) + (1.0 - drive_correlation) * information_matrix @ prior_covariance
+    weight, pull, covariance_sum = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    np.add.at(weight, drive, np.linalg.solve(blurred, information_matrix))
+    np.add.at(pull, drive, np.linalg.solve(blurred, information_vector[:, :, None])[:, :, 0])
+    np.add.at(covariance_sum, drive, prior_covariance)
+    prior = np.linalg.inv(drive_correlation * covariance_sum / np.bincount(drive, minlength=count)[:, None, None])
     # From where the prior hardly counts: a drive that is far off is found, one that is not is shrunk round by round.
-    trust, error = np.full(count, _FREE), np.zeros((count, 3))
+    prior_weight, error = np.full(count, _FREE), np.zeros((count, 3))
     for _ in range(_ROUNDS):
         error = np.asarray(
-            np.linalg.solve(weight + trust[:, None, None] * prior, pull[:, :, None])[:, :, 0], np.float64
+            np.linalg.solve(weight + prior_weight[:, None, None] * prior, pull[:, :, None])[:, :, 0], np.float64
         )
-        far = alike * np.einsum("ai,aij,aj->a", error, prior, error)
-        trust = (scale**2 / (scale**2 + far)) ** 2
+        far = drive_correlation * np.einsum("ai,aij,aj->a", error, prior, error)
+        prior_weight = (robust_scale**2 / (robust_scale**2 + far)) ** 2
     return error[drive]

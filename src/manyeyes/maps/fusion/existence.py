@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
-from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, Sightings, is_line, sight
-from manyeyes.maps.fusion.point_grid import build_grid, lower_bound, span
+from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, ObservationArrays, compute_visibility, is_line
+from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range, lower_bound
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_LOOK_CELL_M = 32.0
+_VIEW_CELL_M = 32.0
 _POINT_CELL_M = 2.5
 _DAY_S = 86400.0
 
@@ -60,90 +60,91 @@ class EvidenceParameters(NamedTuple):
 
 @dataclass(frozen=True)
 class EvidenceConfig:
-    """detection, false_alarm: P_D and P_FA. clamp: largest |log-odds|; doubt: before the first sighting. daily: largest
-    change one agent makes in a day. unsure, sure: scores of an element below which a sighting adds nothing and above
-    which it adds all; in between, a share.
+    """detection_prob, false_alarm_prob: P_D and P_FA. max_log_odds: largest |log-odds|; max_log_odds_before_detection: before the
+    first sighting. max_daily_change: largest change one agent makes in a day. score_low, score_high: scores of an element below
+    which a sighting adds nothing and above which it adds all; in between, a share.
 
-    publish: log-odds at which a station is published, given publish_agents distinct agents or a surveyed pole;
-    publish_ring: the same of a crossing; publish_seldom: of a line's station that was in view at most ``seldom`` times
-    (summed visibility), which few could have confirmed. retire: at which it is retired, given retire_agents distinct
-    agents that missed it. margin_m: of a view, within which a miss counts less. decay_s: by kind, seconds in which
-    evidence fades to 1/e. along_m, across_m, heading_rad: when a line is at the station; aside_m: when it may be.
-    kernel_m: Geman-McClure scale of the place across. bias_m: error that no number of observations removes.
+    publish_log_odds: log-odds at which a station is published, given publish_agents distinct agents or a surveyed pole;
+    publish_crossing_log_odds: the same of a crossing; publish_low_coverage_log_odds: of a line's station that was in view at most
+    ``low_coverage`` times (summed visibility), which few could have confirmed. retire_log_odds: at which it is retired, given
+    retire_agents distinct agents that missed it. view_margin_m: of a view, within which a miss counts less. decay_time_s: by kind,
+    seconds in which evidence fades to 1/e. max_longitudinal_m, max_lateral_m, max_heading_rad: when a line is at the station;
+    max_ambiguous_lateral_m: when it may be. kernel_m: Geman-McClure scale of the place across. bias_sigma_m: error that no number
+    of observations removes.
     """
 
-    detection: float = 0.7
-    false_alarm: float = 0.15
-    clamp: float = 6.0
-    doubt: float = 2.0
-    daily: float = 2.0
-    unsure: float = 0.4
-    sure: float = 0.7
-    publish: float = 2.2
-    publish_ring: float = 2.2
-    publish_seldom: float = 2.2
-    seldom: float = 3.0
-    publish_agents: int = 2
-    retire: float = -1.4
-    retire_agents: int = 3
-    margin_m: float = 2.0
-    decay_s: tuple[float, float, float, float] = (180 * _DAY_S, 180 * _DAY_S, 365 * _DAY_S, 180 * _DAY_S)
-    along_m: float = 1.5
-    across_m: float = 0.9
-    aside_m: float = 1.2
-    heading_rad: float = 0.35
+    detection_prob: float = 0.7
+    false_alarm_prob: float = 0.15
+    max_log_odds: float = 6.0
+    max_log_odds_before_detection: float = 2.0
+    max_daily_change: float = 2.0
+    score_low: float = 0.4
+    score_high: float = 0.7
+    publish_log_odds: float = 2.2
+    publish_crossing_log_odds: float = 2.2
+    publish_low_coverage_log_odds: float = 2.2
+    low_coverage: float = 3.0
+    min_publish_agents: int = 2
+    retire_log_odds: float = -1.4
+    min_retire_agents: int = 3
+    view_margin_m: float = 2.0
+    decay_time_s: tuple[float, float, float, float] = (180 * _DAY_S, 180 * _DAY_S, 365 * _DAY_S, 180 * _DAY_S)
+    max_longitudinal_m: float = 1.5
+    max_lateral_m: float = 0.9
+    max_ambiguous_lateral_m: float = 1.2
+    max_heading_rad: float = 0.35
     kernel_m: float = 0.5
-    bias_m: float = 0.05
+    bias_sigma_m: float = 0.05
 
     @property
-    def hit(self) -> float:
+    def log_odds_hit(self) -> float:
         """What a sighting adds."""
-        return float(np.log(self.detection / self.false_alarm))
+        return float(np.log(self.detection_prob / self.false_alarm_prob))
 
-    def worth(self, score: Floats) -> Floats:
-        """(E,) which share of ``hit`` a sighting of an element of that score adds."""
-        return np.clip((np.asarray(score) - self.unsure) / (self.sure - self.unsure), 0.0, 1.0)
+    def score_weight(self, score: Floats) -> Floats:
+        """(E,) which share of ``log_odds_hit`` a sighting of an element of that score adds."""
+        return np.clip((np.asarray(score) - self.score_low) / (self.score_high - self.score_low), 0.0, 1.0)
 
-    def publish_from(self, kind: Ints) -> Floats:
+    def publish_threshold(self, kind: Ints) -> Floats:
         """(K,) log-odds at which something of that kind is published."""
-        return np.where(is_line(kind), self.publish, self.publish_ring)
+        return np.where(is_line(kind), self.publish_log_odds, self.publish_crossing_log_odds)
 
     @property
-    def miss(self) -> float:
+    def log_odds_miss(self) -> float:
         """What a clear view without a sighting adds; negative."""
-        return float(np.log((1 - self.detection) / (1 - self.false_alarm)))
+        return float(np.log((1 - self.detection_prob) / (1 - self.false_alarm_prob)))
 
     @property
-    def numbers(self) -> EvidenceParameters:
+    def kernel_params(self) -> EvidenceParameters:
         """The numbers that the compiled loops read."""
         return EvidenceParameters(
-            hit=self.hit,
-            miss=self.miss,
-            max_log_odds=float(self.clamp),
-            max_daily_change=float(self.daily),
-            publish=float(self.publish),
-            retire=float(self.retire),
-            margin_m=float(self.margin_m),
-            max_longitudinal_m=float(self.along_m),
-            max_lateral_m=float(self.across_m),
-            max_nearby_m=float(self.aside_m),
-            min_cosine=float(np.cos(self.heading_rad)),
+            hit=self.log_odds_hit,
+            miss=self.log_odds_miss,
+            max_log_odds=float(self.max_log_odds),
+            max_daily_change=float(self.max_daily_change),
+            publish=float(self.publish_log_odds),
+            retire=float(self.retire_log_odds),
+            margin_m=float(self.view_margin_m),
+            max_longitudinal_m=float(self.max_longitudinal_m),
+            max_lateral_m=float(self.max_lateral_m),
+            max_nearby_m=float(self.max_ambiguous_lateral_m),
+            min_cosine=float(np.cos(self.max_heading_rad)),
             kernel_m=float(self.kernel_m),
-            bias_m=float(self.bias_m),
-            max_initial_log_odds=float(self.doubt),
-            min_publish_agents=self.publish_agents,
-            min_retire_agents=self.retire_agents,
+            bias_m=float(self.bias_sigma_m),
+            max_initial_log_odds=float(self.max_log_odds_before_detection),
+            min_publish_agents=self.min_publish_agents,
+            min_retire_agents=self.min_retire_agents,
         )
 
 
-class Looks(NamedTuple):
-    """Which observations may see a place: rows ``of[start[c]:start[c + 1]]``, in time order, for the cell with key
+class VisibilityIndex(NamedTuple):
+    """Which observations may see a place: rows ``observations[start[c]:start[c + 1]]``, in time order, for the cell with key
     ``keys[c]``.
     """
 
     keys: I64x1
-    start: I64x1
-    of: I64x1
+    offsets: I64x1
+    observations: I64x1
 
 
 class Observers(NamedTuple):
@@ -162,7 +163,7 @@ class Observers(NamedTuple):
 class ObservationScene(NamedTuple):
     """All that decides which observation could see a place: their index by cells, poses, views and occluders."""
 
-    cells: Looks
+    cells: VisibilityIndex
     observers: Observers
     fields: FieldsOfView
 
@@ -175,7 +176,7 @@ class ElementStyles(NamedTuple):
 
 
 class AgentScratch(NamedTuple):
-    """Scratch of :func:`fold_looks`, all by agent (A,): the sum of log-odds of a day, whether it has seen the thing, the
+    """Scratch of :func:`update_existence`, all by agent (A,): the sum of log-odds of a day, whether it has seen the thing, the
     thing (its index + 1) and day of that sum, and the eras in which it last counted as having seen and as having missed it.
     """
 
@@ -206,15 +207,15 @@ class Fold(NamedTuple):
     state: int
 
 
-class Witness(NamedTuple):
-    """Evidence of K stations. shift: (K,) metres along the normal to where the observations agree; sigma: (K,).
+class StationEvidence(NamedTuple):
+    """Evidence of K stations. lateral_shift: (K,) metres along the normal to where the observations agree; sigma: (K,).
 
     log_odds, coverage: (K,), coverage the sum of visibilities. support, agents: (K,). state: (K,). t_first, t_last:
     (K,) ns. style: (K, S) votes. Station k was seen by observations ``sources[first[k]:first[k + 1]]``, rows of the
     sightings.
     """
 
-    shift: F64x1
+    lateral_shift: F64x1
     sigma: F64x1
     log_odds: F64x1
     coverage: F64x1
@@ -224,27 +225,33 @@ class Witness(NamedTuple):
     t_first: I64x1
     t_last: I64x1
     style: F64x2
-    first: I64x1
+    source_offsets: I64x1
     sources: I64x1
 
 
-def looks(sightings: Sightings, pose: Floats, heard: NDArray[np.bool_] | None = None) -> Looks:
-    """The index of who may see what, by cells of 32 m that each view's box meets, for agents at pose (O, 3); heard: (O,) who
+def build_visibility_index(
+    arrays: ObservationArrays, pose: Floats, included: NDArray[np.bool_] | None = None
+) -> VisibilityIndex:
+    """The index of who may see what, by cells of 32 m that each view's box meets, for agents at pose (O, 3); included: (O,) who
     is in it, None: all.
     """
-    xy, first, of = sightings.view.xy, sightings.view.first, sightings.view.of
-    owner = np.repeat(np.repeat(np.arange(len(of) - 1), np.diff(of)), np.diff(first))
+    xy, ring_offsets, observation_offsets = arrays.view.xy, arrays.view.ring_offsets, arrays.view.observation_offsets
+    owner = np.repeat(
+        np.repeat(np.arange(len(observation_offsets) - 1), np.diff(observation_offsets)), np.diff(ring_offsets)
+    )
     c, s = np.cos(pose[owner, 2]), np.sin(pose[owner, 2])
     placed = np.stack((c * xy[:, 0] - s * xy[:, 1], s * xy[:, 0] + c * xy[:, 1]), 1) + pose[owner, :2]
     low, high = np.full((len(pose), 2), np.inf), np.full((len(pose), 2), -np.inf)
     np.minimum.at(low, owner, placed)
     np.maximum.at(high, owner, placed)
-    cell, who = _cells(np.floor(low / _LOOK_CELL_M).astype(np.int64), np.floor(high / _LOOK_CELL_M).astype(np.int64))
-    if heard is not None:
-        cell, who = cell[heard[who]], who[heard[who]]
-    order = np.lexsort((who, cell))
+    cell, observer = _cells(
+        np.floor(low / _VIEW_CELL_M).astype(np.int64), np.floor(high / _VIEW_CELL_M).astype(np.int64)
+    )
+    if included is not None:
+        cell, observer = cell[included[observer]], observer[included[observer]]
+    order = np.lexsort((observer, cell))
     keys, start = np.unique(cell[order], return_index=True)
-    return Looks(keys, np.append(start, len(order)).astype(np.int64), who[order])
+    return VisibilityIndex(keys, np.append(start, len(order)).astype(np.int64), observer[order])
 
 
 @njit(cache=True, nogil=True)
@@ -253,64 +260,68 @@ def _cells(low: I64x2, high: I64x2) -> tuple[I64x1, I64x1]:  # pragma: no cover 
     total = 0
     for o in range(len(low)):
         total += (high[o, 0] - low[o, 0] + 1) * (high[o, 1] - low[o, 1] + 1)
-    cell, who = np.empty(total, np.int64), np.empty(total, np.int64)
+    cell, observer = np.empty(total, np.int64), np.empty(total, np.int64)
     k = 0
     for o in range(len(low)):
         for ix in range(low[o, 0], high[o, 0] + 1):
             for iy in range(low[o, 1], high[o, 1] + 1):
                 cell[k] = ((ix + 536870912) << 30) | (iy + 536870912)
-                who[k] = o
+                observer[k] = o
                 k += 1
-    return cell, who
+    return cell, observer
 
 
-def witnesses(sightings: Sightings, pose: Floats) -> Observers:
+def gather_observers(observation_arrays: ObservationArrays, pose: Floats) -> Observers:
     """The observations at pose (O, 3), as the compiled loops read them."""
-    arrays = (np.asarray(sightings.agent), np.asarray(sightings.time_ns), np.asarray(sightings.trusted))
-    return Observers(np.ascontiguousarray(pose), *arrays, len(sightings.agents))
+    arrays = (
+        np.asarray(observation_arrays.agent),
+        np.asarray(observation_arrays.time_ns),
+        np.asarray(observation_arrays.trusted),
+    )
+    return Observers(np.ascontiguousarray(pose), *arrays, len(observation_arrays.agents))
 
 
-def sights(sightings: Sightings) -> FieldsOfView:
+def gather_visibility_rings(arrays: ObservationArrays) -> FieldsOfView:
     """Views and occluders, as the compiled loops read them."""
-    return FieldsOfView(sightings.view, sightings.occluders)
+    return FieldsOfView(arrays.view, arrays.occluders)
 
 
-def witness(
+def accumulate_evidence(
     xy: Floats,
     tangent: Floats,
     kind: Ints,
-    sightings: Sightings,
+    arrays: ObservationArrays,
     pose: Floats,
     weight: Floats,
-    believed: NDArray[np.bool_],
+    is_inlier: NDArray[np.bool_],
     config: EvidenceConfig = EvidenceConfig(),
-) -> Witness:
+) -> StationEvidence:
     """The evidence for line stations (K,) at xy with unit tangents, from all sightings with agents at pose (O, 3).
 
     ``weight`` (P,) is how much each point of the sightings counts for the place across, 0: it is not there; what it is seen
-    counts once an observation. believed: (O,) whose word that something is not there counts.
+    counts once an observation. is_inlier: (O,) whose word that something is not there counts.
     """
-    points = np.flatnonzero(is_line(sightings.kind) & (weight > 0.0))
-    world, direction = sightings.world(pose)
-    grid = build_grid(world[points, 0], world[points, 1], sightings.kind[points], _POINT_CELL_M)
+    points = np.flatnonzero(is_line(arrays.kind_of_point) & (weight > 0.0))
+    world, direction = arrays.to_world(pose)
+    grid = build_grid(world[points, 0], world[points, 1], arrays.kind_of_point[points], _POINT_CELL_M)
     order = points[grid.order]
-    index = looks(sightings, pose, believed)
+    index = build_visibility_index(arrays, pose, is_inlier)
     others = _EvidencePoints(
         grid.keys,
-        grid.start,
+        grid.offsets,
         world[order],
         direction[order],
-        sightings.observation[order],
-        sightings.element[order],
+        arrays.observation_of_point[order],
+        arrays.element_of_point[order],
         weight[order],
     )
-    return _witness(
+    return _accumulate_evidence(
         _EvidenceStations(xy, tangent, kind),
         others,
-        ObservationScene(index, witnesses(sightings, pose), sights(sightings)),
-        ElementStyles(np.asarray(sightings.elements.style), config.worth(sightings.elements.score)),
-        config.numbers,
-        np.array(config.decay_s),
+        ObservationScene(index, gather_observers(arrays, pose), gather_visibility_rings(arrays)),
+        ElementStyles(np.asarray(arrays.elements.style), config.score_weight(arrays.elements.score)),
+        config.kernel_params,
+        np.array(config.decay_time_s),
     )
 
 
@@ -340,7 +351,7 @@ class _MatchScratch(NamedTuple):
     """What each observation (O,) has at one station: sums over its points near of weight, weight times lateral offset and
     weight times weight of the point; least distance along and the element there; UNMATCHED, MATCHED or NEARBY.
 
-    touched: the observations that are not UNMATCHED, as many as :func:`_collect` returns.
+    touched: the observations that are not UNMATCHED, as many as :func:`_collect_offsets` returns.
     """
 
     mass: F64x1
@@ -374,17 +385,17 @@ def doubled(rows: I64x1) -> I64x1:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _witness(
+def _accumulate_evidence(
     stations: _EvidenceStations,
-    others: _EvidencePoints,
+    points: _EvidencePoints,
     scene: ObservationScene,
-    told: ElementStyles,
-    numbers: EvidenceParameters,
-    decay: F64x1,
-) -> Witness:  # pragma: no cover - compiled
-    """The evidence of each station; decay: (4,) seconds by kind."""
+    element_columns: ElementStyles,
+    params: EvidenceParameters,
+    decay_time_s: F64x1,
+) -> StationEvidence:  # pragma: no cover - compiled
+    """The evidence of each station; decay_time_s: (4,) seconds by kind."""
     xy, tangent, kind = stations
-    style, worth = told
+    style, score_weight = element_columns
     time_ns = scene.observers.time_ns
     count, observations = len(xy), len(time_ns)
     shift, sigma, odds, coverage = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
@@ -394,63 +405,63 @@ def _witness(
     first, sources, filled = np.zeros(count + 1, np.int64), np.empty(max(16, 8 * count), np.int64), 0
     mass, offset, pull = np.zeros(observations), np.zeros(observations), np.zeros(observations)
     nearest, element, gain = np.zeros(observations), np.zeros(observations, np.int64), np.zeros(observations)
-    aside_of = np.full(observations, UNMATCHED, np.int64)
-    touched, place = np.empty(observations, np.int64), np.empty((1, 2))
-    scratch = _MatchScratch(mass, offset, pull, nearest, element, aside_of, touched)
+    lateral_state = np.full(observations, UNMATCHED, np.int64)
+    candidates, place = np.empty(observations, np.int64), np.empty((1, 2))
+    scratch = _MatchScratch(mass, offset, pull, nearest, element, lateral_state, candidates)
     by_agent = new_agent_scratch(scene.observers.num_agents)
     for k in range(count):
-        n = _collect(k, stations, others, numbers, scratch)
+        n = _collect_offsets(k, stations, points, params, scratch)
         # Sums over observations go in their order, whatever order the grid gave.
-        touched[:n].sort()
-        shift[k], sigma[k] = _agree(n, scratch, numbers)
+        candidates[:n].sort()
+        shift[k], sigma[k] = _estimate_shift(n, scratch, params)
         for t in range(n):
-            o = touched[t]
-            if aside_of[o] == MATCHED and abs(offset[o] / mass[o] - shift[k]) > numbers.max_lateral_m:
-                aside_of[o] = NEARBY
+            o = candidates[t]
+            if lateral_state[o] == MATCHED and abs(offset[o] / mass[o] - shift[k]) > params.max_lateral_m:
+                lateral_state[o] = NEARBY
         # Only now is it known which of them are at the place that they agree on.
         for t in range(n):
-            o = touched[t]
-            if aside_of[o] == MATCHED:
+            o = candidates[t]
+            if lateral_state[o] == MATCHED:
                 if filled == len(sources):
                     sources = doubled(sources)
                 sources[filled] = o
                 filled += 1
                 votes[k] += style[element[o]]
-                gain[o] = worth[element[o]]
+                gain[o] = score_weight[element[o]]
         first[k + 1] = filled
         place[0, 0], place[0, 1] = xy[k, 0] - shift[k] * tangent[k, 1], xy[k, 1] + shift[k] * tangent[k, 0]
-        hits = MatchedObservations(sources[first[k] : filled], aside_of, gain)
-        odds[k], coverage[k], agents[k], state[k] = fold_looks(
-            place, k, hits, scene, numbers, float(decay[kind[k]]), by_agent
+        hits = MatchedObservations(sources[first[k] : filled], lateral_state, gain)
+        odds[k], coverage[k], agents[k], state[k] = update_existence(
+            place, k, hits, scene, params, float(decay_time_s[kind[k]]), by_agent
         )
         support[k] = filled - first[k]
         if support[k] > 0:
             t_first[k], t_last[k] = time_ns[sources[first[k]]], time_ns[sources[filled - 1]]
         for t in range(n):
-            o = touched[t]
-            mass[o], offset[o], pull[o], aside_of[o] = 0.0, 0.0, 0.0, UNMATCHED
-    return Witness(
+            o = candidates[t]
+            mass[o], offset[o], pull[o], lateral_state[o] = 0.0, 0.0, 0.0, UNMATCHED
+    return StationEvidence(
         shift, sigma, odds, coverage, support, agents, state, t_first, t_last, votes, first, sources[:filled].copy()
     )
 
 
 @njit(cache=True, nogil=True)
-def _collect(
-    k: int, stations: _EvidenceStations, others: _EvidencePoints, numbers: EvidenceParameters, scratch: _MatchScratch
+def _collect_offsets(
+    k: int, stations: _EvidenceStations, points: _EvidencePoints, params: EvidenceParameters, scratch: _MatchScratch
 ) -> int:  # pragma: no cover - compiled
     """Each observation's place across station k, averaged over its points near; the number of observations that have
     any.
     """
     xy, tangent, kind = stations
-    keys, start, rxy, rtangent, robservation, relement, rweight = others
-    mass, offset, pull, nearest, element, aside_of, touched = scratch
-    reach, across, wide = numbers.max_longitudinal_m, numbers.max_lateral_m, numbers.max_nearby_m
-    cosine = numbers.min_cosine
+    keys, start, rxy, rtangent, robservation, relement, rweight = points
+    mass, offset, pull, nearest, element, lateral_state, candidates = scratch
+    reach, across, wide = params.max_longitudinal_m, params.max_lateral_m, params.max_nearby_m
+    cosine = params.min_cosine
     x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
     ix, iy = int(np.floor(x / _POINT_CELL_M)), int(np.floor(y / _POINT_CELL_M))
     n = 0
     for dx in range(-1, 2):
-        low, high = span(keys, start, kind[k], ix + dx, iy - 1, iy + 1)
+        low, high = find_cell_range(keys, start, kind[k], ix + dx, iy - 1, iy + 1)
         for q in range(low, high):
             ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
             if ex * ex + ey * ey > reach * reach + wide * wide:
@@ -465,14 +476,14 @@ def _collect(
             if along > reach or abs(aside) > wide:
                 continue
             o = robservation[q]
-            if aside_of[o] == UNMATCHED:
-                touched[n] = o
+            if lateral_state[o] == UNMATCHED:
+                candidates[n] = o
                 n += 1
-                aside_of[o] = NEARBY
+                lateral_state[o] = NEARBY
                 nearest[o] = np.inf
             if abs(aside) > across:
                 continue
-            aside_of[o] = MATCHED
+            lateral_state[o] = MATCHED
             # The nearest points decide: weights fall steeply, so that two points astride the station interpolate.
             w = (1.0 - along / reach) ** 2 + 1e-9
             mass[o] += w
@@ -485,22 +496,28 @@ def _collect(
 
 
 @njit(cache=True, nogil=True)
-def _agree(
-    n: int, scratch: _MatchScratch, numbers: EvidenceParameters
+def _estimate_shift(
+    n: int, scratch: _MatchScratch, params: EvidenceParameters
 ) -> tuple[float, float]:  # pragma: no cover - compiled
     """Where across the station the observations agree, and its sigma: reweighted means, one contribution an
     observation.
     """
-    mass, offset, pull, aside_of, touched = scratch.mass, scratch.offset, scratch.pull, scratch.match, scratch.touched
-    kernel, floor = numbers.kernel_m, numbers.bias_m
+    mass, offset, pull, lateral_state, candidates = (
+        scratch.mass,
+        scratch.offset,
+        scratch.pull,
+        scratch.match,
+        scratch.touched,
+    )
+    kernel, floor = params.kernel_m, params.bias_m
     place, spread = 0.0, 1.0
     for turn in range(4):
         total, aside, information = 0.0, 0.0, 0.0
         # The kernel narrows from the gate's width, so that the start, which may lie between two lines, decides little.
         c2 = (kernel * (2.0 if turn == 0 else 1.0)) ** 2
         for i in range(n):
-            o = touched[i]
-            if aside_of[o] == MATCHED:
+            o = candidates[i]
+            if lateral_state[o] == MATCHED:
                 d = offset[o] / mass[o]
                 g = c2 / (c2 + (d - place) ** 2)
                 w = pull[o] / mass[o] * g * g
@@ -515,26 +532,26 @@ def _agree(
 
 
 @njit(cache=True, nogil=True)
-def fold_looks(
+def update_existence(
     places: F64x2,
     k: int,
     found: MatchedObservations,
     scene: ObservationScene,
-    numbers: EvidenceParameters,
-    decay: float,
+    params: EvidenceParameters,
+    decay_time_s: float,
     scratch: AgentScratch,
 ) -> Fold:  # pragma: no cover - compiled
     """Log-odds, coverage, distinct agents and state of thing k after all looks at it, in time order.
 
-    ``places`` (M, 2) are points of it whose visibilities are averaged. decay: seconds in which evidence fades to 1/e.
+    ``places`` (M, 2) are points of it whose visibilities are averaged. decay_time_s: seconds in which evidence fades to 1/e.
     """
     pose, agent, time_ns, trusted, _ = scene.observers
-    hits, aside_of, worth = found
-    of = scene.cells.of
-    hit, miss, clamp, daily = numbers.hit, numbers.miss, numbers.max_log_odds, numbers.max_daily_change
+    hits, lateral_state, score_weight = found
+    of = scene.cells.observations
+    hit, miss, max_log_odds, max_daily_change = params.hit, params.miss, params.max_log_odds, params.max_daily_change
     low, high = _cell_of(places, scene.cells)
     odds, coverage, state, then, surveyed, started = 0.0, 0.0, CANDIDATE, 0, False, False
-    seen_by, all_by, missed_by, next_hit, q, floor = 0, 0, 0, 0, low, -numbers.max_initial_log_odds
+    seen_by, all_by, missed_by, next_hit, q, floor = 0, 0, 0, 0, low, -params.max_initial_log_odds
     era_seen, era_missed = 1, 1
     while next_hit < len(hits) or q < high:
         is_hit = next_hit < len(hits) and (q >= high or hits[next_hit] <= of[q])
@@ -546,22 +563,26 @@ def fold_looks(
         else:
             o = of[q]
             q += 1
-            seen = 0.0 if aside_of[o] == NEARBY else visibility(places, o, pose, scene.fields, numbers.margin_m)
+            seen = (
+                0.0
+                if lateral_state[o] == NEARBY
+                else compute_mean_visibility(places, o, pose, scene.fields, params.margin_m)
+            )
         coverage += seen
         if seen <= 0.0:
             continue
         if started:
-            odds *= np.exp(-(time_ns[o] - then) * 1e-9 / decay)
+            odds *= np.exp(-(time_ns[o] - then) * 1e-9 / decay_time_s)
         started, then = True, time_ns[o]
         a = int(agent[o])
         _open_day(scratch, a, k, int(time_ns[o] // DAY_NS))
-        change = hit * worth[o] if is_hit else miss * seen
+        change = hit * score_weight[o] if is_hit else miss * seen
         if not trusted[o]:
-            allowed = min(daily, max(-daily, scratch.day_sum[a] + change))
+            allowed = min(max_daily_change, max(-max_daily_change, scratch.day_sum[a] + change))
             change, scratch.day_sum[a] = allowed - scratch.day_sum[a], allowed
         if is_hit:
-            floor = -clamp
-        odds = min(clamp, max(floor, odds + change))
+            floor = -max_log_odds
+        odds = min(max_log_odds, max(floor, odds + change))
         if is_hit:
             seen_by += _count_once(scratch.seen_era, a, era_seen)
             if not scratch.has_seen[a]:
@@ -570,11 +591,11 @@ def fold_looks(
             surveyed = surveyed or trusted[o]
         elif all_by > 0:
             missed_by += _count_once(scratch.missed_era, a, era_missed)
-        if odds >= numbers.publish and (seen_by >= numbers.min_publish_agents or surveyed):
+        if odds >= params.publish and (seen_by >= params.min_publish_agents or surveyed):
             state = PUBLISHED
             era_missed += 1
             missed_by = 0
-        elif odds <= numbers.retire and missed_by >= numbers.min_retire_agents and state != RETIRED:
+        elif odds <= params.retire and missed_by >= params.min_retire_agents and state != RETIRED:
             state = RETIRED
             era_seen += 1
             seen_by, surveyed = 0, False
@@ -600,47 +621,47 @@ def _open_day(scratch: AgentScratch, a: int, k: int, day: int) -> None:  # pragm
         scratch.day[a], scratch.day_sum[a] = day, 0.0
 
 
-def vouched(
-    sightings: Sightings, pose: Floats, believed: NDArray[np.bool_], agents: int, margin_m: float
+def find_covered_by_inliers(
+    arrays: ObservationArrays, pose: Floats, is_inlier: NDArray[np.bool_], min_agents: int, view_margin_m: float
 ) -> NDArray[np.bool_]:
     """(P,) which points of observations that nobody believes (O,) lie where so many believed agents looked."""
-    out = np.zeros(len(sightings.xy), np.bool_)
-    if not believed.all():
-        index = looks(sightings, pose, believed)
-        doubted = np.flatnonzero(~believed)
-        xy = sightings.world(pose)[0]
-        scene = ObservationScene(index, witnesses(sightings, pose), sights(sightings))
-        _vouch(doubted, np.asarray(sightings.first), xy, scene, margin_m, agents, out)
+    out = np.zeros(len(arrays.xy), np.bool_)
+    if not is_inlier.all():
+        index = build_visibility_index(arrays, pose, is_inlier)
+        rejected = np.flatnonzero(~is_inlier)
+        xy = arrays.to_world(pose)[0]
+        scene = ObservationScene(index, gather_observers(arrays, pose), gather_visibility_rings(arrays))
+        _mark_covered(rejected, np.asarray(arrays.observation_offsets), xy, scene, view_margin_m, min_agents, out)
     return out
 
 
 @njit(cache=True, nogil=True)
-def _vouch(
-    doubted: I64x1, first: I64x1, xy: F64x2, scene: ObservationScene, margin: float, agents: int, out: Boolx1
+def _mark_covered(
+    rejected: I64x1, first: I64x1, xy: F64x2, scene: ObservationScene, margin: float, min_agents: int, out: Boolx1
 ) -> None:  # pragma: no cover - compiled
-    """Mark in out (P,) the points of observations ``doubted`` that so many agents of the scene could see."""
-    agent, pose, of = scene.observers.agent, scene.observers.pose, scene.cells.of
+    """Mark in out (P,) the points of observations ``rejected`` that so many agents of the scene could see."""
+    agent, pose, of = scene.observers.agent, scene.observers.pose, scene.cells.observations
     seen, place = np.full(scene.observers.num_agents, -1), np.empty((1, 2))
-    for o in doubted:
+    for o in rejected:
         for p in range(first[o], first[o + 1]):
             place[0, 0], place[0, 1] = xy[p, 0], xy[p, 1]
             low, high = _cell_of(place, scene.cells)
             count = 0
             for q in range(low, high):
                 other = of[q]
-                if seen[agent[other]] != p and visibility(place, other, pose, scene.fields, margin) > 0.0:
+                if seen[agent[other]] != p and compute_mean_visibility(place, other, pose, scene.fields, margin) > 0.0:
                     seen[agent[other]] = p
                     count += 1
-                    if count == agents:
+                    if count == min_agents:
                         out[p] = True
                         break
 
 
 @njit(cache=True, nogil=True)
-def _cell_of(places: F64x2, index: Looks) -> tuple[int, int]:  # pragma: no cover - compiled
-    """The range in ``index.of`` of the observations that may see the first place."""
+def _cell_of(places: F64x2, index: VisibilityIndex) -> tuple[int, int]:  # pragma: no cover - compiled
+    """The range in ``index.observations`` of the observations that may see the first place."""
     keys, start, _ = index
-    ix, iy = int(np.floor(places[0, 0] / _LOOK_CELL_M)), int(np.floor(places[0, 1] / _LOOK_CELL_M))
+    ix, iy = int(np.floor(places[0, 0] / _VIEW_CELL_M)), int(np.floor(places[0, 1] / _VIEW_CELL_M))
     key = ((ix + 536870912) << 30) | (iy + 536870912)
     cell = lower_bound(keys, key)
     if cell < len(keys) and keys[cell] == key:
@@ -649,14 +670,14 @@ def _cell_of(places: F64x2, index: Looks) -> tuple[int, int]:  # pragma: no cove
 
 
 @njit(cache=True, nogil=True)
-def visibility(
-    places: F64x2, o: int, pose: F64x2, sights: FieldsOfView, margin: float
+def compute_mean_visibility(
+    places: F64x2, o: int, pose: F64x2, rings: FieldsOfView, margin: float
 ) -> float:  # pragma: no cover - compiled
     """Mean visibility of the places from observation o; what is seen by less than half says nothing."""
     c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
     total = 0.0
     for i in range(len(places)):
         dx, dy = places[i, 0] - pose[o, 0], places[i, 1] - pose[o, 1]
-        total += sight(c * dx + s * dy, -s * dx + c * dy, o, sights.views, sights.occluders, margin)
+        total += compute_visibility(c * dx + s * dy, -s * dx + c * dy, o, rings.views, rings.occluders, margin)
     mean = total / len(places)
     return mean if len(places) == 1 or mean >= 0.5 else 0.0

@@ -2,7 +2,7 @@
 """One map from many observations: align, find stations, link them to lines, keep their evidence.
 
 The whole of specs/maps.md 3.4 in three steps: :func:`manyeyes.maps.fusion.pose_optimization.solve_poses`,
-:func:`manyeyes.maps.fusion.stations.find_stations` and :func:`assemble`. The first two are local and may run tile by tile; the
+:func:`manyeyes.maps.fusion.stations.build_stations` and :func:`assemble_map`. The first two are local and may run tile by tile; the
 third takes the stations of all tiles, which are few, so no line is ever cut at a border. The map is a fold over the
 sorted set of observations: giving one again, or in another order, changes nothing, and taking one out gives the map
 that never had it.
@@ -17,95 +17,119 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, I64x1, njit
-from manyeyes.datatypes.map_element import DASHED, MapElements, rows_of
-from manyeyes.maps.elements.observation import Frame, Observation
-from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED, Stations, Topology, VectorMap, content_ids
-from manyeyes.maps.fusion.coverage import cut_unseen
-from manyeyes.maps.fusion.observation_arrays import gather
-from manyeyes.maps.fusion.parallel_extension import BesideConfig, continued
-from manyeyes.maps.fusion.polyline_linking import LinkConfig, link, smooth
-from manyeyes.maps.fusion.pose_config import AlignConfig
-from manyeyes.maps.fusion.pose_optimization import Alignment, solve_poses
-from manyeyes.maps.fusion.stations import Area, Evidence, StationConfig, StationTable, find_stations, with_style
-from manyeyes.maps.fusion.topology import topology_of
+from manyeyes.datatypes.map_element import DASHED, MapElements, take_rows
+from manyeyes.maps.elements.observation import MapFrame, Observation
+from manyeyes.maps.elements.vector_map import (
+    CANDIDATE,
+    PUBLISHED,
+    RETIRED,
+    PointEvidence,
+    Topology,
+    VectorMap,
+    compute_content_ids,
+)
+from manyeyes.maps.fusion.coverage import cut_unobserved
+from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
+from manyeyes.maps.fusion.parallel_extension import ParallelExtensionConfig, extend_parallel
+from manyeyes.maps.fusion.polyline_linking import LinkConfig, link_stations, smooth_chains
+from manyeyes.maps.fusion.pose_config import PoseSolverConfig
+from manyeyes.maps.fusion.pose_optimization import PoseSolution, solve_poses
+from manyeyes.maps.fusion.stations import (
+    Area,
+    EvidenceTable,
+    StationConfig,
+    StationTable,
+    build_stations,
+    normalize_style,
+)
+from manyeyes.maps.fusion.topology import build_topology
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class FuseConfig:
-    """align, stations, link: of the three steps. least_m: shortest line by kind (divider, boundary, crossing, stop
+class MapFusionConfig:
+    """pose_solver, stations, link: of the three steps. min_length_m: shortest line by kind (divider, boundary, crossing, stop
     line).
 
-    full_score_m: length by kind from which a line's score is not lowered.
+    full_score_length_m: length by kind from which a line's score is not lowered.
     """
 
-    align: AlignConfig = field(default_factory=AlignConfig)
+    pose_solver: PoseSolverConfig = field(default_factory=PoseSolverConfig)
     stations: StationConfig = field(default_factory=StationConfig)
     link: LinkConfig = field(default_factory=LinkConfig)
-    beside: BesideConfig = field(default_factory=BesideConfig)
-    least_m: tuple[float, float, float, float] = (2.0, 4.0, 0.0, 2.0)
-    full_score_m: tuple[float, float, float, float] = (20.0, 20.0, 0.0, 3.0)
+    parallel_extension: ParallelExtensionConfig = field(default_factory=ParallelExtensionConfig)
+    min_length_m: tuple[float, float, float, float] = (2.0, 4.0, 0.0, 2.0)
+    full_score_length_m: tuple[float, float, float, float] = (20.0, 20.0, 0.0, 3.0)
 
 
 def fuse(
-    observations: Sequence[Observation], config: FuseConfig = FuseConfig(), frame: Frame | None = None
+    observations: Sequence[Observation], config: MapFusionConfig = MapFusionConfig(), frame: MapFrame | None = None
 ) -> VectorMap:
     """The map of the observations, in their frame."""
-    return fuse_aligned(observations, solve_poses(observations, config.align), None, config, frame)
+    return fuse_at_poses(observations, solve_poses(observations, config.pose_solver), None, config, frame)
 
 
-def fuse_aligned(
+def fuse_at_poses(
     observations: Sequence[Observation],
-    alignment: Alignment,
+    solution: PoseSolution,
     area: Area | None = None,
-    config: FuseConfig = FuseConfig(),
-    frame: Frame | None = None,
+    config: MapFusionConfig = MapFusionConfig(),
+    frame: MapFrame | None = None,
 ) -> VectorMap:
     """The map of the observations at given poses, from the stations in area (x0, y0, x1, y1), or everywhere."""
-    sightings = gather(observations, config.align.spacing_m)
-    return assemble(find_stations(sightings, alignment, area, config.stations), config, frame)
+    arrays = to_observation_arrays(observations, config.pose_solver.spacing_m)
+    return assemble_map(build_stations(arrays, solution, area, config.stations), config, frame)
 
 
-def assemble(table: StationTable, config: FuseConfig = FuseConfig(), frame: Frame | None = None) -> VectorMap:
+def assemble_map(
+    table: StationTable, config: MapFusionConfig = MapFusionConfig(), frame: MapFrame | None = None
+) -> VectorMap:
     """The map that the stations of all areas make: retired ones for themselves, the others linked to lines."""
-    parts = [_lines(table, table.line.state != RETIRED, config), _lines(table, table.line.state == RETIRED, config)]
-    whole = _Parts.cat([*parts, _crossings(table)])
-    return _as_map(whole, Evidence.cat([table.line, table.ring]), frame or Frame())
+    parts = [
+        _build_lines(table, table.line_evidence.state != RETIRED, config),
+        _build_lines(table, table.line_evidence.state == RETIRED, config),
+    ]
+    whole = _ElementParts.cat([*parts, _build_crossings(table)])
+    return _to_vector_map(whole, EvidenceTable.cat([table.line_evidence, table.ring_evidence]), frame or MapFrame())
 
 
 @dataclass(frozen=True, eq=False)
-class _Parts:
+class _ElementParts:
     """Elements on their way: points (P, 2), offsets first (N + 1,), the row of evidence behind each point (P,), and
     whether that place itself was seen (P,) or is inferred.
     """
 
     points: Floats
-    first: Ints
-    row: Ints
-    seen: NDArray[np.bool_]
+    offsets: Ints
+    evidence_row: Ints
+    is_observed: NDArray[np.bool_]
     score: Floats
 
     @classmethod
-    def cat(cls, many: Sequence[_Parts]) -> _Parts:
-        starts = np.cumsum([0, *(len(m.points) for m in many)])
+    def cat(cls, parts: Sequence[_ElementParts]) -> _ElementParts:
+        starts = np.cumsum([0, *(len(m.points) for m in parts)])
         return cls(
-            np.concatenate([m.points for m in many]),
-            np.concatenate([m.first[:-1] + start for m, start in zip(many, starts)] + [starts[-1:]]),
-            np.concatenate([m.row for m in many]),
-            np.concatenate([m.seen for m in many]),
-            np.concatenate([m.score for m in many]),
+            np.concatenate([m.points for m in parts]),
+            np.concatenate([m.offsets[:-1] + start for m, start in zip(parts, starts)] + [starts[-1:]]),
+            np.concatenate([m.evidence_row for m in parts]),
+            np.concatenate([m.is_observed for m in parts]),
+            np.concatenate([m.score for m in parts]),
         )
 
 
-def _lines(table: StationTable, chosen: NDArray[np.bool_], config: FuseConfig) -> _Parts:
+def _build_lines(table: StationTable, chosen: NDArray[np.bool_], config: MapFusionConfig) -> _ElementParts:
     rows = np.flatnonzero(chosen)
     xy, tangent = table.xy[rows], table.tangent[rows]
-    first, members = _linked(table, rows, xy, tangent, config)
-    seen = len(rows)
-    added, turned, source = continued(
-        xy, table.line.kind[rows], table.line.coverage[rows], (first, members), config.beside
+    offsets, members = _link_stations(table, rows, xy, tangent, config)
+    num_observed = len(rows)
+    added, turned, source = extend_parallel(
+        xy,
+        table.line_evidence.kind[rows],
+        table.line_evidence.coverage[rows],
+        (offsets, members),
+        config.parallel_extension,
     )
     if len(added):
         xy, tangent, rows = (
@@ -113,51 +137,59 @@ def _lines(table: StationTable, chosen: NDArray[np.bool_], config: FuseConfig) -
             np.concatenate((tangent, turned)),
             np.concatenate((rows, rows[source])),
         )
-        first, members = _linked(table, rows, xy, tangent, config)
-    kind, weight = table.line.kind[rows], 1.0 / table.line.sigma[rows] ** 2
-    points = smooth(xy, first, members, weight, config.link.smooth)
-    first, kept = cut_unseen(points, first, members >= seen, table.looked)
-    points, members = points[kept], members[kept]
-    first, order = _canonical(first, points)
+        offsets, members = _link_stations(table, rows, xy, tangent, config)
+    kind, weight = table.line_evidence.kind[rows], 1.0 / table.line_evidence.sigma[rows] ** 2
+    points = smooth_chains(xy, offsets, members, weight, config.link.smoothing_sigma)
+    offsets, kept_points = cut_unobserved(points, offsets, members >= num_observed, table.observed_cells)
+    points, members = points[kept_points], members[kept_points]
+    offsets, order = _canonical_order(offsets, points)
     points, members = points[order], members[order]
-    length = _lengths(first, points)
-    line_kind = kind[members[first[:-1]]] if len(members) else np.zeros(0, np.int64)
+    length = _lengths(offsets, points)
+    line_kind = kind[members[offsets[:-1]]] if len(members) else np.zeros(0, np.int64)
     mean = (
-        np.add.reduceat(table.line.log_odds[rows][members], first[:-1]) / np.diff(first)
+        np.add.reduceat(table.line_evidence.log_odds[rows][members], offsets[:-1]) / np.diff(offsets)
         if len(members)
         else np.zeros(0)
     )
-    share = np.minimum(1.0, length / np.array(config.full_score_m)[line_kind].clip(1e-9))
+    share = np.minimum(1.0, length / np.array(config.full_score_length_m)[line_kind].clip(1e-9))
     score = share / (1.0 + np.exp(-mean / 4.0))
-    stays = np.flatnonzero(length >= np.array(config.least_m)[line_kind])
-    kept, places = rows_of(first, stays)
-    return _Parts(points[places], kept, rows[members[places]], members[places] < seen, score[stays])
-
-
-def _linked(table: StationTable, rows: Ints, xy: Floats, tangent: Floats, config: FuseConfig) -> tuple[Ints, Ints]:
-    """Chains of stations at xy with the evidence of the table's rows."""
-    line = table.line
-    dashed = line.style[rows].argmax(1) == DASHED
-    return link(xy, tangent, line.kind[rows], line.log_odds[rows], dashed, line.coverage[rows], config.link)
-
-
-def _crossings(table: StationTable) -> _Parts:
-    offset = len(table.line.kind)
-    owner = np.repeat(np.arange(len(table.ring_start) - 1), np.diff(table.ring_start))
-    seen = np.ones(len(owner), bool)
-    return _Parts(
-        table.ring_xy, table.ring_start, offset + owner, seen, 1.0 / (1.0 + np.exp(-table.ring.log_odds / 4.0))
+    stays = np.flatnonzero(length >= np.array(config.min_length_m)[line_kind])
+    kept_points, places = take_rows(offsets, stays)
+    return _ElementParts(
+        points[places], kept_points, rows[members[places]], members[places] < num_observed, score[stays]
     )
 
 
-def _as_map(parts: _Parts, evidence: Evidence, frame: Frame) -> VectorMap:
+def _link_stations(
+    table: StationTable, rows: Ints, xy: Floats, tangent: Floats, config: MapFusionConfig
+) -> tuple[Ints, Ints]:
+    """Chains of stations at xy with the evidence of the table's rows."""
+    line = table.line_evidence
+    dashed = line.style[rows].argmax(1) == DASHED
+    return link_stations(xy, tangent, line.kind[rows], line.log_odds[rows], dashed, line.coverage[rows], config.link)
+
+
+def _build_crossings(table: StationTable) -> _ElementParts:
+    offset = len(table.line_evidence.kind)
+    owner = np.repeat(np.arange(len(table.ring_offsets) - 1), np.diff(table.ring_offsets))
+    is_observed = np.ones(len(owner), bool)
+    return _ElementParts(
+        table.ring_xy,
+        table.ring_offsets,
+        offset + owner,
+        is_observed,
+        1.0 / (1.0 + np.exp(-table.ring_evidence.log_odds / 4.0)),
+    )
+
+
+def _to_vector_map(parts: _ElementParts, evidence: EvidenceTable, frame: MapFrame) -> VectorMap:
     """Elements in canonical order with the evidence of the rows behind them."""
-    count = len(parts.first) - 1
-    evidence = with_style(evidence)
-    owner = np.repeat(np.arange(count), np.diff(parts.first))
-    head = parts.row[parts.first[:-1]]
-    row = parts.row
-    counts = np.maximum(1, np.diff(parts.first))
+    count = len(parts.offsets) - 1
+    evidence = normalize_style(evidence)
+    owner = np.repeat(np.arange(count), np.diff(parts.offsets))
+    head = parts.evidence_row[parts.offsets[:-1]]
+    row = parts.evidence_row
+    counts = np.maximum(1, np.diff(parts.offsets))
     mean = np.bincount(owner, evidence.log_odds[row], count) / counts
     published = np.bincount(owner, (evidence.state[row] == PUBLISHED).astype(np.float64), count) / counts
     state = np.where(evidence.state[head] == RETIRED, RETIRED, np.where(published >= 0.5, PUBLISHED, CANDIDATE))
@@ -166,15 +198,15 @@ def _as_map(parts: _Parts, evidence: Evidence, frame: Frame) -> VectorMap:
     )
     elements = MapElements(
         evidence.kind[head],
-        parts.first,
+        parts.offsets,
         parts.points,
         parts.score.clip(0.0, 1.0),
         evidence.sigma[row],
         style,
     )
-    sources_first, sources = _sources(owner, row, count, evidence)
-    stations = Stations(
-        *(getattr(evidence, n)[row] * parts.seen for n in ("support", "agents")),
+    sources_first, sources = _collect_sources(owner, row, count, evidence)
+    stations = PointEvidence(
+        *(getattr(evidence, n)[row] * parts.is_observed for n in ("support", "agents")),
         *(getattr(evidence, n)[row] for n in ("log_odds", "sigma", "t_first", "t_last")),
     )
     t_first, t_last = np.full(count, np.iinfo(np.int64).max), np.zeros(count, np.int64)
@@ -185,70 +217,72 @@ def _as_map(parts: _Parts, evidence: Evidence, frame: Frame) -> VectorMap:
     return VectorMap(
         frame=frame,
         elements=elements,
-        id=content_ids(elements),
+        id=compute_content_ids(elements),
         state=state,
         log_odds=mean,
         supporters=np.diff(sources_first),
         agents=agents,
         t_first=t_first,
         t_last=t_last,
-        stations=stations,
-        topology=_topology(elements, state),
+        point_evidence=stations,
+        topology=_build_topology(elements, state),
         observations=evidence.observations,
-        sources_first=sources_first,
+        source_offsets=sources_first,
         sources=sources,
     )
 
 
-def _topology(elements: MapElements, state: Ints) -> Topology:
+def _build_topology(elements: MapElements, state: Ints) -> Topology:
     """Relations among the elements that are not retired."""
     alive = np.flatnonzero(state != RETIRED)
-    return topology_of(elements.take(alive)).renumbered(alive)
+    return build_topology(elements.take(alive)).renumber(alive)
 
 
-def _sources(owner: Ints, row: Ints, count: int, evidence: Evidence) -> tuple[Ints, Ints]:
+def _collect_sources(owner: Ints, row: Ints, count: int, evidence: EvidenceTable) -> tuple[Ints, Ints]:
     """Offsets and observations behind each element, each once, ascending."""
-    sizes = np.diff(evidence.first)[row]
-    starts = evidence.first[row]
-    whose = np.repeat(owner, sizes)
+    sizes = np.diff(evidence.source_offsets)[row]
+    starts = evidence.source_offsets[row]
+    element_rows = np.repeat(owner, sizes)
     place = (
         np.arange(int(sizes.sum())) + np.repeat(starts - np.concatenate(([0], np.cumsum(sizes)[:-1])), sizes)
         if len(row)
         else []
     )
-    pairs = np.unique(whose * np.int64(len(evidence.observations) + 1) + evidence.sources[np.asarray(place, np.int64)])
+    pairs = np.unique(
+        element_rows * np.int64(len(evidence.observations) + 1) + evidence.sources[np.asarray(place, np.int64)]
+    )
     element, source = np.divmod(pairs, np.int64(len(evidence.observations) + 1))
-    first = np.concatenate(([0], np.cumsum(np.bincount(element, minlength=count)))).astype(np.int64)
-    return first, source
+    offsets = np.concatenate(([0], np.cumsum(np.bincount(element, minlength=count)))).astype(np.int64)
+    return offsets, source
 
 
-def _canonical(first: Ints, points: Floats) -> tuple[Ints, Ints]:
+def _canonical_order(offsets: Ints, points: Floats) -> tuple[Ints, Ints]:
     """Offsets and an order of the points in which chains stand by their first point and start at their lesser end."""
     if not len(points):
         return np.zeros(1, np.int64), np.zeros(0, np.int64)
-    head, tail = points[first[:-1]], points[first[1:] - 1]
+    head, tail = points[offsets[:-1]], points[offsets[1:] - 1]
     turned = (tail[:, 0] < head[:, 0]) | ((tail[:, 0] == head[:, 0]) & (tail[:, 1] < head[:, 1]))
     start = np.where(turned[:, None], tail, head)
     walk = np.lexsort((start[:, 1], start[:, 0]))
-    order = _walk(first, walk, turned)
-    return np.concatenate(([0], np.cumsum(np.diff(first)[walk]))).astype(np.int64), order
+    order = _ordered_points(offsets, walk, turned)
+    return np.concatenate(([0], np.cumsum(np.diff(offsets)[walk]))).astype(np.int64), order
 
 
 @njit(cache=True, nogil=True)
-def _walk(first: I64x1, walk: I64x1, turned: Boolx1) -> I64x1:  # pragma: no cover - compiled
-    order, n = np.empty(first[-1], np.int64), 0
+def _ordered_points(offsets: I64x1, walk: I64x1, turned: Boolx1) -> I64x1:  # pragma: no cover - compiled
+    order, n = np.empty(offsets[-1], np.int64), 0
     for c in walk:
-        size = first[c + 1] - first[c]
+        size = offsets[c + 1] - offsets[c]
         for i in range(size):
-            order[n] = first[c + 1] - 1 - i if turned[c] else first[c] + i
+            order[n] = offsets[c + 1] - 1 - i if turned[c] else offsets[c] + i
             n += 1
     return order
 
 
-def _lengths(first: Ints, points: Floats) -> Floats:
+def _lengths(offsets: Ints, points: Floats) -> Floats:
     """(L,) metres along each chain."""
     if len(points) == 0:
         return np.zeros(0)
     step = np.concatenate((np.hypot(*np.diff(points, axis=0).T), [0.0]))
-    step[first[1:] - 1] = 0.0
-    return np.add.reduceat(step, first[:-1])
+    step[offsets[1:] - 1] = 0.0
+    return np.add.reduceat(step, offsets[:-1])

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x1, F64x2, F64x3, I64x1, njit
-from manyeyes.maps.fusion.observation_arrays import Sightings
-from manyeyes.maps.fusion.point_grid import span
+from manyeyes.maps.fusion.observation_arrays import ObservationArrays
+from manyeyes.maps.fusion.point_grid import find_cell_range
 
 if TYPE_CHECKING:
-    from manyeyes.maps.fusion.pose_config import AlignConfig
+    from manyeyes.maps.fusion.pose_config import PoseSolverConfig
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -31,16 +31,16 @@ _Numbers = tuple[float, float, float, float, float, float]
 
 
 @njit(cache=True, nogil=True)
-def normal_equations(
-    home: I64x1, own: _Own, others: _Others, numbers: _Numbers, stride: int = 1
+def build_normal_equations(
+    home: I64x1, own_points: _Own, other_points: _Others, params: _Numbers, point_stride: int = 1
 ) -> F64x2:  # pragma: no cover - compiled
     """Sum the normal equations of each home observation (H, 13): pivot x, y; information xx, xy, xt, yy, yt, tt; right side
     x, y, t; weighted square residual (m²) and sum of votes. Every stride-th point votes, for all.
     """
-    first, xy, tangent, kind, sigma = own
-    cell, keys, start, rxy, rtangent, robservation, rweight = others
-    gate, kernel, reach, cosine, scatter, correlation = numbers
-    correlation /= stride
+    first, xy, tangent, kind, sigma = own_points
+    cell, keys, start, rxy, rtangent, robservation, rweight = other_points
+    gate, kernel, reach, cosine, scatter, correlation = params
+    correlation /= point_stride
     out = np.zeros((len(home), 13))
     c2, far = kernel * kernel, gate * gate + reach * reach
     radius, shorter = np.sqrt(far), 1.0 / reach
@@ -51,12 +51,12 @@ def normal_equations(
             continue
         px, py = xy[a:b, 0].mean(), xy[a:b, 1].mean()
         out[h, 0], out[h, 1] = px, py
-        for p in range(a, b, stride):
+        for p in range(a, b, point_stride):
             x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
             lowest, highest = int(np.floor((y - radius) / cell)), int(np.floor((y + radius) / cell))
             total, pull, square = 0.0, 0.0, 0.0
             for ix in range(int(np.floor((x - radius) / cell)), int(np.floor((x + radius) / cell)) + 1):
-                low, high = span(keys, start, kind[p], ix, lowest, highest)
+                low, high = find_cell_range(keys, start, kind[p], ix, lowest, highest)
                 for q in range(low, high):
                     ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
                     if ex * ex + ey * ey > far or robservation[q] == o:
@@ -97,82 +97,88 @@ def normal_equations(
 
 
 def step_poses(
-    sightings: Sightings, home: Ints, at: tuple[Floats, Floats, Floats], sums: Floats, config: AlignConfig
+    arrays: ObservationArrays,
+    home: Ints,
+    states: tuple[Floats, Floats, Floats],
+    normal_sums: Floats,
+    config: PoseSolverConfig,
 ) -> dict[str, Floats]:
-    """The columns of an Alignment that a sweep changes, for the home rows; at: start, lean and pose (O, 3) of all."""
-    start, lean, pose = (np.ascontiguousarray(rows[home]) for rows in at)
-    prior = np.ascontiguousarray(np.asarray(sightings.covariance)[home])
-    numbers = (config.frozen_above, config.prior_scale, config.damping)
-    trusted = np.asarray(sightings.trusted)[home]
-    after, covariance, observability, heard, urge = _steps(sums, start, lean, pose, prior, trusted, numbers)
+    """The columns of an Alignment that a sweep changes, for the home rows; states: start, lean and pose (O, 3) of all."""
+    start, prior_mean, pose = (np.ascontiguousarray(rows[home]) for rows in states)
+    prior = np.ascontiguousarray(np.asarray(arrays.covariance)[home])
+    params = (config.max_variance_ratio, config.prior_scale, config.damping)
+    trusted = np.asarray(arrays.trusted)[home]
+    next_pose, covariance, observability, information_matrix, information_vector = _step_all(
+        normal_sums, start, prior_mean, pose, prior, trusted, params
+    )
     return {
-        "pose": after,
+        "pose": next_pose,
         "covariance": covariance,
         "observability": observability,
-        "heard": heard,
-        "urge": urge,
-        "residual": sums[:, 11],
-        "matched": sums[:, 12],
+        "heard": information_matrix,
+        "urge": information_vector,
+        "residual": normal_sums[:, 11],
+        "matched": normal_sums[:, 12],
     }
 
 
 @njit(cache=True, nogil=True)
-def _steps(
-    sums: F64x2,
+def _step_all(
+    normal_sums: F64x2,
     start: F64x2,
-    lean: F64x2,
+    prior_mean: F64x2,
     pose: F64x2,
     prior: F64x3,
     trusted: Boolx1,
-    numbers: tuple[float, float, float],
+    params: tuple[float, float, float],
 ) -> tuple[F64x2, F64x3, F64x2, F64x3, F64x2]:  # pragma: no cover - compiled
     """Poses (H, 3) after the step, their covariances (H, 3, 3), how far lines tell each of their three directions (H, 3), and
     the lines' information (H, 3, 3) and what they ask for (H, 3).
     """
-    frozen_above, prior_scale, damping = numbers
-    count = len(sums)
-    after, covariance, observability = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3))
-    heard, urge = np.empty((count, 3, 3)), np.empty((count, 3))
+    frozen_above, prior_scale, damping = params
+    count = len(normal_sums)
+    next_pose, covariance, observability = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3))
+    information_matrix, information_vector = np.empty((count, 3, 3)), np.empty((count, 3))
     jacobian, information = np.eye(3), np.empty((3, 3))
     limit = np.array([1.0, 1.0, 0.05])
     for h in range(count):
-        px, py = sums[h, 0], sums[h, 1]
+        px, py = normal_sums[h, 0], normal_sums[h, 1]
         jacobian[0, 2], jacobian[1, 2] = -(pose[h, 1] - py), pose[h, 0] - px
         k = 2
         for i in range(3):
             for j in range(i, 3):
-                information[i, j] = information[j, i] = sums[h, k]
+                information[i, j] = information[j, i] = normal_sums[h, k]
                 k += 1
         moved = pose[h] - start[h]
         moved[2] = (moved[2] + np.pi) % (2 * np.pi) - np.pi
-        off = moved - lean[h]
+        off = moved - prior_mean[h]
         # In units in which the prior is a unit ball the data's information tells directly how much it adds to the prior.
         inverse = np.linalg.inv(jacobian)
         root = np.linalg.cholesky(inverse @ prior[h] @ inverse.T)
         strength, axes = np.linalg.eigh(root.T @ information @ root)
         strength = np.maximum(strength, 0.0)
-        spoken = np.where(1.0 / (1.0 + strength) <= frozen_above, strength, 0.0)
+        observed_strength = np.where(1.0 / (1.0 + strength) <= frozen_above, strength, 0.0)
         weighted = np.linalg.solve(prior[h], off)
         distance = np.sum(off * weighted)
         trust = (prior_scale**2 / (prior_scale**2 + distance)) ** 2
-        pull = axes.T @ (root.T @ sums[h, 8:11])
+        pull = axes.T @ (root.T @ normal_sums[h, 8:11])
         for i in range(3):
-            if spoken[i] <= 0.0:
+            if observed_strength[i] <= 0.0:
                 pull[i] = 0.0
         back = axes.T @ (root.T @ (jacobian.T @ weighted)) * trust
-        step = root @ (axes @ ((pull - back) / (spoken + trust))) * damping
+        step = root @ (axes @ ((pull - back) / (observed_strength + trust))) * damping
         step = np.minimum(np.maximum(step, -limit), limit)
         if trusted[h]:
             step[:] = 0.0
         c, s = np.cos(step[2]), np.sin(step[2])
         ax, ay = pose[h, 0] - px, pose[h, 1] - py
-        after[h, 0], after[h, 1] = px + c * ax - s * ay + step[0], py + s * ax + c * ay + step[1]
-        after[h, 2] = pose[h, 2] + step[2]
+        next_pose[h, 0], next_pose[h, 1] = px + c * ax - s * ay + step[0], py + s * ax + c * ay + step[1]
+        next_pose[h, 2] = pose[h, 2] + step[2]
         spread = jacobian @ root @ axes
         outward = np.ascontiguousarray(np.linalg.inv(spread).T)
-        narrow = (spread / (1.0 + spoken)) @ spread.T
+        narrow = (spread / (1.0 + observed_strength)) @ spread.T
         covariance[h] = (narrow + narrow.T) / 2
-        heard[h] = (outward * spoken) @ outward.T
-        observability[h] = np.sort(spoken / (1.0 + strength))
-        urge[h] = heard[h] @ moved + outward @ pull
-    return after, covariance, observability, heard, urge
+        information_matrix[h] = (outward * observed_strength) @ outward.T
+        observability[h] = np.sort(observed_strength / (1.0 + strength))
+        information_vector[h] = information_matrix[h] @ moved + outward @ pull
+    return next_pose, covariance, observability, information_matrix, information_vector

@@ -22,9 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
 from manyeyes.datatypes import ConfigError, ShapeError
-from manyeyes.datatypes.map_element import MapElements, frozen
+from manyeyes.datatypes.map_element import MapElements, freeze
 from manyeyes.maps.elements.observation import Observation
-from manyeyes.ops.polyline import close_rings, headings, near_pairs, resample_spaced
+from manyeyes.ops.polyline import close_rings, find_near_pairs, headings, resample_spaced
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -40,24 +40,25 @@ _NUM_COLUMNS = 13
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """Metres and radians. spacing_m: of the points that are compared. turn: greatest difference of directions that face.
+    """Metres and radians. spacing_m: of the points that are compared. max_turn_rad: greatest difference of directions that face.
 
-    overlap_m: greatest mean offset of an overlap; parallel_m: of a parallel. least_m: shortest interval of either, or half of the
-    shorter element. gap_m, gap_turn: of ends that continue, aside by at most aside_m + aside_share times the gap. cross_turn: least
-    angle of a crossing. apart_m: offset from which elements of one observation are two.
+    max_overlap_offset_m: greatest mean offset of an overlap; max_parallel_offset_m: of a parallel. min_interval_m: shortest
+    interval of either, or half of the shorter element. max_gap_m, max_gap_turn_rad: of ends that continue, aside by at most aside_m
+    + aside_share times the gap. min_crossing_angle_rad: least angle of a crossing. min_separation_m: offset from which elements of
+    one observation are two.
     """
 
     spacing_m: float = 1.0
-    turn: float = math.radians(20.0)
-    overlap_m: float = 1.2
-    parallel_m: float = 6.0
-    least_m: float = 5.0
-    gap_m: float = 6.0
-    gap_turn: float = math.radians(15.0)
-    aside_m: float = 0.25
-    aside_share: float = 0.08
-    cross_turn: float = math.radians(20.0)
-    apart_m: float = 1.0
+    max_turn_rad: float = math.radians(20.0)
+    max_overlap_offset_m: float = 1.2
+    max_parallel_offset_m: float = 6.0
+    min_interval_m: float = 5.0
+    max_gap_m: float = 6.0
+    max_gap_turn_rad: float = math.radians(15.0)
+    max_lateral_m: float = 0.25
+    lateral_slope: float = 0.08
+    min_crossing_angle_rad: float = math.radians(20.0)
+    min_separation_m: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +82,12 @@ class ElementGraph:
     gap: Floats
     turn: Floats
     ends: Ints
-    apart_m: float
+    min_separation_m: float
 
     def __len__(self) -> int:
         return len(self.edge)
 
-    def of(self, relation: str) -> ElementGraph:
+    def select_relation(self, relation: str) -> ElementGraph:
         """The edges of one relation."""
         if relation not in RELATIONS:
             raise ConfigError(
@@ -101,48 +102,50 @@ class ElementGraph:
     @property
     def cannot_link(self) -> NDArray[np.bool_]:
         """(E,) pairs of one observation that face each other farther apart than one thing is wide."""
-        return (self.relation == SAME_OBSERVATION) & (np.abs(self.lateral) > self.apart_m)
+        return (self.relation == SAME_OBSERVATION) & (np.abs(self.lateral) > self.min_separation_m)
 
 
-def observation_graph(
-    observations: Sequence[Observation], known: MapElements | None = None, config: GraphConfig = GraphConfig()
+def build_observation_graph(
+    observations: Sequence[Observation], map_elements: MapElements | None = None, config: GraphConfig = GraphConfig()
 ) -> ElementGraph:
     """The graph of all elements of observations at their claimed poses, ordered by time and id, after those of a map."""
     chosen = sorted({o.id: o for o in observations}.values(), key=lambda o: (o.time_ns, o.id))
-    sets = [known or MapElements.empty(), *(o.in_map() for o in chosen)]
+    sets = [map_elements or MapElements.empty(), *(o.elements_in_map() for o in chosen)]
     owner = np.repeat(np.arange(-1, len(chosen)), [len(s) for s in sets])
-    return element_graph(MapElements.cat(sets), owner, config)
+    return build_element_graph(MapElements.cat(sets), owner, config)
 
 
-def element_graph(nodes: MapElements, observation: ArrayLike = -1, config: GraphConfig = GraphConfig()) -> ElementGraph:
+def build_element_graph(
+    nodes: MapElements, observation: ArrayLike = -1, config: GraphConfig = GraphConfig()
+) -> ElementGraph:
     """The graph of elements in one frame; observation: (N,) or one for all, -1 for elements of a map."""
     owner = np.array(np.broadcast_to(np.asarray(observation, np.int64), (len(nodes),)))
     if len(nodes) and int(nodes.counts.min()) < 2:
         raise ShapeError("element_graph needs elements of two points or more; got fewer: take those with counts > 1.")
-    pairs = near_pairs(nodes.bounds(), max(config.parallel_m, config.gap_m))
-    points, first = close_rings(nodes.points, nodes.first, nodes.closed)
-    dense, dense_first = resample_spaced(points, first, config.spacing_m)
-    lines = _Polylines(frozen(points, np.float64), frozen(first, np.int64))
-    samples = _Samples(frozen(dense, np.float64), frozen(dense_first, np.int64), headings(dense, dense_first))
-    found = _measure(lines, samples, frozen(pairs, np.int64), nodes.closed, _Thresholds.of(config))
-    return _classified(nodes, owner, pairs, found, config)
+    pairs = find_near_pairs(nodes.bounds(), max(config.max_parallel_offset_m, config.max_gap_m))
+    points, offsets = close_rings(nodes.points, nodes.offsets, nodes.closed)
+    dense, dense_first = resample_spaced(points, offsets, config.spacing_m)
+    lines = _Polylines(freeze(points, np.float64), freeze(offsets, np.int64))
+    samples = _Samples(freeze(dense, np.float64), freeze(dense_first, np.int64), headings(dense, dense_first))
+    found = _measure_pairs(lines, samples, freeze(pairs, np.int64), nodes.closed, _Thresholds.of(config))
+    return _classify(nodes, owner, pairs, found, config)
 
 
-def _classified(nodes: MapElements, owner: Ints, pairs: Ints, found: Floats, config: GraphConfig) -> ElementGraph:
+def _classify(nodes: MapElements, owner: Ints, pairs: Ints, found: Floats, config: GraphConfig) -> ElementGraph:
     """The edges that the measurements (K, _NUM_COLUMNS) of pairs (K, 2) make."""
     i, j = pairs.T
     length = nodes.lengths()
-    least = np.minimum(config.least_m, 0.5 * np.minimum(length[i], length[j]))
-    facing = (found[:, _COUNT] >= 2) & (found[:, _END_I] - found[:, _START_I] >= least)
+    min_interval = np.minimum(config.min_interval_m, 0.5 * np.minimum(length[i], length[j]))
+    facing = (found[:, _COUNT] >= 2) & (found[:, _END_I] - found[:, _START_I] >= min_interval)
     offset = np.abs(found[:, _MEAN])
-    alike = nodes.kind[i] == nodes.kind[j]
+    same_kind = nodes.kind[i] == nodes.kind[j]
     lines = ~nodes.closed[i] & ~nodes.closed[j]
-    overlap = facing & alike & (offset <= config.overlap_m)
+    overlap = facing & same_kind & (offset <= config.max_overlap_offset_m)
     of_one = (owner[i] == owner[j]) & (owner[i] >= 0)
     chosen = {
         OVERLAP: overlap,
-        CONTINUES: alike & lines & ~overlap & np.isfinite(found[:, _GAP]),
-        PARALLEL: facing & lines & (offset > config.overlap_m) & (offset <= config.parallel_m),
+        CONTINUES: same_kind & lines & ~overlap & np.isfinite(found[:, _GAP]),
+        PARALLEL: facing & lines & (offset > config.max_overlap_offset_m) & (offset <= config.max_parallel_offset_m),
         CROSSES: np.isfinite(found[:, _CROSS_I]),
         SAME_OBSERVATION: of_one,
     }
@@ -166,7 +169,7 @@ def _classified(nodes: MapElements, owner: Ints, pairs: Ints, found: Floats, con
         gap=np.where(continuing, held[:, _GAP], np.nan),
         turn=turn,
         ends=np.where(ends[:, None] >= 0, np.stack((ends // 2, ends % 2), 1), -1),
-        apart_m=config.apart_m,
+        min_separation_m=config.min_separation_m,
     )
 
 
@@ -197,44 +200,51 @@ class _Thresholds(NamedTuple):
 
     @classmethod
     def of(cls, config: GraphConfig) -> _Thresholds:
-        bounds = (config.turn, config.gap_m, config.gap_turn, config.aside_m, config.aside_share, config.cross_turn)
+        bounds = (
+            config.max_turn_rad,
+            config.max_gap_m,
+            config.max_gap_turn_rad,
+            config.max_lateral_m,
+            config.lateral_slope,
+            config.min_crossing_angle_rad,
+        )
         return cls(*(float(bound) for bound in bounds))
 
 
 @njit(cache=True)
-def _measure(
-    lines: _Polylines, samples: _Samples, pairs: I64x2, closed: Boolx1, numbers: _Thresholds
+def _measure_pairs(
+    lines: _Polylines, samples: _Samples, pairs: I64x2, closed: Boolx1, params: _Thresholds
 ) -> F64x2:  # pragma: no cover - compiled
     """(K, _NUM_COLUMNS) what is measured of each pair; infinity where two ends do not continue or two lines do not cross."""
-    points, first = lines
+    points, offsets = lines
     dense, dense_first, heading = samples
     out = np.full((len(pairs), _NUM_COLUMNS), np.inf)
     out[:, :_CROSS_I] = 0.0
     for k in range(len(pairs)):
         i, j = pairs[k]
-        line = points[first[j] : first[j + 1]]
+        line = points[offsets[j] : offsets[j + 1]]
         _face(
             dense[dense_first[i] : dense_first[i + 1]],
             heading[dense_first[i] : dense_first[i + 1]],
             line,
-            numbers.max_facing_turn,
+            params.max_facing_turn,
             out[k],
         )
-        _cross(points[first[i] : first[i + 1]], line, numbers.min_cross_turn, out[k])
+        _cross(points[offsets[i] : offsets[i + 1]], line, params.min_cross_turn, out[k])
         if not closed[i] and not closed[j]:
-            _continue(points[first[i] : first[i + 1]], line, numbers, out[k])
+            _continue(points[offsets[i] : offsets[i + 1]], line, params, out[k])
     return out
 
 
 @njit(cache=True)
-def _turn(ax: float, ay: float, bx: float, by: float) -> float:  # pragma: no cover - compiled
+def _angle_between(ax: float, ay: float, bx: float, by: float) -> float:  # pragma: no cover - compiled
     """The angle between two directions without regard to sense, [0, pi / 2]."""
     return np.arctan2(abs(ax * by - ay * bx), abs(ax * bx + ay * by))
 
 
 @njit(cache=True)
 def _face(
-    dense: F64x2, heading: F64x1, line: F64x2, most_turn: float, out: F64x1
+    dense: F64x2, heading: F64x1, line: F64x2, max_turn: float, out: F64x1
 ) -> None:  # pragma: no cover - compiled
     """Interval and offset of the points whose foot lies inside the line, under a like direction."""
     n = len(dense)
@@ -259,7 +269,7 @@ def _face(
             beyond = (q == 0 and share < -1e-9) or (q == len(line) - 2 and share > 1.0 + 1e-9)
             if gap < best:
                 best = gap
-                if beyond or _turn(cx, cy, dx, dy) > most_turn:
+                if beyond or _angle_between(cx, cy, dx, dy) > max_turn:
                     side = np.inf
                 else:
                     side = np.sqrt(gap) if cx * ey - cy * ex >= 0.0 else -np.sqrt(gap)
@@ -280,7 +290,7 @@ def _face(
 
 
 @njit(cache=True)
-def _cross(one: F64x2, two: F64x2, least_turn: float, out: F64x1) -> None:  # pragma: no cover - compiled
+def _cross(one: F64x2, two: F64x2, min_turn: float, out: F64x1) -> None:  # pragma: no cover - compiled
     """Where along both they first intersect at an angle."""
     passed_i = 0.0
     for p in range(len(one) - 1):
@@ -290,19 +300,19 @@ def _cross(one: F64x2, two: F64x2, least_turn: float, out: F64x1) -> None:  # pr
             bx, by = two[q + 1, 0] - two[q, 0], two[q + 1, 1] - two[q, 1]
             length_j = np.hypot(bx, by)
             across = ax * by - ay * bx
-            if across != 0.0 and _turn(ax, ay, bx, by) >= least_turn:
+            if across != 0.0 and _angle_between(ax, ay, bx, by) >= min_turn:
                 ox, oy = two[q, 0] - one[p, 0], two[q, 1] - one[p, 1]
                 s, t = (ox * by - oy * bx) / across, (ox * ay - oy * ax) / across
                 if 0.0 <= s <= 1.0 and 0.0 <= t <= 1.0:
                     out[_CROSS_I], out[_CROSS_J] = passed_i + s * length_i, passed_j + t * length_j
-                    out[_CROSS_TURN] = _turn(ax, ay, bx, by)
+                    out[_CROSS_TURN] = _angle_between(ax, ay, bx, by)
                     return
             passed_j += length_j
         passed_i += length_i
 
 
 @njit(cache=True)
-def _continue(one: F64x2, two: F64x2, numbers: _Thresholds, out: F64x1) -> None:  # pragma: no cover - compiled
+def _continue(one: F64x2, two: F64x2, params: _Thresholds, out: F64x1) -> None:  # pragma: no cover - compiled
     """The nearest pair of ends of which each lies ahead of the other."""
     for end_i in range(2):
         a, before = (len(one) - 1, len(one) - 2) if end_i else (0, 1)
@@ -314,16 +324,16 @@ def _continue(one: F64x2, two: F64x2, numbers: _Thresholds, out: F64x1) -> None:
             norm_v = np.hypot(vx, vy)
             gx, gy = two[b, 0] - one[a, 0], two[b, 1] - one[a, 1]
             gap = np.hypot(gx, gy)
-            if norm_u == 0.0 or norm_v == 0.0 or gap > numbers.max_gap_m or gap >= out[_GAP]:
+            if norm_u == 0.0 or norm_v == 0.0 or gap > params.max_gap_m or gap >= out[_GAP]:
                 continue
             ahead = (gx * ux + gy * uy) / norm_u
             aside = abs(gx * uy - gy * ux) / norm_u
-            turn = _turn(ux, uy, vx, vy)
+            turn = _angle_between(ux, uy, vx, vy)
             # Two ends may have passed each other by as much as a line's own spread.
             if (
                 ux * vx + uy * vy < 0.0
-                and turn < numbers.max_gap_turn
-                and aside <= numbers.max_lateral_m + numbers.lateral_slope * gap
+                and turn < params.max_gap_turn
+                and aside <= params.max_lateral_m + params.lateral_slope * gap
                 and ahead >= -0.5
             ):
                 out[_GAP], out[_GAP_TURN], out[_ENDS] = gap, turn, 2 * end_i + end_j

@@ -3,7 +3,7 @@
 
 An observation is aligned to the map as to one more neighbour (stages 1 and 2 of specs/maps.md 3.4, the map standing
 still), then each station it could see gains or loses log-odds and is drawn a little across towards what was seen, and
-what no station explains becomes candidate stations. What that costs against the fold is told by :func:`drift`.
+what no station explains becomes candidate stations. What that costs against the fold is told by :func:`compute_map_fscore`.
 Differences on purpose: earlier observations are not moved again, what an agent said of a station before the one
 observation last heard is forgotten when its daily sum is capped, and crossings keep their shape.
 """
@@ -19,223 +19,255 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
-from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, rows_of
+from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, take_rows
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, VectorMap
-from manyeyes.maps.fusion.coarse_search import best_moves, moved_by
-from manyeyes.maps.fusion.coverage import along, looked_at, merged
-from manyeyes.maps.fusion.crossings import hulls_of, overlap_of
-from manyeyes.maps.fusion.existence import EvidenceConfig, EvidenceParameters, doubled, visibility
-from manyeyes.maps.fusion.existence import sights as sights_of
-from manyeyes.maps.fusion.fuse import FuseConfig, assemble
-from manyeyes.maps.fusion.gauss_newton import normal_equations, step_poses
-from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, Sightings, gather, is_line
-from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, span
-from manyeyes.maps.fusion.pose_config import AlignConfig
-from manyeyes.maps.fusion.stations import Evidence, StationTable
-from manyeyes.ops.nearest_line import nearest_line
+from manyeyes.maps.fusion.coarse_search import apply_shifts, find_best_shifts
+from manyeyes.maps.fusion.coverage import find_cells_under_lines, find_observed_cells, merge_runs
+from manyeyes.maps.fusion.crossings import compute_convex_hull, compute_overlap
+from manyeyes.maps.fusion.existence import EvidenceConfig, EvidenceParameters, compute_mean_visibility, doubled
+from manyeyes.maps.fusion.existence import gather_visibility_rings as sights_of
+from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_map
+from manyeyes.maps.fusion.gauss_newton import build_normal_equations, step_poses
+from manyeyes.maps.fusion.observation_arrays import (
+    DAY_NS,
+    FieldsOfView,
+    ObservationArrays,
+    is_line,
+    to_observation_arrays,
+)
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
+from manyeyes.maps.fusion.pose_config import PoseSolverConfig
+from manyeyes.maps.fusion.stations import EvidenceTable, StationTable
+from manyeyes.ops.nearest_line import find_nearest_line
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _CELL_M = 1.25
-_STILL = -1  # the observation that the map's own points belong to: none
+_NO_OBSERVATION = -1  # the observation that the map's own points belong to: none
 
 
 @dataclass(frozen=True)
-class StreamConfig:
-    """fuse: of the fold. gates_m, kernels_m: of the steps to the map. fold_in: candidates that wait before the grid is
+class IncrementalConfig:
+    """fusion: of the fold. gates_m, kernels_m: of the steps to the map. max_candidates: candidates that wait before the grid is
     built anew.
     """
 
-    fuse: FuseConfig = field(default_factory=FuseConfig)
+    fusion: MapFusionConfig = field(default_factory=MapFusionConfig)
     gates_m: tuple[float, ...] = (2.0, 1.3, 0.8, 0.8)
     kernels_m: tuple[float, ...] = (0.8, 0.5, 0.35, 0.35)
-    fold_in: int = 20000
+    max_candidates: int = 20000
 
 
 @dataclass(frozen=True, eq=False)
-class Assimilated:
+class UpdateResult:
     """What one observation did: its pose (3,) and covariance (3, 3), stations it confirmed, missed and began."""
 
     pose: Floats
     covariance: Floats
-    confirmed: int
-    missed: int
-    begun: int
+    num_confirmed: int
+    num_missed: int
+    num_created: int
 
 
-class StreamingMap:
+class IncrementalMap:
     """A map in memory that observations are added to; holds its own copy of everything."""
 
-    def __init__(self, start: VectorMap, config: StreamConfig = StreamConfig()) -> None:
+    def __init__(self, start: VectorMap, config: IncrementalConfig = IncrementalConfig()) -> None:
         self.config, self.frame = config, start.frame
         lines = np.flatnonzero(is_line(start.elements.kind) & (start.state != RETIRED))
         rings = np.flatnonzero(~is_line(start.elements.kind) & (start.state != RETIRED))
-        self._rings = _Rows.of(start, rings)
+        self._rings = _EvidenceRows.of(start, rings)
         self._ring_points = [np.array(start.elements.polyline(int(k))) for k in rings]
-        self._middles = np.array([ring.mean(0) for ring in self._ring_points]).reshape(-1, 2)
-        rows = _Rows.of_points(start, lines)
-        xy, tangent = _points_of(start.elements.take(lines))
+        self._ring_centers = np.array([ring.mean(0) for ring in self._ring_points]).reshape(-1, 2)
+        rows = _EvidenceRows.of_points(start, lines)
+        xy, tangent = _points_and_tangents(start.elements.take(lines))
         order = _order(xy, rows.kind)
-        self._main = _Ground.of(xy[order], tangent[order], rows.take(order))
-        self._new = _Ground.of(np.zeros((0, 2)), np.zeros((0, 2)), rows.take(order[:0]))
-        self._known = [row.tobytes() for row in start.observations]
+        self._merged_stations = _StationGrid.of(xy[order], tangent[order], rows.take(order))
+        self._candidate_stations = _StationGrid.of(np.zeros((0, 2)), np.zeros((0, 2)), rows.take(order[:0]))
+        self._observation_ids = [row.tobytes() for row in start.observations]
         self._origin = np.repeat(lines, start.elements.counts[lines])[order]
         self._start = start
         # Of a map nobody knows where its observations looked, but under its lines somebody did.
         kept = start.elements.take(lines)
-        self._looked = [along(kept.points, kept.first)]
+        self._observed_cells = [find_cells_under_lines(kept.points, kept.offsets)]
         # Candidates are sorted anew with every observation; what was heard of them counts them as they came.
-        self._arrival = np.zeros(0, np.int64)
-        self._heard: list[tuple[Ints, bool, int]] = []
-        self._ids = {name: k for k, name in enumerate(self._known)}
+        self._candidate_order = np.zeros(0, np.int64)
+        self._support_log: list[tuple[Ints, bool, int]] = []
+        self._observation_rows = {name: k for k, name in enumerate(self._observation_ids)}
 
-    def assimilate(self, observation: Observation) -> Assimilated:
+    def update(self, observation: Observation) -> UpdateResult:
         """Add one observation; one that the map holds already changes nothing."""
         raw = bytes.fromhex(observation.id)
-        s = gather([observation], self.config.fuse.align.spacing_m)
-        if raw in self._ids:
-            return Assimilated(np.array(observation.pose), np.array(observation.covariance), 0, 0, 0)
-        pose, covariance = self._align(s)
-        self._ids[raw] = len(self._known)
-        self._known.append(raw)
-        self._looked.append(looked_at(s, pose))
-        xy, tangent = s.world(pose)
+        s = to_observation_arrays([observation], self.config.fusion.pose_solver.spacing_m)
+        if raw in self._observation_rows:
+            return UpdateResult(np.array(observation.pose), np.array(observation.covariance), 0, 0, 0)
+        pose, covariance = self._estimate_pose(s)
+        self._observation_rows[raw] = len(self._observation_ids)
+        self._observation_ids.append(raw)
+        self._observed_cells.append(find_observed_cells(s, pose))
+        xy, tangent = s.to_world(pose)
         weight = 0.04 / (s.sigma**2 + 0.1**2 + covariance[0, 0, 0] / 2 + covariance[0, 1, 1] / 2)
-        worth = self.config.fuse.stations.evidence.worth(s.elements.score)[s.element]
+        score_weight = self.config.fusion.stations.evidence.score_weight(s.elements.score)[s.element_of_point]
         confirmed, missed, explained = 0, 0, np.zeros(len(xy), bool)
-        look = _Look.of(s, pose, (xy, tangent, weight, worth), self.config.fuse.stations.evidence)
-        for ground in (self._main, self._new):
-            hits, misses, near = ground.update(s, look, self.config)
-            main = ground is self._main
-            self._heard.append((hits if main else self._arrival[hits], main, len(self._known) - 1))
+        placed = _PlacedObservation.of(
+            s, pose, (xy, tangent, weight, score_weight), self.config.fusion.stations.evidence
+        )
+        for station_grid in (self._merged_stations, self._candidate_stations):
+            hits, misses, near = station_grid.update(s, placed, self.config)
+            main = station_grid is self._merged_stations
+            self._support_log.append(
+                (hits if main else self._candidate_order[hits], main, len(self._observation_ids) - 1)
+            )
             confirmed, missed, explained = confirmed + len(hits), missed + misses, explained | near
-        confirmed, missed = self._cross(s, pose, confirmed, missed)
-        fresh = np.flatnonzero(~explained & is_line(s.kind))
-        self._begin(s, xy[fresh], tangent[fresh], fresh, worth[fresh])
-        if len(self._new) > self.config.fold_in:
-            self._fold_in()
-        return Assimilated(pose[0], covariance[0], confirmed, missed, len(fresh))
+        confirmed, missed = self._update_crossings(s, pose, confirmed, missed)
+        unexplained = np.flatnonzero(~explained & is_line(s.kind_of_point))
+        self._add_candidates(s, xy[unexplained], tangent[unexplained], unexplained, score_weight[unexplained])
+        if len(self._candidate_stations) > self.config.max_candidates:
+            self._merge_candidates()
+        return UpdateResult(pose[0], covariance[0], confirmed, missed, len(unexplained))
 
-    def map(self) -> VectorMap:
+    def build_map(self) -> VectorMap:
         """The map as it stands, linked to lines."""
-        self._fold_in()
-        ground, count = self._main, len(self._main)
-        listed: list[list[int]] = [[] for _ in range(count)]
-        first, sources = self._start.sources_first, self._start.sources
+        self._merge_candidates()
+        station_grid, count = self._merged_stations, len(self._merged_stations)
+        sources_of_station: list[list[int]] = [[] for _ in range(count)]
+        offsets, sources = self._start.source_offsets, self._start.sources
         for k, origin in enumerate(self._origin.tolist()):
             if origin >= 0:
-                listed[k] = sources[first[origin] : first[origin + 1]].tolist()
-        for rows, _, number in self._heard:
+                sources_of_station[k] = sources[offsets[origin] : offsets[origin + 1]].tolist()
+        for rows, _, number in self._support_log:
             for k in rows.tolist():
-                listed[k].append(number)
+                sources_of_station[k].append(number)
         ring_rows = np.flatnonzero(~is_line(self._start.elements.kind) & (self._start.state != RETIRED))
-        of_rings = [sources[first[k] : first[k + 1]].tolist() for k in ring_rows.tolist()]
+        of_rings = [sources[offsets[k] : offsets[k + 1]].tolist() for k in ring_rows.tolist()]
         of_rings += [[] for _ in range(len(self._ring_points) - len(of_rings))]
-        ids = np.frombuffer(b"".join(self._known), np.uint8).reshape(-1, 16)
+        ids = np.frombuffer(b"".join(self._observation_ids), np.uint8).reshape(-1, 16)
         starts = np.concatenate(([0], np.cumsum([len(r) for r in self._ring_points], dtype=np.int64))).astype(np.int64)
         ring_xy = np.concatenate(self._ring_points) if self._ring_points else np.zeros((0, 2))
-        line, ring = ground.rows.evidence(listed, ids), self._rings.evidence(of_rings, ids)
+        line, ring = station_grid.rows.to_table(sources_of_station, ids), self._rings.to_table(of_rings, ids)
         alive = np.flatnonzero((line.log_odds > 0.0) | (line.state != 0))
         table = StationTable(
-            ground.xy[alive], ground.tangent[alive], line.take(alive), starts, ring_xy, ring, self._looked[0]
+            station_grid.xy[alive],
+            station_grid.tangent[alive],
+            line.take(alive),
+            starts,
+            ring_xy,
+            ring,
+            self._observed_cells[0],
         )
-        return assemble(StationTable.cat([table]), self.config.fuse, self.frame)
+        return assemble_map(StationTable.cat([table]), self.config.fusion, self.frame)
 
-    def _align(self, s: Sightings) -> tuple[Floats, Floats]:
+    def _estimate_pose(self, s: ObservationArrays) -> tuple[Floats, Floats]:
         """Pose (1, 3) and covariance (1, 3, 3) of the one observation against the map."""
-        config, ground, home = self.config.fuse.align, self._main, np.zeros(1, np.int64)
+        config, station_grid, home = self.config.fusion.pose_solver, self._merged_stations, np.zeros(1, np.int64)
         one = replace(config, gates_m=self.config.gates_m, kernels_m=self.config.kernels_m, damping=1.0)
         pose, covariance = np.array(s.pose), np.array(s.covariance)
-        if not len(ground) or not len(s.xy):
+        if not len(station_grid) or not len(s.xy):
             return pose, covariance
-        pose = moved_by(s, home, best_moves(*_search_arguments(s, home, ground.wide, config)))
+        pose = apply_shifts(s, home, find_best_shifts(*_to_search_arguments(s, home, station_grid.coarse_grid, config)))
         begin = pose
         for gate, kernel in zip(one.gates_m, one.kernels_m):
-            xy, tangent = s.world(pose)
-            sums = normal_equations(
+            xy, tangent = s.to_world(pose)
+            sums = build_normal_equations(
                 home,
-                (s.first, xy, tangent, s.kind, s.sigma),
+                (s.observation_offsets, xy, tangent, s.kind_of_point, s.sigma),
                 (
-                    ground.grid.cell_m,
-                    ground.grid.keys,
-                    ground.grid.start,
-                    ground.xy,
-                    ground.tangent,
-                    ground.owner,
-                    ground.weight,
+                    station_grid.grid.cell_m,
+                    station_grid.grid.keys,
+                    station_grid.grid.offsets,
+                    station_grid.xy,
+                    station_grid.tangent,
+                    station_grid.observation_of_point,
+                    station_grid.weight,
                 ),
-                (gate, kernel, one.along_m, float(np.cos(one.heading_rad)), one.sigma_m, one.correlation),
+                (
+                    gate,
+                    kernel,
+                    one.max_longitudinal_m,
+                    float(np.cos(one.max_heading_rad)),
+                    one.sigma_m,
+                    one.points_per_independent,
+                ),
             )
-            moved = step_poses(s, home, (begin, np.zeros((1, 3)), pose), sums, one)
-            pose, covariance = moved["pose"], moved["covariance"]
+            columns = step_poses(s, home, (begin, np.zeros((1, 3)), pose), sums, one)
+            pose, covariance = columns["pose"], columns["covariance"]
         return pose, covariance
 
-    def _cross(self, s: Sightings, pose: Floats, confirmed: int, missed: int) -> tuple[int, int]:
+    def _update_crossings(self, s: ObservationArrays, pose: Floats, confirmed: int, missed: int) -> tuple[int, int]:
         """Evidence for crossings: overlapped by one of the observation's, or in clear view without."""
-        config, rows = self.config.fuse.stations, np.flatnonzero(np.asarray(s.elements.kind) == CROSSING)
+        config, rows = self.config.fusion.stations, np.flatnonzero(np.asarray(s.elements.kind) == CROSSING)
         moved = s.elements.transform(*(float(v) for v in pose[0]))
-        mine = [hulls_of(np.asarray(moved.polyline(int(k)))) for k in rows]
-        worth = config.evidence.worth(s.elements.score[rows])
-        used = [False] * len(mine)
-        reach = float(s.reach_m[0]) + 5.0
-        for k in np.flatnonzero(np.hypot(*(self._middles - pose[0, :2]).T) <= reach).tolist():
-            ring, middle = self._ring_points[k], self._middles[k]
-            shares = [overlap_of(hull, hulls_of(ring)) for hull in mine]
+        own_hulls = [compute_convex_hull(np.asarray(moved.polyline(int(k)))) for k in rows]
+        score_weight = config.evidence.score_weight(s.elements.score[rows])
+        is_matched = [False] * len(own_hulls)
+        radius = float(s.radius_m[0]) + 5.0
+        for k in np.flatnonzero(np.hypot(*(self._ring_centers - pose[0, :2]).T) <= radius).tolist():
+            ring, middle = self._ring_points[k], self._ring_centers[k]
+            shares = [compute_overlap(hull, compute_convex_hull(ring)) for hull in own_hulls]
             best = max(shares, default=0.0)
-            if best >= config.polygon.overlap:
-                used = [u or share >= config.polygon.overlap for u, share in zip(used, shares)]
-                amount = config.evidence.hit * float(worth[int(np.argmax(shares))])
-                self._rings.change(np.array([k]), amount, s, True, self.config)
+            if best >= config.polygon.min_overlap:
+                is_matched = [u or share >= config.polygon.min_overlap for u, share in zip(is_matched, shares)]
+                amount = config.evidence.log_odds_hit * float(score_weight[int(np.argmax(shares))])
+                self._rings.add_log_odds(np.array([k]), amount, s, True, self.config)
                 confirmed += 1
             elif best <= 0.05:
                 places = np.concatenate((middle[None], (ring + middle) / 2))
-                seen = visibility(places, 0, np.ascontiguousarray(pose), sights_of(s), config.evidence.margin_m)
+                seen = compute_mean_visibility(
+                    places, 0, np.ascontiguousarray(pose), sights_of(s), config.evidence.view_margin_m
+                )
                 if seen > 0.0:
-                    self._rings.change(np.array([k]), config.evidence.miss * seen, s, False, self.config)
+                    self._rings.add_log_odds(np.array([k]), config.evidence.log_odds_miss * seen, s, False, self.config)
                     missed += 1
-        for k, (hull, known) in enumerate(zip(mine, used)):
+        for k, (hull, known) in enumerate(zip(own_hulls, is_matched)):
             if not known and len(hull) >= 3:
                 self._ring_points.append(hull)
-                self._middles = np.concatenate((self._middles, hull.mean(0)[None]))
-                self._rings = self._rings.grown(np.array([CROSSING]), worth[[k]], s, self.config)
+                self._ring_centers = np.concatenate((self._ring_centers, hull.mean(0)[None]))
+                self._rings = self._rings.append_created(np.array([CROSSING]), score_weight[[k]], s, self.config)
         return confirmed, missed
 
-    def _begin(self, s: Sightings, xy: Floats, tangent: Floats, points: Ints, worth: Floats) -> None:
+    def _add_candidates(
+        self, s: ObservationArrays, xy: Floats, tangent: Floats, points: Ints, score_weight: Floats
+    ) -> None:
         """New candidates from points that no station explains, each worth a share of a hit."""
         if not len(xy):
             return
-        count = len(self._new)
-        rows = self._new.rows.grown(s.kind[points], worth, s, self.config)
-        xy, tangent = np.concatenate((self._new.xy, xy)), np.concatenate((self._new.tangent, tangent))
+        count = len(self._candidate_stations)
+        rows = self._candidate_stations.rows.append_created(s.kind_of_point[points], score_weight, s, self.config)
+        xy, tangent = (
+            np.concatenate((self._candidate_stations.xy, xy)),
+            np.concatenate((self._candidate_stations.tangent, tangent)),
+        )
         order = _order(xy, rows.kind)
-        self._arrival = np.concatenate((self._arrival, np.arange(count, len(xy))))[order]
-        self._new = _Ground.of(xy[order], tangent[order], rows.take(order))
-        self._heard.append((np.arange(count, len(xy)), False, len(self._known) - 1))
+        self._candidate_order = np.concatenate((self._candidate_order, np.arange(count, len(xy))))[order]
+        self._candidate_stations = _StationGrid.of(xy[order], tangent[order], rows.take(order))
+        self._support_log.append((np.arange(count, len(xy)), False, len(self._observation_ids) - 1))
 
-    def _fold_in(self) -> None:
+    def _merge_candidates(self) -> None:
         """Make candidates part of the main ground, and what was looked at one whole."""
-        self._looked = [merged(np.concatenate(self._looked))]
-        if not len(self._new):
+        self._observed_cells = [merge_runs(np.concatenate(self._observed_cells))]
+        if not len(self._candidate_stations):
             return
-        both = _Rows.cat(self._main.rows, self._new.rows)
-        xy = np.concatenate((self._main.xy, self._new.xy))
-        tangent = np.concatenate((self._main.tangent, self._new.tangent))
+        both = _EvidenceRows.cat(self._merged_stations.rows, self._candidate_stations.rows)
+        xy = np.concatenate((self._merged_stations.xy, self._candidate_stations.xy))
+        tangent = np.concatenate((self._merged_stations.tangent, self._candidate_stations.tangent))
         order = _order(xy, both.kind)
         place = np.empty(len(order), np.int64)
         place[order] = np.arange(len(order))
-        came = np.empty(len(self._new), np.int64)
-        came[self._arrival] = place[len(self._main) :]
-        self._heard = [((place if main else came)[rows], True, k) for rows, main, k in self._heard]
-        self._arrival = self._arrival[:0]
-        self._origin = np.concatenate((self._origin, np.full(len(self._new), -1, np.int64)))[order]
-        self._main = _Ground.of(xy[order], tangent[order], both.take(order))
-        self._new = _Ground.of(np.zeros((0, 2)), np.zeros((0, 2)), both.take(order[:0]))
+        candidate_place = np.empty(len(self._candidate_stations), np.int64)
+        candidate_place[self._candidate_order] = place[len(self._merged_stations) :]
+        self._support_log = [
+            ((place if main else candidate_place)[rows], True, k) for rows, main, k in self._support_log
+        ]
+        self._candidate_order = self._candidate_order[:0]
+        self._origin = np.concatenate((self._origin, np.full(len(self._candidate_stations), -1, np.int64)))[order]
+        self._merged_stations = _StationGrid.of(xy[order], tangent[order], both.take(order))
+        self._candidate_stations = _StationGrid.of(np.zeros((0, 2)), np.zeros((0, 2)), both.take(order[:0]))
 
 
 @dataclass(eq=False)
-class _Rows:
+class _EvidenceRows:
     """Evidence columns that change; row by row with stations or rings."""
 
     kind: Ints
@@ -252,25 +284,25 @@ class _Rows:
     day_sum: Floats
 
     @classmethod
-    def of(cls, m: VectorMap, rows: Ints) -> _Rows:
+    def of(cls, m: VectorMap, rows: Ints) -> _EvidenceRows:
         """Of the elements ``rows``, one row each."""
         columns = (m.log_odds, m.supporters, m.agents, m.state, m.t_first, m.t_last)
-        sigma = np.array([m.elements.sigma[m.elements.first[k]] for k in rows.tolist()])
+        sigma = np.array([m.elements.sigma[m.elements.offsets[k]] for k in rows.tolist()])
         return cls._of(m.elements.kind[rows], sigma, tuple(c[rows] for c in columns), m.elements.style[rows])
 
     @classmethod
-    def of_points(cls, m: VectorMap, rows: Ints) -> _Rows:
+    def of_points(cls, m: VectorMap, rows: Ints) -> _EvidenceRows:
         """Of the points of the elements ``rows``."""
-        _, points = rows_of(m.elements.first, rows)
-        owner = m.elements.owner[points]
-        t = m.stations
-        columns = (t.log_odds, t.support, t.agents, m.state[m.elements.owner], t.t_first, t.t_last)
+        _, points = take_rows(m.elements.offsets, rows)
+        owner = m.elements.element_of_point[points]
+        t = m.point_evidence
+        columns = (t.log_odds, t.support, t.agents, m.state[m.elements.element_of_point], t.t_first, t.t_last)
         return cls._of(
             m.elements.kind[owner], t.sigma[points], tuple(c[points] for c in columns), m.elements.style[owner]
         )
 
     @classmethod
-    def _of(cls, kind: Ints, sigma: Floats, columns: tuple[NDArray, ...], style: Floats) -> _Rows:
+    def _of(cls, kind: Ints, sigma: Floats, columns: tuple[NDArray, ...], style: Floats) -> _EvidenceRows:
         count = len(kind)
         log_odds, support, agents, state, first, last = (np.array(c) for c in columns)
         return cls(
@@ -289,21 +321,23 @@ class _Rows:
         )
 
     @classmethod
-    def cat(cls, one: _Rows, two: _Rows) -> _Rows:
+    def cat(cls, one: _EvidenceRows, two: _EvidenceRows) -> _EvidenceRows:
         """Both, in order."""
         return cls(*(np.concatenate((getattr(one, n), getattr(two, n))) for n in cls.__dataclass_fields__))
 
-    def take(self, order: Ints) -> _Rows:
+    def take(self, order: Ints) -> _EvidenceRows:
         """The chosen rows, in the order given."""
-        return _Rows(*(getattr(self, n)[order] for n in self.__dataclass_fields__))
+        return _EvidenceRows(*(getattr(self, n)[order] for n in self.__dataclass_fields__))
 
-    def grown(self, kind: Ints, worth: Floats, s: Sightings, config: StreamConfig) -> _Rows:
+    def append_created(
+        self, kind: Ints, score_weight: Floats, s: ObservationArrays, config: IncrementalConfig
+    ) -> _EvidenceRows:
         """With rows begun by an observation: their kinds (N,) and which share of a hit each is worth (N,)."""
-        evidence, time, count = config.fuse.stations.evidence, int(s.time_ns[0]), len(kind)
-        odds = np.minimum(evidence.hit * worth, evidence.daily)
-        state = np.where(bool(s.trusted[0]) & (odds >= evidence.publish_from(kind)), PUBLISHED, 0)
+        evidence, time, count = config.fusion.stations.evidence, int(s.time_ns[0]), len(kind)
+        odds = np.minimum(evidence.log_odds_hit * score_weight, evidence.max_daily_change)
+        state = np.where(bool(s.trusted[0]) & (odds >= evidence.publish_threshold(kind)), PUBLISHED, 0)
         one = np.ones(count, np.int64)
-        begun = _Rows(
+        created = _EvidenceRows(
             np.asarray(kind, np.int64),
             np.full(count, 0.3),
             odds,
@@ -313,30 +347,32 @@ class _Rows:
             one * time,
             one * time,
             np.full((count, len(STYLES)), 1.0 / len(STYLES)),
-            np.full(count, _agent_number(s)),
+            np.full(count, _hash_agent(s)),
             one * (time // DAY_NS),
             odds.copy(),
         )
-        return _Rows.cat(self, begun)
+        return _EvidenceRows.cat(self, created)
 
-    def change(self, rows: Ints, amount: float | Floats, s: Sightings, hit: bool, config: StreamConfig) -> None:
+    def add_log_odds(
+        self, rows: Ints, log_odds_change: float | Floats, s: ObservationArrays, hit: bool, config: IncrementalConfig
+    ) -> None:
         """Add to the log-odds of rows: decayed since they were last heard of, capped by agent and day, clamped; then
         their state.
         """
-        evidence, time = config.fuse.stations.evidence, int(s.time_ns[0])
+        evidence, time = config.fusion.stations.evidence, int(s.time_ns[0])
         kinds = np.arange(len(KINDS))
-        _change(
+        _add_log_odds(
             rows,
-            np.broadcast_to(np.asarray(amount, np.float64), len(rows)),
+            np.broadcast_to(np.asarray(log_odds_change, np.float64), len(rows)),
             self._columns,
-            _Update(time, time // DAY_NS, _agent_number(s), hit, bool(s.trusted[0])),
+            _Update(time, time // DAY_NS, _hash_agent(s), hit, bool(s.trusted[0])),
             _UpdateLimits(
-                evidence.daily,
-                evidence.clamp,
-                float(evidence.publish_agents),
-                evidence.retire,
-                np.array(evidence.decay_s),
-                evidence.publish_from(kinds),
+                evidence.max_daily_change,
+                evidence.max_log_odds,
+                float(evidence.min_publish_agents),
+                evidence.retire_log_odds,
+                np.array(evidence.decay_time_s),
+                evidence.publish_threshold(kinds),
             ),
         )
 
@@ -354,11 +390,11 @@ class _Rows:
             day_sum=self.day_sum,
         )
 
-    def evidence(self, listed: Sequence[Sequence[int]], ids: NDArray[np.uint8]) -> Evidence:
-        """As the fold's table; ``listed``: the observations (rows of ids) of each row."""
-        known, place = np.unique(ids, axis=0, return_inverse=True)
-        sources = [np.unique(place.reshape(-1)[np.array(one, np.int64)]) for one in listed]
-        return Evidence(
+    def to_table(self, sources_of_row: Sequence[Sequence[int]], ids: NDArray[np.uint8]) -> EvidenceTable:
+        """As the fold's table; ``sources_of_row``: the observations (rows of ids) of each row."""
+        digests, place = np.unique(ids, axis=0, return_inverse=True)
+        sources = [np.unique(place.reshape(-1)[np.array(one, np.int64)]) for one in sources_of_row]
+        return EvidenceTable(
             kind=self.kind,
             sigma=self.sigma,
             log_odds=self.log_odds,
@@ -369,14 +405,14 @@ class _Rows:
             t_first=self.t_first,
             t_last=self.t_last,
             style=self.style,
-            first=np.concatenate(([0], np.cumsum([len(one) for one in sources]))).astype(np.int64),
+            source_offsets=np.concatenate(([0], np.cumsum([len(one) for one in sources]))).astype(np.int64),
             sources=np.concatenate(sources) if sources else np.zeros(0, np.int64),
-            observations=known,
+            observations=digests,
         )
 
 
 class _UpdatedColumns(NamedTuple):
-    """The columns of :class:`_Rows` that an observation changes, and the kind."""
+    """The columns of :class:`_EvidenceRows` that an observation changes, and the kind."""
 
     kind: I64x1
     log_odds: F64x1
@@ -411,21 +447,21 @@ class _UpdateLimits(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _change(
-    rows: I64x1, amount: F64x1, columns: _UpdatedColumns, now: _Update, numbers: _UpdateLimits
+def _add_log_odds(
+    rows: I64x1, amount: F64x1, columns: _UpdatedColumns, now: _Update, params: _UpdateLimits
 ) -> None:  # pragma: no cover - compiled
     """Add amount (N,) to the log-odds of rows (N,), decayed, capped by agent and day and clamped; then set their state."""
     kind, log_odds, support, agents, state, t_last, last_agent, day, day_sum = columns
     time, today, agent, hit, trusted = now
-    daily, clamp, least, retire, decay, publish = numbers
+    max_daily_change, max_log_odds, min_agents, retire, decay_time_s, publish = params
     for k, added in zip(rows, amount):
-        odds = log_odds[k] * np.exp(-max(0.0, (time - t_last[k]) * 1e-9) / decay[kind[k]])
+        odds = log_odds[k] * np.exp(-max(0.0, (time - t_last[k]) * 1e-9) / decay_time_s[kind[k]])
         same = last_agent[k] == agent and day[k] == today
         before = day_sum[k] if same else 0.0
         after = before + added
         if not trusted:
-            after = min(max(after, -daily), daily)
-        odds = min(max(odds + after - before, -clamp), clamp)
+            after = min(max(after, -max_daily_change), max_daily_change)
+        odds = min(max(odds + after - before, -max_log_odds), max_log_odds)
         log_odds[k], day_sum[k], last_agent[k], day[k] = odds, after, agent, today
         if hit:
             agents[k] += not same
@@ -433,85 +469,91 @@ def _change(
             t_last[k] = max(t_last[k], time)
         if odds <= retire:
             state[k] = RETIRED
-        elif hit and odds >= publish[kind[k]] and (trusted or agents[k] >= least):
+        elif hit and odds >= publish[kind[k]] and (trusted or agents[k] >= min_agents):
             state[k] = PUBLISHED
 
 
-class _Look(NamedTuple):
-    """One observation at its pose (1, 3), as :func:`_compare` reads it; order: where its points stand among all."""
+class _PlacedObservation(NamedTuple):
+    """One observation at its pose (1, 3), as :func:`_match_stations` reads it; order: where its points stand among all."""
 
     pose: F64x2
     order: I64x1
     points: _LookPoints
     box: _ViewBounds
-    sights: FieldsOfView
-    numbers: EvidenceParameters
+    visibility_rings: FieldsOfView
+    kernel_params: EvidenceParameters
 
     @classmethod
     def of(
-        cls, s: Sightings, pose: Floats, columns: tuple[Floats, Floats, Floats, Floats], evidence: EvidenceConfig
-    ) -> _Look:
+        cls,
+        s: ObservationArrays,
+        pose: Floats,
+        columns: tuple[Floats, Floats, Floats, Floats],
+        evidence: EvidenceConfig,
+    ) -> _PlacedObservation:
         """columns: places, tangents, weights and worths of its points."""
-        lines = np.flatnonzero(is_line(s.kind))
-        xy, tangent, weight, worth = columns
-        fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind[lines], _CELL_M)
-        order, corner = lines[fine.order], s.world_view(pose)
-        points = _LookPoints(fine.keys, fine.start, xy[order], tangent[order], weight[order], worth[order])
+        lines = np.flatnonzero(is_line(s.kind_of_point))
+        xy, tangent, weight, score_weight = columns
+        fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind_of_point[lines], _CELL_M)
+        order, corner = lines[fine.order], s.view_corners_in_world(pose)
+        points = _LookPoints(fine.keys, fine.offsets, xy[order], tangent[order], weight[order], score_weight[order])
         box = _ViewBounds(corner.min(0), corner.max(0))
-        return cls(np.ascontiguousarray(pose), order, points, box, sights_of(s), evidence.numbers)
+        return cls(np.ascontiguousarray(pose), order, points, box, sights_of(s), evidence.kernel_params)
 
 
 @dataclass(eq=False)
-class _Ground:
+class _StationGrid:
     """Stations in the order of their grid, so that the compiled loops read them in place."""
 
     xy: Floats
     tangent: Floats
-    rows: _Rows
+    rows: _EvidenceRows
     grid: PointGrid
-    owner: Ints
+    observation_of_point: Ints
     weight: Floats
 
     @classmethod
-    def of(cls, xy: Floats, tangent: Floats, rows: _Rows) -> _Ground:
+    def of(cls, xy: Floats, tangent: Floats, rows: _EvidenceRows) -> _StationGrid:
         xy, tangent = np.ascontiguousarray(xy), np.ascontiguousarray(tangent)
         grid = build_grid(xy[:, 0], xy[:, 1], rows.kind, _CELL_M)
-        nobody = np.full(len(xy), _STILL, np.int64)
+        no_observation = np.full(len(xy), _NO_OBSERVATION, np.int64)
         weight = np.minimum(4.0, rows.support.astype(np.float64))
-        return cls(xy, tangent, rows, grid, nobody, weight)
+        return cls(xy, tangent, rows, grid, no_observation, weight)
 
     @cached_property
-    def wide(self) -> tuple[Ints, Ints, Floats, Floats, Ints]:
+    def coarse_grid(self) -> tuple[Ints, Ints, Floats, Floats, Ints]:
         """The stations as the gross search reads them, where they stood when they were first asked for."""
         grid = build_grid(self.xy[:, 0], self.xy[:, 1], self.rows.kind, 8.0)
-        return grid.keys, grid.start, self.xy[grid.order], self.tangent[grid.order], self.owner
+        return grid.keys, grid.offsets, self.xy[grid.order], self.tangent[grid.order], self.observation_of_point
 
     def __len__(self) -> int:
         return len(self.xy)
 
-    def update(self, s: Sightings, look: _Look, config: StreamConfig) -> tuple[Ints, int, NDArray[np.bool_]]:
+    def update(
+        self, s: ObservationArrays, placed: _PlacedObservation, config: IncrementalConfig
+    ) -> tuple[Ints, int, NDArray[np.bool_]]:
         """Evidence of one observation: rows confirmed, how many missed, and which of its points (P,) some station
         explains.
         """
-        evidence, whole = config.fuse.stations.evidence, np.zeros(len(s.xy), bool)
-        if not len(self) or not len(whole):
-            return np.zeros(0, np.int64), 0, whole
-        near, place, mass, seen, sure, explained = _compare(
-            _GridStations(self.grid.keys, self.grid.start, self.xy, self.tangent),
-            look,
+        evidence, explained_points = config.fusion.stations.evidence, np.zeros(len(s.xy), bool)
+        if not len(self) or not len(explained_points):
+            return np.zeros(0, np.int64), 0, explained_points
+        near, place, mass, seen, score_weight, explained = _match_stations(
+            _GridStations(self.grid.keys, self.grid.offsets, self.xy, self.tangent),
+            placed,
             len(KINDS),
         )
         hit = mass > 0.0
         rows = near[hit]
         gain = mass[hit] / (mass[hit] + 1.0 / np.maximum(self.rows.sigma[rows], 0.02) ** 2 * 0.04)
-        self.rows.change(rows, evidence.hit * sure[hit], s, True, config)
+        self.rows.add_log_odds(rows, evidence.log_odds_hit * score_weight[hit], s, True, config)
         normal = np.stack((-self.tangent[rows, 1], self.tangent[rows, 0]), 1)
         self.xy[rows] += (gain * place[hit])[:, None] * normal
-        self.rows.sigma[rows] = np.maximum(evidence.bias_m, self.rows.sigma[rows] * np.sqrt(1.0 - gain))
-        lost = (mass < 0.0) & (seen > 0.0)
-        self.rows.change(near[lost], evidence.miss * seen[lost], s, False, config)
-        whole[look.order] = explained
-        return rows, int(lost.sum()), whole
+        self.rows.sigma[rows] = np.maximum(evidence.bias_sigma_m, self.rows.sigma[rows] * np.sqrt(1.0 - gain))
+        missed = (mass < 0.0) & (seen > 0.0)
+        self.rows.add_log_odds(near[missed], evidence.log_odds_miss * seen[missed], s, False, config)
+        explained_points[placed.order] = explained
+        return rows, int(missed.sum()), explained_points
 
 
 class _GridStations(NamedTuple):
@@ -557,31 +599,33 @@ class _Comparison(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _compare(ground: _GridStations, look: _Look, kinds: int) -> _Comparison:  # pragma: no cover - compiled
+def _match_stations(
+    stations: _GridStations, look: _PlacedObservation, kinds: int
+) -> _Comparison:  # pragma: no cover - compiled
     """Compare the stations in the box of a view with the points seen; those with a line only a little aside are left out."""
-    keys, start, xy, tangent = ground
-    pkeys, pstart, pxy, ptangent, pweight, pworth = look.points
-    numbers, (low, high) = look.numbers, look.box
-    reach, across, wide = numbers.max_longitudinal_m, numbers.max_lateral_m, numbers.max_nearby_m
-    cosine, radius = numbers.min_cosine, np.hypot(reach, wide)
+    keys, start, xy, tangent = stations
+    pkeys, pstart, pxy, ptangent, pweight, pscore_weight = look.points
+    params, (low, high) = look.kernel_params, look.box
+    reach, across, wide = params.max_longitudinal_m, params.max_lateral_m, params.max_nearby_m
+    cosine, radius = params.min_cosine, np.hypot(reach, wide)
     explained = np.zeros(len(pxy), np.bool_)
     size, n = 1024, 0
     rows, place, mass = np.empty(size, np.int64), np.empty(size), np.empty(size)
-    seen, sure = np.empty(size), np.empty(size)
+    seen, score_weight = np.empty(size), np.empty(size)
     spot = np.empty((1, 2))
     for kind in range(kinds):
         if kind == CROSSING:
             continue
         for ix in range(int(np.floor((low[0] - 2.0) / _CELL_M)), int(np.floor((high[0] + 2.0) / _CELL_M)) + 1):
-            first, last = span(
+            first, last = find_cell_range(
                 keys, start, kind, ix, int(np.floor((low[1] - 2.0) / _CELL_M)), int(np.floor((high[1] + 2.0) / _CELL_M))
             )
             for k in range(first, last):
                 x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
-                total, offset, heavy, certain, beside = 0.0, 0.0, 0.0, 0.0, False
+                total, offset, heavy, certain, is_near = 0.0, 0.0, 0.0, 0.0, False
                 lowest, highest = int(np.floor((y - radius) / _CELL_M)), int(np.floor((y + radius) / _CELL_M))
                 for jx in range(int(np.floor((x - radius) / _CELL_M)), int(np.floor((x + radius) / _CELL_M)) + 1):
-                    a, b = span(pkeys, pstart, kind, jx, lowest, highest)
+                    a, b = find_cell_range(pkeys, pstart, kind, jx, lowest, highest)
                     for q in range(a, b):
                         ex, ey = pxy[q, 0] - x, pxy[q, 1] - y
                         dot = u * ptangent[q, 0] + v * ptangent[q, 1]
@@ -593,73 +637,85 @@ def _compare(ground: _GridStations, look: _Look, kinds: int) -> _Comparison:  # 
                         along, aside = abs(ex * mx + ey * my), ey * mx - ex * my
                         if along > reach or abs(aside) > wide:
                             continue
-                        beside = True
+                        is_near = True
                         explained[q] = explained[q] or abs(aside) <= across
                         if abs(aside) <= across:
                             w = (1.0 - along / reach) ** 2 + 1e-9
                             total += w
                             offset += w * aside
                             heavy += w * pweight[q]
-                            certain += w * pworth[q]
+                            certain += w * pscore_weight[q]
                 spot[0, 0], spot[0, 1] = x, y
-                visible = visibility(spot, 0, look.pose, look.sights, numbers.margin_m) if not beside else 1.0
-                if total <= 0.0 and (beside or visible <= 0.0):
+                visible = (
+                    compute_mean_visibility(spot, 0, look.pose, look.visibility_rings, params.margin_m)
+                    if not is_near
+                    else 1.0
+                )
+                if total <= 0.0 and (is_near or visible <= 0.0):
                     continue
                 if n == size:
                     size *= 2
-                    rows, place = doubled(rows), _longer(place, size)
-                    mass, seen, sure = _longer(mass, size), _longer(seen, size), _longer(sure, size)
-                rows[n], seen[n], sure[n] = k, visible, certain / total if total > 0.0 else 0.0
+                    rows, place = doubled(rows), _resize(place, size)
+                    mass, seen, score_weight = _resize(mass, size), _resize(seen, size), _resize(score_weight, size)
+                rows[n], seen[n], score_weight[n] = k, visible, certain / total if total > 0.0 else 0.0
                 place[n], mass[n] = (offset / total, heavy / total) if total > 0.0 else (0.0, -1.0)
                 n += 1
-    return _Comparison(rows[:n].copy(), place[:n].copy(), mass[:n].copy(), seen[:n].copy(), sure[:n].copy(), explained)
+    return _Comparison(
+        rows[:n].copy(), place[:n].copy(), mass[:n].copy(), seen[:n].copy(), score_weight[:n].copy(), explained
+    )
 
 
 @njit(cache=True, nogil=True)
-def _longer(values: F64x1, size: int) -> F64x1:  # pragma: no cover - compiled
+def _resize(values: F64x1, size: int) -> F64x1:  # pragma: no cover - compiled
     """The same values at the start of an array of that size."""
     out = np.empty(size)
     out[: len(values)] = values
     return out
 
 
-def drift(one: VectorMap, two: VectorMap, within_m: float = 0.5) -> float:
+def compute_map_fscore(one: VectorMap, two: VectorMap, threshold_m: float = 0.5) -> float:
     """F-score of two maps' published lines: harmonic mean of the shares of points of each within a distance of the
     other's kind.
     """
-    shares = []
-    for a, b in ((one.published(), two.published()), (two.published(), one.published())):
+    fractions = []
+    for a, b in ((one.select_published(), two.select_published()), (two.select_published(), one.select_published())):
         close, total = 0, 0
-        kind = a.elements.kind[a.elements.owner]
+        kind = a.elements.kind[a.elements.element_of_point]
         for k in np.flatnonzero(is_line(np.arange(len(KINDS)))).tolist():
             others = b.elements.take(np.flatnonzero(b.elements.kind == k))
             points = a.elements.points[kind == k]
-            away = nearest_line(points, others.points, others.first, within_m).distance
-            close, total = close + int((away <= within_m).sum()), total + len(points)
-        shares.append(close / total if total else 1.0)
-    return 2 * shares[0] * shares[1] / (shares[0] + shares[1]) if sum(shares) > 0 else 0.0
+            away = find_nearest_line(points, others.points, others.offsets, threshold_m).distance
+            close, total = close + int((away <= threshold_m).sum()), total + len(points)
+        fractions.append(close / total if total else 1.0)
+    return 2 * fractions[0] * fractions[1] / (fractions[0] + fractions[1]) if sum(fractions) > 0 else 0.0
 
 
-def _search_arguments(s: Sightings, home: Ints, others: tuple, config: AlignConfig) -> tuple:
-    gross = config.gross
+def _to_search_arguments(s: ObservationArrays, home: Ints, other_points: tuple, config: PoseSolverConfig) -> tuple:
+    search_config = config.coarse_search
     return (
         home,
         np.asarray(s.pose),
         np.asarray(s.trusted),
-        (s.first, s.xy, s.tangent, s.kind),
-        others,
+        (s.observation_offsets, s.xy, s.tangent, s.kind_of_point),
+        other_points,
         np.asarray(s.agent),
-        np.array(gross.yaws),
-        (gross.reach_m, gross.cell_m, gross.gain, gross.least_m, gross.price),
-        gross.stride,
+        np.array(search_config.yaw_steps_rad),
+        (
+            search_config.max_shift_m,
+            search_config.cell_m,
+            search_config.min_score_gain,
+            search_config.min_shift_m,
+            search_config.cost_per_m,
+        ),
+        search_config.point_stride,
     )
 
 
-def _points_of(elements: MapElements) -> tuple[Floats, Floats]:
+def _points_and_tangents(elements: MapElements) -> tuple[Floats, Floats]:
     """Points and unit tangents (P, 2): the chord over both neighbours."""
     points = np.array(elements.points)
     index = np.arange(len(points))
-    first, last = elements.first[:-1][elements.owner], elements.first[1:][elements.owner] - 1
+    first, last = elements.offsets[:-1][elements.element_of_point], elements.offsets[1:][elements.element_of_point] - 1
     step = points[np.minimum(index + 1, last)] - points[np.maximum(index - 1, first)]
     return points, step / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-12)[:, None]
 
@@ -668,6 +724,6 @@ def _order(xy: Floats, kind: Ints) -> Ints:
     return build_grid(xy[:, 0], xy[:, 1], kind, _CELL_M).order
 
 
-def _agent_number(s: Sightings) -> int:
+def _hash_agent(s: ObservationArrays) -> int:
     """A number for the agent's name that is the same in every process."""
     return int.from_bytes(s.agents[int(s.agent[0])].encode()[-7:], "little")

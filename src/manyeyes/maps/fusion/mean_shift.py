@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import F64x1, F64x2, I64x1, njit
-from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, span
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -28,24 +28,24 @@ _THIN_CELL_M = 2.0
 
 @dataclass(frozen=True)
 class RidgeConfig:
-    """along_m, across_m: half extents of the kernel. along_sigma_m, across_sigma_m: its Gaussian scales. heading_rad:
-    largest turn.
+    """longitudinal_extent_m, lateral_extent_m: half extents of the kernel. longitudinal_sigma_m, lateral_sigma_m: its Gaussian
+    scales. max_heading_rad: largest turn.
 
-    rounds: of mean shift. spacing_m: between the points that stay; twin_m: points closer across than this are one
+    num_iterations: of mean shift. spacing_m: between the points that stay; min_separation_m: points closer across than this are one
     ridge.
     """
 
-    along_m: float = 2.5
-    across_m: float = 0.9
-    along_sigma_m: float = 1.2
-    across_sigma_m: float = 0.45
-    heading_rad: float = 0.35
-    rounds: int = 4
+    longitudinal_extent_m: float = 2.5
+    lateral_extent_m: float = 0.9
+    longitudinal_sigma_m: float = 1.2
+    lateral_sigma_m: float = 0.45
+    max_heading_rad: float = 0.35
+    num_iterations: int = 4
     spacing_m: float = 0.7
-    twin_m: float = 0.5
+    min_separation_m: float = 0.5
 
 
-def shift_to_ridges(
+def mean_shift_to_ridges(
     seeds: Ints, xy: Floats, tangent: Floats, kind: Ints, weight: Floats, config: RidgeConfig = RidgeConfig()
 ) -> tuple[Floats, Floats, Floats]:
     """Points ``seeds`` (S,) of all points (P,) moved to their ridges: positions (S, 2), unit tangents (S, 2) and
@@ -53,14 +53,20 @@ def shift_to_ridges(
     """
     grid = build_grid(xy[:, 0], xy[:, 1], kind, _SHIFT_CELL_M)
     order = grid.order
-    cosine = float(np.cos(config.heading_rad))
+    cosine = float(np.cos(config.max_heading_rad))
     return _shift(
         xy[seeds],
         tangent[seeds],
         kind[seeds],
-        _WeightedPoints(grid.keys, grid.start, xy[order], tangent[order], weight[order]),
-        _Kernel(config.along_m, config.across_m, config.along_sigma_m, config.across_sigma_m, cosine),
-        config.rounds,
+        _WeightedPoints(grid.keys, grid.offsets, xy[order], tangent[order], weight[order]),
+        _Kernel(
+            config.longitudinal_extent_m,
+            config.lateral_extent_m,
+            config.longitudinal_sigma_m,
+            config.lateral_sigma_m,
+            cosine,
+        ),
+        config.num_iterations,
     )
 
 
@@ -86,11 +92,11 @@ class _Kernel(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _shift(
-    xy: F64x2, tangent: F64x2, kind: I64x1, others: _WeightedPoints, numbers: _Kernel, rounds: int
+    xy: F64x2, tangent: F64x2, kind: I64x1, points: _WeightedPoints, params: _Kernel, rounds: int
 ) -> tuple[F64x2, F64x2, F64x1]:  # pragma: no cover - compiled
     """Positions (S, 2), unit tangents (S, 2) and density (S,) of points after some rounds of mean shift along normals."""
-    keys, start, rxy, rtangent, rweight = others
-    reach, across, sigma_along, sigma_across, cosine = numbers
+    keys, start, rxy, rtangent, rweight = points
+    reach, across, sigma_along, sigma_across, cosine = params
     place, turned, density = xy.copy(), tangent.copy(), np.zeros(len(xy))
     far = reach * reach + across * across
     for p in range(len(xy)):
@@ -99,7 +105,7 @@ def _shift(
             total, pull, cc, ss = 0.0, 0.0, 0.0, 0.0
             ix, iy = int(np.floor(x / _SHIFT_CELL_M)), int(np.floor(y / _SHIFT_CELL_M))
             for dx in range(-1, 2):
-                low, high = span(keys, start, int(kind[p]), ix + dx, iy - 1, iy + 1)
+                low, high = find_cell_range(keys, start, int(kind[p]), ix + dx, iy - 1, iy + 1)
                 for q in range(low, high):
                     ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
                     if ex * ex + ey * ey > far:
@@ -129,7 +135,7 @@ def _shift(
     return place, turned, density
 
 
-def thin(
+def thin_ridges(
     xy: Floats, tangent: Floats, kind: Ints, priority: NDArray[np.uint64], config: RidgeConfig = RidgeConfig()
 ) -> Ints:
     """Which of the ridge points (S,) stay: walked by priority, a point stays unless one that stays is close along and
@@ -141,7 +147,7 @@ def thin(
     place = np.empty(len(xy), np.int64)
     place[grid.order] = np.arange(len(xy))
     walk = place[np.lexsort((xy[:, 1], xy[:, 0], priority))]
-    gates = _ThinningGates(config.spacing_m, config.twin_m, float(np.cos(config.heading_rad * 1.5)))
+    gates = _ThinningGates(config.spacing_m, config.min_separation_m, float(np.cos(config.max_heading_rad * 1.5)))
     kept = _thin(walk, grid, xy[grid.order], tangent[grid.order], kind[grid.order], gates)
     return np.sort(grid.order[kept])
 
@@ -156,11 +162,11 @@ class _ThinningGates(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _thin(
-    walk: I64x1, grid: PointGrid, xy: F64x2, tangent: F64x2, kind: I64x1, numbers: _ThinningGates
+    walk: I64x1, grid: PointGrid, xy: F64x2, tangent: F64x2, kind: I64x1, params: _ThinningGates
 ) -> I64x1:  # pragma: no cover - compiled
     """Which points stay, ascending; all arrays are in the order of the grid, and walk names places in it."""
-    keys, start = grid.keys, grid.start
-    spacing, twin, cosine = numbers
+    keys, start = grid.keys, grid.offsets
+    spacing, min_separation, cosine = params
     kept = np.zeros(len(xy), np.bool_)
     for step in range(len(walk)):
         p = walk[step]
@@ -168,14 +174,14 @@ def _thin(
         ix, iy = int(np.floor(x / _THIN_CELL_M)), int(np.floor(y / _THIN_CELL_M))
         free = True
         for dx in range(-1, 2):
-            low, high = span(keys, start, int(kind[p]), ix + dx, iy - 1, iy + 1)
+            low, high = find_cell_range(keys, start, int(kind[p]), ix + dx, iy - 1, iy + 1)
             for q in range(low, high):
                 if kept[q]:
                     ex, ey = xy[q, 0] - x, xy[q, 1] - y
                     dot = u * tangent[q, 0] + v * tangent[q, 1]
                     if abs(dot) < cosine:
                         continue
-                    if abs(ex * u + ey * v) < spacing and abs(ey * u - ex * v) < twin:
+                    if abs(ex * u + ey * v) < spacing and abs(ey * u - ex * v) < min_separation:
                         free = False
                         break
             if not free:

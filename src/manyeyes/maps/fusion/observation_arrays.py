@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import F64x2, I64x1, njit
-from manyeyes.datatypes.map_element import CROSSING, MapElements, frozen
+from manyeyes.datatypes.map_element import CROSSING, MapElements, freeze
 from manyeyes.maps.elements.observation import Observation
-from manyeyes.maps.fusion.point_grid import content_priority, resample_lines
+from manyeyes.maps.fusion.point_grid import hash_coordinates, resample_lines
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -22,32 +22,32 @@ Flags = NDArray[np.bool_]
 DAY_NS = 86_400_000_000_000
 
 
-class Rings(NamedTuple):
-    """Polygons of O observations: ring r is ``xy[first[r]:first[r + 1]]``, rings of o are ``of[o]:of[o + 1]``; agents'
-    frames.
+class ObservationRings(NamedTuple):
+    """Polygons of O observations: ring r is ``xy[first[r]:first[r + 1]]``, rings of o are ``observation_offsets[o]:of[o + 1]``;
+    agents' frames.
     """
 
     xy: F64x2
-    first: I64x1
-    of: I64x1
+    ring_offsets: I64x1
+    observation_offsets: I64x1
 
 
 class FieldsOfView(NamedTuple):
     """What O observations could see: the polygons of their views, and the occluders that hid parts of them."""
 
-    views: Rings
-    occluders: Rings
+    views: ObservationRings
+    occluders: ObservationRings
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class ObservationArrays:
     """O observations, ordered by time and then by id, and the P points of their E elements, in the agents' frames.
 
     ids: (O,) hexadecimal. drives: (O,) names of drives, each one agent's. agent, time_ns: (O,). pose: (O, 3) and
     covariance (O, 3, 3) as claimed. trusted: (O,).
-    reach_m: (O,) from the agent to the farthest point or corner of view. first: (O + 1,) offsets of points.
-    observation, element, kind: (P,). xy, tangent: (P, 2). sigma: (P,) metres. priority: (P,) of
-    associate.content_priority. elements: all, agents' frames; element_observation: (E,). element_first: (E + 1,)
+    radius_m: (O,) from the agent to the farthest point or corner of view. observation_offsets: (O + 1,) offsets of points.
+    observation_of_point, element_of_point, kind_of_point: (P,). xy, tangent: (P, 2). sigma: (P,) metres. priority: (P,) of
+    associate.content_priority. elements: all, agents' frames; observation_of_element: (E,). element_offsets: (E + 1,)
     offsets of points. agents: names, ascending; ``agent`` counts in them.
     """
 
@@ -59,31 +59,33 @@ class Sightings:
     pose: Floats
     covariance: Floats
     trusted: Flags
-    reach_m: Floats
-    first: Ints
-    observation: Ints
-    element: Ints
-    kind: Ints
+    radius_m: Floats
+    observation_offsets: Ints
+    observation_of_point: Ints
+    element_of_point: Ints
+    kind_of_point: Ints
     xy: Floats
     tangent: Floats
     sigma: Floats
     priority: NDArray[np.uint64]
     elements: MapElements
-    element_observation: Ints
-    element_first: Ints
-    view: Rings
-    occluders: Rings
+    observation_of_element: Ints
+    element_offsets: Ints
+    view: ObservationRings
+    occluders: ObservationRings
 
     def __len__(self) -> int:
         return len(self.ids)
 
-    def world(self, pose: Floats) -> tuple[Floats, Floats]:
+    def to_world(self, pose: Floats) -> tuple[Floats, Floats]:
         """Points and tangents (P, 2) in the map's frame when the agents stand at pose (O, 3)."""
-        return _in_world(self.xy, self.tangent, self.first, np.ascontiguousarray(pose))
+        return _to_world(self.xy, self.tangent, self.observation_offsets, np.ascontiguousarray(pose))
 
-    def world_view(self, pose: Floats) -> Floats:
+    def view_corners_in_world(self, pose: Floats) -> Floats:
         """Corners (Q, 2) of all views in the map's frame when the agents stand at pose (O, 3)."""
-        owner = np.repeat(np.repeat(np.arange(len(self)), np.diff(self.view.of)), np.diff(self.view.first))
+        owner = np.repeat(
+            np.repeat(np.arange(len(self)), np.diff(self.view.observation_offsets)), np.diff(self.view.ring_offsets)
+        )
         at = pose[owner]
         c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
         x, y = self.view.xy[:, 0], self.view.xy[:, 1]
@@ -91,64 +93,66 @@ class Sightings:
 
 
 @njit(cache=True, nogil=True)
-def _in_world(
-    xy: F64x2, tangent: F64x2, first: I64x1, pose: F64x2
+def _to_world(
+    xy: F64x2, tangent: F64x2, offsets: I64x1, pose: F64x2
 ) -> tuple[F64x2, F64x2]:  # pragma: no cover - compiled
     """Points and tangents (P, 2) of observations, those of o from first[o] on, that stand at pose (O, 3)."""
     out, turned = np.empty_like(xy), np.empty_like(tangent)
-    for o in range(len(first) - 1):
+    for o in range(len(offsets) - 1):
         c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
-        for p in range(first[o], first[o + 1]):
+        for p in range(offsets[o], offsets[o + 1]):
             x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
             out[p, 0], out[p, 1] = c * x - s * y + pose[o, 0], s * x + c * y + pose[o, 1]
             turned[p, 0], turned[p, 1] = c * u - s * v, s * u + c * v
     return out, turned
 
 
-def gather(observations: Sequence[Observation], spacing_m: float) -> Sightings:
+def to_observation_arrays(observations: Sequence[Observation], spacing_m: float) -> ObservationArrays:
     """Observations as columns, whatever their order and however often each is given.
 
     Elements are sampled about every spacing_m along them. Observations stand in the order of time, then id.
     """
-    once = {o.id: o for o in observations}
-    chosen = sorted(once.values(), key=lambda o: (o.time_ns, o.id))
+    unique = {o.id: o for o in observations}
+    chosen = sorted(unique.values(), key=lambda o: (o.time_ns, o.id))
     count = len(chosen)
     agents = tuple(sorted({o.agent for o in chosen}))
     number = {name: k for k, name in enumerate(agents)}
     elements = MapElements.cat([o.elements for o in chosen])
     owner = np.repeat(np.arange(count), [len(o.elements) for o in chosen]).astype(np.int64)
     first, xy, tangent, sigma = resample_lines(
-        elements.first, elements.points, elements.sigma, elements.closed, spacing_m
+        elements.offsets, elements.points, elements.sigma, elements.closed, spacing_m
     )
     element = np.repeat(np.arange(len(elements)), np.diff(first))
     observation = owner[element]
     view = _rings([o.view for o in chosen], np.arange(count + 1))
-    hidden = [o.occluders.ring(r) for o in chosen for r in range(len(o.occluders))]
-    occluders = _rings(hidden, np.cumsum([0, *(len(o.occluders) for o in chosen)]))
-    reach = np.zeros(count)
-    np.maximum.at(reach, observation, np.hypot(xy[:, 0], xy[:, 1]))
-    np.maximum.at(reach, np.repeat(np.arange(count), np.diff(view.first)), np.hypot(view.xy[:, 0], view.xy[:, 1]))
-    return Sightings(
+    occluder_rings = [o.occluders.ring(r) for o in chosen for r in range(len(o.occluders))]
+    occluders = _rings(occluder_rings, np.cumsum([0, *(len(o.occluders) for o in chosen)]))
+    radius = np.zeros(count)
+    np.maximum.at(radius, observation, np.hypot(xy[:, 0], xy[:, 1]))
+    np.maximum.at(
+        radius, np.repeat(np.arange(count), np.diff(view.ring_offsets)), np.hypot(view.xy[:, 0], view.xy[:, 1])
+    )
+    return ObservationArrays(
         ids=tuple(o.id for o in chosen),
         drives=tuple(f"{o.agent}\n{o.pass_id}" for o in chosen),
         agents=agents,
-        agent=frozen([number[o.agent] for o in chosen], np.int64),
-        time_ns=frozen([o.time_ns for o in chosen], np.int64),
-        pose=frozen(np.reshape([o.pose for o in chosen], (-1, 3)), np.float64),
-        covariance=frozen(np.reshape([o.covariance for o in chosen], (-1, 3, 3)), np.float64),
-        trusted=frozen([o.trusted for o in chosen], np.bool_),
-        reach_m=reach,
-        first=np.searchsorted(observation, np.arange(count + 1)).astype(np.int64),
-        observation=observation,
-        element=element,
-        kind=np.asarray(elements.kind)[element],
+        agent=freeze([number[o.agent] for o in chosen], np.int64),
+        time_ns=freeze([o.time_ns for o in chosen], np.int64),
+        pose=freeze(np.reshape([o.pose for o in chosen], (-1, 3)), np.float64),
+        covariance=freeze(np.reshape([o.covariance for o in chosen], (-1, 3, 3)), np.float64),
+        trusted=freeze([o.trusted for o in chosen], np.bool_),
+        radius_m=radius,
+        observation_offsets=np.searchsorted(observation, np.arange(count + 1)).astype(np.int64),
+        observation_of_point=observation,
+        element_of_point=element,
+        kind_of_point=np.asarray(elements.kind)[element],
         xy=xy,
         tangent=tangent,
         sigma=sigma,
-        priority=content_priority(xy),
+        priority=hash_coordinates(xy),
         elements=elements,
-        element_observation=owner,
-        element_first=first,
+        observation_of_element=owner,
+        element_offsets=first,
         view=view,
         occluders=occluders,
     )
@@ -160,8 +164,8 @@ def is_line(kind: Ints) -> Flags:
 
 
 @njit(cache=True, nogil=True)
-def sight(
-    x: float, y: float, o: int, view: Rings, occluders: Rings, margin: float
+def compute_visibility(
+    x: float, y: float, o: int, view: ObservationRings, occluders: ObservationRings, margin: float
 ) -> float:  # pragma: no cover - compiled
     """How well observation o could see the point x, y of its own frame: 0 outside its view or behind an occluder, 1
     well inside.
@@ -169,18 +173,18 @@ def sight(
     Within ``margin`` metres of the border of what can
     be seen it rises linearly: there a missing line says little.
     """
-    xy, first, of = view
+    xy, ring_offsets, observation_offsets = view
     best = -1.0
-    for r in range(of[o], of[o + 1]):
-        inside, distance = _inside(x, y, xy, first[r], first[r + 1])
+    for r in range(observation_offsets[o], observation_offsets[o + 1]):
+        inside, distance = _inside(x, y, xy, ring_offsets[r], ring_offsets[r + 1])
         if inside:
             best = max(best, distance)
     if best < 0.0:
         return 0.0
-    xy, first, of = occluders
-    for r in range(of[o], of[o + 1]):
-        inside, distance = _inside(x, y, xy, first[r], first[r + 1])
-        if inside or _blocks(x, y, xy, first[r], first[r + 1]):
+    xy, ring_offsets, observation_offsets = occluders
+    for r in range(observation_offsets[o], observation_offsets[o + 1]):
+        inside, distance = _inside(x, y, xy, ring_offsets[r], ring_offsets[r + 1])
+        if inside or _occludes(x, y, xy, ring_offsets[r], ring_offsets[r + 1]):
             return 0.0
         best = min(best, distance)
     return min(1.0, best / margin)
@@ -205,7 +209,7 @@ def _inside(x: float, y: float, xy: F64x2, a: int, b: int) -> tuple[bool, float]
 
 
 @njit(cache=True, nogil=True)
-def _blocks(x: float, y: float, xy: F64x2, a: int, b: int) -> bool:  # pragma: no cover - compiled
+def _occludes(x: float, y: float, xy: F64x2, a: int, b: int) -> bool:  # pragma: no cover - compiled
     """Whether the sight line from the agent, who stands at the origin, to x, y meets an edge of the ring a..b."""
     j = b - 1
     for i in range(a, b):
@@ -218,7 +222,7 @@ def _blocks(x: float, y: float, xy: F64x2, a: int, b: int) -> bool:  # pragma: n
     return False
 
 
-def _rings(rings: Sequence[Floats], of: Ints | NDArray) -> Rings:
-    first = np.concatenate(([0], np.cumsum([len(ring) for ring in rings], dtype=np.int64))).astype(np.int64)
+def _rings(rings: Sequence[Floats], observation_offsets: Ints | NDArray) -> ObservationRings:
+    ring_offsets = np.concatenate(([0], np.cumsum([len(ring) for ring in rings], dtype=np.int64))).astype(np.int64)
     xy = np.concatenate(rings) if rings else np.zeros((0, 2))
-    return Rings(np.ascontiguousarray(xy), first, np.asarray(of, np.int64))
+    return ObservationRings(np.ascontiguousarray(xy), ring_offsets, np.asarray(observation_offsets, np.int64))

@@ -18,55 +18,55 @@ from numpy.typing import NDArray
 
 from manyeyes._jit import F64x1, F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import BOUNDARY
-from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, span
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _CELL_M = 2.5
-_BESIDE_M = 0.8  # along a line, within which a point of it lies beside another point
+_MAX_LONGITUDINAL_M = 0.8  # along a line, within which a point of it lies beside another point
 
 
 @dataclass(frozen=True)
-class BesideConfig:
-    """nearest_m, farthest_m: of a guide. even_m: how much its distance may change over the last back_m of the line.
-    heading_rad: largest turn against it.
+class ParallelExtensionConfig:
+    """min_guide_m, max_guide_m: of a guide. max_spacing_change_m: how much its distance may change over the last back_m of the
+    line. max_heading_rad: largest turn against it.
 
-    few: how often a place may have been in view (summed visibility). across_m: how far aside of the line's other part
-    the way may arrive. bridge_m: longest way that arrives; open_m: by kind, longest that does not (divider, boundary,
+    max_coverage: how often a place may have been in view (summed visibility). max_lateral_m: how far aside of the line's other part
+    the way may arrive. max_bridge_m: longest way that arrives; max_open_m: by kind, longest that does not (divider, boundary,
     crossing, stop line).
     """
 
-    nearest_m: float = 2.0
-    farthest_m: float = 5.0
-    even_m: float = 0.5
-    back_m: float = 8.0
-    heading_rad: float = 0.15
-    few: float = 5.0
-    across_m: float = 1.2
-    bridge_m: float = 80.0
-    open_m: tuple[float, float, float, float] = (40.0, 0.0, 0.0, 0.0)
+    min_guide_m: float = 2.0
+    max_guide_m: float = 5.0
+    max_spacing_change_m: float = 0.5
+    parallel_length_m: float = 8.0
+    max_heading_rad: float = 0.15
+    max_coverage: float = 5.0
+    max_lateral_m: float = 1.2
+    max_bridge_m: float = 80.0
+    max_open_m: tuple[float, float, float, float] = (40.0, 0.0, 0.0, 0.0)
 
 
-def continued(
+def extend_parallel(
     xy: Floats,
     kind: Ints,
     coverage: Floats,
     chains: tuple[Ints, Ints],
-    config: BesideConfig = BesideConfig(),
+    config: ParallelExtensionConfig = ParallelExtensionConfig(),
 ) -> tuple[Floats, Floats, Ints]:
     """Inferred stations (V, 2), their unit tangents and the end station (V,) that each continues.
 
     xy, kind, coverage: (K,) stations, as in linking.link, whose answer is ``chains``.
     """
-    first, members = chains
+    offsets, members = chains
     chain, place = np.empty(len(xy), np.int64), np.empty(len(xy), np.int64)
-    chain[members] = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    chain[members] = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     place[members] = np.arange(len(members))
     grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _CELL_M)
     line = xy[members]
-    chains_of = _Chains(first, line, _chords(line, first), kind[members], coverage[members], chain[members])
-    return _continue(members, chains_of, grid._replace(order=place[grid.order]), _limits(config))
+    chains_of = _Chains(offsets, line, _chords(line, offsets), kind[members], coverage[members], chain[members])
+    return _extend_chains(members, chains_of, grid._replace(order=place[grid.order]), _limits(config))
 
 
 class _Chains(NamedTuple):
@@ -97,52 +97,52 @@ class _ExtensionLimits(NamedTuple):
     max_open_m: F64x1
 
 
-def _limits(config: BesideConfig) -> _ExtensionLimits:
+def _limits(config: ParallelExtensionConfig) -> _ExtensionLimits:
     return _ExtensionLimits(
-        min_distance_m=float(config.nearest_m),
-        max_distance_m=float(config.farthest_m),
-        max_distance_change_m=float(config.even_m),
-        lookback_m=float(config.back_m),
-        min_cosine=float(np.cos(config.heading_rad)),
-        max_coverage=float(config.few),
-        max_lateral_m=float(config.across_m),
-        max_bridge_m=float(config.bridge_m),
-        max_open_m=np.array(config.open_m),
+        min_distance_m=float(config.min_guide_m),
+        max_distance_m=float(config.max_guide_m),
+        max_distance_change_m=float(config.max_spacing_change_m),
+        lookback_m=float(config.parallel_length_m),
+        min_cosine=float(np.cos(config.max_heading_rad)),
+        max_coverage=float(config.max_coverage),
+        max_lateral_m=float(config.max_lateral_m),
+        max_bridge_m=float(config.max_bridge_m),
+        max_open_m=np.array(config.max_open_m),
     )
 
 
-def _chords(line: Floats, first: Ints) -> Floats:
+def _chords(line: Floats, offsets: Ints) -> Floats:
     """(M, 2) unit direction of each chain at its points, over three points on each side."""
     at = np.arange(len(line))
-    low, high = np.repeat(first[:-1], np.diff(first)), np.repeat(first[1:] - 1, np.diff(first))
+    low, high = np.repeat(offsets[:-1], np.diff(offsets)), np.repeat(offsets[1:] - 1, np.diff(offsets))
     step = line[np.minimum(at + 3, high)] - line[np.maximum(at - 3, low)]
     return step / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
 
 
 @njit(cache=True, nogil=True)
-def _continue(
-    members: I64x1, lines: _Chains, grid: PointGrid, numbers: _ExtensionLimits
+def _extend_chains(
+    members: I64x1, lines: _Chains, grid: PointGrid, params: _ExtensionLimits
 ) -> tuple[F64x2, F64x2, I64x1]:  # pragma: no cover - compiled
     """Inferred stations (V, 2), unit tangents (V, 2) and the end station (V,), of members, that each continues.
 
     grid: of the points of the chains, its order in rows of lines.
     """
-    first, chord, kind, chain = lines.first, lines.direction, lines.kind, lines.chain
+    offsets, chord, kind, chain = lines.first, lines.direction, lines.kind, lines.chain
     xy, tangent, source = [(0.0, 0.0)], [(0.0, 0.0)], [0]
-    way, turn = np.empty((1024, 2)), np.empty((1024, 2))
-    met = np.zeros(len(chain), np.bool_)
-    for c in range(len(first) - 1):
-        if first[c + 1] - first[c] < 4 or kind[first[c]] > BOUNDARY:
+    path, turn = np.empty((1024, 2)), np.empty((1024, 2))
+    is_bridged = np.zeros(len(chain), np.bool_)
+    for c in range(len(offsets) - 1):
+        if offsets[c + 1] - offsets[c] < 4 or kind[offsets[c]] > BOUNDARY:
             continue
         for side in range(2):
-            end, inward = (first[c], 1) if side == 0 else (first[c + 1] - 1, -1)
+            end, inward = (offsets[c], 1) if side == 0 else (offsets[c + 1] - 1, -1)
             # Of two ends that lead to each other one is enough.
-            if met[end]:
+            if is_bridged[end]:
                 continue
             best, arrived = 0, -1
-            for g in _guides(end, inward, lines, grid, numbers):
+            for g in _find_guides(end, inward, lines, grid, params):
                 against = (chord[g, 0] * chord[end, 0] + chord[g, 1] * chord[end, 1]) * inward > 0.0
-                n, gap, at = _walk(end, g, -1 if against else 1, lines, grid, numbers, way, turn)
+                n, gap, at = _follow_guide(end, g, -1 if against else 1, lines, grid, params, path, turn)
                 # One that arrives before one that does not, then the longer.
                 if n == 0 or (arrived >= 0 and at < 0) or ((at >= 0) == (arrived >= 0) and n <= best):
                     continue
@@ -153,26 +153,28 @@ def _continue(
                 best, arrived = n, at
                 for i in range(n):
                     share = gap * (i + 1) / (n + 1)
-                    xy.append((way[i, 0] - turn[i, 1] * share, way[i, 1] + turn[i, 0] * share))
+                    xy.append((path[i, 0] - turn[i, 1] * share, path[i, 1] + turn[i, 0] * share))
                     tangent.append((turn[i, 0], turn[i, 1]))
                     source.append(int(members[end]))
             if arrived >= 0:
-                met[max(first[chain[arrived]], arrived - 4) : min(first[chain[arrived] + 1], arrived + 5)] = True
+                is_bridged[
+                    max(offsets[chain[arrived]], arrived - 4) : min(offsets[chain[arrived] + 1], arrived + 5)
+                ] = True
     return np.array(xy)[1:], np.array(tangent)[1:], np.array(source)[1:]
 
 
 @njit(cache=True, nogil=True)
-def _guides(
-    end: int, inward: int, lines: _Chains, grid: PointGrid, numbers: _ExtensionLimits
+def _find_guides(
+    end: int, inward: int, lines: _Chains, grid: PointGrid, params: _ExtensionLimits
 ) -> list[int]:  # pragma: no cover - compiled
     """Points within _BESIDE_M, along it, of the end of a chain, on lines that run beside it there and did so before."""
-    first, line, chord, kind, _, chain = lines
-    keys, start, order = grid.keys, grid.start, grid.order
-    nearest, farthest, even = numbers.min_distance_m, numbers.max_distance_m, numbers.max_distance_change_m
-    back, cosine = numbers.lookback_m, numbers.min_cosine
+    offsets, line, chord, kind, _, chain = lines
+    keys, start, order = grid.keys, grid.offsets, grid.order
+    nearest, farthest, even = params.min_distance_m, params.max_distance_m, params.max_distance_change_m
+    back, cosine = params.lookback_m, params.min_cosine
     found = [0]
     x, y = line[end, 0], line[end, 1]
-    size = first[chain[end] + 1] - first[chain[end]]
+    size = offsets[chain[end] + 1] - offsets[chain[end]]
     inner, walked = end, 0.0
     for _ in range(size - 1):
         if walked >= back:
@@ -180,9 +182,9 @@ def _guides(
         walked += np.hypot(line[inner + inward, 0] - line[inner, 0], line[inner + inward, 1] - line[inner, 1])
         inner += inward
     ix, iy = int(np.floor(x / _CELL_M)), int(np.floor(y / _CELL_M))
-    wide = int(np.ceil(np.hypot(farthest, _BESIDE_M) / _CELL_M))
+    wide = int(np.ceil(np.hypot(farthest, _MAX_LONGITUDINAL_M) / _CELL_M))
     for dx in range(-wide, wide + 1):
-        low, high = span(keys, start, 0, ix + dx, iy - wide, iy + wide)
+        low, high = find_cell_range(keys, start, 0, ix + dx, iy - wide, iy + wide)
         for k in range(low, high):
             q = order[k]
             if chain[q] == chain[end] or kind[q] > BOUNDARY:
@@ -190,21 +192,21 @@ def _guides(
             dot = chord[q, 0] * chord[end, 0] + chord[q, 1] * chord[end, 1]
             ex, ey = x - line[q, 0], y - line[q, 1]
             aside, along = chord[q, 0] * ey - chord[q, 1] * ex, chord[q, 0] * ex + chord[q, 1] * ey
-            if abs(dot) < cosine or abs(along) > _BESIDE_M or abs(aside) < nearest or abs(aside) > farthest:
+            if abs(dot) < cosine or abs(along) > _MAX_LONGITUDINAL_M or abs(aside) < nearest or abs(aside) > farthest:
                 continue
-            before = _beside(line[inner, 0], line[inner, 1], int(chain[q]), first, line, chord)
+            before = _lateral_offset(line[inner, 0], line[inner, 1], int(chain[q]), offsets, line, chord)
             if abs(before - aside) <= even:
                 found.append(q)
     return found[1:]
 
 
 @njit(cache=True, nogil=True)
-def _beside(
-    x: float, y: float, c: int, first: I64x1, line: F64x2, chord: F64x2
+def _lateral_offset(
+    x: float, y: float, c: int, offsets: I64x1, line: F64x2, chord: F64x2
 ) -> float:  # pragma: no cover - compiled
     """How far left of a chain a place lies; inf where it has no foot on it."""
     best, out = np.inf, np.inf
-    for q in range(first[c], first[c + 1]):
+    for q in range(offsets[c], offsets[c + 1]):
         ex, ey = x - line[q, 0], y - line[q, 1]
         square = ex * ex + ey * ey
         if square < best:
@@ -215,57 +217,62 @@ def _beside(
 
 
 @njit(cache=True, nogil=True)
-def _walk(
-    end: int, g: int, ahead: int, lines: _Chains, grid: PointGrid, numbers: _ExtensionLimits, way: F64x2, turn: F64x2
+def _follow_guide(
+    end: int, g: int, ahead: int, lines: _Chains, grid: PointGrid, params: _ExtensionLimits, path: F64x2, turn: F64x2
 ) -> tuple[int, float, int]:  # pragma: no cover - compiled
     """Places beside a guide from its point g on, written to way and turn: their number, the gap across where they
     arrive, and at which point (-1: nowhere).
     """
     _, line, chord, kind, coverage, chain = lines
-    few, across, bridge, open_m = numbers.max_coverage, numbers.max_lateral_m, numbers.max_bridge_m, numbers.max_open_m
+    max_coverage, across, bridge, open_m = (
+        params.max_coverage,
+        params.max_lateral_m,
+        params.max_bridge_m,
+        params.max_open_m,
+    )
     ex, ey = line[end, 0] - line[g, 0], line[end, 1] - line[g, 1]
     aside = chord[g, 0] * ey - chord[g, 1] * ex
     n, walked, free, q = 0, 0.0, 0, g
-    while n < len(way):
+    while n < len(path):
         after = q + ahead
         if after < 0 or after >= len(line) or chain[after] != chain[g]:
             break
         step = np.hypot(line[after, 0] - line[q, 0], line[after, 1] - line[q, 1])
         walked, q = walked + step, after
-        if step > 6.0 or walked > bridge or coverage[q] > few or coverage[q] <= 0.5:
+        if step > 6.0 or walked > bridge or coverage[q] > max_coverage or coverage[q] <= 0.5:
             break
         u, v = ahead * chord[q, 0], ahead * chord[q, 1]
         x, y = line[q, 0] - aside * chord[q, 1], line[q, 1] + aside * chord[q, 0]
         if walked > 2.0:
-            at, gap = _arrival(x, y, u, v, end, lines, grid, across)
+            at, gap = _find_arrival(x, y, u, v, end, lines, grid, across)
             if at >= 0:
                 return n, gap, at
         if walked >= 1.0:
-            way[n, 0], way[n, 1], turn[n, 0], turn[n, 1] = x, y, u, v
+            path[n, 0], path[n, 1], turn[n, 0], turn[n, 1] = x, y, u, v
             n += 1
             free = n if walked <= open_m[kind[end]] else free
     return free, 0.0, -1
 
 
 @njit(cache=True, nogil=True)
-def _arrival(
-    x: float, y: float, u: float, v: float, end: int, lines: _Chains, grid: PointGrid, across: float
+def _find_arrival(
+    x: float, y: float, u: float, v: float, end: int, lines: _Chains, grid: PointGrid, max_lateral: float
 ) -> tuple[int, float]:  # pragma: no cover - compiled
     """The point of another chain of the end's kind nearest across a way at x, y in direction u, v, and how far left it
     lies; -1: none.
     """
     _, line, chord, kind, _, chain = lines
-    keys, start, order = grid.keys, grid.start, grid.order
+    keys, start, order = grid.keys, grid.offsets, grid.order
     ix, iy = int(np.floor(x / _CELL_M)), int(np.floor(y / _CELL_M))
     best, at = np.inf, -1
     for dx in range(-1, 2):
-        low, high = span(keys, start, 0, ix + dx, iy - 1, iy + 1)
+        low, high = find_cell_range(keys, start, 0, ix + dx, iy - 1, iy + 1)
         for k in range(low, high):
             q = order[k]
             if chain[q] == chain[end] or kind[q] != kind[end] or abs(chord[q, 0] * u + chord[q, 1] * v) < 0.9:
                 continue
             ex, ey = line[q, 0] - x, line[q, 1] - y
             aside = u * ey - v * ex
-            if abs(u * ex + v * ey) <= 1.0 and abs(aside) <= across and abs(aside) < abs(best):
+            if abs(u * ex + v * ey) <= 1.0 and abs(aside) <= max_lateral and abs(aside) < abs(best):
                 best, at = aside, q
     return at, best

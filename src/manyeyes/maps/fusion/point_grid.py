@@ -24,13 +24,13 @@ _SHIFT = 30
 
 
 class PointGrid(NamedTuple):
-    """Points sorted by (kind, cell): ``keys`` (U,) of the occupied cells, ``start`` (U+1,) and ``order`` (P,) into the
+    """Points sorted by (kind, cell): ``keys`` (U,) of the occupied cells, ``offsets`` (U+1,) and ``order`` (P,) into the
     points. Points of the cell with key ``keys[c]`` are ``order[start[c]:start[c + 1]]``.
     """
 
     cell_m: float
     keys: I64x1
-    start: I64x1
+    offsets: I64x1
     order: I64x1
 
 
@@ -51,7 +51,7 @@ def cell_key(kind: Ints, x: Floats, y: Floats, cell_m: float) -> Ints:
 
 
 @njit(cache=True, nogil=True)
-def span(
+def find_cell_range(
     keys: I64x1, start: I64x1, kind: int, ix: int, iy0: int, iy1: int
 ) -> tuple[int, int]:  # pragma: no cover - compiled
     """The range in a grid's order of the points of cells (ix, iy0..iy1) of a kind."""
@@ -78,27 +78,27 @@ def lower_bound(keys: I64x1, key: int) -> int:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def resample_lines(
-    first: I64x1, points: F64x2, sigma: F64x1, closed: Boolx1, spacing: float
+    offsets: I64x1, points: F64x2, sigma: F64x1, closed: Boolx1, spacing_m: float
 ) -> tuple[I64x1, F64x2, F64x2, F64x1]:  # pragma: no cover - compiled
-    """Elements (E) as points at equal arc length, about ``spacing`` apart, with unit tangents and sigma.
+    """Elements (E) as points at equal arc length, about ``spacing_m`` apart, with unit tangents and sigma.
 
     Returns first (E+1,), points (P, 2), tangents (P, 2) and sigma (P,). A closed ring is walked once and its first
     point is not repeated; an element without length gives no points. The tangent is the chord over the two neighbours:
     noise of a vertex counts half.
     """
-    count = len(first) - 1
+    count = len(offsets) - 1
     sizes = np.zeros(count + 1, np.int64)
     lengths = np.zeros(count, np.float64)
     for e in range(count):
         length = 0.0
-        n = first[e + 1] - first[e]
+        n = offsets[e + 1] - offsets[e]
         last = n if closed[e] else n - 1
         for k in range(last):
-            i, j = first[e] + k, first[e] + (k + 1) % n
+            i, j = offsets[e] + k, offsets[e] + (k + 1) % n
             length += np.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
         lengths[e] = length
         if n >= 2 and length > 1e-6:
-            steps = max(1 if not closed[e] else 3, int(np.floor(length / spacing + 0.5)))
+            steps = max(1 if not closed[e] else 3, int(np.floor(length / spacing_m + 0.5)))
             sizes[e + 1] = steps if closed[e] else steps + 1
     out_first = np.cumsum(sizes)
     total = out_first[-1]
@@ -107,10 +107,10 @@ def resample_lines(
         a, b = out_first[e], out_first[e + 1]
         if a == b:
             continue
-        n = first[e + 1] - first[e]
+        n = offsets[e + 1] - offsets[e]
         step = lengths[e] / ((b - a) if closed[e] else (b - a - 1))
         k, walked = 0, 0.0
-        i, j = first[e], first[e] + 1 % n
+        i, j = offsets[e], offsets[e] + 1 % n
         piece = np.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
         last = n if closed[e] else n - 1
         for r in range(b - a):
@@ -118,7 +118,7 @@ def resample_lines(
             while walked + piece < target and k < last - 1:
                 walked += piece
                 k += 1
-                i, j = first[e] + k, first[e] + (k + 1) % n
+                i, j = offsets[e] + k, offsets[e] + (k + 1) % n
                 piece = np.hypot(points[j, 0] - points[i, 0], points[j, 1] - points[i, 1])
             f = min(1.0, (target - walked) / piece) if piece > 0.0 else 0.0
             xy[a + r, 0] = points[i, 0] + f * (points[j, 0] - points[i, 0])
@@ -136,8 +136,10 @@ def resample_lines(
     return out_first, xy, tangent, wide
 
 
-def bound_observations(key: Ints, observation: Ints, agent: Ints, rank: Ints, most: int) -> NDArray[np.bool_]:
-    """Which points (P,) stay when a cell may hold at most ``most`` observations.
+def limit_observations(
+    key: Ints, observation: Ints, agent: Ints, rank: Ints, max_observations: int
+) -> NDArray[np.bool_]:
+    """Which points (P,) stay when a cell may hold at most ``max_observations`` observations.
 
     ``key`` (P,) names the cell (kind, place and heading), ``observation`` (P,) its observation, ``agent`` and ``rank``
     (O,) its agent and its place among all (lower is better: more information, then newer, then smaller id). Agents take
@@ -148,19 +150,19 @@ def bound_observations(key: Ints, observation: Ints, agent: Ints, rank: Ints, mo
     begins = np.ones(len(key), bool)
     begins[1:] = (key[1:] != key[:-1]) | (observation[1:] != observation[:-1])
     run = np.cumsum(begins) - 1
-    cell, who = key[begins], observation[begins].astype(np.int64)
-    order = np.lexsort((who, cell))
+    cell, observer = key[begins], observation[begins].astype(np.int64)
+    order = np.lexsort((observer, cell))
     fresh = np.ones(len(order), bool)
-    fresh[1:] = (cell[order][1:] != cell[order][:-1]) | (who[order][1:] != who[order][:-1])
+    fresh[1:] = (cell[order][1:] != cell[order][:-1]) | (observer[order][1:] != observer[order][:-1])
     pair = np.empty(len(order), np.int64)
     pair[order] = np.cumsum(fresh) - 1
-    cell, who = cell[order][fresh], who[order][fresh]
-    turn = _place_in_group((cell, agent[who]), rank[who])
-    place = _place_in_group((cell,), turn * (rank.max(initial=0) + 1) + rank[who])
-    return (place < most)[pair[run]]
+    cell, observer = cell[order][fresh], observer[order][fresh]
+    turn = _rank_in_group((cell, agent[observer]), rank[observer])
+    place = _rank_in_group((cell,), turn * (rank.max(initial=0) + 1) + rank[observer])
+    return (place < max_observations)[pair[run]]
 
 
-def _place_in_group(group: tuple[Ints, ...], value: Ints) -> Ints:
+def _rank_in_group(group: tuple[Ints, ...], value: Ints) -> Ints:
     """For each row, how many rows of its group have a smaller value."""
     order = np.lexsort((value, *reversed(group)))
     new = np.zeros(len(value), bool)
@@ -174,7 +176,7 @@ def _place_in_group(group: tuple[Ints, ...], value: Ints) -> Ints:
     return place
 
 
-def content_priority(xy: Floats) -> NDArray[np.uint64]:
+def hash_coordinates(xy: Floats) -> NDArray[np.uint64]:
     """A number (P,) that looks random and depends on the point's coordinates in its agent's frame alone (splitmix64 of
     their bits).
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx2, F64x1, F64x2, I64x1, I64x2, I64x3, njit
-from manyeyes.maps.fusion.point_grid import build_grid, span
+from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -28,38 +28,38 @@ _FRONT, _BEHIND = 0, 1
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """gap_m: largest gap between linked stations; join_m: between ends of lines in the second round; dashed_m: between
-    ends of dashed lines; far_m: between ends that were in view at most ``few`` times (summed visibility), where that
-    nobody saw more is likely chance.
+    """max_gap_m: largest gap between linked stations; max_join_gap_m: between ends of lines in the second round; max_dashed_gap_m:
+    between ends of dashed lines; max_low_coverage_gap_m: between ends that were in view at most ``max_coverage`` times (summed
+    visibility), where that nobody saw more is likely chance.
 
-    lateral_m, lateral_slope: largest lateral gap between linked stations at no gap, and how it grows;
-    end_lateral_m, end_lateral_slope: between ends, which few saw, so that they scatter more. heading_rad,
-    heading_slope: largest turn and its growth a metre of gap; far_heading_rad: over the gaps of far_m. lateral_cost:
-    metres of gap that a metre of lateral gap costs. smooth: Gaussian scale, in stations, of the local parabola that
+    max_lateral_m, lateral_slope: largest lateral gap between linked stations at no gap, and how it grows;
+    max_end_lateral_m, end_lateral_slope: between ends, which few saw, so that they scatter more. heading_rad,
+    heading_slope: largest turn and its growth a metre of gap; max_low_coverage_heading_rad: over the gaps of far_m. lateral_cost:
+    metres of gap that a metre of lateral gap costs. smoothing_sigma: Gaussian scale, in stations, of the local parabola that
     smooths.
     """
 
-    gap_m: float = 6.0
-    join_m: float = 8.0
-    dashed_m: float = 12.0
-    far_m: float = 24.0
-    few: float = 12.0
-    lateral_m: float = 0.25
+    max_gap_m: float = 6.0
+    max_join_gap_m: float = 8.0
+    max_dashed_gap_m: float = 12.0
+    max_low_coverage_gap_m: float = 24.0
+    max_coverage: float = 12.0
+    max_lateral_m: float = 0.25
     lateral_slope: float = 0.08
-    end_lateral_m: float = 0.8
+    max_end_lateral_m: float = 0.8
     end_lateral_slope: float = 0.04
-    heading_rad: float = 0.26
+    max_heading_rad: float = 0.26
     heading_slope: float = 0.06
-    far_heading_rad: float = 0.6
+    max_low_coverage_heading_rad: float = 0.6
     lateral_cost: float = 4.0
-    smooth: float = 2.0
+    smoothing_sigma: float = 2.0
 
 
-def link(
+def link_stations(
     xy: Floats,
     tangent: Floats,
     kind: Ints,
-    strength: Floats,
+    log_odds: Floats,
     dashed: Flags,
     coverage: Floats,
     config: LinkConfig = LinkConfig(),
@@ -69,46 +69,50 @@ def link(
 
     ``coverage`` (K,) is how often each was in view. A closed loop is opened at its weakest station.
     """
-    pair = _links(xy, tangent, kind, config.gap_m, config)
-    first, members = _follow(pair, strength)
-    near, far = (config.heading_rad, config.heading_slope), (config.far_heading_rad, 0.0)
+    pair = _find_links(xy, tangent, kind, config.max_gap_m, config)
+    offsets, members = _trace_chains(pair, log_odds)
+    near, far = (config.max_heading_rad, config.heading_slope), (config.max_low_coverage_heading_rad, 0.0)
     rounds = (
-        (config.join_m, near, np.ones(len(xy), bool)),
-        (config.dashed_m, near, dashed),
-        (config.far_m, far, coverage <= config.few),
+        (config.max_join_gap_m, near, np.ones(len(xy), bool)),
+        (config.max_dashed_gap_m, near, dashed),
+        (config.max_low_coverage_gap_m, far, coverage <= config.max_coverage),
     )
-    for reach, turn, may in rounds:
-        ends = np.unique(np.concatenate((members[first[:-1]], members[first[1:] - 1])))
-        ends = ends[may[ends]]
-        pair = _join(pair, ends, xy, tangent, kind, reach, turn, config, (first, members))
-        first, members = _follow(pair, strength)
-    return first, members
+    for max_gap, turn, allowed in rounds:
+        ends = np.unique(np.concatenate((members[offsets[:-1]], members[offsets[1:] - 1])))
+        ends = ends[allowed[ends]]
+        pair = _join_ends(pair, ends, xy, tangent, kind, max_gap, turn, config, (offsets, members))
+        offsets, members = _trace_chains(pair, log_odds)
+    return offsets, members
 
 
-def _links(xy: Floats, tangent: Floats, kind: Ints, reach: float, config: LinkConfig) -> Ints:
+def _find_links(xy: Floats, tangent: Floats, kind: Ints, max_gap: float, config: LinkConfig) -> Ints:
     """(K, 2) the station linked in front of and behind each one's own tangent, or -1."""
-    grid = build_grid(xy[:, 0], xy[:, 1], kind, reach)
-    best = _best(
+    grid = build_grid(xy[:, 0], xy[:, 1], kind, max_gap)
+    best = _find_best_partners(
         xy,
         tangent,
         kind,
         np.ones((len(xy), 2), np.bool_),
-        _LinkCandidates(grid.keys, grid.start, grid.order, xy, tangent),
-        reach,
+        _LinkCandidates(grid.keys, grid.offsets, grid.order, xy, tangent),
+        max_gap,
         _LinkGates(
-            config.lateral_m, config.lateral_slope, config.heading_rad, config.heading_slope, config.lateral_cost
+            config.max_lateral_m,
+            config.lateral_slope,
+            config.max_heading_rad,
+            config.heading_slope,
+            config.lateral_cost,
         ),
     )
-    return _mutual(best)
+    return _select_mutual(best)
 
 
-def _join(
+def _join_ends(
     pair: Ints,
     ends: Ints,
     xy: Floats,
     tangent: Floats,
     kind: Ints,
-    reach: float,
+    max_gap: float,
     turn: tuple[float, float],
     config: LinkConfig,
     chains: tuple[Ints, Ints],
@@ -117,19 +121,19 @@ def _join(
     stations.
     """
     direction = _end_tangents(xy, tangent, *chains)
-    grid = build_grid(xy[ends, 0], xy[ends, 1], kind[ends], reach)
+    grid = build_grid(xy[ends, 0], xy[ends, 1], kind[ends], max_gap)
     free = (pair < 0)[ends]
-    best = _best(
+    best = _find_best_partners(
         xy[ends],
         direction[ends],
         kind[ends],
         free,
-        _LinkCandidates(grid.keys, grid.start, grid.order, xy[ends], direction[ends]),
-        reach,
-        _LinkGates(config.end_lateral_m, config.end_lateral_slope, *turn, config.lateral_cost),
+        _LinkCandidates(grid.keys, grid.offsets, grid.order, xy[ends], direction[ends]),
+        max_gap,
+        _LinkGates(config.max_end_lateral_m, config.end_lateral_slope, *turn, config.lateral_cost),
     )
     # A tangent that was turned round for the fit turns front and back round with it.
-    more = _mutual(best)
+    more = _select_mutual(best)
     added = pair.copy()
     for side in range(2):
         rows = np.flatnonzero((more[:, side] >= 0) & free[:, side])
@@ -158,26 +162,26 @@ class _LinkGates(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _best(
-    xy: F64x2, tangent: F64x2, kind: I64x1, free: Boolx2, others: _LinkCandidates, reach: float, numbers: _LinkGates
+def _find_best_partners(
+    xy: F64x2, tangent: F64x2, kind: I64x1, free: Boolx2, points: _LinkCandidates, max_gap: float, params: _LinkGates
 ) -> I64x3:  # pragma: no cover - compiled
     """(K, 2, 2) best partner on each side (_FRONT, _BEHIND): its row and which of its sides faces back; -1 for none."""
-    keys, start, order, rxy, rtangent = others
-    lateral0, lateral1, heading0, heading1, price = numbers
+    keys, start, order, rxy, rtangent = points
+    lateral0, lateral1, heading0, heading1, lateral_cost = params
     best = np.full((len(xy), 2, 2), -1, np.int64)
     for k in range(len(xy)):
         x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
-        ix, iy = int(np.floor(x / reach)), int(np.floor(y / reach))
+        ix, iy = int(np.floor(x / max_gap)), int(np.floor(y / max_gap))
         cost = np.full(2, np.inf)
         for dx in range(-1, 2):
-            low, high = span(keys, start, kind[k], ix + dx, iy - 1, iy + 1)
+            low, high = find_cell_range(keys, start, kind[k], ix + dx, iy - 1, iy + 1)
             for place in range(low, high):
                 q = order[place]
                 if q == k:
                     continue
                 ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
                 gap = np.hypot(ex, ey)
-                if gap > reach or gap < 1e-9:
+                if gap > max_gap or gap < 1e-9:
                     continue
                 dot = u * rtangent[q, 0] + v * rtangent[q, 1]
                 if abs(dot) < 0.5:
@@ -195,7 +199,7 @@ def _best(
                 back = 1 - side if sign > 0.0 else side
                 if not free[k, side] or not free[q, back]:
                     continue
-                value = gap + price * aside + 2.0 * turn
+                value = gap + lateral_cost * aside + 2.0 * turn
                 if value < cost[side] or (value == cost[side] and q < best[k, side, 0]):
                     cost[side] = value
                     best[k, side, 0], best[k, side, 1] = q, back
@@ -203,7 +207,7 @@ def _best(
 
 
 @njit(cache=True, nogil=True)
-def _mutual(best: I64x3) -> I64x2:  # pragma: no cover - compiled
+def _select_mutual(best: I64x3) -> I64x2:  # pragma: no cover - compiled
     pair = np.full((len(best), 2), -1, np.int64)
     for k in range(len(best)):
         for side in range(2):
@@ -214,13 +218,13 @@ def _mutual(best: I64x3) -> I64x2:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _follow(pair: I64x2, strength: F64x1) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
+def _trace_chains(pair: I64x2, log_odds: F64x1) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
     """Chains of linked stations: offsets and rows; open chains first by their smallest end, then loops, opened where
     weakest.
     """
     count = len(pair)
     done = np.zeros(count, np.bool_)
-    first, members, filled = [0], np.empty(count, np.int64), 0
+    offsets, members, filled = [0], np.empty(count, np.int64), 0
     for loops in range(2):
         for k in range(count):
             if done[k] or (loops == 0 and pair[k, 0] >= 0 and pair[k, 1] >= 0):
@@ -229,7 +233,7 @@ def _follow(pair: I64x2, strength: F64x1) -> tuple[I64x1, I64x1]:  # pragma: no 
             if loops == 1:
                 last, at = k, pair[k, 0]
                 while at != k:
-                    if strength[at] < strength[begin] or (strength[at] == strength[begin] and at < begin):
+                    if log_odds[at] < log_odds[begin] or (log_odds[at] == log_odds[begin] and at < begin):
                         begin = at
                     one, two = pair[at, 0], pair[at, 1]
                     step = two if one == last else one
@@ -245,16 +249,16 @@ def _follow(pair: I64x2, strength: F64x1) -> tuple[I64x1, I64x1]:  # pragma: no 
                 else:
                     step = two if one == last else one
                 last, at = at, step
-            first.append(filled)
-    return np.array(first), members
+            offsets.append(filled)
+    return np.array(offsets), members
 
 
 @njit(cache=True, nogil=True)
-def _end_tangents(xy: F64x2, tangent: F64x2, first: I64x1, members: I64x1) -> F64x2:  # pragma: no cover - compiled
+def _end_tangents(xy: F64x2, tangent: F64x2, offsets: I64x1, members: I64x1) -> F64x2:  # pragma: no cover - compiled
     """Tangents (K, 2) with those of chain ends replaced by the chord over their last stations, of the same sign."""
     out = tangent.copy()
-    for c in range(len(first) - 1):
-        a, b = first[c], first[c + 1]
+    for c in range(len(offsets) - 1):
+        a, b = offsets[c], offsets[c + 1]
         far = min(5, b - a - 1)
         if far < 2:
             continue
@@ -267,8 +271,8 @@ def _end_tangents(xy: F64x2, tangent: F64x2, first: I64x1, members: I64x1) -> F6
 
 
 @njit(cache=True, nogil=True)
-def smooth(
-    xy: F64x2, first: I64x1, members: I64x1, weight: F64x1, scale: float
+def smooth_chains(
+    xy: F64x2, offsets: I64x1, members: I64x1, weight: F64x1, sigma: float
 ) -> F64x2:  # pragma: no cover - compiled
     """Chains' stations (M, 2) in order, each moved to a parabola through its neighbours along the chain, weighted by
     distance.
@@ -277,21 +281,21 @@ def smooth(
     neighbours on one side.
     """
     out = np.empty((len(members), 2))
-    reach = int(np.ceil(2.5 * scale))
-    for c in range(len(first) - 1):
-        a, b = first[c], first[c + 1]
+    window = int(np.ceil(2.5 * sigma))
+    for c in range(len(offsets) - 1):
+        a, b = offsets[c], offsets[c + 1]
         arc = np.zeros(b - a)
         for i in range(1, b - a):
             p, q = members[a + i - 1], members[a + i]
             arc[i] = arc[i - 1] + np.hypot(xy[q, 0] - xy[p, 0], xy[q, 1] - xy[p, 1])
         for i in range(b - a):
-            low, high = max(0, i - reach), min(b - a, i + reach + 1)
+            low, high = max(0, i - window), min(b - a, i + window + 1)
             s = np.zeros(5)
             tx, ty = np.zeros(3), np.zeros(3)
             for j in range(low, high):
                 m = members[a + j]
                 d = arc[j] - arc[i]
-                w = weight[m] * np.exp(-0.5 * (d / scale) ** 2)
+                w = weight[m] * np.exp(-0.5 * (d / sigma) ** 2)
                 power = w
                 for n in range(5):
                     s[n] += power

@@ -14,8 +14,8 @@ anew at its end: whom liars had made look a liar is heard again. Once liars are 
 back is wider, which errs less.
 
 A step of an observation reads only observations that overlap it. So a city is solved tile by tile with the result of
-one piece: :func:`search` and each :func:`advance` are run for the home observations of each tile, given all
-observations that :func:`overlapping` names and the poses after the step before, and :func:`merge` joins the tiles'
+one piece: :func:`search_coarse_poses` and each :func:`run_step` are run for the home observations of each tile, given all
+observations that :func:`find_overlapping` names and the poses after the step before, and :func:`merge_solutions` joins the tiles'
 answers; :func:`solve_poses` is that with one tile.
 """
 
@@ -28,13 +28,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.maps.elements.observation import Observation
-from manyeyes.maps.fusion.agent_weights import NOT_BELIEVED, common_error, faith_of, looks_weight, told_by_lines
-from manyeyes.maps.fusion.coarse_search import gross_search
-from manyeyes.maps.fusion.drive_bias import drive_error
-from manyeyes.maps.fusion.gauss_newton import normal_equations, step_poses
-from manyeyes.maps.fusion.observation_arrays import Sightings, gather
-from manyeyes.maps.fusion.point_grid import bound_observations, build_grid, cell_key
-from manyeyes.maps.fusion.pose_config import DEFAULT_ALIGN, AlignConfig
+from manyeyes.maps.fusion.agent_weights import (
+    REJECTED_WEIGHT,
+    compute_observability,
+    compute_observation_weights,
+    estimate_agent_weights,
+    estimate_gauge_offset,
+)
+from manyeyes.maps.fusion.coarse_search import search_coarse
+from manyeyes.maps.fusion.drive_bias import estimate_drive_bias
+from manyeyes.maps.fusion.gauss_newton import build_normal_equations, step_poses
+from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
+from manyeyes.maps.fusion.point_grid import build_grid, cell_key, limit_observations
+from manyeyes.maps.fusion.pose_config import DEFAULT_ALIGN, PoseSolverConfig
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,48 +50,48 @@ _SWEEP_CELL_M = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class PoseSolution:
     """Corrected poses, ids ascending: ids: (O,) hexadecimal. pose: (O, 3), covariance: (O, 3, 3) of it.
 
-    start: (O, 3) after the gross search, the claimed pose where it moved nothing. scale: (O,) metres, how far the lines
+    initial_pose: (O, 3) after the gross search, the claimed pose where it moved nothing. scale: (O,) metres, how far the lines
     of the observation's agent lie from others' (robust). observability: (O, 3) from 0 (only the prior speaks) to 1,
     ascending, of the three directions of the pose. residual: (O,) and matched (O,): weighted square residual (m²) and
-    number of points with neighbours. offset: (O, 2) metres moved more than those around. faith: (O,) in (0, 1], how
-    well the claims of the observation's agent and others' fit. claim: (O, 3, 3) covariance of the claimed pose. voice:
-    (O,) how much that claim counts for where all stand, 0 if the search moved it. fixed: (O,) 1 for surveyed poles.
-    moved: (O, 2) metres that the gross search moved. heard: (O, 3, 3) and urge (O, 3): information of the lines on the
-    pose, and that times the move from start that they ask for. lean: (O, 3) from start, where the prior has its mode.
-    drives: (O,) names of drives, each one agent's.
+    number of points with neighbours. relative_offset: (O, 2) metres moved more than those around. agent_weight: (O,) in (0, 1], how
+    well the claims of the observation's agent and others' fit. prior_covariance: (O, 3, 3) covariance of the claimed pose.
+    gauge_weight: (O,) how much that claim counts for where all stand, 0 if the search moved it. is_surveyed: (O,) 1 for surveyed
+    poles. search_shift: (O, 2) metres that the gross search moved. information_matrix: (O, 3, 3) and urge (O, 3): information of
+    the lines on the pose, and that times the move from start that they ask for. prior_mean: (O, 3) from start, where the prior has
+    its mode. drives: (O,) names of drives, each one agent's.
     """
 
     ids: tuple[str, ...]
     agents: tuple[str, ...]
     drives: tuple[str, ...]
-    claim: Floats
-    start: Floats
+    prior_covariance: Floats
+    initial_pose: Floats
     pose: Floats
     covariance: Floats
     scale: Floats
     observability: Floats
     residual: Floats
-    matched: Floats
-    offset: Floats
-    faith: Floats
-    voice: Floats
-    fixed: Floats
-    moved: Floats
-    heard: Floats
-    urge: Floats
-    lean: Floats
+    num_matched: Floats
+    relative_offset: Floats
+    agent_weight: Floats
+    gauge_weight: Floats
+    is_surveyed: Floats
+    search_shift: Floats
+    information_matrix: Floats
+    information_vector: Floats
+    prior_mean: Floats
 
-    def rows(self, ids: Sequence[str]) -> Ints:
+    def row_indices(self, ids: Sequence[str]) -> Ints:
         """Where these ids stand."""
         place = {name: k for k, name in enumerate(self.ids)}
         return np.array([place[name] for name in ids], np.int64)
 
-    def take(self, rows: Ints) -> Alignment:
+    def take(self, rows: Ints) -> PoseSolution:
         """The chosen rows, in the order given."""
-        return Alignment(
+        return PoseSolution(
             tuple(self.ids[k] for k in rows.tolist()),
             tuple(self.agents[k] for k in rows.tolist()),
             tuple(self.drives[k] for k in rows.tolist()),
@@ -97,146 +103,179 @@ _STATE = ("claim", "start", "pose", "covariance", "scale", "observability", "res
 _COLUMNS = (*_STATE, "offset", "faith", "voice", "fixed", "moved", "heard", "urge", "lean")
 
 
-def solve_poses(observations: Sequence[Observation], config: AlignConfig = DEFAULT_ALIGN) -> Alignment:
+def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = DEFAULT_ALIGN) -> PoseSolution:
     """The corrected pose of each observation; a pure function of the set."""
-    sightings = gather(observations, config.spacing_m)
-    home = np.arange(len(sightings))
-    state = merge([search(sightings, home, config)], config)
+    arrays = to_observation_arrays(observations, config.spacing_m)
+    home = np.arange(len(arrays))
+    state = merge_solutions([search_coarse_poses(arrays, home, config)], config)
     keep = None
-    for number in range(config.steps):
-        if number == 0 or config.schedule[number - 1].width is None:  # after a search, which alone moves the starts
-            keep = bounded(sightings, state.start[state.rows(sightings.ids)], config.most)
-        state = merge([advance(sightings, state, number, home, config, keep)], config, number)
+    for number in range(config.num_steps):
+        if (
+            number == 0 or config.schedule[number - 1].gate_and_kernel_m is None
+        ):  # after a search, which alone moves the starts
+            keep = limit_per_cell(
+                arrays, state.initial_pose[state.row_indices(arrays.ids)], config.max_observations_per_cell
+            )
+        state = merge_solutions([run_step(arrays, state, number, home, config, keep)], config, number)
     return state
 
 
-def overlapping(
-    observations: Sequence[Observation], home: Sequence[Observation], margin_m: float = 45.0
+def find_overlapping(
+    observations: Sequence[Observation], home_observations: Sequence[Observation], margin_m: float = 45.0
 ) -> list[Observation]:
     """Those of the observations that any step of the home observations reads, themselves included, ids ascending."""
-    if not len(home):
+    if not len(home_observations):
         return []
-    reach = {o.id: _reach(o) for o in (*observations, *home)}
+    radius_of = {o.id: _bounding_radius(o) for o in (*observations, *home_observations)}
     xy = np.array([o.pose[:2] for o in observations]).reshape(-1, 2)
-    radius = np.array([reach[o.id] for o in observations])
+    radius = np.array([radius_of[o.id] for o in observations])
     chosen = np.zeros(len(observations), bool)
-    for o in home:
+    for o in home_observations:
         near = np.hypot(*(xy - o.pose[:2]).T)
         # A cell that a home point lies in keeps its best observations among all that have a point in it.
-        chosen |= near <= radius + reach[o.id] + margin_m + _BOUND_CELL_M * np.sqrt(2.0)
+        chosen |= near <= radius + radius_of[o.id] + margin_m + _BOUND_CELL_M * np.sqrt(2.0)
     return sorted((observations[k] for k in np.flatnonzero(chosen).tolist()), key=lambda o: o.id)
 
 
-def claimed(sightings: Sightings) -> Alignment:
+def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:
     """The observations where they claim to stand, ids ascending."""
-    count = len(sightings)
-    pose = np.array(sightings.pose)
-    start = Alignment(
-        sightings.ids,
-        tuple(sightings.agents[a] for a in sightings.agent.tolist()),
-        sightings.drives,
-        np.array(sightings.covariance),
+    count = len(arrays)
+    pose = np.array(arrays.pose)
+    start = PoseSolution(
+        arrays.ids,
+        tuple(arrays.agents[a] for a in arrays.agent.tolist()),
+        arrays.drives,
+        np.array(arrays.covariance),
         pose,
         pose,
-        np.array(sightings.covariance),
+        np.array(arrays.covariance),
         np.full(count, 0.2),
         np.zeros((count, 3)),
         np.zeros(count),
         np.zeros(count),
         np.zeros((count, 2)),
         np.ones(count),
-        looks_weight(sightings, pose, np.zeros(count), np.ones(count)),
-        np.asarray(sightings.trusted).astype(np.float64),
+        compute_observation_weights(arrays, pose, np.zeros(count), np.ones(count)),
+        np.asarray(arrays.trusted).astype(np.float64),
         np.zeros((count, 2)),
         np.zeros((count, 3, 3)),
         np.zeros((count, 3)),
         np.zeros((count, 3)),
     )
-    return start.take(np.array(sorted(range(count), key=lambda k: sightings.ids[k]), np.int64))
+    return start.take(np.array(sorted(range(count), key=lambda k: arrays.ids[k]), np.int64))
 
 
-def search(sightings: Sightings, home: Ints, config: AlignConfig = DEFAULT_ALIGN) -> Alignment:
+def search_coarse_poses(
+    arrays: ObservationArrays, home: Ints, config: PoseSolverConfig = DEFAULT_ALIGN
+) -> PoseSolution:
     """The home observations (H,) rows of the sightings after the gross search, ids ascending."""
-    state = _of(claimed(sightings), sightings, home)
-    rows = _rows_in(sightings, state)
-    keep = bounded(sightings, np.asarray(sightings.pose), config.most)
-    return _searched(state, gross_search(sightings, keep, rows, config.gross))
+    state = _select_home(make_initial_solution(arrays), arrays, home)
+    rows = _rows_in(arrays, state)
+    keep = limit_per_cell(arrays, np.asarray(arrays.pose), config.max_observations_per_cell)
+    return _apply_search(state, search_coarse(arrays, keep, rows, config.coarse_search))
 
 
-def advance(
-    sightings: Sightings,
-    state: Alignment,
+def run_step(
+    arrays: ObservationArrays,
+    state: PoseSolution,
     number: int,
     home: Ints,
-    config: AlignConfig = DEFAULT_ALIGN,
+    config: PoseSolverConfig = DEFAULT_ALIGN,
     keep: NDArray[np.bool_] | None = None,
-) -> Alignment:
+) -> PoseSolution:
     """The home observations after one more step, ids ascending; ``state`` holds all of the sightings after the step
-    before. keep: (P,) the points that count in a sweep, :func:`bounded` at the state's starts; None: found here.
+    before. keep: (P,) the points that count in a sweep, :func:`limit_per_cell` at the state's starts; None: found here.
     """
     step = config.schedule[number]
-    if step.width is None:
-        return _search_again(sightings, state, home, config)
+    if step.gate_and_kernel_m is None:
+        return _repeat_search(arrays, state, home, config)
     if keep is None:
-        keep = bounded(sightings, state.start[state.rows(sightings.ids)], config.most)
-    return _sweep(sightings, state, np.flatnonzero(keep), (*step.width, step.stride), home, config)
+        keep = limit_per_cell(
+            arrays, state.initial_pose[state.row_indices(arrays.ids)], config.max_observations_per_cell
+        )
+    return _sweep(arrays, state, np.flatnonzero(keep), (*step.gate_and_kernel_m, step.point_stride), home, config)
 
 
-def _search_again(sightings: Sightings, state: Alignment, home: Ints, config: AlignConfig) -> Alignment:
+def _repeat_search(
+    arrays: ObservationArrays, state: PoseSolution, home: Ints, config: PoseSolverConfig
+) -> PoseSolution:
     """The home observations where they claim to stand, or where the search finds them among those alone who are believed now:
     the others leave no trace.
     """
-    begun = _of(claimed(sightings), sightings, home)
-    begun = replace(begun, faith=np.where(_of(state, sightings, home).faith > NOT_BELIEVED, 1.0, NOT_BELIEVED))
-    keep = bounded(sightings, np.asarray(sightings.pose), config.most)
-    keep &= (state.faith[state.rows(sightings.ids)] > NOT_BELIEVED)[sightings.observation]
-    return _searched(begun, gross_search(sightings, keep, _rows_in(sightings, begun), config.gross))
+    initial = _select_home(make_initial_solution(arrays), arrays, home)
+    initial = replace(
+        initial,
+        agent_weight=np.where(_select_home(state, arrays, home).agent_weight > REJECTED_WEIGHT, 1.0, REJECTED_WEIGHT),
+    )
+    keep = limit_per_cell(arrays, np.asarray(arrays.pose), config.max_observations_per_cell)
+    keep &= (state.agent_weight[state.row_indices(arrays.ids)] > REJECTED_WEIGHT)[arrays.observation_of_point]
+    return _apply_search(initial, search_coarse(arrays, keep, _rows_in(arrays, initial), config.coarse_search))
 
 
-def _of(state: Alignment, sightings: Sightings, home: Ints) -> Alignment:
+def _select_home(state: PoseSolution, arrays: ObservationArrays, home: Ints) -> PoseSolution:
     """The rows of a state that are at home, ids ascending."""
-    return state.take(state.rows(sorted(sightings.ids[k] for k in home.tolist())))
+    return state.take(state.row_indices(sorted(arrays.ids[k] for k in home.tolist())))
 
 
-def _rows_in(sightings: Sightings, state: Alignment) -> Ints:
+def _rows_in(arrays: ObservationArrays, state: PoseSolution) -> Ints:
     """Where the state's observations stand among the sightings."""
-    place = {name: k for k, name in enumerate(sightings.ids)}
+    place = {name: k for k, name in enumerate(arrays.ids)}
     return np.array([place[name] for name in state.ids], np.int64)
 
 
-def _searched(state: Alignment, found: Floats) -> Alignment:
+def _apply_search(state: PoseSolution, found_pose: Floats) -> PoseSolution:
     """A state at the claimed poses, moved to those that the search found."""
-    still = (found == state.pose).all(1)
-    moved = (found - state.pose)[:, :2]
-    return replace(state, start=found, pose=found, voice=np.where(still, state.voice, 0.0), moved=moved)
+    unmoved = (found_pose == state.pose).all(1)
+    shift = (found_pose - state.pose)[:, :2]
+    return replace(
+        state,
+        initial_pose=found_pose,
+        pose=found_pose,
+        gauge_weight=np.where(unmoved, state.gauge_weight, 0.0),
+        search_shift=shift,
+    )
 
 
 def _sweep(
-    sightings: Sightings, state: Alignment, keep: Ints, width: tuple[float, float, int], home: Ints, config: AlignConfig
-) -> Alignment:
+    arrays: ObservationArrays,
+    state: PoseSolution,
+    keep: Ints,
+    gate_kernel_stride: tuple[float, float, int],
+    home: Ints,
+    config: PoseSolverConfig,
+) -> PoseSolution:
     """The home observations after one sweep with this gate, kernel and stride among the points ``keep``."""
-    gate, kernel, stride = width
-    rows = state.rows(sightings.ids)
-    start, lean, pose = state.start[rows], state.lean[rows], state.pose[rows]
-    xy, tangent = sightings.world(pose)
-    weight = looks_weight(sightings, start, state.scale[rows], state.faith[rows])
-    grid = build_grid(xy[keep, 0], xy[keep, 1], sightings.kind[keep], _SWEEP_CELL_M)
+    gate, kernel, stride = gate_kernel_stride
+    rows = state.row_indices(arrays.ids)
+    start, prior_mean, pose = state.initial_pose[rows], state.prior_mean[rows], state.pose[rows]
+    xy, tangent = arrays.to_world(pose)
+    weight = compute_observation_weights(arrays, start, state.scale[rows], state.agent_weight[rows])
+    grid = build_grid(xy[keep, 0], xy[keep, 1], arrays.kind_of_point[keep], _SWEEP_CELL_M)
     order = keep[grid.order]
-    far = np.asarray(sightings.observation)[order]
-    sums = normal_equations(
+    far = np.asarray(arrays.observation_of_point)[order]
+    sums = build_normal_equations(
         home,
-        (sightings.first, xy, tangent, sightings.kind, sightings.sigma),
-        (grid.cell_m, grid.keys, grid.start, xy[order], tangent[order], far, weight[far]),
-        (gate, kernel, config.along_m, np.cos(config.heading_rad), config.sigma_m, config.correlation),
+        (arrays.observation_offsets, xy, tangent, arrays.kind_of_point, arrays.sigma),
+        (grid.cell_m, grid.keys, grid.offsets, xy[order], tangent[order], far, weight[far]),
+        (
+            gate,
+            kernel,
+            config.max_longitudinal_m,
+            np.cos(config.max_heading_rad),
+            config.sigma_m,
+            config.points_per_independent,
+        ),
         stride,
     )
-    moved = step_poses(sightings, home, (start, lean, pose), sums, config)
+    columns = step_poses(arrays, home, (start, prior_mean, pose), sums, config)
     part = state.take(rows[home])
-    part = replace(part, **moved)
+    part = replace(part, **columns)
     return part.take(np.array(sorted(range(len(part.ids)), key=lambda k: part.ids[k]), np.int64))
 
 
-def merge(parts: Sequence[Alignment], config: AlignConfig = DEFAULT_ALIGN, number: int | None = None) -> Alignment:
+def merge_solutions(
+    parts: Sequence[PoseSolution], config: PoseSolverConfig = DEFAULT_ALIGN, number: int | None = None
+) -> PoseSolution:
     """Home observations of all tiles as one after a step (None: the first search), ids ascending; after a sweep with
     each agent's scale from all its residuals and its faith from all its offsets, after the trial with each drive's error.
     """
@@ -244,63 +283,87 @@ def merge(parts: Sequence[Alignment], config: AlignConfig = DEFAULT_ALIGN, numbe
     agents = [name for part in parts for name in part.agents]
     drives = [name for part in parts for name in part.drives]
     order = np.array(sorted(range(len(ids)), key=lambda k: ids[k]), np.int64)
-    whole = Alignment(
+    whole = PoseSolution(
         tuple(ids[k] for k in order.tolist()),
         tuple(agents[k] for k in order.tolist()),
         tuple(drives[k] for k in order.tolist()),
         *(np.concatenate([getattr(part, name) for part in parts])[order] for name in _COLUMNS),
     )
     step = None if number is None else config.schedule[number]
-    if step is None or step.width is None:
+    if step is None or step.gate_and_kernel_m is None:
         return whole
     names, agent = np.unique(np.array(whole.agents), return_inverse=True)
     residual = np.bincount(agent, whole.residual, len(names))
-    matched = np.bincount(agent, whole.matched, len(names))
+    matched = np.bincount(agent, whole.num_matched, len(names))
     # Two points of prior knowledge keep an agent that nobody else saw at the usual scatter.
     variance = (residual + 20.0 * 0.04) / (matched + 20.0)
-    claim = whole.claim[:, :2, :2]
-    told = told_by_lines(whole.covariance, claim)
-    usual = np.trace(claim, axis1=1, axis2=2) / 2
-    gauge = (config.gauge_m, config.trial_gauge_scale if step.trial else config.gauge_scale)
-    common = common_error((whole.start, whole.pose), told, whole.voice * whole.faith, usual, gauge)
-    offset = (whole.pose - whole.start)[:, :2] - common
+    prior_covariance = whole.prior_covariance[:, :2, :2]
+    observability = compute_observability(whole.covariance, prior_covariance)
+    mean_variance = np.trace(prior_covariance, axis1=1, axis2=2) / 2
+    gauge = (config.gauge_radius_m, config.rejection_gauge_scale if step.is_rejection_pass else config.gauge_scale)
+    common = estimate_gauge_offset(
+        (whole.initial_pose, whole.pose), observability, whole.gauge_weight * whole.agent_weight, mean_variance, gauge
+    )
+    offset = (whole.pose - whole.initial_pose)[:, :2] - common
     pose = whole.pose.copy()
-    pose[:, :2] -= np.where(whole.fixed[:, None] > 0, 0.0, common)
-    limits = (config.agent_scale, config.agent_limit if step.trial else np.inf, config.alike)
-    faith = faith_of(offset + whole.moved, told, usual, agent, limits)
+    pose[:, :2] -= np.where(whole.is_surveyed[:, None] > 0, 0.0, common)
+    limits = (
+        config.agent_scale,
+        config.rejection_agent_scale if step.is_rejection_pass else np.inf,
+        config.drive_correlation,
+    )
+    agent_weight = estimate_agent_weights(offset + whole.search_shift, observability, mean_variance, agent, limits)
     # Whom a trial did not believe is not heard until the next one ends.
-    silent = (whole.faith <= NOT_BELIEVED) & (not step.judges)
-    faith = np.where(whole.fixed > 0, 1.0, np.where(silent, NOT_BELIEVED, faith))
-    lean = whole.lean if step.trial else _lean(whole, common, config)
-    return replace(whole, pose=pose, offset=offset, scale=np.sqrt(variance)[agent], faith=faith, lean=lean)
+    stays_rejected = (whole.agent_weight <= REJECTED_WEIGHT) & (not step.reinstates)
+    agent_weight = np.where(whole.is_surveyed > 0, 1.0, np.where(stays_rejected, REJECTED_WEIGHT, agent_weight))
+    prior_mean = whole.prior_mean if step.is_rejection_pass else _estimate_prior_mean(whole, common, config)
+    return replace(
+        whole,
+        pose=pose,
+        relative_offset=offset,
+        scale=np.sqrt(variance)[agent],
+        agent_weight=agent_weight,
+        prior_mean=prior_mean,
+    )
 
 
-def _lean(whole: Alignment, common: Floats, config: AlignConfig) -> Floats:
+def _estimate_prior_mean(whole: PoseSolution, common: Floats, config: PoseSolverConfig) -> Floats:
     """(O, 3) from start, where each observation stands by its claim and the error of its drive."""
     drive = np.unique(np.array(whole.drives), return_inverse=True)[1]
     from_claim = np.zeros((len(drive), 3))
-    from_claim[:, :2] = whole.moved - common
-    urge = whole.urge + np.einsum("oij,oj->oi", whole.heard, from_claim)
-    lean = drive_error(whole.heard, urge, whole.claim, drive, config.alike, config.drive_scale)
-    lean[:, :2] -= whole.moved
-    return np.where(whole.fixed[:, None] > 0, 0.0, lean)
+    from_claim[:, :2] = whole.search_shift - common
+    information_vector = whole.information_vector + np.einsum("oij,oj->oi", whole.information_matrix, from_claim)
+    prior_mean = estimate_drive_bias(
+        whole.information_matrix,
+        information_vector,
+        whole.prior_covariance,
+        drive,
+        config.drive_correlation,
+        config.drive_scale,
+    )
+    prior_mean[:, :2] -= whole.search_shift
+    return np.where(whole.is_surveyed[:, None] > 0, 0.0, prior_mean)
 
 
-def bounded(sightings: Sightings, pose: Floats, most: int) -> NDArray[np.bool_]:
-    """Which points (P,) count when the agents stand at pose (O, 3): at most ``most`` observations a class, heading and
+def limit_per_cell(arrays: ObservationArrays, pose: Floats, max_observations: int) -> NDArray[np.bool_]:
+    """Which points (P,) count when the agents stand at pose (O, 3): at most ``max_observations`` observations a class, heading and
     cell of 8 m.
     """
-    xy, tangent = sightings.world(pose)
+    xy, tangent = arrays.to_world(pose)
     bins = np.floor(np.arctan2(tangent[:, 1], tangent[:, 0]) / np.pi % 1.0 * 6.0).astype(np.int64) % 6
-    key = cell_key(np.zeros(len(xy), np.int64), xy[:, 0], xy[:, 1], _BOUND_CELL_M) * 32 + bins * 4 + sightings.kind
-    information = -np.trace(np.asarray(sightings.covariance)[:, :2, :2], axis1=1, axis2=2)
-    ids = np.array(sightings.ids)
-    order = np.lexsort((ids, -np.asarray(sightings.time_ns), -information, ~np.asarray(sightings.trusted)))
+    key = (
+        cell_key(np.zeros(len(xy), np.int64), xy[:, 0], xy[:, 1], _BOUND_CELL_M) * 32 + bins * 4 + arrays.kind_of_point
+    )
+    information = -np.trace(np.asarray(arrays.covariance)[:, :2, :2], axis1=1, axis2=2)
+    ids = np.array(arrays.ids)
+    order = np.lexsort((ids, -np.asarray(arrays.time_ns), -information, ~np.asarray(arrays.trusted)))
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))
-    return bound_observations(key, np.asarray(sightings.observation), np.asarray(sightings.agent), rank, most)
+    return limit_observations(
+        key, np.asarray(arrays.observation_of_point), np.asarray(arrays.agent), rank, max_observations
+    )
 
 
-def _reach(o: Observation) -> float:
+def _bounding_radius(o: Observation) -> float:
     points = np.concatenate((o.view, o.elements.points))
     return float(np.hypot(points[:, 0], points[:, 1]).max())

@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
-from manyeyes.datatypes.map_element import CROSSING, STYLES, rows_of
+from manyeyes.datatypes.map_element import CROSSING, STYLES, take_rows
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
-from manyeyes.maps.fusion.agent_weights import NOT_BELIEVED, looks_weight
-from manyeyes.maps.fusion.coverage import looked_at, merged
-from manyeyes.maps.fusion.crossings import Crossings, PolygonConfig, find_crossings
-from manyeyes.maps.fusion.existence import EvidenceConfig, Witness, vouched, witness
-from manyeyes.maps.fusion.mean_shift import RidgeConfig, shift_to_ridges, thin
-from manyeyes.maps.fusion.observation_arrays import Sightings, is_line
-from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, span
-from manyeyes.maps.fusion.pose_optimization import Alignment, bounded
+from manyeyes.maps.fusion.agent_weights import REJECTED_WEIGHT, compute_observation_weights
+from manyeyes.maps.fusion.coverage import find_observed_cells, merge_runs
+from manyeyes.maps.fusion.crossings import CrossingConfig, FusedCrossings, fuse_crossings
+from manyeyes.maps.fusion.existence import EvidenceConfig, StationEvidence, accumulate_evidence, find_covered_by_inliers
+from manyeyes.maps.fusion.mean_shift import RidgeConfig, mean_shift_to_ridges, thin_ridges
+from manyeyes.maps.fusion.observation_arrays import ObservationArrays, is_line
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
+from manyeyes.maps.fusion.pose_optimization import PoseSolution, limit_per_cell
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -37,32 +37,32 @@ Area = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class StationConfig:
-    """most: observations that shape a ridge in a cell of 8 m, class and heading. halo_m: of an area, where ridges are
-    found too.
+    """max_observations_per_cell: observations that shape a ridge in a cell of 8 m, class and heading. halo_m: of an area, where
+    ridges are found too.
 
-    vouched: what an agent whom nobody believes says of lines counts only where fewer believed agents looked. least_support:
+    min_inlier_agents: what an agent whom nobody believes says of lines counts only where fewer believed agents looked. min_support:
     observations that a station needs, where at least seen_by (summed visibility) could have seen it.
-    rival_m: stations of two kinds of line this close across, or of one kind within rival_far_m, exclude each other
+    conflict_radius_m: stations of two kinds of line this close across, or of one kind within rival_far_m, exclude each other
     unless the same observations saw both: the one with the smaller log-odds goes if the ratio of supports, or the
     difference of log-odds, is that large.
     """
 
-    most: int = 32
+    max_observations_per_cell: int = 32
     halo_m: float = 24.0
-    vouched: int = 5
-    least_support: int = 1
-    seen_by: float = 3.0
-    rival_m: float = 0.6
-    rival_far_m: float = 2.0
-    rival_ratio: float = 1.5
-    rival_odds: float = 3.0
+    min_inlier_agents: int = 5
+    min_support: int = 1
+    min_support_coverage: float = 3.0
+    conflict_radius_m: float = 0.6
+    same_kind_conflict_radius_m: float = 2.0
+    conflict_support_ratio: float = 1.5
+    conflict_log_odds: float = 3.0
     ridge: RidgeConfig = field(default_factory=RidgeConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
-    polygon: PolygonConfig = field(default_factory=PolygonConfig)
+    polygon: CrossingConfig = field(default_factory=CrossingConfig)
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class EvidenceTable:
     """What K stations or crossings share: columns as in evidence.Witness; ``sources`` count in observations (U, 16),
     each station's and the observations ascending.
     """
@@ -77,152 +77,181 @@ class Evidence:
     t_first: Ints
     t_last: Ints
     style: Floats
-    first: Ints
+    source_offsets: Ints
     sources: Ints
     observations: Digests
 
-    def take(self, rows: Ints) -> Evidence:
+    def take(self, rows: Ints) -> EvidenceTable:
         """The chosen rows, in the order given."""
-        first, places = rows_of(self.first, rows)
+        first, places = take_rows(self.source_offsets, rows)
         columns = {name: getattr(self, name)[rows] for name in _PER_ROW}
-        return Evidence(first=first, sources=self.sources[places], observations=self.observations, **columns)
+        return EvidenceTable(
+            source_offsets=first, sources=self.sources[places], observations=self.observations, **columns
+        )
 
     @classmethod
-    def cat(cls, many: Sequence[Evidence]) -> Evidence:
+    def cat(cls, tables: Sequence[EvidenceTable]) -> EvidenceTable:
         """Several as one, in order, their observations merged."""
-        known, place = np.unique(np.concatenate([e.observations for e in many]), axis=0, return_inverse=True)
-        seen = np.cumsum([0, *(len(e.observations) for e in many)])
-        counts = np.concatenate([np.diff(e.first) for e in many])
+        digests, place = np.unique(np.concatenate([e.observations for e in tables]), axis=0, return_inverse=True)
+        seen = np.cumsum([0, *(len(e.observations) for e in tables)])
+        counts = np.concatenate([np.diff(e.source_offsets) for e in tables])
         return cls(
-            first=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-            sources=np.concatenate([place.reshape(-1)[start + e.sources] for e, start in zip(many, seen)]),
-            observations=known,
-            **{name: np.concatenate([getattr(e, name) for e in many]) for name in _PER_ROW},
+            source_offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+            sources=np.concatenate([place.reshape(-1)[start + e.sources] for e, start in zip(tables, seen)]),
+            observations=digests,
+            **{name: np.concatenate([getattr(e, name) for e in tables]) for name in _PER_ROW},
         )
 
 
-_PER_ROW = tuple(f.name for f in fields(Evidence) if f.name not in ("first", "sources", "observations"))
+_PER_ROW = tuple(f.name for f in fields(EvidenceTable) if f.name not in ("first", "sources", "observations"))
 
 
 @dataclass(frozen=True, eq=False)
 class StationTable:
     """Stations of lines and whole crossings of an area, with their evidence.
 
-    xy, tangent: (K, 2) metres and unit, map frame; line: (K,) their evidence. ring_start: (C + 1,), ring_xy: crossings'
-    rings; ring: (C,) their evidence. looked: (R, 3) runs of ground that was in some view (maps.looked); none: not known.
+    xy, tangent: (K, 2) metres and unit, map frame; line_evidence: (K,) their evidence. ring_offsets: (C + 1,), ring_xy: crossings'
+    rings; ring_evidence: (C,) their evidence. observed_cells: (R, 3) runs of ground that was in some view (maps.looked); none: not
+    known.
     """
 
     xy: Floats
     tangent: Floats
-    line: Evidence
-    ring_start: Ints
+    line_evidence: EvidenceTable
+    ring_offsets: Ints
     ring_xy: Floats
-    ring: Evidence
-    looked: Ints
+    ring_evidence: EvidenceTable
+    observed_cells: Ints
 
     def __len__(self) -> int:
         return len(self.xy)
 
     @classmethod
-    def cat(cls, many: Sequence[StationTable]) -> StationTable:
+    def cat(cls, tables: Sequence[StationTable]) -> StationTable:
         """The stations of several areas that do not overlap as one table, in an order that does not depend on the
         areas.
         """
-        xy = np.concatenate([t.xy for t in many])
-        tangent = np.concatenate([t.tangent for t in many])
-        line, ring = Evidence.cat([t.line for t in many]), Evidence.cat([t.ring for t in many])
-        points = np.concatenate([t.ring_xy for t in many])
-        sizes = np.concatenate([np.diff(t.ring_start) for t in many])
+        xy = np.concatenate([t.xy for t in tables])
+        tangent = np.concatenate([t.tangent for t in tables])
+        line, ring = (
+            EvidenceTable.cat([t.line_evidence for t in tables]),
+            EvidenceTable.cat([t.ring_evidence for t in tables]),
+        )
+        points = np.concatenate([t.ring_xy for t in tables])
+        sizes = np.concatenate([np.diff(t.ring_offsets) for t in tables])
         start = np.concatenate(([0], np.cumsum(sizes))).astype(np.int64)
         order = np.lexsort((xy[:, 1], xy[:, 0], line.kind))
         rings = np.lexsort((points[start[:-1], 1], points[start[:-1], 0])) if len(sizes) else np.zeros(0, np.int64)
-        ring_start, places = rows_of(start, rings)
-        looked = merged(np.concatenate([t.looked for t in many]))
-        return cls(xy[order], tangent[order], line.take(order), ring_start, points[places], ring.take(rings), looked)
+        ring_start, places = take_rows(start, rings)
+        observed_cells = merge_runs(np.concatenate([t.observed_cells for t in tables]))
+        return cls(
+            xy[order], tangent[order], line.take(order), ring_start, points[places], ring.take(rings), observed_cells
+        )
 
 
-def find_stations(
-    sightings: Sightings, alignment: Alignment, area: Area | None = None, config: StationConfig = StationConfig()
+def build_stations(
+    arrays: ObservationArrays, solution: PoseSolution, area: Area | None = None, config: StationConfig = StationConfig()
 ) -> StationTable:
     """Stations and crossings in area (x0, y0, x1, y1), lower sides included, upper excluded; None is everywhere.
 
-    ``sightings`` are all observations that reach into the area widened by the halo; ``pose`` has them all.
+    ``arrays`` are all observations that reach into the area widened by the halo; ``pose`` has them all.
     """
-    rows = alignment.rows(sightings.ids)
-    pose, covariance = alignment.pose[rows], alignment.covariance[rows]
-    weight = looks_weight(sightings, alignment.start[rows], alignment.scale[rows], alignment.faith[rows])
-    believed = alignment.faith[rows] > NOT_BELIEVED
-    lines = _lines(sightings, pose, covariance, (weight, believed), area, config)
-    rank = np.argsort(np.argsort(np.array(sightings.ids)))
-    crossings = find_crossings(sightings, pose, weight, rank, config.polygon, config.evidence)
-    ring, ring_start, ring_xy = _rings_inside(crossings, sightings, area, config)
-    looked = looked_at(sightings, pose, area)
-    return StationTable.cat([StationTable(*lines, ring_start, ring_xy, ring, looked)])
+    rows = solution.row_indices(arrays.ids)
+    pose, covariance = solution.pose[rows], solution.covariance[rows]
+    weight = compute_observation_weights(
+        arrays, solution.initial_pose[rows], solution.scale[rows], solution.agent_weight[rows]
+    )
+    is_inlier = solution.agent_weight[rows] > REJECTED_WEIGHT
+    lines = _build_line_stations(arrays, pose, covariance, (weight, is_inlier), area, config)
+    rank = np.argsort(np.argsort(np.array(arrays.ids)))
+    crossings = fuse_crossings(arrays, pose, weight, rank, config.polygon, config.evidence)
+    ring, ring_offsets, ring_xy = _rings_inside(crossings, arrays, area, config)
+    observed_cells = find_observed_cells(arrays, pose, area)
+    return StationTable.cat([StationTable(*lines, ring_offsets, ring_xy, ring, observed_cells)])
 
 
-def _lines(
-    sightings: Sightings,
+def _build_line_stations(
+    arrays: ObservationArrays,
     pose: Floats,
     covariance: Floats,
-    standing: tuple[Floats, NDArray[np.bool_]],
+    observation_weights: tuple[Floats, NDArray[np.bool_]],
     area: Area | None,
     config: StationConfig,
-) -> tuple[Floats, Floats, Evidence]:
-    """Positions, tangents and evidence of line stations in the area. standing: weight and belief (O,) of observations."""
-    xy, tangent = sightings.world(pose)
-    weight, believed = standing
-    point_weight = _information(sightings, xy, tangent, pose, covariance) * weight[sightings.observation]
-    point_weight[vouched(sightings, pose, believed, config.vouched, config.evidence.margin_m)] = 0.0
-    counts = np.flatnonzero(bounded(sightings, pose, config.most) & is_line(sightings.kind) & (point_weight > 0.0))
+) -> tuple[Floats, Floats, EvidenceTable]:
+    """Positions, tangents and evidence of line stations in the area. observation_weights: weight and belief (O,) of
+    observations.
+    """
+    xy, tangent = arrays.to_world(pose)
+    weight, is_inlier = observation_weights
+    point_weight = _compute_point_weights(arrays, xy, tangent, pose, covariance) * weight[arrays.observation_of_point]
+    point_weight[
+        find_covered_by_inliers(arrays, pose, is_inlier, config.min_inlier_agents, config.evidence.view_margin_m)
+    ] = 0.0
+    counts = np.flatnonzero(
+        limit_per_cell(arrays, pose, config.max_observations_per_cell)
+        & is_line(arrays.kind_of_point)
+        & (point_weight > 0.0)
+    )
     inside = _within(xy[counts], area, config.halo_m)
-    places, turned, _ = shift_to_ridges(
-        np.flatnonzero(inside), xy[counts], tangent[counts], sightings.kind[counts], point_weight[counts], config.ridge
+    places, turned, _ = mean_shift_to_ridges(
+        np.flatnonzero(inside),
+        xy[counts],
+        tangent[counts],
+        arrays.kind_of_point[counts],
+        point_weight[counts],
+        config.ridge,
     )
     seeds = counts[inside]
-    kept = thin(places, turned, sightings.kind[seeds], sightings.priority[seeds], config.ridge)
+    kept = thin_ridges(places, turned, arrays.kind_of_point[seeds], arrays.priority[seeds], config.ridge)
     seeds, places, turned = seeds[kept], places[kept], turned[kept]
-    kind = sightings.kind[seeds]
-    found = witness(places, turned, kind, sightings, pose, point_weight, believed, config.evidence)
+    kind = arrays.kind_of_point[seeds]
+    found = accumulate_evidence(places, turned, kind, arrays, pose, point_weight, is_inlier, config.evidence)
     normal = np.stack((-turned[:, 1], turned[:, 0]), 1)
-    places = places + found.shift[:, None] * normal
-    enough = (found.support >= config.least_support) | (found.coverage < config.seen_by)
-    stays = np.flatnonzero((found.support > 0) & (enough | (found.state == RETIRED)))
-    again = thin(places[stays], turned[stays], kind[stays], sightings.priority[seeds[stays]], config.ridge)
-    stays = stays[again]
-    table = _published_seldom(_evidence_of(found, kind, sightings).take(stays), config.evidence)
+    places = places + found.lateral_shift[:, None] * normal
+    has_support = (found.support >= config.min_support) | (found.coverage < config.min_support_coverage)
+    stays = np.flatnonzero((found.support > 0) & (has_support | (found.state == RETIRED)))
+    thinned = thin_ridges(places[stays], turned[stays], kind[stays], arrays.priority[seeds[stays]], config.ridge)
+    stays = stays[thinned]
+    table = _publish_low_coverage(_to_table(found, kind, arrays).take(stays), config.evidence)
     places, turned = places[stays], turned[stays]
-    loses = _rivals(places, turned, table, config)
+    loses = _find_conflicts(places, turned, table, config)
     chosen = np.flatnonzero(_within(places, area, 0.0) & ~loses & ((table.log_odds > 0.0) | (table.state != 0)))
     return places[chosen], turned[chosen], table.take(chosen)
 
 
-def _evidence_of(found: Witness | Crossings, kind: Ints, sightings: Sightings) -> Evidence:
+def _to_table(found: StationEvidence | FusedCrossings, kind: Ints, arrays: ObservationArrays) -> EvidenceTable:
     names = [name for name in _PER_ROW if name != "kind"]
-    ids = np.frombuffer(bytes.fromhex("".join(sightings.ids)), np.uint8).reshape(-1, 16)
-    known, place = np.unique(ids, axis=0, return_inverse=True)
+    ids = np.frombuffer(bytes.fromhex("".join(arrays.ids)), np.uint8).reshape(-1, 16)
+    digests, place = np.unique(ids, axis=0, return_inverse=True)
     columns = {name: getattr(found, name) for name in names}
     sources = place.reshape(-1)[found.sources]
-    owner = np.repeat(np.arange(len(kind)), np.diff(found.first))
-    return Evidence(
-        kind=kind, first=found.first, sources=sources[np.lexsort((sources, owner))], observations=known, **columns
+    owner = np.repeat(np.arange(len(kind)), np.diff(found.source_offsets))
+    return EvidenceTable(
+        kind=kind,
+        source_offsets=found.source_offsets,
+        sources=sources[np.lexsort((sources, owner))],
+        observations=digests,
+        **columns,
     )
 
 
-def _published_seldom(table: Evidence, config: EvidenceConfig) -> Evidence:
+def _publish_low_coverage(table: EvidenceTable, config: EvidenceConfig) -> EvidenceTable:
     """The table with those candidates published that few could have seen and that are likely enough for that."""
-    seldom = (table.coverage <= config.seldom) & (table.log_odds >= config.publish_seldom)
-    seldom &= (table.state == CANDIDATE) & (table.agents >= config.publish_agents)
-    return replace(table, state=np.where(seldom, PUBLISHED, table.state))
+    low_coverage = (table.coverage <= config.low_coverage) & (table.log_odds >= config.publish_low_coverage_log_odds)
+    low_coverage &= (table.state == CANDIDATE) & (table.agents >= config.min_publish_agents)
+    return replace(table, state=np.where(low_coverage, PUBLISHED, table.state))
 
 
-def _information(sightings: Sightings, xy: Floats, tangent: Floats, pose: Floats, covariance: Floats) -> Floats:
+def _compute_point_weights(
+    arrays: ObservationArrays, xy: Floats, tangent: Floats, pose: Floats, covariance: Floats
+) -> Floats:
     """(P,) 1 / variance across the line, by detection and pose, in units of that of a point seen to 0.2 m."""
-    owner = sightings.observation
+    owner = arrays.observation_of_point
     normal = np.stack((-tangent[:, 1], tangent[:, 0]), 1)
     lever = xy - pose[owner, :2]
     jacobian = np.concatenate((normal, (normal[:, 1] * lever[:, 0] - normal[:, 0] * lever[:, 1])[:, None]), 1)
     spread = np.einsum("pi,pij,pj->p", jacobian, covariance[owner], jacobian)
-    return 0.04 / (sightings.sigma**2 + 0.1**2 + spread)
+    return 0.04 / (arrays.sigma**2 + 0.1**2 + spread)
 
 
 def _within(xy: Floats, area: Area | None, halo: float) -> NDArray[np.bool_]:
@@ -232,16 +261,21 @@ def _within(xy: Floats, area: Area | None, halo: float) -> NDArray[np.bool_]:
     return (x >= area[0] - halo) & (x < area[2] + halo) & (y >= area[1] - halo) & (y < area[3] + halo)
 
 
-def _rivals(xy: Floats, tangent: Floats, table: Evidence, config: StationConfig) -> NDArray[np.bool_]:
+def _find_conflicts(xy: Floats, tangent: Floats, table: EvidenceTable, config: StationConfig) -> NDArray[np.bool_]:
     """(K,) which stations lose against another that cannot be true at the same time."""
     grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _RIVAL_CELL_M)
-    numbers = _RivalLimits(config.rival_m, config.rival_far_m, config.rival_ratio, config.rival_odds)
-    standing = _RivalColumns(table.kind, table.log_odds, table.support, table.state, table.first, table.sources)
-    return _losers(xy, tangent, standing, grid, numbers)
+    params = _RivalLimits(
+        config.conflict_radius_m,
+        config.same_kind_conflict_radius_m,
+        config.conflict_support_ratio,
+        config.conflict_log_odds,
+    )
+    columns = _RivalColumns(table.kind, table.log_odds, table.support, table.state, table.source_offsets, table.sources)
+    return _find_losers(xy, tangent, columns, grid, params)
 
 
 class _RivalColumns(NamedTuple):
-    """The columns of :class:`Evidence` that decide which of two stations stays."""
+    """The columns of :class:`EvidenceTable` that decide which of two stations stays."""
 
     kind: I64x1
     log_odds: F64x1
@@ -263,19 +297,19 @@ class _RivalLimits(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _losers(
-    xy: F64x2, tangent: F64x2, standing: _RivalColumns, grid: PointGrid, numbers: _RivalLimits
+def _find_losers(
+    xy: F64x2, tangent: F64x2, columns: _RivalColumns, grid: PointGrid, params: _RivalLimits
 ) -> Boolx1:  # pragma: no cover - compiled
     """(K,) which stations, at xy (K, 2) with unit tangents (K, 2), lose against another."""
-    kind, odds, support, state, first, sources = standing
-    keys, start, order = grid.keys, grid.start, grid.order
-    near, far, ratio, difference = numbers
+    kind, odds, support, state, first, sources = columns
+    keys, start, order = grid.keys, grid.offsets, grid.order
+    near, far, ratio, difference = params
     loses = np.zeros(len(xy), np.bool_)
     for k in range(len(xy)):
         u, v = tangent[k, 0], tangent[k, 1]
         ix, iy = int(np.floor(xy[k, 0] / _RIVAL_CELL_M)), int(np.floor(xy[k, 1] / _RIVAL_CELL_M))
         for dx in range(-1, 2):
-            low, high = span(keys, start, 0, ix + dx, iy - 1, iy + 1)
+            low, high = find_cell_range(keys, start, 0, ix + dx, iy - 1, iy + 1)
             for place in range(low, high):
                 q = order[place]
                 if q == k or state[q] == RETIRED or state[k] == RETIRED:
@@ -289,13 +323,13 @@ def _losers(
                 else:
                     wins = odds[q] > odds[k] + difference and support[q] >= 3
                 # Two lines that the same observations saw are two lines; else they are two readings of one.
-                if wins and 4 * _shared(sources, first, k, q) < min(support[k], support[q]):
+                if wins and 4 * _count_shared(sources, first, k, q) < min(support[k], support[q]):
                     loses[k] = True
     return loses
 
 
 @njit(cache=True, nogil=True)
-def _shared(sources: I64x1, first: I64x1, k: int, q: int) -> int:  # pragma: no cover - compiled
+def _count_shared(sources: I64x1, first: I64x1, k: int, q: int) -> int:  # pragma: no cover - compiled
     """How many observations saw both stations; each one's sources ascend."""
     both, i, j = 0, first[k], first[q]
     while i < first[k + 1] and j < first[q + 1]:
@@ -311,22 +345,22 @@ def _shared(sources: I64x1, first: I64x1, k: int, q: int) -> int:  # pragma: no 
 
 
 def _rings_inside(
-    crossings: Crossings, sightings: Sightings, area: Area | None, config: StationConfig
-) -> tuple[Evidence, Ints, Floats]:
+    crossings: FusedCrossings, arrays: ObservationArrays, area: Area | None, config: StationConfig
+) -> tuple[EvidenceTable, Ints, Floats]:
     """Evidence, offsets and rings of the crossings whose centre lies in the area."""
     count = len(crossings.support)
-    table = _evidence_of(crossings, np.full(count, CROSSING, np.int64), sightings)
-    counts = np.diff(crossings.start)
+    table = _to_table(crossings, np.full(count, CROSSING, np.int64), arrays)
+    counts = np.diff(crossings.ring_offsets)
     owner = np.repeat(np.arange(count), counts)
     centre = np.stack([np.bincount(owner, crossings.xy[:, axis], count) / np.maximum(1, counts) for axis in (0, 1)], 1)
-    enough = (table.support >= config.least_support) | (table.coverage < config.seen_by)
-    alive = ((table.log_odds > 0.0) & enough) | (table.state == PUBLISHED) | (table.state == RETIRED)
+    has_support = (table.support >= config.min_support) | (table.coverage < config.min_support_coverage)
+    alive = ((table.log_odds > 0.0) & has_support) | (table.state == PUBLISHED) | (table.state == RETIRED)
     chosen = np.flatnonzero(_within(centre, area, 0.0) & alive & (table.support > 0))
-    start, places = rows_of(crossings.start, chosen)
+    start, places = take_rows(crossings.ring_offsets, chosen)
     return table.take(chosen), start, crossings.xy[places]
 
 
-def with_style(table: Evidence) -> Evidence:
+def normalize_style(table: EvidenceTable) -> EvidenceTable:
     """The same with style votes as probabilities (K, S); without votes all alike."""
     total = table.style.sum(1, keepdims=True)
     return replace(table, style=np.where(total > 0, table.style / np.maximum(total, 1e-12), 1.0 / len(STYLES)))

@@ -9,7 +9,8 @@ nobody painted. What each element of the truth is depends on the choices below; 
 2. boundary: the edge of the paved ground, out of the file's edges (Argoverse 2, Lanelet2) or as the outline of the union of
    all paved lanes and their shoulders (OpenDRIVE, whose curbs are incomplete). Where the map itself ends there is no edge, and
    edges farther than ``beside_m`` from any drivable lane (Argoverse 2 has ground without lanes) belong to no road.
-3. A line within ``merge_m`` and ``merge_heading_rad`` of a longer one of its class is the same line; what of it stands out stays.
+3. A line within ``merge_radius_m`` and ``max_merge_heading_rad`` of a longer one of its class is the same line; what of it stands
+out stays.
 4. Lines whose ends lie within ``gap_m`` and continue each other's direction are one line.
 5. Cut policy ``junction``: lines are cut at the outline of each junction's lanes, widened by ``junction_margin_m``.
    :func:`cut_elements` does the same to anybody's map. Attributes (style) do not cut.
@@ -44,23 +45,23 @@ _CAP_M = 3.0
 
 
 @dataclass(frozen=True)
-class TruthPolicy:
+class GroundTruthPolicy:
     """What counts as one element; the numbers of the module's list. Lengths in metres, angles in radians, areas in m²."""
 
     boundary: Literal["marks", "pavement"] = "marks"
-    merge_m: float = 0.3
-    merge_heading_rad: float = 0.26
-    gap_m: float = 0.5
-    gap_heading_rad: float = 0.175
+    merge_radius_m: float = 0.3
+    max_merge_heading_rad: float = 0.26
+    max_gap_m: float = 0.5
+    max_gap_heading_rad: float = 0.175
     junction_margin_m: float = 1.5
-    beside_m: float = 15.0
-    min_line_m: float = 5.0
-    min_crossing_m2: float = 3.0
-    min_island_m2: float = 10.0
+    max_lane_distance_m: float = 15.0
+    min_line_length_m: float = 5.0
+    min_crossing_area_m2: float = 3.0
+    min_island_area_m2: float = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Line:
+class _StyledLine:
     """A line on its way: points (M, 2) and metres of it in each of STYLES (S,)."""
 
     points: Array
@@ -71,38 +72,38 @@ class _Line:
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
 
-def map_truth(network: RoadNetwork, policy: TruthPolicy = TruthPolicy()) -> MapElements:
+def build_ground_truth_map(network: RoadNetwork, policy: GroundTruthPolicy = GroundTruthPolicy()) -> MapElements:
     """All true elements of a road network, in its world frame, by the rules of this module."""
     _shapely()
-    region = junction_region(network, policy.junction_margin_m)
+    region = compute_junction_region(network, policy.junction_margin_m)
     paint = [mark for mark in network.marks if mark.kind in ("solid", "broken")]
-    dividers = _outside(_middles(paint), junction_region(network, policy.merge_m))
-    dividers = chain(merge(dividers, policy), policy)
+    dividers = _clip_outside(_merge_double_lines(paint), compute_junction_region(network, policy.merge_radius_m))
+    dividers = chain_lines(merge_duplicates(dividers, policy), policy)
     if policy.boundary == "pavement":
-        edges = _pavement_rings(network, policy)
+        edges = _trace_pavement(network, policy)
     else:
-        edges = [_Line(mark.line[:, :2], _style("none")) for mark in network.marks if mark.kind == "curb"]
-    edges = _beside_lanes(_without_map_ends(edges, network), network, policy)
-    boundaries = chain(merge(edges, policy), policy)
-    boundaries = [piece for line in boundaries for piece in _pieces(line, region, policy.min_line_m)]
-    stops = [_Line(mark.line[:, :2], _style("none")) for mark in network.marks if mark.kind == "stop"]
-    found: list[tuple[str, _Line]] = []
-    found += [("divider", line) for line in dividers if line.length_m >= policy.min_line_m]
-    found += [("boundary", line) for line in boundaries if line.length_m >= policy.min_line_m]
-    found += [("crossing", line) for line in _crossings(network, policy)]
+        edges = [_StyledLine(mark.line[:, :2], _one_hot_style("none")) for mark in network.marks if mark.kind == "curb"]
+    edges = _keep_near_lanes(_drop_map_ends(edges, network), network, policy)
+    boundaries = chain_lines(merge_duplicates(edges, policy), policy)
+    boundaries = [piece for line in boundaries for piece in _split_line(line, region, policy.min_line_length_m)]
+    stops = [_StyledLine(mark.line[:, :2], _one_hot_style("none")) for mark in network.marks if mark.kind == "stop"]
+    found: list[tuple[str, _StyledLine]] = []
+    found += [("divider", line) for line in dividers if line.length_m >= policy.min_line_length_m]
+    found += [("boundary", line) for line in boundaries if line.length_m >= policy.min_line_length_m]
+    found += [("crossing", line) for line in _select_crossings(network, policy)]
     found += [("stop_line", line) for line in stops if line.length_m >= 1.0]
-    return _elements(found)
+    return _to_elements(found)
 
 
-def junction_region(network: RoadNetwork, margin_m: float) -> BaseGeometry:
+def compute_junction_region(network: RoadNetwork, margin_m: float) -> BaseGeometry:
     """The ground of all junctions' drivable lanes, widened by a margin (shapely geometry, network frame)."""
     shapely = _shapely()
     inside = [lane for lane in network.lanes if lane.junction_id is not None and lane.is_drivable]
-    ground = shapely.union_all(shapely.buffer(_grounds(inside), 0.05))
+    ground = shapely.union_all(shapely.buffer(_lane_polygons(inside), 0.05))
     return shapely.simplify(shapely.buffer(ground, margin_m - 0.05, join_style="mitre"), 0.05)
 
 
-def cut_elements(elements: MapElements, region: BaseGeometry, min_line_m: float = 5.0) -> MapElements:
+def cut_elements(elements: MapElements, region: BaseGeometry, min_line_length_m: float = 5.0) -> MapElements:
     """The elements with lines cut where they enter or leave the region; crossings stay whole, pieces keep score and style.
 
     A cut that would leave a piece shorter than min_line_m is not made.
@@ -115,8 +116,8 @@ def cut_elements(elements: MapElements, region: BaseGeometry, min_line_m: float 
     for k in range(len(elements)):
         line = elements.polyline(k)
         ring = elements.kind[k] == CROSSING
-        sigma = elements.sigma[elements.first[k] : elements.first[k + 1]]
-        for part in [line] if ring else _split(line, region, min_line_m):
+        sigma = elements.sigma[elements.offsets[k] : elements.offsets[k + 1]]
+        for part in [line] if ring else _split(line, region, min_line_length_m):
             parts.append(part)
             source.append(k)
             # The nearest own point's sigma: cuts add points, they do not move any.
@@ -126,7 +127,7 @@ def cut_elements(elements: MapElements, region: BaseGeometry, min_line_m: float 
     return MapElements.of(parts, elements.kind[own], elements.score[own], sigma, elements.style[own])
 
 
-def merge(lines: Sequence[_Line], policy: TruthPolicy) -> list[_Line]:
+def merge_duplicates(lines: Sequence[_StyledLine], policy: GroundTruthPolicy) -> list[_StyledLine]:
     """Each physical line once: a stretch that runs along a longer line of the list is left out."""
     shapely = _shapely()
     ranked = sorted((line for line in lines if line.length_m > 0.1), key=lambda line: (-line.length_m, *_ends(line)))
@@ -136,24 +137,24 @@ def merge(lines: Sequence[_Line], policy: TruthPolicy) -> list[_Line]:
     tree = shapely.STRtree(shapes)
     kept = []
     for rank, line in enumerate(ranked):
-        near = np.sort(tree.query(shapes[rank], predicate="dwithin", distance=policy.merge_m))
+        near = np.sort(tree.query(shapes[rank], predicate="dwithin", distance=policy.merge_radius_m))
         near = near[near < rank]
         covered = np.zeros(0, bool)
         points = line.points
         if len(near):
-            points = _dense(line.points, _STEP_M / 2)
+            points = _densify(line.points, _STEP_M / 2)
             covered = np.zeros(len(points), bool)
             for other in near.tolist():
-                covered |= _runs_along(points, shapes[other], policy)
-        kept += [_Line(part, line.style) for part in _runs(points, ~covered)] if covered.any() else [line]
+                covered |= _is_duplicate(points, shapes[other], policy)
+        kept += [_StyledLine(part, line.style) for part in _split_runs(points, ~covered)] if covered.any() else [line]
     return [line for line in kept if line.length_m >= 2 * _STEP_M]
 
 
-def _runs_along(points: Array, shape: BaseGeometry, policy: TruthPolicy) -> NDArray[np.bool_]:
+def _is_duplicate(points: Array, shape: BaseGeometry, policy: GroundTruthPolicy) -> NDArray[np.bool_]:
     """(M,) whether each point lies within merge_m beside a line, not beyond its ends, and has its direction."""
     shapely = _shapely()
     probe = shapely.points(points)
-    close = shapely.distance(probe, shape) <= policy.merge_m
+    close = shapely.distance(probe, shape) <= policy.merge_radius_m
     if close.any():
         along = shapely.line_locate_point(shape, probe[close])
         ahead = shapely.get_coordinates(shapely.line_interpolate_point(shape, np.minimum(along + 0.25, shape.length)))
@@ -161,11 +162,11 @@ def _runs_along(points: Array, shape: BaseGeometry, policy: TruthPolicy) -> NDAr
         step = np.gradient(points, axis=0)[close]
         turn = np.abs(_angle(step) - _angle(ahead - behind)) % np.pi
         beside = (along > 1e-6) & (along < shape.length - 1e-6)
-        close[close] = beside & (np.minimum(turn, np.pi - turn) <= policy.merge_heading_rad)
+        close[close] = beside & (np.minimum(turn, np.pi - turn) <= policy.max_merge_heading_rad)
     return close
 
 
-def chain(lines: Sequence[_Line], policy: TruthPolicy) -> list[_Line]:
+def chain_lines(lines: Sequence[_StyledLine], policy: GroundTruthPolicy) -> list[_StyledLine]:
     """Lines joined end to end where two ends are each other's best continuation."""
     shapely = _shapely()
     if not lines:
@@ -173,11 +174,11 @@ def chain(lines: Sequence[_Line], policy: TruthPolicy) -> list[_Line]:
     ordered = sorted(lines, key=_ends)
     # End 2k is the start of line k, 2k + 1 its end; out points away from the line.
     place = np.array([p for line in ordered for p in (line.points[0], line.points[-1])])
-    out = np.array([_outward(line.points[::way]) for line in ordered for way in (1, -1)])
+    out = np.array([_outward(line.points[::direction]) for line in ordered for direction in (1, -1)])
     tree = shapely.STRtree(shapely.points(place))
-    one, two = tree.query(shapely.points(place), predicate="dwithin", distance=policy.gap_m)
+    one, two = tree.query(shapely.points(place), predicate="dwithin", distance=policy.max_gap_m)
     turn = np.abs(np.angle(-out[one] * np.conj(out[two])))
-    fits = (one != two) & (turn <= policy.gap_heading_rad)
+    fits = (one != two) & (turn <= policy.max_gap_heading_rad)
     one, two, turn = one[fits], two[fits], turn[fits]
     gap = np.linalg.norm(place[one] - place[two], axis=1)
     # A line of one short piece may meet its own other end; only rings longer than that close.
@@ -187,10 +188,10 @@ def chain(lines: Sequence[_Line], policy: TruthPolicy) -> list[_Line]:
     for k in order.tolist():
         if not loop[k] and partner[one[k]] < 0 and partner[two[k]] < 0:
             partner[one[k]], partner[two[k]] = two[k], one[k]
-    return _follow(ordered, partner)
+    return _join_chains(ordered, partner)
 
 
-def _follow(lines: Sequence[_Line], partner: NDArray[np.int64]) -> list[_Line]:
+def _join_chains(lines: Sequence[_StyledLine], partner: NDArray[np.int64]) -> list[_StyledLine]:
     """The chains that the partners of ends (2K,) make; rings begin at their smallest line."""
     used = np.zeros(len(lines), bool)
     joined = []
@@ -206,18 +207,18 @@ def _follow(lines: Sequence[_Line], partner: NDArray[np.int64]) -> list[_Line]:
         if points:
             whole = np.concatenate(points)
             fresh = np.concatenate(([True], np.linalg.norm(np.diff(whole, axis=0), axis=1) > 0.01))
-            joined.append(_Line(whole[fresh] if fresh.sum() > 1 else whole[[0, -1]], style))
+            joined.append(_StyledLine(whole[fresh] if fresh.sum() > 1 else whole[[0, -1]], style))
     return joined
 
 
-def _middles(marks: Sequence[RoadMark]) -> list[_Line]:
+def _merge_double_lines(marks: Sequence[RoadMark]) -> list[_StyledLine]:
     """Painted lines, those of one border that run side by side (a double line) as their middle."""
     groups: dict[tuple[str, int, int, int, tuple[float, ...]], list[RoadMark]] = {}
     for number, mark in enumerate(marks):
         # Only lines of one border and one stretch pair up: same count of points, ends within a few widths.
         key = (mark.road_id, mark.section, mark.lane_id, len(mark.line), tuple(np.round(mark.line[0, :2] / 4).tolist()))
-        alone = (f"#{number}", 0, 0, 0, ())
-        groups.setdefault(key if mark.road_id and mark.lane_id is not None else alone, []).append(mark)
+        own_key = (f"#{number}", 0, 0, 0, ())
+        groups.setdefault(key if mark.road_id and mark.lane_id is not None else own_key, []).append(mark)
     lines = []
     for group in groups.values():
         while group:
@@ -225,29 +226,31 @@ def _middles(marks: Sequence[RoadMark]) -> list[_Line]:
             pair = next((k for k, other in enumerate(rest) if np.abs(other.line - mark.line)[:, :2].max() < 0.6), None)
             if pair is None:
                 name = "solid" if mark.kind == "solid" else "dashed"
-                lines.append(_Line(mark.line[:, :2], _style(name)))
+                lines.append(_StyledLine(mark.line[:, :2], _one_hot_style(name)))
             else:
-                lines.append(_Line((mark.line[:, :2] + rest.pop(pair).line[:, :2]) / 2, _style("double")))
+                lines.append(_StyledLine((mark.line[:, :2] + rest.pop(pair).line[:, :2]) / 2, _one_hot_style("double")))
             group = rest
     return lines
 
 
-def _pavement_rings(network: RoadNetwork, policy: TruthPolicy) -> list[_Line]:
+def _trace_pavement(network: RoadNetwork, policy: GroundTruthPolicy) -> list[_StyledLine]:
     """The outline of the union of all paved lanes and shoulders."""
     shapely = _shapely()
     paved = [lane for lane in network.lanes if lane.kind in ROADWAY and lane.width_m.max() > 0.05]
-    strips = shapely.buffer(_grounds(paved), 0.1, join_style="mitre")
+    strips = shapely.buffer(_lane_polygons(paved), 0.1, join_style="mitre")
     ground = shapely.buffer(shapely.union_all(strips), -0.1, join_style="mitre")
     found = []
     for part in shapely.get_parts(ground):
-        if part.area < policy.min_island_m2:
+        if part.area < policy.min_island_area_m2:
             continue
-        islands = [ring for ring in part.interiors if shapely.Polygon(ring).area >= policy.min_island_m2]
-        found += [_Line(shapely.get_coordinates(ring), _style("none")) for ring in (part.exterior, *islands)]
+        islands = [ring for ring in part.interiors if shapely.Polygon(ring).area >= policy.min_island_area_m2]
+        found += [
+            _StyledLine(shapely.get_coordinates(ring), _one_hot_style("none")) for ring in (part.exterior, *islands)
+        ]
     return found
 
 
-def _without_map_ends(lines: Sequence[_Line], network: RoadNetwork) -> list[_Line]:
+def _drop_map_ends(lines: Sequence[_StyledLine], network: RoadNetwork) -> list[_StyledLine]:
     """Edges without those that cross a lane's end where nothing follows: there the map ends, not the road."""
     shapely = _shapely()
     caps = []
@@ -263,29 +266,31 @@ def _without_map_ends(lines: Sequence[_Line], network: RoadNetwork) -> list[_Lin
     heading = np.array([_angle(cap[1:] - cap[:1])[0] for cap in caps])
     kept = []
     for line in lines:
-        points = _dense(line.points, _STEP_M)
+        points = _densify(line.points, _STEP_M)
         probe, bar = tree.query(shapely.points(points), predicate="dwithin", distance=_CAP_M)
         turn = np.abs(_angle(np.gradient(points, axis=0))[probe] - heading[bar]) % np.pi
         across = np.zeros(len(points), bool)
         across[probe[np.minimum(turn, np.pi - turn) < np.pi / 4]] = True
-        kept += [_Line(part, line.style) for part in _runs(points, ~across)] if across.any() else [line]
+        kept += [_StyledLine(part, line.style) for part in _split_runs(points, ~across)] if across.any() else [line]
     return kept
 
 
-def _beside_lanes(lines: Sequence[_Line], network: RoadNetwork, policy: TruthPolicy) -> list[_Line]:
+def _keep_near_lanes(
+    lines: Sequence[_StyledLine], network: RoadNetwork, policy: GroundTruthPolicy
+) -> list[_StyledLine]:
     """Edges near drivable lanes, without what runs through the middle of one: a record's end, not an edge."""
     shapely = _shapely()
-    lanes = _grounds([lane for lane in network.lanes if lane.is_drivable])
-    near = shapely.union_all(shapely.buffer(lanes, policy.beside_m))
-    return _outside(lines, shapely.union_all(shapely.buffer(lanes, -1.0)), near)
+    lanes = _lane_polygons([lane for lane in network.lanes if lane.is_drivable])
+    near = shapely.union_all(shapely.buffer(lanes, policy.max_lane_distance_m))
+    return _clip_outside(lines, shapely.union_all(shapely.buffer(lanes, -1.0)), near)
 
 
-def _crossings(network: RoadNetwork, policy: TruthPolicy) -> list[_Line]:
+def _select_crossings(network: RoadNetwork, policy: GroundTruthPolicy) -> list[_StyledLine]:
     """Rings of crossings, the smaller of two that share half of its ground left out."""
     shapely = _shapely()
     rings = [shapely.make_valid(shapely.Polygon(crossing.polygon[:, :2])) for crossing in network.crossings]
     parts = [part for ring in rings for part in shapely.get_parts(ring) if part.geom_type == "Polygon"]
-    parts = [shapely.simplify(part, _SIMPLIFY_M) for part in parts if part.area >= policy.min_crossing_m2]
+    parts = [shapely.simplify(part, _SIMPLIFY_M) for part in parts if part.area >= policy.min_crossing_area_m2]
     parts.sort(key=lambda part: (-part.area, *part.bounds))
     kept = []
     for part in parts:
@@ -295,15 +300,15 @@ def _crossings(network: RoadNetwork, policy: TruthPolicy) -> list[_Line]:
     for part in kept:
         ring = shapely.get_coordinates(part.exterior)[:-1]
         ring = ring if shapely.is_ccw(part.exterior) else ring[::-1]
-        found.append(_Line(np.roll(ring, -int(np.lexsort(ring.T[::-1])[0]), axis=0), _style("none")))
+        found.append(_StyledLine(np.roll(ring, -int(np.lexsort(ring.T[::-1])[0]), axis=0), _one_hot_style("none")))
     return found
 
 
-def _elements(found: Sequence[tuple[str, _Line]]) -> MapElements:
+def _to_elements(lines_by_kind: Sequence[tuple[str, _StyledLine]]) -> MapElements:
     """Lines and rings as a table in canonical order and direction."""
     shapely = _shapely()
     rows = []
-    for kind, line in found:
+    for kind, line in lines_by_kind:
         points = line.points
         if kind != "crossing":
             points = shapely.get_coordinates(shapely.LineString(points).simplify(_SIMPLIFY_M))
@@ -322,7 +327,9 @@ def _elements(found: Sequence[tuple[str, _Line]]) -> MapElements:
     )
 
 
-def _outside(lines: Sequence[_Line], region: BaseGeometry, within: BaseGeometry | None = None) -> list[_Line]:
+def _clip_outside(
+    lines: Sequence[_StyledLine], region: BaseGeometry, within: BaseGeometry | None = None
+) -> list[_StyledLine]:
     """What of the lines lies outside a region, and inside another."""
     shapely = _shapely()
     shapely.prepare(region)
@@ -335,15 +342,15 @@ def _outside(lines: Sequence[_Line], region: BaseGeometry, within: BaseGeometry 
             kept.append(line)
             continue
         parts = shapely.get_parts(shapely.line_merge(rest))
-        kept += [_Line(shapely.get_coordinates(part), line.style) for part in parts if part.length > 0.0]
+        kept += [_StyledLine(shapely.get_coordinates(part), line.style) for part in parts if part.length > 0.0]
     return kept
 
 
-def _pieces(line: _Line, region: BaseGeometry, least_m: float) -> list[_Line]:
-    return [_Line(part, line.style) for part in _split(line.points, region, least_m)]
+def _split_line(line: _StyledLine, region: BaseGeometry, min_length_m: float) -> list[_StyledLine]:
+    return [_StyledLine(part, line.style) for part in _split(line.points, region, min_length_m)]
 
 
-def _split(points: Array, region: BaseGeometry, least_m: float) -> list[Array]:
+def _split(points: Array, region: BaseGeometry, min_length_m: float) -> list[Array]:
     """The stretches of a line outside and inside a region, in the line's order, none cut shorter than least_m."""
     shapely = _shapely()
     shape = shapely.LineString(points)
@@ -358,7 +365,7 @@ def _split(points: Array, region: BaseGeometry, least_m: float) -> list[Array]:
         along = np.mod(along - along.min(), shape.length)
     kept = [0.0]
     for s in np.unique(along.round(6)).tolist():
-        if s - kept[-1] >= least_m and shape.length - s >= least_m:
+        if s - kept[-1] >= min_length_m and shape.length - s >= min_length_m:
             kept.append(s)
     return _cut_along(points, np.array(kept[1:]))
 
@@ -374,7 +381,7 @@ def _cut_along(points: Array, along: Array) -> list[Array]:
     return parts
 
 
-def _dense(points: Array, step_m: float) -> Array:
+def _densify(points: Array, step_m: float) -> Array:
     """The line with points at most a step apart; its own points stay."""
     length = np.linalg.norm(np.diff(points, axis=0), axis=1)
     station = np.concatenate(([0.0], np.cumsum(length)))
@@ -384,7 +391,7 @@ def _dense(points: Array, step_m: float) -> Array:
     return np.stack([np.interp(s, station, points[:, axis]) for axis in (0, 1)], 1)
 
 
-def _runs(points: Array, keep: NDArray[np.bool_]) -> list[Array]:
+def _split_runs(points: Array, keep: NDArray[np.bool_]) -> list[Array]:
     """Stretches of two or more points that are kept."""
     edge = np.flatnonzero(np.diff(np.concatenate(([False], keep, [False])).astype(np.int8)))
     return [points[a:b] for a, b in zip(edge[::2], edge[1::2]) if b - a >= 2]
@@ -398,7 +405,7 @@ def _outward(points: Array) -> complex:
     return complex(*(step / max(np.linalg.norm(step), 1e-9)))
 
 
-def _ends(line: _Line) -> tuple[float, ...]:
+def _ends(line: _StyledLine) -> tuple[float, ...]:
     return (*line.points[0].tolist(), *line.points[-1].tolist(), float(len(line.points)))
 
 
@@ -406,14 +413,14 @@ def _angle(step: Array) -> Array:
     return np.arctan2(step[:, 1], step[:, 0])
 
 
-def _grounds(lanes: Sequence[Lane]) -> NDArray[np.object_]:
+def _lane_polygons(lanes: Sequence[Lane]) -> NDArray[np.object_]:
     """The lanes' surfaces as valid polygons."""
     shapely = _shapely()
     rings = [np.concatenate((lane.left, lane.right[::-1]))[:, :2] for lane in lanes if len(lane.left) > 1]
     return shapely.make_valid(np.array([shapely.Polygon(ring) for ring in rings], object))
 
 
-def _style(name: str) -> Array:
+def _one_hot_style(name: str) -> Array:
     return np.eye(len(STYLES))[STYLES.index(name)]
 
 
@@ -425,4 +432,4 @@ def _shapely() -> Any:
     return shapely
 
 
-__all__ = ["TruthPolicy", "cut_elements", "junction_region", "map_truth"]
+__all__ = ["GroundTruthPolicy", "build_ground_truth_map", "compute_junction_region", "cut_elements"]

@@ -16,23 +16,23 @@ Array = NDArray[np.float64]
 _STEP_M = 1.0
 
 
-def equal_stations(left: Array, right: Array, step_m: float = _STEP_M) -> tuple[Array, Array]:
+def resample_borders(left: Array, right: Array, step_m: float = _STEP_M) -> tuple[Array, Array]:
     """Two borders (A, 3) and (B, 3) as (M, 3) each, row i of both at the same share of their lengths."""
     longest = max(_lengths(left)[-1], _lengths(right)[-1])
     share = np.linspace(0.0, 1.0, max(2, int(np.ceil(longest / step_m)) + 1))
-    return _at_share(left, share), _at_share(right, share)
+    return _interpolate_at(left, share), _interpolate_at(right, share)
 
 
 def _lengths(line: Array) -> Array:
     return np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1))))
 
 
-def _at_share(line: Array, share: Array) -> Array:
+def _interpolate_at(line: Array, fractions: Array) -> Array:
     along = _lengths(line)
-    return np.stack([np.interp(share * along[-1], along, line[:, axis]) for axis in range(3)], 1)
+    return np.stack([np.interp(fractions * along[-1], along, line[:, axis]) for axis in range(3)], 1)
 
 
-def components(count: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
+def connected_components(count: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
     """(count,) the smallest member of each node's component; pairs: (E, 2) edges."""
     label = np.arange(count)
 
@@ -48,7 +48,7 @@ def components(count: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.array([root(k) for k in range(count)], np.int64)
 
 
-def link_neighbors(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
+def complete_lane_links(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
     """The lanes with predecessors completed by others' successors, and the reverse: files name some links on one side only."""
     before = [set(lane.predecessors) for lane in lanes]
     after = [set(lane.successors) for lane in lanes]
@@ -63,7 +63,7 @@ def link_neighbors(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
     )
 
 
-def junctions_of_lanes(lanes: Sequence[Lane]) -> tuple[Junction, ...]:
+def build_junctions(lanes: Sequence[Lane]) -> tuple[Junction, ...]:
     """Junctions from the lanes' junction ids, with the extent of their drivable lanes."""
     members: dict[str, list[Lane]] = {}
     for lane in lanes:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.maps.roads.surface import Surface
+from manyeyes.maps.roads.surface import RoadSurface
 
 Array = NDArray[np.float64]
 
@@ -141,15 +141,15 @@ class RoadNetwork:
     xodr: bytes = field(default=b"", repr=False)
 
     @cached_property
-    def surface(self) -> Surface:
+    def surface(self) -> RoadSurface:
         """Every lane's surface, the heights of which :meth:`height` reads."""
-        return Surface.of_strips([lane.left for lane in self.lanes], [lane.right for lane in self.lanes])
+        return RoadSurface.of_strips([lane.left for lane in self.lanes], [lane.right for lane in self.lanes])
 
     @cached_property
-    def drivable_surface(self) -> Surface:
+    def drivable_surface(self) -> RoadSurface:
         """The surface of the drivable lanes; triangle owners index ``[lane for lane in lanes if lane.is_drivable]``."""
         drivable = [lane for lane in self.lanes if lane.is_drivable]
-        return Surface.of_strips([lane.left for lane in drivable], [lane.right for lane in drivable])
+        return RoadSurface.of_strips([lane.left for lane in drivable], [lane.right for lane in drivable])
 
     def height(self, xy: Array, near_z: Array | float | None = None) -> Array:
         """(N,) road height under points (N, 2); off the road, that of the nearest lane.

@@ -36,24 +36,24 @@ class _Buckets(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class RoadSurface:
     """T triangles over the ground plane.
 
-    triangles: (T, 3, 3) metres; owner: (T,) int64, the strip each came from. x0, y0, columns, rows: the buckets' lattice,
-    BUCKET_M wide; bucket b holds the triangles ``member[first[b]:first[b + 1]]`` whose bounding boxes touch it.
+    triangles: (T, 3, 3) metres; strip_index: (T,) int64, the strip each came from. x0, y0, columns, rows: the buckets' lattice,
+    BUCKET_M wide; bucket b holds the triangles ``triangle_index[first[b]:first[b + 1]]`` whose bounding boxes touch it.
     """
 
     triangles: Array
-    owner: NDArray[np.int64]
+    strip_index: NDArray[np.int64]
     x0: float
     y0: float
     columns: int
     rows: int
-    first: NDArray[np.int64]
-    member: NDArray[np.int64]
+    bucket_offsets: NDArray[np.int64]
+    triangle_index: NDArray[np.int64]
 
     @classmethod
-    def of_strips(cls, left: Sequence[Array], right: Sequence[Array]) -> Surface:
+    def of_strips(cls, left: Sequence[Array], right: Sequence[Array]) -> RoadSurface:
         """From strips given by two borders of equal length each, (M, 3) and (M, 3)."""
         parts, owners = [np.zeros((0, 3, 3))], [np.zeros(0, np.int64)]
         for k, (a, b) in enumerate(zip(left, right)):
@@ -84,19 +84,19 @@ class Surface:
         """(N,) metres from points (N, 2) to the surface in plan; 0 on it, inf when there is none."""
         return self._query(xy, None).distance
 
-    def owner_at(self, xy: Array, near_z: Array | float | None = None) -> NDArray[np.int64]:
+    def strip_at(self, xy: Array, near_z: Array | float | None = None) -> NDArray[np.int64]:
         """(N,) the strip of the triangle that :meth:`height` reads; -1 when there is none."""
         index = self._query(xy, near_z).triangle
-        return np.where(index >= 0, self.owner[np.maximum(index, 0)], -1) if len(self.owner) else index
+        return np.where(index >= 0, self.strip_index[np.maximum(index, 0)], -1) if len(self.strip_index) else index
 
-    def spread(self, xy: Array) -> Array:
+    def height_range(self, xy: Array) -> Array:
         """(N,) metres between the lowest and the highest triangle that cover each point; 0 where one or none does."""
-        return _spread(np.ascontiguousarray(xy, np.float64), self._buckets)
+        return _height_range(np.ascontiguousarray(xy, np.float64), self._buckets)
 
     @property
     def _buckets(self) -> _Buckets:
         lattice = _Lattice(self.x0, self.y0, self.columns, self.rows)
-        return _Buckets(self.triangles, lattice, self.first, self.member)
+        return _Buckets(self.triangles, lattice, self.bucket_offsets, self.triangle_index)
 
     def _query(self, xy: Array, near_z: Array | float | None) -> _SurfacePoints:
         points = np.ascontiguousarray(xy, np.float64)
@@ -126,15 +126,15 @@ def _fill_buckets(triangles: F64x3, lattice: _Lattice) -> tuple[I64x1, I64x1]:  
         for r in range(span[t, 2], span[t, 3] + 1):
             for c in range(span[t, 0], span[t, 1] + 1):
                 count[r * columns + c + 1] += 1
-    first = np.cumsum(count)
-    cursor = first[:-1].copy()
-    member = np.empty(first[-1], np.int64)
+    bucket_offsets = np.cumsum(count)
+    cursor = bucket_offsets[:-1].copy()
+    member = np.empty(bucket_offsets[-1], np.int64)
     for t in range(len(triangles)):
         for r in range(span[t, 2], span[t, 3] + 1):
             for c in range(span[t, 0], span[t, 1] + 1):
                 member[cursor[r * columns + c]] = t
                 cursor[r * columns + c] += 1
-    return first, member
+    return bucket_offsets, member
 
 
 @njit(cache=True)
@@ -169,7 +169,7 @@ def _edge_nearest(corner: F64x2, x: float, y: float) -> tuple[float, float]:  # 
 @njit(cache=True)
 def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _SurfacePoints:  # pragma: no cover - compiled
     """Height, distance and triangle at each point: the own bucket first, then rings of buckets until none can be nearer."""
-    triangles, (x0, y0, columns, rows), first, member = buckets
+    triangles, (x0, y0, columns, rows), bucket_offsets, member = buckets
     n = len(xy)
     height, distance, index = np.zeros(n), np.full(n, np.inf), np.full(n, -1, np.int64)
     if len(triangles) == 0:
@@ -185,7 +185,7 @@ def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _SurfacePoints:  # pr
                 c = max(0, column - ring) if whole else column - ring
                 while c <= min(columns - 1, column + ring):
                     if c >= 0:
-                        for m in range(first[r * columns + c], first[r * columns + c + 1]):
+                        for m in range(bucket_offsets[r * columns + c], bucket_offsets[r * columns + c + 1]):
                             t = member[m]
                             inside, z = _plane_z(triangles[t], x, y)
                             if inside:
@@ -207,9 +207,9 @@ def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _SurfacePoints:  # pr
 
 
 @njit(cache=True)
-def _spread(xy: F64x2, buckets: _Buckets) -> F64x1:  # pragma: no cover - compiled
+def _height_range(xy: F64x2, buckets: _Buckets) -> F64x1:  # pragma: no cover - compiled
     """(N,) metres between the lowest and the highest triangle that cover each point; 0 where one or none does."""
-    triangles, (x0, y0, columns, rows), first, member = buckets
+    triangles, (x0, y0, columns, rows), bucket_offsets, member = buckets
     out = np.zeros(len(xy))
     if len(triangles) == 0:
         return out
@@ -218,7 +218,7 @@ def _spread(xy: F64x2, buckets: _Buckets) -> F64x1:  # pragma: no cover - compil
         if not (0 <= column < columns and 0 <= row < rows):
             continue
         low, high = np.inf, -np.inf
-        for m in range(first[row * columns + column], first[row * columns + column + 1]):
+        for m in range(bucket_offsets[row * columns + column], bucket_offsets[row * columns + column + 1]):
             inside, z = _plane_z(triangles[member[m]], xy[i, 0], xy[i, 1])
             if inside:
                 low, high = min(low, z), max(high, z)

@@ -23,7 +23,7 @@ _READ_ONLY = "!"
 def save_columns(path: Path, value: object) -> None:
     """Write a value to an uncompressed ``.npz``: whole, or not there."""
     arrays: dict[str, np.ndarray] = {}
-    _take_apart(value, "", arrays)
+    _flatten(value, "", arrays)
     with atomic_replace(path, durable=False) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)  # pyright: ignore[reportArgumentType] - arrays have names that are no parameters
 
@@ -32,28 +32,28 @@ def load_columns(path: Path, kind: type[T]) -> T | None:
     """The value of a file that :func:`save_columns` wrote; None where there is no such file, or a damaged one."""
     try:
         with np.load(path, allow_pickle=False) as stored:
-            return _put_together(kind, "", {name: stored[name] for name in stored.files})
+            return _unflatten(kind, "", {name: stored[name] for name in stored.files})
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
 
 
-def _take_apart(value: object, prefix: str, arrays: dict[str, np.ndarray]) -> None:
+def _flatten(value: object, prefix: str, arrays: dict[str, np.ndarray]) -> None:
     for field in _field_names(type(value)):
         item = getattr(value, field)
         if _field_names(type(item)):
-            _take_apart(item, f"{prefix}{field}.", arrays)
+            _flatten(item, f"{prefix}{field}.", arrays)
         else:
             array = np.array(item, dtype=np.str_) if isinstance(item, tuple) else np.asarray(item)
             arrays[prefix + field + ("" if array.flags.writeable else _READ_ONLY)] = array
 
 
-def _put_together(kind: type[T], prefix: str, arrays: dict[str, np.ndarray]) -> T:
+def _unflatten(kind: type[T], prefix: str, arrays: dict[str, np.ndarray]) -> T:
     hints = get_type_hints(kind)
     made: dict[str, Any] = {}
     for field in _field_names(kind):
         hint = hints[field]
         if isinstance(hint, type) and _field_names(hint):
-            made[field] = _put_together(hint, f"{prefix}{field}.", arrays)
+            made[field] = _unflatten(hint, f"{prefix}{field}.", arrays)
             continue
         name = prefix + field
         array = arrays[name if name in arrays else name + _READ_ONLY]

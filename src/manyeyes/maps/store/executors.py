@@ -25,7 +25,7 @@ R = TypeVar("R")
 Progress = Callable[[int, int], None]
 
 
-class Runner(Protocol):
+class ExecutorSession(Protocol):
     """An engine that is up: runs a function over blocks and yields (index of the block, result) as they finish."""
 
     def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
@@ -36,17 +36,17 @@ class Runner(Protocol):
 class Executor(Protocol):
     """Where blocks may run; opening it starts the engine, which then serves any number of calls."""
 
-    def open(self) -> AbstractContextManager[Runner]:
+    def open(self) -> AbstractContextManager[ExecutorSession]:
         """The engine, up until the context ends."""
         ...
 
 
 @dataclass(frozen=True)
-class Inline:
+class InlineExecutor:
     """One block after the other in this process: the slow twin of the others, and what a debugger wants."""
 
     @contextmanager
-    def open(self) -> Iterator[Runner]:
+    def open(self) -> Iterator[ExecutorSession]:
         """Nothing is started."""
         yield self
 
@@ -57,63 +57,63 @@ class Inline:
 
 
 @dataclass(frozen=True)
-class ProcessPool:
+class ProcessExecutor:
     """Blocks over processes of this machine; ``workers`` None: one a core.
 
     Workers are never forks of this process, whose threads of numba or torch would hang them: they are forked from a clean
     server that has imported this package once, or started afresh where the system has no such server.
     A script that calls this needs the usual ``if __name__ == "__main__":``.
-    At most ``ahead`` blocks a worker wait in the queue, so that large blocks are not all pickled at once.
+    At most ``queued_per_worker`` blocks a worker wait in the queue, so that large blocks are not all pickled at once.
     """
 
     workers: int | None = None
-    ahead: int = 2
+    queued_per_worker: int = 2
 
     @contextmanager
-    def open(self) -> Iterator[Runner]:
+    def open(self) -> Iterator[ExecutorSession]:
         """Start the pool; it ends with the context, at once if that ends with an exception."""
         clean = "forkserver" in multiprocessing.get_all_start_methods()
         context = multiprocessing.get_context("forkserver" if clean else "spawn")
         if clean:
             context.set_forkserver_preload([__name__])
-        workers = self.workers or _cores()
+        workers = self.workers or _available_cores()
         with ProcessPoolExecutor(workers, mp_context=context) as pool:
             try:
-                yield _Pool(pool, workers * (1 + self.ahead))
+                yield _ProcessSession(pool, workers * (1 + self.queued_per_worker))
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
 
 
 @dataclass(frozen=True)
-class _Pool:
+class _ProcessSession:
     """A process pool that is up, with the number of blocks that may be under way."""
 
     pool: ProcessPoolExecutor
-    window: int
+    max_in_flight: int
 
     def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
         """Every block once, as they finish."""
-        under_way: dict[Future[R], int] = {}
+        in_flight: dict[Future[R], int] = {}
         next_block = 0
-        while next_block < len(blocks) or under_way:
-            while next_block < len(blocks) and len(under_way) < self.window:
-                under_way[self.pool.submit(fn, blocks[next_block])] = next_block
+        while next_block < len(blocks) or in_flight:
+            while next_block < len(blocks) and len(in_flight) < self.max_in_flight:
+                in_flight[self.pool.submit(fn, blocks[next_block])] = next_block
                 next_block += 1
-            done, _ = wait(under_way, return_when=FIRST_COMPLETED)
+            done, _ = wait(in_flight, return_when=FIRST_COMPLETED)
             for future in done:
-                yield under_way.pop(future), future.result()
+                yield in_flight.pop(future), future.result()
 
 
 @dataclass(frozen=True)
-class Dask:
+class DaskExecutor:
     """Blocks over a Dask cluster: ``address`` of a scheduler, or None for one on this machine with ``workers`` processes."""
 
     address: str | None = None
     workers: int | None = None
 
     @contextmanager
-    def open(self) -> Iterator[Runner]:
+    def open(self) -> Iterator[ExecutorSession]:
         """Connect, or start a cluster that ends with the context."""
         try:
             from dask.distributed import Client, LocalCluster
@@ -121,15 +121,15 @@ class Dask:
             raise MissingExtraError("dask", "Running on a Dask cluster") from None
         if self.address is not None:
             with Client(self.address) as client:
-                yield _DaskClient(client)
+                yield _DaskSession(client)
             return
-        local: dict[str, Any] = {"n_workers": self.workers or _cores(), "dashboard_address": None}
+        local: dict[str, Any] = {"n_workers": self.workers or _available_cores(), "dashboard_address": None}
         with LocalCluster(processes=True, threads_per_worker=1, **local) as cluster, Client(cluster) as client:
-            yield _DaskClient(client)
+            yield _DaskSession(client)
 
 
 @dataclass(frozen=True)
-class _DaskClient:
+class _DaskSession:
     """A connection to a Dask scheduler."""
 
     client: Any
@@ -146,7 +146,7 @@ class _DaskClient:
 
 
 @dataclass(frozen=True)
-class Ray:
+class RayExecutor:
     """Blocks over a Ray cluster: ``address`` of a head node, or None for one on this machine with ``workers`` processes.
 
     A cluster that this process is already connected to is used as it is and left running.
@@ -156,7 +156,7 @@ class Ray:
     workers: int | None = None
 
     @contextmanager
-    def open(self) -> Iterator[Runner]:
+    def open(self) -> Iterator[ExecutorSession]:
         """Connect, or start a cluster that ends with the context."""
         try:
             import ray  # pyright: ignore[reportMissingImports]
@@ -164,17 +164,21 @@ class Ray:
             raise MissingExtraError("ray", "Running on a Ray cluster") from None
         started = not ray.is_initialized()
         if started:
-            local = {"num_cpus": self.workers or _cores(), "include_dashboard": False} if self.address is None else {}
+            local = (
+                {"num_cpus": self.workers or _available_cores(), "include_dashboard": False}
+                if self.address is None
+                else {}
+            )
             ray.init(address=self.address, log_to_driver=False, logging_level=logging.ERROR, **local)
         try:
-            yield _RayClient(ray)
+            yield _RaySession(ray)
         finally:
             if started:
                 ray.shutdown()
 
 
 @dataclass(frozen=True)
-class _RayClient:
+class _RaySession:
     """The ray module, connected."""
 
     ray: Any
@@ -193,38 +197,38 @@ class _RayClient:
 EXECUTORS: tuple[str, ...] = ("inline", "process", "dask", "ray")
 
 
-def named_executor(name: str, workers: int | None = None, address: str | None = None) -> Executor:
+def make_executor(name: str, workers: int | None = None, address: str | None = None) -> Executor:
     """The executor of a name from the command line: one of ``EXECUTORS``."""
     if name == "inline":
-        return Inline()
+        return InlineExecutor()
     if name == "process":
-        return ProcessPool(workers)
+        return ProcessExecutor(workers)
     if name == "dask":
-        return Dask(address, workers)
+        return DaskExecutor(address, workers)
     if name == "ray":
-        return Ray(address, workers)
+        return RayExecutor(address, workers)
     raise ConfigError(f"No executor '{name}'; choose one of {', '.join(EXECUTORS)}.")
 
 
 def map_blocks(
-    fn: Callable[[B], R], blocks: Sequence[B], runner: Runner | None = None, progress: Progress | None = None
+    fn: Callable[[B], R], blocks: Sequence[B], session: ExecutorSession | None = None, progress: Progress | None = None
 ) -> list[R]:
     """``[fn(block) for block in blocks]`` on an engine that is up (a process pool for this call if None), in the blocks' order.
 
     ``fn`` and the blocks must pickle; ``fn`` must be pure: an engine may run a block again on another worker.
     """
-    if runner is None:
-        with ProcessPool(min(_cores(), max(len(blocks), 1))).open() as pool:
+    if session is None:
+        with ProcessExecutor(min(_available_cores(), max(len(blocks), 1))).open() as pool:
             return map_blocks(fn, blocks, pool, progress)
     results: dict[int, R] = {}
-    for index, result in runner.run(fn, blocks):
+    for index, result in session.run(fn, blocks):
         results[index] = result
         if progress is not None:
             progress(len(results), len(blocks))
     return [results[index] for index in range(len(blocks))]
 
 
-def _cores() -> int:
+def _available_cores() -> int:
     """Cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -36,7 +36,7 @@ _SCHEMA = {
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class ActiveObservations:
     """Where O observations stand, ids ascending: (O,) columns; xy: (O, 2) metres; segment: number into ``segments``."""
 
     ids: tuple[str, ...]
@@ -45,14 +45,14 @@ class Standing:
     row_group: Ints
     time_ns: Ints
     xy: Floats
-    reach_m: Floats
+    radius_m: Floats
 
     def __len__(self) -> int:
         return len(self.ids)
 
 
 @dataclass(frozen=True)
-class Indexed:
+class IndexRow:
     """One observation's row of the index."""
 
     id: str
@@ -61,12 +61,12 @@ class Indexed:
     agent: str
     x: float
     y: float
-    reach_m: float
+    radius_m: float
     pass_id: str
 
 
 @dataclass(frozen=True)
-class RefusedEntry:
+class InvalidEntry:
     """One row of a segment that is outside the limits: its number in the segment, and why."""
 
     id: str
@@ -76,7 +76,7 @@ class RefusedEntry:
     reason: str
 
 
-class Catalogue:
+class LogIndex:
     """The index of one log; one writer at a time, any number of readers."""
 
     def __init__(self, path: Path) -> None:
@@ -115,32 +115,32 @@ class Catalogue:
         with self._open() as db:
             return {name for (name,) in db.execute("SELECT name FROM entries")}
 
-    def known(self, ids: Iterable[str]) -> set[str]:
+    def filter_known(self, ids: Iterable[str]) -> set[str]:
         """Which of these observations are indexed, retracted and refused ones too."""
-        return self._among(
+        return self._filter_ids(
             ids, "SELECT 1 FROM observations WHERE id = ?1 UNION ALL SELECT 1 FROM refused WHERE id = ?1"
         )
 
-    def retracted(self, ids: Iterable[str]) -> set[str]:
+    def filter_retracted(self, ids: Iterable[str]) -> set[str]:
         """Which of these observations are retracted."""
-        return self._among(ids, "SELECT 1 FROM retracted WHERE id = ?1")
+        return self._filter_ids(ids, "SELECT 1 FROM retracted WHERE id = ?1")
 
-    def _among(self, ids: Iterable[str], query: str) -> set[str]:
+    def _filter_ids(self, ids: Iterable[str], query: str) -> set[str]:
         with self._open() as db:
             return {name for name in ids if db.execute(query, (bytes.fromhex(name),)).fetchone()}
 
-    def between(self, low: str, high: str) -> list[str]:
+    def ids_between(self, low: str, high: str) -> list[str]:
         """Ids of indexed and refused observations from low to high, ascending."""
         query = "SELECT id FROM observations WHERE id BETWEEN ?1 AND ?2 UNION SELECT id FROM refused WHERE id BETWEEN ?1 AND ?2"
         return self._ids(query, (bytes.fromhex(low), bytes.fromhex(high)))
 
-    def sent_by(self, agent: str | None, pass_id: str | None) -> list[str]:
+    def ids_of_sender(self, agent: str | None, pass_id: str | None) -> list[str]:
         """Ids of indexed and refused observations of an agent, of a pass or of both, ascending; None: of any."""
         chosen = "(?1 IS NULL OR agent = ?1) AND (?2 IS NULL OR pass_id = ?2)"
         query = f"SELECT id FROM observations WHERE {chosen} UNION SELECT id FROM refused WHERE {chosen}"
         return self._ids(query, (agent, pass_id))
 
-    def names(self, column: str) -> list[str]:
+    def distinct_values(self, column: str) -> list[str]:
         """All values of the column ``agent`` or ``pass_id``, ascending."""
         with self._open() as db:
             rows = db.execute(f"SELECT {column} FROM observations UNION SELECT {column} FROM refused ORDER BY 1")
@@ -150,12 +150,12 @@ class Catalogue:
         with self._open() as db:
             return sorted(name.hex() for (name,) in db.execute(query, values))
 
-    def add_segment(self, name: str, rows: Iterable[Indexed], refused: Iterable[RefusedEntry] = ()) -> None:
+    def add_segment(self, name: str, rows: Iterable[IndexRow], invalid: Iterable[InvalidEntry] = ()) -> None:
         """Index a segment of observations, and its rows that are none; one in two segments keeps its first place."""
         values = [
-            (bytes.fromhex(r.id), name, r.row_group, r.time_ns, r.agent, r.x, r.y, r.reach_m, r.pass_id) for r in rows
+            (bytes.fromhex(r.id), name, r.row_group, r.time_ns, r.agent, r.x, r.y, r.radius_m, r.pass_id) for r in rows
         ]
-        outside = list(refused)
+        outside = list(invalid)
         with self._open() as db:
             db.executemany("INSERT OR IGNORE INTO observations VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
             db.executemany(
@@ -174,19 +174,19 @@ class Catalogue:
             db.executemany("INSERT OR IGNORE INTO retracted VALUES (?, ?)", values)
             db.execute("INSERT OR REPLACE INTO entries VALUES (?, ?)", (name, len(values)))
 
-    def add_quarantine(self, name: str, rows: Iterable[tuple[str, int, int, str]]) -> None:
+    def add_rejected(self, name: str, rows: Iterable[tuple[str, int, int, str]]) -> None:
         """Index what an ingest put aside: file, row, count, reason."""
         values = [(name, *row) for row in rows]
         with self._open() as db:
             db.executemany("INSERT INTO quarantine VALUES (?, ?, ?, ?, ?)", values)
             db.execute("INSERT OR REPLACE INTO entries VALUES (?, ?)", (name, len(values)))
 
-    def quarantined(self) -> list[tuple[str, int, int, str]]:
+    def list_rejected(self) -> list[tuple[str, int, int, str]]:
         """Everything that was put aside, in the order of the log."""
         with self._open() as db:
             return list(db.execute("SELECT file, row, count, reason FROM quarantine ORDER BY entry, file, row"))
 
-    def standing(self) -> Standing:
+    def active_observations(self) -> ActiveObservations:
         """All observations that count."""
         with self._open() as db:
             rows = db.execute(
@@ -195,14 +195,14 @@ class Catalogue:
             ).fetchall()
         segments = tuple(sorted({row[1] for row in rows}))
         number = {name: k for k, name in enumerate(segments)}
-        return Standing(
+        return ActiveObservations(
             ids=tuple(row[0].hex() for row in rows),
             segments=segments,
             segment=np.array([number[row[1]] for row in rows], np.int64),
             row_group=np.array([row[2] for row in rows], np.int64),
             time_ns=np.array([row[3] for row in rows], np.int64),
             xy=np.array([row[4:6] for row in rows], np.float64).reshape(-1, 2),
-            reach_m=np.array([row[6] for row in rows], np.float64),
+            radius_m=np.array([row[6] for row in rows], np.float64),
         )
 
 

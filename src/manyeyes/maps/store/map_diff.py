@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from manyeyes._io import atomic_write
 from manyeyes._jit import F64x2, njit
 from manyeyes.datatypes import MissingExtraError
-from manyeyes.maps.elements.vector_map import VectorMap, element_digests
-from manyeyes.maps.formats.attributes import hex_ids
+from manyeyes.maps.elements.vector_map import VectorMap, compute_element_digests
+from manyeyes.maps.formats.attributes import to_hex_ids
 from manyeyes.maps.formats.geoparquet import MapFileError, read_map, write_map
-from manyeyes.maps.store.observation_log import tile_of
+from manyeyes.maps.store.observation_log import tile_indices
 
 Ints = NDArray[np.int64]
 
-_NEAR_M = 1.0
-_SHARE = 0.5
+_MATCH_RADIUS_M = 1.0
+_MIN_FRACTION = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,60 +43,60 @@ class MapDelta:
     @property
     def modified(self) -> tuple[str, ...]:
         """Ids of elements that are other than before, ascending."""
-        return tuple(sorted(set(hex_ids(self.changed.id)) - set(self.added)))
+        return tuple(sorted(set(to_hex_ids(self.changed.id)) - set(self.added)))
 
     def by_tile(self) -> list[tuple[tuple[int, int], int, int, int]]:
         """(tile, added, modified, deleted) of every tile where anything changed, by tile."""
         new = set(self.added)
-        tiles = [(int(x), int(y)) for x, y in home_tiles(self.changed)]
-        names = hex_ids(self.changed.id)
+        tiles = [(int(x), int(y)) for x, y in compute_home_tiles(self.changed)]
+        names = to_hex_ids(self.changed.id)
         add = Counter(t for t, name in zip(tiles, names) if name in new)
         change = Counter(t for t, name in zip(tiles, names) if name not in new)
         gone = Counter((int(x), int(y)) for x, y in self.deleted_tiles)
         return [(t, add[t], change[t], gone[t]) for t in sorted({*add, *change, *gone})]
 
 
-def home_tiles(vector_map: VectorMap) -> Ints:
+def compute_home_tiles(vector_map: VectorMap) -> Ints:
     """(N, 2) the tile that each element is stored in: that of its canonical start, the lesser end or a ring's least point."""
     e = vector_map.elements
     if not len(e):
         return np.zeros((0, 2), np.int64)
-    head, tail = e.points[e.first[:-1]], e.points[e.first[1:] - 1]
+    head, tail = e.points[e.offsets[:-1]], e.points[e.offsets[1:] - 1]
     later = (tail[:, 0] < head[:, 0]) | ((tail[:, 0] == head[:, 0]) & (tail[:, 1] < head[:, 1]))
     start = np.where(later[:, None], tail, head)
     for row in np.flatnonzero(e.closed).tolist():
         ring = e.polyline(row)
         start[row] = ring[np.lexsort((ring[:, 1], ring[:, 0]))[0]]
-    return tile_of(start)
+    return tile_indices(start)
 
 
-def delta_between(before: VectorMap, after: VectorMap) -> MapDelta:
+def compute_delta(before: VectorMap, after: VectorMap) -> MapDelta:
     """What to add, modify and delete to come from one map to the other; equal to 1 cm, in one state, is unchanged."""
-    old, new = hex_ids(before.id), hex_ids(after.id)
-    was = dict(zip(old, element_digests(before.elements, before.state, 1.0).tolist()))
-    now = dict(zip(new, element_digests(after.elements, after.state, 1.0).tolist()))
-    rows = [k for k, name in enumerate(new) if was.get(name) != now[name]]
+    old, new = to_hex_ids(before.id), to_hex_ids(after.id)
+    old_digests = dict(zip(old, compute_element_digests(before.elements, before.state, 1.0).tolist()))
+    new_digests = dict(zip(new, compute_element_digests(after.elements, after.state, 1.0).tolist()))
+    rows = [k for k, name in enumerate(new) if old_digests.get(name) != new_digests[name]]
     deleted = sorted(set(old) - set(new))
     place = {name: k for k, name in enumerate(old)}
-    gone = np.array([place[name] for name in deleted], np.int64)
+    deleted_rows = np.array([place[name] for name in deleted], np.int64)
     return MapDelta(
         changed=after.take(np.array(rows, np.int64)),
         added=tuple(sorted(set(new) - set(old))),
         deleted=tuple(deleted),
-        deleted_tiles=home_tiles(before)[gone],
+        deleted_tiles=compute_home_tiles(before)[deleted_rows],
     )
 
 
 def apply_delta(before: VectorMap, delta: MapDelta) -> VectorMap:
     """The map after the delta, elements by ascending id; relations between changed and unchanged elements are left out."""
-    drop = {*delta.deleted, *hex_ids(delta.changed.id)}
-    kept = np.array([k for k, name in enumerate(hex_ids(before.id)) if name not in drop], np.int64)
+    drop = {*delta.deleted, *to_hex_ids(delta.changed.id)}
+    kept = np.array([k for k, name in enumerate(to_hex_ids(before.id)) if name not in drop], np.int64)
     after = VectorMap.cat([before.take(kept), delta.changed])
     return after.take(np.lexsort(after.id.T[::-1]))
 
 
 def write_delta(delta: MapDelta, folder: Path) -> None:
-    """Write a delta: ``lines.parquet`` and ``crossings.parquet`` of what changed, then ``delta.json`` with the rest."""
+    """Write a delta: ``summarize_methods.parquet`` and ``crossings.parquet`` of what changed, then ``delta.json`` with the rest."""
     write_map(delta.changed, folder / "lines.parquet", folder / "crossings.parquet")
     tiles = [
         {"x": x, "y": y, "added": added, "modified": modified, "deleted": deleted}
@@ -121,28 +121,28 @@ def read_delta(folder: Path) -> MapDelta:
     return MapDelta(changed, added, deleted, tiles)
 
 
-def with_ids_of(after: VectorMap, before: VectorMap) -> VectorMap:
+def transfer_ids(after: VectorMap, before: VectorMap) -> VectorMap:
     """The map with the ids of the elements of an earlier one that its own continue; the others keep theirs.
 
     Each old element is continued by at most one new one: the largest share of common points first, then the smaller ids.
     """
-    old, new = hex_ids(before.id), hex_ids(after.id)
+    old, new = to_hex_ids(before.id), to_hex_ids(after.id)
     same = set(old) & set(new)
     rows_new = np.array([k for k, name in enumerate(new) if name not in same], np.int64)
     rows_old = np.array([k for k, name in enumerate(old) if name not in same], np.int64)
-    pairs = _overlaps(after, rows_new, before, rows_old)
+    pairs = _find_overlaps(after, rows_new, before, rows_old)
     ids = after.id.copy()
-    given: set[int] = set()
+    assigned: set[int] = set()
     continued: set[int] = set()
     for _, _, _, row, twin in sorted((-share, new[a], old[b], a, b) for share, a, b in pairs):
-        if row not in given and twin not in continued:
-            given.add(row)
+        if row not in assigned and twin not in continued:
+            assigned.add(row)
             continued.add(twin)
             ids[row] = before.id[twin]
     return replace(after, id=ids)
 
 
-def _overlaps(a: VectorMap, rows_a: Ints, b: VectorMap, rows_b: Ints) -> list[tuple[float, int, int]]:
+def _find_overlaps(a: VectorMap, rows_a: Ints, b: VectorMap, rows_b: Ints) -> list[tuple[float, int, int]]:
     """(share, row of a, row of b) of elements of one kind that share at least half of the shorter one's points."""
     if not (len(rows_a) and len(rows_b)):
         return []
@@ -151,10 +151,10 @@ def _overlaps(a: VectorMap, rows_a: Ints, b: VectorMap, rows_b: Ints) -> list[tu
     except ImportError:
         raise MissingExtraError("map", "Comparing maps") from None
     one, other = a.elements.take(rows_a), b.elements.take(rows_b)
-    boxes = shapely.box(*(one.bounds() + (-_NEAR_M, -_NEAR_M, _NEAR_M, _NEAR_M)).T)
+    boxes = shapely.box(*(one.bounds() + (-_MATCH_RADIUS_M, -_MATCH_RADIUS_M, _MATCH_RADIUS_M, _MATCH_RADIUS_M)).T)
     i, k = shapely.STRtree(shapely.box(*other.bounds().T)).query(boxes)
-    alike = one.kind[i] == other.kind[k]
-    i, k = i[alike], k[alike]
+    same_kind = one.kind[i] == other.kind[k]
+    i, k = i[same_kind], k[same_kind]
     length_a, length_b = one.lengths(), other.lengths()
     out = []
     for row, twin in zip(i.tolist(), k.tolist()):
@@ -163,14 +163,14 @@ def _overlaps(a: VectorMap, rows_a: Ints, b: VectorMap, rows_b: Ints) -> list[tu
             shorter, longer = longer, shorter
         line = longer[0].polyline(longer[1])
         line = np.concatenate((line, line[:1])) if longer[0].closed[longer[1]] else line
-        share = float(_near(shorter[0].polyline(shorter[1]), np.ascontiguousarray(line), _NEAR_M))
-        if share >= _SHARE:
+        share = float(_fraction_near(shorter[0].polyline(shorter[1]), np.ascontiguousarray(line), _MATCH_RADIUS_M))
+        if share >= _MIN_FRACTION:
             out.append((share, int(rows_a[row]), int(rows_b[twin])))
     return out
 
 
 @njit(cache=True)
-def _near(points: F64x2, line: F64x2, reach: float) -> float:  # pragma: no cover - compiled
+def _fraction_near(points: F64x2, line: F64x2, radius: float) -> float:  # pragma: no cover - compiled
     """The share of points (K, 2) within reach metres of a polyline (M, 2)."""
     near = 0
     for k in range(len(points)):
@@ -179,7 +179,7 @@ def _near(points: F64x2, line: F64x2, reach: float) -> float:  # pragma: no cove
             px, py = points[k, 0] - line[m, 0], points[k, 1] - line[m, 1]
             square = dx * dx + dy * dy
             along = 0.0 if square == 0.0 else min(max((px * dx + py * dy) / square, 0.0), 1.0)
-            if (px - along * dx) ** 2 + (py - along * dy) ** 2 <= reach * reach:
+            if (px - along * dx) ** 2 + (py - along * dy) ** 2 <= radius * radius:
                 near += 1
                 break
     return near / len(points)

@@ -25,20 +25,20 @@ from numpy.typing import NDArray
 
 from manyeyes._io import atomic_replace, atomic_write, remove_unfinished
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
-from manyeyes.maps.elements.observation import Frame, Observation, shortened
+from manyeyes.maps.elements.observation import MapFrame, Observation, shorten
 from manyeyes.maps.elements.observation_file import (
-    Quarantined,
-    RefusedRow,
+    InvalidRow,
+    RejectedRows,
+    iterate_rows,
     observation_table,
     read_observations,
-    rows_of,
 )
 from manyeyes.maps.elements.observation_limits import LIMITS
-from manyeyes.maps.store.log_index import Catalogue, Indexed, RefusedEntry, Standing
+from manyeyes.maps.store.log_index import ActiveObservations, IndexRow, InvalidEntry, LogIndex
 
 TILE_M = 256.0
 # Observations of a tile stand together, so that reading a tile decodes little else.
-_ROWS_A_GROUP = 128
+_ROW_GROUP_SIZE = 128
 _ID_DIGITS = 32
 
 
@@ -47,60 +47,60 @@ class StoreError(ManyeyesError):
 
 
 @dataclass(frozen=True)
-class Ingested:
+class IngestResult:
     """What one ingest did: observations added, those that were there already, and what was put aside."""
 
-    added: int
-    known: int
-    quarantined: tuple[Quarantined, ...]
+    num_added: int
+    num_known: int
+    rejected: tuple[RejectedRows, ...]
 
 
 class ObservationLog:
     """The log in a folder; frame: of all its poses.
 
-    refused: rows of segments that were found to be outside the limits since this object was made; the catalogue lists all.
+    rejected: rows of segments that were found to be outside the limits since this object was made; the catalogue lists all.
     """
 
-    def __init__(self, folder: Path, frame: Frame) -> None:
+    def __init__(self, folder: Path, frame: MapFrame) -> None:
         self.folder, self.frame = folder, frame
-        self.catalogue = Catalogue(folder.parent / "catalogue.sqlite")
-        self.refused: tuple[Quarantined, ...] = ()
+        self.index = LogIndex(folder.parent / "catalogue.sqlite")
+        self.rejected: tuple[RejectedRows, ...] = ()
 
     def recover(self) -> None:
         """Index entries that a killed writer left without, or all under new limits; the caller holds the lock."""
         self.folder.mkdir(parents=True, exist_ok=True)
         remove_unfinished(self.folder)
-        if not self.catalogue.is_current(repr(LIMITS)):
-            self.catalogue.clear(repr(LIMITS))
-        indexed = self.catalogue.entries()
+        if not self.index.is_current(repr(LIMITS)):
+            self.index.clear(repr(LIMITS))
+        indexed = self.index.entries()
         for path in sorted(self.folder.iterdir()):
             if path.name not in indexed:
                 self._index(path)
 
-    def ingest(self, source: Path | str) -> Ingested:
+    def ingest(self, source: Path | str) -> IngestResult:
         """Read a file or folder of observations, append the new ones, and keep a record of what was put aside."""
         reading = read_observations(source, self.frame)
         added, known = self.append(reading.observations)
-        if reading.quarantined:
-            rows = [[q.file, q.row, q.count, q.reason] for q in reading.quarantined]
+        if reading.rejected:
+            rows = [[q.file, q.row, q.count, q.reason] for q in reading.rejected]
             text = json.dumps({"quarantined": rows}, indent=1).encode()
             path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "quarantine.json")
             atomic_write(path, text)
             self._index(path)
-        return Ingested(added, known, reading.quarantined)
+        return IngestResult(added, known, reading.rejected)
 
     def append(self, observations: Sequence[Observation]) -> tuple[int, int]:
         """Append those that are not there yet as one segment: (added, known)."""
-        once = {o.id: o for o in observations}
-        known = self.catalogue.known(once)
-        fresh = [o for name, o in once.items() if name not in known]
-        if fresh:
-            fresh = _by_place(fresh)
-            digest = hashlib.blake2b("".join(o.id for o in fresh).encode(), digest_size=8).hexdigest()
+        unique = {o.id: o for o in observations}
+        known = self.index.filter_known(unique)
+        new = [o for name, o in unique.items() if name not in known]
+        if new:
+            new = _sort_by_tile(new)
+            digest = hashlib.blake2b("".join(o.id for o in new).encode(), digest_size=8).hexdigest()
             path = self.folder / self._name(digest, "parquet")
-            self._write_segment(fresh, path)
-            self.catalogue.add_segment(path.name, [_indexed(o, k // _ROWS_A_GROUP) for k, o in enumerate(fresh)])
-        return len(fresh), len(observations) - len(fresh)
+            self._write_segment(new, path)
+            self.index.add_segment(path.name, [_to_index_row(o, k // _ROW_GROUP_SIZE) for k, o in enumerate(new)])
+        return len(new), len(observations) - len(new)
 
     def find(self, ids: Sequence[str] = (), agent: str | None = None, pass_id: str | None = None) -> tuple[str, ...]:
         """Find observations by id or the start of one, or by agent and pass; retracted and refused ones too.
@@ -111,32 +111,32 @@ class ObservationLog:
         Raises:
             StoreError: an id is not hexadecimal, is unknown or is the start of several; no such agent or pass.
         """
-        found = {name for one in ids for name in self._starting(one)}
+        found = {name for one in ids for name in self._ids_starting_with(one)}
         if agent is not None or pass_id is not None:
-            sent = self.catalogue.sent_by(agent, pass_id)
+            sent = self.index.ids_of_sender(agent, pass_id)
             if not sent:
-                raise StoreError(f"{self.folder}: no observation of {self._unknown(agent, pass_id)}")
+                raise StoreError(f"{self.folder}: no observation of {self._describe_unknown(agent, pass_id)}")
             found.update(sent)
         return tuple(sorted(found))
 
-    def _starting(self, start: str) -> list[str]:
+    def _ids_starting_with(self, start: str) -> list[str]:
         digits = start.lower()
         if not 0 < len(digits) <= _ID_DIGITS or set(digits) - set("0123456789abcdef"):
-            raise StoreError(f"An id is 32 hexadecimal digits, or the first of them; got '{shortened(start)}'.")
-        found = self.catalogue.between(digits.ljust(_ID_DIGITS, "0"), digits.ljust(_ID_DIGITS, "f"))
+            raise StoreError(f"An id is 32 hexadecimal digits, or the first of them; got '{shorten(start)}'.")
+        found = self.index.ids_between(digits.ljust(_ID_DIGITS, "0"), digits.ljust(_ID_DIGITS, "f"))
         if len(found) != 1:
             count = f"{len(found)} observations have" if found else "no observation has"
             remedy = "give more digits." if found else "ids are those that a map or a quarantine names."
             raise StoreError(f"{self.folder}: {count} an id that starts with {digits}; {remedy}")
         return found
 
-    def _unknown(self, agent: str | None, pass_id: str | None) -> str:
+    def _describe_unknown(self, agent: str | None, pass_id: str | None) -> str:
         """Name what is not there, with the nearest name that is."""
         for column, word, name in (("agent", "agent", agent), ("pass_id", "pass", pass_id)):
-            if name is not None and name not in (known := self.catalogue.names(column)):
+            if name is not None and name not in (known := self.index.distinct_values(column)):
                 close = difflib.get_close_matches(name, known, 1)
                 hint = f"did you mean '{close[0]}'?" if close else f"there are {len(known)} others."
-                return f"{word} '{shortened(name)}'; {hint}"
+                return f"{word} '{shorten(name)}'; {hint}"
         return f"agent '{agent}' in pass '{pass_id}', though both are known."
 
     def retract(self, ids: Sequence[str], reason: str) -> int:
@@ -145,12 +145,12 @@ class ObservationLog:
         Returns:
             How many counted until now; where none did, nothing is appended.
         """
-        missing = sorted(set(ids) - self.catalogue.known(ids))
+        missing = sorted(set(ids) - self.index.filter_known(ids))
         if missing:
             raise StoreError(
                 f"{self.folder}: no observation {missing[0]} to retract; {len(missing)} of {len(ids)} are unknown."
             )
-        fresh = sorted(set(ids) - self.catalogue.retracted(ids))
+        fresh = sorted(set(ids) - self.index.filter_retracted(ids))
         if fresh:
             text = json.dumps({"retracted": fresh, "reason": reason}, indent=1).encode()
             path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "retract.json")
@@ -158,16 +158,16 @@ class ObservationLog:
             self._index(path)
         return len(fresh)
 
-    def standing(self) -> Standing:
+    def active_observations(self) -> ActiveObservations:
         """Where every observation that counts stands."""
-        return self.catalogue.standing()
+        return self.index.active_observations()
 
     def _write_segment(self, observations: Sequence[Observation], path: Path) -> None:
         parquet = _parquet()
         table = observation_table(observations, self.frame)
         with atomic_replace(path) as temporary:
             parquet.write_table(
-                table, temporary, compression="zstd", row_group_size=_ROWS_A_GROUP, write_page_checksum=True
+                table, temporary, compression="zstd", row_group_size=_ROW_GROUP_SIZE, write_page_checksum=True
             )
 
     def _name(self, digest: str, kind: str) -> str:
@@ -180,26 +180,26 @@ class ObservationLog:
             return
         content = json.loads(path.read_bytes())
         if path.name.endswith(".retract.json"):
-            self.catalogue.add_retraction(path.name, content["retracted"], content["reason"])
+            self.index.add_retraction(path.name, content["retracted"], content["reason"])
         elif path.name.endswith(".quarantine.json"):
-            self.catalogue.add_quarantine(path.name, [tuple(row) for row in content["quarantined"]])
+            self.index.add_rejected(path.name, [tuple(row) for row in content["quarantined"]])
         else:
             raise StoreError(f"{path}: no entry of a log of observations; move the file elsewhere.")
 
     def _index_segment(self, path: Path) -> None:
         """Index the observations of a segment; rows outside the limits are put aside."""
-        rows: list[Indexed] = []
-        refused: list[RefusedEntry] = []
+        rows: list[IndexRow] = []
+        invalid: list[InvalidEntry] = []
         for group in range(_groups(path)):
             for item in _read_rows(path, [group]):
                 if isinstance(item, Observation):
-                    rows.append(_indexed(item, group))
+                    rows.append(_to_index_row(item, group))
                 else:
-                    number = len(rows) + len(refused)
+                    number = len(rows) + len(invalid)
                     reason = f"{item.reason} Its id is {item.id}."
-                    refused.append(RefusedEntry(item.id, item.agent, item.pass_id, number, reason))
-        self.catalogue.add_segment(path.name, rows, refused)
-        self.refused += tuple(Quarantined(str(path), r.row, 1, r.reason) for r in refused)
+                    invalid.append(InvalidEntry(item.id, item.agent, item.pass_id, number, reason))
+        self.index.add_segment(path.name, rows, invalid)
+        self.rejected += tuple(RejectedRows(str(path), r.row, 1, r.reason) for r in invalid)
 
 
 def read_groups(segment: Path, groups: Sequence[int]) -> list[Observation]:
@@ -207,7 +207,7 @@ def read_groups(segment: Path, groups: Sequence[int]) -> list[Observation]:
     return [item for item in _read_rows(segment, groups) if isinstance(item, Observation)]
 
 
-def _read_rows(segment: Path, groups: Sequence[int]) -> list[Observation | RefusedRow]:
+def _read_rows(segment: Path, groups: Sequence[int]) -> list[Observation | InvalidRow]:
     """Read the rows of some row groups; one that is no observation has an id that agrees with its content.
 
     Such a row is what an older version, with wider limits, wrote. Any other wrong row is damage, hence a StoreError.
@@ -221,25 +221,25 @@ def _read_rows(segment: Path, groups: Sequence[int]) -> list[Observation | Refus
     except (ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{segment}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
-    out = list(rows_of(table))
+    out = list(iterate_rows(table))
     for row, item in enumerate(out):
-        if isinstance(item, RefusedRow) and not item.id:
+        if isinstance(item, InvalidRow) and not item.id:
             raise StoreError(
                 f"{segment}: row {row} of groups {list(groups)[:3]}: {item.reason} Restore the file from a copy."
             )
     return out
 
 
-def read_standing(folder: Path, standing: Standing, rows: NDArray[np.int64]) -> list[Observation]:
+def read_active(folder: Path, active: ActiveObservations, row_indices: NDArray[np.int64]) -> list[Observation]:
     """The observations in these rows of the index, ids ascending."""
-    wanted = {standing.ids[row] for row in rows.tolist()}
+    wanted_ids = {active.ids[row] for row in row_indices.tolist()}
     out: dict[str, Observation] = {}
-    for number in np.unique(standing.segment[rows]).tolist():
-        groups = np.unique(standing.row_group[rows[standing.segment[rows] == number]]).tolist()
-        for o in read_groups(folder / standing.segments[number], groups):
-            if o.id in wanted:
+    for number in np.unique(active.segment[row_indices]).tolist():
+        groups = np.unique(active.row_group[row_indices[active.segment[row_indices] == number]]).tolist()
+        for o in read_groups(folder / active.segments[number], groups):
+            if o.id in wanted_ids:
                 out[o.id] = o
-    missing = wanted - set(out)
+    missing = wanted_ids - set(out)
     if missing:
         raise StoreError(
             f"{folder}: observation {min(missing)} is indexed but not there; restore its segment from a copy."
@@ -247,13 +247,13 @@ def read_standing(folder: Path, standing: Standing, rows: NDArray[np.int64]) -> 
     return [out[name] for name in sorted(out)]
 
 
-def tile_of(xy: NDArray[np.float64], size_m: float = TILE_M) -> NDArray[np.int64]:
+def tile_indices(xy: NDArray[np.float64], tile_size_m: float = TILE_M) -> NDArray[np.int64]:
     """(N, 2) column and row of the tile that each point (N, 2) lies in; tiles are half open and anchored at the origin."""
-    return np.floor(np.asarray(xy, np.float64).reshape(-1, 2) / size_m).astype(np.int64)
+    return np.floor(np.asarray(xy, np.float64).reshape(-1, 2) / tile_size_m).astype(np.int64)
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
+def hold_lock(path: Path) -> Iterator[None]:
     """Hold a store's lock, which the system takes back from a program that is killed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
@@ -269,19 +269,19 @@ def locked(path: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _by_place(observations: Sequence[Observation]) -> list[Observation]:
+def _sort_by_tile(observations: Sequence[Observation]) -> list[Observation]:
     """By tile, rows of tiles in turn, then by id."""
-    tiles = tile_of(np.array([o.pose[:2] for o in observations]))
+    tiles = tile_indices(np.array([o.pose[:2] for o in observations]))
     keys: list[tuple[Any, ...]] = [(*tile, o.id) for tile, o in zip(tiles[:, ::-1].tolist(), observations)]
     return [observations[k] for k in sorted(range(len(keys)), key=keys.__getitem__)]
 
 
-def _indexed(o: Observation, group: int) -> Indexed:
+def _to_index_row(o: Observation, group: int) -> IndexRow:
     x, y = float(o.pose[0]), float(o.pose[1])
-    return Indexed(o.id, group, o.time_ns, o.agent, x, y, reach_of(o), o.pass_id)
+    return IndexRow(o.id, group, o.time_ns, o.agent, x, y, compute_radius(o), o.pass_id)
 
 
-def reach_of(o: Observation) -> float:
+def compute_radius(o: Observation) -> float:
     """Metres from the agent to the farthest point that it saw or could have seen."""
     points = np.concatenate((o.view, o.elements.points))
     return float(np.hypot(points[:, 0], points[:, 1]).max())

@@ -30,14 +30,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._io import atomic_rename, atomic_write, remove_unfinished
-from manyeyes.maps.elements.observation import Frame
+from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.geoparquet import read_map, write_map
-from manyeyes.maps.fusion.fuse import FuseConfig
+from manyeyes.maps.fusion.fuse import MapFusionConfig
 from manyeyes.maps.store.executors import Executor
-from manyeyes.maps.store.map_diff import MapDelta, delta_between, home_tiles, read_delta, with_ids_of, write_delta
-from manyeyes.maps.store.observation_log import TILE_M, ObservationLog, StoreError, locked
-from manyeyes.maps.store.tiled_fusion import ALGORITHM, StepProgress, TileConfig, fuse_tiles
+from manyeyes.maps.store.map_diff import (
+    MapDelta,
+    compute_delta,
+    compute_home_tiles,
+    read_delta,
+    transfer_ids,
+    write_delta,
+)
+from manyeyes.maps.store.observation_log import TILE_M, ObservationLog, StoreError, hold_lock
+from manyeyes.maps.store.tiled_fusion import ALGORITHM, StepProgress, TiledFusionConfig, fuse_tiles
 
 STORE_VERSION = 1
 
@@ -82,7 +89,7 @@ class MapStore:
 
     def __init__(self, folder: Path | str) -> None:
         self.folder = Path(folder)
-        content = _json(self.folder / "store.json", "a store of maps")
+        content = _read_json(self.folder / "store.json", "a store of maps")
         if content.get("format") != "manyeyes.store":
             raise StoreError(
                 f"{self.folder}/store.json: expected format 'manyeyes.store'; got {content.get('format')!r}."
@@ -92,11 +99,11 @@ class MapStore:
                 f"{self.folder}/store.json: version {content['version']}, but this program knows up to {STORE_VERSION}; "
                 "update manyeyes."
             )
-        self.frame = Frame(content["latitude"], content["longitude"])
+        self.frame = MapFrame(content["latitude"], content["longitude"])
         self.log = ObservationLog(self.folder / "log", self.frame)
 
     @classmethod
-    def create(cls, folder: Path | str, frame: Frame) -> MapStore:
+    def create(cls, folder: Path | str, frame: MapFrame) -> MapStore:
         """A new, empty store about an origin; a folder that holds one of the same frame is opened."""
         path = Path(folder) / "store.json"
         if not path.exists():
@@ -110,9 +117,9 @@ class MapStore:
         return store
 
     @contextmanager
-    def writing(self) -> Iterator[ObservationLog]:
+    def open_for_writing(self) -> Iterator[ObservationLog]:
         """Hold the store's lock and bring log and index together; gives the log to append to."""
-        with locked(self.folder / "lock"):
+        with hold_lock(self.folder / "lock"):
             self.log.recover()
             for name in ("tiles", "deltas", "releases"):
                 (self.folder / name).mkdir(exist_ok=True)
@@ -131,7 +138,7 @@ class MapStore:
         number = known[-1] if number is None else number
         if number not in known:
             raise StoreError(f"{self.folder}: no release {number}; there are {', '.join(map(str, known))}.")
-        return _manifest(self.folder / "releases" / f"{number:06d}.json")
+        return _read_manifest(self.folder / "releases" / f"{number:06d}.json")
 
     def read(self, number: int | None = None, area: tuple[float, float, float, float] | None = None) -> VectorMap:
         """The map of a release, the last one if no number is given, elements by ascending id.
@@ -153,24 +160,24 @@ class MapStore:
 
     def fuse(
         self,
-        config: FuseConfig | None = None,
-        tiles: TileConfig | None = None,
+        config: MapFusionConfig | None = None,
+        tile_config: TiledFusionConfig | None = None,
         executor: Executor | None = None,
         progress: StepProgress | None = None,
     ) -> Manifest:
         """Fuse all observations that count and publish the map; steps done before a kill, or for a former release, are reused."""
-        config, tiles = config or FuseConfig(), tiles or TileConfig()
+        config, tile_config = config or MapFusionConfig(), tile_config or TiledFusionConfig()
         work = self.folder / "work"
-        with self.writing() as log:
-            standing = log.standing()
+        with self.open_for_writing() as log:
+            active = log.active_observations()
             work.mkdir(exist_ok=True)
-            fused = fuse_tiles(log.folder, standing, self.frame, work, config, tiles, executor, progress)
-            watermark = watermark_of(standing.ids, standing.time_ns)
+            fused = fuse_tiles(log.folder, active, self.frame, work, config, tile_config, executor, progress)
+            watermark = compute_watermark(active.ids, active.time_ns)
             return self._publish(fused, ALGORITHM, repr(config), watermark)
 
     def publish(self, fused: VectorMap, algorithm: str, settings: str, watermark: Watermark) -> Manifest:
         """Publish a map that was fused elsewhere."""
-        with self.writing():
+        with self.open_for_writing():
             return self._publish(fused, algorithm, settings, watermark)
 
     def delta(self, number: int) -> MapDelta:
@@ -180,16 +187,18 @@ class MapStore:
 
     def clear_work(self) -> None:
         """Delete kept results of steps; the next fusion does them all again."""
-        with self.writing():
+        with self.open_for_writing():
             shutil.rmtree(self.folder / "work", ignore_errors=True)
 
     def collect_garbage(self) -> list[Path]:
         """Delete files of tiles and deltas that no release names, as a killed writer leaves them."""
-        with self.writing():
+        with self.open_for_writing():
             numbers = self.releases()
             named = {name for n in numbers for tile in self.manifest(n).tiles for name in tile.files}
             left = [
-                p for p in (self.folder / "tiles").rglob("*.parquet") if _below(p, self.folder / "tiles") not in named
+                p
+                for p in (self.folder / "tiles").rglob("*.parquet")
+                if _relative_name(p, self.folder / "tiles") not in named
             ]
             for path in left:
                 path.unlink()
@@ -200,16 +209,16 @@ class MapStore:
             return sorted(left)
 
     def _publish(self, fused: VectorMap, algorithm: str, settings: str, watermark: Watermark) -> Manifest:
-        known = self.releases()
-        parent = known[-1] if known else 0
+        numbers = self.releases()
+        parent = numbers[-1] if numbers else 0
         before = self.read(parent) if parent else VectorMap.empty(self.frame)
-        fused = with_ids_of(fused, before)
+        fused = transfer_ids(fused, before)
         number = parent + 1
         tiles = self._write_tiles(fused)
         delta_folder = self.folder / "deltas" / f"{number:06d}"
         shutil.rmtree(delta_folder, ignore_errors=True)
         delta_folder.mkdir(parents=True)
-        write_delta(delta_between(before, fused), delta_folder)
+        write_delta(compute_delta(before, fused), delta_folder)
         manifest = Manifest(
             number=number,
             parent=parent,
@@ -227,7 +236,7 @@ class MapStore:
 
     def _write_tiles(self, fused: VectorMap) -> tuple[TileEntry, ...]:
         """Write the files of every tile that are not there yet; entries by column and row."""
-        keys = home_tiles(fused)
+        keys = compute_home_tiles(fused)
         entries = []
         by_id = np.lexsort(fused.id.T[::-1])
         for x, y in np.unique(keys, axis=0).tolist() if len(keys) else []:
@@ -245,19 +254,19 @@ class MapStore:
             digest = _hash(draft.read_bytes())
             path = folder / f"{digest}.{kind}.parquet"
             atomic_rename(draft, path)
-            names.append(_below(path, self.folder / "tiles"))
+            names.append(_relative_name(path, self.folder / "tiles"))
             hashes.append(digest)
         return TileEntry(x, y, len(rows), (names[0], names[1]), (hashes[0], hashes[1]))
 
 
-def watermark_of(ids: Sequence[str], times_ns: NDArray[np.int64]) -> Watermark:
+def compute_watermark(ids: Sequence[str], times_ns: NDArray[np.int64]) -> Watermark:
     """The watermark of a set of observations."""
     latest = int(times_ns.max()) if len(times_ns) else -1
     return Watermark(len(ids), _hash("".join(sorted(ids)).encode()), latest)
 
 
-def _manifest(path: Path) -> Manifest:
-    content = _json(path, "the manifest of a release")
+def _read_manifest(path: Path) -> Manifest:
+    content = _read_json(path, "the manifest of a release")
     if content.get("version", 0) > STORE_VERSION:
         raise StoreError(
             f"{path}: version {content['version']}, but this program knows up to {STORE_VERSION}; update it."
@@ -272,14 +281,16 @@ def _manifest(path: Path) -> Manifest:
         raise StoreError(f"{path}: expected the manifest of a release; {type(error).__name__} {error}.") from None
 
 
-def _json(path: Path, what: str) -> dict[str, Any]:
+def _read_json(path: Path, expected: str) -> dict[str, Any]:
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
         reason = " ".join(str(error).split())
-        raise StoreError(f"{path}: expected {what}; {reason}. Create one, or restore the file from a copy.") from None
+        raise StoreError(
+            f"{path}: expected {expected}; {reason}. Create one, or restore the file from a copy."
+        ) from None
     if not isinstance(content, dict):
-        raise StoreError(f"{path}: expected {what}; got a {type(content).__name__}.")
+        raise StoreError(f"{path}: expected {expected}; got a {type(content).__name__}.")
     return content
 
 
@@ -288,7 +299,7 @@ def _touches(tile: TileEntry, area: tuple[float, float, float, float]) -> bool:
     return x0 <= area[2] and area[0] < x0 + TILE_M and y0 <= area[3] and area[1] < y0 + TILE_M
 
 
-def _below(path: Path, folder: Path) -> str:
+def _relative_name(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix()
 
 

@@ -19,73 +19,71 @@ SPEED_UNIT = 10.0
 """Metres per second in one unit of RawBoxes.velocity."""
 
 
-class Columns:
+class RawBoxLayout:
     """Where each quantity of RawBoxes stands in a row of numbers."""
 
     def __init__(self) -> None:
         ends = list(accumulate(WIDTHS, initial=0))
         spans = [slice(a, b) for a, b in pairwise(ends)]
-        self.heat, self.offset, self.z, self.log_size, self.axis, self.direction = spans[:6]
-        self.kind, self.log_sigma_xy, self.log_sigma_yaw, self.overlap, self.velocity = spans[6:]
+        self.heatmap_logit, self.offset, self.z, self.log_size, self.axis, self.direction = spans[:6]
+        self.class_logits, self.log_sigma_xy, self.log_sigma_yaw, self.iou_logit, self.velocity = spans[6:]
         self.total = ends[-1]
 
 
 WIDTHS = (1, 2, 1, 3, 2, 2, len(LABELS), 1, 1, 1, 2)
-RAW = Columns()
+BOX_LAYOUT = RawBoxLayout()
 
 
 @dataclass(frozen=True, eq=False)
 class RawBoxes:
     """What the head says of each of N sites, before decoding.
 
-    heat: (N,) logit that a box is centred here. offset: (N, 2), x and y from the cell's centre, in cells. z: (N,) metres.
+    heatmap_logit: (N,) logit that a box is centred here. offset: (N, 2), x and y from the cell's centre, in cells. z: (N,) metres.
     log_size: (N, 3) of size / TYPICAL_SIZE. axis: (N, 2), cosine and sine of twice the yaw: the body's axis modulo pi.
     direction: (N, 2): its product with a unit vector along the axis is the logit that the vehicle faces that way; turning the
-    vector by pi turns the sign, so there is no seam. kind: (N, labels) logits.
-    log_sigma_xy, log_sigma_yaw: (N,), m and rad. overlap: (N,) logit of the IoU that the box will have.
+    vector by pi turns the sign, so there is no seam. class_logits: (N, labels) logits.
+    log_sigma_xy, log_sigma_yaw: (N,), m and rad. iou_logit: (N,) logit of the IoU that the box will have.
     velocity: (N, 2) over the ground along x and y, in SPEED_UNIT.
     """
 
     sites: Sites
-    heat: Tensor
+    heatmap_logit: Tensor
     offset: Tensor
     z: Tensor
     log_size: Tensor
     axis: Tensor
     direction: Tensor
-    kind: Tensor
+    class_logits: Tensor
     log_sigma_xy: Tensor
     log_sigma_yaw: Tensor
-    overlap: Tensor
+    iou_logit: Tensor
     velocity: Tensor
 
     @classmethod
-    def of(cls, columns: Tensor, sites: Sites) -> RawBoxes:
+    def of(cls, rows: Tensor, sites: Sites) -> RawBoxes:
         """From rows (N, RAW.total)."""
-        heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap, velocity = columns.split(
-            WIDTHS, 1
-        )
+        heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap, velocity = rows.split(WIDTHS, 1)
         return cls(
             sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind,
             sigma_xy[:, 0], sigma_yaw[:, 0], overlap[:, 0], velocity,
         )  # fmt: skip
 
-    def columns(self) -> Tensor:
+    def to_rows(self) -> Tensor:
         """(N, RAW.total): all quantities side by side."""
-        values = (self.heat, self.offset, self.z, self.log_size, self.axis, self.direction, self.kind)
-        values = (*values, self.log_sigma_xy, self.log_sigma_yaw, self.overlap, self.velocity)
+        values = (self.heatmap_logit, self.offset, self.z, self.log_size, self.axis, self.direction, self.class_logits)
+        values = (*values, self.log_sigma_xy, self.log_sigma_yaw, self.iou_logit, self.velocity)
         return torch.cat([v[:, None] if v.dim() == 1 else v for v in values], 1)
 
     def bev(self) -> Tensor:
         """(N, 5): x, y, length, width, yaw (of the axis) of every site's box, differentiable."""
-        xy = self.sites.xy + self.offset * self.sites.grid.cell
+        xy = self.sites.xy + self.offset * self.sites.grid.cell_size_m
         size = torch.tensor(TYPICAL_SIZE[:2]) * self.log_size[:, :2].clamp(-3, 3).exp()
         return torch.cat((xy, size, axis_yaw(self.axis)[:, None]), 1)
 
-    def rows(self, mask: Tensor) -> RawBoxes:
+    def select(self, mask: Tensor) -> RawBoxes:
         """Some of the sites."""
         sites = Sites(self.sites.key[mask], self.sites.grid, self.sites.batch_size)
-        return RawBoxes.of(self.columns()[mask], sites)
+        return RawBoxes.of(self.to_rows()[mask], sites)
 
 
 def axis_yaw(axis: Tensor) -> Tensor:
@@ -93,7 +91,7 @@ def axis_yaw(axis: Tensor) -> Tensor:
     return torch.atan2(axis[:, 1], axis[:, 0]) / 2
 
 
-def facing(raw: RawBoxes) -> Tensor:
+def heading_logit(raw: RawBoxes) -> Tensor:
     """(N,) logit that the vehicle faces along axis_yaw and not along its opposite; no gradient to the axis."""
     yaw = axis_yaw(raw.axis).detach()
     return raw.direction[:, 0] * yaw.cos() + raw.direction[:, 1] * yaw.sin()
@@ -111,7 +109,7 @@ class BoxHead(nn.Module):
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
         self.shared = _trunk(inputs, channels)
-        self.out = nn.Linear(channels, RAW.total)
+        self.out = nn.Linear(channels, BOX_LAYOUT.total)
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
         with torch.no_grad():
@@ -128,52 +126,52 @@ class RefineHead(nn.Module):
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
         self.shared = _trunk(inputs, channels)
-        self.out = nn.Linear(channels, RAW.total)
+        self.out = nn.Linear(channels, BOX_LAYOUT.total)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, x: SparseBev, given: Tensor) -> RawBoxes:
+    def forward(self, x: SparseBev, proposals: Tensor) -> RawBoxes:
         """Features, and the boxes (N, RAW.total) given of the same sites, to better boxes."""
-        return RawBoxes.of(given + self.out(self.shared(x).features), x.sites)
+        return RawBoxes.of(proposals + self.out(self.shared(x).features), x.sites)
 
 
 @dataclass(frozen=True)
 class DecodeConfig:
-    """score_threshold and nms_iou as in the evaluation's protocol; overlap_power: score = heat^(1-p) * IoU^p."""
+    """score_threshold and nms_iou as in the evaluation's protocol; iou_score_weight: score = heat^(1-p) * IoU^p."""
 
     score_threshold: float = 0.05
     nms_iou: float = 0.15
     max_boxes: int = 200
-    overlap_power: float = 0.4
+    iou_score_weight: float = 0.4
 
 
 def decode(raw: RawBoxes, config: DecodeConfig) -> list[Boxes]:
     """Boxes of every grid in the batch, in its agent's frame, best first."""
-    heat, overlap = torch.sigmoid(raw.heat.detach()), torch.sigmoid(raw.overlap.detach())
-    score = heat ** (1 - config.overlap_power) * overlap**config.overlap_power
+    heatmap, iou = torch.sigmoid(raw.heatmap_logit.detach()), torch.sigmoid(raw.iou_logit.detach())
+    score = heatmap ** (1 - config.iou_score_weight) * iou**config.iou_score_weight
     batch, found = raw.sites.batch, []
     for b in range(raw.sites.batch_size):
         rows = ((batch == b) & (score > config.score_threshold)).nonzero()[:, 0]
         rows = rows[score[rows].sort(descending=True, stable=True).indices]
-        some = _boxes(raw, rows, score)
-        found.append(some[rotated_nms(some.bev().double(), some.score, config.nms_iou)[: config.max_boxes]])
+        boxes = _boxes(raw, rows, score)
+        found.append(boxes[rotated_nms(boxes.bev().double(), boxes.score, config.nms_iou)[: config.max_boxes]])
     return found
 
 
 def _boxes(raw: RawBoxes, rows: Tensor, score: Tensor) -> Boxes:
-    cell = raw.sites.grid.cell
+    cell = raw.sites.grid.cell_size_m
     xy = raw.sites.xy[rows] + raw.offset[rows] * cell
-    right = torch.sigmoid(facing(raw))[rows]
+    right = torch.sigmoid(heading_logit(raw))[rows]
     yaw = axis_yaw(raw.axis[rows]) + math.pi * (right < 0.5)
     return Boxes(
         center=torch.cat((xy, raw.z[rows, None]), 1).detach(),
         size=(torch.tensor(TYPICAL_SIZE) * raw.log_size[rows].clamp(-3, 3).exp()).detach(),
         yaw=torch.atan2(yaw.sin(), yaw.cos()).detach(),
         score=score[rows],
-        label=raw.kind[rows].argmax(1),
+        label=raw.class_logits[rows].argmax(1),
         id=torch.full((len(rows),), -1, dtype=torch.int64),
         sigma_xy=raw.log_sigma_xy[rows].exp().detach(),
         sigma_yaw=raw.log_sigma_yaw[rows].exp().detach(),
-        flip=torch.minimum(right, 1 - right).detach(),
+        p_flip=torch.minimum(right, 1 - right).detach(),
         velocity=raw.velocity[rows].detach() * SPEED_UNIT,
     )

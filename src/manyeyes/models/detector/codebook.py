@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import ConfigError, ShapeError
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.proposal_codes import PROPOSAL_CODES, proposal_from_codes, proposal_to_codes
 
 FREQUENCY_TOTAL = 4096
@@ -49,34 +49,34 @@ class Codebook(nn.Module):
         uniform = torch.full((self.width, 256), FREQUENCY_TOTAL // 256, dtype=torch.int16)
         self.register_buffer("frequencies", uniform)
 
-    def write(self, told: Tensor) -> Tensor:
+    def encode(self, tokens: Tensor) -> Tensor:
         """What is told, rows (N, C + PROPOSAL), as rows (N, W) uint8."""
-        features = told[:, :-PROPOSAL]
+        features = tokens[:, :-PROPOSAL_DIM]
         if features.shape[1] != self.centres.shape[2]:
             raise ShapeError(f"This codebook is of {self.centres.shape[2]} features; got {features.shape[1]}.")
-        return torch.cat((residual_codes(features, self.centres), proposal_to_codes(told[:, -PROPOSAL:])), 1)
+        return torch.cat((residual_codes(features, self.centres), proposal_to_codes(tokens[:, -PROPOSAL_DIM:])), 1)
 
-    def read(self, rows: Tensor) -> Tensor:
+    def decode(self, codes: Tensor) -> Tensor:
         """The inverse of write, within the error of the centres; any bytes (N, W) can be read."""
         stages, size, _ = self.centres.shape
-        if rows.shape[1] != self.width:
-            raise ShapeError(f"This codebook reads rows of {self.width} bytes; got {rows.shape[1]}.")
+        if codes.shape[1] != self.width:
+            raise ShapeError(f"This codebook reads rows of {self.width} bytes; got {codes.shape[1]}.")
         # Where there are fewer than 256 centres, nobody writes the bytes beyond, and they must not break the reader.
-        index = rows[:, :stages].long().clamp_max(size - 1)
+        index = codes[:, :stages].long().clamp_max(size - 1)
         features = self.centres[torch.arange(stages), index].sum(1)
-        return torch.cat((features, proposal_from_codes(rows[:, stages:])), 1)
+        return torch.cat((features, proposal_from_codes(codes[:, stages:])), 1)
 
 
 def residual_codes(features: Tensor, centres: Tensor) -> Tensor:
     """(N, C) to (N, stages) uint8: stage by stage the nearest of centres (stages, size, C) to what is left over."""
-    left, codes = features, []
+    residual, codes = features, []
     for stage in centres:
-        code = nearest(left, stage)
-        left = left - stage[code]
+        code = nearest_centre(residual, stage)
+        residual = residual - stage[code]
         codes.append(code)
     return torch.stack(codes, 1).to(torch.uint8)
 
 
-def nearest(x: Tensor, centres: Tensor) -> Tensor:
+def nearest_centre(x: Tensor, centres: Tensor) -> Tensor:
     """(N,) int64: which of centres (K, C) is nearest to each row of x (N, C), the first where two are."""
     return (centres.square().sum(1) - 2 * (x @ centres.T)).argmin(1)

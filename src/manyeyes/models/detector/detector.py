@@ -14,15 +14,15 @@ from manyeyes.models.detector.box_head import BoxHead, DecodeConfig, RawBoxes, R
 from manyeyes.models.detector.codebook import Codebook, CodebookConfig
 from manyeyes.models.detector.encoder import EncoderConfig, SparseEncoder
 from manyeyes.models.detector.pillars import PillarEncoder, PillarKind
-from manyeyes.models.detector.proposal import propose
-from manyeyes.models.detector.pruning import FocalPrune, Pruned
+from manyeyes.models.detector.proposal import make_proposals
+from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.models.detector.selector import Selector
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
-from manyeyes.models.fusion.flow_aware import FlowAwareFusion
-from manyeyes.models.fusion.max_fusion import MaximumFusion
+from manyeyes.models.fusion.flow_aware import FastFusion
+from manyeyes.models.fusion.max_fusion import MaxFusion
 from manyeyes.models.fusion.multi_scale import MultiScaleFusion
 from manyeyes.models.fusion.self_attention import SelfAttentionFusion
-from manyeyes.models.fusion.token_merge import Fused
+from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.models.fusion.v2x_vit import V2xVitFusion
 
@@ -30,7 +30,7 @@ from manyeyes.models.fusion.v2x_vit import V2xVitFusion
 @dataclass(frozen=True)
 class DetectorConfig:
     """grid: what an agent sees and tells, and the pillar size. prune_threshold: probability of lying near an object below which
-    a cell is dropped. answers: the range in which its boxes are asked for, where that is less than it sees; None: all of it.
+    a cell is dropped. output_range: the range in which its boxes are asked for, where that is less than it sees; None: all of it.
     sweeps: how many an agent looks at together, its last one or two. codebook: of the bytes that its tokens are sent as; None
     where none was fitted.
     """
@@ -45,22 +45,22 @@ class DetectorConfig:
     head_channels: int = 64
     prune_threshold: float = 0.1
     decode: DecodeConfig = field(default_factory=DecodeConfig)
-    answers: BevGrid | None = None
+    output_range: BevGrid | None = None
     sweeps: Literal[1, 2] = 1
     codebook: CodebookConfig | None = None
 
     @property
-    def range(self) -> BevGrid:
+    def detection_range(self) -> BevGrid:
         """Where boxes are asked for."""
-        return self.answers or self.grid
+        return self.output_range or self.grid
 
 
 @dataclass(frozen=True)
-class Seen:
+class ExtractedFeatures:
     """What a batch of agents made of their own clouds: tokens to keep or send, and pruning's decisions."""
 
     tokens: SparseBev
-    pruned: tuple[Pruned, ...]
+    pruned: tuple[PruneOutput, ...]
     sites_per_stride: tuple[int, ...]
 
 
@@ -77,7 +77,7 @@ class Detector(nn.Module):
         self.dast = WindowTransformer(channels, config.dast)
         self.token_prune = FocalPrune(channels)
         self.selector = Selector(channels)
-        self.fusion = _fusion(channels, config)
+        self.fusion = _build_fusion(channels, config)
         self.head = BoxHead(channels, config.head_channels)
         self.refine = RefineHead(channels, config.head_channels)
         self.codebook = None if config.codebook is None else Codebook(channels, config.codebook)
@@ -87,52 +87,54 @@ class Detector(nn.Module):
         """The lattice of the tokens."""
         return self.config.grid.at(self.config.encoder.head_stride)
 
-    def see(
+    def extract_features(
         self,
         clouds: list[PointCloud],
-        earlier: list[PointCloud] | None = None,
+        previous_clouds: list[PointCloud] | None = None,
         prune_threshold: float | None = None,
-    ) -> Seen:
-        """Clouds in their agents' frames to tokens on a batch of as many grids. earlier: the sweeps before, in the same frames."""
+    ) -> ExtractedFeatures:
+        """Clouds in their agents' frames to tokens on a batch of as many grids. previous_clouds: the sweeps before, in the same
+        frames.
+        """
         threshold = self.config.prune_threshold if prune_threshold is None else prune_threshold
-        encoded = self.encoder(self.pillars(clouds, earlier), threshold)
+        encoded = self.encoder(self.pillars(clouds, previous_clouds), threshold)
         tokens = encoded.tokens
         sites = tokens.sites
         tokens = tokens.with_features(self.dast(tokens.features, sites.xy, sites.batch, sites.grid, sites.cache))
         kept, decision = self.token_prune(tokens, threshold)
-        return Seen(kept, (*encoded.pruned, decision), encoded.sites_per_stride)
+        return ExtractedFeatures(kept, (*encoded.pruned, decision), encoded.sites_per_stride)
 
-    def look(self, tokens: SparseBev) -> RawBoxes:
+    def predict(self, tokens: SparseBev) -> RawBoxes:
         """What each agent makes of its own tokens, in its own frame."""
         return self.head(tokens)
 
-    def tell(self, tokens: SparseBev, raw: RawBoxes) -> SparseBev:
+    def make_tokens(self, tokens: SparseBev, raw: RawBoxes) -> SparseBev:
         """What is sent: features (N, C) and, behind them, the proposals of raw, the agent's own view of these tokens."""
-        return tokens.with_features(torch.cat((tokens.features, propose(raw)), 1))
+        return tokens.with_features(torch.cat((tokens.features, make_proposals(raw)), 1))
 
-    def choose(self, told: SparseBev) -> Tensor:
+    def score_tokens(self, tokens: SparseBev) -> Tensor:
         """(N,) logits of how much each token is worth to others; a budget sends the highest."""
-        return self.selector(told)
+        return self.selector(tokens)
 
     def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
         """Tokens of all agents around each ego, its own among them, to raw boxes in the ego's frame.
 
         past: what the ego itself told at its last instants, moved into its frame of now.
         """
-        fused = self.merge(tokens, past)
-        return self.refine(fused.bev, fused.given)
+        fused = self.fuse_tokens(tokens, past)
+        return self.refine(fused.bev, fused.merged_proposals)
 
-    def merge(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+    def fuse_tokens(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """The first half of fuse: one feature and one merged box a cell."""
         return self.fusion(tokens, past)
 
 
-_ATTENTIVE = {"flow_aware": FlowAwareFusion, "self_attention": SelfAttentionFusion, "v2x_vit": V2xVitFusion}
+_ATTENTION_FUSIONS = {"flow_aware": FastFusion, "self_attention": SelfAttentionFusion, "v2x_vit": V2xVitFusion}
 
 
-def _fusion(
+def _build_fusion(
     channels: int, config: DetectorConfig
-) -> FlowAwareFusion | SelfAttentionFusion | MaximumFusion | MultiScaleFusion | V2xVitFusion:
-    if config.fusion in _ATTENTIVE:
-        return _ATTENTIVE[config.fusion](channels, config.fusion_attention)
-    return MaximumFusion(channels) if config.fusion == "maximum" else MultiScaleFusion(channels)
+) -> FastFusion | SelfAttentionFusion | MaxFusion | MultiScaleFusion | V2xVitFusion:
+    if config.fusion in _ATTENTION_FUSIONS:
+        return _ATTENTION_FUSIONS[config.fusion](channels, config.fusion_attention)
+    return MaxFusion(channels) if config.fusion == "maximum" else MultiScaleFusion(channels)

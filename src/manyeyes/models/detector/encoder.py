@@ -9,7 +9,7 @@ from torch import nn
 
 from manyeyes.datatypes import ConfigError, SparseBev
 from manyeyes.models.detector.layers import DownLayer, SubmanifoldLayer, SubmanifoldStage, UpLayer
-from manyeyes.models.detector.pruning import FocalPrune, Pruned
+from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.ops.sparse_conv import merge
 
 STRIDES: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
@@ -21,7 +21,7 @@ class EncoderConfig:
 
     prune_strides: levels with a focal pruning layer. head_stride: stride of the tokens that are fused, sent and decoded;
     8 is the paper's letter, 4 the default. dilating: spconv's strided active set instead of parents only.
-    coarse: whether strides 16 and 32 take part (Eq. 3); without them the merge has stride 8 alone.
+    use_coarse_strides: whether strides 16 and 32 take part (Eq. 3); without them the merge has stride 8 alone.
     token_channels: tokens are projected to so many channels before attention; None keeps those of their stride.
     """
 
@@ -31,7 +31,7 @@ class EncoderConfig:
     head_stride: int = 4
     dilating: bool = False
     token_channels: int | None = None
-    coarse: bool = True
+    use_coarse_strides: bool = True
 
     def __post_init__(self) -> None:
         if len(self.channels) != 6 or len(self.layers) != 6:
@@ -45,11 +45,11 @@ class EncoderConfig:
 
 
 @dataclass(frozen=True)
-class Encoded:
+class EncoderOutput:
     """Tokens at the head's stride, what every pruning layer decided on, and the number of sites at each stride."""
 
     tokens: SparseBev
-    pruned: tuple[Pruned, ...]
+    pruned: tuple[PruneOutput, ...]
     sites_per_stride: tuple[int, ...]
 
 
@@ -60,7 +60,7 @@ class SparseEncoder(nn.Module):
         super().__init__()
         self.config = config
         width = dict(zip(STRIDES, config.channels))
-        self.strides = STRIDES if config.coarse else STRIDES[:4]
+        self.strides = STRIDES if config.use_coarse_strides else STRIDES[:4]
         self.down = nn.ModuleList(
             [SubmanifoldLayer(inputs, width[1], kernel=1)]
             + [DownLayer(width[s // 2], width[s], config.dilating) for s in self.strides[1:]]
@@ -76,10 +76,10 @@ class SparseEncoder(nn.Module):
             nn.Identity() if config.token_channels is None else nn.Linear(width[config.head_stride], self.out_channels)
         )
 
-    def forward(self, x: SparseBev, prune_threshold: float) -> Encoded:
+    def forward(self, x: SparseBev, prune_threshold: float) -> EncoderOutput:
         """prune_threshold: probability below which a cell is dropped; 0 drops none."""
         levels: dict[int, SparseBev] = {}
-        pruned: list[Pruned] = []
+        pruned: list[PruneOutput] = []
         for stride, down, stage in zip(self.strides, self.down, self.stages):
             x = stage(down(x))
             if str(stride) in self.prune:
@@ -90,4 +90,4 @@ class SparseEncoder(nn.Module):
         for stride, up in self.up.items():
             tokens = up(tokens, levels[int(stride)])
         tokens = tokens.with_features(self.project(tokens.features))
-        return Encoded(tokens, tuple(pruned), tuple(len(levels[s].sites) for s in self.strides))
+        return EncoderOutput(tokens, tuple(pruned), tuple(len(levels[s].sites) for s in self.strides))

@@ -10,7 +10,7 @@ from manyeyes.models.detector.layers import DownLayer, SubmanifoldLayer, Submani
 from manyeyes.models.detector.transformer import WindowBlock
 
 
-def folded(model: Detector) -> Detector:
+def fold_norms(model: Detector) -> Detector:
     """A copy in evaluation mode, without gradients, whose convolutions hold their norms: the same answers, sooner.
 
     It keeps configuration and fingerprint, so that it understands the messages of the model it was made of; it is not a

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import Sites, SparseBev
-from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, takes
+from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, is_supported
 from manyeyes.ops.sparse_conv import inverse_conv, same_sites_map, strided_conv, strided_map, submanifold_conv
 from manyeyes.ops.sparse_index import Window
 
@@ -74,7 +74,7 @@ class SubmanifoldLayer(nn.Module):
 
     def forward(self, x: SparseBev) -> SparseBev:
         """(N, inputs) to (N, outputs) on the same sites."""
-        if self.folded is not None and takes(x.features):
+        if self.folded is not None and is_supported(x.features):
             return x.with_features(self.folded(x.features, same_sites_map(x.sites, self.weight.shape[2])))
         y = self.norm(submanifold_conv(x, self.weight, self.bias).features)
         return x.with_features(_rectified(y, x.features if self.skip else None))
@@ -105,7 +105,7 @@ class SubmanifoldStage(nn.Sequential):
 
     def forward(self, input: SparseBev) -> SparseBev:
         """(N, channels) to (N, channels)."""
-        if self.folded is not None and takes(input.features):
+        if self.folded is not None and is_supported(input.features):
             return input.with_features(self.folded(input.features, same_sites_map(input.sites, kernel=3)))
         return super().forward(input)
 
@@ -134,7 +134,7 @@ class DownLayer(nn.Module):
 
     def forward(self, x: SparseBev) -> SparseBev:
         """Features at twice the stride."""
-        if self.folded is not None and takes(x.features):
+        if self.folded is not None and is_supported(x.features):
             sites, table = strided_map(x.sites, Window(3, 2, 1), self.dilating)
             return SparseBev(self.folded(x.features, table), sites)
         y = strided_conv(x, self.weight, self.bias, stride=2, padding=1, dilating=self.dilating)

@@ -14,7 +14,7 @@ from manyeyes.ops._pillar_kernels import pillar_maxima
 from manyeyes.ops.voxelize import Pillars, pillar_moments, pillar_sites, segment_max, segment_mean
 
 PillarKind = Literal["points", "moments"]
-MOMENTS = 12
+NUM_MOMENTS = 12
 
 
 class PointPillars(nn.Module):
@@ -28,9 +28,13 @@ class PointPillars(nn.Module):
         self.sweeps = sweeps
         self.linear, self.norm = nn.Linear(9 + sweeps, channels, bias=False), ActiveNorm(channels)
 
-    def forward(self, xyz: Tensor, bright: Tensor, old: Tensor, pillars: Pillars) -> Tensor:
+    def forward(self, xyz: Tensor, intensities: Tensor, is_previous: Tensor, pillars: Pillars) -> Tensor:
         """Kept points (P, 3), their intensities (P,) and whether they are of the sweep before (P,) to (N, channels)."""
-        intensity = bright[:, None] if self.sweeps == 1 else torch.stack((bright, old.to(bright.dtype)), 1)
+        intensity = (
+            intensities[:, None]
+            if self.sweeps == 1
+            else torch.stack((intensities, is_previous.to(intensities.dtype)), 1)
+        )
         sites, row = pillars.sites, pillars.row
         mean = segment_mean(xyz, row, len(sites))
         grid = sites.grid
@@ -38,10 +42,10 @@ class PointPillars(nn.Module):
         inputs = torch.cat((xyz, intensity[:, :1], xyz - mean[row], xyz - centre[row], intensity[:, 1:]), -1)
         return segment_max(torch.relu(self.norm(self.linear(inputs))), row, len(sites))
 
-    def infer(self, now: list[PointCloud], before: list[PointCloud], grid: BevGrid) -> SparseBev:
+    def infer(self, clouds: list[PointCloud], previous_clouds: list[PointCloud], grid: BevGrid) -> SparseBev:
         """The same numbers of whole clouds, float32 in the CPU's memory, with the norm folded in: for inference."""
         weight, bias = fold_norm(self.linear.weight, self.norm)
-        return pillar_maxima(now, before, grid, nn.functional.pad(weight, (0, 2 - self.sweeps)), bias)
+        return pillar_maxima(clouds, previous_clouds, grid, nn.functional.pad(weight, (0, 2 - self.sweeps)), bias)
 
 
 class MomentPillars(nn.Module):
@@ -53,16 +57,16 @@ class MomentPillars(nn.Module):
     def __init__(self, channels: int, sweeps: int = 1) -> None:
         super().__init__()
         self.sweeps = sweeps
-        self.scale = ActiveNorm(MOMENTS * sweeps)
+        self.scale = ActiveNorm(NUM_MOMENTS * sweeps)
         self.layers = nn.Sequential(
-            nn.Linear(MOMENTS * sweeps, 2 * channels), nn.ReLU(), nn.Linear(2 * channels, channels, bias=False)
+            nn.Linear(NUM_MOMENTS * sweeps, 2 * channels), nn.ReLU(), nn.Linear(2 * channels, channels, bias=False)
         )
         self.norm = ActiveNorm(channels)
 
-    def forward(self, xyz: Tensor, bright: Tensor, old: Tensor, pillars: Pillars) -> Tensor:
+    def forward(self, xyz: Tensor, intensities: Tensor, is_previous: Tensor, pillars: Pillars) -> Tensor:
         """Kept points (P, 3), their intensities (P,) and whether they are of the sweep before (P,) to (N, channels)."""
-        sweeps = (~old, old) if self.sweeps == 2 else (slice(None),)
-        moments = torch.cat([pillar_moments(xyz[s], bright[s], pillars.row[s], pillars.sites) for s in sweeps], 1)
+        sweeps = (~is_previous, is_previous) if self.sweeps == 2 else (slice(None),)
+        moments = torch.cat([pillar_moments(xyz[s], intensities[s], pillars.row[s], pillars.sites) for s in sweeps], 1)
         return torch.relu(self.norm(self.layers(self.scale(moments))))
 
 
@@ -74,22 +78,22 @@ class PillarEncoder(nn.Module):
         self.grid, self.sweeps = grid.at(1), sweeps
         self.net = PointPillars(channels, sweeps) if kind == "points" else MomentPillars(channels, sweeps)
 
-    def forward(self, clouds: list[PointCloud], earlier: list[PointCloud] | None = None) -> SparseBev:
+    def forward(self, clouds: list[PointCloud], previous_clouds: list[PointCloud] | None = None) -> SparseBev:
         """One cloud an agent, each in that agent's frame, to (N, channels) on a batch of as many grids.
 
-        earlier: the sweep before each, moved into the same frame; left out where the net looks at one sweep only.
+        previous_clouds: the sweep before each, moved into the same frame; left out where the net looks at one sweep only.
         """
-        before = earlier if earlier is not None and self.sweeps == 2 else []
+        before = previous_clouds if previous_clouds is not None and self.sweeps == 2 else []
         many, agents = [*clouds, *before], [*range(len(clouds)), *range(len(before))]
         if isinstance(self.net, PointPillars) and not self.training and not torch.is_grad_enabled() and _plain(many):
             return self.net.infer(clouds, before, self.grid)
-        xyz, bright = _joined([cloud.xyz for cloud in many]), _joined([cloud.intensity for cloud in many])
+        xyz, intensities = _joined([cloud.xyz for cloud in many]), _joined([cloud.intensity for cloud in many])
         batch = _joined([torch.full((len(cloud),), agent) for cloud, agent in zip(many, agents)])
         pillars = pillar_sites(xyz, batch, self.grid, len(clouds))
         kept = pillars.inside.nonzero()[:, 0]
-        old = kept >= sum(map(len, clouds))
-        xyz, bright = xyz.index_select(0, kept), bright.index_select(0, kept)
-        features = self.net(xyz, bright, old, pillars)
+        is_previous = kept >= sum(map(len, clouds))
+        xyz, intensities = xyz.index_select(0, kept), intensities.index_select(0, kept)
+        features = self.net(xyz, intensities, is_previous, pillars)
         return SparseBev(features, pillars.sites)
 
 

@@ -12,7 +12,7 @@ from manyeyes.models.detector.transformer import AttentionConfig
 SMALL_GRID = BevGrid(-70.4, -38.4, -5.0, 70.4, 38.4, 6.0)
 OPV2V_GRID = BevGrid(-140.8, -38.4, -3.0, 140.8, 38.4, 3.0)
 
-SMALL_AROUND = BevGrid(-70.4, -70.4, -5.0, 70.4, 70.4, 6.0)
+SMALL_SQUARE_GRID = BevGrid(-70.4, -70.4, -5.0, 70.4, 70.4, 6.0)
 """As far to the sides as ahead: what lies beside an agent may lie ahead of another."""
 
 COSTR_SMALL = DetectorConfig(
@@ -22,7 +22,7 @@ COSTR_SMALL = DetectorConfig(
     encoder=EncoderConfig((32, 32, 64, 64, 64, 64), (0, 2, 2, 2, 1, 1), prune_strides=(2, 4)),
     head_channels=64,
     prune_threshold=0.1,
-    decode=DecodeConfig(overlap_power=0.6),
+    decode=DecodeConfig(iou_score_weight=0.6),
     fusion="flow_aware",
     sweeps=2,
 )

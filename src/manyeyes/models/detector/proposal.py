@@ -11,36 +11,36 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from manyeyes.models.detector.box_head import RAW, SPEED_UNIT, RawBoxes
+from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT, RawBoxes
 
-PROPOSAL = RAW.total
+PROPOSAL_DIM = BOX_LAYOUT.total
 """Columns of a proposal: those of RawBoxes, in its order."""
 
 
-def propose(raw: RawBoxes) -> Tensor:
+def make_proposals(raw: RawBoxes) -> Tensor:
     """(N, PROPOSAL) of what the head said of each site; a statement, so it carries no gradient."""
-    return raw.columns().detach().clamp(-16, 16)
+    return raw.to_rows().detach().clamp(-16, 16)
 
 
 def proposed_offset(proposal: Tensor) -> Tensor:
     """(N, 2): from the token's own place to the centre of the box, in cells."""
-    return proposal[:, RAW.offset]
+    return proposal[:, BOX_LAYOUT.offset]
 
 
 def proposed_heat(proposal: Tensor) -> Tensor:
     """(N,): the logit that the token is the middle of an object."""
-    return proposal[:, RAW.heat][:, 0]
+    return proposal[:, BOX_LAYOUT.heatmap_logit][:, 0]
 
 
 def proposed_velocity(proposal: Tensor) -> Tensor:
     """(N, 2): of the object, metres per second."""
-    return proposal[:, RAW.velocity] * SPEED_UNIT
+    return proposal[:, BOX_LAYOUT.velocity] * SPEED_UNIT
 
 
 def reset_origin(proposal: Tensor, shift: Tensor) -> Tensor:
     """The same boxes, measured from places that lie (N, 2) cells before the tokens' own."""
     moved = proposal.clone()
-    moved[:, RAW.offset] += shift
+    moved[:, BOX_LAYOUT.offset] += shift
     return moved
 
 
@@ -50,9 +50,9 @@ def move_proposal(proposal: Tensor, yaw: Tensor, height: Tensor) -> Tensor:
     once = torch.stack((torch.stack((c, s)), torch.stack((-s, c))))
     twice = once @ once
     moved = proposal.clone()
-    moved[:, RAW.offset] = proposal[:, RAW.offset] @ once
-    moved[:, RAW.z] += height[:, None]
-    moved[:, RAW.axis] = proposal[:, RAW.axis] @ twice
-    moved[:, RAW.direction] = proposal[:, RAW.direction] @ once
-    moved[:, RAW.velocity] = proposal[:, RAW.velocity] @ once
+    moved[:, BOX_LAYOUT.offset] = proposal[:, BOX_LAYOUT.offset] @ once
+    moved[:, BOX_LAYOUT.z] += height[:, None]
+    moved[:, BOX_LAYOUT.axis] = proposal[:, BOX_LAYOUT.axis] @ twice
+    moved[:, BOX_LAYOUT.direction] = proposal[:, BOX_LAYOUT.direction] @ once
+    moved[:, BOX_LAYOUT.velocity] = proposal[:, BOX_LAYOUT.velocity] @ once
     return moved

@@ -15,17 +15,17 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import LABELS
-from manyeyes.models.detector.box_head import RAW, SPEED_UNIT, axis_yaw
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT, axis_yaw
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 
 _STEPS = (
-    (RAW.heat, 1 / 16),
+    (BOX_LAYOUT.heatmap_logit, 1 / 16),
     # Beyond fusion.settle.REACH_CELLS a proposal is not followed: what saturates stays beyond.
-    (RAW.offset, 2.25 / 127),
-    (RAW.z, 0.04),
-    (RAW.log_size, 0.0125),
-    (RAW.overlap, 1 / 16),
-    (RAW.velocity, 0.25 / SPEED_UNIT),
+    (BOX_LAYOUT.offset, 2.25 / 127),
+    (BOX_LAYOUT.z, 0.04),
+    (BOX_LAYOUT.log_size, 0.0125),
+    (BOX_LAYOUT.iou_logit, 1 / 16),
+    (BOX_LAYOUT.velocity, 0.25 / SPEED_UNIT),
 )
 _FACING_STEP = 1 / 8
 _LEADS = 256 // len(LABELS)
@@ -47,11 +47,11 @@ PROPOSAL_CODES = len(_COLUMNS) + 4
 def proposal_to_codes(proposal: Tensor) -> Tensor:
     """(N, PROPOSAL) to (N, PROPOSAL_CODES) uint8."""
     single = _signed(proposal[:, _COLUMNS], _COLUMN_STEPS)
-    axis = torch.remainder(torch.round(axis_yaw(proposal[:, RAW.axis]) * (256 / math.pi)), 256)
-    facing = (proposal[:, RAW.direction] * _along(axis)).sum(1)
-    best = proposal[:, RAW.kind].topk(2, dim=1)
+    axis = torch.remainder(torch.round(axis_yaw(proposal[:, BOX_LAYOUT.axis]) * (256 / math.pi)), 256)
+    facing = (proposal[:, BOX_LAYOUT.direction] * _along(axis)).sum(1)
+    best = proposal[:, BOX_LAYOUT.class_logits].topk(2, dim=1)
     lead = torch.floor((best.values[:, 0] - best.values[:, 1]) / _LEAD_STEP).clamp(0, _LEADS - 1)
-    sigma = [proposal[:, c][:, 0] for c in (RAW.log_sigma_xy, RAW.log_sigma_yaw)]
+    sigma = [proposal[:, c][:, 0] for c in (BOX_LAYOUT.log_sigma_xy, BOX_LAYOUT.log_sigma_yaw)]
     nibbles = [torch.round((s - _SIGMA_LOW) / _SIGMA_STEP).clamp(0, 15) for s in sigma]
     rest = (axis, _signed(facing, _FACING_STEP), best.indices[:, 0] * _LEADS + lead, nibbles[0] * 16 + nibbles[1])
     return torch.cat((single, torch.stack(rest, 1)), 1).to(torch.uint8)
@@ -61,17 +61,17 @@ def proposal_from_codes(codes: Tensor) -> Tensor:
     """The inverse: (N, PROPOSAL_CODES) uint8 to (N, PROPOSAL) float32; any bytes stand for some proposal."""
     code = codes.float()
     axis, facing, kind, sigma = code[:, -4:].unbind(1)
-    proposal = code.new_zeros(len(code), PROPOSAL)
+    proposal = code.new_zeros(len(code), PROPOSAL_DIM)
     proposal[:, _COLUMNS] = (code[:, :-4] - 128) * _COLUMN_STEPS
     turn = axis * (2 * math.pi / 256)
-    proposal[:, RAW.axis] = torch.stack((turn.cos(), turn.sin()), 1)
-    proposal[:, RAW.direction] = ((facing - 128) * _FACING_STEP)[:, None] * _along(axis)
+    proposal[:, BOX_LAYOUT.axis] = torch.stack((turn.cos(), turn.sin()), 1)
+    proposal[:, BOX_LAYOUT.direction] = ((facing - 128) * _FACING_STEP)[:, None] * _along(axis)
     # The middle of its step: never 0, so that the best stays the best.
     lead = (torch.remainder(kind, _LEADS) + 0.5) * (_LEAD_STEP / 2)
     named = torch.arange(len(LABELS)) == kind.div(_LEADS, rounding_mode="floor")[:, None]
-    proposal[:, RAW.kind] = torch.where(named, lead[:, None], -lead[:, None])
+    proposal[:, BOX_LAYOUT.class_logits] = torch.where(named, lead[:, None], -lead[:, None])
     nibbles = torch.stack((sigma.div(16, rounding_mode="floor"), torch.remainder(sigma, 16)), 1)
-    proposal[:, [RAW.log_sigma_xy.start, RAW.log_sigma_yaw.start]] = _SIGMA_LOW + _SIGMA_STEP * nibbles
+    proposal[:, [BOX_LAYOUT.log_sigma_xy.start, BOX_LAYOUT.log_sigma_yaw.start]] = _SIGMA_LOW + _SIGMA_STEP * nibbles
     return proposal
 
 

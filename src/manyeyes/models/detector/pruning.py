@@ -12,7 +12,7 @@ from manyeyes.datatypes import Sites, SparseBev
 
 
 @dataclass(frozen=True)
-class Pruned:
+class PruneOutput:
     """What one pruning layer saw: its sites before pruning and the logit (N,) of each lying near an object."""
 
     sites: Sites
@@ -27,10 +27,10 @@ class FocalPrune(nn.Module):
         self.score = nn.Linear(channels, 1)
         nn.init.constant_(self.score.bias, -2.19)
 
-    def forward(self, x: SparseBev, threshold: float) -> tuple[SparseBev, Pruned]:
+    def forward(self, x: SparseBev, threshold: float) -> tuple[SparseBev, PruneOutput]:
         """Cells whose probability exceeds threshold (0 keeps all), as a new set, and what was decided on."""
         logit = self.score(x.features)[:, 0]
-        pruned = Pruned(x.sites, logit)
+        pruned = PruneOutput(x.sites, logit)
         if threshold <= 0:
             return x, pruned
         return x.keep(torch.sigmoid(logit.detach()) > threshold), pruned

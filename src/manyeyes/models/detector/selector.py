@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import SparseBev
-from manyeyes.models.detector.proposal import PROPOSAL, proposed_heat
-from manyeyes.models.fusion.token_merge import WORD_SCALE, resting_keys
+from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
+from manyeyes.models.fusion.token_merge import PROPOSAL_SCALE, target_cell_keys
 
 
 class Selector(nn.Module):
@@ -21,20 +21,20 @@ class Selector(nn.Module):
 
     def __init__(self, channels: int, hidden: int = 64) -> None:
         super().__init__()
-        self.inner, self.outer = nn.Linear(channels + PROPOSAL + 1, hidden), nn.Linear(hidden, 1)
-        self.repeat = nn.Parameter(torch.tensor(-2.0))
+        self.inner, self.outer = nn.Linear(channels + PROPOSAL_DIM + 1, hidden), nn.Linear(hidden, 1)
+        self.redundancy_weight = nn.Parameter(torch.tensor(-2.0))
         nn.init.zeros_(self.outer.weight)
         nn.init.zeros_(self.outer.bias)
 
-    def forward(self, told: SparseBev) -> Tensor:
+    def forward(self, tokens: SparseBev) -> Tensor:
         """(N, C + PROPOSAL) on one grid or a batch of them to logits (N,); no gradient reaches what is told."""
-        rows = told.features.detach()
-        proposal = rows[:, -PROPOSAL:]
+        rows = tokens.features.detach()
+        proposal = rows[:, -PROPOSAL_DIM:]
         heat = proposed_heat(proposal)
-        rank = rank_in_group(resting_keys(told.sites.xy, proposal, told.sites.batch, told.grid), heat).log1p()
-        words = torch.cat((rows[:, :-PROPOSAL], proposal * WORD_SCALE, rank[:, None]), 1)
-        learned = self.outer(torch.relu(self.inner(words)))[:, 0]
-        return heat + self.repeat * rank + learned
+        rank = rank_in_group(target_cell_keys(tokens.sites.xy, proposal, tokens.sites.batch, tokens.grid), heat).log1p()
+        inputs = torch.cat((rows[:, :-PROPOSAL_DIM], proposal * PROPOSAL_SCALE, rank[:, None]), 1)
+        learned = self.outer(torch.relu(self.inner(inputs)))[:, 0]
+        return heat + self.redundancy_weight * rank + learned
 
 
 def rank_in_group(key: Tensor, value: Tensor) -> Tensor:

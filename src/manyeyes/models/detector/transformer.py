@@ -19,7 +19,7 @@ from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_
 class AttentionConfig:
     """window: edge S of a window in cells of the token grid; blocks alternate regular and shifted windows.
 
-    levels: shares of S^2 up to which a window's number of tokens is Low, and Medium; above it is High (Eq. 5).
+    density_thresholds: shares of S^2 up to which a window's number of tokens is Low, and Medium; above it is High (Eq. 5).
     separate_weights: a block has weights for each level, the paper's letter; shared ones do not ask for the level.
     """
 
@@ -27,14 +27,14 @@ class AttentionConfig:
     blocks: int = 2
     heads: int = 4
     expansion: int = 2
-    levels: tuple[float, float] = (0.125, 0.25)
+    density_thresholds: tuple[float, float] = (0.125, 0.25)
     separate_weights: bool = False
 
     def __post_init__(self) -> None:
-        low, medium = self.levels
+        low, medium = self.density_thresholds
         if not 0 <= low <= medium:
             raise ConfigError(
-                f"AttentionConfig.levels are two ascending shares of a window's cells; got {self.levels}."
+                f"AttentionConfig.levels are two ascending shares of a window's cells; got {self.density_thresholds}."
             )
 
 
@@ -69,9 +69,9 @@ class WindowBlock(nn.Module):
         cache = {} if cache is None else cache
         name = ("windows", self.window, self.shifted)
         if name not in cache:
-            edge = self.window * grid.cell
+            edge = self.window * grid.cell_size_m
             origin, shift = (grid.x_min, grid.y_min), edge / 2 if self.shifted else 0.0
-            cache[name] = window_places(xy, batch, origin, edge, grid.cell, shift)
+            cache[name] = window_places(xy, batch, origin, edge, grid.cell_size_m, shift)
         ids, offsets = cache[name]
         if self.folded is not None and _plain(features):
             return run_block(features, offsets, window_runs(ids), self.folded)
@@ -109,9 +109,9 @@ class RoutedBlock(nn.Module):
         self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
     ) -> Tensor:
         """(N, C) to (N, C); see WindowBlock. cache is not used: each level has tokens of its own."""
-        edge = self.config.window * grid.cell
+        edge = self.config.window * grid.cell_size_m
         ids = window_ids(xy, batch, (grid.x_min, grid.y_min), edge, edge / 2 if self.shifted else 0.0)
-        level = density_levels(ids, self.config.window**2, self.config.levels)
+        level = density_levels(ids, self.config.window**2, self.config.density_thresholds)
         out = features
         for number, block in enumerate(self.levels):
             rows = (level == number).nonzero()[:, 0]
@@ -120,14 +120,14 @@ class RoutedBlock(nn.Module):
         return out
 
 
-def density_levels(window: Tensor, cells: int, levels: tuple[float, float]) -> Tensor:
+def density_levels(window: Tensor, cells: int, thresholds: tuple[float, float]) -> Tensor:
     """(N,) int64: 0 Low, 1 Medium, 2 High, by how many tokens n_w the window (N,) of each holds (CoSTr Eq. 5).
 
     Low: n_w / cells at most levels[0]; Medium: at most levels[1]; tokens at continuous places may be more than cells.
     """
     _, row, count = window.unique(return_inverse=True, return_counts=True)
     share = count[row].double() / cells
-    return (share > levels[0]).long() + (share > levels[1]).long()
+    return (share > thresholds[0]).long() + (share > thresholds[1]).long()
 
 
 def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:

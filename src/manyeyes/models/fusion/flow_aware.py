@@ -6,8 +6,8 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
-from manyeyes.models.fusion.positional_encoding import Placement
-from manyeyes.models.fusion.token_merge import Fused, Settle, settle
+from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
 
@@ -30,16 +30,16 @@ class PastAttention(nn.Module):
         for nothing in (self.out.weight, last.weight, last.bias):
             nn.init.zeros_(nothing)
 
-    def forward(self, features: Tensor, tokens: Tokens, remembered: Tensor, past: Tokens) -> Tensor:
+    def forward(self, features: Tensor, tokens: Tokens, past_features: Tensor, past: Tokens) -> Tensor:
         """features (N, C) of tokens and remembered (M, C) of the past, placed and timed, to (N, C)."""
-        edge, cell = self.window * tokens.grid.cell, tokens.grid.cell
+        edge, cell = self.window * tokens.grid.cell_size_m, tokens.grid.cell_size_m
         origin = (tokens.grid.x_min, tokens.grid.y_min)
-        asking, known_in = (window_ids(t.xy, t.ego, origin, edge) for t in (tokens, past))
-        plan = plan_windows(asking, known_in)
-        asked = (plan.query_place < plan.query_slot.shape[0]).nonzero()[:, 0]
-        if not len(asked):
+        query_window, past_window = (window_ids(t.xy, t.ego, origin, edge) for t in (tokens, past))
+        plan = plan_windows(query_window, past_window)
+        has_past = (plan.query_place < plan.query_slot.shape[0]).nonzero()[:, 0]
+        if not len(has_past):
             return features
-        normed, known = self.norm(features), self.norm_past(remembered)
+        normed, known = self.norm(features), self.norm_past(past_features)
         here, there = (
             sincos_encoding(window_offsets(t.xy, origin, edge, cell), features.shape[1]) for t in (tokens, past)
         )
@@ -48,24 +48,24 @@ class PastAttention(nn.Module):
             return x.view(x.shape[0], self.heads, x.shape[1] // self.heads)
 
         heads = split(self.query(normed + here)), split(self.key(known + there)), split(self.value(known))
-        some = (features + self.out(window_attention(*heads, plan).flatten(1)))[asked]
-        return features.index_copy(0, asked, some + self.ffn(self.norm_ffn(some)))
+        some = (features + self.out(window_attention(*heads, plan).flatten(1)))[has_past]
+        return features.index_copy(0, has_past, some + self.ffn(self.norm_ffn(some)))
 
 
-class FlowAwareFusion(nn.Module):
+class FastFusion(nn.Module):
     """Tokens attend to each other where their objects should be by now, then to what the ego itself saw, then settle."""
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
-        self.placement, self.transformer = Placement(channels), WindowTransformer(channels, config)
-        self.past = PastAttention(channels, config)
-        self.settle = Settle(channels, "trust")
+        self.encoding, self.transformer = SpatioTemporalEncoding(channels), WindowTransformer(channels, config)
+        self.past_attention = PastAttention(channels, config)
+        self.merge = TokenMerge(channels, "trust")
 
-    def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+    def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Tokens of all agents, and those of the ego's own last instants, to one feature and one box a cell."""
-        key, place = settle(tokens)
-        attended = self.transformer(self.placement(tokens.features, tokens, place), tokens.xy, tokens.ego, tokens.grid)
+        key, place = assign_cells(tokens)
+        attended = self.transformer(self.encoding(tokens.features, tokens, place), tokens.xy, tokens.ego, tokens.grid)
         if past is not None and len(past.features):
-            remembered = self.placement(past.features, past, settle(past)[1])
-            attended = self.past(attended, tokens, remembered, past)
-        return self.settle(attended, tokens, key, place)
+            past_features = self.encoding(past.features, past, assign_cells(past)[1])
+            attended = self.past_attention(attended, tokens, past_features, past)
+        return self.merge(attended, tokens, key, place)

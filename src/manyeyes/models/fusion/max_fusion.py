@@ -5,19 +5,19 @@ from __future__ import annotations
 
 from torch import nn
 
-from manyeyes.models.fusion.positional_encoding import Placement
-from manyeyes.models.fusion.token_merge import Fused, Settle, settle
+from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 
 
-class MaximumFusion(nn.Module):
+class MaxFusion(nn.Module):
     """Every agent's feature on the cell where it settles; the maximum of each channel."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.placement, self.settle = Placement(channels), Settle(channels, "max")
+        self.encoding, self.merge = SpatioTemporalEncoding(channels), TokenMerge(channels, "max")
 
-    def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+    def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
-        key, place = settle(tokens)
-        return self.settle(self.placement(tokens.features, tokens, place), tokens, key, place)
+        key, place = assign_cells(tokens)
+        return self.merge(self.encoding(tokens.features, tokens, place), tokens, key, place)

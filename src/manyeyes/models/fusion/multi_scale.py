@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import ConfigError, Sites, SparseBev
 from manyeyes.models.detector.layers import SubmanifoldLayer
-from manyeyes.models.fusion.positional_encoding import Placement
-from manyeyes.models.fusion.token_merge import Fused, Settle, settle
+from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.sparse_index import distinct
 from manyeyes.ops.voxelize import segment_max
@@ -26,31 +26,31 @@ class MultiScaleFusion(nn.Module):
         super().__init__()
         if levels < 2:
             raise ConfigError(f"MultiScaleFusion needs at least two levels; got {levels}. Maximum fusion has one.")
-        self.placement, self.settle = Placement(channels), Settle(channels, "max")
-        self.coarser = nn.ModuleList(Scale(channels, 2**level) for level in range(1, levels))
+        self.encoding, self.merge = SpatioTemporalEncoding(channels), TokenMerge(channels, "max")
+        self.coarse_scales = nn.ModuleList(CoarseScale(channels, 2**level) for level in range(1, levels))
         self.out = nn.Linear(levels * channels, channels, bias=False)
         with torch.no_grad():
             self.out.weight.copy_(torch.eye(channels, levels * channels))
 
-    def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+    def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
-        key, place = settle(tokens)
-        placed = self.placement(tokens.features, tokens, place)
-        fine = self.settle(placed, tokens, key, place)
+        key, place = assign_cells(tokens)
+        placed = self.encoding(tokens.features, tokens, place)
+        fine = self.merge(placed, tokens, key, place)
         row = torch.searchsorted(fine.bev.sites.key, key)
-        heard = placed * tokens.kept[:, None]
-        scales = [fine.bev.features, *(scale(heard, row, fine.bev.sites) for scale in self.coarser)]
-        return Fused(fine.bev.with_features(self.out(torch.cat(scales, 1))), fine.given)
+        masked = placed * tokens.selection_mask[:, None]
+        scales = [fine.bev.features, *(scale(masked, row, fine.bev.sites) for scale in self.coarse_scales)]
+        return FusedBev(fine.bev.with_features(self.out(torch.cat(scales, 1))), fine.given)
 
 
-class Scale(nn.Module):
+class CoarseScale(nn.Module):
     """One coarser scale: tokens of a cell times as wide become one, look around, and are told to the fine cells within."""
 
     def __init__(self, channels: int, times: int) -> None:
         super().__init__()
         self.times = times
         self.down = nn.Sequential(nn.Linear(channels, channels), nn.LayerNorm(channels), nn.ReLU())
-        self.around = SubmanifoldLayer(channels, channels, norm=nn.LayerNorm)
+        self.conv = SubmanifoldLayer(channels, channels, norm=nn.LayerNorm)
 
     def forward(self, features: Tensor, row: Tensor, sites: Sites) -> Tensor:
         """features: (N, C) of tokens that rest on fine sites row (N,); to (sites, C)."""
@@ -59,5 +59,5 @@ class Scale(nn.Module):
         yx = grid.cells(sites.xy)
         key, parent = distinct((sites.batch * rows + yx[:, 0]) * columns + yx[:, 1], sites.batch_size * rows * columns)
         merged = segment_max(self.down(features), parent[row], len(key))
-        coarse = self.around(SparseBev(merged, Sites(key, grid, sites.batch_size)))
+        coarse = self.conv(SparseBev(merged, Sites(key, grid, sites.batch_size)))
         return coarse.features[parent]

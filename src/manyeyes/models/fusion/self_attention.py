@@ -6,8 +6,8 @@ from __future__ import annotations
 from torch import nn
 
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
-from manyeyes.models.fusion.positional_encoding import Placement
-from manyeyes.models.fusion.token_merge import Fused, Settle, settle
+from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 
 
@@ -16,12 +16,12 @@ class SelfAttentionFusion(nn.Module):
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
-        self.placement, self.transformer = Placement(channels), WindowTransformer(channels, config)
-        self.settle = Settle(channels, "trust")
+        self.encoding, self.transformer = SpatioTemporalEncoding(channels), WindowTransformer(channels, config)
+        self.merge = TokenMerge(channels, "trust")
 
-    def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+    def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
-        key, place = settle(tokens)
-        placed = self.placement(tokens.features, tokens, place)
+        key, place = assign_cells(tokens)
+        placed = self.encoding(tokens.features, tokens, place)
         attended = self.transformer(placed, tokens.xy, tokens.ego, tokens.grid)
-        return self.settle(attended, tokens, key, place)
+        return self.merge(attended, tokens, key, place)

@@ -10,49 +10,49 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, Sites, SparseBev
-from manyeyes.models.detector.box_head import RAW
-from manyeyes.models.detector.proposal import PROPOSAL, proposed_heat, proposed_offset, reset_origin
+from manyeyes.models.detector.box_head import BOX_LAYOUT
+from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat, proposed_offset, reset_origin
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.sparse_index import distinct
 from manyeyes.ops.voxelize import segment_max, segment_sum
 
-VOTING_HEAT = -3.0
+MIN_VOTE_LOGIT = -3.0
 """Logit from which a token is taken at its word and settles where it says that its object is; others stay where they are."""
 DRIFT_MPS = 1.0
 """How fast a remembered or delayed box is taken to become uncertain: what is left of a velocity's error."""
-REACH_CELLS = 2.0
+MAX_OFFSET_CELLS = 2.0
 """A proposal that points farther, in cells, is not followed: at stride 4 heads learn centres up to 1.5 cells away."""
 
 
 @dataclass(frozen=True, eq=False)
-class Fused:
+class FusedBev:
     """One feature a cell (N, C), and the agents' boxes for it (N, PROPOSAL), merged: where the second look starts from."""
 
     bev: SparseBev
-    given: Tensor
+    merged_proposals: Tensor
 
 
-def settle(tokens: Tokens) -> tuple[Tensor, Tensor]:
+def assign_cells(tokens: Tokens) -> tuple[Tensor, Tensor]:
     """Key (N,) of the cell where each token comes to rest, and the token's own place (N, 2) from that cell's centre, in cells."""
-    key = resting_keys(tokens.xy, tokens.proposal, tokens.ego, tokens.grid)
+    key = target_cell_keys(tokens.xy, tokens.proposal, tokens.ego, tokens.grid)
     rows, columns = tokens.grid.shape
     within = key.remainder(rows * columns)
     yx = torch.stack((within.div(columns, rounding_mode="floor"), within.remainder(columns)), -1)
-    return key, (tokens.xy - tokens.grid.centers(yx)) / tokens.grid.cell
+    return key, (tokens.xy - tokens.grid.centers(yx)) / tokens.grid.cell_size_m
 
 
-def resting_keys(xy: Tensor, proposal: Tensor, grid_of: Tensor, grid: BevGrid) -> Tensor:
+def target_cell_keys(xy: Tensor, proposal: Tensor, grid_of: Tensor, grid: BevGrid) -> Tensor:
     """(N,) int64, ``(grid_of * rows + row) * columns + column`` of the cell where tokens at xy (N, 2) come to rest."""
     offset = proposed_offset(proposal)
-    votes = (proposed_heat(proposal) > VOTING_HEAT) & (offset.abs().amax(1) <= REACH_CELLS)
-    goal = xy + offset * votes[:, None] * grid.cell
-    goal = torch.where(grid.inside(goal)[:, None], goal, xy)
+    votes = (proposed_heat(proposal) > MIN_VOTE_LOGIT) & (offset.abs().amax(1) <= MAX_OFFSET_CELLS)
+    goal = xy + offset * votes[:, None] * grid.cell_size_m
+    goal = torch.where(grid.contains(goal)[:, None], goal, xy)
     rows, columns = grid.shape
     yx = grid.cells(goal)
     return (grid_of * rows + yx[:, 0]) * columns + yx[:, 1]
 
 
-class Settle(nn.Module):
+class TokenMerge(nn.Module):
     """Tokens of a cell become one: a mean by trust, or the maximum, of features; a mean by trust of their boxes.
 
     Trust is a softmax within the cell of what the tokens propose (heat, own word on overlap and error) and of their features;
@@ -64,44 +64,48 @@ class Settle(nn.Module):
     def __init__(self, channels: int, reduce: Literal["trust", "max"]) -> None:
         super().__init__()
         self.reduce = reduce
-        self.word, self.inner_trust = nn.Linear(3, 1, bias=False), nn.Linear(channels, 1, bias=False)
-        self.inner = nn.Linear(RAW.velocity.start + 4, 2 * channels)
+        self.proposal_weight, self.feature_weight = nn.Linear(3, 1, bias=False), nn.Linear(channels, 1, bias=False)
+        self.inner = nn.Linear(BOX_LAYOUT.velocity.start + 4, 2 * channels)
         self.outer = nn.Linear(2 * channels, channels, bias=False)
         with torch.no_grad():
-            self.word.weight.copy_(torch.tensor([[1.0, 1.0, -1.0]]))
-        nn.init.zeros_(self.inner_trust.weight)
+            self.proposal_weight.weight.copy_(torch.tensor([[1.0, 1.0, -1.0]]))
+        nn.init.zeros_(self.feature_weight.weight)
 
-    def forward(self, features: Tensor, tokens: Tokens, key: Tensor, place: Tensor) -> Fused:
+    def forward(self, features: Tensor, tokens: Tokens, key: Tensor, cell_offset: Tensor) -> FusedBev:
         """Features (N, C) of tokens that rest on cells key (N,), their places from there (N, 2)."""
         rows, columns = tokens.grid.shape
         found, row = distinct(key, tokens.batch_size * rows * columns)
         n = found.shape[0]
-        boxes = reset_origin(tokens.proposal, place)
+        boxes = reset_origin(tokens.proposal, cell_offset)
         moved = DRIFT_MPS * 0.1 * tokens.age
-        blur = (boxes[:, RAW.log_sigma_xy].clamp(-5, 3).exp() ** 2 + (tokens.doubt**2 + moved**2)[:, None]).log() / 2
-        words = torch.cat((boxes[:, RAW.heat], boxes[:, RAW.overlap], blur), 1)
-        trust = (self.word(words) + self.inner_trust(features))[:, 0] + tokens.kept.log()
-        share = _softmax(trust, row, n)[:, None]
-        given = segment_sum(share * boxes, row, n)
-        sure = torch.sigmoid(boxes[:, RAW.heat])
-        away = (boxes[:, RAW.offset] - given[row][:, RAW.offset]) ** 2
-        met = segment_sum(torch.cat((torch.ones_like(sure), sure), 1), row, n).log1p()
-        apart = segment_sum(share * away, row, n).clamp_max(1)
-        told = torch.cat(((given * WORD_SCALE)[:, : RAW.velocity.start], met, apart), 1)
-        features = features * tokens.kept[:, None]
-        merged = segment_max(features, row, n) if self.reduce == "max" else segment_sum(share * features, row, n)
-        merged = merged + self.outer(torch.relu(self.inner(told)))
-        return Fused(SparseBev(merged, Sites(found, tokens.grid, tokens.batch_size)), given)
+        blur = (
+            boxes[:, BOX_LAYOUT.log_sigma_xy].clamp(-5, 3).exp() ** 2 + (tokens.sigma_m**2 + moved**2)[:, None]
+        ).log() / 2
+        proposal_terms = torch.cat((boxes[:, BOX_LAYOUT.heatmap_logit], boxes[:, BOX_LAYOUT.iou_logit], blur), 1)
+        logit = (self.proposal_weight(proposal_terms) + self.feature_weight(features))[
+            :, 0
+        ] + tokens.selection_mask.log()
+        weight = _softmax(logit, row, n)[:, None]
+        merged_proposals = segment_sum(weight * boxes, row, n)
+        score = torch.sigmoid(boxes[:, BOX_LAYOUT.heatmap_logit])
+        away = (boxes[:, BOX_LAYOUT.offset] - merged_proposals[row][:, BOX_LAYOUT.offset]) ** 2
+        met = segment_sum(torch.cat((torch.ones_like(score), score), 1), row, n).log1p()
+        apart = segment_sum(weight * away, row, n).clamp_max(1)
+        statistics = torch.cat(((merged_proposals * PROPOSAL_SCALE)[:, : BOX_LAYOUT.velocity.start], met, apart), 1)
+        features = features * tokens.selection_mask[:, None]
+        merged = segment_max(features, row, n) if self.reduce == "max" else segment_sum(weight * features, row, n)
+        merged = merged + self.outer(torch.relu(self.inner(statistics)))
+        return FusedBev(SparseBev(merged, Sites(found, tokens.grid, tokens.batch_size)), merged_proposals)
 
 
-def _word_scale() -> Tensor:
-    scale = torch.ones(PROPOSAL)
-    for logits in (RAW.heat, RAW.overlap, RAW.kind, RAW.direction):
+def _proposal_scale() -> Tensor:
+    scale = torch.ones(PROPOSAL_DIM)
+    for logits in (BOX_LAYOUT.heatmap_logit, BOX_LAYOUT.iou_logit, BOX_LAYOUT.class_logits, BOX_LAYOUT.direction):
         scale[logits] = 0.25
     return scale
 
 
-WORD_SCALE = _word_scale()
+PROPOSAL_SCALE = _proposal_scale()
 """Brings a proposal's logits to a few units."""
 
 

@@ -10,30 +10,31 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, Transform
-from manyeyes.models.detector.proposal import PROPOSAL, move_proposal, proposed_velocity
+from manyeyes.models.detector.proposal import PROPOSAL_DIM, move_proposal, proposed_velocity
 
-CUES = 5
-FASTEST_MPS = 40.0
+POSE_CONTEXT_DIM = 5
+MAX_SPEED_MPS = 40.0
 """A proposal that claims a higher speed is not moved by it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class AgentTokens:
     """What one agent told of one instant, for one ego of a batch.
 
-    told: (n, C + PROPOSAL); xy: (n, 2), metres in the sender's frame. ego_from_sender: from the sender's frame when it looked
-    to the ego's now; None: the ego's own, of now. age_s: how long ago that was. doubt_xy_m, doubt_yaw_rad: standard deviations
-    of that motion, as claimed. kept: (n,), ones through which the gradient of having been selected flows; None: no selection.
+    tokens: (n, C + PROPOSAL); xy: (n, 2), metres in the sender's frame. ego_from_sender: from the sender's frame when it looked
+    to the ego's now; None: the ego's own, of now. age_s: how long ago that was. sigma_xy_m, sigma_yaw_rad: standard deviations
+    of that motion, as claimed. selection_mask: (n,), ones through which the gradient of having been selected flows; None: no
+    selection.
     """
 
     ego: int
-    told: Tensor
+    tokens: Tensor
     xy: Tensor
     ego_from_sender: Transform | None = None
     age_s: float = 0.0
-    doubt_xy_m: float = 0.0
-    doubt_yaw_rad: float = 0.0
-    kept: Tensor | None = None
+    sigma_xy_m: float = 0.0
+    sigma_yaw_rad: float = 0.0
+    selection_mask: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,29 +42,29 @@ class Tokens:
     """N tokens around a batch of egos; cells of different agents may coincide.
 
     features: (N, C); xy: (N, 2) metres in the ego's frame, where their object should be by now; ego: (N,) int64, which ego of
-    the batch. cue: (N, CUES), how the sender's frame differs from the ego's there: height in metres, sine and cosine - 1 of the
-    relative yaw, doubt (one standard deviation of the place, metres), age (units of 100 ms); zero for the ego's own of now.
-    proposal: (N, PROPOSAL) in the ego's axes, from the token's own place. kept: (N,) as in Part.
+    the batch. pose_context: (N, CUES), how the sender's frame differs from the ego's there: height in metres, sine and cosine - 1
+    of the relative yaw, doubt (one standard deviation of the place, metres), age (units of 100 ms); zero for the ego's own of now.
+    proposal: (N, PROPOSAL) in the ego's axes, from the token's own place. selection_mask: (N,) as in Part.
     """
 
     features: Tensor
     xy: Tensor
     ego: Tensor
-    cue: Tensor
+    pose_context: Tensor
     proposal: Tensor
-    kept: Tensor
+    selection_mask: Tensor
     grid: BevGrid
     batch_size: int
 
     @property
-    def doubt(self) -> Tensor:
+    def sigma_m(self) -> Tensor:
         """(N,) metres."""
-        return self.cue[:, 3]
+        return self.pose_context[:, 3]
 
     @property
     def age(self) -> Tensor:
         """(N,) in units of 100 ms (detection.md, Eq. 9)."""
-        return self.cue[:, 4]
+        return self.pose_context[:, 4]
 
 
 def rotate_vectors(features: Tensor, yaw: Tensor) -> Tensor:
@@ -78,31 +79,38 @@ def rotate_vectors(features: Tensor, yaw: Tensor) -> Tensor:
     return torch.cat((turned.flatten(1), features[:, channels // 2 :]), 1)
 
 
-def gather(parts: Iterable[Part], grid: BevGrid, batch_size: int) -> Tokens:
+def to_ego_frame(agent_tokens: Iterable[AgentTokens], grid: BevGrid, batch_size: int) -> Tokens:
     """All parts in their egos' frames; tokens that fall outside the ego's range are dropped. grid: the lattice of all tokens."""
-    columns = [_moved(part, grid) for part in parts]
+    columns = [_transform_part(part, grid) for part in agent_tokens]
     features, places, egos, cues, proposals, kept = (torch.cat(column) for column in zip(*columns))
     return Tokens(features, places, egos, cues, proposals, kept, grid, batch_size)
 
 
-def _moved(part: Part, grid: BevGrid) -> tuple[Tensor, ...]:
-    feature, proposal, xy = part.told[:, :-PROPOSAL], part.told[:, -PROPOSAL:], part.xy
+def _transform_part(part: AgentTokens, grid: BevGrid) -> tuple[Tensor, ...]:
+    feature, proposal, xy = part.tokens[:, :-PROPOSAL_DIM], part.tokens[:, -PROPOSAL_DIM:], part.xy
     n = feature.shape[0]
     ego = torch.full((n,), part.ego, dtype=torch.int64, device=feature.device)
-    kept = feature.new_ones(n) if part.kept is None else part.kept
+    selection_mask = feature.new_ones(n) if part.selection_mask is None else part.selection_mask
     if part.ego_from_sender is None:
-        return feature, xy, ego, feature.new_zeros(n, CUES), proposal, kept
+        return feature, xy, ego, feature.new_zeros(n, POSE_CONTEXT_DIM), proposal, selection_mask
     if part.age_s:
         velocity = proposed_velocity(proposal)
-        xy = xy + velocity * part.age_s * (velocity.norm(dim=1, keepdim=True) <= FASTEST_MPS)
+        xy = xy + velocity * part.age_s * (velocity.norm(dim=1, keepdim=True) <= MAX_SPEED_MPS)
     yaw = part.ego_from_sender.yaw
     moved = part.ego_from_sender.apply(torch.cat((xy, xy.new_zeros(n, 1)), 1).double())
     height = moved[:, 2].to(feature.dtype)
-    doubt = (part.doubt_xy_m**2 + (part.doubt_yaw_rad * xy.norm(dim=1)) ** 2).sqrt()
+    sigma_m = (part.sigma_xy_m**2 + (part.sigma_yaw_rad * xy.norm(dim=1)) ** 2).sqrt()
     same = torch.stack((yaw.sin(), yaw.cos() - 1)).to(feature.dtype).expand(n, 2)
-    age = torch.full_like(doubt, part.age_s / 0.1)
-    cue = torch.cat((height[:, None], same, doubt[:, None], age[:, None]), 1)
+    age = torch.full_like(sigma_m, part.age_s / 0.1)
+    pose_context = torch.cat((height[:, None], same, sigma_m[:, None], age[:, None]), 1)
     xy = moved[:, :2].float()
-    near = grid.inside(xy)
-    columns = (rotate_vectors(feature, yaw), xy, ego, cue, move_proposal(proposal, yaw, height), kept)
+    near = grid.contains(xy)
+    columns = (
+        rotate_vectors(feature, yaw),
+        xy,
+        ego,
+        pose_context,
+        move_proposal(proposal, yaw, height),
+        selection_mask,
+    )
     return tuple(column[near] for column in columns)

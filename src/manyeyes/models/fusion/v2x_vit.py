@@ -14,26 +14,28 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.models.detector.transformer import AttentionConfig
-from manyeyes.models.fusion.positional_encoding import Placement
-from manyeyes.models.fusion.token_merge import Fused, Settle, settle
+from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.voxelize import segment_sum
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
 
-KINDS = 2
+NUM_AGENT_TYPES = 2
 """The ego's own tokens, and those that it heard."""
 
 
-class ByKind(nn.Module):
+class PerAgentType(nn.Module):
     """A linear map of its own for each kind of agent (the paper's Dense_c)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.maps = nn.ModuleList(nn.Linear(channels, channels) for _ in range(KINDS))
+        self.maps = nn.ModuleList(nn.Linear(channels, channels) for _ in range(NUM_AGENT_TYPES))
 
-    def forward(self, features: Tensor, kind: Tensor) -> Tensor:
+    def forward(self, features: Tensor, agent_type: Tensor) -> Tensor:
         """(N, C) of agents of kind (N,) to (N, C)."""
-        return torch.stack([each(features) for each in self.maps])[kind, torch.arange(len(kind), device=kind.device)]
+        return torch.stack([each(features) for each in self.maps])[
+            agent_type, torch.arange(len(agent_type), device=agent_type.device)
+        ]
 
 
 class AgentAttention(nn.Module):
@@ -47,13 +49,13 @@ class AgentAttention(nn.Module):
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.query, self.key, self.value, self.out = (ByKind(channels) for _ in range(4))
+        self.query, self.key, self.value, self.out = (PerAgentType(channels) for _ in range(4))
         d = channels // heads
-        same = torch.eye(d).expand(KINDS, KINDS, heads, d, d)
-        self.attends, self.tells = nn.Parameter(same.clone()), nn.Parameter(same.clone())
-        _silence(self.out)
+        same = torch.eye(d).expand(NUM_AGENT_TYPES, NUM_AGENT_TYPES, heads, d, d)
+        self.attention_matrix, self.message_matrix = nn.Parameter(same.clone()), nn.Parameter(same.clone())
+        _zero_init(self.out)
 
-    def forward(self, features: Tensor, key: Tensor, kind: Tensor) -> Tensor:
+    def forward(self, features: Tensor, key: Tensor, agent_type: Tensor) -> Tensor:
         """(N, C) of agents of kind (N,) that meet where key (N,) is the same, to (N, C)."""
 
         def split(x: Tensor) -> Tensor:
@@ -61,16 +63,18 @@ class AgentAttention(nn.Module):
 
         def to_both(x: Tensor, by_edge: Tensor) -> Tensor:
             """(N, heads, KINDS * d): rows x (N, heads, d) as queries of each kind are told of them."""
-            return torch.einsum("nhd,qnhde->nhqe", x, by_edge[:, kind]).flatten(2)
+            return torch.einsum("nhd,qnhde->nhqe", x, by_edge[:, agent_type]).flatten(2)
 
-        query = split(self.query(features, kind))
-        asks = torch.nn.functional.one_hot(kind, KINDS).to(query.dtype)
+        query = split(self.query(features, agent_type))
+        one_hot = torch.nn.functional.one_hot(agent_type, NUM_AGENT_TYPES).to(query.dtype)
         # The wider head would be scaled by the root of its own width.
-        query = (query[:, :, None] * asks[:, None, :, None]).flatten(2) * KINDS**0.5
-        known = to_both(split(self.key(features, kind)), self.attends)
-        told = to_both(split(self.value(features, kind)), self.tells)
-        heard = window_attention(query, known, told, plan_windows(key, key)).unflatten(2, (KINDS, -1))
-        return self.out(heard[torch.arange(len(kind), device=kind.device), :, kind].flatten(1), kind)
+        query = (query[:, :, None] * one_hot[:, None, :, None]).flatten(2) * NUM_AGENT_TYPES**0.5
+        keys = to_both(split(self.key(features, agent_type)), self.attention_matrix)
+        messages = to_both(split(self.value(features, agent_type)), self.message_matrix)
+        attended = window_attention(query, keys, messages, plan_windows(key, key)).unflatten(2, (NUM_AGENT_TYPES, -1))
+        return self.out(
+            attended[torch.arange(len(agent_type), device=agent_type.device), :, agent_type].flatten(1), agent_type
+        )
 
 
 class WindowScale(nn.Module):
@@ -80,20 +84,20 @@ class WindowScale(nn.Module):
         super().__init__()
         self.heads, self.window = heads, window
         self.qkv, self.out = nn.Linear(channels, 3 * channels), nn.Linear(channels, channels)
-        _silence(self.out)
+        _zero_init(self.out)
 
     def forward(self, features: Tensor, tokens: Tokens, agent: Tensor) -> Tensor:
         """(N, C) of agents (N,) to (N, C)."""
-        cell, origin = tokens.grid.cell, (tokens.grid.x_min, tokens.grid.y_min)
+        cell, origin = tokens.grid.cell_size_m, (tokens.grid.x_min, tokens.grid.y_min)
         ids = window_ids(tokens.xy, agent, origin, self.window * cell)
         place = sincos_encoding(window_offsets(tokens.xy, origin, self.window * cell, cell), features.shape[1])
         # The place is told to queries and keys; values are what is there.
         weight, bias = self.qkv.weight, self.qkv.bias
-        asks, knows, tells = (
+        query, key, value = (
             torch.nn.functional.linear(x, w, b).unflatten(1, (self.heads, -1))
             for x, w, b in zip((features + place, features + place, features), weight.chunk(3), bias.chunk(3))
         )
-        return self.out(window_attention(asks, knows, tells, plan_windows(ids, ids)).flatten(1))
+        return self.out(window_attention(query, key, value, plan_windows(ids, ids)).flatten(1))
 
 
 class MultiScaleWindows(nn.Module):
@@ -120,24 +124,29 @@ class MultiScaleWindows(nn.Module):
         return (share[agent] * scales).sum(1)
 
 
-class Layer(nn.Module):
+class V2xVitLayer(nn.Module):
     """One layer: between agents, over windows, and a feed-forward net; pre-norm, residual, and silent at the start."""
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
-        self.agents, self.windows = AgentAttention(channels, config.heads), MultiScaleWindows(channels, config)
+        self.agent_attention, self.window_attention = (
+            AgentAttention(channels, config.heads),
+            MultiScaleWindows(channels, config),
+        )
         hidden = channels * config.expansion
         last = nn.Linear(hidden, channels)
         self.ffn = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), last)
-        _silence(last)
+        _zero_init(last)
 
-    def forward(self, features: Tensor, tokens: Tokens, key: Tensor, kind: Tensor) -> Tensor:
+    def forward(self, features: Tensor, tokens: Tokens, key: Tensor, agent_type: Tensor) -> Tensor:
         """(N, C) to (N, C)."""
         between, within, alone = self.norms
-        features = features + self.agents(between(features), key, kind)
-        agent = tokens.ego * KINDS + kind
-        features = features + self.windows(within(features), tokens, agent, tokens.batch_size * KINDS)
+        features = features + self.agent_attention(between(features), key, agent_type)
+        agent = tokens.ego * NUM_AGENT_TYPES + agent_type
+        features = features + self.window_attention(
+            within(features), tokens, agent, tokens.batch_size * NUM_AGENT_TYPES
+        )
         return features + self.ffn(alone(features))
 
 
@@ -151,23 +160,23 @@ class V2xVitFusion(nn.Module):
                 "V2xVitFusion needs even heads and window, and channels divisible by twice the heads; got "
                 f"{config.heads}, {config.window} and {channels}."
             )
-        self.placement, self.settle = Placement(channels), Settle(channels, "trust")
-        self.layers = nn.ModuleList(Layer(channels, config) for _ in range(config.blocks))
+        self.encoding, self.merge = SpatioTemporalEncoding(channels), TokenMerge(channels, "trust")
+        self.layers = nn.ModuleList(V2xVitLayer(channels, config) for _ in range(config.blocks))
 
-    def forward(self, tokens: Tokens, past: Tokens | None = None) -> Fused:
+    def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
-        key, place = settle(tokens)
-        features, kind = self.placement(tokens.features, tokens, place), kinds(tokens)
+        key, place = assign_cells(tokens)
+        features, agent_type = self.encoding(tokens.features, tokens, place), agent_types(tokens)
         for layer in self.layers:
-            features = layer(features, tokens, key, kind)
-        return self.settle(features, tokens, key, place)
+            features = layer(features, tokens, key, agent_type)
+        return self.merge(features, tokens, key, place)
 
 
-def kinds(tokens: Tokens) -> Tensor:
+def agent_types(tokens: Tokens) -> Tensor:
     """(N,) int64: 0 the ego's own of now, whose cues are zero, 1 what was heard."""
-    return tokens.cue.any(1).long()
+    return tokens.pose_context.any(1).long()
 
 
-def _silence(module: nn.Module) -> None:
+def _zero_init(module: nn.Module) -> None:
     for parameter in module.parameters():
         nn.init.zeros_(parameter)

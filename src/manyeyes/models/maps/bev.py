@@ -18,12 +18,18 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, ConfigError, PointCloud
 from manyeyes.datatypes.camera import CameraImage
-from manyeyes.models.maps.image_encoder import ImageEncoder, ImageEncoderConfig, Pyramid, Residual, conv
+from manyeyes.models.maps.image_encoder import (
+    FeaturePyramid,
+    ImageEncoder,
+    ImageEncoderConfig,
+    ResidualBlock,
+    conv_norm,
+)
 from manyeyes.models.maps.view_transform import DepthBins, lift_depth, lift_ground
 from manyeyes.ops.voxelize import MOMENTS, pillar_moments, pillar_sites
 
 Sensor = Literal["lidar", "camera"]
-Lift = Literal["depth", "ground"]
+ViewTransform = Literal["depth", "ground"]
 
 # Brings each of MOMENTS to about one: offsets within a pillar are decimetres, heights metres, asphalt's intensity is near 0.1.
 _SCALE = (0.5, 4.0, 4.0, 1.0, 1.0, 0.5, 2.0, 8.0, 8.0, 40.0, 4.0, 3.0)
@@ -33,22 +39,23 @@ _SCALE = (0.5, 4.0, 4.0, 1.0, 1.0, 0.5, 2.0, 8.0, 8.0, 40.0, 4.0, 3.0)
 class BevConfig:
     """grid: what an agent sees, metres in its frame, and the pillars of the raster; its tokens lie at twice its stride.
 
-    sensors: which it has. channels: of the features; raster_width: of the raster's first stage. image: the encoder of pictures,
-    which are first brought to image_size, (height, width) pixels. lift: how pictures reach the ground; coarsest_m: of ``ground``
-    alone, how much of the ground one pixel may cover; heights_m and depth: of ``depth`` alone.
+    sensors: which it has. channels: of the features; raster_channels: of the raster's first stage. image_encoder: the encoder of
+    pictures, which are first brought to image_size, (height, width) pixels. view_transform: how pictures reach the ground;
+    max_pixel_footprint_m: of ``ground`` alone, how much of the ground one pixel may cover; heights_m and depth_bins: of
+    ``depth_bins`` alone.
     """
 
     grid: BevGrid
     sensors: tuple[Sensor, ...] = ("lidar",)
     channels: int = 64
-    raster_width: int = 32
+    raster_channels: int = 32
     raster_blocks: tuple[int, ...] = (1, 2, 2)
-    image: ImageEncoderConfig = field(default_factory=ImageEncoderConfig)
+    image_encoder: ImageEncoderConfig = field(default_factory=ImageEncoderConfig)
     image_size: tuple[int, int] = (224, 400)
-    lift: Lift = "depth"
-    coarsest_m: float = math.inf
+    view_transform: ViewTransform = "depth"
+    max_pixel_footprint_m: float = math.inf
     heights_m: tuple[float, ...] = (-0.5, 0.0, 0.5, 2.0)
-    depth: DepthBins = field(default_factory=DepthBins)
+    depth_bins: DepthBins = field(default_factory=DepthBins)
 
     def __post_init__(self) -> None:
         if not self.sensors or not set(self.sensors) <= {"lidar", "camera"}:
@@ -62,7 +69,7 @@ class BevConfig:
         return self.grid.at(2)
 
 
-def rasterise(clouds: Sequence[PointCloud], grid: BevGrid) -> tuple[Tensor, Tensor]:
+def rasterise_clouds(clouds: Sequence[PointCloud], grid: BevGrid) -> tuple[Tensor, Tensor]:
     """Clouds of N agents, each in its own frame, as (N, 13, rows, columns), and which cells (N, rows, columns) hold a return.
 
     The channels are the twelve moments of a pillar, brought to about one, and whether there is any; zero elsewhere.
@@ -81,24 +88,24 @@ def rasterise(clouds: Sequence[PointCloud], grid: BevGrid) -> tuple[Tensor, Tens
     return raster, raster[:, -1] > 0
 
 
-class _GroundNet(nn.Module):
+class _RasterEncoder(nn.Module):
     """A raster of the ground (N, inputs, rows, columns) through a small residual network and a pyramid, to the token grid."""
 
     def __init__(self, inputs: int, config: BevConfig) -> None:
         super().__init__()
-        width = config.raster_width
+        width = config.raster_channels
         widths = [width * 2**i for i in range(len(config.raster_blocks))]
         # Paint is narrower than a token: what is fine is read before it is made coarse.
-        self.stem = nn.Sequential(conv(inputs, width, 3), nn.ReLU())
+        self.stem = nn.Sequential(conv_norm(inputs, width, 3), nn.ReLU())
         stages, inputs = [], width
         for count, outputs in zip(config.raster_blocks, widths):
-            blocks = [Residual(inputs, outputs, 2)] + [Residual(outputs, outputs) for _ in range(count - 1)]
+            blocks = [ResidualBlock(inputs, outputs, 2)] + [ResidualBlock(outputs, outputs) for _ in range(count - 1)]
             stages.append(nn.Sequential(*blocks))
             inputs = outputs
         self.stages = nn.ModuleList(stages)
-        self.pyramid = Pyramid(tuple(widths), config.channels)
+        self.pyramid = FeaturePyramid(tuple(widths), config.channels)
 
-    def read(self, raster: Tensor) -> Tensor:
+    def encode(self, raster: Tensor) -> Tensor:
         """(N, channels, h, w)."""
         x, levels = self.stem(raster), []
         for stage in self.stages:
@@ -107,7 +114,7 @@ class _GroundNet(nn.Module):
         return self.pyramid(levels)
 
 
-class LidarBev(_GroundNet):
+class LidarBev(_RasterEncoder):
     """A 2.5-D raster of clouds; a cell is seen where a return lies in or beside it."""
 
     def __init__(self, config: BevConfig) -> None:
@@ -116,19 +123,19 @@ class LidarBev(_GroundNet):
 
     def forward(self, clouds: Sequence[PointCloud]) -> tuple[Tensor, Tensor]:
         """N clouds to features (N, C, h, w) on the token grid and what is seen (N, h, w)."""
-        raster, hit = rasterise(clouds, self.grid)
-        return self.read(raster), F.max_pool2d(hit[:, None].float(), 5, 2, 2)[:, 0] > 0
+        raster, hit = rasterise_clouds(clouds, self.grid)
+        return self.encode(raster), F.max_pool2d(hit[:, None].float(), 5, 2, 2)[:, 0] > 0
 
 
-class CameraBev(_GroundNet):
+class CameraBev(_RasterEncoder):
     """Pictures through the image encoder, lifted to a raster of the ground beside where each of its cells lies."""
 
     def __init__(self, config: BevConfig) -> None:
-        super().__init__(config.raster_width + 2, config)
+        super().__init__(config.raster_channels + 2, config)
         self.config = config
-        self.encoder = ImageEncoder(config.image)
-        bins = config.depth.count if config.lift == "depth" else 0
-        self.project = nn.Conv2d(config.image.channels, config.raster_width + bins, 1)
+        self.encoder = ImageEncoder(config.image_encoder)
+        bins = config.depth_bins.num_bins if config.view_transform == "depth" else 0
+        self.project = nn.Conv2d(config.image_encoder.channels, config.raster_channels + bins, 1)
 
     def forward(self, images: Sequence[Sequence[CameraImage]]) -> tuple[Tensor, Tensor]:
         """The pictures of N agents, any number each, to features (N, C, h, w) on the token grid and what is seen (N, h, w)."""
@@ -137,25 +144,35 @@ class CameraBev(_GroundNet):
         if not flat:
             shape = config.token_grid.shape
             return torch.zeros(len(images), config.channels, *shape), torch.zeros(len(images), *shape, dtype=torch.bool)
-        owner = torch.repeat_interleave(torch.arange(len(images)), torch.tensor([len(one) for one in images]))
+        agent_of_camera = torch.repeat_interleave(torch.arange(len(images)), torch.tensor([len(one) for one in images]))
         height, width = config.image_size
-        cameras = [image.camera.resized(width, height) for image in flat]
+        cameras = [image.camera.resize(width, height) for image in flat]
         rgb = torch.cat([_resized(image.rgb, config.image_size) for image in flat])
-        told = self.project(self.encoder(rgb.contiguous(memory_format=torch.channels_last)))
-        features, stride = told[:, : config.raster_width], config.image.stride
-        if config.lift == "ground":
-            raster, seen = lift_ground(features, cameras, owner, len(images), grid, stride, config.coarsest_m)
+        outputs = self.project(self.encoder(rgb.contiguous(memory_format=torch.channels_last)))
+        features, stride = outputs[:, : config.raster_channels], config.image_encoder.stride
+        if config.view_transform == "ground":
+            raster, seen = lift_ground(
+                features, cameras, agent_of_camera, len(images), grid, stride, config.max_pixel_footprint_m
+            )
         else:
-            depth = told[:, config.raster_width :].softmax(1)
+            depth = outputs[:, config.raster_channels :].softmax(1)
             raster, seen = lift_depth(
-                features, depth, cameras, owner, len(images), grid, stride, config.depth, config.heights_m
+                features,
+                depth,
+                cameras,
+                agent_of_camera,
+                len(images),
+                grid,
+                stride,
+                config.depth_bins,
+                config.heights_m,
             )
         # How sharply a cell is seen depends on where it lies.
         rows, columns = grid.shape
         y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
         raster = torch.cat((raster, torch.stack((x, y)).expand(len(images), 2, rows, columns)), 1)
         near = F.max_pool2d(seen[:, None].float(), 3, 2, 1)[:, 0] > 0
-        return self.read(raster.contiguous(memory_format=torch.channels_last)), near
+        return self.encode(raster.contiguous(memory_format=torch.channels_last)), near
 
 
 def _resized(rgb: Tensor, size: tuple[int, int]) -> Tensor:

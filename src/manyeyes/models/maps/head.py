@@ -26,48 +26,54 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
-from manyeyes.models.maps.line_field_head import APART, Sketch, SketchHead, propose
+from manyeyes.models.maps.line_field_head import DUPLICATE_DISTANCE, LineFieldHead, RawLineField, propose_lines
 from manyeyes.ops.deformable import sample_weighted
 
-Group = Literal["one", "many"]
+QueryGroup = Literal["one", "many"]
 
-STEP = 0.1
+MOVE_SCALE = 0.1
 """What one unit of a move's output is, as a share of the tile."""
 
-_WAVES = math.pi * 2.0 ** torch.arange(8)
+_FREQUENCIES = math.pi * 2.0 ** torch.arange(8)
 
 
 @dataclass(frozen=True)
 class MapHeadConfig:
-    """kinds: of elements that are told apart, by name. elements, points: queries of one-to-one matching, and points of each;
-    many: queries of one-to-many matching, in training only. learned: of the former's number, those that begin as lines of their own
-    rather than the sketch's, as MapTR's do. seeds: cells from which lines are followed that queries begin as, no
-    fewer than these; least: how sure a cell is at least for a line to run on through it. places: looked at by each of the heads, a
-    point and layer.
+    """kinds: of elements that are told apart, by name. num_queries, num_points: queries of one-to-one matching, and points of each;
+    num_one_to_many_queries: queries of one-to-many matching, in training only. num_learned_queries: of the former's number, those
+    that begin as lines of their own rather than the sketch's, as MapTR's do. num_seeds: cells from which lines are followed that
+    queries begin as, no fewer than these; min_trace_score: how sure a cell is at least for a line to run on through it.
+    num_sampling_points: looked at by each of the heads, a point and layer.
 
-    keep, threshold: at most so many answers, by score over all elements and kinds, and those of at least that score.
+    max_elements, score_threshold: at most so many answers, by score over all elements and kinds, and those of at least that score.
     """
 
     kinds: tuple[str, ...] = ("divider", "boundary", "crossing")
-    elements: int = 50
-    points: int = 20
-    many: int = 0
-    learned: int = 0
-    seeds: int = 160
-    least: float = 0.2
+    num_queries: int = 50
+    num_points: int = 20
+    num_one_to_many_queries: int = 0
+    num_learned_queries: int = 0
+    num_seeds: int = 160
+    min_trace_score: float = 0.2
     channels: int = 128
-    feed: int = 256
+    feedforward_channels: int = 256
     layers: int = 3
     heads: int = 8
-    places: int = 4
-    keep: int = 50
-    threshold: float = 0.05
+    num_sampling_points: int = 4
+    max_elements: int = 50
+    score_threshold: float = 0.05
 
     def __post_init__(self) -> None:
-        if self.channels % self.heads or self.points < 2 or min(self.elements, self.layers, self.places) < 1:
+        if (
+            self.channels % self.heads
+            or self.num_points < 2
+            or min(self.num_queries, self.layers, self.num_sampling_points) < 1
+        ):
             raise ConfigError(f"MapHeadConfig needs channels divisible by heads and two points or more; got {self}.")
-        if not 0 <= self.learned < self.elements:
-            raise ConfigError(f"MapHeadConfig.learned are fewer than its {self.elements} elements; got {self.learned}.")
+        if not 0 <= self.num_learned_queries < self.num_queries:
+            raise ConfigError(
+                f"MapHeadConfig.learned are fewer than its {self.num_queries} elements; got {self.num_learned_queries}."
+            )
         if not self.kinds or not set(self.kinds) <= set(KINDS) or len(set(self.kinds)) != len(self.kinds):
             raise ConfigError(f"MapHeadConfig.kinds are some of {', '.join(KINDS)}; got {self.kinds}.")
 
@@ -86,12 +92,12 @@ class _SelfAttention(nn.Module):
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.compare, self.value = nn.Linear(channels, 2 * channels), nn.Linear(channels, channels)
+        self.query_key, self.value = nn.Linear(channels, 2 * channels), nn.Linear(channels, channels)
         self.out = nn.Linear(channels, channels)
 
     def forward(self, x: Tensor, place: Tensor) -> Tensor:
         """(..., L, C) to (..., L, C), place of a shape that broadcasts."""
-        query, key = self.compare(x + place).chunk(2, -1)
+        query, key = self.query_key(x + place).chunk(2, -1)
         query, key, value = (t.unflatten(-1, (self.heads, -1)).transpose(-2, -3) for t in (query, key, self.value(x)))
         mixed = F.scaled_dot_product_attention(query, key, value)
         return self.out(mixed.transpose(-2, -3).flatten(-2))
@@ -100,16 +106,16 @@ class _SelfAttention(nn.Module):
 class DeformableAttention(nn.Module):
     """Each query looks at a few places around its reference point, which it chooses itself (Deformable DETR, Eq. 2)."""
 
-    def __init__(self, channels: int, heads: int, places: int) -> None:
+    def __init__(self, channels: int, heads: int, num_points: int) -> None:
         super().__init__()
-        self.heads, self.places = heads, places
+        self.heads, self.num_points = heads, num_points
         self.value, self.out = nn.Linear(channels, channels), nn.Linear(channels, channels)
-        self.offset, self.weight = nn.Linear(channels, heads * places * 2), nn.Linear(channels, heads * places)
+        self.offset, self.weight = nn.Linear(channels, heads * num_points * 2), nn.Linear(channels, heads * num_points)
         # Heads start by looking in as many directions, each place a cell farther.
         angle = torch.arange(heads) * (2 * math.pi / heads)
         ring = torch.stack((angle.cos(), angle.sin()), -1)
         ring = ring / ring.abs().amax(-1, keepdim=True)
-        steps = ring[:, None] * torch.arange(1, places + 1)[:, None]
+        steps = ring[:, None] * torch.arange(1, num_points + 1)[:, None]
         nn.init.zeros_(self.offset.weight)
         nn.init.zeros_(self.weight.weight)
         nn.init.zeros_(self.weight.bias)
@@ -121,13 +127,13 @@ class DeformableAttention(nn.Module):
         b, q, channels = query.shape
         rows, columns = ground.shape[1:3]
         values = self.value(ground).view(b, rows, columns, self.heads, channels // self.heads).permute(0, 3, 4, 1, 2)
-        offset = self.offset(query).view(b, q, self.heads, self.places, 2)
-        weight = self.weight(query).view(b, q, self.heads, self.places).softmax(-1)
+        offset = self.offset(query).view(b, q, self.heads, self.num_points, 2)
+        weight = self.weight(query).view(b, q, self.heads, self.num_points).softmax(-1)
         at = reference[:, :, None, None] + offset / offset.new_tensor([columns, rows])
         return self.out(sample_weighted(values, at, weight))
 
 
-class MapLayer(nn.Module):
+class MapDecoderLayer(nn.Module):
     """To the ground, within each instance, among instances, and each point by itself; a norm after each.
 
     The ground comes first, not third as in MapTR: there the first layer compares queries before any has seen something.
@@ -136,19 +142,21 @@ class MapLayer(nn.Module):
     def __init__(self, config: MapHeadConfig) -> None:
         super().__init__()
         c = config.channels
-        self.among, self.within = _SelfAttention(c, config.heads), _SelfAttention(c, config.heads)
-        self.look = DeformableAttention(c, config.heads, config.places)
-        self.feed = nn.Sequential(nn.Linear(c, config.feed), nn.ReLU(), nn.Linear(config.feed, c))
+        self.instance_attention, self.point_attention = _SelfAttention(c, config.heads), _SelfAttention(c, config.heads)
+        self.deformable_attention = DeformableAttention(c, config.heads, config.num_sampling_points)
+        self.ffn = nn.Sequential(
+            nn.Linear(c, config.feedforward_channels), nn.ReLU(), nn.Linear(config.feedforward_channels, c)
+        )
         self.norms = nn.ModuleList(nn.LayerNorm(c) for _ in range(4))
 
     def forward(self, x: Tensor, place: Tensor, reference: Tensor, ground: Tensor) -> Tensor:
         """x and place (B, I, P, C), reference (B, I, P, 2), ground (B, rows, columns, C), to (B, I, P, C)."""
-        look = self.look((x + place).flatten(1, 2), reference.flatten(1, 2), ground)
-        x = self.norms[0](x + look.view_as(x))
-        x = self.norms[1](x + self.within(x, place))
-        among = self.among(x.transpose(1, 2), place.transpose(1, 2)).transpose(1, 2)
-        x = self.norms[2](x + among)
-        return self.norms[3](x + self.feed(x))
+        attended = self.deformable_attention((x + place).flatten(1, 2), reference.flatten(1, 2), ground)
+        x = self.norms[0](x + attended.view_as(x))
+        x = self.norms[1](x + self.point_attention(x, place))
+        mixed = self.instance_attention(x.transpose(1, 2), place.transpose(1, 2)).transpose(1, 2)
+        x = self.norms[2](x + mixed)
+        return self.norms[3](x + self.ffn(x))
 
 
 class MapHead(nn.Module):
@@ -158,77 +166,83 @@ class MapHead(nn.Module):
         super().__init__()
         self.config = config
         c = config.channels
-        self.sketch = SketchHead(c, len(config.kinds))
-        self.kind = nn.Parameter(torch.randn(len(config.kinds), 2 * c))
-        self.point = nn.Parameter(torch.randn(config.points, 2 * c))
-        if config.learned:
-            self.own = nn.Parameter(torch.randn(config.learned, 2 * c))
-            self.start = nn.Parameter(start_lines(config.learned, config.points))
-        self.where = nn.Sequential(nn.Linear(4 * len(_WAVES), c), nn.ReLU(), nn.Linear(c, c))
-        self.layers = nn.ModuleList(MapLayer(config) for _ in range(config.layers))
-        self.kinds = nn.ModuleList(_kind_branch(c, len(config.kinds)) for _ in range(config.layers))
-        self.moves = nn.ModuleList(_move_branch(c) for _ in range(config.layers))
+        self.line_field_head = LineFieldHead(c, len(config.kinds))
+        self.class_embedding = nn.Parameter(torch.randn(len(config.kinds), 2 * c))
+        self.point_embedding = nn.Parameter(torch.randn(config.num_points, 2 * c))
+        if config.num_learned_queries:
+            self.query_embedding = nn.Parameter(torch.randn(config.num_learned_queries, 2 * c))
+            self.start_points = nn.Parameter(make_start_lines(config.num_learned_queries, config.num_points))
+        self.position_encoder = nn.Sequential(nn.Linear(4 * len(_FREQUENCIES), c), nn.ReLU(), nn.Linear(c, c))
+        self.layers = nn.ModuleList(MapDecoderLayer(config) for _ in range(config.layers))
+        self.class_branches = nn.ModuleList(_class_branch(c, len(config.kinds)) for _ in range(config.layers))
+        self.point_branches = nn.ModuleList(_point_branch(c) for _ in range(config.layers))
 
-    def forward(self, ground: Tensor, sketch: Sketch, group: Group = "one") -> tuple[RawMap, ...]:
+    def forward(self, ground: Tensor, line_field: RawLineField, group: QueryGroup = "one") -> tuple[RawMap, ...]:
         """Features of B tiles (B, C, rows, columns) and their sketch to one RawMap a layer, the last the best; group: of queries.
 
         The first group begins as each line of the sketch once, the second as all that were followed, copies too.
         """
-        reference, logit, kind = self.begin(sketch, group)
-        each = self.kind[kind]
-        if self.config.learned and group == "one":
-            each = torch.cat((each, self.own.expand(len(each), *self.own.shape)), 1)
-        embedded, x = (each[:, :, None] + self.point).chunk(2, -1)
+        reference, logit, kind = self.init_queries(line_field, group)
+        each = self.class_embedding[kind]
+        if self.config.num_learned_queries and group == "one":
+            each = torch.cat((each, self.query_embedding.expand(len(each), *self.query_embedding.shape)), 1)
+        embedded, x = (each[:, :, None] + self.point_embedding).chunk(2, -1)
         ground = ground.permute(0, 2, 3, 1)
         out = []
-        for layer, say, move in zip(self.layers, self.kinds, self.moves):
-            place = embedded + self.where(waves(reference))
+        for layer, class_branch, point_branch in zip(self.layers, self.class_branches, self.point_branches):
+            place = embedded + self.position_encoder(encode_position(reference))
             x = layer(x, place, reference, ground)
             # How far a point has still to go depends on where it is by now, which x alone does not say.
-            point = reference + STEP * move(x + place)
-            out.append(RawMap(logit + say(x.mean(2)), point))
+            point = reference + MOVE_SCALE * point_branch(x + place)
+            out.append(RawMap(logit + class_branch(x.mean(2)), point))
             reference = point.detach()
         return tuple(out)
 
-    def begin(self, sketch: Sketch, group: Group = "one") -> tuple[Tensor, Tensor, Tensor]:
+    def init_queries(self, line_field: RawLineField, group: QueryGroup = "one") -> tuple[Tensor, Tensor, Tensor]:
         """What queries begin as: points (B, I, P, 2), logits (B, I, kinds) and kinds of those from the sketch, which come first.
 
         Nothing of the sketch has gradients.
         """
         config = self.config
         rings = torch.tensor([is_ring(kind) for kind in config.kinds])
-        count, apart = (config.elements - config.learned, APART) if group == "one" else (config.many, 0.0)
-        found = propose(sketch, rings, count, config.points, max(config.seeds, count), config.least, apart)
-        own = F.one_hot(found.kind, len(config.kinds)).to(found.sure)
+        count, apart = (
+            (config.num_queries - config.num_learned_queries, DUPLICATE_DISTANCE)
+            if group == "one"
+            else (config.num_one_to_many_queries, 0.0)
+        )
+        found = propose_lines(
+            line_field, rings, count, config.num_points, max(config.num_seeds, count), config.min_trace_score, apart
+        )
+        own = F.one_hot(found.kind, len(config.kinds)).to(found.score)
         # Few queries are elements of a kind that the sketch does not say: a probability of 0.01 (focal loss, Lin et al. 2017).
-        point, logit = found.point, own * (torch.logit(found.sure) + math.log(99))[..., None] - math.log(99)
-        if config.learned and group == "one":
-            point = torch.cat((point, self.start.expand(len(point), *self.start.shape)), 1)
+        point, logit = found.point, own * (torch.logit(found.score) + math.log(99))[..., None] - math.log(99)
+        if config.num_learned_queries and group == "one":
+            point = torch.cat((point, self.start_points.expand(len(point), *self.start_points.shape)), 1)
             logit = torch.cat(
-                (logit, logit.new_full((len(point), config.learned, len(config.kinds)), -math.log(99))), 1
+                (logit, logit.new_full((len(point), config.num_learned_queries, len(config.kinds)), -math.log(99))), 1
             )
         return point, logit, found.kind
 
 
-def start_lines(count: int, points: int) -> Tensor:
+def make_start_lines(count: int, points: int) -> Tensor:
     """(count, points, 2) straight lines all over the tile, in shares of it, 0.3 long, of all directions.
 
     Middles and directions are the additive recurrence of least discrepancy in three dimensions (Roberts 2018).
     """
     ratio = torch.tensor(1.2207440846).double() ** -torch.arange(1, 4)
     x, y, way = ((0.5 + torch.arange(count)[:, None] * ratio) % 1).unbind(-1)
-    along = torch.stack(((math.pi * way).cos(), (math.pi * way).sin()), -1)
+    unit = torch.stack(((math.pi * way).cos(), (math.pi * way).sin()), -1)
     middle = 0.1 + 0.8 * torch.stack((x, y), -1)
-    return (middle[:, None] + torch.linspace(-0.15, 0.15, points)[:, None] * along[:, None]).clamp(0, 1).float()
+    return (middle[:, None] + torch.linspace(-0.15, 0.15, points)[:, None] * unit[:, None]).clamp(0, 1).float()
 
 
-def waves(place: Tensor) -> Tensor:
+def encode_position(place: Tensor) -> Tensor:
     """Places (..., 2), shares of the tile, as (..., 32) sines and cosines of waves from twice the tile to a 64th of it."""
-    phase = (place[..., None] * _WAVES.to(place)).flatten(-2)
+    phase = (place[..., None] * _FREQUENCIES.to(place)).flatten(-2)
     return torch.cat((phase.sin(), phase.cos()), -1)
 
 
-def _kind_branch(channels: int, kinds: int) -> nn.Sequential:
+def _class_branch(channels: int, kinds: int) -> nn.Sequential:
     last = nn.Linear(channels, kinds)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
@@ -236,14 +250,14 @@ def _kind_branch(channels: int, kinds: int) -> nn.Sequential:
     return nn.Sequential(*hidden, last)
 
 
-def _move_branch(channels: int) -> nn.Sequential:
+def _point_branch(channels: int) -> nn.Sequential:
     last = nn.Linear(channels, 2)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
     return nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels), nn.ReLU(), last)
 
 
-def decode(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[MapElements]:
+def decode_elements(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[MapElements]:
     """The elements of each tile, in its frame, metres, within it, best first; a query may answer under two kinds, as in MapTR."""
     score = raw.logit.detach().sigmoid()
     low = np.array([tile.x_min, tile.y_min])
@@ -252,7 +266,7 @@ def decode(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[MapElement
     out = []
     for scores, points in zip(score, raw.point.detach().clamp(0, 1).double()):
         value, order = scores.flatten().sort(descending=True, stable=True)
-        kept = order[: config.keep][value[: config.keep] >= config.threshold]
+        kept = order[: config.max_elements][value[: config.max_elements] >= config.score_threshold]
         query, kind = (kept // scores.shape[1]).numpy(), (kept % scores.shape[1]).numpy()
         lines = points.numpy()[query] * size + low
         out.append(MapElements.of(list(lines), code[kind], scores.flatten()[kept].double().numpy()))

@@ -23,20 +23,22 @@ from manyeyes.datatypes import ConfigError
 
 @dataclass(frozen=True)
 class ImageEncoderConfig:
-    """blocks: residual blocks at strides 4, 8, 16, …, two stages or more; width: channels of the first stage, doubled by each.
+    """blocks: residual blocks at strides 4, 8, 16, …, two stages or more; stem_channels: channels of the first stage, doubled by
+    each.
 
     bottleneck: 1-3-1 blocks with four times the channels (ResNet-50 is (3, 4, 6, 3), 64, True); else 3-3 blocks
     (ResNet-18 is (2, 2, 2, 2), 64, False). channels: of the pyramid and of what comes out. stride: pixels of the picture a pixel of
-    what comes out, along each axis, 8 or 4; feature o is centred on pixel stride * o. recompute: training keeps what blocks begin
-    from and computes the rest again for its gradients, the same to the last bit: more time for a fraction of the memory.
+    what comes out, along each axis, 8 or 4; feature o is centred on pixel stride * o. gradient_checkpointing: training keeps what
+    blocks begin from and computes the rest again for its gradients, the same to the last bit: more time for a fraction of the
+    memory.
     """
 
     blocks: tuple[int, ...] = (2, 2, 2, 2)
-    width: int = 64
+    stem_channels: int = 64
     bottleneck: bool = False
     channels: int = 128
     stride: int = 8
-    recompute: bool = False
+    gradient_checkpointing: bool = False
 
     def __post_init__(self) -> None:
         if len(self.blocks) < 2 or min(self.blocks) < 1:
@@ -47,26 +49,32 @@ class ImageEncoderConfig:
             raise ConfigError(f"ImageEncoderConfig.stride is 4 or 8; got {self.stride}.")
 
 
-def conv(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
+def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
     """Convolution and norm; sizes are divided by the stride, rounded up."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, bias=False), nn.BatchNorm2d(outputs)
     )
 
 
-class Residual(nn.Module):
+class ResidualBlock(nn.Module):
     """A residual block; the shortcut is projected where size or channels change."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, bottleneck: bool = False) -> None:
         super().__init__()
         inner = outputs // 4 if bottleneck else outputs
         layers = (
-            [conv(inputs, inner, 1), nn.ReLU(), conv(inner, inner, 3, stride), nn.ReLU(), conv(inner, outputs, 1)]
+            [
+                conv_norm(inputs, inner, 1),
+                nn.ReLU(),
+                conv_norm(inner, inner, 3, stride),
+                nn.ReLU(),
+                conv_norm(inner, outputs, 1),
+            ]
             if bottleneck
-            else [conv(inputs, inner, 3, stride), nn.ReLU(), conv(inner, outputs, 3)]
+            else [conv_norm(inputs, inner, 3, stride), nn.ReLU(), conv_norm(inner, outputs, 3)]
         )
         self.inner = nn.Sequential(*layers)
-        self.shortcut = nn.Identity() if inputs == outputs and stride == 1 else conv(inputs, outputs, 1)
+        self.shortcut = nn.Identity() if inputs == outputs and stride == 1 else conv_norm(inputs, outputs, 1)
         self.stride = stride
 
     def forward(self, x: Tensor) -> Tensor:
@@ -75,27 +83,27 @@ class Residual(nn.Module):
         return torch.relu(self.shortcut(x[..., :: self.stride, :: self.stride]) + self.inner(x))
 
 
-def finer(x: Tensor, size: tuple[int, int]) -> Tensor:
+def upsample(x: Tensor, size: tuple[int, int]) -> Tensor:
     """(N, C, h, w) at twice the density, cut to size, bilinear: cell o comes to lie on cell 2 o, where strided layers took it."""
     h, w = x.shape[-2:]
     padded = F.pad(x, (0, 1, 0, 1), mode="replicate")
     return F.interpolate(padded, (2 * h + 1, 2 * w + 1), mode="bilinear", align_corners=True)[..., : size[0], : size[1]]
 
 
-class Pyramid(nn.Module):
+class FeaturePyramid(nn.Module):
     """Maps of falling size as one map of the size of the first: each level is told what the coarser ones saw."""
 
     def __init__(self, inputs: tuple[int, ...], channels: int) -> None:
         super().__init__()
         self.lateral = nn.ModuleList(nn.Conv2d(c, channels, 1) for c in inputs)
-        self.smooth = conv(channels, channels, 3)
+        self.smooth = conv_norm(channels, channels, 3)
 
     def forward(self, levels: list[Tensor]) -> Tensor:
         """(N, inputs[i], h_i, w_i), finest first, to (N, channels, h_0, w_0)."""
         laterals = [lateral(level) for lateral, level in zip(self.lateral, levels)]
         down = laterals[-1]
         for level in laterals[-2::-1]:
-            down = level + finer(down, level.shape[-2:])
+            down = level + upsample(down, level.shape[-2:])
         return torch.relu(self.smooth(down))
 
 
@@ -105,40 +113,40 @@ class ImageEncoder(nn.Module):
     def __init__(self, config: ImageEncoderConfig) -> None:
         super().__init__()
         grow = 4 if config.bottleneck else 1
-        self.stem = nn.Sequential(conv(3, config.width, 7, 2), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
-        widths = [config.width * grow * 2**i for i in range(len(config.blocks))]
-        stages, inputs = [], config.width
+        self.stem = nn.Sequential(conv_norm(3, config.stem_channels, 7, 2), nn.ReLU(), nn.MaxPool2d(3, 2, 1))
+        widths = [config.stem_channels * grow * 2**i for i in range(len(config.blocks))]
+        stages, inputs = [], config.stem_channels
         for i, (count, width) in enumerate(zip(config.blocks, widths)):
-            blocks = [Residual(inputs, width, 2 if i else 1, config.bottleneck)]
-            blocks += [Residual(width, width, 1, config.bottleneck) for _ in range(count - 1)]
+            blocks = [ResidualBlock(inputs, width, 2 if i else 1, config.bottleneck)]
+            blocks += [ResidualBlock(width, width, 1, config.bottleneck) for _ in range(count - 1)]
             stages.append(nn.Sequential(*blocks))
             inputs = width
         self.stages = nn.ModuleList(stages)
         self.finest = 1 if config.stride == 8 else 0
-        self.pyramid = Pyramid(tuple(widths[self.finest :]), config.channels)
-        self.recompute = config.recompute
+        self.pyramid = FeaturePyramid(tuple(widths[self.finest :]), config.channels)
+        self.gradient_checkpointing = config.gradient_checkpointing
 
     def forward(self, rgb: Tensor) -> Tensor:
         """(V, 3, h, w) uint8, or floats in [0, 255], to (V, channels, ceil(h / stride), ceil(w / stride))."""
-        x = self._through(self.stem, rgb.to(torch.float32) / 64 - 2)
+        x = self._run(self.stem, rgb.to(torch.float32) / 64 - 2)
         levels = []
         for stage in self.stages:
             for block in stage.children():
-                x = self._through(block, x)
+                x = self._run(block, x)
             levels.append(x)
         return self.pyramid(levels[self.finest :])
 
-    def _through(self, part: nn.Module, x: Tensor) -> Tensor:
-        if not (self.recompute and self.training and torch.is_grad_enabled()):
+    def _run(self, part: nn.Module, x: Tensor) -> Tensor:
+        if not (self.gradient_checkpointing and self.training and torch.is_grad_enabled()):
             return part(x)
         return cast(
             Tensor,
-            checkpoint(part, x, use_reentrant=False, context_fn=lambda: (nullcontext(), _statistics_kept(part))),
+            checkpoint(part, x, use_reentrant=False, context_fn=lambda: (nullcontext(), _freeze_norm_statistics(part))),
         )
 
 
 @contextmanager
-def _statistics_kept(part: nn.Module) -> Iterator[None]:
+def _freeze_norm_statistics(part: nn.Module) -> Iterator[None]:
     """While it is computed again, a norm has told its running statistics already."""
     norms = [module for module in part.modules() if isinstance(module, nn.BatchNorm2d)]
     before = [(norm, norm.momentum, norm.num_batches_tracked) for norm in norms]

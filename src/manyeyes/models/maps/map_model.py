@@ -16,26 +16,26 @@ from torch import Tensor, nn
 from manyeyes.datatypes import BevGrid, ConfigError, PointCloud, Sites, SparseBev, Transform
 from manyeyes.datatypes.camera import CameraImage
 from manyeyes.models.maps.bev import BevConfig, CameraBev, LidarBev
-from manyeyes.models.maps.head import Group, MapHead, MapHeadConfig, RawMap
-from manyeyes.models.maps.image_encoder import Pyramid, Residual
-from manyeyes.models.maps.line_field_head import Sketch
-from manyeyes.ops.bev_warp import masked_max, warp
+from manyeyes.models.maps.head import MapHead, MapHeadConfig, QueryGroup, RawMap
+from manyeyes.models.maps.image_encoder import FeaturePyramid, ResidualBlock
+from manyeyes.models.maps.line_field_head import RawLineField
+from manyeyes.ops.bev_warp import masked_max, warp_bev
 
-LOOKS = 10
+FRAMES_PER_TILE = 10
 """Looks at a tile, CrowdMap section 3.1."""
 
 
 @dataclass(frozen=True)
-class MapperConfig:
+class MapModelConfig:
     """bev: what an agent sees. tile: the piece of map that is drawn, in its own frame, 120 m by 60 m in the paper.
 
-    token_channels: of what is sent. neck: residual blocks on the tile, at its own, twice and four times its cells.
+    token_channels: of what is sent. neck_blocks: residual blocks on the tile, at its own, twice and four times its cells.
     """
 
     bev: BevConfig
     tile: BevGrid
     token_channels: int = 32
-    neck: tuple[int, ...] = (1, 1, 1)
+    neck_blocks: tuple[int, ...] = (1, 1, 1)
     head: MapHeadConfig = field(default_factory=MapHeadConfig)
 
     def __post_init__(self) -> None:
@@ -44,100 +44,112 @@ class MapperConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class MapFeatures:
     """What a batch of looks made of their own sensors: tokens (N, C), one grid a look, and of what kinds each cell is.
 
-    ink: (N, kinds) logits that an element of a kind runs through the cell; worth: (N,) the greatest probability, by which
-    tokens are chosen where bytes are few.
+    line_logits: (N, kinds) logits that an element of a kind runs through the cell; cell_score: (N,) the greatest probability, by
+    which tokens are chosen where bytes are few.
     """
 
     tokens: SparseBev
-    ink: Tensor
+    line_logits: Tensor
 
     @property
-    def worth(self) -> Tensor:
+    def cell_score(self) -> Tensor:
         """(N,) in (0, 1)."""
-        return self.ink.detach().sigmoid().amax(1)
+        return self.line_logits.detach().sigmoid().amax(1)
 
 
-class Mapper(nn.Module):
+class MapModel(nn.Module):
     """Sensors of many looks to the elements of tiles."""
 
-    def __init__(self, config: MapperConfig) -> None:
+    def __init__(self, config: MapModelConfig) -> None:
         super().__init__()
         self.config = config
         self.fingerprint = bytes(8)
         bev, head, tokens = config.bev, config.head, config.token_channels
         self.lidar = LidarBev(bev) if "lidar" in bev.sensors else None
         self.camera = CameraBev(bev) if "camera" in bev.sensors else None
-        self.shrink = nn.Conv2d(bev.channels, tokens, 1)
-        self.ink = nn.Linear(tokens, len(head.kinds))
-        nn.init.constant_(self.ink.bias, -3.0)
-        self.null = nn.Parameter(torch.zeros(tokens))
-        widths = tuple(min(head.channels, 2 * tokens * 2**i) for i in range(len(config.neck)))
+        self.token_projection = nn.Conv2d(bev.channels, tokens, 1)
+        self.line_classifier = nn.Linear(tokens, len(head.kinds))
+        nn.init.constant_(self.line_classifier.bias, -3.0)
+        self.empty_feature = nn.Parameter(torch.zeros(tokens))
+        widths = tuple(min(head.channels, 2 * tokens * 2**i) for i in range(len(config.neck_blocks)))
         # Beside the features: how many looks saw the cell, and each cell's place in the tile.
         inputs, stages = tokens + 3, []
-        for i, (count, width) in enumerate(zip(config.neck, widths)):
-            blocks = [Residual(inputs, width, 2 if i else 1)] + [Residual(width, width) for _ in range(count - 1)]
+        for i, (count, width) in enumerate(zip(config.neck_blocks, widths)):
+            blocks = [ResidualBlock(inputs, width, 2 if i else 1)] + [
+                ResidualBlock(width, width) for _ in range(count - 1)
+            ]
             stages.append(nn.Sequential(*blocks))
             inputs = width
         self.neck = nn.ModuleList(stages)
-        self.pyramid = Pyramid(widths, head.channels)
+        self.pyramid = FeaturePyramid(widths, head.channels)
         self.head = MapHead(head)
         # Of each kind's logits, once training is done (training/maps/score_calibration.py): scores are then shares that are true.
-        self.scale, self.shift = nn.Buffer(torch.ones(len(head.kinds))), nn.Buffer(torch.zeros(len(head.kinds)))
+        self.logit_scale, self.logit_shift = (
+            nn.Buffer(torch.ones(len(head.kinds))),
+            nn.Buffer(torch.zeros(len(head.kinds))),
+        )
 
     @property
     def token_grid(self) -> BevGrid:
         """The lattice of the tokens, in each agent's frame."""
         return self.config.bev.token_grid
 
-    def see(self, clouds: Sequence[PointCloud] = (), images: Sequence[Sequence[CameraImage]] = ()) -> Look:
+    def extract_features(
+        self, clouds: Sequence[PointCloud] = (), images: Sequence[Sequence[CameraImage]] = ()
+    ) -> MapFeatures:
         """A cloud each, pictures each, or both, of N looks in their agents' frames; tokens lie where a sensor saw the ground.
 
         A model of both sensors takes either alone: the other then saw nothing.
         """
-        eyes = [net(sense) for net, sense in ((self.lidar, clouds), (self.camera, images)) if net is not None and sense]
-        if not eyes:
+        branches = [
+            net(inputs) for net, inputs in ((self.lidar, clouds), (self.camera, images)) if net is not None and inputs
+        ]
+        if not branches:
             raise ConfigError(f"This mapper has {', '.join(self.config.bev.sensors)}; give what they saw.")
-        features, seen = torch.stack([e[0] for e in eyes], 1), torch.stack([e[1] for e in eyes], 1)
-        merged = self.shrink(masked_max(features, seen, features.new_zeros(features.shape[2])))
+        features, seen = torch.stack([e[0] for e in branches], 1), torch.stack([e[1] for e in branches], 1)
+        merged = self.token_projection(masked_max(features, seen, features.new_zeros(features.shape[2])))
         flat = merged.permute(0, 2, 3, 1).flatten(0, 2)
         key = seen.any(1).flatten().nonzero()[:, 0]
         tokens = SparseBev(flat[key], Sites(key, self.token_grid, merged.shape[0]))
-        return Look(tokens, self.ink(tokens.features))
+        return MapFeatures(tokens, self.line_classifier(tokens.features))
 
-    def fuse(self, tokens: SparseBev, tile_from_agent: Transform, tile: Tensor, tiles: int) -> Tensor:
-        """Tokens of N looks, as they were received, to features of tiles (tiles, C, rows, columns); arguments as for ``place``.
+    def fuse(self, tokens: SparseBev, tile_from_agent: Transform, tile_index: Tensor, num_tiles: int) -> Tensor:
+        """Tokens of N looks, as they were received, to features of tiles (tiles, C, rows, columns); arguments as for
+        ``warp_tokens``.
 
         The order of looks does not count, nor does a look that sees nothing of its tile.
         """
-        return self.merge(*self.place(tokens, tile_from_agent, tile, tiles))
+        return self.fuse_features(*self.warp_tokens(tokens, tile_from_agent, tile_index, num_tiles))
 
-    def place(self, tokens: SparseBev, tile_from_agent: Transform, tile: Tensor, tiles: int) -> tuple[Tensor, Tensor]:
+    def warp_tokens(
+        self, tokens: SparseBev, tile_from_agent: Transform, tile_index: Tensor, num_tiles: int
+    ) -> tuple[Tensor, Tensor]:
         """Tokens of N looks on the cells of their tiles: features (tiles, K, C, rows, columns) of at most K looks a tile, and what
         each sees (tiles, K, rows, columns).
 
-        tile_from_agent: N motions, by claimed or corrected poses; tile: (N,) int64, which tile each look is of.
+        tile_from_agent: N motions, by claimed or corrected poses; tile_index: (N,) int64, which tile each look is of.
         """
         rows, columns = self.config.tile.shape
         dense = tokens.dense()
         there = torch.zeros(dense.shape[0] * dense.shape[2] * dense.shape[3], dtype=torch.bool)
         there[tokens.sites.key] = True
-        moved, seen = warp(
+        moved, seen = warp_bev(
             dense, there.view(dense.shape[0], *dense.shape[2:]), tokens.grid, self.config.tile, tile_from_agent
         )
         # The n-th look at its tile takes the n-th place there; places that are left over see nothing.
-        place = (tile[:, None] == tile[None]).tril(-1).sum(1)
-        looks = int(place.max()) + 1 if len(tile) else 1
-        slot = tile * looks + place
-        features = moved.new_zeros(tiles * looks, moved.shape[1], rows, columns).index_copy(0, slot, moved)
-        views = torch.zeros(tiles * looks, rows, columns, dtype=torch.bool).index_copy(0, slot, seen)
-        return features.unflatten(0, (tiles, looks)), views.unflatten(0, (tiles, looks))
+        place = (tile_index[:, None] == tile_index[None]).tril(-1).sum(1)
+        max_frames = int(place.max()) + 1 if len(tile_index) else 1
+        slot = tile_index * max_frames + place
+        features = moved.new_zeros(num_tiles * max_frames, moved.shape[1], rows, columns).index_copy(0, slot, moved)
+        views = torch.zeros(num_tiles * max_frames, rows, columns, dtype=torch.bool).index_copy(0, slot, seen)
+        return features.unflatten(0, (num_tiles, max_frames)), views.unflatten(0, (num_tiles, max_frames))
 
-    def merge(self, features: Tensor, seen: Tensor) -> Tensor:
+    def fuse_features(self, features: Tensor, seen: Tensor) -> Tensor:
         """Features (B, K, C, rows, columns) of K looks on the cells of their tiles, and what they see, to (B, D, rows, columns)."""
-        fused = masked_max(features, seen, self.null)
+        fused = masked_max(features, seen, self.empty_feature)
         coverage = seen.sum(1, keepdim=True).to(fused.dtype).log1p()
         b, _, rows, columns = fused.shape
         y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
@@ -149,21 +161,25 @@ class Mapper(nn.Module):
             levels.append(x)
         return self.pyramid(levels)
 
-    def sketch(self, ground: Tensor) -> Sketch:
+    def predict_line_field(self, ground: Tensor) -> RawLineField:
         """What the cells of tiles (B, D, rows, columns) say of the lines that run by them."""
-        return self.head.sketch(ground)
+        return self.head.line_field_head(ground)
 
-    def draw(self, ground: Tensor, group: Group = "one", sketch: Sketch | None = None) -> tuple[RawMap, ...]:
+    def predict_elements(
+        self, ground: Tensor, group: QueryGroup = "one", line_field: RawLineField | None = None
+    ) -> tuple[RawMap, ...]:
         """Elements of tiles (B, D, rows, columns), one RawMap a layer, the last the best, its scores calibrated when not training.
 
-        sketch: of this ground, if known.
+        line_field: of this ground, if known.
         """
-        *before, last = self.head(ground, self.sketch(ground) if sketch is None else sketch, group)
+        *before, last = self.head(ground, self.predict_line_field(ground) if line_field is None else line_field, group)
         if not self.training:
-            last = RawMap(last.logit * self.scale + self.shift, last.point)
+            last = RawMap(last.logit * self.logit_scale + self.logit_shift, last.point)
         return (*before, last)
 
     def forward(self, features: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """The part that is exported: looks on the cells of their tiles, as for ``merge``, to the last layer's logits and points."""
-        raw = self.draw(self.merge(features, seen))[-1]
+        """The part that is exported: looks on the cells of their tiles, as for ``fuse_features``, to the last layer's logits
+        and points.
+        """
+        raw = self.predict_elements(self.fuse_features(features, seen))[-1]
         return raw.logit, raw.point

@@ -9,7 +9,7 @@ from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.models.maps.bev import BevConfig, Sensor
 from manyeyes.models.maps.head import MapHeadConfig
 from manyeyes.models.maps.image_encoder import ImageEncoderConfig
-from manyeyes.models.maps.map_model import MapperConfig
+from manyeyes.models.maps.map_model import MapModelConfig
 from manyeyes.models.maps.view_transform import DepthBins
 
 FORMAT = "manyeyes-mapper-1"
@@ -21,63 +21,67 @@ def _tile(cell_m: float) -> BevGrid:
     return BevGrid(-60.0, -30.0, -5.0, 60.0, 30.0, 5.0, pillar=cell_m)
 
 
-TOY = MapperConfig(
+MAP_TINY = MapModelConfig(
     BevConfig(
         BevGrid(-36.0, -36.0, -2.0, 36.0, 36.0, 4.0, pillar=0.8),
         channels=32,
-        raster_width=12,
+        raster_channels=12,
         raster_blocks=(1, 1),
-        image=ImageEncoderConfig((1, 1), 12, channels=32),
+        image_encoder=ImageEncoderConfig((1, 1), 12, channels=32),
         image_size=(64, 112),
-        depth=DepthBins(1.0, 37.0, 19),
+        depth_bins=DepthBins(1.0, 37.0, 19),
     ),
     _tile(1.5),
     token_channels=16,
-    head=MapHeadConfig(elements=80, points=10, learned=60, channels=64, feed=128, layers=2, heads=4),
+    head=MapHeadConfig(
+        num_queries=80, num_points=10, num_learned_queries=60, channels=64, feedforward_channels=128, layers=2, heads=4
+    ),
 )
 """For tests, and to learn a few tiles by heart: lines of its own learn those sooner than a sketch does."""
 
-SMALL = MapperConfig(
+MAP_SMALL = MapModelConfig(
     BevConfig(
         BevGrid(-38.4, -38.4, -2.0, 38.4, 38.4, 4.0, pillar=0.4),
         channels=24,
-        raster_width=16,
+        raster_channels=16,
         raster_blocks=(1, 1, 1),
-        image=ImageEncoderConfig((1, 1, 1), 16, channels=24, stride=4),
+        image_encoder=ImageEncoderConfig((1, 1, 1), 16, channels=24, stride=4),
         image_size=(136, 320),
-        lift="ground",
-        coarsest_m=4.0,
+        view_transform="ground",
+        max_pixel_footprint_m=4.0,
     ),
     _tile(0.8),
     token_channels=24,
-    neck=(1, 1, 1, 1),
-    head=MapHeadConfig(elements=60, points=20, channels=64, feed=128, layers=2, heads=4),
+    neck_blocks=(1, 1, 1, 1),
+    head=MapHeadConfig(num_queries=60, num_points=20, channels=64, feedforward_channels=128, layers=2, heads=4),
 )
 """For two cores: a look is read with few layers, since the ground around it is read again where all looks have met."""
 
-PAPER = MapperConfig(
+MAP_PAPER = MapModelConfig(
     BevConfig(
         BevGrid(-51.2, -51.2, -2.0, 51.2, 51.2, 4.0, pillar=0.4),
         channels=256,
-        raster_width=64,
+        raster_channels=64,
         raster_blocks=(2, 2, 2),
-        image=ImageEncoderConfig((3, 4, 6, 3), 64, True, 256, recompute=True),
+        image_encoder=ImageEncoderConfig((3, 4, 6, 3), 64, True, 256, gradient_checkpointing=True),
         image_size=(480, 640),
-        depth=DepthBins(1.0, 69.0, 69),
+        depth_bins=DepthBins(1.0, 69.0, 69),
     ),
     _tile(0.6),
     token_channels=128,
-    neck=(2, 2, 2),
-    head=MapHeadConfig(elements=100, points=20, many=300, channels=256, feed=512, layers=6),
+    neck_blocks=(2, 2, 2),
+    head=MapHeadConfig(
+        num_queries=100, num_points=20, num_one_to_many_queries=300, channels=256, feedforward_channels=512, layers=6
+    ),
 )
 """ResNet-50, 120 m by 60 m, 100 queries of 20 points: CrowdMap section 3.1, and MapTRv2's decoder where it is silent. For GPUs."""
 
-MAPPERS = {"toy": TOY, "small": SMALL, "paper": PAPER}
+MAP_MODELS = {"toy": MAP_TINY, "small": MAP_SMALL, "paper": MAP_PAPER}
 
 
-def mapper_config(name: str, sensors: tuple[Sensor, ...] = ("lidar",)) -> MapperConfig:
+def get_map_model_config(name: str, sensors: tuple[Sensor, ...] = ("lidar",)) -> MapModelConfig:
     """A preset by its name in MAPPERS, for agents that carry these sensors."""
-    if name not in MAPPERS:
-        raise ConfigError(f"No map model is called {name!r}; choose one of {', '.join(MAPPERS)}.")
-    config = MAPPERS[name]
+    if name not in MAP_MODELS:
+        raise ConfigError(f"No map model is called {name!r}; choose one of {', '.join(MAP_MODELS)}.")
+    config = MAP_MODELS[name]
     return replace(config, bev=replace(config.bev, sensors=sensors))

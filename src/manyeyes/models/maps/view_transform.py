@@ -22,7 +22,7 @@ from torch.nn.utils.rnn import pad_sequence
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Transform
 from manyeyes.datatypes.camera import Camera
 
-NEAR_M = 0.5
+MIN_DEPTH_M = 0.5
 """Nearer to a camera than this, nothing is looked up."""
 
 
@@ -32,99 +32,103 @@ class DepthBins:
 
     near_m: float = 1.0
     far_m: float = 49.0
-    count: int = 49
+    num_bins: int = 49
 
     def __post_init__(self) -> None:
-        if not (0 < self.near_m < self.far_m and self.count >= 2):
+        if not (0 < self.near_m < self.far_m and self.num_bins >= 2):
             raise ConfigError(f"DepthBins needs 0 < near_m < far_m and two bins or more; got {self}.")
 
 
 @dataclass(frozen=True)
-class _LookUp:
+class _ProjectedCells:
     """Of V cameras, the cells of a grid that each sees, M at most: cell (V, M) int64, row by row; place (V, M, 2) in the features,
-    as grid_sample counts; depth_m (V, M); there (V, M): false where a camera sees fewer than M.
+    as grid_sample counts; depth_m (V, M); valid (V, M): false where a camera sees fewer than M.
     """
 
     cell: Tensor
     place: Tensor
     depth_m: Tensor
-    there: Tensor
+    valid: Tensor
 
 
 @dataclass(frozen=True)
-class _View:
+class _LiftGeometry:
     """What a look-up depends on but the camera. features: their height and width; their cell o is centred on pixel stride * o."""
 
     grid: BevGrid
     height_m: float
-    coarsest_m: float
+    max_pixel_footprint_m: float
     features: tuple[int, int]
     stride: int
 
 
-def _look_up(cameras: Sequence[Camera], view: _View) -> _LookUp:
+def _project_cells(cameras: Sequence[Camera], geometry: _LiftGeometry) -> _ProjectedCells:
     """Where cells of the ground, height_m above the road, lie in the features of each camera."""
-    found = [_cells_in(_told(camera), camera.width, camera.height, view) for camera in cameras]
+    found = [_cells_in(_camera_key(camera), camera.width, camera.height, geometry) for camera in cameras]
     cells, places, depths = (pad_sequence(list(part), batch_first=True) for part in zip(*found))
-    there = torch.arange(cells.shape[1]) < torch.tensor([[len(one[0])] for one in found])
-    return _LookUp(cells, places, depths, there)
+    valid = torch.arange(cells.shape[1]) < torch.tensor([[len(one[0])] for one in found])
+    return _ProjectedCells(cells, places, depths, valid)
 
 
-def _told(camera: Camera) -> tuple[float, ...]:
+def _camera_key(camera: Camera) -> tuple[float, ...]:
     pose = camera.agent_from_camera
     numbers = torch.cat((camera.intrinsic.flatten(), pose.rotation.flatten(), pose.translation))
     return tuple(numbers.double().tolist())
 
 
 @lru_cache(maxsize=256)
-def _cells_in(numbers: tuple[float, ...], width: int, height: int, view: _View) -> tuple[Tensor, Tensor, Tensor]:
+def _cells_in(
+    key: tuple[float, ...], width: int, height: int, geometry: _LiftGeometry
+) -> tuple[Tensor, Tensor, Tensor]:
     """Cells (M,), places (M, 2) and depths (M,) of one camera, kept: a rig looks the same way from look to look."""
-    told = torch.tensor(numbers, dtype=torch.float64)
-    camera = Camera(told[:9].view(3, 3), Transform(told[9:18].view(3, 3), told[18:]), width, height)
-    rows, columns = view.grid.shape
+    values = torch.tensor(key, dtype=torch.float64)
+    camera = Camera(values[:9].view(3, 3), Transform(values[9:18].view(3, 3), values[18:]), width, height)
+    rows, columns = geometry.grid.shape
     row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
-    xy = view.grid.centers(torch.stack((row, column), -1).view(-1, 2)).double()
-    points = torch.cat((xy, torch.full((len(xy), 1), view.height_m, dtype=torch.float64)), 1)
+    xy = geometry.grid.centers(torch.stack((row, column), -1).view(-1, 2)).double()
+    points = torch.cat((xy, torch.full((len(xy), 1), geometry.height_m, dtype=torch.float64)), 1)
     pixel, depth = camera.project(points)
-    inside = (depth > NEAR_M) & (pixel >= 0).all(-1) & (pixel[:, 0] <= width) & (pixel[:, 1] <= height)
-    if view.coarsest_m < math.inf:
-        inside &= _pixel_on_ground(camera, points) <= view.coarsest_m
+    inside = (depth > MIN_DEPTH_M) & (pixel >= 0).all(-1) & (pixel[:, 0] <= width) & (pixel[:, 1] <= height)
+    if geometry.max_pixel_footprint_m < math.inf:
+        inside &= _pixel_footprint(camera, points) <= geometry.max_pixel_footprint_m
     cell = inside.nonzero()[:, 0]
-    size = torch.tensor(view.features[::-1], dtype=torch.float64)
-    return cell, ((2 * (pixel[cell] - 0.5) / view.stride + 1) / size - 1).float(), depth[cell].float()
+    size = torch.tensor(geometry.features[::-1], dtype=torch.float64)
+    return cell, ((2 * (pixel[cell] - 0.5) / geometry.stride + 1) / size - 1).float(), depth[cell].float()
 
 
-def _pixel_on_ground(camera: Camera, points: Tensor) -> Tensor:
+def _pixel_footprint(camera: Camera, points: Tensor) -> Tensor:
     """(N,) metres of a level plane through each point (N, 3) that one pixel covers along the ray; vast above the camera."""
-    away = points - camera.agent_from_camera.translation
-    return away.square().sum(1) / (-away[:, 2] * camera.intrinsic[1, 1]).clamp_min(1e-9)
+    offset = points - camera.agent_from_camera.translation
+    return offset.square().sum(1) / (-offset[:, 2] * camera.intrinsic[1, 1]).clamp_min(1e-9)
 
 
 def lift_ground(
     features: Tensor,
     cameras: Sequence[Camera],
-    owner: Tensor,
-    agents: int,
+    agent_of_camera: Tensor,
+    num_agents: int,
     grid: BevGrid,
     stride: int,
-    coarsest_m: float = math.inf,
+    max_pixel_footprint_m: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
     """Features (V, C, h, w) of V cameras to (agents, C, rows, columns), zero where unseen, and what is seen, bool.
 
-    owner: (V,) int64, whose camera it is. stride: pixels a feature, the first centred on the first pixel. coarsest_m: ground of
-    which one pixel covers more than this along its ray is unseen.
+    agent_of_camera: (V,) int64, whose camera it is. stride: pixels a feature, the first centred on the first pixel.
+    max_pixel_footprint_m: ground of which one pixel covers more than this along its ray is unseen.
     """
-    _check(features, cameras, owner)
-    look = _look_up(cameras, _View(grid, 0.0, coarsest_m, _size(features), stride))
-    return _mean_of_cameras([(look, look.there, _sample(features, look.place))], owner, agents, grid)
+    _check(features, cameras, agent_of_camera)
+    projected = _project_cells(cameras, _LiftGeometry(grid, 0.0, max_pixel_footprint_m, _size(features), stride))
+    return _average_cameras(
+        [(projected, projected.valid, _sample(features, projected.place))], agent_of_camera, num_agents, grid
+    )
 
 
 def lift_depth(
     features: Tensor,
     depth: Tensor,
     cameras: Sequence[Camera],
-    owner: Tensor,
-    agents: int,
+    agent_of_camera: Tensor,
+    num_agents: int,
     grid: BevGrid,
     stride: int,
     bins: DepthBins,
@@ -135,20 +139,20 @@ def lift_depth(
     A point takes its pixel's feature times the likelihood of the point's depth there, linear between bins; a cell is the sum over
     heights. Places beyond the bins are unseen.
     """
-    _check(features, cameras, owner)
-    if depth.shape != (features.shape[0], bins.count, *features.shape[-2:]):
+    _check(features, cameras, agent_of_camera)
+    if depth.shape != (features.shape[0], bins.num_bins, *features.shape[-2:]):
         raise ShapeError(
-            f"lift_depth needs depth (V, {bins.count}, h, w) beside {tuple(features.shape)}; got {tuple(depth.shape)}."
+            f"lift_depth needs depth (V, {bins.num_bins}, h, w) beside {tuple(features.shape)}; got {tuple(depth.shape)}."
         )
     found = []
     for height_m in heights_m:
-        look = _look_up(cameras, _View(grid, height_m, math.inf, _size(features), stride))
-        bin_at = (look.depth_m - bins.near_m) / (bins.far_m - bins.near_m) * (bins.count - 1)
-        deep = torch.cat((look.place, (2 * bin_at[..., None] + 1) / bins.count - 1), -1)
-        likely = _sample(depth[:, None], deep[:, None])
-        within = look.there & (look.depth_m >= bins.near_m) & (look.depth_m <= bins.far_m)
-        found.append((look, within, _sample(features, look.place) * likely))
-    return _mean_of_cameras(found, owner, agents, grid)
+        projected = _project_cells(cameras, _LiftGeometry(grid, height_m, math.inf, _size(features), stride))
+        bin_at = (projected.depth_m - bins.near_m) / (bins.far_m - bins.near_m) * (bins.num_bins - 1)
+        deep = torch.cat((projected.place, (2 * bin_at[..., None] + 1) / bins.num_bins - 1), -1)
+        likelihood = _sample(depth[:, None], deep[:, None])
+        within = projected.valid & (projected.depth_m >= bins.near_m) & (projected.depth_m <= bins.far_m)
+        found.append((projected, within, _sample(features, projected.place) * likelihood))
+    return _average_cameras(found, agent_of_camera, num_agents, grid)
 
 
 def _size(features: Tensor) -> tuple[int, int]:
@@ -161,27 +165,31 @@ def _sample(values: Tensor, place: Tensor) -> Tensor:
     return found.flatten(2).mT
 
 
-def _mean_of_cameras(
-    found: Sequence[tuple[_LookUp, Tensor, Tensor]], owner: Tensor, agents: int, grid: BevGrid
+def _average_cameras(
+    found: Sequence[tuple[_ProjectedCells, Tensor, Tensor]], agent_of_camera: Tensor, num_agents: int, grid: BevGrid
 ) -> tuple[Tensor, Tensor]:
     """Sums of what was found, (V, M, C) where within (V, M), on the cells of agents, over the number of cameras that see a cell."""
     rows, columns = grid.shape
     cells, channels = rows * columns, found[0][2].shape[2]
-    total = found[0][2].new_zeros(agents * cells, channels)
-    sees = torch.zeros(len(owner), cells, dtype=torch.bool)
-    camera = torch.arange(len(owner))[:, None]
-    for look, within, values in found:
-        total = total.index_add(0, (owner[:, None] * cells + look.cell)[within], values[within])
-        sees[camera.expand_as(within)[within], look.cell[within]] = True
-    count = total.new_zeros(agents, cells).index_add(0, owner, sees.to(total.dtype)).view(agents, rows, columns)
-    mean = total.view(agents, rows, columns, channels) / count.clamp_min(1)[..., None]
+    total = found[0][2].new_zeros(num_agents * cells, channels)
+    visible = torch.zeros(len(agent_of_camera), cells, dtype=torch.bool)
+    camera = torch.arange(len(agent_of_camera))[:, None]
+    for projected, within, values in found:
+        total = total.index_add(0, (agent_of_camera[:, None] * cells + projected.cell)[within], values[within])
+        visible[camera.expand_as(within)[within], projected.cell[within]] = True
+    count = (
+        total.new_zeros(num_agents, cells)
+        .index_add(0, agent_of_camera, visible.to(total.dtype))
+        .view(num_agents, rows, columns)
+    )
+    mean = total.view(num_agents, rows, columns, channels) / count.clamp_min(1)[..., None]
     # Channels stay innermost in memory, as convolutions like them.
     return mean.permute(0, 3, 1, 2), count > 0
 
 
-def _check(features: Tensor, cameras: Sequence[Camera], owner: Tensor) -> None:
-    if features.dim() != 4 or len(cameras) != features.shape[0] or owner.shape != (len(cameras),):
+def _check(features: Tensor, cameras: Sequence[Camera], agent_of_camera: Tensor) -> None:
+    if features.dim() != 4 or len(cameras) != features.shape[0] or agent_of_camera.shape != (len(cameras),):
         raise ShapeError(
             f"Lifting needs features (V, C, h, w) and an owner (V,) for each of {len(cameras)} cameras; got "
-            f"{tuple(features.shape)} and {tuple(owner.shape)}."
+            f"{tuple(features.shape)} and {tuple(agent_of_camera.shape)}."
         )

@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models import checkpoint
-from manyeyes.models.pose.box_descriptors import BoxKeypointNet, BoxKeypoints
-from manyeyes.models.pose.keypoint_net import DenseKeypointNet, DenseKeypoints, View
-from manyeyes.models.pose.matcher import Matcher, MatcherConfig, Points, mutual
-from manyeyes.models.pose.neighbour_geometry import ConstellationConfig
+from manyeyes.models.pose.box_descriptors import BoxKeypointConfig, BoxKeypointNet
+from manyeyes.models.pose.keypoint_net import DenseKeypointConfig, DenseKeypointNet, DetectorView
+from manyeyes.models.pose.matcher import KeypointBatch, Matcher, MatcherConfig, find_mutual_matches
+from manyeyes.models.pose.neighbour_geometry import NeighbourGeometryConfig
 
 FORMAT = "manyeyes-feakm-1"
 
@@ -27,7 +27,7 @@ class FeakmConfig:
     on; views of others mean nothing to it.
     """
 
-    keypoints: DenseKeypoints | BoxKeypoints
+    keypoints: DenseKeypointConfig | BoxKeypointConfig
     matcher: MatcherConfig
     detector: str = ""
 
@@ -47,21 +47,25 @@ class FeakmNet(nn.Module):
         super().__init__()
         self.config = config
         kind = config.keypoints
-        self.keypoints = DenseKeypointNet(kind) if isinstance(kind, DenseKeypoints) else BoxKeypointNet(kind)
+        self.keypoints = DenseKeypointNet(kind) if isinstance(kind, DenseKeypointConfig) else BoxKeypointNet(kind)
         self.matcher = Matcher(config.matcher)
 
-    def describe(self, views: Sequence[View], together: int = 0) -> list[Keypoints]:
+    def describe(self, views: Sequence[DetectorView], group_size: int = 0) -> list[Keypoints]:
         """Keypoints of views, described in groups of so many together (0: all): one, as a sender does, or a pair, as FeaKM's
         code does; only as published does it make a difference.
         """
-        return self.keypoints(views, together)
+        return self.keypoints(views, group_size)
 
     @torch.no_grad()
-    def match(self, ego: Points, other: Points) -> Matches:
+    def match(self, ego_keypoints: KeypointBatch, other_keypoints: KeypointBatch) -> Matches:
         """Points of one view each that are one object, by what they look like and how they stand; no pose is given."""
-        if not ego.mask.any() or not other.mask.any():
+        if not ego_keypoints.mask.any() or not other_keypoints.mask.any():
             return Matches(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0))
-        return Matches(*mutual(self.matcher(ego, other)[-1], self.config.matcher.threshold)[0])
+        return Matches(
+            *find_mutual_matches(self.matcher(ego_keypoints, other_keypoints)[-1], self.config.matcher.min_match_prob)[
+                0
+            ]
+        )
 
     def check_views(self, detector: bytes) -> None:
         """Refuse views of a detector of that fingerprint, where the net was taught on another's."""
@@ -72,13 +76,19 @@ class FeakmNet(nn.Module):
             )
 
 
-FEAKM_PAPER = FeakmConfig(DenseKeypoints(), MatcherConfig())
+FEAKM_PAPER = FeakmConfig(DenseKeypointConfig(), MatcherConfig())
 """As published: 15 M parameters with its 128 input channels."""
 
 FEAKM_SMALL = FeakmConfig(
-    BoxKeypoints(),
+    BoxKeypointConfig(),
     MatcherConfig(
-        descriptor=32, width=128, layers=4, heads=4, unit_m=10.0, threshold=0.1, constellation=ConstellationConfig()
+        descriptor_dim=32,
+        width=128,
+        layers=4,
+        heads=4,
+        position_unit_m=10.0,
+        min_match_prob=0.1,
+        neighbour_geometry=NeighbourGeometryConfig(),
     ),
 )
 """Mended, and at most 2 M parameters."""

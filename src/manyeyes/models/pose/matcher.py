@@ -17,27 +17,27 @@ from torch.nn import functional
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.keypoints import Keypoints
-from manyeyes.models.pose.neighbour_geometry import Constellation, ConstellationConfig
+from manyeyes.models.pose.neighbour_geometry import NeighbourGeometryConfig, NeighbourGeometryEncoder
 
-NEVER = -1e4
+MASKED_LOGIT = -1e4
 """Logit of what may not be attended to or assigned; finite, so that an empty set gives no NaN."""
 
 
 @dataclass(frozen=True)
 class MatcherConfig:
-    """descriptor: length of what comes in; width, layers, heads: of the attention. unit_m: in which positions are measured,
-    and frequency: spread of the angles that a unit turns, before they are learned. threshold: least probability of a match.
-    constellation: points are also told how those around them stand, whichever way their agent looks; None as published.
+    """descriptor_dim: length of what comes in; width, layers, heads: of the attention. position_unit_m: in which positions are
+    measured, and frequency: spread of the angles that a unit turns, before they are learned. min_match_prob: least probability of a
+    match. neighbour_geometry: points are also told how those around them stand, whichever way their agent looks; None as published.
     """
 
-    descriptor: int = 256
+    descriptor_dim: int = 256
     width: int = 256
     layers: int = 9
     heads: int = 4
-    unit_m: float = 100.0
-    frequency: float = 1.0
-    threshold: float = 0.1
-    constellation: ConstellationConfig | None = None
+    position_unit_m: float = 100.0
+    frequency_std: float = 1.0
+    min_match_prob: float = 0.1
+    neighbour_geometry: NeighbourGeometryConfig | None = None
 
     def __post_init__(self) -> None:
         if self.width % (4 * self.heads):
@@ -45,7 +45,7 @@ class MatcherConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class KeypointBatch:
     """Keypoints of B views as one batch. descriptor: (B, N, D); xy: (B, N, 2) m; yaw: (B, N); size: (B, N, 2) m; mask: (B, N)
     bool, which are points and not padding.
     """
@@ -57,31 +57,31 @@ class Points:
     mask: Tensor
 
     @classmethod
-    def of(cls, many: Sequence[Keypoints]) -> Points:
+    def of(cls, keypoints: Sequence[Keypoints]) -> KeypointBatch:
         """Padded to the longest."""
 
         def pad(values: Sequence[Tensor]) -> Tensor:
             return nn.utils.rnn.pad_sequence([v.float() for v in values], batch_first=True)
 
         return cls(
-            pad([k.descriptor for k in many]),
-            pad([k.xy for k in many]),
-            pad([k.boxes.yaw for k in many]),
-            pad([k.boxes.size[:, :2] for k in many]),
-            pad([torch.ones(len(k)) for k in many]).bool(),
+            pad([k.descriptor for k in keypoints]),
+            pad([k.xy for k in keypoints]),
+            pad([k.boxes.yaw for k in keypoints]),
+            pad([k.boxes.size[:, :2] for k in keypoints]),
+            pad([torch.ones(len(k)) for k in keypoints]).bool(),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """log_p: (B, N, M) of a match; log_alone_a, log_alone_b: (B, N), (B, M) that a point has none."""
+    """log_p: (B, N, M) of a match; log_unmatched_a, log_unmatched_b: (B, N), (B, M) that a point has none."""
 
     log_p: Tensor
-    log_alone_a: Tensor
-    log_alone_b: Tensor
+    log_unmatched_a: Tensor
+    log_unmatched_b: Tensor
 
 
-def mutual(assignment: Assignment, threshold: float) -> list[tuple[Tensor, Tensor]]:
+def find_mutual_matches(assignment: Assignment, min_prob: float) -> list[tuple[Tensor, Tensor]]:
     """Of each pair of views: rows (P, 2) that are each other's best with a probability above the threshold, and that (P,)."""
     found = []
     for log_p in assignment.log_p:
@@ -90,7 +90,7 @@ def mutual(assignment: Assignment, threshold: float) -> list[tuple[Tensor, Tenso
             continue
         best, j = log_p.max(1)
         i = torch.arange(len(log_p))
-        rows = (log_p.argmax(0)[j] == i) & (best.exp() > threshold)
+        rows = (log_p.argmax(0)[j] == i) & (best.exp() > min_prob)
         found.append((torch.stack((i[rows], j[rows]), 1), best[rows].exp()))
     return found
 
@@ -102,33 +102,35 @@ class Matcher(nn.Module):
         super().__init__()
         self.config = config
         d, heads = config.width, config.heads
-        self.enter = nn.Identity() if config.descriptor == d else nn.Linear(config.descriptor, d)
-        self.around = None if config.constellation is None else Constellation(d, config.constellation)
-        self.position = nn.Linear(2, d // heads // 2, bias=False)
-        nn.init.normal_(self.position.weight, std=config.frequency)
-        self.within = nn.ModuleList(SelfBlock(d, heads) for _ in range(config.layers))
-        self.across = nn.ModuleList(CrossBlock(d, heads) for _ in range(config.layers))
-        self.assign = nn.ModuleList(AssignmentHead(d) for _ in range(config.layers))
+        self.input_projection = nn.Identity() if config.descriptor_dim == d else nn.Linear(config.descriptor_dim, d)
+        self.neighbour_geometry = (
+            None if config.neighbour_geometry is None else NeighbourGeometryEncoder(d, config.neighbour_geometry)
+        )
+        self.position_encoder = nn.Linear(2, d // heads // 2, bias=False)
+        nn.init.normal_(self.position_encoder.weight, std=config.frequency_std)
+        self.self_blocks = nn.ModuleList(SelfAttentionBlock(d, heads) for _ in range(config.layers))
+        self.cross_blocks = nn.ModuleList(CrossAttentionBlock(d, heads) for _ in range(config.layers))
+        self.assignment_heads = nn.ModuleList(AssignmentHead(d) for _ in range(config.layers))
 
-    def forward(self, a: Points, b: Points) -> list[Assignment]:
+    def forward(self, a: KeypointBatch, b: KeypointBatch) -> list[Assignment]:
         """Pairs of views to the assignment of every layer, the last of which is the answer; see mutual."""
-        (x, turn_x), (y, turn_y) = self._enter(a), self._enter(b)
+        (x, turn_x), (y, turn_y) = self._embed(a), self._embed(b)
         found = []
-        for within, across, assign in zip(self.within, self.across, self.assign):
-            x, y = within(x, turn_x, a.mask), within(y, turn_y, b.mask)
-            x, y = across(x, y, a.mask, b.mask)
-            found.append(assign(x, y, a.mask, b.mask))
+        for self_block, cross_block, assignment_head in zip(self.self_blocks, self.cross_blocks, self.assignment_heads):
+            x, y = self_block(x, turn_x, a.mask), self_block(y, turn_y, b.mask)
+            x, y = cross_block(x, y, a.mask, b.mask)
+            found.append(assignment_head(x, y, a.mask, b.mask))
         return found
 
-    def _enter(self, points: Points) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        x = self.enter(points.descriptor)
-        if self.around is not None:
-            x = x + self.around(points.xy, points.yaw, points.size, points.mask)
-        angle = self.position(points.xy / self.config.unit_m)[:, None]
+    def _embed(self, points: KeypointBatch) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        x = self.input_projection(points.descriptor)
+        if self.neighbour_geometry is not None:
+            x = x + self.neighbour_geometry(points.xy, points.yaw, points.size, points.mask)
+        angle = self.position_encoder(points.xy / self.config.position_unit_m)[:, None]
         return x, (angle.cos(), angle.sin())
 
 
-def rotated(x: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
+def apply_rotary(x: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
     """Pairs of channels of (B, heads, N, c) turned by angles whose cosine and sine are (B, 1, N, c / 2): the product of two
     such depends on the difference of their places alone (RoFormer, Eq. 14).
     """
@@ -137,7 +139,7 @@ def rotated(x: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
     return torch.stack((u * c - v * s, u * s + v * c), -1).flatten(-2)
 
 
-def _feed(width: int) -> nn.Sequential:
+def _make_ffn(width: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Linear(2 * width, 2 * width), nn.LayerNorm(2 * width), nn.GELU(), nn.Linear(2 * width, width)
     )
@@ -150,32 +152,32 @@ def _split(x: Tensor, heads: int) -> Tensor:
 
 def _bias(mask: Tensor) -> Tensor:
     """(B, 1, 1, N) to add to attention's logits."""
-    return (~mask).float()[:, None, None] * NEVER
+    return (~mask).float()[:, None, None] * MASKED_LOGIT
 
 
-class SelfBlock(nn.Module):
+class SelfAttentionBlock(nn.Module):
     """Points of one view attend to each other, by content and relative place."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.qkv, self.out, self.feed = nn.Linear(width, 3 * width), nn.Linear(width, width), _feed(width)
+        self.qkv, self.out, self.ffn = nn.Linear(width, 3 * width), nn.Linear(width, width), _make_ffn(width)
 
     def forward(self, x: Tensor, turn: tuple[Tensor, Tensor], mask: Tensor) -> Tensor:
         """(B, N, d) to (B, N, d)."""
         q, k, v = (_split(part, self.heads) for part in self.qkv(x).chunk(3, -1))
-        heard = functional.scaled_dot_product_attention(rotated(q, turn), rotated(k, turn), v, _bias(mask))
-        return x + self.feed(torch.cat((x, self.out(heard.transpose(1, 2).flatten(-2))), -1))
+        attended = functional.scaled_dot_product_attention(apply_rotary(q, turn), apply_rotary(k, turn), v, _bias(mask))
+        return x + self.ffn(torch.cat((x, self.out(attended.transpose(1, 2).flatten(-2))), -1))
 
 
-class CrossBlock(nn.Module):
+class CrossAttentionBlock(nn.Module):
     """Points of two views attend to each other, by content alone; one projection serves as query and key of both."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
         self.key, self.value, self.out = (nn.Linear(width, width) for _ in range(3))
-        self.feed = _feed(width)
+        self.ffn = _make_ffn(width)
 
     def forward(self, x: Tensor, y: Tensor, mask_x: Tensor, mask_y: Tensor) -> tuple[Tensor, Tensor]:
         """(B, N, d), (B, M, d) to the same."""
@@ -185,8 +187,8 @@ class CrossBlock(nn.Module):
         to_y = functional.scaled_dot_product_attention(key_y, key_x, value_x, _bias(mask_x))
         return self._add(x, to_x), self._add(y, to_y)
 
-    def _add(self, x: Tensor, heard: Tensor) -> Tensor:
-        return x + self.feed(torch.cat((x, self.out(heard.transpose(1, 2).flatten(-2))), -1))
+    def _add(self, x: Tensor, attended: Tensor) -> Tensor:
+        return x + self.ffn(torch.cat((x, self.out(attended.transpose(1, 2).flatten(-2))), -1))
 
 
 class AssignmentHead(nn.Module):
@@ -200,8 +202,8 @@ class AssignmentHead(nn.Module):
         """(B, N, d), (B, M, d) to (B, N, M)."""
         similar = self.project(x) @ self.project(y).mT / x.shape[-1] ** 0.5
         z_x, z_y = self.matchable(x)[..., 0], self.matchable(y)[..., 0]
-        by_row = similar.masked_fill(~mask_y[:, None], NEVER).log_softmax(2)
-        by_column = similar.masked_fill(~mask_x[:, :, None], NEVER).log_softmax(1)
+        by_row = similar.masked_fill(~mask_y[:, None], MASKED_LOGIT).log_softmax(2)
+        by_column = similar.masked_fill(~mask_x[:, :, None], MASKED_LOGIT).log_softmax(1)
         log_p = by_row + by_column + functional.logsigmoid(z_x)[:, :, None] + functional.logsigmoid(z_y)[:, None]
-        log_p = log_p.masked_fill(~(mask_x[:, :, None] & mask_y[:, None]), NEVER)
+        log_p = log_p.masked_fill(~(mask_x[:, :, None] & mask_y[:, None]), MASKED_LOGIT)
         return Assignment(log_p, functional.logsigmoid(-z_x), functional.logsigmoid(-z_y))

@@ -15,58 +15,60 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes.ops.se2 import Edges, solve
-from manyeyes.pose.baselines._common import answered, nearest
+from manyeyes.ops.se2 import PoseGraphEdges, solve_pose_graph
+from manyeyes.pose.baselines._common import make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim, PoseEstimate, unanswered
+from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
 @dataclass(frozen=True)
 class CoalignConfig:
-    """reach_m: boxes nearer than this are one object. least: so many objects or fewer are no graph. hard_rad2: an
-    object whose headings vary by more is left out; where half of them do, there is no answer.
+    """max_distance_m: boxes nearer than this are one object. min_objects: so many objects or fewer are no graph.
+    max_yaw_variance_rad2: an object whose headings vary by more is left out; where half of them do, there is no answer.
     """
 
-    reach_m: float = 1.5
-    least: int = 3
-    hard_rad2: float = 0.2
+    max_distance_m: float = 1.5
+    min_objects: int = 3
+    max_yaw_variance_rad2: float = 0.2
 
 
 def correct(
-    ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: CoalignConfig | None = None
+    ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: CoalignConfig | None = None
 ) -> PoseEstimate:
     """The other's pose in the settled graph; NO_MATCH without a claim or with too few objects."""
     config = config or CoalignConfig()
-    if claimed is None:
-        return unanswered(None)
-    pairs = nearest(ego.xy, other.moved(claimed.pose).xy, config.reach_m)
+    if prior is None:
+        return no_estimate(None)
+    pairs = match_mutual_nearest(ego.xy, other.transform(prior.pose).xy, config.max_distance_m)
     i, k = pairs.T
-    turn = ego.yaw[i] - other.yaw[k] - claimed.pose[2]
+    turn = ego.yaw[i] - other.yaw[k] - prior.pose[2]
     turn = (turn + np.pi / 2) % np.pi - np.pi / 2
-    hard = turn**2 / 4 > config.hard_rad2
-    if len(pairs) <= config.least or 2 * hard.sum() >= len(pairs):
-        return unanswered(claimed)
+    hard = turn**2 / 4 > config.max_yaw_variance_rad2
+    if len(pairs) <= config.min_objects or 2 * hard.sum() >= len(pairs):
+        return no_estimate(prior)
     pairs = pairs[~hard]
-    poses = settled(ego, other, pairs, claimed, turn[~hard])
-    return answered(ego, other, poses[1].numpy(), pairs, claimed)
+    poses = optimize_pose_graph(ego, other, pairs, prior, turn[~hard])
+    return make_estimate(ego, other, poses[1].numpy(), pairs, prior)
 
 
-def settled(ego: Landmarks, other: Landmarks, pairs: np.ndarray, claimed: PoseClaim, turn: np.ndarray) -> Tensor:
+def optimize_pose_graph(
+    ego: Landmarks, other: Landmarks, pairs: np.ndarray, prior: PosePrior, turn: np.ndarray
+) -> Tensor:
     """Poses (2 + P, 3) of ego, other and objects, in the ego's frame; turn (P,): headings' difference modulo pi."""
     i, k = pairs.T
     n = len(pairs)
-    seen = torch.from_numpy(np.column_stack((ego.xy[i], ego.yaw[i])))
+    ego_measured = torch.from_numpy(np.column_stack((ego.xy[i], ego.yaw[i])))
     # The other's heading is taken as the one nearer to the ego's, so that a box turned by pi is the same object.
-    there = torch.from_numpy(np.column_stack((other.xy[k], ego.yaw[i] - claimed.pose[2] - turn)))
-    start = torch.cat((torch.zeros(1, 3, dtype=torch.float64), torch.from_numpy(claimed.pose)[None], seen))
+    other_measured = torch.from_numpy(np.column_stack((other.xy[k], ego.yaw[i] - prior.pose[2] - turn)))
+    start = torch.cat((torch.zeros(1, 3, dtype=torch.float64), torch.from_numpy(prior.pose)[None], ego_measured))
     objects = torch.arange(n) + 2
     sigma = np.concatenate(
         [np.column_stack((s.sigma_xy[r], s.sigma_xy[r], s.sigma_yaw[r])) for s, r in ((ego, i), (other, k))]
     )
-    edges = Edges(
+    edges = PoseGraphEdges(
         torch.cat((torch.zeros(n, dtype=torch.int64), torch.ones(n, dtype=torch.int64))),
         torch.cat((objects, objects)),
-        torch.cat((seen, there)),
+        torch.cat((ego_measured, other_measured)),
         torch.from_numpy(sigma**-2.0).diag_embed(),
     )
-    return solve(start, edges, torch.arange(n + 2) == 0).poses
+    return solve_pose_graph(start, edges, torch.arange(n + 2) == 0).poses

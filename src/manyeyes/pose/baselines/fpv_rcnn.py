@@ -12,50 +12,50 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from manyeyes.pose.baselines._common import answered, nearest, pose_of
+from manyeyes.pose.baselines._common import fit_pose, make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim, PoseEstimate, unanswered
+from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
 @dataclass(frozen=True)
 class FpvRcnnConfig:
-    """The grid: reach_m by step_m in x and y, reach_deg by step_deg in yaw. match_m, accurate_m: how near landmarks
-    meet. weight: of a vehicle. least_score, least_accurate: an answer needs that score, and more accurate matches
+    """The grid: reach_m by step_m in x and y, reach_deg by step_deg in yaw. match_distance_m, accurate_distance_m: how near
+    landmarks meet. vehicle_weight: of a vehicle. min_score, min_accurate: an answer needs that score, and more accurate matches
     than that.
     """
 
-    reach_m: float = 1.0
+    search_m: float = 1.0
     step_m: float = 0.5
-    reach_deg: float = 3.0
+    search_deg: float = 3.0
     step_deg: float = 1.0
-    match_m: float = 1.0
-    accurate_m: float = 0.5
-    weight: float = 2.0
-    least_score: float = 10.0
-    least_accurate: int = 2
+    match_distance_m: float = 1.0
+    accurate_distance_m: float = 0.5
+    vehicle_weight: float = 2.0
+    min_score: float = 10.0
+    min_accurate: int = 2
 
 
 def correct(
-    ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: FpvRcnnConfig | None = None
+    ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: FpvRcnnConfig | None = None
 ) -> PoseEstimate:
     """The grid's best pose, fitted on its accurate matches; NO_MATCH without a claim or enough of them."""
     config = config or FpvRcnnConfig()
-    if claimed is None or not len(ego) or not len(other):
-        return unanswered(claimed)
-    steps = [_steps(config.reach_m, config.step_m)] * 2 + [np.radians(_steps(config.reach_deg, config.step_deg))]
-    best, fewest, pose = -1.0, np.inf, claimed.pose
+    if prior is None or not len(ego) or not len(other):
+        return no_estimate(prior)
+    steps = [_steps(config.search_m, config.step_m)] * 2 + [np.radians(_steps(config.search_deg, config.step_deg))]
+    best, best_distance, pose = -1.0, np.inf, prior.pose
     for offset in itertools.product(*steps):
-        moved = claimed.pose + np.array(offset)
-        apart = np.hypot(*(ego.xy[:, None] - other.moved(moved).xy[None]).transpose(2, 0, 1)).min(0)
-        met = apart <= config.match_m
-        score, distance = config.weight * met.sum(), float(apart[met].sum())
-        if (score, -distance) > (best, -fewest):
-            best, fewest, pose = score, distance, moved
-    pairs = nearest(ego.xy, other.moved(pose).xy, config.accurate_m)
-    if best < config.least_score or len(pairs) <= config.least_accurate:
-        return unanswered(claimed)
-    fitted = pose_of(ego.xy[pairs[:, 0]], other.xy[pairs[:, 1]])
-    return answered(ego, other, fitted, pairs, claimed)
+        moved = prior.pose + np.array(offset)
+        apart = np.hypot(*(ego.xy[:, None] - other.transform(moved).xy[None]).transpose(2, 0, 1)).min(0)
+        met = apart <= config.match_distance_m
+        score, distance = config.vehicle_weight * met.sum(), float(apart[met].sum())
+        if (score, -distance) > (best, -best_distance):
+            best, best_distance, pose = score, distance, moved
+    pairs = match_mutual_nearest(ego.xy, other.transform(pose).xy, config.accurate_distance_m)
+    if best < config.min_score or len(pairs) <= config.min_accurate:
+        return no_estimate(prior)
+    fitted = fit_pose(ego.xy[pairs[:, 0]], other.xy[pairs[:, 1]])
+    return make_estimate(ego, other, fitted, pairs, prior)
 
 
 def _steps(reach: float, step: float) -> np.ndarray:

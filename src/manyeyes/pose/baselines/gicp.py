@@ -13,46 +13,47 @@ import numpy as np
 import torch
 
 from manyeyes.datatypes import MissingExtraError, PointCloud, Transform
-from manyeyes.pose.corrector import mahalanobis
-from manyeyes.pose.types import PoseClaim, PoseEstimate, PoseStatus, planar, unanswered
+from manyeyes.pose.corrector import mahalanobis_squared
+from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, no_estimate, project_to_se2
 
 
 @dataclass(frozen=True)
 class GicpConfig:
-    """voxel_m: edge of the voxels to which clouds are thinned; reach_m: how far apart a pair of points may be; least_share: of
-    the other's points that find one, for an answer. sigma_m, sigma_yaw_rad: the error that an answer states.
+    """voxel_m: edge of the voxels to which clouds are thinned; max_correspondence_m: how far apart a pair of points may be;
+    min_inlier_fraction: of the other's points that find one, for an answer. sigma_m, sigma_yaw_rad: the error that an answer
+    states.
     """
 
     voxel_m: float = 0.5
-    reach_m: float = 2.0
-    least_share: float = 0.3
+    max_correspondence_m: float = 2.0
+    min_inlier_fraction: float = 0.3
     sigma_m: float = 0.1
     sigma_yaw_rad: float = 0.005
 
 
 def correct(
-    ego: PointCloud, other: PointCloud, claimed: PoseClaim | None, config: GicpConfig | None = None
+    ego: PointCloud, other: PointCloud, prior: PosePrior | None, config: GicpConfig | None = None
 ) -> PoseEstimate:
     """Where the clouds fit best near the claim, in all six degrees of freedom; NO_MATCH without a claim or without overlap."""
     config = config or GicpConfig()
     gicp = _small_gicp()
-    if claimed is None or min(len(ego), len(other)) < 3:
-        return unanswered(claimed)
+    if prior is None or min(len(ego), len(other)) < 3:
+        return no_estimate(prior)
     target, source = (gicp.voxelgrid_sampling(c.xyz.double().numpy(), config.voxel_m) for c in (ego, other))
     found = gicp.align(
         target.points()[:, :3],
         source.points()[:, :3],
-        init_T_target_source=claimed.ego_from_other.matrix().double().numpy(),
+        init_T_target_source=prior.ego_from_other.matrix().double().numpy(),
         registration_type="GICP",
         downsampling_resolution=config.voxel_m,
-        max_correspondence_distance=config.reach_m,
+        max_correspondence_distance=config.max_correspondence_m,
         num_threads=1,
     )
-    if not found.converged or found.num_inliers < config.least_share * source.size():
-        return unanswered(claimed)
+    if not found.converged or found.num_inliers < config.min_inlier_fraction * source.size():
+        return no_estimate(prior)
     pose = Transform.from_matrix(torch.from_numpy(np.asarray(found.T_target_source)))
-    flat, covariance = planar(pose), np.diag([config.sigma_m**2, config.sigma_m**2, config.sigma_yaw_rad**2])
-    distance = mahalanobis(flat, covariance, claimed)
+    flat, covariance = project_to_se2(pose), np.diag([config.sigma_m**2, config.sigma_m**2, config.sigma_yaw_rad**2])
+    distance = mahalanobis_squared(flat, covariance, prior)
     none, status = np.zeros((0, 2), np.int64), PoseStatus.CORRECTED
     return PoseEstimate(pose, covariance, status, int(found.num_inliers), 0, 0.0, none, flat, covariance, distance)
 

@@ -9,35 +9,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from manyeyes.pose.baselines._common import answered, nearest, pose_of
+from manyeyes.pose.baselines._common import fit_pose, make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim, PoseEstimate, difference, unanswered
+from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate, pose_difference
 
 
 @dataclass(frozen=True)
 class IcpConfig:
-    """reach_m: how far apart a pair may be; least: pairs that a fit needs; rounds: at most so many."""
+    """max_correspondence_m: how far apart a pair may be; min_pairs: pairs that a fit needs; max_iterations: at most so many."""
 
-    reach_m: float = 3.0
-    least: int = 3
-    rounds: int = 30
+    max_correspondence_m: float = 3.0
+    min_pairs: int = 3
+    max_iterations: int = 30
 
 
-def correct(
-    ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: IcpConfig | None = None
-) -> PoseEstimate:
+def correct(ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: IcpConfig | None = None) -> PoseEstimate:
     """Where closest pairs and their fit no longer change; NO_MATCH without a claim or enough pairs."""
     config = config or IcpConfig()
-    if claimed is None:
-        return unanswered(None)
-    pose, pairs = claimed.pose, np.zeros((0, 2), np.int64)
-    for _ in range(config.rounds):
-        pairs = nearest(ego.xy, other.moved(pose).xy, config.reach_m)
-        if len(pairs) < config.least:
-            return unanswered(claimed)
-        moved = pose_of(ego.xy[pairs[:, 0]], other.xy[pairs[:, 1]])
-        still = np.abs(difference(moved, pose)).max() < 1e-9
+    if prior is None:
+        return no_estimate(None)
+    pose, pairs = prior.pose, np.zeros((0, 2), np.int64)
+    for _ in range(config.max_iterations):
+        pairs = match_mutual_nearest(ego.xy, other.transform(pose).xy, config.max_correspondence_m)
+        if len(pairs) < config.min_pairs:
+            return no_estimate(prior)
+        moved = fit_pose(ego.xy[pairs[:, 0]], other.xy[pairs[:, 1]])
+        still = np.abs(pose_difference(moved, pose)).max() < 1e-9
         pose = moved
         if still:
             break
-    return answered(ego, other, pose, pairs, claimed)
+    return make_estimate(ego, other, pose, pairs, prior)

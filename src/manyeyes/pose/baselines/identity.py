@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim, PoseEstimate, PoseStatus, unanswered
+from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, no_estimate
 
 
-def correct(ego: Landmarks, other: Landmarks, claimed: PoseClaim | None) -> PoseEstimate:
+def correct(ego: Landmarks, other: Landmarks, prior: PosePrior | None) -> PoseEstimate:
     """The claim as it is; NO_MATCH where there is none."""
-    return unanswered(claimed, PoseStatus.NO_MATCH if claimed is None else PoseStatus.OK)
+    return no_estimate(prior, PoseStatus.NO_MATCH if prior is None else PoseStatus.OK)

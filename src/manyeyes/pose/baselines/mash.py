@@ -12,41 +12,41 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from manyeyes.pose.baselines._common import answered, pose_of
+from manyeyes.pose.baselines._common import fit_pose, make_estimate
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim, PoseEstimate, unanswered
+from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
 @dataclass(frozen=True)
 class MashConfig:
-    """neighbours: how many distances describe an object; size_m, distance_m: differences that cost one; least: pairs
-    that an answer needs.
+    """num_neighbours: how many distances describe an object; size_scale_m, distance_scale_m: differences that cost one; min_pairs:
+    pairs that an answer needs.
     """
 
-    neighbours: int = 4
-    size_m: float = 0.3
-    distance_m: float = 1.0
-    least: int = 3
+    num_neighbours: int = 4
+    size_scale_m: float = 0.3
+    distance_scale_m: float = 1.0
+    min_pairs: int = 3
 
 
 def correct(
-    ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: MashConfig | None = None
+    ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: MashConfig | None = None
 ) -> PoseEstimate:
     """The pose that objects give which are each other's best in the cost volume; the claim has no part in it."""
     config = config or MashConfig()
-    if min(len(ego), len(other)) <= config.neighbours:
-        return unanswered(claimed)
-    cost = np.square(_looks(ego, config)[:, None] - _looks(other, config)[None]).sum(-1)
+    if min(len(ego), len(other)) <= config.num_neighbours:
+        return no_estimate(prior)
+    cost = np.square(_descriptors(ego, config)[:, None] - _descriptors(other, config)[None]).sum(-1)
     best = cost.argmin(1)
     rows = np.flatnonzero(cost.argmin(0)[best] == np.arange(len(ego)))
     pairs = np.stack((rows, best[rows]), 1)
-    if len(pairs) < config.least:
-        return unanswered(claimed)
-    pose = pose_of(ego.xy[pairs[:, 0]], other.xy[pairs[:, 1]])
-    return answered(ego, other, pose, pairs, claimed)
+    if len(pairs) < config.min_pairs:
+        return no_estimate(prior)
+    pose = fit_pose(ego.xy[pairs[:, 0]], other.xy[pairs[:, 1]])
+    return make_estimate(ego, other, pose, pairs, prior)
 
 
-def _looks(x: Landmarks, config: MashConfig) -> np.ndarray:
+def _descriptors(x: Landmarks, config: MashConfig) -> np.ndarray:
     """(N, 2 + neighbours)."""
-    apart = np.sort(np.hypot(*(x.xy[:, None] - x.xy[None]).transpose(2, 0, 1)), 1)[:, 1 : config.neighbours + 1]
-    return np.column_stack((x.size / config.size_m, apart / config.distance_m))
+    apart = np.sort(np.hypot(*(x.xy[:, None] - x.xy[None]).transpose(2, 0, 1)), 1)[:, 1 : config.num_neighbours + 1]
+    return np.column_stack((x.size / config.size_scale_m, apart / config.distance_scale_m))

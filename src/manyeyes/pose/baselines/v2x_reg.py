@@ -17,49 +17,50 @@ import torch
 
 from manyeyes.ops.assignment import assign
 from manyeyes.ops.box_iou import pairwise_iou
-from manyeyes.pose.baselines._common import answered, nearest, pose_of
+from manyeyes.pose.baselines._common import fit_pose, make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim, PoseEstimate, unanswered
+from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
 @dataclass(frozen=True)
 class V2xRegConfig:
-    """kind: oDist or oIoU. boxes: the largest so many, within range_m. match_m: how near a car's centre and corners
-    meet. least: affinity that a match needs; where the best is at most ``few``, the best alone are taken.
+    """affinity_kind: oDist or oIoU. max_boxes: the largest so many, within range_m. match_distance_m: how near a car's centre and
+    corners meet. min_affinity: affinity that a match needs; where the best is at most ``max_weak_affinity``, the best alone are
+    taken.
     """
 
-    kind: Literal["oDist", "oIoU"] = "oDist"
-    boxes: int = 15
-    range_m: float = 120.0
-    match_m: float = 1.0
-    least: int = 4
-    few: int = 5
+    affinity_kind: Literal["oDist", "oIoU"] = "oDist"
+    max_boxes: int = 15
+    max_range_m: float = 120.0
+    match_distance_m: float = 1.0
+    min_affinity: int = 4
+    max_weak_affinity: int = 5
 
 
 def correct(
-    ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: V2xRegConfig | None = None
+    ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: V2xRegConfig | None = None
 ) -> PoseEstimate:
     """The pose that the corners of matched boxes give; the claim has no part in it."""
     config = config or V2xRegConfig()
     rows_e, rows_o = _largest(ego, config), _largest(other, config)
     if not len(rows_e) or not len(rows_o):
-        return unanswered(claimed)
+        return no_estimate(prior)
     a, b = ego[rows_e], other[rows_o]
     affinity = _affinity(a, b, config)
     pairs = assign(-affinity)
     found = affinity[pairs[:, 0], pairs[:, 1]]
-    least = found.max() if found.max() <= config.few else config.least
-    pairs, weight = pairs[(found >= least) & (found > 0)], found[(found >= least) & (found > 0)]
+    min_affinity = found.max() if found.max() <= config.max_weak_affinity else config.min_affinity
+    pairs, weight = pairs[(found >= min_affinity) & (found > 0)], found[(found >= min_affinity) & (found > 0)]
     if not len(pairs):
-        return unanswered(claimed)
+        return no_estimate(prior)
     corners = [_corners(x)[r].reshape(-1, 2) for x, r in ((a, pairs[:, 0]), (b, pairs[:, 1]))]
-    pose = pose_of(corners[0], corners[1], np.repeat(weight, 4))
-    return answered(ego, other, pose, np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1), claimed)
+    pose = fit_pose(corners[0], corners[1], np.repeat(weight, 4))
+    return make_estimate(ego, other, pose, np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1), prior)
 
 
 def _largest(x: Landmarks, config: V2xRegConfig) -> np.ndarray:
-    near = np.flatnonzero(np.hypot(*x.xy.T) <= config.range_m)
-    return near[np.lexsort((*x.xy[near].T, -x.size[near].prod(1)))][: config.boxes]
+    near = np.flatnonzero(np.hypot(*x.xy.T) <= config.max_range_m)
+    return near[np.lexsort((*x.xy[near].T, -x.size[near].prod(1)))][: config.max_boxes]
 
 
 def _affinity(a: Landmarks, b: Landmarks, config: V2xRegConfig) -> np.ndarray:
@@ -68,21 +69,25 @@ def _affinity(a: Landmarks, b: Landmarks, config: V2xRegConfig) -> np.ndarray:
     for i in range(len(a)):
         for j in range(len(b)):
             yaw = a.yaw[i] - b.yaw[j]
-            turned = b.moved(np.array([0.0, 0.0, yaw]))
-            moved = b.moved(np.array([*(a.xy[i] - turned.xy[j]), yaw]))
-            out[i, j] = (_overlaps(a, moved) if config.kind == "oIoU" else _meets(a, moved, config.match_m)) - 1.0
+            turned = b.transform(np.array([0.0, 0.0, yaw]))
+            moved = b.transform(np.array([*(a.xy[i] - turned.xy[j]), yaw]))
+            out[i, j] = (
+                _count_overlaps(a, moved)
+                if config.affinity_kind == "oIoU"
+                else _count_matches(a, moved, config.match_distance_m)
+            ) - 1.0
     return out
 
 
-def _meets(a: Landmarks, moved: Landmarks, reach_m: float) -> float:
+def _count_matches(a: Landmarks, moved: Landmarks, max_distance_m: float) -> float:
     """Boxes matched one to one by their centres and by their corners, the mean of both counts."""
-    pairs = nearest(a.xy, moved.xy, reach_m)
+    pairs = match_mutual_nearest(a.xy, moved.xy, max_distance_m)
     apart = _corners(a)[pairs[:, 0]] - _corners(moved)[pairs[:, 1]]
-    by_corner = np.hypot(apart[..., 0], apart[..., 1]).mean(1) <= reach_m
+    by_corner = np.hypot(apart[..., 0], apart[..., 1]).mean(1) <= max_distance_m
     return (len(pairs) + by_corner.sum()) / 2
 
 
-def _overlaps(a: Landmarks, moved: Landmarks) -> float:
+def _count_overlaps(a: Landmarks, moved: Landmarks) -> float:
     """Boxes that overlap, each with its best, one to one."""
     iou = pairwise_iou(*(torch.from_numpy(np.column_stack((x.xy, x.size, x.yaw))) for x in (a, moved))).numpy()
     best = iou.argmax(1)

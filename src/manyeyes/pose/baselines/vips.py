@@ -13,53 +13,56 @@ from dataclasses import dataclass
 import numpy as np
 
 from manyeyes.ops.assignment import assign
-from manyeyes.pose.baselines._common import answered, pose_of
+from manyeyes.pose.baselines._common import fit_pose, make_estimate
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.types import PoseClaim, PoseEstimate, unanswered
+from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
 @dataclass(frozen=True)
 class VipsConfig:
-    """boxes: at most so many an agent, those of highest score. share: of the best pair's weight that a pair needs.
-    least: pairs that an answer needs. rounds: of the power iteration.
+    """max_boxes: at most so many an agent, those of highest score. min_weight_fraction: of the best pair's weight that a pair
+    needs. min_pairs: pairs that an answer needs. num_iterations: of the power iteration.
     """
 
-    boxes: int = 25
-    share: float = 0.3
-    least: int = 3
-    rounds: int = 50
+    max_boxes: int = 25
+    min_weight_fraction: float = 0.3
+    min_pairs: int = 3
+    num_iterations: int = 50
 
 
 def correct(
-    ego: Landmarks, other: Landmarks, claimed: PoseClaim | None, config: VipsConfig | None = None
+    ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: VipsConfig | None = None
 ) -> PoseEstimate:
     """The pose that the matched objects' places give; NO_MATCH where too few match."""
     config = config or VipsConfig()
-    rows_e, rows_o = ego.usable(1e4, config.boxes), other.usable(1e4, config.boxes)
-    if min(len(rows_e), len(rows_o)) < config.least:
-        return unanswered(claimed)
+    rows_e, rows_o = ego.select_indices(1e4, config.max_boxes), other.select_indices(1e4, config.max_boxes)
+    if min(len(rows_e), len(rows_o)) < config.min_pairs:
+        return no_estimate(prior)
     a, b = ego[rows_e], other[rows_o]
-    affinity = affinities(a, b, claimed)
+    affinity = compute_affinities(a, b, prior)
     vector = np.full(len(affinity), len(affinity) ** -0.5)
-    for _ in range(config.rounds):
+    for _ in range(config.num_iterations):
         vector = affinity @ vector
         vector /= np.linalg.norm(vector)
     weight = vector.reshape(len(a), len(b))
     pairs = assign(-weight)
     strong = weight[pairs[:, 0], pairs[:, 1]]
-    pairs, strong = pairs[strong >= config.share * strong.max()], strong[strong >= config.share * strong.max()]
-    if len(pairs) < config.least:
-        return unanswered(claimed)
-    pose = pose_of(a.xy[pairs[:, 0]], b.xy[pairs[:, 1]], strong)
-    return answered(ego, other, pose, np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1), claimed)
+    pairs, strong = (
+        pairs[strong >= config.min_weight_fraction * strong.max()],
+        strong[strong >= config.min_weight_fraction * strong.max()],
+    )
+    if len(pairs) < config.min_pairs:
+        return no_estimate(prior)
+    pose = fit_pose(a.xy[pairs[:, 0]], b.xy[pairs[:, 1]], strong)
+    return make_estimate(ego, other, pose, np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1), prior)
 
 
-def affinities(a: Landmarks, b: Landmarks, claimed: PoseClaim | None) -> np.ndarray:
+def compute_affinities(a: Landmarks, b: Landmarks, prior: PosePrior | None) -> np.ndarray:
     """(N M, N M), pair (i, i') in row i M + i'. Two pairs that share an object have none."""
     n, m = len(a), len(b)
     node = np.exp(-0.5 * np.square(a.size[:, None] - b.size[None]).sum(-1))
-    if claimed is not None:
-        node = node * np.exp(-0.1 * np.hypot(*(a.xy[:, None] - b.moved(claimed.pose).xy[None]).transpose(2, 0, 1)))
+    if prior is not None:
+        node = node * np.exp(-0.1 * np.hypot(*(a.xy[:, None] - b.transform(prior.pose).xy[None]).transpose(2, 0, 1)))
     lengths = [np.hypot(*(x.xy[:, None] - x.xy[None]).transpose(2, 0, 1)) for x in (a, b)]
     turns = [np.sin(x.yaw[:, None] - x.yaw[None]) for x in (a, b)]
     # (i, i', j, j') from the two agents' own (i, j) and (i', j').

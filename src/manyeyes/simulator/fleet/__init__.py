@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Map observations of a fleet: places to drive in, a true map that changes, and what each agent's map model says of it."""
 
-from manyeyes.simulator.fleet.changing_map import Change, World
+from manyeyes.simulator.fleet.changing_map import Change, ChangingMap
 from manyeyes.simulator.fleet.config import CROWDS, CrowdConfig, crowd_config
-from manyeyes.simulator.fleet.place import PLACES, Place, clip_to_box, place, place_of
+from manyeyes.simulator.fleet.place import PLACES, Place, clip_to_box, load_place, make_place
 from manyeyes.simulator.fleet.simulate import ROLES, Crowd, simulate_crowd
 
 __all__ = [
@@ -11,13 +11,13 @@ __all__ = [
     "PLACES",
     "ROLES",
     "Change",
+    "ChangingMap",
     "Crowd",
     "CrowdConfig",
     "Place",
-    "World",
     "clip_to_box",
     "crowd_config",
-    "place",
-    "place_of",
+    "load_place",
+    "make_place",
     "simulate_crowd",
 ]

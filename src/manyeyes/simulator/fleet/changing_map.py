@@ -32,19 +32,21 @@ class Change:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
-    """N versions of elements. name: (N,) the true element each is a version of; born, died: (N,) nanoseconds, half-open."""
+class ChangingMap:
+    """N versions of elements. element_name: (N,) the true element each is a version of; start_ns, end_ns: (N,) nanoseconds,
+    half-open.
+    """
 
     elements: MapElements
-    name: Indices
-    born: Indices
-    died: Indices
+    element_name: Indices
+    start_ns: Indices
+    end_ns: Indices
 
     @classmethod
-    def of(cls, truth: MapElements, changes: Sequence[Change] = ()) -> World:
+    def of(cls, truth: MapElements, changes: Sequence[Change] = ()) -> ChangingMap:
         """A truth and what becomes of it, in the order of time."""
         name = list(range(len(truth)))
-        born, died = [0] * len(truth), [NEVER_NS] * len(truth)
+        start_ns, end_ns = [0] * len(truth), [NEVER_NS] * len(truth)
         moved: list[MapElements] = []
         latest = list(range(len(truth)))
         for change in sorted(changes, key=lambda c: (c.at_ns, c.element)):
@@ -52,22 +54,22 @@ class World:
                 raise ConfigError(f"Change.element: expected 0 to {len(truth) - 1}; got {change.element}.")
             now = latest[change.element]
             if change.what == "remove":
-                died[now] = change.at_ns
+                end_ns[now] = change.at_ns
             elif change.what == "add":
-                born[now] = change.at_ns
+                start_ns[now] = change.at_ns
             else:
-                died[now] = change.at_ns
+                end_ns[now] = change.at_ns
                 latest[change.element] = len(name)
                 name.append(change.element)
-                born.append(change.at_ns)
-                died.append(NEVER_NS)
+                start_ns.append(change.at_ns)
+                end_ns.append(NEVER_NS)
                 before = (truth if now < len(truth) else moved[now - len(truth)]).take([now if now < len(truth) else 0])
                 moved.append(before.transform(*change.shift_m, 0.0))
-        return cls(MapElements.cat([truth, *moved]), np.array(name, np.int64), _times(born), _times(died))
+        return cls(MapElements.cat([truth, *moved]), np.array(name, np.int64), _times(start_ns), _times(end_ns))
 
     def rows_at(self, time_ns: int) -> Indices:
         """Rows of the versions that exist at a time."""
-        return np.flatnonzero((self.born <= time_ns) & (time_ns < self.died))
+        return np.flatnonzero((self.start_ns <= time_ns) & (time_ns < self.end_ns))
 
     def at(self, time_ns: int) -> MapElements:
         """The true map at a time."""
@@ -76,7 +78,7 @@ class World:
     @property
     def epochs(self) -> Indices:
         """(E,) times from which on the world is another, ascending, the first 0."""
-        times = np.unique(np.concatenate(([0], self.born, self.died)))
+        times = np.unique(np.concatenate(([0], self.start_ns, self.end_ns)))
         return times[times < NEVER_NS]
 
 

@@ -17,7 +17,7 @@ class CrowdConfig:
     """Errors of map models and habits of a fleet. Lengths in metres, angles in radians, shares and rates in [0, 1].
 
     Looks: range_x, range_y bound the view in the agent's frame; an agent looks every spacing metres of a drive, and sends at
-    most per_pass looks of one drive. points: of an observed element. model: what the observations say made them.
+    most per_pass looks of one drive. points_per_element: of an observed element. model: what the observations say made them.
     Poses: pose_sigma, yaw_sigma are the claimed pose's errors, of which the share pass_share (of variance) is one error for the
     whole pass. The claimed covariance tells the truth about both, but of outliers and liars, who claim what honest ones claim.
     Elements: drop_out grows with distance (half to one and a half times); false_positive per true stretch in view; fragment
@@ -30,38 +30,38 @@ class CrowdConfig:
     Time: passes begin every pass_interval_s; looks follow at 10 m/s.
     """
 
-    range_x: tuple[float, float] = (-30.0, 30.0)
-    range_y: tuple[float, float] = (-15.0, 15.0)
-    spacing: tuple[float, float] = (30.0, 60.0)
-    per_pass: int = 4
-    passes_per_agent: int = 1
-    points: int = 20
+    range_x_m: tuple[float, float] = (-30.0, 30.0)
+    range_y_m: tuple[float, float] = (-15.0, 15.0)
+    spacing_m: tuple[float, float] = (30.0, 60.0)
+    max_observations_per_drive: int = 4
+    drives_per_agent: int = 1
+    points_per_element: int = 20
     model: str = "simulated-local"
-    pose_sigma: float = 0.4
-    yaw_sigma: float = math.radians(0.5)
-    pass_share: float = 0.5
-    drop_out: float = 0.20
-    false_positive: float = 0.15
-    fragment: float = 0.25
-    confusion: float = 0.02
-    point: float = 0.12
-    point_per_m: float = 0.004
-    bow: float = 0.15
-    end: float = 0.5
-    style_error: float = 0.15
+    pose_sigma_m: float = 0.4
+    yaw_sigma_rad: float = math.radians(0.5)
+    drive_error_fraction: float = 0.5
+    miss_rate: float = 0.20
+    false_positive_rate: float = 0.15
+    fragment_rate: float = 0.25
+    confusion_rate: float = 0.02
+    point_sigma_m: float = 0.12
+    point_sigma_per_m: float = 0.004
+    lateral_bend_m: float = 0.15
+    endpoint_truncation_m: float = 0.5
+    style_error_rate: float = 0.15
     occluders: float = 1.0
-    outlier_share: float = 0.05
-    outlier_offset: tuple[float, float] = (2.0, 4.0)
-    malicious_share: float = 0.0
-    malicious_offset: tuple[float, float] = (1.0, 4.0)
-    malicious: Literal["independent", "colluding"] = "independent"
+    outlier_fraction: float = 0.05
+    outlier_offset_m: tuple[float, float] = (2.0, 4.0)
+    malicious_fraction: float = 0.0
+    malicious_offset_m: tuple[float, float] = (1.0, 4.0)
+    attack_mode: Literal["independent", "colluding"] = "independent"
     malicious_kinds: tuple[str, ...] = ("divider", "boundary", "crossing", "stop_line")
-    stale_share: float = 0.0
-    pole_share: float = 0.0
-    pole_range: float = 50.0
-    log_share: float = 0.25
+    outdated_fraction: float = 0.0
+    infrastructure_fraction: float = 0.0
+    infrastructure_range_m: float = 50.0
+    recorded_drive_fraction: float = 0.25
     start_ns: int = 1_760_000_000_000_000_000
-    pass_interval_s: float = 6 * 3600.0
+    drive_interval_s: float = 6 * 3600.0
 
     def __post_init__(self) -> None:
         for name in ("pass_share", "drop_out", "false_positive", "fragment", "confusion", "style_error"):
@@ -73,13 +73,13 @@ class CrowdConfig:
         for name in ("range_x", "range_y", "spacing", "outlier_offset", "malicious_offset"):
             low, high = getattr(self, name)
             self._require(low <= high, name, "(least, most)")
-        self._require(self.range_x[0] < self.range_x[1], "range_x", "a view wider than 0")
-        self._require(self.range_y[0] < self.range_y[1], "range_y", "a view wider than 0")
-        self._require(self.spacing[0] > 0, "spacing", "more than 0")
+        self._require(self.range_x_m[0] < self.range_x_m[1], "range_x", "a view wider than 0")
+        self._require(self.range_y_m[0] < self.range_y_m[1], "range_y", "a view wider than 0")
+        self._require(self.spacing_m[0] > 0, "spacing", "more than 0")
         self._require(0.0 <= self.occluders <= 3.0, "occluders", "a mean in [0, 3]")
-        self._require(self.per_pass >= 1 and self.passes_per_agent >= 1, "per_pass", "1 or more")
-        self._require(3 <= self.points <= 64, "points", "3 to 64")
-        self._require(self.malicious in ("independent", "colluding"), "malicious", "independent or colluding")
+        self._require(self.max_observations_per_drive >= 1 and self.drives_per_agent >= 1, "per_pass", "1 or more")
+        self._require(3 <= self.points_per_element <= 64, "points", "3 to 64")
+        self._require(self.attack_mode in ("independent", "colluding"), "malicious", "independent or colluding")
 
     def _require(self, holds: bool, name: str, expected: str) -> None:
         if not holds:
@@ -89,14 +89,14 @@ class CrowdConfig:
 _LOCAL = CrowdConfig()
 # A second stage fed by tiles that ten looks made together: wider, fewer holes, no shadows of single vehicles.
 _SEMI_GLOBAL = CrowdConfig(
-    range_x=(-60.0, 60.0),
-    range_y=(-30.0, 30.0),
-    spacing=(60.0, 120.0),
-    points=40,
+    range_x_m=(-60.0, 60.0),
+    range_y_m=(-30.0, 30.0),
+    spacing_m=(60.0, 120.0),
+    points_per_element=40,
     model="simulated-semi-global",
-    drop_out=0.12,
-    false_positive=0.10,
-    fragment=0.20,
+    miss_rate=0.12,
+    false_positive_rate=0.10,
+    fragment_rate=0.20,
     occluders=0.0,
 )
 
@@ -106,7 +106,7 @@ CROWDS: dict[str, CrowdConfig] = {
     "perfect": replace(
         _LOCAL,
         model="simulated-perfect",
-        pose_sigma=0.0,
+        pose_sigma_m=0.0,
         yaw_sigma=0.0,
         drop_out=0.0,
         false_positive=0.0,

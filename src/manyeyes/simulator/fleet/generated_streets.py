@@ -45,7 +45,7 @@ class StreetPlan:
         """From a crossroads' middle to where its arms begin."""
         return self.half_m + _CORNER_M
 
-    def place(self, points: Array) -> Array:
+    def to_local(self, points: Array) -> Array:
         """Plan coordinates (M, 2) as metres about the middle of the plan, bent and turned."""
         middle = np.array([(self.columns - 1) * self.block_m, (self.rows - 1) * self.block_m]) / 2
         x, y = (points - middle).T
@@ -64,10 +64,10 @@ def street_truth(plan: StreetPlan) -> MapElements:
         for k in range(-plan.lanes, plan.lanes + 1):
             kind = BOUNDARY if abs(k) == plan.lanes else DIVIDER
             style = NO_STYLE if kind == BOUNDARY else DOUBLE if k == 0 else DASHED
-            along = np.arange(0.0, length + _STEP_M / 2, _STEP_M)
-            along = np.append(along[along < length - 1e-6], length)
-            lines.append((kind, style, start + along[:, None] * _TURN[way] + k * LANE_M * _TURN[(way + 1) % 4]))
-    placed = [(kind, style, _canonical(kind, plan.place(points))) for kind, style, points in lines]
+            stations = np.arange(0.0, length + _STEP_M / 2, _STEP_M)
+            stations = np.append(stations[stations < length - 1e-6], length)
+            lines.append((kind, style, start + stations[:, None] * _TURN[way] + k * LANE_M * _TURN[(way + 1) % 4]))
+    placed = [(kind, style, _canonical(kind, plan.to_local(points))) for kind, style, points in lines]
     placed.sort(key=lambda row: (row[0], *np.round(row[2][0], 6).tolist(), *np.round(row[2][-1], 6).tolist()))
     return MapElements.of(
         [row[2] for row in placed], [row[0] for row in placed], sigma=0.0, style=[row[1] for row in placed]
@@ -102,14 +102,14 @@ def street_routes(plan: StreetPlan) -> Routes:
                 number = len(lanes)
                 lanes.append(_bend(lanes[rows[a]], lanes[out[b]]))
                 successors += [(rows[a], number), (number, out[b])]
-    return Routes.of([plan.place(lane) for lane in lanes], successors)
+    return Routes.of([plan.to_local(lane) for lane in lanes], successors)
 
 
 def street_junctions(plan: StreetPlan) -> list[Array]:
     """(8, 2) rings, the ground of each crossroads."""
     h, w = plan.mouth_m, plan.half_m
     ring = np.array([[h, -w], [h, w], [w, h], [-w, h], [-h, w], [-h, -w], [-w, -h], [w, -h]])
-    return [plan.place(np.array(node) * plan.block_m + ring) for node in _nodes(plan)]
+    return [plan.to_local(np.array(node) * plan.block_m + ring) for node in _nodes(plan)]
 
 
 def _nodes(plan: StreetPlan) -> list[tuple[int, int]]:
@@ -142,8 +142,8 @@ def _at_mouth(plan: StreetPlan, node: tuple[int, int], way: int) -> list[tuple[i
     middle, out, left = np.array(node, np.float64) * plan.block_m, _TURN[way], _TURN[(way + 1) % 4]
     w, h = plan.half_m, plan.mouth_m
 
-    def at(along: float, across: float) -> Array:
-        return middle + along * out + across * left
+    def at(longitudinal: float, lateral: float) -> Array:
+        return middle + longitudinal * out + lateral * left
 
     ring = np.array([at(h - 4.5, -w), at(h - 0.5, -w), at(h - 0.5, w), at(h - 4.5, w)])
     stop = np.array([at(h + 1.0, 0.2), at(h + 1.0, w - 0.2)])

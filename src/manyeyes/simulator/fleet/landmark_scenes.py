@@ -33,12 +33,12 @@ _RANGE_M = 80.0
 
 
 @dataclass(frozen=True)
-class BoxError:
+class BoxNoise:
     """Errors of detected boxes: sigma_xy_m an axis, sigma_yaw_rad, flip (chance of a heading off by pi), sigma_size_m."""
 
     sigma_xy_m: float = 0.25
     sigma_yaw_rad: float = math.radians(2.5)
-    flip: float = 0.03
+    p_flip: float = 0.03
     sigma_size_m: float = 0.15
 
 
@@ -46,20 +46,21 @@ class BoxError:
 class LandmarkSpec:
     """What is seen at each instant.
 
-    common: objects that both see, or None to draw the number from DAIR_COMMON. ego_extra, other_extra: objects that only one sees.
-    disjoint: the other agent stands at another crossing altogether. instants: how many moments, period_s apart, the last is now.
+    num_common: objects that both see, or None to draw the number from DAIR_COMMON. num_ego_only, num_other_only: objects that only
+    one sees. disjoint: the other agent stands at another crossing altogether. num_instants: how many moments, period_s apart, the
+    last is now.
     """
 
-    common: int | None = None
-    ego_extra: int = 18
-    other_extra: int = 24
-    error: BoxError = BoxError()
+    num_common: int | None = None
+    num_ego_only: int = 18
+    num_other_only: int = 24
+    noise: BoxNoise = BoxNoise()
     disjoint: bool = False
-    instants: int = 1
+    num_instants: int = 1
     period_s: float = 1.0
 
     def __post_init__(self) -> None:
-        if min(self.ego_extra, self.other_extra, self.common or 0) < 0 or self.instants < 1:
+        if min(self.num_ego_only, self.num_other_only, self.num_common or 0) < 0 or self.num_instants < 1:
             raise ConfigError("LandmarkSpec needs counts of at least 0 and at least one instant.")
 
 
@@ -67,7 +68,7 @@ class LandmarkSpec:
 class LandmarkScene:
     """ego, other: boxes of each instant, now first, each in the agent's frame of that instant. ego_from_other: (3,) now.
 
-    ego_from_then, other_from_then: (instants, 3) each agent's own motion, its frame now from its frame then. common: (K, 2)
+    ego_from_then, other_from_then: (instants, 3) each agent's own motion, its frame now from its frame then. common_pairs: (K, 2)
     rows of boxes, now, of one object. common_xy: (K, 2) true places, in the ego's frame, of the objects in common now.
     """
 
@@ -76,7 +77,7 @@ class LandmarkScene:
     ego_from_other: Floats
     ego_from_then: Floats
     other_from_then: Floats
-    common: Ints
+    common_pairs: Ints
     common_xy: Floats
 
 
@@ -100,35 +101,37 @@ def make_landmark_scene(spec: LandmarkSpec, seed: int, scene: int) -> LandmarkSc
     rng = keyed_generator(seed, "landmark scene", scene)
     here = _traffic(rng)
     there = _traffic(rng) if spec.disjoint else here
-    common = int(rng.choice(len(DAIR_COMMON), p=np.array(DAIR_COMMON) / sum(DAIR_COMMON)))
-    common = common if spec.common is None else spec.common
+    num_common = int(rng.choice(len(DAIR_COMMON), p=np.array(DAIR_COMMON) / sum(DAIR_COMMON)))
+    num_common = num_common if spec.num_common is None else spec.num_common
     ego_now, ego_speed = _vehicle(rng)
     unit = _roadside(rng)
     ego, other, then = [], [], []
     now_common, now_xy = np.zeros((0, 2), np.int64), np.zeros((0, 2))
-    for instant in range(spec.instants):
+    for instant in range(spec.num_instants):
         time = -instant * spec.period_s
         pose = ego_now + np.array([np.cos(ego_now[2]), np.sin(ego_now[2]), 0.0]) * ego_speed * time
-        rows, other_rows = _seen(rng, spec, 0 if spec.disjoint else common, (here, pose), (there, unit), time)
+        rows, other_rows = _select_visible(
+            rng, spec, 0 if spec.disjoint else num_common, (here, pose), (there, unit), time
+        )
         order, other_order = rng.permutation(len(rows)), rng.permutation(len(other_rows))
-        ego.append(_boxes(rng, here, rows[order], pose, time, spec.error))
-        other.append(_boxes(rng, there, other_rows[other_order], unit, time, spec.error))
-        then.append(between(ego_now, pose))
+        ego.append(_boxes(rng, here, rows[order], pose, time, spec.noise))
+        other.append(_boxes(rng, there, other_rows[other_order], unit, time, spec.noise))
+        then.append(relative_pose(ego_now, pose))
         if instant == 0 and not spec.disjoint:
-            now_common = np.stack((np.argsort(order)[:common], np.argsort(other_order)[:common]), 1)
-            now_xy = _local(here.at(0.0)[rows[:common]], pose)[:, :2]
+            now_common = np.stack((np.argsort(order)[:num_common], np.argsort(other_order)[:num_common]), 1)
+            now_xy = _local(here.at(0.0)[rows[:num_common]], pose)[:, :2]
     return LandmarkScene(
         tuple(ego),
         tuple(other),
-        between(ego_now, unit),
+        relative_pose(ego_now, unit),
         np.array(then),
-        np.zeros((spec.instants, 3)),
+        np.zeros((spec.num_instants, 3)),
         now_common,
         now_xy,
     )
 
 
-def between(a: Floats, b: Floats) -> Floats:
+def relative_pose(a: Floats, b: Floats) -> Floats:
     """a_from_b of two poses (3,) in one frame."""
     return _local(b[None], a)[0]
 
@@ -148,11 +151,11 @@ def _traffic(rng: np.random.Generator) -> _Traffic:
         for side in (0, 1):
             for lane in _LANES_M:
                 pace = rng.uniform(4.0, 13.0)
-                along = -_HALF_ROAD_M + rng.uniform(0, 15)
-                while along < _HALF_ROAD_M:
+                longitudinal = -_HALF_ROAD_M + rng.uniform(0, 15)
+                while longitudinal < _HALF_ROAD_M:
                     lateral, turn = -lane + 0.3 * rng.standard_normal(), math.radians(1.5) * rng.standard_normal()
-                    rows.append((road, side, along, lateral, turn, pace))
-                    along += 7.0 + rng.exponential(11.0)
+                    rows.append((road, side, longitudinal, lateral, turn, pace))
+                    longitudinal += 7.0 + rng.exponential(11.0)
             for leg in (-1, 1):
                 if rng.random() < 0.4:
                     continue
@@ -161,10 +164,10 @@ def _traffic(rng: np.random.Generator) -> _Traffic:
                         turn = math.radians(2.0) * rng.standard_normal() + math.pi * (rng.random() < 0.1)
                         row = leg * (place + 0.5 * rng.standard_normal())
                         rows.append((road, side, row, -_PARKED_M + 0.15 * rng.standard_normal(), turn, 0.0))
-    road, side, along, lateral, turn, speed = np.array(rows).T
+    road, side, longitudinal, lateral, turn, speed = np.array(rows).T
     direction = road * np.pi / 2 + side * np.pi
     c, s = np.cos(direction), np.sin(direction)
-    pose = np.stack((c * along - s * lateral, s * along + c * lateral, direction + turn), 1)
+    pose = np.stack((c * longitudinal - s * lateral, s * longitudinal + c * lateral, direction + turn), 1)
     large = rng.random(len(pose)) < 0.1
     length = np.where(large, rng.uniform(5.5, 11.0, len(pose)), 4.5 + 0.3 * rng.standard_normal(len(pose)))
     width = np.where(large, rng.uniform(2.1, 2.6, len(pose)), 1.85 + 0.08 * rng.standard_normal(len(pose)))
@@ -176,9 +179,9 @@ def _traffic(rng: np.random.Generator) -> _Traffic:
 def _vehicle(rng: np.random.Generator) -> tuple[Floats, float]:
     """A vehicle's pose and speed, in a lane within 50 m of the crossing."""
     direction = rng.integers(4) * np.pi / 2
-    along, lateral = rng.uniform(-50, 50), -_LANES_M[rng.integers(3)]
+    longitudinal, lateral = rng.uniform(-50, 50), -_LANES_M[rng.integers(3)]
     c, s = np.cos(direction), np.sin(direction)
-    return np.array([c * along - s * lateral, s * along + c * lateral, direction]), rng.uniform(0, 12)
+    return np.array([c * longitudinal - s * lateral, s * longitudinal + c * lateral, direction]), rng.uniform(0, 12)
 
 
 def _roadside(rng: np.random.Generator) -> Floats:
@@ -187,10 +190,10 @@ def _roadside(rng: np.random.Generator) -> Floats:
     return np.array([*corner, rng.uniform(-np.pi, np.pi)])
 
 
-def _seen(
+def _select_visible(
     rng: np.random.Generator,
     spec: LandmarkSpec,
-    common: int,
+    num_common: int,
     ego: tuple[_Traffic, Floats],
     other: tuple[_Traffic, Floats],
     time: float,
@@ -199,24 +202,24 @@ def _seen(
     near = [np.hypot(*_local(t.at(time), pose)[:, :2].T) < _RANGE_M for t, pose in (ego, other)]
     if spec.disjoint:
         sets = [rng.permutation(np.flatnonzero(n)) for n in near]
-        return sets[0][: spec.ego_extra], sets[1][: spec.other_extra]
-    shared = rng.permutation(np.flatnonzero(near[0] & near[1]))[:common]
-    left = rng.permutation(np.setdiff1d(np.flatnonzero(near[0]), shared))[: spec.ego_extra]
+        return sets[0][: spec.num_ego_only], sets[1][: spec.num_other_only]
+    shared = rng.permutation(np.flatnonzero(near[0] & near[1]))[:num_common]
+    left = rng.permutation(np.setdiff1d(np.flatnonzero(near[0]), shared))[: spec.num_ego_only]
     taken = np.concatenate((shared, left))
-    right = rng.permutation(np.setdiff1d(np.flatnonzero(near[1]), taken))[: spec.other_extra]
+    right = rng.permutation(np.setdiff1d(np.flatnonzero(near[1]), taken))[: spec.num_other_only]
     return taken, np.concatenate((shared, right))
 
 
 def _boxes(
-    rng: np.random.Generator, traffic: _Traffic, rows: Ints, pose: Floats, time: float, error: BoxError
+    rng: np.random.Generator, traffic: _Traffic, rows: Ints, pose: Floats, time: float, noise: BoxNoise
 ) -> Boxes:
     """Detections, in the agent's frame, of objects at the rows."""
     n = len(rows)
     local = _local(traffic.at(time)[rows], pose)
-    xy = local[:, :2] + error.sigma_xy_m * rng.standard_normal((n, 2))
-    yaw = local[:, 2] + error.sigma_yaw_rad * rng.standard_normal(n) + np.pi * (rng.random(n) < error.flip)
-    size = np.maximum(traffic.size[rows] + error.sigma_size_m * rng.standard_normal((n, 2)) * np.array([1.0, 0.5]), 0.5)
-    sigma = torch.full((n,), error.sigma_xy_m, dtype=torch.float64)
+    xy = local[:, :2] + noise.sigma_xy_m * rng.standard_normal((n, 2))
+    yaw = local[:, 2] + noise.sigma_yaw_rad * rng.standard_normal(n) + np.pi * (rng.random(n) < noise.p_flip)
+    size = np.maximum(traffic.size[rows] + noise.sigma_size_m * rng.standard_normal((n, 2)) * np.array([1.0, 0.5]), 0.5)
+    sigma = torch.full((n,), noise.sigma_xy_m, dtype=torch.float64)
     return Boxes(
         torch.from_numpy(np.column_stack((xy, np.full(n, 0.8)))),
         torch.from_numpy(np.column_stack((size, np.full(n, 1.6)))),
@@ -225,7 +228,7 @@ def _boxes(
         torch.zeros(n, dtype=torch.int64),
         torch.full((n,), -1, dtype=torch.int64),
         sigma,
-        torch.full((n,), error.sigma_yaw_rad, dtype=torch.float64),
-        torch.full((n,), error.flip, dtype=torch.float64),
+        torch.full((n,), noise.sigma_yaw_rad, dtype=torch.float64),
+        torch.full((n,), noise.p_flip, dtype=torch.float64),
         torch.zeros(n, 2, dtype=torch.float64),
     )

@@ -11,51 +11,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes.map_element import STYLES, MapElements
-from manyeyes.datatypes.message import SeenMap
+from manyeyes.datatypes.message import LocalMap
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.fleet.config import CrowdConfig
 from manyeyes.simulator.fleet.observation_model import (
     COLUMN_KIND,
     COLUMN_SCORE,
     COLUMN_SIGMA,
-    MOST,
-    Noise,
-    Room,
-    look,
-    scenery,
+    MAX_ELEMENTS,
+    MapModelNoise,
+    OutputBuffers,
+    build_map_index,
+    observe_map,
 )
 
 Floats = NDArray[np.float64]
 
 
-class Eyewitness:
+class SimulatedMapPredictor:
     """Looks at one true map, whose frame its poses are in; the same look again says the same."""
 
     def __init__(self, truth: MapElements, config: CrowdConfig, seed: int = 0) -> None:
         self._config, self._seed = config, seed
         lines = [truth.polyline(row) for row in range(len(truth))]
         style = truth.style.argmax(1).astype(np.int64) if len(truth) else np.zeros(0, np.int64)
-        self._scene = scenery(lines, truth.kind, style, np.arange(len(truth)))
-        self._room = Room(np.empty((MOST, config.points, 2)), np.empty((MOST, 4)), np.empty((MOST, len(STYLES))))
+        self._map_index = build_map_index(lines, truth.kind, style, np.arange(len(truth)))
+        self._buffers = OutputBuffers(
+            np.empty((MAX_ELEMENTS, config.points_per_element, 2)),
+            np.empty((MAX_ELEMENTS, 4)),
+            np.empty((MAX_ELEMENTS, len(STYLES))),
+        )
 
-    def see(self, pose: Floats, window: tuple[float, float, float, float], *look_of: int | str) -> SeenMap:
+    def predict(self, pose: Floats, window: tuple[float, float, float, float], *noise_key: int | str) -> LocalMap:
         """What is drawn from a true pose (3,) x, y, yaw within x_min, y_min, x_max, y_max of the agent's frame.
 
-        look_of: names of the look, on which its errors depend, and on nothing else.
+        noise_key: names of the look, on which its errors depend, and on nothing else.
         """
         x0, y0, x1, y1 = window
-        errors = {name: float(getattr(self._config, name)) for name in Noise._fields[4:]}
-        key = np.uint64(int(keyed_uniform((1,), self._seed, "eyewitness", *look_of)[0] * 2.0**52))
-        found = look(
-            self._scene, Noise(x0, x1, y0, y1, **errors), np.asarray(pose), np.zeros((0, 4, 2)), key, self._room
+        errors = {name: float(getattr(self._config, name)) for name in MapModelNoise._fields[4:]}
+        key = np.uint64(int(keyed_uniform((1,), self._seed, "eyewitness", *noise_key)[0] * 2.0**52))
+        num_found = observe_map(
+            self._map_index,
+            MapModelNoise(x0, x1, y0, y1, **errors),
+            np.asarray(pose),
+            np.zeros((0, 4, 2)),
+            key,
+            self._buffers,
         )
-        count, (points, columns, style) = self._config.points, self._room
+        count, (points, columns, style) = self._config.points_per_element, self._buffers
         elements = MapElements(
-            kind=columns[:found, COLUMN_KIND].astype(np.int64),
-            first=np.arange(found + 1, dtype=np.int64) * count,
-            points=points[:found].reshape(-1, 2).copy(),
-            score=columns[:found, COLUMN_SCORE].copy(),
-            sigma=np.repeat(np.maximum(columns[:found, COLUMN_SIGMA], 0.01), count),
-            style=style[:found].copy(),
+            kind=columns[:num_found, COLUMN_KIND].astype(np.int64),
+            offsets=np.arange(num_found + 1, dtype=np.int64) * count,
+            points=points[:num_found].reshape(-1, 2).copy(),
+            score=columns[:num_found, COLUMN_SCORE].copy(),
+            sigma=np.repeat(np.maximum(columns[:num_found, COLUMN_SIGMA], 0.01), count),
+            style=style[:num_found].copy(),
         )
-        return SeenMap(elements, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))
+        return LocalMap(elements, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]))

@@ -16,45 +16,45 @@ from numpy.typing import NDArray
 
 from manyeyes._jit import F64x1, F64x2, F64x3, njit
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, STOP_LINE
-from manyeyes.maps.elements.observation import ring_crosses
+from manyeyes.maps.elements.observation import has_crossing_edges
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 STATION_M = 0.5
 CHUNK = 64
-MOST = 320
+MAX_ELEMENTS = 320
 """Elements that one observation holds at most."""
 
 
-_DROP, _FRAGMENT, _SHARE, _GAP, _CONFUSE, _BOW, _SCORE, _STYLE, _OTHER, _FALSE, _GHOST, _HEAD, _TAIL, _SIDE = range(14)
+_DROP, _FRAGMENT, _CUT, _GAP, _CONFUSE, _BOW, _SCORE, _STYLE, _OTHER, _FALSE, _GHOST, _HEAD, _TAIL, _SIDE = range(14)
 _PLACE = 16
 _POINT = 64
 
 
 COLUMN_KIND, COLUMN_SCORE, COLUMN_SIGMA, COLUMN_NAME = range(4)
-"""Columns of :class:`Room`."""
+"""Columns of :class:`OutputBuffers`."""
 
 
-class Noise(NamedTuple):
+class MapModelNoise(NamedTuple):
     """The errors of a model. Lengths in metres, rates as probabilities; see CrowdConfig for each."""
 
     x_min: float
     x_max: float
     y_min: float
     y_max: float
-    drop_out: float
-    false_positive: float
-    fragment: float
-    confusion: float
-    point: float
-    point_per_m: float
-    bow: float
-    end: float
-    style_error: float
+    miss_rate: float
+    false_positive_rate: float
+    fragment_rate: float
+    confusion_rate: float
+    point_sigma_m: float
+    point_sigma_per_m: float
+    lateral_bend_m: float
+    endpoint_truncation_m: float
+    style_error_rate: float
 
 
-class Room(NamedTuple):
+class OutputBuffers(NamedTuple):
     """Where a look is written: points (MOST, n, 2), columns (MOST, 4) and style (MOST, S).
 
     columns: kind, score, sigma (m), and the name of the true element, -1 for one that is not there; see COLUMN_KIND.
@@ -65,11 +65,11 @@ class Room(NamedTuple):
     style: Array
 
 
-class Scenery(NamedTuple):
+class TrueMapIndex(NamedTuple):
     """The true map, ready to be looked at.
 
     points: (M, 2) metres, lines at stations STATION_M apart and the corners of crossings; first: (N + 1,) offsets; kind, style:
-    (N,); name: (N,) the element each is, the same through all versions of the map. Chunk c holds the stations
+    (N,); element_name: (N,) the element each is, the same through all versions of the map. Chunk c holds the stations
     ``chunk_first[c]:chunk_first[c + 1]``, all of one element, within chunk_radius[c] of chunk_center[c]; of_element: (N + 1,).
     """
 
@@ -77,14 +77,14 @@ class Scenery(NamedTuple):
     first: Indices
     kind: Indices
     style: Indices
-    name: Indices
+    element_name: Indices
     chunk_center: Array
     chunk_radius: Array
     chunk_first: Indices
     of_element: Indices
 
 
-def scenery(points: list[Array], kind: Indices, style: Indices, name: Indices) -> Scenery:
+def build_map_index(points: list[Array], kind: Indices, style: Indices, name: Indices) -> TrueMapIndex:
     """Lines (M, 2) and open rings of N elements with their kinds, styles and names."""
     dense = [p if k == CROSSING else _stations(p) for p, k in zip(points, kind.tolist())]
     first = np.concatenate(([0], np.cumsum([len(p) for p in dense]))).astype(np.int64)
@@ -96,7 +96,7 @@ def scenery(points: list[Array], kind: Indices, style: Indices, name: Indices) -
     for c, (a, b) in enumerate(itertools.pairwise(chunk_first)):
         center[c] = (flat[a:b].min(0) + flat[a:b].max(0)) / 2
         radius[c] = np.linalg.norm(flat[a:b] - center[c], axis=1).max()
-    return Scenery(flat, first, kind, style, name, center, radius, chunk_first, of_element)
+    return TrueMapIndex(flat, first, kind, style, name, center, radius, chunk_first, of_element)
 
 
 def _stations(line: Array) -> Array:
@@ -107,7 +107,7 @@ def _stations(line: Array) -> Array:
 
 
 @njit(cache=True)
-def unit(key: np.uint64, element: int, run: int, purpose: int) -> float:
+def hash_uniform(key: np.uint64, element: int, run: int, purpose: int) -> float:
     """A draw in (0, 1) for a key (uint64) and three counts."""
     z = key
     for part in (element, run, purpose):
@@ -119,10 +119,10 @@ def unit(key: np.uint64, element: int, run: int, purpose: int) -> float:
 
 
 @njit(cache=True)
-def normal(key: np.uint64, element: int, run: int, purpose: int) -> float:
+def hash_normal(key: np.uint64, element: int, run: int, purpose: int) -> float:
     """A standard normal draw (Box and Muller 1958) from the purposes ``purpose`` and ``purpose + 1024``."""
-    radius = np.sqrt(-2.0 * np.log(unit(key, element, run, purpose)))
-    return radius * np.cos(2.0 * np.pi * unit(key, element, run, purpose + 1024))
+    radius = np.sqrt(-2.0 * np.log(hash_uniform(key, element, run, purpose)))
+    return radius * np.cos(2.0 * np.pi * hash_uniform(key, element, run, purpose + 1024))
 
 
 @njit(cache=True)
@@ -168,7 +168,7 @@ def _resample(line: F64x2, count: int, closed: bool, out: F64x2) -> float:
 
 
 @njit(cache=True)
-def _clip_ring(ring: F64x2, noise: Noise) -> tuple[F64x2, float]:
+def _clip_ring(ring: F64x2, noise: MapModelNoise) -> tuple[F64x2, float]:
     """A ring (M, 2) cut to the view (Sutherland and Hodgman 1974), and the cut ring's area."""
     work = ring.copy()
     for side in range(4):
@@ -199,18 +199,20 @@ def _clip_ring(ring: F64x2, noise: Noise) -> tuple[F64x2, float]:
 
 
 @njit(cache=True)
-def _emit_line(line: F64x2, noise: Noise, key: np.uint64, element: int, run: int, part: int, out: F64x2) -> float:
+def _emit_line(
+    line: F64x2, noise: MapModelNoise, key: np.uint64, element: int, run: int, part: int, out: F64x2
+) -> float:
     """Write one observed line into out (n, 2); its mean distance from the agent, or -1 when it is too short to be said."""
     size = len(line)
-    head = abs(normal(key, element, run, _HEAD + 128 * part)) * noise.end
-    tail = abs(normal(key, element, run, _TAIL + 128 * part)) * noise.end
+    head = abs(hash_normal(key, element, run, _HEAD + 128 * part)) * noise.endpoint_truncation_m
+    tail = abs(hash_normal(key, element, run, _TAIL + 128 * part)) * noise.endpoint_truncation_m
     a, b = int(head / STATION_M), size - int(tail / STATION_M)
     if b - a < 3:
         return -1.0
     length = _resample(line[a:b], len(out), False, out)
     if length < 2.0:
         return -1.0
-    bow = normal(key, element, run, _BOW + 128 * part) * noise.bow
+    bow = hash_normal(key, element, run, _BOW + 128 * part) * noise.lateral_bend_m
     count = len(out)
     clean = out.copy()
     total = 0.0
@@ -220,85 +222,89 @@ def _emit_line(line: F64x2, noise: Noise, key: np.uint64, element: int, run: int
         size_of = max(np.hypot(dx, dy), 1e-9)
         distance = np.hypot(clean[k, 0], clean[k, 1])
         total += distance
-        sigma = np.hypot(noise.point, noise.point_per_m * distance)
+        sigma = np.hypot(noise.point_sigma_m, noise.point_sigma_per_m * distance)
         bend = bow * np.sin(np.pi * k / (count - 1))
         shift = 2 * (k + count * part)
-        out[k, 0] += sigma * normal(key, element, run, _POINT + shift) - bend * dy / size_of
-        out[k, 1] += sigma * normal(key, element, run, _POINT + shift + 1) + bend * dx / size_of
+        out[k, 0] += sigma * hash_normal(key, element, run, _POINT + shift) - bend * dy / size_of
+        out[k, 1] += sigma * hash_normal(key, element, run, _POINT + shift + 1) + bend * dx / size_of
     return total / count
 
 
 @njit(cache=True)
-def _emit_ring(ring: F64x2, noise: Noise, key: np.uint64, element: int, run: int, out: F64x2) -> float:
+def _emit_ring(ring: F64x2, noise: MapModelNoise, key: np.uint64, element: int, run: int, out: F64x2) -> float:
     """Write one observed crossing into out (n, 2): noisy corners, resampled; less noise where the ring would cross itself."""
     n = len(ring)
     x, y = ring[:, 0].mean(), ring[:, 1].mean()
     distance = np.hypot(x, y)
-    sigma = np.hypot(noise.point, noise.point_per_m * distance)
+    sigma = np.hypot(noise.point_sigma_m, noise.point_sigma_per_m * distance)
     for attempt in range(4):
         scale = sigma * (1.0 - attempt / 3.0)
         moved = ring.copy()
         for i in range(n):
-            moved[i, 0] += 1.5 * scale * normal(key, element, run, _POINT + 2 * i)
-            moved[i, 1] += 1.5 * scale * normal(key, element, run, _POINT + 2 * i + 1)
+            moved[i, 0] += 1.5 * scale * hash_normal(key, element, run, _POINT + 2 * i)
+            moved[i, 1] += 1.5 * scale * hash_normal(key, element, run, _POINT + 2 * i + 1)
         _resample(moved, len(out), True, out)
         for k in range(len(out)):
-            out[k, 0] += 0.5 * scale * normal(key, element, run, _POINT + 256 + 2 * k)
-            out[k, 1] += 0.5 * scale * normal(key, element, run, _POINT + 256 + 2 * k + 1)
-        if not ring_crosses(out):
+            out[k, 0] += 0.5 * scale * hash_normal(key, element, run, _POINT + 256 + 2 * k)
+            out[k, 1] += 0.5 * scale * hash_normal(key, element, run, _POINT + 256 + 2 * k + 1)
+        if not has_crossing_edges(out):
             return distance
     return -1.0
 
 
 @njit(cache=True)
-def _emit_false(line: F64x2, noise: Noise, key: np.uint64, element: int, run: int, out: F64x2) -> tuple[int, float]:
+def _emit_false(
+    line: F64x2, noise: MapModelNoise, key: np.uint64, element: int, run: int, out: F64x2
+) -> tuple[int, float]:
     """Write a line that is not there: a ghost half a lane beside a true one, or one anywhere in view; its mean distance."""
-    kind = DIVIDER if unit(key, element, run, _GHOST + 32) < 0.7 else BOUNDARY
-    if unit(key, element, run, _GHOST) < 0.5 and len(line) > 6:
-        side = 1.0 if unit(key, element, run, _SIDE) < 0.5 else -1.0
-        offset = side * (1.2 + 1.0 * unit(key, element, run, _SIDE + 32))
+    kind = DIVIDER if hash_uniform(key, element, run, _GHOST + 32) < 0.7 else BOUNDARY
+    if hash_uniform(key, element, run, _GHOST) < 0.5 and len(line) > 6:
+        side = 1.0 if hash_uniform(key, element, run, _SIDE) < 0.5 else -1.0
+        offset = side * (1.2 + 1.0 * hash_uniform(key, element, run, _SIDE + 32))
         dx, dy = line[-1, 0] - line[0, 0], line[-1, 1] - line[0, 1]
         size_of = max(np.hypot(dx, dy), 1e-9)
         ghost = line.copy()
         ghost[:, 0] -= offset * dy / size_of
         ghost[:, 1] += offset * dx / size_of
         return kind, _emit_line(ghost, noise, key, element, run, 2, out)
-    x = noise.x_min + (noise.x_max - noise.x_min) * unit(key, element, run, _PLACE)
-    y = noise.y_min + (noise.y_max - noise.y_min) * unit(key, element, run, _PLACE + 1)
-    heading = 2.0 * np.pi * unit(key, element, run, _PLACE + 2)
-    half = 2.5 + 7.5 * unit(key, element, run, _PLACE + 3)
+    x = noise.x_min + (noise.x_max - noise.x_min) * hash_uniform(key, element, run, _PLACE)
+    y = noise.y_min + (noise.y_max - noise.y_min) * hash_uniform(key, element, run, _PLACE + 1)
+    heading = 2.0 * np.pi * hash_uniform(key, element, run, _PLACE + 2)
+    half = 2.5 + 7.5 * hash_uniform(key, element, run, _PLACE + 3)
     stray = np.empty((int(4 * half), 2))
     for i in range(len(stray)):
-        along = -half + 2.0 * half * i / (len(stray) - 1)
-        stray[i, 0] = min(max(x + along * np.cos(heading), noise.x_min), noise.x_max)
-        stray[i, 1] = min(max(y + along * np.sin(heading), noise.y_min), noise.y_max)
+        station = -half + 2.0 * half * i / (len(stray) - 1)
+        stray[i, 0] = min(max(x + station * np.cos(heading), noise.x_min), noise.x_max)
+        stray[i, 1] = min(max(y + station * np.sin(heading), noise.y_min), noise.y_max)
     return kind, _emit_line(stray, noise, key, element, run, 2, out)
 
 
 @njit(cache=True)
-def _reach(noise: Noise) -> float:
+def _max_range(noise: MapModelNoise) -> float:
     """The farthest that is in view."""
     return np.hypot(max(abs(noise.x_min), abs(noise.x_max)), max(abs(noise.y_min), abs(noise.y_max)))
 
 
 @njit(cache=True)
-def look(scene: Scenery, noise: Noise, pose: F64x1, shadows: F64x3, key: np.uint64, room: Room) -> int:
+def observe_map(
+    scene: TrueMapIndex, noise: MapModelNoise, pose: F64x1, shadows: F64x3, key: np.uint64, buffers: OutputBuffers
+) -> int:
     """Fill a room with what is seen from a pose; how many elements that is.
 
     pose: x, y, yaw (3,) of the agent, true. shadows: (Q, 4, 2) hidden quadrilaterals in its frame.
     """
-    reach = _reach(noise)
+    max_range = _max_range(noise)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     found = 0
     for e in range(len(scene.kind)):
         near = False
         for chunk in range(scene.of_element[e], scene.of_element[e + 1]):
-            far = reach + scene.chunk_radius[chunk]
+            far = max_range + scene.chunk_radius[chunk]
             dx, dy = scene.chunk_center[chunk, 0] - pose[0], scene.chunk_center[chunk, 1] - pose[1]
             if dx * dx + dy * dy < far * far:
                 near = True
                 break
-        if not near or found >= MOST - 6:
+        if not near or found >= MAX_ELEMENTS - 6:
             continue
         a, b = scene.first[e], scene.first[e + 1]
         local = np.empty((b - a, 2))
@@ -306,101 +312,115 @@ def look(scene: Scenery, noise: Noise, pose: F64x1, shadows: F64x3, key: np.uint
             dx, dy = scene.points[i, 0] - pose[0], scene.points[i, 1] - pose[1]
             local[i - a, 0], local[i - a, 1] = c * dx + s * dy, c * dy - s * dx
         if scene.kind[e] == CROSSING:
-            found = _see_crossing(scene, e, local, noise, shadows, key, room, found)
+            found = _observe_crossing(scene, e, local, noise, shadows, key, buffers, found)
             continue
         start, run = -1, 0
         for i in range(len(local) + 1):
-            seen = False
+            is_visible = False
             if i < len(local):
                 x, y = local[i, 0], local[i, 1]
-                seen = noise.x_min <= x <= noise.x_max and noise.y_min <= y <= noise.y_max
-                seen = seen and not _hidden(x, y, shadows)
-            if seen and start < 0:
+                is_visible = noise.x_min <= x <= noise.x_max and noise.y_min <= y <= noise.y_max
+                is_visible = is_visible and not _hidden(x, y, shadows)
+            if is_visible and start < 0:
                 start = i
-            elif not seen and start >= 0:
-                if found < MOST - 6:
-                    found = _see_line(scene, e, run, local[start:i], noise, key, room, found)
+            elif not is_visible and start >= 0:
+                if found < MAX_ELEMENTS - 6:
+                    found = _observe_line(scene, e, run, local[start:i], noise, key, buffers, found)
                 start, run = -1, run + 1
     return found
 
 
 @njit(cache=True)
-def _see_crossing(
-    scene: Scenery, e: int, local: F64x2, noise: Noise, shadows: F64x3, key: np.uint64, room: Room, found: int
+def _observe_crossing(
+    scene: TrueMapIndex,
+    e: int,
+    local: F64x2,
+    noise: MapModelNoise,
+    shadows: F64x3,
+    key: np.uint64,
+    buffers: OutputBuffers,
+    found: int,
 ) -> int:
     """One crossing: said when at least half of it and 4 m² are in sight; how many elements there are now."""
-    points, columns, style = room
-    reach = _reach(noise)
+    points, columns, style = buffers
+    max_range = _max_range(noise)
     ring, area = _clip_ring(local, noise)
-    name = scene.name[e]
-    if area < 4.0 or unit(key, name, 0, _CONFUSE) < noise.confusion / 2:
+    name = scene.element_name[e]
+    if area < 4.0 or hash_uniform(key, name, 0, _CONFUSE) < noise.confusion_rate / 2:
         return found
     x, y = ring[:, 0].mean(), ring[:, 1].mean()
     hidden = 0.0
     for i in range(len(ring)):
-        for share in (0.2, 0.5, 0.9):
-            hidden += _hidden(x + share * (ring[i, 0] - x), y + share * (ring[i, 1] - y), shadows)
+        for fraction in (0.2, 0.5, 0.9):
+            hidden += _hidden(x + fraction * (ring[i, 0] - x), y + fraction * (ring[i, 1] - y), shadows)
     distance = np.hypot(x, y)
-    drop = noise.drop_out * (0.5 + distance / reach)
-    if hidden > 1.5 * len(ring) or unit(key, name, 0, _DROP) < drop:
+    drop = noise.miss_rate * (0.5 + distance / max_range)
+    if hidden > 1.5 * len(ring) or hash_uniform(key, name, 0, _DROP) < drop:
         return found
     if _emit_ring(ring, noise, key, name, 0, points[found]) < 0.0:
         return found
     columns[found, COLUMN_KIND], columns[found, COLUMN_NAME] = CROSSING, name
-    columns[found, COLUMN_SCORE] = _score(0.95, distance / reach, key, name, 0)
-    columns[found, COLUMN_SIGMA] = np.hypot(noise.point, noise.point_per_m * distance)
+    columns[found, COLUMN_SCORE] = _score(0.95, distance / max_range, key, name, 0)
+    columns[found, COLUMN_SIGMA] = np.hypot(noise.point_sigma_m, noise.point_sigma_per_m * distance)
     style[found, :] = 0.0
     style[found, NO_STYLE] = 1.0
     return found + 1
 
 
 @njit(cache=True)
-def _see_line(
-    scene: Scenery, e: int, run: int, line: F64x2, noise: Noise, key: np.uint64, room: Room, found: int
+def _observe_line(
+    scene: TrueMapIndex,
+    e: int,
+    run: int,
+    line: F64x2,
+    noise: MapModelNoise,
+    key: np.uint64,
+    buffers: OutputBuffers,
+    found: int,
 ) -> int:
     """One visible stretch of a line, whole or in two parts, and perhaps a false one beside it; how many elements now."""
-    points, columns, style = room
-    reach = _reach(noise)
-    name, kind = scene.name[e], scene.kind[e]
-    least = 3 if kind == STOP_LINE else 8
-    if len(line) < least:
+    points, columns, style = buffers
+    max_range = _max_range(noise)
+    name, kind = scene.element_name[e], scene.kind[e]
+    min_stations = 3 if kind == STOP_LINE else 8
+    if len(line) < min_stations:
         return found
     middle = line[len(line) // 2]
-    drop = noise.drop_out * (0.5 + np.hypot(middle[0], middle[1]) / reach)
-    if unit(key, name, run, _DROP) >= drop:
+    drop = noise.miss_rate * (0.5 + np.hypot(middle[0], middle[1]) / max_range)
+    if hash_uniform(key, name, run, _DROP) >= drop:
         parts = 1
         cut = gap = 0
-        if kind != STOP_LINE and unit(key, name, run, _FRAGMENT) < noise.fragment:
+        if kind != STOP_LINE and hash_uniform(key, name, run, _FRAGMENT) < noise.fragment_rate:
             parts = 2
-            cut = int(len(line) * (0.25 + 0.5 * unit(key, name, run, _SHARE)))
-            gap = int(3.0 * unit(key, name, run, _GAP) / STATION_M)
-        said = kind
-        if unit(key, name, run, _CONFUSE) < noise.confusion:
-            said = BOUNDARY if kind == DIVIDER else DIVIDER
+            cut = int(len(line) * (0.25 + 0.5 * hash_uniform(key, name, run, _CUT)))
+            gap = int(3.0 * hash_uniform(key, name, run, _GAP) / STATION_M)
+        observed_kind = kind
+        if hash_uniform(key, name, run, _CONFUSE) < noise.confusion_rate:
+            observed_kind = BOUNDARY if kind == DIVIDER else DIVIDER
         for part in range(parts):
             piece = line if parts == 1 else line[:cut] if part == 0 else line[min(cut + gap, len(line)) :]
-            if len(piece) < least:
+            if len(piece) < min_stations:
                 continue
             distance = _emit_line(piece, noise, key, name, run, part, points[found])
             if distance < 0.0:
                 continue
-            columns[found, COLUMN_KIND], columns[found, COLUMN_NAME] = said, name
+            columns[found, COLUMN_KIND], columns[found, COLUMN_NAME] = observed_kind, name
             columns[found, COLUMN_SCORE] = _score(
-                0.95 if said == kind else 0.6, distance / reach, key, name, run + 64 * part
+                0.95 if observed_kind == kind else 0.6, distance / max_range, key, name, run + 64 * part
             )
-            variance = noise.point**2 + (noise.point_per_m * distance) ** 2 + noise.bow**2 / 2
+            variance = noise.point_sigma_m**2 + (noise.point_sigma_per_m * distance) ** 2 + noise.lateral_bend_m**2 / 2
             columns[found, COLUMN_SIGMA] = np.sqrt(variance)
-            _say_style(scene.style[e] if said == DIVIDER else NO_STYLE, noise, key, name, run, style[found])
+            _write_style(scene.style[e] if observed_kind == DIVIDER else NO_STYLE, noise, key, name, run, style[found])
             found += 1
-    if unit(key, name, run, _FALSE) < noise.false_positive:
+    if hash_uniform(key, name, run, _FALSE) < noise.false_positive_rate:
         false_kind, distance = _emit_false(line, noise, key, name, run, points[found])
         if distance >= 0.0:
             columns[found, COLUMN_KIND], columns[found, COLUMN_NAME] = false_kind, -1
-            columns[found, COLUMN_SCORE] = _score(0.55, distance / reach, key, name, run + 128)
+            columns[found, COLUMN_SCORE] = _score(0.55, distance / max_range, key, name, run + 128)
             columns[found, COLUMN_SIGMA] = np.sqrt(
-                noise.point**2 + (noise.point_per_m * distance) ** 2 + noise.bow**2 / 2
+                noise.point_sigma_m**2 + (noise.point_sigma_per_m * distance) ** 2 + noise.lateral_bend_m**2 / 2
             )
-            _say_style(DASHED if false_kind == DIVIDER else NO_STYLE, noise, key, name, run + 128, style[found])
+            _write_style(DASHED if false_kind == DIVIDER else NO_STYLE, noise, key, name, run + 128, style[found])
             found += 1
     return found
 
@@ -408,22 +428,22 @@ def _see_line(
 @njit(cache=True)
 def _score(top: float, far: float, key: np.uint64, element: int, run: int) -> float:
     """A confidence that falls with the distance and scatters."""
-    return min(0.99, max(0.05, top - 0.25 * far + 0.12 * normal(key, element, run, _SCORE)))
+    return min(0.99, max(0.05, top - 0.25 * far + 0.12 * hash_normal(key, element, run, _SCORE)))
 
 
 @njit(cache=True)
-def _say_style(true: int, noise: Noise, key: np.uint64, element: int, run: int, out: F64x1) -> None:
+def _write_style(true: int, noise: MapModelNoise, key: np.uint64, element: int, run: int, out: F64x1) -> None:
     """Probabilities of styles: 0.85 on one, which is another than the true one at the rate style_error."""
     size = len(out)
     if true == NO_STYLE:
         out[:] = 0.0
         out[NO_STYLE] = 1.0
         return
-    said = true
-    if unit(key, element, run, _STYLE) < noise.style_error:
-        said = (true + 1 + int(2.0 * unit(key, element, run, _OTHER))) % 3
+    observed_style = true
+    if hash_uniform(key, element, run, _STYLE) < noise.style_error_rate:
+        observed_style = (true + 1 + int(2.0 * hash_uniform(key, element, run, _OTHER))) % 3
     out[:] = 0.15 / (size - 1)
-    out[said] = 0.85
+    out[observed_style] = 0.85
 
 
 __all__ = [
@@ -431,12 +451,12 @@ __all__ = [
     "COLUMN_NAME",
     "COLUMN_SCORE",
     "COLUMN_SIGMA",
-    "MOST",
-    "Noise",
-    "Room",
-    "Scenery",
-    "look",
-    "normal",
-    "scenery",
-    "unit",
+    "MAX_ELEMENTS",
+    "MapModelNoise",
+    "OutputBuffers",
+    "TrueMapIndex",
+    "build_map_index",
+    "hash_normal",
+    "hash_uniform",
+    "observe_map",
 ]

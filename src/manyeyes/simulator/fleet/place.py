@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError, MissingExtraError
 from manyeyes.datatypes.map_element import CROSSING, MapElements
-from manyeyes.maps.elements.observation import Frame
+from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.formats.argoverse2_map import read_argoverse2_map, read_argoverse2_poses
 from manyeyes.maps.formats.lanelet2 import lanelet2_origin, read_lanelet2
 from manyeyes.maps.formats.v2x_seq_map import read_v2x_seq_map
-from manyeyes.maps.roads.ground_truth import TruthPolicy, junction_region, map_truth
+from manyeyes.maps.roads.ground_truth import GroundTruthPolicy, build_ground_truth_map, compute_junction_region
 from manyeyes.maps.roads.road_network import RoadNetwork
 from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 from manyeyes.simulator.fleet.generated_streets import StreetPlan, street_junctions, street_routes, street_truth
@@ -70,48 +70,48 @@ class Place:
     routes: Routes
     junctions: BaseGeometry
     area: tuple[float, float, float, float]
-    frame: Frame
+    frame: MapFrame
     logs: tuple[Array, ...] = ()
     world_xy: tuple[float, float] = (0.0, 0.0)
 
-    def in_area(self, elements: MapElements | None = None, min_line_m: float = 5.0) -> MapElements:
+    def clip_to_area(self, elements: MapElements | None = None, min_line_m: float = 5.0) -> MapElements:
         """Elements (the truth unless others are given) cut to the area, by :func:`clip_to_box`."""
         return clip_to_box(self.truth if elements is None else elements, self.area, min_line_m)
 
 
-def place(name: str, size_m: float | None = 300.0, data: Path | str | None = None) -> Place:
+def load_place(name: str, size_m: float | None = 300.0, data: Path | str | None = None) -> Place:
     """A place by name: a CARLA town, ``generated-<seed>``, av2-miami, av2-pittsburgh, lanelet2, cross, grid or ``grid-<n>``.
 
     size_m: side of the square area; in towns it lies about the largest junction, None takes all of the place. Real logs and
     generated streets are never larger than they are. data: the folder with ``carla_opendrive``, ``av2`` and ``lanelet2``; where
     none is given, ``shared/data`` beside the repository or above the working directory.
     """
-    return _place(name, size_m, None if data is None else str(data))
+    return _load_place(name, size_m, None if data is None else str(data))
 
 
 @lru_cache(maxsize=16)
-def _place(name: str, size_m: float | None, data: str | None) -> Place:
+def _load_place(name: str, size_m: float | None, data: str | None) -> Place:
     if name in _PLANS or name.startswith("grid-"):
         return _generated(name, size_m)
     if name in TOWNS or name.startswith(GENERATED):
         folder = None if data is None or name.startswith(GENERATED) else Path(data) / "carla_opendrive"
         network = load_town(name, folder)
-        return place_of(network, name, TruthPolicy(boundary="pavement"), size_m, _CARLA_ORIGIN)
+        return make_place(network, name, GroundTruthPolicy(boundary="pavement"), size_m, _CARLA_ORIGIN)
     if name in AV2_LOGS:
         log = _data(data) / "av2" / AV2_LOGS[name]
         city = next(iter(sorted(log.glob("map/log_map_archive_*.json"))), Path("____MIA")).name
         origin = next((o for c, o in _CITY_ORIGIN.items() if f"____{c}_" in city), (0.0, 0.0))
-        found = place_of(read_argoverse2_map(log), name, TruthPolicy(), size_m, origin)
+        found = make_place(read_argoverse2_map(log), name, GroundTruthPolicy(), size_m, origin)
         _, poses = read_argoverse2_poses(log)
         return replace(found, logs=(poses - [*found.world_xy, 0.0],))
     if name == "lanelet2":
         path = _data(data) / "lanelet2" / "mapping_example.osm"
-        return place_of(read_lanelet2(path), name, TruthPolicy(), size_m, lanelet2_origin(path))
+        return make_place(read_lanelet2(path), name, GroundTruthPolicy(), size_m, lanelet2_origin(path))
     raise ConfigError(f"Unknown place '{name}'; known: {', '.join(PLACES)}, grid-<n>, {GENERATED}<seed>.")
 
 
 @lru_cache(maxsize=4)
-def place_of_map(path: Path) -> Place:
+def load_place_from_map(path: Path) -> Place:
     """A place out of a file of a real map: an intersection of V2X-Seq, a map (or log) of Argoverse 2, or Lanelet2's .osm."""
     origin = (0.0, 0.0)
     if path.suffix == ".osm":
@@ -120,11 +120,11 @@ def place_of_map(path: Path) -> Place:
         network = read_argoverse2_map(path)
     else:
         network = read_v2x_seq_map(path)
-    return place_of(network, path.stem, TruthPolicy(), None, origin)
+    return make_place(network, path.stem, GroundTruthPolicy(), None, origin)
 
 
-def place_of(
-    network: RoadNetwork, name: str, policy: TruthPolicy, size_m: float | None, origin: tuple[float, float]
+def make_place(
+    network: RoadNetwork, name: str, policy: GroundTruthPolicy, size_m: float | None, origin: tuple[float, float]
 ) -> Place:
     """A place out of any road network; origin: latitude and longitude of the network's zero, degrees."""
     x0, y0, x1, y1 = network.bounds
@@ -134,13 +134,13 @@ def place_of(
         sites = crossing_sites(network) or crossing_sites(network, single_level=False)
         middle = np.round(sites[0].center[:2]) if sites else middle
         half = np.full(2, size_m / 2)
-    truth = map_truth(network, policy).transform(-middle[0], -middle[1], 0.0)
+    truth = build_ground_truth_map(network, policy).transform(-middle[0], -middle[1], 0.0)
     routes = Routes.of_network(network, middle).within(-half, half)
-    ground = _moved(junction_region(network, policy.junction_margin_m), middle)
+    ground = _moved(compute_junction_region(network, policy.junction_margin_m), middle)
     latitude, longitude = degrees_from_metres(middle, origin).tolist()
     area = (-float(half[0]), -float(half[1]), float(half[0]), float(half[1]))
     return Place(
-        name, truth, routes, ground, area, Frame(latitude, longitude), world_xy=(float(middle[0]), float(middle[1]))
+        name, truth, routes, ground, area, MapFrame(latitude, longitude), world_xy=(float(middle[0]), float(middle[1]))
     )
 
 
@@ -161,7 +161,7 @@ def clip_to_box(elements: MapElements, box: tuple[float, float, float, float], m
             kinds.append(elements.kind[k])
             scores.append(elements.score[k])
             styles.append(elements.style[k])
-            sigmas.append(np.full(len(piece), elements.sigma[elements.first[k] : elements.first[k + 1]].mean()))
+            sigmas.append(np.full(len(piece), elements.sigma[elements.offsets[k] : elements.offsets[k + 1]].mean()))
     if not parts:
         return MapElements.empty()
     return MapElements.of(parts, kinds, scores, np.concatenate(sigmas), np.array(styles))
@@ -182,7 +182,7 @@ def _generated(name: str, size_m: float | None) -> Place:
         half = np.minimum(half, size_m / 2)
     ground = shapely.union_all([shapely.Polygon(ring) for ring in street_junctions(plan)])
     area = (-float(half[0]), -float(half[1]), float(half[0]), float(half[1]))
-    return Place(name, truth, routes.within(-half, half), ground, area, Frame(*_CARLA_ORIGIN))
+    return Place(name, truth, routes.within(-half, half), ground, area, MapFrame(*_CARLA_ORIGIN))
 
 
 def _moved(ground: BaseGeometry, origin: Array) -> BaseGeometry:

@@ -24,19 +24,19 @@ class Routes:
     """
 
     points: Array
-    first: Indices
+    offsets: Indices
     successor: Indices
-    follow: Indices
+    successor_offsets: Indices
 
     @classmethod
     def of(cls, lanes: Sequence[Array], successors: Sequence[tuple[int, int]]) -> Routes:
         """Centre lines (M, 2) and pairs (lane, a lane that follows it)."""
         pairs = np.array(sorted(set(successors)), np.int64).reshape(-1, 2)
-        first = np.concatenate(([0], np.cumsum([len(lane) for lane in lanes]))).astype(np.int64)
+        offsets = np.concatenate(([0], np.cumsum([len(lane) for lane in lanes]))).astype(np.int64)
         count = np.bincount(pairs[:, 0], minlength=len(lanes))
-        follow = np.concatenate(([0], np.cumsum(count))).astype(np.int64)
+        successor_offsets = np.concatenate(([0], np.cumsum(count))).astype(np.int64)
         points = np.concatenate(lanes) if lanes else np.zeros((0, 2))
-        return cls(points, first, pairs[:, 1].copy(), follow)
+        return cls(points, offsets, pairs[:, 1].copy(), successor_offsets)
 
     @classmethod
     def of_network(cls, network: RoadNetwork, origin: Array) -> Routes:
@@ -47,11 +47,11 @@ class Routes:
         return cls.of([lane.center[:, :2] - origin for lane in own], pairs)
 
     def __len__(self) -> int:
-        return len(self.first) - 1
+        return len(self.offsets) - 1
 
     def lane(self, i: int) -> Array:
         """(M, 2) centre line."""
-        return self.points[self.first[i] : self.first[i + 1]]
+        return self.points[self.offsets[i] : self.offsets[i + 1]]
 
     @cached_property
     def lengths(self) -> Array:
@@ -61,12 +61,12 @@ class Routes:
     def within(self, low: Array, high: Array) -> Routes:
         """The lanes that have a point inside a rectangle, with the links among them."""
         inside = np.asarray(np.logical_and(self.points >= low, self.points <= high).all(axis=1))
-        kept = [i for i in range(len(self)) if inside[self.first[i] : self.first[i + 1]].any()]
+        kept = [i for i in range(len(self)) if inside[self.offsets[i] : self.offsets[i + 1]].any()]
         place = {old: new for new, old in enumerate(kept)}
         pairs = [
             (place[i], place[int(k)])
             for i in kept
-            for k in self.successor[self.follow[i] : self.follow[i + 1]]
+            for k in self.successor[self.successor_offsets[i] : self.successor_offsets[i + 1]]
             if int(k) in place
         ]
         return Routes.of([self.lane(i) for i in kept], pairs)
@@ -79,21 +79,21 @@ class Routes:
             size = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
             parts.append(line if not parts else line[1:])
             left -= size
-            after = self.successor[self.follow[lane] : self.follow[lane + 1]]
+            after = self.successor[self.successor_offsets[lane] : self.successor_offsets[lane + 1]]
             if left <= 0 or not len(after) or step > 1000:
                 return np.concatenate(parts)
             lane = int(after[choose(step, len(after))])
             line, step = self.lane(lane), step + 1
 
 
-def along(path: Array, distance_m: Array) -> Array:
+def sample_poses(path: Array, station_m: Array) -> Array:
     """Poses (K, 3) as x, y, yaw at distances (K,) from the start of a path (M, 2)."""
     length = np.linalg.norm(np.diff(path, axis=0), axis=1)
     station = np.concatenate(([0.0], np.cumsum(length)))
-    x, y = (np.interp(distance_m, station, path[:, axis]) for axis in (0, 1))
+    x, y = (np.interp(station_m, station, path[:, axis]) for axis in (0, 1))
     # Over two metres, so that corners between lanes turn the vehicle gradually.
-    ahead = [np.interp(distance_m + 1.0, station, path[:, axis]) for axis in (0, 1)]
-    behind = [np.interp(distance_m - 1.0, station, path[:, axis]) for axis in (0, 1)]
+    ahead = [np.interp(station_m + 1.0, station, path[:, axis]) for axis in (0, 1)]
+    behind = [np.interp(station_m - 1.0, station, path[:, axis]) for axis in (0, 1)]
     return np.stack((x, y, np.arctan2(ahead[1] - behind[1], ahead[0] - behind[0])), 1)
 
 

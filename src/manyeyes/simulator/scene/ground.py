@@ -21,7 +21,7 @@ _LEVEL_GAP_M = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Ground:
+class GroundRaster:
     """Heights at nodes and surface classes on cells, around one scene, world axes.
 
     height: (rows, columns) float32 metres at nodes ``x0 + column * cell_m, y0 + row * cell_m``, bilinear between; beyond the
@@ -44,7 +44,7 @@ class Ground:
         row = np.minimum(v.astype(np.int64), rows - 2)
         return column, row, u - column, v - row
 
-    def z(self, x: ArrayLike, y: ArrayLike) -> Array:
+    def height_at(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Height at points, any shape; metres."""
         column, row, u, v = self._cell(x, y)
         h = self.height
@@ -52,7 +52,7 @@ class Ground:
         far = h[row + 1, column] * (1 - u) + h[row + 1, column + 1] * u
         return near * (1 - v) + far * v
 
-    def slope(self, x: ArrayLike, y: ArrayLike) -> Array:
+    def normal_at(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Upward unit normals (..., 3) at points."""
         column, row, u, v = self._cell(x, y)
         h = self.height.astype(np.float64)
@@ -76,7 +76,7 @@ def build_ground(
     half_size_m: float,
     cell_m: float = 0.5,
     surface_cell_m: float = 0.125,
-) -> Ground:
+) -> GroundRaster:
     """The square of 2 half_size_m around a centre: heights of the lanes, filled smoothly between them, and their paint.
 
     Where roads cross on two levels, the one nearest to the height at the centre is taken; see :func:`is_multilevel`.
@@ -97,7 +97,7 @@ def build_ground(
     _raster_height(height, triangles[reach], x0, y0, cell_m, level)
     surface = np.zeros((cells, cells), np.uint8)
     _paint_surface(surface, network, x0, y0, surface_cell_m)
-    return Ground(x0, y0, cell_m, _fill_smooth(height, level).astype(np.float32), surface_cell_m, surface)
+    return GroundRaster(x0, y0, cell_m, _fill_smooth(height, level).astype(np.float32), surface_cell_m, surface)
 
 
 def is_multilevel(network: RoadNetwork, center_xy: ArrayLike, radius_m: float, step_m: float = 2.0) -> bool:
@@ -106,7 +106,7 @@ def is_multilevel(network: RoadNetwork, center_xy: ArrayLike, radius_m: float, s
     axis = np.arange(-radius_m, radius_m + step_m / 2, step_m)
     offsets = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     offsets = offsets[np.linalg.norm(offsets, axis=1) <= radius_m]
-    return bool((network.surface.spread(center + offsets) > _LEVEL_GAP_M).any())
+    return bool((network.surface.height_range(center + offsets) > _LEVEL_GAP_M).any())
 
 
 def _paint_surface(surface: NDArray[np.uint8], network: RoadNetwork, x0: float, y0: float, cell: float) -> None:
@@ -131,9 +131,9 @@ def _paint_surface(surface: NDArray[np.uint8], network: RoadNetwork, x0: float, 
         if reaches(crossing.polygon):
             polygon = np.ascontiguousarray(crossing.polygon[:, :2])
             edges = np.roll(polygon, -1, axis=0) - polygon
-            along = edges[np.argmax(np.linalg.norm(edges, axis=1))]
-            along = along / max(np.linalg.norm(along), 1e-9)
-            _fill_stripes(surface, polygon, along, x0, y0, cell, _STRIPE_M, CROSSING)
+            direction = edges[np.argmax(np.linalg.norm(edges, axis=1))]
+            direction = direction / max(np.linalg.norm(direction), 1e-9)
+            _fill_stripes(surface, polygon, direction, x0, y0, cell, _STRIPE_M, CROSSING)
 
 
 def _close_gaps(surface: NDArray[np.uint8], reach: int) -> None:
@@ -287,9 +287,9 @@ def _fill_quads(
 
 @njit(cache=True)
 def _fill_stripes(
-    raster: U8x2, polygon: F64x2, along: F64x1, x0: float, y0: float, cell: float, stripe: float, value: int
+    raster: U8x2, polygon: F64x2, direction: F64x1, x0: float, y0: float, cell: float, stripe: float, value: int
 ) -> None:  # pragma: no cover
-    """Every other band across ``along`` of the cells inside a polygon (even-odd)."""
+    """Every other band across ``direction`` of the cells inside a polygon (even-odd)."""
     rows, columns = raster.shape
     n = len(polygon)
     c_low = max(0, int((polygon[:, 0].min() - x0) / cell))
@@ -306,6 +306,6 @@ def _fill_stripes(
                 if (ay > y) != (by > y) and x < ax + (y - ay) / (by - ay) * (bx - ax):
                     inside = not inside
             if inside:
-                u = (x - polygon[0, 0]) * along[0] + (y - polygon[0, 1]) * along[1]
+                u = (x - polygon[0, 0]) * direction[0] + (y - polygon[0, 1]) * direction[1]
                 if int(np.floor(u / stripe)) % 2 == 0:
                     raster[r, c] = value

@@ -13,12 +13,12 @@ from manyeyes.simulator.scene.vehicles import VehicleStates, draw_vehicles, over
 Array = NDArray[np.float64]
 
 PARKED_ID = 1_000_000
-_SHARES = (0.86, 0.12, 0.02, 0.0)
+_KIND_FRACTIONS = (0.86, 0.12, 0.02, 0.0)
 _PITCH_M = 6.6
 _END_CLEARANCE_M = 9.0
 _CROSSING_CLEARANCE_M = 7.0
 _KERB_GAP_M = 0.3
-_FASTEST_MPS = 20.0
+_MAX_SPEED_LIMIT_MPS = 20.0
 
 
 def parked_cars(
@@ -33,7 +33,7 @@ def parked_cars(
     candidates = [_in_spaces(network, seed, density)]
     for lane in network.lanes:
         if _has_kerb(network, lane) and np.linalg.norm(lane.center[:, :2] - center, axis=1).min() < radius_m + 10.0:
-            candidates.append(_along(network, lane, seed, density))
+            candidates.append(_cars_along_lane(network, lane, seed, density))
     cars = VehicleStates.cat(candidates)
     cars = cars[np.linalg.norm(cars.position[:, :2] - center, axis=1) <= radius_m]
     return _without_conflicts(network, cars)
@@ -41,13 +41,13 @@ def parked_cars(
 
 def _has_kerb(network: RoadNetwork, lane: Lane) -> bool:
     """Whether it is the outermost drivable lane of a street where people park."""
-    if not lane.is_drivable or lane.junction_id is not None or lane.speed_limit_mps > _FASTEST_MPS:
+    if not lane.is_drivable or lane.junction_id is not None or lane.speed_limit_mps > _MAX_SPEED_LIMIT_MPS:
         return False
     right = lane.right_neighbor
     return right < 0 or network.lanes[right].kind not in DRIVABLE
 
 
-def _along(network: RoadNetwork, lane: Lane, seed: int, density: float) -> VehicleStates:
+def _cars_along_lane(network: RoadNetwork, lane: Lane, seed: int, density: float) -> VehicleStates:
     """Places every 6.6 m beside the right border of a lane, each taken by chance."""
     random = keyed_generator(seed, "parked", lane.road_id, lane.section, lane.lane_id)
     border = lane.right
@@ -55,9 +55,9 @@ def _along(network: RoadNetwork, lane: Lane, seed: int, density: float) -> Vehic
     station = np.concatenate(([0.0], np.cumsum(step)))
     places = np.arange(_END_CLEARANCE_M, station[-1] - _END_CLEARANCE_M, _PITCH_M)
     # Some streets are full, some nearly empty: the mean stays.
-    share = density * 2 * random.random()
-    taken = random.random(len(places)) < share
-    kind, size = draw_vehicles(random, len(places), _SHARES)
+    taken_prob = density * 2 * random.random()
+    taken = random.random(len(places)) < taken_prob
+    kind, size = draw_vehicles(random, len(places), _KIND_FRACTIONS)
     shift, twist, turned = (
         random.normal(0, 0.35, len(places)),
         random.normal(0, 0.025, len(places)),

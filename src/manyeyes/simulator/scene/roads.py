@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from manyeyes.maps.roads.road_network import PAVED, WALKABLE, Lane, RoadNetwork
-from manyeyes.maps.roads.surface import Surface
+from manyeyes.maps.roads.surface import RoadSurface
 from manyeyes.simulator.scene.ground import is_multilevel
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 class CrossingSite:
     """A place where roads meet. center: (3,) metres, on the road; radius_m reaches the farthest corner of its lanes.
 
-    approaches: ids of the drivable lanes that lead into it. arms: how many roads meet, counted by the directions in which
+    approaches: ids of the drivable lanes that lead into it. num_arms: how many roads meet, counted by the directions in which
     their lanes begin and end. is_multilevel: whether roads pass over each other within 60 m.
     """
 
@@ -27,7 +27,7 @@ class CrossingSite:
     center: Array
     radius_m: float
     approaches: tuple[int, ...]
-    arms: int
+    num_arms: int
     is_multilevel: bool
 
 
@@ -48,16 +48,16 @@ def crossing_sites(network: RoadNetwork, min_arms: int = 3, single_level: bool =
         if not (single_level and stacked):
             site = CrossingSite(junction.id, center, junction.radius_m, junction.incoming, arms, stacked)
             sites.append(site)
-    return tuple(sorted(sites, key=lambda site: (-site.arms, -len(site.approaches), site.junction_id)))
+    return tuple(sorted(sites, key=lambda site: (-site.num_arms, -len(site.approaches), site.junction_id)))
 
 
-def _count_arms(angle: Array, apart: float = np.radians(35.0)) -> int:
-    """How many groups of angles (N,) lie around the circle, cut where neighbours are more than ``apart`` from each other."""
+def _count_arms(angle: Array, min_gap_rad: float = np.radians(35.0)) -> int:
+    """How many groups of angles (N,) lie around the circle, cut where neighbours are more than ``min_gap_rad`` from each other."""
     if len(angle) < 2:
         return len(angle)
     ordered = np.sort(np.mod(angle, 2 * np.pi))
     gaps = np.diff(np.concatenate((ordered, ordered[:1] + 2 * np.pi)))
-    return max(1, int((gaps > apart).sum()))
+    return max(1, int((gaps > min_gap_rad).sum()))
 
 
 def distance_to_road(network: RoadNetwork, xy: ArrayLike) -> Array:
@@ -74,7 +74,7 @@ def lane_at(network: RoadNetwork, xy: ArrayLike, near_z: Array | float | None = 
     """The drivable lane under each point (N, 2); None off the road. Where lanes overlap, as in junctions, one of them."""
     points = np.asarray(xy, np.float64).reshape(-1, 2)
     drivable = [lane for lane in network.lanes if lane.is_drivable]
-    owner = network.drivable_surface.owner_at(points, near_z)
+    owner = network.drivable_surface.strip_at(points, near_z)
     covered = network.drivable_surface.distance(points) <= 0.0
     return tuple(drivable[k] if inside else None for k, inside in zip(owner, covered))
 
@@ -120,10 +120,10 @@ def roadside_points(
     return RoadsidePoints(xy, np.arctan2(-dy, -dx), distance)
 
 
-def _nearby_surface(network: RoadNetwork, kinds: tuple[str, ...], center: Array, radius_m: float) -> Surface:
+def _nearby_surface(network: RoadNetwork, kinds: tuple[str, ...], center: Array, radius_m: float) -> RoadSurface:
     near = [
         lane
         for lane in network.lanes
         if lane.kind in kinds and np.linalg.norm(lane.center[:, :2] - center, axis=1).min() <= radius_m
     ]
-    return Surface.of_strips([lane.left for lane in near], [lane.right for lane in near])
+    return RoadSurface.of_strips([lane.left for lane in near], [lane.right for lane in near])

@@ -23,7 +23,7 @@ _CELL = 0.5
 
 
 @dataclass(frozen=True)
-class ClutterSpec:
+class RoadsideObjectSpec:
     """How much stands beside the road, as wishes: what finds no place is left out.
 
     buildings … hedges: at most. setback_m: from the pavement's edge to a front. radius_m: how far from the middle.
@@ -86,16 +86,16 @@ def distance_transform(blocked: Boolx2) -> Array:
 
 
 @dataclass(frozen=True)
-class Plot:
+class PlacementGrid:
     """Where things may stand, on cells of 0.5 m: distances to the carriageway and to any pavement, and what is taken."""
 
     ground: HeightField
-    to_road: Array
-    to_paved: Array
-    taken: NDArray[np.bool_]
+    distance_to_road_m: Array
+    distance_to_pavement_m: Array
+    is_occupied: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, ground: HeightField) -> Plot:
+    def of(cls, ground: HeightField) -> PlacementGrid:
         """From a ground, with nothing on it."""
         factor = max(1, round(_CELL / ground.surface_cell))
         rows, columns = (n // factor for n in ground.surface.shape)
@@ -116,19 +116,25 @@ class Plot:
         """Row, column (clamped) and whether inside, of points (..., 2)."""
         column = np.floor((xy[..., 0] - self.ground.x_min) / self.cell).astype(np.int64)
         row = np.floor((xy[..., 1] - self.ground.y_min) / self.cell).astype(np.int64)
-        rows, columns = self.taken.shape
+        rows, columns = self.is_occupied.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         return np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1), inside
 
-    def away(self, xy: Array) -> tuple[float, Array]:
+    def pavement_clearance(self, xy: Array) -> tuple[float, Array]:
         """Distance to the pavement at one point (2,), and the unit direction in which it grows."""
         row, column, _ = self.index(xy)
-        i, j = min(max(int(row), 2), self.taken.shape[0] - 3), min(max(int(column), 2), self.taken.shape[1] - 3)
+        i, j = (
+            min(max(int(row), 2), self.is_occupied.shape[0] - 3),
+            min(max(int(column), 2), self.is_occupied.shape[1] - 3),
+        )
         slope = np.array(
-            [self.to_paved[i, j + 2] - self.to_paved[i, j - 2], self.to_paved[i + 2, j] - self.to_paved[i - 2, j]]
+            [
+                self.distance_to_pavement_m[i, j + 2] - self.distance_to_pavement_m[i, j - 2],
+                self.distance_to_pavement_m[i + 2, j] - self.distance_to_pavement_m[i - 2, j],
+            ]
         )
         length = float(np.hypot(*slope))
-        return float(self.to_paved[i, j]), slope / length if length > 1e-6 else np.array([1.0, 0.0])
+        return float(self.distance_to_pavement_m[i, j]), slope / length if length > 1e-6 else np.array([1.0, 0.0])
 
     def footprint(self, center: Array, half: tuple[float, float], yaw: float) -> Array:
         """Points (P, 2) that fill an oriented rectangle no coarser than a cell."""
@@ -137,19 +143,25 @@ class Plot:
         c, s = math.cos(yaw), math.sin(yaw)
         return np.stack((center[0] + u * c - v * s, center[1] + u * s + v * c), -1).reshape(-1, 2)
 
-    def take(self, center: Array, half: tuple[float, float], yaw: float, clear_m: float, road_m: float = 0.0) -> bool:
+    def occupy_if_free(
+        self, center: Array, half: tuple[float, float], yaw: float, clear_m: float, road_m: float = 0.0
+    ) -> bool:
         """Take a rectangle if all of it is free, at least clear_m from pavement and road_m from the carriageway."""
         row, column, inside = self.index(self.footprint(center, half, yaw))
-        free = inside & ~self.taken[row, column]
-        if not free.all() or (self.to_paved[row, column] < clear_m).any() or (self.to_road[row, column] < road_m).any():
+        free = inside & ~self.is_occupied[row, column]
+        if (
+            not free.all()
+            or (self.distance_to_pavement_m[row, column] < clear_m).any()
+            or (self.distance_to_road_m[row, column] < road_m).any()
+        ):
             return False
-        self.taken[row, column] = True
+        self.is_occupied[row, column] = True
         return True
 
-    def keep_out(self, center: Array, half: tuple[float, float], yaw: float) -> None:
+    def occupy(self, center: Array, half: tuple[float, float], yaw: float) -> None:
         """Take a rectangle whatever is there."""
         row, column, inside = self.index(self.footprint(center, half, yaw))
-        self.taken[row[inside], column[inside]] = True
+        self.is_occupied[row[inside], column[inside]] = True
 
     def height(self, xy: Array) -> Array:
         """Ground height at points (..., 2), nearest node."""
@@ -161,7 +173,7 @@ class Plot:
 
 
 @dataclass
-class _Heap:
+class _SolidList:
     """Solids as they come."""
 
     rows: list[tuple[int, tuple[float, float, float], float, tuple[float, float, float], float, int, float]]
@@ -185,7 +197,7 @@ class _Heap:
         )  # fmt: skip
 
 
-def _band(plot: Plot, middle: Array, radius: float, low: float, high: float, to: Array) -> Array:
+def _band(plot: PlacementGrid, middle: Array, radius: float, low: float, high: float, to: Array) -> Array:
     """(N, 2) centres of the cells around the middle whose distance ``to`` is within low … high."""
     row, column = np.nonzero((to >= low) & (to <= high))
     x, y = plot.ground.x_min + (column + 0.5) * plot.cell, plot.ground.y_min + (row + 0.5) * plot.cell
@@ -202,19 +214,21 @@ def _draw(random: np.random.Generator, places: Array, count: int, middle: Array,
     return chosen[order][: 4 * count]
 
 
-def _buildings(heap: _Heap, plot: Plot, spec: ClutterSpec, middle: Array, random: np.random.Generator) -> None:
+def _buildings(
+    heap: _SolidList, plot: PlacementGrid, spec: RoadsideObjectSpec, middle: Array, random: np.random.Generator
+) -> None:
     """Prisms that front the pavement, those at the crossing's corners first: they decide who sees what."""
-    places = _band(plot, middle, spec.radius_m, spec.setback_m, spec.setback_m + 1.5, plot.to_paved)
+    places = _band(plot, middle, spec.radius_m, spec.setback_m, spec.setback_m + 1.5, plot.distance_to_pavement_m)
     for xy in _draw(random, places, spec.buildings, middle, 60.0):
         if len(heap.rows) >= spec.buildings:
             break
-        distance, away = plot.away(xy)
+        distance, away = plot.pavement_clearance(xy)
         depth, width, height = random.uniform(6, 16), random.uniform(7, 24), random.uniform(4, 18)
         for shrink in (1.0, 0.6, 0.35):
             half = (depth * max(shrink, 0.6) / 2, width * shrink / 2)
             center = xy + away * half[0]
             yaw = math.atan2(away[1], away[0])
-            if plot.take(center, half, yaw, 0.6 * min(distance, spec.setback_m), 1.0):
+            if plot.occupy_if_free(center, half, yaw, 0.6 * min(distance, spec.setback_m), 1.0):
                 base = float(plot.height(plot.footprint(center, half, yaw)).min()) - 0.5
                 z, half_z = base + height / 2, height / 2
                 heap.add(
@@ -223,29 +237,35 @@ def _buildings(heap: _Heap, plot: Plot, spec: ClutterSpec, middle: Array, random
                 break
 
 
-def _walls(heap: _Heap, plot: Plot, spec: ClutterSpec, middle: Array, random: np.random.Generator) -> None:
+def _walls(
+    heap: _SolidList, plot: PlacementGrid, spec: RoadsideObjectSpec, middle: Array, random: np.random.Generator
+) -> None:
     """Walls and fences along the pavement, and hedges, which are low and dark."""
     for count, thick, low, high, bright in ((spec.walls, 0.12, 1.0, 2.4, 0.4), (spec.hedges, 0.4, 0.8, 1.7, 0.25)):
-        places = _band(plot, middle, 0.8 * spec.radius_m, 0.6, 3.0, plot.to_paved)
+        places = _band(plot, middle, 0.8 * spec.radius_m, 0.6, 3.0, plot.distance_to_pavement_m)
         for xy in _draw(random, places, count, middle, 150.0)[:count]:
-            _, away = plot.away(xy)
+            _, away = plot.pavement_clearance(xy)
             half, height = (thick, random.uniform(2, 8)), random.uniform(low, high)
             yaw = math.atan2(away[1], away[0])
-            if plot.take(xy, half, yaw, 0.3, 0.8):
+            if plot.occupy_if_free(xy, half, yaw, 0.3, 0.8):
                 z = float(plot.height(xy)) + height / 2 - 0.1
                 heap.add(BOX, (xy[0], xy[1], z), (*half, height / 2 + 0.1), yaw, reflectivity=bright)
 
 
-def _poles(heap: _Heap, plot: Plot, spec: ClutterSpec, middle: Array, random: np.random.Generator) -> None:
+def _poles(
+    heap: _SolidList, plot: PlacementGrid, spec: RoadsideObjectSpec, middle: Array, random: np.random.Generator
+) -> None:
     """Lamps, signs with a retro-reflecting plate, and traffic lights near the crossing."""
     placed: list[Array] = []
-    for xy in _draw(random, _band(plot, middle, 0.8 * spec.radius_m, 0.6, 1.6, plot.to_road), spec.poles, middle, 80.0):
+    for xy in _draw(
+        random, _band(plot, middle, 0.8 * spec.radius_m, 0.6, 1.6, plot.distance_to_road_m), spec.poles, middle, 80.0
+    ):
         if len(placed) >= spec.poles or any(np.hypot(*(xy - other)) < 7.0 for other in placed):
             continue
-        if not plot.take(xy, (0.2, 0.2), 0.0, 0.0, 0.5):
+        if not plot.occupy_if_free(xy, (0.2, 0.2), 0.0, 0.0, 0.5):
             continue
         placed.append(xy)
-        z, (_, away) = float(plot.height(xy)), plot.away(xy)
+        z, (_, away) = float(plot.height(xy)), plot.pavement_clearance(xy)
         what, yaw = random.uniform(), math.atan2(away[1], away[0])
         x, y = float(xy[0]), float(xy[1])
         if what < 0.5:
@@ -258,13 +278,17 @@ def _poles(heap: _Heap, plot: Plot, spec: ClutterSpec, middle: Array, random: np
             heap.add(BOX, (x, y, z + 3.6), (0.16, 0.16, 0.45), yaw, reflectivity=0.1)
 
 
-def _trees(heap: _Heap, plot: Plot, spec: ClutterSpec, middle: Array, random: np.random.Generator) -> None:
+def _trees(
+    heap: _SolidList, plot: PlacementGrid, spec: RoadsideObjectSpec, middle: Array, random: np.random.Generator
+) -> None:
     """A trunk and a crown that lets rays through; the crown's lower side stays above 2.3 m."""
     placed: list[Array] = []
-    for xy in _draw(random, _band(plot, middle, spec.radius_m, 1.5, 9.0, plot.to_road), spec.trees, middle, 200.0):
+    for xy in _draw(
+        random, _band(plot, middle, spec.radius_m, 1.5, 9.0, plot.distance_to_road_m), spec.trees, middle, 200.0
+    ):
         if len(placed) >= spec.trees or any(np.hypot(*(xy - other)) < 4.0 for other in placed):
             continue
-        if not plot.take(xy, (0.4, 0.4), 0.0, 0.0, 1.2):
+        if not plot.occupy_if_free(xy, (0.4, 0.4), 0.0, 0.0, 1.2):
             continue
         placed.append(xy)
         z, wide, tall = float(plot.height(xy)), random.uniform(1.2, 2.6), random.uniform(1.2, 2.4)
@@ -275,9 +299,11 @@ def _trees(heap: _Heap, plot: Plot, spec: ClutterSpec, middle: Array, random: np
         heap.add(ELLIPSOID, crown, (wide, wide, tall), density=float(density), reflectivity=float(bright))
 
 
-def place_clutter(plot: Plot, spec: ClutterSpec, middle: Array, key: tuple[int | str, ...]) -> Primitives:
+def place_roadside_objects(
+    plot: PlacementGrid, spec: RoadsideObjectSpec, middle: Array, key: tuple[int | str, ...]
+) -> Primitives:
     """All that stands beside the roads around middle (2,). Buildings come first, so that nothing else is built over."""
-    heap, random = _Heap([]), keyed_generator(*key, "clutter")
+    heap, random = _SolidList([]), keyed_generator(*key, "clutter")
     _buildings(heap, plot, spec, middle, random)
     _walls(heap, plot, spec, middle, random)
     _poles(heap, plot, spec, middle, random)
@@ -285,17 +311,17 @@ def place_clutter(plot: Plot, spec: ClutterSpec, middle: Array, key: tuple[int |
     return heap.solids()
 
 
-def corner_places(plot: Plot, middle: Array, low_m: float = 0.6, high_m: float = 2.5) -> Array:
+def find_pole_sites(plot: PlacementGrid, middle: Array, low_m: float = 0.6, high_m: float = 2.5) -> Array:
     """(N, 2) free places beside the carriageway, nearest to the middle first: where a roadside unit's pole can stand."""
-    places = _band(plot, middle, 45.0, low_m, high_m, plot.to_road)
+    places = _band(plot, middle, 45.0, low_m, high_m, plot.distance_to_road_m)
     row, column, _ = plot.index(places)
-    places = places[~plot.taken[row, column]]
+    places = places[~plot.is_occupied[row, column]]
     return places[np.argsort(np.hypot(*(places - middle).T), kind="stable")]
 
 
-def pole(xy: Array, z: float, height: float, instance: int) -> Primitives:
+def make_pole(xy: Array, z: float, height: float, instance: int) -> Primitives:
     """A roadside unit's pole: its own instance, so that it is not met by the sensor it carries."""
-    heap = _Heap([])
+    heap = _SolidList([])
     heap.add(
         CYLINDER, (xy[0], xy[1], z + height / 2), (0.1, 0.1, height / 2 + 0.3), instance=instance, reflectivity=0.5
     )

@@ -10,20 +10,32 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import LABELS, AgentFrame, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datatypes import LABELS, AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.maps.roads.road_network import Junction, RoadNetwork
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import HeightField, Primitives
-from manyeyes.simulator.scene.ground import Ground, build_ground, is_multilevel
+from manyeyes.simulator.scene.ground import GroundRaster, build_ground, is_multilevel
 from manyeyes.simulator.scene.parking import parked_cars
-from manyeyes.simulator.scene.roadside_objects import ClutterSpec, Plot, corner_places, place_clutter, pole
+from manyeyes.simulator.scene.roadside_objects import (
+    PlacementGrid,
+    RoadsideObjectSpec,
+    find_pole_sites,
+    make_pole,
+    place_roadside_objects,
+)
 from manyeyes.simulator.scene.traffic import simulate_traffic
-from manyeyes.simulator.scene.vehicle_shapes import Body, box_centers, place_bodies, rotation_of, vehicle_body
+from manyeyes.simulator.scene.vehicle_shapes import (
+    VehicleShape,
+    box_centers,
+    make_vehicle_shape,
+    place_vehicle_shapes,
+    rotation_from_yaw_pitch,
+)
 from manyeyes.simulator.scene.vehicles import VehicleStates
-from manyeyes.simulator.sensors.camera import CameraSpec, Stage, camera_rig, take
-from manyeyes.simulator.sensors.lidar import LidarSpec, Scene, lidar_spec, scan
+from manyeyes.simulator.sensors.camera import CameraSpec, LitScene, camera_rig, render_image
+from manyeyes.simulator.sensors.lidar import LidarSpec, RaycastScene, lidar_spec, scan
 from manyeyes.simulator.sensors.lighting import draw_light
-from manyeyes.simulator.sensors.materials import Look, still_look, vehicle_look
+from manyeyes.simulator.sensors.materials import Materials, make_static_materials, make_vehicle_materials
 
 Array = NDArray[np.float64]
 
@@ -81,7 +93,7 @@ class NoSceneError(ConfigError):
 
 
 @dataclass(frozen=True, eq=False)
-class Roadside:
+class RoadsideUnit:
     """A unit on a pole: its upright frame on the road under it, facing the crossing, and its sensors."""
 
     world_from_agent: Transform
@@ -90,25 +102,26 @@ class Roadside:
 
 
 @dataclass(frozen=True, eq=False)
-class Scenario:
+class SimulatedScenario:
     """All that is fixed before the first frame. states: one a frame, moving and parked vehicles alike, same ids throughout
-    where they stay near. agents: ids of the connected vehicles. still: what does not move; solids of vehicles come on top."""
+    where they stay near. agents: ids of the connected vehicles. static_solids: what does not move; solids of vehicles come on
+    top."""
 
     spec: ScenarioSpec
     network: RoadNetwork
     ground: HeightField
-    still: Primitives
+    static_solids: Primitives
     states: tuple[VehicleStates, ...]
-    bodies: dict[int, Body]
+    shapes: dict[int, VehicleShape]
     agents: tuple[int, ...]
-    roadside: Roadside | None
+    roadside: RoadsideUnit | None
     crossing: Array
 
     def __len__(self) -> int:
         return len(self.states)
 
     @property
-    def moving_share(self) -> float:
+    def moving_fraction(self) -> float:
         """Share of the first frame's vehicles that are elsewhere in the last; frames of the lead do not count."""
         return float(_moving(self.states[self.spec.lead_frames :]).mean())
 
@@ -117,42 +130,51 @@ class Scenario:
         states, spec = self.states[index], self.spec
         scene, boxes = self.scene(index), true_boxes(states)
         rig = camera_rig(spec.cameras)
-        stage = self.stage(index) if {spec.cameras, spec.roadside_cameras} != {"none"} else None
+        lit_scene = self.lit_scene(index) if {spec.cameras, spec.roadside_cameras} != {"none"} else None
         time_ns = round(index * 1e9 / spec.rate_hz)
         drawn_ms = round((index - spec.lead_frames) * 1e3 / spec.rate_hz)
-        frames, seen = [], []
+        frames, visible = [], []
         for agent in self.agents:
             row = int(np.flatnonzero(states.id == agent)[0])
             pose = _pose(states, row)
             speed = float(states.speed[row])
-            frame, mine = self._sense(scene, agent, pose, lidar_spec(spec.lidar), boxes, (time_ns, drawn_ms), speed)
-            frames.append(_with_images(frame, stage, rig))
-            seen.append(mine)
+            frame, own_visible = self._sense(
+                scene, agent, pose, lidar_spec(spec.lidar), boxes, (time_ns, drawn_ms), speed
+            )
+            frames.append(_with_images(frame, lit_scene, rig))
+            visible.append(own_visible)
         if self.roadside is not None:
             unit = self.roadside
-            frame, mine = self._sense(scene, RSU_ID, unit.world_from_agent, unit.lidar, boxes, (time_ns, drawn_ms), 0.0)
-            frames.append(_with_images(frame, stage, unit.cameras))
-            seen.append(mine)
-        truth = Truth(boxes, torch.stack(seen), Transform.stack([f.world_from_agent for f in frames]))
+            frame, own_visible = self._sense(
+                scene, RSU_ID, unit.world_from_agent, unit.lidar, boxes, (time_ns, drawn_ms), 0.0
+            )
+            frames.append(_with_images(frame, lit_scene, unit.cameras))
+            visible.append(own_visible)
+        truth = GroundTruth(boxes, torch.stack(visible), Transform.stack([f.world_from_agent for f in frames]))
         return Snapshot(spec.name, index, tuple(frames), truth)
 
-    def scene(self, index: int) -> Scene:
+    def scene(self, index: int) -> RaycastScene:
         """All that rays can meet at one instant."""
         states = self.states[index]
-        moving = place_bodies(
-            [self.bodies[int(i)] for i in states.id], states.position, states.yaw, states.pitch, states.id
+        moving = place_vehicle_shapes(
+            [self.shapes[int(i)] for i in states.id], states.position, states.yaw, states.pitch, states.id
         )
-        return Scene(Primitives.cat([self.still, moving]), self.ground)
+        return RaycastScene(Primitives.cat([self.static_solids, moving]), self.ground)
 
-    def stage(self, index: int) -> Stage:
+    def lit_scene(self, index: int) -> LitScene:
         """The scene at one instant as cameras see it."""
         seed = self.spec.seed
-        look = Look.cat([still_look(self.still, seed), vehicle_look(self.states[index], self.bodies, seed)])
-        return Stage.of(self.scene(index), look, draw_light(seed, self.spec.name))
+        materials = Materials.cat(
+            [
+                make_static_materials(self.static_solids, seed),
+                make_vehicle_materials(self.states[index], self.shapes, seed),
+            ]
+        )
+        return LitScene.of(self.scene(index), materials, draw_light(seed, self.spec.name))
 
     def _sense(
         self,
-        scene: Scene,
+        scene: RaycastScene,
         agent: int,
         pose: Transform,
         lidar: LidarSpec,
@@ -174,13 +196,13 @@ class Scenario:
             speed_mps=speed,
             is_infrastructure=agent < 0,
         )
-        return frame, seen_boxes(points, instance, pose, boxes, agent)
+        return frame, find_visible_boxes(points, instance, pose, boxes, agent)
 
 
-def _with_images(frame: AgentFrame, stage: Stage | None, rig: tuple[CameraSpec, ...]) -> AgentFrame:
-    if stage is None:
+def _with_images(frame: AgentFrame, lit_scene: LitScene | None, rig: tuple[CameraSpec, ...]) -> AgentFrame:
+    if lit_scene is None:
         return frame
-    pictures = (take(stage, frame.world_from_agent, camera, own=frame.agent_id) for camera in rig)
+    pictures = (render_image(lit_scene, frame.world_from_agent, camera, own=frame.agent_id) for camera in rig)
     return replace(frame, images=tuple(picture.image for picture in pictures))
 
 
@@ -191,12 +213,12 @@ def true_boxes(states: VehicleStates) -> Boxes:
     return Boxes.of(*place, label=torch.from_numpy(states.kind), id=torch.from_numpy(states.id))
 
 
-def seen_boxes(
+def find_visible_boxes(
     points: PointCloud, instance: NDArray[np.int64], pose: Transform, boxes: Boxes, own: int
 ) -> torch.Tensor:
     """(N,) bool: boxes with at least one return of that vehicle inside (5 cm margin); never the agent's own."""
     met = torch.from_numpy(np.flatnonzero((instance > 0) & (instance != own)))
-    seen = torch.zeros(len(boxes), dtype=torch.bool)
+    visible = torch.zeros(len(boxes), dtype=torch.bool)
     # Each return is asked of its own vehicle's box alone.
     by_id = boxes.id.argsort()
     row = by_id[torch.searchsorted(boxes.id[by_id], torch.from_numpy(instance)[met])]
@@ -207,21 +229,21 @@ def seen_boxes(
     inside = (delta[:, 0] * c + delta[:, 1] * s).abs() <= half[:, 0]
     inside &= (delta[:, 1] * c - delta[:, 0] * s).abs() <= half[:, 1]
     inside &= delta[:, 2].abs() <= half[:, 2]
-    seen[row[inside]] = True
-    return seen
+    visible[row[inside]] = True
+    return visible
 
 
 def _pose(states: VehicleStates, row: int) -> Transform:
-    rotation = rotation_of(states.yaw[row : row + 1], states.pitch[row : row + 1])[0]
+    rotation = rotation_from_yaw_pitch(states.yaw[row : row + 1], states.pitch[row : row + 1])[0]
     return Transform(torch.from_numpy(rotation), torch.from_numpy(states.position[row].copy()))
 
 
-def height_field(ground: Ground) -> HeightField:
+def to_height_field(ground: GroundRaster) -> HeightField:
     """The ground as rays see it."""
     return HeightField(ground.height, ground.surface, ground.x0, ground.y0, ground.cell_m, ground.surface_cell_m)
 
 
-def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> Scenario:
+def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> SimulatedScenario:
     """Traffic of the whole town, one busy crossing of it, agents among the vehicles there, and what stands around.
 
     Raises NoSceneError where no crossing has enough traffic; at least half of the vehicles near the chosen one move.
@@ -231,7 +253,7 @@ def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> Scenario:
     warmup_s = round(float(random.uniform(8.0, 15.0)), 1)
     lead = spec.lead_frames
     traffic = simulate_traffic(
-        network, spec.seed, spec.frames, 1 / spec.rate_hz, 9.0 * spec.density, warmup_s=warmup_s, lead=lead
+        network, spec.seed, spec.frames, 1 / spec.rate_hz, 9.0 * spec.density, warmup_s=warmup_s, lead_steps=lead
     )
     # SUMO counts from 0, which is the instance of what is not a vehicle.
     traffic = tuple(replace(states, id=states.id + 1) for states in traffic)
@@ -244,15 +266,15 @@ def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> Scenario:
         # Cheap refusals before the ground is drawn: a jam, and roads over roads.
         if _moving(near[lead:]).mean() < 0.5 or is_multilevel(network, middle, 1.5 * _NEAR_M):
             continue
-        field = height_field(build_ground(network, middle, _HALF_SIZE_M))
-        plot = Plot.of(field)
+        field = to_height_field(build_ground(network, middle, _HALF_SIZE_M))
+        plot = PlacementGrid.of(field)
         states = tuple(s[np.abs(plot.height(s.position[:, :2]) - s.position[:, 2]) < _LEVEL_GAP_M] for s in near)
         parked = parked_cars(network, spec.seed, middle, 110.0, float(random.uniform(0.1, 0.6)))
         parked = _parked(states[lead:], parked, random)
         states = tuple(VehicleStates.cat([now, parked]) for now in states)
         if _moving(states[lead:]).mean() < 0.5 or not all((s.id == a).any() for a in agents for s in states):
             continue
-        return _furnish(spec, network, field, plot, states, agents, middle, random)
+        return _place_static_objects(spec, network, field, plot, states, agents, middle, random)
     raise NoSceneError(
         f"{spec.name}: no crossing in {spec.town} has {spec.min_vehicles} vehicles with {spec.vehicles} cars to connect "
         f"at seed {spec.seed}; another seed or a higher density may."
@@ -289,10 +311,10 @@ def _choose_agents(
     """Cars of the traffic around the crossing, drawn one after the other with a gap between any two."""
     first = traffic[0]
     distance = np.hypot(*(first.position[:, :2] - middle).T)
-    always = np.ones(len(first), bool)
+    present_throughout = np.ones(len(first), bool)
     for states in traffic[1:]:
-        always &= np.isin(first.id, states.id)
-    rows = np.flatnonzero((first.kind == 0) & (distance > spec.low_m) & (distance < spec.high_m) & always)
+        present_throughout &= np.isin(first.id, states.id)
+    rows = np.flatnonzero((first.kind == 0) & (distance > spec.low_m) & (distance < spec.high_m) & present_throughout)
     chosen: list[int] = []
     for row in random.permutation(rows).tolist():
         gaps = np.linalg.norm(first.position[chosen, :2] - first.position[row, :2], axis=-1)
@@ -308,40 +330,42 @@ def _parked(states: tuple[VehicleStates, ...], parked: VehicleStates, random: np
     return parked[np.sort(random.permutation(len(parked))[:room])]
 
 
-def _furnish(
-    spec: ScenarioSpec, network: RoadNetwork, field: HeightField, plot: Plot, states: tuple[VehicleStates, ...],
+def _place_static_objects(
+    spec: ScenarioSpec, network: RoadNetwork, field: HeightField, plot: PlacementGrid, states: tuple[VehicleStates, ...],
     agents: tuple[int, ...], middle: Array, random: np.random.Generator,
-) -> Scenario:  # fmt: skip
+) -> SimulatedScenario:  # fmt: skip
     """A roadside unit and everything that stands still, put around vehicles that are already there."""
     drawn = states[spec.lead_frames]
     still = drawn[drawn.speed == 0]
     for position, size, yaw in zip(still.position, still.size, still.yaw):
-        plot.keep_out(position[:2], (float(size[0]) / 2 + 0.5, float(size[1]) / 2 + 0.5), float(yaw))
+        plot.occupy(position[:2], (float(size[0]) / 2 + 0.5, float(size[1]) / 2 + 0.5), float(yaw))
     roadside, solids = None, []
     if random.random() < spec.roadside_chance:
         roadside = _roadside(plot, middle, spec, random)
     if roadside is not None:
         xyz = roadside.world_from_agent.translation.numpy()
-        plot.keep_out(xyz[:2], (1.0, 1.0), 0.0)
-        solids.append(pole(xyz[:2], float(xyz[2]), roadside.lidar.height_m - 0.3, RSU_ID))
-    wish = ClutterSpec()
-    clutter = ClutterSpec(
+        plot.occupy(xyz[:2], (1.0, 1.0), 0.0)
+        solids.append(make_pole(xyz[:2], float(xyz[2]), roadside.lidar.height_m - 0.3, RSU_ID))
+    wish = RoadsideObjectSpec()
+    clutter = RoadsideObjectSpec(
         *(round(spec.clutter * n) for n in (wish.buildings, wish.walls, wish.poles, wish.trees, wish.hedges))
     )
     solids.append(
-        place_clutter(plot, replace(clutter, setback_m=float(random.uniform(1.5, 6.0))), middle, (spec.seed,))
+        place_roadside_objects(plot, replace(clutter, setback_m=float(random.uniform(1.5, 6.0))), middle, (spec.seed,))
     )
-    bodies: dict[int, Body] = {}
+    shapes: dict[int, VehicleShape] = {}
     for now in states:
         for id, kind, size in zip(now.id.tolist(), now.kind.tolist(), now.size.tolist()):
-            if id not in bodies:
-                bodies[id] = vehicle_body(LABELS[kind], tuple(size), spec.seed, id)
-    return Scenario(spec, network, field, Primitives.cat(solids), states, bodies, agents, roadside, middle)
+            if id not in shapes:
+                shapes[id] = make_vehicle_shape(LABELS[kind], tuple(size), spec.seed, id)
+    return SimulatedScenario(spec, network, field, Primitives.cat(solids), states, shapes, agents, roadside, middle)
 
 
-def _roadside(plot: Plot, middle: Array, spec: ScenarioSpec, random: np.random.Generator) -> Roadside | None:
+def _roadside(
+    plot: PlacementGrid, middle: Array, spec: ScenarioSpec, random: np.random.Generator
+) -> RoadsideUnit | None:
     """A pole beside the carriageway near the crossing, facing it, 4.5 to 6 m high; None where there is no place."""
-    places = corner_places(plot, middle)
+    places = find_pole_sites(plot, middle)
     if not len(places):
         return None
     xy = places[int(random.integers(min(len(places), 150)))]
@@ -349,4 +373,4 @@ def _roadside(plot: Plot, middle: Array, spec: ScenarioSpec, random: np.random.G
     pose = Transform.from_xyz_yaw(float(xy[0]), float(xy[1]), float(plot.height(xy)), math.atan2(toward[1], toward[0]))
     height = float(random.uniform(4.5, 6.0))
     cameras = tuple(replace(camera, z_m=height) for camera in camera_rig(spec.roadside_cameras))
-    return Roadside(pose, replace(lidar_spec(spec.roadside_lidar), height_m=height), cameras)
+    return RoadsideUnit(pose, replace(lidar_spec(spec.roadside_lidar), height_m=height), cameras)

@@ -50,12 +50,12 @@ def find_town(name: str, path: Path | str | None = None) -> Path | bytes:
     Looked for, in this order: path (a file, a folder, or py123d's wheel), $MANYEYES_TOWNS (the same), shared/data/carla_opendrive
     beside the repository or above the working directory, a CARLA installation at $CARLA_ROOT, the installed py123d.
     """
-    looked: list[str] = []
+    searched: list[str] = []
     if path is not None:
         given = _in_place(name, Path(path))
         if given is not None:
             return given
-        looked.append(str(path))
+        searched.append(str(path))
         if not Path(path).exists() or name not in TOWNS:
             raise ConfigError(
                 f"No roads for '{name}' in {path}: give an .xodr[.gz] file, a folder with {name}.xodr[.gz], or py123d's wheel."
@@ -66,13 +66,14 @@ def find_town(name: str, path: Path | str | None = None) -> Path | bytes:
         found = _in_place(name, place)
         if found is not None:
             return found
-        looked.append(str(place))
+        searched.append(str(place))
     if name not in TOWNS:
         raise ConfigError(
-            f"Unknown town '{name}'; known: {', '.join(TOWNS)}, {GENERATED}<seed>. Looked in: {'; '.join(looked)}."
+            f"Unknown town '{name}'; known: {', '.join(TOWNS)}, {GENERATED}<seed>. Looked in: {'; '.join(searched)}."
         )
     raise ConfigError(
-        f"The roads of {name} are in none of: {'; '.join(looked) or 'no place'}. Give a path, set MANYEYES_TOWNS or CARLA_ROOT, or "
+        f"The roads of {name} are in none of: {'; '.join(searched) or 'no place'}. Give a path, set MANYEYES_TOWNS "
+        "or CARLA_ROOT, or "
         f"`pip download --no-deps py123d==0.7.0 -d DIR` and give DIR; '{GENERATED}1' needs no file."
     )
 

@@ -41,7 +41,7 @@ _NETCONVERT = (
 )  # fmt: skip
 # Part of the cache's key: raise it when _for_traffic changes.
 _CONVERSION = 1
-_FASTEST_MPS = 16.7
+_MAX_SPEED_MPS = 16.7
 _TRUCK_SPEED_MPS = 22.0
 _TRAIL_S = 20.0
 _TOUCH_MARGIN_M = 0.02
@@ -51,7 +51,7 @@ _LATERAL_SIGMA_M, _LATERAL_LIMIT_M = 0.12, 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class _Edges:
+class _DrivableEdges:
     """What motor traffic can use of a SUMO net: names, lengths in m, lanes, limits in m/s and, per edge, which follow it."""
 
     name: tuple[str, ...]
@@ -69,17 +69,17 @@ def simulate_traffic(
     vehicles_per_lane_km: float = 9.0,
     count: int | None = None,
     warmup_s: float = 60.0,
-    lead: int = 0,
+    lead_steps: int = 0,
 ) -> tuple[VehicleStates, ...]:
     """Moving and waiting vehicles of the whole network, one VehicleStates a step, after warmup_s of driving.
 
-    Each vehicle walks the net at random, far enough not to arrive before the end. count overrides vehicles_per_lane_km. lead: the
-    last so many steps of the warm-up come first; the others stay as they are.
+    Each vehicle walks the net at random, far enough not to arrive before the end. count overrides vehicles_per_lane_km. lead_steps:
+    the last so many steps of the warm-up come first; the others stay as they are.
     """
-    if steps < 1 or step_s <= 0 or not 0 <= lead * step_s <= warmup_s:
+    if steps < 1 or step_s <= 0 or not 0 <= lead_steps * step_s <= warmup_s:
         raise ConfigError(
             "simulate_traffic needs steps >= 1, step_s > 0 and 0 <= lead * step_s <= warmup_s; got "
-            f"{steps}, {step_s}, {lead} and {warmup_s}."
+            f"{steps}, {step_s}, {lead_steps} and {warmup_s}."
         )
     net = sumo_net(network)
     edges = _read_edges(net)
@@ -96,19 +96,19 @@ def simulate_traffic(
             "--no-warnings", "true", "--duration-log.disable", "true", "--default.action-step-length", repr(step_s),
         ]  # fmt: skip
         output = Path(folder) / "states.npz"
-        before = min(max(lead, round(_TRAIL_S / step_s)), round(warmup_s / step_s))
+        before = min(max(lead_steps, round(_TRAIL_S / step_s)), round(warmup_s / step_s))
         skipped = round(warmup_s / step_s) - before
         job = {"arguments": arguments, "warmup_steps": skipped, "steps": steps + before, "output": str(output)}
         _run_worker(Path(folder) / "job.json", job)
         with np.load(output) as states:
             step, vehicle, state = states["step"], states["vehicle"], states["state"]
     heading = _headings(vehicle, state, size[:, 0])
-    aside = np.clip(random.normal(0.0, _LATERAL_SIGMA_M, wanted), -_LATERAL_LIMIT_M, _LATERAL_LIMIT_M)
-    shown = step >= before - lead
-    everything = _to_states(network, vehicle[shown], state[shown], heading[shown], kind, size, aside)
+    lateral_offset = np.clip(random.normal(0.0, _LATERAL_SIGMA_M, wanted), -_LATERAL_LIMIT_M, _LATERAL_LIMIT_M)
+    shown = step >= before - lead_steps
+    everything = _to_states(network, vehicle[shown], state[shown], heading[shown], kind, size, lateral_offset)
     everything = replace(everything, speed=_speeds(step, vehicle, state, step_s)[shown])
-    frames = tuple(everything[step[shown] == before + k] for k in range(-lead, steps))
-    touching = np.unique(np.concatenate([_touching(frame) for frame in frames[lead:]]))
+    frames = tuple(everything[step[shown] == before + k] for k in range(-lead_steps, steps))
+    touching = np.unique(np.concatenate([_touching(frame) for frame in frames[lead_steps:]]))
     return tuple(frame[~np.isin(frame.id, touching)] for frame in frames)
 
 
@@ -145,7 +145,7 @@ def _for_traffic(xodr: bytes) -> bytes:
             if lane.get("type") in ("parking", "bidirectional"):
                 lane.set("type", "none")
             elif lane.get("type") == "driving" and lane.find("speed") is None and stated.replace(".", "", 1).isdigit():
-                limit = min(float(stated) * unit, _FASTEST_MPS)
+                limit = min(float(stated) * unit, _MAX_SPEED_MPS)
                 ET.SubElement(lane, "speed", sOffset="0", max=f"{limit:.2f}", unit="m/s")
     return ET.tostring(root)
 
@@ -166,7 +166,7 @@ def _sumo_version() -> str:
         raise MissingExtraError("sim", "traffic") from error
 
 
-def _read_edges(net: Path) -> _Edges:
+def _read_edges(net: Path) -> _DrivableEdges:
     """Edges that cars may use and what follows each, in the file's order."""
     root = ET.parse(net).getroot()
     name, length, lanes, limit = [], [], [], []
@@ -188,7 +188,7 @@ def _read_edges(net: Path) -> _Edges:
         if one is not None and two is not None:
             following[one].add(two)
     ordered = tuple(tuple(sorted(after)) for after in _without_dead_ends(following))
-    return _Edges(tuple(name), np.array(length), np.array(lanes, np.int64), np.array(limit), ordered)
+    return _DrivableEdges(tuple(name), np.array(length), np.array(lanes, np.int64), np.array(limit), ordered)
 
 
 def _without_dead_ends(following: list[set[int]]) -> list[set[int]]:
@@ -212,7 +212,7 @@ def _admits_cars(lane: ET.Element) -> bool:
 
 def _write_routes(
     path: Path,
-    edges: _Edges,
+    edges: _DrivableEdges,
     kind: NDArray[np.int64],
     size: Array,
     random: np.random.Generator,
@@ -243,7 +243,7 @@ def _write_routes(
     ET.ElementTree(root).write(path, encoding="utf-8")
 
 
-def _walk(edges: _Edges, start: int, random: np.random.Generator, seconds: float) -> list[str]:
+def _walk(edges: _DrivableEdges, start: int, random: np.random.Generator, seconds: float) -> list[str]:
     """Edges from start, each drawn among those that follow, until driving them at the limit takes longer than ``seconds``."""
     here, route, left = start, [start], seconds + 20.0
     while left > 0 and edges.following[here]:
@@ -318,17 +318,17 @@ def _to_states(
     yaw: Array,
     kind: NDArray[np.int64],
     size: Array,
-    aside: Array,
+    lateral_offset: Array,
 ) -> VehicleStates:
     """SUMO's front bumpers as footprints on the road.
 
-    aside: (vehicles,) metres left of the lane's middle that each keeps. Wheels stand at 0.3 lengths before and behind
+    lateral_offset: (vehicles,) metres left of the lane's middle that each keeps. Wheels stand at 0.3 lengths before and behind
     the middle; their heights give pitch and z.
     """
-    size, kind, aside = size[vehicle], kind[vehicle], aside[vehicle]
+    size, kind, lateral_offset = size[vehicle], kind[vehicle], lateral_offset[vehicle]
     ahead = np.stack((np.cos(yaw), np.sin(yaw)), -1)
     left = np.stack((-ahead[:, 1], ahead[:, 0]), -1)
-    middle = state[:, :2] - ahead * size[:, :1] / 2 + left * aside[:, None]
+    middle = state[:, :2] - ahead * size[:, :1] / 2 + left * lateral_offset[:, None]
     base = size[:, :1] * 0.3
     surface = network.drivable_surface
     front = surface.height(middle + ahead * base, state[:, 2])

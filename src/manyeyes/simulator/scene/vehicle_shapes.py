@@ -19,7 +19,7 @@ _RUBBER, _GLASS, _TARPAULIN = 0.06, 0.12, 0.45
 
 
 @dataclass(frozen=True)
-class Body:
+class VehicleShape:
     """Boxes in the vehicle's frame (x forward, y left, origin on the road under its middle).
 
     center and half: (P, 3) metres; reflectivity: (P,); part: (P,) uint8, BODYWORK … CHASSIS (a CABIN has windows all around).
@@ -31,7 +31,7 @@ class Body:
     part: NDArray[np.uint8]
 
 
-def vehicle_body(kind: str, size: tuple[float, float, float], seed: int, id: int) -> Body:
+def make_vehicle_shape(kind: str, size: tuple[float, float, float], seed: int, id: int) -> VehicleShape:
     """The body of one vehicle of a kind in LABELS and size (l, w, h); proportions and paint vary with (seed, id)."""
     if kind not in LABELS:
         raise ConfigError(f"No body for a vehicle of kind '{kind}'; choose one of {', '.join(LABELS)}.")
@@ -42,7 +42,7 @@ def vehicle_body(kind: str, size: tuple[float, float, float], seed: int, id: int
     low, high = np.array([p[0] for p in parts]), np.array([p[1] for p in parts])
     scale = np.array(size)
     bright, part = np.array([min(p[2], 0.95) for p in parts]), np.array([p[3] for p in parts], np.uint8)
-    return Body((low + high) / 2 * scale, (high - low) / 2 * scale, bright, part)
+    return VehicleShape((low + high) / 2 * scale, (high - low) / 2 * scale, bright, part)
 
 
 # A part is (low corner, high corner, reflectivity, what it is) in fractions of length, width (-0.5 … 0.5) and height (0 … 1).
@@ -101,33 +101,35 @@ def _bus(paint: float, vary: Array) -> list[_Part]:
     ]
 
 
-def rotation_of(yaw: Array, pitch: Array) -> Array:
+def rotation_from_yaw_pitch(yaw: Array, pitch: Array) -> Array:
     """(N, 3, 3) world_from_vehicle: Rz(yaw) Ry(pitch) as Transform.from_rpy has it: uphill is negative."""
     c, s, cp, sp, zero = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.zeros_like(yaw)
     rows = ((c * cp, -s, c * sp), (s * cp, c, s * sp), (-sp, zero, cp))
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
-def place_bodies(bodies: list[Body], position: Array, yaw: Array, pitch: Array, ids: NDArray[np.int64]) -> Primitives:
+def place_vehicle_shapes(
+    shapes: list[VehicleShape], position: Array, yaw: Array, pitch: Array, ids: NDArray[np.int64]
+) -> Primitives:
     """Bodies at positions (N, 3) on the road as solids in the world; instance is the vehicle's id."""
-    if not bodies:
+    if not shapes:
         return Primitives.empty()
-    counts = np.array([len(b.center) for b in bodies])
-    which = np.repeat(np.arange(len(bodies)), counts)
-    rotation = rotation_of(yaw, pitch)[which]
-    local = np.concatenate([b.center for b in bodies])
+    counts = np.array([len(b.center) for b in shapes])
+    which = np.repeat(np.arange(len(shapes)), counts)
+    rotation = rotation_from_yaw_pitch(yaw, pitch)[which]
+    local = np.concatenate([b.center for b in shapes])
     center = position[which] + (rotation @ local[..., None])[..., 0]
     return Primitives(
         np.full(len(which), BOX, np.uint8),
         center,
         rotation,
-        np.concatenate([b.half for b in bodies]),
+        np.concatenate([b.half for b in shapes]),
         np.zeros(len(which)),
         ids[which],
-        np.concatenate([b.reflectivity for b in bodies]),
+        np.concatenate([b.reflectivity for b in shapes]),
     )
 
 
 def box_centers(position: Array, yaw: Array, pitch: Array, height: Array) -> Array:
     """(N, 3) centres of vehicles' boxes: half a height above the road, along the vehicle's own upright axis."""
-    return position + rotation_of(yaw, pitch)[:, :, 2] * (height / 2)[:, None]
+    return position + rotation_from_yaw_pitch(yaw, pitch)[:, :, 2] * (height / 2)[:, None]

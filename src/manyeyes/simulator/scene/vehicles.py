@@ -12,7 +12,7 @@ from manyeyes.datatypes import LABELS, ShapeError
 
 Array = NDArray[np.float64]
 
-KIND_SHARES = (0.78, 0.10, 0.07, 0.05)
+KIND_FRACTIONS = (0.78, 0.10, 0.07, 0.05)
 # Low and high of length, width, height in metres, by LABELS: what drives in European cities.
 _SIZE_RANGES = np.array(
     [
@@ -77,10 +77,10 @@ class VehicleStates:
 
 
 def draw_vehicles(
-    random: np.random.Generator, count: int, shares: tuple[float, ...] = KIND_SHARES
+    random: np.random.Generator, count: int, kind_fractions: tuple[float, ...] = KIND_FRACTIONS
 ) -> tuple[NDArray[np.int64], Array]:
     """Kinds (N,) by shares over LABELS, and sizes (N, 3); long cars tend to be wide ones."""
-    kind = random.choice(len(LABELS), count, p=shares).astype(np.int64)
+    kind = random.choice(len(LABELS), count, p=kind_fractions).astype(np.int64)
     unit = random.random((count, 3))
     unit[:, 1] = (unit[:, 0] + unit[:, 1]) / 2
     low, high = _SIZE_RANGES[kind, :, 0], _SIZE_RANGES[kind, :, 1]

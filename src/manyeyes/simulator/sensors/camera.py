@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from manyeyes.datatypes import Camera, CameraImage, ConfigError, Transform
 from manyeyes.ops.pinhole import cast_pinhole
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, GROUND, NOTHING
-from manyeyes.simulator.sensors.lidar import Scene
-from manyeyes.simulator.sensors.lighting import Light, along, develop
-from manyeyes.simulator.sensors.materials import PAINTWORK, Look
-from manyeyes.simulator.sensors.shadow import Shadows, daylight, index_shadows
-from manyeyes.simulator.sensors.texture import Spots, ground_rgb, solid_rgb
+from manyeyes.simulator.sensors.lidar import RaycastScene
+from manyeyes.simulator.sensors.lighting import Light, dot, tone_map
+from manyeyes.simulator.sensors.materials import PAINTWORK, Materials
+from manyeyes.simulator.sensors.shadow import ShadowIndex, build_shadow_index, sun_and_sky_visibility
+from manyeyes.simulator.sensors.texture import SolidPoints, ground_rgb, solid_rgb
 
 Array = NDArray[np.float64]
 Real = NDArray[np.floating]
@@ -120,23 +120,23 @@ def camera_rig(name: str) -> tuple[CameraSpec, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class LitScene:
     """A scene at one instant as cameras see it: its solids' materials, its light and what shades what."""
 
-    scene: Scene
-    look: Look
+    scene: RaycastScene
+    materials: Materials
     light: Light
-    shadows: Shadows
+    shadows: ShadowIndex
 
     @classmethod
-    def of(cls, scene: Scene, look: Look, light: Light) -> Stage:
+    def of(cls, scene: RaycastScene, materials: Materials, light: Light) -> LitScene:
         """A stage, with the index of its shadows."""
         lowest = float(scene.ground.height.min())
-        return cls(scene, look, light, index_shadows(scene.solids, light.sun, lowest, light.seed))
+        return cls(scene, materials, light, build_shadow_index(scene.solids, light.sun, lowest, light.seed))
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class RenderedImage:
     """An image, and what made it, per pixel's first ray: depth_m (height, width) along the axis, inf in the sky; instance
     (height, width): a vehicle's id (> 0), a pole's agent (< 0), 0 for anything else."""
 
@@ -145,19 +145,19 @@ class Picture:
     instance: NDArray[np.int64]
 
 
-def take(stage: Stage, world_from_agent: Transform, spec: CameraSpec, own: int = 0) -> Picture:
+def render_image(lit_scene: LitScene, world_from_agent: Transform, spec: CameraSpec, own: int = 0) -> RenderedImage:
     """The picture of one camera. own: the instance that carries it, which is not seen but throws its shadow."""
     camera, n = spec.camera, spec.samples
-    dense = camera.resized(n * camera.width, n * camera.height)
+    dense = camera.resize(n * camera.width, n * camera.height)
     world_from_camera = world_from_agent @ camera.agent_from_camera
     origin, rotation = world_from_camera.translation.numpy(), np.ascontiguousarray(world_from_camera.rotation.numpy())
-    solids = stage.scene.solids
-    sight = cast_pinhole(
-        solids, stage.scene.ground, origin, rotation, dense.intrinsic.numpy(), dense.width, dense.height,
-        spec.max_depth_m, stage.light.seed, own,
+    solids = lit_scene.scene.solids
+    hits = cast_pinhole(
+        solids, lit_scene.scene.ground, origin, rotation, dense.intrinsic.numpy(), dense.width, dense.height,
+        spec.max_depth_m, lit_scene.light.seed, own,
     )  # fmt: skip
     # (pixels, n n): where all rays of a pixel meet the same thing, one through its middle has the colour of all.
-    owner, depth = (_by_pixel(grid, n) for grid in (sight.primitive, sight.depth_m))
+    owner, depth = (_by_pixel(grid, n) for grid in (hits.primitive, hits.depth_m))
     one = (owner == owner[:, :1]).all(1)
     whole, split = np.flatnonzero(one), np.flatnonzero(~one)
     with np.errstate(divide="ignore"):  # the sky's depth is inf
@@ -167,9 +167,9 @@ def take(stage: Stage, world_from_agent: Transform, spec: CameraSpec, own: int =
     rays = np.concatenate((few.reshape(-1, 3)[whole], many))
     pixel = float(2 / (camera.intrinsic[0, 0] + camera.intrinsic[1, 1]))
     pixels = np.concatenate((np.full(len(whole), pixel), np.full(len(many), pixel / n)))
-    colour = develop(
+    colour = tone_map(
         _shade(
-            stage, np.concatenate((owner[whole, 0], owner[split].ravel())),
+            lit_scene, np.concatenate((owner[whole, 0], owner[split].ravel())),
             np.concatenate((middle, depth[split].ravel())), origin, rays, pixels,
         )
     )  # fmt: skip
@@ -180,7 +180,7 @@ def take(stage: Stage, world_from_agent: Transform, spec: CameraSpec, own: int =
     first = owner[:, 0].reshape(camera.height, camera.width)
     instance = np.append(solids.instance, 0)[np.where(first >= 0, first, -1)]
     image = CameraImage(camera, picture.permute(2, 0, 1).contiguous())
-    return Picture(image, depth[:, 0].reshape(first.shape), instance)
+    return RenderedImage(image, depth[:, 0].reshape(first.shape), instance)
 
 
 def _by_pixel(grid: NDArray, n: int) -> NDArray:
@@ -199,42 +199,46 @@ def _world_rays(world_from_camera: Array, camera: Camera) -> Array:
     return x[None, :, None] * right + y[:, None, None] * down + ahead
 
 
-def _shade(stage: Stage, owner: NDArray[np.int32], depth: Array, origin: Array, rays: Array, pixel: Array) -> Real:
+def _shade(
+    lit_scene: LitScene, owner: NDArray[np.int32], depth: Array, origin: Array, rays: Array, pixel: Array
+) -> Real:
     """Radiance (N, 3). rays: (N, 3) world axes, of depth one; pixel: (N,) the width of one at a depth of one."""
-    light = stage.light
+    light = lit_scene.light
     length = np.linalg.norm(rays, axis=1)
     toward = (rays / length[:, None]).astype(np.float32)
     radiance = np.empty((len(rays), 3), np.float32)
     sky = np.flatnonzero(owner == NOTHING)
-    radiance[sky] = light.sky(toward[sky])
+    radiance[sky] = light.sky_radiance(toward[sky])
     met = np.flatnonzero(owner != NOTHING)
     points = origin + depth[met, None] * rays[met]
     width = (pixel[met] * depth[met]).astype(np.float32)
-    surface = _surfaces(stage, owner[met], points, toward[met], width)
-    lit, open_sky = daylight(stage.shadows, points + _OFF_M * surface.face, owner[met] == GROUND)
-    facing = np.clip(along(surface.normal, light.sun), 0, 1) * (along(surface.face, light.sun) > 0)
+    surface = _surfaces(lit_scene, owner[met], points, toward[met], width)
+    lit, open_sky = sun_and_sky_visibility(lit_scene.shadows, points + _OFF_M * surface.face, owner[met] == GROUND)
+    facing = np.clip(dot(surface.normal, light.sun), 0, 1) * (dot(surface.face, light.sun) > 0)
     sun = (lit * facing).astype(np.float32)[:, None] * light.sun_rgb
-    seen = surface.albedo * (sun + light.ambient(surface.normal) * open_sky.astype(np.float32)[:, None])
+    reflected = surface.albedo * (sun + light.ambient(surface.normal) * open_sky.astype(np.float32)[:, None])
     shiny = np.flatnonzero(surface.gloss > 0.01)
-    seen[shiny] += _mirrored(light, toward[met][shiny], surface.normal[shiny], surface.gloss[shiny], lit[shiny])
-    radiance[met] = light.through_air(seen, (depth[met] * length[met]).astype(np.float32))
+    reflected[shiny] += _mirror_reflection(
+        light, toward[met][shiny], surface.normal[shiny], surface.gloss[shiny], lit[shiny]
+    )
+    radiance[met] = light.apply_haze(reflected, (depth[met] * length[met]).astype(np.float32))
     return radiance
 
 
-def _mirrored(light: Light, toward: Real, normal: Real, gloss: Real, lit: Array) -> Real:
+def _mirror_reflection(light: Light, toward: Real, normal: Real, gloss: Real, lit: Array) -> Real:
     """What lacquer and glass add: the sky by Schlick's approximation (Computer Graphics Forum 1994), and the sun's glint."""
-    across = (toward * normal).sum(1)
-    away = toward - 2 * across[:, None] * normal
-    share = _MIRROR + (1 - _MIRROR) * (1 - np.clip(np.abs(across), 0, 1)) ** 5
-    sky = light.clear_sky(away)
+    cosine = (toward * normal).sum(1)
+    away = toward - 2 * cosine[:, None] * normal
+    reflectance = _MIRROR + (1 - _MIRROR) * (1 - np.clip(np.abs(cosine), 0, 1)) ** 5
+    sky = light.clear_sky_radiance(away)
     below = np.clip(-6 * away[:, 2:3], 0, 1)
     sky = sky + below * (0.25 * light.horizon_rgb - sky)
-    glint = np.clip(along(away, light.sun), 0, 1) ** 90 * lit
-    return ((gloss * share)[:, None] * sky + (gloss * glint * 0.7)[:, None] * light.sun_rgb).astype(np.float32)
+    glint = np.clip(dot(away, light.sun), 0, 1) ** 90 * lit
+    return ((gloss * reflectance)[:, None] * sky + (gloss * glint * 0.7)[:, None] * light.sun_rgb).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
+class _SurfacePoints:
     """Of N points: normals (N, 3), of the solid itself (face) and as light takes them; albedo (N, 3); gloss (N,)."""
 
     face: Real
@@ -243,26 +247,28 @@ class _Surface:
     gloss: Real
 
 
-def _surfaces(stage: Stage, owner: NDArray[np.int32], points: Array, toward: Real, width: Real) -> _Surface:
+def _surfaces(
+    lit_scene: LitScene, owner: NDArray[np.int32], points: Array, toward: Real, width: Real
+) -> _SurfacePoints:
     n = len(points)
     face, normal, albedo = np.zeros((3, n, 3), np.float32)
-    surface = _Surface(face, normal, albedo, np.zeros(n, np.float32))
+    surface = _SurfacePoints(face, normal, albedo, np.zeros(n, np.float32))
     ground = np.flatnonzero(owner == GROUND)
-    _fill_ground(surface, ground, stage, points[ground], toward[ground], width[ground])
+    _fill_ground(surface, ground, lit_scene, points[ground], toward[ground], width[ground])
     solid = np.flatnonzero(owner >= 0)
     if len(solid):
-        _fill_solids(surface, solid, stage, owner[solid], points[solid], width[solid])
+        _fill_solids(surface, solid, lit_scene, owner[solid], points[solid], width[solid])
     return surface
 
 
 def _fill_ground(
-    surface: _Surface, rows: NDArray[np.int64], stage: Stage, points: Array, toward: Real, width: Real
+    surface: _SurfacePoints, rows: NDArray[np.int64], lit_scene: LitScene, points: Array, toward: Real, width: Real
 ) -> None:
-    field = stage.scene.ground
+    field = lit_scene.scene.ground
     x, y, cell = points[:, 0], points[:, 1], field.cell
     step = 0.5 * cell
-    gx = (_height(stage, x + step, y) - _height(stage, x - step, y)) / cell
-    gy = (_height(stage, x, y + step) - _height(stage, x, y - step)) / cell
+    gx = (_height(lit_scene, x + step, y) - _height(lit_scene, x - step, y)) / cell
+    gy = (_height(lit_scene, x, y + step) - _height(lit_scene, x, y - step)) / cell
     normal = np.stack((-gx, -gy, np.ones_like(gx)), -1)
     normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32)
     steep = np.maximum(np.abs((normal * toward).sum(1)), 0.004)
@@ -270,13 +276,13 @@ def _fill_ground(
     reach = toward[:, :2] / np.maximum(flat, 1e-6)[:, None] * (width / steep * np.maximum(flat, steep))[:, None]
     surface.face[rows], surface.normal[rows] = normal, normal
     surface.albedo[rows] = ground_rgb(
-        field, points[:, :2], reach.astype(np.float64), stage.light.wear, stage.light.seed
+        field, points[:, :2], reach.astype(np.float64), lit_scene.light.wear, lit_scene.light.seed
     )
 
 
-def _height(stage: Stage, x: Array, y: Array) -> Array:
+def _height(lit_scene: LitScene, x: Array, y: Array) -> Array:
     """Bilinear heights of the ground at points; the border value goes on outside."""
-    field = stage.scene.ground
+    field = lit_scene.scene.ground
     rows, columns = field.height.shape
     u = np.clip((x - field.x_min) / field.cell, 0, columns - 1.001)
     v = np.clip((y - field.y_min) / field.cell, 0, rows - 1.001)
@@ -286,14 +292,14 @@ def _height(stage: Stage, x: Array, y: Array) -> Array:
 
 
 def _fill_solids(
-    surface: _Surface,
+    surface: _SurfacePoints,
     rows: NDArray[np.int64],
-    stage: Stage,
+    lit_scene: LitScene,
     owner: NDArray[np.int32],
     points: Array,
     width: Real,
 ) -> None:
-    solids, look = stage.scene.solids, stage.look
+    solids, materials = lit_scene.scene.solids, lit_scene.materials
     rotation = solids.rotation[owner]
     local = np.einsum("nji,nj->ni", rotation, points - solids.center[owner])
     half, kind = solids.half[owner], solids.kind[owner]
@@ -305,7 +311,7 @@ def _fill_solids(
     face[round_] = local[round_] * (1, 1, 0)
     face[crown] = local[crown] / half[crown] ** 2
     normal = face.copy()
-    lacquer = look.material[owner] >= PAINTWORK
+    lacquer = materials.material[owner] >= PAINTWORK
     normal[lacquer] += (
         0.7 * np.sign(local[lacquer]) * np.clip(1 - (half - np.abs(local))[lacquer] / _BEVEL_M, 0, 1) ** 2
     )
@@ -314,10 +320,12 @@ def _fill_solids(
     normal[crown] = 0.5 * normal[crown] + (0, 0, 0.5)
     surface.face[rows] = np.einsum("nij,nj->ni", rotation, face)
     surface.normal[rows] = np.einsum("nij,nj->ni", rotation, normal)
-    spots = Spots(
-        local.astype(np.float32), axis, side.astype(np.float32), half.astype(np.float32), width, look.rgb[owner],
-        look.seed[owner], look.anchor[owner], look.size[owner], look.axles[owner],
+    spots = SolidPoints(
+        local.astype(np.float32), axis, side.astype(np.float32), half.astype(np.float32), width, materials.rgb[owner],
+        materials.seed[owner], materials.anchor[owner], materials.size[owner], materials.axles[owner],
     )  # fmt: skip
-    for material in np.unique(look.material[owner]):
-        here = np.flatnonzero(look.material[owner] == material)
-        surface.albedo[rows[here]], surface.gloss[rows[here]] = solid_rgb(int(material), spots[here], stage.light.seed)
+    for material in np.unique(materials.material[owner]):
+        here = np.flatnonzero(materials.material[owner] == material)
+        surface.albedo[rows[here]], surface.gloss[rows[here]] = solid_rgb(
+            int(material), spots[here], lit_scene.light.seed
+        )

@@ -15,14 +15,14 @@ _SIDE, _WAVES = 1024, 16
 def _tile() -> NDArray[np.float32]:
     """(1024, 1024) periodic noise of mean 0 and variance 1 whose amplitude falls with frequency: the same in every process."""
     random = np.random.Generator(np.random.Philox(key=7))
-    along, across = np.fft.fftfreq(_SIDE)[:, None] * _SIDE, np.fft.rfftfreq(_SIDE)[None] * _SIDE
-    frequency = np.hypot(along, across)
+    row_frequency, column_frequency = np.fft.fftfreq(_SIDE)[:, None] * _SIDE, np.fft.rfftfreq(_SIDE)[None] * _SIDE
+    frequency = np.hypot(row_frequency, column_frequency)
     frequency[0, 0] = np.inf
     tile = np.fft.irfft2(np.fft.rfft2(random.standard_normal((_SIDE, _SIDE))) / np.maximum(frequency, _WAVES) ** 1.5)
     return ((tile - tile.mean()) / tile.std()).astype(np.float32)
 
 
-def noise(xy: NDArray[np.floating], scale: float, seed: int) -> NDArray[np.floating]:
+def fractal_noise(xy: NDArray[np.floating], scale: float, seed: int) -> NDArray[np.floating]:
     """(N,) about normal values at points (N, 2), bilinear: waves as long as ``scale``, and ever weaker ones down to 1/32 of it.
 
     It repeats after 16 scales; seed shifts it.

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from manyeyes._jit import F32x2, F64x1, F64x2, I32x2, I64x1, U8x2, njit
 from manyeyes.datatypes import ConfigError, PointCloud, Transform
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.ops.raycast import GROUND, NOTHING, HeightField, Primitives, cast
+from manyeyes.ops.raycast import GROUND, NOTHING, HeightField, Primitives, cast_rays
 
 OFF_ROAD, ASPHALT, PAINT, SIDEWALK, CROSSING = range(5)
 
@@ -111,7 +111,7 @@ def lidar_spec(name: str) -> LidarSpec:
 
 
 @dataclass(frozen=True)
-class Scene:
+class RaycastScene:
     """All that a ray can meet at one instant. Instances: a vehicle's id (> 0), a pole's agent (< 0), 0 for anything else."""
 
     solids: Primitives
@@ -199,7 +199,7 @@ def _assemble(
 
 
 def scan(
-    scene: Scene, world_from_agent: Transform, spec: LidarSpec, key: tuple[int | str, ...], own: int = 0
+    scene: RaycastScene, world_from_agent: Transform, spec: LidarSpec, key: tuple[int | str, ...], own: int = 0
 ) -> tuple[PointCloud, NDArray[np.int64]]:
     """One sweep from a sensor spec.height_m above the road: the cloud in the agent's frame, and the instance of each return.
 
@@ -210,15 +210,15 @@ def scan(
     origin = world_from_agent.translation.numpy() + spec.height_m * rotation[:, 2]
     solids = scene.solids[(scene.solids.instance != own) | (scene.solids.instance == 0)] if own else scene.solids
     foliage = int(random.integers(2**63))
-    hits = cast(
+    hits = cast_rays(
         solids, scene.ground, origin, rotation, spec.elevation, spec.azimuth, spec.per_turn, spec.max_range_m, foliage
     )
     shape = hits.range_m.shape
     azimuth, elevation = spec.azimuth, spec.elevation
-    turned = (azimuth + math.pi) / (2 * math.pi)
+    turn_fraction = (azimuth + math.pi) / (2 * math.pi)
     rows, instance = _assemble(
         _HitArrays(hits.range_m, hits.primitive, hits.cosine, hits.surface),
-        _Directions(np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth), turned),
+        _Directions(np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth), turn_fraction),
         _Targets(solids.reflectivity, SURFACE_REFLECTIVITY, solids.instance),
         _Draws(random.standard_normal(shape, np.float32), random.random(shape, np.float32)),
         _ReturnModel(

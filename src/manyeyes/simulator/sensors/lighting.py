@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.simulator.sensors.fractal_noise import noise
+from manyeyes.simulator.sensors.fractal_noise import fractal_noise
 
 Array = NDArray[np.float64]
 Colour = NDArray[np.floating]
@@ -44,26 +44,32 @@ class Light:
         ground = 0.16 * (sky + self.sun_rgb * np.float32(self.sun[2]))
         return up * sky + (1 - up) * ground
 
-    def clear_sky(self, direction: NDArray[np.floating]) -> Colour:
+    def clear_sky_radiance(self, direction: NDArray[np.floating]) -> Colour:
         """Radiance from unit directions (N, 3), without clouds and without what stands on the horizon."""
         up = np.clip(direction[:, 2:3], 0, 1)
-        glow = np.clip(along(direction, self.sun), 0, 1)[:, None] ** 24
+        glow = np.clip(dot(direction, self.sun), 0, 1)[:, None] ** 24
         blue = 1 - (1 - up) ** 3.2
         return self.horizon_rgb * (1 - blue) + self.zenith_rgb * blue + (0.35 * (1 - self.cloud)) * glow * self.sun_rgb
 
-    def sky(self, direction: NDArray[np.floating]) -> Colour:
+    def sky_radiance(self, direction: NDArray[np.floating]) -> Colour:
         """What is seen beyond everything: sky with clouds, and hazy woods and roofs along the horizon."""
         up = np.maximum(direction[:, 2], 0.02)
         flat = direction[:, :2] / (up + 0.12)[:, None]
-        puff = 0.8 * noise(flat, 1.1, self.seed) + 0.4 * noise(flat, 0.4, self.seed + 1)
-        cover = _smooth(1.0 - 2.6 * self.cloud, 2.2 - 2.2 * self.cloud, puff) * _smooth(0.0, 0.12, direction[:, 2])
+        puff = 0.8 * fractal_noise(flat, 1.1, self.seed) + 0.4 * fractal_noise(flat, 0.4, self.seed + 1)
+        cover = _smoothstep(1.0 - 2.6 * self.cloud, 2.2 - 2.2 * self.cloud, puff) * _smoothstep(
+            0.0, 0.12, direction[:, 2]
+        )
         bright = 0.55 * self.horizon_rgb + 0.30 * self.sun_rgb + 0.12 * np.float32(1.0)
         white = bright * (0.92 - 0.12 * np.clip(puff, 0, 2))[:, None]
-        colour = self.clear_sky(direction)
+        colour = self.clear_sky_radiance(direction)
         colour = colour + (cover * 0.9)[:, None] * (white - colour)
         turn = np.arctan2(direction[:, 1], direction[:, 0])
         around = np.stack((np.cos(turn), np.sin(turn)), -1)
-        woods = 0.022 + 0.008 * noise(around, 0.25, self.seed + 2) + 0.003 * noise(around, 0.02, self.seed + 3)
+        woods = (
+            0.022
+            + 0.008 * fractal_noise(around, 0.25, self.seed + 2)
+            + 0.003 * fractal_noise(around, 0.02, self.seed + 3)
+        )
         roofs = np.floor(turn * 40 / math.pi)
         roofs = 0.012 + 0.055 * ((np.sin(roofs * 127.1 + self.seed % 89) * 43758.5) % 1.0) ** 3
         rise = direction[:, 2] / np.hypot(direction[:, 0], direction[:, 1])
@@ -72,7 +78,7 @@ class Light:
         colour = np.where((rise < roofs)[:, None], grey, colour)
         return np.where((rise < woods)[:, None], green, colour).astype(np.float32)
 
-    def through_air(self, radiance: Colour, distance: NDArray[np.floating]) -> Colour:
+    def apply_haze(self, radiance: Colour, distance: NDArray[np.floating]) -> Colour:
         """Radiance (N, 3) after so many metres (N,) of haze."""
         clear = np.exp(-self.haze * distance)[:, None].astype(np.float32)
         return radiance * clear + self.horizon_rgb * (1 - clear)
@@ -95,20 +101,20 @@ def draw_light(*key: int | str) -> Light:
     return Light(sun, sun_rgb, zenith, horizon, cloud, haze, wear, int(random.integers(2**31)))
 
 
-def develop(radiance: Colour) -> NDArray[np.floating]:
+def tone_map(radiance: Colour) -> NDArray[np.floating]:
     """Linear radiance to sRGB values in [0, 1]: a film's curve, then gamma. Source: Narkowicz, ACES filmic tone curve, 2015."""
     x = np.maximum(radiance, 0) * np.float32(0.6)
     toned = (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14)
     return np.clip(toned, 0, 1).astype(np.float32) ** np.float32(1 / 2.2)
 
 
-def along(vectors: NDArray[np.floating], axis: Array) -> NDArray[np.floating]:
+def dot(vectors: NDArray[np.floating], axis: Array) -> NDArray[np.floating]:
     """(N,) products of vectors (N, 3) with one: no matrix product, for its last bit can depend on the number of threads."""
     x, y, z = axis.astype(np.float32)
     return (vectors[:, 0] * x + vectors[:, 1] * y + vectors[:, 2] * z).astype(np.float32)
 
 
-def _smooth(low: float, high: float, value: NDArray[np.floating]) -> NDArray[np.floating]:
+def _smoothstep(low: float, high: float, value: NDArray[np.floating]) -> NDArray[np.floating]:
     """0 below low, 1 above high, a cubic between."""
     t = np.clip((value - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import BOX, CYLINDER, Primitives
-from manyeyes.simulator.scene.vehicle_shapes import BODYWORK, CABIN, CARGO, CHASSIS, TYRE, WINDSCREEN, Body
+from manyeyes.simulator.scene.vehicle_shapes import BODYWORK, CABIN, CARGO, CHASSIS, TYRE, WINDSCREEN, VehicleShape
 from manyeyes.simulator.scene.vehicles import VehicleStates
 
 FACADE, WALL, HEDGE, METAL, BARK, LEAVES, PLATE, SIGNAL = range(8)
@@ -30,7 +30,7 @@ _COVERS = ((0.60, 0.60, 0.58), (0.08, 0.16, 0.35), (0.40, 0.07, 0.06), (0.10, 0.
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Materials:
     """Of N primitives, in their order.
 
     material: (N,) uint8, FACADE … STEEL. rgb: (N, 3) float32 albedo. seed: (N,) float32 in [0, 1), one of each object.
@@ -47,12 +47,12 @@ class Look:
     axles: NDArray[np.float32]
 
     @classmethod
-    def cat(cls, many: list[Look]) -> Look:
+    def cat(cls, many: list[Materials]) -> Materials:
         """Several sets as one; at least one set."""
-        return cls(*(np.concatenate([getattr(look, f.name) for look in many]) for f in fields(cls)))
+        return cls(*(np.concatenate([getattr(part, f.name) for part in many]) for f in fields(cls)))
 
 
-def still_look(solids: Primitives, seed: int) -> Look:
+def make_static_materials(solids: Primitives, seed: int) -> Materials:
     """Of what stands beside the road, told by its shape, as simulator/scene/roadside_objects.py builds it."""
     n, half = len(solids), solids.half
     material = np.full(n, LEAVES, np.uint8)
@@ -82,34 +82,34 @@ def still_look(solids: Primitives, seed: int) -> Look:
     autumn = np.clip(unit[:, 2:3] * 1.6 - 0.9, 0, 1)
     leaf = (1 - autumn) * np.array([0.075, 0.14, 0.035]) + autumn * np.array([0.22, 0.15, 0.03])
     rgb[material == LEAVES] = (leaf * shade)[material == LEAVES]
-    return Look(
+    return Materials(
         material, rgb.astype(np.float32), unit[:, 4].astype(np.float32), np.zeros((n, 3), np.float32),
         (2 * half).astype(np.float32), np.full((n, 4), np.inf, np.float32),
     )  # fmt: skip
 
 
-def vehicle_look(states: VehicleStates, bodies: Mapping[int, Body], seed: int) -> Look:
+def make_vehicle_materials(states: VehicleStates, shapes: Mapping[int, VehicleShape], seed: int) -> Materials:
     """Of the vehicles' solids, in the order of bodies.place_bodies; colours vary with (seed, id)."""
-    looks = [_one_vehicle(bodies[id], size, seed, id) for id, size in zip(states.id.tolist(), states.size)]
+    parts = [_one_vehicle(shapes[id], size, seed, id) for id, size in zip(states.id.tolist(), states.size)]
     nothing = np.zeros((0, 3), np.float32)
-    none = Look(np.zeros(0, np.uint8), nothing, nothing[:, 0], nothing, nothing, np.zeros((0, 4), np.float32))
-    return Look.cat([none, *looks])
+    none = Materials(np.zeros(0, np.uint8), nothing, nothing[:, 0], nothing, nothing, np.zeros((0, 4), np.float32))
+    return Materials.cat([none, *parts])
 
 
-def _one_vehicle(body: Body, size: NDArray[np.float64], seed: int, id: int) -> Look:
-    n = len(body.part)
+def _one_vehicle(shape: VehicleShape, size: NDArray[np.float64], seed: int, id: int) -> Materials:
+    n = len(shape.part)
     random = keyed_generator(seed, "look", id)
-    lacquer = float(body.reflectivity[0])
+    lacquer = float(shape.reflectivity[0])
     palette = _DARK if lacquer < 0.25 else _MIDDLE if lacquer < 0.6 else _BRIGHT
     paint, cover = palette[int(random.integers(len(palette)))], _COVERS[int(random.integers(len(_COVERS)))]
-    material = np.array([_OF_PART[part] for part in body.part.tolist()], np.uint8)
+    material = np.array([_OF_PART[part] for part in shape.part.tolist()], np.uint8)
     rgb = np.tile(np.array(paint, np.float32), (n, 1))
     rgb[material == RUBBER], rgb[material == STEEL], rgb[material == TARPAULIN] = 0.02, 0.04, cover
     axles = np.full(4, np.inf, np.float32)
-    tyres = np.flatnonzero(body.part == TYRE)
-    axles[: len(tyres)] = body.center[tyres, 0]
-    axles[3] = body.half[tyres[0], 2] if len(tyres) else 0.0
-    return Look(
-        material, rgb, np.full(n, random.random(), np.float32), body.center.astype(np.float32),
+    tyres = np.flatnonzero(shape.part == TYRE)
+    axles[: len(tyres)] = shape.center[tyres, 0]
+    axles[3] = shape.half[tyres[0], 2] if len(tyres) else 0.0
+    return Materials(
+        material, rgb, np.full(n, random.random(), np.float32), shape.center.astype(np.float32),
         np.tile(size.astype(np.float32), (n, 1)), np.tile(axles, (n, 1)),
     )  # fmt: skip

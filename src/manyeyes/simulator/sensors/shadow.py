@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x1, F64x2, I32x1, I64x1, njit
-from manyeyes.ops.pinhole import meet
+from manyeyes.ops.pinhole import intersect_primitive
 from manyeyes.ops.raycast import BOX, ELLIPSOID, Primitives, SolidArrays, hit_ellipsoid
 
 Array = NDArray[np.float64]
@@ -28,7 +28,7 @@ _SCATTER = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Shadows:
+class ShadowIndex:
     """An index: solids first[c] … first[c + 1] of member may shade cell c = row * columns + column; sun: (3,) unit, towards it."""
 
     solids: Primitives
@@ -37,20 +37,20 @@ class Shadows:
     y_min: float
     columns: int
     rows: int
-    first: NDArray[np.int64]
+    offsets: NDArray[np.int64]
     member: NDArray[np.int32]
     seed: int
 
 
-def index_shadows(solids: Primitives, sun: Array, lowest: float, seed: int = 0) -> Shadows:
+def build_shadow_index(solids: Primitives, sun: Array, min_height: float, seed: int = 0) -> ShadowIndex:
     """Of solids whose shadows are wanted down to the height lowest; seed is that of the leaves (ops/pinhole.py)."""
     reach = np.einsum("nij,nj->ni", np.abs(solids.rotation), solids.half)
-    top = np.maximum(solids.center[:, 2] + reach[:, 2] - lowest, 0.0)
+    top = np.maximum(solids.center[:, 2] + reach[:, 2] - min_height, 0.0)
     shift = -(sun[:2] / sun[2]) * top[:, None]
     low = solids.center[:, :2] - reach[:, :2] + np.minimum(shift, 0) - _NEAR_M
     high = solids.center[:, :2] + reach[:, :2] + np.maximum(shift, 0) + _NEAR_M
     if not len(solids):
-        return Shadows(solids, sun, 0.0, 0.0, 0, 0, np.zeros(1, np.int64), np.zeros(0, np.int32), seed)
+        return ShadowIndex(solids, sun, 0.0, 0.0, 0, 0, np.zeros(1, np.int64), np.zeros(0, np.int32), seed)
     corner = low.min(0)
     columns, rows = (int(v) for v in np.ceil((high.max(0) - corner) / _CELL_M + 1e-9))
     a, b = np.floor((low - corner) / _CELL_M).astype(np.int64), np.floor((high - corner) / _CELL_M).astype(np.int64)
@@ -64,11 +64,11 @@ def index_shadows(solids: Primitives, sun: Array, lowest: float, seed: int = 0) 
     cell, member = cell[kept], member[kept]
     order = np.argsort(cell, kind="stable")
     first = np.searchsorted(cell[order], np.arange(rows * columns + 1))
-    return Shadows(solids, sun, float(corner[0]), float(corner[1]), columns, rows, first, member[order], seed)
+    return ShadowIndex(solids, sun, float(corner[0]), float(corner[1]), columns, rows, first, member[order], seed)
 
 
 class _ShadowIndex(NamedTuple):
-    """The cells of :class:`Shadows` and the solids first[c] … first[c + 1] of member that may shade each."""
+    """The cells of :class:`ShadowIndex` and the solids first[c] … first[c + 1] of member that may shade each."""
 
     x_min: float
     y_min: float
@@ -119,17 +119,17 @@ def _light(
                 if leave < math.inf and enter == 0.0:
                     lit[n] *= math.exp(-_SCATTER * density[i] * leave)
                     continue
-            if meet(kind[i], half[i], density[i], o, d0, d1, d2, seed + i) < math.inf:
+            if intersect_primitive(kind[i], half[i], density[i], o, d0, d1, d2, seed + i) < math.inf:
                 lit[n] = 0.0
 
 
-def daylight(shadows: Shadows, points: Array, on_ground: NDArray[np.bool_]) -> tuple[Array, Array]:
+def sun_and_sky_visibility(shadows: ShadowIndex, points: Array, on_ground: NDArray[np.bool_]) -> tuple[Array, Array]:
     """At points (N, 3): the share of the sun that comes through, (N,), and of the sky that is open, (N,), both in [0, 1].
 
     Points on a solid must lie a little outside it. Only what lies on the ground is darkened by what stands beside it.
     """
     lit, open_sky = np.ones(len(points)), np.ones(len(points))
-    index = _ShadowIndex(shadows.x_min, shadows.y_min, shadows.columns, shadows.rows, shadows.first, shadows.member)
+    index = _ShadowIndex(shadows.x_min, shadows.y_min, shadows.columns, shadows.rows, shadows.offsets, shadows.member)
     at = np.ascontiguousarray(points, np.float64)
     _light(shadows.solids.arrays, shadows.sun, index, shadows.seed, at, on_ground, lit, open_sky)
     return lit, open_sky

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.study import Condition, Sweep
+from manyeyes.evaluation.study import Condition, ResultGrid
 from manyeyes.models import checkpoint
-from manyeyes.studies.detection.perturbations import PERFECT, Disturbance
-from manyeyes.studies.running import OURS, PAPER, carry_out, publish, start, with_replay
-from manyeyes.viz.curves import Curve, Panel
-from manyeyes.viz.study_table import Sheet, change, log2, number, value
+from manyeyes.studies.detection.perturbations import CLEAN, Perturbation
+from manyeyes.studies.running import OURS, PAPER_NOTE, prepare_study, run_study, with_replay, write_study_report
+from manyeyes.viz.curves import Curve, CurvePanel
+from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_log2, format_number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
     from manyeyes.studies.options import Options
 
-MASKED = "learned"
-UNDER = (PERFECT, Disturbance(delay_s=0.2), Disturbance(position_m=0.4))
-PAPER_TABLE = (
+LEARNED_MASK = "learned"
+PERTURBATIONS = (CLEAN, Perturbation(delay_s=0.2), Perturbation(position_sigma_m=0.4))
+PAPER_ROWS = (
     ("none", 0.875, 0.831, 0.762, 16.43),
     ("SE", 0.897, 0.842, 0.790, 16.94),
     ("SE, DAST", 0.919, 0.849, 0.883, 16.94),
@@ -41,18 +41,20 @@ PAPER_TABLE = (
 
 
 @dataclass(frozen=True)
-class Row:
-    """A branch. ap: at IoU 0.5 and 0.7 under each of UNDER; over_last: AP@0.5 over the branch before. card: of its weights."""
+class AblationRow:
+    """A branch. ap: at IoU 0.5 and 0.7 under each of UNDER; gain_over_previous: AP@0.5 over the branch before. card: of its
+    weights.
+    """
 
-    branch: str
+    variant: str
     ap: tuple[tuple[Interval, Interval], ...]
-    over_last: tuple[Interval, ...]
+    gain_over_previous: tuple[Interval, ...]
     bytes_per_message: float
     card: dict[str, Any]
 
 
 @dataclass(frozen=True)
-class _Branch:
+class _AblationVariant:
     """A detector, and the most bytes of a message if the trained mask is to choose its tokens."""
 
     name: str
@@ -61,109 +63,124 @@ class _Branch:
 
     @property
     def method(self) -> str:
-        return OURS if self.budget_bytes is None else MASKED
+        return OURS if self.budget_bytes is None else LEARNED_MASK
 
-    def on(self, base: BenchmarkConfig) -> BenchmarkConfig:
+    def apply_to(self, base: BenchmarkConfig) -> BenchmarkConfig:
         """The configuration of a benchmark of this branch."""
         config = replace(base, methods=(self.method,), weights=str(self.weights))
         return config if self.budget_bytes is None else with_replay(config, budget_bytes=self.budget_bytes)
 
 
-def _branch(name: str, weights: str, most: str) -> _Branch:
-    if most and not (most.isdigit() and int(most)):
-        raise ConfigError(f"Branch {name!r}: behind @ stands a number of bytes, one or more; got {most!r}.")
-    return _Branch(name, Path(weights), int(most) if most else None)
+def _parse_variant(name: str, weights: str, max_bytes: str) -> _AblationVariant:
+    if max_bytes and not (max_bytes.isdigit() and int(max_bytes)):
+        raise ConfigError(f"Branch {name!r}: behind @ stands a number of bytes, one or more; got {max_bytes!r}.")
+    return _AblationVariant(name, Path(weights), int(max_bytes) if max_bytes else None)
 
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    branches = [
-        _branch(name, *words.partition("@")[::2])
-        for name, words in branches_of(options.branches, files="weights.safetensors[@BYTES]").items()
+    variants = [
+        _parse_variant(name, *words.partition("@")[::2])
+        for name, words in parse_checkpoints(options.checkpoints, files="weights.safetensors[@BYTES]").items()
     ]
-    begun = start(options, console)
+    context = prepare_study(options, console)
     conditions = [
-        Condition(_name(branch.name, under), under.on(branch.on(begun.base))) for branch in branches for under in UNDER
+        Condition(_condition_name(variant.name, perturbation), perturbation.apply_to(variant.apply_to(context.base)))
+        for variant in variants
+        for perturbation in PERTURBATIONS
     ]
-    cards = [checkpoint.read_card(branch.weights) for branch in branches]
-    table = rows(carry_out(begun, conditions), branches, cards)
-    sheets = [_sheet(table), _cards(table), _paper()]
-    payload: dict[str, object] = {"rows": table, "paper": {"note": PAPER, "rows": PAPER_TABLE}}
-    publish(begun, payload, sheets, panels(table), conditions, (PAPER.replace('column "paper"', "last table"),))
+    cards = [checkpoint.read_card(variant.weights) for variant in variants]
+    result_rows = make_rows(run_study(context, conditions), variants, cards)
+    tables = [_make_results_table(result_rows), _make_cards_table(result_rows), _make_paper_table()]
+    payload: dict[str, object] = {"rows": result_rows, "paper": {"note": PAPER_NOTE, "rows": PAPER_ROWS}}
+    write_study_report(
+        context,
+        payload,
+        tables,
+        make_panels(result_rows),
+        conditions,
+        (PAPER_NOTE.replace('column "paper"', "last table"),),
+    )
 
 
-def branches_of(words: Sequence[str], study: str = "ablation", files: str = "weights.safetensors") -> dict[str, str]:
+def parse_checkpoints(
+    words: Sequence[str], study: str = "ablation", files: str = "weights.safetensors"
+) -> dict[str, str]:
     """Names and files of ``name=weights.safetensors``, or whatever files the study takes."""
     pairs = [word.partition("=") for word in words]
-    odd = [word for word, (name, _, path) in zip(words, pairs) if not name or not path]
+    invalid = [word for word, (name, _, path) in zip(words, pairs) if not name or not path]
     names = [name for name, _, _ in pairs]
-    if odd or not words or len(set(names)) < len(names):
+    if invalid or not words or len(set(names)) < len(names):
         raise ConfigError(
             f"The study '{study}' takes --branches name={files} ..., each name once; got {' '.join(words) or 'none'}."
         )
     return {name: path for name, _, path in pairs}
 
 
-def _name(branch: str, under: Disturbance) -> str:
-    return f"{branch}: {under.name}"
+def _condition_name(variant: str, perturbation: Perturbation) -> str:
+    return f"{variant}: {perturbation.name}"
 
 
-def rows(done: Sweep, branches: Sequence[_Branch], cards: Sequence[dict[str, Any]]) -> tuple[Row, ...]:
+def make_rows(
+    results: ResultGrid, variants: Sequence[_AblationVariant], cards: Sequence[dict[str, Any]]
+) -> tuple[AblationRow, ...]:
     """The table, in the order of the branches."""
-    out, before = [], []
-    for branch, card in zip(branches, cards):
-        places = [(_name(branch.name, under), branch.method) for under in UNDER]
+    out, previous = [], []
+    for variant, card in zip(variants, cards):
+        keys = [(_condition_name(variant.name, perturbation), variant.method) for perturbation in PERTURBATIONS]
         out.append(
-            Row(
-                branch.name,
-                tuple((done.ap(place, 0), done.ap(place, 1)) for place in places),
-                tuple(done.less(place, other, 0) for place, other in zip(places, before)),
-                done.cells[places[0]].bytes_per_message,
+            AblationRow(
+                variant.name,
+                tuple((results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)) for key in keys),
+                tuple(results.paired_difference(key, other, 0) for key, other in zip(keys, previous)),
+                results.results[keys[0]].bytes_per_message,
                 card,
             )
         )
-        before = places
+        previous = keys
     return tuple(out)
 
 
-def _sheet(table: Sequence[Row]) -> Sheet:
-    names = [under.name for under in UNDER]
+def _make_results_table(result_rows: Sequence[AblationRow]) -> StudyTable:
+    names = [perturbation.name for perturbation in PERTURBATIONS]
     headings = (
         "branch", *(f"AP@0.5 {n}" for n in names), *(f"AP@0.7 {n}" for n in names),
         *(f"over the one before {n}" for n in names), "bytes/message", "AB log2",
     )  # fmt: skip
     lines = tuple(
         (
-            row.branch,
-            *(value(half) for half, _ in row.ap),
-            *(value(seven) for _, seven in row.ap),
-            *(tuple(map(change, row.over_last)) or ("",) * len(UNDER)),
-            number(row.bytes_per_message),
-            log2(row.bytes_per_message),
+            row.variant,
+            *(format_interval(half) for half, _ in row.ap),
+            *(format_interval(seven) for _, seven in row.ap),
+            *(tuple(map(format_difference, row.gain_over_previous)) or ("",) * len(PERTURBATIONS)),
+            format_number(row.bytes_per_message),
+            format_log2(row.bytes_per_message),
         )
-        for row in table
+        for row in result_rows
     )
-    return Sheet("Branches", headings, lines)
+    return StudyTable("Branches", headings, lines)
 
 
-def _cards(table: Sequence[Row]) -> Sheet:
-    lines = tuple((row.branch, *(str(row.card.get(key, "")) for key in ("steps", "seed", "command"))) for row in table)
-    return Sheet("How they were trained", ("branch", "steps", "seed", "command"), lines)
+def _make_cards_table(result_rows: Sequence[AblationRow]) -> StudyTable:
+    lines = tuple(
+        (row.variant, *(str(row.card.get(key, "")) for key in ("steps", "seed", "command"))) for row in result_rows
+    )
+    return StudyTable("How they were trained", ("branch", "steps", "seed", "command"), lines)
 
 
-def _paper() -> Sheet:
-    lines = tuple((name, *(f"{v:.3f}" for v in ap), f"{ab:.2f}") for name, *ap, ab in PAPER_TABLE)
-    headings = ("parts", *(under.name for under in UNDER), "AB log2")
-    return Sheet("The paper's own table, AP@0.5: another data set, unknown protocol", headings, lines)
+def _make_paper_table() -> StudyTable:
+    lines = tuple((name, *(f"{v:.3f}" for v in ap), f"{ab:.2f}") for name, *ap, ab in PAPER_ROWS)
+    headings = ("parts", *(perturbation.name for perturbation in PERTURBATIONS), "AB log2")
+    return StudyTable("The paper's own table, AP@0.5: another data set, unknown protocol", headings, lines)
 
 
-def panels(table: Sequence[Row]) -> list[Panel]:
+def make_panels(result_rows: Sequence[AblationRow]) -> list[CurvePanel]:
     """AP@0.5 and AP@0.7 of the branches, a line a disturbance."""
-    x, ticks = tuple(map(float, range(len(table)))), tuple(row.branch for row in table)
+    x, ticks = tuple(map(float, range(len(result_rows)))), tuple(row.variant for row in result_rows)
     return [
-        Panel(
+        CurvePanel(
             f"AP@{iou}", "", f"AP@{iou}",
-            tuple(Curve(u.name, tuple(row.ap[k][which] for row in table), x) for k, u in enumerate(UNDER)),
+            tuple(Curve(u.name, tuple(row.ap[k][which] for row in result_rows), x) for k, u in enumerate(PERTURBATIONS)),
             ticks=ticks,
         )
         for which, iou in enumerate(("0.5", "0.7"))

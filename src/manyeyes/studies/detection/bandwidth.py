@@ -11,24 +11,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from manyeyes.comms.payloads import PRECISIONS
+from manyeyes.comms.payloads import TOKEN_ENCODINGS
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.detection.benchmark import loaded
+from manyeyes.evaluation.detection.benchmark import load_detector
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.statistics.significance import Claim, claim
-from manyeyes.evaluation.study import Condition, Sweep
+from manyeyes.evaluation.statistics.significance import MarginTest, check_margin
+from manyeyes.evaluation.study import Condition, ResultGrid
 from manyeyes.studies.running import (
-    ALONE,
+    NO_FUSION,
     OURS,
-    carry_out,
-    claims_sheet,
-    publish,
-    selectors,
-    start,
+    make_margin_table,
+    prepare_study,
+    resolve_token_selection,
+    run_study,
     with_replay,
+    write_study_report,
 )
-from manyeyes.viz.curves import Curve, Panel
-from manyeyes.viz.study_table import Sheet, change, log2, number, value
+from manyeyes.viz.curves import Curve, CurvePanel
+from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_log2, format_number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,161 +36,202 @@ if TYPE_CHECKING:
     from manyeyes.studies.options import Options
 
 BUDGETS = (1398, 2796, 4096, 8192, 16384, 32768, 65536, 131072)
-REFERENCES, WHOLE, CODES = "references", "float32", "codes"
-THREE_PACKETS, FEWER = 4096, 4.7
+UNLIMITED, REFERENCE_ENCODING, CODEBOOK = "references", "float32", "codes"
+THREE_PACKETS_BYTES, MIN_COMPRESSION_RATIO = 4096, 4.7
 
 
 @dataclass(frozen=True)
-class Row:
-    """Tokens chosen and written in one way within a budget, None: all. lost: AP less than with all tokens at float32.
+class BandwidthRow:
+    """Tokens chosen and written in one way within a budget, None: all. ap_drop: AP less than with all tokens at float32.
 
-    bytes_per_message: mean; largest: of one message. fewer: how many times fewer bytes than all tokens at float32.
+    bytes_per_message: mean; max_message_bytes: of one message. compression_ratio: how many times fewer bytes than all tokens at
+    float32.
     """
 
     budget_bytes: int | None
-    precision: str
-    selector: str
+    token_encoding: str
+    method: str
     ap: tuple[Interval, Interval]
-    lost: tuple[Interval, Interval] | None
+    ap_drop: tuple[Interval, Interval] | None
     bytes_per_message: float
-    largest: int
-    fewer: float | None
+    max_message_bytes: int
+    compression_ratio: float | None
 
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    begun, chosen = start(options, console), selectors(options)
-    precisions = _precisions(options)
+    context, methods = prepare_study(options, console), resolve_token_selection(options)
+    encodings = _resolve_encodings(options)
     budgets = (*sorted(options.budgets or BUDGETS), None)
-    others = tuple(m for m in begun.base.methods if m not in chosen)
+    others = tuple(m for m in context.base.methods if m not in methods)
     conditions = [
-        Condition(_name(b, p), with_replay(replace(begun.base, methods=chosen), precision=p, budget_bytes=b))
-        for p in precisions
+        Condition(
+            _condition_name(b, p), with_replay(replace(context.base, methods=methods), token_encoding=p, budget_bytes=b)
+        )
+        for p in encodings
         for b in budgets
     ]
-    if WHOLE not in precisions:
-        config = with_replay(replace(begun.base, methods=chosen), precision=WHOLE, budget_bytes=None)
-        conditions.append(Condition(_name(None, WHOLE), config))
+    if REFERENCE_ENCODING not in encodings:
+        config = with_replay(
+            replace(context.base, methods=methods), token_encoding=REFERENCE_ENCODING, budget_bytes=None
+        )
+        conditions.append(Condition(_condition_name(None, REFERENCE_ENCODING), config))
     if others:
-        conditions.append(Condition(REFERENCES, replace(begun.base, methods=others)))
-    done = carry_out(begun, conditions)
-    table = rows(done, precisions, budgets, chosen)
-    beside = tuple(
-        Row(None, "", m, (done.ap((REFERENCES, m), 0), done.ap((REFERENCES, m), 1)), None,
-            done.cells[REFERENCES, m].bytes_per_message, done.cells[REFERENCES, m].volume.largest, None)
+        conditions.append(Condition(UNLIMITED, replace(context.base, methods=others)))
+    results = run_study(context, conditions)
+    result_rows = make_rows(results, encodings, budgets, methods)
+    reference_rows = tuple(
+        BandwidthRow(None, "", m, (results.bootstrap_ap((UNLIMITED, m), 0), results.bootstrap_ap((UNLIMITED, m), 1)), None,
+            results.results[UNLIMITED, m].bytes_per_message, results.results[UNLIMITED, m].volume.max_message_bytes, None)
         for m in others
     )  # fmt: skip
-    held = claims(done, table, precisions, budgets, chosen)
-    sheets = [_sheet(f"Tokens as {p}", [row for row in table if row.precision == p]) for p in precisions]
-    sheets += [_sheet("Beside", beside)] if beside else []
-    sheets += [claims_sheet(held)] if held else []
-    payload: dict[str, object] = {"rows": table, "beside": beside, "claims": held}
-    publish(begun, payload, sheets, panels(table, beside), conditions)
+    margin_tests = check_margins(results, result_rows, encodings, budgets, methods)
+    tables = [
+        _make_results_table(f"Tokens as {p}", [row for row in result_rows if row.token_encoding == p])
+        for p in encodings
+    ]
+    tables += [_make_results_table("Beside", reference_rows)] if reference_rows else []
+    tables += [make_margin_table(margin_tests)] if margin_tests else []
+    payload: dict[str, object] = {"rows": result_rows, "beside": reference_rows, "claims": margin_tests}
+    write_study_report(context, payload, tables, make_panels(result_rows, reference_rows), conditions)
 
 
-def _precisions(options: Options) -> tuple[str, ...]:
+def _resolve_encodings(options: Options) -> tuple[str, ...]:
     """Those asked for, or all that the weights can write: codes need a codebook."""
-    for name in options.precisions:
-        if name not in PRECISIONS:
-            raise ConfigError(f"Tokens are not written as {name!r}; known: {', '.join(PRECISIONS)}.")
-    has_codes = loaded(options.playing.weights).codebook is not None
-    return options.precisions or tuple(name for name in PRECISIONS if name != CODES or has_codes)
+    for name in options.token_encodings:
+        if name not in TOKEN_ENCODINGS:
+            raise ConfigError(f"Tokens are not written as {name!r}; known: {', '.join(TOKEN_ENCODINGS)}.")
+    has_codes = load_detector(options.replay_options.weights).codebook is not None
+    return options.token_encodings or tuple(name for name in TOKEN_ENCODINGS if name != CODEBOOK or has_codes)
 
 
-def _name(budget: int | None, precision: str) -> str:
-    return f"{'all' if budget is None else budget} {precision}"
+def _condition_name(budget: int | None, encoding: str) -> str:
+    return f"{'all' if budget is None else budget} {encoding}"
 
 
-def rows(
-    done: Sweep, precisions: Sequence[str], budgets: Sequence[int | None], chosen: Sequence[str]
-) -> tuple[Row, ...]:
+def make_rows(
+    results: ResultGrid, encodings: Sequence[str], budgets: Sequence[int | None], methods: Sequence[str]
+) -> tuple[BandwidthRow, ...]:
     """The table: precisions, budgets, selectors."""
     out = []
-    for precision in precisions:
+    for encoding in encodings:
         for budget in budgets:
-            for selector in chosen:
-                place, whole = (_name(budget, precision), selector), (_name(None, WHOLE), selector)
-                cell, all_of_it = done.cells[place], done.cells[whole]
-                sent = cell.bytes_per_message
+            for method in methods:
+                key, reference_key = (
+                    (_condition_name(budget, encoding), method),
+                    (_condition_name(None, REFERENCE_ENCODING), method),
+                )
+                result, reference = results.results[key], results.results[reference_key]
+                bytes_per_message = result.bytes_per_message
                 out.append(
-                    Row(
+                    BandwidthRow(
                         budget,
-                        precision,
-                        selector,
-                        (done.ap(place, 0), done.ap(place, 1)),
-                        (done.less(whole, place, 0), done.less(whole, place, 1)),
-                        sent,
-                        cell.volume.largest,
-                        all_of_it.bytes_per_message / sent if sent else None,
+                        encoding,
+                        method,
+                        (results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)),
+                        (
+                            results.paired_difference(reference_key, key, 0),
+                            results.paired_difference(reference_key, key, 1),
+                        ),
+                        bytes_per_message,
+                        result.volume.max_message_bytes,
+                        reference.bytes_per_message / bytes_per_message if bytes_per_message else None,
                     )
                 )
     return tuple(out)
 
 
-def claims(
-    done: Sweep,
-    table: Sequence[Row],
-    precisions: Sequence[str],
+def check_margins(
+    results: ResultGrid,
+    result_rows: Sequence[BandwidthRow],
+    encodings: Sequence[str],
     budgets: Sequence[int | None],
-    chosen: Sequence[str],
-) -> tuple[Claim, ...]:
+    methods: Sequence[str],
+) -> tuple[MarginTest, ...]:
     """What is claimed of our selection: little lost at few bytes, never worse than a rival at equal budgets."""
-    if OURS not in chosen:
+    if OURS not in methods:
         return ()
-    out: list[Claim] = []
-    whole = (_name(None, WHOLE), OURS)
-    few = [r for r in table if r.selector == OURS and r.precision == WHOLE and r.fewer and r.fewer >= FEWER]
-    if few:
-        most = max(few, key=lambda row: row.bytes_per_message)
-        what = f"{most.fewer:.1f} times fewer bytes - all, {WHOLE}"
-        out.append(claim(what, done, (_name(most.budget_bytes, WHOLE), OURS), whole, 0, -0.005))
-    short = [p for p in precisions if p not in ("float32", "float16")]
-    if THREE_PACKETS in budgets:
-        for p in short:
+    out: list[MarginTest] = []
+    reference_key = (_condition_name(None, REFERENCE_ENCODING), OURS)
+    compressed = [
+        r
+        for r in result_rows
+        if r.method == OURS
+        and r.token_encoding == REFERENCE_ENCODING
+        and r.compression_ratio
+        and r.compression_ratio >= MIN_COMPRESSION_RATIO
+    ]
+    if compressed:
+        largest_row = max(compressed, key=lambda row: row.bytes_per_message)
+        description = f"{largest_row.compression_ratio:.1f} times fewer bytes - all, {REFERENCE_ENCODING}"
+        out.append(
+            check_margin(
+                description,
+                results,
+                (_condition_name(largest_row.budget_bytes, REFERENCE_ENCODING), OURS),
+                reference_key,
+                0,
+                -0.005,
+            )
+        )
+    compact_encodings = [p for p in encodings if p not in ("float32", "float16")]
+    if THREE_PACKETS_BYTES in budgets:
+        for p in compact_encodings:
             out.append(
-                claim(
-                    f"{THREE_PACKETS} B as {p} - all, {WHOLE}", done, (_name(THREE_PACKETS, p), OURS), whole, 0, -0.01
+                check_margin(
+                    f"{THREE_PACKETS_BYTES} B as {p} - all, {REFERENCE_ENCODING}",
+                    results,
+                    (_condition_name(THREE_PACKETS_BYTES, p), OURS),
+                    reference_key,
+                    0,
+                    -0.01,
                 )
             )
-    for precision in precisions:
+    for encoding in encodings:
         for budget in (b for b in budgets if b is not None):
-            for rival in (s for s in chosen if s != OURS):
-                name = _name(budget, precision)
-                out.append(claim(f"{OURS} - {rival}, {name}", done, (name, OURS), (name, rival), 0, 0.0))
+            for baseline in (s for s in methods if s != OURS):
+                name = _condition_name(budget, encoding)
+                out.append(
+                    check_margin(f"{OURS} - {baseline}, {name}", results, (name, OURS), (name, baseline), 0, 0.0)
+                )
     return tuple(out)
 
 
-def _sheet(title: str, table: Sequence[Row]) -> Sheet:
+def _make_results_table(title: str, result_rows: Sequence[BandwidthRow]) -> StudyTable:
     headings = (
         "budget B", "selector", "AP@0.5", "AP@0.7", "lost @0.5", "lost @0.7", "bytes/message", "AB log2", "largest B", "fewer",
     )  # fmt: skip
     lines = tuple(
         (
-            "" if not row.precision else "all" if row.budget_bytes is None else f"{row.budget_bytes:,}",
-            row.selector,
-            *map(value, row.ap),
-            *(map(change, row.lost) if row.lost else ("", "")),
-            number(row.bytes_per_message),
-            log2(row.bytes_per_message),
-            number(row.largest),
-            "" if row.fewer is None else f"{row.fewer:.1f} x",
+            "" if not row.token_encoding else "all" if row.budget_bytes is None else f"{row.budget_bytes:,}",
+            row.method,
+            *map(format_interval, row.ap),
+            *(map(format_difference, row.ap_drop) if row.ap_drop else ("", "")),
+            format_number(row.bytes_per_message),
+            format_log2(row.bytes_per_message),
+            format_number(row.max_message_bytes),
+            "" if row.compression_ratio is None else f"{row.compression_ratio:.1f} x",
         )
-        for row in table
+        for row in result_rows
     )
-    return Sheet(title, headings, lines)
+    return StudyTable(title, headings, lines)
 
 
-def panels(table: Sequence[Row], beside: Sequence[Row]) -> list[Panel]:
+def make_panels(result_rows: Sequence[BandwidthRow], reference_rows: Sequence[BandwidthRow]) -> list[CurvePanel]:
     """AP@0.5 against the mean bytes of a message, a panel a precision."""
     out = []
-    for precision in dict.fromkeys(row.precision for row in table):
+    for encoding in dict.fromkeys(row.token_encoding for row in result_rows):
         curves = []
-        for selector in dict.fromkeys(row.selector for row in table):
-            own = [r for r in table if (r.precision, r.selector) == (precision, selector) and r.bytes_per_message]
-            if own:
-                curves.append(Curve(selector, tuple(r.ap[0] for r in own), tuple(r.bytes_per_message for r in own)))
-        for row in beside:
-            sent = (row.bytes_per_message,) if row.bytes_per_message and row.selector != ALONE else ()
-            curves.append(Curve(row.selector, (row.ap[0],), sent))
-        out.append(Panel(f"Tokens as {precision}", "bytes a message, mean", "AP@0.5", tuple(curves), in_bytes=True))
+        for method in dict.fromkeys(row.method for row in result_rows):
+            method_rows = [
+                r for r in result_rows if (r.token_encoding, r.method) == (encoding, method) and r.bytes_per_message
+            ]
+            if method_rows:
+                curves.append(
+                    Curve(method, tuple(r.ap[0] for r in method_rows), tuple(r.bytes_per_message for r in method_rows))
+                )
+        for row in reference_rows:
+            message_bytes = (row.bytes_per_message,) if row.bytes_per_message and row.method != NO_FUSION else ()
+            curves.append(Curve(row.method, (row.ap[0],), message_bytes))
+        out.append(CurvePanel(f"Tokens as {encoding}", "bytes a message, mean", "AP@0.5", tuple(curves), in_bytes=True))
     return out

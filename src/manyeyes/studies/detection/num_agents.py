@@ -12,107 +12,115 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.detection.average_precision import protocol_named
+from manyeyes.evaluation.detection.average_precision import get_protocol
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.study import Condition, Place, Sweep
-from manyeyes.studies.running import ALONE, carry_out, publish, start
-from manyeyes.viz.curves import Curve, Panel
-from manyeyes.viz.study_table import Sheet, change, number, value
+from manyeyes.evaluation.study import Condition, ResultGrid, ResultKey
+from manyeyes.studies.running import NO_FUSION, prepare_study, run_study, write_study_report
+from manyeyes.viz.curves import Curve, CurvePanel
+from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_number
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from manyeyes.studies.options import Options
 
-MOST = 5
+MAX_AGENTS = 5
 
 
 @dataclass(frozen=True)
-class Row:
-    """A method with so many agents, on as many scenarios as have them. instant_bytes: of all senders together, mean."""
+class NumAgentsRow:
+    """A method with so many agents, on as many scenarios as have them. mean_snapshot_bytes: of all senders together, mean."""
 
-    agents: int
+    num_agents: int
     method: str
-    scenarios: int
+    num_scenarios: int
     ap: tuple[Interval, Interval]
-    over_one_fewer: Interval | None
-    over_alone: Interval | None
+    gain_over_one_fewer: Interval | None
+    gain_over_no_fusion: Interval | None
     bytes_per_message: float
-    instant_bytes: float
+    mean_snapshot_bytes: float
 
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    if protocol_named(options.protocol).min_points_in_gt:
+    if get_protocol(options.protocol).min_points_in_gt:
         raise ConfigError(f"The study 'agents' cannot count points in true boxes, as protocol {options.protocol} does.")
-    begun = start(options, console)
-    recording, methods = begun.opener(), begun.base.methods
-    most = min(MOST, max(len(recording.agents(name)) for name in recording.scenarios))
-    hearing = tuple(m for m in methods if m != ALONE)
+    context = prepare_study(options, console)
+    recording, methods = context.opener(), context.base.methods
+    max_agents = min(MAX_AGENTS, max(len(recording.agents(name)) for name in recording.scenarios))
+    collaborative = tuple(m for m in methods if m != NO_FUSION)
     conditions = [
-        Condition(str(n), replace(begun.base, agents=n, methods=methods if n == 1 else hearing))
-        for n in range(1, most + 1)
-        if n == 1 or hearing
+        Condition(str(n), replace(context.base, num_agents=n, methods=methods if n == 1 else collaborative))
+        for n in range(1, max_agents + 1)
+        if n == 1 or collaborative
     ]
-    done = carry_out(begun, conditions)
-    table = rows(done)
-    publish(begun, {"rows": table}, [_sheet(table)], panels(table), conditions)
-
-
-def rows(done: Sweep) -> tuple[Row, ...]:
-    """The table, by number of agents."""
-    return tuple(_row(done, int(name), method) for name, method in done.cells)
-
-
-def _row(done: Sweep, agents: int, method: str) -> Row:
-    place, fewer, alone = (str(agents), method), (str(agents - 1), method), ("1", ALONE)
-    cell, here = done.cells[place], done.scenarios(place)
-
-    def over(other: Place) -> Interval | None:
-        return done.less(place, other, 0, here) if other in done.cells and other != place else None
-
-    return Row(
-        agents,
-        method,
-        len(here),
-        (done.ap(place, 0), done.ap(place, 1)),
-        over(fewer),
-        over(alone),
-        cell.bytes_per_message,
-        cell.volume.instant_mean,
+    results = run_study(context, conditions)
+    result_rows = make_rows(results)
+    write_study_report(
+        context, {"rows": result_rows}, [_make_results_table(result_rows)], make_panels(result_rows), conditions
     )
 
 
-def _sheet(table: Sequence[Row]) -> Sheet:
+def make_rows(results: ResultGrid) -> tuple[NumAgentsRow, ...]:
+    """The table, by number of agents."""
+    return tuple(_make_row(results, int(name), method) for name, method in results.results)
+
+
+def _make_row(results: ResultGrid, num_agents: int, method: str) -> NumAgentsRow:
+    key, fewer_key, no_fusion_key = (str(num_agents), method), (str(num_agents - 1), method), ("1", NO_FUSION)
+    result, scenarios = results.results[key], results.scenarios_of(key)
+
+    def gain_over(other: ResultKey) -> Interval | None:
+        return (
+            results.paired_difference(key, other, 0, scenarios) if other in results.results and other != key else None
+        )
+
+    return NumAgentsRow(
+        num_agents,
+        method,
+        len(scenarios),
+        (results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)),
+        gain_over(fewer_key),
+        gain_over(no_fusion_key),
+        result.bytes_per_message,
+        result.volume.mean_snapshot_bytes,
+    )
+
+
+def _make_results_table(result_rows: Sequence[NumAgentsRow]) -> StudyTable:
     headings = (
         "agents", "method", "scenarios", "AP@0.5", "AP@0.7", "over one fewer @0.5", "over alone @0.5", "bytes/message",
         "bytes/instant",
     )  # fmt: skip
     lines = tuple(
         (
-            str(row.agents),
+            str(row.num_agents),
             row.method,
-            str(row.scenarios),
-            *map(value, row.ap),
-            change(row.over_one_fewer),
-            change(row.over_alone),
-            number(row.bytes_per_message),
-            number(row.instant_bytes),
+            str(row.num_scenarios),
+            *map(format_interval, row.ap),
+            format_difference(row.gain_over_one_fewer),
+            format_difference(row.gain_over_no_fusion),
+            format_number(row.bytes_per_message),
+            format_number(row.mean_snapshot_bytes),
         )
-        for row in table
+        for row in result_rows
     )
-    return Sheet("Agents", headings, lines)
+    return StudyTable("Agents", headings, lines)
 
 
-def panels(table: Sequence[Row]) -> list[Panel]:
+def make_panels(result_rows: Sequence[NumAgentsRow]) -> list[CurvePanel]:
     """AP by number of agents on all scenarios that have them, and what that is over ego alone on the same scenarios."""
-    methods = [m for m in dict.fromkeys(row.method for row in table) if m != ALONE]
-    whole, gain = [], []
+    methods = [m for m in dict.fromkeys(row.method for row in result_rows) if m != NO_FUSION]
+    ap_curves, gain_curves = [], []
     for method in methods:
-        own = [row for row in table if row.method == method]
-        whole.append(Curve(method, tuple(r.ap[0] for r in own), tuple(float(r.agents) for r in own)))
-        over = [(r.over_alone, float(r.agents)) for r in own if r.over_alone is not None]
-        if over:
-            gain.append(Curve(method, tuple(y for y, _ in over), tuple(x for _, x in over)))
-    out = [Panel("Scenarios that have them", "agents", "AP@0.5", tuple(whole))] if whole else []
-    return out + ([Panel("The same scenarios", "agents", "AP@0.5 over ego alone", tuple(gain))] if gain else [])
+        method_rows = [row for row in result_rows if row.method == method]
+        ap_curves.append(
+            Curve(method, tuple(r.ap[0] for r in method_rows), tuple(float(r.num_agents) for r in method_rows))
+        )
+        gains = [(r.gain_over_no_fusion, float(r.num_agents)) for r in method_rows if r.gain_over_no_fusion is not None]
+        if gains:
+            gain_curves.append(Curve(method, tuple(y for y, _ in gains), tuple(x for _, x in gains)))
+    out = [CurvePanel("Scenarios that have them", "agents", "AP@0.5", tuple(ap_curves))] if ap_curves else []
+    return out + (
+        [CurvePanel("The same scenarios", "agents", "AP@0.5 over ego alone", tuple(gain_curves))] if gain_curves else []
+    )

@@ -12,61 +12,65 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
 from manyeyes.studies.running import with_replay
 
-LATEST = 4
+MAX_DELAY_FRAMES = 4
 """Frames between the capture of a message and its use at the greatest delay, 0.4 s at 10 Hz."""
 
 
 @dataclass(frozen=True)
-class Disturbance:
-    """delay_s: how much later every packet comes, while the ego waits for none. heading_deg, position_m: standard deviations
-    of collaborators' claimed poses, anew in each frame. loss: share of packets lost.
+class Perturbation:
+    """delay_s: how much later every packet comes, while the ego waits for none. heading_sigma_deg, position_sigma_m: standard
+    deviations of collaborators' claimed poses, anew in each frame. packet_loss: share of packets lost.
     """
 
     delay_s: float = 0.0
-    heading_deg: float = 0.0
-    position_m: float = 0.0
-    loss: float = 0.0
+    heading_sigma_deg: float = 0.0
+    position_sigma_m: float = 0.0
+    packet_loss: float = 0.0
 
     @property
     def name(self) -> str:
         """How tables call it."""
         parts = (
             (self.delay_s, f"{self.delay_s:g} s"),
-            (self.heading_deg, f"{self.heading_deg:g}°"),
-            (self.position_m, f"{self.position_m:g} m"),
-            (self.loss, f"{100 * self.loss:g} % lost"),
+            (self.heading_sigma_deg, f"{self.heading_sigma_deg:g}°"),
+            (self.position_sigma_m, f"{self.position_sigma_m:g} m"),
+            (self.packet_loss, f"{100 * self.packet_loss:g} % lost"),
         )
         return ", ".join(text for level, text in parts if level) or "perfect"
 
-    def on(self, config: BenchmarkConfig) -> BenchmarkConfig:
+    def apply_to(self, config: BenchmarkConfig) -> BenchmarkConfig:
         """The configuration under it.
 
         Under any, as many more frames are played before the first judged one as the latest message is late: conditions of one
         history share what their agents see.
         """
-        radio, played = config.replay.radio, config.replay
+        radio, replay = config.replay.radio, config.replay
         channel = replace(radio, base_latency_s=radio.base_latency_s + self.delay_s)
-        noise = PoseNoise("collaborators_iid", self.position_m, math.radians(self.heading_deg), played.seed)
-        disturbed = with_replay(
-            config, channel=channel.with_loss(self.loss) if self.loss else channel, history=played.history + LATEST
+        noise = PoseNoise("collaborators_iid", self.position_sigma_m, math.radians(self.heading_sigma_deg), replay.seed)
+        perturbed = with_replay(
+            config,
+            channel=channel.with_loss(self.packet_loss) if self.packet_loss else channel,
+            warmup_frames=replay.warmup_frames + MAX_DELAY_FRAMES,
         )
-        return replace(disturbed, noise=noise if self.position_m or self.heading_deg else config.noise)
+        return replace(
+            perturbed, pose_noise=noise if self.position_sigma_m or self.heading_sigma_deg else config.pose_noise
+        )
 
 
-PERFECT = Disturbance()
+CLEAN = Perturbation()
 
 
-def chosen(names: Sequence[str], among: Sequence[Disturbance]) -> tuple[Disturbance, ...]:
+def select_perturbations(names: Sequence[str], candidates: Sequence[Perturbation]) -> tuple[Perturbation, ...]:
     """The perfect setting and those of a study's disturbances that have these names; all of them for none."""
-    unknown = sorted(set(names) - {d.name for d in among})
+    unknown = sorted(set(names) - {d.name for d in candidates})
     if unknown:
-        raise ConfigError(f"No disturbance {unknown[0]!r}; choose from {', '.join(d.name for d in among)}.")
-    return tuple(d for d in among if not names or d == PERFECT or d.name in names)
+        raise ConfigError(f"No disturbance {unknown[0]!r}; choose from {', '.join(d.name for d in candidates)}.")
+    return tuple(d for d in candidates if not names or d == CLEAN or d.name in names)
 
 
-DELAYS = tuple(Disturbance(delay_s=d) for d in (0.1, 0.2, 0.3, 0.4))
-HEADINGS = tuple(Disturbance(heading_deg=h) for h in (0.2, 0.4, 0.6, 0.8))
-POSITIONS = tuple(Disturbance(position_m=p) for p in (0.2, 0.4, 0.6, 0.8))
-LOSSES = tuple(Disturbance(loss=p) for p in (0.1, 0.2, 0.3))
-JOINT = Disturbance(0.1, 0.2, 0.2)
-HARD = Disturbance(0.4, 0.8, 0.8, 0.3)
+DELAYS = tuple(Perturbation(delay_s=d) for d in (0.1, 0.2, 0.3, 0.4))
+HEADINGS = tuple(Perturbation(heading_sigma_deg=h) for h in (0.2, 0.4, 0.6, 0.8))
+POSITIONS = tuple(Perturbation(position_sigma_m=p) for p in (0.2, 0.4, 0.6, 0.8))
+LOSSES = tuple(Perturbation(packet_loss=p) for p in (0.1, 0.2, 0.3))
+COMBINED = Perturbation(0.1, 0.2, 0.2)
+COMBINED_SEVERE = Perturbation(0.4, 0.8, 0.8, 0.3)

@@ -10,19 +10,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from manyeyes.agents.replay import Step, replay
+from manyeyes.agents.replay import ReplayStep, replay
 from manyeyes.datatypes import BevGrid
-from manyeyes.evaluation.detection.accumulator import Tally
-from manyeyes.evaluation.detection.average_precision import Protocol
-from manyeyes.evaluation.detection.benchmark import judging_protocol
+from manyeyes.evaluation.detection.accumulator import MetricAccumulator
+from manyeyes.evaluation.detection.average_precision import DetectionProtocol
+from manyeyes.evaluation.detection.benchmark import resolve_protocol
 from manyeyes.evaluation.study import Condition
 from manyeyes.models import pretrained
-from manyeyes.studies.detection.perturbations import JOINT
-from manyeyes.studies.replay_options import excerpt
-from manyeyes.studies.running import publish, start
-from manyeyes.viz.birds_eye import draw, save_png, scene_of
-from manyeyes.viz.canvas import pillow
-from manyeyes.viz.study_table import Sheet, number
+from manyeyes.studies.detection.perturbations import COMBINED
+from manyeyes.studies.replay_options import make_excerpt
+from manyeyes.studies.running import prepare_study, write_study_report
+from manyeyes.viz.birds_eye import draw_scene, make_scene, save_png
+from manyeyes.viz.canvas import import_pillow
+from manyeyes.viz.study_table import StudyTable, format_number
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -30,29 +30,29 @@ if TYPE_CHECKING:
 
     from manyeyes.studies.options import Options
 
-WIDTH, COLUMNS, SCORE_MIN = 960, 2, 0.4
+WIDTH, COLUMNS, MIN_SCORE = 960, 2, 0.4
 
 
 @dataclass(frozen=True)
-class Row:
+class QualitativeRow:
     """A method in the frame: true boxes, those found at IoU 0.5 and 0.7, and what was neither, with scores from SCORE_MIN."""
 
     method: str
-    true: int
-    found: tuple[int, int]
-    false: tuple[int, int]
+    num_true: int
+    num_found: tuple[int, int]
+    num_false: tuple[int, int]
     bytes_per_message: float
 
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    begun = start(options, console)
-    config, recording = JOINT.on(begun.base), begun.opener()
+    context = prepare_study(options, console)
+    config, recording = COMBINED.apply_to(context.base), context.opener()
     scenario = max(recording.scenarios, key=lambda name: len(recording.agents(name)))
-    judged = recording.judged(scenario)
-    instant = judged[len(judged) // 2]
-    drive = excerpt(recording, scenario, judged.index(instant) + 1)
-    detector, protocol = pretrained.load(config.weights), judging_protocol(config)
+    eval_indices = recording.eval_indices(scenario)
+    frame_index = eval_indices[len(eval_indices) // 2]
+    drive = make_excerpt(recording, scenario, eval_indices.index(frame_index) + 1)
+    detector, protocol = pretrained.load(config.weights), resolve_protocol(config)
     steps = [
         step
         for step in replay(
@@ -61,62 +61,70 @@ def run(options: Options, console: Console) -> None:
             detector,
             config.methods,
             config.replay,
-            lambda snapshot: config.noise.apply(snapshot, 0) if config.noise else snapshot,
-            known={},
+            lambda snapshot: config.pose_noise.apply(snapshot, 0) if config.pose_noise else snapshot,
+            feature_cache={},
         )
-        if step.snapshot.index == instant
+        if step.snapshot.index == frame_index
     ]
-    table = [_row(step, protocol) for step in steps]
-    images = [_image(step, row, detector.config.range) for step, row in zip(steps, table)]
-    save_png(_tiled(images), options.out / "picture.png")
-    sheet = _sheet(f"{scenario}, frame {instant}, {JOINT.name}", table)
-    condition = Condition(JOINT.name, config)
-    payload: dict[str, object] = {"scenario": scenario, "frame": instant, "rows": table}
-    publish(begun, payload, [sheet], [], [condition])
+    result_rows = [_make_row(step, protocol) for step in steps]
+    images = [_draw_image(step, row, detector.config.detection_range) for step, row in zip(steps, result_rows)]
+    save_png(_tile_images(images), options.out / "picture.png")
+    results_table = _make_results_table(f"{scenario}, frame {frame_index}, {COMBINED.name}", result_rows)
+    condition = Condition(COMBINED.name, config)
+    payload: dict[str, object] = {"scenario": scenario, "frame": frame_index, "rows": result_rows}
+    write_study_report(context, payload, [results_table], [], [condition])
 
 
-def _row(step: Step, protocol: Protocol) -> Row:
-    tally = Tally(step.method, protocol)
-    tally.add(step)
-    half, seven = (matches[0] for matches in tally.matches())
-    sure = half.score >= SCORE_MIN
-    found = (int((half.tp & sure).sum()), int((seven.tp & sure).sum()))
-    sent = tally.communication()
-    size = sent.bytes_per_message if sent.messages else 0.0
-    return Row(step.method, half.n_gt, found, (int(sure.sum()) - found[0], int(sure.sum()) - found[1]), size)
+def _make_row(step: ReplayStep, protocol: DetectionProtocol) -> QualitativeRow:
+    accumulator = MetricAccumulator(step.method, protocol)
+    accumulator.add(step)
+    half, seven = (matches[0] for matches in accumulator.match_frames())
+    confident = half.score >= MIN_SCORE
+    num_found = (int((half.tp & confident).sum()), int((seven.tp & confident).sum()))
+    sent = accumulator.summarize_communication()
+    size = sent.bytes_per_message if sent.num_messages else 0.0
+    return QualitativeRow(
+        step.method,
+        half.n_gt,
+        num_found,
+        (int(confident.sum()) - num_found[0], int(confident.sum()) - num_found[1]),
+        size,
+    )
 
 
-def _image(step: Step, row: Row, grid: BevGrid) -> Image:
-    heard = {reception.message.agent_id for reception in step.perception.heard}
-    unheard = {frame.agent_id for frame in step.snapshot.frames} - heard
-    scene = scene_of(step.snapshot, step.boxes, step.ego, unheard)
+def _draw_image(step: ReplayStep, row: QualitativeRow, grid: BevGrid) -> Image:
+    received_ids = {reception.message.agent_id for reception in step.perception.received}
+    missing_ids = {frame.agent_id for frame in step.snapshot.frames} - received_ids
+    view = make_scene(step.snapshot, step.boxes, step.ego, missing_ids)
     sent = f" · {row.bytes_per_message / 1e3:,.1f} kB a message" if row.bytes_per_message else ""
-    caption = f"{JOINT.name} · {row.found[0]} of {row.true} found at IoU 0.5, {row.found[1]} at 0.7{sent}"
-    return draw(scene, grid, step.method, caption, WIDTH, SCORE_MIN)
+    caption = (
+        f"{COMBINED.name} · {row.num_found[0]} of {row.num_true} found at IoU 0.5, {row.num_found[1]} at 0.7{sent}"
+    )
+    return draw_scene(view, grid, step.method, caption, WIDTH, MIN_SCORE)
 
 
-def _tiled(images: Sequence[Image]) -> Image:
+def _tile_images(images: Sequence[Image]) -> Image:
     """Pictures of one size, two to a row."""
     wide, high = images[0].size
     columns = min(COLUMNS, len(images))
-    out = pillow().Image.new("RGB", (columns * wide, -(-len(images) // columns) * high), "white")
-    for place, image in enumerate(images):
-        out.paste(image, (place % columns * wide, place // columns * high))
+    out = import_pillow().Image.new("RGB", (columns * wide, -(-len(images) // columns) * high), "white")
+    for index, image in enumerate(images):
+        out.paste(image, (index % columns * wide, index // columns * high))
     return out
 
 
-def _sheet(title: str, table: Sequence[Row]) -> Sheet:
+def _make_results_table(title: str, result_rows: Sequence[QualitativeRow]) -> StudyTable:
     headings = ("method", "true", "found @0.5", "false @0.5", "found @0.7", "false @0.7", "bytes/message")
     lines = tuple(
         (
             row.method,
-            str(row.true),
-            str(row.found[0]),
-            str(row.false[0]),
-            str(row.found[1]),
-            str(row.false[1]),
-            number(row.bytes_per_message),
+            str(row.num_true),
+            str(row.num_found[0]),
+            str(row.num_false[0]),
+            str(row.num_found[1]),
+            str(row.num_false[1]),
+            format_number(row.bytes_per_message),
         )
-        for row in table
+        for row in result_rows
     )
-    return Sheet(title, headings, lines)
+    return StudyTable(title, headings, lines)

@@ -17,23 +17,32 @@ from typing import TYPE_CHECKING
 from manyeyes.agents.strategies import METHODS
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.statistics.significance import Claim, claim
-from manyeyes.evaluation.study import Condition, Place, Sweep
-from manyeyes.studies.detection.ablation import branches_of
+from manyeyes.evaluation.statistics.significance import MarginTest, check_margin
+from manyeyes.evaluation.study import Condition, ResultGrid, ResultKey
+from manyeyes.studies.detection.ablation import parse_checkpoints
 from manyeyes.studies.detection.perturbations import (
+    CLEAN,
+    COMBINED,
+    COMBINED_SEVERE,
     DELAYS,
-    HARD,
     HEADINGS,
-    JOINT,
     LOSSES,
-    PERFECT,
     POSITIONS,
-    Disturbance,
-    chosen,
+    Perturbation,
+    select_perturbations,
 )
-from manyeyes.studies.running import ALONE, BOUND, OURS, PAPER, carry_out, claims_sheet, publish, start
-from manyeyes.viz.curves import Curve, Panel
-from manyeyes.viz.study_table import Sheet, change, number, value
+from manyeyes.studies.running import (
+    NO_FUSION,
+    OURS,
+    PAPER_NOTE,
+    UPPER_BOUND,
+    make_margin_table,
+    prepare_study,
+    run_study,
+    write_study_report,
+)
+from manyeyes.viz.curves import Curve, CurvePanel
+from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -41,17 +50,17 @@ if TYPE_CHECKING:
     from manyeyes.studies.options import Options
 
 ORACLES = {
-    replace(JOINT, heading_deg=0, position_m=0): "true poses",
-    replace(JOINT, delay_s=0): "no delay",
-    replace(HARD, heading_deg=0, position_m=0): "true poses",
-    replace(HARD, delay_s=0): "no delay",
+    replace(COMBINED, heading_sigma_deg=0, position_sigma_m=0): "true poses",
+    replace(COMBINED, delay_s=0): "no delay",
+    replace(COMBINED_SEVERE, heading_sigma_deg=0, position_sigma_m=0): "true poses",
+    replace(COMBINED_SEVERE, delay_s=0): "no delay",
 }
-TOGETHER = (JOINT, *list(ORACLES)[:2], HARD, *list(ORACLES)[2:])
-ALL = (PERFECT, *DELAYS, *HEADINGS, *POSITIONS, *LOSSES, *(d for d in TOGETHER if d not in DELAYS))
-SPEEDS = {"still": (0.0, 0.1), "below 5 m/s": (0.1, 5.0), "from 5 m/s": (5.0, math.inf)}
-LOSES_AT_MOST = {DELAYS[-1]: 0.037, HEADINGS[-1]: 0.054, POSITIONS[-1]: 0.044, LOSSES[-1]: 0.03}
+COMBINED_LEVELS = (COMBINED, *list(ORACLES)[:2], COMBINED_SEVERE, *list(ORACLES)[2:])
+ALL_PERTURBATIONS = (CLEAN, *DELAYS, *HEADINGS, *POSITIONS, *LOSSES, *(d for d in COMBINED_LEVELS if d not in DELAYS))
+SPEED_RANGES = {"still": (0.0, 0.1), "below 5 m/s": (0.1, 5.0), "from 5 m/s": (5.0, math.inf)}
+MAX_AP_DROP = {DELAYS[-1]: 0.037, HEADINGS[-1]: 0.054, POSITIONS[-1]: 0.044, LOSSES[-1]: 0.03}
 PAPER_AP50 = {
-    PERFECT: 0.946,
+    CLEAN: 0.946,
     **dict(zip(DELAYS, (0.937, 0.928, 0.917, 0.909))),
     **dict(zip(HEADINGS, (0.937, 0.921, 0.904, 0.892))),
     **dict(zip(POSITIONS, (0.941, 0.926, 0.913, 0.902))),
@@ -59,115 +68,127 @@ PAPER_AP50 = {
 
 
 @dataclass(frozen=True)
-class Row:
-    """A method under a disturbance. lost: AP less than without any; over_alone: more than ego alone; two IoUs each.
+class RobustnessRow:
+    """A method under a disturbance. ap_drop: AP less than without any; gain_over_no_fusion: more than ego alone; two IoUs each.
 
-    by_speed: AP@0.5 of each class of SPEEDS, where messages are late. paper: CoSTr's own AP@0.5.
+    ap_by_speed: AP@0.5 of each class of SPEEDS, where messages are late. paper_ap: CoSTr's own AP@0.5.
     """
 
-    disturbance: Disturbance
+    perturbation: Perturbation
     oracle: str
     method: str
     ap: tuple[Interval, Interval]
-    lost: tuple[Interval, Interval]
-    over_alone: tuple[Interval, Interval] | None
+    ap_drop: tuple[Interval, Interval]
+    gain_over_no_fusion: tuple[Interval, Interval] | None
     bytes_per_message: float
     age_ms: float
-    by_speed: tuple[Interval, ...]
-    paper: float | None
+    ap_by_speed: tuple[Interval, ...]
+    paper_ap: float | None
 
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    begun = start(options, console)
-    methods = begun.base.methods
-    hearing = tuple(m for m in methods if m != ALONE)
+    context = prepare_study(options, console)
+    methods = context.base.methods
+    collaborative = tuple(m for m in methods if m != NO_FUSION)
     conditions = [
-        Condition(d.name, d.on(replace(begun.base, methods=methods if d == PERFECT else hearing)))
-        for d in chosen(options.disturbances, ALL)
-        if d == PERFECT or hearing
+        Condition(d.name, d.apply_to(replace(context.base, methods=methods if d == CLEAN else collaborative)))
+        for d in select_perturbations(options.perturbations, ALL_PERTURBATIONS)
+        if d == CLEAN or collaborative
     ]
-    rivals = branches_of(options.branches, "robustness") if options.branches else {}
-    if taken := sorted(set(rivals) & set(METHODS)):
+    baselines = parse_checkpoints(options.checkpoints, "robustness") if options.checkpoints else {}
+    if name_clashes := sorted(set(baselines) & set(METHODS)):
         raise ConfigError(
-            f"The study 'robustness' has methods of the names {', '.join(taken)}; call these branches otherwise."
+            f"The study 'robustness' has methods of the names {', '.join(name_clashes)}; call these branches otherwise."
         )
-    for rival, weights in rivals.items():
-        base = replace(begun.base, methods=(OURS,), weights=weights)
-        conditions += [Condition(_place(d, rival, (rival,))[0], d.on(base)) for d in chosen(options.disturbances, ALL)]
-    done = carry_out(begun, conditions)
-    table, held = rows(done, tuple(rivals)), claims(done, tuple(rivals))
-    sheets = [
-        _sheet(title, table, group)
+    for baseline, weights in baselines.items():
+        base = replace(context.base, methods=(OURS,), weights=weights)
+        conditions += [
+            Condition(_result_key(d, baseline, (baseline,))[0], d.apply_to(base))
+            for d in select_perturbations(options.perturbations, ALL_PERTURBATIONS)
+        ]
+    results = run_study(context, conditions)
+    result_rows, margin_tests = make_rows(results, tuple(baselines)), check_margins(results, tuple(baselines))
+    tables = [
+        _make_results_table(title, result_rows, group)
         for title, group in (
             ("Delay", DELAYS),
             ("Heading", HEADINGS),
             ("Position", POSITIONS),
             ("Lost packets", LOSSES),
-            ("Together", TOGETHER),
+            ("Together", COMBINED_LEVELS),
         )
-        if any(row.disturbance in group for row in table)
+        if any(row.perturbation in group for row in result_rows)
     ]
-    payload: dict[str, object] = {"rows": table, "claims": held, "paper": PAPER}
-    publish(begun, payload, [*sheets, claims_sheet(held)], panels(table), conditions, (PAPER,))
+    payload: dict[str, object] = {"rows": result_rows, "claims": margin_tests, "paper": PAPER_NOTE}
+    write_study_report(
+        context,
+        payload,
+        [*tables, make_margin_table(margin_tests)],
+        make_panels(result_rows),
+        conditions,
+        (PAPER_NOTE,),
+    )
 
 
-def _place(disturbance: Disturbance, method: str, rivals: Sequence[str]) -> Place:
+def _result_key(perturbation: Perturbation, method: str, baselines: Sequence[str]) -> ResultKey:
     """Where a method, or a rival's weights, lies in the sweep."""
-    return (f"{method}: {disturbance.name}", OURS) if method in rivals else (disturbance.name, method)
+    return (f"{method}: {perturbation.name}", OURS) if method in baselines else (perturbation.name, method)
 
 
-def rows(done: Sweep, rivals: Sequence[str] = ()) -> tuple[Row, ...]:
+def make_rows(results: ResultGrid, baselines: Sequence[str] = ()) -> tuple[RobustnessRow, ...]:
     """The table, a disturbance after the other."""
     return tuple(
-        _row(done, d, method, rivals)
-        for d in ALL
-        for method in (*(m for name, m in done.cells if name == d.name), *rivals)
-        if _place(d, method, rivals) in done.cells
+        _make_row(results, d, method, baselines)
+        for d in ALL_PERTURBATIONS
+        for method in (*(m for name, m in results.results if name == d.name), *baselines)
+        if _result_key(d, method, baselines) in results.results
     )
 
 
-def _row(done: Sweep, disturbance: Disturbance, method: str, rivals: Sequence[str]) -> Row:
-    place, perfect = (_place(d, method, rivals) for d in (disturbance, PERFECT))
-    alone = (PERFECT.name, ALONE)
-    cell = done.cells[place]
-    late = disturbance == PERFECT or disturbance.delay_s > 0
-    return Row(
-        disturbance,
-        ORACLES.get(disturbance, ""),
+def _make_row(results: ResultGrid, perturbation: Perturbation, method: str, baselines: Sequence[str]) -> RobustnessRow:
+    key, clean_key = (_result_key(d, method, baselines) for d in (perturbation, CLEAN))
+    no_fusion_key = (CLEAN.name, NO_FUSION)
+    result = results.results[key]
+    has_delay = perturbation == CLEAN or perturbation.delay_s > 0
+    return RobustnessRow(
+        perturbation,
+        ORACLES.get(perturbation, ""),
         method,
-        (done.ap(place, 0), done.ap(place, 1)),
-        (done.less(perfect, place, 0), done.less(perfect, place, 1)),
-        (done.less(place, alone, 0), done.less(place, alone, 1)) if alone in done.cells and method != ALONE else None,
-        cell.bytes_per_message,
-        cell.age_ms,
-        tuple(done.ap(place, 0, speeds) for speeds in SPEEDS.values()) if late else (),
-        PAPER_AP50.get(disturbance) if method == OURS else None,
+        (results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)),
+        (results.paired_difference(clean_key, key, 0), results.paired_difference(clean_key, key, 1)),
+        (results.paired_difference(key, no_fusion_key, 0), results.paired_difference(key, no_fusion_key, 1))
+        if no_fusion_key in results.results and method != NO_FUSION
+        else None,
+        result.bytes_per_message,
+        result.age_ms,
+        tuple(results.bootstrap_ap(key, 0, speed_range) for speed_range in SPEED_RANGES.values()) if has_delay else (),
+        PAPER_AP50.get(perturbation) if method == OURS else None,
     )
 
 
-def claims(done: Sweep, branches: Sequence[str] = ()) -> tuple[Claim, ...]:
+def check_margins(results: ResultGrid, checkpoints: Sequence[str] = ()) -> tuple[MarginTest, ...]:
     """What is claimed of the project's own method: better than every other but the bound everywhere, and little lost."""
-    if (PERFECT.name, OURS) not in done.cells:
+    if (CLEAN.name, OURS) not in results.results:
         return ()
-    rivals = [method for name, method in done.cells if name == PERFECT.name and method not in (OURS, BOUND)]
-    rivals += branches
+    baselines = [method for name, method in results.results if name == CLEAN.name and method not in (OURS, UPPER_BOUND)]
+    baselines += checkpoints
     out = []
-    played = [d for d in ALL if (d.name, OURS) in done.cells]
-    for disturbance in played:
-        for rival in rivals:
-            other = _place(PERFECT if rival == ALONE else disturbance, rival, branches)
-            what = f"{OURS} - {rival}, {disturbance.name}"
-            out += [claim(what, done, (disturbance.name, OURS), other, iou, 0.0) for iou in (0, 1)]
-    for disturbance, most in ((d, LOSES_AT_MOST[d]) for d in played if d in LOSES_AT_MOST):
-        what = f"{OURS}, {disturbance.name} - {PERFECT.name}"
-        out.append(claim(what, done, (disturbance.name, OURS), (PERFECT.name, OURS), 0, -most))
+    evaluated = [d for d in ALL_PERTURBATIONS if (d.name, OURS) in results.results]
+    for perturbation in evaluated:
+        for baseline in baselines:
+            other = _result_key(CLEAN if baseline == NO_FUSION else perturbation, baseline, checkpoints)
+            description = f"{OURS} - {baseline}, {perturbation.name}"
+            out += [check_margin(description, results, (perturbation.name, OURS), other, iou, 0.0) for iou in (0, 1)]
+    for perturbation, max_drop in ((d, MAX_AP_DROP[d]) for d in evaluated if d in MAX_AP_DROP):
+        description = f"{OURS}, {perturbation.name} - {CLEAN.name}"
+        out.append(check_margin(description, results, (perturbation.name, OURS), (CLEAN.name, OURS), 0, -max_drop))
     return tuple(out)
 
 
-def _sheet(title: str, table: Sequence[Row], group: Sequence[Disturbance]) -> Sheet:
+def _make_results_table(title: str, result_rows: Sequence[RobustnessRow], group: Sequence[Perturbation]) -> StudyTable:
     """One kind of disturbance, the perfect setting on top; the word for an oracle row where it is one."""
-    table = [row for row in table if row.disturbance in (PERFECT, *group)]
+    result_rows = [row for row in result_rows if row.perturbation in (CLEAN, *group)]
     headings = (
         "disturbance",
         "method",
@@ -179,52 +200,52 @@ def _sheet(title: str, table: Sequence[Row], group: Sequence[Disturbance]) -> Sh
         "bytes/message",
         "age ms",
     )
-    speeds = any(row.by_speed for row in table if row.disturbance != PERFECT)
+    has_speeds = any(row.ap_by_speed for row in result_rows if row.perturbation != CLEAN)
     lines = []
-    for row in table:
-        name = row.disturbance.name + (f" ({row.oracle})" if row.oracle and JOINT in group else "")
-        plain = row.disturbance == PERFECT
+    for row in result_rows:
+        name = row.perturbation.name + (f" ({row.oracle})" if row.oracle and COMBINED in group else "")
+        is_clean = row.perturbation == CLEAN
         line = (
             name,
             row.method,
-            *map(value, row.ap),
-            *("" if plain else change(lost) for lost in row.lost),
-            change(row.over_alone[0]) if row.over_alone else "",
-            number(row.bytes_per_message),
-            number(row.age_ms),
+            *map(format_interval, row.ap),
+            *("" if is_clean else format_difference(drop) for drop in row.ap_drop),
+            format_difference(row.gain_over_no_fusion[0]) if row.gain_over_no_fusion else "",
+            format_number(row.bytes_per_message),
+            format_number(row.age_ms),
         )
-        by_speed = tuple(value(v) for v in row.by_speed) or ("",) * len(SPEEDS)
-        paper = "" if row.paper is None else f"{row.paper:.3f}"
-        lines.append((*line, *(by_speed if speeds else ()), paper))
-    more = tuple(f"AP@0.5 {name}" for name in SPEEDS) if speeds else ()
-    return Sheet(title, (*headings, *more, "paper"), tuple(lines))
+        by_speed = tuple(format_interval(v) for v in row.ap_by_speed) or ("",) * len(SPEED_RANGES)
+        paper = "" if row.paper_ap is None else f"{row.paper_ap:.3f}"
+        lines.append((*line, *(by_speed if has_speeds else ()), paper))
+    speed_headings = tuple(f"AP@0.5 {name}" for name in SPEED_RANGES) if has_speeds else ()
+    return StudyTable(title, (*headings, *speed_headings, "paper"), tuple(lines))
 
 
-def panels(table: Sequence[Row]) -> list[Panel]:
+def make_panels(result_rows: Sequence[RobustnessRow]) -> list[CurvePanel]:
     """AP@0.5 against each disturbance by itself, and a panel of the joint ones."""
-    by_place = {(row.disturbance, row.method): row.ap[0] for row in table}
-    methods = list(dict.fromkeys(row.method for row in table))
+    ap_by_key = {(row.perturbation, row.method): row.ap[0] for row in result_rows}
+    methods = list(dict.fromkeys(row.method for row in result_rows))
     out = []
-    for title, xlabel, group, level in (
+    for title, xlabel, group, field_name in (
         ("Delay", "seconds", DELAYS, "delay_s"),
         ("Heading", "standard deviation, degrees", HEADINGS, "heading_deg"),
         ("Position", "standard deviation, m", POSITIONS, "position_m"),
         ("Lost packets", "share", LOSSES, "loss"),
     ):
-        levels = (PERFECT, *group)
-        x = tuple(getattr(d, level) for d in levels)
-        curves = (_curve(m, [by_place.get((d, m)) for d in levels], x) for m in methods)
-        out.append(Panel(title, xlabel, "AP@0.5", tuple(c for c in curves if c)))
-    x, levels = tuple(map(float, range(3))), (PERFECT, JOINT, HARD)
-    curves = (_curve(m, [by_place.get((d, m)) for d in levels], x) for m in methods)
-    out.append(Panel("Together", "", "AP@0.5", tuple(c for c in curves if c), ticks=tuple(d.name for d in levels)))
+        levels = (CLEAN, *group)
+        x = tuple(getattr(d, field_name) for d in levels)
+        curves = (_make_curve(m, [ap_by_key.get((d, m)) for d in levels], x) for m in methods)
+        out.append(CurvePanel(title, xlabel, "AP@0.5", tuple(c for c in curves if c)))
+    x, levels = tuple(map(float, range(3))), (CLEAN, COMBINED, COMBINED_SEVERE)
+    curves = (_make_curve(m, [ap_by_key.get((d, m)) for d in levels], x) for m in methods)
+    out.append(CurvePanel("Together", "", "AP@0.5", tuple(c for c in curves if c), ticks=tuple(d.name for d in levels)))
     return out
 
 
-def _curve(method: str, y: Sequence[Interval | None], x: tuple[float, ...]) -> Curve | None:
+def _make_curve(method: str, y: Sequence[Interval | None], x: tuple[float, ...]) -> Curve | None:
     """A line through the levels that were played, a level where one alone was: ego alone."""
-    known = [(v, at) for v, at in zip(y, x) if v is not None]
+    known = [(v, x_value) for v, x_value in zip(y, x) if v is not None]
     values = tuple(v for v, _ in known)
     if len(known) > 1:
-        return Curve(method, values, tuple(at for _, at in known))
+        return Curve(method, values, tuple(x_value for _, x_value in known))
     return Curve(method, values) if known else None

@@ -13,10 +13,17 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.study import Condition, Sweep
-from manyeyes.studies.running import ALONE, carry_out, publish, selectors, start, with_replay
-from manyeyes.viz.curves import Curve, Panel
-from manyeyes.viz.study_table import Sheet, change, number, value
+from manyeyes.evaluation.study import Condition, ResultGrid
+from manyeyes.studies.running import (
+    NO_FUSION,
+    prepare_study,
+    resolve_token_selection,
+    run_study,
+    with_replay,
+    write_study_report,
+)
+from manyeyes.viz.curves import Curve, CurvePanel
+from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,58 +31,64 @@ if TYPE_CHECKING:
     from manyeyes.studies.options import Options
 
 BUDGETS = (8192, 16384, 65536, 337_500)
-UNBOUND = "no budget"
+NO_BUDGET = "no budget"
 
 
 @dataclass(frozen=True)
-class Row:
-    """A method with all agents as egos, their messages of an instant together within the budget. most: of an instant."""
+class SharedBandwidthRow:
+    """A method with all agents as egos, their messages of an instant together within the budget. max_snapshot_bytes: of an
+    instant.
+    """
 
     budget_bytes: int | None
     method: str
-    ego_frames: int
+    num_ego_frames: int
     ap: tuple[Interval, Interval]
-    over_alone: Interval | None
-    instant_bytes: float
-    most: int
+    gain_over_no_fusion: Interval | None
+    mean_snapshot_bytes: float
+    max_snapshot_bytes: int
 
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    begun, chosen = start(options, console, all_egos=True), selectors(options)
-    others = tuple(m for m in begun.base.methods if m not in chosen)
+    context, selected = prepare_study(options, console, all_egos=True), resolve_token_selection(options)
+    others = tuple(m for m in context.base.methods if m not in selected)
     conditions = [
-        Condition(str(b), with_replay(replace(begun.base, methods=chosen), channel_bytes=b))
+        Condition(str(b), with_replay(replace(context.base, methods=selected), channel_budget_bytes=b))
         for b in sorted(options.budgets or BUDGETS)
     ]
     if others:
-        conditions.append(Condition(UNBOUND, replace(begun.base, methods=others)))
-    done = carry_out(begun, conditions)
-    table = rows(done)
-    publish(begun, {"rows": table}, [_sheet(table)], panels(table), conditions)
+        conditions.append(Condition(NO_BUDGET, replace(context.base, methods=others)))
+    results = run_study(context, conditions)
+    result_rows = make_rows(results)
+    write_study_report(
+        context, {"rows": result_rows}, [_make_results_table(result_rows)], make_panels(result_rows), conditions
+    )
 
 
-def rows(done: Sweep) -> tuple[Row, ...]:
+def make_rows(results: ResultGrid) -> tuple[SharedBandwidthRow, ...]:
     """The table, by budget."""
-    alone = (UNBOUND, ALONE)
+    no_fusion_key = (NO_BUDGET, NO_FUSION)
     out = []
-    for place, cell in done.cells.items():
-        name, method = place
+    for key, result in results.results.items():
+        name, method = key
         out.append(
-            Row(
-                None if name == UNBOUND else int(name),
+            SharedBandwidthRow(
+                None if name == NO_BUDGET else int(name),
                 method,
-                len(cell.matches[0]),
-                (done.ap(place, 0), done.ap(place, 1)),
-                done.less(place, alone, 0) if alone in done.cells and place != alone else None,
-                cell.volume.instant_mean,
-                cell.volume.instant_most,
+                len(result.matches[0]),
+                (results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)),
+                results.paired_difference(key, no_fusion_key, 0)
+                if no_fusion_key in results.results and key != no_fusion_key
+                else None,
+                result.volume.mean_snapshot_bytes,
+                result.volume.max_snapshot_bytes,
             )
         )
     return tuple(out)
 
 
-def _sheet(table: Sequence[Row]) -> Sheet:
+def _make_results_table(result_rows: Sequence[SharedBandwidthRow]) -> StudyTable:
     headings = (
         "budget B/instant",
         "method",
@@ -88,24 +101,30 @@ def _sheet(table: Sequence[Row]) -> Sheet:
     )
     lines = tuple(
         (
-            UNBOUND if row.budget_bytes is None else f"{row.budget_bytes:,}",
+            NO_BUDGET if row.budget_bytes is None else f"{row.budget_bytes:,}",
             row.method,
-            f"{row.ego_frames:,}",
-            *map(value, row.ap),
-            change(row.over_alone),
-            number(row.instant_bytes),
-            number(row.most),
+            f"{row.num_ego_frames:,}",
+            *map(format_interval, row.ap),
+            format_difference(row.gain_over_no_fusion),
+            format_number(row.mean_snapshot_bytes),
+            format_number(row.max_snapshot_bytes),
         )
-        for row in table
+        for row in result_rows
     )
-    return Sheet("Every agent as ego", headings, lines)
+    return StudyTable("Every agent as ego", headings, lines)
 
 
-def panels(table: Sequence[Row]) -> list[Panel]:
+def make_panels(result_rows: Sequence[SharedBandwidthRow]) -> list[CurvePanel]:
     """AP@0.5 of all egos against the mean bytes of an instant."""
     curves = []
-    for method in dict.fromkeys(row.method for row in table):
-        own = [row for row in table if row.method == method]
-        x = tuple(row.instant_bytes for row in own) if all(row.instant_bytes for row in own) else ()
-        curves.append(Curve(method, tuple(row.ap[0] for row in own), x))
-    return [Panel("Every agent as ego", "bytes an instant, all senders, mean", "AP@0.5", tuple(curves), in_bytes=True)]
+    for method in dict.fromkeys(row.method for row in result_rows):
+        method_rows = [row for row in result_rows if row.method == method]
+        x = (
+            tuple(row.mean_snapshot_bytes for row in method_rows)
+            if all(row.mean_snapshot_bytes for row in method_rows)
+            else ()
+        )
+        curves.append(Curve(method, tuple(row.ap[0] for row in method_rows), x))
+    return [
+        CurvePanel("Every agent as ego", "bytes an instant, all senders, mean", "AP@0.5", tuple(curves), in_bytes=True)
+    ]

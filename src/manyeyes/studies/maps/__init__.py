@@ -15,12 +15,12 @@ MODEL_STUDIES = {"local": "local", "semi-global": "semi_global", "whole": "full_
 """Studies of the map model, and their modules."""
 
 
-def model_study(options: Options, console: Console) -> None:
+def run_model_study(options: Options, console: Console) -> None:
     """Runs one of MODEL_STUDIES; what is finished is kept under --out."""
     from manyeyes.datatypes import ConfigError
-    from manyeyes.studies.maps.running import missing_files
+    from manyeyes.studies.maps.running import find_missing_files
 
     if options.data is None:
         raise ConfigError(f"The study {options.study!r} needs --data, a dataset of towns such as data/streets.")
-    missing_files(options, console)
+    find_missing_files(options, console)
     import_module(f"manyeyes.studies.maps.{MODEL_STUDIES[options.study or '']}").run(options, console)

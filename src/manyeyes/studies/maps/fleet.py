@@ -7,18 +7,25 @@ from typing import TYPE_CHECKING
 
 from manyeyes._io import atomic_write_text
 from manyeyes.evaluation.maps.oracles import ORACLES
-from manyeyes.evaluation.maps.registry import METHODS, check_method, tuned
-from manyeyes.evaluation.maps.study import TEST_PLACES, StudyConfig, lines, run_study, smaller, verdicts
-from manyeyes.maps.store.executors import Executor, Inline, ProcessPool
+from manyeyes.evaluation.maps.registry import METHODS, check_method, make_tuned_settings
+from manyeyes.evaluation.maps.study import (
+    TEST_PLACES,
+    MapStudyConfig,
+    check_margins,
+    restrict_study,
+    run_map_study,
+    summarize_methods,
+)
+from manyeyes.maps.store.executors import Executor, InlineExecutor, ProcessExecutor
 from manyeyes.studies import provenance
 from manyeyes.viz.map_table import (
-    malice_markdown,
-    malice_terminal,
-    study_markdown,
-    study_terminal,
-    verdicts_terminal,
+    format_adversarial,
+    format_study,
+    make_adversarial_table,
+    make_margin_table,
+    make_study_table,
 )
-from manyeyes.viz.progress import bars
+from manyeyes.viz.progress import make_progress_bars
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,85 +39,89 @@ TITLES = {
 }
 
 
-def study(options: Options, console: Console) -> None:
+def run_study_command(options: Options, console: Console) -> None:
     """Runs the named study; cells that are kept are not made again."""
     for method in options.methods:
         check_method(method)
     if options.study == "tuning":
-        _tune(options, console)
+        _run_search(options, console)
     elif options.study == "malicious":
-        _malicious(options, console)
+        _run_adversarial_study(options, console)
     else:
-        _side_by_side(options, console)
+        _run_fusion_study(options, console)
 
 
-def executor_of(workers: int) -> Executor:
+def choose_executor(workers: int) -> Executor:
     """This process, or a pool."""
-    return ProcessPool(workers) if workers > 1 else Inline()
+    return ProcessExecutor(workers) if workers > 1 else InlineExecutor()
 
 
-def _side_by_side(options: Options, console: Console) -> None:
+def _run_fusion_study(options: Options, console: Console) -> None:
     name = str(options.study)
     methods = (*(options.methods or METHODS), *(ORACLES if options.oracles else ()))
-    config = StudyConfig(name, methods=methods, settings=tuned())
-    config = smaller(config, options.places, options.counts, options.seeds)
-    with bars(console) as progress:
+    config = MapStudyConfig(name, methods=methods, settings=make_tuned_settings())
+    config = restrict_study(config, options.places, options.observation_counts, options.seeds)
+    with make_progress_bars(console) as progress:
         task = progress.add_task("Trials", total=None)
-        cells = run_study(
+        results = run_map_study(
             config,
             options.out / "cells",
-            executor_of(options.workers),
+            choose_executor(options.workers),
             lambda done, total: progress.update(task, completed=done, total=total),
         )
-    table, held = lines(config, cells), verdicts(config, cells)
-    for group in dict.fromkeys(line.group for line in table):
-        console.print(study_terminal(table, group))
+    summaries, margin_tests = summarize_methods(config, results), check_margins(config, results)
+    for group in dict.fromkeys(summary.group for summary in summaries):
+        console.print(make_study_table(summaries, group))
         console.print()
-    if held:
-        console.print(verdicts_terminal(held))
-    payload = {"lines": table, "verdicts": held, "cells": cells}
+    if margin_tests:
+        console.print(make_margin_table(margin_tests))
+    payload = {"lines": summaries, "verdicts": margin_tests, "cells": results}
     provenance.write_json(options.out / f"{name}.json", payload, {"options": options, "study": config}, 0)
-    atomic_write_text(options.out / f"{name}.md", study_markdown(TITLES[name], table, held))
+    atomic_write_text(options.out / f"{name}.md", format_study(TITLES[name], summaries, margin_tests))
     console.print(f"\nTable and numbers are in {options.out / name}.md and .json", highlight=False, soft_wrap=True)
 
 
-def _tune(options: Options, console: Console) -> None:
-    from manyeyes.evaluation.maps.hyperparameter_search import BUDGET, CHOICES, tune
+def _run_search(options: Options, console: Console) -> None:
+    from manyeyes.evaluation.maps.hyperparameter_search import NUM_CONFIGS, SEARCH_SPACE, run_random_search
 
     methods = options.methods or METHODS
-    with bars(console) as progress:
+    with make_progress_bars(console) as progress:
         task = progress.add_task("Cells", total=None)
-        attempts = tune(
+        search_trials = run_random_search(
             methods,
             options.out / "cells",
-            executor_of(options.workers),
+            choose_executor(options.workers),
             lambda done, total: progress.update(task, completed=done, total=total),
         )
     for method in methods:
-        best = next(a for a in attempts if a.method == method)
-        first = next(a for a in attempts if a.method == method and a.number == 0)
-        said = ", ".join(f"{name}={value}" for name, value in best.changed) or "its defaults"
+        best = next(a for a in search_trials if a.method == method)
+        default = next(a for a in search_trials if a.method == method and a.config_index == 0)
+        changes = ", ".join(f"{name}={value}" for name, value in best.changes) or "its defaults"
         console.print(
-            f"{method}: {best.worth:.3f} ({first.worth:.3f} by default) with {said}", highlight=False, soft_wrap=True
+            f"{method}: {best.mean_ap:.3f} ({default.mean_ap:.3f} by default) with {changes}",
+            highlight=False,
+            soft_wrap=True,
         )
-    payload = {"budget": BUDGET, "attempts": attempts}
-    provenance.write_json(options.out / "tuning.json", payload, {"options": options, "choices": CHOICES}, 0)
+    payload = {"budget": NUM_CONFIGS, "attempts": search_trials}
+    provenance.write_json(options.out / "tuning.json", payload, {"options": options, "choices": SEARCH_SPACE}, 0)
     console.print(f"All attempts are in {options.out / 'tuning.json'}", highlight=False, soft_wrap=True)
 
 
-def _malicious(options: Options, console: Console) -> None:
-    from manyeyes.evaluation.maps.adversarial import malice_units, run_malice
+def _run_adversarial_study(options: Options, console: Console) -> None:
+    from manyeyes.evaluation.maps.adversarial import make_adversarial_jobs, run_adversarial_jobs
 
-    settings = tuned()
-    units = malice_units(options.places or TEST_PLACES, range(options.seeds), settings, options.out / "cells")
-    with bars(console) as progress:
-        task = progress.add_task("Trials", total=len(units))
-        found = run_malice(
-            units, executor_of(options.workers), lambda done, total: progress.update(task, completed=done, total=total)
+    settings = make_tuned_settings()
+    jobs = make_adversarial_jobs(options.places or TEST_PLACES, range(options.seeds), settings, options.out / "cells")
+    with make_progress_bars(console) as progress:
+        task = progress.add_task("Trials", total=len(jobs))
+        results = run_adversarial_jobs(
+            jobs,
+            choose_executor(options.workers),
+            lambda done, total: progress.update(task, completed=done, total=total),
         )
-    console.print(malice_terminal(found))
+    console.print(make_adversarial_table(results))
     provenance.write_json(
-        options.out / "malicious.json", {"trials": found}, {"options": options, "settings": settings}, 0
+        options.out / "malicious.json", {"trials": results}, {"options": options, "settings": settings}, 0
     )
-    atomic_write_text(options.out / "malicious.md", malice_markdown(found))
+    atomic_write_text(options.out / "malicious.md", format_adversarial(results))
     console.print(f"Table and numbers are in {options.out / 'malicious'}.md and .json", highlight=False, soft_wrap=True)

@@ -15,19 +15,35 @@ from typing import TYPE_CHECKING
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.maps.metrics import PAPER_KINDS
-from manyeyes.evaluation.maps.pooled_ap import Block, Judged, MapClaim, blocks_of, claimed, mean_of, pooled_ap, squares
-from manyeyes.evaluation.maps.registry import METHODS, OURS, RIVALS
-from manyeyes.evaluation.maps.spatial_bootstrap import BLOCK_M
-from manyeyes.evaluation.statistics.bootstrap import Drawn, Interval
-from manyeyes.evaluation.study import recording_digest
+from manyeyes.evaluation.maps.pooled_ap import (
+    Block,
+    MapMarginTest,
+    MapPair,
+    assign_to_squares,
+    average_samples,
+    bootstrap_pooled_ap,
+    check_map_margin,
+    collect_blocks,
+)
+from manyeyes.evaluation.maps.registry import BASELINES, METHODS, OURS
+from manyeyes.evaluation.maps.spatial_bootstrap import BLOCK_SIZE_M
+from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval
+from manyeyes.evaluation.study import hash_recording
 from manyeyes.maps.store.executors import map_blocks
-from manyeyes.studies.maps.fleet import executor_of
-from manyeyes.studies.maps.recorded_fleet import CrowdMap, CrowdUnit, run_unit
-from manyeyes.studies.maps.running import Model, cells_of, claims_sheet, models, publish, title_of
-from manyeyes.studies.town_maps import grounds_of
-from manyeyes.viz.map_figures import Panel
-from manyeyes.viz.progress import bars
-from manyeyes.viz.study_table import Sheet, number, value
+from manyeyes.studies.maps.fleet import choose_executor
+from manyeyes.studies.maps.recorded_fleet import FleetMap, FleetMapJob, run_fleet_job
+from manyeyes.studies.maps.running import (
+    StudyModel,
+    get_results_folder,
+    make_margin_table,
+    make_title,
+    resolve_models,
+    write_study_report,
+)
+from manyeyes.studies.town_maps import group_by_town
+from manyeyes.viz.map_figures import MapPanel
+from manyeyes.viz.progress import make_progress_bars
+from manyeyes.viz.study_table import StudyTable, format_interval, format_number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -35,10 +51,10 @@ if TYPE_CHECKING:
     from manyeyes.studies.maps.options import Options
 
 LOCAL, SEMI_GLOBAL = "local", "semi-global"
-SURVEYS = (SEMI_GLOBAL, LOCAL)
-GOAL = 0.10
-PICTURED_M = 150.0
-PAPER = Sheet(
+MAP_MODES = (SEMI_GLOBAL, LOCAL)
+TARGET_MARGIN = 0.10
+FIGURE_HALF_SIZE_M = 150.0
+PAPER_TABLE = StudyTable(
     "CrowdMap's Table 3: two crossroads of DAIR-V2X; no bar and no rival",
     ("method", "Map-06 AP ped", "AP div", "mAP", "Map-13 AP ped", "AP div", "mAP"),
     (
@@ -49,135 +65,163 @@ PAPER = Sheet(
     ),
 )
 
-Place = tuple[str, str]
+MapKey = tuple[str, str]
 """A survey and a method."""
 
 
 @dataclass(frozen=True)
-class Row:
-    """A survey and a method on one town, maptr; over 64 m squares with all seeds. seen: agents' observations a map."""
+class FullMapRow:
+    """A survey and a method on one town, maptr; over 64 m squares with all seeds. observations_per_map: agents' observations a
+    map.
+    """
 
     town: str
-    survey: str
+    map_mode: str
     method: str
-    ap: tuple[Interval, ...]
-    mean: Interval
-    exact: Interval
-    in_own_view: Interval
-    seen: float
+    ap_by_kind: tuple[Interval, ...]
+    mean_ap: Interval
+    exact_mean_ap: Interval
+    own_view_mean_ap: Interval
+    observations_per_map: float
     bytes_per_message: float
 
 
 @dataclass(frozen=True, eq=False)
-class Town:
+class TownResults:
     """All maps of one town, by survey and method, each once a seed, and the truth in view of anybody's tile."""
 
     name: str
-    maps: dict[Place, tuple[CrowdMap, ...]]
+    maps: dict[MapKey, tuple[FleetMap, ...]]
 
     @cached_property
-    def known(self) -> list[Block]:
+    def blocks(self) -> list[Block]:
         """Every square that holds anything."""
-        return blocks_of([self.judged(place, own) for place in self.maps for own in (False, True)])
+        return collect_blocks([self.map_pairs(key, in_own_view) for key in self.maps for in_own_view in (False, True)])
 
-    def judged(self, place: Place, in_own_view: bool = False) -> list[Judged]:
+    def map_pairs(self, key: MapKey, in_own_view: bool = False) -> list[MapPair]:
         """A row's maps against the truth, seed by seed."""
-        truths = self.maps[place] if in_own_view else self.maps[SEMI_GLOBAL, place[1]]
-        of = squares(self.name, BLOCK_M)
-        return [Judged(one.made, other.truth, of) for one, other in zip(self.maps[place], truths)]
+        truths = self.maps[key] if in_own_view else self.maps[SEMI_GLOBAL, key[1]]
+        assign_blocks = assign_to_squares(self.name, BLOCK_SIZE_M)
+        return [MapPair(one.fused, other.truth, assign_blocks) for one, other in zip(self.maps[key], truths)]
 
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    model, *others = models(options)
+    model, *others = resolve_models(options)
     if others:
         raise ConfigError(f"The study 'whole' takes one model: name it with --weights; got {1 + len(others)}.")
     methods = options.methods or METHODS
-    towns = _towns(options, console, model, methods)
-    means = {town.name: {place: _mean(town, place, town.known) for place in town.maps} for town in towns}
-    rows = [_row(town, place, means[town.name][place]) for town in towns for place in town.maps]
-    claims = _claims(means, methods)
-    sheets = [_sheet(town.name, rows) for town in towns] + [claims_sheet(claims, "squares of 64 m"), PAPER]
-    payload: dict[str, object] = {"rows": rows, "claims": claims}
-    publish(options, console, title_of(options, [model]), payload, sheets, _panels(towns, means), 3)
+    town_results = _build_town_results(options, console, model, methods)
+    means = {town.name: {key: _bootstrap_mean_ap(town, key, town.blocks) for key in town.maps} for town in town_results}
+    rows = [_make_row(town, key, means[town.name][key]) for town in town_results for key in town.maps]
+    margin_tests = _check_margins(means, methods)
+    study_tables = [_make_table(town.name, rows) for town in town_results] + [
+        make_margin_table(margin_tests, "squares of 64 m"),
+        PAPER_TABLE,
+    ]
+    payload: dict[str, object] = {"rows": rows, "claims": margin_tests}
+    write_study_report(
+        options, console, make_title(options, [model]), payload, study_tables, _make_panels(town_results, means), 3
+    )
 
 
-def _towns(options: Options, console: Console, model: Model, methods: Sequence[str]) -> list[Town]:
-    recording = model.world.open()
-    data, cells = recording_digest(recording), cells_of(options)
-    grounds = grounds_of(recording, recording.scenarios[:: options.every], "elsewhere")
-    units = [
-        CrowdUnit(model.world, model.weights, ground, survey, seed, tuple(methods), cells, data)
-        for ground in grounds
-        for survey in SURVEYS
+def _build_town_results(
+    options: Options, console: Console, model: StudyModel, methods: Sequence[str]
+) -> list[TownResults]:
+    recording = model.source.open_recording()
+    recording_hash, results_folder = hash_recording(recording), get_results_folder(options)
+    town_maps = group_by_town(recording, recording.scenarios[:: options.scenario_stride], "elsewhere")
+    jobs = [
+        FleetMapJob(
+            model.source, model.weights, town_map, map_mode, seed, tuple(methods), results_folder, recording_hash
+        )
+        for town_map in town_maps
+        for map_mode in MAP_MODES
         for seed in range(options.seeds)
     ]
-    with bars(console) as progress:
-        task = progress.add_task("Maps of towns", total=len(units))
-        with executor_of(options.workers).open() as runner:
-            done = map_blocks(run_unit, units, runner, lambda at, total: progress.update(task, completed=at))
-    made = {(u.ground.name, u.survey, u.seed): maps for u, maps in zip(units, done)}
+    with make_progress_bars(console) as progress:
+        task = progress.add_task("Maps of towns", total=len(jobs))
+        with choose_executor(options.workers).open() as session:
+            maps_by_job = map_blocks(
+                run_fleet_job, jobs, session, lambda at, total: progress.update(task, completed=at)
+            )
+    map_by_key = {(job.town_map.name, job.map_mode, job.seed): maps for job, maps in zip(jobs, maps_by_job)}
     return [
-        Town(
-            ground.name,
+        TownResults(
+            town_map.name,
             {
-                (survey, method): tuple(made[ground.name, survey, seed][k] for seed in range(options.seeds))
-                for survey in SURVEYS
+                (map_mode, method): tuple(map_by_key[town_map.name, map_mode, seed][k] for seed in range(options.seeds))
+                for map_mode in MAP_MODES
                 for k, method in enumerate(methods)
             },
         )
-        for ground in grounds
+        for town_map in town_maps
     ]
 
 
-def _mean(town: Town, place: Place, known: list[Block], way: str = "maptr", in_own_view: bool = False) -> Drawn:
-    judged = town.judged(place, in_own_view)
-    return mean_of([pooled_ap(judged, kind, way, known=known) for kind in PAPER_KINDS])
+def _bootstrap_mean_ap(
+    town: TownResults, key: MapKey, blocks: list[Block], protocol: str = "maptr", in_own_view: bool = False
+) -> BootstrapSamples:
+    pairs = town.map_pairs(key, in_own_view)
+    return average_samples([bootstrap_pooled_ap(pairs, kind, protocol, all_blocks=blocks) for kind in PAPER_KINDS])
 
 
-def _row(town: Town, place: Place, mean: Drawn) -> Row:
-    known, maps = town.known, town.maps[place]
-    return Row(
+def _make_row(town: TownResults, key: MapKey, mean_ap: BootstrapSamples) -> FullMapRow:
+    blocks, maps = town.blocks, town.maps[key]
+    return FullMapRow(
         town.name,
-        *place,
-        ap=tuple(pooled_ap(town.judged(place), kind, known=known).interval() for kind in PAPER_KINDS),
-        mean=mean.interval(),
-        exact=_mean(town, place, known, "exact").interval(),
-        in_own_view=_mean(town, place, known, in_own_view=True).interval(),
-        seen=sum(one.seen for one in maps) / len(maps),
+        *key,
+        ap_by_kind=tuple(
+            bootstrap_pooled_ap(town.map_pairs(key), kind, all_blocks=blocks).interval() for kind in PAPER_KINDS
+        ),
+        mean_ap=mean_ap.interval(),
+        exact_mean_ap=_bootstrap_mean_ap(town, key, blocks, "exact").interval(),
+        own_view_mean_ap=_bootstrap_mean_ap(town, key, blocks, in_own_view=True).interval(),
+        observations_per_map=sum(one.num_observations for one in maps) / len(maps),
         bytes_per_message=sum(one.bytes_per_message for one in maps) / len(maps),
     )
 
 
-def _claims(means: dict[str, dict[Place, Drawn]], methods: Sequence[str]) -> list[MapClaim]:
+def _check_margins(means: dict[str, dict[MapKey, BootstrapSamples]], methods: Sequence[str]) -> list[MapMarginTest]:
     """The whole, semi-global and our fusion, less each local row with a rival's fusion, as the mean over towns."""
     if OURS not in methods:
         return []
 
-    def over_towns(place: Place) -> Drawn:
-        return mean_of([of[place] for of in means.values()])
+    def over_towns(key: MapKey) -> BootstrapSamples:
+        return average_samples([bootstraps[key] for bootstraps in means.values()])
 
-    whole = over_towns((SEMI_GLOBAL, OURS))
-    rivals = {method: over_towns((LOCAL, method)) for method in methods if method in RIVALS}
-    out = [claimed(f"the whole - local + {method}", whole.less(rival), 0.0) for method, rival in rivals.items()]
-    if rivals:
-        best = max(rivals, key=lambda method: rivals[method].value)
-        out.append(claimed(f"the whole - local + {best}, the best of them, goal", whole.less(rivals[best]), GOAL))
-    out.append(claimed(f"the whole - local + {OURS}", whole.less(over_towns((LOCAL, OURS))), 0.0))
+    full_map = over_towns((SEMI_GLOBAL, OURS))
+    baselines = {method: over_towns((LOCAL, method)) for method in methods if method in BASELINES}
+    out = [
+        check_map_margin(f"the whole - local + {method}", full_map.paired_difference(baseline), 0.0)
+        for method, baseline in baselines.items()
+    ]
+    if baselines:
+        best = max(baselines, key=lambda method: baselines[method].value)
+        out.append(
+            check_map_margin(
+                f"the whole - local + {best}, the best of them, goal",
+                full_map.paired_difference(baselines[best]),
+                TARGET_MARGIN,
+            )
+        )
+    out.append(
+        check_map_margin(f"the whole - local + {OURS}", full_map.paired_difference(over_towns((LOCAL, OURS))), 0.0)
+    )
     return out
 
 
-def _sheet(town: str, rows: Sequence[Row]) -> Sheet:
+def _make_table(town: str, rows: Sequence[FullMapRow]) -> StudyTable:
     lines = tuple(
         (
-            row.survey,
+            row.map_mode,
             row.method,
-            *map(value, row.ap),
-            value(row.mean),
-            value(row.exact),
-            value(row.in_own_view),
-            number(row.seen),
-            number(row.bytes_per_message),
+            *map(format_interval, row.ap_by_kind),
+            format_interval(row.mean_ap),
+            format_interval(row.exact_mean_ap),
+            format_interval(row.own_view_mean_ap),
+            format_number(row.observations_per_map),
+            format_number(row.bytes_per_message),
         )
         for row in rows
         if row.town == town
@@ -193,24 +237,26 @@ def _sheet(town: str, rows: Sequence[Row]) -> Sheet:
         "observations",
         "bytes/message",
     )
-    return Sheet(f"The map of {town}", headings, lines)
+    return StudyTable(f"The map of {town}", headings, lines)
 
 
-def _panels(towns: Sequence[Town], means: dict[str, dict[Place, Drawn]]) -> list[Panel]:
+def _make_panels(
+    town_results: Sequence[TownResults], means: dict[str, dict[MapKey, BootstrapSamples]]
+) -> list[MapPanel]:
     """For each town the truth, the best local row of a rival, and the whole, about the middle of what is true."""
     out = []
-    for town in towns:
-        locals_ = {place: d.value for place, d in means[town.name].items() if place[0] == LOCAL and place[1] != OURS}
-        best = max(locals_, key=lambda place: locals_[place], default=(LOCAL, OURS))
-        places = [place for place in (best, (SEMI_GLOBAL, OURS)) if place in town.maps]
-        if not places:
+    for town in town_results:
+        local_values = {key: d.value for key, d in means[town.name].items() if key[0] == LOCAL and key[1] != OURS}
+        best = max(local_values, key=lambda key: local_values[key], default=(LOCAL, OURS))
+        keys = [key for key in (best, (SEMI_GLOBAL, OURS)) if key in town.maps]
+        if not keys:
             continue
-        truth = town.maps[SEMI_GLOBAL, places[-1][1]][0].truth
+        truth = town.maps[SEMI_GLOBAL, keys[-1][1]][0].truth
         x, y = truth.points.mean(0).round().tolist() if len(truth) else (0.0, 0.0)
-        area = (x - PICTURED_M, y - PICTURED_M, x + PICTURED_M, y + PICTURED_M)
-        out.append(Panel(f"{town.name}: truth in view", truth, area=area))
+        area = (x - FIGURE_HALF_SIZE_M, y - FIGURE_HALF_SIZE_M, x + FIGURE_HALF_SIZE_M, y + FIGURE_HALF_SIZE_M)
+        out.append(MapPanel(f"{town.name}: truth in view", truth, area=area))
         out += [
-            Panel(f"{town.name}: {survey} + {method}", town.maps[survey, method][0].made, truth, area=area)
-            for survey, method in places
+            MapPanel(f"{town.name}: {map_mode} + {method}", town.maps[map_mode, method][0].fused, truth, area=area)
+            for map_mode, method in keys
         ]
     return out

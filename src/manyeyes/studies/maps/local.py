@@ -10,19 +10,27 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from manyeyes.agents.map_perception import SURVEYS
-from manyeyes.evaluation.maps.tile_cells import TileCell
-from manyeyes.evaluation.maps.tile_prediction import ROADSIDE, VEHICLE, DrawLocal
-from manyeyes.studies.maps.running import models, publish, rows_sheet, shown, tables, tile_panels, title_of
-from manyeyes.viz.study_table import Sheet
+from manyeyes.agents.map_perception import MAP_MODES
+from manyeyes.evaluation.maps.tile_cells import TileStudyResult
+from manyeyes.evaluation.maps.tile_prediction import ROADSIDE, VEHICLE, LocalPredictor
+from manyeyes.studies.maps.running import (
+    make_rows_table,
+    make_tile_panels,
+    make_title,
+    predict_tables,
+    resolve_models,
+    select_for_figure,
+    write_study_report,
+)
+from manyeyes.viz.study_table import StudyTable
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from manyeyes.studies.maps.options import Options
 
-WINDOWS = {VEHICLE: SURVEYS["local"].vehicle, ROADSIDE: SURVEYS["local"].roadside}
-PAPER = Sheet(
+WINDOWS = {VEHICLE: MAP_MODES["local"].vehicle_window, ROADSIDE: MAP_MODES["local"].roadside_window}
+PAPER_TABLE = StudyTable(
     "CrowdMap's Table 1: DAIR-V2X, one camera an agent; no bar and no rival",
     ("range", "agent", "AP ped", "AP div", "mAP"),
     (("30 x 30 m", VEHICLE, "0.745", "0.909", "0.827"), ("50 x 30 m", ROADSIDE, "0.772", "0.785", "0.778")),
@@ -31,21 +39,26 @@ PAPER = Sheet(
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    found = models(options)
-    done = tables(options, console, found, DrawLocal())
+    models_used = resolve_models(options)
+    tile_tables = predict_tables(options, console, models_used, LocalPredictor())
     names = tuple(WINDOWS)
-    rows = {sensors: [table.row(name) for name in names if name in table.names] for sensors, table in done.items()}
-    sheet = rows_sheet("Local maps, by sensors and agent", rows)
-    cells = next(iter(done.values())).cells
+    rows = {
+        sensors: [table.make_row(name) for name in names if name in table.names]
+        for sensors, table in tile_tables.items()
+    }
+    results_table = make_rows_table("Local maps, by sensors and agent", rows)
+    results = next(iter(tile_tables.values())).results
     panels = []
     for name, area in WINDOWS.items():
-        own = [one for cell in cells if (one := _first(cell, name)) is not None]
-        for cell in shown(own, lambda c: len(c.drawings[0].truth), 2) if own else ():
-            panels += tile_panels(cell, {name: name}, area)
-    publish(options, console, title_of(options, found), {"rows": rows}, [sheet, PAPER], panels, 4)
+        row_results = [one for result in results if (one := _keep_first(result, name)) is not None]
+        for result in select_for_figure(row_results, lambda c: len(c.predictions[0].truth), 2) if row_results else ():
+            panels += make_tile_panels(result, {name: name}, area)
+    write_study_report(
+        options, console, make_title(options, models_used), {"rows": rows}, [results_table, PAPER_TABLE], panels, 4
+    )
 
 
-def _first(cell: TileCell, row: str) -> TileCell | None:
+def _keep_first(result: TileStudyResult, row_name: str) -> TileStudyResult | None:
     """The cell with the first drawing of a row alone."""
-    own = [one for one in cell.drawings if one.row == row]
-    return replace(cell, drawings=(own[0],)) if own else None
+    predictions = [one for one in result.predictions if one.row_name == row_name]
+    return replace(result, predictions=(predictions[0],)) if predictions else None

@@ -23,7 +23,7 @@ class Options:
     """fusion, noise, table3, malicious or tuning; of the map model local, semi-global, whole or pose."""
     places: tuple[str, ...] = ()
     """Only these places of a study."""
-    counts: tuple[int, ...] = ()
+    observation_counts: tuple[int, ...] = ()
     """Only these counts of observations of the study 'fusion'."""
     seeds: int = 3
     """How many seeds of a study."""
@@ -39,9 +39,9 @@ class Options:
     """Which split of it: towns that did not teach."""
     weights: tuple[str, ...] = ()
     """Map models, one a set of sensors: shipped names or .safetensors files; by default all that ship."""
-    every: int = 1
+    scenario_stride: int = 1
     """Only every n-th scenario of it."""
-    align: str = "vote"
+    pose_correction: str = "vote"
     """Who corrects claimed poses in the study 'pose', by name."""
     out: Path = Path("out/map-study")
     """Folder for a study: cells are kept there, and a study that was stopped goes on."""

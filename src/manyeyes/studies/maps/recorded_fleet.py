@@ -12,90 +12,103 @@ import numpy as np
 
 from manyeyes._source import source_digest
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.detection.one_instant import OneInstant
-from manyeyes.evaluation.maps.map_cells import code_digest as fusion_digest
-from manyeyes.evaluation.maps.registry import map_of, tuned
-from manyeyes.evaluation.maps.tile_cells import World
+from manyeyes.evaluation.detection.one_instant import SingleFramePerScenario
+from manyeyes.evaluation.maps.map_cells import hash_map_sources as fusion_digest
+from manyeyes.evaluation.maps.registry import fuse_observations, make_tuned_settings
+from manyeyes.evaluation.maps.tile_cells import RecordingSource
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.elements.observation_file import read_observations, write_observations
 from manyeyes.maps.store.columns_file import load_columns, save_columns
 from manyeyes.models import pretrained
-from manyeyes.models.maps.map_model import Mapper
-from manyeyes.studies.map_pipeline import Building, build_map
-from manyeyes.studies.town_maps import Ground
+from manyeyes.models.maps.map_model import MapModel
+from manyeyes.studies.map_pipeline import MapBuildConfig, build_map
+from manyeyes.studies.town_maps import TownMap
 
 COMPUTED_BY = ("manyeyes.studies.map_pipeline", "manyeyes.evaluation.detection.one_instant")
 
 
 @dataclass(frozen=True)
-class CrowdUnit:
-    """One town, survey and seed, fused by all methods. data: the recording's digest; folder: where files are kept."""
+class FleetMapJob:
+    """One town, survey and seed, fused by all methods. recording_hash: the recording's digest; results_folder: where files are
+    kept.
+    """
 
-    world: World
+    recording_source: RecordingSource
     weights: str
-    ground: Ground
-    survey: str
+    town_map: TownMap
+    map_mode: str
     seed: int
     methods: tuple[str, ...]
-    folder: Path
-    data: str
+    results_folder: Path
+    recording_hash: str
 
 
 @dataclass(frozen=True, eq=False)
-class CrowdMap:
-    """A method's map of one town, cut as the truth is, and the truth in view of these agents. seen: observations."""
+class FleetMap:
+    """A method's map of one town, cut as the truth is, and the truth in view of these agents. num_observations: observations."""
 
-    made: MapElements
+    fused: MapElements
     truth: MapElements
-    seen: int
+    num_observations: int
     bytes_per_message: float
 
 
 @dataclass(frozen=True, eq=False)
-class _Truth:
+class _ObservedTruth:
     elements: MapElements
     bytes_per_message: np.ndarray
 
 
-def run_unit(unit: CrowdUnit) -> tuple[CrowdMap, ...]:
+def run_fleet_job(job: FleetMapJob) -> tuple[FleetMap, ...]:
     """The maps of a unit in the order of its methods: found, or made and kept."""
-    observations, truth = _seen(unit)
-    settings, cut = tuned(), unit.ground.cut
-    assert cut is not None
-    said = "".join(sorted(o.id for o in observations))
+    observations, truth = _load_or_observe(job)
+    settings, cut_policy = make_tuned_settings(), job.town_map.cut_policy
+    assert cut_policy is not None
+    observation_ids = "".join(sorted(o.id for o in observations))
     out = []
-    for method in unit.methods:
-        key = repr((said, method, settings.of(method), fusion_digest(method)))
-        path = _path(unit, method, key)
-        made = load_columns(path, MapElements)
-        if made is None:
-            made = cut(map_of(method, observations, settings, unit.ground.frame).published().elements)
-            save_columns(path, made)
-        out.append(CrowdMap(made, truth.elements, len(observations), float(truth.bytes_per_message)))
+    for method in job.methods:
+        key = repr((observation_ids, method, settings.config_of(method), fusion_digest(method)))
+        path = _make_path(job, method, key)
+        fused = load_columns(path, MapElements)
+        if fused is None:
+            fused = cut_policy(
+                fuse_observations(method, observations, settings, job.town_map.frame).select_published().elements
+            )
+            save_columns(path, fused)
+        out.append(FleetMap(fused, truth.elements, len(observations), float(truth.bytes_per_message)))
     return tuple(out)
 
 
-def _seen(unit: CrowdUnit) -> tuple[tuple[Observation, ...], _Truth]:
+def _load_or_observe(job: FleetMapJob) -> tuple[tuple[Observation, ...], _ObservedTruth]:
     """What the cartographer took of a unit's agents, and what of the truth was in their views."""
-    key = repr((_mapper(unit.weights).fingerprint.hex(), unit.data, unit.ground.scenarios, source_digest(*COMPUTED_BY)))
-    path = _path(unit, "seen", key)
-    truth = load_columns(path, _Truth)
+    key = repr(
+        (
+            _load_map_model(job.weights).fingerprint.hex(),
+            job.recording_hash,
+            job.town_map.scenarios,
+            source_digest(*COMPUTED_BY),
+        )
+    )
+    path = _make_path(job, "seen", key)
+    truth = load_columns(path, _ObservedTruth)
     if truth is None:
-        recording = OneInstant(unit.world.open(), unit.seed)
-        built = build_map(recording, unit.ground, Building(_mapper(unit.weights), unit.survey, every=1))
+        recording = SingleFramePerScenario(job.recording_source.open_recording(), job.seed)
+        built = build_map(
+            recording, job.town_map, MapBuildConfig(_load_map_model(job.weights), job.map_mode, frame_stride=1)
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_observations(path.with_suffix(".parquet"), built.cartographer.observations, unit.ground.frame)
+        write_observations(path.with_suffix(".parquet"), built.map_server.observations, job.town_map.frame)
         assert built.truth is not None
-        truth = _Truth(built.truth, np.array(built.numbers.bytes_per_message))
+        truth = _ObservedTruth(built.truth, np.array(built.stats.bytes_per_message))
         save_columns(path, truth)
     return read_observations(path.with_suffix(".parquet")).observations, truth
 
 
-def _path(unit: CrowdUnit, what: str, key: str) -> Path:
+def _make_path(job: FleetMapJob, content_name: str, key: str) -> Path:
     digest = hashlib.blake2b(key.encode(), digest_size=8).hexdigest()
-    return unit.folder / f"{unit.ground.name}-{unit.survey}-{unit.seed}-{what}-{digest}.npz"
+    return job.results_folder / f"{job.town_map.name}-{job.map_mode}-{job.seed}-{content_name}-{digest}.npz"
 
 
 @lru_cache(maxsize=2)
-def _mapper(weights: str) -> Mapper:
-    return pretrained.load_mapper(weights)
+def _load_map_model(weights: str) -> MapModel:
+    return pretrained.load_map_model(weights)

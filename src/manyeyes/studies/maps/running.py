@@ -13,21 +13,28 @@ from rich.console import Console
 
 from manyeyes._io import atomic_write_text
 from manyeyes.datasets.base import Recording
-from manyeyes.datasets.dair_index import dair_root
+from manyeyes.datasets.dair_index import find_dair_root
 from manyeyes.datasets.missing import MissingFiles
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.maps.pooled_ap import MapClaim
-from manyeyes.evaluation.maps.tile_cells import Draw, TileCell, World, run_tiles
-from manyeyes.evaluation.maps.tile_metrics import KINDS, WAYS, TileRow, TileTable
-from manyeyes.evaluation.maps.tiles import assert_split
+from manyeyes.evaluation.maps.pooled_ap import MapMarginTest
+from manyeyes.evaluation.maps.tile_cells import RecordingSource, TilePredictor, TileStudyResult, run_tile_study
+from manyeyes.evaluation.maps.tile_metrics import TABLE_KINDS, TABLE_PROTOCOLS, TileRow, TileTable
+from manyeyes.evaluation.maps.tiles import check_town_split
 from manyeyes.models import pretrained
 from manyeyes.studies import provenance
-from manyeyes.studies.map_recordings import has_pictures, open_looks, true_maps
-from manyeyes.studies.maps.fleet import executor_of
-from manyeyes.studies.recordings import cells_folder, check_files, open_recording
-from manyeyes.viz.map_figures import Panel, save_figure
-from manyeyes.viz.progress import bars
-from manyeyes.viz.study_table import Sheet, change, markdown, number, terminal, value
+from manyeyes.studies.map_recordings import has_images, load_true_maps, open_sensor_recording
+from manyeyes.studies.maps.fleet import choose_executor
+from manyeyes.studies.recordings import check_files, choose_results_folder, open_recording
+from manyeyes.viz.map_figures import MapPanel, save_figure
+from manyeyes.viz.progress import make_progress_bars
+from manyeyes.viz.study_table import (
+    StudyTable,
+    format_difference,
+    format_interval,
+    format_markdown,
+    format_number,
+    make_terminal_table,
+)
 from manyeyes.viz.table import NOT_RUN, missing_footer
 
 if TYPE_CHECKING:
@@ -40,7 +47,7 @@ HEADINGS = ("sensors", "row", "AP ped", "AP div", "mAP", "exact", "AP edge", "lo
 
 
 @dataclass(frozen=True)
-class OpenLooks:
+class OpenRecording:
     """Opens the recording with what these sensors took, in this process or another."""
 
     data: Path
@@ -49,144 +56,167 @@ class OpenLooks:
 
     def __call__(self) -> Recording:
         """The recording."""
-        return open_looks(self.data, self.split, self.sensors)
+        return open_sensor_recording(self.data, self.split, self.sensors)
 
 
 @dataclass(frozen=True)
-class Model:
+class StudyModel:
     """Weights by name, the sensors that they are for, and where they are judged."""
 
     weights: str
     sensors: str
-    world: World
+    source: RecordingSource
 
 
-def missing_files(options: Options, console: Console) -> MissingFiles:
+def find_missing_files(options: Options, console: Console) -> MissingFiles:
     """The files that the recording of a study lacks; an error unless they are allowed."""
     assert options.data is not None
     return check_files(open_recording(options.data, options.split), options.checks, console)
 
 
-def cells_of(options: Options) -> Path:
+def get_results_folder(options: Options) -> Path:
     """The folder for the kept results of this study."""
-    return cells_folder(options.out, missing_files(options, Console(quiet=True)))
+    return choose_results_folder(options.out, find_missing_files(options, Console(quiet=True)))
 
 
-def models(options: Options) -> tuple[Model, ...]:
+def resolve_models(options: Options) -> tuple[StudyModel, ...]:
     """The models that are judged: those given, or those that ship; refused where one was taught by a town that would judge it."""
     assert options.data is not None
-    names = options.weights or _shipped_for(options)
+    names = options.weights or _select_shipped(options)
     if not names:
         raise ConfigError(
             "No map model ships with this version: give --weights FILE of 'manyeyes train --preset map-small'."
         )
-    found = []
+    resolved = []
     for name in names:
-        sensors = pretrained.load_mapper(name).config.bev.sensors
-        world = World(OpenLooks(options.data, options.split, sensors), true_maps)
-        assert_split(
-            pretrained.mapper_towns(name), [scenario.rpartition("_")[0] for scenario in world.open().scenarios]
+        sensors = pretrained.load_map_model(name).config.bev.sensors
+        source = RecordingSource(OpenRecording(options.data, options.split, sensors), load_true_maps)
+        check_town_split(
+            pretrained.read_training_towns(name),
+            [scenario.rpartition("_")[0] for scenario in source.open_recording().scenarios],
         )
-        found.append(Model(str(name), SENSORS[tuple(sorted(sensors, reverse=True))], world))
-    if len({model.sensors for model in found}) < len(found):
-        raise ConfigError(f"One model a set of sensors; got {', '.join(m.sensors for m in found)}.")
-    return tuple(found)
+        resolved.append(StudyModel(str(name), SENSORS[tuple(sorted(sensors, reverse=True))], source))
+    if len({model.sensors for model in resolved}) < len(resolved):
+        raise ConfigError(f"One model a set of sensors; got {', '.join(m.sensors for m in resolved)}.")
+    return tuple(resolved)
 
 
-def _shipped_for(options: Options) -> tuple[str, ...]:
+def _select_shipped(options: Options) -> tuple[str, ...]:
     """The shipped models whose sensors the recording has."""
     assert options.data is not None
-    if not pretrained.mappers():
+    if not pretrained.list_map_models():
         return ()
-    seeing = dair_root(options.data) is None and has_pictures(open_recording(options.data, options.split, images=True))
+    has_camera = find_dair_root(options.data) is None and has_images(
+        open_recording(options.data, options.split, images=True)
+    )
     return tuple(
         name
-        for name in pretrained.mappers()
-        if seeing or "camera" not in pretrained.load_mapper(name).config.bev.sensors
+        for name in pretrained.list_map_models()
+        if has_camera or "camera" not in pretrained.load_map_model(name).config.bev.sensors
     )
 
 
-def tables(options: Options, console: Console, found: Sequence[Model], draw: Draw) -> dict[str, TileTable]:
+def predict_tables(
+    options: Options, console: Console, models_used: Sequence[StudyModel], predictor: TilePredictor
+) -> dict[str, TileTable]:
     """What each model draws, by its sensors."""
-    return {model.sensors: TileTable(_drawn(options, console, model, draw)) for model in found}
+    return {model.sensors: TileTable(_predict(options, console, model, predictor)) for model in models_used}
 
 
-def _drawn(options: Options, console: Console, model: Model, draw: Draw) -> tuple[TileCell, ...]:
-    with bars(console) as progress:
+def _predict(
+    options: Options, console: Console, model: StudyModel, predictor: TilePredictor
+) -> tuple[TileStudyResult, ...]:
+    with make_progress_bars(console) as progress:
         task = progress.add_task(f"Tiles, {model.sensors}", total=None)
-        return run_tiles(
-            model.world,
+        return run_tile_study(
+            model.source,
             model.weights,
-            draw,
+            predictor,
             range(options.seeds),
-            cells_of(options),
-            executor_of(options.workers),
+            get_results_folder(options),
+            choose_executor(options.workers),
             lambda done, total: progress.update(task, completed=done, total=total),
-            options.every,
+            options.scenario_stride,
         )
 
 
-def rows_sheet(title: str, rows: Mapping[str, Sequence[TileRow]]) -> Sheet:
+def make_rows_table(title: str, rows: Mapping[str, Sequence[TileRow]]) -> StudyTable:
     """A line for each row of each set of sensors; sets without weights read "not run"."""
     lines: list[tuple[str, ...]] = []
     for sensors in SENSORS.values():
-        lines += [(sensors, row.row, *_cells(row)) for row in rows.get(sensors, ())]
+        lines += [(sensors, row.name, *_format_cells(row)) for row in rows.get(sensors, ())]
         if sensors not in rows:
             lines.append((sensors, NOT_RUN, *[""] * (len(HEADINGS) - 2)))
-    return Sheet(title, HEADINGS, tuple(lines))
+    return StudyTable(title, HEADINGS, tuple(lines))
 
 
-def _cells(row: TileRow) -> tuple[str, ...]:
-    ap = dict(zip(KINDS, row.ap[WAYS.index("maptr")]))
-    means = [value(row.mean[WAYS.index(way)]) for way in WAYS]
-    sizes = (number(row.looks, 1), number(row.bytes_per_look), number(row.bytes_per_tile))
-    return (value(ap["crossing"]), value(ap["divider"]), *means, value(ap["boundary"]), *sizes)
-
-
-def claims_sheet(claims: Sequence[MapClaim], over: str) -> Sheet:
-    """The claims as a table; over: what is drawn with replacement."""
-    lines = tuple((c.what, change(c.difference), f"{c.bar:+.3f}", c.verdict) for c in claims)
-    return Sheet(
-        f"Claims, mAP paired over {over}", ("claim", "difference, 95 % interval", "at least", "verdict"), lines
+def _format_cells(row: TileRow) -> tuple[str, ...]:
+    ap = dict(zip(TABLE_KINDS, row.ap[TABLE_PROTOCOLS.index("maptr")]))
+    means = [format_interval(row.mean_ap[TABLE_PROTOCOLS.index(way)]) for way in TABLE_PROTOCOLS]
+    sizes = (
+        format_number(row.frames_per_tile, 1),
+        format_number(row.bytes_per_frame),
+        format_number(row.bytes_per_tile),
+    )
+    return (
+        format_interval(ap["crossing"]),
+        format_interval(ap["divider"]),
+        *means,
+        format_interval(ap["boundary"]),
+        *sizes,
     )
 
 
-def shown(cells: Sequence[TileCell], weigh: Callable[[TileCell], int], count: int = 3) -> list[TileCell]:
+def make_margin_table(margin_tests: Sequence[MapMarginTest], resampled_unit: str) -> StudyTable:
+    """The claims as a table; resampled_unit: what is drawn with replacement."""
+    lines = tuple((c.description, format_difference(c.difference), f"{c.margin:+.3f}", c.verdict) for c in margin_tests)
+    return StudyTable(
+        f"Claims, mAP paired over {resampled_unit}",
+        ("claim", "difference, 95 % interval", "at least", "verdict"),
+        lines,
+    )
+
+
+def select_for_figure(
+    results: Sequence[TileStudyResult], size_of: Callable[[TileStudyResult], int], max_results: int = 3
+) -> list[TileStudyResult]:
     """So many cells of the first seed for a picture, evenly spaced in the order of what they weigh, not chosen for their looks."""
-    first = sorted((c for c in cells if c.seed == cells[0].seed), key=lambda c: (weigh(c), c.scenario))
-    places = np.unique(np.linspace(0, len(first) - 1, count + 2)[1:-1].round().astype(int))
-    return [first[place] for place in places.tolist()]
+    first_seed = sorted((c for c in results if c.seed == results[0].seed), key=lambda c: (size_of(c), c.scenario))
+    indices = np.unique(np.linspace(0, len(first_seed) - 1, max_results + 2)[1:-1].round().astype(int))
+    return [first_seed[index] for index in indices.tolist()]
 
 
-def tile_panels(cell: TileCell, rows: Mapping[str, str], area: tuple[float, float, float, float]) -> list[Panel]:
+def make_tile_panels(
+    result: TileStudyResult, rows: Mapping[str, str], area: tuple[float, float, float, float]
+) -> list[MapPanel]:
     """The truth of a cell's tile, and the drawings of some rows on it; rows: their titles by name."""
-    held = {one.row: one for one in cell.drawings}
-    truth = held[next(iter(rows))].truth
-    sure = {name: held[name].drawn.take(held[name].drawn.score >= 0.3) for name in rows}
+    by_name = {one.row_name: one for one in result.predictions}
+    truth = by_name[next(iter(rows))].truth
+    confident = {name: by_name[name].predicted.take(by_name[name].predicted.score >= 0.3) for name in rows}
     return [
-        Panel(f"{cell.scenario}: truth", truth, area=area),
-        *(Panel(f"{cell.scenario}: {title}", sure[name], truth, area=area) for name, title in rows.items()),
+        MapPanel(f"{result.scenario}: truth", truth, area=area),
+        *(MapPanel(f"{result.scenario}: {title}", confident[name], truth, area=area) for name, title in rows.items()),
     ]
 
 
-def publish(
+def write_study_report(
     options: Options,
     console: Console,
     title: str,
     payload: dict[str, object],
-    sheets: Sequence[Sheet],
-    panels: Sequence[Panel],
+    study_tables: Sequence[StudyTable],
+    panels: Sequence[MapPanel],
     columns: int,
     notes: Sequence[str] = (),
 ) -> None:
     """Tables in the terminal; STUDY.json, STUDY.md and STUDY.png in the folder --out."""
     name = str(options.study)
-    missing = missing_files(options, Console(quiet=True))
+    missing = find_missing_files(options, Console(quiet=True))
     footer = missing_footer(missing.count, f"{name}.json")
     notes = (*notes, footer) if footer else notes
     console.print(f"{title}\n", highlight=False, soft_wrap=True)
-    for sheet in sheets:
-        console.print(terminal(sheet))
+    for study_table in study_tables:
+        console.print(make_terminal_table(study_table))
         console.print()
     if footer:
         console.print(footer, highlight=False, soft_wrap=True)
@@ -195,7 +225,9 @@ def publish(
     )
     save_figure(panels, options.out / f"{name}.png", columns)
     picture = f"![{name}]({name}.png)\n"
-    text = "\n".join([f"# {name}\n\n{title}\n", *map(markdown, sheets), *(f"{note}\n" for note in notes), picture])
+    text = "\n".join(
+        [f"# {name}\n\n{title}\n", *map(format_markdown, study_tables), *(f"{note}\n" for note in notes), picture]
+    )
     atomic_write_text(options.out / f"{name}.md", text)
     console.print(
         f"Intervals, numbers and picture are in {options.out / name}.md, .json and .png",
@@ -204,9 +236,9 @@ def publish(
     )
 
 
-def title_of(options: Options, found: Sequence[Model]) -> str:
+def make_title(options: Options, models_used: Sequence[StudyModel]) -> str:
     """Weights, data, and how much of it."""
     assert options.data is not None
-    scenarios = found[0].world.open().scenarios[:: options.every]
-    names = ", ".join(Path(model.weights).stem for model in found)
+    scenarios = models_used[0].source.open_recording().scenarios[:: options.scenario_stride]
+    names = ", ".join(Path(model.weights).stem for model in models_used)
     return f"{names} on {options.data.name}/{options.split}: {len(scenarios)} scenarios, {options.seeds} seeds"

@@ -5,29 +5,29 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from manyeyes.evaluation.maps.pooled_ap import MapClaim
+from manyeyes.evaluation.maps.pooled_ap import MapMarginTest
 from manyeyes.evaluation.maps.tile_metrics import TileTable
-from manyeyes.evaluation.maps.tile_prediction import DrawSemiGlobal
+from manyeyes.evaluation.maps.tile_prediction import SemiGlobalPredictor
 from manyeyes.studies.maps.running import (
-    claims_sheet,
-    models,
-    publish,
-    rows_sheet,
-    shown,
-    tables,
-    tile_panels,
-    title_of,
+    make_margin_table,
+    make_rows_table,
+    make_tile_panels,
+    make_title,
+    predict_tables,
+    resolve_models,
+    select_for_figure,
+    write_study_report,
 )
-from manyeyes.viz.study_table import Sheet
+from manyeyes.viz.study_table import StudyTable
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from manyeyes.studies.maps.options import Options
 
-BAR, GOAL = 0.20, 0.30
-TILE = (-60.0, -30.0, 60.0, 30.0)
-PAPER = Sheet(
+MARGIN, TARGET_MARGIN = 0.20, 0.30
+TILE_AREA = (-60.0, -30.0, 60.0, 30.0)
+PAPER_TABLE = StudyTable(
     "CrowdMap's Table 2: DAIR-V2X, cameras; no bar and no rival",
     ("looks", "method", "AP ped", "AP div", "mAP"),
     (("1", "MapTR", "0.182", "0.103", "0.143"), ("10", "CrowdMap", "0.599", "0.682", "0.641")),
@@ -36,23 +36,44 @@ PAPER = Sheet(
 
 def run(options: Options, console: Console) -> None:
     """The study."""
-    found = models(options)
-    draw = DrawSemiGlobal()
-    done = tables(options, console, found, draw)
-    names = tuple(map(str, draw.looks))
-    rows = {sensors: [table.row(name) for name in names] for sensors, table in done.items()}
-    held = [claim for sensors, table in done.items() for claim in claims(sensors, table, draw.looks)]
-    sheets = [rows_sheet("Tiles, by sensors and looks", rows), claims_sheet(held, "scenarios"), PAPER]
-    titles = {names[0]: "one vehicle", names[-1]: f"{names[-1]} looks"}
-    cells = next(iter(done.values())).cells
-    panels = [
-        panel for cell in shown(cells, lambda c: len(c.drawings[0].truth)) for panel in tile_panels(cell, titles, TILE)
+    models_used = resolve_models(options)
+    predictor = SemiGlobalPredictor()
+    tile_tables = predict_tables(options, console, models_used, predictor)
+    names = tuple(map(str, predictor.frame_counts))
+    rows = {sensors: [table.make_row(name) for name in names] for sensors, table in tile_tables.items()}
+    margin_tests = [
+        margin_test
+        for sensors, table in tile_tables.items()
+        for margin_test in check_margins(sensors, table, predictor.frame_counts)
     ]
-    publish(options, console, title_of(options, found), {"rows": rows, "claims": held}, sheets, panels, 3)
+    study_tables = [
+        make_rows_table("Tiles, by sensors and looks", rows),
+        make_margin_table(margin_tests, "scenarios"),
+        PAPER_TABLE,
+    ]
+    titles = {names[0]: "one vehicle", names[-1]: f"{names[-1]} looks"}
+    results = next(iter(tile_tables.values())).results
+    panels = [
+        panel
+        for result in select_for_figure(results, lambda c: len(c.predictions[0].truth))
+        for panel in make_tile_panels(result, titles, TILE_AREA)
+    ]
+    write_study_report(
+        options,
+        console,
+        make_title(options, models_used),
+        {"rows": rows, "claims": margin_tests},
+        study_tables,
+        panels,
+        3,
+    )
 
 
-def claims(sensors: str, table: TileTable, looks: tuple[int, ...]) -> list[MapClaim]:
+def check_margins(sensors: str, table: TileTable, frame_counts: tuple[int, ...]) -> list[MapMarginTest]:
     """More looks against one: the bar and the goal for the most, and that none is worse."""
-    one, *more = map(str, looks)
-    bars = ((more[-1], BAR, ""), (more[-1], GOAL, ", goal"), *((name, 0.0, "") for name in more))
-    return [table.claim(f"{sensors}: {name} looks - one vehicle{said}", name, one, bar) for name, bar, said in bars]
+    one, *more = map(str, frame_counts)
+    margins = ((more[-1], MARGIN, ""), (more[-1], TARGET_MARGIN, ", goal"), *((name, 0.0, "") for name in more))
+    return [
+        table.check_margin(f"{sensors}: {name} looks - one vehicle{suffix}", name, one, margin)
+        for name, margin, suffix in margins
+    ]

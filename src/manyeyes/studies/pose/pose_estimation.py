@@ -10,18 +10,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manyeyes._source import source_digest
-from manyeyes.agents.pose_correction import Aligner
-from manyeyes.evaluation.detection.benchmark import loaded
-from manyeyes.evaluation.pose.accuracy import AccuracyRow, Meeting, Trial, answered, kept, meetings, rows
-from manyeyes.evaluation.pose.metrics import ClaimNoise
+from manyeyes.agents.pose_correction import PoseCorrection
+from manyeyes.evaluation.detection.benchmark import load_detector
+from manyeyes.evaluation.pose.accuracy import (
+    AccuracyRow,
+    CorrectorTrial,
+    LandmarkPair,
+    iterate_landmark_pairs,
+    load_or_run,
+    run_corrector,
+    summarize_run,
+)
+from manyeyes.evaluation.pose.metrics import PriorNoise
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.study import recording_digest
+from manyeyes.evaluation.study import hash_recording
 from manyeyes.models.checkpoint import fingerprint
-from manyeyes.pose.registry import corrector
-from manyeyes.studies.running import Start, publish, start
-from manyeyes.viz.curves import Curve, Panel
-from manyeyes.viz.progress import bars
-from manyeyes.viz.study_table import Sheet, number
+from manyeyes.pose.registry import load_corrector
+from manyeyes.studies.running import StudyContext, prepare_study, write_study_report
+from manyeyes.viz.curves import Curve, CurvePanel
+from manyeyes.viz.progress import make_progress_bars
+from manyeyes.viz.study_table import StudyTable, format_number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,130 +38,163 @@ if TYPE_CHECKING:
 
 CORRECTORS = ("given", "vote", "coalign", "fpv-rcnn", "feaco", "v2x-reg-odist")
 SIGMAS = (0.0, 0.4, 0.8, 1.2, 2.0)
-FAMILIES = (
+NOISE_FAMILIES = (
     ("gaussian_all", 0.8), ("laplace", 0.8), ("bias", 0.8), ("walk", 0.8), ("latency", 2.0), ("heavy", 0.4), ("offset", 0.5),
     ("unknown", 0.0), ("none", 0.0),
 )  # fmt: skip
-SHOWN = ("gaussian", 0.8)
+LISTED_NOISE = ("gaussian", 0.8)
 
 
 def run(options: Options, console: Console) -> None:
     """The study: Gaussian errors for every corrector, every other family for the first two."""
-    begun = start(options, console)
+    context = prepare_study(options, console)
     names = options.correctors or CORRECTORS
     for name in names:
-        corrector(name)
-    trials = [Trial(n, ClaimNoise("gaussian", s, s, options.seed)) for n in names for s in SIGMAS]
-    trials += [Trial(n, ClaimNoise(kind, s, s, options.seed)) for n in names[:2] for kind, s in FAMILIES]
-    table = carried_out(begun, trials)
-    payload: dict[str, object] = {"rows": [asdict(row) for row in table]}
-    publish(begun, payload, [_sheet(table), _by_common(table)], panels(table), [])
+        load_corrector(name)
+    trials = [CorrectorTrial(n, PriorNoise("gaussian", s, s, options.seed)) for n in names for s in SIGMAS]
+    trials += [CorrectorTrial(n, PriorNoise(kind, s, s, options.seed)) for n in names[:2] for kind, s in NOISE_FAMILIES]
+    result_rows = run_trials(context, trials)
+    payload: dict[str, object] = {"rows": [asdict(row) for row in result_rows]}
+    write_study_report(
+        context,
+        payload,
+        [_make_results_table(result_rows), _make_common_objects_table(result_rows)],
+        make_panels(result_rows),
+        [],
+    )
 
 
-def carried_out(begun: Start, trials: Sequence[Trial]) -> list[AccuracyRow]:
+def run_trials(context: StudyContext, trials: Sequence[CorrectorTrial]) -> list[AccuracyRow]:
     """The rows of every trial; answers that are kept under --out are not made again."""
-    met: dict[str, list[Meeting]] = {}
-    base, detector = begun.base, loaded(begun.base.weights)
-    recording = begun.opener()
-    data = (
-        recording_digest(recording),
+    pairs_by_net: dict[str, list[LandmarkPair]] = {}
+    base, detector = context.base, load_detector(context.base.weights)
+    recording = context.opener()
+    data_key = (
+        hash_recording(recording),
         detector.fingerprint.hex(),
-        base.every,
+        base.frame_stride,
         source_digest("manyeyes.evaluation.pose.accuracy"),
     )
-    nets = {name: Aligner(name).net for name in {trial.corrector for trial in trials}}
-    marks = {name: "" if net is None else fingerprint(net).hex() for name, net in nets.items()}
+    nets = {name: PoseCorrection(name).net for name in {trial.corrector for trial in trials}}
+    net_fingerprints = {name: "" if net is None else fingerprint(net).hex() for name, net in nets.items()}
 
-    def seen(name: str) -> list[Meeting]:
-        if marks[name] not in met:
-            met[marks[name]] = list(meetings(recording, detector, every=base.every, net=nets[name]))
-        return met[marks[name]]
+    def get_pairs(name: str) -> list[LandmarkPair]:
+        if net_fingerprints[name] not in pairs_by_net:
+            pairs_by_net[net_fingerprints[name]] = list(
+                iterate_landmark_pairs(recording, detector, frame_stride=base.frame_stride, net=nets[name])
+            )
+        return pairs_by_net[net_fingerprints[name]]
 
     out = []
-    with bars(begun.console) as progress:
+    with make_progress_bars(context.console) as progress:
         for trial in progress.track(trials, description="Aligning"):
-            key = hashlib.blake2b(repr((trial, marks[trial.corrector], data)).encode(), digest_size=8).hexdigest()
-            path = begun.cells / f"pose-{Path(trial.corrector).stem}-{key}.json"
-            found = kept(path, lambda trial=trial: answered(seen(trial.corrector), trial))
-            out += rows(trial, found)
+            key = hashlib.blake2b(
+                repr((trial, net_fingerprints[trial.corrector], data_key)).encode(), digest_size=8
+            ).hexdigest()
+            path = context.results_folder / f"pose-{Path(trial.corrector).stem}-{key}.json"
+            corrector_run = load_or_run(path, lambda trial=trial: run_corrector(get_pairs(trial.corrector), trial))
+            out += summarize_run(trial, corrector_run)
     return out
 
 
-def _name(row: AccuracyRow) -> str:
+def _noise_name(row: AccuracyRow) -> str:
     noise = row.trial.noise
     return noise.kind if noise.kind in ("unknown", "none") else f"{noise.kind} {noise.sigma_m:g}"
 
 
-def _sheet(table: Sequence[AccuracyRow]) -> Sheet:
+def _make_results_table(result_rows: Sequence[AccuracyRow]) -> StudyTable:
     headings = (
         "corrector", "errors", "frames", "within 1 m, 1°", "2", "3", "answered", "right", "wrong", "conflict", "m, median",
         "m, p95", "°, median", "objects off m", "NEES", "AURC", "bytes", "ms", "ms p95",
     )  # fmt: skip
-    return Sheet(
-        "All meetings", headings, tuple((r.trial.corrector, _name(r), *_cells(r)) for r in table if r.common is None)
+    return StudyTable(
+        "All meetings",
+        headings,
+        tuple((r.trial.corrector, _noise_name(r), *_format_cells(r)) for r in result_rows if r.common_range is None),
     )
 
 
-def _cells(row: AccuracyRow) -> tuple[str, ...]:
+def _format_cells(row: AccuracyRow) -> tuple[str, ...]:
     s = row.score
-    shares = (*s.success, s.coverage, s.precision, s.wrong_accepts, s.conflicts)
-    lengths = (s.median_metres, s.p95_metres, s.median_degrees, s.displacement, s.nees, s.aurc)
+    shares = (*s.success_rate, s.coverage, s.precision, s.false_accept_rate, s.conflict_rate)
+    lengths = (
+        s.median_translation_error_m,
+        s.p95_translation_error_m,
+        s.median_rotation_error_deg,
+        s.mean_displacement_m,
+        s.nees,
+        s.aurc,
+    )
     return (
-        number(s.frames),
-        *(number(100 * x, 1) for x in shares),
-        *(number(x, 2) for x in lengths),
-        number(row.bytes),
-        number(row.mean_ms, 1),
-        number(row.p95_ms, 1),
+        format_number(s.num_frames),
+        *(format_number(100 * x, 1) for x in shares),
+        *(format_number(x, 2) for x in lengths),
+        format_number(row.bytes_per_message),
+        format_number(row.mean_ms, 1),
+        format_number(row.p95_ms, 1),
     )
 
 
-def _by_common(table: Sequence[AccuracyRow]) -> Sheet:
-    shown = [r for r in table if r.common and (r.trial.noise.kind, r.trial.noise.sigma_m) in (SHOWN, ("offset", 0.5))]
+def _make_common_objects_table(result_rows: Sequence[AccuracyRow]) -> StudyTable:
+    listed = [
+        r
+        for r in result_rows
+        if r.common_range and (r.trial.noise.kind, r.trial.noise.sigma_m) in (LISTED_NOISE, ("offset", 0.5))
+    ]
     lines = tuple(
         (
             r.trial.corrector,
-            _name(r),
-            f"{r.common[0]}+" if r.common[1] >= 10**9 else "-".join(dict.fromkeys(map(str, r.common))),
-            *_cells(r)[:13],
+            _noise_name(r),
+            f"{r.common_range[0]}+"
+            if r.common_range[1] >= 10**9
+            else "-".join(dict.fromkeys(map(str, r.common_range))),
+            *_format_cells(r)[:13],
         )
-        for r in shown
-        if r.common
+        for r in listed
+        if r.common_range
     )
     headings = (
         "corrector", "errors", "in common", "frames", "within 1 m, 1°", "2", "3", "answered", "right", "wrong", "conflict",
         "m, median", "m, p95", "°, median", "objects off m", "NEES",
     )  # fmt: skip
-    return Sheet("By objects in common", headings, lines)
+    return StudyTable("By objects in common", headings, lines)
 
 
-def panels(table: Sequence[AccuracyRow]) -> list[Panel]:
+def make_panels(result_rows: Sequence[AccuracyRow]) -> list[CurvePanel]:
     """Success and objects' displacement against sigma; risk against coverage at one sigma."""
-    every = [r for r in table if r.common is None and r.trial.noise.kind == "gaussian"]
-    names = list(dict.fromkeys(r.trial.corrector for r in every))
-    own = {name: [r for r in every if r.trial.corrector == name] for name in names}
+    overall = [r for r in result_rows if r.common_range is None and r.trial.noise.kind == "gaussian"]
+    names = list(dict.fromkeys(r.trial.corrector for r in overall))
+    rows_by_corrector = {name: [r for r in overall if r.trial.corrector == name] for name in names}
     success = [
-        Curve(n, tuple(_plain(r.score.success[0]) for r in rs), tuple(r.trial.noise.sigma_m for r in rs))
-        for n, rs in own.items()
+        Curve(
+            n,
+            tuple(_make_interval(r.score.success_rate[0]) for r in corrector_rows),
+            tuple(r.trial.noise.sigma_m for r in corrector_rows),
+        )
+        for n, corrector_rows in rows_by_corrector.items()
     ]
-    shift = [
-        Curve(n, tuple(_plain(r.score.displacement) for r in rs), tuple(r.trial.noise.sigma_m for r in rs))
-        for n, rs in own.items()
+    displacement = [
+        Curve(
+            n,
+            tuple(_make_interval(r.score.mean_displacement_m) for r in corrector_rows),
+            tuple(r.trial.noise.sigma_m for r in corrector_rows),
+        )
+        for n, corrector_rows in rows_by_corrector.items()
     ]
-    share = tuple(k / 20 for k in range(1, 21))
+    coverage = tuple(k / 20 for k in range(1, 21))
     risk = [
-        Curve(n, tuple(map(_plain, r.risk)), share)
-        for n, rs in own.items()
-        for r in rs
-        if r.trial.noise.sigma_m == SHOWN[1]
+        Curve(n, tuple(map(_make_interval, r.risk_by_coverage)), coverage)
+        for n, corrector_rows in rows_by_corrector.items()
+        for r in corrector_rows
+        if r.trial.noise.sigma_m == LISTED_NOISE[1]
     ]
     sigma = "sigma of the claim, metres and degrees"
     return [
-        Panel("Success, all meetings", sigma, "within 1 m and 1°", tuple(success)),
-        Panel("Objects in common", sigma, "mean displacement, m", tuple(shift)),
-        Panel(f"Risk, sigma {SHOWN[1]:g}", "coverage", "share not within 2 m and 2°", tuple(risk)),
+        CurvePanel("Success, all meetings", sigma, "within 1 m and 1°", tuple(success)),
+        CurvePanel("Objects in common", sigma, "mean displacement, m", tuple(displacement)),
+        CurvePanel(f"Risk, sigma {LISTED_NOISE[1]:g}", "coverage", "share not within 2 m and 2°", tuple(risk)),
     ]
 
 
-def _plain(value: float) -> Interval:
+def _make_interval(value: float) -> Interval:
     return Interval(value, value, value, 0.95, 1)

@@ -9,37 +9,37 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from manyeyes.agents.perception_cache import Eyes
-from manyeyes.datasets.base import Recording, judged_frames
+from manyeyes.agents.perception_cache import PerceptionCache
+from manyeyes.datasets.base import Recording, iter_eval_frames
 from manyeyes.datatypes import ConfigError
 from manyeyes.models.checkpoint import fingerprint
-from manyeyes.models.detector.codebook import FREQUENCY_TOTAL, Codebook, CodebookConfig, nearest
+from manyeyes.models.detector.codebook import FREQUENCY_TOTAL, Codebook, CodebookConfig, nearest_centre
 from manyeyes.models.detector.detector import Detector
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.ops.keyed_random import keyed_uniform
 
-_ROUNDS = 20
+_KMEANS_ITERATIONS = 20
 
 
 def fit_centres(features: Tensor, config: CodebookConfig, seed: int) -> Tensor:
     """Centres (stages, size, C) of residual vector quantisation of features (N, C): k-means of what each stage leaves over."""
-    left, stages = features, []
+    residual, stages = features, []
     for stage in range(config.stages):
-        centres = k_means(left, config.size, (seed, "codebook", stage))
-        left = left - centres[nearest(left, centres)]
+        centres = k_means(residual, config.size, (seed, "codebook", stage))
+        residual = residual - centres[nearest_centre(residual, centres)]
         stages.append(centres)
     return torch.stack(stages)
 
 
-def k_means(x: Tensor, size: int, key: tuple[int | str, ...], rounds: int = _ROUNDS) -> Tensor:
+def k_means(x: Tensor, size: int, key: tuple[int | str, ...], iterations: int = _KMEANS_ITERATIONS) -> Tensor:
     """Centres (size, C) of rows x (N, C): Lloyd's rounds (1982) from k-means++ (Arthur and Vassilvitskii 2007) drawn by key.
 
     A centre that nobody is nearest to is put where the error is largest. Where there are fewer rows than centres, some
     centres are the same.
     """
-    centres = _far_apart(x, size, key)
-    for _ in range(rounds):
-        owner = nearest(x, centres)
+    centres = _init_centres(x, size, key)
+    for _ in range(iterations):
+        owner = nearest_centre(x, centres)
         count = torch.bincount(owner, minlength=size)
         total = torch.zeros_like(centres).index_add_(0, owner, x)
         error = (x - centres[owner]).square().sum(1)
@@ -50,7 +50,7 @@ def k_means(x: Tensor, size: int, key: tuple[int | str, ...], rounds: int = _ROU
     return centres
 
 
-def _far_apart(x: Tensor, size: int, key: tuple[int | str, ...]) -> Tensor:
+def _init_centres(x: Tensor, size: int, key: tuple[int | str, ...]) -> Tensor:
     """Rows to begin with: each is drawn with the square of its distance from those before it."""
     draws = keyed_uniform((size,), *key)
     chosen = [int(draws[0] * len(x))]
@@ -76,27 +76,27 @@ def fit_frequencies(codes: Tensor) -> Tensor:
     return torch.stack(columns)
 
 
-def told_tokens(detector: Detector, recording: Recording, every: int) -> Iterator[Tensor]:
+def collect_shared_tokens(detector: Detector, recording: Recording, frame_stride: int) -> Iterator[Tensor]:
     """Rows (n, C + PROPOSAL) that each agent tells at every such judged frame, having seen the frame before it too."""
-    for number, (scenario, index) in enumerate(judged_frames(recording)):
-        if number % every:
+    for number, (scenario, index) in enumerate(iter_eval_frames(recording)):
+        if number % frame_stride:
             continue
         earlier = recording.snapshot(scenario, index - 1) if index else None
         snapshot = recording.snapshot(scenario, index)
         for frame in snapshot.frames:
-            eyes = Eyes(detector)
+            cache = PerceptionCache(detector)
             for before in earlier.frames if earlier else ():
                 if before.agent_id == frame.agent_id:
-                    eyes.see(before)
-            yield eyes.see(frame).told.features
+                    cache.process(before)
+            yield cache.process(frame).shared_tokens.features
 
 
-def fit(
+def fit_codebook(
     detector: Detector,
     recording: Recording,
     seed: int = 0,
     config: CodebookConfig | None = None,
-    every: int = 10,
+    frame_stride: int = 10,
     report: Callable[[int], None] = lambda tokens: None,
 ) -> Detector:
     """The detector with a codebook fitted to every such judged frame of a recording; its fingerprint is another.
@@ -104,8 +104,8 @@ def fit(
     report: is told how many tokens have been gathered.
     """
     rows: list[Tensor] = []
-    for told in told_tokens(detector, recording, every):
-        rows.append(told)
+    for tokens in collect_shared_tokens(detector, recording, frame_stride):
+        rows.append(tokens)
         report(sum(map(len, rows)))
     if not any(map(len, rows)):
         raise ConfigError(
@@ -114,13 +114,13 @@ def fit(
     return with_codebook(detector, torch.cat(rows), seed, config or CodebookConfig())
 
 
-def with_codebook(detector: Detector, told: Tensor, seed: int, config: CodebookConfig) -> Detector:
+def with_codebook(detector: Detector, tokens: Tensor, seed: int, config: CodebookConfig) -> Detector:
     """The detector with a codebook fitted to told rows (N, C + PROPOSAL)."""
     fitted = Detector(replace(detector.config, codebook=config))
-    book = Codebook(told.shape[1] - PROPOSAL, config)
+    book = Codebook(tokens.shape[1] - PROPOSAL_DIM, config)
     # As files of half precision keep them, so that saving changes nothing.
-    book.centres.copy_(fit_centres(told[:, :-PROPOSAL], config, seed).half())
-    book.frequencies.copy_(fit_frequencies(book.write(told)))
+    book.centres.copy_(fit_centres(tokens[:, :-PROPOSAL_DIM], config, seed).half())
+    book.frequencies.copy_(fit_frequencies(book.encode(tokens)))
     weights = {k: v for k, v in detector.state_dict().items() if not k.startswith("codebook.")}
     fitted.load_state_dict(weights | {f"codebook.{k}": v for k, v in book.state_dict().items()})
     fitted.eval().requires_grad_(False)

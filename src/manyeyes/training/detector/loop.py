@@ -16,9 +16,9 @@ from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import CheckpointError
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector, DetectorConfig
-from manyeyes.training.checkpointing import RunState, warm_cosine
+from manyeyes.training.checkpointing import RunState, warmup_cosine
 from manyeyes.training.detector.losses import LossConfig, LossTerms
-from manyeyes.training.detector.samples import AugmentConfig, RoadConfig, SampleStream, epoch_length
+from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig, SampleStream, epoch_length
 from manyeyes.training.detector.step import loss_terms
 from manyeyes.training.detector.targets import TargetConfig
 
@@ -27,8 +27,9 @@ from manyeyes.training.detector.targets import TargetConfig
 class TrainConfig:
     """A run. steps, or epochs over the judged frames when steps is 0; batch: samples a step over all processes.
 
-    warm_up: steps of linear growth of the learning rate, then a cosine to zero. prune_from, prune_full: the pruning threshold
-    grows from 0 to the detector's between these shares of the run. ema: decay of the averaged weights that are saved.
+    warmup_steps: steps of linear growth of the learning rate, then a cosine to zero. prune_warmup_start, prune_warmup_end: the
+    pruning threshold grows from 0 to the detector's between these shares of the run. ema_decay: decay of the averaged weights that
+    are saved.
     """
 
     detector: DetectorConfig
@@ -37,20 +38,20 @@ class TrainConfig:
     batch: int = 4
     learning_rate: float = 2e-4
     weight_decay: float = 1e-2
-    warm_up: int = 500
-    clip: float = 10.0
-    ema: float = 0.999
-    prune_from: float = 0.03
-    prune_full: float = 0.10
+    warmup_steps: int = 500
+    max_grad_norm: float = 10.0
+    ema_decay: float = 0.999
+    prune_warmup_start: float = 0.03
+    prune_warmup_end: float = 0.10
     save_every: int = 200
     augment: AugmentConfig = field(default_factory=AugmentConfig)
-    road: RoadConfig = field(default_factory=RoadConfig)
+    degradation: DegradationConfig = field(default_factory=DegradationConfig)
     targets: TargetConfig = field(default_factory=TargetConfig)
     loss: LossConfig = field(default_factory=LossConfig)
 
 
 @dataclass(frozen=True)
-class Progress:
+class DetectorProgress:
     """One line of the log."""
 
     step: int
@@ -60,7 +61,7 @@ class Progress:
     learning_rate: float
     seconds: float
 
-    def line(self) -> dict[str, float]:
+    def to_record(self) -> dict[str, float]:
         """As it stands in log.jsonl."""
         terms = {name: round(float(value.detach()), 5) for name, value in vars(self.terms).items()}
         return {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
@@ -68,16 +69,16 @@ class Progress:
 
 def learning_rate(config: TrainConfig, step: int, steps: int) -> float:
     """Linear warm-up, then a cosine to zero."""
-    return config.learning_rate * warm_cosine(config.warm_up, step, steps)
+    return config.learning_rate * warmup_cosine(config.warmup_steps, step, steps)
 
 
 def prune_threshold(config: TrainConfig, step: int, steps: int) -> float:
     """The detector's threshold, approached linearly between prune_from and prune_full of the run; 0 before."""
-    ramp = (step / steps - config.prune_from) / max(1e-9, config.prune_full - config.prune_from)
+    ramp = (step / steps - config.prune_warmup_start) / max(1e-9, config.prune_warmup_end - config.prune_warmup_start)
     return config.detector.prune_threshold * min(1.0, max(0.0, ramp))
 
 
-class Run:
+class DetectorRun:
     """One training run of the detector, in a folder from which it resumes."""
 
     def __init__(
@@ -85,34 +86,34 @@ class Run:
     ) -> None:
         self.config = config
         self.steps = config.steps or math.ceil(config.epochs * epoch_length(recording) / config.batch)
-        self.stream = SampleStream(recording, config.detector.grid, config.augment, seed, config.road)
+        self.stream = SampleStream(recording, config.detector.grid, config.augment, seed, config.degradation)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             model = Detector(config.detector)
         if start is not None:
             _load_weights(model, start)
-        self.state = RunState(model, config, seed, folder, config.weight_decay, given=start is not None)
+        self.state = RunState(model, config, seed, folder, config.weight_decay, from_weights=start is not None)
 
-    def advance(self) -> Progress:
+    def advance(self) -> DetectorProgress:
         """One step of the optimiser."""
         config, state = self.config, self.state
-        samples = [self.stream.draw(number) for number in state.numbers(config.batch)]
+        samples = [self.stream.draw(number) for number in state.sample_numbers(config.batch)]
         model = state.model.train()
         threshold = prune_threshold(config, state.step, self.steps)
-        terms = loss_terms(model, samples, config.targets, threshold, config.loss.together, config.loss.target)
+        terms = loss_terms(model, samples, config.targets, threshold, config.loss.fusion_weight, config.loss.target)
         loss, rate = terms.total(config.loss), learning_rate(config, state.step, self.steps)
         state.backward(loss)
-        state.descend(rate, config.clip, config.ema)
-        return Progress(state.step, self.steps, float(loss.detach()), terms, rate, state.seconds)
+        state.optimiser_step(rate, config.max_grad_norm, config.ema_decay)
+        return DetectorProgress(state.step, self.steps, float(loss.detach()), terms, rate, state.seconds)
 
 
-def train(
+def train_detector(
     config: TrainConfig,
     recording: Recording,
     folder: Path,
     seed: int = 0,
     card: dict[str, Any] | None = None,
-    report: Callable[[Progress], None] = lambda progress: None,
+    report: Callable[[DetectorProgress], None] = lambda progress: None,
     start: Path | None = None,
 ) -> Path:
     """Train, or go on where the run in folder stopped; returns the file of averaged weights.
@@ -121,9 +122,9 @@ def train(
 
     Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
     """
-    run = Run(config, recording, folder, seed, start)
+    run = DetectorRun(config, recording, folder, seed, start)
     state = run.state
-    state.finish(run.steps, config.save_every, run.advance, report)
+    state.run_to_end(run.steps, config.save_every, run.advance, report)
     weights = folder / "weights.safetensors"
     if not state.rank:
         about = {"seed": seed, "steps": run.steps, "train_seconds": round(state.seconds), "config": asdict(config)}
@@ -136,7 +137,7 @@ def _load_weights(model: Detector, start: Path) -> None:
     it were not there: a new part as it is built, new rows and columns of a matrix at zero. Parts that the model lacks are left out,
     as an ablation does."""
     state, own = checkpoint.read_state(start), model.state_dict()
-    begun = {name: _grown(value, state[name]) for name, value in own.items() if name in state}
+    begun = {name: _grow(value, state[name]) for name, value in own.items() if name in state}
     odd = sorted(name for name, value in begun.items() if value is None)
     if odd or not begun:
         raise CheckpointError(
@@ -146,7 +147,7 @@ def _load_weights(model: Detector, start: Path) -> None:
     model.load_state_dict(begun, strict=False)
 
 
-def _grown(new: Tensor, old: Tensor) -> Tensor | None:
+def _grow(new: Tensor, old: Tensor) -> Tensor | None:
     """The old values at the start of the new tensor, None where they do not fit into it."""
     if new.dim() != old.dim() or any(n < o for n, o in zip(new.shape, old.shape)):
         return None

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from manyeyes.models.detector.box_head import SPEED_UNIT, TYPICAL_SIZE, RawBoxes, axis_yaw, facing
-from manyeyes.models.detector.pruning import Pruned
+from manyeyes.models.detector.box_head import SPEED_UNIT, TYPICAL_SIZE, RawBoxes, axis_yaw, heading_logit
+from manyeyes.models.detector.pruning import PruneOutput
 from manyeyes.ops.box_iou import aligned_iou
-from manyeyes.training.detector.mutual_information import Target
+from manyeyes.training.detector.mutual_information import InformationTarget
 from manyeyes.training.detector.targets import Targets
 
-FEW_CELLS_VOICE = 8.0
+MAX_CELL_WEIGHT = 8.0
 """At most so many times a cell's fair share, so that an object of one cell does not speak for a whole batch."""
 
 
@@ -23,24 +23,24 @@ FEW_CELLS_VOICE = 8.0
 class LossConfig:
     """Weights of the terms. iou: of 1 - IoU itself, for boxes that nearly fit already; off at the start, where none do.
 
-    kept, information: of the selector's L1 and InfoNCE (CoSTr Eq. 12). together: the share of what egos make of all that they
-    hear, the rest is what agents make of their own view. target: what the information is measured against; own_task, but for
+    mask_l1, information: of the selector's L1 and InfoNCE (CoSTr Eq. 12). fusion_weight: the share of what egos make of all that
+    they hear, the rest is what agents make of their own view. target: what the information is measured against; own_task, but for
     studies.
     """
 
     heat: float = 1.0
     shape: float = 0.5
     direction: float = 0.3
-    kind: float = 0.1
+    classification: float = 0.1
     sigma: float = 0.05
-    overlap: float = 0.3
+    iou_score: float = 0.3
     iou: float = 0.0
     velocity: float = 1.0
     prune: float = 0.2
-    kept: float = 0.02
+    mask_l1: float = 0.02
     information: float = 0.01
-    together: float = 0.5
-    target: Target = "own_task"
+    fusion_weight: float = 0.5
+    target: InformationTarget = "own_task"
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,16 @@ class LossTerms:
     heat: Tensor
     shape: Tensor
     direction: Tensor
-    kind: Tensor
+    classification: Tensor
     sigma: Tensor
-    overlap: Tensor
+    iou_score: Tensor
     iou: Tensor
     velocity: Tensor
     prune: Tensor
-    kept: Tensor
+    mask_l1: Tensor
     information: Tensor
 
-    def mixed(self, other: LossTerms, share: float) -> LossTerms:
+    def mix(self, other: LossTerms, share: float) -> LossTerms:
         """So much of the other, the rest of this."""
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return LossTerms(*((1 - share) * mine + share * theirs for mine, theirs in pairs))
@@ -77,7 +77,7 @@ def centre_focal(logit: Tensor, heat: Tensor, positive: Tensor) -> Tensor:
     return (gain + rest) / positive.sum().clamp_min(1)
 
 
-def prune_focal(pruned: Pruned, near: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
+def prune_focal(pruned: PruneOutput, near: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
     """Sigmoid focal loss (Lin et al. 2017) on whether a cell lies near an object, divided by max(1, number that do).
 
     near: (N,), of objects_near. Every object has one voice, however many cells it fills: a vehicle of two cells is lost
@@ -86,23 +86,23 @@ def prune_focal(pruned: Pruned, near: Tensor, alpha: float = 0.25, gamma: float 
     found, row, cells = near.unique(return_inverse=True, return_counts=True)
     is_near = near >= 0
     number, objects = is_near.sum(), (found >= 0).sum()
-    voice = (number / (objects.clamp_min(1) * cells[row])).clamp_max(FEW_CELLS_VOICE)
+    cell_weight = (number / (objects.clamp_min(1) * cells[row])).clamp_max(MAX_CELL_WEIGHT)
     p = torch.sigmoid(pruned.logit)
     right = torch.where(is_near, p, 1 - p)
-    share = torch.where(is_near, alpha * voice, torch.as_tensor(1 - alpha))
+    share = torch.where(is_near, alpha * cell_weight, torch.as_tensor(1 - alpha))
     entropy = functional.binary_cross_entropy_with_logits(pruned.logit, is_near.to(p.dtype), reduction="none")
     return (share * (1 - right) ** gamma * entropy).sum() / number.clamp_min(1)
 
 
-def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, kept: Tensor, information: Tensor) -> LossTerms:
+def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, information: Tensor) -> LossTerms:
     """All terms of one batch; every one is finite and zero where there is nothing to learn from."""
-    heat = centre_focal(raw.heat, targets.heat, targets.positive)
+    heat = centre_focal(raw.heatmap_logit, targets.heat, targets.positive)
     rows = (targets.box >= 0).nonzero()[:, 0]
     if not len(rows):
-        zero = raw.heat.sum() * 0
-        return LossTerms(heat, zero, zero, zero, zero, zero, zero, zero, prune, kept, information)
+        zero = raw.heatmap_logit.sum() * 0
+        return LossTerms(heat, zero, zero, zero, zero, zero, zero, zero, prune, mask_l1, information)
     some, truth, weight = (
-        raw.rows(targets.box >= 0),
+        raw.select(targets.box >= 0),
         targets.boxes[targets.box[rows]].to(torch.float32),
         targets.weight[rows],
     )
@@ -110,7 +110,7 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, kept: Tensor, inf
     def mean(value: Tensor) -> Tensor:
         return (value * weight).sum() / weight.sum()
 
-    offset = (truth.center[:, :2] - some.sites.xy) / some.sites.grid.cell
+    offset = (truth.center[:, :2] - some.sites.xy) / some.sites.grid.cell_size_m
     log_size = (truth.size / torch.tensor(TYPICAL_SIZE)).log()
     axis = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1)
     off = (some.offset - offset).abs().sum(1) + (some.z - truth.center[:, 2]).abs() * 0.2
@@ -119,17 +119,17 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, kept: Tensor, inf
     yaw = axis_yaw(some.axis).detach()
     turn = truth.yaw - yaw
     ahead = (turn.cos() > 0).float()
-    direction = functional.binary_cross_entropy_with_logits(facing(some), ahead, reduction="none")
-    kind = functional.cross_entropy(some.kind, truth.label, reduction="none")
-    sigma = _gaussian_nll(((some.offset - offset) * some.sites.grid.cell).detach(), some.log_sigma_xy)
+    direction = functional.binary_cross_entropy_with_logits(heading_logit(some), ahead, reduction="none")
+    kind = functional.cross_entropy(some.class_logits, truth.label, reduction="none")
+    sigma = _gaussian_nll(((some.offset - offset) * some.sites.grid.cell_size_m).detach(), some.log_sigma_xy)
     axis_error = torch.atan2((2 * turn).sin(), (2 * turn).cos())[:, None] / 2
     sigma = sigma + _gaussian_nll(axis_error, some.log_sigma_yaw)
     iou = aligned_iou(some.bev(), truth.bev())
     overlap = functional.binary_cross_entropy_with_logits(
-        some.overlap, iou.detach().clamp(0, 1).float(), reduction="none"
+        some.iou_logit, iou.detach().clamp(0, 1).float(), reduction="none"
     )
     speed = (some.velocity - truth.velocity / SPEED_UNIT).abs().sum(1)
-    rest = (mean(sigma), mean(overlap), mean(1 - iou), mean(speed), prune, kept, information)
+    rest = (mean(sigma), mean(overlap), mean(1 - iou), mean(speed), prune, mask_l1, information)
     return LossTerms(heat, mean(shape), mean(direction), mean(kind), *rest)
 
 

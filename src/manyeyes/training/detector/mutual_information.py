@@ -17,28 +17,28 @@ from torch import Tensor
 from torch.nn import functional
 
 from manyeyes.datatypes import SparseBev
-from manyeyes.models.detector.proposal import PROPOSAL
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.ops.voxelize import segment_sum
 from manyeyes.ops.window_attention import window_ids
 
 WINDOW_CELLS = 8
 TEMPERATURE = 0.1
-Target = Literal["own_task", "receiver", "literal"]
+InformationTarget = Literal["own_task", "receiver", "literal"]
 
 
-def information_terms(told: SparseBev, mask: Tensor, matters: Tensor) -> tuple[Tensor, Tensor]:
+def mutual_information_loss(tokens: SparseBev, mask: Tensor, relevance: Tensor) -> tuple[Tensor, Tensor]:
     """(mean of the mask, InfoNCE in nats) of told tokens (N, C + PROPOSAL); mask (N,), matters (N,) in [0, 1] from the truth."""
     if not len(mask):
         zero = mask.sum()
         return zero, zero
-    features = functional.normalize(told.features[:, :-PROPOSAL].detach(), dim=1)
-    grid = told.grid
-    ids = window_ids(told.sites.xy, told.sites.batch, (grid.x_min, grid.y_min), WINDOW_CELLS * grid.cell)
+    features = functional.normalize(tokens.features[:, :-PROPOSAL_DIM].detach(), dim=1)
+    grid = tokens.grid
+    ids = window_ids(tokens.sites.xy, tokens.sites.batch, (grid.x_min, grid.y_min), WINDOW_CELLS * grid.cell_size_m)
     row = ids.unique(return_inverse=True)[1]
-    return mask.mean(), window_information(features, mask, matters, row)
+    return mask.mean(), window_mutual_information(features, mask, relevance, row)
 
 
-def window_information(features: Tensor, mask: Tensor, matters: Tensor, row: Tensor) -> Tensor:
+def window_mutual_information(features: Tensor, mask: Tensor, relevance: Tensor, row: Tensor) -> Tensor:
     """Symmetric InfoNCE, scalar, between the masked and the mattering part of each window; features (N, C), row (N,) windows.
 
     z^X is the mean over a window of mask * feature, not divided by the sum of the mask; z^Y that of matters * feature, which
@@ -47,57 +47,57 @@ def window_information(features: Tensor, mask: Tensor, matters: Tensor, row: Ten
     windows = int(row.max()) + 1
     count = torch.bincount(row, minlength=windows).to(mask.dtype)[:, None]
     x = segment_sum(mask[:, None] * features, row, windows) / count.sqrt()
-    y = segment_sum(matters[:, None] * features, row, windows).detach() / count.sqrt()
-    some = (segment_sum(matters[:, None], row, windows)[:, 0] > 0.5).nonzero()[:, 0]
+    y = segment_sum(relevance[:, None] * features, row, windows).detach() / count.sqrt()
+    some = (segment_sum(relevance[:, None], row, windows)[:, 0] > 0.5).nonzero()[:, 0]
     return _info_nce(x, y, some) if len(some) >= 2 else mask.sum() * 0
 
 
 @dataclass(frozen=True, eq=False)
-class Meeting:
+class AgentPairTokens:
     """Senders' and receivers' tokens in the receivers' windows, for the study targets.
 
-    sent (N, C) and had (M, C): unit features, the receivers' own turned axes; sent_mask (N,); sent_row (N,) and had_row (M,):
+    sent (N, C) and own (M, C): unit features, the receivers' own turned axes; sent_mask (N,); sent_row (N,) and own_row (M,):
     windows, numbered from 0.
     """
 
     sent: Tensor
     sent_mask: Tensor
     sent_row: Tensor
-    had: Tensor
-    had_row: Tensor
+    own: Tensor
+    own_row: Tensor
 
 
-def receiver_information(met: Meeting) -> Tensor:
+def receiver_mutual_information(pairs: AgentPairTokens) -> Tensor:
     """Symmetric InfoNCE, scalar, between what is sent of a window and what the receiver itself has there.
 
     Windows that only one of them has cannot be compared and take no part: what only the sender sees is worth nothing here.
     """
-    windows = _windows(met)
-    sent, had = (torch.bincount(row, minlength=windows) for row in (met.sent_row, met.had_row))
-    both = ((sent > 0) & (had > 0)).nonzero()[:, 0]
+    windows = _count_windows(pairs)
+    sent, own = (torch.bincount(row, minlength=windows) for row in (pairs.sent_row, pairs.own_row))
+    both = ((sent > 0) & (own > 0)).nonzero()[:, 0]
     if len(both) < 2:
-        return met.sent_mask.sum() * 0
-    x = segment_sum(met.sent_mask[:, None] * met.sent, met.sent_row, windows)[both] / sent[both, None].sqrt()
-    y = segment_sum(met.had, met.had_row, windows)[both].detach() / had[both, None].sqrt()
+        return pairs.sent_mask.sum() * 0
+    x = segment_sum(pairs.sent_mask[:, None] * pairs.sent, pairs.sent_row, windows)[both] / sent[both, None].sqrt()
+    y = segment_sum(pairs.own, pairs.own_row, windows)[both].detach() / own[both, None].sqrt()
     return _info_nce(x, y, torch.arange(len(both)))
 
 
-def literal_information(met: Meeting) -> Tensor:
+def paper_mutual_information(pairs: AgentPairTokens) -> Tensor:
     """Minus Eq. 11 of the joint aggregate of Eq. 10, scalar: each window's unit vector against itself and all others."""
-    windows = _windows(met)
+    windows = _count_windows(pairs)
     if not windows:
-        return met.sent_mask.sum() * 0
-    joint = segment_sum(met.sent_mask[:, None] * met.sent, met.sent_row, windows)
-    z = functional.normalize(joint + segment_sum(met.had, met.had_row, windows).detach(), dim=1)
-    z = z[torch.unique(torch.cat((met.sent_row, met.had_row)))]
+        return pairs.sent_mask.sum() * 0
+    joint = segment_sum(pairs.sent_mask[:, None] * pairs.sent, pairs.sent_row, windows)
+    z = functional.normalize(joint + segment_sum(pairs.own, pairs.own_row, windows).detach(), dim=1)
+    z = z[torch.unique(torch.cat((pairs.sent_row, pairs.own_row)))]
     return functional.cross_entropy(z @ z.mT / TEMPERATURE, torch.arange(len(z)))
 
 
-STUDIED = {"receiver": receiver_information, "literal": literal_information}
+STUDY_TARGETS = {"receiver": receiver_mutual_information, "literal": paper_mutual_information}
 
 
-def _windows(met: Meeting) -> int:
-    rows = torch.cat((met.sent_row, met.had_row))
+def _count_windows(pairs: AgentPairTokens) -> int:
+    rows = torch.cat((pairs.sent_row, pairs.own_row))
     return int(rows.max()) + 1 if len(rows) else 0
 
 

@@ -6,33 +6,40 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from manyeyes.models.detector.presets import COSTR_OPV2V, COSTR_SMALL, COSTR_TINY, SMALL_AROUND, SMALL_GRID
+from manyeyes.models.detector.presets import COSTR_OPV2V, COSTR_SMALL, COSTR_TINY, SMALL_GRID, SMALL_SQUARE_GRID
 from manyeyes.training.detector.loop import TrainConfig
 from manyeyes.training.detector.losses import LossConfig
-from manyeyes.training.detector.samples import AugmentConfig, RoadConfig
+from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig
 
-_ROAD = TrainConfig(
-    replace(COSTR_SMALL, grid=SMALL_AROUND, answers=SMALL_GRID, prune_threshold=0.08),
+_DEGRADED = TrainConfig(
+    replace(COSTR_SMALL, grid=SMALL_SQUARE_GRID, output_range=SMALL_GRID, prune_threshold=0.08),
     steps=5200,
     batch=4,
     learning_rate=1e-3,
-    warm_up=100,
+    warmup_steps=100,
     save_every=100,
-    prune_from=0.0,
-    prune_full=0.02,
-    augment=AugmentConfig(thin=0.1),
-    road=RoadConfig(past=2, late_share=0.4, astray_share=0.5, lost_share=0.25, few_share=0.4),
-    loss=LossConfig(iou=0.5, together=0.6),
+    prune_warmup_start=0.0,
+    prune_warmup_end=0.02,
+    augment=AugmentConfig(max_point_dropout=0.1),
+    degradation=DegradationConfig(
+        ego_history=2, delay_prob=0.4, pose_noise_prob=0.5, packet_loss_prob=0.25, budget_prob=0.4
+    ),
+    loss=LossConfig(iou=0.5, fusion_weight=0.6),
 )
-_CROWD = replace(
-    _ROAD,
-    detector=replace(_ROAD.detector, prune_threshold=0.12),
+_FINAL = replace(
+    _DEGRADED,
+    detector=replace(_DEGRADED.detector, prune_threshold=0.12),
     steps=3400,
-    augment=AugmentConfig(thin=0.1, early_share=0.2),
-    loss=LossConfig(iou=0.8, together=0.6, prune=1.0),
+    augment=AugmentConfig(max_point_dropout=0.1, early_fusion_prob=0.2),
+    loss=LossConfig(iou=0.8, fusion_weight=0.6, prune=1.0),
 )
 _BRANCH = replace(
-    _CROWD, road=replace(_CROWD.road, said=2), steps=240, learning_rate=3e-4, warm_up=20, prune_full=0.001
+    _FINAL,
+    degradation=replace(_FINAL.degradation, sender_history=2),
+    steps=240,
+    learning_rate=3e-4,
+    warmup_steps=20,
+    prune_warmup_end=0.001,
 )
 
 
@@ -41,7 +48,7 @@ def _branch(**changes: Any) -> TrainConfig:
     return replace(_BRANCH, detector=replace(_BRANCH.detector, **changes))
 
 
-_FINE_ONLY = replace(COSTR_SMALL.encoder, coarse=False, prune_strides=())
+_FINE_ONLY = replace(COSTR_SMALL.encoder, use_coarse_strides=False, prune_strides=())
 _NO_BLOCKS = replace(COSTR_SMALL.dast, blocks=0)
 _PLAIN = {"dast": _NO_BLOCKS, "fusion": "maximum"}
 
@@ -51,25 +58,25 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
         steps=9000,
         batch=4,
         learning_rate=1.5e-3,
-        warm_up=200,
+        warmup_steps=200,
         save_every=100,
-        prune_from=0.02,
-        prune_full=0.10,
+        prune_warmup_start=0.02,
+        prune_warmup_end=0.10,
     ),
     "costr-small-2": TrainConfig(
-        replace(COSTR_SMALL, grid=SMALL_AROUND, answers=SMALL_GRID, prune_threshold=0.08),
+        replace(COSTR_SMALL, grid=SMALL_SQUARE_GRID, output_range=SMALL_GRID, prune_threshold=0.08),
         steps=3000,
         batch=4,
         learning_rate=5e-4,
-        warm_up=50,
+        warmup_steps=50,
         save_every=100,
-        prune_from=0.0,
-        prune_full=0.001,
+        prune_warmup_start=0.0,
+        prune_warmup_end=0.001,
         augment=AugmentConfig(max_agents=99),
         loss=LossConfig(iou=0.5),
     ),
-    "costr-small-3": _ROAD,
-    "costr-small-4": _CROWD,
+    "costr-small-3": _DEGRADED,
+    "costr-small-4": _FINAL,
     "branch-plain": _branch(**_PLAIN, encoder=_FINE_ONLY),
     "branch-se": _branch(**_PLAIN),
     "branch-se-dast": _branch(fusion="maximum"),
@@ -80,7 +87,13 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
     "branch-multi-scale": _branch(fusion="multi_scale"),
     "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
     "costr-tiny": TrainConfig(
-        COSTR_TINY, steps=60, batch=2, learning_rate=3e-3, warm_up=5, save_every=20, augment=AugmentConfig(max_agents=3)
+        COSTR_TINY,
+        steps=60,
+        batch=2,
+        learning_rate=3e-3,
+        warmup_steps=5,
+        save_every=20,
+        augment=AugmentConfig(max_agents=3),
     ),
 }
 """costr-small and then, each from the weights before, costr-small-2 (what lies to the sides is seen as well, all agents at once,

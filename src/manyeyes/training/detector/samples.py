@@ -15,25 +15,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes.datasets.base import Recording, judged_frames
-from manyeyes.datatypes import BevGrid, Boxes, ConfigError, PointCloud, Snapshot, Transform, Truth
+from manyeyes.datasets.base import Recording, iter_eval_frames
+from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_generator
 
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """turn_rad: each agent's frame is turned by a uniform angle up to this, its pose with it, so that relative headings vary.
+    """max_yaw_rad: each agent's frame is turned by a uniform angle up to this, its pose with it, so that relative headings vary.
 
-    scale: everything is enlarged by a uniform factor within 1 ± scale; flip: mirrored left to right half of the time.
-    thin: share of points dropped, uniform up to this. early_share: samples whose clouds are merged into the ego's, as early
-    fusion does. max_agents: at most so many, ego included, a random number of them; from 99 on all that there are.
+    max_scale_change: everything is enlarged by a uniform factor within 1 ± scale; flip: mirrored left to right half of the time.
+    max_point_dropout: share of points dropped, uniform up to this. early_fusion_prob: samples whose clouds are merged into the
+    ego's, as early fusion does. max_agents: at most so many, ego included, a random number of them; from 99 on all that there are.
     """
 
-    turn_rad: float = math.pi / 4
-    scale: float = 0.05
+    max_yaw_rad: float = math.pi / 4
+    max_scale_change: float = 0.05
     flip: bool = True
-    thin: float = 0.3
-    early_share: float = 0.15
+    max_point_dropout: float = 0.3
+    early_fusion_prob: float = 0.15
     max_agents: int = 5
 
     @classmethod
@@ -43,191 +43,213 @@ class AugmentConfig:
 
 
 @dataclass(frozen=True)
-class RoadConfig:
+class DegradationConfig:
     """What goes wrong, drawn anew for every sample (issue: training for the real world; detection.md 5.3).
 
-    past: instants before now that the ego looks back at. said: messages of each collaborator before its last that the ego
-    remembers. late_share: of collaborators that looked 1 … late_frames ago.
-    astray_share: of samples whose collaborators' claims are off, with deviations uniform up to xy_m and yaw_rad, each of which
-    is nothing half of the time. lost_share: of collaborators that lose packets, up to lost of their tokens. few_share: of
+    ego_history: instants before now that the ego looks back at. sender_history: messages of each collaborator before its last that
+    the ego remembers. delay_prob: of collaborators that looked 1 … late_frames ago.
+    pose_noise_prob: of samples whose collaborators' claims are off, with deviations uniform up to xy_m and yaw_rad, each of which
+    is nothing half of the time. packet_loss_prob: of collaborators that lose packets, up to lost of their tokens. budget_prob: of
     collaborators under a budget, which leaves them from few tokens to all, uniform in the logarithm.
     """
 
-    past: int = 0
-    said: int = 0
-    late_share: float = 0.0
-    late_frames: int = 4
-    astray_share: float = 0.0
-    xy_m: float = 0.8
-    yaw_rad: float = math.radians(0.8)
-    lost_share: float = 0.0
-    lost: float = 0.6
-    few_share: float = 0.0
-    few: int = 12
+    ego_history: int = 0
+    sender_history: int = 0
+    delay_prob: float = 0.0
+    max_delay_frames: int = 4
+    pose_noise_prob: float = 0.0
+    max_sigma_xy_m: float = 0.8
+    max_sigma_yaw_rad: float = math.radians(0.8)
+    packet_loss_prob: float = 0.0
+    max_loss_fraction: float = 0.6
+    budget_prob: float = 0.0
+    min_budget_tokens: int = 12
 
 
 @dataclass(frozen=True)
-class View:
-    """One look of one agent. now and earlier: its last two sweeps, in its frame of then.
+class AgentView:
+    """One look of one agent. cloud and previous_cloud: its last two sweeps, in its frame of then.
 
-    ego_from_view: from there to the ego's frame of now, as claimed. age_s: how long ago. doubt_xy_m, doubt_yaw_rad: of the claim.
-    seen: what the agent listed then, in its frame. lost: share of its tokens that do not arrive; keep: how many of them a
-    budget lets it send, None for all.
+    ego_from_view: from there to the ego's frame of now, as claimed. age_s: how long ago. sigma_xy_m, sigma_yaw_rad: of the claim.
+    visible_boxes: what the agent listed then, in its frame. loss_fraction: share of its tokens that do not arrive; max_tokens: how
+    many of them a budget lets it send, None for all.
     """
 
-    now: PointCloud
-    earlier: PointCloud
+    cloud: PointCloud
+    previous_cloud: PointCloud
     ego_from_view: Transform
     age_s: float
-    seen: Boxes
-    doubt_xy_m: float = 0.0
-    doubt_yaw_rad: float = 0.0
-    lost: float = 0.0
-    keep: int | None = None
+    visible_boxes: Boxes
+    sigma_xy_m: float = 0.0
+    sigma_yaw_rad: float = 0.0
+    loss_fraction: float = 0.0
+    max_tokens: int | None = None
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One ego and its collaborators: views[0] is the ego's own. past: the ego's own looks before, newest first.
+    """One ego and its collaborators: views[0] is the ego's own. ego_history: the ego's own looks before, newest first.
 
-    said: what each collaborator looked at before, newest first, agent by agent. union: what any of the agents lists now, in the
-    ego's frame. key: of draws that follow.
+    sender_history: what each collaborator looked at before, newest first, agent by agent. merged_gt_boxes: what any of the agents
+    lists now, in the ego's frame. key: of draws that follow.
     """
 
-    views: tuple[View, ...]
-    past: tuple[View, ...]
-    said: tuple[View, ...]
-    union: Boxes
+    views: tuple[AgentView, ...]
+    ego_history: tuple[AgentView, ...]
+    sender_history: tuple[AgentView, ...]
+    merged_gt_boxes: Boxes
     key: tuple[int | str, ...]
 
 
 def make_sample(
-    moments: Sequence[Snapshot],
+    snapshots: Sequence[Snapshot],
     ego: int,
     grid: BevGrid,
     config: AugmentConfig,
     key: tuple[int | str, ...],
-    road: RoadConfig | None = None,
+    degradation: DegradationConfig | None = None,
 ) -> Sample:
     """The sample with this ego, a row of the last moment; every random choice follows from key.
 
-    moments: consecutive snapshots, oldest first; the last is now. Where they reach back less far than asked, so does the sample.
+    snapshots: consecutive snapshots, oldest first; the last is now. Where they reach back less far than asked, so does the sample.
     """
-    road = road or RoadConfig()
+    degradation = degradation or DegradationConfig()
     rng = keyed_generator("augment", *key)
-    scene = _Scene(moments, rng, config)
-    now = moments[-1]
+    scene = _AugmentedScene(snapshots, rng, config)
+    now = snapshots[-1]
     others = [i for i in range(len(now.frames)) if i != ego]
-    most = min(len(others), config.max_agents - 1)
+    max_others = min(len(others), config.max_agents - 1)
     # The larger of two draws: few collaborators are met too, many more often.
-    wanted = int(rng.integers(0, most + 1, 2).max()) if config.max_agents < 99 else len(others)
-    chosen = [ego, *(others[i] for i in rng.permutation(len(others))[:wanted])]
+    num_others = int(rng.integers(0, max_others + 1, 2).max()) if config.max_agents < 99 else len(others)
+    chosen = [ego, *(others[i] for i in rng.permutation(len(others))[:num_others])]
     ids = [now.frames[i].agent_id for i in chosen]
     flip = config.flip and rng.random() < 0.5
-    scale = 1 + config.scale * rng.uniform(-1, 1)
+    scale = 1 + config.max_scale_change * rng.uniform(-1, 1)
     ego_pose = scene.pose(0, ids[0])
     assert ego_pose is not None
     truth = _truth(now)
     mine = truth.boxes.id != ids[0]
-    union = truth.boxes[truth.seen[chosen].any(0) & mine].transform(ego_pose.inverse())
-    astray = rng.random() < road.astray_share
-    xy_m, yaw_rad = (astray * (rng.random() < 0.5) * top * rng.random() for top in (road.xy_m, road.yaw_rad))
-    if not xy_m and not yaw_rad and astray:
-        xy_m = road.xy_m * rng.random()
-    views, said = [scene.view(0, ids[0], ego_pose)], list[View]()
-    if rng.random() < config.early_share:
-        views = [scene.merged(ids, ego_pose, union)]
+    merged_gt_boxes = truth.boxes[truth.seen[chosen].any(0) & mine].transform(ego_pose.inverse())
+    has_pose_noise = rng.random() < degradation.pose_noise_prob
+    sigma_xy_m, sigma_yaw_rad = (
+        has_pose_noise * (rng.random() < 0.5) * top * rng.random()
+        for top in (degradation.max_sigma_xy_m, degradation.max_sigma_yaw_rad)
+    )
+    if not sigma_xy_m and not sigma_yaw_rad and has_pose_noise:
+        sigma_xy_m = degradation.max_sigma_xy_m * rng.random()
+    views, sender_history = [scene.view(0, ids[0], ego_pose)], list[AgentView]()
+    if rng.random() < config.early_fusion_prob:
+        views = [scene.merge(ids, ego_pose, merged_gt_boxes)]
     else:
-        for who in ids[1:]:
-            back = int(rng.integers(1, road.late_frames + 1)) if rng.random() < road.late_share else 0
-            off = rng.standard_normal(3) * (xy_m, xy_m, yaw_rad)
-            lost = road.lost * rng.random() * (rng.random() < road.lost_share)
-            few = math.exp(rng.uniform(math.log(road.few), math.log(1500))) if rng.random() < road.few_share else None
-            back = back if scene.pose(back, who) is not None else 0
-            keep = None if few is None else int(few)
-            instants = [k for k in range(back, back + 1 + road.said) if scene.pose(k, who) is not None]
-            looks = (scene.view(k, who, ego_pose, off) for k in instants)
-            told = [replace(v, doubt_xy_m=xy_m, doubt_yaw_rad=yaw_rad, lost=lost, keep=keep) for v in looks]
-            views.append(told[0])
-            said += told[1:]
-    known = (k for k in range(1, road.past + 1) if scene.pose(k, ids[0]) is not None)
-    past = tuple(scene.view(k, ids[0], ego_pose) for k in known) if len(views) > 1 or len(ids) == 1 else ()
+        for agent_id in ids[1:]:
+            back = (
+                int(rng.integers(1, degradation.max_delay_frames + 1)) if rng.random() < degradation.delay_prob else 0
+            )
+            off = rng.standard_normal(3) * (sigma_xy_m, sigma_xy_m, sigma_yaw_rad)
+            loss_fraction = degradation.max_loss_fraction * rng.random() * (rng.random() < degradation.packet_loss_prob)
+            budget = (
+                math.exp(rng.uniform(math.log(degradation.min_budget_tokens), math.log(1500)))
+                if rng.random() < degradation.budget_prob
+                else None
+            )
+            back = back if scene.pose(back, agent_id) is not None else 0
+            max_tokens = None if budget is None else int(budget)
+            instants = [
+                k for k in range(back, back + 1 + degradation.sender_history) if scene.pose(k, agent_id) is not None
+            ]
+            raw_views = (scene.view(k, agent_id, ego_pose, off) for k in instants)
+            agent_views = [
+                replace(
+                    v,
+                    sigma_xy_m=sigma_xy_m,
+                    sigma_yaw_rad=sigma_yaw_rad,
+                    loss_fraction=loss_fraction,
+                    max_tokens=max_tokens,
+                )
+                for v in raw_views
+            ]
+            views.append(agent_views[0])
+            sender_history += agent_views[1:]
+    known = (k for k in range(1, degradation.ego_history + 1) if scene.pose(k, ids[0]) is not None)
+    ego_history = tuple(scene.view(k, ids[0], ego_pose) for k in known) if len(views) > 1 or len(ids) == 1 else ()
     return Sample(
         tuple(_resize_view(view, scale, flip, grid) for view in views),
-        tuple(_resize_view(view, scale, flip, grid) for view in past),
-        tuple(_resize_view(view, scale, flip, grid) for view in said),
-        _in_range(_resize_boxes(union, scale, flip), grid),
+        tuple(_resize_view(view, scale, flip, grid) for view in ego_history),
+        tuple(_resize_view(view, scale, flip, grid) for view in sender_history),
+        _in_range(_resize_boxes(merged_gt_boxes, scale, flip), grid),
         key,
     )
 
 
-class _Scene:
+class _AugmentedScene:
     """The moments of one sample, with every agent's frame turned by an angle of its own."""
 
     def __init__(self, moments: Sequence[Snapshot], rng: np.random.Generator, config: AugmentConfig) -> None:
         self._moments, self._rng, self._config = moments, rng, config
         self._turn = {
-            frame.agent_id: Transform.from_xyz_yaw(0, 0, 0, config.turn_rad * rng.uniform(-1, 1))
+            frame.agent_id: Transform.from_xyz_yaw(0, 0, 0, config.max_yaw_rad * rng.uniform(-1, 1))
             for frame in moments[-1].frames
         }
 
-    def _row(self, back: int, who: int) -> int | None:
+    def _row(self, back: int, agent_id: int) -> int | None:
         if back >= len(self._moments):
             return None
         ids = [frame.agent_id for frame in self._moments[-1 - back].frames]
-        return ids.index(who) if who in ids else None
+        return ids.index(agent_id) if agent_id in ids else None
 
-    def pose(self, back: int, who: int) -> Transform | None:
+    def pose(self, back: int, agent_id: int) -> Transform | None:
         """World from the turned frame of an agent, so many moments ago; None where it was not there."""
-        row = self._row(back, who)
+        row = self._row(back, agent_id)
         if row is None:
             return None
-        return self._moments[-1 - back].frames[row].world_from_agent @ self._turn[who]
+        return self._moments[-1 - back].frames[row].world_from_agent @ self._turn[agent_id]
 
-    def cloud(self, back: int, who: int) -> PointCloud | None:
+    def cloud(self, back: int, agent_id: int) -> PointCloud | None:
         """Its sweep, in its turned frame of then, thinned."""
-        row = self._row(back, who)
+        row = self._row(back, agent_id)
         if row is None:
             return None
-        cloud = self._moments[-1 - back].frames[row].points.transform(self._turn[who].inverse())
-        if self._config.thin:
-            thin = self._config.thin * self._rng.random()
+        cloud = self._moments[-1 - back].frames[row].points.transform(self._turn[agent_id].inverse())
+        if self._config.max_point_dropout:
+            thin = self._config.max_point_dropout * self._rng.random()
             cloud = cloud[torch.from_numpy(self._rng.random(len(cloud)) >= thin)]
         return cloud
 
-    def view(self, back: int, who: int, ego: Transform, off: np.ndarray | None = None) -> View:
+    def view(self, back: int, agent_id: int, ego: Transform, off: np.ndarray | None = None) -> AgentView:
         """The look of an agent so many moments ago, which must be there; off: of its claim in x, y (m) and yaw (rad)."""
-        snapshot, row = self._moments[-1 - back], self._row(back, who)
-        pose, now = self.pose(back, who), self.cloud(back, who)
+        snapshot, row = self._moments[-1 - back], self._row(back, agent_id)
+        pose, now = self.pose(back, agent_id), self.cloud(back, agent_id)
         assert row is not None
         assert pose is not None
         assert now is not None
         truth = _truth(snapshot)
-        true = truth.world_from_agent[row] @ self._turn[who]
-        seen = truth.boxes[truth.seen[row] & (truth.boxes.id != who)].transform(true.inverse())
+        true = truth.world_from_agent[row] @ self._turn[agent_id]
+        seen = truth.boxes[truth.seen[row] & (truth.boxes.id != agent_id)].transform(true.inverse())
         age_s = (self._moments[-1].frames[0].timestamp_ns - snapshot.frames[0].timestamp_ns) / 1e9
-        return View(now, self._before(back, who, pose), ego.inverse() @ _displaced(pose, off), age_s, seen)
+        return AgentView(
+            now, self._previous_cloud(back, agent_id, pose), ego.inverse() @ _displaced(pose, off), age_s, seen
+        )
 
-    def merged(self, who: Sequence[int], ego: Transform, union: Boxes) -> View:
+    def merge(self, agent_ids: Sequence[int], ego: Transform, merged_gt_boxes: Boxes) -> AgentView:
         """The clouds of all agents as the ego's own, now and the moment before."""
         clouds, earlier = [], []
-        for one in who:
+        for one in agent_ids:
             pose, cloud = self.pose(0, one), self.cloud(0, one)
             assert pose is not None
             assert cloud is not None
             clouds.append(cloud.transform(ego.inverse() @ pose))
-            earlier.append(self._before(0, one, ego))
-        return View(PointCloud.cat(clouds), PointCloud.cat(earlier), ego.inverse() @ ego, 0.0, union)
+            earlier.append(self._previous_cloud(0, one, ego))
+        return AgentView(PointCloud.cat(clouds), PointCloud.cat(earlier), ego.inverse() @ ego, 0.0, merged_gt_boxes)
 
-    def _before(self, back: int, who: int, frame: Transform) -> PointCloud:
+    def _previous_cloud(self, back: int, agent_id: int, frame: Transform) -> PointCloud:
         """An agent's sweep of the moment before, moved by its own motion into a frame; empty where there is none."""
-        pose, cloud = self.pose(back + 1, who), self.cloud(back + 1, who)
+        pose, cloud = self.pose(back + 1, agent_id), self.cloud(back + 1, agent_id)
         if pose is None or cloud is None:
             return PointCloud.of(torch.zeros(0, 3))
         return cloud.transform(frame.inverse() @ pose)
 
 
-def _truth(snapshot: Snapshot) -> Truth:
+def _truth(snapshot: Snapshot) -> GroundTruth:
     if snapshot.truth is None:
         raise ConfigError(
             f"Scenario {snapshot.scenario}, frame {snapshot.index} has no truth: it cannot train or judge a detector."
@@ -244,20 +266,20 @@ def _displaced(pose: Transform, off: np.ndarray | None) -> Transform:
 
 
 def _in_range(boxes: Boxes, grid: BevGrid) -> Boxes:
-    return boxes[grid.inside(boxes.center[:, :2])]
+    return boxes[grid.contains(boxes.center[:, :2])]
 
 
 def _mirror(flip: bool, dtype: torch.dtype) -> Tensor:
     return torch.tensor([1.0, -1.0 if flip else 1.0, 1.0], dtype=dtype)
 
 
-def _resize_view(view: View, scale: float, flip: bool, grid: BevGrid) -> View:
+def _resize_view(view: AgentView, scale: float, flip: bool, grid: BevGrid) -> AgentView:
     return replace(
         view,
-        now=_resize_cloud(view.now, scale, flip),
-        earlier=_resize_cloud(view.earlier, scale, flip),
+        cloud=_resize_cloud(view.cloud, scale, flip),
+        earlier=_resize_cloud(view.previous_cloud, scale, flip),
         ego_from_view=_resize_motion(view.ego_from_view, scale, flip),
-        seen=_in_range(_resize_boxes(view.seen, scale, flip), grid),
+        seen=_in_range(_resize_boxes(view.visible_boxes, scale, flip), grid),
     )
 
 
@@ -286,7 +308,7 @@ class SampleStream:
     grid: BevGrid
     augment: AugmentConfig
     seed: int
-    road: RoadConfig = RoadConfig()
+    degradation: DegradationConfig = DegradationConfig()
 
     def draw(self, number: int) -> Sample:
         """Sample of that number: a scenario, a frame with what the road asks for before it, and an ego, all uniform."""
@@ -294,12 +316,15 @@ class SampleStream:
         scenarios = self.recording.scenarios
         scenario = scenarios[int(rng.integers(len(scenarios)))]
         index = int(rng.integers(self.recording.length(scenario)))
-        back = 1 + max(self.road.past, self.road.said + (self.road.late_frames if self.road.late_share else 0))
+        back = 1 + max(
+            self.degradation.ego_history,
+            self.degradation.sender_history + (self.degradation.max_delay_frames if self.degradation.delay_prob else 0),
+        )
         moments = [self.recording.snapshot(scenario, i) for i in range(max(0, index - back), index + 1)]
         ego = int(rng.integers(len(moments[-1].frames)))
-        return make_sample(moments, ego, self.grid, self.augment, (self.seed, number), self.road)
+        return make_sample(moments, ego, self.grid, self.augment, (self.seed, number), self.degradation)
 
 
 def epoch_length(recording: Recording) -> int:
     """Judged frames of a recording: one epoch."""
-    return sum(1 for _ in judged_frames(recording))
+    return sum(1 for _ in iter_eval_frames(recording))

@@ -12,99 +12,107 @@ from torch.nn import functional
 
 from manyeyes.datatypes import Boxes, SparseBev
 from manyeyes.models.detector.box_head import RawBoxes
-from manyeyes.models.detector.detector import Detector, Seen
-from manyeyes.models.fusion.transform_tokens import Part, gather
+from manyeyes.models.detector.detector import Detector, ExtractedFeatures
+from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.window_attention import window_ids
 from manyeyes.training.detector.losses import LossTerms, head_terms, prune_focal
-from manyeyes.training.detector.mutual_information import STUDIED, WINDOW_CELLS, Meeting, Target, information_terms
-from manyeyes.training.detector.samples import Sample, View
-from manyeyes.training.detector.targets import TargetConfig, assign, objects_near
+from manyeyes.training.detector.mutual_information import (
+    STUDY_TARGETS,
+    WINDOW_CELLS,
+    AgentPairTokens,
+    InformationTarget,
+    mutual_information_loss,
+)
+from manyeyes.training.detector.samples import AgentView, Sample
+from manyeyes.training.detector.targets import TargetConfig, assign_targets, find_nearby_objects
 
-PACKET_TOKENS = 8
+TOKENS_PER_PACKET = 8
 """How many tokens are lost together: what a packet of 1,398 bytes holds of float16 features, about."""
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ForwardOutput:
     """What one batch of samples gave: every agent's own view (alone), and every ego's with all it hears (together).
 
-    told: what each view tells, on a batch of grids. mask: (N,) in (0, 1), how much of it the selector would keep.
+    shared_tokens: what each view tells, on a batch of grids. mask: (N,) in (0, 1), how much of it the selector would keep.
     """
 
-    seen: Seen
-    alone: RawBoxes
-    together: RawBoxes
-    told: SparseBev
+    features: ExtractedFeatures
+    single_agent_boxes: RawBoxes
+    fused_boxes: RawBoxes
+    shared_tokens: SparseBev
     mask: Tensor
 
 
-def forward(model: Detector, samples: list[Sample], prune_threshold: float | None = None) -> Outcome:
+def forward(model: Detector, samples: list[Sample], prune_threshold: float | None = None) -> ForwardOutput:
     """Every agent looks as ego, then tells; every sample's ego fuses (CoSTr section III-A).
 
     The tokens take the very path that they take as bytes: seen in the sender's frame, moved metrically, fused, decoded.
     """
     views = [view for sample in samples for view in sample.views]
-    seen = model.see([v.now for v in views], [v.earlier for v in views], prune_threshold)
-    alone = model.look(seen.tokens)
-    told = model.tell(seen.tokens, alone)
-    score = model.choose(told)
+    seen = model.extract_features([v.cloud for v in views], [v.previous_cloud for v in views], prune_threshold)
+    alone = model.predict(seen.tokens)
+    shared = model.make_tokens(seen.tokens, alone)
+    score = model.score_tokens(shared)
     mask = torch.sigmoid(score)
     parts, number = [], 0
-    batch, xy = told.sites.batch, told.sites.xy
+    batch, xy = shared.sites.batch, shared.sites.xy
     for ego, sample in enumerate(samples):
         for i, view in enumerate(sample.views):
             rows = (batch == number).nonzero()[:, 0]
-            part = _part(ego, view, told.features, xy)
+            part = _agent_tokens(ego, view, shared.features, xy)
             if not i:
-                part = replace(part, ego_from_sender=None, told=told.features[rows], xy=xy[rows])
+                part = replace(part, ego_from_sender=None, tokens=shared.features[rows], xy=xy[rows])
             else:
-                rows = _arriving(rows, score.detach(), view, (*sample.key, i))
-                kept = None if view.keep is None else 1 + mask[rows] - mask[rows].detach()
-                part = replace(part, told=told.features[rows], xy=xy[rows], kept=kept)
+                rows = _select_delivered(rows, score.detach(), view, (*sample.key, i))
+                kept = None if view.max_tokens is None else 1 + mask[rows] - mask[rows].detach()
+                part = replace(part, tokens=shared.features[rows], xy=xy[rows], selection_mask=kept)
             parts.append(part)
             number += 1
-    past, said = (_before(model, samples, which, prune_threshold) for which in ("past", "said"))
-    tokens = gather([*parts, *past, *said], told.grid, len(samples))
-    looked_back = gather(past, told.grid, len(samples)) if past else None
-    return Outcome(seen, alone, model.fuse(tokens, looked_back), told, mask)
+    ego_history, sender_history = (
+        _history_tokens(model, samples, which, prune_threshold) for which in ("past", "said")
+    )
+    tokens = to_ego_frame([*parts, *ego_history, *sender_history], shared.grid, len(samples))
+    ego_past = to_ego_frame(ego_history, shared.grid, len(samples)) if ego_history else None
+    return ForwardOutput(seen, alone, model.fuse(tokens, ego_past), shared, mask)
 
 
-def _part(ego: int, view: View, told: Tensor, xy: Tensor) -> Part:
-    return Part(ego, told, xy, view.ego_from_view, view.age_s, view.doubt_xy_m, view.doubt_yaw_rad)
+def _agent_tokens(ego: int, view: AgentView, features: Tensor, xy: Tensor) -> AgentTokens:
+    return AgentTokens(ego, features, xy, view.ego_from_view, view.age_s, view.sigma_xy_m, view.sigma_yaw_rad)
 
 
-def _arriving(rows: Tensor, score: Tensor, view: View, key: tuple[int | str, ...]) -> Tensor:
+def _select_delivered(rows: Tensor, score: Tensor, view: AgentView, key: tuple[int | str, ...]) -> Tensor:
     """The rows of a view's tokens that a budget sends and the air does not lose, packet by packet."""
-    if view.keep is None and not view.lost:
+    if view.max_tokens is None and not view.loss_fraction:
         return rows
     rng = keyed_generator("arriving", *key)
-    if view.keep is not None:
+    if view.max_tokens is not None:
         # Near ties are drawn by chance, so that what is just left out is tried too.
         noise = torch.from_numpy(rng.gumbel(size=len(rows))).float()
         order = (score[rows] + 0.5 * noise).sort(descending=True, stable=True).indices
-        rows = rows[order[: view.keep]]
-    packet = torch.arange(len(rows)) // PACKET_TOKENS
+        rows = rows[order[: view.max_tokens]]
+    packet = torch.arange(len(rows)) // TOKENS_PER_PACKET
     luck = torch.from_numpy(rng.random(int(packet[-1]) + 1 if len(rows) else 0))
-    return rows[luck[packet] >= view.lost].sort().values
+    return rows[luck[packet] >= view.loss_fraction].sort().values
 
 
 @torch.no_grad()
-def _before(
+def _history_tokens(
     model: Detector, samples: list[Sample], which: Literal["past", "said"], prune_threshold: float | None
-) -> list[Part]:
+) -> list[AgentTokens]:
     """What egos, or those that they hear, told at instants before, as memory holds it: no gradient reaches it."""
-    looks = [(ego, view) for ego, sample in enumerate(samples) for view in getattr(sample, which)]
-    if not looks:
+    views = [(ego, view) for ego, sample in enumerate(samples) for view in getattr(sample, which)]
+    if not views:
         return []
-    seen = model.see([v.now for _, v in looks], [v.earlier for _, v in looks], prune_threshold)
-    told = model.tell(seen.tokens, model.look(seen.tokens))
-    score, batch, xy = model.choose(told), told.sites.batch, told.sites.xy
+    seen = model.extract_features([v.now for _, v in views], [v.earlier for _, v in views], prune_threshold)
+    shared = model.make_tokens(seen.tokens, model.predict(seen.tokens))
+    score, batch, xy = model.score_tokens(shared), shared.sites.batch, shared.sites.xy
     parts = []
-    for number, (ego, view) in enumerate(looks):
+    for number, (ego, view) in enumerate(views):
         key = (*samples[ego].key, which, number)
-        rows = _arriving((batch == number).nonzero()[:, 0], score, view, key)
-        parts.append(_part(ego, view, told.features[rows], xy[rows]))
+        rows = _select_delivered((batch == number).nonzero()[:, 0], score, view, key)
+        parts.append(_agent_tokens(ego, view, shared.features[rows], xy[rows]))
     return parts
 
 
@@ -113,39 +121,41 @@ def loss_terms(
     samples: list[Sample],
     targets: TargetConfig,
     prune_threshold: float | None = None,
-    together: float = 0.5,
-    target: Target = "own_task",
+    fusion_weight: float = 0.5,
+    target: InformationTarget = "own_task",
 ) -> LossTerms:
     """Losses of one batch: egos against the union of what their agents list, each agent against its own list.
 
-    together: the share of the former. target: what the selector's information is measured against.
+    fusion_weight: the share of the former. target: what the selector's information is measured against.
     """
     out = forward(model, samples, prune_threshold)
-    listed: list[Boxes] = [view.seen for sample in samples for view in sample.views]
-    union = [sample.union for sample in samples]
-    prune = torch.stack([prune_focal(p, objects_near(p.sites, listed, targets)) for p in out.seen.pruned]).mean()
-    own = assign(out.alone.sites, listed, targets)
-    kept, information = information_terms(out.told, out.mask, own.heat)
+    listed: list[Boxes] = [view.visible_boxes for sample in samples for view in sample.views]
+    union = [sample.merged_gt_boxes for sample in samples]
+    prune = torch.stack(
+        [prune_focal(p, find_nearby_objects(p.sites, listed, targets)) for p in out.features.pruned]
+    ).mean()
+    own = assign_targets(out.single_agent_boxes.sites, listed, targets)
+    kept, information = mutual_information_loss(out.shared_tokens, out.mask, own.heat)
     if target != "own_task":
-        information = STUDIED[target](meeting(out, samples))
-    alone = head_terms(out.alone, own, prune, kept, information)
-    fused = head_terms(out.together, assign(out.together.sites, union, targets), prune, kept, information)
-    return alone.mixed(fused, together)
+        information = STUDY_TARGETS[target](pair_agent_tokens(out, samples))
+    alone = head_terms(out.single_agent_boxes, own, prune, kept, information)
+    fused = head_terms(out.fused_boxes, assign_targets(out.fused_boxes.sites, union, targets), prune, kept, information)
+    return alone.mix(fused, fusion_weight)
 
 
-def meeting(out: Outcome, samples: list[Sample]) -> Meeting:
+def pair_agent_tokens(out: ForwardOutput, samples: list[Sample]) -> AgentPairTokens:
     """What collaborators tell and what their egos see themselves, in windows of the egos' frames; no gradient but the mask's."""
-    told, batch, xy = out.told, out.told.sites.batch, out.told.sites.xy
+    shared, batch, xy = out.shared_tokens, out.shared_tokens.sites.batch, out.shared_tokens.sites.xy
     views = [(ego, i, view) for ego, sample in enumerate(samples) for i, view in enumerate(sample.views)]
-    sides: tuple[list[Part], list[Part]] = ([], [])
+    sides: tuple[list[AgentTokens], list[AgentTokens]] = ([], [])
     for number, (ego, i, view) in enumerate(views):
         rows = batch == number
-        part = _part(ego, view, told.features[rows].detach(), xy[rows])
-        sides[i > 0].append(replace(part, kept=out.mask[rows]))
-    none = Part(0, told.features[:0].detach(), xy[:0], kept=out.mask[:0])
-    had, sent = (gather([none, *parts], told.grid, len(samples)) for parts in sides)
-    origin, edge = (told.grid.x_min, told.grid.y_min), WINDOW_CELLS * told.grid.cell
-    ids = torch.cat([window_ids(t.xy, t.ego, origin, edge) for t in (sent, had)])
+        part = _agent_tokens(ego, view, shared.features[rows].detach(), xy[rows])
+        sides[i > 0].append(replace(part, selection_mask=out.mask[rows]))
+    none = AgentTokens(0, shared.features[:0].detach(), xy[:0], selection_mask=out.mask[:0])
+    own, sent = (to_ego_frame([none, *parts], shared.grid, len(samples)) for parts in sides)
+    origin, edge = (shared.grid.x_min, shared.grid.y_min), WINDOW_CELLS * shared.grid.cell_size_m
+    ids = torch.cat([window_ids(t.xy, t.ego, origin, edge) for t in (sent, own)])
     row = ids.unique(return_inverse=True)[1]
-    unit = [functional.normalize(t.features, dim=1) for t in (sent, had)]
-    return Meeting(unit[0], sent.kept, row[: len(sent.xy)], unit[1], row[len(sent.xy) :])
+    unit = [functional.normalize(t.features, dim=1) for t in (sent, own)]
+    return AgentPairTokens(unit[0], sent.selection_mask, row[: len(sent.xy)], unit[1], row[len(sent.xy) :])

@@ -15,12 +15,12 @@ from manyeyes.datatypes import Boxes, Sites
 class TargetConfig:
     """heat_sigma_m: spread of the heat around a centre, metres (the metric form of detection.md 4.1's warning).
 
-    reach_m: cells up to here from a box's centre also learn its shape, with a weight that falls off as a Gaussian of
+    assign_radius_m: cells up to here from a box's centre also learn its shape, with a weight that falls off as a Gaussian of
     shape_sigma_m. prune_margin_m: boxes are enlarged by at least this before asking whether a cell lies near one.
     """
 
     heat_sigma_m: float = 0.6
-    reach_m: float = 2.4
+    assign_radius_m: float = 2.4
     shape_sigma_m: float = 1.2
     prune_margin_m: float = 0.5
 
@@ -40,7 +40,7 @@ class Targets:
     positive: Tensor
 
 
-def assign(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Targets:
+def assign_targets(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Targets:
     """Truth of each grid of the batch to its sites: the nearest site of a box is its centre, no site serves two boxes.
 
     Pairs are taken from the nearest on (ties by site, then box), so that a box whose nearest site is taken gets the next one.
@@ -55,11 +55,11 @@ def assign(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Targets:
         if len(rows) and len(boxes):
             distance = torch.cdist(xy[rows], boxes.center[:, :2].float())
             nearest, which = distance.min(1)
-            near = nearest < config.reach_m
+            near = nearest < config.assign_radius_m
             heat[rows] = torch.exp(-(nearest**2) / (2 * config.heat_sigma_m**2)).clamp_max(0.99)
             box[rows[near]] = which[near] + first
             weight[rows[near]] = torch.exp(-(nearest[near] ** 2) / (2 * config.shape_sigma_m**2))
-            for site, target in _unique_pairs(distance, config.reach_m):
+            for site, target in _unique_pairs(distance, config.assign_radius_m):
                 heat[rows[site]], weight[rows[site]], positive[rows[site]] = 1.0, 1.0, True
                 box[rows[site]] = first + target
         first += len(boxes)
@@ -80,12 +80,12 @@ def _unique_pairs(distance: Tensor, reach_m: float) -> list[tuple[int, int]]:
     return pairs
 
 
-def objects_near(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Tensor:
+def find_nearby_objects(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Tensor:
     """(N,) int64: the box, a row of all grids' boxes, that a cell's centre lies in, -1 for none (detection.md section 4.2).
 
     Boxes are enlarged by max(margin, half a cell) on every side; of several the one whose centre is nearest.
     """
-    margin = max(config.prune_margin_m, sites.grid.cell / 2)
+    margin = max(config.prune_margin_m, sites.grid.cell_size_m / 2)
     batch, xy = sites.batch, sites.xy
     near, first = torch.full((len(sites),), -1, dtype=torch.int64), 0
     for b, boxes in enumerate(truth):
@@ -93,9 +93,9 @@ def objects_near(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Tens
         if len(rows) and len(boxes):
             delta = xy[rows][:, None] - boxes.center[None, :, :2].float()
             c, s = boxes.yaw.float().cos(), boxes.yaw.float().sin()
-            along, across = delta[..., 0] * c + delta[..., 1] * s, delta[..., 1] * c - delta[..., 0] * s
+            longitudinal, lateral = delta[..., 0] * c + delta[..., 1] * s, delta[..., 1] * c - delta[..., 0] * s
             half = boxes.size[:, :2].float() / 2 + margin
-            inside = (along.abs() <= half[:, 0]) & (across.abs() <= half[:, 1])
+            inside = (longitudinal.abs() <= half[:, 0]) & (lateral.abs() <= half[:, 1])
             distance, which = torch.where(inside, delta.norm(dim=2), torch.inf).min(1)
             near[rows] = torch.where(distance < torch.inf, which + first, -1)
         first += len(boxes)

@@ -18,49 +18,51 @@ from torch import Tensor
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.models.maps.head import is_ring
-from manyeyes.models.maps.line_field_head import REACH, Sketch
+from manyeyes.models.maps.line_field_head import MAX_LINE_OFFSET, RawLineField
 from manyeyes.ops.polyline import headings, resample_spaced
 
 Floats = NDArray[np.float64]
 
-SPREAD = 0.6
+LINE_SIGMA = 0.6
 """Cells: at so far from a line a cell is held for drawn at exp(-1/2)."""
-SPACING = 0.25
+SAMPLE_SPACING = 0.25
 """Cells between the points that stand for a line."""
-FEW = 20.0
+MIN_NORMALISER = 20.0
 """Cells of ink, or of ends, for which a kind counts that has fewer in a batch: one short line."""
-BEYOND_M = 4.0
+OBSERVED_MARGIN_M = 4.0
 """So far beyond what was seen, lines are still asked for: gaps between beams, and what stands behind a car."""
-TIP = 0.75
+END_RADIUS = 0.75
 """Cells from the end of a line within which a cell says that it ends here, where it is not the tile's border that cuts it."""
 
 
 @dataclass(frozen=True, eq=False)
-class SketchTarget:
-    """One tile's truth as its cells should tell it. ink: (K, rows, columns) in [0, 1]; end: likewise, 0 or 1; near: likewise,
-    bool, within REACH of a line, where alone the others mean something: foot, way (K, 2, rows, columns) and half (K, rows,
-    columns) as in a sketch.
+class LineFieldTarget:
+    """One tile's truth as its cells should tell it. line_prob: (K, rows, columns) in [0, 1]; end_mask: likewise, 0 or 1; near_line:
+    likewise, bool, within REACH of a line, where alone the others mean something: foot, way (K, 2, rows, columns) and half (K,
+    rows, columns) as in a sketch.
     """
 
-    ink: Tensor
-    end: Tensor
-    near: Tensor
-    foot: Tensor
-    way: Tensor
-    half: Tensor
+    line_prob: Tensor
+    end_mask: Tensor
+    near_line: Tensor
+    offset_to_line: Tensor
+    direction: Tensor
+    half_width: Tensor
 
-    def within(self, seen: Tensor) -> SketchTarget:
+    def mask_unobserved(self, seen: Tensor) -> LineFieldTarget:
         """Without lines where nothing was seen (rows, columns) bool."""
-        return replace(self, ink=self.ink * seen, end=self.end * seen, near=self.near & seen)
+        return replace(
+            self, line_prob=self.line_prob * seen, end_mask=self.end_mask * seen, near_line=self.near_line & seen
+        )
 
 
-def around_seen(seen: Tensor, tile: BevGrid) -> Tensor:
+def dilate_observed(seen: Tensor, tile: BevGrid) -> Tensor:
     """(B, rows, columns) bool: cells within BEYOND_M of one that was seen (B, rows, columns), along either axis."""
-    reach = round(BEYOND_M / tile.cell)
+    reach = round(OBSERVED_MARGIN_M / tile.cell_size_m)
     return F.max_pool2d(seen[:, None].float(), 2 * reach + 1, 1, reach)[:, 0] > 0
 
 
-def sketch_of(truth: MapElements, tile: BevGrid, kinds: Sequence[str]) -> SketchTarget:
+def make_line_field_target(truth: MapElements, tile: BevGrid, kinds: Sequence[str]) -> LineFieldTarget:
     """The elements of those kinds, in the tile's frame, metres."""
     rows, columns = tile.shape
     ink = torch.zeros(len(kinds), rows, columns)
@@ -70,23 +72,23 @@ def sketch_of(truth: MapElements, tile: BevGrid, kinds: Sequence[str]) -> Sketch
         own = np.flatnonzero(truth.kind == KINDS.index(kind))
         if not len(own):
             continue
-        lines = [(truth.polyline(row) - [tile.x_min, tile.y_min]) / tile.cell for row in own.tolist()]
+        lines = [(truth.polyline(row) - [tile.x_min, tile.y_min]) / tile.cell_size_m for row in own.tolist()]
         widths = np.zeros(len(own))
         if is_ring(kind):
-            lines, widths = map(list, zip(*(middle_line(ring) for ring in lines)))
+            lines, widths = map(list, zip(*(fit_middle_line(ring) for ring in lines)))
         cell, near, angle, row = _nearest([np.asarray(line) for line in lines], rows, columns)
         away = near - (cell[:, ::-1] + 0.5)
         at = (layer, *torch.from_numpy(cell.T.copy()))
-        ink[at] = torch.from_numpy(np.exp(-(away**2).sum(1) / (2 * SPREAD**2))).float()
+        ink[at] = torch.from_numpy(np.exp(-(away**2).sum(1) / (2 * LINE_SIGMA**2))).float()
         both = (layer, slice(None), *torch.from_numpy(cell.T.copy()))
         foot[both] = torch.from_numpy(away).float().T
         way[both] = torch.from_numpy(np.stack((np.cos(2 * angle), np.sin(2 * angle)))).float()
         half[at] = torch.from_numpy(np.asarray(widths)[row]).float()
         end[layer] = torch.from_numpy(_tips(lines, rows, columns))
-    return SketchTarget(ink, end, ink > 0, foot, way, half)
+    return LineFieldTarget(ink, end, ink > 0, foot, way, half)
 
 
-def middle_line(ring: Floats) -> tuple[Floats, float]:
+def fit_middle_line(ring: Floats) -> tuple[Floats, float]:
     """A ring (K, 2) as the line (2, 2) along the middle of the rectangle about it, along its longest edge, and half its width."""
     edges = np.roll(ring, -1, axis=0) - ring
     unit = edges[int(np.argmax(np.hypot(*edges.T)))]
@@ -108,7 +110,7 @@ def _tips(lines: Sequence[Floats], rows: int, columns: int) -> NDArray[np.float3
     ends = ends[((ends > 0.5) & (ends < [columns - 0.5, rows - 0.5])).all(1)]
     x, y = np.arange(columns) + 0.5, np.arange(rows) + 0.5
     away = np.hypot(x - ends[:, 0, None, None], y[:, None] - ends[:, 1, None, None])
-    return np.any(away <= TIP, axis=0, keepdims=True)[0].astype(np.float32)
+    return np.any(away <= END_RADIUS, axis=0, keepdims=True)[0].astype(np.float32)
 
 
 def _nearest(
@@ -116,14 +118,14 @@ def _nearest(
 ) -> tuple[NDArray[np.int64], Floats, Floats, NDArray[np.int64]]:
     """Cells (Q, 2), row and column, within REACH of lines in cells; the nearest point (Q, 2), its heading, and its line's row."""
     first = np.concatenate(([0], np.cumsum([len(line) for line in lines])))
-    points, first = resample_spaced(np.concatenate(lines), first, SPACING)
+    points, first = resample_spaced(np.concatenate(lines), first, SAMPLE_SPACING)
     angle, line = headings(points, first), np.repeat(np.arange(len(lines)), np.diff(first))
-    side = np.arange(-int(np.ceil(REACH)), int(np.ceil(REACH)) + 1)
+    side = np.arange(-int(np.ceil(MAX_LINE_OFFSET)), int(np.ceil(MAX_LINE_OFFSET)) + 1)
     around = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     cell = (np.floor(points).astype(np.int64)[:, None] + around).reshape(-1, 2)
     owner = np.repeat(np.arange(len(points)), len(around))
     away = ((cell + 0.5 - points[owner]) ** 2).sum(1)
-    kept = (away <= REACH**2) & ((cell >= 0) & (cell < [columns, rows])).all(1)
+    kept = (away <= MAX_LINE_OFFSET**2) & ((cell >= 0) & (cell < [columns, rows])).all(1)
     cell, owner, away = cell[kept], owner[kept], away[kept]
     key = cell[:, 1] * columns + cell[:, 0]
     order = np.lexsort((away, key))
@@ -132,7 +134,7 @@ def _nearest(
     return cell[best][:, ::-1], points[owner[best]], angle[owner[best]], line[owner[best]]
 
 
-def sketch_loss(sketch: Sketch, targets: Sequence[SketchTarget]) -> Tensor:
+def line_field_loss(line_field: RawLineField, targets: Sequence[LineFieldTarget]) -> Tensor:
     """Of a batch of tiles: ink and ends by cross entropy per unit of true ink, or end, of each kind by itself, since crossings are
     few; foot (cells), way and half (cells), absolute, means over the cells near a line.
     """
@@ -140,14 +142,14 @@ def sketch_loss(sketch: Sketch, targets: Sequence[SketchTarget]) -> Tensor:
         torch.stack([getattr(target, name) for target in targets])
         for name in ("ink", "end", "near", "foot", "way", "half")
     )
-    drawn, ended = _per_unit(sketch.ink, ink), _per_unit(sketch.end, end)
-    off = ((sketch.foot - foot).abs() + (sketch.way - way).abs()).sum(2)
+    drawn, ended = _per_unit(line_field.line_logit, ink), _per_unit(line_field.end_logit, end)
+    off = ((line_field.offset_to_line - foot).abs() + (line_field.direction - way).abs()).sum(2)
     wide = near & (half > 0)
-    broad = ((sketch.half - half).abs() * wide).sum() / wide.sum().clamp_min(1)
+    broad = ((line_field.half_width - half).abs() * wide).sum() / wide.sum().clamp_min(1)
     return drawn + 0.5 * ended + (off * near).sum() / near.sum().clamp_min(1) + 0.2 * broad
 
 
 def _per_unit(logit: Tensor, share: Tensor) -> Tensor:
     """Cross entropy (B, K, rows, columns) per unit of what is true, FEW units at least, kind by kind; the mean over kinds."""
     each = F.binary_cross_entropy_with_logits(logit, share, reduction="none").sum((0, 2, 3))
-    return (each / share.sum((0, 2, 3)).clamp_min(FEW)).mean()
+    return (each / share.sum((0, 2, 3)).clamp_min(MIN_NORMALISER)).mean()

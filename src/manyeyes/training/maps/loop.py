@@ -12,45 +12,47 @@ import torch
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.models import checkpoint
-from manyeyes.models.maps.map_model import Mapper, MapperConfig
+from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.ops.keyed_random import keyed_uniform
-from manyeyes.training.checkpointing import RunState, warm_cosine
-from manyeyes.training.maps.losses import MapLossConfig, MapTerms
-from manyeyes.training.maps.samples import MapAugment, MapSamples
-from manyeyes.training.maps.score_calibration import calibrate
+from manyeyes.training.checkpointing import RunState, warmup_cosine
+from manyeyes.training.maps.losses import MapLossConfig, MapLossTerms
+from manyeyes.training.maps.samples import MapAugmentConfig, MapSamples
+from manyeyes.training.maps.score_calibration import calibrate_scores
 from manyeyes.training.maps.step import loss_terms
 
-_LAST = ("scale", "shift")
+_CALIBRATION_TENSORS = ("scale", "shift")
 
 
 @dataclass(frozen=True)
 class MapTrainConfig:
-    """A run. batch: tiles a step over all processes. warm_up: steps of linear growth of the learning rate, then a cosine to zero.
+    """A run. batch: tiles a step over all processes. warmup_steps: steps of linear growth of the learning rate, then a cosine to
+    zero.
 
-    thin: the greatest share of a look's tokens that is left out, those of least worth, as a budget in bytes would; uniform, so that
-    the model knows tiles of many bytes and of few. ema: decay of the averaged weights that are saved. beta2: decay of Adam's mean
-    square; at the usual 0.999 it still divides by the great gradients of the start when half of a short run is over. sketch_steps:
-    first steps in which the decoder is not taught, since what it would begin from shows nothing yet. calibrated: tiles that follow
-    those of the last step, by which scores are brought to what is true in the end; without any they stay as they are. at_once:
-    tiles that a process holds in memory together; parts of a batch are normed each by itself, as those of several processes are.
+    max_token_dropout: the greatest share of a look's tokens that is left out, those of least worth, as a budget in bytes would;
+    uniform, so that the model knows tiles of many bytes and of few. ema_decay: decay of the averaged weights that are saved. beta2:
+    decay of Adam's mean square; at the usual 0.999 it still divides by the great gradients of the start when half of a short run is
+    over. line_field_steps: first steps in which the decoder is not taught, since what it would begin from shows nothing yet.
+    calibration_tiles: tiles that follow those of the last step, by which scores are brought to what is true in the end; without any
+    they stay as they are. micro_batch: tiles that a process holds in memory together; parts of a batch are normed each by itself,
+    as those of several processes are.
     """
 
-    mapper: MapperConfig
+    map_model: MapModelConfig
     steps: int
     batch: int = 4
     learning_rate: float = 6e-4
     weight_decay: float = 1e-2
     beta2: float = 0.98
-    warm_up: int = 100
-    clip: float = 35.0
-    ema: float = 0.998
-    thin: float = 0.9
-    sketch_steps: int = 0
-    calibrated: int = 0
-    at_once: int = 8
+    warmup_steps: int = 100
+    max_grad_norm: float = 35.0
+    ema_decay: float = 0.998
+    max_token_dropout: float = 0.9
+    line_field_steps: int = 0
+    calibration_tiles: int = 0
+    micro_batch: int = 8
     save_every: int = 100
-    augment: MapAugment = field(default_factory=MapAugment)
+    augment: MapAugmentConfig = field(default_factory=MapAugmentConfig)
     loss: MapLossConfig = field(default_factory=MapLossConfig)
 
 
@@ -61,11 +63,11 @@ class MapProgress:
     step: int
     steps: int
     loss: float
-    terms: MapTerms
+    terms: MapLossTerms
     learning_rate: float
     seconds: float
 
-    def line(self) -> dict[str, float]:
+    def to_record(self) -> dict[str, float]:
         """As it stands in log.jsonl."""
         terms = {name: round(float(value.detach()), 5) for name, value in vars(self.terms).items()}
         return {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
@@ -85,29 +87,29 @@ class MapRun:
         self.config, self.samples, self.seed = config, samples, seed
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            model = Mapper(config.mapper)
+            model = MapModel(config.map_model)
         _begin_from(model, start)
         self.state = RunState(model, config, seed, folder, config.weight_decay, config.beta2, bool(start))
 
     def advance(self) -> MapProgress:
         """One step of the optimiser."""
         config, state = self.config, self.state
-        numbers = state.numbers(config.batch)
+        numbers = state.sample_numbers(config.batch)
         loss, parts = 0.0, []
-        for first in numbers[:: config.at_once]:
-            part = [self.samples.draw(number) for number in numbers[first - numbers.start :][: config.at_once]]
-            looks = sum(len(sample.looks) for sample in part)
-            thin = config.thin * keyed_uniform((looks,), "thin", self.seed, first).float()
-            terms = loss_terms(state.model.train(), part, config.loss, thin, state.step >= config.sketch_steps)
+        for first in numbers[:: config.micro_batch]:
+            part = [self.samples.draw(number) for number in numbers[first - numbers.start :][: config.micro_batch]]
+            num_frames = sum(len(sample.frames) for sample in part)
+            dropout = config.max_token_dropout * keyed_uniform((num_frames,), "thin", self.seed, first).float()
+            terms = loss_terms(state.model.train(), part, config.loss, dropout, state.step >= config.line_field_steps)
             share = len(part) / len(numbers)
             loss += state.backward(terms.total(config.loss), share)
-            parts.append(terms.shared(share))
-        rate = config.learning_rate * warm_cosine(config.warm_up, state.step, config.steps)
-        state.descend(rate, config.clip, config.ema)
-        return MapProgress(state.step, config.steps, loss, MapTerms.summed(parts), rate, state.seconds)
+            parts.append(terms.scale(share))
+        rate = config.learning_rate * warmup_cosine(config.warmup_steps, state.step, config.steps)
+        state.optimiser_step(rate, config.max_grad_norm, config.ema_decay)
+        return MapProgress(state.step, config.steps, loss, MapLossTerms.add_up(parts), rate, state.seconds)
 
 
-def train_mapper(
+def train_map_model(
     config: MapTrainConfig,
     samples: MapSamples,
     folder: Path,
@@ -123,11 +125,13 @@ def train_mapper(
     """
     run = MapRun(config, samples, folder, seed, start)
     state = run.state
-    state.finish(config.steps, config.save_every, run.advance, report)
+    state.run_to_end(config.steps, config.save_every, run.advance, report)
     weights = folder / "weights.safetensors"
     if not state.rank:
         first = config.steps * config.batch
-        calibrate(state.average, (samples.draw(number) for number in range(first, first + config.calibrated)))
+        calibrate_scores(
+            state.average, (samples.draw(number) for number in range(first, first + config.calibration_tiles))
+        )
         about = {
             "seed": seed,
             "steps": config.steps,
@@ -139,12 +143,16 @@ def train_mapper(
     return weights
 
 
-def _begin_from(model: Mapper, start: Sequence[Mapping[str, torch.Tensor]]) -> None:
+def _begin_from(model: MapModel, start: Sequence[Mapping[str, torch.Tensor]]) -> None:
     """Tensors of these names and shapes are taken over: a model of other sensors has its tiles and its drawing in common."""
     own = model.state_dict()
     for state in reversed(start):
         # Scores are calibrated in the end; what is taught is what comes before.
-        fitting = {k: v.float() for k, v in state.items() if k in own and v.shape == own[k].shape and k not in _LAST}
+        fitting = {
+            k: v.float()
+            for k, v in state.items()
+            if k in own and v.shape == own[k].shape and k not in _CALIBRATION_TENSORS
+        }
         if not fitting:
             raise ConfigError(
                 "None of the given weights' tensors fits this preset; begin from a map model of its size."

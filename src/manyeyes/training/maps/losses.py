@@ -23,60 +23,68 @@ ALPHA, GAMMA = 0.25, 2.0
 
 @dataclass(frozen=True)
 class MapLossConfig:
-    """Weights of the terms. repeat: how often each element is wanted of the one-to-many queries; many: their share of the loss.
+    """Weights of the terms. one_to_many_repeats: how often each element is wanted of the one-to-many queries; one_to_many: their
+    share of the loss.
 
-    far: mean over an element's points of the L1 distance, in shares of the tile, beyond which no query answers for it: where no
-    line of the sketch comes near, only the sketch has something to learn, and a query that was drawn there would unlearn. Queries
-    that begin as lines of their own have to be drawn from anywhere.
+    max_match_distance: mean over an element's points of the L1 distance, in shares of the tile, beyond which no query answers for
+    it: where no line of the sketch comes near, only the sketch has something to learn, and a query that was drawn there would
+    unlearn. Queries that begin as lines of their own have to be drawn from anywhere.
     """
 
-    kind: float = 2.0
+    classification: float = 2.0
     point: float = 5.0
     direction: float = 0.005
-    ink: float = 10.0
-    sketch: float = 2.0
-    repeat: int = 2
-    far: float = 0.2
-    many: float = 1.0
+    segmentation: float = 10.0
+    line_field: float = 2.0
+    one_to_many_repeats: int = 2
+    max_match_distance: float = 0.2
+    one_to_many: float = 1.0
 
 
 @dataclass(frozen=True)
-class MapTerms:
-    """Scalars, each a sum over the head's layers where it has any; sketch: of what queries begin from
+class MapLossTerms:
+    """Scalars, each a sum over the head's layers where it has any; line_field: of what queries begin from
     (training/maps/line_field_targets.py);
-    many: all terms of the one-to-many queries, weighed already.
+    one_to_many: all terms of the one-to-many queries, weighed already.
     """
 
-    kind: Tensor
+    classification: Tensor
     point: Tensor
     direction: Tensor
-    ink: Tensor
-    sketch: Tensor
-    many: Tensor
+    segmentation: Tensor
+    line_field: Tensor
+    one_to_many: Tensor
 
     @classmethod
-    def undrawn(cls, ink: Tensor, sketch: Tensor) -> MapTerms:
+    def without_elements(cls, segmentation: Tensor, line_field: Tensor) -> MapLossTerms:
         """Where nothing was drawn."""
-        nothing = sketch.new_zeros(())
-        return cls(nothing, nothing, nothing, ink, sketch, nothing)
+        nothing = line_field.new_zeros(())
+        return cls(nothing, nothing, nothing, segmentation, line_field, nothing)
 
-    def shared(self, share: float) -> MapTerms:
+    def scale(self, fraction: float) -> MapLossTerms:
         """What they count where they are of this share of a batch, without their gradients."""
-        return MapTerms(**{name: share * value.detach() for name, value in vars(self).items()})
+        return MapLossTerms(**{name: fraction * value.detach() for name, value in vars(self).items()})
 
     @classmethod
-    def summed(cls, parts: Sequence[MapTerms]) -> MapTerms:
+    def add_up(cls, parts: Sequence[MapLossTerms]) -> MapLossTerms:
         """The terms of a batch from those of its parts."""
         return cls(**{f.name: torch.stack([getattr(part, f.name) for part in parts]).sum() for f in fields(cls)})
 
     def total(self, config: MapLossConfig) -> Tensor:
         """The loss."""
-        own = config.kind * self.kind + config.point * self.point + config.direction * self.direction
-        return own + config.ink * self.ink + config.sketch * self.sketch + config.many * self.many
+        own = (
+            config.classification * self.classification + config.point * self.point + config.direction * self.direction
+        )
+        return (
+            own
+            + config.segmentation * self.segmentation
+            + config.line_field * self.line_field
+            + config.one_to_many * self.one_to_many
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Match:
+class QueryMatch:
     """In one tile: query (M,) and element (M,) int64 of each pair, and the points (M, P, 2) in the order that fits the query."""
 
     query: Tensor
@@ -84,22 +92,24 @@ class Match:
     points: Tensor
 
 
-def match(logit: Tensor, point: Tensor, target: MapTarget, config: MapLossConfig) -> Match:
+def match_queries(logit: Tensor, point: Tensor, target: MapTarget, config: MapLossConfig) -> QueryMatch:
     """One query an element, at the least cost over all pairs: focal cost of the kind plus the L1 distance in the best order.
 
     logit (I, kinds), point (I, P, 2). Distances are of shares of the tile, summed over points.
     """
     elements, orders = target.orders.shape[:2]
     if elements == 0:
-        nobody = torch.zeros(0, dtype=torch.int64)
-        return Match(nobody, nobody, target.orders.new_zeros(0, *point.shape[1:]))
+        empty = torch.zeros(0, dtype=torch.int64)
+        return QueryMatch(empty, empty, target.orders.new_zeros(0, *point.shape[1:]))
     with torch.no_grad():
-        away = torch.cdist(point.flatten(1), target.orders.flatten(0, 1).flatten(1), p=1).view(-1, elements, orders)
-        least, best = away.min(2)
-        cost = config.kind * _focal_cost(logit)[:, target.kind] + config.point * least
+        distance = torch.cdist(point.flatten(1), target.orders.flatten(0, 1).flatten(1), p=1).view(-1, elements, orders)
+        min_distance, best = distance.min(2)
+        cost = config.classification * _focal_cost(logit)[:, target.kind] + config.point * min_distance
         pairs = torch.from_numpy(assign(cost.double().numpy()).copy())
-        query, element = pairs[least[pairs[:, 0], pairs[:, 1]] <= config.far * point.shape[1]].unbind(1)
-    return Match(query, element, target.orders[element, best[query, element]])
+        query, element = pairs[
+            min_distance[pairs[:, 0], pairs[:, 1]] <= config.max_match_distance * point.shape[1]
+        ].unbind(1)
+    return QueryMatch(query, element, target.orders[element, best[query, element]])
 
 
 def head_terms(
@@ -107,27 +117,27 @@ def head_terms(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(kind, point, direction) of one group of queries, each layer matched anew, summed over layers."""
     queries = layers[0].logit.shape[1]
-    answers = max(1, sum(min(len(target), queries) for target in targets))
+    num_matches = max(1, sum(min(len(target), queries) for target in targets))
     kind = point = direction = layers[0].logit.new_zeros(())
     for raw in layers:
         hot = torch.zeros_like(raw.logit)
         for tile, target in enumerate(targets):
-            found = match(raw.logit[tile], raw.point[tile], target, config)
+            found = match_queries(raw.logit[tile], raw.point[tile], target, config)
             hot[tile, found.query, target.kind[found.element]] = 1
-            mine, ring = raw.point[tile, found.query], target.ring[found.element]
-            point = point + (mine - found.points).abs().sum() / answers
-            direction = direction + turned_away(mine, found.points, ring).sum() / answers
-        kind = kind + focal(raw.logit, hot).sum() / answers
+            matched, ring = raw.point[tile, found.query], target.ring[found.element]
+            point = point + (matched - found.points).abs().sum() / num_matches
+            direction = direction + direction_loss(matched, found.points, ring).sum() / num_matches
+        kind = kind + focal_loss(raw.logit, hot).sum() / num_matches
     return kind, point, direction
 
 
-def turned_away(mine: Tensor, theirs: Tensor, ring: Tensor) -> Tensor:
+def direction_loss(predicted: Tensor, target: Tensor, ring: Tensor) -> Tensor:
     """(M,) sums of 1 - cosine between the edges of two figures (M, P, 2); a ring (M,) has its closing edge too."""
-    gap = 1 - F.cosine_similarity(mine.roll(-1, 1) - mine, theirs.roll(-1, 1) - theirs, dim=2, eps=1e-6)
+    gap = 1 - F.cosine_similarity(predicted.roll(-1, 1) - predicted, target.roll(-1, 1) - target, dim=2, eps=1e-6)
     return gap[:, :-1].sum(1) + gap[:, -1] * ring
 
 
-def focal(logit: Tensor, hot: Tensor) -> Tensor:
+def focal_loss(logit: Tensor, hot: Tensor) -> Tensor:
     """Focal loss of each logit against 0 or 1."""
     likely = torch.sigmoid(logit)
     miss = torch.where(hot > 0, 1 - likely, likely)
@@ -137,27 +147,27 @@ def focal(logit: Tensor, hot: Tensor) -> Tensor:
 
 def _focal_cost(logit: Tensor) -> Tensor:
     """What it costs a query to say a kind rather than not: the focal loss as it would be less the loss as it is without."""
-    return focal(logit, torch.ones_like(logit)) - focal(logit, torch.zeros_like(logit))
+    return focal_loss(logit, torch.ones_like(logit)) - focal_loss(logit, torch.zeros_like(logit))
 
 
-def ink_loss(logit: Tensor, drawn: Tensor) -> Tensor:
+def segmentation_loss(logit: Tensor, occupied: Tensor) -> Tensor:
     """Of tokens (N, kinds), whether an element of each kind runs through their cells (MapTRv2's segmentation, weight 4)."""
-    return F.binary_cross_entropy_with_logits(logit, drawn, pos_weight=logit.new_full((), 4.0))
+    return F.binary_cross_entropy_with_logits(logit, occupied, pos_weight=logit.new_full((), 4.0))
 
 
 def map_terms(
     one: Sequence[RawMap],
     many: Sequence[RawMap],
-    ink: Tensor,
-    sketch: Tensor,
+    segmentation: Tensor,
+    line_field: Tensor,
     targets: Sequence[MapTarget],
     config: MapLossConfig,
-) -> MapTerms:
+) -> MapLossTerms:
     """All terms of one batch of tiles; many is empty where the head has no such queries."""
     kind, point, direction = head_terms(one, targets, config)
     extra = kind.new_zeros(())
     if many:
-        repeated = [target.repeated(config.repeat) for target in targets]
+        repeated = [target.repeat(config.one_to_many_repeats) for target in targets]
         more = head_terms(many, repeated, config)
-        extra = config.kind * more[0] + config.point * more[1] + config.direction * more[2]
-    return MapTerms(kind, point, direction, ink, sketch, extra)
+        extra = config.classification * more[0] + config.point * more[1] + config.direction * more[2]
+    return MapLossTerms(kind, point, direction, segmentation, line_field, extra)

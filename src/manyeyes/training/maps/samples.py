@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from manyeyes.datasets.base import Recording
-from manyeyes.datasets.frame_reader import SingleFrames, single_frames
+from manyeyes.datasets.frame_reader import FrameReader, as_frame_reader
 from manyeyes.datatypes import AgentFrame, BevGrid, Camera, CameraImage, Transform
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
-from manyeyes.evaluation.maps.tiles import assert_split, cut_to, town_of
-from manyeyes.models.maps.map_model import LOOKS, MapperConfig
+from manyeyes.evaluation.maps.tiles import check_town_split, crop_to_tile, find_town
+from manyeyes.models.maps.map_model import FRAMES_PER_TILE, MapModelConfig
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.polyline import resample_spaced
 
@@ -33,15 +33,16 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MapSample:
-    """One tile. looks: frames as they were seen; tile_from_look: one motion each, by claimed poses.
+    """One tile. frames: frames as they were seen; tile_from_agent: one motion each, by claimed poses.
 
-    truth: in the tile's frame. ink: (looks, kinds, rows, columns) bool, where elements run through the cells of each look's tokens.
+    truth: in the tile's frame. line_mask: (looks, kinds, rows, columns) bool, where elements run through the cells of each look's
+    tokens.
     """
 
-    looks: tuple[AgentFrame, ...]
-    tile_from_look: Transform
+    frames: tuple[AgentFrame, ...]
+    tile_from_agent: Transform
     truth: MapElements
-    ink: Tensor
+    line_mask: Tensor
 
 
 class MapSamples(Protocol):
@@ -58,17 +59,18 @@ class MapSamples(Protocol):
 
 
 @dataclass(frozen=True)
-class MapAugment:
-    """least, most: looks at a tile, uniform. turn_rad: of the tile against the heading of the agent it is put about; shift_m: of
-    its middle, along and across. sigma_m, sigma_rad: of the error of claimed poses; flip: mirrored left to right half of the time.
+class MapAugmentConfig:
+    """min_frames, max_frames: looks at a tile, uniform. max_yaw_rad: of the tile against the heading of the agent it is put about;
+    max_shift_m: of its middle, along and across. sigma_xy_m, sigma_yaw_rad: of the error of claimed poses; flip: mirrored left to
+    right half of the time.
     """
 
-    least: int = 1
-    most: int = LOOKS
-    turn_rad: float = math.radians(15)
-    shift_m: float = 15.0
-    sigma_m: float = 0.0
-    sigma_rad: float = 0.0
+    min_frames: int = 1
+    max_frames: int = FRAMES_PER_TILE
+    max_yaw_rad: float = math.radians(15)
+    max_shift_m: float = 15.0
+    sigma_xy_m: float = 0.0
+    sigma_yaw_rad: float = 0.0
     flip: bool = True
 
 
@@ -78,13 +80,13 @@ class TileStream:
 
     recording: Recording
     maps: Mapping[str, MapElements]
-    mapper: MapperConfig
-    augment: MapAugment
+    map_model: MapModelConfig
+    augment: MapAugmentConfig
     seed: int
     held_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        assert_split(self.towns, self.held_out)
+        check_town_split(self.towns, self.held_out)
 
     @property
     def towns(self) -> tuple[str, ...]:
@@ -92,11 +94,11 @@ class TileStream:
         return tuple(sorted({self._town(s) for s in self.recording.scenarios}))
 
     def _town(self, scenario: str) -> str:
-        return town_of(scenario, tuple(self.maps))
+        return find_town(scenario, tuple(self.maps))
 
     @cached_property
-    def _frames(self) -> SingleFrames:
-        return single_frames(self.recording)
+    def _frames(self) -> FrameReader:
+        return as_frame_reader(self.recording)
 
     @cached_property
     def _places(self) -> dict[str, Floats]:
@@ -112,19 +114,19 @@ class TileStream:
         scenarios = self.recording.scenarios
         scenario = scenarios[int(rng.integers(len(scenarios)))]
         index = int(rng.integers(self.recording.length(scenario)))
-        present = self._frames.present(scenario, index)
+        present = self._frames.present_agents(scenario, index)
         own = self._frames.frame(scenario, index, present[int(rng.integers(len(present)))])
-        turn = float(own.world_from_agent.yaw) + augment.turn_rad * rng.uniform(-1, 1)
-        shift = augment.shift_m * rng.uniform(-1, 1, 2)
+        turn = float(own.world_from_agent.yaw) + augment.max_yaw_rad * rng.uniform(-1, 1)
+        shift = augment.max_shift_m * rng.uniform(-1, 1, 2)
         middle = own.world_from_agent.translation[:2].numpy() + shift
         world_from_tile = Transform.from_xyz_yaw(float(middle[0]), float(middle[1]), 0.0, turn)
-        wanted = int(rng.integers(augment.least, augment.most + 1))
-        looks = [own, *self._others(scenario, middle, wanted - 1, rng)]
-        return self._sample(scenario, world_from_tile, looks, rng)
+        num_frames = int(rng.integers(augment.min_frames, augment.max_frames + 1))
+        frames = [own, *self._sample_frames(scenario, middle, num_frames - 1, rng)]
+        return self._sample(scenario, world_from_tile, frames, rng)
 
-    def _others(self, scenario: str, middle: Floats, wanted: int, rng: np.random.Generator) -> list[AgentFrame]:
+    def _sample_frames(self, scenario: str, middle: Floats, count: int, rng: np.random.Generator) -> list[AgentFrame]:
         """So many looks of agents that were near, each at an instant of its own; a pole's first, where there is one."""
-        town, reach = self._town(scenario), self.mapper.tile.x_max + self.mapper.bev.grid.x_max / 2
+        town, reach = self._town(scenario), self.map_model.tile.x_max + self.map_model.bev.grid.x_max / 2
         near = [
             (s, row)
             for s, places in self._places.items()
@@ -136,35 +138,40 @@ class TileStream:
         if rng.random() < 0.5:
             order = sorted(order.tolist(), key=lambda k: near[k][0] != scenario)
         found: list[AgentFrame] = []
-        while near and len(found) < wanted:
-            for k in order[: wanted - len(found)]:
+        while near and len(found) < count:
+            for k in order[: count - len(found)]:
                 s, row = near[int(k)]
                 index = int(rng.integers(self.recording.length(s)))
-                present = self._frames.present(s, index)
+                present = self._frames.present_agents(s, index)
                 found.append(self._frames.frame(s, index, present[min(row, len(present) - 1)]))
         return sorted(found, key=lambda frame: not frame.is_infrastructure)
 
     def _sample(
-        self, scenario: str, world_from_tile: Transform, looks: Sequence[AgentFrame], rng: np.random.Generator
+        self, scenario: str, world_from_tile: Transform, frames: Sequence[AgentFrame], rng: np.random.Generator
     ) -> MapSample:
-        augment, config = self.augment, self.mapper
+        augment, config = self.augment, self.map_model
         world = self.maps[self._town(scenario)]
         tile_from_world = world_from_tile.inverse()
-        claimed, there = [], []
-        for look in looks:
-            dx, dy, turn = rng.normal(size=3) * [augment.sigma_m, augment.sigma_m, augment.sigma_rad]
+        reported, local_elements = [], []
+        for frame in frames:
+            dx, dy, turn = rng.normal(size=3) * [augment.sigma_xy_m, augment.sigma_xy_m, augment.sigma_yaw_rad]
             error = Transform.from_xyz_yaw(float(dx), float(dy), 0.0, float(turn))
-            claimed.append(tile_from_world @ look.world_from_agent @ error)
-            there.append(cut_to(world, look.world_from_agent, config.bev.grid))
-        truth = cut_to(world, world_from_tile, config.tile)
+            reported.append(tile_from_world @ frame.world_from_agent @ error)
+            local_elements.append(crop_to_tile(world, frame.world_from_agent, config.bev.grid))
+        truth = crop_to_tile(world, world_from_tile, config.tile)
         if augment.flip and rng.random() < 0.5:
-            looks, claimed = [mirrored(look) for look in looks], [mirrored_motion(motion) for motion in claimed]
-            truth, *there = (_mirrored_elements(elements) for elements in (truth, *there))
-        ink = torch.stack([inked(elements, config.bev.token_grid, config.head.kinds) for elements in there])
-        return MapSample(tuple(looks), Transform.stack(claimed), truth, ink)
+            frames, reported = (
+                [mirror_frame(frame) for frame in frames],
+                [mirror_transform(motion) for motion in reported],
+            )
+            truth, *local_elements = (_mirrored_elements(elements) for elements in (truth, *local_elements))
+        line_mask = torch.stack(
+            [rasterise_elements(elements, config.bev.token_grid, config.head.kinds) for elements in local_elements]
+        )
+        return MapSample(tuple(frames), Transform.stack(reported), truth, line_mask)
 
 
-def inked(elements: MapElements, grid: BevGrid, kinds: Sequence[str]) -> Tensor:
+def rasterise_elements(elements: MapElements, grid: BevGrid, kinds: Sequence[str]) -> Tensor:
     """(kinds, rows, columns) bool: the cells of a grid that elements of each kind, in its frame, run through; crossings filled."""
     rows, columns = grid.shape
     out = torch.zeros(len(kinds), rows, columns, dtype=torch.bool)
@@ -172,11 +179,11 @@ def inked(elements: MapElements, grid: BevGrid, kinds: Sequence[str]) -> Tensor:
         own = elements.take(elements.kind == KINDS.index(kind))
         if len(own):
             if KINDS.index(kind) == CROSSING:
-                points = np.concatenate([_filled(own.polyline(i), grid.cell / 2) for i in range(len(own))])
+                points = np.concatenate([_filled(own.polyline(i), grid.cell_size_m / 2) for i in range(len(own))])
             else:
-                points = resample_spaced(own.points, own.first, grid.cell / 2)[0]
+                points = resample_spaced(own.points, own.offsets, grid.cell_size_m / 2)[0]
             xy = torch.from_numpy(points)
-            yx = grid.cells(xy[grid.inside(xy)])
+            yx = grid.cells(xy[grid.contains(xy)])
             out[layer, yx[:, 0], yx[:, 1]] = True
     return out
 
@@ -196,10 +203,10 @@ def _filled(ring: Floats, step_m: float) -> Floats:
 _MIRROR = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
 
 
-def mirrored(look: AgentFrame) -> AgentFrame:
+def mirror_frame(frame: AgentFrame) -> AgentFrame:
     """The look seen in a mirror: left is right in its frame, its cloud, its cameras and their pictures."""
-    cloud = replace(look.points, xyz=look.points.xyz * _MIRROR.to(look.points.xyz.dtype))
-    return replace(look, points=cloud, images=tuple(_mirrored_image(image) for image in look.images))
+    cloud = replace(frame.points, xyz=frame.points.xyz * _MIRROR.to(frame.points.xyz.dtype))
+    return replace(frame, points=cloud, images=tuple(_mirrored_image(image) for image in frame.images))
 
 
 def _mirrored_image(image: CameraImage) -> CameraImage:
@@ -213,7 +220,7 @@ def _mirrored_image(image: CameraImage) -> CameraImage:
     return CameraImage(placed, image.rgb.flip(-1))
 
 
-def mirrored_motion(motion: Transform) -> Transform:
+def mirror_transform(motion: Transform) -> Transform:
     """The motion between two frames that are both mirrored."""
     return Transform(_MIRROR[:, None] * motion.rotation * _MIRROR, motion.translation * _MIRROR)
 

@@ -16,42 +16,42 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
-from manyeyes.models.maps.head import decode
-from manyeyes.models.maps.map_model import Mapper
+from manyeyes.models.maps.head import decode_elements
+from manyeyes.models.maps.map_model import MapModel
 from manyeyes.ops.polyline import close_rings, resample_spaced
 from manyeyes.training.maps.samples import MapSample
-from manyeyes.training.maps.step import placed, see
+from manyeyes.training.maps.step import extract_features, warp_tokens
 
-NEAR_M, SPACING_M = 1.0, 0.5
+MATCH_RADIUS_M, SPACING_M = 1.0, 0.5
 """What lies so near to a true element of its kind is true; points of elements are so far apart."""
-PRIOR = 3.0
+PRIOR_WEIGHT = 3.0
 """Elements that the identity counts as, against those that were drawn."""
-FLATTEST = 0.1
+MIN_SLOPE = 0.1
 """Least slope of a line: calibration never changes the ranking within a kind."""
 
 
 @torch.no_grad()
-def calibrate(model: Mapper, samples: Iterable[MapSample]) -> None:
+def calibrate_scores(model: MapModel, samples: Iterable[MapSample]) -> None:
     """Set the model's scale and shift of logits by what it draws of the samples, from as many looks as they have."""
     config, was = model.config, model.training
     model.eval()
-    model.scale.fill_(1.0)
-    model.shift.fill_(0.0)
-    said: list[tuple[MapElements, NDArray[np.float64]]] = []
+    model.logit_scale.fill_(1.0)
+    model.logit_shift.fill_(0.0)
+    results: list[tuple[MapElements, NDArray[np.float64]]] = []
     for sample in samples:
-        ground = model.merge(*placed(model, see(model, [sample]).tokens, [sample]))
-        drawn = decode(model.draw(ground)[-1], config.tile, config.head)[0]
-        said.append((drawn, news_share(drawn, sample.truth)))
+        ground = model.fuse_features(*warp_tokens(model, extract_features(model, [sample]).tokens, [sample]))
+        drawn = decode_elements(model.predict_elements(ground)[-1], config.tile, config.head)[0]
+        results.append((drawn, novel_fraction(drawn, sample.truth)))
     for row, kind in enumerate(config.head.kinds):
-        own = [(drawn.kind == KINDS.index(kind), drawn, share) for drawn, share in said]
+        own = [(drawn.kind == KINDS.index(kind), drawn, share) for drawn, share in results]
         score = np.concatenate([drawn.score[which] for which, drawn, _ in own] or [np.zeros(0)])
         share = np.concatenate([share[which] for which, _, share in own] or [np.zeros(0)])
-        scale, shift = platt(torch.logit(torch.from_numpy(score), 1e-6), torch.from_numpy(share))
-        model.scale[row], model.shift[row] = scale, shift
+        scale, shift = fit_platt(torch.logit(torch.from_numpy(score), 1e-6), torch.from_numpy(share))
+        model.logit_scale[row], model.logit_shift[row] = scale, shift
     model.train(was)
 
 
-def news_share(drawn: MapElements, truth: MapElements) -> NDArray[np.float64]:
+def novel_fraction(drawn: MapElements, truth: MapElements) -> NDArray[np.float64]:
     """(N,) how much of each element's length lies within NEAR_M of a true one of its kind, and of none that is drawn before it.
 
     drawn: the best first.
@@ -64,27 +64,27 @@ def news_share(drawn: MapElements, truth: MapElements) -> NDArray[np.float64]:
         if not len(theirs):
             continue
         points = torch.from_numpy(mine)
-        news = torch.cdist(points, torch.from_numpy(theirs)).amin(1) <= NEAR_M
+        news = torch.cdist(points, torch.from_numpy(theirs)).amin(1) <= MATCH_RADIUS_M
         owner = torch.from_numpy(np.repeat(np.arange(len(rows)), np.diff(first)))
-        told = (torch.cdist(points, points) <= NEAR_M) & (owner[None] < owner[:, None])
-        news &= ~told.any(1)
+        is_duplicate = (torch.cdist(points, points) <= MATCH_RADIUS_M) & (owner[None] < owner[:, None])
+        news &= ~is_duplicate.any(1)
         out[rows] = np.add.reduceat(news.numpy().astype(np.float64), first[:-1]) / np.diff(first)
     return out
 
 
-def platt(logit: Tensor, share: Tensor) -> tuple[float, float]:
+def fit_platt(logit: Tensor, fraction: Tensor) -> tuple[float, float]:
     """Scale and shift of logits (N,) for which the cross entropy against shares (N,) is least; few of them stay as they are."""
     start = torch.tensor([1.0, 0.0], dtype=torch.float64)
     x = torch.stack((logit.double(), torch.ones_like(logit, dtype=torch.float64)), 1)
     line = start.clone()
     for _ in range(50):
         p = (x @ line).sigmoid()
-        slope = x.T @ (p - share) + PRIOR * (line - start)
-        bend = (x * (p * (1 - p))[:, None]).T @ x + PRIOR * torch.eye(2, dtype=torch.float64)
-        line = line - torch.linalg.solve(bend, slope).clamp(-1.0, 1.0)
-    return max(FLATTEST, float(line[0])), float(line[1])
+        gradient = x.T @ (p - fraction) + PRIOR_WEIGHT * (line - start)
+        hessian = (x * (p * (1 - p))[:, None]).T @ x + PRIOR_WEIGHT * torch.eye(2, dtype=torch.float64)
+        line = line - torch.linalg.solve(hessian, gradient).clamp(-1.0, 1.0)
+    return max(MIN_SLOPE, float(line[0])), float(line[1])
 
 
 def _points(elements: MapElements) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    points, first = close_rings(elements.points, elements.first, elements.kind == CROSSING)
+    points, first = close_rings(elements.points, elements.offsets, elements.kind == CROSSING)
     return resample_spaced(points, first, SPACING_M)

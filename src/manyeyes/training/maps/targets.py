@@ -20,7 +20,7 @@ from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.models.maps.head import is_ring
 from manyeyes.ops.polyline import resample, resample_spaced
 
-MET_SHARE = 0.3
+MIN_OBSERVED_FRACTION = 0.3
 """Of an element's length: what looks must have seen for it to be asked of them (specs: maps.md 1.5)."""
 
 
@@ -39,39 +39,39 @@ class MapTarget:
     def __len__(self) -> int:
         return self.kind.shape[0]
 
-    def repeated(self, times: int) -> MapTarget:
+    def repeat(self, times: int) -> MapTarget:
         """Every element so many times, for one-to-many matching."""
         return MapTarget(*(column.repeat(times, *(1,) * (column.dim() - 1)) for column in vars(self).values()))
 
 
-def target_of(truth: MapElements, tile: BevGrid, kinds: Sequence[str], points: int) -> MapTarget:
+def make_map_target(truth: MapElements, tile: BevGrid, kinds: Sequence[str], points: int) -> MapTarget:
     """The elements of those kinds, in the tile's frame and within it, as targets of that many points each."""
     shares, kind, ring = [], [], []
     size = np.array([tile.x_max - tile.x_min, tile.y_max - tile.y_min])
     for row in range(len(truth)):
         name = KINDS[int(truth.kind[row])]
         if name in kinds:
-            line = evenly(truth.polyline(row), points, is_ring(name))
+            line = resample_evenly(truth.polyline(row), points, is_ring(name))
             shares.append((line - [tile.x_min, tile.y_min]) / size)
             kind.append(list(kinds).index(name))
             ring.append(is_ring(name))
     places = torch.from_numpy(np.array(shares).reshape(-1, points, 2)).float()
     rings = torch.tensor(ring, dtype=torch.bool)
-    return MapTarget(torch.tensor(kind, dtype=torch.int64), rings, orders_of(places, rings))
+    return MapTarget(torch.tensor(kind, dtype=torch.int64), rings, enumerate_orders(places, rings))
 
 
-def met(truth: MapElements, seen: Tensor, tile: BevGrid) -> MapElements:
+def select_observed(truth: MapElements, seen: Tensor, tile: BevGrid) -> MapElements:
     """Those elements of a tile of which cells that are seen (rows, columns) hold MET_SHARE of the length or more."""
     if not len(truth):
         return truth
-    points, first = resample_spaced(truth.points, truth.first, tile.cell / 2)
-    cell = np.floor((points - [tile.x_min, tile.y_min]) / tile.cell).astype(np.int64)
+    points, first = resample_spaced(truth.points, truth.offsets, tile.cell_size_m / 2)
+    cell = np.floor((points - [tile.x_min, tile.y_min]) / tile.cell_size_m).astype(np.int64)
     cell = cell.clip(0, [tile.shape[1] - 1, tile.shape[0] - 1])
     share = np.add.reduceat(seen.numpy()[cell[:, 1], cell[:, 0]].astype(np.float64), first[:-1]) / np.diff(first)
-    return truth.take(share >= MET_SHARE)
+    return truth.take(share >= MIN_OBSERVED_FRACTION)
 
 
-def evenly(line: NDArray[np.float64], points: int, ring: bool) -> NDArray[np.float64]:
+def resample_evenly(line: NDArray[np.float64], points: int, ring: bool) -> NDArray[np.float64]:
     """(points, 2) at equal arc length: of a line, both ends among them; of a ring (K, 2), from its least corner."""
     if ring:
         line = np.roll(line, -int(np.lexsort(line.T[::-1])[0]), axis=0)
@@ -80,7 +80,7 @@ def evenly(line: NDArray[np.float64], points: int, ring: bool) -> NDArray[np.flo
     return resample(line, np.array([0, len(line)]), np.array([count]))[0][:points]
 
 
-def orders_of(points: Tensor, ring: Tensor) -> Tensor:
+def enumerate_orders(points: Tensor, ring: Tensor) -> Tensor:
     """(G, 2 P, P, 2) of points (G, P, 2): all orders in which an element may be drawn; see MapTarget."""
     count = points.shape[1]
     place = torch.arange(count)

@@ -23,57 +23,65 @@ from manyeyes.datatypes import ConfigError, Transform
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models import checkpoint
 from manyeyes.models.pose.feakm import FEAKM_PAPER, FEAKM_SMALL, FORMAT, FeakmConfig, FeakmNet
-from manyeyes.models.pose.keypoint_net import View
-from manyeyes.models.pose.matcher import Assignment, Points, mutual
+from manyeyes.models.pose.keypoint_net import DetectorView
+from manyeyes.models.pose.matcher import Assignment, KeypointBatch, find_mutual_matches
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.training.checkpointing import RunState, warm_cosine
-from manyeyes.training.pose.feakm_cache import FeatureCache, Pair
+from manyeyes.training.checkpointing import RunState, warmup_cosine
+from manyeyes.training.pose.feakm_cache import FeatureCache, ViewPair
 
 
 @dataclass(frozen=True)
-class KeypointAugment:
-    """turn: each agent's frame is turned by any angle. flip: share of headings turned by pi before they are described.
+class KeypointAugmentConfig:
+    """random_yaw: each agent's frame is turned by any angle. flip_prob: share of headings turned by pi before they are described.
 
-    drop: points left out, a share uniform up to this. sigma_xy_m, sigma_yaw_rad: errors added to places and headings.
+    max_drop_fraction: points left out, a share uniform up to this. sigma_xy_m, sigma_yaw_rad: errors added to places and headings.
     """
 
-    turn: bool = True
-    flip: float = 0.03
-    drop: float = 0.3
+    random_yaw: bool = True
+    flip_prob: float = 0.03
+    max_drop_fraction: float = 0.3
     sigma_xy_m: float = 0.15
     sigma_yaw_rad: float = 0.03
 
     @classmethod
-    def none(cls) -> KeypointAugment:
+    def none(cls) -> KeypointAugmentConfig:
         """Pairs as they were seen."""
         return cls(False, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class FeakmTrainConfig:
-    """A run of steps with batch pairs each. near_m, far_m: see the module. ema: decay of the averaged weights that are saved."""
+    """A run of steps with batch pairs each. match_radius_m, unmatched_radius_m: see the module. ema_decay: decay of the
+    averaged weights that are saved.
+    """
 
     net: FeakmConfig
     steps: int
     batch: int = 16
     learning_rate: float = 2e-4
     weight_decay: float = 1e-2
-    warm_up: int = 100
-    clip: float = 5.0
-    ema: float = 0.999
+    warmup_steps: int = 100
+    max_grad_norm: float = 5.0
+    ema_decay: float = 0.999
     save_every: int = 200
-    near_m: float = 2.4
-    far_m: float = 2.4
-    augment: KeypointAugment = field(default_factory=KeypointAugment.none)
+    match_radius_m: float = 2.4
+    unmatched_radius_m: float = 2.4
+    augment: KeypointAugmentConfig = field(default_factory=KeypointAugmentConfig.none)
 
     def __post_init__(self) -> None:
-        if not 0 < self.near_m <= self.far_m or self.steps < 1 or self.batch < 1:
+        if not 0 < self.match_radius_m <= self.unmatched_radius_m or self.steps < 1 or self.batch < 1:
             raise ConfigError("FeakmTrainConfig needs 0 < near_m <= far_m, steps >= 1 and batch >= 1.")
 
 
-FEAKM_TRAINING: dict[str, FeakmTrainConfig] = {
+FEAKM_TRAINING_PRESETS: dict[str, FeakmTrainConfig] = {
     "feakm": FeakmTrainConfig(
-        FEAKM_SMALL, steps=6000, batch=16, learning_rate=1e-3, near_m=1.5, far_m=2.4, augment=KeypointAugment()
+        FEAKM_SMALL,
+        steps=6000,
+        batch=16,
+        learning_rate=1e-3,
+        match_radius_m=1.5,
+        unmatched_radius_m=2.4,
+        augment=KeypointAugmentConfig(),
     ),
     "feakm-paper": FeakmTrainConfig(FEAKM_PAPER, steps=15000, batch=16, learning_rate=2e-4, weight_decay=0.0),
 }
@@ -81,43 +89,51 @@ FEAKM_TRAINING: dict[str, FeakmTrainConfig] = {
 
 
 @dataclass(frozen=True, eq=False)
-class TrueMatches:
-    """Of B pairs of views. pairs: (B, N, M) bool, one object; alone_a: (B, N), alone_b: (B, M) bool, surely without one."""
+class GroundTruthMatches:
+    """Of B pairs of views. pairs: (B, N, M) bool, one object; unmatched_a: (B, N), alone_b: (B, M) bool, surely without one."""
 
     pairs: Tensor
-    alone_a: Tensor
-    alone_b: Tensor
+    unmatched_a: Tensor
+    unmatched_b: Tensor
 
 
-def true_matches(
-    a: Sequence[Keypoints], b: Sequence[Keypoints], a_from_b: Sequence[Transform], near_m: float, far_m: float
-) -> TrueMatches:
+def match_ground_truth(
+    a: Sequence[Keypoints],
+    b: Sequence[Keypoints],
+    a_from_b: Sequence[Transform],
+    match_radius_m: float,
+    unmatched_radius_m: float,
+) -> GroundTruthMatches:
     """What the matcher should have said, padded to the longest list on either side."""
     shape = len(a), max(map(len, a)), max(map(len, b))
     pairs = torch.zeros(shape, dtype=torch.bool)
-    alone_a, alone_b = torch.zeros(shape[:2], dtype=torch.bool), torch.zeros(shape[::2], dtype=torch.bool)
+    unmatched_a, unmatched_b = torch.zeros(shape[:2], dtype=torch.bool), torch.zeros(shape[::2], dtype=torch.bool)
     for i, (ego, other, motion) in enumerate(zip(a, b, a_from_b)):
         n, m = len(ego), len(other)
-        alone_a[i, :n], alone_b[i, :m] = True, True
+        unmatched_a[i, :n], unmatched_b[i, :m] = True, True
         if n and m:
             moved = motion.apply(other.boxes.center.double())[:, :2]
             away = torch.cdist(ego.xy.double(), moved)
             nearest, back = away.argmin(1), away.argmin(0)
-            rows = (back[nearest] == torch.arange(n)) & (away.amin(1) < near_m)
+            rows = (back[nearest] == torch.arange(n)) & (away.amin(1) < match_radius_m)
             pairs[i, rows.nonzero()[:, 0], nearest[rows]] = True
-            alone_a[i, :n], alone_b[i, :m] = away.amin(1) > far_m, away.amin(0) > far_m
-    return TrueMatches(pairs, alone_a, alone_b)
+            unmatched_a[i, :n], unmatched_b[i, :m] = (
+                away.amin(1) > unmatched_radius_m,
+                away.amin(0) > unmatched_radius_m,
+            )
+    return GroundTruthMatches(pairs, unmatched_a, unmatched_b)
 
 
-def matching_loss(layers: Sequence[Assignment], truth: TrueMatches) -> Tensor:
+def matching_loss(layers: Sequence[Assignment], truth: GroundTruthMatches) -> Tensor:
     """Half of the true pairs', half of the lonely points' mean -log P, over layers and pairs of views; 0 where there is none."""
     total = layers[0].log_p.new_zeros(())
     for layer in layers:
-        right = _mean(-layer.log_p, truth.pairs)
-        alone = _mean(
-            -torch.cat((layer.log_alone_a, layer.log_alone_b), 1), torch.cat((truth.alone_a, truth.alone_b), 1)
+        matched = _mean(-layer.log_p, truth.pairs)
+        unmatched = _mean(
+            -torch.cat((layer.log_unmatched_a, layer.log_unmatched_b), 1),
+            torch.cat((truth.unmatched_a, truth.unmatched_b), 1),
         )
-        total = total + (right + alone).mean() / 2
+        total = total + (matched + unmatched).mean() / 2
     return total / len(layers)
 
 
@@ -139,10 +155,10 @@ class MatchProgress:
     learning_rate: float
     seconds: float
 
-    def line(self) -> dict[str, float]:
+    def to_record(self) -> dict[str, float]:
         """As it stands in log.jsonl."""
-        told = {"step": self.step, "loss": round(self.loss, 5), "lr": self.learning_rate}
-        return told | {"recall": round(self.recall, 4), "precision": round(self.precision, 4)}
+        record = {"step": self.step, "loss": round(self.loss, 5), "lr": self.learning_rate}
+        return record | {"recall": round(self.recall, 4), "precision": round(self.precision, 4)}
 
 
 class FeakmRun:
@@ -159,42 +175,44 @@ class FeakmRun:
         """One step of the optimiser."""
         config, state = self.config, self.state
         state.model.train()
-        numbers = state.numbers(config.batch)
+        numbers = state.sample_numbers(config.batch)
         first = numbers.start
         pairs = [self.cache.draw(self.seed, number) for number in numbers]
         ego, other, motions = self._keypoints(pairs, first)
-        truth = true_matches(ego, other, motions, config.near_m, config.far_m)
-        ego, other = (self._disturbed(side, name, first) for side, name in ((ego, "ego"), (other, "other")))
-        layers = state.model.matcher(Points.of(ego), Points.of(other))
+        truth = match_ground_truth(ego, other, motions, config.match_radius_m, config.unmatched_radius_m)
+        ego, other = (self._perturb(side, name, first) for side, name in ((ego, "ego"), (other, "other")))
+        layers = state.model.matcher(KeypointBatch.of(ego), KeypointBatch.of(other))
         loss = matching_loss(layers, truth)
-        rate = config.learning_rate * warm_cosine(config.warm_up, state.step, config.steps)
+        rate = config.learning_rate * warmup_cosine(config.warmup_steps, state.step, config.steps)
         state.backward(loss)
-        state.descend(rate, config.clip, config.ema)
-        recall, precision = found_right(layers[-1], truth, config.net.matcher.threshold)
+        state.optimiser_step(rate, config.max_grad_norm, config.ema_decay)
+        recall, precision = matching_recall_precision(layers[-1], truth, config.net.matcher.min_match_prob)
         return MatchProgress(state.step, config.steps, float(loss.detach()), recall, precision, rate, state.seconds)
 
-    def _keypoints(self, pairs: Sequence[Pair], first: int) -> tuple[list[Keypoints], list[Keypoints], list[Transform]]:
+    def _keypoints(
+        self, pairs: Sequence[ViewPair], first: int
+    ) -> tuple[list[Keypoints], list[Keypoints], list[Transform]]:
         """Points as they are described, some left out; still in the frames that the true motions belong to."""
         augment = self.config.augment
         views = []
         for i, both in enumerate(pairs):
             rng = keyed_generator("feakm flip", self.seed, first + i)
-            views += [_flipped(view, augment.flip, rng) for view in (both.ego, both.other)]
-        described = self.state.model.describe(views, together=2)
+            views += [_flip_headings(view, augment.flip_prob, rng) for view in (both.ego, both.other)]
+        described = self.state.model.describe(views, group_size=2)
         kept = []
         for i, points in enumerate(described):
             rng = keyed_generator("feakm drop", self.seed, first * 2 + i)
-            share = augment.drop * rng.random()
+            share = augment.max_drop_fraction * rng.random()
             kept.append(points[torch.from_numpy(rng.random(len(points)) >= share)])
         return kept[::2], kept[1::2], [both.ego_from_other for both in pairs]
 
-    def _disturbed(self, many: Sequence[Keypoints], side: str, first: int) -> list[Keypoints]:
+    def _perturb(self, many: Sequence[Keypoints], side: str, first: int) -> list[Keypoints]:
         """The same points, their frames turned and their places and headings off by a little."""
         augment = self.config.augment
         found = []
         for i, points in enumerate(many):
             rng = keyed_generator("feakm move", side, self.seed, first + i)
-            angle = rng.uniform(-math.pi, math.pi) if augment.turn else 0.0
+            angle = rng.uniform(-math.pi, math.pi) if augment.random_yaw else 0.0
             moved = points.transform(Transform.from_xyz_yaw(0.0, 0.0, 0.0, angle))
             error = torch.from_numpy(rng.standard_normal((len(points), 3))).to(moved.boxes.center.dtype)
             center = moved.boxes.center.clone()
@@ -204,17 +222,19 @@ class FeakmRun:
         return found
 
 
-def found_right(assignment: Assignment, truth: TrueMatches, threshold: float) -> tuple[float, float]:
+def matching_recall_precision(
+    assignment: Assignment, truth: GroundTruthMatches, threshold: float
+) -> tuple[float, float]:
     """Recall and precision of the matches of a batch; 1 where there is nothing to find, or nothing found."""
-    right = found = 0
-    for (pairs, _), true in zip(mutual(assignment, threshold), truth.pairs):
+    correct = found = 0
+    for (pairs, _), true in zip(find_mutual_matches(assignment, threshold), truth.pairs):
         found += len(pairs)
-        right += int(true[pairs[:, 0], pairs[:, 1]].sum())
-    wanted = int(truth.pairs.sum())
-    return right / wanted if wanted else 1.0, right / found if found else 1.0
+        correct += int(true[pairs[:, 0], pairs[:, 1]].sum())
+    num_true = int(truth.pairs.sum())
+    return correct / num_true if num_true else 1.0, correct / found if found else 1.0
 
 
-def _flipped(view: View, share: float, rng: np.random.Generator) -> View:
+def _flip_headings(view: DetectorView, share: float, rng: np.random.Generator) -> DetectorView:
     """With some headings off by pi, as a detector errs."""
     turned = torch.from_numpy(rng.random(len(view.boxes)) < share)
     return replace(view, boxes=replace(view.boxes, yaw=view.boxes.yaw + math.pi * turned))
@@ -234,7 +254,7 @@ def train_feakm(
     """
     run = FeakmRun(config, cache, folder, seed)
     state = run.state
-    state.finish(config.steps, config.save_every, run.advance, report)
+    state.run_to_end(config.steps, config.save_every, run.advance, report)
     weights = folder / "weights.safetensors"
     if not state.rank:
         about = {"seed": seed, "steps": config.steps, "train_seconds": round(state.seconds), "config": asdict(config)}

@@ -17,7 +17,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from manyeyes._io import atomic_write
-from manyeyes.agents.perception_cache import Eyes, Sight
+from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
 from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import (
     BevGrid,
@@ -30,24 +30,24 @@ from manyeyes.datatypes import (
     Transform,
 )
 from manyeyes.models.detector.detector import Detector
-from manyeyes.models.pose.keypoint_net import View
+from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.ops.keyed_random import keyed_generator
 
 
 @dataclass(frozen=True)
-class Scene:
+class CachedSnapshot:
     """views of all agents at one instant, each in its own frame, and their true poses, batch shape (agents,)."""
 
-    views: tuple[View, ...]
+    views: tuple[DetectorView, ...]
     world_from_agent: Transform
 
 
 @dataclass(frozen=True)
-class Pair:
+class ViewPair:
     """Views of two agents at one instant and where the second truly is, seen from the first."""
 
-    ego: View
-    other: View
+    ego: DetectorView
+    other: DetectorView
     ego_from_other: Transform
 
 
@@ -58,67 +58,69 @@ class FeatureCache:
     folder: Path
     snapshots: tuple[tuple[str, int], ...]
 
-    def scene(self, number: int) -> Scene:
+    def load_snapshot(self, number: int) -> CachedSnapshot:
         """All agents of the snapshot of that number."""
-        return read_scene(_file(self.folder, *self.snapshots[number]))
+        return read_cached_snapshot(_file(self.folder, *self.snapshots[number]))
 
-    def draw(self, seed: int, number: int) -> Pair:
+    def draw(self, seed: int, number: int) -> ViewPair:
         """Pair of that number of an endless, keyed stream: a snapshot and two of its agents, uniform."""
         rng = keyed_generator("feakm pair", seed, number)
-        scene = self.scene(int(rng.integers(len(self.snapshots))))
+        scene = self.load_snapshot(int(rng.integers(len(self.snapshots))))
         ego, other = rng.permutation(len(scene.views))[:2].tolist()
-        return pair(scene, ego, other)
+        return make_pair(scene, ego, other)
 
-    def pairs(self) -> Iterator[Pair]:
+    def pairs(self) -> Iterator[ViewPair]:
         """Every two agents of every snapshot, the first of them as ego."""
         for number in range(len(self.snapshots)):
-            scene = self.scene(number)
+            scene = self.load_snapshot(number)
             for other in range(1, len(scene.views)):
-                yield pair(scene, 0, other)
+                yield make_pair(scene, 0, other)
 
 
-def pair(scene: Scene, ego: int, other: int) -> Pair:
+def make_pair(scene: CachedSnapshot, ego: int, other: int) -> ViewPair:
     """Two agents of a scene."""
     poses = scene.world_from_agent
-    return Pair(scene.views[ego], scene.views[other], poses[ego].inverse() @ poses[other])
+    return ViewPair(scene.views[ego], scene.views[other], poses[ego].inverse() @ poses[other])
 
 
-def wanted(recording: Recording, every: int = 3) -> list[tuple[str, int]]:
+def select_snapshots(recording: Recording, frame_stride: int = 3) -> list[tuple[str, int]]:
     """Every so many judged snapshots of at least two agents: neighbours in time show nearly the same."""
-    if every < 1:
-        raise ConfigError(f"Every how many snapshots is at least 1; got {every}.")
+    if frame_stride < 1:
+        raise ConfigError(f"Every how many snapshots is at least 1; got {frame_stride}.")
     found = [
         (scenario, index)
         for scenario in recording.scenarios
         if len(recording.agents(scenario)) > 1
-        for index in recording.judged(scenario)[::every]
+        for index in recording.eval_indices(scenario)[::frame_stride]
     ]
     if not found:
         raise RecordingError("No snapshot of this recording has two agents; matching needs two.")
     return found
 
 
-def build(recording: Recording, detector: Detector, root: Path, every: int = 3) -> Iterator[FeatureCache]:
+def build_cache(recording: Recording, detector: Detector, root: Path, frame_stride: int = 3) -> Iterator[FeatureCache]:
     """See what is not yet kept under root, giving what is there after each snapshot; the last one given is the whole.
 
     Each agent sees the snapshot before as well, so that a detector of several sweeps has both.
     """
     folder, done = root / detector.fingerprint.hex(), []
-    for scenario, index in wanted(recording, every):
+    for scenario, index in select_snapshots(recording, frame_stride):
         path = _file(folder, scenario, index)
         if not path.exists():
-            eyes = {agent: Eyes(detector) for agent in recording.agents(scenario)}
+            caches = {agent: PerceptionCache(detector) for agent in recording.agents(scenario)}
             for before in range(max(0, index - 1), index):
-                _see(eyes, recording.snapshot(scenario, before))
+                _run_detectors(caches, recording.snapshot(scenario, before))
             snapshot = recording.snapshot(scenario, index)
-            views = tuple(View.of(sight.told, sight.boxes) for sight in _see(eyes, snapshot))
-            write_scene(path, Scene(views, _poses(snapshot)))
+            views = tuple(
+                DetectorView.of(sight.shared_tokens, sight.boxes) for sight in _run_detectors(caches, snapshot)
+            )
+            write_cached_snapshot(path, CachedSnapshot(views, _poses(snapshot)))
         done.append((scenario, index))
         yield FeatureCache(folder, tuple(done))
 
 
-def _see(eyes: dict[int, Eyes], snapshot: Snapshot) -> list[Sight]:
-    return [eyes[frame.agent_id].see(frame) for frame in snapshot.frames]
+def _run_detectors(caches: dict[int, PerceptionCache], snapshot: Snapshot) -> list[AgentOutput]:
+    return [caches[frame.agent_id].process(frame) for frame in snapshot.frames]
 
 
 def _poses(snapshot: Snapshot) -> Transform:
@@ -133,7 +135,7 @@ def _file(folder: Path, scenario: str, index: int) -> Path:
     return folder / scenario / f"{index:06d}.safetensors"
 
 
-def write_scene(path: Path, scene: Scene) -> None:
+def write_cached_snapshot(path: Path, scene: CachedSnapshot) -> None:
     """One snapshot's views: features and confidence as float16, boxes as they are."""
     state: dict[str, Tensor] = {"world_from_agent": scene.world_from_agent.matrix().contiguous()}
     for i, view in enumerate(scene.views):
@@ -147,7 +149,7 @@ def write_scene(path: Path, scene: Scene) -> None:
     atomic_write(path, save(state, {"grid": json.dumps(asdict(scene.views[0].tokens.grid))}), durable=False)
 
 
-def read_scene(path: Path) -> Scene:
+def read_cached_snapshot(path: Path) -> CachedSnapshot:
     """The inverse of write_scene."""
     try:
         with safe_open(path, "pt") as file:
@@ -162,5 +164,5 @@ def read_scene(path: Path) -> Scene:
     for i in range(len(poses.translation)):
         tokens = SparseBev(state[f"{i}.features"].float(), Sites(state[f"{i}.key"], grid))
         boxes = Boxes(**{f.name: state[f"{i}.boxes.{f.name}"] for f in fields(Boxes)})
-        views.append(View(tokens, state[f"{i}.confidence"].float(), boxes))
-    return Scene(tuple(views), poses)
+        views.append(DetectorView(tokens, state[f"{i}.confidence"].float(), boxes))
+    return CachedSnapshot(tuple(views), poses)
