@@ -101,7 +101,7 @@ def sparse_config(widths: Widths, head_stride: int) -> DetectorConfig:
         pillar_channels=widths.pillar_channels,
         encoder=encoder,
         dast=AttentionConfig(),
-        fusion="flow_aware",
+        fusion="fast",
         head_channels=64,
     )
 

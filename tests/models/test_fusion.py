@@ -30,17 +30,17 @@ from manyeyes.models.fusion.v2x_vit import V2xVitFusion
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 16
-FUSIONS = ("maximum", "self_attention", "flow_aware", "v2x_vit")
+FUSIONS = ("max", "self-attention", "fast", "v2x-vit")
 
 
 def fusion(name: str, random_placement: bool = True) -> torch.nn.Module:
     torch.manual_seed(0)
     attention = AttentionConfig(heads=2)
     model = {
-        "maximum": lambda: MaxFusion(CHANNELS),
-        "self_attention": lambda: SelfAttentionFusion(CHANNELS, attention),
-        "flow_aware": lambda: FastFusion(CHANNELS, attention),
-        "v2x_vit": lambda: V2xVitFusion(CHANNELS, attention),
+        "max": lambda: MaxFusion(CHANNELS),
+        "self-attention": lambda: SelfAttentionFusion(CHANNELS, attention),
+        "fast": lambda: FastFusion(CHANNELS, attention),
+        "v2x-vit": lambda: V2xVitFusion(CHANNELS, attention),
     }[name]()
     if random_placement:
         torch.nn.init.normal_(model.encoding.outer.weight, std=0.3)
@@ -126,7 +126,7 @@ def test_moving_the_whole_world_changes_nothing(name):
 
 
 def test_maximum_of_a_neighbour_shifted_by_whole_cells_is_the_dense_maximum():
-    model, mine, theirs = fusion("maximum", random_placement=False), silent(random_tokens(0)), silent(random_tokens(1))
+    model, mine, theirs = fusion("max", random_placement=False), silent(random_tokens(0)), silent(random_tokens(1))
     shift = Transform.from_xyz_yaw(3 * GRID.cell_size_m, -2 * GRID.cell_size_m)
     parts = [AgentTokens(0, mine.features, mine.sites.xy), AgentTokens(0, theirs.features, theirs.sites.xy, shift)]
     out = model(to_ego_frame(parts, GRID, 1)).bev

@@ -111,7 +111,7 @@ def test_the_levels_are_feakms_columns() -> None:
 def test_baseline_fusions_are_rows_with_uncorrected_priors(data, tmp_path) -> None:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        baseline = Detector(replace(COSTR_TINY, fusion="v2x_vit"))
+        baseline = Detector(replace(COSTR_TINY, fusion="v2x-vit"))
         checkpoint.save(baseline, data / "rival.safetensors", {})
     words = ("--methods", "intermediate", "--every", 2, "--correctors", "given", "--disturbances", "2°, 2 m")
     held = evaluate(data, tmp_path, "pose", *words, "--branches", f"V2X-ViT={data / 'rival.safetensors'}")

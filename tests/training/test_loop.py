@@ -132,9 +132,9 @@ def test_a_tensor_grows_at_its_ends_by_zeros_and_a_vector_keeps_its_own():
 
 def test_what_a_model_has_grown_by_starts_as_if_it_were_not_there(toy, tmp_path):
     """From one sweep and plain self-attention to two sweeps and a past: the same boxes, before the first step."""
-    plain = dataclasses.replace(COSTR_TINY, sweeps=1, fusion="self_attention", prune_threshold=0.0)
+    plain = dataclasses.replace(COSTR_TINY, sweeps=1, fusion="self-attention", prune_threshold=0.0)
     first = train_detector(dataclasses.replace(TINY, detector=plain, steps=2), small(toy), tmp_path / "first", seed=1)
-    grown = dataclasses.replace(plain, sweeps=2, fusion="flow_aware")
+    grown = dataclasses.replace(plain, sweeps=2, fusion="fast")
     run = DetectorRun(dataclasses.replace(TINY, detector=grown), small(toy), tmp_path / "second", 2, first)
     old, new = checkpoint.load(first), run.state.model.eval()
     now, before = (toy().snapshot("toy_0", i).frames[0].points for i in (1, 0))

@@ -40,7 +40,7 @@ class DetectorConfig:
     pillar_channels: int = 32
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     dast: AttentionConfig = field(default_factory=AttentionConfig)
-    fusion: Literal["flow_aware", "self_attention", "maximum", "multi_scale", "v2x_vit"] = "self_attention"
+    fusion: Literal["fast", "self-attention", "max", "multi-scale", "v2x-vit"] = "self-attention"
     fusion_attention: AttentionConfig = field(default_factory=AttentionConfig)
     head_channels: int = 64
     prune_threshold: float = 0.1
@@ -129,7 +129,7 @@ class Detector(nn.Module):
         return self.fusion(tokens, past)
 
 
-_ATTENTION_FUSIONS = {"flow_aware": FastFusion, "self_attention": SelfAttentionFusion, "v2x_vit": V2xVitFusion}
+_ATTENTION_FUSIONS = {"fast": FastFusion, "self-attention": SelfAttentionFusion, "v2x-vit": V2xVitFusion}
 
 
 def _build_fusion(
@@ -137,4 +137,4 @@ def _build_fusion(
 ) -> FastFusion | SelfAttentionFusion | MaxFusion | MultiScaleFusion | V2xVitFusion:
     if config.fusion in _ATTENTION_FUSIONS:
         return _ATTENTION_FUSIONS[config.fusion](channels, config.fusion_attention)
-    return MaxFusion(channels) if config.fusion == "maximum" else MultiScaleFusion(channels)
+    return MaxFusion(channels) if config.fusion == "max" else MultiScaleFusion(channels)

@@ -23,7 +23,7 @@ COSTR_SMALL = DetectorConfig(
     head_channels=64,
     prune_threshold=0.1,
     decode=DecodeConfig(iou_score_weight=0.6),
-    fusion="flow_aware",
+    fusion="fast",
     sweeps=2,
 )
 """Half of OPV2V's length, narrow: trains on two cores in about an hour."""
@@ -35,7 +35,7 @@ COSTR_OPV2V = DetectorConfig(
     encoder=EncoderConfig(prune_strides=(4, 8, 16, 32), head_stride=8),
     head_channels=128,
     decode=DecodeConfig(score_threshold=0.05),
-    fusion="flow_aware",
+    fusion="fast",
     sweeps=2,
 )
 """The paper's range and widths; head stride 8 is its letter."""
@@ -48,7 +48,7 @@ COSTR_TINY = DetectorConfig(
     dast=AttentionConfig(blocks=1, heads=2),
     fusion_attention=AttentionConfig(blocks=1, heads=2),
     head_channels=32,
-    fusion="flow_aware",
+    fusion="fast",
     sweeps=2,
 )
 """For tests and examples: seconds, not minutes."""

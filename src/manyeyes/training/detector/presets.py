@@ -50,7 +50,7 @@ def _branch(**changes: Any) -> TrainConfig:
 
 _FINE_ONLY = replace(COSTR_SMALL.encoder, use_coarse_strides=False, prune_strides=())
 _NO_BLOCKS = replace(COSTR_SMALL.dast, blocks=0)
-_PLAIN = {"dast": _NO_BLOCKS, "fusion": "maximum"}
+_PLAIN = {"dast": _NO_BLOCKS, "fusion": "max"}
 
 TRAINING_PRESETS: dict[str, TrainConfig] = {
     "costr-small": TrainConfig(
@@ -79,12 +79,12 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
     "costr-small-4": _FINAL,
     "branch-plain": _branch(**_PLAIN, encoder=_FINE_ONLY),
     "branch-se": _branch(**_PLAIN),
-    "branch-se-dast": _branch(fusion="maximum"),
-    "branch-se-dast-dast": _branch(fusion="self_attention"),
+    "branch-se-dast": _branch(fusion="max"),
+    "branch-se-dast-dast": _branch(fusion="self-attention"),
     "branch-se-fast": _branch(dast=_NO_BLOCKS),
     "branch-se-dast-fast": _BRANCH,
-    "branch-v2x-vit": _branch(fusion="v2x_vit"),
-    "branch-multi-scale": _branch(fusion="multi_scale"),
+    "branch-v2x-vit": _branch(fusion="v2x-vit"),
+    "branch-multi-scale": _branch(fusion="multi-scale"),
     "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
     "costr-tiny": TrainConfig(
         COSTR_TINY,
