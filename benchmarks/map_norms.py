@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument("--held", type=int, default=20)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    mapper = MAP_TRAINING_PRESETS["map-small"].map_model
+    mapper = MAP_TRAINING_PRESETS["map-small-lidar"].map_model
     recording = open_sensor_recording(options.data, "train", ("lidar",))
     stream = TileStream(recording, load_true_maps(recording), mapper, MapAugmentConfig(3, 6), 3)
     samples = [stream.draw(number) for number in range(options.tiles)]

@@ -29,17 +29,17 @@ def recorded(tmp_path_factory):
 @pytest.mark.slow
 def test_train_then_judge(recorded, tmp_path, capsys):
     out = tmp_path / "run"
-    train.main(train.Options(recorded, preset="map-toy", out=out, steps=2, batch=1))
+    train.main(train.Options(recorded, preset="map-tiny", out=out, steps=2, batch=1))
     weights = out / "weights.safetensors"
     model = checkpoint.load_as(weights, FORMAT, MapModelConfig, MapModel)
     assert model.config.tile.x_max == 60.0 and (out / "loss.png").exists() and (out / "train.json").exists()
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["generated-1"] and card["command"]
     study = ("map", "evaluate", "--study", "semi-global", "--data", recorded, "--weights", weights, "--workers", 1)
-    common = [str(word) for word in (*study, "--seeds", 1, "--every", 2, "--out", tmp_path / "study")]
+    common = [str(word) for word in (*study, "--seeds", 1, "--frame-stride", 2, "--out", tmp_path / "study")]
     assert cli.main(common) == 0
     rows = json.loads((tmp_path / "study" / "semi-global.json").read_text())["result"]["rows"]["LiDAR"]
-    assert [row["row"] for row in rows] == ["1", "2", "5", "10"] and (tmp_path / "study" / "semi-global.png").exists()
+    assert [row["name"] for row in rows] == ["1", "2", "5", "10"] and (tmp_path / "study" / "semi-global.png").exists()
     assert cli.main([*common, "--split", "train"]) == 1
     assert "Split by place" in capsys.readouterr().err
 
@@ -51,7 +51,7 @@ def test_true_maps_are_those_of_the_scenarios_towns(recorded):
 
 
 def test_an_unknown_preset_names_the_map_presets():
-    with pytest.raises(ConfigError, match="map-small"):
+    with pytest.raises(ConfigError, match="map-small-lidar"):
         train.main(train.Options(Path("nowhere"), preset="map-large"))
 
 

@@ -47,7 +47,7 @@ def words(tmp_path, monkeypatch) -> list[str]:
 
 
 def test_both_presets_train_on_the_same_kept_views(words, capsys):
-    assert cli.main([*words, "feakm", "--steps", "2", "--out", "small"]) == 0
+    assert cli.main([*words, "feakm-small", "--steps", "2", "--out", "small"]) == 0
     assert "weights.safetensors; the loss over steps" in capsys.readouterr().out.replace("\n", "")
     made = {p.name for p in Path("small").iterdir()}
     assert made == {"weights.safetensors", "last.pt", "log.jsonl", "loss.png", "train.json"}
@@ -59,11 +59,11 @@ def test_both_presets_train_on_the_same_kept_views(words, capsys):
     kept = {p: p.stat().st_mtime_ns for p in Path("runs/views").rglob("*.safetensors")}
     assert len(kept) == 1 and detector.fingerprint.hex() in str(next(iter(kept)))
     before = Path("small/log.jsonl").read_text()
-    assert cli.main([*words, "feakm", "--steps", "2", "--out", "small"]) == 0
+    assert cli.main([*words, "feakm-small", "--steps", "2", "--out", "small"]) == 0
     assert Path("small/log.jsonl").read_text() == before
     assert kept == {p: p.stat().st_mtime_ns for p in Path("runs/views").rglob("*.safetensors")}
     assert json.loads(Path("small/train.json").read_text())["result"]["weights"] == "weights.safetensors"
-    assert cli.main([*words, "feakm", "--steps", "3", "--out", "small"]) == 1
+    assert cli.main([*words, "feakm-small", "--steps", "3", "--out", "small"]) == 1
     assert "another configuration or seed" in capsys.readouterr().err
 
 

@@ -27,7 +27,7 @@ def extract_own_keypoints(
     if not isinstance(keypoint_config, BoxKeypointConfig) or keypoint_config.descriptor_dim != DESCRIPTOR_DIM:
         raise ConfigError(
             f"A message carries objects with {DESCRIPTOR_DIM} numbers each; this net has {keypoint_config.descriptor_dim} "
-            f"of {type(keypoint_config).__name__}. Nets of 'manyeyes train --preset feakm' can be sent; --study feakm takes any."
+            f"of {type(keypoint_config).__name__}. Nets of 'manyeyes train --preset feakm-small' can be sent; --study feakm takes any."
         )
     net.check_views(cache.detector.fingerprint)
     output = cache.process(frame)

@@ -17,7 +17,7 @@ class Options:
     """A dataset in OPV2V's layout, a folder of scenarios, or one scenario; or a root in DAIR-V2X's layout."""
     split: str | None = "train"
     """Which split of a dataset: a folder inside it."""
-    preset: str = "costr-small"
+    preset: str = "costr-small/stage1"
     """Settings by name; an unknown name lists the known ones."""
     out: Path | None = None
     """Folder of the run, runs/PRESET by default: weights.safetensors, log.jsonl, loss.png, train.json, last.pt to go on from."""

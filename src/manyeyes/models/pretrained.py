@@ -19,10 +19,10 @@ from manyeyes.models.maps.presets import FORMAT
 from manyeyes.models.pose import feakm
 
 DEFAULT_DETECTOR = "costr-small"
-DEFAULT_FEAKM = "feakm"
+DEFAULT_FEAKM = "feakm-small"
 """The shipped net that recognises objects; no detector, so that it is not among the names."""
-DEFAULT_MAP_MODEL = "map-small"
-"""The map model of agents with LiDAR; those with cameras are map-small-camera and map-small-both."""
+DEFAULT_MAP_MODEL = "map-small-lidar"
+"""The map model of agents with LiDAR; those with cameras are map-small-camera and map-small-fusion."""
 _MAP_PREFIX = "map-"
 
 
@@ -60,20 +60,20 @@ def load(name_or_path: str | Path = DEFAULT_DETECTOR) -> Detector:
 
 
 def load_feakm(name_or_path: str | Path = DEFAULT_FEAKM) -> feakm.FeakmNet:
-    """FeaKM's net: the shipped one by its name, or a .safetensors file of 'manyeyes train --preset feakm'."""
+    """FeaKM's net: the shipped one by its name, or a .safetensors file of 'manyeyes train --preset feakm-small'."""
     if str(name_or_path) != DEFAULT_FEAKM:
         return feakm.load(Path(name_or_path))
     shipped = files("manyeyes.models") / "weights" / f"{DEFAULT_FEAKM}.safetensors"
     if not shipped.is_file():
         raise CheckpointError(
-            "No weights of FeaKM are shipped; train them (manyeyes train --preset feakm) and give the .safetensors file."
+            "No weights of FeaKM are shipped; train them (manyeyes train --preset feakm-small) and give the .safetensors file."
         )
     with as_file(shipped) as path:
         return feakm.load(path)
 
 
 def load_map_model(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> MapModel:
-    """A map model for inference: a shipped name, or a .safetensors file of 'manyeyes train --preset map-small'."""
+    """A map model for inference: a shipped name, or a .safetensors file of 'manyeyes train --preset map-small-lidar'."""
     with _map_model_file(name_or_path) as path:
         model = checkpoint.load_as(path, FORMAT, MapModelConfig, MapModel)
     model.fingerprint = checkpoint.fingerprint(model)
@@ -102,6 +102,6 @@ def _map_model_file(name_or_path: str | Path) -> Iterator[Path]:
     if path.suffix != ".safetensors":
         raise CheckpointError(
             f"No map weights are named {name_or_path!r}; shipped are {', '.join(list_map_models()) or 'none'}: train some "
-            "(manyeyes train --preset map-small) and give the .safetensors file."
+            "(manyeyes train --preset map-small-lidar) and give the .safetensors file."
         )
     yield path

@@ -59,7 +59,7 @@ class FastFusion(nn.Module):
         super().__init__()
         self.encoding, self.transformer = SpatioTemporalEncoding(channels), WindowTransformer(channels, config)
         self.past_attention = PastAttention(channels, config)
-        self.merge = TokenMerge(channels, "trust")
+        self.merge = TokenMerge(channels, "softmax")
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Tokens of all agents, and those of the ego's own last instants, to one feature and one box a cell."""

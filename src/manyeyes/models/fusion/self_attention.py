@@ -17,7 +17,7 @@ class SelfAttentionFusion(nn.Module):
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
         self.encoding, self.transformer = SpatioTemporalEncoding(channels), WindowTransformer(channels, config)
-        self.merge = TokenMerge(channels, "trust")
+        self.merge = TokenMerge(channels, "softmax")
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Tokens of all agents to one feature and one box a cell; the past is not looked at."""

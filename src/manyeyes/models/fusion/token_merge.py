@@ -61,7 +61,7 @@ class TokenMerge(nn.Module):
     tokens met, how sure they are together and how far apart their boxes lie is told to the feature: no mean could.
     """
 
-    def __init__(self, channels: int, reduce: Literal["trust", "max"]) -> None:
+    def __init__(self, channels: int, reduce: Literal["softmax", "max"]) -> None:
         super().__init__()
         self.reduce = reduce
         self.proposal_weight, self.feature_weight = nn.Linear(3, 1, bias=False), nn.Linear(channels, 1, bias=False)

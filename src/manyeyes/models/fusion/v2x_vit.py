@@ -160,7 +160,7 @@ class V2xVitFusion(nn.Module):
                 "V2xVitFusion needs even heads and window, and channels divisible by twice the heads; got "
                 f"{config.heads}, {config.window} and {channels}."
             )
-        self.encoding, self.merge = SpatioTemporalEncoding(channels), TokenMerge(channels, "trust")
+        self.encoding, self.merge = SpatioTemporalEncoding(channels), TokenMerge(channels, "softmax")
         self.layers = nn.ModuleList(V2xVitLayer(channels, config) for _ in range(config.blocks))
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:

@@ -76,11 +76,11 @@ MAP_PAPER = MapModelConfig(
 )
 """ResNet-50, 120 m by 60 m, 100 queries of 20 points: CrowdMap section 3.1, and MapTRv2's decoder where it is silent. For GPUs."""
 
-MAP_MODELS = {"toy": MAP_TINY, "small": MAP_SMALL, "paper": MAP_PAPER}
+MAP_MODELS = {"tiny": MAP_TINY, "small": MAP_SMALL, "paper": MAP_PAPER}
 
 
 def get_map_model_config(name: str, sensors: tuple[Sensor, ...] = ("lidar",)) -> MapModelConfig:
-    """A preset by its name in MAPPERS, for agents that carry these sensors."""
+    """A preset by its name in MAP_MODELS, for agents that carry these sensors."""
     if name not in MAP_MODELS:
         raise ConfigError(f"No map model is called {name!r}; choose one of {', '.join(MAP_MODELS)}.")
     config = MAP_MODELS[name]

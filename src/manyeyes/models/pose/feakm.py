@@ -72,7 +72,7 @@ class FeakmNet(nn.Module):
         if self.config.detector and self.config.detector != detector.hex():
             raise ConfigError(
                 f"This net of FeaKM was taught on views of the weights {self.config.detector}, these are {detector.hex()}; "
-                "train it on this detector: manyeyes train --preset feakm --weights DETECTOR."
+                "train it on this detector: manyeyes train --preset feakm-small --weights DETECTOR."
             )
 
 
@@ -93,7 +93,7 @@ FEAKM_SMALL = FeakmConfig(
 )
 """Mended, and at most 2 M parameters."""
 
-FEAKM = {"feakm-paper": FEAKM_PAPER, "feakm": FEAKM_SMALL}
+FEAKM = {"feakm-paper": FEAKM_PAPER, "feakm-small": FEAKM_SMALL}
 
 
 def load(path: Path) -> FeakmNet:

@@ -85,7 +85,7 @@ def resolve_models(options: Options) -> tuple[StudyModel, ...]:
     names = options.weights or _select_shipped(options)
     if not names:
         raise ConfigError(
-            "No map model ships with this version: give --weights FILE of 'manyeyes train --preset map-small'."
+            "No map model ships with this version: give --weights FILE of 'manyeyes train --preset map-small-lidar'."
         )
     resolved = []
     for name in names:

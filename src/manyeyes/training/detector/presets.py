@@ -53,7 +53,7 @@ _NO_BLOCKS = replace(COSTR_SMALL.dast, blocks=0)
 _PLAIN = {"dast": _NO_BLOCKS, "fusion": "max"}
 
 TRAINING_PRESETS: dict[str, TrainConfig] = {
-    "costr-small": TrainConfig(
+    "costr-small/stage1": TrainConfig(
         COSTR_SMALL,
         steps=9000,
         batch=4,
@@ -63,7 +63,7 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
         prune_warmup_start=0.02,
         prune_warmup_end=0.10,
     ),
-    "costr-small-2": TrainConfig(
+    "costr-small/stage2": TrainConfig(
         replace(COSTR_SMALL, grid=SMALL_SQUARE_GRID, output_range=SMALL_GRID, prune_threshold=0.08),
         steps=3000,
         batch=4,
@@ -75,16 +75,16 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
         augment=AugmentConfig(max_agents=99),
         loss=LossConfig(iou=0.5),
     ),
-    "costr-small-3": _DEGRADED,
-    "costr-small-4": _FINAL,
-    "branch-plain": _branch(**_PLAIN, encoder=_FINE_ONLY),
-    "branch-se": _branch(**_PLAIN),
-    "branch-se-dast": _branch(fusion="max"),
-    "branch-se-dast-dast": _branch(fusion="self-attention"),
-    "branch-se-fast": _branch(dast=_NO_BLOCKS),
-    "branch-se-dast-fast": _BRANCH,
-    "branch-v2x-vit": _branch(fusion="v2x-vit"),
-    "branch-multi-scale": _branch(fusion="multi-scale"),
+    "costr-small/stage3": _DEGRADED,
+    "costr-small/stage4": _FINAL,
+    "ablation/none": _branch(**_PLAIN, encoder=_FINE_ONLY),
+    "ablation/se": _branch(**_PLAIN),
+    "ablation/se-dast": _branch(fusion="max"),
+    "ablation/se-dast-self-attention": _branch(fusion="self-attention"),
+    "ablation/se-fast": _branch(dast=_NO_BLOCKS),
+    "ablation/se-dast-fast": _BRANCH,
+    "ablation/v2x-vit": _branch(fusion="v2x-vit"),
+    "ablation/multi-scale": _branch(fusion="multi-scale"),
     "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
     "costr-tiny": TrainConfig(
         COSTR_TINY,
@@ -96,7 +96,8 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
         augment=AugmentConfig(max_agents=3),
     ),
 }
-"""costr-small and then, each from the weights before, costr-small-2 (what lies to the sides is seen as well, all agents at once,
-IoU itself in the loss), costr-small-3 (past, delay, pose errors, loss, budgets) and costr-small-4 (fewer cells kept, object by
-object): what ships. branch-*: rows of the ablation,
-each from what ships, with equal further steps. costr-opv2v: the paper's 80 + 10 epochs. costr-tiny: tests and examples."""
+"""costr-small/stage1 to stage4, each initialised with the weights of the stage before, give the shipped weights: stage2 adds the
+wider range, all agents and the IoU loss; stage3 adds history, delay, pose errors, packet loss and budgets; stage4 prunes more
+cells, object by object. ablation/*: rows of the ablation, each trained on from the shipped weights for the same number of steps.
+costr-opv2v: 80 + 10 epochs as in the paper. costr-tiny: tests and examples.
+"""

@@ -277,9 +277,9 @@ def _resize_view(view: AgentView, scale: float, flip: bool, grid: BevGrid) -> Ag
     return replace(
         view,
         cloud=_resize_cloud(view.cloud, scale, flip),
-        earlier=_resize_cloud(view.previous_cloud, scale, flip),
+        previous_cloud=_resize_cloud(view.previous_cloud, scale, flip),
         ego_from_view=_resize_motion(view.ego_from_view, scale, flip),
-        seen=_in_range(_resize_boxes(view.visible_boxes, scale, flip), grid),
+        visible_boxes=_in_range(_resize_boxes(view.visible_boxes, scale, flip), grid),
     )
 
 

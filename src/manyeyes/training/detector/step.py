@@ -102,10 +102,14 @@ def _history_tokens(
     model: Detector, samples: list[Sample], which: Literal["past", "said"], prune_threshold: float | None
 ) -> list[AgentTokens]:
     """What egos, or those that they hear, told at instants before, as memory holds it: no gradient reaches it."""
-    views = [(ego, view) for ego, sample in enumerate(samples) for view in getattr(sample, which)]
+    views = [
+        (ego, view)
+        for ego, sample in enumerate(samples)
+        for view in getattr(sample, {"past": "ego_history", "said": "sender_history"}[which])
+    ]
     if not views:
         return []
-    seen = model.extract_features([v.now for _, v in views], [v.earlier for _, v in views], prune_threshold)
+    seen = model.extract_features([v.cloud for _, v in views], [v.previous_cloud for _, v in views], prune_threshold)
     shared = model.make_tokens(seen.tokens, model.predict(seen.tokens))
     score, batch, xy = model.score_tokens(shared), shared.sites.batch, shared.sites.xy
     parts = []

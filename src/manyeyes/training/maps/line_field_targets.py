@@ -140,7 +140,7 @@ def line_field_loss(line_field: RawLineField, targets: Sequence[LineFieldTarget]
     """
     ink, end, near, foot, way, half = (
         torch.stack([getattr(target, name) for target in targets])
-        for name in ("ink", "end", "near", "foot", "way", "half")
+        for name in ("line_prob", "end_mask", "near_line", "offset_to_line", "direction", "half_width")
     )
     drawn, ended = _per_unit(line_field.line_logit, ink), _per_unit(line_field.end_logit, end)
     off = ((line_field.offset_to_line - foot).abs() + (line_field.direction - way).abs()).sum(2)

@@ -21,7 +21,7 @@ from manyeyes.training.maps.samples import MapAugmentConfig, MapSamples
 from manyeyes.training.maps.score_calibration import calibrate_scores
 from manyeyes.training.maps.step import loss_terms
 
-_CALIBRATION_TENSORS = ("scale", "shift")
+_CALIBRATION_TENSORS = ("logit_scale", "logit_shift")
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ _SMALL = MapTrainConfig(
 )
 
 MAP_TRAINING_PRESETS: dict[str, MapTrainConfig] = {
-    "map-toy": MapTrainConfig(
-        get_map_model_config("toy"),
+    "map-tiny": MapTrainConfig(
+        get_map_model_config("tiny"),
         steps=60,
         batch=2,
         learning_rate=2e-3,
@@ -37,17 +37,17 @@ MAP_TRAINING_PRESETS: dict[str, MapTrainConfig] = {
         loss=MapLossConfig(max_match_distance=math.inf),
         calibration_tiles=2,
     ),
-    "map-small": _SMALL,
+    "map-small-lidar": _SMALL,
     "map-small-camera": replace(
         _SMALL, map_model=get_map_model_config("small", ("camera",)), steps=1200, line_field_steps=300
     ),
-    "map-small-both": replace(
+    "map-small-fusion": replace(
         _SMALL,
         map_model=get_map_model_config("small", ("lidar", "camera")),
         steps=300,
         learning_rate=2e-3,
-        warm_up=40,
-        sketch_steps=0,
+        warmup_steps=40,
+        line_field_steps=0,
     ),
     "map-paper": MapTrainConfig(
         get_map_model_config("paper", ("camera",)),
@@ -62,6 +62,7 @@ MAP_TRAINING_PRESETS: dict[str, MapTrainConfig] = {
         loss=MapLossConfig(one_to_many_repeats=6),
     ),
 }
-"""map-toy: tests. map-small: one to ten looks a tile, two cores; its two siblings need pictures in the recording, and their steps
-are enough where a run begins from weights (the verb's --weights) that know tiles already. map-paper: the
-paper's ten pictures a tile and batch of eight; steps and rate are MapTRv2's, the paper gives none."""
+"""map-tiny: tests. map-small-lidar, map-small-camera, map-small-fusion: one to ten frames a tile, trainable on two CPU cores; the
+two with cameras need images in the recording, and their steps suffice when initialised with trained weights (--weights).
+map-paper: ten images a tile and batches of eight tiles as in the paper; steps and learning rate are those of MapTRv2.
+"""

@@ -74,7 +74,7 @@ class FeakmTrainConfig:
 
 
 FEAKM_TRAINING_PRESETS: dict[str, FeakmTrainConfig] = {
-    "feakm": FeakmTrainConfig(
+    "feakm-small": FeakmTrainConfig(
         FEAKM_SMALL,
         steps=6000,
         batch=16,
@@ -85,7 +85,7 @@ FEAKM_TRAINING_PRESETS: dict[str, FeakmTrainConfig] = {
     ),
     "feakm-paper": FeakmTrainConfig(FEAKM_PAPER, steps=15000, batch=16, learning_rate=2e-4, weight_decay=0.0),
 }
-"""feakm: what ships. feakm-paper: 15 M parameters, as published but for the shape of the schedule."""
+"""feakm-small: the shipped weights. feakm-paper: 15 M parameters, as published but for the shape of the schedule."""
 
 
 @dataclass(frozen=True, eq=False)
