@@ -82,8 +82,8 @@ def test_the_folder_is_read_by_the_other_commands(built, tmp_path) -> None:
     assert MapFolder(tmp_path).read_cut_policy() is not None and "A crossroads" in (tmp_path / "map.html").read_text()
     assert cli.main(["map", "evaluate", str(tmp_path / "map")]) == 0
     held = json.loads((tmp_path / "map" / "quality.json").read_text())["result"]["ap"]
-    exact = next(r for r in held if (r["way"], r["thresholds"]) == ("maptr", "narrow"))
-    assert exact["mean"] == pytest.approx(built.stats.scores.mean_ap(), abs=0.02)
+    exact = next(r for r in held if (r["protocol"], r["thresholds"]) == ("maptr", "narrow"))
+    assert exact["mean_ap"] == pytest.approx(built.stats.scores.mean_ap(), abs=0.02)
 
 
 def test_the_same_recording_is_the_same_map_and_pose_noise_moves_priors_only(built) -> None:
@@ -202,12 +202,12 @@ def test_the_command_on_a_simulated_recording(tmp_path, capsys) -> None:
     from manyeyes.simulator.presets import simulate
 
     simulate("tiny", tmp_path / "tiny")
-    words = ["map", "build", str(tmp_path / "tiny"), "--split", "test", "--source", "truth", "--every", "2"]
+    words = ["map", "build", str(tmp_path / "tiny"), "--split", "test", "--source", "truth", "--frame-stride", "2"]
     assert cli.main([*words, "--out", str(tmp_path / "out")]) == 0
     assert "against the truth in view" in capsys.readouterr().out
     held = json.loads((tmp_path / "out" / "build.json").read_text())
     (numbers,) = held["result"]
-    assert numbers["name"] == "generated-3" and numbers["observations"] == numbers["messages"] > 2
+    assert numbers["name"] == "generated-3" and numbers["num_observations"] == numbers["num_messages"] > 2
     assert held["provenance"]["config"]["options"]["source"] == "truth"
     assert Path(tmp_path / "out" / "generated-3" / "map.html").is_file()
     assert cli.main([*words, "--map", str(tmp_path / "other.json"), "--out", str(tmp_path / "two")]) == 1

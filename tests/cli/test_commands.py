@@ -63,18 +63,18 @@ def run(*words: object) -> int:
 
 
 def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_path, capsys) -> None:
-    assert run("run", data, "--split", "test", "--weights", weights, "--out", tmp_path, "--score-min", 0.9) == 0
+    assert run("replay", data, "--split", "test", "--weights", weights, "--out", tmp_path, "--min-score", 0.9) == 0
     output = capsys.readouterr()
-    assert all(name in output.out for name in ("alone", "late", "intermediate", "early", "report.html"))
+    assert all(name in output.out for name in ("none", "late", "intermediate", "early", "report.html"))
     made = {p.name for p in tmp_path.iterdir()}
-    pictures = {f"{name}.png" for name in ("alone", "late", "intermediate", "early")}
+    pictures = {f"{name}.png" for name in ("none", "late", "intermediate", "early")}
     assert made == pictures | {"drive.gif", "report.html", "results.json", "results.md"}
     held = json.loads((tmp_path / "results.json").read_text())
-    assert [n["method"] for n in held["result"]["numbers"]] == ["alone", "late", "intermediate", "early"]
+    assert [n["method"] for n in held["result"]["stats"]] == ["none", "late", "intermediate", "early"]
     assert held["provenance"]["config"]["detector"]["pillar_channels"] == COSTR_TINY.pillar_channels
-    sent = {n["method"]: n["communication"]["bytes_per_message"] for n in held["result"]["numbers"]}
-    assert sent["alone"] is None and 0 < sent["late"] < sent["early"]
-    assert all(n["precision"][0]["n_gt"] == 2 for n in held["result"]["numbers"])
+    sent = {n["method"]: n["communication"]["bytes_per_message"] for n in held["result"]["stats"]}
+    assert sent["none"] is None and 0 < sent["late"] < sent["early"]
+    assert all(n["ap_summaries"][0]["n_gt"] == 2 for n in held["result"]["stats"])
     with Image.open(tmp_path / "drive.gif") as film:
         assert film.n_frames == 2
     assert (tmp_path / "report.html").read_text().count("data:image/") == 5
@@ -83,7 +83,7 @@ def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_
 def test_two_runs_agree_except_for_times(data, weights, tmp_path) -> None:
     results = []
     for name, workers in (("one", 1), ("two", 2)):
-        words = ("--workers", workers, "--timed-frames", 0, "--out", tmp_path / name)
+        words = ("--workers", workers, "--timing-frames", 0, "--out", tmp_path / name)
         assert run("evaluate", "--data", data, "--split", "test", "--weights", weights, *words) == 0
         results.append(json.loads((tmp_path / name / "results.json").read_text())["result"])
     assert results[0] == results[1]
@@ -91,14 +91,14 @@ def test_two_runs_agree_except_for_times(data, weights, tmp_path) -> None:
 
 
 def test_evaluate_compares_methods_over_scenarios(data, weights, tmp_path, capsys) -> None:
-    words = ("--methods", "alone", "intermediate", "--workers", 1, "--out", tmp_path)
+    words = ("--methods", "none", "intermediate", "--workers", 1, "--out", tmp_path)
     assert run("evaluate", "--data", data, "--split", "test", "--weights", weights, *words) == 0
     output = capsys.readouterr().out
-    assert "intermediate - alone" in output and "at most 131,072: reached" in output
+    assert "intermediate - none" in output and "at most 131,072: met" in output
     held = json.loads((tmp_path / "results.json").read_text())["result"]
     (half, seven) = held["differences"]
-    assert (half["bar"], seven["bar"]) == (0.12, None)
-    assert half["verdict"] in ("reached", "missed", "not resolved") and half["interval"]["scenarios"] == 2
+    assert (half["margin"], seven["margin"]) == (0.12, None)
+    assert half["verdict"] in ("met", "not met", "inconclusive") and half["interval"]["num_scenarios"] == 2
     assert held["rows"][1]["perceive_ms"] > 0
 
 
@@ -110,9 +110,9 @@ def test_view_draws_a_frame_or_a_drive(data, tmp_path, name) -> None:
 
 
 def test_view_with_detections_differs_from_view_without(data, weights, tmp_path) -> None:
-    common = ("view", data, "--split", "test", "--reach-m", 25.6, 25.6, "--width", 480)
+    common = ("view", data, "--split", "test", "--half-extent-m", 25.6, 25.6, "--width", 480)
     assert run(*common, "--out", tmp_path / "without.png") == 0
-    words = ("--detect", "intermediate", "--weights", weights, "--score-min", 0.0)
+    words = ("--detect", "intermediate", "--weights", weights, "--min-score", 0.0)
     assert run(*common, *words, "--out", tmp_path / "with.png") == 0
     assert (tmp_path / "with.png").read_bytes() != (tmp_path / "without.png").read_bytes()
 
@@ -151,7 +151,7 @@ def spoil_points(folder: Path) -> None:
 def test_a_spoilt_recording_is_one_line_that_names_the_thing(data, weights, tmp_path, capsys, spoil, named) -> None:
     folder = broken(data, tmp_path)
     spoil(folder)
-    assert run("run", folder, "--weights", weights, "--out", tmp_path / "out") == 1
+    assert run("replay", folder, "--weights", weights, "--out", tmp_path / "out") == 1
     output = capsys.readouterr().err.splitlines()
     assert len(output) == 1 and output[0].startswith("manyeyes: ") and named in output[0] and "broken" in output[0]
 
@@ -196,7 +196,8 @@ def test_weights_of_another_shape_are_one_line(data, weights, tmp_path, capsys) 
     state[name] = state[name][:, :-1].contiguous()
     save_file(state, tmp_path / "other.safetensors", metadata)
     assert (
-        run("run", data, "--split", "test", "--weights", tmp_path / "other.safetensors", "--out", tmp_path / "o") == 1
+        run("replay", data, "--split", "test", "--weights", tmp_path / "other.safetensors", "--out", tmp_path / "o")
+        == 1
     )
     output = capsys.readouterr().err.splitlines()
     assert len(output) == 1 and name in output[0] and "other.safetensors" in output[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``manyeyes quantise``: trained weights gain a codebook, in their own precision, with the command in their card."""
+"""``manyeyes fit-codebook``: trained weights gain a codebook, in their own precision, with the command in their card."""
 
 import pytest
 import torch
@@ -28,7 +28,17 @@ def test_weights_gain_a_codebook_and_keep_their_card(tmp_path, half, capsys):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         checkpoint.save(Detector(COSTR_TINY), weights, {"steps": 7}, half)
-    words = ["quantise", "--weights", str(weights), "--data", str(tmp_path / "data"), "--out", str(out), "--every", "1"]
+    words = [
+        "fit-codebook",
+        "--weights",
+        str(weights),
+        "--data",
+        str(tmp_path / "data"),
+        "--out",
+        str(out),
+        "--frame-stride",
+        "1",
+    ]
     assert cli.main([*words, "--stages", "2"]) == 0
     assert "before entropy coding" in capsys.readouterr().out
     fitted, plain = checkpoint.load(out), checkpoint.load(weights)

@@ -20,22 +20,22 @@ def test_help_lists_every_command_and_imports_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "HEAVY [] 0"
-    assert all(f"  {verb} " in done.stdout for verb in cli.COMMANDS)
+    assert all(f"  {command} " in done.stdout for command in cli.COMMANDS)
 
 
-ALL_COMMANDS = [verb for verb in cli.COMMANDS if verb not in cli.COMMAND_GROUPS]
-ALL_COMMANDS += [f"{group} {verb}" for group, verbs in cli.COMMAND_GROUPS.items() for verb in verbs]
+ALL_COMMANDS = [command for command in cli.COMMANDS if command not in cli.COMMAND_GROUPS]
+ALL_COMMANDS += [f"{group} {command}" for group, commands in cli.COMMAND_GROUPS.items() for command in commands]
 
 
-@pytest.mark.parametrize("verb", ALL_COMMANDS)
-def test_every_command_has_options_with_help(verb, capsys) -> None:
-    module = importlib.import_module(cli.module_of(verb))
+@pytest.mark.parametrize("command", ALL_COMMANDS)
+def test_every_command_has_options_with_help(command, capsys) -> None:
+    module = importlib.import_module(cli.module_of(command))
     assert module.__doc__ and callable(module.main)
     with pytest.raises(SystemExit) as stop:
-        cli.main([*verb.split(), "--help"])
+        cli.main([*command.split(), "--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    assert f"manyeyes {verb}" in text
+    assert f"manyeyes {command}" in text
     fields = dataclasses.fields(module.Options)
     assert fields and all(f.name.replace("_", "-") in text.lower() for f in fields)
     # tyro prints nothing between a flag and its default where the field has no docstring.
@@ -46,7 +46,7 @@ def test_every_command_has_options_with_help(verb, capsys) -> None:
 def test_an_unknown_command_lists_the_known(capsys) -> None:
     assert cli.main(["demmo"]) == 2
     assert capsys.readouterr().err == (
-        "manyeyes: there is no verb 'demmo'; did you mean demo? Known verbs: "
+        "manyeyes: there is no command 'demmo'; did you mean demo? Known commands: "
         "demo, simulate, train, quantise, evaluate, run, view, align, map, doctor.\n"
     )
 
@@ -54,9 +54,12 @@ def test_an_unknown_command_lists_the_known(capsys) -> None:
 def test_a_group_lists_its_commands_and_no_other(capsys) -> None:
     assert cli.main(["map"]) == 0
     output = capsys.readouterr().out
-    assert all(f"  {verb} " in output for verb in cli.COMMAND_GROUPS["map"]) and "usage: manyeyes map VERB" in output
+    assert (
+        all(f"  {command} " in output for command in cli.COMMAND_GROUPS["map"])
+        and "usage: manyeyes map COMMAND" in output
+    )
     assert cli.main(["map", "fuze"]) == 2
-    assert "did you mean fuse? Known verbs: build, simulate, import, fuse" in capsys.readouterr().err
+    assert "did you mean fuse? Known commands: build, simulate, import, fuse" in capsys.readouterr().err
 
 
 def test_wrong_arguments_exit_with_2(capsys) -> None:

@@ -34,7 +34,7 @@ def test_simulate_and_fuse_leave_observations_truth_and_a_map(folder) -> None:
     assert len(truth) > 20 and len(made.select_published()) > 5 and made.frame == truth.frame
     held = json.loads((folder / "map" / "fuse.json").read_text())
     assert held["result"]["observations"] == 24 and held["result"]["hash"] == made.quantised_hash()
-    assert held["provenance"]["config"]["settings"]["ours"]["align"]["spacing_m"] == 1.0
+    assert held["provenance"]["config"]["settings"]["ours"]["pose_solver"]["spacing_m"] == 1.0
 
 
 def test_the_same_seed_is_the_same_map(folder, tmp_path) -> None:
@@ -48,11 +48,11 @@ def test_evaluate_prints_and_writes_the_metrics(folder, capsys) -> None:
     output = capsys.readouterr().out
     assert "divider" in output and "mAP" in output
     held = json.loads((folder / "map" / "quality.json").read_text())["result"]
-    exact = next(r for r in held["ap"] if (r["way"], r["thresholds"]) == ("exact", "narrow"))
-    assert 0.3 < exact["mean"] <= 1.0
+    exact = next(r for r in held["ap"] if (r["protocol"], r["thresholds"]) == ("exact", "narrow"))
+    assert 0.3 < exact["mean_ap"] <= 1.0
     assert run("map", "evaluate", folder / "truth", "--truth", folder / "truth") == 0
     perfect = json.loads((folder / "truth" / "quality.json").read_text())["result"]
-    assert {r["mean"] for r in perfect["ap"]} == {1.0}
+    assert {r["mean_ap"] for r in perfect["ap"]} == {1.0}
 
 
 def test_a_baseline_map_is_written_and_diff_lists_the_differences(folder, capsys) -> None:
@@ -63,13 +63,17 @@ def test_a_baseline_map_is_written_and_diff_lists_the_differences(folder, capsys
     assert "divider" in capsys.readouterr().out
     rows = json.loads(numbers.read_text())["result"]["kinds"]
     divider = next(r for r in rows if r["kind"] == "divider")
-    assert divider["kept"] == 0 and divider["added"] > 0 and divider["new_m"] > 0
+    assert divider["num_unchanged"] == 0 and divider["num_added"] > 0 and divider["added_length_m"] > 0
     assert "New map" in page.read_text()
     capsys.readouterr()
     assert run("map", "diff", folder / "map", folder / "map", "--out", numbers) == 0
     rows = json.loads(numbers.read_text())["result"]["kinds"]
-    assert all(r["changed"] == r["added"] == r["removed"] == 0 and r["new_m"] == r["gone_m"] == 0 for r in rows)
-    assert sum(r["kept"] for r in rows) == len(read_vector_map(folder / "map").select_published())
+    assert all(
+        r["num_changed"] == r["num_added"] == r["num_removed"] == 0
+        and r["added_length_m"] == r["removed_length_m"] == 0
+        for r in rows
+    )
+    assert sum(r["num_unchanged"] for r in rows) == len(read_vector_map(folder / "map").select_published())
 
 
 def test_view_draws_a_page_and_a_picture(folder) -> None:
@@ -85,7 +89,7 @@ def test_export_writes_a_file_that_others_read(folder, tmp_path) -> None:
     assert run("map", "export", folder / "map", tmp_path / "map.geojson") == 0
     held = json.loads((tmp_path / "map.geojson").read_text())
     assert len(held["features"]) == len(read_vector_map(folder / "map").select_published())
-    assert run("map", "export", folder / "map", tmp_path / "all.geojson", "--everything") == 0
+    assert run("map", "export", folder / "map", tmp_path / "all.geojson", "--include-unpublished") == 0
     assert len(json.loads((tmp_path / "all.geojson").read_text())["features"]) >= len(held["features"])
 
 
@@ -130,7 +134,7 @@ def spoil_cut(folder: Path) -> Path:
         (("simulate", "moon"), ("moon", "Town03")),
         (("simulate", "cross", "--crowd", "shy"), ("shy", "colluding-liars")),
         (("fuse", "{here}"), ("{here}", "Parquet")),
-        (("fuse", "{here}", "--method", "guess"), ("guess", "chamfer_nms")),
+        (("fuse", "{here}", "--method", "guess"), ("guess", "chamfer-nms")),
         (("evaluate",), ("--study",)),
         (("evaluate", "--study", "moon"), ("moon", "table3")),
         (("evaluate", "--study", "fusion", "--methods", "guess"), ("guess", "union")),

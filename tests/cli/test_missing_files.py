@@ -72,7 +72,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(params=["without digests", "a total digest", "a digest of each file"])
 def data(whole: Path, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy to damage: as another tool writes a recording, and as the simulator's versions do."""
-    monkeypatch.setenv("MANYEYES_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("GLOBAL_SORT_CACHE", str(tmp_path / "cache"))
     shutil.copytree(whole, tmp_path / "data")
     if request.param != "without digests":
         for folder in (tmp_path / "data" / "test").iterdir():
@@ -101,10 +101,10 @@ def evaluate(data: Path, weights: Path, out: Path, *words: object) -> int:
         weights,
         "--workers",
         1,
-        "--timed-frames",
+        "--timing-frames",
         0,
         "--methods",
-        "alone",
+        "none",
         "early",
     )
     return run("evaluate", "--data", data, *common, "--out", out, *words)
@@ -177,7 +177,7 @@ def test_allowed_files_are_counted_in_json_and_footers(
     (file,) = held["missing"]["files"]
     assert (file["path"], file["kind"], file["scenario"]) == (str(path), "missing", "a")
     # One of four judged frames is absent, and with it a quarter of the true boxes.
-    assert [n["precision"][0]["n_gt"] for n in held["numbers"]] == [18, 18]
+    assert [n["ap_summaries"][0]["n_gt"] for n in held["stats"]] == [18, 18]
     assert FOOTER in capsys.readouterr().out and FOOTER in (tmp_path / "results.md").read_text()
 
 
@@ -196,7 +196,7 @@ def test_a_whole_recording_has_no_footer(
         assert evaluate(data, weights, tmp_path) == 0
     held = json.loads((tmp_path / "results.json").read_text())["result"]
     assert held["missing"] == {"count": 0, "files": []}
-    assert [n["precision"][0]["n_gt"] for n in held["numbers"]] == [24, 24]
+    assert [n["ap_summaries"][0]["n_gt"] for n in held["stats"]] == [24, 24]
     assert "missing" not in capsys.readouterr().out + (tmp_path / "results.md").read_text()
 
 
@@ -214,8 +214,8 @@ def test_many_files_are_counted_and_the_list_is_capped(
         writer.write(street("long", index, (5, 7)))
     shutil.rmtree(tmp_path / "data" / "long" / "7")
     (tmp_path / "data" / "long" / "7").mkdir()
-    words = ("evaluate", "--data", tmp_path / "data", "--weights", weights, "--methods", "alone", "--every", 30)
-    words = (*words, "--workers", 1, "--timed-frames", 0, "--out", tmp_path)
+    words = ("evaluate", "--data", tmp_path / "data", "--weights", weights, "--methods", "none", "--frame-stride", 30)
+    words = (*words, "--workers", 1, "--timing-frames", 0, "--out", tmp_path)
     assert run(*words) == 1
     assert "long/7/000000.pcd: missing (other agents have the frame), and 119 more" in capsys.readouterr().err
     assert run(*words, "--allow-missing") == 0
@@ -225,7 +225,7 @@ def test_many_files_are_counted_and_the_list_is_capped(
 
 
 def run_pose(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
-    return ("align", data, "--split", "test", "--weights", weights, "--correctors", "given", "--out", out)
+    return ("pose", data, "--split", "test", "--weights", weights, "--correctors", "identity", "--out", out)
 
 
 def run_replay(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
@@ -237,10 +237,10 @@ def run_replay(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
         "--weights",
         weights,
         "--methods",
-        "alone",
+        "none",
         "--out",
         out,
-        "--score-min",
+        "--min-score",
         0.9,
     )
     return (*words, "--no-animate")
@@ -248,12 +248,12 @@ def run_replay(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
 
 def run_fit_codebook(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
     words = ("quantise", "--data", data, "--split", "test", "--weights", weights, "--out", out / "coded.safetensors")
-    return (*words, "--stages", 1, "--every", 1)
+    return (*words, "--stages", 1, "--frame-stride", 1)
 
 
 def run_study(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
     words = ("evaluate", "--data", data, "--split", "test", "--weights", weights, "--study", "agents", "--workers", 1)
-    return (*words, "--methods", "alone", "late", "--every", 2, "--out", out)
+    return (*words, "--methods", "none", "late", "--frame-stride", 2, "--out", out)
 
 
 def run_train(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
@@ -328,7 +328,7 @@ def test_cells_of_an_incomplete_recording_are_kept_apart(whole: Path, weights: P
     path = data / "test" / "a" / "7" / "000004.yaml"  # behind the first judged frame, which alone names a cell
     text = path.read_text()
     path.unlink()
-    words = (*run_study(data, weights, tmp_path / "out"), "--every", 1)
+    words = (*run_study(data, weights, tmp_path / "out"), "--frame-stride", 1)
     assert run(*words, "--allow-missing") == 0
     damaged = json.loads((tmp_path / "out" / "agents.json").read_text())["result"]
     path.write_text(text)

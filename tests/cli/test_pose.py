@@ -69,20 +69,25 @@ def test_an_unknown_pose_is_found_and_a_noisy_prior_improved(drive, capsys) -> N
     data, weights, out = drive
     noise = ("--noise-xy-m", 0.4, "--noise-yaw-deg", 0.4)
     assert (
-        run("align", data, "--split", "test", "--weights", weights, "--out", out, "--unknown", "--correctors", "vote")
+        run("pose", data, "--split", "test", "--weights", weights, "--out", out, "--no-prior", "--correctors", "voting")
         == 0
     )
-    assert run("align", data, "--split", "test", "--weights", weights, "--out", out / "noisy", *noise) == 0
+    assert run("pose", data, "--split", "test", "--weights", weights, "--out", out / "noisy", *noise) == 0
     output = capsys.readouterr().out
     assert (
-        "vote" in output and "given" in output and "align.json" in output and "agent -1: sound over 2 frames" in output
+        "voting" in output
+        and "identity" in output
+        and "align.json" in output
+        and "agent -1: sound over 2 frames" in output
     )
     free, noisy = (json.loads((p / "align.json").read_text())["result"] for p in (out, out / "noisy"))
     for answer in free["answers"]:
         assert answer["status"] == "corrected" and answer["inliers"] == len(PLACES) and answer["common"] == len(PLACES)
         assert answer["error_m"] < 1e-3
     scores = noisy["scores"]
-    assert scores["vote"]["displacement"] < scores["given"]["displacement"] and math.isfinite(scores["vote"]["nees"])
+    assert scores["voting"]["mean_displacement_m"] < scores["identity"]["mean_displacement_m"] and math.isfinite(
+        scores["voting"]["nees"]
+    )
 
 
 def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
@@ -93,15 +98,15 @@ def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
         sizes.append((len(ego), len(other)))
         return no_estimate(prior)
 
-    monkeypatch.setitem(CLOUD_CORRECTORS, "register", cloud)
-    words = ("--split", "test", "--weights", weights, "--out", out, "--correctors", "register", "vote")
-    assert run("align", data, *words) == 0
+    monkeypatch.setitem(CLOUD_CORRECTORS, "scan-registration", cloud)
+    words = ("--split", "test", "--weights", weights, "--out", out, "--correctors", "scan-registration", "voting")
+    assert run("pose", data, *words) == 0
     answers = json.loads((out / "align.json").read_text())["result"]["answers"]
-    assert [a["corrector"] for a in answers] == ["register", "vote"] * len(sizes) and len(sizes) > 0
+    assert [a["corrector"] for a in answers] == ["scan-registration", "voting"] * len(sizes) and len(sizes) > 0
     assert [tuple(a["landmarks"]) for a in answers[::2]] == sizes and answers[0]["status"] == "no match"
 
 
 def test_an_unknown_corrector_lists_the_known(drive, capsys) -> None:
     data, weights, out = drive
-    assert run("align", data, "--split", "test", "--weights", weights, "--out", out, "--correctors", "magic") == 1
+    assert run("pose", data, "--split", "test", "--weights", weights, "--out", out, "--correctors", "magic") == 1
     assert "known: vote, given, coalign" in capsys.readouterr().err

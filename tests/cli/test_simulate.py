@@ -249,11 +249,11 @@ def test_a_replaced_cloud_of_a_simulated_recording_is_an_error_of_evaluate(
         "--weights",
         weights,
         "--methods",
-        "alone",
+        "none",
         "--workers",
         1,
     )
-    words = [str(word) for word in (*words, "--timed-frames", 0, "--out", tmp_path / "out")]
+    words = [str(word) for word in (*words, "--timing-frames", 0, "--out", tmp_path / "out")]
     assert cli.main(words) == 0
     one, *_, other = sorted((folder / "test" / "generated-1_0000").glob("*/000002.pcd"))
     shutil.copyfile(other, one)

@@ -79,7 +79,7 @@ def strategies(data: Path) -> Arrays:
     for number, frame in enumerate(snapshots[0].frames):
         yield f"simulator/points/{number}", frame.points.xyz.numpy()
     for key, strategy in zip(STRATEGIES, METHODS.values(), strict=True):
-        for precision in ("float32", "float16", "int8", "codes"):
+        for precision in ("float32", "float16", "int8", "codebook"):
             agents = {f.agent_id: Agent(detector, strategy, token_encoding=precision) for f in snapshots[0].frames}
             for time, snapshot in enumerate(snapshots):
                 sent = {f.agent_id: agents[f.agent_id].share(f) for f in snapshot.frames}
@@ -129,11 +129,21 @@ def trained_weights(data: Path) -> Arrays:
 
 
 STUDIES: dict[str, tuple[str, ...]] = {
-    "evaluate": ("evaluate", "--methods", "alone", "late", "intermediate"),
-    "robustness": ("evaluate", "--study", "robustness", "--methods", "late", "--disturbances", "0.8 m"),
-    "budget": ("evaluate", "--study", "budget", "--methods", "late", "--selectors", "confidence", "--budgets", "4096"),
-    "agents": ("evaluate", "--study", "agents", "--methods", "intermediate"),
-    "pose": ("evaluate", "--study", "pose", "--correctors", "vote", "--disturbances", "0.8 m"),
+    "evaluate": ("evaluate", "--methods", "none", "late", "intermediate"),
+    "robustness": ("evaluate", "--study", "robustness", "--methods", "late", "--perturbations", "0.8 m"),
+    "budget": (
+        "evaluate",
+        "--study",
+        "bandwidth",
+        "--methods",
+        "late",
+        "--token-selection",
+        "intermediate-confidence",
+        "--budgets",
+        "4096",
+    ),
+    "agents": ("evaluate", "--study", "num-agents", "--methods", "intermediate"),
+    "pose": ("evaluate", "--study", "pose-noise-ap", "--correctors", "voting", "--perturbations", "0.8 m"),
 }
 UNTIMED = ("evaluate",)
 
@@ -142,7 +152,7 @@ def studies(data: Path) -> Arrays:
     """The numbers of one cell of each study, on a drive of a few frames; times are left out."""
     for key, words in STUDIES.items():
         out = fresh(data / f"study-{key}")
-        timing = ("--timed-frames", "0") if key in UNTIMED else ()
+        timing = ("--timing-frames", "0") if key in UNTIMED else ()
         common = ("--data", str(data / "tiny"), "--split", "test", "--workers", "1", *timing, "--out", str(out))
         assert cli.main([words[0], *common, *words[1:]]) == 0, key
         for path in sorted(out.glob("*.json")):

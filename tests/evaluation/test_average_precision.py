@@ -29,8 +29,8 @@ from manyeyes.evaluation.detection.average_precision import (
 )
 from manyeyes.ops.box_iou import pairwise_iou
 
-MANYEYES = PROTOCOLS["manyeyes"]
-NO_NMS = replace(MANYEYES, nms_iou=1.0)
+GLOBAL_SORT = PROTOCOLS["global-sort"]
+NO_NMS = replace(GLOBAL_SORT, nms_iou=1.0)
 
 
 def cars(*rows, size=(4.0, 2.0, 1.5), z=0.75):
@@ -52,27 +52,27 @@ def three_frames():
 
 def test_three_frames_by_hand_sorted_and_concatenated():
     """By score: T F T T F, precision 1 1/2 2/3 3/4 3/5; concatenated: T F F T T, precision 1 1/2 1/3 1/2 3/5."""
-    got = average_precision(three_frames(), 0.5, MANYEYES)
+    got = average_precision(three_frames(), 0.5, GLOBAL_SORT)
     assert got.ap_global == pytest.approx(0.25 + 0.25 * 0.75 + 0.25 * 0.75, abs=1e-15)
     assert got.ap_legacy == pytest.approx(0.25 + 0.25 * 0.6 + 0.25 * 0.6, abs=1e-15)
     assert (got.recall, got.precision, got.n_gt, got.n_detections) == (0.75, 0.6, 4, 5)
     assert got.ap == got.ap_global
-    assert average_precision(three_frames(), 0.5, replace(MANYEYES, ap_order="concatenated")).ap == got.ap_legacy
+    assert average_precision(three_frames(), 0.5, replace(GLOBAL_SORT, ap_order="concatenated")).ap == got.ap_legacy
     assert [m.tp.tolist() for m in got.frames] == [[True, False], [False, True], [True]]
 
 
 def test_several_thresholds_at_once():
     frames = list(random_frames(5))
-    together = average_precisions(frames, (0.3, 0.5, 0.7), MANYEYES)
+    together = average_precisions(frames, (0.3, 0.5, 0.7), GLOBAL_SORT)
     assert [r.ap_global for r in together] == [
-        average_precision(frames, t, MANYEYES).ap_global for t in (0.3, 0.5, 0.7)
+        average_precision(frames, t, GLOBAL_SORT).ap_global for t in (0.3, 0.5, 0.7)
     ]
     assert together[0].ap_global > together[2].ap_global
 
 
 def test_frames_may_come_in_any_order():
     frames = three_frames()
-    forward, back = average_precision(frames, 0.5, MANYEYES), average_precision(frames[::-1], 0.5, MANYEYES)
+    forward, back = average_precision(frames, 0.5, GLOBAL_SORT), average_precision(frames[::-1], 0.5, GLOBAL_SORT)
     assert (forward.ap_global, forward.ap_legacy) == (back.ap_global, back.ap_legacy)
 
 
@@ -128,37 +128,37 @@ def random_frames(n, per=8, seed=0, miss=0.25, clutter=3):
 @pytest.mark.parametrize("thr", [0.3, 0.5, 0.7])
 def test_agrees_with_its_slow_twin(thr):
     frames = list(random_frames(12))
-    got = average_precision(frames, thr, MANYEYES)
+    got = average_precision(frames, thr, GLOBAL_SORT)
     assert got.ap_global == pytest.approx(slow_ap(frames, thr, True), abs=1e-12)
     assert got.ap_legacy == pytest.approx(slow_ap(frames, thr, False), abs=1e-12)
     assert 0.2 < got.ap_global < 0.95
 
 
 def test_legacy_ap_tends_to_recall_times_precision():
-    got = average_precision(list(random_frames(250, clutter=5)), 0.5, MANYEYES)
+    got = average_precision(list(random_frames(250, clutter=5)), 0.5, GLOBAL_SORT)
     assert got.ap_legacy == pytest.approx(got.recall * got.precision, abs=0.02)
     assert got.ap_global > got.ap_legacy + 0.1
 
 
 def test_frames_without_detections_add_truth_and_frames_without_truth_add_false_positives():
     base = three_frames()
-    plain = average_precision(base, 0.5, MANYEYES)
+    plain = average_precision(base, 0.5, GLOBAL_SORT)
     silent = [*base, FrameResult("c", 0, Boxes.empty(), cars((0, 0, 1)))]
-    got = average_precision(silent, 0.5, MANYEYES)
+    got = average_precision(silent, 0.5, GLOBAL_SORT)
     assert got.n_gt == 5 and got.ap_global == pytest.approx(plain.ap_global * 4 / 5)
-    skipped = average_precision(silent, 0.5, replace(MANYEYES, count_frames_without_det=False))
+    skipped = average_precision(silent, 0.5, replace(GLOBAL_SORT, count_frames_without_det=False))
     assert skipped.n_gt == 4 and skipped.ap_global == plain.ap_global
-    ghost = average_precision([*base, FrameResult("c", 0, cars((0, 0, 0.95)), Boxes.empty())], 0.5, MANYEYES)
+    ghost = average_precision([*base, FrameResult("c", 0, cars((0, 0, 0.95)), Boxes.empty())], 0.5, GLOBAL_SORT)
     assert ghost.n_gt == 4 and ghost.precision == pytest.approx(3 / 6) and ghost.ap_global < plain.ap_global
 
 
 def test_without_truth_ap_is_nan_and_without_detections_it_is_zero():
-    nothing = average_precision([FrameResult("a", 0, cars((0, 0, 0.9)), Boxes.empty())], 0.5, MANYEYES)
+    nothing = average_precision([FrameResult("a", 0, cars((0, 0, 0.9)), Boxes.empty())], 0.5, GLOBAL_SORT)
     assert math.isnan(nothing.ap_global) and math.isnan(nothing.ap_legacy) and math.isnan(nothing.recall)
     assert nothing.precision == 0.0
-    blind = average_precision([FrameResult("a", 0, Boxes.empty(), cars((0, 0, 1)))], 0.5, MANYEYES)
+    blind = average_precision([FrameResult("a", 0, Boxes.empty(), cars((0, 0, 1)))], 0.5, GLOBAL_SORT)
     assert (blind.ap_global, blind.ap_legacy, blind.recall) == (0.0, 0.0, 0.0) and math.isnan(blind.precision)
-    assert math.isnan(average_precision([], 0.5, MANYEYES).ap_global)
+    assert math.isnan(average_precision([], 0.5, GLOBAL_SORT).ap_global)
 
 
 def test_a_detection_whose_box_is_taken_takes_the_next_best_or_not():
@@ -176,24 +176,24 @@ def test_truth_first_lets_each_box_choose():
 
 def test_the_first_recall_segment_can_be_dropped():
     plain, dropped = (
-        average_precision(three_frames(), 0.5, p) for p in (MANYEYES, replace(MANYEYES, drop_first_segment=True))
+        average_precision(three_frames(), 0.5, p) for p in (GLOBAL_SORT, replace(GLOBAL_SORT, drop_first_segment=True))
     )
     assert dropped.ap_global == pytest.approx(plain.ap_global - 0.25)
 
 
 def test_iou_equal_to_the_threshold_is_a_true_positive():
     frame = FrameResult("a", 0, cars((1, 0, 0.9)), cars((0, 0, 1)))
-    assert compute_frame_iou(frame, MANYEYES).iou.item() == 0.6
-    assert match_frame(frame, 0.6, MANYEYES).tp.tolist() == [True]
-    assert match_frame(frame, np.nextafter(0.6, 1), MANYEYES).tp.tolist() == [False]
+    assert compute_frame_iou(frame, GLOBAL_SORT).iou.item() == 0.6
+    assert match_frame(frame, 0.6, GLOBAL_SORT).tp.tolist() == [True]
+    assert match_frame(frame, np.nextafter(0.6, 1), GLOBAL_SORT).tp.tolist() == [False]
 
 
 def test_a_bus_is_dropped_by_the_six_metre_filter_alone():
     bus = cars((10, 0, 0.9), size=(11.0, 2.5, 1.5))
-    assert len(filter_detections(bus, MANYEYES)) == 1
+    assert len(filter_detections(bus, GLOBAL_SORT)) == 1
     assert len(filter_detections(bus, get_protocol("opencood"))) == 0
     frame = FrameResult("a", 0, bus, bus)
-    assert average_precision([frame], 0.5, MANYEYES).ap_global == 1.0
+    assert average_precision([frame], 0.5, GLOBAL_SORT).ap_global == 1.0
     assert average_precision([frame], 0.5, PROTOCOLS["opencood"]).ap_global == 0.0
     turned = replace(cars((10, 0, 0.9), size=(4.5, 1.9, 1.5)), yaw=torch.tensor([math.pi / 4]).double())
     assert len(filter_detections(turned, PROTOCOLS["opencood"])) == 1
@@ -201,19 +201,19 @@ def test_a_bus_is_dropped_by_the_six_metre_filter_alone():
 
 def test_range_by_centre_and_by_corners():
     edge = cars((139.5, 0, 0.9))  # its front is at 141.5
-    for name, kept in (("manyeyes", 1), ("opencood", 0), ("sparsealign", 1)):
+    for name, kept in (("global-sort", 1), ("opencood", 0), ("sparsealign", 1)):
         assert len(filter_detections(edge, PROTOCOLS[name])) == kept, name
         assert compute_frame_iou(FrameResult("a", 0, edge, edge), PROTOCOLS[name]).iou.shape == (kept, kept), name
-    assert len(filter_detections(cars((0, 40, 0.9)), MANYEYES)) == 1  # closed
-    assert len(filter_detections(cars((0, 40.001, 0.9)), MANYEYES)) == 0
-    near = MANYEYES.with_range((-70.4, -38.4, -3.0, 70.4, 38.4, 1.0))
+    assert len(filter_detections(cars((0, 40, 0.9)), GLOBAL_SORT)) == 1  # closed
+    assert len(filter_detections(cars((0, 40.001, 0.9)), GLOBAL_SORT)) == 0
+    near = GLOBAL_SORT.with_range((-70.4, -38.4, -3.0, 70.4, 38.4, 1.0))
     assert len(filter_detections(cars((71, 20, 0.9), (70, 0, 0.8)), near)) == 1
 
 
 def test_z_is_judged_from_the_lidar_and_only_by_the_legacy_protocols():
     tall = cars((0, 0, 0.9), size=(5.0, 2.5, 3.2), z=1.6)  # 3.2 m over the road, 1.3 m over a roof of 1.9 m
     truth = cars((0, 0, 1), size=(5.0, 2.5, 3.2), z=1.6)
-    assert compute_frame_iou(FrameResult("a", 0, tall, truth), MANYEYES).iou.shape == (1, 1)
+    assert compute_frame_iou(FrameResult("a", 0, tall, truth), GLOBAL_SORT).iou.shape == (1, 1)
     assert compute_frame_iou(FrameResult("a", 0, tall, truth), PROTOCOLS["opencood"]).iou.shape == (0, 0)
     low = cars((0, 0, 0.9), size=(5.0, 2.5, 2.8), z=1.4)
     assert len(filter_detections(low, PROTOCOLS["opencood"])) == 1
@@ -221,10 +221,10 @@ def test_z_is_judged_from_the_lidar_and_only_by_the_legacy_protocols():
 
 def test_score_threshold_and_nms_of_each_protocol():
     weak = cars((0, 0, 0.2), (20, 0, 0.21), (40, 0, 0.05), (60, 0, 0.06))
-    assert filter_detections(weak, MANYEYES).score.tolist() == [0.21, 0.2, 0.06]
+    assert filter_detections(weak, GLOBAL_SORT).score.tolist() == [0.21, 0.2, 0.06]
     assert filter_detections(weak, PROTOCOLS["opencood"]).score.tolist() == [0.21]
     shifted = cars((0, 0, 0.9), (3.5, 0, 0.8))  # IoU 1/15
-    assert len(filter_detections(shifted, MANYEYES)) == 2
+    assert len(filter_detections(shifted, GLOBAL_SORT)) == 2
     assert len(filter_detections(shifted, PROTOCOLS["sparsealign"])) == 1
 
 
@@ -234,15 +234,15 @@ def test_ties_keep_frame_and_row_order():
         FrameResult("a", 1, cars((50, 0, 0.5), (0, 0, 0.5)), cars((0, 0, 1))),
         FrameResult("a", 0, cars((0, 0, 0.5), (50, 0, 0.5)), cars((0, 0, 1))),
     ]
-    got = average_precision(frames, 0.5, MANYEYES)
+    got = average_precision(frames, 0.5, GLOBAL_SORT)
     assert got.ap_global == got.ap_legacy == pytest.approx(0.5 + 0.5 * 0.5)
 
 
 def test_unknown_protocol_lists_the_known():
-    with pytest.raises(ConfigError, match="manyeyes, opencood, coalign, sparsealign, dair"):
+    with pytest.raises(ConfigError, match="global-sort, opencood, coalign, sparsealign, dair"):
         get_protocol("opencod")
     with pytest.raises(FrozenInstanceError):
-        MANYEYES.score_threshold = 0.5  # pyright: ignore
+        GLOBAL_SORT.score_threshold = 0.5  # pyright: ignore
 
 
 # Truth of an ego.
@@ -282,15 +282,15 @@ def crossing(order=(0, 1, 2), move=None, prior_error=0.0):
 
 def test_truth_is_the_union_of_agents_in_range_without_the_ego_and_without_repeats():
     """Agent 12 is 80 m from agent 10: what it alone sees (3) does not count for 10."""
-    assert select_ego_truth(crossing(), 0, MANYEYES).id.tolist() == [11, 12, 1, 2]
-    assert select_ego_truth(crossing(), 1, MANYEYES).id.tolist() == [10, 12, 1, 2, 3]
-    far = replace(MANYEYES, com_range_m=100.0)
+    assert select_ego_truth(crossing(), 0, GLOBAL_SORT).id.tolist() == [11, 12, 1, 2]
+    assert select_ego_truth(crossing(), 1, GLOBAL_SORT).id.tolist() == [10, 12, 1, 2, 3]
+    far = replace(GLOBAL_SORT, com_range_m=100.0)
     assert select_ego_truth(crossing(), 0, far).id.tolist() == [11, 12, 1, 2, 3]
-    assert select_ego_truth(crossing(), 0, replace(MANYEYES, com_range_m=1.0)).id.tolist() == [11, 1]
+    assert select_ego_truth(crossing(), 0, replace(GLOBAL_SORT, com_range_m=1.0)).id.tolist() == [11, 1]
 
 
 def test_truth_is_in_the_egos_true_frame():
-    got = select_ego_truth(crossing(), 0, MANYEYES)
+    got = select_ego_truth(crossing(), 0, GLOBAL_SORT)
     assert got.center.dtype == torch.float64
     at = got.id.tolist().index(1)
     c, s = math.cos(0.3), math.sin(0.3)
@@ -300,13 +300,16 @@ def test_truth_is_in_the_egos_true_frame():
 
 @pytest.mark.parametrize("order", [(2, 1, 0), (1, 2, 0), (0, 2, 1)])
 def test_truth_does_not_depend_on_the_order_of_agents(order):
-    one, other = select_ego_truth(crossing(), 1, MANYEYES), select_ego_truth(crossing(order), order.index(1), MANYEYES)
+    one, other = (
+        select_ego_truth(crossing(), 1, GLOBAL_SORT),
+        select_ego_truth(crossing(order), order.index(1), GLOBAL_SORT),
+    )
     assert torch.equal(one.center, other.center) and torch.equal(one.id, other.id)
 
 
 def test_truth_does_not_depend_on_where_the_world_is():
-    one = select_ego_truth(crossing(), 1, MANYEYES)
-    other = select_ego_truth(crossing(move=Transform.from_xyz_yaw(3000, -500, 7, 2.2)), 1, MANYEYES)
+    one = select_ego_truth(crossing(), 1, GLOBAL_SORT)
+    other = select_ego_truth(crossing(move=Transform.from_xyz_yaw(3000, -500, 7, 2.2)), 1, GLOBAL_SORT)
     assert torch.equal(one.id, other.id)
     torch.testing.assert_close(one.center, other.center, atol=1e-9, rtol=0)
 
@@ -315,24 +318,24 @@ def test_agents_in_range_are_decided_by_true_poses():
     """Agent 12 is 80 m away and claims 50 m; agent 11 is 60 m away and claims 90 m."""
     for error in (-15.0, 30.0):
         one, other = (
-            select_ego_truth(crossing(), 0, MANYEYES),
-            select_ego_truth(crossing(prior_error=error), 0, MANYEYES),
+            select_ego_truth(crossing(), 0, GLOBAL_SORT),
+            select_ego_truth(crossing(prior_error=error), 0, GLOBAL_SORT),
         )
         assert torch.equal(one.id, other.id) and torch.equal(one.center, other.center)
 
 
 def test_truth_respects_range_and_points():
-    near = MANYEYES.with_range((-70.4, -38.4, -3.0, 25.0, 38.4, 1.0))
+    near = GLOBAL_SORT.with_range((-70.4, -38.4, -3.0, 25.0, 38.4, 1.0))
     assert select_ego_truth(crossing(), 0, near).id.tolist() == [1]
     # one point of box 1 and four of box 2 by each of the two agents in range; box 2's second row is its repeat
-    assert select_ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=2)).id.tolist() == [1, 2]
-    assert select_ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=3)).id.tolist() == [2]
-    assert select_ego_truth(crossing(), 0, replace(MANYEYES, min_points_in_gt=9)).id.tolist() == []
+    assert select_ego_truth(crossing(), 0, replace(GLOBAL_SORT, min_points_in_gt=2)).id.tolist() == [1, 2]
+    assert select_ego_truth(crossing(), 0, replace(GLOBAL_SORT, min_points_in_gt=3)).id.tolist() == [2]
+    assert select_ego_truth(crossing(), 0, replace(GLOBAL_SORT, min_points_in_gt=9)).id.tolist() == []
 
 
 def test_a_snapshot_without_truth_is_refused():
     with pytest.raises(RecordingError, match="crossing #0 has no truth"):
-        select_ego_truth(replace(crossing(), truth=None), 0, MANYEYES)
+        select_ego_truth(replace(crossing(), truth=None), 0, GLOBAL_SORT)
 
 
 def test_ranges_on_dair_differ_where_their_sources_do() -> None:

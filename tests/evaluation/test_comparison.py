@@ -13,7 +13,7 @@ from manyeyes.evaluation.detection.accumulator import MethodResult, MetricAccumu
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS
 from manyeyes.evaluation.statistics.comparison import Margin, compare_methods
 
-PROTOCOL = PROTOCOLS["manyeyes"]
+PROTOCOL = PROTOCOLS["global-sort"]
 SPOTS = ((10.0, 3.0), (20.0, -3.0), (30.0, 3.0), (40.0, -3.0))
 
 
@@ -61,21 +61,21 @@ def test_ap_bytes_age_and_times_are_those_of_the_steps() -> None:
 
 
 def test_an_agent_that_sends_nothing_has_no_message_age_or_share_time() -> None:
-    result = accumulate("alone", [1], sent_bytes=0)
+    result = accumulate("none", [1], sent_bytes=0)
     assert result.communication.num_messages == 0 and result.communication.num_ego_frames == 2
     assert math.isnan(result.age_ms) and math.isnan(result.share_ms) and result.perceive_ms == pytest.approx(50)
 
 
 @pytest.mark.parametrize(
     ("fused", "margin", "verdict"),
-    [([3] * 5, 0.25, "reached"), ([3] * 5, 0.26, "missed"), ([1, 1, 4, 1, 4], 0.25, "not resolved")],
+    [([3] * 5, 0.25, "met"), ([3] * 5, 0.26, "not met"), ([1, 1, 4, 1, 4], 0.25, "inconclusive")],
 )
 def test_a_margin_is_compared_with_the_paired_difference(fused, margin, verdict) -> None:
-    results = [accumulate("alone", [2] * 5), accumulate("intermediate", fused)]
-    half, seven = compare_methods(results, PROTOCOL, margins=(Margin("intermediate", "alone", margin),))
+    results = [accumulate("none", [2] * 5), accumulate("intermediate", fused)]
+    half, seven = compare_methods(results, PROTOCOL, margins=(Margin("intermediate", "none", margin),))
     assert (half.method, half.baseline, half.iou, half.margin, half.verdict) == (
         "intermediate",
-        "alone",
+        "none",
         0.5,
         margin,
         verdict,
@@ -85,10 +85,10 @@ def test_a_margin_is_compared_with_the_paired_difference(fused, margin, verdict)
 
 
 def test_one_scenario_resolves_nothing() -> None:
-    results = [accumulate("alone", [0]), accumulate("intermediate", [4])]
-    assert compare_methods(results, PROTOCOL)[0].verdict == "not resolved"
+    results = [accumulate("none", [0]), accumulate("intermediate", [4])]
+    assert compare_methods(results, PROTOCOL)[0].verdict == "inconclusive"
 
 
 def test_without_the_method_there_is_nothing_to_compare() -> None:
-    assert compare_methods([accumulate("alone", [1]), accumulate("late", [2])], PROTOCOL) == ()
+    assert compare_methods([accumulate("none", [1]), accumulate("late", [2])], PROTOCOL) == ()
     assert compare_methods([accumulate("intermediate", [1])], PROTOCOL) == ()

@@ -128,19 +128,19 @@ def test_correctors_are_evaluated_on_the_same_pairs_and_priors():
         x, y, yaw = made.ego_from_other.tolist()
         points = [Keypoints(boxes, torch.zeros(len(boxes), 1)) for boxes in (made.ego[0], made.other[0])]
         pairs.append((*points, Transform.from_xyz_yaw(x, y, 0.0, yaw)))
-    finders = {"vote": correct_pose, "claim": lambda ego, other, prior: no_estimate(prior)}
+    finders = {"voting": correct_pose, "claim": lambda ego, other, prior: no_estimate(prior)}
     found = evaluate_correctors(pairs, finders, PriorNoise("gaussian", 1.0, 1.0))
     assert all(len(frames) == 4 for frames in found.values())
-    assert [f.num_common for f in found["vote"]] == [f.num_common for f in found["claim"]] and found["vote"][
+    assert [f.num_common for f in found["voting"]] == [f.num_common for f in found["claim"]] and found["voting"][
         0
     ].num_common >= 6
     assert (
-        summarize_evaluations(found["vote"]).success_rate[0] == 1.0
+        summarize_evaluations(found["voting"]).success_rate[0] == 1.0
         and summarize_evaluations(found["claim"]).success_rate[0] == 0.0
     )
     assert 0.2 < found["claim"][0].translation_error_m < 5
     nothing = evaluate_correctors([(pairs[0][0][:0], pairs[0][1], pairs[0][2])], finders, PriorNoise("none"))
-    assert nothing["vote"][0].num_common == 0 and math.isinf(nothing["claim"][0].translation_error_m)
+    assert nothing["voting"][0].num_common == 0 and math.isinf(nothing["claim"][0].translation_error_m)
 
 
 def test_views_are_described_in_pairs():

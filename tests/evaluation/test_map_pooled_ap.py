@@ -115,10 +115,10 @@ def test_a_mean_is_over_what_has_truth() -> None:
 @pytest.mark.parametrize(
     ("low", "high", "blocks", "verdict"),
     [
-        (0.21, 0.3, 9, "reached"),
-        (0.1, 0.19, 9, "missed"),
-        (0.1, 0.3, 9, "not resolved"),
-        (0.25, 0.25, 1, "not resolved"),
+        (0.21, 0.3, 9, "met"),
+        (0.1, 0.19, 9, "not met"),
+        (0.1, 0.3, 9, "inconclusive"),
+        (0.25, 0.25, 1, "inconclusive"),
     ],
 )
 def test_a_margin_is_met_by_the_whole_interval(low, high, blocks, verdict) -> None:

@@ -173,7 +173,7 @@ class CountingPredictor:
 
     def __call__(self, map_model, source, scenario, seed):
         self.num_calls += 1
-        truth = source.truth(scenario, Transform.from_xyz_yaw(100, 50, 0, seed), CONFIG.tile)
+        truth = source.crop_truth(scenario, Transform.from_xyz_yaw(100, 50, 0, seed), CONFIG.tile)
         return [
             TilePrediction("one", truth, truth, (100 + seed,)),
             TilePrediction("none", MapElements.empty(), truth, ()),

@@ -34,12 +34,16 @@ def table():
 
 def test_a_row_holds_ap_by_kind_mean_and_bytes(table):
     half, whole = table.make_row("half"), table.make_row("all")
-    assert table.names == ("half", "all") and (half.tiles, half.looks, half.bytes_per_tile) == (8, 1.0, 100.0)
-    assert (whole.looks, whole.bytes_per_frame, whole.bytes_per_tile) == (2.0, 107.5, 215.0)
+    assert table.names == ("half", "all") and (half.num_tiles, half.frames_per_tile, half.bytes_per_tile) == (
+        8,
+        1.0,
+        100.0,
+    )
+    assert (whole.frames_per_tile, whole.bytes_per_frame, whole.bytes_per_tile) == (2.0, 107.5, 215.0)
     for way in range(2):
         assert [i.value for i in half.ap[way]] == pytest.approx([0.5, 0.5, 0.0])
-        assert half.mean[way].value == pytest.approx(0.5) and whole.mean[way].low == 1.0
-    assert half.mean_ap_by_seed == pytest.approx((0.5, 0.5)) and half.mean[0].scenarios == 4
+        assert half.mean_ap[way].value == pytest.approx(0.5) and whole.mean_ap[way].low == 1.0
+    assert half.mean_ap_by_seed == pytest.approx((0.5, 0.5)) and half.mean_ap[0].num_scenarios == 4
     assert half.ap[0][1].low == half.ap[0][1].high == 0.5, "every scenario has half of the dividers"
     assert half.ap[0][0].low == 0.0 and half.ap[0][0].high == 1.0, "crossings differ among scenarios"
 
@@ -48,10 +52,9 @@ def test_a_margin_test_is_a_paired_difference(table):
     margin_test = table.check_margin("all - half", "all", "half", 0.2)
     assert margin_test.difference.value == pytest.approx(0.5) and margin_test.difference.low == pytest.approx(0.25)
     assert (
-        margin_test.verdict == "reached"
-        and table.check_margin("all - half", "all", "half", 0.5).verdict == "not resolved"
+        margin_test.verdict == "met" and table.check_margin("all - half", "all", "half", 0.5).verdict == "inconclusive"
     )
-    assert table.check_margin("half - all", "half", "all", 0.2, "exact").verdict == "missed"
+    assert table.check_margin("half - all", "half", "all", 0.2, "exact").verdict == "not met"
 
 
 def test_what_has_no_truth_is_no_part_of_the_mean():
@@ -59,6 +62,6 @@ def test_what_has_no_truth_is_no_part_of_the_mean():
     table = TileTable([TileStudyResult("a", 0, (TilePrediction("row", lines, lines, ()),))])
     row = table.make_row("row")
     assert row.mean_ap[0].value == 1.0 and np.isnan(row.ap[0][0].value) and row.bytes_per_frame == 0.0
-    assert table.check_margin("row - row", "row", "row", 0.0).verdict == "not resolved", (
+    assert table.check_margin("row - row", "row", "row", 0.0).verdict == "inconclusive", (
         "one scenario says nothing of others"
     )

@@ -42,13 +42,13 @@ def make_pair(common: int, index: int) -> LandmarkPair:
 
 def test_evaluations_follow_priors_and_objects() -> None:
     pairs = [make_pair(9, 0), make_pair(0, 1)]
-    found = run_corrector(pairs, CorrectorTrial("vote", PriorNoise("offset", 0.5, 0.5)))
+    found = run_corrector(pairs, CorrectorTrial("voting", PriorNoise("offset", 0.5, 0.5)))
     assert [f.status for f in found.evaluations] == [PoseStatus.CONFLICT, PoseStatus.NO_MATCH]
     assert found.expected_status == (PoseStatus.CONFLICT, PoseStatus.NO_MATCH) and found.message_bytes == (150, 151)
     assert found.evaluations[0].translation_error_m < 0.1 and found.evaluations[1].translation_error_m == pytest.approx(
         2.5
     )
-    whole, none, many = summarize_run(CorrectorTrial("vote", PriorNoise("offset", 0.5, 0.5)), found)
+    whole, none, many = summarize_run(CorrectorTrial("voting", PriorNoise("offset", 0.5, 0.5)), found)
     assert (whole.common_range, none.common_range, many.common_range) == (None, (0, 0), (8, 10**9))
     assert whole.score.conflict_rate == 0.5 and many.score.conflict_rate == 1.0 and whole.bytes_per_message == 150.5
     assert whole.confusion[2][2] == 1 and whole.confusion[4][4] == 1 and sum(map(sum, whole.confusion)) == 2

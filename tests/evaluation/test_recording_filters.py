@@ -58,9 +58,9 @@ def test_the_nearest_are_left_in_their_order(count, left) -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4])
 def test_the_truth_does_not_shrink_with_the_number_of_agents(count) -> None:
-    whole = select_ego_truth(Street().snapshot("many", 9), 0, PROTOCOLS["manyeyes"])
+    whole = select_ego_truth(Street().snapshot("many", 9), 0, PROTOCOLS["global-sort"])
     less = NearestAgents(Street(), count).snapshot("many", 9)
-    got = select_ego_truth(less, 0, PROTOCOLS["manyeyes"])
+    got = select_ego_truth(less, 0, PROTOCOLS["global-sort"])
     assert got.id.tolist() == whole.id.tolist() == [107, 103, 109, 104] and torch.equal(got.center, whole.center)
     for frame, pose in zip(less.frames, less.truth.world_from_agent.translation):
         assert pose[:2].tolist() == list(PLACES[frame.agent_id])

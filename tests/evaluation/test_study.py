@@ -34,7 +34,7 @@ def weights(tmp_path_factory) -> Path:
 
 
 def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_path) -> None:
-    base = BenchmarkConfig(str(weights / "0.safetensors"), ("alone", "late"))
+    base = BenchmarkConfig(str(weights / "0.safetensors"), ("none", "late"))
     late = replace(channel_preset("ideal"), base_latency_s=0.1)
     others = [
         replace(base, weights=str(weights / "1.safetensors")),
@@ -44,13 +44,13 @@ def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_p
         replace(base, pose_noise=PoseNoise(sigma_xy_m=0.2)),
         replace(base, pose_noise=PoseNoise(sigma_xy_m=0.2, seed=1)),
         *(replace(base, replay=ReplayConfig(**changed)) for changed in (
-            {"channel": late}, {"channel": late.with_loss(0.1)}, {"precision": "int8"}, {"budget_bytes": 99},
-            {"channel_bytes": 999},
-            {"seed": 1}, {"all_egos": True}, {"history": 3}, {"wait_s": 0.1},
+            {"channel": late}, {"channel": late.with_loss(0.1)}, {"token_encoding": "int8"}, {"budget_bytes": 99},
+            {"channel_budget_bytes": 999},
+            {"seed": 1}, {"all_egos": True}, {"warmup_frames": 3}, {"latency_budget_s": 0.1},
         )),
     ]  # fmt: skip
     paths = [result_path(tmp_path, config, "late", "data") for config in (base, *others)]
-    paths += [result_path(tmp_path, base, "alone", "data"), result_path(tmp_path, base, "late", "other data")]
+    paths += [result_path(tmp_path, base, "none", "data"), result_path(tmp_path, base, "late", "other data")]
     assert len(set(paths)) == len(paths) == 18
     # Neither the company of other methods nor where the same weights lie makes a difference.
     (tmp_path / "copy.safetensors").write_bytes((weights / "0.safetensors").read_bytes())
@@ -97,7 +97,7 @@ def make_result(method: str, hits: tuple[int, ...]) -> StudyResult:
 
 
 def test_differences_are_paired_and_may_be_over_some_scenarios_alone() -> None:
-    protocol = PROTOCOLS["manyeyes"]
+    protocol = PROTOCOLS["global-sort"]
     results = {("x", "a"): make_result("a", (4, 3, 2, 4)), ("x", "b"): make_result("b", (2, 2, 1, 2))}
     grid = ResultGrid(results, protocol)
     a, b = (results[key].matches[0] for key in results)
@@ -115,13 +115,13 @@ def test_a_margin_is_met_where_the_whole_interval_is() -> None:
         ("x", "b"): make_result("b", (2, 2, 2)),
         ("x", "c"): make_result("c", (4, 4, 2)),
     }
-    grid = ResultGrid(results, PROTOCOLS["manyeyes"])
+    grid = ResultGrid(results, PROTOCOLS["global-sort"])
     verdicts = [
         check_margin("", grid, ("x", "a"), ("x", other), 0, margin).verdict
         for other, margin in (("b", 0.4), ("b", 0.6), ("c", 0.1))
     ]
-    assert verdicts == ["reached", "missed", "not resolved"]
+    assert verdicts == ["met", "not met", "inconclusive"]
     single_scenario = ResultGrid(
-        {("x", m): make_result(m, (h,)) for m, h in (("a", 4), ("b", 1))}, PROTOCOLS["manyeyes"]
+        {("x", m): make_result(m, (h,)) for m, h in (("a", 4), ("b", 1))}, PROTOCOLS["global-sort"]
     )
-    assert check_margin("", single_scenario, ("x", "a"), ("x", "b"), 0, 0.0).verdict == "not resolved"
+    assert check_margin("", single_scenario, ("x", "a"), ("x", "b"), 0, 0.0).verdict == "inconclusive"

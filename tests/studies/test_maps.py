@@ -141,18 +141,22 @@ def make_predictor(parts):
 
 
 def get_verdicts(result):
-    return {margin_test["what"]: margin_test["verdict"] for margin_test in result["claims"]}
+    return {margin_test["description"]: margin_test["verdict"] for margin_test in result["margin_tests"]}
 
 
 def test_more_frames_against_one(weights, tmp_path, monkeypatch):
     monkeypatch.setattr(semi_global, "SemiGlobalPredictor", lambda: make_predictor({"1": 1, "2": 2, "5": 5, "10": 6}))
     result, text = study("semi-global", weights, tmp_path)
-    rows = {row["row"]: row for row in result["rows"]["LiDAR"]}
+    rows = {row["name"]: row for row in result["rows"]["LiDAR"]}
     # One of four dividers and no crossing: (0 + .25) / 2; with five elements all of both.
-    assert [rows[name]["mean"][0]["value"] for name in ("1", "2", "5", "10")] == pytest.approx([0.125, 0.25, 1.0, 1.0])
+    assert [rows[name]["mean_ap"][0]["value"] for name in ("1", "2", "5", "10")] == pytest.approx(
+        [0.125, 0.25, 1.0, 1.0]
+    )
     assert rows["1"]["ap"][0][2]["value"] == 0.0 and rows["10"]["ap"][0][2]["value"] == 1.0, "the boundary"
-    assert rows["2"]["bytes_per_tile"] == 2000 and rows["2"]["tiles"] == 6 and len(rows["2"]["by_seed"]) == 2
-    assert get_verdicts(result)["LiDAR: 10 looks - one vehicle"] == "reached" and " +0.300 |" in text
+    assert (
+        rows["2"]["bytes_per_tile"] == 2000 and rows["2"]["num_tiles"] == 6 and len(rows["2"]["mean_ap_by_seed"]) == 2
+    )
+    assert get_verdicts(result)["LiDAR: 10 looks - one vehicle"] == "met" and " +0.300 |" in text
     assert text.count("not run") == 2, "cameras, and both"
 
 
@@ -165,13 +169,16 @@ def table(parts):
 
 def test_margins_that_are_not_met_are_missed():
     held = semi_global.check_margins("LiDAR", table({"1": 3, "10": 4}), (1, 10))
-    assert [(c.margin, c.verdict) for c in held] == [(0.2, "missed"), (0.3, "missed"), (0.0, "reached")]
+    assert [(c.margin, c.verdict) for c in held] == [(0.2, "not met"), (0.3, "not met"), (0.0, "met")]
 
 
 def test_local_maps_have_a_row_for_each_kind_of_agent(weights, tmp_path, monkeypatch):
     monkeypatch.setattr(local, "LocalPredictor", lambda: make_predictor({VEHICLE: 6, ROADSIDE: 2}))
     result, text = study("local", weights, tmp_path)
-    assert [(r["row"], r["mean"][0]["value"]) for r in result["rows"]["LiDAR"]] == [(VEHICLE, 1.0), (ROADSIDE, 0.25)]
+    assert [(r["name"], r["mean_ap"][0]["value"]) for r in result["rows"]["LiDAR"]] == [
+        (VEHICLE, 1.0),
+        (ROADSIDE, 0.25),
+    ]
     assert "CrowdMap's Table 1" in text
 
 
@@ -180,11 +187,11 @@ def test_the_corrector_is_held_against_half_of_the_loss(weights, tmp_path, monke
     monkeypatch.setattr(pose, "PoseNoisePredictor", lambda aligner: make_predictor(rows))
     result, text = study("pose", weights, tmp_path)
     half = "LiDAR: corrected - (clean + noisy) / 2"
-    assert get_verdicts(result)[half] == get_verdicts(result)["LiDAR: corrected without errors - clean"] == "reached"
+    assert get_verdicts(result)[half] == get_verdicts(result)["LiDAR: corrected without errors - clean"] == "met"
     assert "off by 0.5 m and 1 degrees" in text
     # Clean 1, noisy .25: half of it won back is .625; four lines have all dividers and no crossing, .5.
     less = {c.description: c for c in pose.check_margins("LiDAR", table(rows | {CORRECTED: 4}))}[half]
-    assert less.verdict == "missed" and less.difference.value == pytest.approx(-0.125)
+    assert less.verdict == "not met" and less.difference.value == pytest.approx(-0.125)
 
 
 def test_full_maps_by_map_mode_and_method_against_one_truth(weights, tmp_path, monkeypatch):
@@ -197,21 +204,26 @@ def test_full_maps_by_map_mode_and_method_against_one_truth(weights, tmp_path, m
         "MapBuildConfig",
         lambda mapper, survey, every: made.append(survey) or MapBuildConfig(None, survey, every),
     )
-    result, text = study("whole", weights, tmp_path, "--methods", "manyeyes", "union", "chamfer_nms", seeds=1)
-    rows = {(row["survey"], row["method"]): row for row in result["rows"]}
+    result, text = study("full-map", weights, tmp_path, "--methods", "manyeyes", "union", "chamfer-nms", seeds=1)
+    rows = {(row["map_mode"], row["method"]): row for row in result["rows"]}
     assert list(rows)[:2] == [("semi-global", "manyeyes"), ("semi-global", "union")] and len(rows) == 6
     ours, late = rows["semi-global", "manyeyes"], rows["local", "union"]
-    assert ours["seen"] == late["seen"] == 12 and ours["bytes_per_message"] > late["bytes_per_message"] > 80
-    assert ours["mean"]["value"] == pytest.approx(ours["in_own_view"]["value"])
-    assert late["mean"]["value"] < late["in_own_view"]["value"], "a local map is held against what tiles see, too"
-    assert ours["mean"]["value"] > late["mean"]["value"] + 0.1 and ours["mean"]["scenarios"] > 5
+    assert (
+        ours["observations_per_map"] == late["observations_per_map"] == 12
+        and ours["bytes_per_message"] > late["bytes_per_message"] > 80
+    )
+    assert ours["mean_ap"]["value"] == pytest.approx(ours["own_view_mean_ap"]["value"])
+    assert late["mean_ap"]["value"] < late["own_view_mean_ap"]["value"], (
+        "a local map is held against what tiles see, too"
+    )
+    assert ours["mean_ap"]["value"] > late["mean_ap"]["value"] + 0.1 and ours["mean_ap"]["num_scenarios"] > 5
     verdicts_by_name = get_verdicts(result)
-    assert {"the whole - local + union", "the whole - local + chamfer_nms", "the whole - local + manyeyes"} <= set(
+    assert {"the whole - local + union", "the whole - local + chamfer-nms", "the whole - local + manyeyes"} <= set(
         verdicts_by_name
     )
     assert sum("the best of them, goal" in what for what in verdicts_by_name) == 1 and "The map of cross" in text
     assert made == ["semi-global", "local"]
-    study("whole", weights, tmp_path, "--methods", "manyeyes", "union", seeds=1)
+    study("full-map", weights, tmp_path, "--methods", "manyeyes", "union", seeds=1)
     assert len(made) == 2, "what was seen is kept"
 
 
@@ -222,10 +234,10 @@ def test_what_is_missing_or_twice_is_one_line(weights, tmp_path, capsys, monkeyp
 
     assert "--data" in refused("local")
     monkeypatch.setattr(pretrained, "list_map_models", lambda: ())
-    assert "--preset map-small" in refused("local", "--data", tmp_path)
+    assert "--preset map-small-lidar" in refused("local", "--data", tmp_path)
     again = save(tmp_path / "again.safetensors")
     assert "One model a set of sensors" in refused("local", "--data", tmp_path, "--weights", weights, again)
     both = save(tmp_path / "both.safetensors", ("lidar", "camera"))
-    assert "takes one model" in refused("whole", "--data", tmp_path, "--weights", weights, both)
+    assert "takes one model" in refused("full-map", "--data", tmp_path, "--weights", weights, both)
     trained = save(tmp_path / "taught.safetensors", towns=("Cross",))
     assert "Split by place" in refused("pose", "--data", tmp_path, "--weights", trained)

@@ -81,15 +81,15 @@ def evaluate(data, out, study, *words):
 
 
 def test_every_corrector_with_every_fusion_under_the_requested_levels(data, tmp_path) -> None:
-    words = ("--methods", "alone", "intermediate", "--every", 2, "--disturbances", "2°, 2 m", "0.8 m")
+    words = ("--methods", "none", "intermediate", "--frame-stride", 2, "--perturbations", "2°, 2 m", "0.8 m")
     held = evaluate(data, tmp_path, "pose", *words)
     assert [(r["corrector"], r["method"]) for r in held["rows"][::3]] == [
-        ("given", "intermediate"),
-        ("vote", "intermediate"),
+        ("identity", "intermediate"),
+        ("voting", "intermediate"),
     ]
-    assert held["frames"] == {"0 to 3": 0, "4 to 7": 0, "8 and more": 2}
-    assert all(len(r["by_common"]) == 3 and r["over_alone"] for r in held["rows"])
-    descriptions = [c["what"] for c in held["claims"]]
+    assert held["num_frames"] == {"0 to 3": 0, "4 to 7": 0, "8 and more": 2}
+    assert all(len(r["ap_by_common_objects"]) == 3 and r["gain_over_no_fusion"] for r in held["rows"])
+    descriptions = [c["description"] for c in held["margin_tests"]]
     assert descriptions[:3] == [
         "vote, perfect: corrected - true claims",
         "vote, 0.8 m: corrected - true claims",
@@ -98,7 +98,7 @@ def test_every_corrector_with_every_fusion_under_the_requested_levels(data, tmp_
     assert descriptions[3].startswith("vote, worst level (") and descriptions[3].endswith(
         "8 and more in common: corrected - alone"
     )
-    assert [c["bar"] for c in held["claims"]] == [-0.002, -0.044, -0.01, 0.0]
+    assert [c["margin"] for c in held["margin_tests"]] == [-0.002, -0.044, -0.01, 0.0]
     assert {name: len(at5) for name, at5, _ in held["paper"]["rows"]}["FeaKM, 4 pairs"] == 11
 
 
@@ -113,12 +113,12 @@ def test_baseline_fusions_are_rows_with_uncorrected_priors(data, tmp_path) -> No
         torch.manual_seed(0)
         baseline = Detector(replace(COSTR_TINY, fusion="v2x-vit"))
         checkpoint.save(baseline, data / "rival.safetensors", {})
-    words = ("--methods", "intermediate", "--every", 2, "--correctors", "given", "--disturbances", "2°, 2 m")
-    held = evaluate(data, tmp_path, "pose", *words, "--branches", f"V2X-ViT={data / 'rival.safetensors'}")
-    assert [(r["corrector"], r["method"]) for r in held["rows"]] == 2 * [("given", "intermediate")] + 2 * [
-        ("given", "V2X-ViT")
+    words = ("--methods", "intermediate", "--frame-stride", 2, "--correctors", "identity", "--perturbations", "2°, 2 m")
+    held = evaluate(data, tmp_path, "pose", *words, "--checkpoints", f"V2X-ViT={data / 'rival.safetensors'}")
+    assert [(r["corrector"], r["method"]) for r in held["rows"]] == 2 * [("identity", "intermediate")] + 2 * [
+        ("identity", "V2X-ViT")
     ]
-    assert held["rows"][2]["lost"][0]["value"] == 0.0
+    assert held["rows"][2]["ap_drop"][0]["value"] == 0.0
     assert "| given" in (tmp_path / "pose.md").read_text() and "V2X-ViT" in (tmp_path / "pose.md").read_text()
 
 
@@ -138,20 +138,20 @@ def write_net(data, name: str, detector: str = "", max_keypoints: int = 64) -> s
 def test_the_ablation_of_feakm_has_a_row_per_variant_and_level_and_stores_it(data, tmp_path, monkeypatch) -> None:
     one, two = write_net(data, "one.safetensors"), write_net(data, "two.safetensors", max_keypoints=3)
     detector = data / "untrained.safetensors"
-    words = ("--every", 2, "--branches", f"map={detector},{one}", f"three points={detector},{two}@8")
+    words = ("--frame-stride", 2, "--checkpoints", f"map={detector},{one}", f"three points={detector},{two}@8")
     held = evaluate(data, tmp_path, "feakm", *words)
-    assert [(r["branch"], r["sigma"]) for r in held["rows"]] == [
+    assert [(r["variant"], r["sigma"]) for r in held["rows"]] == [
         (name, sigma) for name in ("map", "three points") for sigma in (0.0, 0.4, 0.8, 1.2)
     ]
-    assert all(len(r["ap"]) == 2 and r["frames"] == r["asked"] == 2 for r in held["rows"])
-    assert held["rows"][4]["answered"] == 0.0 and held["paper"]["rows"][3][1] == 0.768
+    assert all(len(r["ap"]) == 2 and r["num_frames"] == r["num_collaborators"] == 2 for r in held["rows"])
+    assert held["rows"][4]["found_fraction"] == 0.0 and held["paper"]["rows"][3][1] == 0.768
     monkeypatch.setattr(feakm, "run_ablation", None)
     assert evaluate(data, tmp_path, "feakm", *words)["rows"] == held["rows"]
 
 
 def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path) -> None:
     net = write_net(data, "few.safetensors", max_keypoints=5)
-    options = ("--every", 2, "--disturbances", "perfect", "--correctors", "given", net, f"{net}@8")
+    options = ("--frame-stride", 2, "--perturbations", "perfect", "--correctors", "identity", net, f"{net}@8")
     words = ("--methods", "intermediate", *options)
     held = evaluate(data, tmp_path, "pose", *words)
     plain, four, eight = (r["bytes_per_message"] for r in held["rows"])
@@ -160,7 +160,7 @@ def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path)
     with torch.random.fork_rng():
         wrong = write_net(data, "wrong.safetensors", detector="ab" * 8)
     common = ("--data", data / "data", "--split", "test", "--weights", data / "untrained.safetensors", "--workers", 1)
-    assert cli.main([str(w) for w in ("evaluate", *common, "--out", tmp_path, "--align", wrong)]) == 1
+    assert cli.main([str(w) for w in ("evaluate", *common, "--out", tmp_path, "--pose-correction", wrong)]) == 1
 
 
 def test_poses_are_evaluated_by_error_and_common_objects_and_stored(data, tmp_path, monkeypatch) -> None:
@@ -173,25 +173,27 @@ def test_poses_are_evaluated_by_error_and_common_objects_and_stored(data, tmp_pa
         return SimpleNamespace(boxes=cars().transform(POSES[frame.agent_id].inverse()).to(torch.float32))
 
     monkeypatch.setattr(PerceptionCache, "process", process)
-    held = evaluate(data, tmp_path, "pose-accuracy", "--correctors", "given", "vote", "coalign")
+    held = evaluate(data, tmp_path, "pose-estimation", "--correctors", "identity", "voting", "coalign")
     rows = {(r["trial"]["corrector"], r["trial"]["noise"]["kind"], r["trial"]["noise"]["sigma_m"]): r
-            for r in held["rows"] if r["common"] is None}  # fmt: skip
+            for r in held["rows"] if r["common_range"] is None}  # fmt: skip
     assert len(rows) == 3 * 2 + 2 * 2 and calls
-    assert rows["vote", "gaussian", 0.8]["score"]["success"] == [1.0, 1.0, 1.0]
+    assert rows["voting", "gaussian", 0.8]["score"]["success_rate"] == [1.0, 1.0, 1.0]
     assert (
-        rows["vote", "gaussian", 0.8]["score"]["displacement"] < rows["given", "gaussian", 0.8]["score"]["displacement"]
+        rows["voting", "gaussian", 0.8]["score"]["mean_displacement_m"]
+        < rows["identity", "gaussian", 0.8]["score"]["mean_displacement_m"]
     )
     assert (
-        rows["vote", "none", 0.0]["score"]["coverage"] == 1.0 and rows["given", "none", 0.0]["score"]["coverage"] == 0.0
+        rows["voting", "none", 0.0]["score"]["coverage"] == 1.0
+        and rows["identity", "none", 0.0]["score"]["coverage"] == 0.0
     )
     # Off by 2.5 m where 0.5 m is stated, eight objects in common: each is contradicted, none of the honest is.
-    assert rows["vote", "offset", 0.5]["score"]["conflicts"] == 1.0
-    assert rows["vote", "gaussian", 0.8]["score"]["conflicts"] == 0.0
-    conflict = list(map(list, rows["vote", "offset", 0.5]["confusion"]))[2]
+    assert rows["voting", "offset", 0.5]["score"]["conflicts"] == 1.0
+    assert rows["voting", "gaussian", 0.8]["score"]["conflicts"] == 0.0
+    conflict = list(map(list, rows["voting", "offset", 0.5]["confusion"]))[2]
     assert conflict == [0, 0, 4, 0, 0]
-    assert {r["common"][0] for r in held["rows"] if r["common"]} == {8}
-    assert all(100 < r["bytes"] < 400 and len(r["risk"]) == 20 for r in held["rows"])
+    assert {r["common_range"][0] for r in held["rows"] if r["common_range"]} == {8}
+    assert all(100 < r["bytes_per_message"] < 400 and len(r["risk"]) == 20 for r in held["rows"])
     calls.clear()
-    again = evaluate(data, tmp_path, "pose-accuracy", "--correctors", "given", "vote", "coalign")
+    again = evaluate(data, tmp_path, "pose-estimation", "--correctors", "identity", "voting", "coalign")
     assert not calls and again["rows"] == held["rows"]
-    assert not math.isnan(rows["vote", "gaussian", 0.8]["score"]["displacement"])
+    assert not math.isnan(rows["voting", "gaussian", 0.8]["score"]["mean_displacement_m"])

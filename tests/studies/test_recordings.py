@@ -88,11 +88,11 @@ def test_an_ego_waits_for_the_later_sweep_of_a_pair(data: Path, tmp_path: Path) 
 
 
 def test_evaluate_scores_pairs_with_infrastructure_messages(data: Path, weights: Path, tmp_path: Path) -> None:
-    words = ("--methods", "alone", "late", "early", "--protocol", "dair", "--workers", 1, "--timed-frames", 0)
+    words = ("--methods", "none", "late", "early", "--protocol", "dair", "--workers", 1, "--timing-frames", 0)
     assert run("evaluate", "--data", data, "--split", "test", "--weights", weights, *words, "--out", tmp_path) == 0
     held = json.loads((tmp_path / "results.json").read_text())["result"]
-    assert [n["precision"][0]["n_gt"] for n in held["numbers"]] == [4, 4, 4]
-    early = held["numbers"][2]
+    assert [n["ap_summaries"][0]["n_gt"] for n in held["stats"]] == [4, 4, 4]
+    early = held["stats"][2]
     assert early["communication"]["bytes_per_message"] > 0
     assert early["age_ms"] == pytest.approx(30, abs=5), (
         "heard within the wait of 50 ms, 20 ms after the vehicle's sweep"

@@ -103,7 +103,9 @@ def small_set(monkeypatch) -> tuple:
 
 
 def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_path, small_set, panels) -> None:
-    held = evaluate(data, weights, tmp_path, "robustness", "--methods", "alone", "late", "intermediate", "--every", 2)
+    held = evaluate(
+        data, weights, tmp_path, "robustness", "--methods", "none", "late", "intermediate", "--frame-stride", 2
+    )
     rows, origin = held["result"]["rows"], held["provenance"]
     assert {"command", "seed", "versions", "git_commit", "config"} <= set(origin)
     assert len(rows) == 1 + 2 * len(small_set)
@@ -111,27 +113,27 @@ def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_pat
     assert [r["oracle"] for r in late] == ["", "true poses", "", "", "", "no delay"]
     # A message that is d old when it comes is d old when it is used; frame 4 alone is judged.
     assert [late[k]["age_ms"] for k in (0, 1, 2, 3)] == pytest.approx([0, 100, 400, 0])
-    assert [len(r["by_speed"]) for r in late] == [3, 3, 3, 0, 0, 0]
+    assert [len(r["ap_by_speed"]) for r in late] == [3, 3, 3, 0, 0, 0]
     # One car stands, one drives at 10 m/s, none is slower: that class has no AP.
-    assert [speed["value"] is None for speed in late[0]["by_speed"]] == [False, True, False]
-    assert late[0]["lost"][0]["value"] == 0 and late[0]["bytes_per_message"] > 0
-    assert [r["paper"] for r in rows if r["method"] == "intermediate"][:3] == [0.946, 0.937, 0.909]
-    margin_tests = held["result"]["claims"]
-    assert sum("intermediate - late" in c["what"] for c in margin_tests) == 2 * len(small_set)
-    assert [c["bar"] for c in margin_tests[-3:]] == [-0.037, -0.044, -0.03]
+    assert [speed["value"] is None for speed in late[0]["ap_by_speed"]] == [False, True, False]
+    assert late[0]["ap_drop"][0]["value"] == 0 and late[0]["bytes_per_message"] > 0
+    assert [r["paper_ap"] for r in rows if r["method"] == "intermediate"][:3] == [0.946, 0.937, 0.909]
+    margin_tests = held["result"]["margin_tests"]
+    assert sum("intermediate - late" in c["description"] for c in margin_tests) == 2 * len(small_set)
+    assert [c["margin"] for c in margin_tests[-3:]] == [-0.037, -0.044, -0.03]
     assert [p.title for p in panels] == ["Delay", "Heading", "Position", "Lost packets", "Together"]
     assert {c.label: c.x for c in panels[0].curves} == {
-        "alone": (),
+        "none": (),
         "late": (0, 0.1, 0.4),
         "intermediate": (0, 0.1, 0.4),
     }
 
 
 def test_perturbations_are_selected_by_name(data, weights, tmp_path, panels) -> None:
-    words = ("--methods", "late", "intermediate", "--every", 2, "--disturbances", "0.4 s")
+    words = ("--methods", "late", "intermediate", "--frame-stride", 2, "--perturbations", "0.4 s")
     held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
-    assert [r["disturbance"]["delay_s"] for r in held["rows"]] == [0, 0, 0.4, 0.4]
-    assert "intermediate, 0.4 s - perfect" in {c["what"] for c in held["claims"]}
+    assert [r["perturbation"]["delay_s"] for r in held["rows"]] == [0, 0, 0.4, 0.4]
+    assert "intermediate, 0.4 s - perfect" in {c["description"] for c in held["margin_tests"]}
     text = (tmp_path / "robustness.md").read_text()
     assert "## Delay" in text and "## Position" not in text
     with pytest.raises(ConfigError, match=r"No disturbance '4 s'; choose from perfect, 0.1 s"):
@@ -141,18 +143,27 @@ def test_perturbations_are_selected_by_name(data, weights, tmp_path, panels) -> 
 def test_baseline_fusions_are_compared_with_ours_under_each_perturbation(
     data, weights, tmp_path, panels, capsys
 ) -> None:
-    words = ("--methods", "intermediate", "--every", 2, "--disturbances", "0.4 s", "--branches", f"same={weights}")
+    words = (
+        "--methods",
+        "intermediate",
+        "--frame-stride",
+        2,
+        "--perturbations",
+        "0.4 s",
+        "--checkpoints",
+        f"same={weights}",
+    )
     held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
-    assert [(r["method"], r["disturbance"]["delay_s"]) for r in held["rows"]] == [
+    assert [(r["method"], r["perturbation"]["delay_s"]) for r in held["rows"]] == [
         ("intermediate", 0), ("same", 0), ("intermediate", 0.4), ("same", 0.4),
     ]  # fmt: skip
     # A rival of the same weights is as good, and loses as much.
     for ours, same in (held["rows"][:2], held["rows"][2:]):
-        assert ours["ap"] == same["ap"] and ours["lost"] == same["lost"]
-    against = [c for c in held["claims"] if "intermediate - same" in c["what"]]
+        assert ours["ap"] == same["ap"] and ours["ap_drop"] == same["ap_drop"]
+    against = [c for c in held["margin_tests"] if "intermediate - same" in c["description"]]
     assert len(against) == 4 and all(c["difference"]["value"] == 0 for c in against)
     common = ("evaluate", "--data", data, "--split", "test", "--weights", weights, "--study", "robustness")
-    assert cli.main([str(word) for word in (*common, "--out", tmp_path / "b", "--branches", f"late={weights}")]) != 0
+    assert cli.main([str(word) for word in (*common, "--out", tmp_path / "b", "--checkpoints", f"late={weights}")]) != 0
     assert "methods of the names late" in capsys.readouterr().err and not (tmp_path / "b").exists()
 
 
@@ -160,7 +171,7 @@ def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(
     data, weights, tmp_path, monkeypatch, small_set, panels
 ) -> None:
     monkeypatch.setattr(robustness, "ALL_PERTURBATIONS", small_set[:4])
-    words = ("--methods", "alone", "late", "--every", 2)
+    words = ("--methods", "none", "late", "--frame-stride", 2)
     first = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
     cells = sorted((tmp_path / "cells").iterdir())
     assert len(cells) == 1 + 4
@@ -178,67 +189,69 @@ def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(
 
 
 def test_budgets_are_respected_and_small_ones_send_less(data, weights, tmp_path) -> None:
-    words = ("--methods", "alone", "late", "--selectors", "intermediate", "--precisions", "float16", "int8")
-    held = evaluate(data, weights, tmp_path, "budget", *words, "--budgets", 1398, 4096, "--every", 2)["result"]
+    words = ("--methods", "none", "late", "--token-selection", "intermediate", "--token-encodings", "float16", "int8")
+    held = evaluate(data, weights, tmp_path, "bandwidth", *words, "--budgets", 1398, 4096, "--frame-stride", 2)[
+        "result"
+    ]
     rows = held["rows"]
-    assert [(r["precision"], r["budget_bytes"]) for r in rows] == [
+    assert [(r["token_encoding"], r["budget_bytes"]) for r in rows] == [
         (p, b) for p in ("float16", "int8") for b in (1398, 4096, None)
     ]
     for row in rows:
-        assert row["budget_bytes"] is None or 0 < row["largest"] <= row["budget_bytes"]
-        assert row["bytes_per_message"] <= row["largest"] and row["fewer"] > 1
+        assert row["budget_bytes"] is None or 0 < row["max_message_bytes"] <= row["budget_bytes"]
+        assert row["bytes_per_message"] <= row["max_message_bytes"] and row["compression_ratio"] > 1
     assert rows[0]["bytes_per_message"] <= rows[1]["bytes_per_message"] <= rows[2]["bytes_per_message"]
-    assert {r["selector"] for r in held["beside"]} == {"alone", "late"}
+    assert {r["method"] for r in held["reference_rows"]} == {"none", "late"}
 
 
 def test_agents_are_judged_on_the_scenarios_that_have_them(data, weights, tmp_path, panels) -> None:
-    words = ("--methods", "alone", "late", "--every", 2)
-    rows = evaluate(data, weights, tmp_path, "agents", *words)["result"]["rows"]
-    assert [(r["agents"], r["method"], r["scenarios"]) for r in rows] == [
-        (1, "alone", 2), (1, "late", 2), (2, "late", 2), (3, "late", 1),
+    words = ("--methods", "none", "late", "--frame-stride", 2)
+    rows = evaluate(data, weights, tmp_path, "num-agents", *words)["result"]["rows"]
+    assert [(r["num_agents"], r["method"], r["num_scenarios"]) for r in rows] == [
+        (1, "none", 2), (1, "late", 2), (2, "late", 2), (3, "late", 1),
     ]  # fmt: skip
     assert rows[1]["bytes_per_message"] == 0 < rows[2]["bytes_per_message"]
-    assert rows[1]["over_alone"]["value"] == 0 and rows[2]["over_one_fewer"]["scenarios"] == 2
-    assert rows[3]["over_alone"]["scenarios"] == 1
+    assert rows[1]["gain_over_no_fusion"]["value"] == 0 and rows[2]["gain_over_one_fewer"]["num_scenarios"] == 2
+    assert rows[3]["gain_over_no_fusion"]["num_scenarios"] == 1
     assert [(p.ylabel, c.label, c.x) for p in panels for c in p.curves] == [
         ("AP@0.5", "late", (1, 2, 3)), ("AP@0.5 over ego alone", "late", (1, 2, 3)),
     ]  # fmt: skip
 
 
 def test_ablation_shows_each_checkpoint_with_its_card(data, weights, tmp_path, panels) -> None:
-    words = ("--every", 2, "--branches", f"first={weights}", f"again={weights}")
+    words = ("--frame-stride", 2, "--checkpoints", f"first={weights}", f"again={weights}")
     rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
-    assert [r["branch"] for r in rows] == ["first", "again"] and rows[0]["card"]["steps"] == 7
-    assert [d["value"] for d in rows[1]["over_last"]] == [0, 0, 0] and rows[0]["over_last"] == []
+    assert [r["variant"] for r in rows] == ["first", "again"] and rows[0]["card"]["steps"] == 7
+    assert [d["value"] for d in rows[1]["gain_over_previous"]] == [0, 0, 0] and rows[0]["gain_over_previous"] == []
     assert rows[0]["bytes_per_message"] > 0 and "| first" in (tmp_path / "ablation.md").read_text()
     assert [p.ticks for p in panels] == 2 * [("first", "again")] and len(panels[0].curves) == 3
 
 
 def test_a_checkpoint_of_the_ablation_may_have_a_budget(data, weights, tmp_path, panels, capsys) -> None:
-    words = ("--every", 2, "--branches", f"all={weights}", f"masked={weights}@1398")
+    words = ("--frame-stride", 2, "--checkpoints", f"all={weights}", f"masked={weights}@1398")
     rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
     assert 0 < rows[1]["bytes_per_message"] <= 1398 < rows[0]["bytes_per_message"]
     for wrong in ("0", "many", "-5"):
-        words = ("--data", data, "--split", "test", "--study", "ablation", "--branches", f"masked={weights}@{wrong}")
+        words = ("--data", data, "--split", "test", "--study", "ablation", "--checkpoints", f"masked={weights}@{wrong}")
         assert cli.main([str(word) for word in ("evaluate", *words)]) == 1
         assert "behind @ stands a number of bytes" in capsys.readouterr().err
 
 
 def test_with_shared_bandwidth_every_agent_is_ego_under_one_budget(data, weights, tmp_path, panels) -> None:
-    words = ("--methods", "alone", "--selectors", "intermediate", "--budgets", 6000, "--every", 2)
-    rows = evaluate(data, weights, tmp_path, "system", *words)["result"]["rows"]
+    words = ("--methods", "none", "--token-selection", "intermediate", "--budgets", 6000, "--frame-stride", 2)
+    rows = evaluate(data, weights, tmp_path, "shared-bandwidth", *words)["result"]["rows"]
     bound, alone = rows
-    assert (bound["budget_bytes"], alone["budget_bytes"], alone["method"]) == (6000, None, "alone")
-    assert 0 < bound["instant_bytes"] <= bound["most"] <= 6000
-    assert bound["ego_frames"] == alone["ego_frames"] == 2 + 3
-    assert {c.label: len(c.x) for c in panels[0].curves} == {"intermediate": 1, "alone": 0}
+    assert (bound["budget_bytes"], alone["budget_bytes"], alone["method"]) == (6000, None, "none")
+    assert 0 < bound["mean_snapshot_bytes"] <= bound["max_snapshot_bytes"] <= 6000
+    assert bound["num_ego_frames"] == alone["num_ego_frames"] == 2 + 3
+    assert {c.label: len(c.x) for c in panels[0].curves} == {"intermediate": 1, "none": 0}
 
 
 def test_the_qualitative_study_shows_the_frame_with_max_agents(data, weights, tmp_path) -> None:
-    held = evaluate(data, weights, tmp_path, "picture")["result"]
+    held = evaluate(data, weights, tmp_path, "qualitative")["result"]
     assert (held["scenario"], held["frame"]) == ("b", 5)
-    assert [r["method"] for r in held["rows"]] == ["alone", "late", "intermediate", "early"]
-    assert all(r["true"] == 2 for r in held["rows"])
+    assert [r["method"] for r in held["rows"]] == ["none", "late", "intermediate", "early"]
+    assert all(r["num_true"] == 2 for r in held["rows"])
 
 
 def scores(tallies: list[MetricAccumulator]) -> list[list[float]]:
@@ -256,7 +269,7 @@ def test_conditions_side_by_side_are_as_each_by_itself(data, weights) -> None:
 
 
 def test_no_fusion_is_the_same_under_every_perturbation(data, weights) -> None:
-    base = BenchmarkConfig(str(weights), ("alone",))
+    base = BenchmarkConfig(str(weights), ("none",))
     calm, rough = run_scenario(
         partial(Opv2vRecording, data, "test"), [CLEAN.apply_to(base), COMBINED_SEVERE.apply_to(base)], "b"
     )
@@ -267,12 +280,12 @@ def test_no_fusion_is_the_same_under_every_perturbation(data, weights) -> None:
     ("words", "named"),
     [
         (("--study", "moon"), ("moon", "robustness")),
-        (("--study", "budget", "--precisions", "moon"), ("moon", "float16")),
-        (("--study", "budget", "--selectors", "moon"), ("moon", "intermediate")),
+        (("--study", "bandwidth", "--token-encodings", "moon"), ("moon", "float16")),
+        (("--study", "bandwidth", "--token-selection", "moon"), ("moon", "intermediate")),
         (("--study", "ablation"), ("name=weights.safetensors",)),
-        (("--study", "ablation", "--branches", "a=x", "a=y"), ("each name once",)),
+        (("--study", "ablation", "--checkpoints", "a=x", "a=y"), ("each name once",)),
         (("--study", "robustness", "--noise-xy-m", 0.2), ("--noise-xy-m",)),
-        (("--study", "agents", "--every", 0), ("at least 1",)),
+        (("--study", "num-agents", "--frame-stride", 0), ("at least 1",)),
     ],
 )
 def test_what_is_wrong_is_one_line_before_any_work(data, weights, tmp_path, capsys, words, named) -> None:

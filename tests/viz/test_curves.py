@@ -28,7 +28,7 @@ def drawn(panels: list[CurvePanel], path) -> np.ndarray:
 
 def test_a_wider_interval_and_another_level_are_other_pictures(tmp_path) -> None:
     def panel(half: float, level: float) -> list[CurvePanel]:
-        curves = (Curve("late", at(0.8, 0.7, half=half), (0.0, 0.4)), Curve("alone", at(level)))
+        curves = (Curve("late", at(0.8, 0.7, half=half), (0.0, 0.4)), Curve("none", at(level)))
         return [CurvePanel("Delay", "seconds", "AP@0.5", curves)]
 
     first, wider, other = (drawn(panel(*p), tmp_path / "x.png") for p in ((0.01, 0.75), (0.05, 0.75), (0.01, 0.72)))

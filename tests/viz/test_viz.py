@@ -167,14 +167,14 @@ def interval(value: float, low: float = math.nan, high: float = math.nan) -> Int
 
 
 ROWS = (
-    MethodRow("alone", interval(0.612, 0.55, 0.66), interval(0.4), 0.0, None, None, 41.0),
+    MethodRow("none", interval(0.612, 0.55, 0.66), interval(0.4), 0.0, None, None, 41.0),
     MethodRow("intermediate", interval(0.812, 0.75, 0.86), interval(0.66), 2.0**15, 104.2, 45.0, 53.0),
     MethodRow("early"),
 )
 
 
 def test_a_row_reads_as_numbers_and_what_is_absent_reads_not_run() -> None:
-    assert format_cells(ROWS[0]) == ("alone", "0.612 [0.550, 0.660]", "0.400", "0", "-", "-", "-", "41.0")
+    assert format_cells(ROWS[0]) == ("none", "0.612 [0.550, 0.660]", "0.400", "0", "-", "-", "-", "41.0")
     assert format_cells(ROWS[1])[3:6] == ("32,768", "15.00", "104")
     assert format_cells(ROWS[2]) == ("early", *["not run"] * 7)
     assert format_cells(MethodRow("x", interval(math.nan)))[1] == "no object"

@@ -40,12 +40,12 @@ class Options:
     """Draw the animation of the drive."""
     min_score: float = 0.4
     """Detections below this score are not drawn; they count all the same."""
-    replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(channel="its-g5-27"))
+    replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(channel="its-g5-27mbps"))
     """How agents collaborate."""
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from rich.console import Console
 
     from manyeyes.datasets.opv2v import Opv2vRecording
@@ -83,7 +83,7 @@ def main(options: Options) -> None:
         facts=(("Town", town),),
         commands=(
             f"manyeyes demo --seed {options.seed}",
-            f"manyeyes run {folder} --split test",
+            f"manyeyes replay {folder} --split test",
             f"manyeyes view {folder} --split test --out drive.gif",
             f"manyeyes map fuse {options.out / 'map'}",
         ),

@@ -120,7 +120,7 @@ def find_towns(folder: Path | None = None) -> tuple[tuple[str, ...], str]:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     diagnosis = diagnose(options.towns)
     if options.json:
         sys.stdout.write(json.dumps(provenance.to_plain(diagnosis), indent=2) + "\n")

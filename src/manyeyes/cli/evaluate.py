@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from rich.console import Console
 
     from manyeyes._io import atomic_write_text

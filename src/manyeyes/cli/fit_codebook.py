@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fits a codebook to trained weights, so that their tokens can be sent as a few bytes (--precision codes)."""
+"""Fits a codebook to trained weights, so that their tokens can be sent as a few bytes (--token-encoding codebook)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     import torch
     from rich.console import Console
 

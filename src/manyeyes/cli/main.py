@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command ``manyeyes``: one literal table of verbs; a verb's module is imported when it is called, not before."""
+"""The command ``manyeyes``: one literal table of commands; a command's module is imported when it is called, not before."""
 
 from __future__ import annotations
 
@@ -11,53 +11,53 @@ from collections.abc import Iterable, Sequence
 from manyeyes import __version__
 
 COMMANDS = {
-    "demo": "make a drive, share bytes, perceive, judge: table, pictures, animation, report",
-    "simulate": "make scenes from a seed, in OPV2V's layout",
+    "demo": "simulate a drive, run every fusion method on it, and write a table, figures, an animation and a report",
+    "simulate": "simulate scenes from a seed, in OPV2V's layout",
     "train": "train a detector on a recording",
-    "quantise": "fit the codebook by which trained weights send few bytes",
-    "evaluate": "judge methods on a split: AP with intervals, bytes, paired differences",
-    "run": "replay your own OPV2V-format recording as demo does",
+    "fit-codebook": "fit the codebook that quantises the tokens of trained weights",
+    "evaluate": "evaluate methods on a split: AP with intervals, bytes, paired differences; or run a study",
+    "replay": "replay your own recording in OPV2V's layout as demo does",
     "view": "draw a frame of a recording, or animate a drive",
-    "align": "where agents are, from what they detect: claimed and corrected poses judged",
+    "pose": "evaluate pose correction from detected objects: prior and corrected poses",
     "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",
     "doctor": "print what a bug report needs",
 }
 COMMAND_GROUPS = {
     "map": {
-        "build": "a recording's sensors become elements, messages, and one map",
-        "simulate": "send a crowd through a place: observations and truth from a seed",
-        "import": "result files of MapTR or StreamMapNet with their poses become observations",
-        "fuse": "one map of a folder of observations",
-        "retract": "take observations of a store back, and publish the map without them",
-        "evaluate": "judge a map against the truth, or methods in a study",
-        "diff": "what changed from one map to another",
-        "export": "GeoJSON, GeoPackage, Lanelet2, Argoverse 2, nuScenes, PMTiles",
-        "view": "a web page (.html) that needs no internet, or a picture (.png)",
+        "build": "build one map of a recording, from sensor data by way of messages",
+        "simulate": "simulate a fleet: observations and ground truth of a place from a seed",
+        "import": "convert result files of MapTR or StreamMapNet with their poses to observations",
+        "fuse": "fuse a folder of observations to one map",
+        "retract": "remove observations from a store, and publish the map without them",
+        "evaluate": "evaluate a map against the ground truth, or run a study of methods",
+        "diff": "list what changed from one map to another",
+        "export": "export a map: GeoJSON, GeoPackage, Lanelet2, Argoverse 2, nuScenes, PMTiles",
+        "view": "draw a map as a web page (.html) that needs no internet, or as an image (.png)",
     },
 }
-MODULES = {"run": "replay", "align": "pose", "quantise": "fit_codebook", "map import": "map import_predictions"}
-"""The modules of verbs that are called otherwise."""
+MODULES = {"fit-codebook": "fit_codebook", "map import": "map import_predictions"}
+"""Modules of commands whose name differs from the command."""
 INTERRUPTED_EXIT_CODE = 130
 
 
 def make_help_text(group: str = "") -> str:
-    """What ``manyeyes --help`` prints, or the help of a group of verbs."""
+    """Make the text of ``manyeyes --help``, or the help of a group of commands."""
     table, prog = (COMMAND_GROUPS[group], f"manyeyes {group}") if group else (COMMANDS, "manyeyes")
     width = max(map(len, table)) + 2
     command_lines = "\n".join(f"  {command.ljust(width)}{what}" for command, what in table.items())
     about = (
         f"manyeyes {group}: {COMMANDS[group]}."
         if group
-        else "manyeyes: many agents, each with its own eyes and few bytes to say what it sees."
+        else "manyeyes: collaborative perception of many agents that exchange few bytes."
     )
     return (
-        f"{about}\n\nusage: {prog} VERB [options]\n\n{command_lines}\n\n"
-        f"{prog} VERB --help lists the options of a verb; manyeyes --version prints the version.\n"
+        f"{about}\n\nusage: {prog} COMMAND [options]\n\n{command_lines}\n\n"
+        f"{prog} COMMAND --help lists the options of a command; manyeyes --version prints the version.\n"
     )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one verb; the exit code is 0, 1 for a designed error, 2 for wrong arguments, 130 after Ctrl-C."""
+    """Run one command; the exit code is 0, 1 for a designed error, 2 for wrong arguments, 130 after Ctrl-C."""
     argument_list = list(sys.argv[1:] if arguments is None else arguments)
     if not argument_list or argument_list[0] in ("-h", "--help", "help"):
         sys.stdout.write(make_help_text())
@@ -74,13 +74,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
 
 
-def module_of(verb: str) -> str:
-    """The module that holds a verb's Options and main."""
-    return f"manyeyes.cli.{MODULES.get(verb, verb).replace(' ', '.')}"
+def module_of(command: str) -> str:
+    """Name the module that holds a command's Options and main."""
+    return f"manyeyes.cli.{MODULES.get(command, command).replace(' ', '.')}"
 
 
 def _run_group(group: str, arguments: Sequence[str]) -> int:
-    """A verb of a group, such as ``map fuse``, lives in the module ``map.fuse``."""
+    """Run a command of a group; ``map fuse`` lives in the module ``map.fuse``."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         sys.stdout.write(make_help_text(group))
         return 0
@@ -95,7 +95,7 @@ def _run_group(group: str, arguments: Sequence[str]) -> int:
 def _report_unknown(word: str, known: Iterable[str]) -> int:
     close = difflib.get_close_matches(word, known, 1)
     hint = f"did you mean {close[0]}? " if close else ""
-    return _fail(f"there is no verb {word!r}; {hint}Known verbs: {', '.join(known)}.", 2)
+    return _fail(f"there is no command {word!r}; {hint}Known commands: {', '.join(known)}.", 2)
 
 
 def _run_command(command: str, arguments: Sequence[str]) -> int:

@@ -37,7 +37,7 @@ class Options:
     """Which scenario; the first by default."""
     frames: int = 60
     """At most so many judged frames."""
-    correctors: tuple[str, ...] = ("given", "vote")
+    correctors: tuple[str, ...] = ("identity", "voting")
     """Any of vote, given, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist, v2x-reg-oiou, mash, feakm, or a .safetensors
     file of FeaKM; of whole clouds register and gicp."""
     noise_xy_m: float = 0.0
@@ -75,7 +75,7 @@ class CorrectorResult:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from rich.console import Console
 
     from manyeyes.agents.perception_cache import PerceptionCache
@@ -107,7 +107,7 @@ def main(options: Options) -> None:
         console.print(_make_table(scores, title))
     if missing.count:
         console.print(missing_footer(missing.count, "align.json"), highlight=False, soft_wrap=True)
-    health = run_pose_monitor([f for f in results if f.corrector == "vote"])
+    health = run_pose_monitor([f for f in results if f.corrector == "voting"])
     for agent, report in health.items():
         console.print(f"agent {agent}: {report.health.value} over {report.num_frames} frames", highlight=False)
     provenance.write_json(

@@ -40,7 +40,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from rich.console import Console
 
     from manyeyes.models import pretrained
@@ -65,7 +65,7 @@ def main(options: Options) -> None:
         animate=options.animate,
         min_score=options.min_score,
         missing=missing,
-        commands=(f"manyeyes run {options.recording}{split} --scenario {drive.scenario}",),
+        commands=(f"manyeyes replay {options.recording}{split} --scenario {drive.scenario}",),
     )
     replay_and_report(drive, pretrained.load(options.replay_options.weights), spec, console)
     console.print(

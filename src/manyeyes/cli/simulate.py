@@ -27,7 +27,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     import json
 
     from rich.console import Console

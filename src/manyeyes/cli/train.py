@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     import torch
     import torch.distributed as dist
     from rich.console import Console

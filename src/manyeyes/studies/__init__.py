@@ -15,26 +15,26 @@ if TYPE_CHECKING:
 
 STUDIES = {
     "robustness": "delay, errors of pose, lost packets, one at a time and together (CoSTr, Table II)",
-    "budget": "AP against bytes a message, for each way to choose tokens and to write them (CoSTr, Fig. 3)",
-    "agents": "one agent to five",
+    "bandwidth": "AP against bytes a message, for each way to choose tokens and to write them (CoSTr, Fig. 3)",
+    "num-agents": "one agent to five",
     "ablation": "branches of a training, side by side (CoSTr, Table III)",
-    "system": "every agent judged as ego, one budget for the channel (CoSTr, Eq. 2)",
-    "pose": "errors of pose, with and without a corrector before each fusion (FeaKM, Tables 1 and 2)",
+    "shared-bandwidth": "every agent judged as ego, one budget for the channel (CoSTr, Eq. 2)",
+    "pose-noise-ap": "errors of pose, with and without a corrector before each fusion (FeaKM, Tables 1 and 2)",
     "feakm": "branches of FeaKM: its confidence map, its scales (FeaKM, Table 3)",
-    "pose-accuracy": "how good corrected poses are, by corrector, error and objects in common",
-    "picture": "one frame under errors, methods side by side (CoSTr, Fig. 4)",
+    "pose-estimation": "how good corrected poses are, by corrector, error and objects in common",
+    "qualitative": "one frame under errors, methods side by side (CoSTr, Fig. 4)",
 }
 
 MODULES = {
     "robustness": "detection.robustness",
-    "budget": "detection.bandwidth",
-    "agents": "detection.num_agents",
+    "bandwidth": "detection.bandwidth",
+    "num-agents": "detection.num_agents",
     "ablation": "detection.ablation",
-    "system": "detection.shared_bandwidth",
-    "pose": "pose.pose_noise_ap",
+    "shared-bandwidth": "detection.shared_bandwidth",
+    "pose-noise-ap": "pose.pose_noise_ap",
     "feakm": "pose.feakm",
-    "pose-accuracy": "pose.pose_estimation",
-    "picture": "detection.qualitative",
+    "pose-estimation": "pose.pose_estimation",
+    "qualitative": "detection.qualitative",
 }
 
 

@@ -20,8 +20,9 @@ class Options:
     """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
     out: Path = Path("out/evaluate")
     """Folder for results.json and results.md."""
-    protocol: str = "manyeyes"
-    """Rules of the AP: manyeyes, opencood, coalign, sparsealign; on DAIR-V2X also dair, heal-dair, costr-dair, sparsealign-dair."""
+    protocol: str = "global-sort"
+    """Evaluation protocol: global-sort, opencood, coalign, sparsealign; on DAIR-V2X also dair, heal-dair, costr-dair,
+    sparsealign-dair."""
     noise_xy_m: float = 0.0
     """Standard deviation of errors of collaborators' claimed positions."""
     noise_yaw_deg: float = 0.0
@@ -39,21 +40,24 @@ class Options:
     frame_stride: int = 1
     """Judge each so many-th frame of those that the recording judges."""
     study: str | None = None
-    """robustness, budget, agents, ablation, system, pose, pose-accuracy, feakm or picture; what is finished is kept under --out."""
+    """robustness, bandwidth, num-agents, ablation, shared-bandwidth, pose-noise-ap, pose-estimation, feakm or qualitative; finished
+    results are stored under --out."""
     perturbations: tuple[str, ...] = ()
-    """Those that the studies 'robustness' and 'pose' play, by the names of their tables, such as "0.4 s" "30 % lost"
+    """Those that the studies 'robustness' and 'pose-noise-ap' play, by the names of their tables, such as "0.4 s" "30 % lost"
     or "2°, 2 m" "0.8 m"; by default all."""
     budgets: tuple[int, ...] = ()
-    """Bytes: of a message in the study 'budget', of all messages of an instant in 'system'; by default the study's own."""
+    """Budgets in bytes: of a message in the study 'bandwidth', of all messages of a snapshot in 'shared-bandwidth'; by default the
+    study's own."""
     token_selection: tuple[str, ...] = ()
-    """Methods that choose tokens, in the studies 'budget' and 'system'; by default intermediate, confidence, random."""
+    """Methods that choose tokens, in the studies 'bandwidth' and 'shared-bandwidth'; by default intermediate,
+    intermediate-confidence, intermediate-random."""
     token_encodings: tuple[str, ...] = ()
-    """Ways to write tokens, in the study 'budget'; by default all."""
+    """Ways to write tokens, in the study 'bandwidth'; by default all."""
     correctors: tuple[str, ...] = ()
-    """Who corrects claimed poses, in the studies 'pose' and 'pose-accuracy', feakm or a file of its weights among them; by
-    default the study's own."""
+    """Pose correctors of the studies 'pose-noise-ap' and 'pose-estimation', among them feakm or a file of its weights; by default
+    the study's own."""
     checkpoints: tuple[str, ...] = ()
-    """Weights that the study 'ablation' compares, and rival fusions of 'robustness' and 'pose', each as name=weights.safetensors;
+    """Weights that the study 'ablation' compares, and baselines of 'robustness' and 'pose-noise-ap', as name=weights.safetensors;
     of 'feakm' each as name=detector.safetensors,net.safetensors."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.base import Recording
 
-ALL_METHODS = ("alone", "late", "intermediate", "early")
+ALL_METHODS = ("none", "late", "intermediate", "early")
 FRAME_PERIOD_MS = 100.0
 IDEAL_LATENCY_BUDGET_MS = 0.0
 
@@ -32,7 +32,7 @@ class ReplayOptions:
     """How long an ego waits for messages after its own sweep; by default 0 on the ideal channel, else one period, 100."""
     budget_bytes: int = 1 << 17
     """The most that a message of tokens may weigh."""
-    token_encoding: Literal["float32", "float16", "int8", "codes"] | None = None
+    token_encoding: Literal["float32", "float16", "int8", "codebook"] | None = None
     """How tokens are written: their features as numbers, or all of them as the codes of the weights' codebook; by default as
     codes where the weights have one, else as float16."""
     request_maps: bool = False

@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 REPORT = "report.html"
 WIDTH, FILM_WIDTH, FILM_FRAME_MS = 1280, 800, 200
 TITLES = {
-    "alone": "Ego alone",
+    "none": "No fusion",
     "late": "Late fusion: boxes are shared",
-    "late-remembering": "Late fusion: boxes are shared and remembered",
+    "late-temporal": "Late fusion: boxes are shared and remembered",
     "intermediate": "Intermediate fusion: tokens are shared",
     "early": "Early fusion: all points are shared",
 }
@@ -106,7 +106,7 @@ def replay_and_report(drive: Excerpt, detector: Detector, spec: ReportSpec, cons
         for warning in summary.make_warnings():
             console.print(f"{chapter.title}: {warning}", highlight=False, soft_wrap=True)
     pictures = _save_animation(film, spec.out) + _save_pictures(pictured_steps, comparison, grid, spec)
-    config = {"showing": spec, "detector": detector.config}
+    config = {"spec": spec, "detector": detector.config}
     origin = provenance.write_json(spec.out / "results.json", comparison, config, spec.replay.seed)
     atomic_write_text(
         spec.out / "results.md",
@@ -143,12 +143,14 @@ def _make_pose_chapters(pose_summaries: Mapping[str, PoseCorrectionSummary]) -> 
 def make_protocol(detector: Detector) -> DetectionProtocol:
     """The project's own protocol over the range that the detector sees."""
     grid = detector.config.detection_range
-    return get_protocol("manyeyes").with_range((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
+    return get_protocol("global-sort").with_range(
+        (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
+    )
 
 
 def _select_animated(methods: Sequence[str]) -> tuple[str, ...]:
     """The two methods whose difference is the point, or as many of them as were run."""
-    preferred = tuple(name for name in ("alone", "intermediate") if name in methods)
+    preferred = tuple(name for name in ("none", "intermediate") if name in methods)
     return preferred or tuple(methods[:1])
 
 

@@ -30,14 +30,14 @@ _DEGREES = 7
 
 KIND_COLOURS = {"divider": "#e07b00", "boundary": "#2e7d32", "crossing": "#1565c0", "stop_line": "#8e24aa"}
 CONFIDENCE_STOPS = ((0.0, "#d7301f"), (0.5, "#fdae61"), (0.8, "#41b6c4"), (1.0, "#0c2c84"))
-DISCREPANCY_COLOURS = {"invented": "#d50000", "missed": "#ff6fae", "unexplained": "#9e9d24"}
+DISCREPANCY_COLOURS = {"false_positives": "#d50000", "false_negatives": "#ff6fae", "unsupported": "#9e9d24"}
 LAYERS = {"truth": "Truth", "observed": "Observations", "fused": "Fused map", "disagreement": "Disagreement"}
 CHANGE_NAMES = (
     ("truth", "Old map"),
     ("fused", "New map"),
     ("disagreement", "Changes"),
-    ("invented", "new"),
-    ("missed", "gone"),
+    ("false_positives", "new"),
+    ("false_negatives", "gone"),
 )
 
 

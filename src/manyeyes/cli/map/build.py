@@ -36,7 +36,7 @@ class Options:
     source: Literal["model", "truth"] = "model"
     """What draws: a map model; or, as an oracle for all that follows, the true map with the errors of a simulated crowd."""
     weights: str | None = None
-    """Of the map model: a shipped name or a .safetensors file of 'manyeyes train --preset map-small'."""
+    """Of the map model: a shipped name or a .safetensors file of 'manyeyes train --preset map-small-lidar'."""
     map_mode: Literal["local", "semi-global"] = "local"
     """local: what lies ahead, 30 x 30 m of a vehicle, 50 x 30 m of a roadside unit, each by its own look. semi-global: 120 x 60 m
     about each agent, together with the looks of the others."""
@@ -58,7 +58,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from rich.console import Console
 
     from manyeyes.comms.channel import channel_preset
@@ -120,7 +120,7 @@ def _load_map_model(options: Options) -> MapModel | None:
         return None
     if options.weights is None and pretrained.DEFAULT_MAP_MODEL not in pretrained.list_map_models():
         raise ConfigError(
-            "No map model ships with this version: give --weights FILE of 'manyeyes train --preset map-small', or "
+            "No map model ships with this version: give --weights FILE of 'manyeyes train --preset map-small-lidar', or "
             "--source truth to see what follows from a model with the errors of a simulated crowd."
         )
     return pretrained.load_map_model(options.weights or pretrained.DEFAULT_MAP_MODEL)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Judges a map against the truth, or runs a study: methods side by side over places, counts and seeds, against bars.
 
-Studies: fusion (four places that nothing was tuned on), noise (pose errors of 0 to 1.5 m), table3 (the CrowdMap paper's Table 3
-as a study), malicious (do liars move what honest agents saw), tuning (all methods with the same budget, on other places).
-Of the map model, on a recording of towns that it was not taught by: local, semi-global and whole (that paper's Tables 1 to 3, from
-sensors), pose (tiles under errors of claimed poses, and behind their corrector).
+Studies: fusion (four test places), fleet-pose-noise (pose noise of 0 to 1.5 m), crowdmap-table3 (Table 3 of the CrowdMap paper),
+adversarial (displacement by malicious agents), tuning (hyperparameter search with equal budgets, on other places).
+Of the map model, on a recording of towns outside its training set: local, semi-global and full-map (Tables 1 to 3 of that paper,
+from sensors), map-pose-noise (tiles under pose noise, with and without pose correction).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from manyeyes.studies.maps.options import Options
 if TYPE_CHECKING:
     from rich.console import Console
 
-STUDIES = ("fusion", "noise", "table3", "malicious", "tuning", *MODEL_STUDIES)
+STUDIES = ("fusion", "fleet-pose-noise", "crowdmap-table3", "adversarial", "tuning", *MODEL_STUDIES)
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from rich.console import Console
 
     if options.study is not None and options.study not in STUDIES:

@@ -26,7 +26,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from rich.console import Console
 
     from manyeyes.maps.formats.export import export_map

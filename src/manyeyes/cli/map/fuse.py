@@ -28,7 +28,7 @@ class Options:
     out: Path | None = None
     """Folder for the map, two GeoParquet files; 'map' beside the observations by default."""
     method: str = "manyeyes"
-    """manyeyes, or a rival: union, chamfer_nms, crowdmap_literal, polymerge, frechet_clustering, heatmap_buffer, ..."""
+    """manyeyes, or a baseline: union, chamfer-nms, crowdmap-literal, polymerge, frechet-clustering, heatmap-buffer, ..."""
     store: Path | None = None
     """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release."""
     executor: str = "process"
@@ -38,7 +38,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     import time
 
     from rich.console import Console
@@ -63,7 +63,7 @@ def main(options: Options) -> None:
     published = len(fused.select_published())
     payload = {
         "observations": len(loaded.observations),
-        "put_aside": len(loaded.rejected),
+        "rejected": len(loaded.rejected),
         "elements": len(fused),
         "published": published,
         "hash": fused.quantised_hash(),

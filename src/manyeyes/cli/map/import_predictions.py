@@ -41,7 +41,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from rich.console import Console
 
     from manyeyes.maps.elements.observation import MapFrame
@@ -75,7 +75,7 @@ def main(options: Options) -> None:
         raise ConfigError(f"{options.results}: no sample could be used; the reasons stand above.")
     MapFolder(options.out).write_observations(loaded.observations, loaded.frame)
     elements = sum(len(o.elements) for o in loaded.observations)
-    payload = {"observations": len(loaded.observations), "elements": elements, "put_aside": len(loaded.rejected)}
+    payload = {"observations": len(loaded.observations), "elements": elements, "rejected": len(loaded.rejected)}
     provenance.write_json(options.out / "import.json", payload, options, None)
     console.print(
         f"{len(loaded.observations)} observations of {elements} elements in {options.out}",

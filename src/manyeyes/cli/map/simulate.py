@@ -30,7 +30,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from dataclasses import replace
 
     from rich.console import Console

@@ -28,7 +28,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """The verb."""
+    """Run the command."""
     from rich.console import Console
 
     from manyeyes.datatypes.map_element import MapElements

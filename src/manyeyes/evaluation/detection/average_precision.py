@@ -100,7 +100,7 @@ _OPENCOOD = DetectionProtocol(
 _COALIGN = replace(
     _OPENCOOD,
     name="coalign",
-    sort="global",
+    ap_order="global",
     gt_range=(-100.8, -40.0, -3.5, 100.8, 40.0, 1.5),
     gt_range_mode="corners_xy",
     pred_range_mode="corners",
@@ -121,7 +121,7 @@ _SPARSEALIGN = DetectionProtocol(
 PROTOCOLS: dict[str, DetectionProtocol] = {
     p.name: p
     for p in (
-        DetectionProtocol(name="manyeyes"),
+        DetectionProtocol(name="global-sort"),
         _OPENCOOD,
         _COALIGN,
         _SPARSEALIGN,

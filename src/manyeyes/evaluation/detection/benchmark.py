@@ -37,8 +37,8 @@ class BenchmarkConfig:
     """
 
     weights: str = pretrained.DEFAULT_DETECTOR
-    methods: tuple[str, ...] = ("alone", "late", "intermediate", "early")
-    protocol: str = "manyeyes"
+    methods: tuple[str, ...] = ("none", "late", "intermediate", "early")
+    protocol: str = "global-sort"
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     pose_noise: PoseNoise | None = None
     frame_stride: int = 1
@@ -53,7 +53,7 @@ class BenchmarkConfig:
 def resolve_protocol(config: BenchmarkConfig) -> DetectionProtocol:
     """The named protocol; our own one judges over the range that the detector answers for."""
     protocol, grid = get_protocol(config.protocol), load_detector(config.weights).config.detection_range
-    if config.protocol != "manyeyes":
+    if config.protocol != "global-sort":
         return protocol
     return protocol.with_range((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
 

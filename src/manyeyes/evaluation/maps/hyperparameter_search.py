@@ -30,45 +30,45 @@ SearchSpace = dict[str, tuple[Any, ...]]
 _DISTANCES_M = (0.5, 0.75, 1.0, 1.5, 2.0)
 _RULES: SearchSpace = {
     "rules.min_score": (0.0, 0.2, 0.3, 0.4, 0.5),
-    "rules.publish": (-6.0, 0.0, 1.0, 2.2),
-    "rules.least_observations": (1, 2, 3),
+    "rules.publish_log_odds": (-6.0, 0.0, 1.0, 2.2),
+    "rules.min_observations": (1, 2, 3),
 }
 SEARCH_SPACE: dict[str, SearchSpace] = {
     OURS: {
-        "align.sigma_m": (0.1, 0.2, 0.3),
-        "align.correlation": (4.0, 8.0, 16.0),
-        "stations.least_support": (1, 2, 3),
-        "stations.ridge.across_sigma_m": (0.35, 0.45, 0.6),
-        "stations.evidence.publish": (1.0, 1.5, 2.2, 3.0),
-        "stations.evidence.publish_ring": (0.5, 1.0, 2.2),
-        "stations.evidence.publish_seldom": (0.3, 1.0, 2.2),
-        "stations.evidence.publish_agents": (1, 2),
-        "link.join_m": (6.0, 12.0, 18.0),
-        "link.lateral_m": (0.25, 0.4, 0.6),
+        "pose_solver.sigma_m": (0.1, 0.2, 0.3),
+        "pose_solver.points_per_independent": (4.0, 8.0, 16.0),
+        "stations.min_support": (1, 2, 3),
+        "stations.ridge.lateral_sigma_m": (0.35, 0.45, 0.6),
+        "stations.evidence.publish_log_odds": (1.0, 1.5, 2.2, 3.0),
+        "stations.evidence.publish_crossing_log_odds": (0.5, 1.0, 2.2),
+        "stations.evidence.publish_low_coverage_log_odds": (0.3, 1.0, 2.2),
+        "stations.evidence.min_publish_agents": (1, 2),
+        "link.max_join_gap_m": (6.0, 12.0, 18.0),
+        "link.max_lateral_m": (0.25, 0.4, 0.6),
     },
     "union": _RULES,
-    "chamfer_nms": {"gate_m": _DISTANCES_M, **_RULES},
-    "crowdmap_literal": {
-        "gate_m": _DISTANCES_M,
-        "accept_m": _DISTANCES_M,
+    "chamfer-nms": {"max_chamfer_m": _DISTANCES_M, **_RULES},
+    "crowdmap-literal": {
+        "max_overlap_chamfer_m": _DISTANCES_M,
+        "max_registered_chamfer_m": _DISTANCES_M,
         "merge": ("keep", "mean"),
-        "cpd.outlier": (0.0, 0.1, 0.3),
+        "cpd.outlier_fraction": (0.0, 0.1, 0.3),
         **_RULES,
     },
-    "polymerge": {"gate_m": _DISTANCES_M, "share": (0.3, 0.5), **_RULES},
-    "frechet_clustering": {
-        "gate_m": (1.0, 1.5, 1.75, 2.0, 3.0),
+    "polymerge": {"max_vertex_distance_m": _DISTANCES_M, "min_fraction": (0.3, 0.5), **_RULES},
+    "frechet-clustering": {
+        "max_frechet_m": (1.0, 1.5, 1.75, 2.0, 3.0),
         "linkage": ("average", "single", "complete"),
-        "take": ("mean", "medoid"),
+        "representative": ("mean", "medoid"),
         **_RULES,
     },
-    "heatmap_buffer": {
+    "heatmap-buffer": {
         "buffer_m": (0.3, 0.5, 0.75, 1.0),
-        "share": (0.2, 0.3, 0.4, 0.5),
+        "min_view_fraction": (0.2, 0.3, 0.4, 0.5),
         "simplify_m": (0.1, 0.2, 0.5),
         **_RULES,
     },
-    "global_map_builder": {"simplify_m": (0.2, 0.5, 1.0), "overlap": (0.1, 0.3), **_RULES},
+    "global-map-builder": {"simplify_m": (0.2, 0.5, 1.0), "max_buffer_iou": (0.1, 0.3), **_RULES},
 }
 
 
@@ -87,7 +87,7 @@ def sample_changes(method: str, config_index: int) -> tuple[tuple[str, Any], ...
     if config_index == 0:
         return ()
     applicable = [item for item in SEARCH_SPACE[method].items() if _has_field(make_default_config(method), item[0])]
-    unit = keyed_uniform((len(applicable),), SEED, "map-tuning", method, config_index).numpy()
+    unit = keyed_uniform((len(applicable),), SEED, "map-tuning", method.replace("-", "_"), config_index).numpy()
     return tuple((name, values[int(u * len(values))]) for (name, values), u in zip(applicable, unit))
 
 

@@ -18,7 +18,7 @@ from manyeyes._source import source_digest
 from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.evaluation.maps.experiment import FleetExperiment, FleetTrial, run_trial
 from manyeyes.evaluation.maps.metrics import THRESHOLDS, MapMetrics, evaluate_map
-from manyeyes.evaluation.maps.registry import BASELINES, MethodSettings, fuse_experiment
+from manyeyes.evaluation.maps.registry import BASELINE_MODULES, MethodSettings, fuse_experiment
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class MapStudyResult:
     ap_rows: tuple[ApRow, ...]
     kind_rows: tuple[KindRow, ...]
 
-    def get_ap(self, kind: str = "mean", protocol: str = "exact", thresholds: str = "narrow") -> float:
+    def get_ap(self, kind: str = "mean_ap", protocol: str = "exact", thresholds: str = "narrow") -> float:
         """One AP: what is a kind, or mean."""
         return next(
             getattr(row, kind) for row in self.ap_rows if (row.protocol, row.thresholds) == (protocol, thresholds)
@@ -102,9 +102,8 @@ def map_result_path(job: MapStudyJob, method: str) -> Path:
 
 def hash_map_sources(method: str) -> str:
     """A hash of the code that a cell of a method follows from."""
-    return source_digest(
-        "manyeyes.evaluation.maps.map_cells", *((f"manyeyes.maps.baselines.{method}",) if method in BASELINES else ())
-    )
+    modules = [f"manyeyes.maps.baselines.{BASELINE_MODULES[method][0]}"] if method in BASELINE_MODULES else []
+    return source_digest("manyeyes.evaluation.maps.map_cells", *modules)
 
 
 def run_study_job(job: MapStudyJob) -> list[MapStudyResult]:
@@ -176,8 +175,8 @@ def read_map_result(path: Path) -> MapStudyResult | None:
     """A kept cell; None where there is none, or one of another form."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8"), parse_constant=float)
-        ap = tuple(ApRow(**restore_row(row)) for row in stored.pop("ap"))
-        kinds = tuple(KindRow(**restore_row(row)) for row in stored.pop("kinds"))
+        ap = tuple(ApRow(**restore_row(row)) for row in stored.pop("ap_rows"))
+        kinds = tuple(KindRow(**restore_row(row)) for row in stored.pop("kind_rows"))
         return MapStudyResult(ap_rows=ap, kind_rows=kinds, **stored)
     except (OSError, ValueError, TypeError, KeyError):
         return None

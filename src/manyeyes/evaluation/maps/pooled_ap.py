@@ -168,7 +168,7 @@ class MapMarginTest:
 def check_map_margin(description: str, difference: Interval, margin: float) -> MapMarginTest:
     """The claim that a difference is at least the bar; of a single block nothing is resolved."""
     has_several_blocks = difference.num_scenarios > 1
-    verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_blocks else "not resolved"
+    verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_blocks else "inconclusive"
     return MapMarginTest(description, difference, margin, verdict)
 
 

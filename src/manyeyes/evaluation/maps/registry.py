@@ -20,15 +20,17 @@ from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 
 OURS = "manyeyes"
-BASELINES = (
-    "union",
-    "chamfer_nms",
-    "crowdmap_literal",
-    "polymerge",
-    "frechet_clustering",
-    "heatmap_buffer",
-    "global_map_builder",
-)
+BASELINE_MODULES = {
+    "union": ("union", "UnionConfig"),
+    "chamfer-nms": ("chamfer_nms", "ChamferNmsConfig"),
+    "crowdmap-literal": ("crowdmap_literal", "CrowdMapLiteralConfig"),
+    "polymerge": ("polymerge", "PolyMergeConfig"),
+    "frechet-clustering": ("frechet_clustering", "FrechetClusteringConfig"),
+    "heatmap-buffer": ("heatmap_buffer", "HeatmapBufferConfig"),
+    "global-map-builder": ("global_map_builder", "GlobalMapBuilderConfig"),
+}
+"""The module below ``manyeyes.maps.baselines`` and the configuration class of each baseline."""
+BASELINES = tuple(BASELINE_MODULES)
 METHODS = (OURS, *BASELINES)
 
 
@@ -52,15 +54,19 @@ ConfigChanges = tuple[tuple[str, Any], ...]
 # nothing behind those that many saw.
 TUNED_CHANGES: dict[str, ConfigChanges] = {
     OURS: (
-        ("stations.evidence.publish", 1.0),
-        ("stations.evidence.publish_ring", 0.5),
-        ("stations.evidence.publish_seldom", 0.3),
-        ("stations.evidence.publish_agents", 1),
+        ("stations.evidence.publish_log_odds", 1.0),
+        ("stations.evidence.publish_crossing_log_odds", 0.5),
+        ("stations.evidence.publish_low_coverage_log_odds", 0.3),
+        ("stations.evidence.min_publish_agents", 1),
     ),
-    "chamfer_nms": (("gate_m", 0.75), ("rules.min_score", 0.2)),
-    "polymerge": (("gate_m", 0.75), ("share", 0.3), ("rules.min_score", 0.5)),
-    "heatmap_buffer": (("buffer_m", 0.5), ("share", 0.3), ("simplify_m", 0.1), ("rules.min_score", 0.0)),
-    "crowdmap_literal": (("gate_m", 0.75), ("accept_m", 1.0), ("rules.min_score", 0.2)),
+    "chamfer-nms": (("max_chamfer_m", 0.75), ("rules.min_score", 0.2)),
+    "polymerge": (("max_vertex_distance_m", 0.75), ("min_fraction", 0.3), ("rules.min_score", 0.5)),
+    "heatmap-buffer": (("buffer_m", 0.5), ("min_view_fraction", 0.3), ("simplify_m", 0.1), ("rules.min_score", 0.0)),
+    "crowdmap-literal": (
+        ("max_overlap_chamfer_m", 0.75),
+        ("max_registered_chamfer_m", 1.0),
+        ("rules.min_score", 0.2),
+    ),
 }
 
 
@@ -73,9 +79,10 @@ def make_tuned_settings() -> MethodSettings:
 
 def make_default_config(method: str) -> Any:
     """A method's configuration as it comes."""
-    return (
-        MapFusionConfig() if method == OURS else importlib.import_module(f"manyeyes.maps.baselines.{method}").Config()
-    )
+    if method == OURS:
+        return MapFusionConfig()
+    module, config_class = BASELINE_MODULES[method]
+    return getattr(importlib.import_module(f"manyeyes.maps.baselines.{module}"), config_class)()
 
 
 def apply_changes(config: Any, changes: ConfigChanges) -> Any:
@@ -100,8 +107,9 @@ def fuse_observations(
         return fuse(observations, settings.ours, frame)
     if method not in BASELINES:
         raise ConfigError(f"{method!r} is told more than observations; known: {', '.join(METHODS)}.")
-    baseline, config = importlib.import_module(f"manyeyes.maps.baselines.{method}"), settings.config_of(method)
-    return baseline.fuse(observations, baseline.Config() if config is None else config, frame)
+    baseline = importlib.import_module(f"manyeyes.maps.baselines.{BASELINE_MODULES[method][0]}")
+    config = settings.config_of(method)
+    return baseline.fuse(observations, make_default_config(method) if config is None else config, frame)
 
 
 def fuse_experiment(method: str, experiment: FleetExperiment, settings: MethodSettings) -> MapElements:

@@ -20,8 +20,7 @@ from manyeyes.evaluation.maps.experiment import FleetTrial
 from manyeyes.evaluation.maps.map_cells import MapStudyJob, MapStudyResult, run_study_job
 from manyeyes.evaluation.maps.oracles import ORACLES
 from manyeyes.evaluation.maps.registry import BASELINES, OURS, MethodSettings
-from manyeyes.evaluation.statistics.bootstrap import Interval, compare_to_margin, mean_interval
-from manyeyes.evaluation.statistics.bootstrap import MarginVerdict as Word
+from manyeyes.evaluation.statistics.bootstrap import Interval, MarginVerdict, compare_to_margin, mean_interval
 from manyeyes.maps.store.executors import Executor, map_blocks
 from manyeyes.simulator.fleet.config import CROWDS
 
@@ -57,14 +56,14 @@ def make_trials(config: MapStudyConfig) -> list[FleetTrial]:
             for n in config.observation_counts
             for s in config.seeds
         ]
-    if config.name == "noise":
+    if config.name == "fleet-pose-noise":
         noise_free = [
             FleetTrial(p, NOISE_NUM_OBSERVATIONS, s, fleet_config=fleet_config)
             for p in config.places
             for s in config.seeds
         ]
         return [trial.with_pose_noise(sigma) for trial in noise_free for sigma in config.noise_sigmas_m]
-    if config.name == "table3":
+    if config.name == "crowdmap-table3":
         view_labels = ("local", "semi-global")
         return [
             FleetTrial(p, TABLE3_NUM_OBSERVATIONS, s, size, view_label, CROWDS[view_label])
@@ -72,7 +71,9 @@ def make_trials(config: MapStudyConfig) -> list[FleetTrial]:
             for view_label in view_labels
             for s in config.seeds
         ]
-    raise ConfigError(f"No study is called {config.name!r}; known: fusion, noise, table3, malicious, tuning.")
+    raise ConfigError(
+        f"No study is called {config.name!r}; known: fusion, fleet-pose-noise, crowdmap-table3, adversarial, tuning."
+    )
 
 
 def run_map_study(
@@ -116,14 +117,14 @@ class StudyMarginTest:
     low: float
     high: float
     margin: float
-    verdict: Word
+    verdict: MarginVerdict
 
 
 def group_name(config: MapStudyConfig, result: MapStudyResult) -> str:
     """Which table a cell belongs to."""
-    if config.name == "noise":
+    if config.name == "fleet-pose-noise":
         return f"{result.pose_sigma_m:g} m"
-    if config.name == "table3":
+    if config.name == "crowdmap-table3":
         return f"{result.size_m:g} m {result.place}, {result.view_label}"
     return f"{result.num_observations} observations"
 
@@ -188,8 +189,8 @@ def check_margins(config: MapStudyConfig, results: Sequence[MapStudyResult]) -> 
             low, high = duplication.low, duplication.high
             # Within both sides: the worse of two words.
             verdicts = compare_to_margin(0.95, low, high), compare_to_margin(-1.05, -high, -low)
-            verdict: Word = (
-                "reached" if verdicts == ("reached",) * 2 else "missed" if "missed" in verdicts else "not resolved"
+            verdict: MarginVerdict = (
+                "met" if verdicts == ("met",) * 2 else "not met" if "not met" in verdicts else "inconclusive"
             )
             description = "duplication of dividers, 0.95 to 1.05"
             out.append(StudyMarginTest(group, description, "", duplication.value, low, high, 1.0, verdict))
@@ -199,10 +200,10 @@ def check_margins(config: MapStudyConfig, results: Sequence[MapStudyResult]) -> 
 def _check_best_baseline(
     group: str, results: Sequence[MapStudyResult], methods: Sequence[str], protocol: str, thresholds: str
 ) -> list[StudyMarginTest]:
-    baseline = find_best_baseline(results, methods, "mean", protocol, thresholds)
+    baseline = find_best_baseline(results, methods, "mean_ap", protocol, thresholds)
     if baseline is None:
         return []
-    gain = compute_paired_difference(results, OURS, baseline, "mean", protocol, thresholds)
+    gain = compute_paired_difference(results, OURS, baseline, "mean_ap", protocol, thresholds)
     description = f"mAP ({protocol}, {thresholds}) above the best rival"
     return [
         StudyMarginTest(
@@ -283,6 +284,6 @@ def restrict_study(
     return replace(
         config,
         places=tuple(places or config.places),
-        counts=tuple(observation_counts or config.observation_counts),
+        observation_counts=tuple(observation_counts or config.observation_counts),
         seeds=tuple(range(num_seeds)),
     )

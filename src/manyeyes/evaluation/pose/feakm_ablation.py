@@ -73,7 +73,7 @@ def run_ablation(
     variants: Sequence[FeakmVariant],
     sigmas: Sequence[float] = SIGMAS,
     frame_stride: int = 1,
-    protocol: DetectionProtocol = PROTOCOLS["manyeyes"],
+    protocol: DetectionProtocol = PROTOCOLS["global-sort"],
     seed: int = 0,
     report: Callable[[str, int], None] = lambda scenario, index: None,
 ) -> tuple[FeakmVariantRow, ...]:

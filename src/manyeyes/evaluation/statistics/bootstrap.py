@@ -31,7 +31,7 @@ from manyeyes.evaluation.detection.average_precision import (
 )
 from manyeyes.ops.keyed_random import keyed_uniform
 
-MarginVerdict = Literal["reached", "missed", "not resolved"]
+MarginVerdict = Literal["met", "not met", "inconclusive"]
 _CHUNK_ROWS = 4_000_000
 
 
@@ -125,7 +125,7 @@ def bootstrap(
     num_resamples: int = 1000,
     seed: int = 0,
     confidence_level: float = 0.95,
-    protocol: DetectionProtocol = PROTOCOLS["manyeyes"],
+    protocol: DetectionProtocol = PROTOCOLS["global-sort"],
     statistic: Statistic = weighted_ap,
 ) -> BootstrapSamples:
     """The AP (or another statistic) of matched frames on n resamples, made once for any number of differences."""
@@ -140,7 +140,7 @@ def scenario_interval(
     num_resamples: int = 1000,
     seed: int = 0,
     confidence_level: float = 0.95,
-    protocol: DetectionProtocol = PROTOCOLS["manyeyes"],
+    protocol: DetectionProtocol = PROTOCOLS["global-sort"],
     statistic: Statistic = weighted_ap,
 ) -> Interval:
     """The AP (or another statistic) of matched frames and its interval over scenarios."""
@@ -153,7 +153,7 @@ def paired_difference(
     num_resamples: int = 1000,
     seed: int = 0,
     confidence_level: float = 0.95,
-    protocol: DetectionProtocol = PROTOCOLS["manyeyes"],
+    protocol: DetectionProtocol = PROTOCOLS["global-sort"],
     statistic: Statistic = weighted_ap,
 ) -> Interval:
     """Statistic of a minus that of b, both on the same resampled scenarios, which must be the same with equal truth."""
@@ -177,8 +177,8 @@ def mean_interval(
 def compare_to_margin(margin: float, low: float, high: float) -> MarginVerdict:
     """The verdict on a bar: reached when the whole interval is at or above it, missed when it is below, else undecided."""
     if low >= margin:
-        return "reached"
-    return "missed" if high < margin else "not resolved"
+        return "met"
+    return "not met" if high < margin else "inconclusive"
 
 
 def draw_resamples(num_scenarios: int, num_resamples: int, seed: int) -> np.ndarray:

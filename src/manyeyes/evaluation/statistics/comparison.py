@@ -2,7 +2,7 @@
 """Methods side by side, held against the bars that they are to clear.
 
 A bar is judged on the paired difference over scenarios: "reached" when the whole 95 % interval is at or above it, "missed"
-when it is below, else "not resolved". One scenario alone resolves nothing.
+when it is below, else "inconclusive". One scenario alone resolves nothing.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Margin:
 
 
 MARGINS = (
-    Margin("intermediate", "alone", 0.12),
+    Margin("intermediate", "none", 0.12),
     Margin("intermediate", "late", 0.02),
-    Margin("intermediate", "late-remembering", 0.02),
+    Margin("intermediate", "late-temporal", 0.02),
 )
 
 
@@ -69,4 +69,4 @@ def compare_methods(
 def _check_margin(margin: float | None, interval: Interval) -> MarginVerdict | None:
     if margin is None:
         return None
-    return compare_to_margin(margin, interval.low, interval.high) if interval.num_scenarios > 1 else "not resolved"
+    return compare_to_margin(margin, interval.low, interval.high) if interval.num_scenarios > 1 else "inconclusive"

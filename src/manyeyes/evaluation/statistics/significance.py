@@ -27,5 +27,5 @@ def check_margin(
     """The claim that a cell's AP minus another's is at least the bar. iou counts the thresholds of IOUS."""
     difference = results.paired_difference(key, baseline_key, iou)
     has_several_scenarios = difference.num_scenarios > 1
-    verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_scenarios else "not resolved"
+    verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_scenarios else "inconclusive"
     return MarginTest(description, IOU_THRESHOLDS[iou], difference, margin, verdict)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
     from manyeyes.studies.options import Options
 
-LEARNED_MASK = "learned"
+LEARNED_MASK = "intermediate-mi"
 PERTURBATIONS = (CLEAN, Perturbation(delay_s=0.2), Perturbation(position_sigma_m=0.4))
 PAPER_ROWS = (
     ("none", 0.875, 0.831, 0.762, 16.43),
@@ -112,7 +112,7 @@ def parse_checkpoints(
     names = [name for name, _, _ in pairs]
     if invalid or not words or len(set(names)) < len(names):
         raise ConfigError(
-            f"The study '{study}' takes --branches name={files} ..., each name once; got {' '.join(words) or 'none'}."
+            f"The study '{study}' takes --checkpoints name={files} ..., each name once; got {' '.join(words) or 'none'}."
         )
     return {name: path for name, _, path in pairs}
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from manyeyes.studies.options import Options
 
 BUDGETS = (1398, 2796, 4096, 8192, 16384, 32768, 65536, 131072)
-UNLIMITED, REFERENCE_ENCODING, CODEBOOK = "references", "float32", "codes"
+UNLIMITED, REFERENCE_ENCODING, CODEBOOK = "references", "float32", "codebook"
 THREE_PACKETS_BYTES, MIN_COMPRESSION_RATIO = 4096, 4.7
 
 
@@ -92,7 +92,7 @@ def run(options: Options, console: Console) -> None:
     ]
     tables += [_make_results_table("Beside", reference_rows)] if reference_rows else []
     tables += [make_margin_table(margin_tests)] if margin_tests else []
-    payload: dict[str, object] = {"rows": result_rows, "beside": reference_rows, "claims": margin_tests}
+    payload: dict[str, object] = {"rows": result_rows, "reference_rows": reference_rows, "margin_tests": margin_tests}
     write_study_report(context, payload, tables, make_panels(result_rows, reference_rows), conditions)
 
 

@@ -3,8 +3,8 @@
 
 Oracle rows tell what is lost to geometry from what is lost to the model: of each joint disturbance, the row with true poses has
 its delay and loss alone, the row without delay its errors of pose alone. Early fusion is the bound. Ego alone hears nobody,
-hence is the same under every disturbance: it is played once. --branches name=weights.safetensors plays rival fusions beside, such
-as the ablation's branches; for a fair race --weights is then the branch of as many steps.
+hence is the same under every disturbance: it is played once. --checkpoints name=weights.safetensors adds
+baselines, such as variants of the ablation; for a fair comparison --weights is then the variant of as many steps.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from manyeyes.agents.strategies import METHODS
+from manyeyes.agents.strategies import STRATEGIES
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.significance import MarginTest, check_margin
@@ -97,7 +97,7 @@ def run(options: Options, console: Console) -> None:
         if d == CLEAN or collaborative
     ]
     baselines = parse_checkpoints(options.checkpoints, "robustness") if options.checkpoints else {}
-    if name_clashes := sorted(set(baselines) & set(METHODS)):
+    if name_clashes := sorted(set(baselines) & set(STRATEGIES)):
         raise ConfigError(
             f"The study 'robustness' has methods of the names {', '.join(name_clashes)}; call these branches otherwise."
         )
@@ -120,7 +120,7 @@ def run(options: Options, console: Console) -> None:
         )
         if any(row.perturbation in group for row in result_rows)
     ]
-    payload: dict[str, object] = {"rows": result_rows, "claims": margin_tests, "paper": PAPER_NOTE}
+    payload: dict[str, object] = {"rows": result_rows, "margin_tests": margin_tests, "paper": PAPER_NOTE}
     write_study_report(
         context,
         payload,
@@ -228,9 +228,9 @@ def make_panels(result_rows: Sequence[RobustnessRow]) -> list[CurvePanel]:
     out = []
     for title, xlabel, group, field_name in (
         ("Delay", "seconds", DELAYS, "delay_s"),
-        ("Heading", "standard deviation, degrees", HEADINGS, "heading_deg"),
-        ("Position", "standard deviation, m", POSITIONS, "position_m"),
-        ("Lost packets", "share", LOSSES, "loss"),
+        ("Heading", "standard deviation, degrees", HEADINGS, "heading_sigma_deg"),
+        ("Position", "standard deviation, m", POSITIONS, "position_sigma_m"),
+        ("Lost packets", "share", LOSSES, "packet_loss"),
     ):
         levels = (CLEAN, *group)
         x = tuple(getattr(d, field_name) for d in levels)

@@ -11,7 +11,12 @@ if TYPE_CHECKING:
 
     from manyeyes.studies.maps.options import Options
 
-MODEL_STUDIES = {"local": "local", "semi-global": "semi_global", "whole": "full_map", "pose": "map_pose_noise"}
+MODEL_STUDIES = {
+    "local": "local",
+    "semi-global": "semi_global",
+    "full-map": "full_map",
+    "map-pose-noise": "map_pose_noise",
+}
 """Studies of the map model, and their modules."""
 
 

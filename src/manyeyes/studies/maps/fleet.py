@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 TITLES = {
     "fusion": "Fusion on places that nothing was tuned on",
-    "noise": "Fusion under errors of claimed poses",
-    "table3": "Two intersections, stage-1 input local and semi-global (after CrowdMap, Table 3)",
+    "fleet-pose-noise": "Fusion under errors of claimed poses",
+    "crowdmap-table3": "Two intersections, stage-1 input local and semi-global (after CrowdMap, Table 3)",
 }
 
 
@@ -45,7 +45,7 @@ def run_study_command(options: Options, console: Console) -> None:
         check_method(method)
     if options.study == "tuning":
         _run_search(options, console)
-    elif options.study == "malicious":
+    elif options.study == "adversarial":
         _run_adversarial_study(options, console)
     else:
         _run_fusion_study(options, console)
@@ -75,7 +75,7 @@ def _run_fusion_study(options: Options, console: Console) -> None:
         console.print()
     if margin_tests:
         console.print(make_margin_table(margin_tests))
-    payload = {"lines": summaries, "verdicts": margin_tests, "cells": results}
+    payload = {"summaries": summaries, "margin_tests": margin_tests, "results": results}
     provenance.write_json(options.out / f"{name}.json", payload, {"options": options, "study": config}, 0)
     atomic_write_text(options.out / f"{name}.md", format_study(TITLES[name], summaries, margin_tests))
     console.print(f"\nTable and numbers are in {options.out / name}.md and .json", highlight=False, soft_wrap=True)
@@ -102,8 +102,8 @@ def _run_search(options: Options, console: Console) -> None:
             highlight=False,
             soft_wrap=True,
         )
-    payload = {"budget": NUM_CONFIGS, "attempts": search_trials}
-    provenance.write_json(options.out / "tuning.json", payload, {"options": options, "choices": SEARCH_SPACE}, 0)
+    payload = {"budget": NUM_CONFIGS, "search_trials": search_trials}
+    provenance.write_json(options.out / "tuning.json", payload, {"options": options, "search_space": SEARCH_SPACE}, 0)
     console.print(f"All attempts are in {options.out / 'tuning.json'}", highlight=False, soft_wrap=True)
 
 
@@ -121,7 +121,9 @@ def _run_adversarial_study(options: Options, console: Console) -> None:
         )
     console.print(make_adversarial_table(results))
     provenance.write_json(
-        options.out / "malicious.json", {"trials": results}, {"options": options, "settings": settings}, 0
+        options.out / "adversarial.json", {"trials": results}, {"options": options, "settings": settings}, 0
     )
-    atomic_write_text(options.out / "malicious.md", format_adversarial(results))
-    console.print(f"Table and numbers are in {options.out / 'malicious'}.md and .json", highlight=False, soft_wrap=True)
+    atomic_write_text(options.out / "adversarial.md", format_adversarial(results))
+    console.print(
+        f"Table and numbers are in {options.out / 'adversarial'}.md and .json", highlight=False, soft_wrap=True
+    )

@@ -119,7 +119,7 @@ def run(options: Options, console: Console) -> None:
         make_margin_table(margin_tests, "squares of 64 m"),
         PAPER_TABLE,
     ]
-    payload: dict[str, object] = {"rows": rows, "claims": margin_tests}
+    payload: dict[str, object] = {"rows": rows, "margin_tests": margin_tests}
     write_study_report(
         options, console, make_title(options, [model]), payload, study_tables, _make_panels(town_results, means), 3
     )

@@ -20,7 +20,8 @@ class Options:
     truth: Path | None = None
     """A map's folder with the truth; 'truth' beside the map is found by itself."""
     study: str | None = None
-    """fusion, noise, table3, malicious or tuning; of the map model local, semi-global, whole or pose."""
+    """fusion, fleet-pose-noise, crowdmap-table3, adversarial or tuning; of the map model local, semi-global, full-map or
+    map-pose-noise."""
     places: tuple[str, ...] = ()
     """Only these places of a study."""
     observation_counts: tuple[int, ...] = ()
@@ -41,8 +42,8 @@ class Options:
     """Map models, one a set of sensors: shipped names or .safetensors files; by default all that ship."""
     scenario_stride: int = 1
     """Only every n-th scenario of it."""
-    pose_correction: str = "vote"
-    """Who corrects claimed poses in the study 'pose', by name."""
+    pose_correction: str = "voting"
+    """Who corrects claimed poses in the study 'map-pose-noise', by name."""
     out: Path = Path("out/map-study")
     """Folder for a study: cells are kept there, and a study that was stopped goes on."""
     checks: FileChecks = field(default_factory=FileChecks)

@@ -62,7 +62,7 @@ def run(options: Options, console: Console) -> None:
         options,
         console,
         make_title(options, models_used),
-        {"rows": rows, "claims": margin_tests},
+        {"rows": rows, "margin_tests": margin_tests},
         study_tables,
         panels,
         3,

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from manyeyes.studies.options import Options
 
-CORRECTORS = ("given", "vote", "coalign", "fpv-rcnn", "feaco", "v2x-reg-odist")
+CORRECTORS = ("identity", "voting", "coalign", "fpv-rcnn", "feaco", "v2x-reg-odist")
 SIGMAS = (0.0, 0.4, 0.8, 1.2, 2.0)
 NOISE_FAMILIES = (
     ("gaussian_all", 0.8), ("laplace", 0.8), ("bias", 0.8), ("walk", 0.8), ("latency", 2.0), ("heavy", 0.4), ("offset", 0.5),

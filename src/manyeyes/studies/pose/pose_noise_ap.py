@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """AP against errors of claimed poses, for each way to fuse and each corrector before it: FeaKM, Tables 1 and 2.
 
---branches name=weights.safetensors adds rival fusions, which believe every claim: the paper's rows F-Cooper (preset
+--checkpoints name=weights.safetensors adds rival fusions, which believe every claim: the paper's rows F-Cooper (preset
 branch-se-dast, the maximum) and V2X-ViT (branch-v2x-vit). Buckets are of judged frames, by the fewest objects that the ego shares
 with any agent within reach of its radio: the corrector has that much to go by. Ego alone hears nobody and is played once. "given"
-believes every claim; with true ones it is the oracle that losses are taken from. --disturbances plays some levels alone.
+believes every claim; with true ones it is the oracle that losses are taken from. --perturbations plays some levels alone.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from manyeyes.studies.options import Options
 
-IDENTITY, DEFAULT_CORRECTOR = "given", "vote"
+IDENTITY, DEFAULT_CORRECTOR = "identity", "voting"
 SIGMAS = (0.0, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0)
 CLEAN = Perturbation()
 LEVELS = (
@@ -131,7 +131,7 @@ def run(options: Options, console: Console) -> None:
     ]
     payload: dict[str, object] = {
         "rows": result_rows,
-        "claims": margin_tests,
+        "margin_tests": margin_tests,
         "frames": {
             _format_range(b): sum(b[0] <= n <= b[1] for n in common_objects_by_frame.values())
             for b in COMMON_OBJECT_RANGES
@@ -298,7 +298,7 @@ def _check_corrector(
 
 def _check_margin(description: str, difference: Interval, margin: float) -> MarginTest:
     has_several_scenarios = difference.num_scenarios > 1
-    verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_scenarios else "not resolved"
+    verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_scenarios else "inconclusive"
     return MarginTest(description, IOU_THRESHOLDS[0], difference, margin, verdict)
 
 
