@@ -34,6 +34,7 @@ import torch
 
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
 from manyeyes.maps.baselines import crowdmap_literal
+from manyeyes.maps.baselines.cpd import CpdConfig
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import fuse
@@ -167,7 +168,7 @@ class LiteralMap:
         for new, old in pairs.tolist():
             one, two = held + new, old
             anchor, other = (one, two) if both.score[one] > both.score[two] else (two, one)
-            crowdmap_literal.register(line[anchor], line[other], None)
+            crowdmap_literal.register(line[anchor], line[other], CpdConfig())
             dropped[other] = True
         self.elements = both.take(~dropped)
         return len(pairs)

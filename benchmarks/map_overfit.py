@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map preset learns a few tiles of a recording by heart: mAP on those very tiles, by steps and seconds of training.
 
-The bar (issue: "Seeing the map"): map-toy above 0.9 on 16 tiles in five minutes on two cores. One process, or for two cores
+The bar (issue: "Seeing the map"): map-tiny above 0.9 on 16 tiles in five minutes on two cores. One process, or for two cores
 
 torchrun --nproc-per-node 2 benchmarks/map_overfit.py [--data data/streets] [--split train] [--tiles 16] [--steps 800]
-    [--batch 4] [--rate 4e-3] [--threads 1] [--every 200] [--preset map-toy]
+    [--batch 4] [--rate 4e-3] [--threads 1] [--every 200] [--preset map-tiny]
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=4e-3)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--every", type=int, default=200)
-    parser.add_argument("--preset", default="map-toy", choices=MAP_TRAINING_PRESETS)
+    parser.add_argument("--preset", default="map-tiny", choices=MAP_TRAINING_PRESETS)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
@@ -94,11 +94,11 @@ def main() -> None:
         steps=options.steps,
         batch=options.batch,
         learning_rate=options.rate,
-        warm_up=30,
-        thin=0.0,
-        ema=0.98,
+        warmup_steps=30,
+        max_token_dropout=0.0,
+        ema_decay=0.98,
         # Queries that begin as lines of their own learn from the first step.
-        sketch_steps=0 if preset.map_model.head.num_learned_queries else options.steps // 4,
+        line_field_steps=0 if preset.map_model.head.num_learned_queries else options.steps // 4,
     )
     with tempfile.TemporaryDirectory() as folder:
         run = MapRun(config, few, Path(folder), seed=0)

@@ -15,7 +15,7 @@ if __name__ == "__main__":
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(tempfile.mkdtemp()) / "drive"
     if not folder.exists():
         simulate("tiny", folder, seed=0)
-    config = BenchmarkConfig(replay=ReplayConfig(channel="its-g5-27", latency_budget_s=0.1))
+    config = BenchmarkConfig(replay=ReplayConfig(channel="its-g5-27mbps", latency_budget_s=0.1))
     for row in run_benchmark(partial(Opv2vRecording, folder, "test"), config):
         sent = row.communication
         size = f"{sent.bytes_per_message:9.0f} bytes a message" if sent.num_messages else "nothing sent"

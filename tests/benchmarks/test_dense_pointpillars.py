@@ -56,7 +56,7 @@ def test_a_pillar_lands_on_its_cell_and_nowhere_else(model):
 
 
 def test_maps_have_strides_two_four_eight(model):
-    maps = model.see(PointCloud.of(torch.rand(200, 3, generator=torch.Generator().manual_seed(0))))
+    maps = model.extract_maps(PointCloud.of(torch.rand(200, 3, generator=torch.Generator().manual_seed(0))))
     assert [tuple(m.shape) for m in maps] == [(1, 8, 8, 16), (1, 16, 4, 8), (1, 32, 2, 4)]
     logits, boxes = model.fuse(maps)
     assert logits.shape == (1, 2, 8, 16) and boxes.shape == (1, 14, 8, 16)
@@ -65,7 +65,7 @@ def test_maps_have_strides_two_four_eight(model):
 def test_bytes_carry_the_maps_exactly(model):
     random = torch.Generator().manual_seed(1)
     clouds = [PointCloud.of(torch.rand(200, 3, generator=random) * 6 - 3) for _ in range(3)]
-    maps = [model.see(cloud) for cloud in clouds]
+    maps = [model.extract_maps(cloud) for cloud in clouds]
     together = model.fuse([torch.cat(scale) for scale in zip(*maps)])
     found = model.perceive(maps[0], [model.share(cloud) for cloud in clouds[1:]], 256)
     best, rows = torch.sigmoid(together[0]).flatten().topk(1)

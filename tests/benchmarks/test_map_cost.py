@@ -41,7 +41,7 @@ def test_tiles_cover_the_area_once(cost):
 def test_the_dense_model_has_the_area_s_cells_and_the_tiles_queries(cost, length, width, tiles):
     config = cost.over_all(MAP_TINY, length, width, tiles)
     assert math.prod(config.tile.shape) == (length / 1.5) * (width / 1.5)
-    assert config.head.elements == 80 * tiles
+    assert config.head.num_queries == 80 * tiles
 
 
 def test_poses_lie_within_the_area_and_are_the_same_again(cost):

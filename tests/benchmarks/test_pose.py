@@ -9,17 +9,21 @@ from manyeyes.evaluation.pose.metrics import PoseEvaluation, summarize_evaluatio
 from manyeyes.pose.types import PoseStatus
 
 
-def row(table: str, claim: str, sigma: float, flagged: int, nees: tuple[float, ...] = (3.0,) * 100) -> Row:
+def row(table: str, prior_noise: str, sigma: float, flagged: int, nees: tuple[float, ...] = (3.0,) * 100) -> Row:
     """A row of a hundred answers, so many of which contradict the claim."""
     statuses = [PoseStatus.CONFLICT] * flagged + [PoseStatus.OK] * (100 - flagged)
     frames = [PoseEvaluation(s, 5, 0.1, 0.1, 0.1, n, 1.0) for s, n in zip(statuses, nees)]
-    return Row(table, "vote", 5, 8, 10, 1, False, False, claim, sigma, summarize_evaluations(frames), 1.0, 1.0)
+    return Row(table, "voting", 5, 8, 10, 1, False, False, prior_noise, sigma, summarize_evaluations(frames), 1.0, 1.0)
 
 
 def test_the_monitor_is_held_to_its_worst_row():
-    rows = [row("watched", "offset", 0.5, 100), row("watched", "offset", 0.5, 97), row("watched", "bias", 0.5, 0)]
-    rows += [row("watched", "offset", 1.0, 98), row("watched", "gaussian", 1.0, 1), row("watched", "bias", 1.0, 0)]
-    rows += [row("watchman", "offset", 1.0, 90), row("watchman", "gaussian", 1.0, 0)]
+    rows = [row("monitored", "offset", 0.5, 100), row("monitored", "offset", 0.5, 97), row("monitored", "bias", 0.5, 0)]
+    rows += [
+        row("monitored", "offset", 1.0, 98),
+        row("monitored", "gaussian", 1.0, 1),
+        row("monitored", "bias", 1.0, 0),
+    ]
+    rows += [row("monitor", "offset", 1.0, 90), row("monitor", "gaussian", 1.0, 0)]
     assert [(bar.value, bar.verdict) for bar in bars(rows)] == [
         (0.97, "missed"), (0.0, "reached"), (0.98, "reached"), (0.01, "missed"), (0.9, "missed"), (0.0, "reached"),
     ]  # fmt: skip
@@ -36,5 +40,5 @@ def test_a_mean_nees_whose_interval_holds_a_bar_is_not_resolved():
     }
     verdicts = {name: [bar.verdict for bar in bars([one])] for name, one in rows.items()}
     assert verdicts == {"wide": ["not resolved"], "sure": ["reached"], "high": ["missed"], "low": ["missed"]}
-    # Where something is claimed, or one answer says nothing of its spread, there is no bar.
+    # There is no bar with a prior, nor without a standard error of the NEES.
     assert not list(bars([row("success", "gaussian", 1.0, 0), replace(rows["sure"], score=summarize_evaluations([]))]))

@@ -125,5 +125,5 @@ def test_gradients_go_to_the_largest_seen_feature_else_to_null():
 
 
 def test_features_of_another_grid_are_refused():
-    with pytest.raises(ShapeError, match="warp needs features"):
+    with pytest.raises(ShapeError, match="warp_bev needs features"):
         warp_bev(torch.zeros(1, 2, 3, 3), torch.ones(1, 3, 3, dtype=torch.bool), SMALL, TILE, one())

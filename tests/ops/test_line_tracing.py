@@ -42,25 +42,25 @@ def line(a, b, count=400):
 
 def trace_one_line(field, cell, min_confidence, stride, strides):
     """One line, one stride at a time, in plain numbers."""
-    rows, columns = field.sure.shape[1:]
-    start = field.foot[0, cell[0], cell[1]].tolist()
+    rows, columns = field.confidence.shape[1:]
+    start = field.nearest_point[0, cell[0], cell[1]].tolist()
     both, closed = [], False
     for sign in (1, -1):
-        at, heading, out = start, [sign * v for v in field.way[0, cell[0], cell[1]].tolist()], []
+        at, heading, out = start, [sign * v for v in field.direction[0, cell[0], cell[1]].tolist()], []
         for k in range(0 if closed else strides):
             to = [at[0] + stride * heading[0], at[1] + stride * heading[1]]
             c, r = math.floor(to[0]), math.floor(to[1])
             if not (0 <= c < columns and 0 <= r < rows):
                 out.append([min(max(to[0], 0), columns), min(max(to[1], 0), rows)])
                 break
-            way = field.way[0, r, c].tolist()
+            way = field.direction[0, r, c].tolist()
             turn = way[0] * heading[0] + way[1] * heading[1]
-            if float(field.sure[0, r, c]) < min_confidence or abs(turn) < MIN_TURN_COSINE:
+            if float(field.confidence[0, r, c]) < min_confidence or abs(turn) < MIN_TURN_COSINE:
                 out.append([(at[0] + to[0]) / 2, (at[1] + to[1]) / 2])
                 break
             way = [-v for v in way] if turn < 0 else way
             side = [-way[1], way[0]]
-            foot = field.foot[0, r, c].tolist()
+            foot = field.nearest_point[0, r, c].tolist()
             off = (foot[0] - to[0]) * side[0] + (foot[1] - to[1]) * side[1]
             at, heading = [to[0] + off * side[0], to[1] + off * side[1]], way
             if k >= MIN_STRIDES_TO_CLOSE and math.hypot(at[0] - start[0], at[1] - start[1]) < stride:
@@ -128,7 +128,9 @@ def test_a_cell_that_is_not_sure_begins_no_line():
 
 def test_pictures_do_not_mix():
     across, along = field_of(line([3.5, 0.0], [3.5, 8.0]), 8, 20), field_of(line([0.0, 2.5], [20.0, 2.5]), 8, 20)
-    field = TracingField(*(torch.cat((getattr(across, f), getattr(along, f))) for f in ("sure", "foot", "way")))
+    field = TracingField(
+        *(torch.cat((getattr(across, f), getattr(along, f))) for f in ("confidence", "nearest_point", "direction"))
+    )
     walks = trace_lines(field, torch.tensor([1, 0]), torch.tensor([[2, 3], [2, 3]]), 0.5, 1.0, 30)
     assert float((walks.points[0, :, 1] - 2.5).abs().max()) < 0.05
     assert float((walks.points[1, :, 0] - 3.5).abs().max()) < 0.05
@@ -156,5 +158,5 @@ def test_distances_are_to_the_nearest_of_all_edges():
 
 
 def test_a_field_of_other_shapes_is_refused():
-    with pytest.raises(ShapeError, match="LineField needs"):
+    with pytest.raises(ShapeError, match="TracingField needs"):
         TracingField(torch.zeros(1, 3, 4), torch.zeros(1, 3, 4), torch.zeros(1, 3, 4, 2))

@@ -219,7 +219,7 @@ def test_an_unconstrained_pose_has_infinite_covariance():
         solve_pose_graph(truth / 0, edges, anchored(6))
     with pytest.raises(ShapeError, match="edge 0 joins one to itself"):
         replace(edges, j=edges.i)
-    with pytest.raises(ShapeError, match=r"Edges\.measured"):
+    with pytest.raises(ShapeError, match=r"PoseGraphEdges\.measured"):
         replace(edges, measured=edges.measured[1:])
 
 

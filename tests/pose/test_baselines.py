@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes import Transform
-from manyeyes.pose.baselines import coalign, feaco, fpv_rcnn, icp, mash, v2x_reg, vips
-from manyeyes.pose.baselines import identity as given
+from manyeyes.pose.baselines import coalign, feaco, fpv_rcnn, icp, identity, mash, v2x_reg, vips
 from manyeyes.pose.baselines.v2x_reg import V2xRegConfig
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PosePrior, PoseStatus, pose_difference
@@ -42,7 +41,7 @@ def layout(places=PLACES, yaw=YAW):
 
 def seen_from(pose, marks):
     back = Transform.from_xyz_yaw(*map(float, (pose[0], pose[1], 0.0, pose[2]))).inverse()
-    return marks.moved(np.array([*back.translation[:2].tolist(), float(back.yaw)]))
+    return marks.transform(np.array([*back.translation[:2].tolist(), float(back.yaw)]))
 
 
 @pytest.mark.parametrize("name", [*NEEDS_A_PRIOR, *NEEDS_NONE])
@@ -77,8 +76,8 @@ def test_nothing_seen_is_no_answer(name):
 
 
 def test_what_is_given_is_kept():
-    assert given.correct(layout(), Landmarks.empty(), ORIGIN).status is PoseStatus.OK
-    assert given.correct(layout(), layout(), None).ego_from_other is None
+    assert identity.correct(layout(), Landmarks.empty(), ORIGIN).status is PoseStatus.OK
+    assert identity.correct(layout(), layout(), None).ego_from_other is None
 
 
 def test_coalign_needs_four_objects_and_cannot_reach_past_its_clusters():

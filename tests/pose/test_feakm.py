@@ -25,7 +25,7 @@ from manyeyes.pose.registry import load_corrector
 from manyeyes.pose.types import PosePrior, PoseStatus, pose_difference
 
 TRUTH = np.array([20.0, -7.0, 2.2])
-SOLVERS = {"published": solve_with_ransac, "mended": solve_with_consensus}
+SOLVERS = {"ransac": solve_with_ransac, "consensus": solve_with_consensus}
 
 
 def marks(n: int, seed: int = 0) -> Landmarks:
@@ -59,7 +59,7 @@ def test_pairs_give_the_pose_whatever_the_prior(name):
     for prior in (None, make_prior(TRUTH + [40.0, 3.0, 1.0], 0.5)):
         found = SOLVERS[name](ego, other, same(6), prior)
         np.testing.assert_allclose(pose_difference(found.pose, TRUTH), 0, atol=1e-6)
-        assert found.status.answered and found.inliers == 6
+        assert found.status.has_estimate and found.inliers == 6
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -78,23 +78,21 @@ def test_wrong_pairs_are_outvoted(name):
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("min_pairs", [4, 8])
 def test_fewer_pairs_than_asked_keep_the_claim(name, min_pairs):
-    solver = partial(
-        SOLVERS[name], config=RansacConfig(min_pairs) if name == "published" else ConsensusConfig(min_pairs)
-    )
+    solver = partial(SOLVERS[name], config=RansacConfig(min_pairs) if name == "ransac" else ConsensusConfig(min_pairs))
     ego, prior = marks(8), make_prior(TRUTH + [3.0, 0.0, 0.0], 0.2)
     other = moved_back(TRUTH, ego)
     kept = solver(ego, other, same(min_pairs - 1), prior)
     assert kept.status is PoseStatus.NO_MATCH
     np.testing.assert_allclose(kept.pose, prior.pose)
     assert solver(ego, other, same(min_pairs - 1), None).pose is None
-    assert solver(ego, other, same(min_pairs), prior).status.answered
+    assert solver(ego, other, same(min_pairs), prior).status.has_estimate
     # So many pairs, but one of them joins strangers.
     wrong = same(min_pairs)
     wrong[0, 1], wrong[1, 1] = 1, 0
-    assert not solver(ego, other, wrong, prior).status.answered
+    assert not solver(ego, other, wrong, prior).status.has_estimate
 
 
-def test_as_published_nothing_is_compared_and_a_limit_compares():
+def test_ransac_compares_with_the_prior_only_where_limits_are_set():
     ego = marks(6)
     other = moved_back(TRUTH, ego)
     near, far = make_prior(TRUTH + [0.5, 0.0, 0.01], 0.1), make_prior(TRUTH + [1.5, 0.0, 0.0], 0.1)
@@ -125,7 +123,7 @@ def test_a_reflection_is_no_pose():
     ego = marks(6)
     mirrored = replace(ego, xy=ego.xy * [1.0, -1.0], yaw=-ego.yaw)
     for solver in SOLVERS.values():
-        assert not solver(ego, mirrored, same(6), None).status.answered
+        assert not solver(ego, mirrored, same(6), None).status.has_estimate
 
 
 def test_two_answers_that_fit_alike_are_ambiguous():
@@ -250,10 +248,10 @@ def test_names_select_weights_and_number_of_pairs(tmp_path):
     assert load_corrector(f"{path}@4").net is four.net and load_corrector(str(path)) is not eight
     ego = marks(6)
     for min_pairs, loaded in ((4, four), (8, eight)):
-        assert loaded.solver(ego, moved_back(TRUTH, ego), same(6), None).status.answered == (min_pairs == 4)
+        assert loaded.solver(ego, moved_back(TRUTH, ego), same(6), None).status.has_estimate == (min_pairs == 4)
     for name, why in (
         (f"{path}@x", "4 or 8"),
-        ("magic", "known: vote"),
+        ("magic", "known: voting"),
         (str(tmp_path / "no.safetensors"), "no such file"),
     ):
         with pytest.raises(ManyeyesError, match=why):
@@ -280,8 +278,8 @@ def test_the_half_pixel():
         views.append(DetectorView(tokens, torch.linspace(0.9, 0.5, len(yx))[yx.argsort(0).argsort(0)[:, 0]], boxes))
     errors = {}
     for name, kind in {
-        "published": DenseKeypointConfig(4, (4, 4, 4), 8, num_keypoints=6),
-        "mended": BoxKeypointConfig(4, 8, 8),
+        "ransac": DenseKeypointConfig(4, (4, 4, 4), 8, num_keypoints=6),
+        "consensus": BoxKeypointConfig(4, 8, 8),
     }.items():
         torch.manual_seed(0)
         net = FeakmNet(FeakmConfig(kind, MatcherConfig(8, 8, 1, 1))).eval().requires_grad_(False)
@@ -292,5 +290,5 @@ def test_the_half_pixel():
         off = pose_difference(by_descriptors(*map(Landmarks.of_keypoints, points), None).pose, truth)
         errors[name] = float(np.hypot(off[0], off[1]))
         assert abs(off[2]) < 1e-6
-    assert errors["mended"] < 1e-3
-    assert errors["published"] == pytest.approx(2 * math.hypot(0.4, 0.4), abs=1e-3)
+    assert errors["consensus"] < 1e-3
+    assert errors["ransac"] == pytest.approx(2 * math.hypot(0.4, 0.4), abs=1e-3)

@@ -71,5 +71,5 @@ def test_descriptors_go_where_their_landmarks_go():
     np.testing.assert_array_equal(described.transform(np.ones(3)).descriptor, descriptor)
     np.testing.assert_array_equal(Landmarks.cat([described, described[:1]]).descriptor, descriptor[[0, 1, 2, 0]])
     assert Landmarks.cat([described, one]).descriptor is None and one[:2].descriptor is None
-    with pytest.raises(ShapeError, match=r"Landmarks\.look"):
+    with pytest.raises(ShapeError, match=r"Landmarks\.descriptor"):
         replace(one, descriptor=descriptor[:2])

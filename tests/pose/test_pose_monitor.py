@@ -57,7 +57,7 @@ def test_a_drift_of_a_tenth_of_a_metre_a_second_is_named_within_thirty_frames(ev
         time = np.arange(30) * every_s
         reports = run(noise(30, seed) + time[:, None] * [0.1, 0.0, 0.0], every_s)
         named.append(any(r.health is PoseHealth.DRIFTING for r in reports))
-        assert reports[-1].drift[0] == pytest.approx(0.1, abs=0.03)
+        assert reports[-1].drift_per_s[0] == pytest.approx(0.1, abs=0.03)
     assert np.mean(named) >= min_fraction
 
 

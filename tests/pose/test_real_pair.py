@@ -38,7 +38,7 @@ def disturbed(marks, *key):
     unit = keyed_normal((len(marks), 3), *key).numpy()
     shift = Landmarks(
         marks.xy + 0.25 * unit[:, :2], marks.yaw + 0.044 * unit[:, 2], marks.size, marks.score, marks.sigma_xy,
-        marks.sigma_yaw, marks.flip, marks.instant,
+        marks.sigma_yaw, marks.p_flip, marks.instant,
     )  # fmt: skip
     return shift
 

@@ -83,7 +83,7 @@ def test_the_field_is_a_gaussian_around_the_nearest_column():
     # Bilinear between cells, nothing outside.
     assert field.sample(np.array([0.2, 0.1])) == pytest.approx((1 + math.exp(-0.125)) / 2, abs=1e-6)
     assert field.sample(np.array([[2.1, 0.1], [30.0, 0.0]])).tolist() == [0.0, 0.0]
-    with pytest.raises(ConfigError, match="candidates >= 2"):
+    with pytest.raises(ConfigError, match="num_candidates >= 2"):
         replace(FEW, num_candidates=1)
 
 

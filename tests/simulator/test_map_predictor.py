@@ -34,7 +34,7 @@ def test_without_errors_it_predicts_what_is_there():
 
 def test_errors_depend_on_the_key_and_the_seed_alone():
     def predict(predictor, *noise_key, pose=POSE):
-        return predictor.see(pose, AHEAD, *noise_key).elements
+        return predictor.predict(pose, AHEAD, *noise_key).elements
 
     config = replace(crowd_config("local"), miss_rate=0.0)
     one, again, other = (

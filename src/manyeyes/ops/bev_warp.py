@@ -28,7 +28,7 @@ def warp_bev(
     """
     if features.shape[-2:] != source.shape or seen.shape != features.shape[:1] + features.shape[-2:]:
         raise ShapeError(
-            f"warp needs features (N, C, {source.shape[0]}, {source.shape[1]}) and seen of the same cells; got "
+            f"warp_bev needs features (N, C, {source.shape[0]}, {source.shape[1]}) and seen of the same cells; got "
             f"{tuple(features.shape)} and {tuple(seen.shape)}."
         )
     at = _places(source, target, target_from_source).to(features)

@@ -40,8 +40,8 @@ class TracingField:
             or self.confidence.dim() != 3
         ):
             raise ShapeError(
-                f"LineField needs sure (M, rows, columns), foot and way (M, rows, columns, 2); got {tuple(self.confidence.shape)}, "
-                f"{tuple(self.nearest_point.shape)} and {tuple(self.direction.shape)}."
+                f"TracingField needs confidence (M, rows, columns), nearest_point and direction (M, rows, columns, 2); "
+                f"got {tuple(self.confidence.shape)}, {tuple(self.nearest_point.shape)} and {tuple(self.direction.shape)}."
             )
 
 

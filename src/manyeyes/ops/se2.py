@@ -101,7 +101,7 @@ class PoseGraphEdges:
         wanted = {"i": (n,), "j": (n,), "measured": (n, 3), "information": (n, 3, 3)}
         for name, shape in wanted.items():
             if tuple(getattr(self, name).shape) != shape:
-                raise ShapeError(f"Edges.{name} needs shape {shape}; got {tuple(getattr(self, name).shape)}.")
+                raise ShapeError(f"PoseGraphEdges.{name} needs shape {shape}; got {tuple(getattr(self, name).shape)}.")
         if bool((self.i == self.j).any()):
             raise ShapeError(
                 f"An edge joins two poses; edge {int((self.i == self.j).nonzero()[0, 0])} joins one to itself."
@@ -174,16 +174,20 @@ def _check(initial: Tensor, edges: PoseGraphEdges, fixed: Tensor, huber: float |
     n = initial.shape[0]
     if initial.shape != (n, 3) or fixed.shape != (n,) or fixed.dtype != torch.bool:
         raise ShapeError(
-            f"solve needs poses (N, 3) and fixed (N,) bool; got {tuple(initial.shape)}, {tuple(fixed.shape)}."
+            f"solve_pose_graph needs poses (N, 3) and fixed (N,) bool; got {tuple(initial.shape)}, {tuple(fixed.shape)}."
         )
     if len(edges.i) and not bool(
         ((torch.stack((edges.i, edges.j)) >= 0) & (torch.stack((edges.i, edges.j)) < n)).all()
     ):
         raise ShapeError(f"An edge names a pose that does not exist; there are {n}.")
     if not bool(initial.isfinite().all() and edges.measured.isfinite().all() and edges.information.isfinite().all()):
-        raise ConfigError("solve needs finite poses, measurements and information; drop what is NaN or infinite first.")
+        raise ConfigError(
+            "solve_pose_graph needs finite poses, measurements and information; drop what is NaN or infinite first."
+        )
     if not bool(fixed.any()):
-        raise ConfigError("solve needs at least one fixed pose: edges alone leave the whole graph free to move.")
+        raise ConfigError(
+            "solve_pose_graph needs at least one fixed pose: edges alone leave the whole graph free to move."
+        )
     if huber is not None and huber <= 0:
         raise ConfigError(f"huber is a number of standard deviations above 0, or None; got {huber}.")
 

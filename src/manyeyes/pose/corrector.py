@@ -60,10 +60,10 @@ class AcceptanceTest:
             math.isfinite(self.min_score) and self.min_margin >= 0 and self.prior_volume > 0 and self.min_pairs > 0
         ):
             raise ConfigError(
-                "Acceptance needs a finite least_score, least_margin >= 0, least_pairs >= 1 and anywhere > 0."
+                "AcceptanceTest needs a finite min_score, min_margin >= 0, min_pairs >= 1 and prior_volume > 0."
             )
         if not self.conflict_margin >= 0:
-            raise ConfigError(f"Acceptance needs refuting >= 0; got {self.conflict_margin}.")
+            raise ConfigError(f"AcceptanceTest needs conflict_margin >= 0; got {self.conflict_margin}.")
 
 
 @dataclass(frozen=True)

@@ -55,7 +55,7 @@ class RansacConfig:
 
     def __post_init__(self) -> None:
         if self.sample_size < 2 or self.min_pairs < self.sample_size or self.num_trials < 1:
-            raise ConfigError("RansacConfig needs trials >= 1 and pairs >= sample >= 2.")
+            raise ConfigError("RansacConfig needs num_trials >= 1 and min_pairs >= sample_size >= 2.")
 
 
 def solve_with_ransac(

@@ -33,7 +33,7 @@ class DetectorUncertainty:
     def __post_init__(self) -> None:
         if not (self.sigma_xy_m > 0 and self.sigma_yaw_rad > 0 and 0 <= self.p_flip <= 0.5):
             raise ConfigError(
-                "DetectorError needs sigma_xy_m > 0, sigma_yaw_rad > 0 and flip in [0, 0.5]; "
+                "DetectorUncertainty needs sigma_xy_m > 0, sigma_yaw_rad > 0 and p_flip in [0, 0.5]; "
                 f"got {self.sigma_xy_m}, {self.sigma_yaw_rad}, {self.p_flip}."
             )
 
@@ -68,7 +68,7 @@ class Landmarks:
         n = len(self.xy)
         wanted = {"xy": (n, 2), "size": (n, 2)}
         if self.descriptor is not None:
-            wanted["look"] = (n, *self.descriptor.shape[1:2])
+            wanted["descriptor"] = (n, *self.descriptor.shape[1:2])
         for field in fields(self):
             if (value := getattr(self, field.name)) is None:
                 continue

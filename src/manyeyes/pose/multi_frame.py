@@ -35,7 +35,7 @@ class TimedLandmarks:
     def __post_init__(self) -> None:
         if self.now_from_then.shape != (3,) or not np.isfinite(self.now_from_then).all() or self.instant < 0:
             raise ConfigError(
-                "Sighting needs now_from_then as a finite x, y, yaw (3,) and an instant of at least 0; "
+                "TimedLandmarks needs now_from_then as a finite x, y, yaw (3,) and an instant of at least 0; "
                 f"got {self.now_from_then.shape} and {self.instant}."
             )
 

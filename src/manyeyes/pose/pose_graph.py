@@ -37,7 +37,7 @@ class RelativePoseEdge:
 
     def __post_init__(self) -> None:
         if self.i == self.j or self.pose.shape != (3,) or self.covariance.shape != (3, 3):
-            raise ConfigError("Link joins two agents by a pose (3,) with a covariance (3, 3).")
+            raise ConfigError("RelativePoseEdge joins two agents by a pose (3,) with a covariance (3, 3).")
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class PoseHealth(Enum):
 
     UNKNOWN = "unknown"
     SOUND = "sound"
-    SUSPECT = "doubtful"
+    SUSPECT = "suspect"
     OFFSET = "offset"
     DRIFTING = "drifting"
 
@@ -53,7 +53,9 @@ class PoseMonitorConfig:
     def __post_init__(self) -> None:
         fits = 3 <= self.min_drift_frames <= self.max_frames and 1 <= self.offset_window <= self.max_frames
         if not fits or min(self.offset_gate, self.suspect_gate, self.drift_gate_sigmas) <= 0:
-            raise ConfigError("WatchConfig needs 3 <= least <= frames, 1 <= lasting <= frames and limits above 0.")
+            raise ConfigError(
+                "PoseMonitorConfig needs 3 <= min_drift_frames <= max_frames, 1 <= offset_window <= max_frames and gates above 0."
+            )
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def update_monitor(
     if prior is not None and estimate.measured is not None and estimate.measured_covariance is not None:
         last = state.time_s[-1] if len(state.time_s) else -np.inf
         if not time_s > last:
-            raise ConfigError(f"watch needs growing times; {time_s} s came after {last} s.")
+            raise ConfigError(f"update_monitor needs growing times; {time_s} s came after {last} s.")
         state = PoseMonitorState(
             np.concatenate((state.innovation, pose_difference(estimate.measured, prior.pose)[None]))[
                 -config.max_frames :

@@ -61,7 +61,7 @@ class RegistrationConfig:
             self.sigma_m,
         )
         if min(lengths) <= 0 or self.num_yaw_steps < 1 or self.num_candidates < 2:
-            raise ConfigError("RegistrationConfig needs lengths above 0, turns >= 1 and candidates >= 2.")
+            raise ConfigError("RegistrationConfig needs lengths above 0, num_yaw_steps >= 1 and num_candidates >= 2.")
 
 
 @dataclass(frozen=True)

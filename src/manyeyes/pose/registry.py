@@ -11,8 +11,7 @@ from collections.abc import Callable
 from functools import partial
 
 from manyeyes.datatypes import ConfigError, PointCloud
-from manyeyes.pose.baselines import coalign, feaco, fpv_rcnn, gicp, icp, mash, v2x_reg, vips
-from manyeyes.pose.baselines import identity as given
+from manyeyes.pose.baselines import coalign, feaco, fpv_rcnn, gicp, icp, identity, mash, v2x_reg, vips
 from manyeyes.pose.baselines.v2x_reg import V2xRegConfig
 from manyeyes.pose.corrector import DETECTOR_BOXES_CONFIG, correct_pose
 from manyeyes.pose.feakm import load_feakm_corrector
@@ -21,8 +20,8 @@ from manyeyes.pose.types import PoseCorrector, PoseEstimate, PosePrior
 
 FEAKM = "feakm"
 CORRECTORS: dict[str, PoseCorrector] = {
-    "vote": partial(correct_pose, config=DETECTOR_BOXES_CONFIG),
-    "given": given.correct,
+    "voting": partial(correct_pose, config=DETECTOR_BOXES_CONFIG),
+    "identity": identity.correct,
     "coalign": coalign.correct,
     "fpv-rcnn": fpv_rcnn.correct,
     "feaco": feaco.correct,
@@ -34,7 +33,7 @@ CORRECTORS: dict[str, PoseCorrector] = {
 }
 
 CLOUD_CORRECTORS: dict[str, Callable[[PointCloud, PointCloud, PosePrior | None], PoseEstimate]] = {
-    "register": register_clouds,
+    "scan-registration": register_clouds,
     "gicp": gicp.correct,
 }
 
@@ -44,7 +43,7 @@ def load_corrector(name: str) -> PoseCorrector:
     weights, _, min_pairs = name.partition("@")
     if weights == FEAKM or weights.endswith(".safetensors"):
         if min_pairs and not min_pairs.isdecimal():
-            raise ConfigError(f"{name!r}: behind @ stands how many pairs must agree, the paper's 4 or 8.")
+            raise ConfigError(f"{name!r}: after @, give the minimum number of pairs, the paper's 4 or 8.")
         return load_feakm_corrector(weights, int(min_pairs or 4))
     if name not in CORRECTORS:
         raise ConfigError(

@@ -50,14 +50,14 @@ class PosePrior:
     def __post_init__(self) -> None:
         if self.covariance.shape != (3, 3) or self.ego_from_other.translation.shape != (3,):
             raise ShapeError(
-                "PoseClaim needs one transform and a covariance (3, 3); "
+                "PosePrior needs one transform and a covariance (3, 3); "
                 f"got {tuple(self.ego_from_other.translation.shape)} and {self.covariance.shape}."
             )
         finite = np.isfinite(self.covariance).all() and bool(self.ego_from_other.matrix().isfinite().all())
         if not finite or np.linalg.eigvalsh((self.covariance + self.covariance.T) / 2).min() < -1e-9:
             raise ConfigError(
-                "PoseClaim needs a finite transform and a finite covariance without a negative variance; "
-                "give no claim (None) where nothing is known."
+                "PosePrior needs a finite transform and a finite covariance without a negative variance; "
+                "give no prior (None) where nothing is known."
             )
 
     @classmethod

@@ -66,9 +66,11 @@ class VoteConfig:
             min(self.max_landmarks, self.max_edges, self.max_hypotheses, self.max_refined) < 1
             or not self.min_edge_m < self.max_edge_m
         ):
-            raise ConfigError("VoteConfig needs caps of at least 1 and shortest_m < longest_m.")
+            raise ConfigError("VoteConfig needs caps of at least 1 and min_edge_m < max_edge_m.")
         if not (self.prior_dof > 0 and 0 <= self.common_variance_fraction < 1 and 0 < self.lateral_sigma_ratio <= 1):
-            raise ConfigError("VoteConfig needs trust > 0, shared in [0, 1) and across in (0, 1].")
+            raise ConfigError(
+                "VoteConfig needs prior_dof > 0, common_variance_fraction in [0, 1) and lateral_sigma_ratio in (0, 1]."
+            )
 
 
 @dataclass(frozen=True)

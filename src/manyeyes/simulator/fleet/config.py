@@ -14,72 +14,105 @@ DAY_NS = 86_400_000_000_000
 
 @dataclass(frozen=True)
 class CrowdConfig:
-    """Errors of map models and habits of a fleet. Lengths in metres, angles in radians, shares and rates in [0, 1].
+    """Observation noise of map models, and the behaviour of a fleet.
 
-    Looks: range_x, range_y bound the view in the agent's frame; an agent looks every spacing metres of a drive, and sends at
-    most per_pass looks of one drive. points_per_element: of an observed element. model: what the observations say made them.
-    Poses: pose_sigma, yaw_sigma are the claimed pose's errors, of which the share pass_share (of variance) is one error for the
-    whole pass. The claimed covariance tells the truth about both, but of outliers and liars, who claim what honest ones claim.
-    Elements: drop_out grows with distance (half to one and a half times); false_positive per true stretch in view; fragment
-    splits a line in two; confusion says another class; point and point_per_m are noise of each point at and with distance; bow
-    bends a line sideways; end shortens it; style_error says another style.
-    Occlusion: occluders vehicles stand near on average, up to three.
-    Fleet: outlier_share of agents have poses wrong by outlier_offset; malicious_share move what they saw of malicious_kinds by
-    malicious_offset, each agent its own way (independent) or all the same way (colluding); stale_share see the world as it was
-    at the start. pole_share of passes are surveyed roadside poles, which see pole_range.
-    Time: passes begin every pass_interval_s; looks follow at 10 m/s.
+    Lengths are in metres, angles in radians, fractions and rates in [0, 1]; pairs are (min, max). range_x_m, range_y_m: the view in
+    the agent's frame. spacing_m: distance between two observations of a drive. model: name of the map model in the observations.
     """
 
     range_x_m: tuple[float, float] = (-30.0, 30.0)
     range_y_m: tuple[float, float] = (-15.0, 15.0)
     spacing_m: tuple[float, float] = (30.0, 60.0)
+    # At most so many observations of one drive are sent.
     max_observations_per_drive: int = 4
     drives_per_agent: int = 1
     points_per_element: int = 20
     model: str = "simulated-local"
+    # Errors of the prior pose; its covariance states them correctly, except for outliers and malicious agents.
     pose_sigma_m: float = 0.4
     yaw_sigma_rad: float = math.radians(0.5)
+    # Fraction of the pose variance that is one common error of the whole drive.
     drive_error_fraction: float = 0.5
+    # Mean rate; it grows with the distance, from half of this to one and a half times.
     miss_rate: float = 0.20
+    # False elements per true stretch in view.
     false_positive_rate: float = 0.15
+    # A line is split in two.
     fragment_rate: float = 0.25
+    # An element has another class.
     confusion_rate: float = 0.02
+    # Noise of each point, at zero distance and per metre of distance.
     point_sigma_m: float = 0.12
     point_sigma_per_m: float = 0.004
+    # Lines are bent sideways and shortened at their ends; both are standard deviations.
     lateral_bend_m: float = 0.15
     endpoint_truncation_m: float = 0.5
+    # A divider has another style.
     style_error_rate: float = 0.15
+    # Mean number of nearby vehicles that occlude, at most 3.
     occluders: float = 1.0
+    # Agents whose poses are wrong by outlier_offset_m.
     outlier_fraction: float = 0.05
     outlier_offset_m: tuple[float, float] = (2.0, 4.0)
+    # Agents that displace observed elements of malicious_kinds by malicious_offset_m.
     malicious_fraction: float = 0.0
     malicious_offset_m: tuple[float, float] = (1.0, 4.0)
+    # Displacements: drawn per agent, or the same for all malicious agents.
     attack_mode: Literal["independent", "colluding"] = "independent"
     malicious_kinds: tuple[str, ...] = ("divider", "boundary", "crossing", "stop_line")
+    # Agents that observe the initial map, whatever has changed since.
     outdated_fraction: float = 0.0
+    # Drives that are surveyed roadside units with exact poses, and how far they see.
     infrastructure_fraction: float = 0.0
     infrastructure_range_m: float = 50.0
+    # Drives along recorded trajectories, where the place has any.
     recorded_drive_fraction: float = 0.25
     start_ns: int = 1_760_000_000_000_000_000
+    # Time between the starts of two drives; vehicles move at 10 m/s.
     drive_interval_s: float = 6 * 3600.0
 
     def __post_init__(self) -> None:
-        for name in ("pass_share", "drop_out", "false_positive", "fragment", "confusion", "style_error"):
+        for name in (
+            "drive_error_fraction",
+            "miss_rate",
+            "false_positive_rate",
+            "fragment_rate",
+            "confusion_rate",
+            "style_error_rate",
+        ):
             self._require(0.0 <= getattr(self, name) <= 1.0, name, "a rate in [0, 1]")
-        for name in ("outlier_share", "malicious_share", "stale_share", "pole_share", "log_share"):
-            self._require(0.0 <= getattr(self, name) <= 1.0, name, "a share in [0, 1]")
-        for name in ("pose_sigma", "yaw_sigma", "point", "point_per_m", "bow", "end", "pass_interval_s"):
+        for name in (
+            "outlier_fraction",
+            "malicious_fraction",
+            "outdated_fraction",
+            "infrastructure_fraction",
+            "recorded_drive_fraction",
+        ):
+            self._require(0.0 <= getattr(self, name) <= 1.0, name, "a fraction in [0, 1]")
+        for name in (
+            "pose_sigma_m",
+            "yaw_sigma_rad",
+            "point_sigma_m",
+            "point_sigma_per_m",
+            "lateral_bend_m",
+            "endpoint_truncation_m",
+            "drive_interval_s",
+        ):
             self._require(0.0 <= getattr(self, name) < math.inf, name, "a number of at least 0")
-        for name in ("range_x", "range_y", "spacing", "outlier_offset", "malicious_offset"):
+        for name in ("range_x_m", "range_y_m", "spacing_m", "outlier_offset_m", "malicious_offset_m"):
             low, high = getattr(self, name)
-            self._require(low <= high, name, "(least, most)")
-        self._require(self.range_x_m[0] < self.range_x_m[1], "range_x", "a view wider than 0")
-        self._require(self.range_y_m[0] < self.range_y_m[1], "range_y", "a view wider than 0")
-        self._require(self.spacing_m[0] > 0, "spacing", "more than 0")
+            self._require(low <= high, name, "(min, max)")
+        self._require(self.range_x_m[0] < self.range_x_m[1], "range_x_m", "a view wider than 0")
+        self._require(self.range_y_m[0] < self.range_y_m[1], "range_y_m", "a view wider than 0")
+        self._require(self.spacing_m[0] > 0, "spacing_m", "more than 0")
         self._require(0.0 <= self.occluders <= 3.0, "occluders", "a mean in [0, 3]")
-        self._require(self.max_observations_per_drive >= 1 and self.drives_per_agent >= 1, "per_pass", "1 or more")
-        self._require(3 <= self.points_per_element <= 64, "points", "3 to 64")
-        self._require(self.attack_mode in ("independent", "colluding"), "malicious", "independent or colluding")
+        self._require(
+            self.max_observations_per_drive >= 1 and self.drives_per_agent >= 1,
+            "max_observations_per_drive",
+            "1 or more",
+        )
+        self._require(3 <= self.points_per_element <= 64, "points_per_element", "3 to 64")
+        self._require(self.attack_mode in ("independent", "colluding"), "attack_mode", "independent or colluding")
 
     def _require(self, holds: bool, name: str, expected: str) -> None:
         if not holds:
@@ -107,23 +140,23 @@ CROWDS: dict[str, CrowdConfig] = {
         _LOCAL,
         model="simulated-perfect",
         pose_sigma_m=0.0,
-        yaw_sigma=0.0,
-        drop_out=0.0,
-        false_positive=0.0,
-        fragment=0.0,
-        confusion=0.0,
-        point=0.0,
-        point_per_m=0.0,
-        bow=0.0,
-        end=0.0,
-        style_error=0.0,
+        yaw_sigma_rad=0.0,
+        miss_rate=0.0,
+        false_positive_rate=0.0,
+        fragment_rate=0.0,
+        confusion_rate=0.0,
+        point_sigma_m=0.0,
+        point_sigma_per_m=0.0,
+        lateral_bend_m=0.0,
+        endpoint_truncation_m=0.0,
+        style_error_rate=0.0,
         occluders=0.0,
-        outlier_share=0.0,
+        outlier_fraction=0.0,
     ),
-    "independent-liars": replace(_LOCAL, malicious_share=0.2),
-    "colluding-liars": replace(_LOCAL, malicious_share=0.2, malicious="colluding"),
-    "stale": replace(_LOCAL, stale_share=0.2),
-    "with-poles": replace(_LOCAL, pole_share=0.1),
+    "independent-malicious": replace(_LOCAL, malicious_fraction=0.2),
+    "colluding-malicious": replace(_LOCAL, malicious_fraction=0.2, attack_mode="colluding"),
+    "outdated": replace(_LOCAL, outdated_fraction=0.2),
+    "with-infrastructure": replace(_LOCAL, infrastructure_fraction=0.1),
 }
 
 

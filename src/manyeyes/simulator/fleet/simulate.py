@@ -39,7 +39,7 @@ from manyeyes.simulator.fleet.routes import sample_poses
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-ROLES = ("honest", "outlier", "malicious", "stale", "pole")
+ROLES = ("honest", "outlier", "malicious", "outdated", "infrastructure")
 HONEST, OUTLIER, MALICIOUS, OUTDATED, INFRASTRUCTURE = range(len(ROLES))
 
 _MIN_SIGMA_M, _MIN_SIGMA_RAD = 0.05, np.radians(0.05)
