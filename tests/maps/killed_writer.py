@@ -124,7 +124,10 @@ def main(folder: Path, step: int, timed: int) -> None:
     """Kill at every ``step``-th operation until a writer lives to its end, then ``timed`` writers at times between."""
     origin = folder / "origin"
     # What every fork would load again.
-    batch(1), fused(1), import_module("pyarrow.parquet"), import_module("pyarrow.compute")
+    batch(1)
+    fused(1)
+    import_module("pyarrow.parquet")
+    import_module("pyarrow.compute")
     start = time.perf_counter()
     in_fork(lambda: write(origin, 1))
     reference = folder / "reference"

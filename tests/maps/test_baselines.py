@@ -42,7 +42,7 @@ def make_observation(
 
 
 def lines_in(made: VectorMap, kind: int = DIVIDER) -> list[np.ndarray]:
-    return [made.elements.polyline(i) for i in np.flatnonzero(made.elements.kind == kind)]
+    return [made.elements.polyline(i) for i in np.flatnonzero(made.elements.kind == kind).tolist()]
 
 
 BASELINES = [union, chamfer_nms, crowdmap_literal, polymerge, frechet_clustering, heatmap_buffer, global_map_builder]
@@ -226,17 +226,17 @@ def test_complete_linkage_joins_nothing_that_has_two_members_too_far_apart() -> 
 
 
 @pytest.mark.parametrize(
-    ("baseline", "change"),
+    ("config_class", "change"),
     [
-        (frechet_clustering, {"linkage": "ward"}),
-        (frechet_clustering, {"take": "best"}),
-        (crowdmap_literal, {"merge": "sum"}),
-        (heatmap_buffer, {"walks": "none"}),
+        (frechet_clustering.FrechetClusteringConfig, {"linkage": "ward"}),
+        (frechet_clustering.FrechetClusteringConfig, {"representative": "best"}),
+        (crowdmap_literal.CrowdMapLiteralConfig, {"merge": "sum"}),
+        (heatmap_buffer.HeatmapBufferConfig, {"walks": "none"}),
     ],
 )
-def test_an_unknown_choice_is_refused(baseline, change: dict) -> None:
+def test_an_unknown_choice_is_refused(config_class: type, change: dict) -> None:
     with pytest.raises(ConfigError, match=r"expected .*; got"):
-        baseline.Config(**change)
+        config_class(**change)
 
 
 def test_frechet_clusters_of_rings_do_not_mind_where_and_which_way_a_ring_begins() -> None:

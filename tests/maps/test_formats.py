@@ -290,5 +290,5 @@ def test_simplified_lines_stay_within_the_tolerance_and_keep_their_evidence(two_
         np.testing.assert_array_equal(a[0], b[0])
         assert ring or (a[-1] == b[-1]).all()
     kept = [np.flatnonzero((m.elements.points == p).all(1))[0] for p in less.elements.points[:10]]
-    np.testing.assert_array_equal(less.point_evidence.support[:10], m.stations.support[kept])
+    np.testing.assert_array_equal(less.point_evidence.support[:10], m.point_evidence.support[kept])
     np.testing.assert_array_equal(simplify_map(m, 0.0).elements.polyline(3), m.elements.polyline(3))

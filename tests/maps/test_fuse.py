@@ -105,8 +105,8 @@ def lines_of(fused, kind, state=PUBLISHED):
 
 def furthest(a, b):
     """The largest distance from a point of elements ``a`` to the lines of ``b``."""
-    first, points = b.first, b.points
-    return find_nearest_line(a.points, points, first, 50.0).distance.max(initial=0.0)
+    offsets, points = b.offsets, b.points
+    return find_nearest_line(a.points, points, offsets, 50.0).distance.max(initial=0.0)
 
 
 def test_a_copies_of_an_observation_are_that_observation():
@@ -186,8 +186,10 @@ def test_g_one_outlier_agent_of_ten_moves_nothing():
 def _crossing_seen_then(count, missed, occluders=None):
     ring = (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))
     before = [make_observation([*road(), ring], (30.0, 0.0, 0.0), f"agent{k}", k) for k in range(count)]
-    more = {} if occluders is None else {"occluders": Polygons.of(occluders)}
-    after = [make_observation(road(), (30.0, 0.0, 0.0), f"later{k}", count + k, **more) for k in range(missed)]
+    hidden = Polygons.of(occluders or ())
+    after = [
+        make_observation(road(), (30.0, 0.0, 0.0), f"later{k}", count + k, occluders=hidden) for k in range(missed)
+    ]
     fused = fuse([*before, *after])
     return int(fused.state[np.flatnonzero(fused.elements.kind == CROSSING)[0]])
 
@@ -308,7 +310,7 @@ def test_colluding_agents_displace_no_station_seen_by_honest_agents():
     world = [*road(), (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))]
     honest = crowd(world, 40)
     for offset in (1.0, 2.0, 4.0):
-        malicious = [replace(o, agent=f"liar{k}", elements=o.elements.with_points(o.elements.points + (0.0, offset)))
+        malicious = [replace(o, agent=f"malicious{k}", elements=o.elements.with_points(o.elements.points + (0.0, offset)))
                  for k, o in enumerate(crowd(world, 10, seed=5))]  # fmt: skip
         malicious = [replace(o, pose=(o.pose[0], o.pose[1], o.pose[2])) for o in malicious if np.cos(o.pose[2]) > 0]
         before, after = fuse(honest).select_published(), fuse([*honest, *malicious]).select_published()
@@ -321,7 +323,9 @@ def test_rejected_agents_leave_poses_unchanged():
     honest = crowd(world, 9, sigma=0.2)
     malicious = [
         replace(
-            o, agent=f"liar{k}", elements=o.elements.with_points(o.elements.points + (0.0, 2.0 * np.cos(o.pose[2])))
+            o,
+            agent=f"malicious{k}",
+            elements=o.elements.with_points(o.elements.points + (0.0, 2.0 * np.cos(o.pose[2]))),
         )
         for k, o in enumerate(crowd(world, 2, sigma=0.2, seed=5))
     ]
@@ -357,11 +361,11 @@ def test_wrongly_rejected_agents_are_reinstated():
 
 def test_rejected_observations_count_only_outside_inlier_coverage():
     """A road in a view of 60 m; four believed agents stand 20 m behind, so that they see two thirds of it."""
-    observations = [make_observation(road(), (30.0, 0.0, 0.0), "doubted")]
+    observations = [make_observation(road(), (30.0, 0.0, 0.0), "rejected")]
     observations += [make_observation(road(), (10.0, 0.0, 0.0), f"agent{k}", k) for k in range(4)]
     arrays = to_observation_arrays(observations, 1.0)
     pose = np.array(arrays.pose)
-    is_inlier = np.array([arrays.agents[a] != "doubted" for a in arrays.agent])
+    is_inlier = np.array([arrays.agents[a] != "rejected" for a in arrays.agent])
     is_rejected = ~is_inlier[arrays.observation_of_point]
     x = arrays.to_world(pose)[0][:, 0]
     seen = find_covered_by_inliers(arrays, pose, is_inlier, 4, 2.0)

@@ -61,7 +61,7 @@ def test_the_documented_example_is_read(tmp_path: Path, monkeypatch: pytest.Monk
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(block, names)
     (seen,) = names["reading"].observations
-    assert names["reading"].frame == FRAME and not names["reading"].quarantined
+    assert names["reading"].frame == FRAME and not names["reading"].rejected
     assert seen.agent == "car-17" and seen.elements.kind.tolist() == [0, 2]
     assert seen.elements.sigma.tolist() == [0.12, 0.3, 0.12, 0.12, 0.12, 0.12]
     assert seen.elements.style.tolist() == [[0.1, 0.9, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]

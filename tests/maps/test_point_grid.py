@@ -53,7 +53,7 @@ def test_the_grid_keeps_the_order_of_points_within_a_cell():
     for begin, end in zip(grid.offsets[:-1], grid.offsets[1:]):
         rows = grid.order[begin:end]
         assert (np.diff(rows) > 0).all() and len(np.unique(np.floor(xy[rows] / 2.5), axis=0)) == 1
-    assert [lower_bound(grid.keys, key) for key in grid.keys] == list(range(len(grid.keys)))
+    assert [lower_bound(grid.keys, key) for key in grid.keys.tolist()] == list(range(len(grid.keys)))
 
 
 def test_priorities_depend_on_coordinates_alone():

@@ -8,6 +8,7 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,13 +83,14 @@ def test_observations_are_found_by_the_start_of_an_id_and_by_agent_and_pass(tmp_
         assert log.find(pass_id="pass") == tuple(sorted(o.id for o in many))
         digit = one.id[0]
         count = sum(o.id[0] == digit for o in many)
-        for words, text in (
+        cases: tuple[tuple[dict[str, Any], str], ...] = (
             ({"ids": [digit]}, rf"{count} observations have an id that starts with {digit}; give more digits"),
             ({"ids": ["0" * 33]}, r"32 hexadecimal digits"),
             ({"ids": [""]}, r"32 hexadecimal digits"),
             ({"agent": "agnt7"}, r"agent 'agnt7'; did you mean 'agent\d*7'"),
             ({"agent": "agent7", "pass_id": "?"}, r"pass '\?'; there are 1 others"),
-        ):
+        )
+        for words, text in cases:
             with pytest.raises(StoreError, match=text):
                 log.find(**words)
 

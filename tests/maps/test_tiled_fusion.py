@@ -45,7 +45,7 @@ def store(crowd, tmp_path):
 
 
 def _tiled(store, work, tile_m, executor=None, progress=None):
-    standing = store.log.standing()
+    standing = store.log.active_observations()
     return fuse_tiles(
         store.log.folder,
         standing,
@@ -61,7 +61,7 @@ def _tiled(store, work, tile_m, executor=None, progress=None):
 def test_four_tiles_that_meet_in_the_crossroads_give_the_map_of_one_piece(store, whole, tmp_path):
     assert len(whole) > 10
     blocks = make_blocks(
-        store.log.folder, store.log.standing(), tmp_path, MapFusionConfig(), TiledFusionConfig(256.0, 1)
+        store.log.folder, store.log.active_observations(), tmp_path, MapFusionConfig(), TiledFusionConfig(256.0, 1)
     )
     assert len(blocks) == 4 and all(block.home_ids for block in blocks)
     assert _tiled(store, tmp_path / "work", 256.0).quantised_hash() == whole.quantised_hash()
@@ -96,7 +96,7 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
     ]  # fmt: skip
     before = {p.name: p.stat().st_mtime_ns for p in work.iterdir()}
     results = sorted(work.iterdir())
-    assert len(results) == 4 * (steps + 2) and not list(work.glob("*.sightings.npz"))
+    assert len(results) == 4 * (steps + 2) and not list(work.glob("*.arrays.npz"))
     results[0].write_bytes(results[0].read_bytes()[:100])
     results[1].unlink()
     assert _tiled(store, work, 256.0).quantised_hash() == whole.quantised_hash()
@@ -126,7 +126,7 @@ def test_a_store_fuses_and_publishes_what_it_holds_and_a_retraction_is_a_refold(
 
 
 def test_every_block_reads_what_its_home_can_meet_and_nothing_from_far_away(store, tmp_path):
-    standing = store.log.standing()
+    standing = store.log.active_observations()
     blocks = make_blocks(
         store.log.folder, standing, tmp_path, MapFusionConfig(), TiledFusionConfig(50.0, 1, halo_m=10.0, margin_m=5.0)
     )
@@ -141,7 +141,7 @@ def test_every_block_reads_what_its_home_can_meet_and_nothing_from_far_away(stor
 
 
 def test_observation_arrays_round_trip_through_work_folder(store, tmp_path):
-    standing = store.log.standing()
+    standing = store.log.active_observations()
     want = to_observation_arrays(read_active(store.log.folder, standing, np.arange(5)), 1.0)
     save_columns(tmp_path / "a.npz", want)
     got = load_columns(tmp_path / "a.npz", type(want))
@@ -158,5 +158,5 @@ def test_observation_arrays_round_trip_through_work_folder(store, tmp_path):
 
 
 def test_sizes_that_make_no_sense_are_refused():
-    with pytest.raises(ConfigError, match="TileConfig"):
+    with pytest.raises(ConfigError, match="TiledFusionConfig"):
         TiledFusionConfig(tile_size_m=0.0)

@@ -105,7 +105,7 @@ def test_ids_follow_content_and_equal_elements_differ_by_rank() -> None:
 def test_columns_that_do_not_fit_are_refused_by_name() -> None:
     with pytest.raises(ShapeError, match=r"VectorMap.state needs shape \(3,\)"):
         replace(small(), state=np.zeros(2, np.int64))
-    with pytest.raises(ShapeError, match="stations needs 9 rows"):
-        replace(small(), point_evidence=PointEvidence(*(np.zeros(8) for _ in range(6))))
-    with pytest.raises(ShapeError, match=r"sources\.first needs offsets"):
+    with pytest.raises(ShapeError, match="point_evidence needs 9 rows"):
+        replace(small(), point_evidence=PointEvidence(*(np.zeros(8, np.int64) for _ in range(6))))
+    with pytest.raises(ShapeError, match=r"sources\.offsets needs offsets"):
         replace(small(), sources=np.zeros(3, np.int64))

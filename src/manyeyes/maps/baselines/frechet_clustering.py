@@ -50,7 +50,7 @@ class FrechetClusteringConfig:
     def __post_init__(self) -> None:
         if self.linkage not in ("single", "average", "complete") or self.representative not in ("mean", "medoid"):
             raise ConfigError(
-                "frechet_clustering.Config: expected linkage single, average or complete and take mean or medoid; "
+                "FrechetClusteringConfig: expected linkage single, average or complete and representative mean or medoid; "
                 f"got {self.linkage!r} and {self.representative!r}. Choose of those."
             )
 

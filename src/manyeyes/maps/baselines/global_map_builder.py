@@ -107,10 +107,12 @@ def _add_observation(
             if column < 0 or cost[local.tolist().index(row), column] > config.max_match_m[kind]:
                 out.append(_BuiltElement(shape, kind, score, weight, (row,)))
                 continue
-            old = built[known_rows[column]]
+            old: _BuiltElement = built[known_rows[column]]
             points = shape if kind == CROSSING else replace_covered(old.points, shape, config.simplify_m)
-            mean = (old.score * old.weight + score * weight) / (old.weight + weight)
-            out[known_rows[column]] = _BuiltElement(points, kind, mean, old.weight + weight, (*old.rows, row))
+            mean = (old.score * old.total_length + score * weight) / (old.total_length + weight)
+            out[known_rows[column]] = _BuiltElement(
+                points, kind, mean, old.total_length + weight, (*old.source_rows, row)
+            )
     return out
 
 

@@ -45,7 +45,7 @@ class MapFrame:
     def __post_init__(self) -> None:
         if not (abs(self.latitude) <= 90.0 and abs(self.longitude) <= 180.0):
             raise ObservationError(
-                f"Frame needs latitude in [-90, 90] and longitude in [-180, 180] degrees; got {self.latitude}, {self.longitude}."
+                f"MapFrame needs latitude in [-90, 90] and longitude in [-180, 180] degrees; got {self.latitude}, {self.longitude}."
             )
 
     @property

@@ -42,7 +42,7 @@ class PointEvidence:
         for f in fields(self):
             if getattr(self, f.name).shape != self.support.shape or self.support.ndim != 1:
                 raise ShapeError(
-                    f"Stations.{f.name} needs shape {self.support.shape}; got {getattr(self, f.name).shape}."
+                    f"PointEvidence.{f.name} needs shape {self.support.shape}; got {getattr(self, f.name).shape}."
                 )
 
     def __len__(self) -> int:
@@ -116,7 +116,7 @@ class VectorMap:
     sources: Ints
 
     def __post_init__(self) -> None:
-        arrays = ("id", "observations", "log_odds", *_COUNTS, "sources_first", "sources")
+        arrays = ("id", "observations", "log_odds", *_COUNTS, "source_offsets", "sources")
         _freeze(self, {"id": np.uint8, "observations": np.uint8, "log_odds": np.float64}, arrays)
         n = len(self.elements)
         for name in ("log_odds", *_COUNTS):
@@ -128,11 +128,11 @@ class VectorMap:
             )
         if len(self.point_evidence) != len(self.elements.points):
             raise ShapeError(
-                f"VectorMap.stations needs {len(self.elements.points)} rows; got {len(self.point_evidence)}."
+                f"VectorMap.point_evidence needs {len(self.elements.points)} rows; got {len(self.point_evidence)}."
             )
         check_offsets("VectorMap.sources", self.source_offsets, len(self.sources))
         if len(self.source_offsets) != n + 1:
-            raise ShapeError(f"VectorMap.sources_first needs shape {(n + 1,)}; got {self.source_offsets.shape}.")
+            raise ShapeError(f"VectorMap.source_offsets needs shape {(n + 1,)}; got {self.source_offsets.shape}.")
 
     @classmethod
     def of(
@@ -203,7 +203,7 @@ class VectorMap:
         new_rows = np.full(len(self), -1, np.int64)
         new_rows[index] = np.arange(len(index))
         _, points = take_rows(self.elements.offsets, index)
-        sources_first, places = take_rows(self.source_offsets, index)
+        source_offsets, places = take_rows(self.source_offsets, index)
         used, sources = np.unique(self.sources[places], return_inverse=True)
         return VectorMap(
             frame=self.frame,
@@ -213,7 +213,7 @@ class VectorMap:
             point_evidence=self.point_evidence.take(points),
             topology=self.topology.renumber(new_rows),
             observations=self.observations[used],
-            source_offsets=sources_first,
+            source_offsets=source_offsets,
             sources=sources,
             **{name: getattr(self, name)[index] for name in _COUNTS},
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps as an OGC GeoPackage on WGS 84 (EPSG:4326), for editing in QGIS: layers ``summarize_methods`` and ``crossings``."""
+"""Maps as an OGC GeoPackage on WGS 84 (EPSG:4326), for editing in QGIS: layers ``lines`` and ``crossings``."""
 
 from __future__ import annotations
 

@@ -18,9 +18,9 @@ _MIN_ZOOM, _MAX_ZOOM = 12, 16
 def write_pmtiles(
     vector_map: VectorMap, path: Path | str, min_zoom: int = _MIN_ZOOM, max_zoom: int = _MAX_ZOOM
 ) -> None:
-    """Write all elements as vector tiles from zoom least_zoom to most_zoom."""
+    """Write all elements as vector tiles from zoom min_zoom to max_zoom."""
     if not 0 <= min_zoom <= max_zoom <= 22:
-        raise ConfigError(f"Expected zooms 0 <= least <= most <= 22; got {min_zoom} and {max_zoom}.")
+        raise ConfigError(f"Expected zooms 0 <= min_zoom <= max_zoom <= 22; got {min_zoom} and {max_zoom}.")
     if not len(vector_map):
         raise ConfigError(f"{path}: vector tiles of an empty map have no place on earth; fuse more observations first.")
     try:

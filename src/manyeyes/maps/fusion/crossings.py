@@ -149,7 +149,7 @@ class _CrossingEvidence(NamedTuple):
     t_first: I64x1
     t_last: I64x1
     style: F64x2
-    first: I64x1
+    source_offsets: I64x1
     sources: I64x1
 
 

@@ -172,7 +172,7 @@ class ElementStyles(NamedTuple):
     """Of E observed elements: style (E, S) probabilities, and worth (E,), the share of a hit that a sighting adds."""
 
     style: F64x2
-    worth: F64x1
+    score_weight: F64x1
 
 
 class AgentScratch(NamedTuple):
@@ -195,10 +195,10 @@ class MatchedObservations(NamedTuple):
 
     rows: I64x1
     match: I64x1
-    worth: F64x1
+    score_weight: F64x1
 
 
-class Fold(NamedTuple):
+class ExistenceEstimate(NamedTuple):
     """Evidence of one thing: log-odds, sum of visibilities, distinct agents that saw it, and its state."""
 
     log_odds: float
@@ -351,7 +351,7 @@ class _MatchScratch(NamedTuple):
     """What each observation (O,) has at one station: sums over its points near of weight, weight times lateral offset and
     weight times weight of the point; least distance along and the element there; UNMATCHED, MATCHED or NEARBY.
 
-    touched: the observations that are not UNMATCHED, as many as :func:`_collect_offsets` returns.
+    candidates: the observations that are not UNMATCHED, as many as :func:`_collect_offsets` returns.
     """
 
     mass: F64x1
@@ -360,7 +360,7 @@ class _MatchScratch(NamedTuple):
     nearest: F64x1
     element: I64x1
     match: I64x1
-    touched: I64x1
+    candidates: I64x1
 
 
 @njit(cache=True, nogil=True)
@@ -507,7 +507,7 @@ def _estimate_shift(
         scratch.offset,
         scratch.pull,
         scratch.match,
-        scratch.touched,
+        scratch.candidates,
     )
     kernel, floor = params.kernel_m, params.bias_m
     place, spread = 0.0, 1.0
@@ -540,7 +540,7 @@ def update_existence(
     params: EvidenceParameters,
     decay_time_s: float,
     scratch: AgentScratch,
-) -> Fold:  # pragma: no cover - compiled
+) -> ExistenceEstimate:  # pragma: no cover - compiled
     """Log-odds, coverage, distinct agents and state of thing k after all looks at it, in time order.
 
     ``places`` (M, 2) are points of it whose visibilities are averaged. decay_time_s: seconds in which evidence fades to 1/e.
@@ -599,7 +599,7 @@ def update_existence(
             state = RETIRED
             era_seen += 1
             seen_by, surveyed = 0, False
-    return Fold(float(odds), coverage, all_by, state)
+    return ExistenceEstimate(float(odds), coverage, all_by, state)
 
 
 @njit(cache=True, nogil=True)

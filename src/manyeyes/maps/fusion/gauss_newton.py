@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_Own = tuple[I64x1, F64x2, F64x2, I64x1, F64x1]
+_OwnPoints = tuple[I64x1, F64x2, F64x2, I64x1, F64x1]
 """first, xy, tangent, kind, sigma."""
-_Others = tuple[float, I64x1, I64x1, F64x2, F64x2, I64x1, F64x1]
+_OtherPoints = tuple[float, I64x1, I64x1, F64x2, F64x2, I64x1, F64x1]
 """cell, keys, start, xy, tangent, observation, weight."""
-_Numbers = tuple[float, float, float, float, float, float]
+_SolverParams = tuple[float, float, float, float, float, float]
 """gate, kernel, reach, cosine, scatter, correlation."""
 
 
 @njit(cache=True, nogil=True)
 def build_normal_equations(
-    home: I64x1, own_points: _Own, other_points: _Others, params: _Numbers, point_stride: int = 1
+    home: I64x1, own_points: _OwnPoints, other_points: _OtherPoints, params: _SolverParams, point_stride: int = 1
 ) -> F64x2:  # pragma: no cover - compiled
     """Sum the normal equations of each home observation (H, 13): pivot x, y; information xx, xy, xt, yy, yt, tt; right side
     x, y, t; weighted square residual (m²) and sum of votes. Every stride-th point votes, for all.
@@ -115,10 +115,10 @@ def step_poses(
         "pose": next_pose,
         "covariance": covariance,
         "observability": observability,
-        "heard": information_matrix,
-        "urge": information_vector,
+        "information_matrix": information_matrix,
+        "information_vector": information_vector,
         "residual": normal_sums[:, 11],
-        "matched": normal_sums[:, 12],
+        "num_matched": normal_sums[:, 12],
     }
 
 

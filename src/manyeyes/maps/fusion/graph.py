@@ -94,7 +94,11 @@ class ElementGraph:
                 f"ElementGraph: expected a relation of {', '.join(RELATIONS)}; got {relation!r}. Choose one."
             )
         chosen = self.relation == RELATIONS.index(relation)
-        kept = {f.name: getattr(self, f.name) for f in fields(self) if f.name in ("nodes", "observation", "apart_m")}
+        kept = {
+            f.name: getattr(self, f.name)
+            for f in fields(self)
+            if f.name in ("nodes", "observation", "min_separation_m")
+        }
         return ElementGraph(
             **kept, **{f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name not in kept}
         )
@@ -121,7 +125,9 @@ def build_element_graph(
     """The graph of elements in one frame; observation: (N,) or one for all, -1 for elements of a map."""
     owner = np.array(np.broadcast_to(np.asarray(observation, np.int64), (len(nodes),)))
     if len(nodes) and int(nodes.counts.min()) < 2:
-        raise ShapeError("element_graph needs elements of two points or more; got fewer: take those with counts > 1.")
+        raise ShapeError(
+            "build_element_graph needs elements of two points or more; got fewer: take those with counts > 1."
+        )
     pairs = find_near_pairs(nodes.bounds(), max(config.max_parallel_offset_m, config.max_gap_m))
     points, offsets = close_rings(nodes.points, nodes.offsets, nodes.closed)
     dense, dense_first = resample_spaced(points, offsets, config.spacing_m)

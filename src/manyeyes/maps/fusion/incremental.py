@@ -25,8 +25,13 @@ from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, VectorMap
 from manyeyes.maps.fusion.coarse_search import apply_shifts, find_best_shifts
 from manyeyes.maps.fusion.coverage import find_cells_under_lines, find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import compute_convex_hull, compute_overlap
-from manyeyes.maps.fusion.existence import EvidenceConfig, EvidenceParameters, compute_mean_visibility, doubled
-from manyeyes.maps.fusion.existence import gather_visibility_rings as sights_of
+from manyeyes.maps.fusion.existence import (
+    EvidenceConfig,
+    EvidenceParameters,
+    compute_mean_visibility,
+    doubled,
+    gather_visibility_rings,
+)
 from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_map
 from manyeyes.maps.fusion.gauss_newton import build_normal_equations, step_poses
 from manyeyes.maps.fusion.observation_arrays import (
@@ -215,7 +220,7 @@ class IncrementalMap:
             elif best <= 0.05:
                 places = np.concatenate((middle[None], (ring + middle) / 2))
                 seen = compute_mean_visibility(
-                    places, 0, np.ascontiguousarray(pose), sights_of(s), config.evidence.view_margin_m
+                    places, 0, np.ascontiguousarray(pose), gather_visibility_rings(s), config.evidence.view_margin_m
                 )
                 if seen > 0.0:
                     self._rings.add_log_odds(np.array([k]), config.evidence.log_odds_miss * seen, s, False, self.config)
@@ -478,7 +483,7 @@ class _PlacedObservation(NamedTuple):
 
     pose: F64x2
     order: I64x1
-    points: _LookPoints
+    points: _ObservationPoints
     box: _ViewBounds
     visibility_rings: FieldsOfView
     kernel_params: EvidenceParameters
@@ -491,14 +496,16 @@ class _PlacedObservation(NamedTuple):
         columns: tuple[Floats, Floats, Floats, Floats],
         evidence: EvidenceConfig,
     ) -> _PlacedObservation:
-        """columns: places, tangents, weights and worths of its points."""
+        """Place an observation; columns: positions, tangents, weights and score weights of its points."""
         lines = np.flatnonzero(is_line(s.kind_of_point))
         xy, tangent, weight, score_weight = columns
         fine = build_grid(xy[lines, 0], xy[lines, 1], s.kind_of_point[lines], _CELL_M)
         order, corner = lines[fine.order], s.view_corners_in_world(pose)
-        points = _LookPoints(fine.keys, fine.offsets, xy[order], tangent[order], weight[order], score_weight[order])
+        points = _ObservationPoints(
+            fine.keys, fine.offsets, xy[order], tangent[order], weight[order], score_weight[order]
+        )
         box = _ViewBounds(corner.min(0), corner.max(0))
-        return cls(np.ascontiguousarray(pose), order, points, box, sights_of(s), evidence.kernel_params)
+        return cls(np.ascontiguousarray(pose), order, points, box, gather_visibility_rings(s), evidence.kernel_params)
 
 
 @dataclass(eq=False)
@@ -565,7 +572,7 @@ class _GridStations(NamedTuple):
     tangent: F64x2
 
 
-class _LookPoints(NamedTuple):
+class _ObservationPoints(NamedTuple):
     """Points of one observation's lines in the order of their grid of _CELL_M: its keys and starts, places and unit
     tangents (P, 2) in the map's frame, weights (P,) and shares of a hit (P,).
     """
@@ -575,7 +582,7 @@ class _LookPoints(NamedTuple):
     xy: F64x2
     tangent: F64x2
     weight: F64x1
-    worth: F64x1
+    score_weight: F64x1
 
 
 class _ViewBounds(NamedTuple):
@@ -594,18 +601,18 @@ class _Comparison(NamedTuple):
     offset: F64x1
     weight: F64x1
     visibility: F64x1
-    worth: F64x1
+    score_weight: F64x1
     explained: Boolx1
 
 
 @njit(cache=True, nogil=True)
 def _match_stations(
-    stations: _GridStations, look: _PlacedObservation, kinds: int
+    stations: _GridStations, placed: _PlacedObservation, kinds: int
 ) -> _Comparison:  # pragma: no cover - compiled
     """Compare the stations in the box of a view with the points seen; those with a line only a little aside are left out."""
     keys, start, xy, tangent = stations
-    pkeys, pstart, pxy, ptangent, pweight, pscore_weight = look.points
-    params, (low, high) = look.kernel_params, look.box
+    pkeys, pstart, pxy, ptangent, pweight, pscore_weight = placed.points
+    params, (low, high) = placed.kernel_params, placed.box
     reach, across, wide = params.max_longitudinal_m, params.max_lateral_m, params.max_nearby_m
     cosine, radius = params.min_cosine, np.hypot(reach, wide)
     explained = np.zeros(len(pxy), np.bool_)
@@ -647,7 +654,7 @@ def _match_stations(
                             certain += w * pscore_weight[q]
                 spot[0, 0], spot[0, 1] = x, y
                 visible = (
-                    compute_mean_visibility(spot, 0, look.pose, look.visibility_rings, params.margin_m)
+                    compute_mean_visibility(spot, 0, placed.pose, placed.visibility_rings, params.margin_m)
                     if not is_near
                     else 1.0
                 )

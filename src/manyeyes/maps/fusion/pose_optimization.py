@@ -99,8 +99,27 @@ class PoseSolution:
         )
 
 
-_STATE = ("claim", "start", "pose", "covariance", "scale", "observability", "residual", "matched")
-_COLUMNS = (*_STATE, "offset", "faith", "voice", "fixed", "moved", "heard", "urge", "lean")
+_STATE = (
+    "prior_covariance",
+    "initial_pose",
+    "pose",
+    "covariance",
+    "scale",
+    "observability",
+    "residual",
+    "num_matched",
+)
+_COLUMNS = (
+    *_STATE,
+    "relative_offset",
+    "agent_weight",
+    "gauge_weight",
+    "is_surveyed",
+    "search_shift",
+    "information_matrix",
+    "information_vector",
+    "prior_mean",
+)
 
 
 def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = DEFAULT_ALIGN) -> PoseSolution:

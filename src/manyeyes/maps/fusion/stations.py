@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Digests = NDArray[np.uint8]
 
-_RIVAL_CELL_M = 2.5
+_CONFLICT_CELL_M = 2.5
 
 Area = tuple[float, float, float, float]
 
@@ -103,7 +103,7 @@ class EvidenceTable:
         )
 
 
-_PER_ROW = tuple(f.name for f in fields(EvidenceTable) if f.name not in ("first", "sources", "observations"))
+_PER_ROW = tuple(f.name for f in fields(EvidenceTable) if f.name not in ("source_offsets", "sources", "observations"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,18 +263,20 @@ def _within(xy: Floats, area: Area | None, halo: float) -> NDArray[np.bool_]:
 
 def _find_conflicts(xy: Floats, tangent: Floats, table: EvidenceTable, config: StationConfig) -> NDArray[np.bool_]:
     """(K,) which stations lose against another that cannot be true at the same time."""
-    grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _RIVAL_CELL_M)
-    params = _RivalLimits(
+    grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _CONFLICT_CELL_M)
+    params = _ConflictLimits(
         config.conflict_radius_m,
         config.same_kind_conflict_radius_m,
         config.conflict_support_ratio,
         config.conflict_log_odds,
     )
-    columns = _RivalColumns(table.kind, table.log_odds, table.support, table.state, table.source_offsets, table.sources)
+    columns = _ConflictColumns(
+        table.kind, table.log_odds, table.support, table.state, table.source_offsets, table.sources
+    )
     return _find_losers(xy, tangent, columns, grid, params)
 
 
-class _RivalColumns(NamedTuple):
+class _ConflictColumns(NamedTuple):
     """The columns of :class:`EvidenceTable` that decide which of two stations stays."""
 
     kind: I64x1
@@ -285,7 +287,7 @@ class _RivalColumns(NamedTuple):
     sources: I64x1
 
 
-class _RivalLimits(NamedTuple):
+class _ConflictLimits(NamedTuple):
     """Lateral distances (m) within which stations of two kinds, and of one kind, exclude each other; least advantages of
     the one that stays: ratio of supports, difference of log-odds.
     """
@@ -298,7 +300,7 @@ class _RivalLimits(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _find_losers(
-    xy: F64x2, tangent: F64x2, columns: _RivalColumns, grid: PointGrid, params: _RivalLimits
+    xy: F64x2, tangent: F64x2, columns: _ConflictColumns, grid: PointGrid, params: _ConflictLimits
 ) -> Boolx1:  # pragma: no cover - compiled
     """(K,) which stations, at xy (K, 2) with unit tangents (K, 2), lose against another."""
     kind, odds, support, state, first, sources = columns
@@ -307,7 +309,7 @@ def _find_losers(
     loses = np.zeros(len(xy), np.bool_)
     for k in range(len(xy)):
         u, v = tangent[k, 0], tangent[k, 1]
-        ix, iy = int(np.floor(xy[k, 0] / _RIVAL_CELL_M)), int(np.floor(xy[k, 1] / _RIVAL_CELL_M))
+        ix, iy = int(np.floor(xy[k, 0] / _CONFLICT_CELL_M)), int(np.floor(xy[k, 1] / _CONFLICT_CELL_M))
         for dx in range(-1, 2):
             low, high = find_cell_range(keys, start, 0, ix + dx, iy - 1, iy + 1)
             for place in range(low, high):

@@ -96,7 +96,7 @@ def apply_delta(before: VectorMap, delta: MapDelta) -> VectorMap:
 
 
 def write_delta(delta: MapDelta, folder: Path) -> None:
-    """Write a delta: ``summarize_methods.parquet`` and ``crossings.parquet`` of what changed, then ``delta.json`` with the rest."""
+    """Write a delta: ``lines.parquet`` and ``crossings.parquet`` of what changed, then ``delta.json`` with the rest."""
     write_map(delta.changed, folder / "lines.parquet", folder / "crossings.parquet")
     tiles = [
         {"x": x, "y": y, "added": added, "modified": modified, "deleted": deleted}

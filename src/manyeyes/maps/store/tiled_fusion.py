@@ -61,7 +61,7 @@ class TiledFusionConfig:
 
     def __post_init__(self) -> None:
         if not (self.tile_size_m > 0 and self.tiles_per_block >= 1 and self.margin_m >= 0 and self.halo_m >= 0):
-            raise ConfigError(f"TileConfig needs positive sizes and at least one tile a block; got {self}.")
+            raise ConfigError(f"TiledFusionConfig needs positive sizes and at least one tile a block; got {self}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +239,7 @@ def _run_station_step(step: _BlockStep) -> None:
 
 def _load_arrays(block: TileBlock) -> ObservationArrays:
     """The block's observations as columns, kept in the work folder for the next step of this fusion."""
-    path = block.work_folder / f"{block.key}.sightings.npz"
+    path = block.work_folder / f"{block.key}.arrays.npz"
     found = load_columns(path, ObservationArrays)
     if found is None:
         rows = np.arange(len(block.observations))
