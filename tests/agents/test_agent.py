@@ -11,7 +11,7 @@ import torch
 
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.perception_cache import PerceptionCache
-from manyeyes.agents.strategies import METHODS, get_strategy
+from manyeyes.agents.strategies import STRATEGIES, get_strategy
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, PointCloud, Transform
 from manyeyes.models.detector.box_head import RawBoxes
@@ -140,7 +140,7 @@ def test_collaborators_change_what_the_ego_sees(drive, detector: Detector) -> No
     assert len(Agent(detector).perceive(blind, packets).boxes) > len(Agent(detector).perceive(blind).boxes)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", STRATEGIES)
 def test_an_empty_cloud_and_an_empty_inbox_give_no_error(detector: Detector, name: str) -> None:
     empty = AgentFrame.of(PointCloud.of(torch.zeros(0, 3)), Transform.identity(), agent_id=7)
     agent = Agent(detector, get_strategy(name))
@@ -194,5 +194,5 @@ def test_late_fusion_keeps_one_box_of_two_that_overlap(drive, detector: Detector
 
 
 def test_an_unknown_strategy_lists_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match=", ".join(METHODS)):
+    with pytest.raises(ConfigError, match=", ".join(STRATEGIES)):
         get_strategy("telepathy")

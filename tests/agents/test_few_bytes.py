@@ -62,7 +62,7 @@ def detector() -> Detector:
     return with_codebook(plain, torch.cat(features), 0, CodebookConfig(3, 64))
 
 
-@pytest.mark.parametrize("precision", ["float16", "codes"])
+@pytest.mark.parametrize("precision", ["float16", "codebook"])
 @pytest.mark.parametrize("channel_bytes", [None, 2500])
 def test_the_bytes_of_a_table_are_those_handed_to_the_bus(detector, monkeypatch, precision, channel_bytes):
     """Packet by packet: what a step reports of a sender is the length of every packet that the bus was given, in order."""
@@ -89,18 +89,18 @@ def test_the_bytes_of_a_table_are_those_handed_to_the_bus(detector, monkeypatch,
 def test_codes_arrive_as_what_they_stand_for_in_a_tenth_of_the_bytes(detector):
     """All of them: the receiver reads, cell by cell, what the sender's codebook makes of its tokens."""
     frames = Plane().snapshot("plane", 0).frames
-    sender = Agent(detector, token_encoding="codes", budget_bytes=None)
+    sender = Agent(detector, token_encoding="codebook", budget_bytes=None)
     packets = sender.share(frames[1])
     (received,) = Agent(detector).perceive(frames[0], packets).received
     tokens = sender.perception_cache.process(frames[1]).shared_tokens
     assert torch.equal(received.message.tokens.sites.key, tokens.sites.key)
     book = detector.codebook
-    assert torch.equal(received.message.tokens.features, book.read(book.write(tokens.features)))
+    assert torch.equal(received.message.tokens.features, book.decode(book.encode(tokens.features)))
     whole = Agent(detector, token_encoding="float32", budget_bytes=None).share(frames[1])
     assert sum(map(len, packets)) < 0.12 * sum(map(len, whole))
 
 
-@pytest.mark.parametrize("precision", ["float16", "codes"])
+@pytest.mark.parametrize("precision", ["float16", "codebook"])
 def test_a_message_of_tokens_never_exceeds_any_budget_and_a_smaller_one_keeps_a_part(detector, precision):
     frame = Plane().snapshot("plane", 0).frames[2]
     agent, kept = Agent(detector, token_encoding=precision, budget_bytes=None), []
@@ -116,7 +116,7 @@ def test_weights_with_a_codebook_send_codes_by_default(detector):
     """And those without one float16: an agent alone, and one in a recording that is played."""
     plain = Detector(replace(detector.config, codebook=None)).eval()
     frame = Plane().snapshot("plane", 0).frames[1]
-    for model, usual in ((detector, "codes"), (plain, "float16")):
+    for model, usual in ((detector, "codebook"), (plain, "float16")):
         packets = Agent(model).share(frame)
         assert (
             packets
@@ -129,12 +129,12 @@ def test_weights_with_a_codebook_send_codes_by_default(detector):
 
 def test_codes_need_a_codebook_on_both_sides(detector):
     plain = Detector(replace(detector.config, codebook=None)).eval()
-    with pytest.raises(ConfigError, match="manyeyes quantise"):
-        Agent(plain, token_encoding="codes")
+    with pytest.raises(ConfigError, match="manyeyes fit-codebook"):
+        Agent(plain, token_encoding="codebook")
     frames = Plane().snapshot("plane", 0).frames
-    with pytest.raises(ConfigError, match="manyeyes quantise"):
+    with pytest.raises(ConfigError, match="manyeyes fit-codebook"):
         encode_tokens(Agent(plain).perception_cache.process(frames[0]).shared_tokens, plain)
-    packets = Agent(detector, token_encoding="codes").share(frames[1])
+    packets = Agent(detector, token_encoding="codebook").share(frames[1])
     # Without the tables coded packets are of other weights; and rows of another width mean nothing here.
     inbox = Inbox(detector.fingerprint)
     for packet in packets:
@@ -175,7 +175,7 @@ def test_requests_are_counted_and_change_what_is_sent(detector):
 
 
 def test_requests_of_a_replay_reach_all_senders(detector):
-    config = ReplayConfig(token_encoding="codes", budget_bytes=1398, send_request_map=True)
+    config = ReplayConfig(token_encoding="codebook", budget_bytes=1398, send_request_map=True)
     steps = list(replay(Plane(), "plane", detector, ["intermediate"], config))
     assert all(r.message.request is not None for step in steps for r in step.perception.received)
     assert all(s.num_bytes <= 1398 for step in steps for s in step.sent)

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from manyeyes import Agent, AgentFrame, Boxes, Inbox
-from manyeyes.agents.strategies import METHODS, get_strategy
+from manyeyes.agents.strategies import STRATEGIES, get_strategy
 
 BODY, CHANNELS, CELLS, KEYS = 64, 80, 82, 84
 TENTH_NS = 100_000_000
@@ -171,12 +171,12 @@ def with_rows(detector, drive):
     return frame, Agent(detector, get_strategy("late")).share(drive(2).frame(1, 2))[0]
 
 
-@pytest.mark.parametrize("name", ["late", "late-remembering"])
+@pytest.mark.parametrize("name", ["late", "late-temporal"])
 @pytest.mark.parametrize("x_m", [150.0, 0.0], ids=["out of range", "within range"])
 def test_boxes_of_strangers_erase_none_that_the_ego_detects_itself(drive, detector, name: str, x_m: float) -> None:
     """Ten messages of 1,000 boxes at score 1 filled the suppression's list, and no own box was left."""
     frame, honest = with_rows(detector, drive)
-    alone = Agent(detector, get_strategy("alone")).perceive(frame).boxes
+    alone = Agent(detector, get_strategy("none")).perceive(frame).boxes
     assert len(alone) > 5
     packets = [forged(honest, 70 + k, far_boxes(1000, x_m + k, 0.3 * k), kind=2) for k in range(10)]
     found = Agent(detector, get_strategy(name)).perceive(frame, packets).boxes
@@ -189,7 +189,7 @@ def test_boxes_of_strangers_erase_none_that_the_ego_detects_itself(drive, detect
 def test_a_stranger_that_covers_an_own_box_from_the_side_does_not_take_its_place(drive, detector) -> None:
     """One box at score 1, 1.5 m beside each own one, suppressed them all."""
     frame, honest = with_rows(detector, drive)
-    alone = Agent(detector, get_strategy("alone")).perceive(frame).boxes
+    alone = Agent(detector, get_strategy("none")).perceive(frame).boxes
     ego_from_sender = frame.world_from_agent.inverse() @ drive(2).frame(1, 2).world_from_agent
     beside = alone.transform(ego_from_sender.inverse())
     rows = b"".join(
@@ -204,7 +204,7 @@ def test_a_stranger_that_covers_an_own_box_from_the_side_does_not_take_its_place
     assert float(torch.cdist(alone.center[:, :2], found.center[:, :2]).min(1).values.max()) <= 1.0
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", STRATEGIES)
 def test_no_bytes_make_perceive_raise(drive, detector, name: str) -> None:
     """Bytes of honest packets at random places, with checksums made right: everything decodable is fused or rejected."""
     some, random = drive(2), np.random.default_rng(20)

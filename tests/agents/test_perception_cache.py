@@ -154,7 +154,7 @@ def test_multi_hop_messages_echo_the_receivers_own_tokens(drive, detector: Detec
     """CoSTr Eq. 1 to the letter: A hears of its own car through B. What B saw itself holds nothing of A's."""
     first, then = drive(2).frames(2), drive(2).frames(3)
     blind = PointCloud.of(torch.zeros(0, 3))
-    for name, echoes in (("intermediate", False), ("fused", True)):
+    for name, echoes in (("intermediate", False), ("intermediate-multihop", True)):
         a, b = (Agent(detector, get_strategy(name), budget_bytes=None) for _ in range(2))
         b.perceive(replace(first[1], points=blind), a.share(first[0]))
         inbox = Inbox(detector.fingerprint)

@@ -38,7 +38,7 @@ def cars(count: int, seed: int) -> Boxes:
     size = np.column_stack((rng.uniform(4, 5.2, count), rng.uniform(1.7, 2.1, count), np.full(count, 1.6)))
     found = Boxes.of(*map(torch.from_numpy, (center, size)), torch.from_numpy(rng.uniform(-3, 3, count)))
     sure = torch.full((count,), 0.1, dtype=torch.float64)
-    return replace(found, sigma_xy=sure, sigma_yaw=sure * 0.2, flip=sure * 0.1)
+    return replace(found, sigma_xy=sure, sigma_yaw=sure * 0.2, p_flip=sure * 0.1)
 
 
 class FixedBoxesCache(PerceptionCache):
@@ -204,9 +204,11 @@ def monitored(offsets: Sequence[float], world: Boxes, last: Boxes) -> Any:
 def test_a_prior_with_an_offset_is_not_used_without_common_objects() -> None:
     world, strange = cars(10, 10), cars(10, 11)
     honest, caught = monitored([0.0] * 6, world, strange), monitored([2.0] * 6, world, strange)
-    assert honest.verdicts[0].use is MessageUse.PRIOR and honest.verdicts[0].health.health is PoseHealth.SOUND
-    assert caught.verdicts[0].use is MessageUse.UNCERTAIN and caught.verdicts[0].health.health is PoseHealth.OFFSET
-    assert caught.verdicts[0].untrusted and not honest.verdicts[0].untrusted
+    assert honest.corrections[0].use is MessageUse.PRIOR and honest.corrections[0].health.health is PoseHealth.SOUND
+    assert (
+        caught.corrections[0].use is MessageUse.UNCERTAIN and caught.corrections[0].health.health is PoseHealth.OFFSET
+    )
+    assert caught.corrections[0].untrusted and not honest.corrections[0].untrusted
 
 
 def test_a_repeated_message_is_counted_once_and_a_new_drive_resets_the_monitor() -> None:
@@ -305,17 +307,17 @@ def test_a_sender_without_common_objects_is_propagated_from_its_last_pose() -> N
         ([drive[0], strange], (0, 100), {}),
         (drive[:2], (0, 600), {}),
         ([hidden, hidden], (0, 100), {}),
-        (drive[:2], (0, 100), {"follow_s": 0.0}),
+        (drive[:2], (0, 100), {"propagate_s": 0.0}),
     ):
         assert propagated_run(seen, steps, **settings)[-1][0].use is MessageUse.UNCERTAIN
-    with pytest.raises(ConfigError, match="pace_mps"):
+    with pytest.raises(ConfigError, match="sigma_speed_mps"):
         PoseCorrection(sigma_speed_mps=0.0)
 
 
 def test_no_messages_and_unknown_correctors() -> None:
     found = PoseCorrection().correct(frame(), cache_of(cars(5, 0)), [], {})
     assert (found.messages, found.corrections, dict(found.states)) == ((), (), {})
-    with pytest.raises(ConfigError, match="known: vote, given"):
+    with pytest.raises(ConfigError, match="known: voting, identity"):
         PoseCorrection(corrector="magic")
 
 
@@ -339,10 +341,10 @@ def mutual_detection(pole: bool, late_ns: int) -> Any:
 
 def test_vehicles_that_see_each_other_are_landmarks_themselves() -> None:
     found, sender = mutual_detection(pole=False, late_ns=0)
-    (verdict,) = found.verdicts
+    (verdict,) = found.corrections
     assert verdict.use is MessageUse.CORRECTED and verdict.estimate.inliers == 3
     assert pose_error(found.messages[0], sender)[0] < 0.15
     # A pole is no vehicle that the ego could have seen, and where a sender was it may not be any more.
     for pole, late_ns in ((True, 0), (False, 100_000_000)):
-        (verdict,) = mutual_detection(pole, late_ns)[0].verdicts
+        (verdict,) = mutual_detection(pole, late_ns)[0].corrections
         assert verdict.estimate.inliers < 3

@@ -69,22 +69,22 @@ def test_of_boxes_that_overlap_the_best_stays() -> None:
 
 def test_what_is_hidden_now_stands_where_it_should_be_by_now() -> None:
     """Seen at 30 m a tenth of a second ago, at 10 m/s: 1 m farther on, 1 m nearer for the agent's own motion."""
-    found = get_strategy("late-remembering").fuse(FixedCache(boxes(), boxes(30.0, speed=10.0)), frame(9), ())
+    found = get_strategy("late-temporal").fuse(FixedCache(boxes(), boxes(30.0, speed=10.0)), frame(9), ())
     assert found.center[:, 0].tolist() == pytest.approx([30.0]) and float(found.score) == pytest.approx(
         0.8 * SCORE_DECAY_PER_100MS
     )
-    still = get_strategy("late-remembering").fuse(FixedCache(boxes(), boxes(30.0)), frame(9), ())
+    still = get_strategy("late-temporal").fuse(FixedCache(boxes(), boxes(30.0)), frame(9), ())
     assert still.center[:, 0].tolist() == pytest.approx([29.0])
 
 
 def test_current_boxes_win_over_past_ones() -> None:
-    found = get_strategy("late-remembering").fuse(FixedCache(boxes(30.0), boxes(31.0)), frame(9), ())
+    found = get_strategy("late-temporal").fuse(FixedCache(boxes(30.0), boxes(31.0)), frame(9), ())
     assert len(found) == 1 and float(found.score) == pytest.approx(0.8) and float(found.center[0, 0]) == 30.0
 
 
 def test_scores_of_earlier_messages_decay_but_not_of_a_late_one() -> None:
     messages = [message_of(6, boxes(10.0)), message_of(5, boxes(10.5, 50.0))]
-    found = get_strategy("late-remembering").fuse(FixedCache(boxes()), frame(9), messages)
+    found = get_strategy("late-temporal").fuse(FixedCache(boxes()), frame(9), messages)
     by_place = dict(zip(found.center[:, 0].tolist(), found.score.tolist()))
     assert by_place == {10.0: pytest.approx(0.8), 50.0: pytest.approx(0.8 * SCORE_DECAY_PER_100MS)}
 

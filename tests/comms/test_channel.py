@@ -26,7 +26,7 @@ def packets(count: int, size: int = 1000, mark: int = 0) -> tuple[bytes, ...]:
 
 
 def arrivals(deliveries) -> list[tuple[int, int, float]]:
-    return [(d.sender, d.packet[1], d.arrival_ns / MS) for d in deliveries]
+    return [(d.sender_id, d.packet[1], d.arrival_ns / MS) for d in deliveries]
 
 
 def test_airtime_by_hand():
@@ -217,7 +217,7 @@ def test_misuse_is_named():
     bus.publish(1, HERE, [bytes(10)], 10)
     with pytest.raises(ConfigError, match="in order of time"):
         bus.publish(1, HERE, [bytes(10)], 9)
-    with pytest.raises(ConfigError, match="known are ideal, its-g5, its-g5-27, lte-v2x, nr-sidelink, cellular"):
+    with pytest.raises(ConfigError, match="known are ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular"):
         channel_preset("pigeon")
 
 

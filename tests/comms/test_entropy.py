@@ -139,9 +139,9 @@ def coded_message(count: int, seed: int, tables: CodeTables) -> Message:
 def test_packets_of_coded_tokens_decode_alone_and_cost_less():
     tables = skewed(20)
     message = coded_message(300, 1, tables)
-    packets = wire.encode(message, token_encoding="codes", tables=tables)
+    packets = wire.encode(message, token_encoding="codebook", tables=tables)
     assert len(packets) >= 2 and all(len(p) <= wire.DEFAULT_MTU for p in packets)
-    plain = wire.encode(message, token_encoding="codes")
+    plain = wire.encode(message, token_encoding="codebook")
     assert len(b"".join(packets)) < 0.9 * len(b"".join(plain))
     inbox = Inbox(MODEL, tables=tables)
     for packet in packets[::-1]:
@@ -162,11 +162,11 @@ def test_budgets_are_never_exceeded_and_nested(seed, count, budget, more, mtu):
     message = coded_message(count, seed, tables)
     kept = []
     for limit in (budget, budget + more):
-        bev, score = select_within_budget(message.tokens, message.token_score, limit, "codes", mtu, tables)
+        bev, score = select_within_budget(message.tokens, message.token_score, limit, "codebook", mtu, tables)
         kept.append(set(bev.sites.key.tolist()))
         if len(score):
             selected = replace(message, tokens=bev, token_score=score)
-            assert len(b"".join(wire.encode(selected, token_encoding="codes", mtu=mtu, tables=tables))) <= limit
+            assert len(b"".join(wire.encode(selected, token_encoding="codebook", mtu=mtu, tables=tables))) <= limit
     assert kept[0] <= kept[1]
 
 
@@ -174,9 +174,9 @@ def test_a_budget_is_used_up_but_for_a_row():
     tables = skewed(20)
     message = coded_message(400, 2, tables)
     for budget in (1398, 2000, 3000):
-        bev, score = select_within_budget(message.tokens, message.token_score, budget, "codes", tables=tables)
+        bev, score = select_within_budget(message.tokens, message.token_score, budget, "codebook", tables=tables)
         selected = replace(message, tokens=bev, token_score=score)
-        sizes = [len(p) for p in wire.encode(selected, token_encoding="codes", tables=tables)]
+        sizes = [len(p) for p in wire.encode(selected, token_encoding="codebook", tables=tables)]
         assert budget - 24 <= sum(sizes) <= budget
 
 
@@ -196,16 +196,16 @@ def test_counts_fill_each_body_before_the_next():
 def test_coded_tokens_of_other_weights_are_distinguished_from_garbage():
     tables, other = skewed(20), CodeTables(b"model-02", skewed(20, 5).frequencies)
     message = coded_message(50, 4, tables)
-    (packet,) = wire.encode(message, token_encoding="codes", tables=tables)
+    (packet,) = wire.encode(message, token_encoding="codebook", tables=tables)
     for reader in (None, other):
         inbox = Inbox(tables=reader)
         inbox.push(packet)
         assert inbox.dropped == DropCounts(wrong_model=1)
     with pytest.raises(WireError, match="do not code"):
-        wire.encode(message, token_encoding="codes", tables=other)
+        wire.encode(message, token_encoding="codebook", tables=other)
     narrow = CodeTables(MODEL, skewed(19).frequencies)
     with pytest.raises(WireError, match="19 bytes"):
-        wire.encode(message, token_encoding="codes", tables=narrow)
+        wire.encode(message, token_encoding="codebook", tables=narrow)
     with pytest.raises(PacketError) as caught:
         wire.decode_packet(packet, narrow)
     assert caught.value.reason == "implausible"
@@ -215,7 +215,7 @@ def test_coded_tokens_of_other_weights_are_distinguished_from_garbage():
 @given(st.integers(0, 1000), st.data())
 def test_a_faulty_sender_of_codes_never_crashes_the_reader(seed, data):
     tables = skewed(4)
-    (packet,) = wire.encode(coded_message(30, seed, tables), token_encoding="codes", tables=tables)
+    (packet,) = wire.encode(coded_message(30, seed, tables), token_encoding="codebook", tables=tables)
     at = data.draw(st.integers(64, len(packet) - 5))
     new = data.draw(st.binary(min_size=1, max_size=min(8, len(packet) - 4 - at)))
     changed = packet[:at] + new + packet[at + len(new) : -4]

@@ -76,5 +76,5 @@ def test_an_encoded_request_map_gives_the_same_weights_within_half_a_step():
 
 @pytest.mark.parametrize("confidence", [torch.zeros(2), torch.tensor([0.5]), torch.tensor([0.1, 0.2, 1.5])])
 def test_invalid_confidence_is_refused(confidence):
-    with pytest.raises(ConfigError, match="sure needs"):
+    with pytest.raises(ConfigError, match="confidence needs"):
         build_request_map(torch.zeros(3, 2), confidence, WINDOW)

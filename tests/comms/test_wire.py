@@ -91,7 +91,7 @@ sizes = st.one_of(st.none(), st.integers(0, 300))
 @given(st.integers(0, 10**6), sizes, sizes, sizes, st.sampled_from(payloads.TOKEN_ENCODINGS), st.integers(300, 3000))
 def test_round_trip(seed, tokens, objects, points, precision, mtu):
     message = random_message(seed, tokens, objects, points)
-    message = with_codes(message) if precision == "codes" else message
+    message = with_codes(message) if precision == "codebook" else message
     packets = wire.encode(message, token_encoding=precision, mtu=mtu)
     assert all(len(p) <= mtu for p in packets)
     back = wire.assemble(wire.decode_packet(p) for p in packets)
@@ -121,7 +121,7 @@ def test_round_trip(seed, tokens, objects, points, precision, mtu):
 def check_tokens(got: SparseBev, sent: SparseBev, precision: payloads.TokenEncoding) -> None:
     assert got.grid == sent.grid
     assert torch.equal(got.sites.key, sent.sites.key)
-    if precision == "codes":
+    if precision == "codebook":
         assert got.features.dtype == torch.uint8 and torch.equal(got.features, sent.features)
         return
     error = (got.features - sent.features).abs()
@@ -456,10 +456,10 @@ def test_what_does_not_fit_is_refused_by_the_sender(change, match):
 
 
 def test_unknown_settings_are_refused():
-    with pytest.raises(ConfigError, match="float32, float16, int8, codes"):
+    with pytest.raises(ConfigError, match="float32, float16, int8, codebook"):
         wire.encode(random_message(9), token_encoding="float8")
     with pytest.raises(WireError, match="only codes are"):
-        wire.encode(random_message(9), token_encoding="codes")
+        wire.encode(random_message(9), token_encoding="codebook")
     with pytest.raises(WireError, match="only codes are"):
         wire.encode(with_codes(random_message(9)), token_encoding="int8")
     with pytest.raises(ConfigError, match="mtu"):

@@ -74,8 +74,8 @@ def test_the_columns_cannot_be_written_but_the_callers_array_can() -> None:
     ("column", "value", "message_match"),
     [
         ("kind", [0, 4], "0 to 3"),
-        ("first", [0, 3, 6], "end at 7"),
-        ("first", [0, 7], r"\(3,\)"),
+        ("offsets", [0, 3, 6], "end at 7"),
+        ("offsets", [0, 7], r"\(3,\)"),
         ("score", [1.0], r"score needs shape \(2,\)"),
         ("sigma", [1.0], r"sigma needs shape \(7,\)"),
         ("style", [[1.0, 0.0]] * 2, r"style needs shape \(2, 4\)"),
@@ -83,7 +83,7 @@ def test_the_columns_cannot_be_written_but_the_callers_array_can() -> None:
 )
 def test_columns_that_do_not_fit_are_refused_by_name(column: str, value: list, message_match: str) -> None:
     good = two()
-    columns = {name: getattr(good, name) for name in ("kind", "first", "points", "score", "sigma", "style")}
+    columns = {name: getattr(good, name) for name in ("kind", "offsets", "points", "score", "sigma", "style")}
     with pytest.raises(ShapeError, match=message_match):
         MapElements(**(columns | {column: np.asarray(value)}))
 

@@ -91,7 +91,7 @@ class Agent:
         self.budget_bytes = budget_bytes
         self.send_request_map, self.map_predictor = send_request_map, map_predictor
         self._tables = make_code_tables(detector)
-        if token_encoding == "codes":
+        if token_encoding == "codebook":
             require_codebook(detector)
 
     def share(
@@ -118,7 +118,7 @@ class Agent:
             shared_tokens = message.tokens.with_features(clamp_features(message.tokens.features))
             tokens = (
                 encode_tokens(shared_tokens, self.perception_cache.detector)
-                if self.token_encoding == "codes"
+                if self.token_encoding == "codebook"
                 else shared_tokens
             )
             score = message.token_score * compute_request_weights(tokens.sites.xy, frame.world_from_agent, requests)

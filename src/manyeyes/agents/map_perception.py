@@ -60,7 +60,7 @@ MAP_MODES = {"local": MapShareConfig(), "semi-global": MapShareConfig(_TILE, _TI
 def get_map_share_config(name: str) -> MapShareConfig:
     """A way to survey by name; ConfigError lists the known ones."""
     if name not in MAP_MODES:
-        raise ConfigError(f"No survey is called {name!r}; known: {', '.join(MAP_MODES)}.")
+        raise ConfigError(f"No map mode is called {name!r}; known: {', '.join(MAP_MODES)}.")
     return MAP_MODES[name]
 
 

@@ -53,10 +53,10 @@ class MessageUse(Enum):
     sees fits nobody else's view in one way.
     """
 
-    PRIOR = "claimed"
+    PRIOR = "prior"
     CORRECTED = "corrected"
-    UNCERTAIN = "unsure"
-    INCONSISTENT = "contradicted"
+    UNCERTAIN = "uncertain"
+    INCONSISTENT = "inconsistent"
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class PoseCorrection:
     sigma_yaw_rate_rps: how fast it may have gone and turned since, one standard deviation.
     """
 
-    corrector: str = "vote"
+    corrector: str = "voting"
     min_score: float = 0.3
     max_sigma_m: float = 0.5
     lever_arm_m: float = 20.0
@@ -120,9 +120,11 @@ class PoseCorrection:
     def __post_init__(self) -> None:
         load_corrector(self.corrector)
         if not (self.max_sigma_m > 0 and min(self.lever_arm_m, self.sigma_velocity_mps, self.propagate_s) >= 0):
-            raise ConfigError("Aligner needs unsure_m > 0, and reach_m, speed_sigma_mps and follow_s of 0 or more.")
+            raise ConfigError(
+                "PoseCorrection needs max_sigma_m > 0, and lever_arm_m, sigma_velocity_mps and propagate_s >= 0."
+            )
         if not min(self.sigma_speed_mps, self.sigma_yaw_rate_rps) > 0:
-            raise ConfigError("Aligner needs pace_mps > 0 and pace_rps > 0.")
+            raise ConfigError("PoseCorrection needs sigma_speed_mps > 0 and sigma_yaw_rate_rps > 0.")
 
     def correct(
         self, frame: AgentFrame, cache: PerceptionCache, messages: Sequence[Message], states: Mapping[int, SenderState]

@@ -18,13 +18,15 @@ from manyeyes.models.detector.proposal import PROPOSAL_DIM
 def require_codebook(detector: Detector) -> Codebook:
     """The codebook, or how to get one."""
     if detector.codebook is None:
-        raise ConfigError("These weights have no codebook, so they cannot send codes: fit one by 'manyeyes quantise'.")
+        raise ConfigError(
+            "These weights have no codebook, so they cannot send codes: fit one by 'manyeyes fit-codebook'."
+        )
     return detector.codebook
 
 
 def default_token_encoding(detector: Detector) -> TokenEncoding:
     """How tokens are written where nobody says: as codes where the weights can, a tenth of the bytes; else as float16."""
-    return "float16" if detector.codebook is None else "codes"
+    return "float16" if detector.codebook is None else "codebook"
 
 
 def make_code_tables(detector: Detector) -> CodeTables | None:

@@ -91,7 +91,7 @@ CHANNELS: tuple[ChannelPreset, ...] = (
         jitter_s=0.003,
     ),
     ChannelPreset(
-        "its-g5-27",
+        "its-g5-27mbps",
         27e6,
         per_packet_overhead_bytes=590,
         busy_ratio_limit=0.6,

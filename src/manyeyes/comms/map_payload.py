@@ -70,7 +70,7 @@ def _pack_rings(rings: Sequence[Floats]) -> bytes:
     lines = [_units(ring, True) for ring in rings]
     if len(lines) > MAX_RINGS or any(len(line) < 3 for line in lines):
         raise WireError(
-            f"Message.seen_map has one view and up to {MAX_RINGS - 1} occluders, rings of 3 points that are "
+            f"Message.local_map has one view and up to {MAX_RINGS - 1} occluders, rings of 3 points that are "
             f"{UNIT_M} m apart or more; got {[len(line) for line in lines]} points: leave small ones out."
         )
     return bytes([len(lines)]) + b"".join(_pack_line(line) for line in lines)
@@ -79,7 +79,7 @@ def _pack_rings(rings: Sequence[Floats]) -> bytes:
 def _pack_elements(elements: MapElements) -> list[bytes]:
     """Each element's bytes, the highest score first; none of one that is too short to be said."""
     if not all(np.isfinite(column).all() for column in (elements.score, elements.sigma, elements.style)):
-        raise WireError("Message.seen_map has NaN or infinite values; drop those elements before sending.")
+        raise WireError("Message.local_map has NaN or infinite values; drop those elements before sending.")
     likeliest = elements.style.argmax(1)
     style_prob = (
         np.rint((elements.style.max(1, initial=0.25) - 0.25) / 0.75 * _STYLE_PROB_STEPS)

@@ -25,9 +25,9 @@ from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import LABELS, BevGrid, Boxes, ConfigError, PointCloud, Sites, SparseBev, WireError
 from manyeyes.datatypes.message import DESCRIPTOR_DIM, RequestMap
 
-TokenEncoding = Literal["float32", "float16", "int8", "codes"]
+TokenEncoding = Literal["float32", "float16", "int8", "codebook"]
 
-TOKEN_ENCODINGS: tuple[TokenEncoding, ...] = ("float32", "float16", "int8", "codes")
+TOKEN_ENCODINGS: tuple[TokenEncoding, ...] = ("float32", "float16", "int8", "codebook")
 # The middle of what drives in European cities.
 LABEL_HEIGHTS = (1.6, 2.3, 3.2, 3.2)
 NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS = range(6)
@@ -46,7 +46,7 @@ _FEATURE_TYPES: dict[TokenEncoding, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),
     "float16": np.dtype("<f2"),
     "int8": np.dtype("i1"),
-    "codes": np.dtype("u1"),
+    "codebook": np.dtype("u1"),
 }
 _CODED = 2
 _MAX_CELLS = 1 << 24
@@ -190,12 +190,12 @@ class TokenCodec:
 
     def __post_init__(self) -> None:
         if self.encoding not in TOKEN_ENCODINGS:
-            raise ConfigError(f"precision is one of {', '.join(TOKEN_ENCODINGS)}; got {self.encoding!r}.")
+            raise ConfigError(f"token encoding is one of {', '.join(TOKEN_ENCODINGS)}; got {self.encoding!r}.")
 
     def select_tables(self, tokens: SparseBev) -> CodeTables | None:
         """The tables, where these tokens are to be coded by them; tokens of another kind than the form's are a WireError."""
         codes = tokens.features.dtype == torch.uint8
-        if codes != (self.encoding == "codes"):
+        if codes != (self.encoding == "codebook"):
             raise WireError(
                 f"Tokens of {tokens.features.dtype} are not sent as {self.encoding}: codes are uint8 rows of the model's "
                 "codebook, and only codes are."
@@ -228,8 +228,8 @@ def count_cells_per_packet(
     fixed_bytes = TOKENS_BYTES + (channels if encoding == "int8" else 0)
     if channels < 1 or channels > 65535 or fixed_bytes + bytes_per_cell + 5 > capacity:
         raise WireError(
-            f"One cell of {channels} channels as {encoding} does not fit a body of {capacity} bytes: lower the "
-            "precision or raise the mtu."
+            f"One cell of {channels} channels as {encoding} does not fit a body of {capacity} bytes: use a "
+            "smaller token encoding or raise the mtu."
         )
     key = np.ascontiguousarray(tokens.sites.key.cpu().numpy()[order], np.int64)
     bytes_left = -1 if budget_bytes is None else max(0, budget_bytes)
@@ -279,9 +279,9 @@ def pack_token_bodies(tokens: SparseBev, score: Tensor | None, token_codec: Toke
     order = token_order(tokens, score)
     key, encoding = tokens.sites.key.cpu().numpy()[order], token_codec.encoding
     features = tokens.features.detach().cpu()
-    features = features if encoding == "codes" else features.float()
+    features = features if encoding == "codebook" else features.float()
     largest, peak = 65504 if encoding == "float16" else math.inf, 0.0
-    if features.numel() and encoding != "codes":
+    if features.numel() and encoding != "codebook":
         peak = float(features.abs().max())
     if not (math.isfinite(peak) and peak <= largest):
         raise WireError(f"Features sent as {encoding} must be finite and at most {largest:g}; these are not.")
@@ -315,10 +315,10 @@ def pack_request_body(request: RequestMap, capacity: int) -> bytes:
     """The body of the one packet of a request map."""
     confidence = request.confidence.detach().double().cpu()
     if not bool(((confidence >= 0) & (confidence <= 1)).all()):
-        raise WireError("Message.request.sure is from 0 to 1; this is not.")
+        raise WireError("Message.request.confidence is from 0 to 1; this is not.")
     if _GRID.size + confidence.numel() > capacity:
         raise WireError(
-            f"A request map fits one packet, {capacity - _GRID.size} cells; got {confidence.numel()}: coarser, please."
+            f"A request map fits one packet, {capacity - _GRID.size} cells; got {confidence.numel()}: use a coarser grid."
         )
     return _GRID.pack(*_grid_fields(request.grid)) + np.rint(confidence.numpy() * 255).astype(np.uint8).tobytes()
 
@@ -328,7 +328,7 @@ def _values(features: Tensor, encoding: TokenEncoding, counts: list[int]) -> tup
     if encoding == "int8":
         codes, steps = primitives.quantise_int8_runs(features.numpy(), counts)
         return steps.tobytes(), [code.tobytes() for code in codes]
-    if encoding == "codes":
+    if encoding == "codebook":
         return features.numpy().tobytes(), [b""] * len(counts)
     # Several times as fast here as numpy's conversion, to the same bits.
     rows = (features.half() if encoding == "float16" else features).numpy()
@@ -403,7 +403,7 @@ def _read_tokens(body: bytes, fingerprint: bytes, tables: CodeTables | None) -> 
     grid, cells = _read_grid(body)
     layout_byte, channels, count = _TOKENS.unpack_from(body, _GRID.size)
     encoding, layout, data = TOKEN_ENCODINGS[layout_byte & 3], layout_byte >> 2, body[TOKENS_BYTES:]
-    if layout > (_CODED if encoding == "codes" else primitives.BITMAP) or not channels:
+    if layout > (_CODED if encoding == "codebook" else primitives.BITMAP) or not channels:
         raise PacketError("garbage", f"Unknown form of tokens: {layout_byte:#04x}, {channels} channels.")
     if layout == _CODED:
         if tables is None or tables.fingerprint != fingerprint:
@@ -445,7 +445,7 @@ def _features(parts: list[TokenRows]) -> NDArray[Any]:
     if parts[0].encoding == "int8":
         codes = np.frombuffer(b"".join(p.scales for p in parts), np.uint8).reshape(-1, channels)
         return primitives.dequantise_int8(np.repeat(codes, [len(p.key) for p in parts], axis=0), values)
-    if parts[0].encoding == "codes":
+    if parts[0].encoding == "codebook":
         return values
     return torch.from_numpy(values).float().numpy()
 

@@ -24,7 +24,7 @@ def build_request_map(xy: Tensor, confidence: Tensor, windows: BevGrid) -> Reque
     is in doubt, help is wanted.
     """
     if confidence.shape != (len(xy),) or not bool(((confidence >= 0) & (confidence <= 1)).all()):
-        raise ConfigError(f"sure needs ({len(xy)},) in [0, 1]; got {tuple(confidence.shape)}.")
+        raise ConfigError(f"confidence needs ({len(xy)},) in [0, 1]; got {tuple(confidence.shape)}.")
     rows, columns = windows.shape
     near = windows.contains(xy)
     yx = windows.cells(xy[near])

@@ -45,7 +45,7 @@ class TokenFormat:
             return "wrong_model"
         if rows.grid != self.grid:
             return "grid"
-        if rows.encoding == "codes":
+        if rows.encoding == "codebook":
             return None if self.tables is not None and rows.channels == self.tables.width else "width"
         if rows.channels != self.channels:
             return "width"

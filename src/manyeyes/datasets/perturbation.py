@@ -109,7 +109,7 @@ class FrameDelay:
 
     def __post_init__(self) -> None:
         if self.frames < 0:
-            raise ConfigError(f"LegacyStaleness counts frames back in time, at least 0; got {self.frames}.")
+            raise ConfigError(f"FrameDelay counts frames back in time, at least 0; got {self.frames}.")
 
     def apply(self, snapshot: Snapshot, ego: int, history: Sequence[Snapshot]) -> Snapshot:
         """The snapshot with its collaborators stale. history: the scenario's previous snapshots, oldest first."""

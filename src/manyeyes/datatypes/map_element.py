@@ -39,7 +39,7 @@ def check_offsets(name: str, offsets: Ints, total: int) -> None:
         or (offsets[1:] < offsets[:-1]).any()
     ):
         raise ShapeError(
-            f"{name}.first needs offsets (N+1,) that start at 0, never fall and end at {total}; "
+            f"{name}.offsets needs offsets (N+1,) that start at 0, never fall and end at {total}; "
             f"got shape {offsets.shape} from {offsets[:1].tolist()} to {offsets[-1:].tolist()}."
         )
 
@@ -105,7 +105,7 @@ class MapElements:
                 raise ShapeError(f"MapElements.{name} needs shape {shape}; got {getattr(self, name).shape}.")
         check_offsets("MapElements", self.offsets, p)
         if len(self.offsets) != n + 1:
-            raise ShapeError(f"MapElements.first needs shape {(n + 1,)}; got {self.offsets.shape}.")
+            raise ShapeError(f"MapElements.offsets needs shape {(n + 1,)}; got {self.offsets.shape}.")
         if n and (self.kind.min() < 0 or self.kind.max() >= len(KINDS)):
             raise ShapeError(
                 f"MapElements.kind needs 0 to {len(KINDS) - 1} ({', '.join(KINDS)}); got {self.kind.max()}."
@@ -145,7 +145,9 @@ class MapElements:
         if not many:
             return cls.empty()
         starts = np.cumsum([0, *(len(m.points) for m in many)])
-        columns = {f.name: np.concatenate([getattr(m, f.name) for m in many]) for f in fields(cls) if f.name != "first"}
+        columns = {
+            f.name: np.concatenate([getattr(m, f.name) for m in many]) for f in fields(cls) if f.name != "offsets"
+        }
         offsets = np.concatenate([m.offsets[:-1] + start for m, start in zip(many, starts)] + [starts[-1:]])
         return cls(offsets=offsets, **columns)
 
@@ -218,7 +220,7 @@ class MapElements:
 
 _DTYPES: dict[str, type[np.generic]] = {
     "kind": np.int64,
-    "first": np.int64,
+    "offsets": np.int64,
     "points": np.float64,
     "score": np.float64,
     "sigma": np.float64,

@@ -33,7 +33,9 @@ class RequestMap:
 
     def __post_init__(self) -> None:
         if tuple(self.confidence.shape) != self.grid.shape:
-            raise ShapeError(f"RequestMap.sure needs shape {self.grid.shape}; got {tuple(self.confidence.shape)}.")
+            raise ShapeError(
+                f"RequestMap.confidence needs shape {self.grid.shape}; got {tuple(self.confidence.shape)}."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,7 @@ class LocalMap:
     def __post_init__(self) -> None:
         object.__setattr__(self, "view", freeze(self.view, np.float64))
         if self.view.ndim != 2 or self.view.shape[1] != 2 or len(self.view) < 3:
-            raise ShapeError(f"SeenMap.view needs shape (K, 2), K >= 3; got {self.view.shape}.")
+            raise ShapeError(f"LocalMap.view needs shape (K, 2), K >= 3; got {self.view.shape}.")
 
 
 @dataclass(frozen=True)

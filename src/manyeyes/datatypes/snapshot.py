@@ -73,7 +73,7 @@ class GroundTruth:
     def __post_init__(self) -> None:
         agents = self.world_from_agent.translation.shape[0]
         if self.seen.shape != (agents, len(self.boxes)):
-            raise ShapeError(f"Truth.seen needs ({agents}, {len(self.boxes)}); got {tuple(self.seen.shape)}.")
+            raise ShapeError(f"GroundTruth.seen needs ({agents}, {len(self.boxes)}); got {tuple(self.seen.shape)}.")
 
 
 @dataclass(frozen=True)

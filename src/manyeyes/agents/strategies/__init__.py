@@ -14,7 +14,15 @@ from manyeyes.agents.strategies.multi_hop import MultiHopFusion
 from manyeyes.agents.strategies.no_fusion import NoFusion
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message
 
-__all__ = ["METHODS", "EarlyFusion", "FusionStrategy", "IntermediateFusion", "LateFusion", "NoFusion", "get_strategy"]
+__all__ = [
+    "STRATEGIES",
+    "EarlyFusion",
+    "FusionStrategy",
+    "IntermediateFusion",
+    "LateFusion",
+    "NoFusion",
+    "get_strategy",
+]
 
 
 class FusionStrategy(Protocol):
@@ -39,16 +47,16 @@ class FusionStrategy(Protocol):
         ...
 
 
-METHODS: dict[str, FusionStrategy] = {
+STRATEGIES: dict[str, FusionStrategy] = {
     m.name: m
     for m in (
         NoFusion(),
         LateFusion(),
-        LateFusion("late-remembering", history_frames=HISTORY_FRAMES),
+        LateFusion("late-temporal", history_frames=HISTORY_FRAMES),
         IntermediateFusion(),
-        IntermediateFusion("learned", mask_score),
-        IntermediateFusion("confidence", confidence_score),
-        IntermediateFusion("random", random_score),
+        IntermediateFusion("intermediate-mi", mask_score),
+        IntermediateFusion("intermediate-confidence", confidence_score),
+        IntermediateFusion("intermediate-random", random_score),
         MultiHopFusion(),
         EarlyFusion(),
     )
@@ -56,7 +64,7 @@ METHODS: dict[str, FusionStrategy] = {
 
 
 def get_strategy(name: str) -> FusionStrategy:
-    """The method of that name."""
-    if name not in METHODS:
-        raise ConfigError(f"There is no method {name!r}; known are {', '.join(METHODS)}.")
-    return METHODS[name]
+    """The strategy of that name; ConfigError lists the known ones."""
+    if name not in STRATEGIES:
+        raise ConfigError(f"There is no strategy {name!r}; known: {', '.join(STRATEGIES)}.")
+    return STRATEGIES[name]

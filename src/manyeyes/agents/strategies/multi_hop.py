@@ -21,7 +21,7 @@ from manyeyes.datatypes import AgentFrame, Boxes, Message
 class MultiHopFusion:
     """Sends the tokens of its last perception, dated as that was; before it has perceived, its own."""
 
-    name: str = "fused"
+    name: str = "intermediate-multihop"
     uses_history: bool = True
 
     def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:

@@ -14,7 +14,7 @@ from manyeyes.datatypes import AgentFrame, Boxes, Message
 class NoFusion:
     """No collaboration."""
 
-    name: str = "alone"
+    name: str = "none"
     uses_history: bool = False
 
     def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
