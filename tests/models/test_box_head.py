@@ -122,7 +122,7 @@ def test_scores_fall_and_mix_heat_with_overlap():
     sites = every_site(8)
     raw = encode(some_boxes(), sites)
     heat = torch.where(raw.heatmap_logit > 0, torch.linspace(0.1, 2.0, len(sites)), raw.heatmap_logit)
-    raw = RawBoxes(**{**vars(raw), "heat": heat, "overlap": torch.zeros(len(sites))})
+    raw = RawBoxes(**{**vars(raw), "heatmap_logit": heat, "iou_logit": torch.zeros(len(sites))})
     (found,) = decode(raw, DecodeConfig(iou_score_weight=0.5))
     assert (found.score[:-1] >= found.score[1:]).all()
     best = torch.sigmoid(heat[raw.heatmap_logit > 0]).max()
@@ -134,4 +134,4 @@ def test_a_fresh_head_expects_few_boxes():
     head = BoxHead(8, 16).eval()
     with torch.no_grad():
         raw = head(SparseBev(torch.randn(64, 8), Sites(torch.arange(64), GRID.at(8))))
-    assert 0.05 < float(torch.sigmoid(raw.heat).mean()) < 0.2
+    assert 0.05 < float(torch.sigmoid(raw.heatmap_logit).mean()) < 0.2

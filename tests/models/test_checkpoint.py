@@ -169,8 +169,8 @@ def test_a_configuration_with_an_option_comes_back_and_an_older_one_gets_its_def
     config = DetectorConfig(BevGrid(-10.0, -10.0, -3.0, 10.0, 10.0, 3.0), output_range=area)
     text = config_to_json(config)
     assert config_from_json(DetectorConfig, text) == config and config.detection_range == area
-    older = {k: v for k, v in json.loads(text).items() if k != "answers"}
+    older = {k: v for k, v in json.loads(text).items() if k != "output_range"}
     read = config_from_json(DetectorConfig, json.dumps(older))
-    assert read.answers is None and read.range == read.grid
+    assert read.output_range is None and read.detection_range == read.grid
     with pytest.raises(ConfigError):
         config_from_json(DetectorConfig, json.dumps({k: v for k, v in older.items() if k != "grid"}))

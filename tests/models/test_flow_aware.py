@@ -143,7 +143,10 @@ def test_an_empty_past_and_windows_without_one_are_exactly_the_identity(gradient
     before = past(n=200)
     here = torch.isin(window_ids(before.xy, before.ego, ORIGIN, EDGE), ids.unique()[:5])
     some = dataclasses.replace(
-        before, **{f: getattr(before, f)[here] for f in ("features", "xy", "ego", "cue", "proposal", "kept")}
+        before,
+        **{
+            f: getattr(before, f)[here] for f in ("features", "xy", "ego", "pose_context", "proposal", "selection_mask")
+        },
     )
     met = torch.isin(ids, ids.unique()[:5])
     with torch.set_grad_enabled(gradients):
@@ -188,11 +191,13 @@ def test_a_fresh_fusion_with_a_past_is_self_attention():
     torch.manual_seed(0)
     flow = FastFusion(CHANNELS, CONFIG).eval()
     plain = SelfAttentionFusion(CHANNELS, CONFIG).eval()
-    plain.load_state_dict({k: v for k, v in flow.state_dict().items() if not k.startswith("past.")})
+    plain.load_state_dict({k: v for k, v in flow.state_dict().items() if not k.startswith("past_attention.")})
     with torch.no_grad():
         a, b, c = flow(own(), past()), flow(own()), plain(own(), past())
     for other in (b, c):
-        assert torch.equal(a.bev.features, other.bev.features) and torch.equal(a.given, other.given)
+        assert torch.equal(a.bev.features, other.bev.features) and torch.equal(
+            a.merged_proposals, other.merged_proposals
+        )
     torch.nn.init.normal_(flow.past_attention.out.weight)
     with torch.no_grad():
         assert not torch.allclose(flow(own(), past()).bev.features, a.bev.features, atol=1e-3)
@@ -258,13 +263,13 @@ def merged_x(x: float, **prior: float) -> float:
     with torch.no_grad():
         fused = fusion.merge(tokens.features, tokens, *assign_cells(tokens))
     assert len(fused.bev.sites) == 1
-    return 0.2 + float(fused.given[0, BOX_LAYOUT.offset][0]) * GRID.cell_size_m
+    return 0.2 + float(fused.merged_proposals[0, BOX_LAYOUT.offset][0]) * GRID.cell_size_m
 
 
 def test_pose_sigma_and_age_lower_the_merge_weight():
     # Trust starts as a softmax of - log sigma: shares go as one over the standard deviations.
     assert merged_x(0.8) == pytest.approx(0.5, abs=1e-5)
-    for prior, moved in (({"doubt_xy_m": 0.6}, 0.6), ({"age_s": 0.4}, 0.4 * DRIFT_MPS)):
+    for prior, moved in (({"sigma_xy_m": 0.6}, 0.6), ({"age_s": 0.4}, 0.4 * DRIFT_MPS)):
         sigma = math.hypot(0.2, moved)
         share = (1 / sigma) / (1 / sigma + 1 / 0.2)
         assert merged_x(0.8, **prior) == pytest.approx(0.2 + 0.6 * share, abs=1e-4)

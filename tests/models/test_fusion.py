@@ -46,7 +46,7 @@ def fusion(name: str, random_placement: bool = True) -> torch.nn.Module:
         torch.nn.init.normal_(model.encoding.outer.weight, std=0.3)
         torch.nn.init.normal_(model.encoding.temporal.weight, std=0.3)
     else:
-        torch.nn.init.zeros_(model.settle.outer.weight)
+        torch.nn.init.zeros_(model.merge.outer.weight)
     return model.eval().requires_grad_(False)
 
 
@@ -92,7 +92,7 @@ def test_fusion_is_invariant_to_agent_order(name):
     a, b = model(tokens_of([0, 1, 2, 3])), model(tokens_of([0, 3, 1, 2]))
     assert torch.equal(a.bev.sites.key, b.bev.sites.key)
     assert torch.allclose(a.bev.features, b.bev.features, atol=1e-5)
-    assert torch.allclose(a.given, b.given, atol=1e-5)
+    assert torch.allclose(a.merged_proposals, b.merged_proposals, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", FUSIONS)
@@ -101,8 +101,8 @@ def test_every_agent_adds_what_it_has(name, agents):
     tokens = tokens_of(list(range(agents)))
     out = fusion(name)(tokens)
     key, _ = assign_cells(tokens)
-    assert torch.equal(out.bev.sites.key, torch.unique(key)) and len(out.given) > 35 * agents**0.5
-    assert bool(torch.isfinite(out.bev.features).all()) and bool(torch.isfinite(out.given).all())
+    assert torch.equal(out.bev.sites.key, torch.unique(key)) and len(out.merged_proposals) > 35 * agents**0.5
+    assert bool(torch.isfinite(out.bev.features).all()) and bool(torch.isfinite(out.merged_proposals).all())
 
 
 @pytest.mark.parametrize("name", FUSIONS)
@@ -122,7 +122,7 @@ def test_moving_the_whole_world_changes_nothing(name):
     here, there = model(tokens_of([0, 1, 2])), model(tokens_of([0, 1, 2], world))
     assert torch.equal(here.bev.sites.key, there.bev.sites.key)
     assert torch.allclose(here.bev.features, there.bev.features, atol=1e-4)
-    assert torch.allclose(here.given, there.given, atol=1e-3)
+    assert torch.allclose(here.merged_proposals, there.merged_proposals, atol=1e-3)
 
 
 def test_maximum_of_a_neighbour_shifted_by_whole_cells_is_the_dense_maximum():
@@ -206,7 +206,7 @@ def test_egos_of_a_batch_are_independent(name):
         rows = together.bev.sites.batch == b
         assert torch.equal(together.bev.sites.yx[rows], alone.bev.sites.yx)
         assert torch.allclose(together.bev.features[rows], alone.bev.features, atol=1e-5)
-        assert torch.allclose(together.given[rows], alone.given, atol=1e-5)
+        assert torch.allclose(together.merged_proposals[rows], alone.merged_proposals, atol=1e-5)
 
 
 def boxes_of(proposal: Tensor, xy: Tensor) -> Boxes:
@@ -265,9 +265,9 @@ def test_tokens_of_one_object_meet_on_its_centre_and_the_surer_counts_more(name)
     assert len(out.bev.sites) == 1
     assert out.bev.sites.xy[0].tolist() == pytest.approx([0.2, 0.2], abs=1e-5)
     share = math.exp(2.0) / (math.exp(2.0) + 1.0)
-    box = boxes_of(out.given, out.bev.sites.xy)
+    box = boxes_of(out.merged_proposals, out.bev.sites.xy)
     assert float(box.center[0, 0]) == pytest.approx(0.5 * share + 0.8 * (1 - share), abs=1e-5)
-    assert float(out.given[0, 0]) == pytest.approx(2.0 * share, abs=1e-5)
+    assert float(out.merged_proposals[0, 0]) == pytest.approx(2.0 * share, abs=1e-5)
 
 
 @pytest.mark.parametrize("name", FUSIONS)
@@ -281,6 +281,6 @@ def test_untrained_refinement_is_identity_and_trained_one_is_not(name):
     fused = fusion(name)(tokens_of([0, 1, 2]))
     torch.manual_seed(1)
     head = RefineHead(CHANNELS, 8).eval().requires_grad_(False)
-    assert torch.equal(head(fused.bev, fused.given).columns(), fused.given)
+    assert torch.equal(head(fused.bev, fused.merged_proposals).to_rows(), fused.merged_proposals)
     torch.nn.init.normal_(head.out.weight)
-    assert not torch.allclose(head(fused.bev, fused.given).columns(), fused.given, atol=1e-2)
+    assert not torch.allclose(head(fused.bev, fused.merged_proposals).to_rows(), fused.merged_proposals, atol=1e-2)

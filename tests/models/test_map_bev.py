@@ -57,9 +57,9 @@ def test_frame_is_independent_of_the_rest_of_its_batch():
     assert torch.allclose(net(clouds)[0][1], net(clouds[1:2])[0][0], atol=1e-5)
 
 
-@pytest.mark.parametrize("lift", ["depth", "ground"])
-def test_pictures_reach_the_ground_ahead_and_learn(lift):
-    net = CameraBev(BevConfig(**{**vars(CONFIG), "lift": lift}))
+@pytest.mark.parametrize("view_transform", ["depth", "ground"])
+def test_pictures_reach_the_ground_ahead_and_learn(view_transform):
+    net = CameraBev(BevConfig(**{**vars(CONFIG), "view_transform": view_transform}))
     features, seen = net([[photo()], [], [photo(10), photo(200)]])
     assert features.shape == (3, 16, 16, 16)
     assert not bool(seen[1].any()) and bool(seen[0].any()) and not bool(seen[0, :, :8].any())

@@ -35,7 +35,7 @@ TILE = BevGrid(-20.0, -10.0, -1.0, 20.0, 10.0, 1.0, pillar=2.0)
 
 
 def drawn(head, ground, group="one"):
-    return head(ground, head.sketch(ground), group)
+    return head(ground, head.line_field_head(ground), group)
 
 
 def test_every_layer_answers_for_every_query_of_its_group():
@@ -170,7 +170,7 @@ def at_three_places(monkeypatch, head, shift):
     start = (THREE[None, :, None] / torch.tensor([20.0, 10.0])).expand(1, 3, 5, 2).clone()
     start[0, 2, :, 0] += shift
     begin = (start, torch.full((1, 3, 3), -4.0), torch.zeros(1, 3, dtype=torch.int64))
-    monkeypatch.setattr(head, "begin", lambda sketch, group: begin)
+    monkeypatch.setattr(head, "init_queries", lambda line_field, group: begin)
     # Nothing is seen anywhere, so only the place itself can change the answer.
     ground = torch.zeros(1, 16, 10, 20)
     return drawn(head, ground)[0], start
@@ -180,7 +180,7 @@ def with_random_branches(head):
     """The same head with branches that say something."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for branch in (*head.moves, *head.kinds):
+        for branch in (*head.point_branches, *head.class_branches):
             branch[-1].weight.normal_(generator=generator)
     return head.eval().requires_grad_(False)
 
@@ -211,7 +211,8 @@ def test_nothing_sure_is_an_empty_map():
 
 
 @pytest.mark.parametrize(
-    "fields", [{"channels": 10}, {"points": 1}, {"kinds": ("divider", "kerb")}, {"kinds": ()}, {"learned": 50}]
+    "fields",
+    [{"channels": 10}, {"num_points": 1}, {"kinds": ("divider", "kerb")}, {"kinds": ()}, {"num_learned_queries": 50}],
 )
 def test_impossible_settings_are_refused(fields):
     with pytest.raises(ConfigError, match="MapHeadConfig"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a sketch to lines: every line once, rings as rectangles, copies unsure; who drops whom against a loop."""
+"""From a line_field to lines: every line once, rings as rectangles, copies unsure; who drops whom against a loop."""
 
 import dataclasses
 import math
@@ -34,14 +34,14 @@ TRUTH = MapElements.of(
 
 
 def perfect(truth=TRUTH):
-    """What a sketch would be that says the truth."""
+    """What a line_field would be that says the truth."""
     target = make_line_field_target(truth, TILE, KINDS)
     ink, end = (torch.logit(share.clamp(0.001, 0.999))[None] for share in (target.line_prob, target.end_mask))
     return RawLineField(ink, end, target.offset_to_line[None], target.direction[None], target.half_width[None])
 
 
-def proposed(sketch, count=5, seeds=40):
-    return propose_lines(sketch, RINGS, count, 8, seeds, 0.3)
+def proposed(line_field, count=5, seeds=40):
+    return propose_lines(line_field, RINGS, count, 8, seeds, 0.3)
 
 
 def test_every_line_of_a_true_sketch_is_proposed_once():
@@ -85,7 +85,7 @@ def test_tiles_of_a_batch_are_proposed_as_if_alone():
         *(torch.cat((getattr(one, f.name), getattr(other, f.name))) for f in dataclasses.fields(RawLineField))
     )
     together, alone = proposed(both), proposed(other)
-    for name in ("point", "kind", "sure"):
+    for name in ("point", "kind", "score"):
         assert torch.allclose(getattr(together, name)[1].float(), getattr(alone, name)[0].float(), atol=1e-6)
 
 
@@ -117,8 +117,8 @@ def test_what_is_kept_is_what_a_loop_keeps():
 
 
 def test_head_covers_every_cell_and_starts_with_low_line_probability():
-    sketch = LineFieldHead(16, 3)(torch.randn(2, 16, 10, 20))
-    assert sketch.ink.shape == sketch.end.shape == sketch.half.shape == (2, 3, 10, 20)
-    assert sketch.foot.shape == sketch.way.shape == (2, 3, 2, 10, 20)
-    assert float(sketch.ink.detach().sigmoid().mean()) == pytest.approx(0.05, abs=0.03)
-    assert math.isfinite(float(sketch.way.detach().sum()))
+    line_field = LineFieldHead(16, 3)(torch.randn(2, 16, 10, 20))
+    assert line_field.line_logit.shape == line_field.end_logit.shape == line_field.half_width.shape == (2, 3, 10, 20)
+    assert line_field.offset_to_line.shape == line_field.direction.shape == (2, 3, 2, 10, 20)
+    assert float(line_field.line_logit.detach().sigmoid().mean()) == pytest.approx(0.05, abs=0.03)
+    assert math.isfinite(float(line_field.direction.detach().sum()))

@@ -70,48 +70,53 @@ def mapper():
 
 
 def test_tokens_lie_where_the_ground_was_seen(mapper):
-    features = mapper.see(clouds(2))
+    features = mapper.extract_features(clouds(2))
     assert features.tokens.features.shape[1] == 8 and features.tokens.sites.batch_size == 2
     assert features.tokens.grid == TINY.bev.token_grid and 20 < len(features.tokens.sites) < 2 * 256
-    assert features.ink.shape == (len(features.tokens.sites), 3) and bool(
-        ((features.worth > 0) & (features.worth < 1)).all()
+    assert features.line_logits.shape == (len(features.tokens.sites), 3) and bool(
+        ((features.cell_score > 0) & (features.cell_score < 1)).all()
     )
 
 
 def test_fusion_is_invariant_to_frame_order(mapper):
     seen, tile = clouds(4), torch.zeros(4, dtype=torch.int64)
     order = [2, 0, 3, 1]
-    a = mapper.fuse(mapper.see(seen).tokens, FOUR, tile, 1)
-    shuffled = mapper.see([seen[i] for i in order]).tokens
+    a = mapper.fuse(mapper.extract_features(seen).tokens, FOUR, tile, 1)
+    shuffled = mapper.extract_features([seen[i] for i in order]).tokens
     b = mapper.fuse(shuffled, FOUR[torch.tensor(order)], tile, 1)
     assert torch.allclose(a, b, atol=1e-5) and float(a.std()) > 0
 
 
 def test_frame_without_tile_coverage_changes_nothing(mapper):
     seen = clouds(3)
-    a = mapper.fuse(mapper.see(seen[:2]).tokens, FOUR[:2], torch.zeros(2, dtype=torch.int64), 1)
+    a = mapper.fuse(mapper.extract_features(seen[:2]).tokens, FOUR[:2], torch.zeros(2, dtype=torch.int64), 1)
     away = poses((0, 0, 0, 0.1), (4, 1, 0, math.pi), (500, 0, 0, 0))
-    b = mapper.fuse(mapper.see(seen).tokens, away, torch.zeros(3, dtype=torch.int64), 1)
+    b = mapper.fuse(mapper.extract_features(seen).tokens, away, torch.zeros(3, dtype=torch.int64), 1)
     assert torch.allclose(a, b, atol=1e-6)
     near = poses((0, 0, 0, 0.1), (4, 1, 0, math.pi), (-6, 0, 0, 0))
-    assert not torch.allclose(a, mapper.fuse(mapper.see(seen).tokens, near, torch.zeros(3, dtype=torch.int64), 1))
+    assert not torch.allclose(
+        a, mapper.fuse(mapper.extract_features(seen).tokens, near, torch.zeros(3, dtype=torch.int64), 1)
+    )
 
 
 def test_frames_of_other_tiles_change_nothing(mapper):
     seen = clouds(4)
-    both = mapper.fuse(mapper.see(seen).tokens, FOUR, torch.tensor([1, 0, 1, 0]), 3)
+    both = mapper.fuse(mapper.extract_features(seen).tokens, FOUR, torch.tensor([1, 0, 1, 0]), 3)
     one = mapper.fuse(
-        mapper.see([seen[1], seen[3]]).tokens, FOUR[torch.tensor([1, 3])], torch.zeros(2, dtype=torch.int64), 1
+        mapper.extract_features([seen[1], seen[3]]).tokens,
+        FOUR[torch.tensor([1, 3])],
+        torch.zeros(2, dtype=torch.int64),
+        1,
     )
     assert torch.allclose(both[0], one[0], atol=1e-5)
     # The last tile had no look: all of it is what nobody saw.
-    blind = mapper.see([PointCloud.of(torch.zeros(0, 3))]).tokens
+    blind = mapper.extract_features([PointCloud.of(torch.zeros(0, 3))]).tokens
     empty = mapper.fuse(blind, FOUR[:1], torch.zeros(1, dtype=torch.int64), 1)
     assert torch.allclose(both[2], empty[0], atol=1e-5)
 
 
 def test_moving_everything_by_one_motion_changes_nothing(mapper):
-    tokens, tile = mapper.see(clouds(4)).tokens, torch.zeros(4, dtype=torch.int64)
+    tokens, tile = mapper.extract_features(clouds(4)).tokens, torch.zeros(4, dtype=torch.int64)
     world_from_tile = Transform.from_xyz_yaw(3000.0, -900.0, 0.0, 2.2)
     world_from_agent = world_from_tile @ FOUR
     back = world_from_tile.inverse() @ world_from_agent
@@ -119,11 +124,11 @@ def test_moving_everything_by_one_motion_changes_nothing(mapper):
 
 
 def test_what_is_drawn_depends_on_what_was_seen(mapper):
-    tokens = mapper.see(clouds(2)).tokens
+    tokens = mapper.extract_features(clouds(2)).tokens
     ground = mapper.fuse(tokens, FOUR[:2], torch.tensor([0, 1]), 2)
-    raw = mapper.draw(ground)[-1]
+    raw = mapper.predict_elements(ground)[-1]
     assert raw.logit.shape == (2, 6, 3) and not torch.allclose(raw.logit[0], raw.logit[1], atol=1e-3)
-    assert mapper.draw(ground, "many")[-1].logit.shape == (2, 4, 3)
+    assert mapper.predict_elements(ground, "many")[-1].logit.shape == (2, 4, 3)
 
 
 def test_scores_are_calibrated_when_drawing_and_not_when_learning():
@@ -181,5 +186,5 @@ def test_presets_have_the_paper_s_sizes():
     for config in MAP_MODELS.values():
         tile = config.tile
         assert (tile.x_max - tile.x_min, tile.y_max - tile.y_min) == (120.0, 60.0)
-    with pytest.raises(ConfigError, match="toy, small, paper"):
+    with pytest.raises(ConfigError, match="tiny, small, paper"):
         get_map_model_config("large")

@@ -64,16 +64,16 @@ def test_a_scale_is_the_maximum_over_its_wider_cells():
 def test_it_starts_as_maximum_fusion():
     some, model = tokens(), fusion(trained=False)
     plain = MaxFusion(CHANNELS).eval().requires_grad_(False)
-    plain.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith(("coarser", "out"))})
+    plain.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith(("coarse_scales", "out"))})
     torch.testing.assert_close(model(some).bev.features, plain(some).bev.features)
-    assert torch.equal(model(some).given, plain(some).given)
+    assert torch.equal(model(some).merged_proposals, plain(some).merged_proposals)
     assert not torch.equal(fusion()(some).bev.features, plain(some).bev.features)
 
 
 def test_the_order_of_tokens_does_not_matter_and_egos_do_not_meet():
     some, model = tokens(), fusion()
     order = torch.randperm(50, generator=torch.Generator().manual_seed(1))
-    columns = ("features", "xy", "ego", "cue", "proposal", "kept")
+    columns = ("features", "xy", "ego", "pose_context", "proposal", "selection_mask")
 
     def take(index):
         return replace(some, **{name: getattr(some, name)[index] for name in columns})

@@ -53,7 +53,7 @@ def test_it_has_as_many_weights_as_the_published_matcher():
 
 
 def test_the_shipped_net_is_small_and_both_presets_survive_json():
-    assert sum(p.numel() for p in FeakmNet(FEAKM["feakm"]).parameters()) <= 2_000_000
+    assert sum(p.numel() for p in FeakmNet(FEAKM["feakm-small"]).parameters()) <= 2_000_000
     for config in FEAKM.values():
         assert checkpoint.config_from_json(FeakmConfig, checkpoint.config_to_json(config)) == config
 
@@ -172,13 +172,13 @@ def test_the_shipped_net_has_a_name_of_its_own(tmp_path, monkeypatch):
         pretrained.load_feakm()
     checkpoint.save(
         FeakmNet(FeakmConfig(BoxKeypointConfig(8, 8, 16), SMALL)),
-        tmp_path / "weights/feakm.safetensors",
+        tmp_path / "weights/feakm-small.safetensors",
         {},
         format=FORMAT,
     )
-    assert pretrained.load_feakm("feakm").config.matcher == SMALL and pretrained.list_detectors() == ()
-    with pytest.raises(checkpoint.CheckpointError, match="No weights are named 'feakm'"):
-        pretrained.load("feakm")
+    assert pretrained.load_feakm("feakm-small").config.matcher == SMALL and pretrained.list_detectors() == ()
+    with pytest.raises(checkpoint.CheckpointError, match="No weights are named 'feakm-small'"):
+        pretrained.load("feakm-small")
 
 
 def test_the_net_that_ships_is_of_the_detector_that_ships():

@@ -36,7 +36,7 @@ def package(tmp_path, monkeypatch):
 
 def test_names_are_grouped_by_model_type(package):
     assert pretrained.list_detectors() == ("costr-small",)
-    assert pretrained.list_map_models() == ("map-small", "map-small-camera")
+    assert pretrained.list_map_models() == ("map-small-camera", "map-small-lidar")
 
 
 def test_a_shipped_map_model_comes_ready_with_its_fingerprint(package):
@@ -46,7 +46,7 @@ def test_a_shipped_map_model_comes_ready_with_its_fingerprint(package):
 
 
 def test_an_unknown_map_model_names_those_that_ship(package):
-    with pytest.raises(CheckpointError, match="map-small, map-small-camera"):
+    with pytest.raises(CheckpointError, match="map-small-camera, map-small-lidar"):
         pretrained.load_map_model("map-large")
     with pytest.raises(CheckpointError, match="no such file"):
         pretrained.load_map_model("map-large.safetensors")

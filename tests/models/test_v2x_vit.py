@@ -57,7 +57,9 @@ def test_agents_at_one_place_attend_by_kind_and_edge():
             for j in mates:
                 kj = int(kind[j])
                 known = model.key.maps[kj](some.features[j]).view(HEADS, d)[h] @ model.attention_matrix[ki, kj, h]
-                messages.append(model.value.maps[kj](some.features[j]).view(HEADS, d)[h] @ model.tells[ki, kj, h])
+                messages.append(
+                    model.value.maps[kj](some.features[j]).view(HEADS, d)[h] @ model.message_matrix[ki, kj, h]
+                )
                 logits.append(query[h] @ known / math.sqrt(d))
             heads.append(torch.stack(logits).softmax(0) @ torch.stack(messages))
         torch.testing.assert_close(found[i], model.out.maps[ki](torch.cat(heads)), atol=1e-4, rtol=1e-4)
@@ -89,7 +91,7 @@ def test_windows_of_three_sizes_are_weighed_by_split_attention():
 def test_it_starts_as_tokens_that_settle_by_trust():
     torch.manual_seed(0)
     some, model = tokens(), V2xVitFusion(CHANNELS, CONFIG).eval().requires_grad_(False)
-    plain = TokenMerge(CHANNELS, "trust")
+    plain = TokenMerge(CHANNELS, "softmax")
     plain.load_state_dict(model.merge.state_dict())
     key, place = assign_cells(some)
     torch.testing.assert_close(model(some).bev.features, plain(some.features, some, key, place).bev.features)
@@ -111,7 +113,7 @@ def test_received_tokens_use_their_own_weights():
 
 def test_egos_do_not_meet_and_gradients_reach_every_layer():
     some, model = tokens(), speaking(V2xVitFusion(CHANNELS, CONFIG))
-    columns = ("features", "xy", "ego", "cue", "proposal", "kept")
+    columns = ("features", "xy", "ego", "pose_context", "proposal", "selection_mask")
     first = model(replace(some, **{name: getattr(some, name)[some.ego == 0] for name in columns}))
     together = model(some)
     wanted = together.bev.features[together.bev.sites.batch == 0]

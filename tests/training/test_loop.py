@@ -207,7 +207,7 @@ def test_the_same_seed_is_the_same_run_and_another_is_not(toy, tmp_path):
 MEASURE = """
 import torch
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.training.detector.loop import Run, TrainConfig
+from manyeyes.training.detector.loop import DetectorRun, TrainConfig
 from manyeyes.training.detector.losses import LossConfig
 from manyeyes.training.detector.samples import AugmentConfig
 
@@ -216,11 +216,11 @@ def measure(toy, out):
     alike = toy(scenarios=("toy_0",), frames=1, agents_n=1, points_per_car=20, ground_points=60)
     # Windows of other samples are negatives of the selector's information: twins among them cost the logarithm of their number.
     loss = LossConfig(information=0.0)
-    config = TrainConfig(COSTR_TINY, steps=6, batch=4, warm_up=2, augment=AugmentConfig.none(), loss=loss)
-    run = Run(config, alike, out / "alike", 0)
+    config = TrainConfig(COSTR_TINY, steps=6, batch=4, warmup_steps=2, augment=AugmentConfig.none(), loss=loss)
+    run = DetectorRun(config, alike, out / "alike", 0)
     first = run.advance()
     state = {k: v for k, v in run.state.model.state_dict().items() if "running" not in k and "tracked" not in k}
-    varied = Run(config, toy(frames=4, points_per_car=20, ground_points=60), out / "varied", 0)
+    varied = DetectorRun(config, toy(frames=4, points_per_car=20, ground_points=60), out / "varied", 0)
     drawn, real = [], varied.stream.draw
     object.__setattr__(varied.stream, "draw", lambda n: drawn.append(n) or real(n))
     losses = [varied.advance().loss for _ in range(2)]

@@ -95,7 +95,8 @@ def test_without_a_box_every_term_is_finite_and_gradients_flow(scale):
         and bool(torch.isfinite(some.heatmap_logit.grad).all())
     )
     assert not any(
-        float(getattr(terms, n).detach()) for n in ("shape", "direction", "kind", "sigma", "overlap", "iou", "velocity")
+        float(getattr(terms, n).detach())
+        for n in ("shape", "direction", "classification", "sigma", "iou_score", "iou", "velocity")
     )
     assert float(terms.heat.detach()) > 0
 
@@ -137,7 +138,7 @@ def test_a_perfect_answer_costs_nothing_and_its_opposite_only_direction(yaw):
     truth = one_box(yaw)
     targets = assign_targets(SITES, [truth], TargetConfig())
     terms = terms_of(perfect(truth), targets)
-    for name in ("shape", "direction", "kind", "overlap", "iou", "velocity"):
+    for name in ("shape", "direction", "classification", "iou_score", "iou", "velocity"):
         assert float(getattr(terms, name)) == pytest.approx(0.0, abs=2e-3), name
     assert float(terms.sigma) == pytest.approx(-10.0, abs=0.1)
     backward = dataclasses.replace(perfect(truth), direction=-perfect(truth).direction)

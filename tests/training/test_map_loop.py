@@ -220,7 +220,7 @@ def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
     assert all(
         math.isfinite(line[name])
         for line in lines
-        for name in ("loss", "kind", "point", "direction", "ink", "sketch", "many")
+        for name in ("loss", "classification", "point", "direction", "segmentation", "line_field", "one_to_many")
     )
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["Nowhere"] and card["steps"] == 4 and card["command"] == "x"
@@ -244,10 +244,10 @@ def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tm
     begun = MapRun(config, Streets(), tmp_path / "begun", 0, [lidar.state_dict(), camera.state_dict()]).state
     state, first, second = (m.state_dict() for m in (begun.model, lidar, camera))
     # The first that has a tensor has the say; calibration is begun anew; the average begins where the model does.
-    assert all(torch.equal(state[k], v) for k, v in first.items() if k not in ("scale", "shift"))
+    assert all(torch.equal(state[k], v) for k, v in first.items() if k not in ("logit_scale", "logit_shift"))
     assert all(torch.equal(state[k], v) for k, v in second.items() if k.startswith("camera."))
-    assert torch.equal(state["scale"], torch.ones(3)) and same_state(begun.average, begun.model)
-    assert not torch.equal(random["shrink.weight"], state["shrink.weight"])
+    assert torch.equal(state["logit_scale"], torch.ones(3)) and same_state(begun.average, begun.model)
+    assert not torch.equal(random["token_projection.weight"], state["token_projection.weight"])
     with pytest.raises(ConfigError, match="of its size"):
         MapRun(config, Streets(), tmp_path / "none", 0, [{"lidar.stem.0.0.weight": torch.zeros(3)}])
 
@@ -264,7 +264,7 @@ def test_scores_are_calibrated_at_the_end_and_training_is_the_same(tmp_path):
     plain, calibrated = (checkpoint.load_as(file, FORMAT, MapModelConfig, MapModel) for file in (plain, calibrated))
     assert not torch.equal(calibrated.logit_scale, plain.logit_scale) and bool((calibrated.logit_scale > 0).all())
     same = {name for name, value in plain.state_dict().items() if torch.equal(value, calibrated.state_dict()[name])}
-    assert set(plain.state_dict()) - same <= {"scale", "shift"}
+    assert set(plain.state_dict()) - same <= {"logit_scale", "logit_shift"}
 
 
 def test_subsampling_drops_the_lowest_scores_of_each_frame():
@@ -290,7 +290,7 @@ def test_the_decoder_is_taught_after_the_sketch(tmp_path):
     only.advance()
     same = {name for name, p in only.state.model.named_parameters() if torch.equal(p, before[name])}
     assert any(name.startswith("head.layers") for name in same)
-    assert not any(name.startswith("head.sketch") for name in same)
+    assert not any(name.startswith("head.line_field_head") for name in same)
 
 
 def test_two_streets_are_learnt_by_heart(tmp_path):
@@ -317,7 +317,9 @@ def test_two_streets_are_learnt_by_heart(tmp_path):
 
 @torch.no_grad()
 def quality(model, streets, truth):
-    raw = model.draw(model.merge(*warp_tokens(model, extract_features(model, streets).tokens, streets)))[-1]
+    raw = model.predict_elements(
+        model.fuse_features(*warp_tokens(model, extract_features(model, streets).tokens, streets))
+    )[-1]
     drawn = place_side_by_side(decode_elements(raw, TINY.tile, TINY.head))
     return evaluate_map(drawn, truth, ("exact",), TINY.head.kinds).mean_ap("exact", kinds=TINY.head.kinds)
 

@@ -55,7 +55,7 @@ def arriving(view: AgentView, score: Tensor, number: int = 0) -> list[int]:
 
 
 def test_a_budget_lets_the_best_through_and_near_ties_by_chance(sample):
-    view = replace(sample.views[1], keep=10)
+    view = replace(sample.views[1], max_tokens=10)
     score = torch.linspace(-10, 10, 40)[torch.randperm(40, generator=torch.Generator().manual_seed(0))]
     best = set((100 + score.sort(descending=True).indices[:10]).tolist())
     drawn = [arriving(view, score, number) for number in range(50)]
@@ -70,12 +70,12 @@ def test_a_budget_lets_the_best_through_and_near_ties_by_chance(sample):
 def test_a_budget_larger_than_the_message_and_none_at_all_take_everything(sample):
     view, score = sample.views[1], torch.randn(30)
     for keep in (None, 30, 1000):
-        assert arriving(replace(view, keep=keep), score) == [*range(100, 130)]
-    assert arriving(replace(view, keep=5, lost=0.5), score[:0]) == []
+        assert arriving(replace(view, max_tokens=keep), score) == [*range(100, 130)]
+    assert arriving(replace(view, max_tokens=5, loss_fraction=0.5), score[:0]) == []
 
 
 def test_what_is_lost_is_lost_by_packets(sample):
-    view, score = replace(sample.views[1], lost=0.4), torch.arange(400.0)
+    view, score = replace(sample.views[1], loss_fraction=0.4), torch.arange(400.0)
     left = 0
     for number in range(20):
         rows = torch.tensor(arriving(view, score, number)) - 100
@@ -88,7 +88,7 @@ def test_what_is_lost_is_lost_by_packets(sample):
 def test_budget_fills_packets_by_descending_score(sample):
     # Scores so far apart that chance moves nothing: the order is falling, so is that of the packets.
     score = -100.0 * torch.arange(64)
-    rows = arriving(replace(sample.views[1], keep=20, lost=0.5), score, 3)
+    rows = arriving(replace(sample.views[1], max_tokens=20, loss_fraction=0.5), score, 3)
     packets = {(row - 100) // TOKENS_PER_PACKET for row in rows}
     assert 0 < len(rows) < 20 and all(row < 120 for row in rows)
     assert {row - 100 for row in rows} == {t for p in packets for t in range(8 * p, min(8 * p + 8, 20))}
@@ -96,7 +96,7 @@ def test_budget_fills_packets_by_descending_score(sample):
 
 def test_the_same_key_loses_the_same(sample):
     view, score = (
-        replace(sample.views[1], keep=20, lost=0.5),
+        replace(sample.views[1], max_tokens=20, loss_fraction=0.5),
         torch.randn(100, generator=torch.Generator().manual_seed(1)),
     )
     assert arriving(view, score, 1) == arriving(view, score, 1) != arriving(view, score, 2)
@@ -127,12 +127,12 @@ def test_ego_history_is_used_without_gradient(detector, sample):
     ] == [0.1]
     assert all(len(part.tokens) > 20 and not part.tokens.requires_grad and not part.sigma_xy_m for part in ego_history)
     with torch.no_grad():
-        for weight in (model.fusion.past.out.weight, model.refine.out.weight):
+        for weight in (model.fusion.past_attention.out.weight, model.refine.out.weight):
             torch.nn.init.normal_(weight)
         with_past, without, no_sender_history = (
-            forward(model, [s]) for s in (sample, replace(sample, past=()), replace(sample, said=()))
+            forward(model, [s]) for s in (sample, replace(sample, ego_history=()), replace(sample, sender_history=()))
         )
-        for weight in (model.fusion.past.out.weight, model.refine.out.weight):
+        for weight in (model.fusion.past_attention.out.weight, model.refine.out.weight):
             torch.nn.init.zeros_(weight)
     assert torch.equal(with_past.single_agent_boxes.to_rows(), without.single_agent_boxes.to_rows())
     for less in (without, no_sender_history):
@@ -145,7 +145,7 @@ def test_ego_history_is_used_without_gradient(detector, sample):
 def test_budget_and_packet_loss_also_apply_to_sender_history(detector, sample):
     model = detector.eval()
     whole = _history_tokens(model, [sample], "said", 0.0)[0]
-    cut = replace(sample, said=tuple(replace(view, keep=5) for view in sample.sender_history))
+    cut = replace(sample, sender_history=tuple(replace(view, max_tokens=5) for view in sample.sender_history))
     few = _history_tokens(model, [cut], "said", 0.0)[0]
     assert len(few.tokens) == 5 < len(whole.tokens)
     detector.train()
@@ -153,7 +153,7 @@ def test_budget_and_packet_loss_also_apply_to_sender_history(detector, sample):
 
 def test_every_part_of_the_model_learns_from_a_step_on_the_road(detector, sample):
     detector.train().zero_grad()
-    past = detector.fusion.past
+    past = detector.fusion.past_attention
     torch.nn.init.normal_(past.out.weight, std=0.1)
     torch.nn.init.normal_(past.ffn[2].weight, std=0.1)
     torch.nn.init.normal_(detector.fusion.encoding.outer.weight, std=0.1)
@@ -166,7 +166,7 @@ def test_every_part_of_the_model_learns_from_a_step_on_the_road(detector, sample
     assert bool(torch.isfinite(total))
     silent = [name for name, p in detector.named_parameters() if p.grad is None or not bool(p.grad.any())]
     # A bias that a norm takes away, or that all keys of a softmax share, has no effect; in a fresh model no token repeats another.
-    assert all("norm" in name or name.endswith(("key.bias", "selector.repeat")) for name in silent), silent
+    assert all("norm" in name or name.endswith(("key.bias", "selector.redundancy_weight")) for name in silent), silent
     assert all(bool(torch.isfinite(p.grad).all()) for p in detector.parameters() if p.grad is not None)
 
 

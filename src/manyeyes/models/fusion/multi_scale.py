@@ -40,7 +40,7 @@ class MultiScaleFusion(nn.Module):
         row = torch.searchsorted(fine.bev.sites.key, key)
         masked = placed * tokens.selection_mask[:, None]
         scales = [fine.bev.features, *(scale(masked, row, fine.bev.sites) for scale in self.coarse_scales)]
-        return FusedBev(fine.bev.with_features(self.out(torch.cat(scales, 1))), fine.given)
+        return FusedBev(fine.bev.with_features(self.out(torch.cat(scales, 1))), fine.merged_proposals)
 
 
 class CoarseScale(nn.Module):
