@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a crowd of map observations costs: place by place, the elements of one and the processor time to make it.
+"""Cost of simulated map observations: elements and processor time of one observation, by place.
 
 The place is made, and one observation of it, before the clock starts. Processor time of this process is counted, so that a busy
 machine does not show.

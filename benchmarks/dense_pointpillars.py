@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rival: dense PointPillars with attention fusion at three scales, as it is deployed (norms folded, channels last).
+"""The baseline: dense PointPillars with attention fusion at three scales, as it is deployed (norms folded, channels last).
 
 Pillars of 10 features to a dense map; three blocks of a strided 3x3 convolution and more of stride 1 (Lang et al. 2019);
 at each scale every cell of the ego attends to the same cell of all agents (AttFuse: Xu et al., OPV2V, ICRA 2022); each
-fused scale is brought to stride 2, all are concatenated, and 1x1 heads say two anchors a cell. Weights are random:
-only time is measured. Maps of the others are taken as already aligned with the ego's, so the rival pays for no warping.
+fused scale is brought to stride 2, all are concatenated, and 1x1 heads predict two anchors a cell. Weights are random:
+only time is measured. Maps of the others are taken as already aligned with the ego's, so the baseline has no cost of warping.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What it costs to draw the map of an area: tile by tile from tokens, or at once on one dense BEV of the whole area.
+"""Cost of predicting the map of an area: tile by tile from tokens, or at once on one dense BEV of the whole area.
 
 Ten looks a tile of 120 m by 60 m lie all over the area; all are one simulated sweep's, since only their cost is of interest, and
 weights are random. ``tiles``: for each tile, the looks that reach it are fused and its elements drawn; what is held of a look are

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the fusion of maps costs, in four questions.
+"""Cost of map fusion, in four measurements.
 
 literal  our fusion against the paper's literal pipeline with pycpd, per observation, in turn in one process (bar: 50 times)
 stream   one observation of about 25 elements taken into a map of 100,000 elements (bar: 10 ms)
@@ -7,7 +7,7 @@ city     a growing city, 10^4, 10^5, 10^6 observed elements, from the log to a r
 engines  10^5 observed elements inline, over processes, Dask and Ray: the map must be identical
 
 Observations are simulated before the clock starts. Besides wall time the processors' own time is given, which a busy
-machine does not change; memory is the largest sum of resident memory over this process and its workers, looked at four times
+machine does not change; memory is the largest sum of resident memory over this process and its workers, sampled four times
 a second, shared pages counted for each.
 
 python benchmarks/map_fusion.py literal|stream|city|engines [--elements 10000 ...] [--workers 2] [--out FILE.json]
@@ -95,7 +95,7 @@ class City:
 
 
 class _Registered:
-    """What pycpd found, with the interface of the project's own registration."""
+    """A result of pycpd with the interface of the project's own registration."""
 
     def __init__(self, moved: np.ndarray) -> None:
         self.moved = moved

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a norm does to a network that reads sweeps as pictures of the ground, most of whose cells are empty.
+"""Effect of the norm on a network over BEV rasters of sweeps, most of whose cells are empty.
 
-Four convolutions say of each cell that a look saw which kinds of element run through it: average precision over the cells of looks
-that were not learnt from, by norm.
+Four convolutions predict for each observed cell which kinds of element it holds: average precision over the cells of held-out
+frames, by norm.
 
 python benchmarks/map_norms.py [--data data/streets] [--tiles 60] [--steps 120] [--looks 6] [--rate 3e-3] [--held 20]
 """

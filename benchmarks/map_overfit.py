@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map preset learns a few tiles of a recording by heart: mAP on those very tiles, by steps and seconds of training.
+"""A map preset overfits a few tiles of a recording: mAP on those tiles, by steps and seconds of training.
 
 The bar (issue: "Seeing the map"): map-tiny above 0.9 on 16 tiles in five minutes on two cores. One process, or for two cores
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What it costs to add one observation to a map of many elements: ``python benchmarks/map_stream.py [elements]``.
+"""Cost of adding one observation to a map of many elements: ``python benchmarks/map_stream.py [elements]``.
 
 The map is that of 60 observations of the generated crossroads, set side by side until it has so many elements (100,000
-unless another
-number is given); 120 more observations of the same crossroads are added to its first copy. Times are of one process.
+unless another number
+is given); 120 more observations of the same crossroads are added to its first copy. Times are of one process.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def main(elements: int) -> None:
     print(
         f"{copies * len(one)} elements, {copies * len(one.points)} stations; {np.mean(seen):.1f} elements an observation"
     )
-    print(f"ms an observation: least {low:.2f}, median {middle:.2f}, 95 % below {high:.2f}")
+    print(f"ms an observation: min {low:.2f}, median {middle:.2f}, 95 % below {high:.2f}")
 
 
 if __name__ == "__main__":

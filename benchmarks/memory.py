@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Peak memory of perceive over the number of agents and the range, and a straight line through it in tokens.
 
-A street's agents share, the ego among them, so that it has looked at its own sweep, as at every instant of a drive; then the
+A street's agents share, the ego among them, so that its own sweep is processed, as at every instant of a drive; then the
 peak of the process's resident memory while it perceives, above what it held just before, is read from the kernel (Linux:
 VmHWM after /proc/self/clear_refs). Weights are random and of costr-small's widths, nothing is pruned and no budget limits a
 message, so that tokens are as many as they can be. Each figure is the second of two runs: the first compiles loops. Tokens:
-all that meet at the ego, its own and those heard within range.
+all that meet at the ego, its own and those received within range.
 
 python benchmarks/memory.py [--agents 1 2 3 5 7 10] [--range 50 100 150 200 280] [--out benchmarks/results/memory.json]
 """

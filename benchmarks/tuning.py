@@ -2,7 +2,7 @@
 """Late and intermediate fusion with the same budget of settings, on the validation town; prints AP of each.
 
 Both are given every pair of (NMS IoU, power of the predicted IoU in the score). What the test table uses is chosen here. Every
-frame is seen, so that agents have their sweep before and their past; every third is judged.
+frame is processed, so that agents have their sweep before and their past; every third is evaluated.
 Usage: python benchmarks/tuning.py --data data/towns-small --weights costr-small
 """
 
@@ -37,7 +37,7 @@ SETTINGS = tuple(itertools.product((0.05, 0.15, 0.30), (0.4, 0.6, 0.8)))
 
 
 class RedecodingCache(PerceptionCache):
-    """What other eyes saw, decoded with another setting."""
+    """The outputs of another cache, decoded with another setting."""
 
     def __init__(self, cache: PerceptionCache, setting: DecodeConfig) -> None:
         super().__init__(cache.detector)
@@ -62,7 +62,7 @@ def frames_in_range(snapshot: Snapshot) -> list[AgentFrame]:
 def perceive(
     strategy: FusionStrategy, caches: dict[int, PerceptionCache], setting: DecodeConfig, snapshot: Snapshot
 ) -> Boxes:
-    """What the first agent finds with this way to collaborate, through bytes; eyes of every agent by its id."""
+    """Boxes of the first agent with this fusion strategy, through bytes; caches: of every agent by its id."""
 
     def agent(frame: AgentFrame) -> Agent:
         own = RedecodingCache(caches[frame.agent_id], setting)
@@ -78,7 +78,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("data/towns-small"))
     parser.add_argument("--split", default="validate")
     parser.add_argument("--weights", default="costr-small")
-    parser.add_argument("--every", type=int, default=3, help="judged frames between two that are looked at")
+    parser.add_argument("--every", type=int, default=3, help="stride of the evaluated frames")
     parser.add_argument("--out", type=Path, default=None)
     options = parser.parse_args()
     torch.set_num_threads(1)

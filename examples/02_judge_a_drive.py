@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a small drive, let its agents share bytes on a radio channel, and judge four ways to collaborate."""
+"""Simulate a small drive, send bytes over a radio channel, and evaluate four fusion strategies."""
 
 import sys
 import tempfile

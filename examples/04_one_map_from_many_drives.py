@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One map from many drives: sixty wrong local maps of a crossroads become one, judged against the truth and drawn.
+"""One map from many drives: fuse sixty noisy local maps of a crossroads, evaluate the result and draw it.
 
 python examples/04_one_map_from_many_drives.py out/crossroads.html
 """
@@ -18,7 +18,7 @@ from manyeyes.viz.map_page import make_page, save_map_page
 page = Path(sys.argv[1] if len(sys.argv) > 1 else "out/crossroads.html")
 page.parent.mkdir(parents=True, exist_ok=True)
 
-# A crowd drives through a crossroads; each look is one Observation with a claimed pose, a view and some map elements.
+# A fleet drives through a crossroads; each Observation has a reported pose, a view and map elements.
 where = load_place("cross", size_m=160.0)
 crowd = simulate_crowd(where, 60, seed=1)
 

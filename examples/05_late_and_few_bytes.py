@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive in which every message is 100 ms old and has at most 4,096 bytes: what the ego sees, and what the others add.
+"""Messages of at most 4,096 bytes that arrive 100 ms late: boxes of the ego alone, and with the messages.
 
-Packets are made by ``share`` at one instant and used by ``perceive`` at the next. The receiver knows from each message when
-and where its sender looked, and moves what it says by the sender's own word on velocities.
+Packets are made by ``share`` at one instant and used by ``perceive`` at the next. Each message holds
+the time and the pose of its sender and the velocities of its boxes, so that the receiver compensates the delay.
 """
 
 import sys

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Twelve vehicles say what they see of a crossroads, a few hundred bytes each; a map service hears them and its map grows.
+"""Twelve vehicles send local maps of a crossroads, a few hundred bytes each, and a map server fuses them online.
 
-What draws here is the true map with the errors of a simulated crowd; on a recording, 'manyeyes map build' takes a map model.
+The local maps are the true map with the errors of a simulated fleet; on a recording, 'manyeyes map build' takes a map model.
 """
 
 import numpy as np
@@ -23,11 +23,11 @@ service, inbox = MapServer(where.frame), Inbox()
 spent = 0
 for instant in range(8):
     for vehicle in range(12):
-        # Three vehicles come in on each of four arms, one behind the other, at 10 m/s, looking once a second.
+        # Three vehicles come in on each of four arms, one behind the other, at 10 m/s, and send once a second.
         heading, away = vehicle % 4 * np.pi / 2, 30.0 + 12.0 * (vehicle // 4) - 10.0 * instant
         pose = np.array([-away * np.cos(heading), -away * np.sin(heading), heading])
         local_map = predictor.predict(pose, window, vehicle, instant)
-        # Each is wrong about where it is, and says by how much it may be.
+        # Reported poses have errors of the stated covariance.
         error = np.random.default_rng([vehicle, instant]).normal(0.0, [0.3, 0.3, 0.005])
         x, y, yaw = (pose + error).tolist()
         frame = AgentFrame(

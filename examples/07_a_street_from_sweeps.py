@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What five agents' sweeps say of a crossing's paint and edges: each sends the cells that it saw, whoever hears them draws the map.
+"""A map of a crossing from five agents' sweeps: each sends its BEV features, and a receiver predicts the map elements.
 
-The street is made here (extra 'sim'); nothing of it was in training. The first agent draws alone, and then with all that it heard.
+The street is generated here (extra 'sim') and was not in training. The first agent predicts alone, then with all messages.
 """
 
 import sys
@@ -40,6 +40,6 @@ for count in (1, len(frames)):
     drawn = predict_tile(mapper, [m for m in messages[:count] if m is not None], world_from_tile)
     quality = evaluate_map(drawn, truth)
     ap_text = ", ".join(f"{kind} {quality.get_ap(kind, 'maptr'):.2f}" for kind in ("divider", "boundary"))
-    print(f"{count} looks, {sum(spent[:count]):,} bytes: {len(drawn)} elements, AP of {ap_text}")
-    panels.append(MapPanel(f"From {count} looks", drawn.take(drawn.score >= 0.3), truth))
+    print(f"{count} frames, {sum(spent[:count]):,} bytes: {len(drawn)} elements, AP of {ap_text}")
+    panels.append(MapPanel(f"From {count} frames", drawn.take(drawn.score >= 0.3), truth))
 save_figure(panels, Path(sys.argv[1] if len(sys.argv) > 1 else "street.png"))

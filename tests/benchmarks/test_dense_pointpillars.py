@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dense rival on cases worked by hand: a rival that computes something else would make any speed look good."""
+"""The dense baseline on cases worked by hand, so that the speed comparison measures the intended computation."""
 
 import importlib.util
 import math

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every numbered example runs as a newcomer would run it."""
+"""Every numbered example runs as a script."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_07_a_street_from_sweeps(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
     picture = tmp_path / "street.png"
     alone, together = run("07_a_street_from_sweeps.py", str(picture)).strip().splitlines()
-    assert alone.startswith("1 looks") and together.startswith("5 looks")
-    # Dividers: what five saw is drawn better than what one saw.
+    assert alone.startswith("1 frames") and together.startswith("5 frames")
+    # The AP of dividers is higher from five frames than from one.
     assert float(together.split("divider ")[1].split(",")[0]) > float(alone.split("divider ")[1].split(",")[0])
     assert picture.stat().st_size > 10_000

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Walks along fields of lines: by hand, and against a walk of one line at a time; even spacing and distances against slow twins."""
+"""Line tracing by hand and against a trace of one line at a time; resampling and distances against slow references."""
 
 import math
 
@@ -29,7 +29,7 @@ def field_of(curve, rows, columns, reach=1.5):
     tangent[near == len(curve) - 1] = (curve[-1] - curve[-2]).expand(int((near == len(curve) - 1).sum()), 2)
     sure = (away.amin(1) <= reach).float()
     way = tangent / tangent.norm(dim=1, keepdim=True)
-    # Cells say the direction with either sign.
+    # Cells hold the direction with either sign.
     way = way * torch.where(torch.arange(len(way)) % 2 == 0, 1.0, -1.0)[:, None]
     return TracingField(
         sure.view(1, rows, columns), curve[near].view(1, rows, columns, 2), way.view(1, rows, columns, 2)
@@ -101,7 +101,7 @@ def test_walks_lie_on_their_lines_and_reach_their_ends():
     for name, (curve, cell) in CURVES.items():
         walks = trace_lines(field_of(curve, 12, 20), torch.tensor([0]), torch.tensor([cell]), 0.5, 1.2, 40)
         inside = curve[((curve >= 0) & (curve <= torch.tensor([20.0, 12.0]))).all(1)]
-        # Cells beyond an end are sure as far as the field reaches, so that a walk goes on for that and half a stride.
+        # Cells beyond an end are confident as far as the field reaches, so that a walk goes on for that and half a stride.
         assert float(torch.cdist(walks.points[0], inside).amin(1).max()) < 2.2, name
         assert float(torch.cdist(inside, resample_evenly(walks.points[0], 200)).amin(1).max()) < 0.12, name
         went = walks.points[0].diff(dim=0).norm(dim=1).sum()
@@ -110,7 +110,7 @@ def test_walks_lie_on_their_lines_and_reach_their_ends():
         assert float(length) - 0.2 < float(went) < float(length) + 4.2, name
 
 
-def test_a_walk_ends_half_a_stride_beyond_the_last_cell_that_is_sure():
+def test_a_trace_ends_half_a_stride_beyond_the_last_confident_cell():
     field = field_of(line([0.0, 2.5], [20.0, 2.5]), 5, 20)
     field.confidence[0, :, 10:] = 0.1
     walks = trace_lines(field, torch.tensor([0]), torch.tensor([[2, 6]]), 0.5, 1.0, 30)
@@ -120,7 +120,7 @@ def test_a_walk_ends_half_a_stride_beyond_the_last_cell_that_is_sure():
     assert float(walks.confidence[0].sum()) == pytest.approx(10) and int((walks.confidence[0] > 0).sum()) == 10
 
 
-def test_a_cell_that_is_not_sure_begins_no_line():
+def test_a_cell_below_the_confidence_starts_no_line():
     field = field_of(line([0.0, 2.5], [20.0, 2.5]), 8, 20)
     walks = trace_lines(field, torch.tensor([0]), torch.tensor([[6, 6]]), 0.5, 1.0, 30)
     assert float((walks.points - walks.points[:, :1]).abs().max()) == 0 and float(walks.confidence.sum()) == 0

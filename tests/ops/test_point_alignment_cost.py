@@ -79,7 +79,7 @@ def test_costs_are_those_of_every_pair_of_points() -> None:
 
 
 def test_a_body_meets_itself_where_it_was() -> None:
-    """0.6 m farther back than was believed, along its length and not the frame's axis; the road under it does not count."""
+    """0.6 m farther back than estimated, along its length and not the frame's axis; the road under it does not count."""
     yaw = 0.7
     ahead = torch.tensor([np.cos(yaw), np.sin(yaw)]).float()
     aside = torch.stack((-ahead[1], ahead[0]))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each rival on a layout small enough to work by hand.
+"""Each baseline on a layout small enough to work by hand.
 
     y
     |  A (2, 10)              five boxes of different lengths, headings as drawn in YAW;
 D (-12, 4)                    the other agent stands at (0.6, -0.4), turned by 0.02 rad,
-    +-------------- B (20, 0) x      and says that it stands at the origin.
+    +-------------- B (20, 0) x      and its prior is the origin.
     |     C (5, -15)     E (16, -9)
 """
 
@@ -45,7 +45,7 @@ def seen_from(pose, marks):
 
 
 @pytest.mark.parametrize("name", [*NEEDS_A_PRIOR, *NEEDS_NONE])
-def test_the_drawn_case(name):
+def test_the_layout_of_the_module_docstring(name):
     ego = layout()
     found = (NEEDS_A_PRIOR | NEEDS_NONE)[name](ego, seen_from(TRUTH, ego), ORIGIN)
     assert found.status is PoseStatus.CORRECTED
@@ -56,26 +56,26 @@ def test_the_drawn_case(name):
 
 
 @pytest.mark.parametrize("name", NEEDS_A_PRIOR)
-def test_those_that_start_at_the_claim_need_one(name):
+def test_local_methods_need_a_prior(name):
     ego = layout()
     assert NEEDS_A_PRIOR[name](ego, seen_from(TRUTH, ego), None).status is PoseStatus.NO_MATCH
 
 
 @pytest.mark.parametrize("name", NEEDS_NONE)
-def test_those_without_a_claim_find_any_pose(name):
+def test_global_methods_find_any_pose(name):
     ego, far = layout(), np.array([30.0, 12.0, 2.0])
     found = NEEDS_NONE[name](ego, seen_from(far, ego), None)
     np.testing.assert_allclose(pose_difference(found.pose, far), 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", [*NEEDS_A_PRIOR, *NEEDS_NONE])
-def test_nothing_seen_is_no_answer(name):
+def test_without_landmarks_there_is_no_match(name):
     found = (NEEDS_A_PRIOR | NEEDS_NONE)[name](layout(), Landmarks.empty(), ORIGIN)
     assert found.status is PoseStatus.NO_MATCH
     np.testing.assert_allclose(found.pose, 0, atol=1e-12)
 
 
-def test_what_is_given_is_kept():
+def test_identity_keeps_the_prior():
     assert identity.correct(layout(), Landmarks.empty(), ORIGIN).status is PoseStatus.OK
     assert identity.correct(layout(), layout(), None).ego_from_other is None
 
@@ -87,27 +87,27 @@ def test_coalign_needs_four_objects_and_cannot_reach_past_its_clusters():
     assert coalign.correct(ego, seen_from(np.array([2.0, 0.0, 0.0]), ego), ORIGIN).status is PoseStatus.NO_MATCH
 
 
-def test_coalign_settles_between_two_equally_sure_agents():
+def test_coalign_averages_two_agents_of_equal_information():
     # One object is 0.4 m off in x: each of five pairs pulls alike, so the pose is off by a fifth of it, but for a turn.
     ego = layout(yaw=np.zeros(5))
     other = layout(PLACES + np.array([(0.4, 0), (0, 0), (0, 0), (0, 0), (0, 0)]), np.zeros(5))
     assert coalign.correct(ego, other, ORIGIN).pose[0] == pytest.approx(-0.08, abs=0.02)
 
 
-def test_coalign_takes_a_turned_box_for_the_same_object():
+def test_coalign_matches_boxes_turned_by_pi():
     ego = layout()
     turned = seen_from(TRUTH, layout(yaw=YAW + np.pi * np.array([1, 0, 0, 0, 0])))
     np.testing.assert_allclose(pose_difference(coalign.correct(ego, turned, ORIGIN).pose, TRUTH), 0, atol=1e-6)
 
 
-def test_fpv_rcnn_cannot_leave_its_grid_and_wants_a_score_of_ten():
+def test_fpv_rcnn_cannot_leave_its_grid_and_needs_a_score_of_ten():
     ego = layout()
     assert fpv_rcnn.correct(ego, seen_from(np.array([3.0, 0.0, 0.0]), ego), ORIGIN).status is PoseStatus.NO_MATCH
     four = ego[np.arange(4)]
     assert fpv_rcnn.correct(four, seen_from(TRUTH, four), ORIGIN).status is PoseStatus.NO_MATCH
 
 
-def test_feaco_cuts_by_the_median_deviation_and_answers_with_one_pair():
+def test_feaco_rejects_by_the_median_deviation_and_accepts_one_pair():
     # Costs 1, 1.125, 0.875, 1, 4: the median is 1, the median deviation 0.125; the last goes.
     ego = layout(yaw=np.zeros(5))
     shift = np.array([1.0, 1.125, 0.875, 1.0, 4.0])[:, None] * [1.0, 0.0]

@@ -76,7 +76,7 @@ def test_nothing_little_and_nothing_in_common_give_no_pose():
             np.testing.assert_allclose(kept.covariance, prior.covariance)
 
 
-def test_an_evenly_spaced_queue_slips_so_it_is_ambiguous():
+def test_an_evenly_spaced_queue_is_ambiguous():
     queue = row([(8.0 * k, 0.02 * k) for k in range(9)])
     found = correct_pose(queue, queue.transform(np.array([3.0, 2.0, 0.5])), None)
     assert found.status is PoseStatus.AMBIGUOUS and found.pose is None and found.runner_up >= 8
@@ -108,7 +108,7 @@ def test_duplicates_and_flipped_headings_do_no_harm():
 
 
 @pytest.mark.parametrize("metres, degrees", [(5.0, 0.0), (50.0, 0.0), (0.0, 20.0), (3.0, 180.0)])
-def test_a_refuted_claim_is_a_conflict_and_not_used(metres, degrees):
+def test_a_wrong_prior_is_a_conflict_and_not_used(metres, degrees):
     ego, other, made = views()
     wrong = make_prior(made.ego_from_other + [metres, 0.0, math.radians(degrees)])
     found = correct_pose(ego, other, wrong)
@@ -117,7 +117,7 @@ def test_a_refuted_claim_is_a_conflict_and_not_used(metres, degrees):
     assert max(off(found.pose, made.ego_from_other)) < 1.0
 
 
-def test_more_is_asked_of_a_vote_that_refutes_a_claim():
+def test_conflict_margin_applies_to_candidates_that_contradict_the_prior():
     ego, other, made = views(common=5, ego_extra=3, other_extra=3)
     wrong = make_prior(made.ego_from_other + np.array([9.0, -6.0, 0.8]))
     plain = correct_pose(ego, other, wrong)
@@ -129,7 +129,7 @@ def test_more_is_asked_of_a_vote_that_refutes_a_claim():
             ego, other, wrong, CorrectorConfig(accept=AcceptanceTest(conflict_margin=enough, min_margin=0.0))
         )
         assert asked.status is status
-    # A claim that objects agree with needs none of it.
+    # A prior that objects agree with needs no such margin.
     right = make_prior(made.ego_from_other)
     much = CorrectorConfig(accept=AcceptanceTest(conflict_margin=1e3))
     assert correct_pose(ego, other, right, much).status is correct_pose(ego, other, right).status is PoseStatus.OK
@@ -137,7 +137,7 @@ def test_more_is_asked_of_a_vote_that_refutes_a_claim():
         AcceptanceTest(conflict_margin=-1.0)
 
 
-def test_a_good_claim_is_fused_and_sharpens_both():
+def test_a_good_prior_is_fused_and_reduces_both_covariances():
     ego, other, made = views()
     prior = make_prior(made.ego_from_other + [0.1, -0.1, 0.002], sigma=0.2)
     found = correct_pose(ego, other, prior)
@@ -155,14 +155,14 @@ def test_a_prior_without_error_stays_while_objects_agree():
     assert found.status in (PoseStatus.OK, PoseStatus.CORRECTED)
 
 
-def test_a_claim_lets_few_objects_answer():
+def test_a_prior_allows_an_estimate_from_few_objects():
     ego, other, made = views(common=3, scene=1)
     assert not correct_pose(ego, other, None).status.has_estimate
     found = correct_pose(ego, other, make_prior(made.ego_from_other, 0.3))
     assert found.status is PoseStatus.OK
 
 
-def test_height_and_tilt_are_those_of_the_claim():
+def test_height_and_tilt_are_those_of_the_prior():
     ego, other, made = views()
     pose = made.ego_from_other
     tilted = Transform.from_rpy(
@@ -175,10 +175,10 @@ def test_height_and_tilt_are_those_of_the_claim():
     assert float(up[0][2]) == pytest.approx(float(up[1][2]), abs=1e-12)
 
 
-@pytest.mark.parametrize("across", [1.0, 0.5])
-def test_the_law_of_moving_frames_and_of_order_and_of_exchange(across):
+@pytest.mark.parametrize("lateral_sigma_ratio", [1.0, 0.5])
+def test_estimates_are_equivariant_to_frames_order_and_exchange(lateral_sigma_ratio):
     ego, other, _ = views()
-    config = CorrectorConfig(VoteConfig(lateral_sigma_ratio=across))
+    config = CorrectorConfig(VoteConfig(lateral_sigma_ratio=lateral_sigma_ratio))
     found = correct_pose(ego, other, None, config)
     step, turn = np.array([4.0, -7.0, 1.1]), np.array([-30.0, 12.0, -2.0])
     moved = correct_pose(ego.transform(step), other.transform(turn), None, config)
@@ -194,7 +194,7 @@ def test_the_law_of_moving_frames_and_of_order_and_of_exchange(across):
     assert back.inliers == found.inliers and back.margin == pytest.approx(found.margin, abs=1e-6)
 
 
-def test_an_inverse_has_the_inverse_covariance():
+def test_exchanged_agents_have_the_inverse_covariance():
     ego, other, _ = views(common=6, ego_extra=4, other_extra=9)
     one = find_candidates(ego, other, VoteConfig())[0]
     two = find_candidates(other, ego, VoteConfig())[0]
@@ -209,7 +209,7 @@ def test_an_inverse_has_the_inverse_covariance():
 
 
 def observe_elongated_errors(count, rng):
-    """Cars of all headings as two agents see them, off by 0.4 m along themselves and 0.1 m across; the pose between."""
+    """Cars of all headings seen by two agents, with 0.4 m longitudinal and 0.1 m lateral errors; the relative pose."""
     truth = np.array([20.0, -9.0, 0.7])
     xy, yaw = rng.uniform(-30, 30, (count, 2)), rng.uniform(-3, 3, count)
     there = transform(truth).inverse()
@@ -217,14 +217,14 @@ def observe_elongated_errors(count, rng):
     marks.append(marks[0].transform(np.array([*there.translation[:2].tolist(), float(there.yaw)])))
     off = []
     for mark in marks:
-        along, across = 0.4 * rng.standard_normal(count), 0.1 * rng.standard_normal(count)
+        longitudinal, lateral = 0.4 * rng.standard_normal(count), 0.1 * rng.standard_normal(count)
         c, s = np.cos(mark.yaw), np.sin(mark.yaw)
-        moved = mark.xy + np.column_stack((along * c - across * s, along * s + across * c))
+        moved = mark.xy + np.column_stack((longitudinal * c - lateral * s, longitudinal * s + lateral * c))
         off.append(replace(mark, xy=moved, yaw=mark.yaw + 0.03 * rng.standard_normal(count)))
     return *off, truth
 
 
-def test_places_that_err_less_across_a_heading_are_weighed_so_and_the_covariance_is_honest():
+def test_lateral_sigma_ratio_reduces_the_error_and_the_covariance_is_consistent():
     rng = np.random.default_rng(4)
     errors, nees = {1.0: [], 0.25: []}, []
     for _ in range(120):
@@ -241,7 +241,7 @@ def test_places_that_err_less_across_a_heading_are_weighed_so_and_the_covariance
     assert 2.3 < np.mean(nees) < 3.7
 
 
-def test_garbage_is_survived_and_crowds_are_bounded():
+def test_invalid_landmarks_are_ignored_and_the_number_is_bounded():
     ego, other, _ = views(common=12)
     junk = replace(other, xy=other.xy.copy(), yaw=other.yaw.copy())
     junk.xy[-1], junk.yaw[-2], junk.xy[-3] = np.nan, np.inf, 1e9
@@ -253,7 +253,7 @@ def test_garbage_is_survived_and_crowds_are_bounded():
     assert len(correct_pose(crowd, crowd[::-1].transform(np.array([1e3, 0.0, 0.0])), None, few).pairs) <= 40
 
 
-def test_fusing_weighs_by_information_and_takes_the_short_way_round():
+def test_fusion_weights_by_information_and_wraps_angles():
     tight, loose = np.diag([0.01, 0.01, 0.0001]), np.diag([1.0, 1.0, 0.01])
     pose, covariance = fuse_estimates(np.array([0.0, 0.0, 3.1]), tight, np.array([1.01, 0.0, -3.1]), loose)
     assert pose[0] == pytest.approx(0.01, abs=1e-12)
@@ -264,7 +264,7 @@ def test_fusing_weighs_by_information_and_takes_the_short_way_round():
     np.testing.assert_allclose(zero, 0, atol=1e-15)
 
 
-def test_settings_and_claims_that_cannot_be_are_refused():
+def test_invalid_settings_and_priors_raise():
     with pytest.raises(ConfigError, match="min_margin"):
         AcceptanceTest(min_margin=-1.0)
     with pytest.raises(ConfigError, match="caps"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FeaKM's solvers: the rigid fit of Eq. 6 on pairs, fewest pairs of 4 and 8, outliers, the rule that compares, the half pixel."""
+"""FeaKM's solvers: rigid fit of Eq. 6, minimum pairs of 4 and 8, outliers, the comparison with the prior, the half pixel."""
 
 import math
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ TRUTH = np.array([20.0, -7.0, 2.2])
 SOLVERS = {"ransac": solve_with_ransac, "consensus": solve_with_consensus}
 
 
-def marks(n: int, seed: int = 0) -> Landmarks:
+def make_landmarks(n: int, seed: int = 0) -> Landmarks:
     rng = np.random.default_rng(seed)
     ones = np.ones(n)
     xy = rng.uniform(-40, 40, (n, 2))
@@ -54,7 +54,7 @@ def make_prior(pose, sigma: float) -> PosePrior:
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_pairs_give_the_pose_whatever_the_prior(name):
-    ego = marks(6)
+    ego = make_landmarks(6)
     other = moved_back(TRUTH, ego)
     for prior in (None, make_prior(TRUTH + [40.0, 3.0, 1.0], 0.5)):
         found = SOLVERS[name](ego, other, same(6), prior)
@@ -63,9 +63,9 @@ def test_pairs_give_the_pose_whatever_the_prior(name):
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_wrong_pairs_are_outvoted(name):
-    """Five pairs are right, five join strangers."""
-    ego = marks(10)
+def test_wrong_pairs_are_rejected(name):
+    """Five pairs are correct, five are mismatches."""
+    ego = make_landmarks(10)
     other = moved_back(TRUTH, ego, 0.1)
     pairs = same(10)
     pairs[5:, 1] = [6, 7, 8, 9, 5]
@@ -77,23 +77,23 @@ def test_wrong_pairs_are_outvoted(name):
 
 @pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("min_pairs", [4, 8])
-def test_fewer_pairs_than_asked_keep_the_claim(name, min_pairs):
+def test_fewer_than_min_pairs_keep_the_prior(name, min_pairs):
     solver = partial(SOLVERS[name], config=RansacConfig(min_pairs) if name == "ransac" else ConsensusConfig(min_pairs))
-    ego, prior = marks(8), make_prior(TRUTH + [3.0, 0.0, 0.0], 0.2)
+    ego, prior = make_landmarks(8), make_prior(TRUTH + [3.0, 0.0, 0.0], 0.2)
     other = moved_back(TRUTH, ego)
     kept = solver(ego, other, same(min_pairs - 1), prior)
     assert kept.status is PoseStatus.NO_MATCH
     np.testing.assert_allclose(kept.pose, prior.pose)
     assert solver(ego, other, same(min_pairs - 1), None).pose is None
     assert solver(ego, other, same(min_pairs), prior).status.has_estimate
-    # So many pairs, but one of them joins strangers.
+    # Enough pairs, but two of them are mismatches.
     wrong = same(min_pairs)
     wrong[0, 1], wrong[1, 1] = 1, 0
     assert not solver(ego, other, wrong, prior).status.has_estimate
 
 
 def test_ransac_compares_with_the_prior_only_where_limits_are_set():
-    ego = marks(6)
+    ego = make_landmarks(6)
     other = moved_back(TRUTH, ego)
     near, far = make_prior(TRUTH + [0.5, 0.0, 0.01], 0.1), make_prior(TRUTH + [1.5, 0.0, 0.0], 0.1)
     assert solve_with_ransac(ego, other, same(6), near).status is PoseStatus.CORRECTED
@@ -101,13 +101,13 @@ def test_ransac_compares_with_the_prior_only_where_limits_are_set():
     kept = solve_with_ransac(ego, other, same(6), near, compares)
     assert kept.status is PoseStatus.OK and kept.measured is not None
     np.testing.assert_allclose(kept.pose, near.pose)
-    refuted = solve_with_ransac(ego, other, same(6), far, compares)
-    assert refuted.status is PoseStatus.CONFLICT
-    np.testing.assert_allclose(pose_difference(refuted.pose, TRUTH), 0, atol=1e-6)
+    conflicting = solve_with_ransac(ego, other, same(6), far, compares)
+    assert conflicting.status is PoseStatus.CONFLICT
+    np.testing.assert_allclose(pose_difference(conflicting.pose, TRUTH), 0, atol=1e-6)
 
 
 def test_consensus_fuses_an_honest_prior_and_rejects_a_wrong_one():
-    ego = marks(6)
+    ego = make_landmarks(6)
     other = moved_back(TRUTH, ego, 0.2)
     alone = solve_with_consensus(ego, other, same(6), None)
     both = solve_with_consensus(ego, other, same(6), make_prior(TRUTH + [0.05, 0.0, 0.0], 0.1))
@@ -119,28 +119,28 @@ def test_consensus_fuses_an_honest_prior_and_rejects_a_wrong_one():
     )
 
 
-def test_a_reflection_is_no_pose():
-    ego = marks(6)
+def test_a_reflection_is_not_matched():
+    ego = make_landmarks(6)
     mirrored = replace(ego, xy=ego.xy * [1.0, -1.0], yaw=-ego.yaw)
     for solver in SOLVERS.values():
         assert not solver(ego, mirrored, same(6), None).status.has_estimate
 
 
-def test_two_answers_that_fit_alike_are_ambiguous():
-    """Four pairs say one pose and four another."""
-    ego = marks(8)
+def test_two_poses_that_fit_equally_are_ambiguous():
+    """Four pairs give one pose and four another."""
+    ego = make_landmarks(8)
     one, two = moved_back(TRUTH, ego), moved_back(TRUTH + [15.0, 0.0, 1.0], ego)
     half = np.arange(8) < 4
     other = replace(one, xy=np.where(half[:, None], one.xy, two.xy), yaw=np.where(half, one.yaw, two.yaw))
     found = solve_with_consensus(ego, other, same(8), None)
     assert found.status is PoseStatus.AMBIGUOUS and found.runner_up == 4
-    # The second answer is never looked at where one hypothesis is all that may be refined.
+    # The second pose is not found where only one hypothesis may be refined.
     bounded = solve_with_consensus(ego, other, same(8), None, ConsensusConfig(max_refined=1))
     assert bounded.runner_up == 0 and bounded.pairs.tolist() in (same(8)[:4].tolist(), same(8)[4:].tolist())
 
 
-def test_where_nothing_holds_only_so_many_hypotheses_are_refined(monkeypatch):
-    ego, other, calls = marks(40), marks(40, seed=7), []
+def test_at_most_max_refined_hypotheses_are_refined(monkeypatch):
+    ego, other, calls = make_landmarks(40), make_landmarks(40, seed=7), []
     monkeypatch.setattr(feakm, "_refined", lambda *arguments: calls.append(arguments))
     for max_refined in (2, 4):
         calls.clear()
@@ -152,7 +152,7 @@ def test_where_nothing_holds_only_so_many_hypotheses_are_refined(monkeypatch):
 
 
 def test_draws_are_keyed_and_equivariant():
-    ego = marks(12)
+    ego = make_landmarks(12)
     other = moved_back(TRUTH, ego, 0.3)
     other = replace(other, xy=np.where(np.arange(12)[:, None] < 5, other.xy + 30, other.xy))
     first = solve_with_ransac(ego, other, same(12), None)
@@ -162,12 +162,12 @@ def test_draws_are_keyed_and_equivariant():
         before, after = solver(ego, other, same(12), None), solver(ego.transform(step), other, same(12), None)
         c, s = math.cos(step[2]), math.sin(step[2])
         x, y, yaw = before.pose
-        wanted = np.array([c * x - s * y + step[0], s * x + c * y + step[1], yaw + step[2]])
-        np.testing.assert_allclose(pose_difference(after.pose, wanted), 0, atol=1e-6)
+        expected = np.array([c * x - s * y + step[0], s * x + c * y + step[1], yaw + step[2]])
+        np.testing.assert_allclose(pose_difference(after.pose, expected), 0, atol=1e-6)
 
 
 @dataclass(frozen=True)
-class Drawn:
+class FixedMatches:
     """A net whose matches are known."""
 
     net: FeakmNet
@@ -181,10 +181,10 @@ class Drawn:
         return Matches(self.pairs, torch.ones(len(self.pairs)))
 
 
-def test_a_pose_is_found_from_what_comes_as_bytes():
+def test_a_pose_is_found_from_decoded_bytes():
     """25 objects with a descriptor each: 45 bytes an object and one header; places come back to a centimetre."""
     n, rng = 25, torch.Generator().manual_seed(2)
-    seen = marks(n)
+    seen = make_landmarks(n)
     boxes = Boxes.of(
         torch.from_numpy(np.column_stack((seen.xy, np.zeros(n)))).float(),
         torch.tensor([4.5, 1.9, 1.6]).expand(n, 3),
@@ -203,7 +203,7 @@ def test_a_pose_is_found_from_what_comes_as_bytes():
     other = Keypoints(received.message.objects, received.message.descriptors)
     alike = (ego.descriptor @ other.descriptor.T).argmax(1)
     net = FeakmNet(FeakmConfig(BoxKeypointConfig(4, 32, 8), MatcherConfig(32, 8, 1, 1)))
-    by_descriptors = FeakmCorrector.of(Drawn(net, torch.stack((torch.arange(n), alike), 1)))
+    by_descriptors = FeakmCorrector.of(FixedMatches(net, torch.stack((torch.arange(n), alike), 1)))
     found = by_descriptors(Landmarks.of_keypoints(ego), Landmarks.of_keypoints(other), None)
     assert found.inliers == n
     off = pose_difference(found.pose, TRUTH)
@@ -211,10 +211,10 @@ def test_a_pose_is_found_from_what_comes_as_bytes():
 
 
 def test_objects_without_descriptors_are_not_matched():
-    ego = marks(6)
+    ego = make_landmarks(6)
     descriptor = np.eye(6, 32)
     net = FeakmNet(FeakmConfig(BoxKeypointConfig(4, 32, 8), MatcherConfig(32, 8, 1, 1)))
-    by_descriptors, prior = FeakmCorrector.of(Drawn(net, torch.from_numpy(same(6)))), make_prior(TRUTH, 0.5)
+    by_descriptors, prior = FeakmCorrector.of(FixedMatches(net, torch.from_numpy(same(6)))), make_prior(TRUTH, 0.5)
     other = moved_back(TRUTH, ego)
     for pair in ((ego, replace(other, descriptor=descriptor)), (replace(ego, descriptor=descriptor), other)):
         assert by_descriptors(*pair, prior).status is PoseStatus.NO_MATCH
@@ -222,22 +222,22 @@ def test_objects_without_descriptors_are_not_matched():
     np.testing.assert_allclose(pose_difference(found.pose, TRUTH), 0, atol=1e-6)
 
 
-def test_a_net_gets_the_landmarks_as_they_are():
-    """The matcher gets of landmarks what it gets of the keypoints that they were made of."""
+def test_the_matcher_gets_equal_inputs_from_landmarks_and_keypoints():
+    """Landmarks give the matcher the same inputs as the keypoints that they were made of."""
     torch.manual_seed(0)
     net = FeakmNet(FeakmConfig(BoxKeypointConfig(4, 32, 8), MatcherConfig(32, 16, 1, 1, min_match_prob=0.0))).eval()
-    seen = marks(5)
+    seen = make_landmarks(5)
     boxes = Boxes.of(
         torch.from_numpy(np.column_stack((seen.xy, np.ones(5)))).float(),
         torch.tensor([4.5, 1.9, 1.6]).expand(5, 3),
         torch.from_numpy(seen.yaw).float(),
     )
     points = [Keypoints(boxes, torch.nn.functional.normalize(torch.randn(5, 32))) for _ in range(2)]
-    wanted = net.match(KeypointBatch.of(points[:1]), KeypointBatch.of(points[1:]))
+    expected = net.match(KeypointBatch.of(points[:1]), KeypointBatch.of(points[1:]))
     received = []
     by_descriptors = FeakmCorrector(net, lambda ego, other, pairs, prior: received.append(pairs))
     by_descriptors(*map(Landmarks.of_keypoints, points), None)
-    assert len(wanted.pairs) and torch.equal(torch.from_numpy(received[0]), wanted.pairs)
+    assert len(expected.pairs) and torch.equal(torch.from_numpy(received[0]), expected.pairs)
 
 
 def test_names_select_weights_and_number_of_pairs(tmp_path):
@@ -246,7 +246,7 @@ def test_names_select_weights_and_number_of_pairs(tmp_path):
     checkpoint.save(net, path, {}, format=FORMAT)
     four, eight = load_corrector(str(path)), load_corrector(f"{path}@8")
     assert load_corrector(f"{path}@4").net is four.net and load_corrector(str(path)) is not eight
-    ego = marks(6)
+    ego = make_landmarks(6)
     for min_pairs, loaded in ((4, four), (8, eight)):
         assert loaded.solver(ego, moved_back(TRUTH, ego), same(6), None).status.has_estimate == (min_pairs == 4)
     for name, why in (
@@ -258,9 +258,9 @@ def test_names_select_weights_and_number_of_pairs(tmp_path):
             load_corrector(name)
 
 
-def test_the_half_pixel():
+def test_box_centres_avoid_the_half_pixel_error_of_cell_corners():
     """A map turned by half a turn: the published corner of a cell costs 2 |(0.4, 0.4)| m at cells of 0.8 m, box centres
-    nothing (specs/pose.md 0.4).
+    nothing.
     """
     grid = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=2)
     last = torch.tensor(grid.shape) - 1
@@ -286,7 +286,7 @@ def test_the_half_pixel():
         points = net.describe(views)
         mirrored = torch.tensor([2 * middle, 2 * middle]) - points[1].xy
         pairs = torch.cdist(points[0].xy, mirrored).argmin(1)
-        by_descriptors = FeakmCorrector.of(Drawn(net, torch.stack((torch.arange(6), pairs), 1)))
+        by_descriptors = FeakmCorrector.of(FixedMatches(net, torch.stack((torch.arange(6), pairs), 1)))
         off = pose_difference(by_descriptors(*map(Landmarks.of_keypoints, points), None).pose, truth)
         errors[name] = float(np.hypot(off[0], off[1]))
         assert abs(off[2]) < 1e-6

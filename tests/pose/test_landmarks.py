@@ -33,14 +33,14 @@ def test_boxes_keep_their_stated_error_and_get_the_detectors_where_they_state_no
     np.testing.assert_allclose(found.p_flip, [0.04, 0.2], atol=1e-7)
 
 
-def test_moving_is_the_pose():
+def test_transform_applies_the_pose():
     moved = marks(1).transform(np.array([1.0, 2.0, np.pi / 2]))
     (x, y), yaw = marks(1).xy[0], marks(1).yaw[0]
     np.testing.assert_allclose(moved.xy[0], [1.0 - y, 2.0 + x])
     assert moved.yaw[0] == pytest.approx(yaw + np.pi / 2)
 
 
-def test_what_is_not_finite_not_a_vehicle_or_far_off_is_left_out():
+def test_unusable_landmarks_are_left_out():
     good = marks(8)
     bad = replace(good, xy=good.xy.copy(), size=good.size.copy(), yaw=good.yaw.copy(), sigma_xy=good.sigma_xy.copy())
     bad.xy[0, 0], bad.xy[1, 1], bad.xy[2, 0] = np.nan, 1e9, 900.0
@@ -64,7 +64,7 @@ def test_shapes_and_errors_are_checked():
     assert len(Landmarks.cat([])) == 0 and len(Landmarks.cat([marks(2), marks(3)])) == 5
 
 
-def test_descriptors_go_where_their_landmarks_go():
+def test_descriptors_follow_their_landmarks():
     one, descriptor = marks(3), np.arange(12.0).reshape(3, 4)
     described = replace(one, descriptor=descriptor)
     np.testing.assert_array_equal(described[np.array([2, 0])].descriptor, descriptor[[2, 0]])

@@ -29,7 +29,7 @@ def both(scene):
     ]
 
 
-def test_five_frames_answer_where_one_does_not():
+def test_five_frames_match_where_one_does_not():
     scene = make_landmark_scene(LandmarkSpec(3, 6, 6, num_instants=5), 4, 1)
     one = correct_pose(Landmarks.of_boxes(scene.ego[0]), Landmarks.of_boxes(scene.other[0]), None)
     five = correct_pose(*both(scene), None)
@@ -44,6 +44,6 @@ def test_objects_of_different_instants_are_never_paired():
     assert len(found.pairs) and (ego.instant[found.pairs[:, 0]] == other.instant[found.pairs[:, 1]]).all()
 
 
-def test_a_motion_that_is_not_a_pose_is_refused():
+def test_a_motion_that_is_not_finite_raises():
     with pytest.raises(ConfigError, match="now_from_then"):
         TimedLandmarks(Landmarks.empty(), 0, np.array([np.nan, 0.0, 0.0]))

@@ -33,7 +33,7 @@ def make_prior(agent, sigma=0.5):
     return PosePrior.of(Transform.from_xyz_yaw(x, y, 0.0, yaw), sigma, 0.01)
 
 
-def test_exact_links_give_exact_poses_however_listed():
+def test_exact_edges_give_exact_poses_in_any_order():
     all_ = make_edges()
     for listed in (all_, all_[::-1]):
         found = optimize_poses(0, listed, {})
@@ -42,14 +42,14 @@ def test_exact_links_give_exact_poses_however_listed():
             np.testing.assert_allclose(pose_difference(found.pose[agent], np.array(place)), 0, atol=1e-9)
 
 
-def test_going_round_is_measured_from_any_link_and_in_any_direction():
+def test_cycle_distance_does_not_depend_on_start_or_direction():
     one, two, three = make_edge(0, 1, np.array([0.5, 0.0, 0.0])), make_edge(1, 2), make_edge(0, 2)
     lengths = [cycle_distance(*order) for order in itertools.permutations((one, two, three))]
     assert max(lengths) == pytest.approx(min(lengths), rel=0.05) and min(lengths) > 1.0
     assert cycle_distance(make_edge(0, 1), make_edge(1, 2), make_edge(0, 2)) == pytest.approx(0.0, abs=1e-18)
 
 
-def test_many_agents_are_surer_than_the_best_link():
+def test_fused_covariance_is_below_that_of_the_best_edge():
     found = optimize_poses(0, make_edges(seed=3), {})
     for agent in range(1, 5):
         assert found.covariance[agent][0, 0] < SIGMA[0] ** 2
@@ -64,9 +64,9 @@ def test_one_outlier_edge_is_rejected_and_the_rest_kept():
     np.testing.assert_allclose(found.pose[3][:2], PLACES[3][:2], atol=0.5)
 
 
-def test_a_colluding_pair_is_isolated_by_those_who_agree():
+def test_an_agent_with_inconsistent_edges_is_isolated():
     listed = [n for n in make_edges(seed=2) if 4 not in (n.i, n.j)]
-    # Agent 4's links each say another place.
+    # Agent 4's edges each give another position.
     listed += [make_edge(i, 4, np.array([3.0 * i + 3.0, -5.0 * (i % 2), 0.3 * i])) for i in range(4)]
     found = optimize_poses(0, listed, {})
     assert found.isolated == (4,) and {(n.i, n.j) for n in found.rejected_edges} == {(i, 4) for i in range(4)}
@@ -93,8 +93,8 @@ def test_priors_place_agents_that_no_edge_reaches_and_weigh_little_elsewhere():
 
 
 def test_two_agents_have_no_cycle_to_fail():
-    kept, refused = reject_inconsistent_edges([make_edge(0, 1, np.array([50.0, 0, 0]))], 16.3)
-    assert len(kept) == 1 and not refused
+    kept, rejected = reject_inconsistent_edges([make_edge(0, 1, np.array([50.0, 0, 0]))], 16.3)
+    assert len(kept) == 1 and not rejected
 
 
 def test_gtsam_finds_the_same_poses():

@@ -31,7 +31,7 @@ def noise(n, seed):
     return np.random.default_rng(seed).standard_normal((n, 3)) * np.sqrt(np.diag(SPREAD))
 
 
-def test_a_sound_agent_with_a_constant_error_of_its_claim_is_left_alone():
+def test_a_constant_error_within_the_prior_covariance_is_not_flagged():
     for seed in range(30):
         bias = np.random.default_rng(1000 + seed).standard_normal(3) * [0.4, 0.4, 0.008]
         health = [r.health for r in run(noise(40, seed) + bias)]
@@ -39,46 +39,46 @@ def test_a_sound_agent_with_a_constant_error_of_its_claim_is_left_alone():
 
 
 def test_an_offset_of_five_sigma_is_flagged_in_its_first_frame():
-    # 2.61 m are five times what the claim's 0.5 m and the measurement's 0.15 m are together.
+    # 2.61 m are five sigma of the prior's 0.5 m and the measurement's 0.15 m together.
     health = [run(noise(1, s) + [0.0, 2.61, 0.0])[0].health for s in range(200)]
     assert np.mean([h in (PoseHealth.OFFSET, PoseHealth.SUSPECT) for h in health]) >= 0.98
     assert np.mean([h is PoseHealth.OFFSET for h in health]) >= 0.95
-    honest = [run(noise(1, s) * 3.5)[0].health for s in range(200)]
-    assert np.mean([h is PoseHealth.OFFSET for h in honest]) <= 0.005
-    # A few frames later hardly any is missed, though each single frame might be forgiven.
+    sound = [run(noise(1, s) * 3.5)[0].health for s in range(200)]
+    assert np.mean([h is PoseHealth.OFFSET for h in sound]) <= 0.005
+    # A few frames later hardly any is missed, though each single frame might pass.
     later = [run(noise(10, s) + [0.0, 2.61, 0.0])[-1].health is PoseHealth.OFFSET for s in range(100)]
     assert np.mean(later) >= 0.98
 
 
 @pytest.mark.parametrize("every_s, min_fraction", [(1.0, 1.0), (0.5, 1.0)])
-def test_a_drift_of_a_tenth_of_a_metre_a_second_is_named_within_thirty_frames(every_s, min_fraction):
-    named = []
+def test_a_drift_of_a_tenth_of_a_metre_a_second_is_detected_within_thirty_frames(every_s, min_fraction):
+    detected = []
     for seed in range(30):
         time = np.arange(30) * every_s
         reports = run(noise(30, seed) + time[:, None] * [0.1, 0.0, 0.0], every_s)
-        named.append(any(r.health is PoseHealth.DRIFTING for r in reports))
+        detected.append(any(r.health is PoseHealth.DRIFTING for r in reports))
         assert reports[-1].drift_per_s[0] == pytest.approx(0.1, abs=0.03)
-    assert np.mean(named) >= min_fraction
+    assert np.mean(detected) >= min_fraction
 
 
-def test_a_drift_that_begins_after_ten_sound_seconds_is_named_within_thirty_frames_at_ten_hertz():
-    """30 frames hold 0.3 m of drift, twice one frame's error: only what was seen before them makes it stand out."""
-    named, fresh = [], []
+def test_a_drift_that_begins_after_ten_sound_seconds_is_detected_within_thirty_frames_at_ten_hertz():
+    """30 frames hold 0.3 m of drift, twice one frame's error: only the earlier frames make it significant."""
+    detected, fresh = [], []
     for seed in range(16):
         away = np.maximum(np.arange(130) - 99, 0)[:, None] * 0.01 * [np.cos(seed), np.sin(seed), 0.0]
-        named.append(any(r.health is PoseHealth.DRIFTING for r in run(noise(130, seed) + away)[100:]))
+        detected.append(any(r.health is PoseHealth.DRIFTING for r in run(noise(130, seed) + away)[100:]))
         fresh.append(any(r.health is PoseHealth.DRIFTING for r in run(noise(30, seed) + away[100:])))
-    assert np.mean(named) >= 0.85 and np.mean(fresh) <= 0.5
+    assert np.mean(detected) >= 0.85 and np.mean(fresh) <= 0.5
 
 
 @pytest.mark.parametrize("prior_error_m, max_fraction", [(0.0, 0.0), (0.3, 0.2)])
 def test_a_sound_agent_is_hardly_ever_reported_as_drifting(prior_error_m, max_fraction):
-    """Twenty seconds at 10 Hz, with claims that err by one and the same, or anew in each frame."""
-    named = []
+    """Twenty seconds at 10 Hz, with prior errors that are constant, or independent in each frame."""
+    detected = []
     for seed in range(6):
         anew = np.random.default_rng(500 + seed).standard_normal((200, 3)) * [prior_error_m, prior_error_m, 0.0]
-        named += [any(r.health is PoseHealth.DRIFTING for r in run(noise(200, seed) + anew))]
-    assert np.mean(named) <= max_fraction
+        detected += [any(r.health is PoseHealth.DRIFTING for r in run(noise(200, seed) + anew))]
+    assert np.mean(detected) <= max_fraction
 
 
 def test_frames_without_a_pose_change_nothing():

@@ -125,7 +125,7 @@ def test_two_real_scans_from_random_starts(starts):
     assert right >= 0.8 * starts and wrong == 0, (right, wrong)
 
 
-def test_icp_on_clouds_names_the_extra_to_install(monkeypatch):
+def test_gicp_names_the_extra_to_install(monkeypatch):
     def absent(name: str):
         raise ImportError(name)
 
@@ -134,7 +134,7 @@ def test_icp_on_clouds_names_the_extra_to_install(monkeypatch):
         gicp.correct(street(0), street(0), PosePrior.of(Transform.identity(), 1.0, 0.1))
 
 
-def test_icp_on_clouds_mends_a_near_claim_and_needs_one():
+def test_gicp_corrects_a_near_prior_and_needs_one():
     pytest.importorskip("small_gicp", reason="small_gicp is absent: pip install 'manyeyes[register]'")
     truth = Transform.from_xyz_yaw(3.0, -2.0, 0.0, 0.3)
     world = street(0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled pieces of a look against slow twins out of NumPy and shapely."""
+"""The compiled observation model against slow references in NumPy and shapely."""
 
 import numpy as np
 import pytest

@@ -35,7 +35,7 @@ def shapes_of(truth):
 
 
 def distances(crowd, shapes):
-    """Each line point's distance from the true element it shows, seen from the true pose."""
+    """Distance of each line point from its true element, at the true pose."""
     found = []
     for k, observation in enumerate(crowd.observations):
         own = observation.elements_in_map(crowd.true_poses[k])
@@ -87,7 +87,7 @@ def test_crossings_lie_on_their_true_ground(cross):
     assert len(shares) > 20 and min(shares) > 0.99
 
 
-def test_the_first_of_many_are_the_few(cross):
+def test_a_smaller_crowd_is_the_start_of_a_larger_one(cross):
     few, many = simulate_crowd(cross, 17, LOCAL, seed=3), simulate_crowd(cross, 40, LOCAL, seed=3)
     assert [o.id for o in few.observations] == [o.id for o in many.observations[:17]]
     assert len({o.id for o in many.observations}) == 40
@@ -106,7 +106,7 @@ def test_pose_errors_scale_the_same_draws(cross):
     np.testing.assert_allclose(errors[2], 3 * errors[1], atol=1e-9)
 
 
-def test_element_noise_scales_and_leaves_what_is_seen_alone(cross):
+def test_element_noise_scales_and_does_not_change_visibility(cross):
     still = dataclasses.replace(PERFECT, miss_rate=0.2, fragment_rate=0.25, point_sigma_m=1e-9)
     noisy = dataclasses.replace(still, point_sigma_m=0.2)
     noisier = dataclasses.replace(still, point_sigma_m=0.4)
@@ -120,7 +120,7 @@ def test_element_noise_scales_and_leaves_what_is_seen_alone(cross):
         np.testing.assert_allclose(twice, 2 * once, atol=1e-6)
 
 
-def test_noise_has_the_size_that_is_asked_for(cross):
+def test_point_noise_has_the_configured_sigma(cross):
     config = dataclasses.replace(PERFECT, point_sigma_m=0.15)
     crowd = simulate_crowd(cross, 80, config)
     beside = distances(crowd, [s if s.length > 12 else shapely.LineString() for s in shapes_of(cross.truth)])
@@ -167,7 +167,7 @@ def test_elements_stay_in_view(cross):
 @pytest.mark.parametrize(
     ("fraction_field", "role"), [("outlier_fraction", "outlier"), ("outdated_fraction", "outdated")]
 )
-def test_shares_of_agents_are_near_exact_for_any_count(cross, fraction_field, role):
+def test_fractions_of_agents_are_near_exact_for_any_count(cross, fraction_field, role):
     config = dataclasses.replace(LOCAL, outlier_fraction=0.0, max_observations_per_drive=1)
     crowd = simulate_crowd(cross, 200, dataclasses.replace(config, **{fraction_field: 0.2}))
     agents = {o.agent: r for o, r in zip(crowd.observations, crowd.roles)}
@@ -176,7 +176,7 @@ def test_shares_of_agents_are_near_exact_for_any_count(cross, fraction_field, ro
         assert abs(found[:count].mean() - 0.2) <= 2.0 / count + 1e-9
 
 
-def test_outliers_claim_wrong_poses_with_honest_covariance(cross):
+def test_outliers_report_wrong_poses_with_unchanged_covariance(cross):
     config = dataclasses.replace(PERFECT, outlier_fraction=0.3)
     crowd = simulate_crowd(cross, 60, config)
     off = np.linalg.norm((poses(crowd) - crowd.true_poses)[:, :2], axis=1)
@@ -216,7 +216,7 @@ def test_malicious_agents_may_displace_some_kinds_only(cross):
         np.testing.assert_array_equal(moved, (o.elements.kind == DIVIDER)[o.elements.element_of_point])
 
 
-def test_the_world_changes_at_a_time_for_all_but_stale_agents(cross):
+def test_the_map_changes_at_a_time_for_all_but_outdated_agents(cross):
     at = LOCAL.start_ns + 5 * DAY_NS
     crossings = np.flatnonzero(cross.truth.kind == CROSSING)
     dividers = np.flatnonzero(cross.truth.kind == DIVIDER)
@@ -259,7 +259,7 @@ def test_an_element_may_move_twice(cross):
         ChangingMap.of(cross.truth, [Change(10_000, 1, "remove")])
 
 
-def test_poles_are_trusted_and_stand_still(cross):
+def test_infrastructure_is_trusted_and_static(cross):
     crowd = simulate_crowd(cross, 60, dataclasses.replace(LOCAL, infrastructure_fraction=0.3))
     pole = crowd.roles == ROLES.index("infrastructure")
     assert pole.sum() >= 8
@@ -285,7 +285,7 @@ def test_time_runs_forward_within_a_pass_and_between_passes(cross):
     assert time[-1] - time[0] > DAY_NS
 
 
-def test_settings_that_make_no_sense_are_refused(cross):
+def test_invalid_settings_raise(cross):
     with pytest.raises(ConfigError, match="miss_rate"):
         dataclasses.replace(LOCAL, miss_rate=1.5)
     with pytest.raises(ConfigError, match="attack_mode"):

@@ -199,7 +199,7 @@ def test_traffic_follows_the_hills_of_town03(monkeypatch: pytest.MonkeyPatch, tm
     steep = abs(states.pitch) > 0.04
     assert steep.sum() >= 2
     np.testing.assert_allclose(-np.tan(states.pitch[steep]), (front - rear)[steep] / 2, atol=0.03)
-    # Nobody drives on parking lanes; in junctions they lie across driving lanes.
+    # No vehicle drives on parking lanes; in junctions they lie across driving lanes.
     parking = [lane for lane in network.lanes if lane.kind == "parking" and lane.junction_id is None]
     near = np.concatenate([lane.center[:, :2] for lane in parking])
     distance = np.linalg.norm(states.position[:, None, :2] - near[None], axis=-1).min(1)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the ground moved between frames, and the maximum over those that saw a place.
+"""Warp BEV feature maps between frames, and take the masked maximum over agents.
 
-What nobody saw is not zero: a maximum against zero would clip every negative feature beside an agent's horizon. Here a place
-out of view is minus infinity, and one that nobody saw is a vector of its own. Source: CrowdMap section 2.2 (affine warp,
-bilinear, maxout); F-Cooper, Chen et al. 2019 (maxout); the mask is ours (specs: maps.md 1.4).
+Unseen cells are not zero: a maximum against zero would clip every negative feature beside an agent's horizon. Here a cell out of
+an agent's view is minus infinity, and one that no agent has seen gets a vector of its own. Source: CrowdMap section 2.2 (affine
+warp, bilinear, maxout); F-Cooper, Chen et al. 2019 (maxout); the mask is an addition.
 """
 
 from __future__ import annotations
@@ -56,6 +56,6 @@ def _places(source: BevGrid, target: BevGrid, target_from_source: Transform) -> 
 
 
 def masked_max(features: Tensor, seen: Tensor, null: Tensor) -> Tensor:
-    """(B, C, H, W): the greatest of features (B, K, C, H, W) over those of K that see a place (B, K, H, W); else null (C,)."""
+    """(B, C, H, W): maximum of features (B, K, C, H, W) over those of K that see a cell (B, K, H, W); else null (C,)."""
     largest = features.masked_fill(~seen[:, :, None], -torch.inf).amax(1)
     return torch.where(seen.any(1)[:, None], largest, null[:, None, None])

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines out of pictures of lines: walk along what each cell says of the line that runs by it, from many places at once.
+"""Trace lines in a line field from many seeds at once.
 
-A cell says how sure it is of a line, where the nearest point of that line lies, and which way it runs, of either sign. A walk takes
-one stride along its heading, reads the cell that it comes to, steps sideways onto the line there, and turns to it; it ends half a
-stride beyond the last cell that is sure, or before the line turns too sharply, or where the picture ends, or where it began. All
-walks take as many strides, those that have ended stand still: no step depends on data, so that it can be exported. Coordinates
-are cells: cell (row, column) spans x from column to column + 1, y from row to row + 1. Nothing here has gradients.
+A cell holds the confidence of a line, the nearest point on it, and its direction of either sign. A trace takes one stride along
+its heading, reads the cell there, moves laterally onto the line, and takes its direction. It ends half a stride beyond the last
+confident cell, before a turn that is too sharp, at the border, or where it began. All traces take as many strides, and those
+that have ended stand still: no step depends on data, so that it can be exported. Coordinates are cells: cell (row, column) spans
+x from column to column + 1, y from row to row + 1. Nothing here has gradients.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class TracedLines:
 def trace_lines(
     field: TracingField, image_index: Tensor, cell: Tensor, min_confidence: float, stride: float, max_strides: int
 ) -> TracedLines:
-    """Walk both ways from cells (W, 2), row and column, of pictures (W,), at most so many strides each; L = 2 strides + 1."""
+    """Trace both ways from cells (W, 2), row and column, of fields (W,), at most so many strides each; L = 2 strides + 1."""
     rows, columns = field.confidence.shape[1:]
     table = torch.cat((field.confidence[..., None], field.nearest_point, field.direction), -1).flatten(0, 2)
     here = table[(image_index * rows + cell[:, 0]) * columns + cell[:, 1]]

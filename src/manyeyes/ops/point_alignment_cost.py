@@ -19,7 +19,7 @@ from manyeyes.datatypes import Boxes
 MAX_DISTANCE_M = 0.4
 """A point whose nearest partner is farther has none."""
 MIN_POINTS, MAX_POINTS = 5, 32
-"""An object with fewer points says nothing; of more, so many are taken evenly."""
+"""Minimum number of points of an object; of more than the maximum, so many are taken evenly."""
 BOX_MARGIN_M = (0.3, 0.25, 0.4)
 """Metres that a box is taken longer and wider at each end and higher at the top, since it is an estimate."""
 ROAD_CLEARANCE_M = 0.25

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distances between polylines, for many pairs of rows at once: Chamfer, directed point-to-segment, discrete Frechet.
+"""Distances between many pairs of polylines at once: Chamfer, directed point-to-segment, discrete Frechet.
 
-Lines are columns as in :mod:`manyeyes.ops.polyline`; pairs: (K, 2), rows of a and of b. Whoever wants a published Chamfer
-distance resamples first: 100 points a line (MapTR, VectorMapNet), 200 (StreamMapNet, MapTracker, GlobalMapNet), or a fixed
-spacing (specs/maps.md 2.1, 2.2).
+Lines are columns as in :mod:`manyeyes.ops.polyline`; pairs: (K, 2), rows of a and of b. For a published Chamfer distance,
+resample first: 100 points a line (MapTR, VectorMapNet), 200 (StreamMapNet, MapTracker, GlobalMapNet), or a fixed spacing.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled loops of the vote: hypotheses from matching edges, their support, and refinement on one-to-one pairs.
+"""Compiled loops of the voting: hypotheses from matching edges, their support, and refinement on one-to-one pairs.
 
-An edge joins two landmarks of one agent. Its length and its angles to the two headings (modulo pi) are the same in
-every frame, and two matched edges give the relative pose with a yaw as exact as the edge is long; a single pair of
-objects (specs/pose.md 4.2) gives a yaw only as exact as a detected heading, which at 50 m is off by two metres.
+An edge joins two landmarks of one agent. Its length and its angles to the two headings (modulo pi) do not depend on the frame.
+Two matched edges give the relative pose with a yaw as exact as the edge is long. A single pair of objects gives a yaw only as
+exact as a detected heading, which is an error of two metres at 50 m.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Edges(NamedTuple):
     heading: F64x2
 
 
-class PointGrid(NamedTuple):
+class LandmarkGrid(NamedTuple):
     """Points by square cells: cell c = column * num_rows + row holds ``order[start[c]:start[c + 1]]``; columns go along x."""
 
     order: I64x1
@@ -85,7 +85,7 @@ def wrap_half_turn(angle: float) -> float:  # pragma: no cover - compiled
 def build_edge_table(
     xy: F64x2, yaw: F64x1, min_length: float, max_length: float
 ) -> Edges:  # pragma: no cover - compiled
-    """Edges between landmarks from shortest to longest metres apart."""
+    """Edges between landmarks whose distance is within min_length and max_length (m)."""
     n = len(xy)
     size = n * (n - 1) // 2
     ends, heading = np.empty((size, 2), np.int64), np.empty((size, 2))
@@ -109,9 +109,7 @@ def build_edge_table(
 def find_compatible(
     size_a: F64x2, size_b: F64x2, instant_a: I64x1, instant_b: I64x1, gate: float
 ) -> Boolx2:  # pragma: no cover - compiled
-    """(N, M) bool: landmarks that may be one object: of one instant, widths within ``gate`` (m), lengths within about
-    twice.
-    """
+    """(N, M) bool: landmarks of one instant that may be one object: widths within ``gate`` (m), lengths within about twice that."""
     ok = np.empty((len(size_a), len(size_b)), np.bool_)
     for i in range(len(size_a)):
         for j in range(len(size_b)):
@@ -133,9 +131,10 @@ def match_edges(
     gate: float,
     max_poses: int,
 ) -> tuple[F64x2, F64x1]:  # pragma: no cover - compiled
-    """Poses (H, 3) a_from_b of edges that agree within ``gate`` standard deviations, and their misfit (H,).
+    """Poses (H, 3) a_from_b of edges that agree within ``gate`` standard deviations, and their squared residuals (H,).
 
-    edges_a, edges_b: by ascending length. is_compatible: (N, M) pairs that may be one object. Of more than at_most, the first.
+    edges_a, edges_b: by ascending length. is_compatible: (N, M) pairs that may be one object. Only the first max_poses are
+    returned.
     """
     xy_a, _, sxy_a, syaw_a = a
     xy_b, _, sxy_b, syaw_b = b
@@ -185,7 +184,7 @@ def match_edges(
 
 
 @njit(cache=True, nogil=True)
-def build_grid(xy: F64x2, cell: float) -> PointGrid:  # pragma: no cover - compiled
+def build_grid(xy: F64x2, cell: float) -> LandmarkGrid:  # pragma: no cover - compiled
     """Points (N, 2) by square cells of edge cell; cells grow where there would be too many."""
     x0, y0, x1, y1 = xy[:, 0].min(), xy[:, 1].min(), xy[:, 0].max(), xy[:, 1].max()
     cell = max(cell, max(x1 - x0, y1 - y0) / 1000.0)
@@ -197,14 +196,20 @@ def build_grid(xy: F64x2, cell: float) -> PointGrid:  # pragma: no cover - compi
         start[key[n] + 1] += 1
     start = np.cumsum(start)
     order = np.argsort(key, kind="mergesort")
-    return PointGrid(order, start, x0, y0, nx, ny, cell)
+    return LandmarkGrid(order, start, x0, y0, nx, ny, cell)
 
 
 @njit(cache=True, nogil=True)
 def compute_support(
-    poses: F64x2, a: LandmarkArrays, b: LandmarkArrays, is_compatible: Boolx2, grid: PointGrid, tau: float, turn: float
+    poses: F64x2,
+    a: LandmarkArrays,
+    b: LandmarkArrays,
+    is_compatible: Boolx2,
+    grid: LandmarkGrid,
+    tau: float,
+    turn: float,
 ) -> F64x1:  # pragma: no cover - compiled
-    """(H,) sum over landmarks of b of the best max(0, 1 - d^2 / tau^2) among a's; spec: specs/pose.md 4.2."""
+    """(H,) sum over landmarks of b of the best max(0, 1 - d^2 / tau^2) among a's."""
     xy_a, yaw_a, _, _ = a
     xy_b, yaw_b, _, _ = b
     order, start, x0, y0, nx, ny, cell = grid

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default corrector: whether the best vote is believed, and what becomes of the claimed pose.
+"""The default corrector: accept or reject the best candidate pose, and fuse it with the prior.
 
-A vote is accepted by how much likelier it is than chance and than the best distinct other vote, at limits calibrated
-on pairs of agents that share no object (calibrate). A claimed pose makes votes near it likelier, by the logarithm of
-its density against that of a pose that may be anywhere; a wrong claim takes nothing away. Then the claim is tested
-against the vote: squared Mahalanobis distance, chi^2 with 3 degrees of freedom. Where they agree the two are fused by
-their information; a doubtful claim is inflated first; a refuted one is not used. Spec: specs/pose.md 4.3, 4.4, which
-replaces FeaKM's "use the calculated pose if it differs significantly".
+A candidate is accepted by its log-likelihood ratio against chance and by its margin over the best distinct other candidate.
+The limits are calibrated on pairs of agents without common objects (threshold_calibration). A prior raises the score of
+candidates near it by the logarithm of its density over that of a uniform pose, and never lowers a score. The accepted
+candidate is compared with the prior by the squared Mahalanobis distance, a chi^2 test with 3 degrees of freedom. Below
+p = 0.05 the two are fused by their information. Below p = 0.001 the prior is not used. In between its covariance is
+inflated first. FeaKM's section 4.2.2 instead replaces the prior wherever the computed pose differs significantly.
 """
 
 from __future__ import annotations
@@ -38,13 +38,12 @@ CHI2_3DOF_P05, CHI2_3DOF_P001 = 7.815, 16.266
 
 @dataclass(frozen=True)
 class AcceptanceTest:
-    """When a vote is believed.
+    """Limits for accepting a candidate.
 
-    min_score: log-likelihood ratio against chance that it needs; min_margin: and against the best distinct other
-    vote. min_pairs: and how many pairs, where no claim supports it. runner_up_margin_pairs: a runner-up that would be believed
-    if it were alone must be so many (mean) pairs behind: a queue that slips by one place loses only one. prior_volume:
-    volume (m^2 rad) of poses that an unknown pose may take, 100 m around with any yaw. conflict_margin: how much more of score and
-    margin a vote needs that refutes the claim, since claims are seldom that wrong.
+    min_score: log-likelihood ratio against chance; min_margin: over the best distinct other candidate. min_pairs: pairs, where
+    no prior supports the candidate. runner_up_margin_pairs: a runner-up that passes min_score must have so many (mean) pairs less,
+    since an evenly spaced queue shifted by one place loses only one pair. prior_volume: volume (m^2 rad) of a uniform pose,
+    100 m around with any yaw. conflict_margin: additional score and margin for a candidate that conflicts with the prior.
     """
 
     min_score: float = 24.0
@@ -68,7 +67,7 @@ class AcceptanceTest:
 
 @dataclass(frozen=True)
 class CorrectorConfig:
-    """How the default corrector searches and when it answers."""
+    """Search and acceptance settings of the default corrector."""
 
     vote: VoteConfig = VoteConfig()
     accept: AcceptanceTest = AcceptanceTest()
@@ -77,15 +76,15 @@ class CorrectorConfig:
 DETECTOR_BOXES_CONFIG = CorrectorConfig(
     VoteConfig(common_variance_fraction=0.05, lateral_sigma_ratio=0.6), AcceptanceTest(conflict_margin=5.0)
 )
-"""For what detectors find: boxes of one view err alike, each towards who sees but one side of a vehicle, and along a vehicle, whose
-far end is seldom seen, more than across it; and vehicles that stand in a queue agree by chance (docs/pose.md has the figures).
+"""For boxes of detectors: errors of one view are correlated, since a sensor observes one side of a vehicle, and longitudinal errors
+are larger than lateral ones, since the far end is seldom observed. Vehicles in a queue agree by chance (docs/pose.md).
 """
 
 
 def correct_pose(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: CorrectorConfig | None = None
 ) -> PoseEstimate:
-    """Where the other agent is, from the objects that both see and from what is claimed, if anything is."""
+    """Estimate ego_from_other from the common objects of two agents and an optional prior."""
     config = config or CorrectorConfig()
     num_instants = len(np.unique(ego.instant))
     return decide(find_candidates(ego, other, config.vote, prior), prior, config.accept, num_instants)
@@ -93,9 +92,7 @@ def correct_pose(
 
 @dataclass(frozen=True)
 class RankedCandidates:
-    """The best vote, its score with what the claim adds, by how much that exceeds the runner-up's, and the
-    runner-up's pairs.
-    """
+    """The best candidate, its score with the prior's part, its margin over the runner-up, and the runner-up's pairs."""
 
     best: Candidate
     score: float
@@ -104,7 +101,7 @@ class RankedCandidates:
 
 
 def rank_candidates(found: list[Candidate], prior: PosePrior | None, prior_volume: float) -> RankedCandidates | None:
-    """Votes ordered by score and claim together."""
+    """Rank candidates by score plus the log density ratio of the prior."""
     if not found:
         return None
     scores = [c.score + _prior_log_ratio(c, prior, prior_volume) for c in found]
@@ -119,7 +116,7 @@ def rank_candidates(found: list[Candidate], prior: PosePrior | None, prior_volum
 def decide(
     found: list[Candidate], prior: PosePrior | None, acceptance: AcceptanceTest, num_instants: int = 1
 ) -> PoseEstimate:
-    """The answer that votes, likeliest first, from so many instants, and a claim give together."""
+    """Accept or reject the best candidate, and fuse it with the prior. num_instants: number of frames of the landmarks."""
     min_score = acceptance.min_score + acceptance.extra_score_per_instant * max(num_instants - 1, 0)
     ranked = rank_candidates(found, prior, acceptance.prior_volume)
     if ranked is None:
@@ -157,9 +154,7 @@ def decide(
 
 
 def fuse_estimates(pose: Floats, covariance: Floats, other: Floats, other_covariance: Floats) -> tuple[Floats, Floats]:
-    """Two independent estimates (3,), (3, 3) of one pose as one, weighted by information; either covariance may be
-    zero.
-    """
+    """Fuse two independent estimates (3,), (3, 3) of one pose by their information; one covariance may be zero."""
     gain = np.linalg.solve(covariance + other_covariance, covariance).T
     mean = pose + gain @ pose_difference(other, pose)
     rest = np.eye(3) - gain
@@ -180,18 +175,18 @@ def _fuse_with_prior(best: Candidate, prior: PosePrior | None) -> tuple[Floats, 
 
 
 def inflate_covariance(prior: PosePrior, distance: float) -> PosePrior:
-    """The claim with a wider covariance, where objects lie at a doubtful squared Mahalanobis distance from it."""
+    """Inflate the prior's covariance where its squared Mahalanobis distance from the candidate exceeds p = 0.05."""
     return replace(prior, covariance=prior.covariance * max(1.0, distance / CHI2_3DOF_P05) ** 2)
 
 
 def mahalanobis_squared(pose: Floats, covariance: Floats, prior: PosePrior) -> float:
-    """Squared Mahalanobis distance of a measured pose (3,), (3, 3) from a claimed one."""
+    """Squared Mahalanobis distance of a measured pose (3,), (3, 3) from the prior."""
     delta = pose_difference(pose, prior.pose)
     return float(delta @ np.linalg.solve(covariance + prior.covariance, delta))
 
 
 def _prior_log_ratio(candidate: Candidate, prior: PosePrior | None, prior_volume: float) -> float:
-    """Log of how much likelier the claim makes this pose than if it could be anywhere; never negative."""
+    """Log density of a pose under the prior, over that of a uniform pose; never negative."""
     if prior is None:
         return 0.0
     spread = candidate.covariance + prior.covariance

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FeaKM's corrector: keypoints that a net says are one object become a pose, and a rule compares it with what is claimed.
+"""FeaKM's corrector: a pose from matched keypoints, and a rule that compares it with the prior.
 
-FeaKM section 4.2.2 and Eq. 6, whose pseudo-inverse notation means the rigid fit of ops/rigid.py. Two solvers behind one
-interface. `solve_with_ransac` is what the paper's public code does (specs/pose.md 1.7): RANSAC, and the computed pose is used in
-place of the claimed one wherever enough pairs agree; the comparison that the paper's text promises is a setting.
-`solve_with_consensus` tries every two pairs, weighs places and headings by their stated errors, asks how much likelier the best
-pose is than the best distinct other one, and leaves the comparison to chi^2 and to information, as the default corrector does
-(decide.py).
+FeaKM section 4.2.2 and Eq. 6, whose pseudo-inverse notation means the rigid fit of ops/rigid.py. Two solvers share one
+interface. `solve_with_ransac` is what the paper's public code does: RANSAC, and the computed pose replaces the prior wherever
+enough pairs are inliers; the comparison of the paper's text is a setting. `solve_with_consensus` tries every two pairs, weights
+positions and headings by their stated errors, requires a margin over the best distinct other pose, and compares with the prior
+by a chi^2 test, as the default corrector does (corrector.py).
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ from manyeyes.pose.voting import Candidate, transform_point
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Solver = Callable[[Landmarks, Landmarks, Ints, "PosePrior | None"], PoseEstimate]
-"""Landmarks of ego and other, rows (P, 2) that are one object by the net, and the claim, to an answer."""
+"""Landmarks of ego and other, rows (P, 2) that the net matches, and the prior, to an estimate."""
 
 
 @dataclass(frozen=True)
 class RansacConfig:
-    """min_pairs: how many must agree, the paper's 4 or 8. sample_size, num_trials, max_residual_m: of RANSAC; seed: of its draws,
-    which the published code leaves open. significant_m, significant_deg: a claim that differs by less is kept; 0 as published.
+    """min_pairs: inliers that are required, the paper's 4 or 8. sample_size, num_trials, max_residual_m: of RANSAC; seed: of its
+    samples. significant_m, significant_deg: a prior that differs by less is kept; 0 in the public code.
     """
 
     min_pairs: int = 4
@@ -61,7 +60,7 @@ class RansacConfig:
 def solve_with_ransac(
     ego: Landmarks, other: Landmarks, pairs: Ints, prior: PosePrior | None, config: RansacConfig | None = None
 ) -> PoseEstimate:
-    """The pose on which most pairs agree; the claim where too few do, or where it does not differ significantly."""
+    """The pose with the most inlier pairs; the prior where these are too few, or where it does not differ significantly."""
     config = config or RansacConfig()
     if len(pairs) < config.min_pairs:
         return no_estimate(prior)
@@ -83,19 +82,19 @@ def solve_with_ransac(
 
 
 def _ransac(target: Floats, source: Floats, config: RansacConfig) -> NDArray[np.bool_]:
-    """(P,) which pairs agree with the best of the poses that random samples give."""
+    """(P,) bool: inlier pairs of the best pose among random samples."""
     rng = keyed_generator(config.seed, "feakm ransac", len(target))
     drawn = rng.random((config.num_trials, len(target))).argsort(1)[:, : config.sample_size]
     poses = fit_se2(torch.from_numpy(source[drawn]), torch.from_numpy(target[drawn])).numpy()
     away = _residuals_m(poses, target, source)
     agree = away < config.max_residual_m
-    # Most pairs first, and of equally many those that fit best.
+    # Most inliers first, ties by the residuals.
     fit_score = agree.sum(1) - np.where(agree, away, 0.0).sum(1) / (config.max_residual_m * (len(target) + 1))
     return agree[fit_score.argmax()]
 
 
 def _residuals_m(poses: Floats, target: Floats, source: Floats) -> Floats:
-    """(H, P) metres by which poses (H, 3) miss pairs of places (P, 2)."""
+    """(H, P) residuals in metres of pairs of positions (P, 2) under poses (H, 3)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x = c * source[:, 0] - s * source[:, 1] + poses[:, :1] - target[:, 0]
     y = s * source[:, 0] + c * source[:, 1] + poses[:, 1:2] - target[:, 1]
@@ -104,11 +103,10 @@ def _residuals_m(poses: Floats, target: Floats, source: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """min_pairs: how many must agree. min_pair_distance_m: two pairs nearer than this give no hypothesis. pair_gate: largest
-    squared misfit of a pair (3 degrees of freedom), area_m2: see vote.py. max_refined: at most so many hypotheses are refined, the
-    best distinct ones, which bounds the time where no two fit. min_separation_m, min_separation_rad: answers that differ by less
-    are one. accept: how much likelier than chance and than the best distinct other pose an answer must be; with the net that ships,
-    0.5 % of 600 pairs of views of different scenes of the validation town score more.
+    """min_pairs: inliers that are required. min_pair_distance_m: two pairs nearer than this give no hypothesis. pair_gate: largest
+    squared residual of a pair (3 degrees of freedom). chance_area_m2: see voting.py. max_refined: at most so many of the best
+    distinct hypotheses are refined. min_separation_m, min_separation_rad: poses that differ by less are one. accept: limits of
+    score and margin; with the shipped net, 0.5 % of 600 pairs of views of different scenes of the validation town score more.
     """
 
     min_pairs: int = 4
@@ -136,7 +134,7 @@ class ConsensusConfig:
 def solve_with_consensus(
     ego: Landmarks, other: Landmarks, pairs: Ints, prior: PosePrior | None, config: ConsensusConfig | None = None
 ) -> PoseEstimate:
-    """What the pairs and the claim say together; see decide.py."""
+    """The pose of largest likelihood over all hypotheses of two pairs, compared with the prior as in corrector.py."""
     config = config or ConsensusConfig()
     if len(pairs) < config.min_pairs:
         return no_estimate(prior)
@@ -163,7 +161,7 @@ def _candidates(ego: Landmarks, other: Landmarks, pairs: Ints, config: Consensus
         if len(found) == 2 or not scores[best] > 0:
             break
         candidate = _refined(poses[best], a, b, pairs, config)
-        # A hypothesis that is refined to an answer already found is no other answer.
+        # A hypothesis that is refined to a pose already found is not distinct.
         if candidate is not None and not any(_alike(candidate.pose[None], f.pose, middle, config)[0] for f in found):
             found.append(candidate)
         scores = np.where(_alike(poses, poses[best], middle, config), -np.inf, scores)
@@ -171,14 +169,14 @@ def _candidates(ego: Landmarks, other: Landmarks, pairs: Ints, config: Consensus
 
 
 def _alike(poses: Floats, pose: Floats, middle: Floats, config: ConsensusConfig) -> NDArray[np.bool_]:
-    """(H,) which poses (H, 3) say the same as one where the objects are."""
+    """(H,) bool: poses (H, 3) within the separation limits of one pose, measured at the objects' centroid."""
     apart = np.hypot(*(transform_point(poses, middle) - transform_point(pose[None], middle)).T)
     turn = np.abs(np.remainder(poses[:, 2] - pose[2] + np.pi, 2 * np.pi) - np.pi)
     return (apart < config.min_separation_m) & (turn < config.min_separation_rad)
 
 
 def _misfits(poses: Floats, a: Landmarks, b: Landmarks) -> Floats:
-    """(H, P) squared misfit of each pair's place and heading (modulo pi), 3 degrees of freedom."""
+    """(H, P) squared residuals of each pair's position and heading (modulo pi), 3 degrees of freedom."""
     place = np.square(_residuals_m(poses, a.xy, b.xy)) / (a.sigma_xy**2 + b.sigma_xy**2)
     turn = np.remainder(a.yaw - b.yaw - poses[:, 2:] + np.pi / 2, np.pi) - np.pi / 2
     return place + np.square(turn) / (a.sigma_yaw**2 + b.sigma_yaw**2)
@@ -191,7 +189,7 @@ def _gains(poses: Floats, a: Landmarks, b: Landmarks, config: ConsensusConfig) -
 
 
 def _refined(pose: Floats, a: Landmarks, b: Landmarks, pairs: Ints, config: ConsensusConfig) -> Candidate | None:
-    """The weighted fit on all pairs that agree, until these no longer change; None where they are not even two."""
+    """The weighted fit on all inlier pairs, iterated until these no longer change; None for fewer than two."""
     weight = 1 / (a.sigma_xy**2 + b.sigma_xy**2)
     agree = np.zeros(len(pairs), bool)
     for _ in range(10):
@@ -213,9 +211,9 @@ def _refined(pose: Floats, a: Landmarks, b: Landmarks, pairs: Ints, config: Cons
 
 @dataclass(frozen=True)
 class FeakmCorrector:
-    """A corrector on landmarks that a net described: which are one object it knows by their looks, a pose is what they give.
+    """A corrector on landmarks with descriptors: the net matches them, the solver computes the pose.
 
-    Landmarks without looks, of an agent that sends no descriptors, are recognised by nobody.
+    Landmarks without descriptors are not matched.
     """
 
     net: FeakmNet
@@ -223,13 +221,13 @@ class FeakmCorrector:
 
     @classmethod
     def of(cls, net: FeakmNet, min_pairs: int = 4) -> FeakmCorrector:
-        """With the solver of the net's own kind and the paper's least number of pairs, 4 or 8."""
+        """With the solver of the net's kind and the paper's minimum number of pairs, 4 or 8."""
         if isinstance(net.config.keypoints, DenseKeypointConfig):
             return cls(net, partial(solve_with_ransac, config=RansacConfig(min_pairs)))
         return cls(net, partial(solve_with_consensus, config=ConsensusConfig(min_pairs)))
 
     def __call__(self, ego: Landmarks, other: Landmarks, prior: PosePrior | None) -> PoseEstimate:
-        """Where the other agent is."""
+        """Estimate ego_from_other from matched descriptors."""
         if ego.descriptor is None or other.descriptor is None:
             return no_estimate(prior)
         pairs = self.net.match(_points(ego, ego.descriptor), _points(other, other.descriptor)).pairs.numpy()
@@ -237,7 +235,7 @@ class FeakmCorrector:
 
 
 def _points(landmarks: Landmarks, descriptors: Floats) -> KeypointBatch:
-    """One view's landmarks as the matcher takes them."""
+    """One view's landmarks as a batch of the matcher."""
     columns = (descriptors, landmarks.xy, landmarks.yaw, landmarks.size, np.ones(len(landmarks)))
     descriptor, xy, yaw, size, mask = (torch.from_numpy(c).float()[None] for c in columns)
     return KeypointBatch(descriptor, xy, yaw, size, mask.bool())
@@ -245,5 +243,5 @@ def _points(landmarks: Landmarks, descriptors: Floats) -> KeypointBatch:
 
 @cache
 def load_feakm_corrector(weights: str, min_pairs: int = 4) -> FeakmCorrector:
-    """The corrector with the weights of that shipped name or file; read once in a process."""
+    """The corrector with the weights of a shipped name or a file; loaded once per process."""
     return FeakmCorrector.of(pretrained.load_feakm(weights), min_pairs)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Landmarks: what an agent's decoded boxes say that another agent can recognise; no identity and no truth is in them."""
+"""Landmarks: decoded boxes as positions, headings, sizes and their uncertainties, without identities."""
 
 from __future__ import annotations
 
@@ -21,9 +21,8 @@ SIZE_RANGE_M = (0.2, 30.0)
 
 @dataclass(frozen=True)
 class DetectorUncertainty:
-    """Errors of a detector that states none of its own: one standard deviation an axis (m), of the heading modulo pi
-    (rad), and the chance that the heading is off by pi. Spec: specs/pose.md 4.2, whose boxes are off by 0.25 m and
-    2.5 degrees, 3 % turned.
+    """Errors of a detector that states none of its own: one standard deviation per axis (m), of the heading modulo pi (rad), and
+    the probability that the heading is off by pi. The defaults are 0.25 m, 2.5 degrees and 3 %.
     """
 
     sigma_xy_m: float = 0.25
@@ -39,7 +38,7 @@ class DetectorUncertainty:
 
 
 EGO_BODY_UNCERTAINTY = DetectorUncertainty(0.3, 0.03, 0.01)
-"""How far the middle of a vehicle may lie off the origin of its own frame, and its heading off the frame's."""
+"""Deviation of a vehicle's centre from the origin of its own frame, and of its heading from the frame's."""
 EGO_BODY_SIZE_M = (4.5, 1.9)
 
 
@@ -47,11 +46,10 @@ EGO_BODY_SIZE_M = (4.5, 1.9)
 class Landmarks:
     """N objects on the ground in one agent's frame (x forward, y left).
 
-    xy: (N, 2) metres. yaw: (N,) radians, sure modulo pi only; p_flip: (N,) in [0, 0.5], the chance that it is off by
-    pi. size: (N, 2) length and width (m). score: (N,) in [0, 1]. sigma_xy: (N,) one standard deviation an axis (m);
-    sigma_yaw: (N,) of the yaw modulo pi (rad). instant: (N,) int64, which frame a landmark was seen in, 0 for the
-    current one and counting back: objects move, so only landmarks of one instant can be the same object
-    (specs/pose.md 4.8). descriptor: (N, D) what a learned net says of how each looks (feakm.py); None where no net was asked.
+    xy: (N, 2) metres. yaw: (N,) radians, certain modulo pi only; p_flip: (N,) in [0, 0.5], the probability that it is off by
+    pi. size: (N, 2) length and width (m). score: (N,) in [0, 1]. sigma_xy: (N,) one standard deviation per axis (m);
+    sigma_yaw: (N,) of the yaw modulo pi (rad). instant: (N,) int64, the frame of a landmark, 0 for the current one and counting
+    back: objects move, so only landmarks of one instant are matched. descriptor: (N, D) learned descriptors (feakm.py), or None.
     """
 
     xy: Floats
@@ -78,7 +76,7 @@ class Landmarks:
 
     @classmethod
     def of_boxes(cls, boxes: Boxes, error: DetectorUncertainty | None = None) -> Landmarks:
-        """What decoded boxes say; a box that states no error of its own (sigma 0) gets the detector's."""
+        """Landmarks of decoded boxes; a box that states no error of its own (sigma 0) gets the detector's."""
         error = error or DetectorUncertainty()
         columns = (
             boxes.center[:, :2],
@@ -104,17 +102,17 @@ class Landmarks:
 
     @classmethod
     def of_keypoints(cls, points: Keypoints, error: DetectorUncertainty | None = None) -> Landmarks:
-        """What described boxes say, and how they look."""
+        """Landmarks of boxes with their descriptors."""
         return replace(cls.of_boxes(points.boxes, error), descriptor=points.descriptor.detach().cpu().double().numpy())
 
     @classmethod
     def empty(cls) -> Landmarks:
-        """None."""
+        """A set without any landmark."""
         zero = np.zeros(0)
         return cls(np.zeros((0, 2)), zero, np.zeros((0, 2)), zero, zero, zero, zero, np.zeros(0, np.int64))
 
     def with_ego_body(self) -> Landmarks:
-        """And the vehicle itself that looks out of this frame's origin: it does not see itself, but others do."""
+        """Append the ego vehicle itself at the origin: other agents observe it, its own sensor does not."""
         one = np.ones(1)
         own = Landmarks(
             np.zeros((1, 2)),
@@ -130,7 +128,7 @@ class Landmarks:
 
     @classmethod
     def cat(cls, many: Sequence[Landmarks]) -> Landmarks:
-        """Several sets of one frame as one; looks are lost where one of them has none."""
+        """Concatenate several sets of one frame; descriptors are dropped where one of the sets has none."""
         columns = [[getattr(m, f.name) for m in many] for f in fields(cls)]
         return cls(*(_concatenate(column) for column in columns)) if many else cls.empty()
 
@@ -142,17 +140,17 @@ class Landmarks:
         return Landmarks(*(getattr(self, f.name)[index] for f in fields(self)[:-1]), descriptor=descriptor)
 
     def transform(self, target_from_source: Floats) -> Landmarks:
-        """The same landmarks in another frame, pose (3,) = target_from_source as x, y (m), yaw (rad)."""
+        """The same landmarks in another frame; target_from_source: (3,) x, y (m), yaw (rad)."""
         c, s = np.cos(target_from_source[2]), np.sin(target_from_source[2])
         x, y = self.xy[:, 0], self.xy[:, 1]
         there = np.stack((c * x - s * y + target_from_source[0], s * x + c * y + target_from_source[1]), 1)
         return replace(self, xy=there, yaw=self.yaw + target_from_source[2])
 
     def select_indices(self, max_range_m: float, max_count: int) -> Ints:
-        """Rows that can be matched, in an order that does not depend on the order given.
+        """Indices of usable landmarks, in an order that does not depend on the order given.
 
-        Numbers are finite, sizes those of a vehicle, the place within ``max_range_m`` of the middle of all; where more
-        than ``max_count`` remain, those of the highest score.
+        Usable: all values are finite, the size is that of a vehicle, and the position is within ``max_range_m`` of the median of
+        all. At most ``max_count`` are returned, those of the highest score.
         """
         numbers = np.column_stack(
             (self.xy, self.yaw, self.size, self.score, self.sigma_xy, self.sigma_yaw, self.p_flip)
@@ -167,7 +165,7 @@ class Landmarks:
         return rows[order] if len(rows) <= max_count else rows[order[self._select_best(rows[order], max_count)]]
 
     def _select_best(self, rows: Ints, max_count: int) -> Ints:
-        """Places in rows of the highest scores, in the order of rows."""
+        """Positions in rows of the highest scores, in the order of rows."""
         return np.sort(np.argsort(-self.score[rows], kind="stable")[:max_count])
 
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several frames as one: earlier landmarks carried into the current frame by the agent's own motion.
+"""Multi-frame accumulation: earlier landmarks transformed into the current frame by the agent's own motion.
 
-An object may have moved since, so only landmarks of one instant are matched with each other; what all instants share
-is where the other agent is now. Spec: specs/pose.md 4.8.
+An object may have moved since, so only landmarks of one instant are matched; the relative pose is common to all instants.
 """
 
 from __future__ import annotations
@@ -21,9 +20,8 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TimedLandmarks:
-    """What one agent saw at one instant: landmarks in its frame of then. instant: how many frames ago, by a clock
-    that both agents share. now_from_then: (3,) its own motion since; sigma_xy_m, sigma_yaw_rad: how well it knows
-    that motion.
+    """One agent's landmarks of one instant, in its frame of that instant. instant: how many frames ago, by a clock that both
+    agents share. now_from_then: (3,) its own motion since; sigma_xy_m, sigma_yaw_rad: standard deviations of that motion.
     """
 
     landmarks: Landmarks
@@ -41,7 +39,7 @@ class TimedLandmarks:
 
 
 def accumulate(timed_landmarks: Sequence[TimedLandmarks]) -> Landmarks:
-    """All landmarks in the agent's frame of now, each with the instant that it was seen in."""
+    """Concatenate all landmarks in the agent's current frame, each with its instant."""
     return Landmarks.cat([_transform_to_now(s) for s in timed_landmarks])
 
 

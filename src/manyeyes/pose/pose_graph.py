@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""More than two agents: answers between pairs become one set of poses, and those that contradict the others are left
-out.
+"""Pose graph of more than two agents: reject inconsistent relative poses, then optimize all poses.
 
-Around a triangle of agents three relative poses must compose to none: an edge that fails this with every triangle
-while others hold is a lie or a mistake. The largest set of edges without a failing triangle is kept (greedily: the
-worst edge goes first), then all poses are settled by least squares on SE(2) with what each agent claims as a prior.
-An agent whose every triangle failed is isolated. Spec: specs/pose.md 4.7.
+Around a triangle of agents three relative poses compose to the identity. An edge that fails this test in every triangle,
+while other triangles pass, is an outlier. The largest set of edges without a failing triangle is kept (greedily: the worst
+edge is removed first). All poses are then found by least squares on SE(2), with the agents' reported poses as priors. An agent
+whose every triangle fails is isolated.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class RelativePoseEdge:
-    """What was measured between two agents: pose (3,) of j in i's frame, covariance (3, 3) in i's axes."""
+    """A measured relative pose of two agents: pose (3,) of j in i's frame, covariance (3, 3) in i's axes."""
 
     i: int
     j: int
@@ -42,9 +41,8 @@ class RelativePoseEdge:
 
 @dataclass(frozen=True)
 class PoseGraphResult:
-    """pose: each connected agent's (3,) in the ego's frame; covariance: (3, 3) each, in the ego's axes. kept_edges: the
-    links that were used. rejected_edges: links that contradict the others. isolated: agents that no kept link joins to the
-    rest while a refused one would.
+    """pose: each connected agent's (3,) in the ego's frame; covariance: (3, 3) each, in the ego's axes. kept_edges: edges that
+    were used. rejected_edges: edges that are inconsistent with the others. isolated: agents that only rejected edges connect.
     """
 
     pose: Mapping[int, Floats]
@@ -61,10 +59,10 @@ def optimize_poses(
     max_cycle_chi2: float = CHI2_3DOF_P001,
     huber: float = 3.0,
 ) -> PoseGraphResult:
-    """Poses of all agents that links or claims join to the ego. priors: ego_from_agent as claimed.
+    """Poses of all agents that edges or priors connect to the ego. priors: ego_from_agent.
 
-    max_cycle_chi2: squared Mahalanobis length (3 degrees of freedom) of a cycle that still closes. The order of links has no
-    part.
+    max_cycle_chi2: largest squared Mahalanobis length (3 degrees of freedom) of a consistent cycle. The result does not depend on
+    the order of edges.
     """
     ordered = sorted(edges, key=lambda n: (n.i, n.j, *n.pose))
     kept, rejected = reject_inconsistent_edges(
@@ -81,9 +79,9 @@ def optimize_poses(
 def reject_inconsistent_edges(
     edges: Sequence[RelativePoseEdge], max_cycle_chi2: float, prior_distances: Sequence[float] = ()
 ) -> tuple[list[RelativePoseEdge], list[RelativePoseEdge]]:
-    """The links without those that no triangle agrees with, and those: the link in most failing triangles goes first.
+    """Split edges into consistent and rejected ones; the edge in most failing triangles is rejected first.
 
-    prior_distances: how badly each link agrees with what is claimed; it decides where triangles do not, as in a single one.
+    prior_distances: squared distance of each edge from the priors, which decides where triangles do not, as in a single one.
     """
     kept, rejected = list(edges), []
     kept_distances = list(prior_distances) or [0.0] * len(kept)
@@ -98,11 +96,11 @@ def reject_inconsistent_edges(
         bad = [n for n in range(len(kept)) if failing[n] > 0]
         if not bad:
             break
-        # A link that some triangle confirms is trusted before one that none does.
+        # An edge that some triangle confirms is kept before one that none confirms.
         worst = max(bad, key=lambda n: (-closing[n], round(failing[n], 9), kept_distances[n], -n))
         rejected.append(kept.pop(worst))
         kept_distances.pop(worst)
-    # Whoever contradicted more than one other and is confirmed by no triangle is not believed for its last link either.
+    # The last edge of an agent with several rejected edges and no consistent triangle is rejected too.
     confirmed = {a for n, count in enumerate(closing) if count for a in (kept[n].i, kept[n].j)}
     contradicted = [a for n in rejected for a in (n.i, n.j)]
     unconfirmed = {a for a in contradicted if contradicted.count(a) > 1} - confirmed
@@ -111,7 +109,7 @@ def reject_inconsistent_edges(
 
 
 def _prior_distance(ego: int, edge: RelativePoseEdge, priors: Mapping[int, PosePrior]) -> float:
-    """Squared Mahalanobis distance of a link from what both its agents claim; 0 where one of them claims nothing."""
+    """Squared Mahalanobis distance of an edge from the priors of both agents; 0 where one of them has none."""
     known = {**priors, ego: PosePrior.of(Transform.identity(), 0.0, 0.0)}
     if edge.i not in known or edge.j not in known:
         return 0.0
@@ -126,7 +124,7 @@ def _prior_distance(ego: int, edge: RelativePoseEdge, priors: Mapping[int, PoseP
 
 
 def cycle_distance(one: RelativePoseEdge, two: RelativePoseEdge, three: RelativePoseEdge) -> float:
-    """Squared Mahalanobis length of going once around three links that join three agents."""
+    """Squared Mahalanobis length of the cycle of three edges that connect three agents."""
     first = one
     second = two if first.j in (two.i, two.j) else three
     third = three if second is two else two
@@ -152,7 +150,7 @@ def _triangles(edges: Sequence[RelativePoseEdge]) -> list[tuple[int, int, int]]:
 
 
 def _from(edge: RelativePoseEdge, agent: int) -> tuple[Floats, Floats]:
-    """The link's pose and covariance, seen from one of its agents."""
+    """The edge's pose and covariance, directed from one of its agents."""
     if edge.i == agent:
         return edge.pose, edge.covariance
     back = inverse(torch.from_numpy(edge.pose)).numpy()
@@ -170,7 +168,7 @@ def _compose_jacobians(a: Floats, b: Floats) -> tuple[Floats, Floats]:
 
 
 def _reached(ego: int, edges: Sequence[RelativePoseEdge], priors: Mapping[int, PosePrior]) -> set[int]:
-    """Agents that links or claims join to the ego."""
+    """Agents that edges or priors connect to the ego."""
     reached = {ego, *priors}
     while True:
         more = {a for n in edges if {n.i, n.j} & reached for a in (n.i, n.j)} - reached
@@ -208,9 +206,7 @@ def _solve(
 
 
 def _information(pose: Floats, covariance: Floats) -> Floats:
-    """Inverse covariance as a small motion on the right of the measured pose; an exact claim counts as known to a
-    tenth of a millimetre.
-    """
+    """Inverse covariance of a small motion on the right of the measured pose; an exact prior has a sigma of 0.1 mm."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     return np.linalg.inv(turn @ covariance @ turn.T + 1e-8 * np.eye(3))
@@ -219,7 +215,7 @@ def _information(pose: Floats, covariance: Floats) -> Floats:
 def _initial_poses(
     ego: int, agents: list[int], edges: Sequence[RelativePoseEdge], priors: Mapping[int, PosePrior]
 ) -> torch.Tensor:
-    """Where to start: along the links from the ego, else as claimed."""
+    """Initial poses: composed along the edges from the ego, else the priors."""
     known = {ego: torch.zeros(3, dtype=torch.float64)}
     pending = list(edges)
     while pending:

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches whether an agent's claimed pose stays true: one refuted frame, a lasting offset, a drift.
+"""Monitor an agent's reported poses over time: an outlier in one frame, a lasting offset, a drift.
 
-What is watched is the innovation: where objects put the agent less where it says it is, in its own claimed
-covariance's axes. One frame is a chi^2 test; a lasting offset that each frame alone would forgive is the mean of the
-last frames, again by chi^2; a drift is the slope of a line that begins at some frame and before it was level, which an
-offset that the claim's own error explains does not hide. What was seen before it tells where the line begins, so that a
-drift is named far sooner than its own frames alone would allow. Pure functions: the state is the caller's.
-Spec: specs/pose.md 4.4, its "infrastructure status"; FeaKM's paper asks for it and has none.
+The monitored quantity is the innovation: the pose measured from objects less the prior, in the axes of the prior's
+covariance. One frame is tested by chi^2. A lasting offset, too small to fail in single frames, is tested by chi^2 of the mean
+over the last frames. A drift is the slope of a line that is level up to some frame and rises after it, so that a constant
+error of the prior does not hide it. Earlier frames fix the level, so that a drift is detected sooner than from its own frames
+alone. Pure functions: the state belongs to the caller.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ Floats = NDArray[np.float64]
 
 
 class PoseHealth(Enum):
-    """UNKNOWN: objects have not yet said enough. SOUND: objects and claim agree. SUSPECT: in this frame they agree
-    badly, as one honest frame in twenty does. OFFSET: the claim is off. DRIFTING: it moves off.
+    """UNKNOWN: no measurement yet. SOUND: measurement and prior agree. SUSPECT: this frame fails at p = 0.05, as one sound
+    frame in twenty does. OFFSET: the prior has an offset. DRIFTING: its error grows.
     """
 
     UNKNOWN = "unknown"
@@ -38,9 +37,9 @@ class PoseHealth(Enum):
 
 @dataclass(frozen=True)
 class PoseMonitorConfig:
-    """max_frames: how many measured frames are remembered. offset_window: of how many an offset is the mean. min_drift_frames: how
-    many a drift needs. offset_gate, suspect_gate, drift_gate_sigmas: limits of the tests, squared and in standard deviations: 16.27
-    is p = 0.001 of one frame; 4.5 of a slope names fewer than one sound agent in twenty in half a minute at 10 Hz.
+    """max_frames: measured frames in memory. offset_window: frames over which an offset is averaged. min_drift_frames: frames that
+    a drift needs. offset_gate, suspect_gate: limits of squared distances, 16.27 is p = 0.001 of one frame. drift_gate_sigmas:
+    limit of the slope; at 4.5, fewer than one sound agent in twenty is reported in half a minute at 10 Hz.
     """
 
     max_frames: int = 100
@@ -60,8 +59,8 @@ class PoseMonitorConfig:
 
 @dataclass(frozen=True)
 class PoseMonitorState:
-    """Innovations (N, 3) of the last measured frames, oldest first, their covariances (N, 3, 3) without and (N, 3, 3)
-    with the claim's, and their times (N,) in seconds.
+    """Innovations (N, 3) of the last measured frames, oldest first; covariances (N, 3, 3) of the measurement and of the prior;
+    times (N,) in seconds.
     """
 
     innovation: Floats
@@ -71,14 +70,14 @@ class PoseMonitorState:
 
     @classmethod
     def new(cls) -> PoseMonitorState:
-        """Nothing seen yet."""
+        """The initial state, without measurements."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0))
 
 
 @dataclass(frozen=True)
 class PoseReport:
-    """health, and what it rests on: distance, squared, of the mean innovation; drift_per_s: metres per second, x and y, and
-    radians per second of yaw (3,); drift_sigmas: its size in standard deviations; num_frames: measured frames in memory.
+    """The health and its statistics. mahalanobis_squared: the larger of the last and the mean innovation's. drift_per_s: (3,)
+    metres and radians per second; drift_sigmas: its size in standard deviations; num_frames: measured frames in memory.
     """
 
     health: PoseHealth
@@ -95,7 +94,7 @@ def update_monitor(
     time_s: float,
     config: PoseMonitorConfig | None = None,
 ) -> tuple[PoseMonitorState, PoseReport]:
-    """The state after one more frame, and what it says. A frame in which objects gave no pose changes nothing."""
+    """Update the state with one frame and report the health; a frame without a measured pose changes nothing."""
     config = config or PoseMonitorConfig()
     if prior is not None and estimate.measured is not None and estimate.measured_covariance is not None:
         last = state.time_s[-1] if len(state.time_s) else -np.inf
@@ -118,7 +117,7 @@ def _report(state: PoseMonitorState, config: PoseMonitorConfig) -> PoseReport:
         return PoseReport(PoseHealth.UNKNOWN, float("nan"), np.zeros(3), 0.0, 0)
     drift, sigmas = _slope(state, config.min_drift_frames) if n >= config.min_drift_frames else (np.zeros(3), 0.0)
     now = _distance(state.innovation[-1], state.measured_covariance[-1] + state.prior_covariance[-1])
-    # The claim's error may be one for all frames, so that only the measurements average out.
+    # The prior's error may be common to all frames, so that only the measurements average out.
     weight = np.linalg.inv(state.measured_covariance[-config.offset_window :])
     joint = np.linalg.inv(weight.sum(0))
     mean = joint @ np.einsum("nab,nb->a", weight, state.innovation[-config.offset_window :])
@@ -132,11 +131,10 @@ def _report(state: PoseMonitorState, config: PoseMonitorConfig) -> PoseReport:
 
 
 def _slope(state: PoseMonitorState, min_frames: int) -> tuple[Floats, float]:
-    """Slope (3,) per second of the line through the innovations that is level and then rises, for at least so many frames;
-    and its size in standard deviations: of the way over the ground, or of the turn, whichever is larger.
+    """Fit a line through the innovations that is level and then rises over at least min_frames.
 
-    The spread is the larger of what the measurements state and what the innovations show, so that a claim whose
-    errors are drawn anew in each frame is not taken for one that moves.
+    Returns its slope (3,) per second, and the larger significance of translation and yaw in standard deviations. The spread is the
+    larger of the stated and the observed one, so that independent prior errors in each frame do not appear as a drift.
     """
     n = len(state.time_s)
     begins = state.time_s[: n - min_frames + 1]

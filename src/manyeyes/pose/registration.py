@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where another agent is, from both clouds alone and whatever was claimed: what stands upright is drawn on a map, the maps are
-laid over each other at every turn and every shift at once, and the best answers are refined and compared.
+"""Global registration of two clouds without a prior: correlate rasters of vertical structures over all yaws and shifts, then
+refine and compare the best candidates.
 
-Of a cloud only columns count whose points differ in height: walls, trunks, vehicles; the ground tells nothing of a shift. The
-correlation over all shifts of a turn is one product of Fourier transforms (Reddy and Chatterji, IEEE TIP 5(8), 1996, for
-pictures; Barnea and Silverman 1972 for the search over offsets); the refinement climbs the likelihood field of the ego's columns
-(Thrun, Burgard, Fox: Probabilistic Robotics, 6.4). An answer needs so large a share of columns that fall on the ego's, and to be
-so much better than the best distinct other one: a street that repeats gives none. x, y and yaw are found; clouds are upright.
+Only columns whose points differ in height count: walls, trunks, vehicles. The ground carries no information on a shift. The
+correlation over all shifts of one yaw is a product of Fourier transforms (Reddy and Chatterji, IEEE TIP 5(8), 1996, for
+images; Barnea and Silverman 1972 for the search over offsets). The refinement climbs the likelihood field of the ego's columns
+(Thrun, Burgard, Fox: Probabilistic Robotics, 6.4). An estimate needs a minimum inlier fraction and a margin over the best
+distinct other candidate, so that a repetitive street gives none. x, y and yaw are found; clouds are upright.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Pixels = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class RegistrationConfig:
-    """max_range_m: columns farther from the sensor are left out. column_m: edge of a column, and least_m: by how much its points
-    differ in height. cell_m, num_yaw_steps: of the search over all poses; fine_step_m, blur_m: cell and Gaussian of the field that
-    refines. num_candidates: answers that are refined; those within apart_m and apart_rad of a better one are the same.
-    min_inlier_fraction: of columns on the ego's, weighed by how near, and least_margin: more than the runner-up's. sigma_m,
-    sigma_yaw_rad: the error that an answer states, one standard deviation.
+    """max_range_m: columns farther from the sensor are left out. column_m: edge of a column; min_height_m: height range of its
+    points. cell_m, num_yaw_steps: of the search over all poses; fine_step_m, blur_m: cell and Gaussian of the field that
+    refines. num_candidates: candidates that are refined; those within min_separation_m and min_separation_rad of a better one
+    are the same. min_inlier_fraction: mean field value at the other's columns; min_margin: over the runner-up. sigma_m,
+    sigma_yaw_rad: standard deviations of an estimate.
     """
 
     max_range_m: float = 60.0
@@ -66,7 +66,7 @@ class RegistrationConfig:
 
 @dataclass(frozen=True)
 class LikelihoodField:
-    """How near to something upright each place is, 1 on it: (rows, columns) over the square of reach_m around the sensor."""
+    """Proximity of each cell to a vertical structure, 1 on it: (rows, columns) over a square of half_size_m around the sensor."""
 
     value: Pixels
     half_size_m: float
@@ -83,7 +83,7 @@ class LikelihoodField:
         return cls(_dilate_gaussian(value, blur_m / cell_m), half_size_m, cell_m)
 
     def sample(self, xy: Floats) -> Floats:
-        """Values at places (..., 2), bilinear, 0 outside."""
+        """Values at positions (..., 2), bilinear, 0 outside."""
         place = (xy + self.half_size_m) / self.cell_m - 0.5
         low = np.floor(place).astype(int)
         part = place - low
@@ -100,7 +100,7 @@ class LikelihoodField:
 def register_clouds(
     ego: PointCloud, other: PointCloud, prior: PosePrior | None, config: RegistrationConfig | None = None
 ) -> PoseEstimate:
-    """ego_from_other from two clouds; the claim has no part in it but for what it says of height and tilt."""
+    """Estimate ego_from_other from two clouds; the prior gives height and tilt only."""
     config = config or RegistrationConfig()
     here, there = (extract_vertical_structures(cloud, config) for cloud in (ego, other))
     if min(len(here), len(there)) < 3:
@@ -124,7 +124,7 @@ def register_clouds(
 
 
 def extract_vertical_structures(cloud: PointCloud, config: RegistrationConfig) -> Floats:
-    """(N, 2) middles of the columns within reach whose points differ enough in height."""
+    """(N, 2) centres of the columns within range whose points differ enough in height."""
     xyz = cloud.xyz.double().numpy()
     xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) < config.max_range_m]
     cell = np.floor(xyz[:, :2] / config.column_m).astype(np.int64)
@@ -140,7 +140,7 @@ def extract_vertical_structures(cloud: PointCloud, config: RegistrationConfig) -
 
 
 def _peaks(here: Floats, there: Floats, config: RegistrationConfig) -> list[Floats]:
-    """Poses (3,) of the best distinct overlaps among all turns and all shifts of whole cells."""
+    """Poses (3,) of the best distinct overlaps among all yaws and all shifts of whole cells."""
     side = 2 * math.ceil(config.max_range_m / config.cell_m)
     own = LikelihoodField.of(here, config.max_range_m, config.cell_m, config.cell_m).value
     # Twice the side, so that no shift wraps around.
@@ -169,7 +169,7 @@ def _peaks(here: Floats, there: Floats, config: RegistrationConfig) -> list[Floa
 
 
 def _climbed(pose: Floats, there: Floats, field: LikelihoodField) -> tuple[Floats, float]:
-    """The pose uphill from one, by steps that halve, and the mean of the field at the columns there."""
+    """Hill climbing from a pose by steps that halve, and the mean of the field at the columns there."""
     step = np.array([1.0, 1.0, 0.03])
     best, height = pose, float(field.sample(_moved(there, pose)).mean())
     moves = np.concatenate((np.eye(3), -np.eye(3)))
@@ -199,7 +199,7 @@ def _alike(a: Floats, b: Floats, config: RegistrationConfig) -> bool:
 
 
 def _dilate_gaussian(value: Pixels, sigma: float) -> Pixels:
-    """The greatest of Gaussians around every set cell, to three sigma: 1 where set."""
+    """The maximum of Gaussians around every set cell, to three sigma: 1 where set."""
     radius = math.ceil(3 * sigma)
     out = torch.from_numpy(value)[None, None]
     for axis_step in ((1, 0), (0, 1)):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default corrector and its rivals by the names that a person gives them.
+"""The default corrector and the baselines by name.
 
-FeaKM's has weights: ``feakm`` is the shipped net, a path that ends in .safetensors one of 'manyeyes train'; ``@8`` behind either
-asks for eight pairs in place of four. Those of CLOUDS are asked with whole clouds in place of landmarks.
+FeaKM has weights: ``feakm`` is the shipped net, a path that ends in .safetensors one of 'manyeyes train'; ``@8`` after either
+requires eight pairs instead of four. CLOUD_CORRECTORS take whole clouds instead of landmarks.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ CLOUD_CORRECTORS: dict[str, Callable[[PointCloud, PointCloud, PosePrior | None],
 
 
 def load_corrector(name: str) -> PoseCorrector:
-    """The corrector of that name; an unknown name lists the known ones."""
+    """The corrector of a name; ConfigError lists the known names."""
     weights, _, min_pairs = name.partition("@")
     if weights == FEAKM or weights.endswith(".safetensors"):
         if min_pairs and not min_pairs.isdecimal():

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When to answer: the least score at which pairs of agents that share no object are answered no more often than asked.
+"""Calibrate the minimum score so that pairs of agents without common objects are accepted at most at a given rate.
 
-Traffic stands in lanes and rows, so that chance agreement is far more frequent than independent places would make it:
-the limit is measured on scenes like those of use, never computed (specs/pose.md 4.3).
+Traffic stands in lanes and rows, so that agreement by chance is far more frequent than for independent positions. The limit
+is therefore measured on representative scenes, not computed.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ def calibrate_acceptance(
     max_false_accept_rate: float,
     config: CorrectorConfig | None = None,
 ) -> AcceptanceTest:
-    """The acceptance whose rate of answers on null scenes is at most ``max_false_accept_rate``, its other limits as
+    """The acceptance test whose rate of estimates on null scenes is at most ``max_false_accept_rate``, its other limits as
     configured.
 
-    null_scenes: what two agents see that have no object in common, without a claim. At least 2 / wrong_accepts scenes are
-    needed.
+    null_scenes: landmarks of two agents that have no object in common, without a prior. At least 2 / max_false_accept_rate scenes
+    are needed.
     """
     config = config or CorrectorConfig()
     scores = sorted((_required_min_score(*pair, config) for pair in null_scenes), reverse=True)
@@ -38,13 +38,13 @@ def calibrate_acceptance(
             f"A rate of {max_false_accept_rate} needs at least {math.ceil(2 / max(max_false_accept_rate, 1e-9))} null scenes; "
             f"got {len(scores)}. Give more scenes or allow more."
         )
-    # Just above the best scene that may no longer be answered.
+    # Just above the best scene that must be rejected.
     min_score = math.nextafter(max(scores[allowed], 0.0), math.inf)
     return replace(config.accept, min_score=min_score)
 
 
 def _required_min_score(ego: Landmarks, other: Landmarks, config: CorrectorConfig) -> float:
-    """The least_score above which this scene gets no answer; minus infinity where other limits already refuse it."""
+    """The min_score above which this scene gets no estimate; minus infinity where other limits already reject it."""
     extra_score = config.accept.extra_score_per_instant * max(len(np.unique(ego.instant)) - 1, 0)
     ranked = rank_candidates(find_candidates(ego, other, config.vote), None, config.accept.prior_volume)
     if ranked is None or ranked.margin < config.accept.min_margin:

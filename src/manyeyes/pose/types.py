@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a corrector is told of a pose and what it answers: a transform, its covariance, and how far to believe it."""
+"""Prior, estimate and status of a relative pose, and the interface of correctors."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ Ints = NDArray[np.int64]
 
 
 class PoseStatus(Enum):
-    """What came of comparing what two agents see with what one claims.
+    """Result of comparing the pose measured from common objects with the prior.
 
-    OK: objects and claim agree. CORRECTED: objects give the pose; nothing was claimed, or what was claimed is
-    doubtful. CONFLICT: objects give a pose that the claim contradicts. AMBIGUOUS: objects fit in more than one way.
-    NO_MATCH: objects give no pose.
+    OK: measurement and prior agree. CORRECTED: the pose is measured; there is no prior, or the chi^2 test is inconclusive.
+    CONFLICT: the pose is measured and the prior contradicts it. AMBIGUOUS: more than one pose fits. NO_MATCH: none fits.
     """
 
     OK = "ok"
@@ -34,15 +33,13 @@ class PoseStatus(Enum):
 
     @property
     def has_estimate(self) -> bool:
-        """Whether objects gave the pose."""
+        """Whether the pose was measured from objects."""
         return self in (PoseStatus.OK, PoseStatus.CORRECTED, PoseStatus.CONFLICT)
 
 
 @dataclass(frozen=True)
 class PosePrior:
-    """ego_from_other as claimed; covariance: (3, 3) of x, y (m) and yaw (rad) in the ego's axes, what is said of its
-    error.
-    """
+    """A prior on ego_from_other; covariance: (3, 3) of x, y (m) and yaw (rad) in the ego's axes."""
 
     ego_from_other: Transform
     covariance: Floats
@@ -62,12 +59,12 @@ class PosePrior:
 
     @classmethod
     def of(cls, ego_from_other: Transform, sigma_xy_m: float, sigma_yaw_rad: float) -> PosePrior:
-        """A claim whose errors in x, y and yaw are independent."""
+        """A prior whose errors in x, y and yaw are independent."""
         return cls(ego_from_other, np.diag([sigma_xy_m**2, sigma_xy_m**2, sigma_yaw_rad**2]))
 
     @classmethod
     def between(cls, ego: AgentFrame | Message, other: AgentFrame | Message) -> PosePrior:
-        """What two agents' claimed poses say together: errors of both, and the ego's yaw error at the other's distance."""
+        """The prior from two agents' reported poses: errors of both, and the ego's yaw error at the other's distance."""
         ego_from_other = ego.world_from_agent.inverse() @ other.world_from_agent
         x, y, _ = project_to_se2(ego_from_other)
         c, s = float(ego.world_from_agent.yaw.cos()), float(ego.world_from_agent.yaw.sin())
@@ -84,14 +81,13 @@ class PosePrior:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """A corrector's answer about ego_from_other.
+    """A corrector's estimate of ego_from_other.
 
-    ego_from_other: what to use, None where nothing is known; x, y and yaw are corrected, height and tilt are those of
-    the claim. covariance: (3, 3) of x, y (m), yaw (rad) in the ego's axes. inliers: pairs that agree with it;
-    runner_up: pairs that agree with the best *distinct* other answer; margin: by how much the answer is likelier than
-    that one (log-likelihood). pairs: (inliers, 2) rows of ego's and other's landmarks. measured, measured_covariance:
-    (3,), (3, 3) what objects alone say, where they say one thing. mahalanobis_squared: squared Mahalanobis distance of that from
-    the claim (3 degrees of freedom), NaN without both.
+    ego_from_other: the pose to use, None where nothing is known; x, y and yaw are corrected, height and tilt are the prior's.
+    covariance: (3, 3) of x, y (m), yaw (rad) in the ego's axes. inliers: number of inlier pairs; runner_up: inlier pairs of the
+    best *distinct* other candidate; margin: log-likelihood difference to that one. pairs: (inliers, 2) rows of ego's and other's
+    landmarks. measured, measured_covariance: (3,), (3, 3) the pose from objects alone, where it is unique. mahalanobis_squared:
+    squared Mahalanobis distance of that from the prior (3 degrees of freedom), NaN without both.
     """
 
     ego_from_other: Transform | None
@@ -112,21 +108,21 @@ class PoseEstimate:
 
 
 class PoseCorrector(Protocol):
-    """The one interface of the default corrector and of its rivals."""
+    """The common interface of the default corrector and the baselines."""
 
     def __call__(self, ego: Landmarks, other: Landmarks, prior: PosePrior | None) -> PoseEstimate:
-        """Where the other agent is, from what both see and what is claimed."""
+        """Estimate ego_from_other from both agents' landmarks and an optional prior."""
         ...
 
 
 def project_to_se2(transform: Transform) -> Floats:
-    """(3,) x, y (m), yaw (rad) of one transform."""
+    """Project one transform to the plane: (3,) x, y (m), yaw (rad)."""
     x, y = transform.translation[:2].tolist()
     return np.array([x, y, float(transform.yaw)])
 
 
 def lift_to_se3(pose: Floats, prior: PosePrior | None) -> Transform:
-    """A pose (3,) in the plane as a transform, with the height and tilt of what was claimed."""
+    """Lift a planar pose (3,) to a transform with the height and tilt of the prior."""
     flat = Transform.from_xyz_yaw(float(pose[0]), float(pose[1]), 0.0, float(pose[2]))
     if prior is None:
         return flat
@@ -137,7 +133,7 @@ def lift_to_se3(pose: Floats, prior: PosePrior | None) -> Transform:
 
 
 def no_estimate(prior: PosePrior | None, status: PoseStatus = PoseStatus.NO_MATCH) -> PoseEstimate:
-    """What a corrector says where objects give no pose: the claim as it was, or nothing."""
+    """The estimate where no pose is measured: the prior unchanged, or nothing."""
     return PoseEstimate(
         None if prior is None else prior.ego_from_other,
         np.full((3, 3), np.inf) if prior is None else prior.covariance,
@@ -153,7 +149,7 @@ def no_estimate(prior: PosePrior | None, status: PoseStatus = PoseStatus.NO_MATC
 
 
 def wrap_angle(angle: float) -> float:
-    """An angle in [-pi, pi)."""
+    """Wrap an angle to [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 

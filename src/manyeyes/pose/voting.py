@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default corrector's hypotheses: every pose that the objects of two agents suggest, best first, whatever is
-claimed.
+"""The default corrector's candidates: poses by hypothesis and verification, best first, independent of the prior.
 
-Pairs of objects vote (vote_loops), the best supported poses are refined on one-to-one pairs, and each is given a
-log-likelihood ratio: how much likelier the agreement is if the pairs are the same objects than if they met by chance.
-A pair gains log(area / 2 pi s^2) less half its squared misfit, ``area`` being the ground on which a chance neighbour
-would have to fall, and log 2p for a heading that agrees, p its chance. Design and the measured reasons for it:
-specs/pose.md 4.2-4.4. The answer does not depend on the order of landmarks nor on which agent is called ego.
+Pairs of objects vote (_voting_kernels), the best supported poses are refined on one-to-one pairs, and each is scored by a
+log-likelihood ratio: pairs are the same objects, against pairs that met by chance. A pair gains log(area / 2 pi s^2) less
+half its squared residual, ``area`` being the mean ground per chance neighbour, and log 2p for a heading that agrees with
+probability p. The result does not depend on the order of landmarks nor on which agent is called ego.
 """
 
 from __future__ import annotations
@@ -27,18 +25,18 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class VoteConfig:
-    """How poses are found.
+    """Search settings.
 
-    max_range_m: landmarks farther than this from the middle of all are left out; max_landmarks: at most so many, those of
-    highest score. min_edge_m, max_edge_m: lengths of edges; max_edges: at most so many an agent, the shortest. max_hypotheses:
-    at most so many, those that agree best. Together the caps bound the time. edge_gate: how many standard deviations
+    max_range_m: landmarks farther than this from the median of all are left out; max_landmarks: at most so many, those of
+    highest score. min_edge_m, max_edge_m: lengths of edges; max_edges: at most so many per agent, the shortest. max_hypotheses:
+    at most so many, of the smallest residual. Together these limits bound the time. edge_gate: standard deviations by which
     edges may differ. size_gate_m: difference of widths (twice that and a tenth of it for lengths). support_radius_m,
-    support_yaw_rad: reach of the coarse support. max_refined: how many of the best are refined. pair_gate: largest squared misfit
-    of a pair (3 degrees of freedom; 14.16 is p = 0.003). chance_area_m2: see the module, fitted on simulated crossings. apart_m,
-    min_separation_rad: answers that differ by less are one. static_radius_m: what moved less between instants counts once.
-    prior_dof: degrees of freedom that stated errors are worth against those that the pairs show. common_variance_fraction: the part
-    of a box's variance that all boxes of one view have in common, which no number of pairs averages out. lateral_sigma_ratio: error
-    of a place across its heading, as a share of that along it, which is the one that landmarks state.
+    support_yaw_rad: reach of the coarse support. max_refined: how many of the best are refined. pair_gate: largest squared
+    residual of a pair (3 degrees of freedom; 14.16 is p = 0.003). chance_area_m2: see the module, fitted on simulated
+    crossings. min_separation_m, min_separation_rad: poses that differ by less are one. static_radius_m: objects that move less
+    between instants count once. prior_dof: degrees of freedom of the stated errors against those of the residuals.
+    common_variance_fraction: fraction of a box's variance that all boxes of one view have in common, which does not average
+    out. lateral_sigma_ratio: lateral error of a box over its longitudinal error, which is the one that landmarks state.
     """
 
     max_range_m: float = 300.0
@@ -75,8 +73,8 @@ class VoteConfig:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One pose (3,) ego_from_other that objects suggest: its covariance (3, 3) in the ego's axes, pairs (P, 2) of
-    rows, the log-likelihood ratio, and the squared misfit of all pairs with its degrees of freedom.
+    """A candidate ego_from_other (3,): its covariance (3, 3) in the ego's axes, pairs (P, 2) of rows, the log-likelihood ratio,
+    and the squared residual of all pairs with its degrees of freedom.
     """
 
     pose: Floats
@@ -90,7 +88,7 @@ class Candidate:
 def find_candidates(
     ego: Landmarks, other: Landmarks, config: VoteConfig, prior: PosePrior | None = None
 ) -> list[Candidate]:
-    """Distinct poses ego_from_other, the likeliest first. A claim is one more hypothesis; it has no say in the score."""
+    """Find distinct poses ego_from_other, most likely first. The prior is one more hypothesis; it does not change scores."""
     rows_e, rows_o = (x.select_indices(config.max_range_m, config.max_landmarks) for x in (ego, other))
     if not len(rows_e) or not len(rows_o):
         return []
@@ -130,7 +128,7 @@ def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None
     support = loops.compute_support(
         poses, numbers_a, numbers_b, is_compatible, grid, config.support_radius_m, config.support_yaw_rad
     )
-    # Equal support is ordered by the pose itself, never by where it stands in a list.
+    # Ties of the support are ordered by the pose itself, never by its place in a list.
     order = np.lexsort((*poses.T, -np.round(support, 9)))
     middle = b.xy.mean(0)
     best = poses[
@@ -156,7 +154,7 @@ def _numbers(x: Landmarks) -> loops.LandmarkArrays:
 
 
 def _with_place_covariance(x: Landmarks, lateral_sigma_ratio: float) -> loops.OrientedLandmarks:
-    """As ``_numbers``, with the places' covariances (N, 3): xx, xy and yy, less across the heading than along it."""
+    """As ``_numbers``, with the positions' covariances (N, 3): xx, xy and yy, smaller laterally than longitudinally."""
     xy, yaw, sigma_xy, sigma_yaw = _numbers(x)
     c, s = np.cos(yaw), np.sin(yaw)
     variance_ratio = lateral_sigma_ratio * lateral_sigma_ratio
@@ -185,9 +183,7 @@ def _edges(x: Landmarks, config: VoteConfig) -> loops.Edges:
 
 
 def _score(a: Landmarks, b: Landmarks, pose: Floats, pairs: Ints, misfit: Floats, config: VoteConfig) -> float:
-    """Log-likelihood ratio of the pairs; a pair that is likelier to have met by chance takes nothing away but its
-    heading.
-    """
+    """Log-likelihood ratio of the pairs; a pair more likely by chance contributes its heading only."""
     i, k = pairs.T
     gain = np.log(config.chance_area_m2 / (2 * np.pi * (a.sigma_xy[i] ** 2 + b.sigma_xy[k] ** 2))) - misfit / 2
     flip_a, flip_b = np.clip(a.p_flip[i], 0.01, 0.5), np.clip(b.p_flip[k], 0.01, 0.5)
@@ -198,7 +194,7 @@ def _score(a: Landmarks, b: Landmarks, pose: Floats, pairs: Ints, misfit: Floats
 
 
 def _keep_static_once(xy: Floats, instant: Ints, gain: Floats, static_radius_m: float) -> NDArray[np.bool_]:
-    """(P,) which pairs count: of those at one place in several instants the best, since what stands still is no new
+    """(P,) bool: pairs that count; of those at one place in several instants only the best, since static objects are no new
     evidence.
     """
     if not instant.any():
@@ -213,7 +209,7 @@ def _keep_static_once(xy: Floats, instant: Ints, gain: Floats, static_radius_m: 
 
 
 def _merge_alike(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[_Found]:
-    """The found poses, best first, without those that say the same as a better one where that one's objects are."""
+    """The found poses, best first, without those within the separation limits of a better one."""
     poses = np.array([f[0] for f in found]).reshape(-1, 3)
     kept, gone = [], np.zeros(len(found), bool)
     for n, one in enumerate(found):
@@ -229,14 +225,14 @@ def _merge_alike(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[
 
 
 def transform_point(poses: Floats, point: Floats) -> Floats:
-    """(N, 2) where poses (N, 3) put a point (2,)."""
+    """(N, 2) a point (2,) transformed by poses (N, 3)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return poses[:, :2] + np.stack((c * point[0] - s * point[1], s * point[0] + c * point[1]), 1)
 
 
 def _covariance(information: Floats, pairs: int, misfit: float, dof: int, config: VoteConfig) -> Floats:
-    """(3, 3): what the pairs' stated errors give, scaled by what they show (the mean of an inverse gamma prior on the
-    scale), and what all boxes of a view have in common.
+    """(3, 3): inverse information, scaled by the residuals (the mean of an inverse gamma prior on the scale), plus the variance
+    that all boxes of a view have in common.
     """
     scale = (config.prior_dof + misfit) / (config.prior_dof + dof)
     covariance = np.asarray(np.linalg.inv(information) * scale, np.float64)
@@ -246,7 +242,7 @@ def _covariance(information: Floats, pairs: int, misfit: float, dof: int, config
 
 
 def _rank(x: Landmarks) -> tuple[float, ...]:
-    """A number of a set that does not depend on its frame or order."""
+    """A sort key of a set that does not depend on its frame or order."""
     return (len(x), *np.round(np.sort(x.size, 0).sum(0), 9), round(float(x.score.sum()), 9))
 
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes from a seed."""
+"""Simulation of towns, traffic, sensors and map fleets, reproducible from a seed."""

@@ -31,14 +31,14 @@ class SplitPreset:
 
 @dataclass(frozen=True)
 class SimulationPreset:
-    """What a recording holds.
+    """Contents of a recording.
 
-    vehicles: least and most connected vehicles of a scene. roadside_chance: of a unit on a pole, which always takes part
-    where there is one vehicle only. lead_frames: before the frames of a scene (ScenarioSpec): whoever hears a message of 0.4 s ago
-    then hears a sender that had looked for half a second by the time it spoke. density, clutter: of traffic and of what stands
-    beside the road (ScenarioSpec), drawn evenly between these for each scene. fallback_town: generated roads where a town is not
-    found; None makes that an error. layout: of the files; dair takes one vehicle and the unit, and judges every pair.
-    cameras, roadside_cameras: as in ScenarioSpec.
+    vehicles: minimum and maximum number of connected vehicles of a scene. roadside_chance: probability of a roadside unit,
+    which is always present with a single vehicle. lead_frames: frames before those of a scene (ScenarioSpec), so that the
+    sender of a message 0.4 s old had half a second of history. density, clutter: of traffic and of roadside objects
+    (ScenarioSpec), uniform between these for each scene. fallback_town: generated roads where a town is not found; None makes
+    that an error. layout: of the files; dair has one vehicle and the unit, and evaluates every pair. cameras, roadside_cameras:
+    as in ScenarioSpec.
     """
 
     splits: tuple[SplitPreset, ...]
@@ -214,7 +214,7 @@ def simulate(
     towns: Path | str | None = None,
     cameras: bool = False,
 ) -> Path:
-    """Make a preset's recording under a folder; the path of its manifest. towns: where roads are looked for first."""
+    """Simulate a preset's recording into a folder; returns the path of its manifest. towns: the first place to search for roads."""
     place = None if towns is None else str(towns)
     wanted = with_cameras(simulation_preset(preset)) if cameras else simulation_preset(preset)
     jobs = make_jobs(wanted, seed, place)

@@ -53,7 +53,7 @@ JobT = TypeVar("JobT")
 
 @dataclass(frozen=True)
 class Job:
-    """One scenario to write: into which split, and where the town's roads are looked for (None: the usual places)."""
+    """One scenario to write: its split, and the first place to search for the town's roads (None: the default places)."""
 
     split: str
     spec: ScenarioSpec
@@ -62,10 +62,11 @@ class Job:
 
 @dataclass(frozen=True)
 class ManifestEntry:
-    """What the manifest says of one scenario.
+    """The manifest's entry of one scenario.
 
-    seed: the one that gave a scene, which is the wanted one plus as many as failed. moving: share of the vehicles near it
-    that move. returns: mean points of a sweep. sha256: of the lines ``<sha256 of a file>  <path in the scenario>``, sorted by path.
+    seed: the one that gave a scene: the requested one plus the number of failed ones. moving: fraction of the vehicles near it
+    that move. returns: mean points of a sweep. sha256: of the lines ``<sha256 of a file>  <path in the scenario>``, sorted by
+    path.
     """
 
     split: str

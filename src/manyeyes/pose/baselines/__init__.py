@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Published ways to correct a pose, one a file, behind the interface of the default corrector: correct(ego, other,
-claimed).
+"""Published pose correctors, one per file, with the interface of the default corrector: correct(ego, other, prior).
 
-Written from the papers and specs/pose.md 2, on landmarks. None of them states a covariance, so each is given that of
-its pairs.
+Written from the papers, on landmarks. None of them states a covariance, so each gets that of its pairs.
 """

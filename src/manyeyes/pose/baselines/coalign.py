@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CoAlign's agent-object pose graph: boxes that the claimed pose brings together are one object, and all poses are
-settled at once.
+"""CoAlign's agent-object pose graph: boxes that the prior pose brings together are one object, and all poses are optimized.
 
-Lu et al., ICRA 2023, section on agent-object pose graph optimisation; specs/pose.md 2.1. The information of an edge
-is that of the detector's stated errors in metres, which stands for the paper's exp(-s) over the anchor's diagonal.
-Clusters hold one box of an agent.
+Lu et al., ICRA 2023, section on agent-object pose graph optimisation. The information of an edge is that of the detector's
+stated errors in metres, instead of the paper's exp(-s) over the anchor's diagonal. A cluster holds one box of each agent.
 """
 
 from __future__ import annotations
@@ -23,8 +21,8 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 @dataclass(frozen=True)
 class CoalignConfig:
-    """max_distance_m: boxes nearer than this are one object. min_objects: so many objects or fewer are no graph.
-    max_yaw_variance_rad2: an object whose headings vary by more is left out; where half of them do, there is no answer.
+    """max_distance_m: boxes nearer than this are one object. min_objects: so many objects or fewer give no graph.
+    max_yaw_variance_rad2: objects whose headings vary by more are left out; where these are half of all, there is no estimate.
     """
 
     max_distance_m: float = 1.5
@@ -35,7 +33,7 @@ class CoalignConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: CoalignConfig | None = None
 ) -> PoseEstimate:
-    """The other's pose in the settled graph; NO_MATCH without a claim or with too few objects."""
+    """The other's pose in the optimized graph; NO_MATCH without a prior or with too few objects."""
     config = config or CoalignConfig()
     if prior is None:
         return no_estimate(None)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FeaCo's pose-error rectification: places of high confidence, assigned by distance, outliers cut by their median
-deviation, then ICP.
+"""FeaCo's pose-error rectification: assign positions of high confidence by distance, reject outliers by the median deviation,
+then ICP.
 
-Gu et al., ACM MM 2023; specs/pose.md 2.3. The paper's centroids of confident cells are the landmarks here. It has no
-least number of matches, so one pair is an answer.
+Gu et al., ACM MM 2023. Landmarks take the place of the paper's centroids of confident cells. The paper has no minimum number of
+matches, so one pair gives an estimate.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class FeacoConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: FeacoConfig | None = None
 ) -> PoseEstimate:
-    """The claim, moved so that assigned places meet; NO_MATCH where nothing is near or nothing is claimed."""
+    """The prior, corrected so that assigned positions coincide; NO_MATCH without a prior or near positions."""
     config = config or FeacoConfig()
     if prior is None or not len(ego) or not len(other):
         return no_estimate(prior)
@@ -45,7 +45,7 @@ def correct(
             return no_estimate(prior)
         i, k = pairs.T
         if len(pairs) == 1:
-            # One place says where, not which way: the yaw stays.
+            # One pair gives the translation only: the yaw stays.
             pose = pose + np.array([*(ego.xy[i] - other.transform(pose).xy[k])[0], 0.0])
         else:
             pose = fit_pose(ego.xy[i], other.xy[k])

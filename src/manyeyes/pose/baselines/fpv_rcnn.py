@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FPV-RCNN's maximum consensus: poses on a grid around the claimed one, the one under which most landmarks meet.
+"""FPV-RCNN's maximum consensus: poses on a grid around the prior, and the one under which most landmarks coincide.
 
-Yuan, Cheng, Sester, IEEE RA-L 7(2), 2022; specs/pose.md 2.2. Landmarks here are vehicles only, which count twice. The
-reach of an accurate match is not published; half the reach of a match is taken.
+Yuan, Cheng, Sester, IEEE RA-L 7(2), 2022. Landmarks here are vehicles only, which count twice. The distance of an accurate match
+is not published; half the distance of a match is taken.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 @dataclass(frozen=True)
 class FpvRcnnConfig:
-    """The grid: reach_m by step_m in x and y, reach_deg by step_deg in yaw. match_distance_m, accurate_distance_m: how near
-    landmarks meet. vehicle_weight: of a vehicle. min_score, min_accurate: an answer needs that score, and more accurate matches
-    than that.
+    """The grid: search_m by step_m in x and y, search_deg by step_deg in yaw. match_distance_m, accurate_distance_m: limits of a
+    match and of an accurate match. vehicle_weight: score of a vehicle. min_score, min_accurate: an estimate needs that score,
+    and more accurate matches than that.
     """
 
     search_m: float = 1.0
@@ -38,7 +38,7 @@ class FpvRcnnConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: FpvRcnnConfig | None = None
 ) -> PoseEstimate:
-    """The grid's best pose, fitted on its accurate matches; NO_MATCH without a claim or enough of them."""
+    """The grid's best pose, fitted to its accurate matches; NO_MATCH without a prior or enough of them."""
     config = config or FpvRcnnConfig()
     if prior is None or not len(ego) or not len(other):
         return no_estimate(prior)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generalised ICP of clouds from the claimed pose, by small-gicp (Koide, JOSS 9(100), 2024; Segal et al., RSS 2009): what ICP means
-where whole clouds are at hand; the extra 'register' brings it. Spec: specs/pose.md 2.9.
+"""Generalised ICP of whole clouds from the prior pose, by small-gicp (extra 'register').
+
+Koide, JOSS 9(100), 2024; Segal et al., RSS 2009.
 """
 
 from __future__ import annotations
@@ -19,9 +20,8 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, no_estimate
 
 @dataclass(frozen=True)
 class GicpConfig:
-    """voxel_m: edge of the voxels to which clouds are thinned; max_correspondence_m: how far apart a pair of points may be;
-    min_inlier_fraction: of the other's points that find one, for an answer. sigma_m, sigma_yaw_rad: the error that an answer
-    states.
+    """voxel_m: edge of the voxels of downsampling; max_correspondence_m: largest distance of a pair of points;
+    min_inlier_fraction: of the other's points. sigma_m, sigma_yaw_rad: standard deviations of an estimate.
     """
 
     voxel_m: float = 0.5
@@ -34,7 +34,7 @@ class GicpConfig:
 def correct(
     ego: PointCloud, other: PointCloud, prior: PosePrior | None, config: GicpConfig | None = None
 ) -> PoseEstimate:
-    """Where the clouds fit best near the claim, in all six degrees of freedom; NO_MATCH without a claim or without overlap."""
+    """The best fit of the clouds near the prior, in six degrees of freedom; NO_MATCH without a prior or without overlap."""
     config = config or GicpConfig()
     gicp = _small_gicp()
     if prior is None or min(len(ego), len(other)) < 3:

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Iterated closest point on landmarks, from the claimed pose. Besl and McKay, IEEE TPAMI 14(2), 1992; specs/pose.md
-2.9.
-"""
+"""Iterative closest point on landmarks, from the prior pose. Besl and McKay, IEEE TPAMI 14(2), 1992."""
 
 from __future__ import annotations
 
@@ -16,7 +14,9 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate, pose_diffe
 
 @dataclass(frozen=True)
 class IcpConfig:
-    """max_correspondence_m: how far apart a pair may be; min_pairs: pairs that a fit needs; max_iterations: at most so many."""
+    """max_correspondence_m: largest distance of a pair; min_pairs: pairs that a fit needs; max_iterations: of matching and
+    fitting.
+    """
 
     max_correspondence_m: float = 3.0
     min_pairs: int = 3
@@ -24,7 +24,7 @@ class IcpConfig:
 
 
 def correct(ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: IcpConfig | None = None) -> PoseEstimate:
-    """Where closest pairs and their fit no longer change; NO_MATCH without a claim or enough pairs."""
+    """Iterate closest pairs and their fit to convergence; NO_MATCH without a prior or enough pairs."""
     config = config or IcpConfig()
     if prior is None:
         return no_estimate(None)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""No correction: what is claimed is used."""
+"""No correction: the prior is used as it is."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, no_estimate
 
 
 def correct(ego: Landmarks, other: Landmarks, prior: PosePrior | None) -> PoseEstimate:
-    """The claim as it is; NO_MATCH where there is none."""
+    """The prior unchanged; NO_MATCH where there is none."""
     return no_estimate(prior, PoseStatus.NO_MATCH if prior is None else PoseStatus.OK)

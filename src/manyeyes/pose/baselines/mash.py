@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose-free floor: objects matched by how they look alone, without geometry between matches and without any pose.
+"""Matching without poses: objects matched by their descriptors alone, without geometry between matches and without a prior.
 
-Stands for MASH (Glaser et al., IROS 2021; specs/pose.md 2.8), which fills a cost volume between all places of two
-agents' features and takes the best place for each. What an object looks like is, without learned weights, its size
-and the distances to its nearest neighbours.
+Stands for MASH (Glaser et al., IROS 2021), which fills a cost volume between all cells of two agents' features and takes the
+best cell for each. Without learned weights, an object's descriptor is its size and the distances to its nearest neighbours.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 @dataclass(frozen=True)
 class MashConfig:
-    """num_neighbours: how many distances describe an object; size_scale_m, distance_scale_m: differences that cost one; min_pairs:
-    pairs that an answer needs.
+    """num_neighbours: distances in a descriptor; size_scale_m, distance_scale_m: differences of unit cost; min_pairs: pairs that
+    an estimate needs.
     """
 
     num_neighbours: int = 4
@@ -32,7 +31,7 @@ class MashConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: MashConfig | None = None
 ) -> PoseEstimate:
-    """The pose that objects give which are each other's best in the cost volume; the claim has no part in it."""
+    """The pose of objects that are mutual best matches in the cost volume; the prior is not used."""
     config = config or MashConfig()
     if min(len(ego), len(other)) <= config.num_neighbours:
         return no_estimate(prior)
@@ -47,6 +46,6 @@ def correct(
 
 
 def _descriptors(x: Landmarks, config: MashConfig) -> np.ndarray:
-    """(N, 2 + neighbours)."""
+    """(N, 2 + num_neighbours) scaled descriptors."""
     apart = np.sort(np.hypot(*(x.xy[:, None] - x.xy[None]).transpose(2, 0, 1)), 1)[:, 1 : config.num_neighbours + 1]
     return np.column_stack((x.size / config.size_scale_m, apart / config.distance_scale_m))

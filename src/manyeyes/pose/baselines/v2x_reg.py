@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""V2X-Reg++: each pair of boxes is a whole pose; the pairs whose poses bring most other boxes together are the
-matches.
+"""V2X-Reg++: each pair of boxes is a pose hypothesis; the matches are the pairs whose poses bring most other boxes together.
 
-Specs/pose.md 2.4 (V2I-Calib's oIoU, V2X-Reg++'s oDist). No pose is needed, and a heading off by pi is not tried.
-There is no class in a landmark, so the threshold is a car's; the affinity of oIoU counts the boxes that overlap.
-Nothing matched is no answer, not the identity.
+V2I-Calib's overall IoU (oIoU) and V2X-Reg++'s overall distance (oDist) are the two affinities. No prior is needed, and a heading
+off by pi is not tried. Landmarks have no class, so the threshold is a car's; the affinity of oIoU counts overlapping boxes.
+Without matches there is no estimate, not the identity.
 """
 
 from __future__ import annotations
@@ -24,9 +23,8 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 @dataclass(frozen=True)
 class V2xRegConfig:
-    """affinity_kind: oDist or oIoU. max_boxes: the largest so many, within range_m. match_distance_m: how near a car's centre and
-    corners meet. min_affinity: affinity that a match needs; where the best is at most ``max_weak_affinity``, the best alone are
-    taken.
+    """affinity_kind: oDist or oIoU. max_boxes: the largest so many, within max_range_m. match_distance_m: limit for a car's centre
+    and corners. min_affinity: affinity of a match; where the best is at most ``max_weak_affinity``, only the best are taken.
     """
 
     affinity_kind: Literal["oDist", "oIoU"] = "oDist"
@@ -40,7 +38,7 @@ class V2xRegConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: V2xRegConfig | None = None
 ) -> PoseEstimate:
-    """The pose that the corners of matched boxes give; the claim has no part in it."""
+    """The pose from the corners of matched boxes; the prior is not used."""
     config = config or V2xRegConfig()
     rows_e, rows_o = _largest(ego, config), _largest(other, config)
     if not len(rows_e) or not len(rows_o):
@@ -64,7 +62,7 @@ def _largest(x: Landmarks, config: V2xRegConfig) -> np.ndarray:
 
 
 def _affinity(a: Landmarks, b: Landmarks, config: V2xRegConfig) -> np.ndarray:
-    """(N, M): how many other boxes meet when box i of a and box j of b are laid on each other."""
+    """(N, M): how many other boxes coincide when box i of a and box j of b are aligned."""
     out = np.zeros((len(a), len(b)))
     for i in range(len(a)):
         for j in range(len(b)):

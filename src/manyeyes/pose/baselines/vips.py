@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""VIPS: two graphs of objects matched by the main eigenvector of their affinities.
+"""VIPS: graph matching of objects by the principal eigenvector of their affinities.
 
-Shi et al., MobiCom 2022; specs/pose.md 2.5. The affinity of (i, i') with itself is exp(-0.5 dsize^2) exp(-0.1 d), d
-the distance that the claimed pose leaves; with (j, j') it is exp(-0.5 dlength^2) exp(-0.1 |dsin heading|). Without a
-claim d is left out. The largest boxes are kept, since the matrix has (N M)^2 entries.
+Shi et al., MobiCom 2022. The affinity of (i, i') with itself is exp(-0.5 dsize^2) exp(-0.1 d), d the distance under the prior
+pose; with (j, j') it is exp(-0.5 dlength^2) exp(-0.1 |dsin heading|). Without a prior d is left out. At most max_boxes are kept,
+since the matrix has (N M)^2 entries.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 @dataclass(frozen=True)
 class VipsConfig:
-    """max_boxes: at most so many an agent, those of highest score. min_weight_fraction: of the best pair's weight that a pair
-    needs. min_pairs: pairs that an answer needs. num_iterations: of the power iteration.
+    """max_boxes: at most so many per agent, those of highest score. min_weight_fraction: smallest weight of a pair over that of
+    the best. min_pairs: pairs that an estimate needs. num_iterations: of the power iteration.
     """
 
     max_boxes: int = 25
@@ -33,7 +33,7 @@ class VipsConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: VipsConfig | None = None
 ) -> PoseEstimate:
-    """The pose that the matched objects' places give; NO_MATCH where too few match."""
+    """The pose from the matched objects' positions; NO_MATCH where too few match."""
     config = config or VipsConfig()
     rows_e, rows_o = ego.select_indices(1e4, config.max_boxes), other.select_indices(1e4, config.max_boxes)
     if min(len(rows_e), len(rows_o)) < config.min_pairs:
@@ -58,7 +58,7 @@ def correct(
 
 
 def compute_affinities(a: Landmarks, b: Landmarks, prior: PosePrior | None) -> np.ndarray:
-    """(N M, N M), pair (i, i') in row i M + i'. Two pairs that share an object have none."""
+    """(N M, N M) affinities, pair (i, i') in row i M + i'; zero for two pairs that share an object."""
     n, m = len(a), len(b)
     node = np.exp(-0.5 * np.square(a.size[:, None] - b.size[None]).sum(-1))
     if prior is not None:

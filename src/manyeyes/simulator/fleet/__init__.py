@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Map observations of a fleet: places to drive in, a true map that changes, and what each agent's map model says of it."""
+"""Map observations of a fleet: places, a true map that changes over time, and the output of each agent's map model."""
 
 from manyeyes.simulator.fleet.changing_map import Change, ChangingMap
 from manyeyes.simulator.fleet.config import CROWDS, CrowdConfig, crowd_config

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A true map that changes: elements that are removed, moved or painted anew at a time."""
+"""A true map over time: elements that are removed, added or moved."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ NEVER_NS = 2**63 - 1
 
 @dataclass(frozen=True)
 class Change:
-    """What happens to one true element (its index in Place.truth) at a time.
+    """A change of one true element (its index in Place.truth) at a time.
 
-    remove: it is gone from then on. add: it was not there before. move: it lies shift_m (x, y metres) elsewhere from then on.
+    remove: it does not exist from then on. add: it did not exist before. move: it is displaced by shift_m (x, y metres).
     """
 
     element: int
@@ -44,7 +44,7 @@ class ChangingMap:
 
     @classmethod
     def of(cls, truth: MapElements, changes: Sequence[Change] = ()) -> ChangingMap:
-        """A truth and what becomes of it, in the order of time."""
+        """A truth with changes, applied in the order of time."""
         name = list(range(len(truth)))
         start_ns, end_ns = [0] * len(truth), [NEVER_NS] * len(truth)
         moved: list[MapElements] = []
@@ -77,7 +77,7 @@ class ChangingMap:
 
     @property
     def epochs(self) -> Indices:
-        """(E,) times from which on the world is another, ascending, the first 0."""
+        """(E,) times from which on the map is another, ascending, the first 0."""
         times = np.unique(np.concatenate(([0], self.start_ns, self.end_ns)))
         return times[times < NEVER_NS]
 

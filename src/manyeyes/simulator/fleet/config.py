@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a crowd drives and errs, with named presets."""
+"""Configuration of a fleet and of its map models' errors, with named presets."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class CrowdConfig:
 
 
 _LOCAL = CrowdConfig()
-# A second stage fed by tiles that ten looks made together: wider, fewer holes, no shadows of single vehicles.
+# Tiles fused from ten observations each: wider, fewer misses, no occlusion by single vehicles.
 _SEMI_GLOBAL = CrowdConfig(
     range_x_m=(-60.0, 60.0),
     range_y_m=(-30.0, 30.0),
@@ -161,7 +161,7 @@ CROWDS: dict[str, CrowdConfig] = {
 
 
 def crowd_config(name: str) -> CrowdConfig:
-    """A preset by name; ConfigError lists the known ones."""
+    """The preset of that name; ConfigError lists the known names."""
     if name not in CROWDS:
         raise ConfigError(f"Unknown crowd '{name}'; known: {', '.join(CROWDS)}.")
     return CROWDS[name]

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes of boxes for pose correction: what a vehicle and a roadside unit at a crossing detect, and where they truly are.
+"""Scenes of boxes for pose correction: detections of a vehicle and a roadside unit at a crossing, and the true poses.
 
 No sensor is simulated, so a thousand scenes take seconds. Two six-lane roads cross; vehicles drive in lanes and stand
-parked in rows, so that chance agreement is as frequent as in traffic (specs/pose.md 4.2, 4.3). How many objects both
-agents see is given, or drawn from the counts of DAIR-V2X's official labels (specs/pose.md 0.7). Which objects are seen is
-drawn anew at each instant; there is no model of occlusion, errors of boxes are independent, and an agent's own motion is
-known exactly.
+parked in rows, so that chance agreement is as frequent as in traffic. The number of common objects is given, or drawn from the
+counts of DAIR-V2X's official labels. Visible objects are drawn independently at each instant; there is no model of occlusion,
+errors of boxes are independent, and an agent's own motion is known exactly.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 DAIR_COMMON = (1784, 584, 612, 503, 478, 584, 633, 616, 415, 261, 110, 31, 5)
-"""Frames of DAIR-V2X with 0, 1, ... 12 boxes in common, of 6,616 (specs/pose.md 0.7)."""
+"""Frames of DAIR-V2X with 0, 1, ... 12 boxes in common, of 6,616, counted on the official labels."""
 
 _LANES_M = (1.75, 5.25, 8.75)
 _PARKED_M = 11.6
@@ -44,11 +43,11 @@ class BoxNoise:
 
 @dataclass(frozen=True)
 class LandmarkSpec:
-    """What is seen at each instant.
+    """Numbers of visible objects at each instant.
 
-    num_common: objects that both see, or None to draw the number from DAIR_COMMON. num_ego_only, num_other_only: objects that only
-    one sees. disjoint: the other agent stands at another crossing altogether. num_instants: how many moments, period_s apart, the
-    last is now.
+    num_common: objects that both agents observe, or None to draw the number from DAIR_COMMON. num_ego_only, num_other_only:
+    objects that only one observes. disjoint: the other agent stands at another crossing. num_instants: number of instants,
+    period_s apart, the last is now.
     """
 
     num_common: int | None = None
@@ -97,7 +96,7 @@ class _Traffic:
 
 
 def make_landmark_scene(spec: LandmarkSpec, seed: int, scene: int) -> LandmarkScene:
-    """One scene, a pure function of the specification, the seed and the number of the scene."""
+    """Make one scene, a pure function of the specification, the seed and the number of the scene."""
     rng = keyed_generator(seed, "landmark scene", scene)
     here = _traffic(rng)
     there = _traffic(rng) if spec.disjoint else here
@@ -185,7 +184,7 @@ def _vehicle(rng: np.random.Generator) -> tuple[Floats, float]:
 
 
 def _roadside(rng: np.random.Generator) -> Floats:
-    """A pole's pose at a corner of the crossing, looking anywhere."""
+    """A pole's pose at a corner of the crossing, with a uniform heading."""
     corner = np.array([rng.choice([-1.0, 1.0]), rng.choice([-1.0, 1.0])]) * rng.uniform(13, 18, 2)
     return np.array([*corner, rng.uniform(-np.pi, np.pi)])
 

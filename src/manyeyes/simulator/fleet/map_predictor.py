@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A true map as a map model would draw it, from true poses: an oracle for all that comes after the model.
+"""A simulated map model: the true map as observed from true poses, with the errors of a simulated fleet.
 
-The errors are those of a simulated crowd (``simulator.fleet``): missing, invented, cut, bent and noisy elements. Poses that are
-claimed are not its business, nor is what hides parts of the view.
+Elements are missing, invented, cut, bent and noisy (``simulator.fleet``). Errors of reported poses and occlusion are not
+simulated here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 
 
 class SimulatedMapPredictor:
-    """Looks at one true map, whose frame its poses are in; the same look again says the same."""
+    """Predict local maps of one true map, in whose frame the poses are; equal inputs give equal outputs."""
 
     def __init__(self, truth: MapElements, config: CrowdConfig, seed: int = 0) -> None:
         self._config, self._seed = config, seed
@@ -43,9 +43,9 @@ class SimulatedMapPredictor:
         )
 
     def predict(self, pose: Floats, window: tuple[float, float, float, float], *noise_key: int | str) -> LocalMap:
-        """What is drawn from a true pose (3,) x, y, yaw within x_min, y_min, x_max, y_max of the agent's frame.
+        """Predict the map from a true pose (3,) x, y, yaw within x_min, y_min, x_max, y_max of the agent's frame.
 
-        noise_key: names of the look, on which its errors depend, and on nothing else.
+        noise_key: names of the observation, which alone determine its errors.
         """
         x0, y0, x1, y1 = window
         errors = {name: float(getattr(self._config, name)) for name in MapModelNoise._fields[4:]}

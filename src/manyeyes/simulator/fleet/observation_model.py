@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one agent's map model says of the true map around it, with the errors that such models make, in one compiled loop.
+"""Observation model: one agent's view of the true map with the errors of a map model, in one compiled loop.
 
 Draws are counted, not streamed: each is a hash of (observation's key, element, run, purpose) by splitmix64's finaliser
-(Steele, Lea, Flood, OOPSLA 2014), so that an element drops out, bends and is noisy by the same unit draw whatever else is
+(Steele, Lea, Flood, OOPSLA 2014), so that an element is missed, bent and perturbed by the same unit draw whatever else is
 visible and however large the noise is.
 """
 
@@ -37,7 +37,7 @@ COLUMN_KIND, COLUMN_SCORE, COLUMN_SIGMA, COLUMN_NAME = range(4)
 
 
 class MapModelNoise(NamedTuple):
-    """The errors of a model. Lengths in metres, rates as probabilities; see CrowdConfig for each."""
+    """View limits and errors of a map model. Lengths in metres, rates as probabilities; see CrowdConfig for each."""
 
     x_min: float
     x_max: float
@@ -55,9 +55,9 @@ class MapModelNoise(NamedTuple):
 
 
 class OutputBuffers(NamedTuple):
-    """Where a look is written: points (MOST, n, 2), columns (MOST, 4) and style (MOST, S).
+    """Output of one observation: points (MAX_ELEMENTS, n, 2), columns (MAX_ELEMENTS, 4) and style (MAX_ELEMENTS, S).
 
-    columns: kind, score, sigma (m), and the name of the true element, -1 for one that is not there; see COLUMN_KIND.
+    columns: kind, score, sigma (m), and the name of the true element, -1 for a false one; see COLUMN_KIND.
     """
 
     points: Array
@@ -66,10 +66,10 @@ class OutputBuffers(NamedTuple):
 
 
 class TrueMapIndex(NamedTuple):
-    """The true map, ready to be looked at.
+    """The true map in chunks, for fast visibility tests.
 
     points: (M, 2) metres, lines at stations STATION_M apart and the corners of crossings; first: (N + 1,) offsets; kind, style:
-    (N,); element_name: (N,) the element each is, the same through all versions of the map. Chunk c holds the stations
+    (N,); element_name: (N,) identity of each element, the same in all versions of the map. Chunk c holds the stations
     ``chunk_first[c]:chunk_first[c + 1]``, all of one element, within chunk_radius[c] of chunk_center[c]; of_element: (N + 1,).
     """
 
@@ -85,7 +85,7 @@ class TrueMapIndex(NamedTuple):
 
 
 def build_map_index(points: list[Array], kind: Indices, style: Indices, name: Indices) -> TrueMapIndex:
-    """Lines (M, 2) and open rings of N elements with their kinds, styles and names."""
+    """Index lines (M, 2) and open rings of N elements with their kinds, styles and names."""
     dense = [p if k == CROSSING else _stations(p) for p, k in zip(points, kind.tolist())]
     first = np.concatenate(([0], np.cumsum([len(p) for p in dense]))).astype(np.int64)
     flat = np.concatenate(dense) if dense else np.zeros((0, 2))
@@ -202,7 +202,7 @@ def _clip_ring(ring: F64x2, noise: MapModelNoise) -> tuple[F64x2, float]:
 def _emit_line(
     line: F64x2, noise: MapModelNoise, key: np.uint64, element: int, run: int, part: int, out: F64x2
 ) -> float:
-    """Write one observed line into out (n, 2); its mean distance from the agent, or -1 when it is too short to be said."""
+    """Write one observed line into out (n, 2); returns its mean distance from the agent, or -1 where it is too short."""
     size = len(line)
     head = abs(hash_normal(key, element, run, _HEAD + 128 * part)) * noise.endpoint_truncation_m
     tail = abs(hash_normal(key, element, run, _TAIL + 128 * part)) * noise.endpoint_truncation_m
@@ -256,7 +256,7 @@ def _emit_ring(ring: F64x2, noise: MapModelNoise, key: np.uint64, element: int, 
 def _emit_false(
     line: F64x2, noise: MapModelNoise, key: np.uint64, element: int, run: int, out: F64x2
 ) -> tuple[int, float]:
-    """Write a line that is not there: a ghost half a lane beside a true one, or one anywhere in view; its mean distance."""
+    """Write a false line, half a lane beside a true one or anywhere in view; returns its kind and mean distance."""
     kind = DIVIDER if hash_uniform(key, element, run, _GHOST + 32) < 0.7 else BOUNDARY
     if hash_uniform(key, element, run, _GHOST) < 0.5 and len(line) > 6:
         side = 1.0 if hash_uniform(key, element, run, _SIDE) < 0.5 else -1.0
@@ -281,7 +281,7 @@ def _emit_false(
 
 @njit(cache=True)
 def _max_range(noise: MapModelNoise) -> float:
-    """The farthest that is in view."""
+    """The largest distance in view, metres."""
     return np.hypot(max(abs(noise.x_min), abs(noise.x_max)), max(abs(noise.y_min), abs(noise.y_max)))
 
 
@@ -289,7 +289,7 @@ def _max_range(noise: MapModelNoise) -> float:
 def observe_map(
     scene: TrueMapIndex, noise: MapModelNoise, pose: F64x1, shadows: F64x3, key: np.uint64, buffers: OutputBuffers
 ) -> int:
-    """Fill a room with what is seen from a pose; how many elements that is.
+    """Write all elements observed from a pose into the buffers; returns their number.
 
     pose: x, y, yaw (3,) of the agent, true. shadows: (Q, 4, 2) hidden quadrilaterals in its frame.
     """
@@ -341,7 +341,7 @@ def _observe_crossing(
     buffers: OutputBuffers,
     found: int,
 ) -> int:
-    """One crossing: said when at least half of it and 4 m² are in sight; how many elements there are now."""
+    """Observe one crossing, if at least half of it and 4 m² are visible; returns the number of elements so far."""
     points, columns, style = buffers
     max_range = _max_range(noise)
     ring, area = _clip_ring(local, noise)
@@ -378,7 +378,7 @@ def _observe_line(
     buffers: OutputBuffers,
     found: int,
 ) -> int:
-    """One visible stretch of a line, whole or in two parts, and perhaps a false one beside it; how many elements now."""
+    """Observe one visible stretch of a line, perhaps with a false line beside it; returns the number of elements so far."""
     points, columns, style = buffers
     max_range = _max_range(noise)
     name, kind = scene.element_name[e], scene.kind[e]
@@ -433,7 +433,7 @@ def _score(top: float, far: float, key: np.uint64, element: int, run: int) -> fl
 
 @njit(cache=True)
 def _write_style(true: int, noise: MapModelNoise, key: np.uint64, element: int, run: int, out: F64x1) -> None:
-    """Probabilities of styles: 0.85 on one, which is another than the true one at the rate style_error."""
+    """Probabilities of styles: 0.85 for one, which is a wrong one at the rate style_error_rate."""
     size = len(out)
     if true == NO_STYLE:
         out[:] = 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places to drive in: a true map, lanes, the ground of junctions and an area to judge, in one local metric frame."""
+"""Places to simulate: a true map, lanes, the ground of junctions and an evaluated area, in one local metric frame."""
 
 from __future__ import annotations
 
@@ -57,12 +57,11 @@ PLACES = (*TOWNS, *AV2_LOGS, "lanelet2", *_PLANS)
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where a crowd drives. All in the local frame: metres, x east, y north, zero in the middle of the area.
+    """A place in its local frame: metres, x east, y north, zero in the middle of the area.
 
     truth: every true element of the place, also beyond the area. routes: lanes that vehicles drive on. junctions: the ground of
-    junctions, at which lines are cut (``maps.roads.ground_truth.cut_elements`` cuts anybody's map there). area: x_min, y_min,
-    x_max, y_max that is driven and judged. logs: recorded drives, poses (N, 3) each. world_xy: the local zero in the source's
-    own frame.
+    junctions, where lines are cut (``maps.roads.ground_truth.cut_elements`` cuts any map there). area: x_min, y_min, x_max, y_max
+    that is driven and evaluated. logs: recorded drives, poses (N, 3) each. world_xy: the local zero in the source's own frame.
     """
 
     name: str
@@ -84,7 +83,7 @@ def load_place(name: str, size_m: float | None = 300.0, data: Path | str | None 
 
     size_m: side of the square area; in towns it lies about the largest junction, None takes all of the place. Real logs and
     generated streets are never larger than they are. data: the folder with ``carla_opendrive``, ``av2`` and ``lanelet2``; where
-    none is given, ``shared/data`` beside the repository or above the working directory.
+    none is given, the folder ``data`` in a folder ``shared`` beside the repository or above the working directory.
     """
     return _load_place(name, size_m, None if data is None else str(data))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lanes that can be driven, as columns, and walks along them."""
+"""Drivable lanes in arrays, and paths along them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Routes:
-    """L lanes: centre lines ``points[first[i]:first[i + 1]]`` (metres, along travel) and the lanes that follow each.
+    """L lanes: centre lines ``points[offsets[i]:offsets[i + 1]]`` (metres, in driving direction) and the successors of each.
 
-    Lane i is followed by ``successor[follow[i]:follow[i + 1]]``.
+    Lane i is followed by ``successor[successor_offsets[i]:successor_offsets[i + 1]]``.
     """
 
     points: Array
@@ -55,7 +55,7 @@ class Routes:
 
     @cached_property
     def lengths(self) -> Array:
-        """(L,) metres."""
+        """(L,) lengths of the lanes, metres."""
         return np.array([np.linalg.norm(np.diff(self.lane(i), axis=0), axis=1).sum() for i in range(len(self))])
 
     def within(self, low: Array, high: Array) -> Routes:
@@ -98,7 +98,7 @@ def sample_poses(path: Array, station_m: Array) -> Array:
 
 
 def _from(line: Array, start_m: float) -> Array:
-    """What of a line lies behind a distance from its start."""
+    """The part of a line after a distance from its start."""
     station = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))))
     start_m = min(max(start_m, 0.0), station[-1] - 0.1)
     at = np.array([[np.interp(start_m, station, line[:, axis]) for axis in (0, 1)]])

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet drives through a place and says what its map models saw: observations, and apart from them what was true.
+"""Simulate a fleet that drives through a place: observations of its map models, and separately the ground truth.
 
-Everything is a function of (seed, agent, pass, look): the first n observations of a longer crowd are the crowd of n, and a draw
-is the same at every noise level, which only scales it.
+All is a function of (seed, agent, drive, observation): the first n observations of a larger crowd are the crowd of n. A draw is
+the same at every noise level, which only scales it.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ HONEST, OUTLIER, MALICIOUS, OUTDATED, INFRASTRUCTURE = range(len(ROLES))
 _MIN_SIGMA_M, _MIN_SIGMA_RAD = 0.05, np.radians(0.05)
 _SPEED_MPS = 10.0
 _TURNS = np.array([5**0.5 - 1, 2**1.5 - 2, 2 * 3**0.5 - 2]) / 2
-# Places of draws that belong to a look, an agent or a pass and to no element.
+# Pseudo-elements of draws that belong to an observation, an agent or a drive.
 _POSE, _PASS, _AGENT, _SHADOW = 2**40, 2**40 + 1, 2**40 + 2, 2**40 + 3
 _CAR_M = (4.6, 1.9)
 
 
 @dataclass(frozen=True, eq=False)
 class Crowd:
-    """N observations, and what nobody who perceives is told.
+    """N observations, and their ground truth.
 
-    true_poses: (N, 3) x, y, yaw. roles: (N,) index into ROLES. origin: the true element (index in Place.truth) that each observed
-    element shows, -1 for none: observation i has ``origin[origin_first[i]:origin_first[i + 1]]``. changing_map: the true map in
-    time.
+    true_poses: (N, 3) x, y, yaw. roles: (N,) index into ROLES. origin: index in Place.truth of the true element that each observed
+    element shows, -1 for none: observation i has ``origin[origin_offsets[i]:origin_offsets[i + 1]]``. changing_map: the true map
+    over time.
     """
 
     observations: tuple[Observation, ...]
@@ -73,7 +73,7 @@ class Crowd:
 
 @dataclass(frozen=True)
 class _Drive:
-    """One drive: who (number and pseudonym), its place among passes, its role, its true poses (K, 3) and its key."""
+    """One drive: agent (number and pseudonym), its number among drives, its role, its true poses (K, 3) and its key."""
 
     agent: int
     name: str
@@ -91,7 +91,7 @@ def simulate_crowd(
     changes: Sequence[Change] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> Crowd:
-    """``count`` observations of a place; progress is called with (done, count) after each pass."""
+    """Simulate ``count`` observations of a place; progress is called with (done, count) after each drive."""
     if count < 0:
         raise ConfigError(f"A crowd has 0 observations or more; got {count}.")
     changing_map = ChangingMap.of(place.truth, changes)
@@ -124,7 +124,7 @@ def simulate_crowd(
 
 
 def _drives(place: Place, config: CrowdConfig, seed: int) -> Iterator[_Drive]:
-    """Drives without end, in the order of time."""
+    """Endless drives, in the order of time."""
     if not len(place.routes):
         raise ConfigError(f"{place.name}: no lane leads through its area; take a larger size_m.")
     cumulative_length = np.cumsum(place.routes.lengths)
@@ -152,7 +152,7 @@ def _key(*parts: int | str) -> np.uint64:
 
 
 def _role(agent: int, config: CrowdConfig, offsets: Array) -> int:
-    """Shares of agents by additive sequences: near exact among any first agents, and nested when a share grows."""
+    """Roles by additive sequences: fractions are near exact for any number of agents, and nested when a fraction grows."""
     turn = (agent * _TURNS + offsets) % 1.0
     if turn[0] < config.malicious_fraction:
         return MALICIOUS
@@ -162,7 +162,7 @@ def _role(agent: int, config: CrowdConfig, offsets: Array) -> int:
 
 
 def _path(place: Place, config: CrowdConfig, key: np.uint64, cumulative_length: Array) -> Array:
-    """Where one drive leads: a recorded one, or a walk over the lanes."""
+    """The path of one drive: a recorded one, or a random walk over the lanes."""
     if place.logs and hash_uniform(key, _PASS, 0, 6) < config.recorded_drive_fraction:
         log = place.logs[int(hash_uniform(key, _PASS, 0, 7) * len(place.logs))]
         fresh = np.concatenate(([True], np.linalg.norm(np.diff(log[:, :2], axis=0), axis=1) > 1e-3))
@@ -180,7 +180,7 @@ def _path(place: Place, config: CrowdConfig, key: np.uint64, cumulative_length: 
 def _observation_poses(
     path: Array, area: tuple[float, float, float, float], config: CrowdConfig, key: np.uint64
 ) -> Array:
-    """True poses (K, 3) of the looks of one drive: every spacing metres until it leaves the area or ends."""
+    """True poses (K, 3) of one drive's observations: every spacing_m until it leaves the area or ends."""
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     low, high = config.spacing_m
     steps = [low + (high - low) * hash_uniform(key, _PASS, k, 1) for k in range(config.max_observations_per_drive - 1)]
@@ -195,7 +195,7 @@ def _observation_poses(
 
 
 def _pole_sites(place: Place) -> Array:
-    """A pole beside each junction: on the corner of its bounding box nearest to the ground, looking at its middle."""
+    """A pole at each junction: on the corner of its bounding box nearest to the ground, facing its centre."""
     sites = []
     for part in getattr(place.junctions, "geoms", [place.junctions]):
         x0, y0, x1, y1 = part.bounds
@@ -208,7 +208,7 @@ def _pole_sites(place: Place) -> Array:
 
 
 class _Observer:
-    """Turns a look into an observation; holds the true map of each epoch and the room that the compiled loop writes to."""
+    """Makes observations; holds the true map of each epoch and the buffers of the compiled loop."""
 
     def __init__(self, changing_map: ChangingMap, config: CrowdConfig, seed: int) -> None:
         self.config, self.seed, self.epochs = config, seed, changing_map.epochs
@@ -240,7 +240,7 @@ class _Observer:
         )
 
     def observe(self, drive: _Drive, k: int, pose: Array) -> tuple[Observation, Indices]:
-        """The k-th look of a drive at a true pose, and the true element of each of its elements."""
+        """The k-th observation of a drive at a true pose, and the true element of each of its elements."""
         config, noise = self.config, self.infrastructure_noise if drive.role == INFRASTRUCTURE else self.noise
         key = _key(self.seed, drive.agent, drive.number, k)
         time = config.start_ns + int(drive.number * config.drive_interval_s * 1e9)
@@ -286,7 +286,7 @@ class _Observer:
         )
 
     def _perturb_pose(self, drive: _Drive, key: np.uint64, pose: Array) -> tuple[Array, Array]:
-        """The claimed pose and its covariance."""
+        """The reported pose and its covariance."""
         c = self.config
         sigma = np.array([c.pose_sigma_m, c.pose_sigma_m, c.yaw_sigma_rad])
         if drive.role == INFRASTRUCTURE:
@@ -300,7 +300,7 @@ class _Observer:
         return pose + error, np.diag(np.maximum(sigma, min_sigma) ** 2)
 
     def _displace_elements(self, elements: MapElements, drive: _Drive, yaw: float) -> MapElements:
-        """Elements of the chosen kinds moved by a vector of the world, the agent's own or everyone's."""
+        """Displace elements of the chosen kinds by a vector in the world, the agent's own or the common one."""
         c = self.config
         whose = "all" if c.attack_mode == "colluding" else drive.agent
         x, y = _offset(_key(self.seed, whose, "lie"), c.malicious_offset_m)
@@ -310,7 +310,7 @@ class _Observer:
 
 
 def _offset(key: np.uint64, size: tuple[float, float]) -> Array:
-    """A vector (2,) of any direction whose length lies in a range."""
+    """A vector (2,) of uniform direction whose length lies in a range."""
     length = size[0] + (size[1] - size[0]) * hash_uniform(key, _AGENT, 0, 0)
     angle = 2 * np.pi * hash_uniform(key, _AGENT, 0, 1)
     return length * np.array([np.cos(angle), np.sin(angle)])
@@ -325,7 +325,7 @@ def _index_map(changing_map: ChangingMap, time_ns: int) -> TrueMapIndex:
 
 
 def _shadows(key: np.uint64, config: CrowdConfig, noise: MapModelNoise) -> Array:
-    """(Q, 4, 2) what up to three vehicles on neighbouring lanes hide, anticlockwise, in the agent's frame."""
+    """(Q, 4, 2) areas hidden by up to three vehicles on neighbouring lanes, anticlockwise, in the agent's frame."""
     quads = []
     reach = 2.0 * max(abs(noise.x_min), abs(noise.x_max), abs(noise.y_min), abs(noise.y_max))
     for j in range(3):

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Roads, traffic and what stands beside them."""
+"""Roads, traffic and roadside objects of a scene."""

@@ -24,7 +24,7 @@ _CELL = 0.5
 
 @dataclass(frozen=True)
 class RoadsideObjectSpec:
-    """How much stands beside the road, as wishes: what finds no place is left out.
+    """Numbers of roadside objects; those without a free place are left out.
 
     buildings … hedges: at most. setback_m: from the pavement's edge to a front. radius_m: how far from the middle.
     """

@@ -48,15 +48,15 @@ _MOVED_M = 0.2
 
 @dataclass(frozen=True)
 class ScenarioSpec:
-    """What is asked of a scenario; the rest follows from the seed.
+    """Specification of a scenario; the rest follows from the seed.
 
-    vehicles: connected vehicles, each at least min_gap_m from the others and within low_m … high_m of the crossing at the
-    first frame. frames: at rate_hz, the first history_frames of which are not judged. lead_frames: as many more before the first,
-    in which everybody is already under way; they change nothing in the frames after them, unless a connected vehicle was not
-    on the road yet in the lead: then others are drawn. roadside_chance: how often a unit
-    on a pole takes part. density: of the traffic, in units of 9 vehicles per kilometre of lane. min_vehicles: within
-    60 m of the crossing, or another one is drawn. clutter: times the numbers of ClutterSpec. cameras, roadside_cameras:
-    names of CAMERA_RIGS, of each vehicle and of the unit, whose cameras are at its LiDAR's height.
+    vehicles: connected vehicles, each at least min_gap_m from the others and within low_m … high_m of the crossing at the first
+    frame. frames: at rate_hz, the first history_frames of which are not evaluated. lead_frames: additional frames before the
+    first, with traffic under way. They leave the frames after them unchanged, except where a connected vehicle was not on the
+    road yet: then others are drawn. roadside_chance: probability of a roadside unit. density: of the traffic, in units of 9
+    vehicles per kilometre of lane. min_vehicles: within 60 m of the crossing, or another crossing is drawn. clutter: factor on
+    the numbers of RoadsideObjectSpec. cameras, roadside_cameras: names of CAMERA_RIGS, of each vehicle and of the unit, at its
+    LiDAR's height.
     """
 
     town: str

@@ -47,8 +47,8 @@ def find_town(name: str, path: Path | str | None = None) -> Path | bytes:
     """The OpenDRIVE file of a town, or its bytes where it lies in a wheel or is generated.
 
     name: one of TOWNS, ``generated-<seed>``, or any name when path is a file or a folder that holds ``<name>.xodr[.gz]``.
-    Looked for, in this order: path (a file, a folder, or py123d's wheel), $MANYEYES_TOWNS (the same), shared/data/carla_opendrive
-    beside the repository or above the working directory, a CARLA installation at $CARLA_ROOT, the installed py123d.
+    Searched in this order: path (a file, a folder, or py123d's wheel), $MANYEYES_TOWNS (the same), ``carla_opendrive`` of the
+    data folder beside the repository or above the working directory, a CARLA installation at $CARLA_ROOT, the installed py123d.
     """
     searched: list[str] = []
     if path is not None:
@@ -69,7 +69,7 @@ def find_town(name: str, path: Path | str | None = None) -> Path | bytes:
         searched.append(str(place))
     if name not in TOWNS:
         raise ConfigError(
-            f"Unknown town '{name}'; known: {', '.join(TOWNS)}, {GENERATED}<seed>. Looked in: {'; '.join(searched)}."
+            f"Unknown town '{name}'; known: {', '.join(TOWNS)}, {GENERATED}<seed>. Searched: {'; '.join(searched)}."
         )
     raise ConfigError(
         f"The roads of {name} are in none of: {'; '.join(searched) or 'no place'}. Give a path, set MANYEYES_TOWNS "
@@ -79,7 +79,7 @@ def find_town(name: str, path: Path | str | None = None) -> Path | bytes:
 
 
 def _places() -> Iterator[Path]:
-    """Folders and wheels to look in when no path is given, best first."""
+    """Folders and wheels to search when no path is given, best first."""
     if os.environ.get("MANYEYES_TOWNS"):
         yield Path(os.environ["MANYEYES_TOWNS"])
     if os.environ.get("CARLA_ROOT"):

@@ -192,7 +192,7 @@ def _read_edges(net: Path) -> _DrivableEdges:
 
 
 def _without_dead_ends(following: list[set[int]]) -> list[set[int]]:
-    """The same without ways that end, so that nobody vanishes on the road; unchanged where every way ends."""
+    """The same without dead ends, so that no vehicle vanishes on the road; unchanged where every edge is one."""
     kept, lost = [set(after) for after in following], set()
     while True:
         ends = {k for k, after in enumerate(kept) if not after} - lost
@@ -261,7 +261,7 @@ def _run_worker(path: Path, job: dict[str, object]) -> None:
         if "libsumo is not installed" in done.stderr:
             raise MissingExtraError("sim", "traffic")
         lines = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
-        raise ConfigError(f"SUMO failed with {done.returncode}: {lines[-1][:300] if lines else 'it said nothing'}")
+        raise ConfigError(f"SUMO failed with {done.returncode}: {lines[-1][:300] if lines else 'no output'}")
 
 
 def _headings(vehicle: NDArray[np.int64], state: Array, length: Array) -> Array:

@@ -52,13 +52,13 @@ class VehicleStates:
 
     @classmethod
     def empty(cls) -> VehicleStates:
-        """No vehicles."""
+        """A set without any vehicle."""
         whole, real, triple = np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))
         return cls(whole, whole, triple, real, real, real, triple)
 
     @classmethod
     def cat(cls, many: list[VehicleStates]) -> VehicleStates:
-        """Several sets as one."""
+        """Concatenate several sets into one."""
         return cls(*(np.concatenate([getattr(v, f.name) for v in many]) for f in fields(cls))) if many else cls.empty()
 
     def __len__(self) -> int:

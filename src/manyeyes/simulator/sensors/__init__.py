@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""LiDAR and cameras in a scene."""
+"""Simulated LiDAR and cameras of a scene."""

@@ -85,7 +85,7 @@ class CameraSpec:
 
 # opv2v: front, right, left and back, 100 degrees wide (intrinsics: recordings.md; places [x, y to the right, z, yaw to the
 # right] [2.5, 0, 1.0, 0], [0, 0.3, 1.8, 100], [0, -0.3, 1.8, -100], [-2, 0, 1.5, 180] as OpenCDA, OPV2V's simulator, has them).
-# dair-infrastructure: the intrinsics of a camera of DAIR-V2X's roadside units; how far it looks down is chosen.
+# dair-infrastructure: the intrinsics of a camera of DAIR-V2X's roadside units; its pitch is chosen.
 _F = 335.639852470912
 _OPV2V = tuple(
     CameraSpec(_F, _F, 400.0, 300.0, 800, 600, x, y, z, math.radians(yaw))
@@ -238,7 +238,7 @@ def _mirror_reflection(light: Light, toward: Real, normal: Real, gloss: Real, li
 
 
 @dataclass(frozen=True, eq=False)
-class _SurfacePoints:
+class _ShadingPoints:
     """Of N points: normals (N, 3), of the solid itself (face) and as light takes them; albedo (N, 3); gloss (N,)."""
 
     face: Real
@@ -249,10 +249,10 @@ class _SurfacePoints:
 
 def _surfaces(
     lit_scene: LitScene, owner: NDArray[np.int32], points: Array, toward: Real, width: Real
-) -> _SurfacePoints:
+) -> _ShadingPoints:
     n = len(points)
     face, normal, albedo = np.zeros((3, n, 3), np.float32)
-    surface = _SurfacePoints(face, normal, albedo, np.zeros(n, np.float32))
+    surface = _ShadingPoints(face, normal, albedo, np.zeros(n, np.float32))
     ground = np.flatnonzero(owner == GROUND)
     _fill_ground(surface, ground, lit_scene, points[ground], toward[ground], width[ground])
     solid = np.flatnonzero(owner >= 0)
@@ -262,7 +262,7 @@ def _surfaces(
 
 
 def _fill_ground(
-    surface: _SurfacePoints, rows: NDArray[np.int64], lit_scene: LitScene, points: Array, toward: Real, width: Real
+    surface: _ShadingPoints, rows: NDArray[np.int64], lit_scene: LitScene, points: Array, toward: Real, width: Real
 ) -> None:
     field = lit_scene.scene.ground
     x, y, cell = points[:, 0], points[:, 1], field.cell
@@ -292,7 +292,7 @@ def _height(lit_scene: LitScene, x: Array, y: Array) -> Array:
 
 
 def _fill_solids(
-    surface: _SurfacePoints,
+    surface: _ShadingPoints,
     rows: NDArray[np.int64],
     lit_scene: LitScene,
     owner: NDArray[np.int32],
@@ -316,7 +316,7 @@ def _fill_solids(
         0.7 * np.sign(local[lacquer]) * np.clip(1 - (half - np.abs(local))[lacquer] / _BEVEL_M, 0, 1) ** 2
     )
     face, normal = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in (face, normal))
-    # Leaves look every way: their light is softer than that of a smooth crown.
+    # Leaves have all orientations: their light is softer than that of a smooth crown.
     normal[crown] = 0.5 * normal[crown] + (0, 0, 0.5)
     surface.face[rows] = np.einsum("nij,nj->ni", rotation, face)
     surface.normal[rows] = np.einsum("nij,nj->ni", rotation, normal)

@@ -62,12 +62,12 @@ class LidarSpec:
 
     @cached_property
     def elevation(self) -> NDArray[np.float64]:
-        """(B,) radians, ascending."""
+        """Elevation angles (B,) of the beams in radians, ascending."""
         return np.linspace(self.lower_rad, self.upper_rad, self.beams)
 
     @cached_property
     def azimuth(self) -> NDArray[np.float64]:
-        """(A,) radians, counter-clockwise."""
+        """Azimuth angles (A,) of the firings in radians, counter-clockwise."""
         all_of_them = -math.pi + 2 * math.pi * (np.arange(self.per_turn) + 0.5) / self.per_turn
         return all_of_them[np.abs(all_of_them) <= self.sector_rad / 2]
 
@@ -137,7 +137,7 @@ class _Directions(NamedTuple):
     turn_fraction: F64x1
 
 
-class _Targets(NamedTuple):
+class _TargetArrays(NamedTuple):
     """Reflectivity (N,) and instance (N,) of each solid, and reflectivity of each class of the ground."""
 
     reflectivity: F64x1
@@ -166,7 +166,7 @@ class _ReturnModel(NamedTuple):
 
 @njit(cache=True)
 def _assemble(
-    hits: _HitArrays, rays: _Directions, targets: _Targets, draws: _Draws, spec: _ReturnModel
+    hits: _HitArrays, rays: _Directions, targets: _TargetArrays, draws: _Draws, spec: _ReturnModel
 ) -> tuple[F32x2, I64x1]:
     """Kept returns as rows x, y, z (agent frame), intensity, time (K, 5), and their instances (K,)."""
     depth, owner, cosine, surface = hits
@@ -219,7 +219,7 @@ def scan(
     rows, instance = _assemble(
         _HitArrays(hits.range_m, hits.primitive, hits.cosine, hits.surface),
         _Directions(np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth), turn_fraction),
-        _Targets(solids.reflectivity, SURFACE_REFLECTIVITY, solids.instance),
+        _TargetArrays(solids.reflectivity, SURFACE_REFLECTIVITY, solids.instance),
         _Draws(random.standard_normal(shape, np.float32), random.random(shape, np.float32)),
         _ReturnModel(
             spec.range_sigma_m,

@@ -53,7 +53,7 @@ class Materials:
 
 
 def make_static_materials(solids: Primitives, seed: int) -> Materials:
-    """Of what stands beside the road, told by its shape, as simulator/scene/roadside_objects.py builds it."""
+    """Materials of roadside objects, by the shapes that simulator/scene/roadside_objects.py builds."""
     n, half = len(solids), solids.half
     material = np.full(n, LEAVES, np.uint8)
     round_ = solids.kind == CYLINDER

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What surfaces look like close by: road, paint and its wear, fronts of houses, vehicles. All colours are linear albedos.
+"""Textures at close range: road, paint and its wear, house fronts, vehicles. All colours are linear albedos.
 
-Each function takes points of one kind of surface and how wide a pixel is there, so that what is finer than a pixel fades
-to its mean instead of flickering. Sizes and colours are chosen to look like a European town.
+Each function takes points of one kind of surface and the extent of a pixel there, so that detail finer than a pixel fades
+to its mean instead of flickering. Sizes and colours are chosen after European towns.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class SolidPoints:
     """N points on solids, as their texture needs them.
 
     local: (N, 3) metres in the primitive's frame; axis: (N,) 0 … 2, the face of a box it lies on, and side: (N,) its sign;
-    half: (N, 3) of the primitive; width: (N,) metres of a pixel there. rgb, seed, anchor, size, axles: of the look, per point.
+    half: (N, 3) of the primitive; width: (N,) metres of a pixel there. rgb, seed, anchor, size, axles: of the materials, per point.
     """
 
     local: Real
