@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""manyeyes: many agents, each with its own eyes and few bytes to say what it sees."""
+"""manyeyes: cooperative perception of many agents within a byte budget."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Names are loaded when they are first used: importing manyeyes alone costs milliseconds."""
+    """Load a name at its first use, so that importing manyeyes takes milliseconds."""
     if name not in _HOME:
         raise AttributeError(f"module 'manyeyes' has no attribute {name!r}")
     return getattr(import_module(_HOME[name]), "load" if name == "load_detector" else name)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """How loops are compiled: numba's njit, whose results are kept on disk by one process at a time.
 
-numba names the files of a function's variants by counting: two processes that compile two variants at the same time give both one
-name, and from then on whoever asks for one of them runs the other, without an error. Workers that begin together on a fresh
-installation do just that. Every compiled loop of the package takes njit from here.
+numba numbers the cache files of a function's variants: two processes that compile two variants at the same time use one file name
+for both, and later processes load the wrong variant without an error. Workers that start together on a fresh installation are such
+processes. Every compiled loop of the package takes njit from here.
 """
 
 from __future__ import annotations

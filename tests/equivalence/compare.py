@@ -17,6 +17,21 @@ import numpy as np
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PROBE = Path("tests") / "equivalence" / "probe.py"
+RENAMED = {
+    "alone": "none",
+    "late-remembering": "late-temporal",
+    "learned": "intermediate-mi",
+    "confidence": "intermediate-confidence",
+    "random": "intermediate-random",
+    "fused": "intermediate-multihop",
+    "codes": "codebook",
+    "vote": "voting",
+    "given": "identity",
+    "odist": "v2x-reg-odist",
+    "oiou": "v2x-reg-oiou",
+    "first": "offsets",
+}
+"""Parts of the keys of arrays, between slashes, in the older code and in this one."""
 
 
 def run(code: Path, place: Path, name: str, probes: list[str]) -> dict[str, np.ndarray]:
@@ -29,6 +44,13 @@ def run(code: Path, place: Path, name: str, probes: list[str]) -> dict[str, np.n
     subprocess.run(words, check=True, env=environment, cwd=place)
     with np.load(place / f"{name}.npz") as file:
         return {key: file[key] for key in file.files}
+
+
+def rename_keys(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of the older code under the keys of this one; a key that occurs twice is an error."""
+    renamed = {"/".join(RENAMED.get(part, part) for part in key.split("/")): array for key, array in arrays.items()}
+    assert len(renamed) == len(arrays), "two keys of the older code map to one"
+    return renamed
 
 
 def differences(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> list[str]:
@@ -49,7 +71,7 @@ def main() -> int:
         place = Path(name)
         subprocess.run(["git", "worktree", "add", "--detach", str(place / "code"), commit], check=True, cwd=REPOSITORY)
         try:
-            old = run(place / "code", place, "old", probes)
+            old = rename_keys(run(place / "code", place, "old", probes))
             new = run(REPOSITORY, place, "new", probes)
         finally:
             remove = ["git", "worktree", "remove", "--force", str(place / "code")]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compute what a renaming must not change, and save it: ``python tests/equivalence/probe.py OUT.npz DATA``.
 
-The keys of the saved arrays are fixed; the names behind them follow the package. ``compare.py`` runs this file of two commits, each
-on its own code, and compares the arrays bit for bit. DATA: a folder in which the probes simulate, kept between runs of one code.
+``compare.py`` runs this file of two commits, each on its own code, and compares the arrays bit for bit. Keys of arrays hold names
+of the package; ``compare.py`` maps those that changed. DATA: a folder in which the probes simulate, kept between runs of one code.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.strategies import METHODS
+from manyeyes.agents.strategies import STRATEGIES
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import Transform
@@ -36,9 +36,6 @@ from manyeyes.training.detector.samples import AugmentConfig
 
 Arrays = Iterator[tuple[str, np.ndarray]]
 
-STRATEGIES = ("alone", "late", "late-remembering", "intermediate", "learned", "confidence", "random", "fused", "early")
-"""Keys of the strategies, in the order of the package's table."""
-POSE_CORRECTORS = ("vote", "given", "coalign", "fpv-rcnn", "feaco", "icp", "vips", "odist", "oiou", "mash")
 FINGERPRINT = slice(56, 64)
 
 
@@ -70,7 +67,7 @@ def content(packets: list[bytes]) -> np.ndarray:
 
 
 def strategies(data: Path) -> Arrays:
-    """Packets of every strategy and precision on one drive, and the boxes of every strategy."""
+    """Packets of every strategy and token encoding on one drive, and the boxes of every strategy."""
     if not (data / "tiny" / "manifest.json").is_file():
         assert cli.main(["simulate", "--preset", "tiny", "--out", str(data / "tiny"), "--workers", "1"]) == 0
     recording, detector = Opv2vRecording(data / "tiny", "test", use_cache=False), pretrained.load()
@@ -78,17 +75,17 @@ def strategies(data: Path) -> Arrays:
     snapshots = [recording.snapshot(scenario, index) for index in range(recording.length(scenario))]
     for number, frame in enumerate(snapshots[0].frames):
         yield f"simulator/points/{number}", frame.points.xyz.numpy()
-    for key, strategy in zip(STRATEGIES, METHODS.values(), strict=True):
-        for precision in ("float32", "float16", "int8", "codebook"):
-            agents = {f.agent_id: Agent(detector, strategy, token_encoding=precision) for f in snapshots[0].frames}
+    for key, strategy in STRATEGIES.items():
+        for encoding in ("float32", "float16", "int8", "codebook"):
+            agents = {f.agent_id: Agent(detector, strategy, token_encoding=encoding) for f in snapshots[0].frames}
             for time, snapshot in enumerate(snapshots):
                 sent = {f.agent_id: agents[f.agent_id].share(f) for f in snapshot.frames}
-                yield f"packets/{key}/{precision}/{time}", content([p for packets in sent.values() for p in packets])
+                yield f"packets/{key}/{encoding}/{time}", content([p for packets in sent.values() for p in packets])
                 ego = snapshot.frames[0]
-                heard = [p for sender, packets in sent.items() if sender != ego.agent_id for p in packets]
-                boxes = agents[ego.agent_id].perceive(ego, heard).boxes
+                received = [p for sender, packets in sent.items() if sender != ego.agent_id for p in packets]
+                boxes = agents[ego.agent_id].perceive(ego, received).boxes
                 yield (
-                    f"boxes/{key}/{precision}/{time}",
+                    f"boxes/{key}/{encoding}/{time}",
                     torch.cat((boxes.bev(), boxes.score[:, None], boxes.velocity), 1).numpy(),
                 )
 
@@ -101,7 +98,7 @@ def corrected_poses(data: Path) -> Arrays:
         ego, other = Landmarks.of_boxes(scene.ego[0]), Landmarks.of_boxes(scene.other[0])
         x, y, yaw = (scene.ego_from_other + np.array([0.8, -0.5, 0.02])).tolist()
         wrong = Transform.from_xyz_yaw(x, y, 0.0, yaw)
-        for key, corrector in zip(POSE_CORRECTORS, CORRECTORS.values(), strict=True):
+        for key, corrector in CORRECTORS.items():
             for prior_key, prior in (("prior", PosePrior(wrong, np.diag([0.5, 0.5, 0.01]))), ("none", None)):
                 found = corrector(ego, other, prior)
                 pose = np.full(3, np.nan) if found.pose is None else np.asarray(found.pose)
@@ -114,7 +111,7 @@ def fused_maps(data: Path) -> Arrays:
     for place in ("cross", "Town07"):
         scene = run_trial(FleetTrial(place, 24, 3, 150.0))
         made = fuse_observations("manyeyes", scene.observations, make_tuned_settings(), scene.place.frame)
-        for field in ("points", "score", "sigma", "style", "kind", "first"):
+        for field in ("points", "score", "sigma", "style", "kind", "offsets"):
             yield f"map/{place}/{field}", np.asarray(getattr(made.elements, field))
 
 

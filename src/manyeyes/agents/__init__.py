@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One agent's whole step, and many agents on one recording."""
+"""The share and perceive steps of one agent, and replays of recordings with many agents."""

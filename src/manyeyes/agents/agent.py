@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One agent's whole step: share(own observation) to bytes, perceive(own observation, inbox) to boxes."""
+"""The step of one agent: share encodes its observation to packets, perceive fuses it with received packets to boxes."""
 
 from __future__ import annotations
 
@@ -43,9 +43,11 @@ REQUEST_MAP_STRIDE = 32
 
 @dataclass(frozen=True)
 class Perception:
-    """boxes: in the agent's own frame, best first. received: the messages that took part, by agent id, from where they were
-    believed to come. corrections: on every message that came, where the agent aligns them. rejected: senders whose content took no
-    part, or only part of it, and why.
+    """Result of one perception.
+
+    boxes: in the agent's frame, by falling score. received: the fused messages by agent id, with their corrected poses.
+    corrections: one for each received message, where the agent corrects poses. rejected: senders whose content was excluded, wholly
+    or in part, with the reason.
     """
 
     boxes: Boxes
@@ -56,7 +58,7 @@ class Perception:
 
 @dataclass(frozen=True)
 class _State:
-    """What a perception leaves behind; it is taken over only where the whole perception succeeded."""
+    """State after a perception; it is stored only if the whole perception succeeded."""
 
     message_history: MessageHistory
     sender_states: dict[int, SenderState]
@@ -64,13 +66,13 @@ class _State:
 
 
 class Agent:
-    """A detector, a way to collaborate, and a limit in bytes for each message.
+    """A detector, a fusion strategy, and a byte budget for each message.
 
-    Nothing but the bytes of share passes between two agents; frames carry no labels, so truth cannot leak by type.
-    token_encoding: how tokens are written; None: as is usual for these weights (``agents.token_codec``).
-    send_request_map: its messages of tokens say, a byte a window, where it needs no help (``comms.request_map``).
-    pose_correction: corrects where others say they are before anything is fused; None believes them. map_predictor: draws what the
-    agent then says of the map (``agents.map_perception``); None: nothing.
+    Agents exchange nothing but the packets of share; frames carry no labels, so ground truth cannot leak by type.
+    token_encoding: of the tokens; None: the default of these weights (``agents.token_codec``).
+    send_request_map: messages with tokens carry a request map, one byte a window (``comms.request_map``).
+    pose_correction: corrects prior poses of senders before fusion; None uses the prior poses. map_predictor: predicts the local map
+    that the agent sends (``agents.map_perception``); None sends no map.
     """
 
     def __init__(
@@ -97,11 +99,11 @@ class Agent:
     def share(
         self, frame: AgentFrame, budget_bytes: int | None = None, requests: Sequence[Message] = ()
     ) -> list[bytes]:
-        """The packets that this frame is worth to others, most important first; none if there is nothing to say.
+        """Packets of this frame, most important first; an empty list if there is nothing to send.
 
-        budget_bytes: less than the agent's own, where others need the channel too. A message of tokens is never longer, be
-        it that nothing is said; objects, points and the map know no budget, but what they take is not there for tokens. requests:
-        what came from others; those with a request weigh the tokens by what they do not see themselves.
+        budget_bytes: a limit below the agent's own, for a shared channel. A message with tokens never exceeds it, even if nothing
+        is sent; objects, points and the map are not limited, but reduce the bytes left for tokens. requests: received messages;
+        those with a request map weight the tokens by the sender's lack of confidence there.
         """
         budget = min((b for b in (self.budget_bytes, budget_bytes) if b is not None), default=None)
         message = self.strategy.compose_message(self.perception_cache, frame)
@@ -138,7 +140,7 @@ class Agent:
         return [] if too_long else packets
 
     def _make_request_map(self, frame: AgentFrame) -> RequestMap:
-        """How sure the agent itself is of the objects around it, in the coarsest windows that its grid knows."""
+        """The confidence of the agent's own objects, in windows of the coarsest stride."""
         boxes = self.perception_cache.process(frame).boxes
         return build_request_map(
             boxes.center[:, :2], boxes.score, self.perception_cache.detector.config.grid.at(REQUEST_MAP_STRIDE)
@@ -146,21 +148,21 @@ class Agent:
 
     @property
     def token_format(self) -> TokenFormat:
-        """What tokens must look like to be fused by this agent."""
+        """The token format that this agent can fuse."""
         return make_token_format(self.perception_cache.detector, self._tables)
 
     def inbox(self, expire_ns: int | None = None) -> Inbox:
-        """An inbox that keeps no tokens but those that this agent can fuse."""
+        """An inbox that accepts only tokens that this agent can fuse."""
         return Inbox(expire_ns=expire_ns, token_format=self.token_format)
 
     def perceive(self, frame: AgentFrame, inbox: Inbox | Iterable[bytes] = (), now_ns: int | None = None) -> Perception:
-        """Boxes around the agent from its own frame and whatever of others' messages has come.
+        """Boxes around the agent from its own frame and from the messages received so far.
 
-        What others send never raises: tokens of another form are left out, and a sender whose content makes fusion fail is left
-        out whole; both stand in ``Perception.rejected``. Nothing of a perception that failed is remembered.
+        Received content never raises: tokens of another format are excluded, and a sender whose content makes fusion fail is
+        excluded as a whole; both are listed in ``Perception.rejected``. A failed perception changes no state.
 
-        inbox: an Inbox that packets were pushed into, best the agent's own (``inbox``), or plain packets. now_ns: when the ego
-        stops waiting; messages that the inbox holds too old by then are left out.
+        inbox: an Inbox that packets were pushed into, preferably the agent's own (``inbox``), or plain packets. now_ns: end of the
+        latency budget; messages that have expired by then are excluded.
         """
         if not isinstance(inbox, Inbox):
             packets, inbox = inbox, self.inbox()
@@ -178,7 +180,7 @@ class Agent:
         return replace(perception, rejected=(*rejected, *failed))
 
     def _perceive(self, frame: AgentFrame, received: list[ReceivedMessage]) -> tuple[Perception, list[Rejection]]:
-        """Fuse what can be fused; the rejections of those whose content cannot."""
+        """Fuse the messages that can be fused, and reject the others."""
         failed: list[Rejection] = []
         try:
             perception, state = self._try_perceive(frame, received)
@@ -189,7 +191,7 @@ class Agent:
             try:
                 perception, state = self._try_perceive(frame, left)
             except Exception as joint_error:
-                # Each passes alone and all fail together: nobody can be named, so nobody takes part, not even what is remembered.
+                # Each message can be fused alone, but not all together: reject all of them and clear the history.
                 failed += [_content_error(reception, joint_error) for reception in left]
                 self.message_history, self._sender_states = MessageHistory(), {}
                 perception, state = self._try_perceive(frame, [])
@@ -203,7 +205,7 @@ class Agent:
     def _find_failing(
         self, frame: AgentFrame, received: Sequence[ReceivedMessage], error: Exception
     ) -> list[Rejection]:
-        """Those of a group that fails whose content alone makes fusion fail, by halving the group."""
+        """Find messages whose content alone makes fusion fail, by bisection of a group that fails."""
         if len(received) <= 1:
             return [_content_error(reception, error) for reception in received]
         failed = []
@@ -215,7 +217,7 @@ class Agent:
         return failed
 
     def _try_perceive(self, frame: AgentFrame, received: Sequence[ReceivedMessage]) -> tuple[Perception, _State]:
-        """One perception and the state after it; the agent's own state is as before, also after an error."""
+        """One perception and the state after it; the agent's own state is restored, also after an error."""
         before = _State(copy(self.message_history), self._sender_states, self.perception_cache.history)
         try:
             usable, corrections = self._correct_poses(frame, tuple(received))
@@ -237,7 +239,7 @@ class Agent:
     def _correct_poses(
         self, frame: AgentFrame, received: tuple[ReceivedMessage, ...]
     ) -> tuple[tuple[ReceivedMessage, ...], tuple[CorrectionOutcome, ...]]:
-        """What was heard from where it belongs, without what belongs nowhere."""
+        """Messages with corrected poses, without those whose pose is uncertain or inconsistent."""
         if self.pose_correction is None:
             return received, ()
         corrected = self.pose_correction.correct(
@@ -259,7 +261,7 @@ def _content_error(reception: ReceivedMessage, error: Exception) -> Rejection:
 
 
 def _remove_own_body(boxes: Boxes, frame: AgentFrame) -> Boxes:
-    """Without the box that others see where the agent itself stands."""
+    """Remove the box of the agent itself, which other agents detect."""
     if frame.is_infrastructure:
         return boxes
     return boxes[(boxes.center[:, 0].abs() > EGO_HALF_SIZE_M[0]) | (boxes.center[:, 1].abs() > EGO_HALF_SIZE_M[1])]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Between a net that describes objects and the messages that carry its words (FeaKM section 4.2.1).
+"""Keypoint descriptors of objects in messages (FeaKM section 4.2.1).
 
-Places, headings and sizes go as a message's objects, 13 bytes each; descriptors beside them, a byte a number (comms/wire.py).
+Positions, headings and sizes are sent as objects of a message, 13 bytes each; descriptors take one byte a channel (comms/wire.py).
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from manyeyes.models.pose.keypoint_net import DetectorView
 def extract_own_keypoints(
     net: FeakmNet, cache: PerceptionCache, frame: AgentFrame, boxes: Boxes | None = None
 ) -> Keypoints:
-    """The agent's own boxes, or those of them that are given, as far as the net takes them for keypoints: best first."""
+    """Keypoints among the agent's own boxes, or among the given ones, by falling score."""
     keypoint_config = net.config.keypoints
     if not isinstance(keypoint_config, BoxKeypointConfig) or keypoint_config.descriptor_dim != DESCRIPTOR_DIM:
         raise ConfigError(
             f"A message carries objects with {DESCRIPTOR_DIM} numbers each; this net has {keypoint_config.descriptor_dim} "
-            f"of {type(keypoint_config).__name__}. Nets of 'manyeyes train --preset feakm-small' can be sent; --study feakm takes any."
+            f"of {type(keypoint_config).__name__}. Use a net of 'manyeyes train --preset feakm-small'; "
+            "--study feakm takes any net."
         )
     net.check_views(cache.detector.fingerprint)
     output = cache.process(frame)
@@ -36,8 +37,9 @@ def extract_own_keypoints(
 
 
 def attach_descriptors(net: FeakmNet, cache: PerceptionCache, frame: AgentFrame, message: Message) -> Message:
-    """The message of a frame with the descriptor of each of its objects, zeros for those that the net leaves out; a message
-    without objects gets those that the net describes.
+    """The message of a frame with a descriptor for each of its objects, zeros for those that are no keypoints.
+
+    A message without objects gets the boxes of the keypoints.
     """
     points = extract_own_keypoints(net, cache, frame, message.objects)
     objects = points.boxes if message.objects is None else message.objects
@@ -48,7 +50,7 @@ def attach_descriptors(net: FeakmNet, cache: PerceptionCache, frame: AgentFrame,
 
 
 def extract_message_keypoints(message: Message) -> Keypoints | None:
-    """What a message describes; None where its sender describes nothing."""
+    """Keypoints of a message; None without descriptors."""
     if message.objects is None or message.descriptors is None:
         return None
     points = Keypoints(message.objects, message.descriptors)

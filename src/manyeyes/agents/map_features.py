@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A look at the map, shared: an agent's frame to packets, and packets of many looks to the elements of a tile.
+"""BEV feature messages of the map model: an agent's frame to packets, and packets of many frames to the elements of a tile.
 
-The only way from one to the other is bytes, for an agent's own looks too: a map is drawn by whoever collects them. Source:
-CrowdMap section 2.2.
+Features are exchanged as packets only, those of an agent's own frames too. Source: CrowdMap section 2.2.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ def encode_map_features(
     budget_bytes: int | None = DEFAULT_BUDGET_BYTES,
     objects: Boxes | None = None,
 ) -> list[bytes]:
-    """The packets that one look is worth, cells that most likely hold an element first; none if nothing was seen.
+    """Packets of the features of one frame, cells by falling score; an empty list without features.
 
-    objects: what the agent detected in its frame, for those who correct claimed poses by what both see; not in the budget.
+    objects: detections in the agent's frame, for pose correction at the receiver; they are not part of the budget.
     """
     sensors = model.config.bev.sensors
     with torch.inference_mode():
@@ -58,7 +57,7 @@ def encode_map_features(
 
 
 def decode_map_features(packets: Iterable[bytes], model: MapModel) -> Message | None:
-    """The message of one look, as far as its packets came; None without tokens that these weights can fuse."""
+    """The message of the received packets of one frame; None without tokens that these weights can fuse."""
     fragments = [wire.decode_packet(packet) for packet in packets]
     if not fragments:
         return None
@@ -75,7 +74,7 @@ def is_compatible(message: Message, model: MapModel) -> bool:
 
 
 def predict_tile(model: MapModel, messages: Sequence[Message], world_from_tile: Transform) -> MapElements:
-    """The elements of one tile, in its frame, best first, from messages with tokens; without any, what nobody's look suggests."""
+    """The elements of one tile, in its frame, by falling score, from messages with tokens; without any, from empty features."""
     grid = model.token_grid
     tile_from_world = world_from_tile.inverse()
     tokens = [message.tokens for message in messages if message.tokens is not None]
@@ -88,7 +87,7 @@ def predict_tile(model: MapModel, messages: Sequence[Message], world_from_tile: 
 
 
 def _batch(tokens: Sequence[SparseBev], grid_cells: int) -> SparseBev:
-    """Tokens of several looks on a batch of as many grids."""
+    """Tokens of several messages as a batch of grids."""
     key = torch.cat([one.sites.key + i * grid_cells for i, one in enumerate(tokens)])
     return SparseBev(torch.cat([one.features for one in tokens]), Sites(key, tokens[0].grid, len(tokens)))
 

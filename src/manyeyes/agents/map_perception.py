@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an agent draws of the map around itself: from its own look alone, or with the looks that it heard, to a message's section.
+"""Local map prediction of one agent, from its own features alone or fused with received ones, as a section of a message.
 
-Sources: CrowdMap sections 2.2 and 3.1. A local map is what one agent sees ahead, 30 m by 30 m from a vehicle and 50 m by 30 m from
-a roadside unit; a semi-global one is the whole tile of 120 m by 60 m about the agent, drawn from its own look and those of others.
+Sources: CrowdMap sections 2.2 and 3.1. A local map covers the area ahead, 30 m by 30 m for a vehicle and 50 m by 30 m for a
+roadside unit. A semi-global map covers the tile of 120 m by 60 m around the agent, from its own and received features.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from manyeyes.ops.polyline import simplify
 Floats = NDArray[np.float64]
 Window = tuple[float, float, float, float]
 MapPredictor = Callable[[AgentFrame, Sequence[Message]], LocalMap | None]
-"""An agent's frame, and messages with looks of others, to what it says of the map; None: nothing."""
+"""Predict a local map from an agent's frame and received messages with map features; None without a map."""
 
 
 @dataclass(frozen=True)
 class MapShareConfig:
-    """vehicle_window, roadside_window: what is drawn, x_min, y_min, x_max, y_max metres in the agent's frame. use_neighbours: also
-    from others' looks.
+    """Settings of the local map that an agent sends.
 
-    min_score: of an element that is said; min_length_m, min_area_m2: length of a line and area of a crossing. simplify_tolerance_m:
-    how far what is said may leave what was drawn.
+    vehicle_window, roadside_window: predicted area, x_min, y_min, x_max, y_max metres in the agent's frame. use_neighbours: fuse
+    received features too. min_score: of a sent element; min_length_m, min_area_m2: of a line and of a crossing.
+    simplify_tolerance_m: maximum deviation of a sent line from the predicted one.
     """
 
     vehicle_window: Window = (0.0, -15.0, 30.0, 15.0)
@@ -49,7 +49,7 @@ class MapShareConfig:
     simplify_tolerance_m: float = 0.03
 
     def window(self, frame: AgentFrame) -> Window:
-        """What is drawn around this agent."""
+        """The predicted area around this agent."""
         return self.roadside_window if frame.is_infrastructure else self.vehicle_window
 
 
@@ -58,7 +58,7 @@ MAP_MODES = {"local": MapShareConfig(), "semi-global": MapShareConfig(_TILE, _TI
 
 
 def get_map_share_config(name: str) -> MapShareConfig:
-    """A way to survey by name; ConfigError lists the known ones."""
+    """The settings of a map mode; ConfigError lists the known modes."""
     if name not in MAP_MODES:
         raise ConfigError(f"No map mode is called {name!r}; known: {', '.join(MAP_MODES)}.")
     return MAP_MODES[name]
@@ -66,13 +66,13 @@ def get_map_share_config(name: str) -> MapShareConfig:
 
 @dataclass(frozen=True)
 class MapModelPredictor:
-    """A map model that looks at frames; what it draws is cut to what looks could cover, and only what is sound is said."""
+    """A map model applied to frames; predictions are clipped to the covered area and filtered."""
 
     model: MapModel
     config: MapShareConfig = MapShareConfig()
 
     def __call__(self, frame: AgentFrame, received: Sequence[Message] = ()) -> LocalMap | None:
-        """The elements in the agent's frame; None where its own sensors, and those whose looks it heard, saw nothing."""
+        """The elements in the agent's frame; None without own or received features."""
         own = decode_map_features(encode_map_features(self.model, frame), self.model)
         others = [m for m in received if is_compatible(m, self.model)]
         messages = [
@@ -87,7 +87,7 @@ class MapModelPredictor:
         return LocalMap(clip_to_view(predicted.take(predicted.score >= self.config.min_score), view, self.config), view)
 
     def _view(self, frame: AgentFrame, tile_from_sender: Sequence[Transform]) -> Floats:
-        """The convex hull of the ground that looks cover, within the agent's window: an open ring, anticlockwise."""
+        """The convex hull of the covered ground, clipped to the agent's window: an open ring, anticlockwise."""
         grid = self.model.token_grid
         corners = rectangle((grid.x_min, grid.y_min, grid.x_max, grid.y_max))
         placed = [corners @ _rotation_2d(float(m.yaw)).T + m.translation[:2].numpy() for m in tile_from_sender]
@@ -95,9 +95,9 @@ class MapModelPredictor:
 
 
 def clip_to_view(elements: MapElements, view: Floats, config: MapShareConfig) -> MapElements:
-    """What of drawn elements is worth saying: cut to a view (K, 2), convex and anticlockwise, long enough, and with few points.
+    """Clip predicted elements to a convex, anticlockwise view (K, 2), simplify them and drop short ones.
 
-    A crossing whose ring crosses itself is no shape, and is left out.
+    Crossings whose ring intersects itself are dropped.
     """
     rows: list[int] = []
     parts: list[Floats] = []
@@ -121,7 +121,7 @@ def clip_to_view(elements: MapElements, view: Floats, config: MapShareConfig) ->
 def encode_map_message(
     frame: AgentFrame, local_map: LocalMap, fingerprint: bytes = bytes(8), mtu: int = wire.DEFAULT_MTU
 ) -> list[bytes]:
-    """The packets of a message that speaks of the map alone; fingerprint: of the weights that drew it."""
+    """Packets of a message with a local map only; fingerprint: of the weights that predicted it."""
     return wire.encode(replace(make_header(frame, fingerprint), local_map=local_map), mtu=mtu)
 
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The agents of one drive and a cartographer: looks pass among agents that draw together, maps go to the service.
+"""Replay of one drive with map agents and a map server: agents exchange features, and send local maps to the server.
 
-There are two kinds of air: agents hear each other's tokens on one, the cartographer hears everybody's elements on the other.
-Nothing else passes, and what passes is counted as it is handed to the radio.
+Features and local maps use separate channels. Only packets are exchanged; their bytes are counted when they are published.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ from manyeyes.comms.local_bus import LocalBus
 from manyeyes.datatypes import AgentFrame
 
 SERVER_ID = -(2**31)
-"""The cartographer's number on the bus."""
+"""Receiver id of the map server on the bus."""
 DRAIN_NS = 10 * NS_PER_S
-"""How long the service still listens when the drive is over."""
+"""How long the server still receives packets after the drive has ended."""
 
 
 @dataclass(frozen=True)
 class SentRecord:
-    """What one agent put on the air at one instant: bytes of its look; bytes and packets of its map, and elements in it."""
+    """What one agent sent at one instant: bytes of features; bytes, packets and elements of its local map."""
 
     agent_id: int
     time_ns: int
@@ -39,12 +38,11 @@ class SentRecord:
 
 @dataclass
 class MapReplay:
-    """One drive. map_predictor: how agents draw. encode_features: a frame to the packets of its look, for agents that draw
-    together; None: each draws from its own. drive: its name, before agents' numbers. fingerprint: of the weights that draw.
-    channel: a preset's name.
+    """Replay of one drive.
 
-    latency_budget_s: how long messages are waited for before tiles are drawn and maps are taken; what comes to the service later is
-    taken with the next instant.
+    map_predictor: of all agents. encode_features: a frame to the packets of its features, for agents that fuse them; None: each
+    agent uses its own only. drive: prefix of agent names at the server. fingerprint: of the weights. channel: name of a preset.
+    latency_budget_s: delay before prediction and before ingestion; later packets are ingested at the next instant.
     """
 
     map_predictor: MapPredictor
@@ -65,7 +63,7 @@ class MapReplay:
         self._feature_bus, self._map_bus = LocalBus(Channel(radio, self.seed)), LocalBus(Channel(radio, self.seed))
 
     def step(self, frames: Sequence[AgentFrame]) -> tuple[SentRecord, ...]:
-        """One instant: looks are shared, maps are drawn and sent, and the cartographer takes what has come."""
+        """One instant: share features, predict and send local maps, and ingest them at the server."""
         feature_sizes = [
             self._send(self._feature_bus, frame, [] if self.encode_features is None else self.encode_features(frame))
             for frame in frames
@@ -88,18 +86,18 @@ class MapReplay:
         return tuple(records)
 
     def finish(self, frames: Sequence[AgentFrame]) -> None:
-        """The drive is over; the service takes what is still under way. frames: the last."""
+        """Ingest the packets still in flight at the end of the drive. frames: of the last instant."""
         self._now_ns += DRAIN_NS
         self._ingest(frames)
 
     def _ingest(self, frames: Sequence[AgentFrame]) -> None:
-        """The service stands amid the agents."""
+        """Ingest what the server received at the mean position of the agents."""
         if frames:
             x, y = np.mean([_position_xy(frame) for frame in frames], 0).tolist()
             self.map_server.ingest(self._receive(self._map_bus, SERVER_ID, (x, y)).received_messages(), self.drive)
 
     def _receive(self, bus: LocalBus, receiver_id: int, position_xy: tuple[float, float]) -> Inbox:
-        """The inbox of an agent, or of the service, with what has come by now."""
+        """The inbox of an agent or of the server, with all packets that have arrived."""
         inbox = self._inboxes.setdefault(receiver_id, Inbox(expire_ns=DRAIN_NS))
         for delivery in bus.deliver(receiver_id, position_xy, self._now_ns):
             inbox.push(delivery.packet, delivery.arrival_ns)
@@ -107,7 +105,7 @@ class MapReplay:
 
     @staticmethod
     def _send(bus: LocalBus, frame: AgentFrame, packets: list[bytes]) -> int:
-        """Hand packets to the agent's radio; their bytes."""
+        """Publish packets of an agent; returns their number of bytes."""
         bus.publish(frame.agent_id, _position_xy(frame), packets, frame.timestamp_ns)
         return sum(map(len, packets))
 

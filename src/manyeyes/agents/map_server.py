@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collects what agents say of the map, from any bus or replay, and keeps the map that follows.
+"""Map server: collects local maps from messages and maintains the fused map.
 
-Each message with a section of the map becomes an observation: who, when, from where with what covariance, in which view. It is
-added to a map in memory at once (``maps.fusion.incremental``); the fold over all observations (``maps.fusion.fuse``) stays the
-map of record. Source: the requirement that observations reach a map as bytes that were sent, like all else between agents.
+Each message with a local map becomes an observation with agent, time, pose, covariance and view. It updates a map in memory
+incrementally (``maps.fusion.incremental``); the batch fusion of all observations (``maps.fusion.fuse``) is the reference map.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ from manyeyes.maps.fusion.incremental import IncrementalConfig, IncrementalMap, 
 Floats = NDArray[np.float64]
 
 MIN_SIGMA_M, MIN_SIGMA_RAD = 0.05, float(np.radians(0.05))
-"""Nobody knows where it is better than this, whatever it claims: a format without covariance reads as zero."""
+"""Lower bounds of the standard deviations of a sender's pose; formats without covariance read as zero."""
 NEW_PASS_NS = 60_000_000_000
-"""An agent that was silent for longer comes by anew."""
+"""A longer gap between messages of an agent starts a new pass."""
 FIRST_REBUILD_COUNT = 8
-"""Observations after which the map in memory is folded anew, and again whenever they have doubled."""
+"""Number of observations at the first rebuild of the map in memory; it is rebuilt whenever their number has doubled."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +43,14 @@ class RejectedMessage:
 
 
 class MapServer:
-    """The map service: hears messages, keeps observations and the map.
+    """The map server: ingests messages and maintains observations and the map.
 
-    frame: of the map, whose zero is the world's point origin_xy (m). trusted: pseudonyms of surveyed poles, whose one word
-    counts; whoever says of itself that it is one, is not. initial_map: a map to go on from.
+    frame: of the map, whose origin is the world's point origin_xy (m). trusted: pseudonyms of surveyed roadside units, of which a
+    single observation suffices; a flag in a message does not make its sender trusted. initial_map: a map to extend.
 
-    What is added one by one is never moved again, so that a map that grows from nothing doubles lines. Hence it is folded anew
-    whenever its observations have doubled, which costs each of them a constant number of folds; not so a map to go on from, whose
-    observations are not here.
+    Incremental updates never move elements again, so a map that grows from nothing has duplicate lines. It is therefore rebuilt
+    whenever the number of observations has doubled, a constant number of rebuilds for each observation. An initial map is not
+    rebuilt, because its observations are not available.
     """
 
     def __init__(
@@ -76,7 +75,7 @@ class MapServer:
 
     @property
     def observations(self) -> tuple[Observation, ...]:
-        """All that was taken, in order."""
+        """All accepted observations, in the order of ingestion."""
         return tuple(self._accepted.values())
 
     @property
@@ -86,17 +85,17 @@ class MapServer:
 
     @property
     def num_incomplete(self) -> int:
-        """Messages of which packets are missing: what they do not say must not count as not seen, so none was taken."""
+        """Number of messages with missing packets; they are not ingested, because absent elements would count as not observed."""
         return len(self._partial)
 
     def ingest(self, messages: Iterable[ReceivedMessage], drive: str = "") -> list[UpdateResult]:
-        """Take what is new of an inbox, as often as it is asked; see :meth:`ingest_message`."""
+        """Ingest the new messages of an inbox; see :meth:`ingest_message`."""
         return [result for one in messages if (result := self.ingest_message(one, drive)) is not None]
 
     def ingest_message(self, received: ReceivedMessage, drive: str = "") -> UpdateResult | None:
-        """Take one message; None where it has no map, was taken before, is not whole yet, or cannot be used.
+        """Ingest one message; None if it has no map, was ingested before, is incomplete, or is rejected.
 
-        drive: names whom the sender's number means, where several drives number their agents alike.
+        drive: prefix of the agent's name, where several drives use the same agent ids.
         """
         message = received.message
         agent = f"{drive}/{message.agent_id}" if drive else str(message.agent_id)
@@ -123,15 +122,15 @@ class MapServer:
         return result
 
     def map(self) -> VectorMap:
-        """The map as it stands: every observation added when it came."""
+        """The current map, updated with each observation in the order of arrival."""
         return self._incremental_map.build_map()
 
     def rebuild(self) -> VectorMap:
-        """The map of record: all observations at once, in no order; without what a map to go on from held."""
+        """Batch fusion of all observations, independent of their order; an initial map is not included."""
         return fuse(self.observations, self._config.fusion, self.frame)
 
     def _assign_pass_number(self, agent: str, time_ns: int) -> int:
-        """The number of the drive that this look belongs to."""
+        """The number of the pass that this observation belongs to."""
         last, number = self._passes.get(agent, (time_ns, 0))
         number += abs(time_ns - last) > NEW_PASS_NS
         self._passes[agent] = time_ns, number
@@ -141,10 +140,10 @@ class MapServer:
 def make_observation(
     message: Message, agent: str, pass_id: str, origin: Floats | None = None, trusted: bool = False
 ) -> Observation:
-    """A message's map as an observation; ObservationError says what of it cannot be used.
+    """The local map of a message as an observation; invalid content raises ObservationError.
 
-    origin: (3,) x, y of the map's zero in the world (m), and 0. A claim's covariance is widened by the least that anybody errs.
-    Crossings whose rings cross themselves are left out.
+    origin: (3,) x, y of the map's origin in the world (m), and 0. The covariance of the pose is inflated by MIN_SIGMA_M and
+    MIN_SIGMA_RAD. Crossings whose rings intersect themselves are dropped.
     """
     if message.local_map is None:
         raise ObservationError("Observation.elements: expected a message with a map; got one without.")
@@ -167,7 +166,7 @@ def make_observation(
 
 
 def _drop_self_intersecting(local_map: LocalMap) -> MapElements:
-    """The elements without crossings whose rings cross themselves; rings of too many points stay, and are refused later."""
+    """The elements without self-intersecting crossings; rings with too many points stay, and are rejected later."""
     elements = local_map.elements
     rings = np.flatnonzero(elements.closed & (elements.counts <= LIMITS.max_ring_points)).tolist()
     crossed = [row for row in rings if not is_simple_ring(elements.polyline(row))]

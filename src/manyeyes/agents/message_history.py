@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an agent remembers of the others: the last few messages of each, since one sweep of few beams does not say everything."""
+"""Buffer of the last few messages of each sender: several sparse sweeps are more complete than one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_AGE_NS = 500_000_000
 
 
 class MessageHistory:
-    """The last messages of each sender, as they were heard. What is older than keep_ns is forgotten."""
+    """The last messages of each sender, as received. Messages older than max_age_ns are dropped."""
 
     def __init__(self, max_age_ns: int = MAX_AGE_NS) -> None:
         self._max_age_ns = max_age_ns
@@ -23,11 +23,11 @@ class MessageHistory:
     def update_and_get(
         self, received: Sequence[Message], now_ns: int, untrusted: Collection[int] = ()
     ) -> list[Message]:
-        """Each message heard, and behind it up to REMEMBERED older ones of its sender, newest first; then the last ones of those
-        who fell silent, or whose message of now nobody could place, while they are no older than keep_ns at now_ns.
+        """Each received message, followed by up to HISTORY_FRAMES older ones of its sender, newest first; then the last messages of
+        senders without a current message, while they are no older than max_age_ns at now_ns.
 
-        A message heard again, with more of its packets, takes its own place; a time that goes back begins anew. untrusted:
-        senders who are forgotten.
+        A message received again with more of its packets replaces itself; a timestamp that decreases clears the history.
+        untrusted: senders whose history is cleared.
         """
         if now_ns < self._now_ns:
             self._messages = {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a detector made of an agent's own sweeps, remembered: sharing and perceiving see each once, and later ones look back."""
+"""Detector and cache of its outputs on an agent's own sweeps: share and perceive run it once a sweep, later frames reuse them."""
 
 from __future__ import annotations
 
@@ -18,23 +18,22 @@ from manyeyes.models.detector.proposal import PROPOSAL_DIM, make_proposals
 from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens
 
 MAX_GAP_NS = 250_000_000
-"""A sweep that lies farther back than this, or one of another agent or scenario, says nothing of the motion since."""
+"""Maximum time between two consecutive sweeps; a longer gap starts a new scenario."""
 MAX_EGO_STEP_M = 30.0
-"""An agent that moved farther between two sweeps did not drive there: another scenario has begun."""
+"""Maximum displacement of an agent between two consecutive sweeps; a larger one starts a new scenario."""
 HISTORY_FRAMES = 2
-"""So many instants back what was seen or heard takes part in what is perceived."""
+"""Number of previous frames whose outputs and messages are fused."""
 TRACK_FRAMES = 5
-"""So many instants back boxes are followed: half a second at 10 Hz, in which a vehicle hardly changes its speed."""
+"""Number of previous frames for velocity estimation: half a second at 10 Hz, in which a vehicle hardly changes its speed."""
 MAX_TOKEN_TO_BOX_M = 2.0
-"""A token belongs to the box whose centre is the nearest to the one that it proposes, if it is no farther."""
+"""Maximum distance between the centre that a token proposes and the centre of its box."""
 
 
 @dataclass(frozen=True)
 class AgentOutput:
-    """One agent's own view: what it can tell others (N, C + PROPOSAL), and its raw boxes.
+    """Detector output on one agent's own frame: tokens to share (N, C + PROPOSAL), and raw boxes.
 
-    tokens_raw_velocity: what it would tell without its past, with velocities as the detector states them: the selector has learned
-    on that.
+    tokens_raw_velocity: the tokens with the detector's own velocities, which the token selector was trained on.
     """
 
     shared_tokens: SparseBev
@@ -44,19 +43,19 @@ class AgentOutput:
 
     @cached_property
     def boxes(self) -> Boxes:
-        """The agent's own boxes, in its frame, best first; decoded when first asked for, since not everybody sends them."""
+        """The agent's own boxes, in its frame, by falling score; decoded at first use, because few strategies send them."""
         return decode(self.raw, self.config)[0]
 
     def with_velocity(self, velocity: Tensor) -> AgentOutput:
-        """The same view, its boxes as fast as (M, 2) m/s says, and so their tokens; what belongs to no box stands still."""
+        """The same output with box velocities (M, 2) m/s, for their tokens too; tokens without a box get velocity 0."""
         place = self.raw.sites.xy + self.raw.offset * self.raw.sites.grid.cell_size_m
         distance = torch.cdist(place, self.boxes.center[:, :2])
-        # One more column, for those that belong to none.
+        # One more column for tokens without a box.
         nearest = pad(distance, (0, 1), value=MAX_TOKEN_TO_BOX_M).argmin(1)
         raw = replace(self.raw, velocity=pad(velocity, (0, 0, 0, 1))[nearest] / SPEED_UNIT)
         features = torch.cat((self.shared_tokens.features[:, :-PROPOSAL_DIM], make_proposals(raw)), 1)
         output = replace(self, shared_tokens=self.shared_tokens.with_features(features), raw=raw)
-        # Speed decides nothing in decoding: the boxes are the same, and need not be found again.
+        # Decoding does not depend on velocity: reuse the decoded boxes.
         vars(output)["boxes"] = replace(self.boxes, velocity=velocity)
         return output
 
@@ -66,13 +65,12 @@ History = tuple[tuple[AgentFrame, PointCloud] | None, tuple[AgentFrame, SparseBe
 
 
 class PerceptionCache:
-    """A detector and the last few frames that it saw, of one agent. Frames are told apart by identity.
+    """A detector and its outputs on the last frames of one agent. Frames are compared by identity.
 
-    max_frames: how many. They are forgotten where time goes back, stands still, or jumps: a scenario has ended.
-    feature_cache: views by agent and time of capture, which are taken as they are and added to, so that several players of one
-    recording look at each sweep once between them. last_fused: the last frame in which the agent fused what it heard, and the fused
-    tokens, where a method keeps them. velocity_config: how boxes are followed through those frames; None leaves the velocities that
-    the detector states.
+    max_frames: number of cached frames; the cache is cleared when time decreases, stands still, or jumps. feature_cache: outputs by
+    agent and timestamp, shared by several replays of one recording, which read and extend it. last_fused: the last fused frame and
+    its fused tokens, for strategies that need them. velocity_config: of velocity estimation over those frames; None keeps the
+    velocities of the detector.
     """
 
     def __init__(
@@ -91,11 +89,11 @@ class PerceptionCache:
 
     @property
     def grid(self) -> BevGrid:
-        """The range that the detector sees around the agent."""
+        """The grid of the detector around the agent."""
         return self.detector.config.grid
 
     def process(self, frame: AgentFrame) -> AgentOutput:
-        """The agent's own view of its frame, with the sweep before it where there is one."""
+        """Detector output on a frame, with its previous sweep if there is one."""
         for cached_frame, output in self._outputs:
             if cached_frame is frame:
                 return output
@@ -113,7 +111,7 @@ class PerceptionCache:
         return output
 
     def _with_estimated_velocity(self, frame: AgentFrame, output: AgentOutput) -> AgentOutput:
-        """The view with its boxes as fast as the last frames in which there were any tell."""
+        """The output with velocities estimated over the last frames that have boxes."""
         if self._velocity_config is None:
             return output
         earlier = []
@@ -134,12 +132,12 @@ class PerceptionCache:
     def previous_outputs(
         self, frame: AgentFrame, num_frames: int = HISTORY_FRAMES
     ) -> list[tuple[AgentFrame, AgentOutput]]:
-        """What the agent saw at its last instants before this frame, newest first."""
+        """Outputs of the frames before this one, newest first."""
         at = next((i for i, (cached_frame, _) in enumerate(self._outputs) if cached_frame is frame), 0)
         return self._outputs[max(0, at - num_frames) : at][::-1]
 
     def previous_tokens(self, frame: AgentFrame, num_frames: int = HISTORY_FRAMES) -> list[AgentTokens]:
-        """What the agent itself told at its last instants before this frame, newest first, for the ego 0."""
+        """The agent's own tokens of the frames before this one, newest first, for ego 0."""
         parts = []
         for before, output in self.previous_outputs(frame, num_frames):
             age_s = (frame.timestamp_ns - before.timestamp_ns) / 1e9
@@ -155,16 +153,16 @@ class PerceptionCache:
         return parts
 
     def record_sent(self, frame: AgentFrame, tokens: SparseBev) -> None:
-        """Keeps which tokens (N, C + PROPOSAL) of this frame went out; who says the same frame anew takes the first word back."""
+        """Record the sent tokens (N, C + PROPOSAL) of this frame; a second call for the same frame replaces the first."""
         self._sent = [*(s for s in self._sent if s[0] is not frame), (frame, tokens)][-HISTORY_FRAMES - 1 :]
 
     def recently_sent(self, frame: AgentFrame) -> list[tuple[AgentFrame, SparseBev]]:
-        """What the agent said at its last instants before this frame, oldest first: what others still remember."""
+        """Tokens sent in the frames before this one, oldest first: those still in the receivers' history."""
         earlier = [(then, tokens) for then, tokens in self._sent if then is not frame]
         return [(then, tokens) for then, tokens in earlier[-HISTORY_FRAMES:] if is_consecutive(frame, then)]
 
     def previous_merged_cloud(self, frame: AgentFrame, merged: PointCloud) -> PointCloud | None:
-        """What was merged around the agent at its last instant, moved to this one; what is merged now is kept for the next."""
+        """The merged cloud of the previous frame, in this frame; the current one is stored for the next frame."""
         last, self._merged = self._merged, (frame, merged)
         if last is None or not is_consecutive(frame, last[0]):
             return None
@@ -172,7 +170,7 @@ class PerceptionCache:
 
     @property
     def history(self) -> History:
-        """What perceiving leaves behind; assign it to take a perception back."""
+        """State changed by perception; assign an earlier value to restore it."""
         return self._merged, self.last_fused
 
     @history.setter
@@ -180,7 +178,7 @@ class PerceptionCache:
         self._merged, self.last_fused = history
 
     def run_detector(self, cloud: PointCloud, earlier: PointCloud | None = None) -> AgentOutput:
-        """The view of any cloud in an agent's frame, and of the one before it in the same frame; not remembered."""
+        """Detector output on any cloud in an agent's frame and on the previous one in the same frame; not cached."""
         with torch.inference_mode():
             before = PointCloud.of(torch.zeros(0, 3)) if earlier is None else earlier
             extracted = self.detector.extract_features([cloud], [before])
@@ -189,17 +187,17 @@ class PerceptionCache:
             return AgentOutput(shared_tokens, shared_tokens, raw, self.detector.config.decode)
 
     def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
-        """Raw boxes around one ego."""
+        """Raw boxes around one ego from fused tokens."""
         with torch.inference_mode():
             return self.detector.fuse(tokens, past)
 
     def decode(self, raw: RawBoxes) -> Boxes:
-        """Boxes around one ego, in its frame, best first."""
+        """Decoded boxes around one ego, in its frame, by falling score."""
         return decode(raw, self.detector.config.decode)[0]
 
 
 def is_consecutive(frame: AgentFrame, before: AgentFrame) -> bool:
-    """Whether one frame is the continuation of another: the same agent, a little later, about there."""
+    """Whether a frame continues another one: same agent, a small time gap, a small displacement."""
     gap = frame.timestamp_ns - before.timestamp_ns
     if frame.agent_id != before.agent_id or not 0 < gap <= MAX_GAP_NS:
         return False

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Before messages are fused: where their senders really are, from what both detect; whom not to believe; who drifts.
+"""Pose correction of received messages before fusion, from objects that ego and sender both detect.
 
-No byte is added for this: the landmarks of a sender are the boxes it sends, or those that its tokens propose, or, where it
-sends its cloud, what the ego's own eyes find in it, and beside them its own vehicle, which others see. Boxes seen earlier are
-moved by their velocity to the ego's instant. A sender whom nobody recognises now is followed from where it was placed a moment ago:
-what it sees itself now is matched with what it saw then.
-Where the corrector is FeaKM's, senders add descriptors, and the boxes that these describe where they send none
-(describing.py): 32 and 13 bytes an object. Spec: specs/pose.md 4.4, 4.7, 4.8.
+No bytes are added: the landmarks of a sender are the boxes it sends, those proposed by its tokens, or detections in its cloud, and
+its own vehicle, which other agents detect. Boxes of an earlier timestamp are propagated by their velocity. A sender without a match
+is propagated from its last corrected pose: its current landmarks are matched with its earlier ones. Pairs of senders are matched
+too; a pose graph combines all matches and isolates inconsistent senders. A monitor reports senders whose prior poses have an offset
+or drift. With a FeaKM corrector, senders add descriptors of 32 bytes an object, and boxes of 13 bytes where they send none.
 """
 
 from __future__ import annotations
@@ -41,16 +40,17 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3
 Floats = NDArray[np.float64]
 
 MAX_SILENCE_S = 60.0
-"""A sender that was silent for so long is judged anew."""
+"""The monitor of a sender restarts after a longer gap."""
 _FAULTY = (PoseHealth.OFFSET, PoseHealth.DRIFTING)
 EGO_NODE = 0
-"""The ego's node in the graph; senders are 1, 2, ... in the order of their messages."""
+"""The ego's node in the pose graph; senders are 1, 2, ... in the order of their messages."""
 
 
 class MessageUse(Enum):
-    """What became of a message. PRIOR: fused where its sender says it is. CORRECTED: fused where objects and claim put
-    it. UNCERTAIN: left out, since nobody knows well enough where it belongs. INCONSISTENT: left out, since what its sender
-    sees fits nobody else's view in one way.
+    """How a message is used.
+
+    PRIOR: fused at its prior pose. CORRECTED: fused at the corrected pose. UNCERTAIN: excluded, since its pose is too uncertain.
+    INCONSISTENT: excluded, since its matches contradict those of the other agents.
     """
 
     PRIOR = "prior"
@@ -61,9 +61,9 @@ class MessageUse(Enum):
 
 @dataclass(frozen=True)
 class CorrectionOutcome:
-    """One message: what objects say of its sender's pose, how far off what is used may be, and how its claims have been.
+    """Outcome for one message: the estimated pose of its sender, its uncertainty, and the health of its prior poses.
 
-    sigma_m: one standard deviation of where the sender's cells land, see Aligner.reach_m. health: the watchman's report.
+    sigma_m: standard deviation of the position of the sender's cells at PoseCorrection.lever_arm_m. health: report of the monitor.
     """
 
     agent_id: int
@@ -75,7 +75,7 @@ class CorrectionOutcome:
 
     @property
     def untrusted(self) -> bool:
-        """Whether nothing that its sender said a moment ago is to be used either."""
+        """Whether earlier messages of the sender are excluded too."""
         return self.use is MessageUse.INCONSISTENT or (
             self.use is MessageUse.UNCERTAIN and self.health.health in _FAULTY
         )
@@ -83,7 +83,7 @@ class CorrectionOutcome:
 
 @dataclass(frozen=True)
 class SenderState:
-    """What to remember of a sender. last_corrected: its last message that objects put where it belongs, near what it claimed."""
+    """State of one sender. last_corrected: its last message with a corrected pose that is consistent with the prior."""
 
     monitor: PoseMonitorState
     last_corrected: Message | None = None
@@ -91,7 +91,7 @@ class SenderState:
 
 @dataclass(frozen=True)
 class CorrectedMessages:
-    """messages: those to be fused, corrected; corrections: one for each that came; states: what to remember, by sender."""
+    """messages: to be fused, with corrected poses; corrections: one a received message; states: of each sender."""
 
     messages: tuple[Message, ...]
     corrections: tuple[CorrectionOutcome, ...]
@@ -100,11 +100,12 @@ class CorrectedMessages:
 
 @dataclass(frozen=True)
 class PoseCorrection:
-    """Settings. corrector: of two agents' landmarks, by name (pose/registry.py), read again where this is sent to
-    another process. min_score: boxes below it are no landmarks. max_sigma_m: a message whose cells may lie this far off (one
-    standard deviation, reach_m from its sender) is not fused. sigma_velocity_mps: error of an object's stated velocity.
-    propagate_s: how long ago a sender may have been placed to be followed from there, 0 for never; sigma_speed_mps,
-    sigma_yaw_rate_rps: how fast it may have gone and turned since, one standard deviation.
+    """Settings of pose correction.
+
+    corrector: name in pose/registry.py, loaded again in each process. min_score: of a landmark box. max_sigma_m: messages with a
+    larger standard deviation of position, lever_arm_m from their sender, are excluded. sigma_velocity_mps: error of an object's
+    velocity. propagate_s: maximum age of a corrected pose that is propagated, 0 for never; sigma_speed_mps, sigma_yaw_rate_rps:
+    standard deviations of the sender's motion since.
     """
 
     corrector: str = "voting"
@@ -129,7 +130,7 @@ class PoseCorrection:
     def correct(
         self, frame: AgentFrame, cache: PerceptionCache, messages: Sequence[Message], states: Mapping[int, SenderState]
     ) -> CorrectedMessages:
-        """The messages that came for a frame, put where they belong. states: of the frame before, by sender."""
+        """Correct the poses of the messages received for a frame. states: of the previous frame, by sender."""
         now_s = frame.timestamp_ns * 1e-9
         new_states = {
             a: s
@@ -178,7 +179,7 @@ class PoseCorrection:
                 kept.append(message)
             elif use is MessageUse.CORRECTED:
                 kept.append(apply_correction(message, frame, estimate))
-            # Whom objects put elsewhere than it says is not followed from there: were it a mistake, it would go on.
+            # Do not propagate from a pose that conflicts with the prior: an error would persist.
             refuted = use is MessageUse.INCONSISTENT or estimate.status is PoseStatus.CONFLICT
             put = kept[-1] if use is MessageUse.CORRECTED else last_corrected.get(message.agent_id)
             new_states[message.agent_id] = SenderState(new_states[message.agent_id].monitor, None if refuted else put)
@@ -186,18 +187,18 @@ class PoseCorrection:
 
     @property
     def net(self) -> FeakmNet | None:
-        """Whose descriptors the corrector reads, if any."""
+        """The net whose descriptors the corrector uses, if any."""
         found = load_corrector(self.corrector)
         return found.net if isinstance(found, FeakmCorrector) else None
 
     def attach_descriptors(self, frame: AgentFrame, cache: PerceptionCache, message: Message) -> Message:
-        """An agent's own message with what the corrector needs beside; one that is dated otherwise than the frame stays."""
+        """Add the descriptors that the corrector needs; a message of another timestamp than the frame is unchanged."""
         if self.net is None or message.timestamp_ns != frame.timestamp_ns:
             return message
         return attach_descriptors(self.net, cache, frame, message)
 
     def extract_own_landmarks(self, frame: AgentFrame, cache: PerceptionCache) -> Landmarks:
-        """What an agent itself sees, as far as the corrector goes by it."""
+        """Landmarks of an agent's own frame for the corrector."""
         if self.net is None:
             landmarks = self._select_landmarks(cache.process(frame).boxes, None, 0.0)
             return landmarks if frame.is_infrastructure else landmarks.with_ego_body()
@@ -205,16 +206,16 @@ class PoseCorrection:
         return self._select_landmarks(points.boxes, points.descriptor, 0.0)
 
     def _message_landmarks(self, cache: PerceptionCache, message: Message, seconds: float) -> Landmarks:
-        """What a message says that left so long ago; nothing, where the corrector needs descriptors and none came."""
+        """Landmarks of a message of that age; none if the corrector needs descriptors and the message has none."""
         if self.net is None:
             landmarks = self._select_landmarks(extract_message_boxes(cache, message), None, seconds)
-            # Where a sender was is not where it is: how fast it goes, it does not say.
+            # An older message does not give the sender's own position now: its velocity is not sent.
             return landmarks if message.is_infrastructure or seconds else landmarks.with_ego_body()
         points = extract_message_keypoints(message)
         return Landmarks.empty() if points is None else self._select_landmarks(points.boxes, points.descriptor, seconds)
 
     def _select_landmarks(self, boxes: Boxes, descriptor: Tensor | None, seconds: float) -> Landmarks:
-        """Boxes that are sure enough, seen so long ago, where they are now."""
+        """Boxes above min_score, propagated by their age."""
         confident = boxes.score >= self.min_score
         now = boxes[confident].after(seconds)
         landmarks = (
@@ -230,8 +231,8 @@ class PoseCorrection:
     def _propagate_prior(
         self, frame: AgentFrame, cache: PerceptionCache, last: Message, message: Message
     ) -> PosePrior | None:
-        """Where a sender is, by where it was placed when it said something before and what it saw then and sees now; None where
-        that is too long ago, or does not fit.
+        """Prior of a sender from its last corrected pose and its motion between both messages; None if the last message is too old
+        or its landmarks do not match.
         """
         seconds = (message.timestamp_ns - last.timestamp_ns) * 1e-9
         if not 0 < seconds <= self.propagate_s:
@@ -252,9 +253,9 @@ class PoseCorrection:
     def _update_monitor(
         self, state: PoseMonitorState | None, message: Message, prior: PosePrior, estimate: PoseEstimate
     ) -> tuple[PoseMonitorState, PoseReport]:
-        """The watchman's state and word after this message; one heard before says nothing new."""
+        """State and report of the monitor after this message; a repeated message does not change them."""
         state, time_s = state or PoseMonitorState.new(), message.timestamp_ns * 1e-9
-        # Where time goes back, another drive has begun.
+        # A decreasing timestamp starts a new drive.
         state = PoseMonitorState.new() if len(state.time_s) and time_s < state.time_s[-1] else state
         again = bool(len(state.time_s)) and time_s == state.time_s[-1]
         return update_monitor(state, estimate, None if again else prior, time_s, self.monitor)
@@ -266,9 +267,7 @@ class PoseCorrection:
         priors: Sequence[PosePrior],
         pairwise_estimates: Sequence[PoseEstimate],
     ) -> tuple[dict[int, PoseEstimate], set[int]]:
-        """What all agents say together of each sender's pose, where two senders also recognise each other's objects; and
-        who contradicts the others.
-        """
+        """Joint estimates of the senders' poses where pairs of senders match too; and the isolated senders."""
         ego_edges = [_make_edge(EGO_NODE, n + 1, pairwise) for n, pairwise in enumerate(pairwise_estimates)]
         sender_edges = []
         for i, j in itertools.combinations(range(len(messages)), 2):
@@ -300,7 +299,7 @@ class PoseCorrection:
     def _decide_use(
         self, estimate: PoseEstimate, pairwise: PoseEstimate, connected: bool, inconsistent: bool, health: PoseReport
     ) -> tuple[MessageUse, float]:
-        """What to do with a message whose pose would be this; connected: others, if not the ego, recognise its objects."""
+        """Use of a message with this estimate; connected: its landmarks match those of any other agent."""
         sigma = math.inf
         if np.isfinite(estimate.covariance).all():
             variance_xy = np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]
@@ -315,7 +314,7 @@ class PoseCorrection:
 
 
 def extract_message_boxes(cache: PerceptionCache, message: Message) -> Boxes:
-    """What a message says of objects, in its sender's frame: sent, proposed by its tokens, or found in its points."""
+    """Objects of a message in its sender's frame: sent, proposed by its tokens, or detected in its points."""
     if message.objects is not None:
         return message.objects
     tokens = message.tokens
@@ -325,7 +324,7 @@ def extract_message_boxes(cache: PerceptionCache, message: Message) -> Boxes:
 
 
 def apply_correction(message: Message, frame: AgentFrame, estimate: PoseEstimate) -> Message:
-    """The message from where the estimate puts its sender, as seen from the ego's claimed pose."""
+    """The message with its sender's pose replaced by the estimate, relative to the ego's prior pose."""
     assert estimate.ego_from_other is not None
     world_from_ego = frame.world_from_agent
     c, s = float(world_from_ego.yaw.cos()), float(world_from_ego.yaw.sin())
@@ -339,7 +338,7 @@ def apply_correction(message: Message, frame: AgentFrame, estimate: PoseEstimate
 
 
 def _make_edge(i: int, j: int, estimate: PoseEstimate) -> RelativePoseEdge | None:
-    """What objects say of two agents, where they say it."""
+    """The pose graph edge of two agents; None without a match."""
     if not estimate.status.has_estimate or estimate.measured is None or estimate.measured_covariance is None:
         return None
     return RelativePoseEdge(i, j, estimate.measured, estimate.measured_covariance)

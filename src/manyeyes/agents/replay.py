@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording played through agents on a channel: share, bytes, deliver, perceive; the functions that an agent calls."""
+"""Replay of a recording with agents on a channel: share, encode, deliver, perceive."""
 
 from __future__ import annotations
 
@@ -23,24 +23,23 @@ from manyeyes.models.detector.detector import Detector
 
 EXPIRE_NS = 500_000_000
 WARMUP_FRAMES = TRACK_FRAMES + HISTORY_FRAMES
-"""Snapshots after which whoever is heard has looked, and spoken, for as long as anybody looks back."""
+"""Number of snapshots after which all histories of agents and receivers are full."""
 
 CachedOutputs = dict[tuple[int, int], AgentOutput]
-"""What agents made of their sweeps, by agent and time of capture."""
+"""Detector outputs by agent and timestamp."""
 
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """How a recording is played.
+    """Settings of a replay.
 
-    channel: a preset by name, or any other radio. token_encoding: of tokens; None: the weights' usual. latency_budget_s: how long
-    after its own sweep an ego waits for messages before it perceives; whatever came by then takes part, the newest of each sender.
-    all_egos: every agent is judged as ego, not the first alone. warmup_frames: snapshots played before the first judged one, so
-    that messages are under way and boxes followed. comm_range_m: radios farther apart do not hear each other (true poses).
-    channel_budget_bytes: what all agents together may send at an instant, shared as ``comms.bandwidth.allocate_max_min_fair`` does
-    by what each would say alone, as if scheduled by one who is told.
-    send_request_map: messages of tokens say where their sender needs no help, and what came lately weighs what is sent.
-    pose_correction: corrects where others say they are, None: nobody does.
+    channel: name of a preset, or a preset. token_encoding: of tokens; None: the default of the weights. latency_budget_s: time
+    between the ego's sweep and its perception; it fuses the newest message of each sender that has arrived by then. all_egos:
+    evaluate every agent as ego, not only the first. warmup_frames: snapshots replayed before the first evaluated one, to fill
+    histories. comm_range_m: maximum distance of sender and receiver (true poses). channel_budget_bytes: bytes of all agents at one
+    instant, allocated by ``comms.bandwidth.allocate_max_min_fair`` from what each agent would send without a limit, as by a central
+    scheduler. send_request_map: messages with tokens carry a request map, and received request maps weight the token scores.
+    pose_correction: of received messages; None uses their prior poses.
     """
 
     channel: str | ChannelPreset = "ideal"
@@ -57,13 +56,13 @@ class ReplayConfig:
 
     @property
     def radio(self) -> ChannelPreset:
-        """The channel itself."""
+        """The preset of the channel."""
         return self.channel if isinstance(self.channel, ChannelPreset) else channel_preset(self.channel)
 
 
 @dataclass(frozen=True)
 class SentPackets:
-    """What one agent put on the air at one instant. packet_sizes: bytes of each packet; seconds: the time that share took."""
+    """Packets that one agent sent at one instant. packet_sizes: bytes of each packet; seconds: duration of share."""
 
     agent_id: int
     packet_sizes: tuple[int, ...]
@@ -71,18 +70,18 @@ class SentPackets:
 
     @property
     def num_bytes(self) -> int:
-        """Of all packets."""
+        """Bytes of all packets."""
         return sum(self.packet_sizes)
 
     @property
     def num_packets(self) -> int:
-        """Their number."""
+        """Number of sent packets."""
         return len(self.packet_sizes)
 
 
 @dataclass(frozen=True)
 class ReplayStep:
-    """One ego at one instant, with one method. ages_s: at the time of perceiving, of every message that took part."""
+    """One ego at one instant with one method. ages_s: of every fused message at the time of perception."""
 
     method: str
     snapshot: Snapshot
@@ -94,14 +93,15 @@ class ReplayStep:
 
     @property
     def boxes(self) -> Boxes:
-        """What the ego perceived, in its frame."""
+        """The boxes around the ego, in its frame."""
         return self.perception.boxes
 
 
 @dataclass
 class DetectionReplay:
-    """All agents of one scenario with one method, their inboxes and the air between them. feature_cache: views that need no
-    second look.
+    """All agents of one scenario with one method, their inboxes and the channel between them.
+
+    feature_cache: detector outputs that are read and extended.
     """
 
     method: str
@@ -116,7 +116,7 @@ class DetectionReplay:
         self._bus = LocalBus(Channel(self.config.radio, self.config.seed))
 
     def step(self, snapshot: Snapshot) -> Iterator[ReplayStep]:
-        """Everybody shares; whoever is judged waits, hears and perceives."""
+        """All agents share; the evaluated egos receive and perceive."""
         positions = _antenna_positions(snapshot)
         sent = self._share(snapshot.frames, positions)
         egos = range(len(snapshot.frames)) if self.config.all_egos else range(1)
@@ -132,7 +132,7 @@ class DetectionReplay:
                 perception = agent.perceive(frame, inbox, deadline_ns)
                 took = time.perf_counter() - began
                 for rejection in perception.rejected:
-                    # All senders of a replay are agents of this program: an error is a defect, not an attack.
+                    # All senders of a replay are agents of this program: an error is a defect of the code.
                     if rejection.cause is not None:
                         raise rejection.cause
                 ages = tuple(message.age_ns(deadline_ns) / 1e9 for message in perception.received)
@@ -141,7 +141,7 @@ class DetectionReplay:
     def _share(
         self, frames: Sequence[AgentFrame], positions: dict[int, tuple[float, float]]
     ) -> tuple[SentPackets, ...]:
-        """What everybody says, handed to the bus: each packet is counted as it is handed over."""
+        """Publish the packets of all agents on the bus and count them."""
         outgoing = [self._share_one(frame) for frame in frames]
         if self.config.channel_budget_bytes is not None:
             requested = [sum(map(len, packets)) for packets, _ in outgoing]
@@ -158,7 +158,7 @@ class DetectionReplay:
         )
 
     def _share_one(self, frame: AgentFrame, budget_bytes: int | None = None) -> tuple[list[bytes], float]:
-        """An agent's packets, and the seconds that they took it."""
+        """Packets of one agent, and the duration of share in seconds."""
         agent, inbox = self._get_agent_and_inbox(frame)
         requests = inbox.messages() if self.config.send_request_map else ()
         began = time.perf_counter()
@@ -185,7 +185,7 @@ class DetectionReplay:
 
 
 def _antenna_positions(snapshot: Snapshot) -> dict[int, tuple[float, float]]:
-    """Where each antenna really is, as far as the recording knows: radio waves do not care for claims."""
+    """True positions of the antennas, or prior positions in recordings without ground truth."""
     poses = (
         snapshot.truth.world_from_agent
         if snapshot.truth
@@ -203,11 +203,11 @@ def replay(
     perturb: Callable[[Snapshot], Snapshot] = lambda snapshot: snapshot,
     feature_cache: CachedOutputs | None = None,
 ) -> Iterator[ReplayStep]:
-    """Every judged snapshot of one scenario through each method in turn.
+    """Replay every evaluated snapshot of one scenario with each method in turn.
 
-    perturb: what happens to claimed poses before anybody sees them. feature_cache: what agents of this scenario and these weights
-    made of their sweeps, played from the same first snapshot on; it is added to, so that the methods look at a sweep once between
-    them. Their boxes are the same; their times are then not to be compared.
+    perturb: applied to each snapshot before the agents read it. feature_cache: detector outputs of this scenario and these weights,
+    from the same first snapshot on; it is extended, so that the detector runs once a sweep for all methods. Boxes do not change;
+    durations of methods are then not comparable.
     """
     replays = [DetectionReplay(name, detector, config, feature_cache) for name in methods]
     eval_indices = recording.eval_indices(scenario)

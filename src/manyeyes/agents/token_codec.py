@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Between what a detector tells and the bytes of its codebook: the one place where weights and wire meet."""
+"""Encoding of a detector's tokens with its codebook, and decoding of received tokens."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from manyeyes.models.detector.proposal import PROPOSAL_DIM
 
 
 def require_codebook(detector: Detector) -> Codebook:
-    """The codebook, or how to get one."""
+    """The codebook of a detector; ConfigError without one."""
     if detector.codebook is None:
         raise ConfigError(
             "These weights have no codebook, so they cannot send codes: fit one by 'manyeyes fit-codebook'."
@@ -25,32 +25,32 @@ def require_codebook(detector: Detector) -> Codebook:
 
 
 def default_token_encoding(detector: Detector) -> TokenEncoding:
-    """How tokens are written where nobody says: as codes where the weights can, a tenth of the bytes; else as float16."""
+    """The default token encoding: codebook if the weights have one (a tenth of the bytes), else float16."""
     return "float16" if detector.codebook is None else "codebook"
 
 
 def make_code_tables(detector: Detector) -> CodeTables | None:
-    """The tables by which codes of these weights are sent and read; None where they have no codebook."""
+    """Entropy coding tables of these weights; None without a codebook."""
     if detector.codebook is None:
         return None
     return CodeTables(detector.fingerprint, detector.codebook.frequencies.numpy())
 
 
 def make_token_format(detector: Detector, tables: CodeTables | None) -> TokenFormat:
-    """What these weights send and read; tables: those of ``make_code_tables``."""
+    """The token format of these weights; tables: those of ``make_code_tables``."""
     channels = detector.encoder.out_channels + PROPOSAL_DIM
     return TokenFormat(detector.fingerprint, detector.token_grid, channels, tables)
 
 
 def encode_tokens(tokens: SparseBev, detector: Detector) -> SparseBev:
-    """Told rows (N, C + PROPOSAL) as bytes (N, W) of the codebook, on the same cells."""
+    """Token rows (N, C + PROPOSAL) as codebook bytes (N, W) on the same cells."""
     return tokens.with_features(require_codebook(detector).encode(tokens.features))
 
 
 def decode_tokens(
     received: ReceivedMessage, detector: Detector, token_format: TokenFormat
 ) -> tuple[ReceivedMessage, Rejection | None]:
-    """The same with codes read, so that tokens are rows of floats again; tokens of another form are left out and rejected."""
+    """The message with tokens decoded to rows of floats; tokens of another format are dropped and rejected."""
     message, codebook = received.message, detector.codebook
     tokens = message.tokens
     if tokens is None:

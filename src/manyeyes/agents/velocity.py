@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast what an agent sees is moving: its own boxes, followed back through its last few sweeps.
+"""Velocity estimation of detected boxes from the boxes and points of the agent's last sweeps.
 
-What a detector states of a velocity, it reads from two sweeps, a tenth of a second apart: 10 cm of error in a place are 1 m/s.
-Half a second of the same boxes says more. A line is laid through the places of each box by weighted least squares; what is
-stated, and that vehicles move along their length, is the prior (the MAP estimate of a Gaussian linear model: Bishop, Pattern
-Recognition and Machine Learning, 2006, section 3.3). Then the points themselves are asked: of the velocities that the line
-leaves open, that one is taken at which the box's points of now meet those of earlier sweeps best
-(``ops.point_alignment_cost``). A velocity that is not significantly more than none is none.
+A detector regresses velocity from two sweeps 100 ms apart, where 10 cm of position error are 1 m/s. Half a second of associated
+boxes is more accurate. A line is fitted to the positions of each box by weighted least squares, with the detected velocity and the
+motion along the vehicle's length as a prior (MAP estimate of a Gaussian linear model: Bishop, Pattern Recognition and Machine
+Learning, 2006, section 3.3). The velocity is then refined by a search around the fit for the minimum alignment cost between the
+box's points of this sweep and of earlier ones (``ops.point_alignment_cost``). Insignificant velocities are set to 0.
 """
 
 from __future__ import annotations
@@ -21,22 +20,21 @@ from manyeyes.datatypes import Boxes
 from manyeyes.ops.point_alignment_cost import MAX_POINTS, compute_alignment_costs
 
 LONGITUDINAL_SIGMAS = torch.linspace(-3.0, 3.0, 31)
-"""Speeds along a box that are tried, in standard deviations of what the line leaves open."""
+"""Longitudinal search offsets, in standard deviations of the line fit."""
 LATERAL_SIGMAS = torch.tensor([-2.0, -4 / 3, -2 / 3, 2 / 3, 4 / 3, 2.0])
-"""Speeds across it, likewise: a heading that is off by a few degrees drives a vehicle aside."""
+"""Lateral search offsets, likewise: a heading error of a few degrees gives a lateral velocity."""
 MIN_LATERAL_SEARCH_MPS = 1.0
-"""Only a box that is faster is asked about them."""
+"""Minimum speed of a box for the lateral search."""
 
 
 @dataclass(frozen=True)
 class VelocityConfig:
-    """Limits, and standard deviations of what they are named for.
+    """Limits and standard deviations of velocity estimation.
 
-    gate_m: a box farther from where it should have been is another. sigma_position_m: of a centre from sweep to sweep, beside what
-    the detector says itself of its error. sigma_detected_velocity_mps: of the velocity that it states. sigma_lateral_velocity_mps:
-    of motion across a vehicle's length. point_match_window_s: sweeps so old are compared with that of now; point_match_weight: what
-    it weighs if no point of an object of many points meets another there, in units of half a squared standard deviation.
-    min_z_score: a vehicle whose velocity is fewer standard deviations from none stands, and so does one below still_mps.
+    gate_m: association gate. sigma_position_m: of a centre between sweeps, in addition to the detector's own sigma_xy.
+    sigma_detected_velocity_mps: of the detector's velocity. sigma_lateral_velocity_mps: of motion across a vehicle's length.
+    point_match_window_s: ages of the sweeps whose points are aligned; point_match_weight: cost of an object of many points without
+    any aligned point, in units of half a squared standard deviation. min_z_score, min_speed_mps: lower velocities are set to 0.
     """
 
     gate_m: float = 2.0
@@ -50,12 +48,12 @@ class VelocityConfig:
 
 
 DEFAULT_VELOCITY_CONFIG = VelocityConfig()
-"""How every agent follows its boxes; chosen on Town07."""
+"""Default settings of every agent; chosen on Town07."""
 
 
 @dataclass(frozen=True)
 class PastDetections:
-    """What the agent saw some seconds ago, in its frame of now: boxes, and (Q, 3) float32 points, none where they are not asked."""
+    """Detections of an earlier frame, in the current frame: boxes, and points (Q, 3) float32 where points are aligned."""
 
     boxes: Boxes
     age_s: float
@@ -65,10 +63,10 @@ class PastDetections:
 def estimate_velocities(
     boxes: Boxes, past: Sequence[PastDetections], config: VelocityConfig, points: Tensor | None = None
 ) -> Tensor:
-    """(N, 2) m/s of boxes, in their frame, from where they were earlier, newest first; as stated where a box was not there.
+    """(N, 2) m/s of boxes, in their frame, from earlier detections, newest first; the detector's velocity without association.
 
-    A box and one of an earlier sweep are the same where each is the nearest to where the other should be, within the gate.
-    points: (P, 3) float32 of now; None: only boxes tell.
+    Boxes are associated as mutual nearest neighbours of the propagated positions, within the gate. points: (P, 3) float32 of this
+    sweep; None uses boxes only.
     """
     if not len(boxes):
         return boxes.velocity
@@ -97,7 +95,7 @@ def _match_points(
     points: Tensor,
     config: VelocityConfig,
 ) -> Tensor:
-    """The velocities (N, 2), of those around them, at which sweeps meet best; known as in _Line."""
+    """Velocities (N, 2) of minimum alignment cost around the given ones; information: as in _LineFit."""
     velocity_covariance = torch.linalg.inv(information)
     longitudinal = torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
     lateral = torch.stack((-longitudinal[:, 1], longitudinal[:, 0]), 1)
@@ -107,7 +105,7 @@ def _match_points(
     sigma_longitudinal = sigma_longitudinal.clamp_max(config.sigma_detected_velocity_mps)
 
     def search(rows: Tensor, lateral_sigmas: float) -> tuple[Tensor, Tensor]:
-        """For some boxes, at one speed across them: the least cost, and its velocity."""
+        """Minimum cost and its velocity of some boxes at one lateral offset."""
         subset, start = boxes[rows], velocity[rows] + lateral_sigmas * sigma_lateral[rows, None] * lateral[rows]
         cost = (LONGITUDINAL_SIGMAS**2 + lateral_sigmas**2).to(start.dtype).expand(len(subset), -1)
         for then in past:
@@ -134,7 +132,7 @@ def _match_points(
 
 @dataclass(frozen=True)
 class _LineFit:
-    """N lines through places, as the sums that least squares needs. Seconds from now, metres from where each box is.
+    """N lines through box positions, as the sums of least squares. Times are relative to now, positions to each box.
 
     sums: (N, 3), over places, of w, w t, w t^2 with w the inverse variance of a place; moments: (N, 2, 2) of w p, w t p.
     prior_information: (N, 2, 2), inverse covariance of the velocity beforehand; prior_vector: (N, 2), it times the mean.
@@ -149,7 +147,7 @@ class _LineFit:
 
     @classmethod
     def from_boxes(cls, boxes: Boxes, config: VelocityConfig) -> _LineFit:
-        """Through where the boxes are, with what is known beforehand."""
+        """The fit of the current positions and the prior."""
         n, ahead = len(boxes), torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
         longitudinal = ahead[:, :, None] * ahead[:, None, :]
         lateral = torch.eye(2) - longitudinal
@@ -159,7 +157,7 @@ class _LineFit:
         return empty.add(boxes, 0.0, torch.ones(n, dtype=torch.bool))
 
     def add(self, boxes: Boxes, t: float, same: Tensor) -> _LineFit:
-        """Through one more place each, where the box is the same, (N,) bool."""
+        """The fit with one more position for each associated box; same: (N,) bool."""
         weight = same / (self.sigma_position_m**2 + boxes.sigma_xy**2)
         powers = weight[:, None] * torch.tensor([1.0, t, t * t])
         moments = powers[:, :2, None] * (boxes.center[:, :2] - self.origin)[:, None]
@@ -173,11 +171,11 @@ class _LineFit:
 
     @property
     def velocity(self) -> Tensor:
-        """(N, 2) m/s."""
+        """Estimated velocities (N, 2), m/s."""
         slope = self.moments[:, 1] - self.moments[:, 0] * (self.sums[:, 1] / self.sums[:, 0])[:, None]
         return torch.linalg.solve(self.information, self.prior_vector + slope)
 
     def position_at(self, t: float) -> Tensor:
-        """(N, 2): where the boxes were."""
+        """Positions (N, 2) of the boxes at time t."""
         w, wt = self.sums[:, 0, None], self.sums[:, 1, None]
         return self.origin + self.moments[:, 0] / w + self.velocity * (t - wt / w)

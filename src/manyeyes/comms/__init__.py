@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bytes between agents: what to send, how it is written, what the air does to it, what is taken in."""
+"""Communication of agents: token selection, wire format, channel simulation and inboxes."""
 
 from manyeyes.comms.bandwidth import allocate_equal_share, allocate_max_min_fair
 from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, Delivery, Transmission, channel_preset

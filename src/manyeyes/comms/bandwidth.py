@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bytes of one instant, shared out among all senders of a channel so that together they never exceed it.
+"""Bandwidth allocation: bytes of one instant, divided among all senders of a channel.
 
-Equal shares of those who speak; what one does not need goes to the others (max-min fairness; Bertsekas and Gallager, "Data
-Networks", section 6.5.2). The rule needs what each sender would say. Who knows that: a roadside unit or a base station that
-schedules the channel, if each announces its want; the replay of a recording, which sees all messages of an instant before any
-is cut. Senders that only hear each other know who spoke lately and not what each will want: for them, :func:`allocate_equal_share`
-of the bytes among those heard, which is never exceeded where everybody hears everybody.
+Senders get equal shares; unused bytes go to the others (max-min fairness; Bertsekas and Gallager, "Data Networks", section 6.5.2).
+The rule needs the requested bytes of each sender. A roadside unit or a base station that schedules the channel knows them, and so
+does the replay of a recording. Senders without a scheduler know only the number of recent senders: they use
+:func:`allocate_equal_share`, which never exceeds the total if all senders receive each other.
 """
 
 from __future__ import annotations
@@ -16,16 +15,16 @@ from manyeyes.datatypes import ConfigError
 
 
 def allocate_max_min_fair(total_bytes: int, requested_bytes: Sequence[int]) -> tuple[int, ...]:
-    """Bytes that each sender may send, in the order of what each wants (0: it does not speak).
+    """Bytes that each sender may send, in the order of requested_bytes (0: sends nothing).
 
-    They sum to total_bytes, or to all that is wanted where that is less; nobody gets more than it wants, and who gets less
-    gets, within a byte, as much as anybody. A byte that does not divide goes to the first in order.
+    They sum to total_bytes, or to all requested bytes if these are fewer. No sender gets more than it requests, and a sender with
+    less than it requests gets, within a byte, the maximum share. Indivisible bytes go to the first senders.
     """
     if total_bytes < 0 or any(w < 0 for w in requested_bytes):
-        raise ConfigError(f"Budgets and wants are 0 bytes or more; got {total_bytes} for {list(requested_bytes)}.")
+        raise ConfigError(f"Budgets and requests are 0 bytes or more; got {total_bytes} for {list(requested_bytes)}.")
     shares, left = [0] * len(requested_bytes), total_bytes
-    # The most modest first: what it leaves is shared among the rest. Among equals the last first, so that what does not
-    # divide is left to the first.
+    # Ascending requests: unused bytes are divided among the rest. Equal requests in reverse order, so that indivisible bytes are
+    # left to the first.
     order = sorted(range(len(requested_bytes)), key=lambda i: (requested_bytes[i], -i))
     for place, sender in enumerate(order):
         shares[sender] = min(requested_bytes[sender], left // (len(order) - place))
@@ -34,9 +33,9 @@ def allocate_max_min_fair(total_bytes: int, requested_bytes: Sequence[int]) -> t
 
 
 def allocate_equal_share(total_bytes: int, num_senders: int) -> int:
-    """Bytes for each of so many speakers that know no more of each other than that they are there."""
+    """Bytes for each of num_senders, without knowledge of their requests."""
     if total_bytes < 0 or num_senders < 1:
         raise ConfigError(
-            f"An equal share is of 0 bytes or more, for one speaker or more; got {total_bytes}, {num_senders}."
+            f"An equal share is of 0 bytes or more, for one sender or more; got {total_bytes}, {num_senders}."
         )
     return total_bytes // num_senders

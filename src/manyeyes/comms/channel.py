@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The air between agents: shared airtime, loss that grows with distance and comes in bursts, latency.
+"""Simulated radio channel between agents: shared airtime, loss that grows with distance and comes in bursts, latency.
 
 Delay follows from the bytes sent. All senders share one medium of ``rate_bps * busy_ratio_limit``; packets that wait are
 served one per sender in turn (ascending ids), and what of a sender's message still waits when its next message comes is
@@ -62,7 +62,7 @@ class ChannelPreset:
         return float(np.interp(distance_m, distances, losses))
 
     def with_loss(self, probability: float) -> ChannelPreset:
-        """The same radio with one loss at every distance, for sweeps."""
+        """The same radio with one loss at every distance, for studies."""
         return replace(self, loss_at_m=((0.0, probability),))
 
     def airtime_ns(self, packet_bytes: int) -> int:
@@ -75,7 +75,7 @@ class ChannelPreset:
         return math.ceil(self.airtime_ns(packet_bytes) / self.busy_ratio_limit)
 
 
-# Rates and latencies: messages.md §"Channels"; loss against distance and overheads are plausible round figures for an
+# Rates and latencies are those of the radio standards; loss against distance and overheads are plausible round figures for an
 # urban street, not measurements: change them by dataclasses.replace. Overhead of ITS-G5: GeoNetworking 40, BTP 4,
 # LLC 8, MAC 30 bytes, then preamble and mean access time (about 150 us) as bytes at the rate.
 CHANNELS: tuple[ChannelPreset, ...] = (

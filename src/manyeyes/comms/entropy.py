@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coded tokens in fewer bytes: cells and rows of one packet as one stream, each symbol at the length of its surprise.
+"""Coded tokens in fewer bytes: cells and rows of one packet as one stream, each symbol at its information content.
 
 The stream is rANS (Duda, "Asymmetric numeral systems", 2013, section 3): a state of 24 bits at most, renormalised by
 bytes, frequencies that sum to 4,096. The decoder ends in the state that the encoder began with and has read every byte, or
@@ -116,7 +116,7 @@ def count_fitting_coded_cells(
     header_bytes: int,
     bytes_left: int,
 ) -> NDArray[np.int64]:
-    """As ``codec.count_fitting_cells`` for coded tokens: how many of keys (N,) and rows (N, W), in the order given, each body
+    """As ``primitives.count_fitting_cells`` for coded tokens: how many of keys (N,) and rows (N, W), in the order given, each body
     takes.
     """
     limits = _BodyLimits(fixed_bytes, capacity, header_bytes, bytes_left)

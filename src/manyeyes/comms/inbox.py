@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an agent has heard: packets in, the newest message of each other agent out. Bad bytes are counted, never raised."""
+"""Inbox of an agent: packets in, the newest message of each sender out. Invalid bytes are counted, never raised."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _CLOCK_SLACK_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class DropCounts:
-    """How many packets were not taken, by reason.
+    """Number of dropped packets by reason.
 
     garbage: not a packet, or cut. version: of another wire version. checksum: bytes were changed. implausible: values
     that cannot be (NaN, cells outside the grid, captured over 1 s after arrival). contradiction: another packet of the
-    same message says otherwise. wrong_model: tokens of other weights. grid, width, value: tokens that name these weights but
+    same message contradicts it. wrong_model: tokens of other weights. grid, width, value: tokens that name these weights but
     lie on another grid, have other channels, or values beyond what the weights send. duplicate: a copy. expired: too old, or
-    older than what this agent has since said. full: no room for more agents or more bytes of this agent.
+    older than the newest message of this agent. full: no room for more agents or more bytes of this agent.
     """
 
     garbage: int = 0
@@ -56,7 +56,7 @@ class DropCounts:
 class Rejection:
     """Content of one sender that takes no part in a perception.
 
-    reason: as in Dropped, or content_error: fusing it raised an error, which is the cause. text: what was expected, what came.
+    reason: as in DropCounts, or content_error: fusing it raised an error, which is the cause. text: what was expected, what came.
     """
 
     agent_id: int
@@ -110,7 +110,7 @@ class Inbox:
     fingerprint: tokens of other weights are refused, other sections of the same message are not; None takes all.
     expire_ns: a message captured longer ago than this is neither taken nor given; None keeps it until a newer one comes.
     At most max_agents senders of max_agent_bytes of packets each are held: a flood of ids cannot exhaust the memory.
-    Beyond it the sender heard of least recently (by capture) gives way to a newer one. tables: of the codebook of these
+    Beyond it the sender with the oldest timestamp is replaced by a newer one. tables: of the codebook of these
     weights; without them coded tokens cannot be read and are refused as of other weights. token_format: refuses, beyond the
     fingerprint, tokens of another grid, width or range, and holds the tables; an agent's own inbox has it (``Agent.inbox``).
     """
@@ -207,7 +207,7 @@ class Inbox:
         return "wrong_model" if others else None
 
     def _reject(self, agent_id: int, reason: TokenRefusal) -> None:
-        """Keep the reason for the next who asks, of at most as many senders as are held: ids are free for all."""
+        """Store the reason for take_rejections, of at most max_agents senders: ids are not authenticated."""
         self._rejections.pop(agent_id, None)
         if len(self._rejections) >= self._max_agents:
             del self._rejections[next(iter(self._rejections))]

@@ -17,7 +17,7 @@ class _Receiver:
 
 
 class LocalBus:
-    """Simulated air with a clock. Publish everything up to an instant before delivering up to it.
+    """Simulated channel with a clock. Publish everything up to an instant before delivering up to it.
 
     Who publishes first at one instant makes no difference. A receiver's distance, hence its loss, is that of the first
     delivery after a packet was sent. Packets that an agent did not collect within keep_s of being sent are let go.

@@ -77,7 +77,7 @@ def _pack_rings(rings: Sequence[Floats]) -> bytes:
 
 
 def _pack_elements(elements: MapElements) -> list[bytes]:
-    """Each element's bytes, the highest score first; none of one that is too short to be said."""
+    """Each element's bytes, the highest score first; none of one that is too short to be sent."""
     if not all(np.isfinite(column).all() for column in (elements.score, elements.sigma, elements.style)):
         raise WireError("Message.local_map has NaN or infinite values; drop those elements before sending.")
     likeliest = elements.style.argmax(1)
@@ -149,7 +149,7 @@ def _read_line(body: bytes, at: int, ring: bool) -> tuple[Ints, int]:
     line = steps.cumsum(0)
     again = (steps[1:] == 0).all(1).any() or (ring and bool((line[0] == line[-1]).all()))
     if again or (np.abs(line) > _MAX_UNITS).any():
-        raise PacketError("implausible", "A line of the map stands still, or leaves what is within reach.")
+        raise PacketError("implausible", "A line of the map repeats a point, or exceeds the maximum range.")
     return line, at + used + more
 
 

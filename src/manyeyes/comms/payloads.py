@@ -183,7 +183,7 @@ def token_order(tokens: SparseBev, score: Tensor | None) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class TokenCodec:
-    """How tokens are written: precision, and the tables by which codes are, or None where their bytes are sent as they are."""
+    """Token encoding, and entropy coding tables of codes; None sends their bytes uncoded."""
 
     encoding: TokenEncoding
     tables: CodeTables | None = None
@@ -193,7 +193,7 @@ class TokenCodec:
             raise ConfigError(f"token encoding is one of {', '.join(TOKEN_ENCODINGS)}; got {self.encoding!r}.")
 
     def select_tables(self, tokens: SparseBev) -> CodeTables | None:
-        """The tables, where these tokens are to be coded by them; tokens of another kind than the form's are a WireError."""
+        """The tables, where these tokens are to be coded by them; tokens of another encoding are a WireError."""
         codes = tokens.features.dtype == torch.uint8
         if codes != (self.encoding == "codebook"):
             raise WireError(

@@ -27,7 +27,7 @@ _FIRST_OCTAVE = -16
 
 
 class PacketError(WireError):
-    """A packet that is refused; ``reason`` says of what kind the fault is."""
+    """A packet that is rejected; ``reason`` is the kind of fault."""
 
     def __init__(self, reason: Reason, text: str) -> None:
         super().__init__(text)
@@ -40,7 +40,7 @@ def varint_sizes(values: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def pack_varints(values: NDArray[np.int64]) -> bytes:
-    """Little-endian base-128 of values (N,) in [0, 2^35): seven bits a byte, the top bit says that more follow."""
+    """Little-endian base-128 of values (N,) in [0, 2^35): seven bits a byte, the top bit is set if more follow."""
     out = np.empty(len(values) * _VARINT_BYTES, np.uint8)
     used = _write_varints(np.ascontiguousarray(values, np.int64), out)
     if used < 0:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a receiver would hear: a coarse map of how sure it is, and what it makes of the worth of others' tokens.
+"""Request maps: a receiver's confidence on a coarse grid, and the weights of a sender's tokens that follow from it.
 
-A receiver broadcasts one byte a window (``RequestMap``). A sender moves its tokens into each receiver's frame, by the poses that
-the messages claim, and lowers the score of what all of them see well: the largest need counts, since one message serves all.
+A receiver broadcasts one byte a window (``RequestMap``). A sender transforms its tokens to each receiver's frame, by the prior
+poses of the messages, and lowers the scores of tokens in confident windows. The maximum weight counts, since one message serves all.
 Compare Where2comm's request map (Hu et al., NeurIPS 2022, section 3.3), which is dense and as fine as the features.
 """
 
@@ -18,10 +18,10 @@ from manyeyes.datatypes.message import Message, RequestMap
 
 
 def build_request_map(xy: Tensor, confidence: Tensor, windows: BevGrid) -> RequestMap:
-    """One agent's map over a coarse grid: in each window the least of sure (N,) in [0, 1], 0 where there is none.
+    """One agent's request map over a coarse grid: the minimum confidence (N,) in [0, 1] of each window, 0 without objects.
 
-    xy: (N, 2) metres in the agent's frame, where it believes an object; confidence: its score. The least: where one of two vehicles
-    is in doubt, help is wanted.
+    xy: (N, 2) metres in the agent's frame, positions of its objects; confidence: their scores. The minimum requests tokens where
+    one of two vehicles is uncertain.
     """
     if confidence.shape != (len(xy),) or not bool(((confidence >= 0) & (confidence <= 1)).all()):
         raise ConfigError(f"confidence needs ({len(xy)},) in [0, 1]; got {tuple(confidence.shape)}.")
@@ -36,11 +36,11 @@ def build_request_map(xy: Tensor, confidence: Tensor, windows: BevGrid) -> Reque
 def compute_request_weights(
     xy: Tensor, world_from_sender: Transform, requests: Sequence[Message], min_weight: float = 0.1
 ) -> Tensor:
-    """(N,) in [least, 1]: what to multiply the positive scores of tokens at xy (N, 2), metres in the sender's frame, with.
+    """Weights (N,) in [min_weight, 1] of the positive scores of tokens at xy (N, 2), metres in the sender's frame.
 
-    requests: messages that have a request; without any, all is needed. To one receiver a token is worth 1 - sure of the window
-    where it falls, and nothing beyond its map; of several receivers the largest counts. ``min_weight`` keeps an order among
-    tokens that nobody asks for: whoever does not broadcast a request may still hear them.
+    requests: messages with a request map; without any, all weights are 1. For one receiver the weight is 1 - confidence of the
+    token's window, and 0 outside the map; the maximum over receivers counts. ``min_weight`` keeps the order of tokens that no
+    receiver requests, for receivers without a request map.
     """
     requesting = [m for m in requests if m.request is not None]
     if not requesting:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tokens of one model look like; tokens that look otherwise are refused before they are kept.
+"""Format of the tokens of one model; tokens of another format are rejected on reception.
 
 Weights fix the grid, the channels and the range of what they send, so equal fingerprints imply all three. What a packet holds
 is therefore compared for equality, not for plausibility.

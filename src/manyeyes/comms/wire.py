@@ -37,8 +37,8 @@ Tokens (kind 1), some cells of one grid with their features:
                       1 cells as a bitmap, 2 cells and codes as one coded stream), 4-7 zero
 16     2     u16      channels C; bytes of a row of codes
 18     2     u16      cells n; 0 only where the message's whole section is empty
-20     ...            layouts 0, 1: cells, in ascending order of ``row * columns + column``, by ``codec.pack_cells``
-...    ...            int8 only: C scale codes u8 (``codec.SCALES``), a channel's step is scale / 127
+20     ...            layouts 0, 1: cells, in ascending order of ``row * columns + column``, by ``primitives.pack_cells``
+...    ...            int8 only: C scale codes u8 (``primitives.SCALES``), a channel's step is scale / 127
 ...    ...            layouts 0, 1: features, n rows of C
 20     ...            layout 2, codes only: both, by ``entropy.pack_coded`` and the tables of the model's codebook
 ====== ===== ======== =====================================================================================
@@ -59,7 +59,7 @@ each, in the sender's frame, highest score first:
 ...    32    32 x i8  with descriptors: 1/127, -127 to 127
 ====== ===== ======== =====================================================================================
 
-Height is not sent: it is read as the mean of the label (``sections.LABEL_HEIGHTS``), and the object stands on the sender's
+Height is not sent: it is read as the mean of the label (``payloads.LABEL_HEIGHTS``), and the object stands on the sender's
 ground plane, centre z = height / 2. Points (kind 3), 7 bytes each: x, y, z i16 centimetres, intensity u8 1/255; time
 within the sweep is not sent. Packet k of K points packets has every K-th point from k on, so a loss thins the cloud. A
 request (kind 4) is one packet: a grid as tokens begin with (15 bytes), then for each of its cells, row by row, u8 how sure the
@@ -76,9 +76,9 @@ see, then what hid parts of it from it. Then elements to the end of the body, th
 3      ...            its line
 ====== ===== ======== =====================================================================================
 
-A line is varints (``codec.pack_varints``): how many points, 2 or more (3 of a ring, whose first is not repeated), then x and y of
-the first and what each further one adds to the one before it, units of 2 cm, zigzag (v << 1 ^ v >> 63), within 327.66 m. No
-point is as the one before it.
+A line is varints (``primitives.pack_varints``): the number of points, 2 or more (3 of a ring, whose first is not repeated), then x
+and y of the first and the difference of each further one to the one before it, units of 2 cm, zigzag (v << 1 ^ v >> 63), within
+327.66 m. No point equals the one before it.
 
 Packets are numbered objects first, then the request, then tokens by falling score (ties by key), then map elements, then points:
 a message that is cut after any packet still helps. A message without sections is one packet of kind 0. Empty sections are one
@@ -125,7 +125,7 @@ _SIGMA_M, _SIGMA_RAD = (1e-3, 1e4), (1e-5, 10.0)
 
 @dataclass(frozen=True)
 class MessageHeader:
-    """What every packet of a message says alike, apart from its number.
+    """Fields that all packets of a message share, apart from the packet number.
 
     pose: position, and quaternion w, x, y, z. covariance_codes: codes of three standard deviations, then of three entries of L.
     """
@@ -275,14 +275,14 @@ def _encode_covariance(covariance: NDArray[np.float64]) -> list[int]:
         raise WireError(f"Message.pose_covariance is symmetric and positive semidefinite; got {covariance.tolist()}.")
     if (sigma[:2] > _SIGMA_M[1]).any():
         raise WireError(f"Message.pose_covariance is too large to send (over 10 km): {covariance.tolist()}.")
-    # Rows have length 1, but for rounding and for what nobody varies.
+    # Rows have length 1, except for rounding and for zero variances.
     lower /= np.maximum(np.linalg.norm(lower, axis=1, keepdims=True), 1e-9)
     codes = [*log_codes(sigma[:2], *_SIGMA_M), *log_codes(sigma[2:], *_SIGMA_RAD)]
     return [int(v) for v in (*codes, *np.rint(lower[[1, 2, 2], [0, 0, 1]] * 127))]
 
 
 def _decode_covariance(covariance_codes: tuple[int, ...]) -> NDArray[np.float64]:
-    """The inverse of _spread; any codes are some covariance."""
+    """The inverse of _encode_covariance; any codes are some covariance."""
     codes = np.array(covariance_codes[:3], np.uint8)
     sigma = np.concatenate((log_values(codes[:2], *_SIGMA_M), log_values(codes[2:], *_SIGMA_RAD))).astype(np.float64)
     lower = np.zeros((3, 3))
@@ -311,9 +311,7 @@ def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
     common = packet[_START.size : _BODY_AT]
     if _CRC.unpack_from(packet, len(packet) - _CRC.size)[0] != zlib.crc32(memoryview(packet)[: -_CRC.size]):
         agent_id = _COMMON.unpack(common)[0]
-        raise PacketError(
-            "checksum", f"The checksum of a packet said to be of agent {agent_id} does not match its bytes."
-        )
+        raise PacketError("checksum", f"The checksum of a packet with agent id {agent_id} does not match its bytes.")
     if flags >> 6 or number >= count:
         raise PacketError("garbage", f"Contradictory header: flags {flags:#04x}, packet {number} of {count}.")
     header = _header(common, flags >> 3, count)

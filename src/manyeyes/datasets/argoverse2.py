@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Argoverse 2 sensor logs: two sweeps of one vehicle, read as two agents with a true relative pose.
 
-A real pair of clouds that nobody simulated. Layout: ``<log>/sensors/lidar/<ns>.feather``, ``annotations.feather`` and
+A pair of real clouds. Layout: ``<log>/sensors/lidar/<ns>.feather``, ``annotations.feather`` and
 ``city_SE3_egovehicle.feather``. AV2's ego frame has its origin at the middle of the rear axle, 0.33 m above the road
 (median over a Pittsburgh log's 2,706 poses and its map's ground height); the agent's frame here is that one moved down.
 The world is the log's city frame.
@@ -102,7 +102,7 @@ class Argoverse2Recording:
         return len(self.sweeps(scenario)) - self._gap
 
     def eval_indices(self, scenario: str) -> range:
-        """All of them."""
+        """All indices of the log."""
         return range(self.length(scenario))
 
     def agents(self, scenario: str) -> tuple[int, ...]:

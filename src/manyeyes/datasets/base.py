@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every reader of a recording offers, and what can be said of any recording."""
+"""Interface of all readers of recordings, and functions on any recording."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from manyeyes.datatypes import RecordingError
 
 ARCHIVE = "cooperative-vehicle-infrastructure"
 SPLIT_FILE = "cooperative-split-data.json"
-# Pairs of the official cooperative split (recordings.md).
+# Number of pairs of the official cooperative split.
 OFFICIAL_PAIRS = {"train": 4813, "val": 1783, "test": 2688, "test_A": 851}
 SIDES = ("vehicle-side", "infrastructure-side")
 _LABEL_FOLDER = {"vehicle-side": "lidar", "infrastructure-side": "virtuallidar"}
@@ -27,7 +27,7 @@ _MOTIONS = {"vehicle-side": ("novatel_to_world", "lidar_to_novatel"), "infrastru
 class SideFrame:
     """One sweep of one side. motions: files of world_from_lidar's factors, outermost first.
 
-    batch: the drive it belongs to. height_m: of the LiDAR above the road, where the index says so (ours does).
+    batch: the drive it belongs to. height_m: of the LiDAR above the road, if the index has it (as in ours).
     """
 
     id: str
@@ -43,7 +43,7 @@ class SideFrame:
 class DairPair:
     """A vehicle's sweep and an infrastructure's. label: the cooperative one, None where the file is not there.
 
-    offset: the correction of the infrastructure's place in metres, None where nobody made one; offset_in_world: along the
+    offset: the correction of the infrastructure's place in metres, None without one; offset_in_world: along the
     world's axes (DAIR-V2X), else along those of the vehicle's LiDAR (V2X-Seq). i2v: vehicle_from_infrastructure's file.
     """
 

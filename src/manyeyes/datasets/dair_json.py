@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What DAIR-V2X's JSON files say: numbers that may be strings, calibrations, labels of one side and of both.
+"""Readers of DAIR-V2X's JSON files: numbers that may be strings, calibrations, labels of one side and of both.
 
 Lengths are metres and angles radians on disk. Vehicles are ``Car``, ``Van``, ``Truck`` and ``Bus``, in any case of
 letters; everything else is left out, and so is a box without size, as in the official reader.
@@ -187,7 +187,7 @@ def _axes(corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tens
 
 
 def _check_corners(path: Path, corners: np.ndarray, where: str) -> None:
-    """Refuse corners in another order: they would give a mirrored, tilted or upturned box without a word."""
+    """Refuse corners in another order: they would give a mirrored, tilted or upturned box without an error."""
     ahead, aside, up = (axis[0].numpy() for axis in _axes(torch.from_numpy(corners[None])))
     volume = float(np.linalg.det(np.stack((ahead, aside, up))))
     full = float(np.linalg.norm(ahead) * np.linalg.norm(aside) * np.linalg.norm(up))

@@ -2,9 +2,9 @@
 """DAIR-V2X-C and V2X-Seq, read: one vehicle (agent 0, the ego) and one infrastructure (agent -1) at a crossing.
 
 The format is right-handed, in metres and radians, and points lie in the LiDAR's frame (the infrastructure's is a virtual
-one, upright, looking along x). What comes out lies in the agent's frame, whose z = 0 is the road. The two sweeps of a
+one, upright, with x ahead). What comes out lies in the agent's frame, whose z = 0 is the road. The two sweeps of a
 pair have their own time stamps. The format has neither the height of a LiDAR (found in the cloud, unless the index has our
-``lidar_height_m``), nor a speed (found from the poses), nor an agent's word on its own error (reads as zero).
+``lidar_height_m``), nor a speed (found from the poses), nor an agent's estimate of its own error (reads as zero).
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ from manyeyes.datatypes import (
 from manyeyes.ops.box_iou import pairwise_iou
 
 VEHICLE_ID, INFRASTRUCTURE_ID = 0, -1
-# CoAlign's threshold for two sides' labels of one vehicle; two vehicles do not overlap at all (detection.md 1.7).
+# CoAlign's threshold for two sides' labels of one vehicle; two vehicles do not overlap at all.
 _SAME_IOU = 0.05
-# Where the road is looked for: near, because a vehicle's LiDAR is tilted by a degree; farther, because a pole's does not see
+# Range in which the road is searched: near, because a vehicle's LiDAR is tilted by a degree; farther, because a pole's does not see
 # the road below it.
 _VEHICLE_RANGE_M, _POLE_RANGE_M = 15.0, 40.0
 _MAX_CACHED_POSES = 20_000
@@ -65,7 +65,7 @@ Labels = Literal["cooperative", "sides"]
 class DairRecording:
     """Pairs under a root in DAIR-V2X's layout; the drives (``batch_id``, ``sequence_id``) are the scenarios.
 
-    split: of the official cooperative-split-data.json, looked for in the root unless split_file is given. labels: the truth
+    split: of the official cooperative-split-data.json, expected in the root unless split_file is given. labels: the truth
     is the cooperative label, or the union of what the two sides list. label_folder: where the cooperative labels lie, such
     as ``label_world_backup`` of the complemented release. delay_frames: the infrastructure's sweep is so many sweeps older.
     native_pose_error: the infrastructure claims the pose of its calibration, without the correction by hand that the truth
@@ -121,7 +121,7 @@ class DairRecording:
         return len(self._pairs(scenario))
 
     def eval_indices(self, scenario: str) -> range:
-        """All of them."""
+        """All indices of the drive."""
         return range(self.length(scenario))
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -319,7 +319,7 @@ def _union(vehicle: Boxes, unit: Boxes) -> Boxes:
 
 
 def _mark_own_body(boxes: Boxes, world_from_lidar: Transform) -> Boxes:
-    """The box around the vehicle's own LiDAR gets the vehicle's id, so that nobody is asked to detect himself."""
+    """The box around the vehicle's own LiDAR gets the vehicle's id, so that it is not evaluated."""
     local = boxes.transform(world_from_lidar.inverse())
     around = Boxes.of(local.center * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64), local.size, local.yaw)
     own = (

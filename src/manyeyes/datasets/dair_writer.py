@@ -19,7 +19,7 @@ from manyeyes.datasets.dair_index import SIDES, SPLIT_FILE
 from manyeyes.datasets.pcd import PcdTable, write_table
 from manyeyes.datatypes import LABELS, AgentFrame, Boxes, RecordingError, Snapshot, Transform
 
-# Chosen: the receiver's y axis looks ahead and it is mounted a little askew, so that no calibration is its own transpose.
+# Chosen: the receiver's y axis points ahead and it is mounted a little askew, so that no calibration is its own transpose.
 _NOVATEL_FROM_LIDAR = Transform.from_rpy(
     torch.tensor([0.35, 1.2, 0.45], dtype=torch.float64),
     torch.tensor(0.01, dtype=torch.float64),

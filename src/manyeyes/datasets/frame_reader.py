@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One agent's frame without those of the others: a cloud is some megabytes, and training on looks wants one of many."""
+"""One agent's frame without those of the others: a cloud is some megabytes, and training on single frames needs one of many."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class FrameReader(Protocol):
         ...
 
     def frame(self, scenario: str, index: int, agent_id: int) -> AgentFrame:
-        """The frame of one of them."""
+        """The frame of one agent."""
         ...
 
 
@@ -30,11 +30,11 @@ class SnapshotFrameReader:
     recording: Recording
 
     def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
-        """See SingleFrames."""
+        """The ids of the agents that have this frame, in the order of the snapshot."""
         return tuple(frame.agent_id for frame in self.recording.snapshot(scenario, index).frames)
 
     def frame(self, scenario: str, index: int, agent_id: int) -> AgentFrame:
-        """See SingleFrames."""
+        """The frame of one agent, from the whole snapshot."""
         frames = self.recording.snapshot(scenario, index).frames
         return next(frame for frame in frames if frame.agent_id == agent_id)
 

@@ -3,7 +3,7 @@
 
 On disk everything is left-handed, in degrees and km/h, and points lie in the LiDAR's frame. What comes out is
 right-handed, in radians and m/s, and points lie in the agent's frame, whose z = 0 is the road. The format has neither
-the time of a point, nor an agent's word on its own error (both read as zero), nor vehicles that no agent lists.
+the time of a point, nor an agent's estimate of its own error (both read as zero), nor vehicles that no agent lists.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Opv2vRecording:
     strict it is an error instead. Clouds are read when a snapshot is asked for; pictures too, with images=True.
     cache_folder: where parsed yaml and ascii clouds are kept (default: the user's cache folder); None with ``use_cache=False``.
 
-    All agents of a scenario have the same stems in OPV2V and V2XSet: their public reader looks every agent up by the ego's
+    All agents of a scenario have the same stems in OPV2V and V2XSet: their public reader finds every agent by the ego's
     stems. A stem that any agent has is hence expected of all, the ego included; ``verify`` names each file that is absent,
     and each whose content does not belong to its frame.
     """
@@ -196,7 +196,7 @@ class Opv2vRecording:
             return []
         digests, found = Digests.read(folder / SCENARIO), []
         if digests is not None and digests.by_path is None and any(p.scenario == name for p in self._missing):
-            digests = None  # a total of files says nothing of the others where some are absent
+            digests = None  # a total digest cannot check files if some are absent
         if digests is not None:
             suffixes = (".pcd", ".yaml", *((".png",) if self._with_images else ()))
             found = digests.check(folder, name, files, used=lambda path: path.endswith(suffixes))
@@ -267,7 +267,7 @@ class Opv2vRecording:
         """Metres from the road up to the LiDAR along the LiDAR's z axis.
 
         By the two poses where they say something plausible. Where a pole's place is its sensor's own, the ground is
-        looked for in the agent's first cloud, once, so that the height is the same in every frame.
+        searched in the agent's first cloud, once, so that the height is the same in every frame.
         """
         stated = _stated_height(record, world_from_lidar)
         if stated is not None:
@@ -470,7 +470,7 @@ class Opv2vWriter:
             write_record(folder / f"{stem}.yaml", record, carla_from_transform(frame.world_from_agent), cameras)
 
     def close(self, protocol: Mapping[str, Any]) -> None:
-        """Write data_protocol.yaml; ``history_frames`` in it says how many first frames are not judged."""
+        """Write data_protocol.yaml; ``history_frames`` is the number of first frames that are not evaluated."""
         write_protocol(self.folder, protocol, self._fixed_delta_s)
 
 

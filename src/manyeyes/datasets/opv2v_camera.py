@@ -31,7 +31,7 @@ _BODY_FROM_CAMERA = Transform(
 
 @dataclass(frozen=True)
 class CameraRecord:
-    """What the yaml says of camera ``number``: cords [x, y, z, roll, yaw, pitch] in metres and degrees, intrinsic (3, 3)."""
+    """The yaml entry of camera ``number``: cords [x, y, z, roll, yaw, pitch] in metres and degrees, intrinsic (3, 3)."""
 
     number: int
     cords: tuple[float, ...]

@@ -26,7 +26,7 @@ _BUSES = ("fusorosa", "bus")
 
 @dataclass(frozen=True)
 class AgentRecord:
-    """What one yaml says, in its own units: metres, degrees and km/h in CARLA's left-handed world.
+    """Content of one yaml in its own units: metres, degrees and km/h in CARLA's left-handed world.
 
     lidar_pose, ego_pose, predicted_pose: [x, y, z, roll, yaw, pitch]; ego_pose is NaN where the file has none.
     id, label: (N,) of the listed vehicles; location, center, extent, angle ([roll, yaw, pitch]): (N, 3); speed: (N,).
@@ -180,7 +180,7 @@ def _label(vehicle: Mapping[Any, Any], size: np.ndarray) -> int:
 def write_record(
     path: Path, record: AgentRecord, predicted_pose: Sequence[float], cameras: Mapping[str, Any] | None = None
 ) -> None:
-    """Write one agent's yaml; predicted_pose is what the agent believes of its own place on the road, cameras its entries of them.
+    """Write one agent's yaml; predicted_pose: the agent's estimate of its own pose on the road; cameras: their entries.
 
     The text is formed by hand, because PyYAML takes ten times as long as the rest of a frame.
     """

@@ -73,7 +73,7 @@ def read_pcd(path: Path, drop_nan: bool = False, cache: ArrayCache | None = None
         cloud = _cloud(path, table)
         if cache is not None and header.encoding == "ascii" and cloud.time_s is None:
             cache.store(path, "pcd", np.concatenate((cloud.xyz, cloud.intensity[:, None]), 1))
-    # The sum is a cheap first look: it is finite where every point is.
+    # The sum is a cheap first check: it is finite where every point is.
     if np.isfinite(cloud.xyz.sum(dtype=np.float64)):
         return cloud
     whole = np.asarray(np.isfinite(cloud.xyz).all(axis=1))

@@ -99,7 +99,7 @@ def opencood_offset(seed: int, sigma_xyz: float, sigma_angle: float) -> tuple[fl
 
 @dataclass(frozen=True)
 class FrameDelay:
-    """Everything that a collaborator says is a whole number of frames old (OpenCOOD's ``sim`` delay: one per 100 ms).
+    """Messages of collaborators are a whole number of frames old (OpenCOOD's ``sim`` delay: one per 100 ms).
 
     Its cloud, pose and time stamp are those of the earlier frame; the ego and the truth are current; the motion of
     objects since then is not removed. The age is clipped at the start of the scenario, or of the agent's presence in it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What things are: frozen dataclasses of tensors, with no drawing, loading or logging."""
+"""Data types: frozen dataclasses of tensors, without drawing, loading or logging."""
 
 from manyeyes.datatypes.boxes import LABELS, Boxes, wrap_angle
 from manyeyes.datatypes.camera import Camera, CameraImage

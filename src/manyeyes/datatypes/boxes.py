@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Oriented boxes on the ground: what a detector finds and what truth holds."""
+"""Oriented boxes on the ground: detections and ground truth."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Boxes:
 
     center: (N, 3) metres, the middle of the box; size: (N, 3) length, width, height; yaw: (N,) radians about +z,
     0 along +x. score: (N,) in [0, 1]; label: (N,) int64, index into LABELS; id: (N,) int64, -1 when unknown.
-    sigma_xy: (N,) metres, sigma_yaw: (N,) radians and p_flip: (N,) in [0, 1] are the detector's own word on its
-    error and on the chance that the heading is off by pi; zero for truth. velocity: (N, 2) m/s over the ground along the
-    frame's x and y, zero where nobody knows it.
+    sigma_xy: (N,) metres, sigma_yaw: (N,) radians and p_flip: (N,) in [0, 1] are the detector's estimates of its
+    error and of the probability that the heading is off by pi; zero for ground truth. velocity: (N, 2) m/s over the
+    ground along the frame's x and y, zero where unknown.
     """
 
     center: Tensor
@@ -73,7 +73,7 @@ class Boxes:
 
     @classmethod
     def empty(cls, dtype: torch.dtype = torch.float32) -> Boxes:
-        """No boxes."""
+        """An instance without boxes."""
         return cls.of(torch.zeros(0, 3, dtype=dtype), torch.zeros(0, 3, dtype=dtype), torch.zeros(0, dtype=dtype))
 
     def __len__(self) -> int:

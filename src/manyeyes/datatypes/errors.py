@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every error that manyeyes raises on purpose; each text says what was expected, what came, and what to do."""
+"""Exceptions of manyeyes; each text gives the expected value, the actual value, and a remedy."""
 
 
 class ManyeyesError(Exception):

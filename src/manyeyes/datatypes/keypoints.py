@@ -36,7 +36,7 @@ class Keypoints:
 
     @property
     def xy(self) -> Tensor:
-        """(N, 2) metres."""
+        """Positions (N, 2) in metres."""
         return self.boxes.center[:, :2]
 
     def transform(self, target_from_source: Transform) -> Keypoints:

@@ -30,7 +30,7 @@ def freeze(values: ArrayLike, dtype: type[np.generic]) -> NDArray:
 
 
 def check_offsets(name: str, offsets: Ints, total: int) -> None:
-    """Raise ShapeError unless first (N+1,) starts at 0, never falls and ends at total."""
+    """Raise ShapeError unless offsets (N+1,) starts at 0, never falls and ends at total."""
     if (
         offsets.ndim != 1
         or len(offsets) == 0
@@ -45,7 +45,7 @@ def check_offsets(name: str, offsets: Ints, total: int) -> None:
 
 
 def take_rows(offsets: Ints, rows: Ints) -> tuple[Ints, Ints]:
-    """The offsets of the chosen rows of a table with offsets first, and the (P',) places of their entries, row by row."""
+    """The offsets of the chosen rows of a table, and the (P',) places of their entries, row by row."""
     counts = offsets[rows + 1] - offsets[rows]
     chosen = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     return chosen, np.arange(chosen[-1]) + np.repeat(offsets[rows] - chosen[:-1], counts)
@@ -53,7 +53,7 @@ def take_rows(offsets: Ints, rows: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True, eq=False)
 class Polygons:
-    """R open rings in one frame, ring i being ``points[first[i]:first[i + 1]]``; points: (Q, 2) metres, offsets: (R+1,)."""
+    """R open rings in one frame, ring i being ``points[offsets[i]:offsets[i + 1]]``; points: (Q, 2) metres, offsets: (R+1,)."""
 
     points: Floats
     offsets: Ints
@@ -82,7 +82,7 @@ class Polygons:
 class MapElements:
     """N polylines and rings in one frame, as columns.
 
-    kind: (N,) int64, index into KINDS. offsets: (N+1,) int64, element i being ``points[first[i]:first[i + 1]]``.
+    kind: (N,) int64, index into KINDS. offsets: (N+1,) int64, element i being ``points[offsets[i]:offsets[i + 1]]``.
     points: (P, 2) float64 metres; a crossing is an open ring (its closing edge is implied), all others are polylines.
     score: (N,) in [0, 1]. sigma: (P,) metres, one standard deviation across the line. style: (N, S) probabilities over
     STYLES. The arrays are read-only. Coordinates are planar: x forward or east, y left or north.
@@ -136,7 +136,7 @@ class MapElements:
 
     @classmethod
     def empty(cls) -> MapElements:
-        """No elements."""
+        """An instance without elements."""
         return cls.of([], DIVIDER)
 
     @classmethod
@@ -208,7 +208,7 @@ class MapElements:
         return np.bincount(element_of_segment, step, len(self)).astype(np.float64)
 
     def bounds(self) -> Floats:
-        """(N, 4) least x, least y, most x, most y; an element without points: inf, inf, -inf, -inf."""
+        """(N, 4) minimum x and y, maximum x and y; an element without points: inf, inf, -inf, -inf."""
         box = np.tile((np.inf, np.inf, -np.inf, -np.inf), (len(self), 1))
         some = self.counts > 0
         starts = self.offsets[:-1][some]

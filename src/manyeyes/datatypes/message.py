@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one agent says to all others at one instant, before it is bytes and after."""
+"""Message of one agent to all others at one instant."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from manyeyes.datatypes.sparse_bev import SparseBev
 from manyeyes.datatypes.transform import Transform
 
 DESCRIPTOR_DIM = 32
-"""Numbers of an object's descriptor."""
+"""Channels of an object's descriptor."""
 
 
 @dataclass(frozen=True, eq=False)
 class RequestMap:
-    """How sure an agent is of what it sees around itself: sure (rows, columns) in [0, 1], one value a cell of a coarse grid.
+    """Confidence (rows, columns) in [0, 1] of an agent's own objects, one value a cell of a coarse grid.
 
-    0 where it sees nothing: there others can help it most.
+    0 where it detects nothing: tokens of others have the highest value there.
     """
 
     grid: BevGrid
@@ -40,10 +40,10 @@ class RequestMap:
 
 @dataclass(frozen=True, eq=False)
 class LocalMap:
-    """What an agent sees of the map, in its own frame, metres: elements, and where it would have seen others.
+    """Map elements that an agent observes, in its own frame, metres, and the area in which it observes.
 
-    view: (K, 2), an open ring; occluders: open rings that hide parts of it. Nothing where nothing is said: there the agent
-    looked, and says that the street is empty.
+    view: (K, 2), an open ring; occluders: open rings that hide parts of it. No element in a visible part of the view means that
+    there is none.
     """
 
     elements: MapElements
@@ -64,7 +64,7 @@ class Message:
     fingerprint: 8 bytes that name the weights which made the tokens; tokens of other weights are refused.
     tokens: one grid, in the sender's frame; features float, or uint8 rows of the weights' codebook. token_score: (N,), which
     cells matter most. objects and points: sender's frame. descriptors: (objects, DESCRIPTOR) in [-1, 1], of each object, for
-    matching. request: what the sender would hear. local_map: what it sees of the map.
+    matching. request: the sender's confidence. local_map: the map elements that it observes.
     """
 
     agent_id: int

@@ -20,7 +20,7 @@ def as_tensor(value: Numbers, name: str, dtype: torch.dtype) -> Tensor:
     """Convert numbers to a tensor of that dtype; a tensor keeps its memory where it fits, everything else is copied.
 
     Raises:
-        ShapeError: the value is not a rectangular array of real numbers; ``name`` says which argument it was.
+        ShapeError: the value is not a rectangular array of real numbers; ``name`` is the name of the argument.
     """
     if isinstance(value, Tensor):
         return value.to(dtype)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a LiDAR returns."""
+"""Point cloud of one LiDAR sweep."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from manyeyes.datatypes.transform import Transform
 class PointCloud:
     """N returns of one sweep.
 
-    xyz: (N, 3) float32, metres, in the frame of whoever holds the cloud (right-handed, z up).
+    xyz: (N, 3) float32, metres, in the frame of the object that holds the cloud (right-handed, z up).
     intensity: (N,) float32 in [0, 1]. time_s: (N,) float32, seconds relative to the frame's time stamp.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One instant of a drive: what each agent knows, and, kept apart from it, the truth."""
+"""One instant of a drive: the frames of all agents and, separately, the ground truth."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from manyeyes.datatypes.transform import Transform
 
 @dataclass(frozen=True)
 class AgentFrame:
-    """One agent at one instant: all that it may use to perceive. No label is in it.
+    """One agent at one instant: all inputs of its perception, without labels.
 
     points: in the agent's own frame (x forward, y left, z up; z = 0 is the road under it, under a pole too).
-    world_from_agent: the *claimed* pose; pose_covariance: (3, 3) of x, y (m) and yaw (rad) in the world, what the
-    agent says of its error. sensor_height_m: height of the LiDAR above the road. speed_mps: own speed. odometry: the pose in a
-    frame of the agent's own that drifts but never jumps, for motion since the frames before; by default the claimed pose.
-    images: what its cameras took, where it has any and they were asked for.
+    world_from_agent: the *claimed* pose; pose_covariance: (3, 3) of x, y (m) and yaw (rad) in the world, the
+    agent's estimate of its error. sensor_height_m: height of the LiDAR above the road. speed_mps: own speed. odometry:
+    the pose in a local frame that drifts but never jumps, for motion since earlier frames; by default the claimed pose.
+    images: of its cameras, if it has any and they were requested.
     """
 
     agent_id: int
@@ -49,7 +49,7 @@ class AgentFrame:
     def of(
         cls, points: PointCloud, world_from_agent: Transform, agent_id: int = 0, timestamp_ns: int = 0
     ) -> AgentFrame:
-        """A frame from a cloud and a pose that is believed to be exact."""
+        """A frame from a cloud and a pose, with zero covariance."""
         return cls(agent_id, timestamp_ns, points, world_from_agent, torch.zeros(3, 3, dtype=torch.float64))
 
     def now_from_earlier(self, earlier: AgentFrame) -> Transform:
@@ -60,7 +60,7 @@ class AgentFrame:
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """What was really there at one instant; seen by evaluation and training only.
+    """Ground truth of one instant; used by evaluation and training only.
 
     boxes: in the world frame, float64, ids set. seen: (agents, N) bool, whether an agent lists the box (its LiDAR met
     it); row order is that of Snapshot.frames. world_from_agent: the true poses, batch shape (agents,).

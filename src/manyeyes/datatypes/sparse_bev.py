@@ -93,7 +93,7 @@ class SparseBev:
         return SparseBev(self.features.index_select(0, rows), sites)
 
     def dense(self) -> Tensor:
-        """(B, C, rows, columns), zero where no site is; for pictures, tests and dense rivals."""
+        """(B, C, rows, columns), zero where no site is; for figures, tests and dense baselines."""
         rows, columns = self.grid.shape
         out = self.features.new_zeros(self.sites.batch_size * rows * columns, self.features.shape[1])
         out[self.sites.key] = self.features

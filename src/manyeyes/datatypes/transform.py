@@ -32,7 +32,7 @@ class Transform:
 
     @classmethod
     def identity(cls, *batch: int, dtype: torch.dtype = torch.float64) -> Transform:
-        """The motion that changes nothing, batch shape as given."""
+        """The identity motion of a batch shape."""
         return cls(torch.eye(3, dtype=dtype).expand(*batch, 3, 3), torch.zeros(*batch, 3, dtype=dtype))
 
     @classmethod
@@ -88,7 +88,7 @@ class Transform:
         return torch.cat((torch.cat((self.rotation, self.translation[..., None]), -1), bottom), -2)
 
     def inverse(self) -> Transform:
-        """source_from_target."""
+        """The inverse motion, source_from_target."""
         back = self.rotation.mT
         return Transform(back, -(back @ self.translation[..., None])[..., 0])
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ways to collaborate: what an agent says, and what it makes of what it hears. One a file."""
+"""Fusion strategies: how an agent composes messages and fuses received ones. One file a strategy."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ __all__ = [
 
 
 class FusionStrategy(Protocol):
-    """The two halves of one way to collaborate."""
+    """Composition and fusion of messages of one collaboration scheme."""
 
     @property
     def name(self) -> str:
-        """How tables call it."""
+        """Name in tables and commands."""
         ...
 
     @property
     def uses_history(self) -> bool:
-        """Whether it also hears what was said a moment ago: older messages, and the last of those who fell silent."""
+        """Whether older messages of each sender are fused too, also of senders without a current message."""
         ...
 
     def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
-        """The message of this frame, before selection and encoding; None says nothing."""
+        """The message of this frame, before selection and encoding; None sends nothing."""
         ...
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes in the agent's frame, from its own cloud and what the others said."""
+        """Boxes in the agent's frame, from its own cloud and received messages."""
         ...
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Early fusion: every agent sends its points; the ego looks at them all as one cloud. The bound, at any price in bytes."""
+"""Early fusion: every agent sends its points; the ego runs the detector on the merged cloud. An upper bound at a high bandwidth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class EarlyFusion:
     uses_history: bool = False
 
     def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
-        """The whole cloud."""
+        """A message with the agent's whole cloud."""
         return replace(make_header(frame, cache.detector.fingerprint), points=frame.points)
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:

@@ -19,13 +19,13 @@ from manyeyes.ops.keyed_random import keyed_uniform
 
 
 def mask_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
-    """What the trained mask says (CoSTr section III-E)."""
+    """Score of the trained mask (CoSTr section III-E)."""
     with torch.inference_mode():
         return torch.sigmoid(cache.detector.score_tokens(cache.process(frame).tokens_raw_velocity))
 
 
 def confidence_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
-    """How sure the sender is that the token is the middle of an object: the rule of Where2comm, on tokens."""
+    """Confidence of the sender that the token is the centre of an object: the rule of Where2comm, on tokens."""
     return torch.sigmoid(proposed_heat(cache.process(frame).shared_tokens.features[:, -PROPOSAL_DIM:]))
 
 
@@ -38,21 +38,21 @@ def random_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
 
 @dataclass(frozen=True)
 class IntermediateFusion:
-    """Tokens of the weights that the ego carries itself; the inbox refuses others. score: which of them a budget keeps first."""
+    """Fusion of tokens of the ego's own weights; the inbox rejects others. score: order in which a budget keeps tokens."""
 
     name: str = "intermediate"
     score: Callable[[PerceptionCache, AgentFrame], Tensor] = novelty_score
     uses_history: bool = True
 
     def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
-        """The tokens that pruning kept with what the agent makes of them, and their worth, by which a budget chooses."""
+        """The pruned tokens with their proposals, and their scores for selection within a budget."""
         tokens = cache.process(frame).shared_tokens
         return replace(
             make_header(frame, cache.detector.fingerprint), tokens=tokens, token_score=self.score(cache, frame)
         )
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes of the fused tokens, with the agent's own last two instants to look back at."""
+        """Boxes of the fused tokens, with the agent's own tokens of the last two frames."""
         return cache.decode(
             cache.fuse(
                 *gather_ego_tokens(frame, cache.process(frame).shared_tokens, cache.previous_tokens(frame), messages)
@@ -63,10 +63,9 @@ class IntermediateFusion:
 def gather_ego_tokens(
     frame: AgentFrame, own: SparseBev, past: Sequence[AgentTokens], messages: Sequence[Message]
 ) -> tuple[Tokens, Tokens | None]:
-    """The ego's own tokens, of now and of its past, and those of every message on the same lattice; and its own past alone.
+    """The ego's current and past tokens with those of every message on the same lattice; and its own past tokens alone.
 
-    What was seen or said a moment ago stands beside what is seen now, where its object should be by now, and weighs what its age
-    leaves of its trust (``models.fusion.token_merge``).
+    Older tokens are propagated by their proposed velocity, and weighted by their age (``models.fusion.token_merge``).
     """
     on_grid = [(m, m.tokens) for m in messages if m.tokens is not None and m.tokens.grid == own.grid]
     received = [_to_agent_tokens(frame, message, tokens.features, tokens.sites.xy) for message, tokens in on_grid]
@@ -75,7 +74,7 @@ def gather_ego_tokens(
 
 
 def _to_agent_tokens(frame: AgentFrame, message: Message, features: Tensor, xy: Tensor) -> AgentTokens:
-    """Both claims may be wrong: their variances add up."""
+    """Tokens in the ego's frame; the pose variances of ego and sender add up."""
     variance = (frame.pose_covariance + message.pose_covariance).diagonal()
     sigma_xy_m = float((variance[:2].mean()).clamp_min(0).sqrt())
     sigma_yaw_rad = float(variance[2].clamp_min(0).sqrt())

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Late fusion: every agent sends its boxes; the ego keeps the best of those that overlap (detection.md A.9).
+"""Late fusion: every agent sends its boxes; the ego applies non-maximum suppression to all of them.
 
-What others send is bounded before it is ranked, and no box of another agent removes what the ego detects itself: an own box that
-gave way to a box elsewhere returns at half its score.
+Received boxes are limited in number before suppression. No received box removes an own detection: an own box suppressed by a box at
+another position is restored at half its score.
 """
 
 from __future__ import annotations
@@ -18,18 +18,17 @@ from manyeyes.agents.strategies.temporal_boxes import DUPLICATE_IOU, decay_score
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 
 DUPLICATE_DISTANCE_M = 1.0
-"""An own box is replaced by one whose centre is no farther away."""
+"""Maximum distance between the centres of an own box and the box that replaces it."""
 DISPLACED_SCORE_FACTOR = 0.5
-"""What is left of the score of an own box that gave way to one farther away."""
+"""Factor on the score of an own box that was suppressed by a box farther away."""
 
 
 @dataclass(frozen=True)
 class LateFusion:
-    """nms_iou: boxes of several agents that overlap more are one object; min_score: the lowest score worth its bytes; max_boxes: so
-    many of a message's boxes inside the ego's range take part, the best.
+    """Exchange of boxes.
 
-    history_frames: so many of the ego's own before now, and with them what is remembered of the others, take part too; 0 is late
-    fusion as papers have it.
+    nms_iou: boxes with a larger IoU are one object; min_score: of a sent box; max_boxes: of a message, by falling score, within the
+    ego's range. history_frames: previous frames of the ego, and of the senders, that are fused too; 0 is the late fusion of papers.
     """
 
     name: str = "late"
@@ -40,18 +39,18 @@ class LateFusion:
 
     @property
     def uses_history(self) -> bool:
-        """With the ego's own past."""
+        """Whether previous frames are fused too."""
         return self.history_frames > 0
 
     def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
-        """The boxes of the agent's own sweeps."""
+        """A message with the agent's own boxes."""
         found = cache.process(frame).boxes
         return replace(make_header(frame, cache.detector.fingerprint), objects=found[found.score > self.min_score])
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """All boxes in the ego's frame, each where its velocity has taken it by now, after suppression by score.
+        """All boxes in the ego's frame, propagated by their velocity, after non-maximum suppression.
 
-        What is remembered is a little less sure (``fading``).
+        Scores of older boxes decay (``temporal_boxes``).
         """
         own, others = cache.process(frame).boxes, list[Boxes]()
         for m, lag_s in zip(messages, lag_behind_newest_s(messages)):
@@ -67,7 +66,7 @@ class LateFusion:
 
 
 def _restore_own_boxes(ranked: Boxes, own: Boxes) -> Boxes:
-    """All of ranked, and the own boxes that none of them replaces, less sure: within SAME_PLACE_M of each own box is a result."""
+    """All ranked boxes, and the own boxes without one of them within DUPLICATE_DISTANCE_M, at a reduced score."""
     replaced = (torch.cdist(own.center[:, :2], ranked.center[:, :2]) <= DUPLICATE_DISTANCE_M).any(1)
     displaced = own[~replaced]
     found = Boxes.cat([ranked, replace(displaced, score=displaced.score * DISPLACED_SCORE_FACTOR)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The head of every message: who, when, from where."""
+"""Header of every message: agent, timestamp and pose."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from manyeyes.datatypes import AgentFrame, Message, Transform
 
 
 def make_header(frame: AgentFrame, fingerprint: bytes) -> Message:
-    """A message of this frame with no section yet."""
+    """A message of this frame without any section."""
     return Message(
         agent_id=frame.agent_id,
         timestamp_ns=frame.timestamp_ns,
@@ -21,16 +21,16 @@ def make_header(frame: AgentFrame, fingerprint: bytes) -> Message:
 
 
 def lag_behind_newest_s(messages: Sequence[Message]) -> list[float]:
-    """Seconds that each message lies behind the newest of its sender: 0 for what is news, more for what is remembered."""
+    """Age of each message relative to the newest of its sender, seconds; 0 for the newest."""
     newest = {m.agent_id: m.timestamp_ns for m in sorted(messages, key=lambda m: m.timestamp_ns)}
     return [(newest[m.agent_id] - m.timestamp_ns) / 1e9 for m in messages]
 
 
 def ego_from_sender(frame: AgentFrame, message: Message) -> Transform:
-    """From the sender's frame when it looked to the ego's now, by the claimed poses of both."""
+    """Transform from the sender's frame at its timestamp to the ego's current frame, by the prior poses of both."""
     return frame.world_from_agent.inverse() @ message.world_from_agent
 
 
 def age_s(frame: AgentFrame, message: Message) -> float:
-    """How long before the ego's frame the sender looked, seconds."""
+    """Age of a message relative to the ego's frame, seconds."""
     return (frame.timestamp_ns - message.timestamp_ns) / 1e9

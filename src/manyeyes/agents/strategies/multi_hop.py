@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fused messages: every agent sends what it made of its own and of others' tokens, as the letter of CoSTr Eq. 1 says.
+"""Multi-hop fusion: every agent sends its fused tokens, the literal reading of CoSTr Eq. 1.
 
-The information of A returns to A through B, counted twice and as old as two messages; ``intermediate`` sends what each saw itself.
+Information of agent A returns to A through B, counted twice and two messages old; ``intermediate`` sends own tokens only.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from manyeyes.datatypes import AgentFrame, Boxes, Message
 
 @dataclass(frozen=True)
 class MultiHopFusion:
-    """Sends the tokens of its last perception, dated as that was; before it has perceived, its own."""
+    """Sends the fused tokens of the last perception with its timestamp; own tokens before the first perception."""
 
     name: str = "intermediate-multihop"
     uses_history: bool = True
 
     def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
-        """What the agent perceived at its last instant, if that was just before; else what it sees."""
+        """The fused tokens of the previous frame if it is consecutive, else the agent's own tokens."""
         cache.process(frame)
         if cache.last_fused is None or not is_consecutive(frame, cache.last_fused[0]):
             return IntermediateFusion().compose_message(cache, frame)
@@ -34,7 +34,7 @@ class MultiHopFusion:
         return replace(make_header(then, cache.detector.fingerprint), tokens=tokens, token_score=score)
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes of the fused tokens, which are kept to be said."""
+        """Boxes of the fused tokens; the tokens are stored for the next message."""
         with torch.inference_mode():
             around = gather_ego_tokens(
                 frame, cache.process(frame).shared_tokens, cache.previous_tokens(frame), messages

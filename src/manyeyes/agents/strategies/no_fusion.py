@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ego alone: says nothing, hears nothing. The floor of every comparison."""
+"""No fusion: the ego neither sends nor fuses messages. The lower bound of every comparison."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from manyeyes.datatypes import AgentFrame, Boxes, Message
 
 @dataclass(frozen=True)
 class NoFusion:
-    """No collaboration."""
+    """Single-agent perception without messages."""
 
     name: str = "none"
     uses_history: bool = False
 
     def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
-        """Nothing."""
+        """None, since nothing is sent."""
         return None
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """What the agent's own cloud shows."""
+        """Boxes of the agent's own cloud."""
         return cache.process(frame).boxes

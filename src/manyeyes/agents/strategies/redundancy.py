@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an agent has not said yet: the order in which a budget keeps its tokens.
+"""Redundancy-aware token scores: the order in which a budget keeps tokens.
 
-Whoever hears an agent remembers its last messages (``agents.message_history``), so the next word is best spent on an object
-that none of them spoke of. A token is worth its sender's confidence, less for each word on the same object that comes before
-it: a surer one of the same message, and those of the last messages, which count once. It is said again, late, where nothing
-else is as likely. Compare CoSTr section III-E, which asks what a message adds to what its receiver has; here that is what the
-sender said itself. A receiver that lost those messages hears of the object again within three.
+Receivers keep the last messages of a sender (``agents.message_history``), so a token of an object that these messages do not cover
+has the highest value. A token's score is its confidence, reduced for each earlier token of the same object: more confident ones of
+the same message, and those of the last messages, which count once. CoSTr section III-E scores what a message adds to the receiver's
+features; here the sender uses its own messages instead. An object is sent again within three messages, in case they were lost.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from manyeyes.datatypes import AgentFrame, SparseBev
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat, proposed_offset, proposed_velocity
 
 REDUNDANCY_DECAY = 0.7
-"""What a word on an object leaves of the worth of the next; chosen on Town07 (0.5 to 0.85 do about as well)."""
+"""Factor on the score for each earlier token of the same object; chosen on Town07 (0.5 to 0.85 are similar)."""
 SAME_OBJECT_M = 2.0
-"""Tokens speak of one object where the centres that they propose are nearer."""
+"""Tokens with proposed centres closer than this belong to one object."""
 
 
 def novelty_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
-    """(N,) in [0, 1], of the tokens that the agent tells of this frame: sigmoid(heat) * AGAIN^(words before it)."""
+    """(N,) in [0, 1], of the shared tokens of a frame: sigmoid(heat) * REDUNDANCY_DECAY^(earlier tokens of the object)."""
     tokens = cache.process(frame).shared_tokens
     place, heat = proposed_centres(tokens), proposed_heat(tokens.features[:, -PROPOSAL_DIM:])
     rank = heat.argsort(descending=True, stable=True).argsort()
@@ -43,7 +42,7 @@ def proposed_centres(tokens: SparseBev) -> Tensor:
 
 
 def _propagate_centres(frame: AgentFrame, then: AgentFrame, sent: SparseBev) -> Tensor:
-    """(N, 2): where the objects of tokens of an earlier frame should be by now, in this one."""
+    """(N, 2): proposed centres of an earlier frame's tokens, propagated to this frame."""
     seconds = (frame.timestamp_ns - then.timestamp_ns) / 1e9
     xy = proposed_centres(sent) + proposed_velocity(sent.features[:, -PROPOSAL_DIM:]) * seconds
     moved = frame.now_from_earlier(then).apply(torch.cat((xy, xy.new_zeros(len(xy), 1)), 1).double())

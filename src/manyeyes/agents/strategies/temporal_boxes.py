@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boxes that were seen or said a moment ago take part too: where they should be by now, a little less sure of themselves.
+"""Boxes of previous frames, propagated by their velocity with decaying scores.
 
-What tokens of the instants before do for intermediate fusion, their boxes do for late fusion that remembers: its strongest rival.
+They give late fusion the same history that tokens of previous frames give intermediate fusion.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from manyeyes.datatypes import AgentFrame, Boxes
 from manyeyes.ops.nms import rotated_nms
 
 SCORE_DECAY_PER_100MS = 0.95
-"""What a tenth of a second leaves of a score; chosen on Town07 for late fusion."""
+"""Factor on a score for each 100 ms of age; chosen on Town07 for late fusion."""
 DUPLICATE_IOU = 0.15
-"""Boxes that overlap more are one object."""
+"""Boxes with a larger IoU are one object."""
 
 
 def decay_scores(boxes: Boxes, seconds: float) -> Boxes:
-    """The same boxes, as sure as so many seconds leave them."""
+    """The same boxes with scores decayed by their age."""
     return replace(boxes, score=boxes.score * SCORE_DECAY_PER_100MS ** (10 * seconds))
 
 
 def propagate_boxes(frame: AgentFrame, outputs: Iterable[tuple[AgentFrame, AgentOutput]]) -> list[Boxes]:
-    """The boxes of an agent's views before this frame, in it, each where its velocity has taken it."""
+    """Boxes of an agent's previous frames, propagated by their velocity to this frame."""
     found = []
     for before, output in outputs:
         seconds = (frame.timestamp_ns - before.timestamp_ns) / 1e9
@@ -35,6 +35,6 @@ def propagate_boxes(frame: AgentFrame, outputs: Iterable[tuple[AgentFrame, Agent
 
 
 def merge_boxes_nms(boxes: list[Boxes], iou: float = DUPLICATE_IOU) -> Boxes:
-    """All boxes, best first, without those that overlap a better one."""
+    """Boxes by falling score after non-maximum suppression."""
     all_of_them = Boxes.cat(boxes)
     return all_of_them[rotated_nms(all_of_them.bev().double(), all_of_them.score, iou, max_candidates=len(all_of_them))]
