@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whom to believe: what honest errors explain counts, what they do not counts next to nothing."""
+"""Agent weights and the gauge offset, against values computed by hand."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ VARIANCE = 0.16
 
 
 def agent_weights(offset, agent, observability=1.0):
-    """Faith by observation where lines told ``observability`` of each place."""
+    """Estimate the agent weight of each observation at this observability."""
     count = len(agent)
     matrix = np.tile(observability * np.eye(2), (count, 1, 1))
     return estimate_agent_weights(np.array(offset, float), matrix, np.full(count, VARIANCE), np.array(agent), LIMITS)
 
 
 def test_weight_matches_hand_computed_value():
-    """n looks whose mean is m off: n m² / (sigma² (1 + alike (n - 1))) against scale², by hand for n = 4, told whole."""
+    """n observations with mean offset m: n m² / (sigma² (1 + rho (n - 1))) against scale², for n = 4 and observability 1."""
     offset = [(0.5, 0.1), (0.3, -0.1), (0.4, 0.0), (0.4, 0.0)]
-    mean = np.array([1.6, 0.0]) / 4.1  # the tenth is what no lines tell
+    mean = np.array([1.6, 0.0]) / 4.1  # 0.1 is the regularization of unobservable directions
     away = 4.0 * mean @ mean / (VARIANCE * (1.0 + 0.5 * 3.0))
     assert agent_weights(offset, [0] * 4) == pytest.approx((4.0 / (4.0 + away)) ** 2)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rivals, each on a case worked by hand, and what they share."""
+"""The baselines, each on a case worked by hand, and what they share."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_the_pre_filter_drops_weak_and_short_elements_and_a_repeated_observation
     assert kept.elements.kind.tolist() == [0, 3, 2] and kept.observation_of_element.tolist() == [0, 1, 1]
 
 
-def test_scores_follow_who_saw_who_missed_and_how_long() -> None:
+def test_scores_follow_hits_misses_and_length() -> None:
     far = VIEW + (400.0, 0.0)
     many = [
         make_observation(0, [line(0.0)]),
@@ -116,7 +116,7 @@ def test_scores_follow_who_saw_who_missed_and_how_long() -> None:
     )
 
 
-def test_an_occluder_excuses_who_did_not_see() -> None:
+def test_occluded_observation_is_no_miss() -> None:
     wall = Polygons.of([[[1.0, -30.0], [1.5, -30.0], [1.5, 30.0], [1.0, 30.0]]])
     hidden = replace(make_observation(1, []), occluders=wall)
     assert union.fuse([make_observation(0, [line(0.0, 5, 45)]), hidden]).log_odds[0] == pytest.approx(
@@ -239,7 +239,7 @@ def test_an_unknown_choice_is_refused(config_class: type, change: dict) -> None:
         config_class(**change)
 
 
-def test_frechet_clusters_of_rings_do_not_mind_where_and_which_way_a_ring_begins() -> None:
+def test_frechet_clusters_of_rings_ignore_start_and_direction() -> None:
     rings = [SQUARE, SQUARE[2:] + SQUARE[:2], [[x + 0.5, y] for x, y in SQUARE][::-1]]
     (ring,) = lines_in(
         frechet_clustering.fuse([make_observation(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING
@@ -292,7 +292,7 @@ def test_the_heat_map_joins_pieces_into_one_line_between_them() -> None:
     assert np.abs(first[:, 1] - 0.2).max() < 0.35 and np.abs(second[:, 1] - 3.5).max() < 0.3
 
 
-def test_heat_that_few_of_those_who_could_see_it_made_is_no_line() -> None:
+def test_heat_of_a_small_fraction_of_views_is_no_line() -> None:
     many = [
         make_observation(0, [line(0.0), line(8.0)]),
         make_observation(1, [line(0.0), line(8.0)]),

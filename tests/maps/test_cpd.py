@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coherent point drift: a known motion is found, with pycpd as an oracle, and where it goes astray as published."""
+"""Coherent point drift: a known motion is found, with pycpd as a reference, and cases where the published method diverges."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The error that looks of one drive share, against the mode of the whole model solved at once."""
+"""The bias of a drive, against the mode of the complete model solved at once."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ FAR = 1e6  # sigmas: the prior never lets go
 
 
 def make_information(information, correction):
-    """heard and urge of looks whom lines tell corrections (O, 3) with information (O, 3, 3)."""
+    """Information matrices (O, 3, 3) and vectors (O, 3) of observations with these corrections (O, 3)."""
     return np.array(information), np.einsum("oij,oj->oi", np.array(information), np.array(correction))
 
 
 def whole_model(information_matrix, information_vector, drive_correlation):
-    """The slow twin: the mode of b and all e_i together, from sum (d - b - e)' L (d - b - e) + e' P_own^-1 e + b' P_all^-1 b."""
+    """Reference: the mode of b and all e_i together, from sum (d - b - e)' L (d - b - e) + e' P_own^-1 e + b' P_all^-1 b."""
     count = len(information_matrix)
     normal, right = np.zeros((3 * count + 3, 3 * count + 3)), np.zeros(3 * count + 3)
     normal[:3, :3] = np.linalg.inv(drive_correlation * P)
@@ -57,7 +57,7 @@ def test_bias_applies_to_unobserved_poses_of_same_drive_only():
     found = estimate_drive_bias(
         information_matrix, information_vector, np.tile(P, (5, 1, 1)), np.array([0, 0, 0, 0, 1]), 0.5, FAR
     )
-    # Three looks told whole: 3 / (3 + 1) of their mean, since own and common error are of one size.
+    # Three fully observable poses: 3 / (3 + 1) of their mean, since own and common variance are equal.
     assert found[:4, :2] == pytest.approx(np.tile((0.45, 0.0), (4, 1)), abs=1e-2)
     assert found[4] == pytest.approx(np.zeros(3))
 

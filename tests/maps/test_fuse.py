@@ -47,7 +47,7 @@ def road(length=100.0, sides=(-5.25, -1.75, 1.75, 5.25)):
 def make_observation(
     world, at, agent="a", hour=0, error=(0.0, 0.0, 0.0), noise=0.0, seed=0, style=NO_STYLE, score=0.9, **more
 ):
-    """What an agent at true pose ``at`` sees of world lines, when its claimed pose is off by ``error``."""
+    """What an agent at true pose ``at`` sees of world lines, when its prior pose is off by ``error``."""
     rng = np.random.default_rng(seed)
     x, y, yaw = at
     back = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
@@ -82,7 +82,7 @@ def _inside(line):
 
 
 def crowd(world, count=12, sigma=0.4, noise=0.1, seed=1, length=100.0):
-    """Looks along a road by as many agents, with errors of pose and points."""
+    """Observations along a road by as many agents, with errors of pose and points."""
     rng = np.random.default_rng(seed)
     return [
         make_observation(
@@ -216,7 +216,7 @@ def test_prior_misses_raise_evidence_needed_to_publish():
     def dividers(observations):
         return len(lines_of(fuse(observations, config), DIVIDER))
 
-    assert dividers(late[:1]) == 3  # nobody looked before
+    assert dividers(late[:1]) == 3  # no earlier view covers it
     assert dividers([*early, *late[:1]]) == 2
     assert dividers([*early, *late]) == 3  # three agree: it is new
 
@@ -354,13 +354,13 @@ def test_wrongly_rejected_agents_are_reinstated():
         )
     assert num_rejected[1] > 0 and off[1] > 0.1
     assert num_rejected[2] == 0 and off[2] < 1e-3
-    # Where five honest agents looked, what the liars add does not count; smoothing brings a centimetre from where fewer did.
+    # Where five honest agents cover the ground, malicious observations do not count; smoothing adds a centimetre near other ground.
     away = measure_displacement(fuse(honest), fuse(simulated.observations))
     assert len(away) > 500 and away.max() < 0.03 and np.median(away) < 1e-5
 
 
 def test_rejected_observations_count_only_outside_inlier_coverage():
-    """A road in a view of 60 m; four believed agents stand 20 m behind, so that they see two thirds of it."""
+    """A road in a view of 60 m; four inlier agents stand 20 m behind, so that they see two thirds of it."""
     observations = [make_observation(road(), (30.0, 0.0, 0.0), "rejected")]
     observations += [make_observation(road(), (10.0, 0.0, 0.0), f"agent{k}", k) for k in range(4)]
     arrays = to_observation_arrays(observations, 1.0)
@@ -376,7 +376,7 @@ def test_rejected_observations_count_only_outside_inlier_coverage():
 
 @pytest.mark.parametrize("later, moved", [({}, True), ({"pass_id": "another"}, False)])
 def test_drive_bias_corrects_isolated_observation(later, moved):
-    """Twelve agents see the first half of a road, one of them the second half too; its claims are off by 0.6 m."""
+    """Twelve agents see the first half of a road, one of them the second half too; its prior poses are off by 0.6 m."""
     world = road(300.0)
     others = crowd(world, 12, sigma=0.05)
     seen, alone = (
@@ -436,8 +436,8 @@ def test_the_map_is_a_function_of_the_set(random, again):
 
 @settings(max_examples=4, deadline=None)
 @given(st.floats(-2.0, 2.0), st.integers(2, 5))
-def test_gauge_is_the_mean_of_the_claims(error, count):
-    """Two groups that claim to stand error apart meet in the middle: nobody's word is the law."""
+def test_gauge_is_the_mean_of_the_prior_poses(error, count):
+    """Two groups whose prior poses differ by error / 2 meet in the middle."""
     seen = [
         make_observation(road(), (30.0 + k, 0.0, 0.0), f"agent{k}", k, (0.0, error / 4 * (-1) ** k, 0.0))
         for k in range(2 * count)
@@ -450,8 +450,8 @@ def test_gauge_is_the_mean_of_the_claims(error, count):
 @pytest.mark.parametrize(
     ("score", "num_observations", "lines"), [(0.55, 1, 2), (0.45, 1, 0), (0.55, 5, 0), (0.9, 5, 0)]
 )
-def test_what_few_could_have_seen_is_published_on_less(score, num_observations, lines):
-    """One agent draws two dividers, half sure or hardly; nobody else looks there, or four see nothing."""
+def test_low_coverage_lowers_the_threshold_of_publication(score, num_observations, lines):
+    """One agent detects two dividers at some score; no other agent covers them, or four miss them."""
     evidence = EvidenceConfig(publish_log_odds=1.0, publish_low_coverage_log_odds=0.3, min_publish_agents=1)
     seen = make_observation(road(sides=(-1.75, 1.75)), (30.0, 0.0, 0.0), "a", score=score)
     blank = [make_observation([], (30.0, 0.0, 0.0), f"b{k}", k + 1) for k in range(num_observations - 1)]

@@ -21,7 +21,7 @@ RING = np.array([[20.0, -5.0], [24.0, -5.0], [24.0, 5.0], [20.0, 5.0]])
 
 
 def make_observation(x, number, error=0.0, crossing=True, low=0.0, high=120.0):
-    """A road along x from low to high, seen from (x, 0), without noise of points; the claimed pose is off sideways."""
+    """A road along x from low to high, seen from (x, 0), without noise of points; the prior pose has a lateral error."""
     along = np.arange(max(low, x - 30.0), min(high, x + 30.0) + 0.1, 2.0)
     lines = [np.stack((along - x, np.full(len(along), y)), 1) for _, y in SIDES]
     kinds = [kind for kind, _ in SIDES]

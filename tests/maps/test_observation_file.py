@@ -149,7 +149,7 @@ def _moved(row: dict) -> None:
         (_covariance, "covariance: expected 6 numbers"),
         (_agent, "agent"),
         (_view, "view"),
-        (_moved, "id: expected [0-9a-f]{32}, as its content says"),
+        (_moved, "id: expected [0-9a-f]{32}, the hash of its content"),
     ],
 )
 def test_a_bad_row_is_put_aside_with_its_reason_and_the_rest_is_read(tmp_path: Path, change, message: str) -> None:

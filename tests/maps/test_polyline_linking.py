@@ -31,10 +31,10 @@ def test_stations_in_a_row_are_one_line_and_rows_a_lane_apart_are_two():
 
 @pytest.mark.parametrize("gap, coverage, dashed, lines", [
     (8.0, 99.0, False, 1),
-    (10.0, 99.0, False, 2),  # many looked there and saw nothing
+    (10.0, 99.0, False, 2),  # high coverage without a detection
     (10.0, 99.0, True, 1),
     (20.0, 99.0, True, 2),
-    (20.0, 3.0, False, 1),  # few looked there
+    (20.0, 3.0, False, 1),  # low coverage
     (30.0, 3.0, False, 2),
 ])  # fmt: skip
 def test_gap_is_bridged_at_low_coverage(gap, coverage, dashed, lines):

@@ -272,6 +272,6 @@ def test_a_writer_killed_at_any_moment_leaves_a_whole_release_and_a_whole_log():
         assert seen["whole"] and seen["first"] and seen["second"] in (0, 40), case
         releases.add(seen["release"])
         seconds.add(seen["second"])
-        # A writer that comes after finishes the work, and nothing tells that another had died.
+        # The next writer completes the work, and no trace of the killed one remains.
         assert json.loads(case["end"]) == report["want"], case
     assert seconds == {0, 40} and 1 in releases

@@ -37,7 +37,7 @@ def road(begin, end, name):
 
 
 def crossing_map():
-    """Two such roads, and a junction between them from x = 60 to 80, whose lanes have borders that nobody painted."""
+    """Two such roads, and a junction between them from x = 60 to 80, whose lanes have unpainted borders."""
     inner = {"j-1": lane(60, 80, 0.0, -3.5), "j-2": lane(80, 60, 0.0, 3.5, is_intersection="True")}
     bare = {"no-borders": {"lane_type": "CITY_DRIVING", "left_boundary": []}}
     return {

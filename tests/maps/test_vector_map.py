@@ -11,7 +11,7 @@ import pytest
 from manyeyes.datatypes import ShapeError
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.maps.elements.observation import MapFrame
-from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, PointEvidence, Topology, VectorMap
+from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, Topology, VectorMap
 
 LINES = [
     [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]],
@@ -106,6 +106,6 @@ def test_columns_that_do_not_fit_are_refused_by_name() -> None:
     with pytest.raises(ShapeError, match=r"VectorMap.state needs shape \(3,\)"):
         replace(small(), state=np.zeros(2, np.int64))
     with pytest.raises(ShapeError, match="point_evidence needs 9 rows"):
-        replace(small(), point_evidence=PointEvidence(*(np.zeros(8, np.int64) for _ in range(6))))
+        replace(small(), point_evidence=small().point_evidence.take(np.arange(8)))
     with pytest.raises(ShapeError, match=r"sources\.offsets needs offsets"):
         replace(small(), sources=np.zeros(3, np.int64))

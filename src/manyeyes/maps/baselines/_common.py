@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every rival shares with manyeyes' own fusion, so that only the merging is compared.
+"""What all baselines share with this project's own fusion, so that only the merging differs.
 
-Pre-filter: elements below a score, and lines below a length, are left out; the same observation given twice counts once, and the
-order of input plays no part (sorted by time, then id). Poses are taken as claimed.
+Pre-filter: elements below a score, and lines below a length, are left out; duplicate observations count once, and the order of
+input has no effect (sorted by time, then id). Poses are the prior poses.
 
-Score: sigmoid(L / 4) min(1, length / full), as in specs/maps.md 3.4 stage 7, times the mean score of the merged elements. L is the
-mean over places of an element of its log-odds: log(P_D / P_FA) for each merged observation, and v log((1 - P_D) / (1 - P_FA)) for
-each other observation that could see the place with visibility v; |L| is at most 6.
+Score: sigmoid(L / 4) min(1, length / full), as in this project's fusion, times the mean score of the merged elements. L is the
+mean over places of an element of its log-odds: log(P_D / P_FA) for each merged observation, and v log((1 - P_D) / (1 - P_FA))
+for each other observation that covers the place with visibility v; |L| is at most 6.
 
-State: published where L, the count of observations and the length reach the rule's least; else candidate.
-Cuts: none here; who compares maps cuts all of them by one policy (lines at junctions).
+State: published where L, the number of observations and the length reach the minimum of the rules; else candidate. Cuts: none
+here; the evaluation cuts all maps by one policy (lines at junctions).
 """
 
 from __future__ import annotations
@@ -40,10 +40,11 @@ _PLACE_M, _MARGIN_M = 2.0, 2.0
 
 @dataclass(frozen=True)
 class BaselineRules:
-    """The shared rules' numbers. By kind (divider, boundary, crossing, stop line): min_seen_m, the shortest element that is
-    used, least_m, the shortest that is published, and full_score_m, the length from which a score is not lowered.
+    """The shared rules, by kind (divider, boundary, crossing, stop line) where they are tuples.
 
-    min_score: of an element that is used. publish_log_odds: least log-odds and least_observations: of what is published.
+    min_score: smallest score of an input element. min_input_length_m: shortest input element.
+    min_published_length_m: shortest published element. full_score_length_m: length from which a score is not lowered.
+    publish_log_odds, min_observations: smallest log-odds and number of observations of a published element.
     """
 
     min_score: float = 0.3
@@ -56,7 +57,9 @@ class BaselineRules:
 
 @dataclass(frozen=True, eq=False)
 class ElementPool:
-    """What passed the pre-filter: observations (O), each once, by time; elements (N) in the map's frame; observation (N,)."""
+    """The result of the pre-filter: observations (O), each once, by time; elements (N) in the map's frame; their observation
+    (N,).
+    """
 
     observations: tuple[Observation, ...]
     elements: MapElements
@@ -75,7 +78,7 @@ class ElementPool:
 
 @dataclass(frozen=True, eq=False)
 class MergedElement:
-    """One element of a map on its way: its points (K, 2), rings open; its kind; and the rows of the pool that it was made of."""
+    """A merged element: its points (K, 2), rings open; its kind; and the rows of the pool that it was made of."""
 
     points: Floats
     kind: int
@@ -189,12 +192,12 @@ def _visibility_rings(observations: Sequence[Observation]) -> FieldsOfView:
     view_offsets = np.concatenate(([0], np.cumsum([len(o.view) for o in observations]))).astype(np.int64)
     view = np.concatenate([o.view for o in observations]) if count else np.zeros((0, 2))
     rings = [o.occluders.ring(r) for o in observations for r in range(len(o.occluders))]
-    ring_first = np.concatenate(([0], np.cumsum([len(r) for r in rings]))).astype(np.int64)
+    ring_offsets = np.concatenate(([0], np.cumsum([len(r) for r in rings]))).astype(np.int64)
     occluder_offsets = np.concatenate(([0], np.cumsum([len(o.occluders) for o in observations]))).astype(np.int64)
     hidden = np.concatenate(rings) if rings else np.zeros((0, 2))
     return FieldsOfView(
         ObservationRings(view, view_offsets, np.arange(count + 1)),
-        ObservationRings(hidden, ring_first, occluder_offsets),
+        ObservationRings(hidden, ring_offsets, occluder_offsets),
     )
 
 

@@ -59,7 +59,7 @@ class CpdResult:
 
 def register(target: Floats, source: Floats, config: CpdConfig = CpdConfig()) -> CpdResult:
     """The motion that brings source (M, 2) onto target (N, 2)."""
-    # About the target's mean: far from the origin the squares would lose what is looked for.
+    # Relative to the target's mean: far from the origin the squares would lose precision.
     centre = target.mean(0)
     x, y = freeze(target - centre, np.float64), freeze(source - centre, np.float64)
     start = -1.0 if config.initial_sigma_m is None else config.initial_sigma_m**2

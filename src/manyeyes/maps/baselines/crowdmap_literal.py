@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CrowdMap's second stage as its text reads (CrowdMap 2.3, specs/maps.md 3.1): gate, register element by element, keep the best.
+"""CrowdMap's second stage as its text reads (CrowdMap 2.3): gate, register element by element, keep the best.
 
-The paper says: two elements overlap where their Chamfer distance is below a threshold; overlapping ones are registered by
-rigid CPD onto the most confident. It gives no threshold, no parameters and no rule of merging. Read here: from the most
-confident element on, each takes the free elements of its class that overlap it; those are registered onto it; one that still
-does not fit within ``accept_m`` of Chamfer was no overlap and stays free; of the others the most confident stays (``keep``), or
-its points become the mean of all (``mean``).
+The paper states: two elements overlap where their Chamfer distance is below a threshold; overlapping ones are registered by
+rigid CPD onto the most confident. It gives no threshold, no parameters and no rule of merging. Interpretation here: from the
+most confident element on, each takes the free elements of its class that overlap it. Those are registered onto it. One that
+still does not fit within ``max_registered_chamfer_m`` stays free. Of the others the most confident stays (``keep``), or its
+points become the mean of all (``mean``).
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ from manyeyes.ops.polyline_distance import chamfer_distance
 
 @dataclass(frozen=True)
 class CrowdMapLiteralConfig:
-    """max_overlap_chamfer_m: Chamfer distance of an overlap before, accept_m: after registration. num_samples: points a line for
-    both.
+    """Configuration of the baseline.
 
-    cpd: settings of the registration. merge: what becomes of registered elements. rules: pre-filter, score and state.
+    max_overlap_chamfer_m: largest Chamfer distance of an overlap; max_registered_chamfer_m: the same after registration.
+    num_samples: points per line for both. cpd: of the registration.
+    merge: result of registered elements. rules: pre-filter, score and state.
     """
 
     max_overlap_chamfer_m: float = 1.5

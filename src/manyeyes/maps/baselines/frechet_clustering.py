@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clusters by Frechet distance: lines of one kind that follow each other from end to end become one.
 
-The paper names "FDC" and cites a review of distances (Besse et al., IEEE T-ITS 17(11), 2016) that has no such algorithm; this is
-the reading of specs/maps.md section 4. Distances are discrete Frechet on equally spaced samples, the lesser of both directions
-(rings: from the sample nearest to the other's first). Clusters join by single, average or complete linkage up to ``gate_m``; what
-comes out is the cluster's medoid, or the mean of its samples brought into one direction.
+CrowdMap names this baseline "FDC" and cites a review of distances (Besse et al., IEEE T-ITS 17(11), 2016) that contains no such
+algorithm; this is an interpretation. Distances are discrete Frechet on equally spaced samples, the smaller of both directions
+(rings: from the sample nearest to the other's first). Clusters join by single, average or complete linkage up to
+``max_frechet_m``. The result is the cluster's medoid, or the mean of its samples in one direction.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from manyeyes.ops.polyline_distance import frechet_distance
 
 @dataclass(frozen=True)
 class FrechetClusteringConfig:
-    """max_frechet_m: greatest distance that joins. num_samples: points a line. linkage: how clusters measure. representative: what
-    a cluster becomes.
+    """Configuration of the baseline.
 
-    rules: pre-filter, score and state.
+    max_frechet_m: largest distance that joins. num_samples: points per line.
+    linkage: distance between clusters. representative: result of a cluster. rules: pre-filter, score and state.
     """
 
     max_frechet_m: float = 1.75

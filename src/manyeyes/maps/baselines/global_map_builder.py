@@ -7,7 +7,7 @@ that it covers, a matched crossing the whole; the unmatched are added. Scores ar
 are suppressed, by descending score, whose buffers overlap a kept one's by more than a share of their union.
 
 Observations come in order of time, whatever the order of input; that the latest wins is the method's own. Published: every
-fourth frame is used, since frames come at 2 Hz; here all are, since observations are tens of metres apart (``every``).
+fourth frame is used, since frames come at 2 Hz; here all are, since observations are tens of metres apart (``observation_stride``).
 """
 
 from __future__ import annotations
@@ -40,10 +40,13 @@ _FAR_M = 1e4
 
 @dataclass(frozen=True)
 class GlobalMapBuilderConfig:
-    """By kind (divider, boundary, crossing, stop line): match_m, distance of a match, and buffer_m, of the suppression.
+    """Configuration of the baseline.
 
-    num_samples: of a line for the distances. simplify_m: before and after a replacement. max_buffer_iou: greatest share of the
-    union of two buffers. observation_stride: observations used, one of so many. rules: pre-filter, score and state.
+    max_match_m: by kind (divider, boundary, crossing, stop line), largest distance of a match. buffer_m: by kind, of the
+        suppression.
+    num_samples: points per line for the distances. simplify_m: before and after a replacement.
+    max_buffer_iou: largest IoU of the buffers of two elements. observation_stride: every n-th observation is used. rules:
+        pre-filter, score and state.
     """
 
     max_match_m: tuple[float, float, float, float] = (1.0, 2.0, 0.5, 1.0)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Heat-map buffer merge: all lines drawn thick into one picture, the picture thinned back to lines.
+"""Heat-map buffer merge: all lines are drawn into one raster, which is thinned back to lines.
 
-The paper names "HBM" and cites Douglas and Peucker (1973), who only simplify; this is the reading of specs/maps.md section 4:
-buffer every line, add the scores up on a raster by kind, smooth, threshold, take components, thin them, walk the skeleton's
-longest way, simplify. Crossings: drawn filled, a component becomes its least rotated rectangle. The threshold is a share of how
-many observations could see a cell, so that one setting serves 20 observations and 200. ``walks="all"`` takes what a component
-has besides its longest way too.
+CrowdMap names this baseline "HBM" and cites Douglas and Peucker (1973), who only simplify; this is an interpretation: buffer
+every line, add the scores on a raster by kind, smooth, threshold, label components, skeletonize, take the longest path,
+simplify. Crossings: drawn filled, a component becomes its minimum rotated rectangle. The threshold is a fraction of the number
+of observations that cover a cell, so that one setting serves 20 observations and 200. ``walks="all"`` takes a component's other
+paths too.
 """
 
 from __future__ import annotations
@@ -38,9 +38,11 @@ _MAX_CELLS = 64_000_000
 
 @dataclass(frozen=True)
 class HeatmapBufferConfig:
-    """cell_m: of the raster. buffer_m: half a line's drawn width. smoothing_sigma_m: of the Gaussian. min_view_fraction: of the
-    views of a cell, and least_heat, summed scores, that the heat must reach. min_walk_length_m: of a walk. simplify_m: of lines.
-    walks: of a component. rules: pre-filter, score and state.
+    """Configuration of the baseline.
+
+    cell_m: of the raster. buffer_m: half width of a drawn line. smoothing_sigma_m: of the Gaussian.
+    min_view_fraction: threshold of the heat as a fraction of the views of a cell; min_heat: smallest summed score.
+    min_walk_length_m: shortest path. simplify_m: of lines. walks: paths of a component. rules: pre-filter, score and state.
     """
 
     cell_m: float = 0.2

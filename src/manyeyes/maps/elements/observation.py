@@ -109,7 +109,7 @@ class ObservationContent:
 class Observation(ObservationContent):
     """One agent's map elements, once; every field is checked, and lies within ``observation_limits.LIMITS``.
 
-    agent: a pseudonym. pass_id: one drive of that agent. time_ns: of the look, nanoseconds since 1970, UTC.
+    agent: a pseudonym. pass_id: one drive of that agent. time_ns: nanoseconds since 1970, UTC.
     pose: (3,) x, y (m), yaw (rad) of the agent in the map's frame, as claimed. covariance: (3, 3) of that pose, m and rad.
     view: (K, 2) metres, the polygon that the agent could see, an open ring in the agent's frame; occluders: what hid parts
     of it, same frame. elements: in the agent's frame. model: what made them. trusted: a surveyed pole, whose one word counts.

@@ -128,7 +128,7 @@ def observation_table(observations: Sequence[Observation], frame: MapFrame) -> p
     )
     rings = [o.occluders for o in observations]
     starts = np.cumsum([0, *(len(r.points) for r in rings)])
-    ring_first = np.concatenate([r.offsets[:-1] + start for r, start in zip(rings, starts)] + [starts[-1:]])
+    ring_offsets = np.concatenate([r.offsets[:-1] + start for r, start in zip(rings, starts)] + [starts[-1:]])
     poses = np.array([o.pose for o in observations]).reshape(-1, 3)
     columns = {
         "agent": pa.array([o.agent for o in observations], pa.string()),
@@ -146,7 +146,7 @@ def observation_table(observations: Sequence[Observation], frame: MapFrame) -> p
         "trusted": pa.array([o.trusted for o in observations], pa.bool_()),
         "id": pa.array([o.id for o in observations], pa.string()),
         "occluders": _list(
-            pa, _offsets([len(r) for r in rings]), _list(pa, ring_first, _xy(pa, [r.points for r in rings]))
+            pa, _offsets([len(r) for r in rings]), _list(pa, ring_offsets, _xy(pa, [r.points for r in rings]))
         ),
     }
     return (
@@ -283,7 +283,7 @@ class _ObservationColumns:
         stated = self.text["id"][row]
         if stated and stated != made.id:
             raise ObservationError(
-                f"Observation.id: expected {made.id}, as its content says; got {shorten(stated)}. Fetch it again."
+                f"Observation.id: expected {made.id}, the hash of its content; got {shorten(stated)}. Fetch it again."
             )
         return made
 

@@ -32,7 +32,7 @@ class ObservationLimits:
     max_reach_m: float = 500.0
     # Points of a view, of an occluder or of a crossing; the test for edges that cross is quadratic in them.
     max_ring_points: int = 1000
-    # Length of a crossing's border; the whole tile of a semi-global look has 360 m.
+    # Length of a crossing's border; the whole tile of a semi-global map has 360 m.
     max_crossing_perimeter_m: float = 500.0
     # Rings that hide parts of the view.
     max_occluders: int = 256

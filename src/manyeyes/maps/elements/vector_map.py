@@ -76,12 +76,12 @@ class Topology:
 
     @classmethod
     def empty(cls) -> Topology:
-        """No relations."""
+        """Make a topology without relations."""
         pairs = np.zeros((0, 2), np.int64)
         return cls(pairs, pairs, pairs, pairs, np.zeros((0, 2)))
 
     def renumber(self, new_rows: Ints) -> Topology:
-        """Row k becomes new[k]; pairs with a row that becomes -1 are left out, and nodes without elements too."""
+        """Map row k to new_rows[k]; drop pairs with a row that becomes -1, and nodes without elements."""
         successor, left, right = (
             _drop_invalid_pairs(new_rows[pairs]) for pairs in (self.successor, self.left, self.right)
         )
@@ -97,7 +97,7 @@ class VectorMap:
     elements: in the map's frame, lines with stations about 1 m apart. id: (N, 16) uint8, stable from release to release.
     state: (N,) int64, index into STATES. log_odds: (N,). supporters: (N,) int64 observations; agents: (N,) int64 distinct
     agents. t_first, t_last: (N,) int64 ns. point_evidence: evidence per point. topology: pairs of rows. observations: (U, 16)
-    uint8 ids, ascending; element i came from ``observations[sources[sources_first[i]:sources_first[i + 1]]]``.
+    uint8 ids, ascending; element i came from ``observations[sources[source_offsets[i]:source_offsets[i + 1]]]``.
     """
 
     frame: MapFrame
@@ -177,7 +177,7 @@ class VectorMap:
 
     @classmethod
     def empty(cls, frame: MapFrame | None = None) -> VectorMap:
-        """A map of nothing."""
+        """Make a map without elements."""
         return cls.of(MapElements.empty(), frame)
 
     def __len__(self) -> int:
@@ -193,7 +193,7 @@ class VectorMap:
         return replace(self, state=np.asarray(state))
 
     def select_published(self) -> VectorMap:
-        """Only what is published."""
+        """Return the map of the published elements."""
         return self.take(self.state == PUBLISHED)
 
     def take(self, rows: ArrayLike) -> VectorMap:
@@ -254,7 +254,9 @@ class VectorMap:
         )
 
     def quantised_hash(self, cell_cm: float = 1.0) -> str:
-        """BLAKE2b-128 over kind, state and geometry on a grid of cm; neither order nor direction nor a ring's start counts."""
+        """Compute BLAKE2b-128 over kind, state and geometry on a grid of cell_cm; order, direction and a ring's start have no
+        effect.
+        """
         digests = compute_element_digests(self.elements, self.state, cell_cm)
         order = np.lexsort(digests.T[::-1])
         return hashlib.blake2b(digests[order].tobytes(), digest_size=16).hexdigest()
@@ -298,7 +300,7 @@ def compute_element_digests(elements: MapElements, state: Ints, cell_cm: float) 
 
 
 def _ring_from_min_point(ring: NDArray) -> NDArray:
-    """The ring from its least point (x, then y) on, towards the lesser of its two neighbours."""
+    """Rotate the ring to its smallest point (x, then y), in the direction of the smaller of its two neighbours."""
     start = int(np.lexsort((ring[:, 1], ring[:, 0]))[0])
     ahead = np.roll(ring, -start, axis=0)
     back = np.roll(ahead[::-1], 1, axis=0)
@@ -310,6 +312,6 @@ def _drop_invalid_pairs(pairs: Ints) -> Ints:
 
 
 def _freeze(value: object, dtypes: dict[str, type[np.generic]], names: Sequence[str] | None = None) -> None:
-    """Make the named array fields (all, if none are named) contiguous and read-only: int64 but for those in other."""
+    """Make the named array fields (all, if none are named) contiguous and read-only: int64 unless dtypes names another."""
     for name in names or [f.name for f in fields(value)]:  # pyright: ignore[reportArgumentType]
         object.__setattr__(value, name, freeze(getattr(value, name), dtypes.get(name, np.int64)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every export says of an element besides its geometry, as columns; and geometry in degrees."""
+"""The attributes of an element that every export format has, as columns; and geometry in degrees."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ def read_frame(table: pa.Table) -> MapFrame:
 _POINT_COLUMNS = ("sigma", *(f.name if f.name != "sigma" else "station_sigma" for f in fields(PointEvidence)))
 _ROW_COLUMNS = ("log_odds", "supporters", "agents", "t_first", "t_last")
 _PAIR_COLUMNS = ("successor", "left", "right")
-# Names that stand both for an element and for its points are told apart by a prefix.
+# Names that stand both for an element and for its points are distinguished by a prefix.
 _AT_POINT = "point_"
 _COLUMNS = (
     "geometry",

@@ -61,7 +61,7 @@ def _line_tags(m: VectorMap, row: int) -> Tags:
     kind = int(m.elements.kind[row])
     style = int(m.elements.style[row].argmax())
     tags = [("type", _TYPE[kind])]
-    # A divider without a known style is one that nobody could read: virtual lines are not painted.
+    # A divider without a known style is exported without paint type: virtual lines are not painted.
     if kind == DIVIDER:
         tags = [("type", "virtual")] if STYLES[style] == "none" else [*tags, ("subtype", _SUBTYPE[style])]
     tags.append(("manyeyes:id", m.id[row].tobytes().hex()))
@@ -104,7 +104,7 @@ class _Writer:
         )
 
     def text(self) -> str:
-        """The whole file."""
+        """Return the OSM file as text."""
         body = "".join((*self.nodes, *self.ways, *self.relations))
         return f'<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6" generator="manyeyes">\n{body}</osm>\n'
 

@@ -64,7 +64,7 @@ class ModelResultsError(ManyeyesError):
 
 @dataclass(frozen=True)
 class SamplePose:
-    """Who looked, when, and where it claims to have stood: x, y (m) and yaw (rad) in the frame, sigma: of each."""
+    """Agent, time and prior pose of a sample: x, y (m) and yaw (rad) in the frame; sigma: standard deviation of each."""
 
     agent: str
     pass_id: str
@@ -106,7 +106,7 @@ RESULT_OPTIONS = {
 
 
 def read_model_results(source: Path | str, poses: PoseTable, options: ModelResultOptions) -> LoadedObservations:
-    """The samples of a result file of MapTR or StreamMapNet (told apart by their layout) as observations, by token."""
+    """The samples of a result file of MapTR or StreamMapNet (distinguished by their layout) as observations, by token."""
     path = Path(source)
     root = _json(path)
     results = root.get("results") if isinstance(root, dict) else None

@@ -85,7 +85,7 @@ class _OpenDriveReader:
         self.marks: list[RoadMark] = []
 
     def network(self, name: str, data: bytes) -> RoadNetwork:
-        """All of it."""
+        """Read the whole file into a RoadNetwork."""
         records = [self.record(road) for road in self.root.findall("road")]
         if not records:
             raise OpenDriveError(f"{self.label}: no <road> element; the file describes no roads.")

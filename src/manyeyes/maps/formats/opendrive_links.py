@@ -63,7 +63,7 @@ def _touch_junctions(root: ET.Element, last: dict[str, int], touch) -> None:
         for connection in junction.findall("connection"):
             incoming, connecting = connection.get("incomingRoad", ""), connection.get("connectingRoad", "")
             ends = facing.get((incoming, junction.get("id")), [])
-            # A road with both ends in one junction cannot be told apart here; its lanes' own links do it.
+            # A road with both ends in one junction cannot be distinguished here; its lanes' own links do it.
             if len(ends) != 1:
                 continue
             far, other_far = ends[0], connection.get("contactPoint") == "end"

@@ -3,7 +3,7 @@
 
 Layout: ``LANE`` (``left_boundary`` and ``right_boundary``, ``lane_type``; in the forecasting part ``is_intersection``,
 ``predecessors``, ``successors`` too), ``JUNCTION`` and ``CROSSWALK`` (``polygon``), ``STOPLINE`` (``centerline``), each by id.
-Points are texts "(x, y)", metres. There is no layer of dividers (specs: maps.md 2.4), so they are derived: of lanes outside
+Points are texts "(x, y)", metres. There is no layer of dividers, so they are derived: of lanes outside
 junctions, a border that another such lane has as well is paint between them; one that no other has is the road's edge.
 :mod:`manyeyes.maps.roads.ground_truth` then makes one line of what is stored twice, and chains what continues.
 """
@@ -34,7 +34,7 @@ _KIND_OF_LANE = {
 }
 _SPEED_MPS = 13.9
 _WIDTH_M = 0.12
-# Two lanes' borders are one physical line where so much of one lies so near the other (specs: maps.md 2.4).
+# Two lanes' borders are one physical line where so much of one lies so near the other.
 _SAME_M, _SHARED = 0.3, 0.5
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 

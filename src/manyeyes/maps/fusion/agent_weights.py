@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whom to believe, and how much: agents whose claims are off alike, observations that say the same again, and the one error
-that all claims around share.
+"""Robust weights for the pose optimization: per agent, per observation, and the common (gauge) offset of all corrections.
+
+An agent whose corrections share one direction by more than its prior covariance explains gets a small weight (M-estimation with
+a Geman-McClure weight). Redundant observations of one agent share their weight. The gauge offset is a robust mode of the
+corrections nearby.
 """
 
 from __future__ import annotations
@@ -16,12 +19,13 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 REJECTED_WEIGHT = 1e-6
-"""Not 0: what only one saw whom nobody believes has a place still."""
+"""Weight of a rejected agent; not 0, so that elements seen by such an agent alone still get a position."""
 
 
 def compute_observability(covariance: Floats, prior_covariance: Floats) -> Floats:
-    """(O, 2, 2) from 0 (the lines tell nothing of the place in that direction) to the identity, for poses of that
-    covariance (O, 3, 3) whose places were claimed with ``prior_covariance`` (O, 2, 2).
+    """Compute how well the lines determine each position: (O, 2, 2), from 0 (not at all) to the identity.
+
+    covariance: (O, 3, 3) of the corrected poses. prior_covariance: (O, 2, 2) of the prior positions.
     """
     observability = np.eye(2) - covariance[:, :2, :2] @ np.linalg.inv(prior_covariance)
     return (observability + observability.transpose(0, 2, 1)) / 2
@@ -30,13 +34,18 @@ def compute_observability(covariance: Floats, prior_covariance: Floats) -> Float
 def estimate_agent_weights(
     offset: Floats, observability: Floats, prior_variance: Floats, agent: Ints, limits: tuple[float, float, float]
 ) -> Floats:
-    """(O,) in (0, 1]: small for agents whose claims are off alike, in the directions that lines told.
+    """Estimate agent weights (O,) in (0, 1] from the mean correction of each agent's prior poses (robust M-estimation).
 
-    offset: (O, 2) metres that an observation was moved more than others around; prior_variance: (O,) of its claim. limits: by
-    how many sigmas off an agent counts little, and next to nothing; which part of the variance is one error of the agent.
+    The mean over an agent's observations is used because independent noise averages out, while a bias or an attack does not.
+    Only observable directions count.
 
-    The mean over an agent's observations tells more than any one of them: their own noise averages out, the agent's
-    common error and its lie do not.
+    Args:
+        offset: (O, 2) metres, correction of each observation relative to those nearby.
+        observability: (O, 2, 2), see :func:`compute_observability`.
+        prior_variance: (O,) m², mean variance of the prior position.
+        agent: (O,) agent of each observation, from 0.
+        limits: Geman-McClure scale and rejection limit, both in standard deviations; fraction of the prior variance that is
+            common to a drive.
     """
     count = int(agent.max(initial=-1)) + 1
     scale, limit, drive_correlation = limits
@@ -67,15 +76,18 @@ def estimate_gauge_offset(
     prior_variance: Floats,
     gauge: tuple[float, float],
 ) -> Floats:
-    """(O, 2) metres by which the observations around each one were moved alike, which nothing but chance explains.
+    """Estimate the offset (O, 2) in metres that all corrections around each observation share.
 
-    poses: start and corrected pose (O, 3); weight: (O,) what each correction has to say; prior_variance: (O,) of its claim;
-    gauge: metres around, and sigmas beyond which a correction has little say.
+    Lines determine only relative positions. The absolute position follows from the prior poses, whose errors have no common
+    direction. So a shared correction is an error of the solution and is subtracted. It is estimated as a mode, which a fifth of
+    colluding agents shifts little. Each correction counts in its observable directions.
 
-    Lines tell where observations stand to each other; where all of them stand is told by their claims alone, whose
-    errors have no common direction. So the mode of the corrections around is an error of all, and is taken back. It is
-    a mode, not a mean: a fifth of agents who lie alike do not move it far. Each correction counts in the directions
-    that lines told; one that the gross search moved does not.
+    Args:
+        poses: initial and corrected pose (O, 3).
+        observability: (O, 2, 2), see :func:`compute_observability`.
+        weight: (O,) of each correction; 0 excludes it.
+        prior_variance: (O,) m², mean variance of the prior position.
+        gauge: radius in metres, and Geman-McClure scale in standard deviations.
     """
     start, pose = poses
     grid = build_grid(start[:, 0], start[:, 1], np.zeros(len(observability), np.int64), gauge[0])
@@ -100,6 +112,7 @@ def _find_modes(
     grid: tuple[I64x1, I64x1, I64x1],
     params: tuple[float, float],
 ) -> F64x2:  # pragma: no cover - compiled
+    """Find the mode (O, 2) of the corrections (O, 2) within a radius of each place by iteratively reweighted least squares."""
     keys, start, order = grid
     radius, scale = params
     out = np.zeros((len(place), 2))
@@ -107,9 +120,9 @@ def _find_modes(
         ix, iy = int(np.floor(place[o, 0] / radius)), int(np.floor(place[o, 1] / radius))
         x, y = 0.0, 0.0
         for turn in range(6):
-            # The scale narrows from where everything counts.
+            # The scale narrows from a value at which all observations count (graduated non-convexity).
             c2 = (scale * max(1.0, 4.0 - turn)) ** 2
-            # One quiet observation more, so that the mode of few is not a rumour.
+            # A prior observation at 0 damps the mode where only few observations are near.
             xx, xy, yy, bx, by = 1.0, 0.0, 1.0, 0.0, 0.0
             for dx in range(-1, 2):
                 low, high = find_cell_range(keys, start, 0, ix + dx, iy - 1, iy + 1)
@@ -137,8 +150,10 @@ def _find_modes(
 def compute_observation_weights(
     arrays: ObservationArrays, initial_pose: Floats, scale: Floats, agent_weight: Floats, radius_m: float = 30.0
 ) -> Floats:
-    """(O,) how much an observation's lines weigh for others: surveyed poles much, agents with odd lines and repeated
-    looks little.
+    """Compute the weight (O,) of each observation's lines in the residuals of other observations.
+
+    Surveyed poles have weight 50. Other weights fall with the residual scale (O,) in metres, with the agent weight (O,), and
+    with the number of observations of the same agent within ``radius_m``.
     """
     grid = build_grid(initial_pose[:, 0], initial_pose[:, 1], np.zeros(len(initial_pose), np.int64), radius_m)
     num_redundant = _count_same_agent(
@@ -152,9 +167,7 @@ def compute_observation_weights(
 def _count_same_agent(
     pose: F64x2, agent: I64x1, keys: I64x1, start: I64x1, order: I64x1, radius: float
 ) -> F64x1:  # pragma: no cover - compiled
-    """How many looks of the same agent stand within a radius, each counted by 1 - (distance / radius)²; itself counts
-    1.
-    """
+    """Count observations (O,) of the same agent within a radius, each weighted by 1 - (distance / radius)²; itself counts 1."""
     counts = np.zeros(len(pose))
     for o in range(len(pose)):
         ix, iy = int(np.floor(pose[o, 0] / radius)), int(np.floor(pose[o, 1] / radius))

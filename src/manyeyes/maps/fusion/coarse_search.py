@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gross search: an observation that stands metres off is moved to where what other agents saw fits it best.
+"""Coarse pose search: correlate each observation with the lines of other agents over a grid of shifts and yaws.
 
-Stage 1 of specs/maps.md 3.4. For each observation the points of *other* agents are drawn as a soft picture in its own
-frame, one layer a class and 30 degrees of heading, and every shift (and a few yaws) is tried. A layer's value s / (s +
-1), with s about the number of agents who saw a line there, keeps dense lines from deciding and still prefers what more
-agents saw.
+For each observation the points of *other* agents are drawn into a soft raster in its own frame, one layer per class and 30
+degrees of heading, and every shift (and a few yaws) is tried. A layer has value s / (s + 1), with s about the number of agents
+that detected a line there. So dense lines do not dominate, and support by more agents is still preferred.
 """
 
 from __future__ import annotations
@@ -24,9 +23,12 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class CoarseSearchConfig:
-    """max_shift_m: largest shift tried along x and y; cell_m: its step; min_score_gain: mean value a point must win; min_shift_m:
-    smaller shifts are left to the sweeps; cost_per_m: value a metre of shift costs; yaw_steps_rad: turns tried (rad); point_stride:
-    every n-th point is looked up.
+    """Configuration of the coarse search.
+
+    max_shift_m: largest shift along x and y; cell_m: its step.
+    min_score_gain: smallest gain of the mean value per point. min_shift_m: smaller shifts are left to Gauss-Newton.
+    cost_per_m: cost per metre of shift. yaw_steps_rad: yaws that are tried.
+    point_stride: every n-th point is evaluated.
     """
 
     max_shift_m: float = 4.5
@@ -39,10 +41,9 @@ class CoarseSearchConfig:
 
 
 def search_coarse(arrays: ObservationArrays, keep: NDArray[np.bool_], home: Ints, config: CoarseSearchConfig) -> Floats:
-    """Poses (H, 3) of the home observations after the search; ``keep`` (P,) are the points that others may be compared
-    with.
+    """Search the poses (H, 3) of the home observations; ``keep`` (P,) are the points of the raster.
 
-    Trusted observations stay where they are.
+    Trusted observations keep their poses.
     """
     xy, tangent = arrays.to_world(np.asarray(arrays.pose))
     chosen = np.flatnonzero(keep)
@@ -69,7 +70,7 @@ def search_coarse(arrays: ObservationArrays, keep: NDArray[np.bool_], home: Ints
 
 
 def apply_shifts(arrays: ObservationArrays, home: Ints, shifts: Floats) -> Floats:
-    """Claimed poses (H, 3) moved by moves (H, 3) of their own frames."""
+    """Apply shifts (H, 3), in the observations' own frames, to the prior poses (H, 3)."""
     start = np.asarray(arrays.pose)[home]
     c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
     x, y = shifts[:, 0], shifts[:, 1]
@@ -88,9 +89,7 @@ def find_best_shifts(
     params: tuple[float, float, float, float, float],
     stride: int,
 ) -> F64x2:  # pragma: no cover - compiled
-    """The move (H, 3) of each home observation's own frame that fits it best to the points of others, all zero for
-    none.
-    """
+    """Find the shift (H, 3) of each home observation, in its own frame, with the best score; zero for none."""
     first, xy, tangent, kind = own_points
     max_shift, cell, min_gain, min_shift, cost_per_m = params
     shifts = np.zeros((len(home), 3))
@@ -137,7 +136,7 @@ def _draw_layers(
     ny: int,
     cell: float,
 ) -> F32x3:  # pragma: no cover - compiled
-    """What other agents saw, in the frame of a pose: (layers, nx, ny) of s."""
+    """Draw the points of other agents in the frame of a pose: (layers, nx, ny) of s."""
     keys, start, rxy, rtangent, ragent = other_points
     picture = np.zeros((24, nx, ny), np.float32)
     stamp = np.empty((5, 5), np.float32)
@@ -187,8 +186,8 @@ def _correlate(
     radius: int,
     stride: int,
 ) -> F64x2:  # pragma: no cover - compiled
-    """Mean of s / (s + 1) of the picture under the points for each shift (2 radius + 1, 2 radius + 1) after a turn about
-    their mean.
+    """Compute the mean of s / (s + 1) under the points for each shift (2 radius + 1, 2 radius + 1), after a turn about their
+    mean.
     """
     _, nx, ny = picture.shape
     score = np.zeros((2 * radius + 1, 2 * radius + 1))

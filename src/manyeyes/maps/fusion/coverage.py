@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ground that somebody looked at, as runs of cells of one metre; lines are cut where nobody did.
+"""Observed ground as runs of cells of one metre, and cutting of lines outside of it.
 
-A link may join two parts of a line over ground that is in no view at all. What lies there is a guess, which a map should not
-show as if it had been seen. Cells are anchored at the map's origin and count where a view holds their middle, so that the
-ground of several areas is the union of each area's. Source: this project's; GlobalMapNet's protocol (arXiv 2409.10063) judges maps
-on the union of all views.
+A link may join two parts of a line across ground that lies in no view. A map should not contain such parts. Cells are anchored
+at the map's origin and count as observed where a view contains their centre. So the observed ground of several areas is the
+union of each area's. GlobalMapNet's protocol (arXiv 2409.10063) also evaluates maps on the union of all views.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ CELL_M = 1.0
 def find_observed_cells(
     arrays: ObservationArrays, pose: Floats, area: tuple[float, float, float, float] | None = None
 ) -> Ints:
-    """The ground in the views of agents at pose (O, 3), inside area (x0, y0, x1, y1; sides are whole metres) or everywhere.
+    """Find the ground in the views of agents at pose (O, 3), inside area (x0, y0, x1, y1; whole metres) or everywhere.
 
-    Runs (R, 3): row and first and last column of cells, ascending, none touching another.
+    Returns runs (R, 3): row, first column and last column of cells, ascending; no two runs touch.
     """
     runs = _fill_rings(arrays.view_corners_in_world(pose), arrays.view.ring_offsets)
     if area is not None:
@@ -37,24 +36,25 @@ def find_observed_cells(
 
 
 def find_cells_under_lines(points: Floats, offsets: Ints) -> Ints:
-    """The ground under lines (N): points (P, 2) metres, line i from first[i] on; runs as of :func:`find_observed_cells`."""
+    """Find the ground under N lines: points (P, 2) metres, offsets (N + 1,); runs as in :func:`find_observed_cells`."""
     if not len(points):
         return np.zeros((0, 3), np.int64)
     return merge_runs(_trace_lines(np.ascontiguousarray(points), offsets))
 
 
 def merge_runs(runs: Ints) -> Ints:
-    """Runs (R, 3) in any order as ascending ones, those that touch or overlap as one."""
+    """Sort runs (R, 3) and merge those that touch or overlap."""
     if not len(runs):
         return np.zeros((0, 3), np.int64)
     return _merge_runs(runs[np.lexsort((runs[:, 1], runs[:, 0]))])
 
 
 def cut_unobserved(points: Floats, offsets: Ints, inferred: NDArray[np.bool_], runs: Ints) -> tuple[Ints, Ints]:
-    """Lines (L,) cut where nobody looked: offsets (M + 1,) of the parts, and which points they keep, in order.
+    """Cut L lines at unobserved ground: offsets (M + 1,) of the parts, and the rows of the points that remain, in order.
 
-    points (P, 2), inferred (P,): places nobody saw, which go where nobody looked. A line is cut between two points where a cell of
-    the way from one to the other, half a metre at a time, is in no run (R, 3). Without runs nothing is known and nothing is cut.
+    points: (P, 2) metres. inferred: (P,) points without an observation of their own, which are dropped on unobserved ground. A
+    line is cut between two points if a cell between them, sampled every half metre, is in no run (R, 3). Without runs the
+    observed ground is unknown and nothing is cut.
     """
     if not len(runs) or not len(points):
         return offsets, np.arange(len(points))
@@ -98,6 +98,7 @@ def _fill_rings(corners: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - co
 
 @njit(cache=True, nogil=True)
 def _trace_lines(points: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
+    """Return the cells under lines as runs (R, 3) of one cell each, sampled every half cell."""
     total = len(points)
     for c in range(len(first) - 1):
         for i in range(first[c], first[c + 1] - 1):
@@ -118,7 +119,7 @@ def _trace_lines(points: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - co
 
 @njit(cache=True, nogil=True)
 def _count_steps(points: F64x2, i: int) -> int:  # pragma: no cover - compiled
-    """How many steps of half a cell it takes from a point to the next."""
+    """Count the steps of half a cell from a point to the next."""
     return max(
         1, int(np.ceil(2.0 * np.hypot(points[i + 1, 0] - points[i, 0], points[i + 1, 1] - points[i, 1]) / CELL_M))
     )
@@ -126,6 +127,7 @@ def _count_steps(points: F64x2, i: int) -> int:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _merge_runs(runs: I64x2) -> I64x2:  # pragma: no cover - compiled
+    """Merge sorted runs that touch or overlap."""
     out, n = runs.copy(), 0
     for k in range(1, len(runs)):
         if runs[k, 0] == out[n, 0] and runs[k, 1] <= out[n, 2] + 1:
@@ -140,6 +142,7 @@ def _merge_runs(runs: I64x2) -> I64x2:  # pragma: no cover - compiled
 def _cut(
     points: F64x2, first: I64x1, inferred: Boolx1, runs: I64x2
 ) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
+    """Cut lines as :func:`cut_unobserved` describes."""
     offsets, kept, n = [0], np.empty(len(points), np.int64), 0
     for c in range(len(first) - 1):
         for i in range(first[c], first[c + 1]):
@@ -158,7 +161,7 @@ def _cut(
 
 @njit(cache=True, nogil=True)
 def _is_observed_between(points: F64x2, i: int, j: int, runs: I64x2) -> bool:  # pragma: no cover - compiled
-    """Whether somebody looked at all of the way between two points; of neighbours less than a metre and a half apart, always."""
+    """Return whether all ground between two points is observed; True for points less than 1.5 cells apart."""
     dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
     length = np.hypot(dx, dy)
     if length < 1.5 * CELL_M:

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Crossings: rings that overlap are one crossing, whose extent is what half of those who could see its side agree on.
+"""Fusion of crossings: overlapping rings are grouped and each group is fused direction by direction.
 
-Stage 6 of specs/maps.md 3.4. Rings are grouped by average linkage on 1 - |A ∩ B| / min(|A|, |B|). A convex ring is told
-by how far it reaches in each direction (its support function), so the occupancy vote "more than half of those who saw
-it" becomes a weighted median a direction: over the observations whose own reach in that direction was not cut off by
-their view. That needs no raster, and so turns with the world. A result that fills most of its rectangle becomes the
-rectangle.
+Rings are grouped by average linkage on 1 - |A ∩ B| / min(|A|, |B|). A convex ring is described by its support function, its
+extent in each direction. The fused extent is a weighted median over the observations whose ring is not cut off by the border of
+their view in that direction, which corresponds to an occupancy vote of more than a half. No raster is needed, so the result is
+rotation equivariant. A result that fills most of its rectangle becomes the rectangle.
 """
 
 from __future__ import annotations
@@ -45,10 +44,12 @@ _MIN_AREA_M2 = 0.5  # of a ring that is used
 
 @dataclass(frozen=True)
 class CrossingConfig:
-    """min_overlap: least mean share of the smaller ring in common within a group. max_rings: rings that decide a group's shape.
+    """Configuration of the fusion of crossings.
 
-    min_rectangle_fill: share of its rectangle that a ring fills to become it. view_border_m: a corner this near the border of the
-    view is cut off.
+    min_overlap: smallest mean overlap within a group, as a fraction of the smaller ring.
+    max_rings: largest number of rings that determine a group's shape.
+    min_rectangle_fill: fraction of its rectangle that a ring fills to become the rectangle.
+    view_border_m: a corner within this distance of the border of the view counts as cut off.
     """
 
     min_overlap: float = 0.3
@@ -59,8 +60,9 @@ class CrossingConfig:
 
 @dataclass(frozen=True, eq=False)
 class FusedCrossings:
-    """K fused crossings: ring k is ``xy[start[k]:start[k + 1]]``; the rest as in evidence.Witness; sigma: (K,) metres
-    of its sides.
+    """K fused crossings: ring k is ``xy[ring_offsets[k]:ring_offsets[k + 1]]``; sigma: (K,) metres of its sides.
+
+    The other columns are those of :class:`~manyeyes.maps.fusion.existence.StationEvidence`.
     """
 
     ring_offsets: Ints
@@ -86,8 +88,9 @@ def fuse_crossings(
     config: CrossingConfig,
     evidence: EvidenceConfig,
 ) -> FusedCrossings:
-    """Crossings from all sightings with agents at pose (O, 3); ``weight`` (O,) of each observation, ``rank`` (O,) lower
-    for better ones.
+    """Fuse the crossings of all observations with agents at pose (O, 3).
+
+    weight: (O,) of each observation. rank: (O,) lower for better observations.
     """
     rows = np.flatnonzero(np.asarray(arrays.elements.kind) == CROSSING)
     owner = arrays.observation_of_element[rows]
@@ -163,12 +166,12 @@ def _transform_rings(arrays: ObservationArrays, rows: Ints, owner: Ints, pose: F
 
 
 def compute_convex_hull(ring: Floats) -> Floats:
-    """The convex hull (K, 2) of one ring, anticlockwise."""
+    """Compute the convex hull (K, 2) of one ring, anticlockwise."""
     return _hulls(np.array([0, len(ring)]), np.ascontiguousarray(ring)).points
 
 
 def compute_overlap(one: Floats, two: Floats) -> float:
-    """The share of the smaller of two convex anticlockwise rings that they have in common."""
+    """Compute the common area of two convex anticlockwise rings as a fraction of the smaller one."""
     if min(len(one), len(two)) < 3:
         return 0.0
     return float(_common(one, two)) / max(1e-9, min(float(_area(one)), float(_area(two))))
@@ -209,6 +212,7 @@ def _hulls(first: I64x1, points: F64x2) -> _OpenRings:  # pragma: no cover - com
 
 @njit(cache=True, nogil=True)
 def _area(ring: F64x2) -> float:  # pragma: no cover - compiled
+    """Compute the signed area of a ring."""
     total, j = 0.0, len(ring) - 1
     for i in range(len(ring)):
         total += (ring[j, 0] - ring[0, 0]) * (ring[i, 1] - ring[0, 1]) - (ring[i, 0] - ring[0, 0]) * (
@@ -220,6 +224,7 @@ def _area(ring: F64x2) -> float:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _areas(first: I64x1, points: F64x2) -> F64x1:  # pragma: no cover - compiled
+    """Compute the area (R,) of each ring; 0 for fewer than three points."""
     out = np.zeros(len(first) - 1)
     for r in range(len(out)):
         if first[r + 1] - first[r] >= 3:
@@ -261,10 +266,10 @@ def _half_plane(ring: F64x2, px: float, py: float, nx: float, ny: float) -> F64x
 def _group_rings(
     first: I64x1, points: F64x2, area: F64x1, usable: Boolx1, walk: I64x1, min_overlap: float, max_rings: int
 ) -> I64x1:  # pragma: no cover - compiled
-    """(R,) the group of each ring, -1 for those that are too many or too small; groups numbered by their best ring.
+    """Assign each ring (R,) to a group; -1 for rings that are too small or too many. Groups are numbered by their best ring.
 
-    Rings whose boxes touch form a block; a block's best ``max_rings`` rings are joined by average linkage while the best
-    pair of groups has at least ``min_overlap`` in common. Ties go to the better ranks.
+    Rings whose boxes touch form a block. The best ``max_rings`` rings of a block are joined by average linkage while the best
+    pair of groups overlaps by at least ``min_overlap``. Ties go to the better ranks.
     """
     count = len(area)
     label = np.full(count, -1, np.int64)
@@ -454,7 +459,7 @@ def _accumulate_evidence(
     decay_time_s: float,
     min_overlap: float,
 ) -> _CrossingEvidence:  # pragma: no cover - compiled
-    """The evidence of each fused ring from the hulls that have a share of at least ``min_overlap`` in common with it."""
+    """Accumulate the evidence of each fused ring from the hulls whose overlap with it is at least ``min_overlap``."""
     start, xy = fused
     style, score_weight = element_columns
     hull_first, hulls, area, owner, rows = rings

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The error that all looks of one drive share: what lines tell of some of them holds for the others too.
+"""Estimate the pose bias that all observations of one drive share (random-effects model).
 
-A satellite receiver's error drifts slowly, so the error of a claim is b + e: b is one for the drive and has the share
-``alike`` of the claimed covariance P, e is each look's own and has the rest. Where lines tell of a look's error d with
-information L, d says of b what is left after e: W = (L^-1 + (1 - alike) P)^-1. The mode of b given all looks of the
-drive is (sum W + (alike P)^-1)^-1 sum W d, a random-effects mean (Laird and Ware, Biometrics 1982). Claims that are off
-by much more than they say are usually off for a whole drive, so beyond ``scale`` sigmas the prior on b lets go. Source of
-the idea: specs/maps.md 3.4 stage 2 (consecutive poses of a pass share a bias); here it is one number a drive.
+The error of a satellite receiver drifts slowly. So the error of a prior pose is b + e, where b is constant over the drive and
+has the fraction ``drive_correlation`` (rho) of the prior covariance P, and e is independent per observation and has the rest.
+If the lines give an observation a correction d with information L, then d observes b with information W = (L^-1 + (1 - rho)
+P)^-1. The mode of b given all observations of the drive is (sum W + (rho P)^-1)^-1 sum W d (random-effects mean; Laird and
+Ware, Biometrics 1982). A prior pose that is off by much more than its covariance is usually off for the whole drive, so the
+prior on b is down-weighted beyond ``robust_scale`` standard deviations.
 """
 
 from __future__ import annotations
@@ -29,11 +29,15 @@ def estimate_drive_bias(
     drive_correlation: float,
     robust_scale: float,
 ) -> Floats:
-    """(O, 3) metres, metres, radians: by how much the claims of each look's drive are off alike, to be added to them.
+    """Estimate the bias (O, 3) in metres, metres, radians of each observation's drive, to be added to its prior pose.
 
-    information_matrix: (O, 3, 3) information L of the lines on each look's pose, which may be singular; information_vector: (O, 3)
-    L d, where d is the correction of the claim that the lines ask for. prior_covariance: (O, 3, 3) covariance P. drive: (O,) which
-    drive, from 0.
+    Args:
+        information_matrix: (O, 3, 3) information L of the lines on each pose; may be singular.
+        information_vector: (O, 3) L d, where d is the correction of the prior pose that the lines give.
+        prior_covariance: (O, 3, 3) covariance P of the prior pose.
+        drive: (O,) drive of each observation, from 0.
+        drive_correlation: fraction of the prior covariance that is common to a drive.
+        robust_scale: Geman-McClure scale of the prior on the bias, in standard deviations.
     """
     count = int(drive.max(initial=-1)) + 1
     blurred = np.eye(3) + (1.0 - drive_correlation) * information_matrix @ prior_covariance
@@ -42,7 +46,7 @@ def estimate_drive_bias(
     np.add.at(pull, drive, np.linalg.solve(blurred, information_vector[:, :, None])[:, :, 0])
     np.add.at(covariance_sum, drive, prior_covariance)
     prior = np.linalg.inv(drive_correlation * covariance_sum / np.bincount(drive, minlength=count)[:, None, None])
-    # From where the prior hardly counts: a drive that is far off is found, one that is not is shrunk round by round.
+    # Start with a weak prior, so that a large bias is found; the prior weight of a small one grows with each iteration.
     prior_weight, error = np.full(count, _FREE), np.zeros((count, 3))
     for _ in range(_ROUNDS):
         error = np.asarray(

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What speaks for and against each station of a map: who saw it, who could have and did not, in the order of time.
+"""Existence probability of map stations as log-odds, updated by detections and misses in order of time.
 
-Stages 4 and 7 of specs/maps.md 3.4. A station gains log(P_D / P_FA) for an observation that has a line there, or a
-share of it where that agent's model was not sure of the line, and loses visibility times log((1 - P_FA) / (1 - P_D))
-for one that could see the place and has none; a line a little aside says neither. Each agent's sum of a day is capped,
-so that one busy or malicious agent cannot decide. It is published and retired with hysteresis. Clear views of the place
-before the first sighting count against it too, but only down to ``doubt``: what many looked for in vain and one saw is
-more likely false than new, and still a few who agree suffice.
+A station gains log(P_D / P_FA) for an observation that has a line at it, times a weight from the detection score. It loses
+visibility times log((1 - P_FA) / (1 - P_D)) for an observation that covers it without a line. A line at a small lateral offset
+counts as neither. The change per agent and day is bounded, so that no single agent decides. States change with hysteresis.
+Misses before the first detection count too, but only down to ``-max_log_odds_before_detection``: one detection after many
+misses is more likely false than new, while a few detections that agree still suffice.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ _VIEW_CELL_M = 32.0
 _POINT_CELL_M = 2.5
 _DAY_S = 86400.0
 
-# What an observation says of a place: nothing there, a line at the place, or one only a little aside.
+# Relation of an observation to a station: no line, a line within the gates, or one at a small lateral offset.
 UNMATCHED, MATCHED, NEARBY = 0, 1, 2
 
 
 class EvidenceParameters(NamedTuple):
-    """The numbers of EvidenceConfig as compiled loops read them; metres, min_cosine: of the largest turn.
+    """The values of EvidenceConfig as compiled loops read them; metres; min_cosine: cosine of the heading gate.
 
-    hit, miss: change of log-odds. max_log_odds: bound of their absolute value, max_initial_log_odds: before the first
-    sighting. min_publish_agents, min_retire_agents: distinct agents.
+    hit, miss: change of log-odds. max_log_odds: bound of their absolute value; max_initial_log_odds: before the first
+    detection. min_publish_agents, min_retire_agents: distinct agents.
     """
 
     hit: float
@@ -60,17 +59,21 @@ class EvidenceParameters(NamedTuple):
 
 @dataclass(frozen=True)
 class EvidenceConfig:
-    """detection_prob, false_alarm_prob: P_D and P_FA. max_log_odds: largest |log-odds|; max_log_odds_before_detection: before the
-    first sighting. max_daily_change: largest change one agent makes in a day. score_low, score_high: scores of an element below
-    which a sighting adds nothing and above which it adds all; in between, a share.
+    """Detection model and thresholds of the existence estimate.
 
-    publish_log_odds: log-odds at which a station is published, given publish_agents distinct agents or a surveyed pole;
-    publish_crossing_log_odds: the same of a crossing; publish_low_coverage_log_odds: of a line's station that was in view at most
-    ``low_coverage`` times (summed visibility), which few could have confirmed. retire_log_odds: at which it is retired, given
-    retire_agents distinct agents that missed it. view_margin_m: of a view, within which a miss counts less. decay_time_s: by kind,
-    seconds in which evidence fades to 1/e. max_longitudinal_m, max_lateral_m, max_heading_rad: when a line is at the station;
-    max_ambiguous_lateral_m: when it may be. kernel_m: Geman-McClure scale of the place across. bias_sigma_m: error that no number
-    of observations removes.
+    detection_prob, false_alarm_prob: P_D and P_FA.
+    max_log_odds: bound of |log-odds|; max_log_odds_before_detection: bound of negative log-odds before the first detection.
+    max_daily_change: bound of the change by one agent in a day.
+    score_low, score_high: scores at which a detection has weight 0 and 1; linear in between.
+    publish_log_odds: threshold of publication of a line's station, given min_publish_agents agents or a surveyed pole.
+    publish_crossing_log_odds: the same for a crossing.
+    publish_low_coverage_log_odds: the same for a line's station whose summed visibility is at most low_coverage.
+    retire_log_odds: threshold of retirement, given misses by min_retire_agents agents.
+    view_margin_m: distance from the border of a view within which a miss counts less.
+    decay_time_s: by kind, time in which log-odds decay to 1/e.
+    max_longitudinal_m, max_lateral_m, max_heading_rad: gates of a detection; max_ambiguous_lateral_m: lateral gate beyond which
+        a line has no influence.
+    kernel_m: Geman-McClure scale of the lateral position; bias_sigma_m: standard deviation that averaging does not reduce.
     """
 
     detection_prob: float = 0.7
@@ -98,25 +101,25 @@ class EvidenceConfig:
 
     @property
     def log_odds_hit(self) -> float:
-        """What a sighting adds."""
+        """The change of log-odds by a detection."""
         return float(np.log(self.detection_prob / self.false_alarm_prob))
 
     def score_weight(self, score: Floats) -> Floats:
-        """(E,) which share of ``log_odds_hit`` a sighting of an element of that score adds."""
+        """Compute the weight (E,) in [0, 1] of detections with these scores."""
         return np.clip((np.asarray(score) - self.score_low) / (self.score_high - self.score_low), 0.0, 1.0)
 
     def publish_threshold(self, kind: Ints) -> Floats:
-        """(K,) log-odds at which something of that kind is published."""
+        """Return the log-odds (K,) from which an element of each kind is published."""
         return np.where(is_line(kind), self.publish_log_odds, self.publish_crossing_log_odds)
 
     @property
     def log_odds_miss(self) -> float:
-        """What a clear view without a sighting adds; negative."""
+        """The change of log-odds by a miss in full visibility; negative."""
         return float(np.log((1 - self.detection_prob) / (1 - self.false_alarm_prob)))
 
     @property
     def kernel_params(self) -> EvidenceParameters:
-        """The numbers that the compiled loops read."""
+        """The configuration as compiled loops read it."""
         return EvidenceParameters(
             hit=self.log_odds_hit,
             miss=self.log_odds_miss,
@@ -138,7 +141,7 @@ class EvidenceConfig:
 
 
 class VisibilityIndex(NamedTuple):
-    """Which observations may see a place: rows ``observations[start[c]:start[c + 1]]``, in time order, for the cell with key
+    """Observations that may cover a place: rows ``observations[offsets[c]:offsets[c + 1]]``, in time order, for cell
     ``keys[c]``.
     """
 
@@ -150,7 +153,7 @@ class VisibilityIndex(NamedTuple):
 class Observers(NamedTuple):
     """O observations at their corrected poses: pose (O, 3) x, y (m), yaw (rad); agent, time_ns and trusted (O,).
 
-    num_agents: of how many agents they are; ``agent`` counts in them.
+    num_agents: number of agents; ``agent`` counts in them.
     """
 
     pose: F64x2
@@ -161,7 +164,7 @@ class Observers(NamedTuple):
 
 
 class ObservationScene(NamedTuple):
-    """All that decides which observation could see a place: their index by cells, poses, views and occluders."""
+    """Everything that determines visibility: the index of observations by cell, their poses, views and occluders."""
 
     cells: VisibilityIndex
     observers: Observers
@@ -169,15 +172,15 @@ class ObservationScene(NamedTuple):
 
 
 class ElementStyles(NamedTuple):
-    """Of E observed elements: style (E, S) probabilities, and worth (E,), the share of a hit that a sighting adds."""
+    """Style probabilities (E, S) of E observed elements and the weights (E,) of their detections."""
 
     style: F64x2
     score_weight: F64x1
 
 
 class AgentScratch(NamedTuple):
-    """Scratch of :func:`update_existence`, all by agent (A,): the sum of log-odds of a day, whether it has seen the thing, the
-    thing (its index + 1) and day of that sum, and the eras in which it last counted as having seen and as having missed it.
+    """Scratch of :func:`update_existence` by agent (A,): sum of log-odds of the day, whether it has detected the element, the
+    element (index + 1) and day of that sum, and the eras in which it last counted as a detection and as a miss.
     """
 
     day_sum: F64x1
@@ -189,8 +192,8 @@ class AgentScratch(NamedTuple):
 
 
 class MatchedObservations(NamedTuple):
-    """How one thing was seen: rows of the observations that saw it, ascending; of all observations (O,) UNMATCHED, MATCHED or
-    NEARBY, and which share of a hit it is worth where it is MATCHED.
+    """Detections of one element: rows of the observations, ascending; of all observations (O,) UNMATCHED, MATCHED or NEARBY,
+    and the weight of each detection.
     """
 
     rows: I64x1
@@ -199,7 +202,7 @@ class MatchedObservations(NamedTuple):
 
 
 class ExistenceEstimate(NamedTuple):
-    """Evidence of one thing: log-odds, sum of visibilities, distinct agents that saw it, and its state."""
+    """Existence of one element: log-odds, sum of visibilities, number of distinct agents that detected it, and its state."""
 
     log_odds: float
     coverage: float
@@ -208,11 +211,11 @@ class ExistenceEstimate(NamedTuple):
 
 
 class StationEvidence(NamedTuple):
-    """Evidence of K stations. lateral_shift: (K,) metres along the normal to where the observations agree; sigma: (K,).
+    """Evidence of K stations.
 
-    log_odds, coverage: (K,), coverage the sum of visibilities. support, agents: (K,). state: (K,). t_first, t_last:
-    (K,) ns. style: (K, S) votes. Station k was seen by observations ``sources[first[k]:first[k + 1]]``, rows of the
-    sightings.
+    lateral_shift: (K,) metres along the normal to the position that the observations agree on; sigma: (K,) of it. log_odds,
+    coverage: (K,), coverage being the sum of visibilities. support, agents, state: (K,). t_first, t_last: (K,) ns. style: (K,
+    S) votes. Station k was detected by observations ``sources[source_offsets[k]:source_offsets[k + 1]]``, rows of the arrays.
     """
 
     lateral_shift: F64x1
@@ -232,8 +235,9 @@ class StationEvidence(NamedTuple):
 def build_visibility_index(
     arrays: ObservationArrays, pose: Floats, included: NDArray[np.bool_] | None = None
 ) -> VisibilityIndex:
-    """The index of who may see what, by cells of 32 m that each view's box meets, for agents at pose (O, 3); included: (O,) who
-    is in it, None: all.
+    """Index the observations by the cells of 32 m that their views' boxes meet, with agents at pose (O, 3).
+
+    included: (O,) observations in the index; None: all.
     """
     xy, ring_offsets, observation_offsets = arrays.view.xy, arrays.view.ring_offsets, arrays.view.observation_offsets
     owner = np.repeat(
@@ -256,7 +260,7 @@ def build_visibility_index(
 
 @njit(cache=True, nogil=True)
 def _cells(low: I64x2, high: I64x2) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
-    """Keys of the cells from low to high (O, 2) of each observation, and the observation of each."""
+    """List the keys of the cells from low to high (O, 2) of each observation, and the observation of each key."""
     total = 0
     for o in range(len(low)):
         total += (high[o, 0] - low[o, 0] + 1) * (high[o, 1] - low[o, 1] + 1)
@@ -272,7 +276,7 @@ def _cells(low: I64x2, high: I64x2) -> tuple[I64x1, I64x1]:  # pragma: no cover 
 
 
 def gather_observers(observation_arrays: ObservationArrays, pose: Floats) -> Observers:
-    """The observations at pose (O, 3), as the compiled loops read them."""
+    """Gather the observations at pose (O, 3) for the compiled loops."""
     arrays = (
         np.asarray(observation_arrays.agent),
         np.asarray(observation_arrays.time_ns),
@@ -282,7 +286,7 @@ def gather_observers(observation_arrays: ObservationArrays, pose: Floats) -> Obs
 
 
 def gather_visibility_rings(arrays: ObservationArrays) -> FieldsOfView:
-    """Views and occluders, as the compiled loops read them."""
+    """Gather views and occluders for the compiled loops."""
     return FieldsOfView(arrays.view, arrays.occluders)
 
 
@@ -296,10 +300,11 @@ def accumulate_evidence(
     is_inlier: NDArray[np.bool_],
     config: EvidenceConfig = EvidenceConfig(),
 ) -> StationEvidence:
-    """The evidence for line stations (K,) at xy with unit tangents, from all sightings with agents at pose (O, 3).
+    """Accumulate the evidence for line stations (K,) at xy with unit tangents from all observations, with agents at pose (O,
+    3).
 
-    ``weight`` (P,) is how much each point of the sightings counts for the place across, 0: it is not there; what it is seen
-    counts once an observation. is_inlier: (O,) whose word that something is not there counts.
+    weight: (P,) weight of each point in the lateral position; points of weight 0 are no detections. A detection counts once per
+    observation. is_inlier: (O,) observations whose misses count.
     """
     points = np.flatnonzero(is_line(arrays.kind_of_point) & (weight > 0.0))
     world, direction = arrays.to_world(pose)
@@ -326,7 +331,7 @@ def accumulate_evidence(
 
 
 class _EvidenceStations(NamedTuple):
-    """Stations of lines: places (K, 2), unit tangents (K, 2) and kinds (K,)."""
+    """Stations of lines: positions (K, 2), unit tangents (K, 2) and kinds (K,)."""
 
     xy: F64x2
     tangent: F64x2
@@ -334,7 +339,7 @@ class _EvidenceStations(NamedTuple):
 
 
 class _EvidencePoints(NamedTuple):
-    """Points of observed lines in the order of their grid of _POINT_CELL_M: its keys and starts, places and unit tangents
+    """Points of observed lines in the order of their grid of _POINT_CELL_M: its keys and offsets, positions and unit tangents
     (P, 2) in the map's frame, rows of observations and elements, and weights (P,).
     """
 
@@ -348,8 +353,8 @@ class _EvidencePoints(NamedTuple):
 
 
 class _MatchScratch(NamedTuple):
-    """What each observation (O,) has at one station: sums over its points near of weight, weight times lateral offset and
-    weight times weight of the point; least distance along and the element there; UNMATCHED, MATCHED or NEARBY.
+    """Match of each observation (O,) at one station: sums over its points of weight, of weight times lateral offset and of
+    weight times weight of the point; smallest longitudinal distance and the element there; UNMATCHED, MATCHED or NEARBY.
 
     candidates: the observations that are not UNMATCHED, as many as :func:`_collect_offsets` returns.
     """
@@ -393,7 +398,7 @@ def _accumulate_evidence(
     params: EvidenceParameters,
     decay_time_s: F64x1,
 ) -> StationEvidence:  # pragma: no cover - compiled
-    """The evidence of each station; decay_time_s: (4,) seconds by kind."""
+    """Accumulate the evidence of each station; decay_time_s: (4,) by kind."""
     xy, tangent, kind = stations
     style, score_weight = element_columns
     time_ns = scene.observers.time_ns
@@ -418,7 +423,7 @@ def _accumulate_evidence(
             o = candidates[t]
             if lateral_state[o] == MATCHED and abs(offset[o] / mass[o] - shift[k]) > params.max_lateral_m:
                 lateral_state[o] = NEARBY
-        # Only now is it known which of them are at the place that they agree on.
+        # The gate is relative to the shift, which is known only now.
         for t in range(n):
             o = candidates[t]
             if lateral_state[o] == MATCHED:
@@ -449,9 +454,7 @@ def _accumulate_evidence(
 def _collect_offsets(
     k: int, stations: _EvidenceStations, points: _EvidencePoints, params: EvidenceParameters, scratch: _MatchScratch
 ) -> int:  # pragma: no cover - compiled
-    """Each observation's place across station k, averaged over its points near; the number of observations that have
-    any.
-    """
+    """Average each observation's lateral offset at station k over its points nearby; returns the number of such observations."""
     xy, tangent, kind = stations
     keys, start, rxy, rtangent, robservation, relement, rweight = points
     mass, offset, pull, nearest, element, lateral_state, candidates = scratch
@@ -484,7 +487,7 @@ def _collect_offsets(
             if abs(aside) > across:
                 continue
             lateral_state[o] = MATCHED
-            # The nearest points decide: weights fall steeply, so that two points astride the station interpolate.
+            # Weights fall steeply with distance, so that the two nearest points interpolate.
             w = (1.0 - along / reach) ** 2 + 1e-9
             mass[o] += w
             offset[o] += w * aside
@@ -499,8 +502,9 @@ def _collect_offsets(
 def _estimate_shift(
     n: int, scratch: _MatchScratch, params: EvidenceParameters
 ) -> tuple[float, float]:  # pragma: no cover - compiled
-    """Where across the station the observations agree, and its sigma: reweighted means, one contribution an
-    observation.
+    """Estimate the lateral position that the observations agree on, and its sigma, by iteratively reweighted means.
+
+    Each observation contributes once.
     """
     mass, offset, pull, lateral_state, candidates = (
         scratch.mass,
@@ -513,7 +517,7 @@ def _estimate_shift(
     place, spread = 0.0, 1.0
     for turn in range(4):
         total, aside, information = 0.0, 0.0, 0.0
-        # The kernel narrows from the gate's width, so that the start, which may lie between two lines, decides little.
+        # The kernel narrows after the first iteration, so that the result depends little on the start.
         c2 = (kernel * (2.0 if turn == 0 else 1.0)) ** 2
         for i in range(n):
             o = candidates[i]
@@ -541,9 +545,9 @@ def update_existence(
     decay_time_s: float,
     scratch: AgentScratch,
 ) -> ExistenceEstimate:  # pragma: no cover - compiled
-    """Log-odds, coverage, distinct agents and state of thing k after all looks at it, in time order.
+    """Update the existence of element k by all observations that cover it, in time order.
 
-    ``places`` (M, 2) are points of it whose visibilities are averaged. decay_time_s: seconds in which evidence fades to 1/e.
+    places: (M, 2) points of the element whose visibilities are averaged. decay_time_s: time in which log-odds decay to 1/e.
     """
     pose, agent, time_ns, trusted, _ = scene.observers
     hits, lateral_state, score_weight = found
@@ -604,7 +608,7 @@ def update_existence(
 
 @njit(cache=True, nogil=True)
 def _count_once(eras: I64x1, a: int, era: int) -> int:  # pragma: no cover - compiled
-    """Note that agent a counts in this era; 1 if it did not yet, else 0."""
+    """Mark agent a as counted in this era; returns 1 if it was not yet, else 0."""
     if eras[a] == era:
         return 0
     eras[a] = era
@@ -613,7 +617,7 @@ def _count_once(eras: I64x1, a: int, era: int) -> int:  # pragma: no cover - com
 
 @njit(cache=True, nogil=True)
 def _open_day(scratch: AgentScratch, a: int, k: int, day: int) -> None:  # pragma: no cover - compiled
-    """Clear what agent a holds of another thing than k, and its sum of another day."""
+    """Reset the scratch of agent a for another element than k, and its sum for another day."""
     if scratch.thing[a] != k + 1:
         scratch.thing[a], scratch.day[a], scratch.seen_era[a], scratch.missed_era[a] = k + 1, day, 0, 0
         scratch.day_sum[a], scratch.has_seen[a] = 0.0, False
@@ -624,7 +628,10 @@ def _open_day(scratch: AgentScratch, a: int, k: int, day: int) -> None:  # pragm
 def find_covered_by_inliers(
     arrays: ObservationArrays, pose: Floats, is_inlier: NDArray[np.bool_], min_agents: int, view_margin_m: float
 ) -> NDArray[np.bool_]:
-    """(P,) which points of observations that nobody believes (O,) lie where so many believed agents looked."""
+    """Find the points (P,) of rejected observations that lie in the views of at least ``min_agents`` inlier agents.
+
+    is_inlier: (O,) observations of agents that were not rejected.
+    """
     out = np.zeros(len(arrays.xy), np.bool_)
     if not is_inlier.all():
         index = build_visibility_index(arrays, pose, is_inlier)
@@ -639,7 +646,7 @@ def find_covered_by_inliers(
 def _mark_covered(
     rejected: I64x1, first: I64x1, xy: F64x2, scene: ObservationScene, margin: float, min_agents: int, out: Boolx1
 ) -> None:  # pragma: no cover - compiled
-    """Mark in out (P,) the points of observations ``rejected`` that so many agents of the scene could see."""
+    """Mark in out (P,) the points of ``rejected`` observations that at least ``min_agents`` agents of the scene cover."""
     agent, pose, of = scene.observers.agent, scene.observers.pose, scene.cells.observations
     seen, place = np.full(scene.observers.num_agents, -1), np.empty((1, 2))
     for o in rejected:
@@ -659,7 +666,7 @@ def _mark_covered(
 
 @njit(cache=True, nogil=True)
 def _cell_of(places: F64x2, index: VisibilityIndex) -> tuple[int, int]:  # pragma: no cover - compiled
-    """The range in ``index.observations`` of the observations that may see the first place."""
+    """Return the range in ``index.observations`` of the observations that may cover the first place."""
     keys, start, _ = index
     ix, iy = int(np.floor(places[0, 0] / _VIEW_CELL_M)), int(np.floor(places[0, 1] / _VIEW_CELL_M))
     key = ((ix + 536870912) << 30) | (iy + 536870912)
@@ -673,7 +680,7 @@ def _cell_of(places: F64x2, index: VisibilityIndex) -> tuple[int, int]:  # pragm
 def compute_mean_visibility(
     places: F64x2, o: int, pose: F64x2, rings: FieldsOfView, margin: float
 ) -> float:  # pragma: no cover - compiled
-    """Mean visibility of the places from observation o; what is seen by less than half says nothing."""
+    """Compute the mean visibility of places from observation o; 0 for several places whose mean is below a half."""
     c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
     total = 0.0
     for i in range(len(places)):

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One map from many observations: align, find stations, link them to lines, keep their evidence.
+"""Fuse many observations into one map: align poses, build stations, link them to lines, keep their evidence.
 
-The whole of specs/maps.md 3.4 in three steps: :func:`manyeyes.maps.fusion.pose_optimization.solve_poses`,
-:func:`manyeyes.maps.fusion.stations.build_stations` and :func:`assemble_map`. The first two are local and may run tile by tile; the
-third takes the stations of all tiles, which are few, so no line is ever cut at a border. The map is a fold over the
-sorted set of observations: giving one again, or in another order, changes nothing, and taking one out gives the map
-that never had it.
+The steps are :func:`manyeyes.maps.fusion.pose_optimization.solve_poses`, :func:`manyeyes.maps.fusion.stations.build_stations`
+and :func:`assemble_map`. The first two are local and may run tile by tile. The third takes the stations of all tiles, which are
+few, so no line is cut at a border. The map is a pure function of the set of observations: repetition and order have no effect,
+and removing an observation gives the map without it.
 """
 
 from __future__ import annotations
@@ -50,10 +49,11 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class MapFusionConfig:
-    """pose_solver, stations, link: of the three steps. min_length_m: shortest line by kind (divider, boundary, crossing, stop
-    line).
+    """Configuration of the fusion.
 
-    full_score_length_m: length by kind from which a line's score is not lowered.
+    pose_solver, stations, link, parallel_extension, topology: of the steps.
+    min_length_m: shortest line by kind (divider, boundary, crossing, stop line).
+    full_score_length_m: by kind, length from which a line's score is not lowered.
     """
 
     pose_solver: PoseSolverConfig = field(default_factory=PoseSolverConfig)
@@ -67,7 +67,7 @@ class MapFusionConfig:
 def fuse(
     observations: Sequence[Observation], config: MapFusionConfig = MapFusionConfig(), frame: MapFrame | None = None
 ) -> VectorMap:
-    """The map of the observations, in their frame."""
+    """Fuse the observations into a map in their frame."""
     return fuse_at_poses(observations, solve_poses(observations, config.pose_solver), None, config, frame)
 
 
@@ -78,7 +78,7 @@ def fuse_at_poses(
     config: MapFusionConfig = MapFusionConfig(),
     frame: MapFrame | None = None,
 ) -> VectorMap:
-    """The map of the observations at given poses, from the stations in area (x0, y0, x1, y1), or everywhere."""
+    """Fuse the observations at given poses, from the stations in area (x0, y0, x1, y1), or everywhere."""
     arrays = to_observation_arrays(observations, config.pose_solver.spacing_m)
     return assemble_map(build_stations(arrays, solution, area, config.stations), config, frame)
 
@@ -86,7 +86,7 @@ def fuse_at_poses(
 def assemble_map(
     table: StationTable, config: MapFusionConfig = MapFusionConfig(), frame: MapFrame | None = None
 ) -> VectorMap:
-    """The map that the stations of all areas make: retired ones for themselves, the others linked to lines."""
+    """Assemble the map from the stations of all areas; retired stations are linked separately."""
     parts = [
         _build_lines(table, table.line_evidence.state != RETIRED, config),
         _build_lines(table, table.line_evidence.state == RETIRED, config),
@@ -97,8 +97,8 @@ def assemble_map(
 
 @dataclass(frozen=True, eq=False)
 class _ElementParts:
-    """Elements on their way: points (P, 2), offsets first (N + 1,), the row of evidence behind each point (P,), and
-    whether that place itself was seen (P,) or is inferred.
+    """Elements under construction: points (P, 2), offsets (N + 1,), the evidence row of each point (P,), and whether the point
+    was observed (P,) or is inferred.
     """
 
     points: Floats
@@ -204,7 +204,7 @@ def _to_vector_map(parts: _ElementParts, evidence: EvidenceTable, frame: MapFram
         evidence.sigma[row],
         style,
     )
-    sources_first, sources = _collect_sources(owner, row, count, evidence)
+    source_offsets, sources = _collect_sources(owner, row, count, evidence)
     stations = PointEvidence(
         *(getattr(evidence, n)[row] * parts.is_observed for n in ("support", "agents")),
         *(getattr(evidence, n)[row] for n in ("log_odds", "sigma", "t_first", "t_last")),
@@ -220,14 +220,14 @@ def _to_vector_map(parts: _ElementParts, evidence: EvidenceTable, frame: MapFram
         id=compute_content_ids(elements),
         state=state,
         log_odds=mean,
-        supporters=np.diff(sources_first),
+        supporters=np.diff(source_offsets),
         agents=agents,
         t_first=t_first,
         t_last=t_last,
         point_evidence=stations,
         topology=_build_topology(elements, state),
         observations=evidence.observations,
-        source_offsets=sources_first,
+        source_offsets=source_offsets,
         sources=sources,
     )
 

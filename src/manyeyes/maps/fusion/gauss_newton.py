@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One damped Gauss-Newton step of each observation's rigid motion towards lines near its own, held back by its claim.
+"""One damped Gauss-Newton step of each observation's pose on point-to-line residuals, with a pose prior.
 
-Stage 2 of specs/maps.md 3.4: residuals count across lines only, along the mean normal of both lines, which has no bias on a
-bend; each point has at most one vote; the prior is the claimed pose, less what its drive is known to be off.
+Residuals are lateral, along the mean normal of both lines, which has no bias on a bend. Each point has a total weight of at
+most one. The prior is the prior pose, corrected by the bias of its drive.
 """
 
 from __future__ import annotations
@@ -23,19 +23,21 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _OwnPoints = tuple[I64x1, F64x2, F64x2, I64x1, F64x1]
-"""first, xy, tangent, kind, sigma."""
+"""offsets, xy, tangent, kind, sigma."""
 _OtherPoints = tuple[float, I64x1, I64x1, F64x2, F64x2, I64x1, F64x1]
-"""cell, keys, start, xy, tangent, observation, weight."""
+"""cell size, keys, offsets, xy, tangent, observation, weight."""
 _SolverParams = tuple[float, float, float, float, float, float]
-"""gate, kernel, reach, cosine, scatter, correlation."""
+"""lateral gate, kernel, longitudinal gate, cosine of the heading gate, sigma, points per independent one."""
 
 
 @njit(cache=True, nogil=True)
 def build_normal_equations(
     home: I64x1, own_points: _OwnPoints, other_points: _OtherPoints, params: _SolverParams, point_stride: int = 1
 ) -> F64x2:  # pragma: no cover - compiled
-    """Sum the normal equations of each home observation (H, 13): pivot x, y; information xx, xy, xt, yy, yt, tt; right side
-    x, y, t; weighted square residual (m²) and sum of votes. Every stride-th point votes, for all.
+    """Build the normal equations (H, 13) of the home observations.
+
+    Columns: pivot x, y; information xx, xy, xt, yy, yt, tt; right side x, y, t; weighted sum of squared residuals (m²); sum of
+    point weights. Of each observation every ``point_stride``-th point counts.
     """
     first, xy, tangent, kind, sigma = own_points
     cell, keys, start, rxy, rtangent, robservation, rweight = other_points
@@ -103,7 +105,11 @@ def step_poses(
     normal_sums: Floats,
     config: PoseSolverConfig,
 ) -> dict[str, Floats]:
-    """The columns of an Alignment that a sweep changes, for the home rows; states: start, lean and pose (O, 3) of all."""
+    """Compute the columns of a PoseSolution that a sweep changes, for the home rows.
+
+    states: initial pose, prior mean and pose (O, 3) of all observations. normal_sums: (H, 13) of
+    :func:`build_normal_equations`.
+    """
     start, prior_mean, pose = (np.ascontiguousarray(rows[home]) for rows in states)
     prior = np.ascontiguousarray(np.asarray(arrays.covariance)[home])
     params = (config.max_variance_ratio, config.prior_scale, config.damping)
@@ -132,10 +138,12 @@ def _step_all(
     trusted: Boolx1,
     params: tuple[float, float, float],
 ) -> tuple[F64x2, F64x3, F64x2, F64x3, F64x2]:  # pragma: no cover - compiled
-    """Poses (H, 3) after the step, their covariances (H, 3, 3), how far lines tell each of their three directions (H, 3), and
-    the lines' information (H, 3, 3) and what they ask for (H, 3).
+    """Solve the damped step of each home observation.
+
+    Returns poses (H, 3), covariances (H, 3, 3), observability (H, 3), and information matrix (H, 3, 3) and vector (H, 3) of the
+    lines.
     """
-    frozen_above, prior_scale, damping = params
+    max_variance_ratio, prior_scale, damping = params
     count = len(normal_sums)
     next_pose, covariance, observability = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3))
     information_matrix, information_vector = np.empty((count, 3, 3)), np.empty((count, 3))
@@ -152,12 +160,12 @@ def _step_all(
         moved = pose[h] - start[h]
         moved[2] = (moved[2] + np.pi) % (2 * np.pi) - np.pi
         off = moved - prior_mean[h]
-        # In units in which the prior is a unit ball the data's information tells directly how much it adds to the prior.
+        # Whitened by the prior, the eigenvalues of the information are ratios of prior to data variance.
         inverse = np.linalg.inv(jacobian)
         root = np.linalg.cholesky(inverse @ prior[h] @ inverse.T)
         strength, axes = np.linalg.eigh(root.T @ information @ root)
         strength = np.maximum(strength, 0.0)
-        observed_strength = np.where(1.0 / (1.0 + strength) <= frozen_above, strength, 0.0)
+        observed_strength = np.where(1.0 / (1.0 + strength) <= max_variance_ratio, strength, 0.0)
         weighted = np.linalg.solve(prior[h], off)
         distance = np.sum(off * weighted)
         trust = (prior_scale**2 / (prior_scale**2 + distance)) ** 2

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CrowdMap's sparse geometric graph as arrays: nodes are elements of maps and observations, edges say how two of them lie.
+"""Sparse geometric graph of map elements as arrays: nodes are elements of maps and observations, edges their relations.
 
-CrowdMap 2.3 makes elements nodes and "spatial or semantic relations" edges and leaves both open; the relations here are those of
-specs/maps.md 3.3. Two lines face each other where the foot of a point of one lies inside the other and their directions differ
-by little; over such an interval the lateral offset has a mean and a median absolute deviation.
+CrowdMap 2.3 makes elements nodes and "spatial or semantic relations" edges, and defines neither; the relations here are this
+project's. Two lines face each other where the foot of a point of one lies inside the other and their directions differ by
+little. Over such an interval the lateral offset has a mean and a median absolute deviation.
 
-overlap: of one class, facing each other at a small offset. parallel: lines that face each other at a lane's distance. continues:
-of one class, an end ahead of an end. crosses: they intersect at an angle. same_observation: seen by one agent in one look; where
-such elements face each other apart, they are two things, whatever others say (:attr:`ElementGraph.cannot_link`).
+overlap: of one class, facing each other at a small offset.
+parallel: lines that face each other at a lane's distance.
+continues: of one class, an end ahead of an end.
+crosses: they intersect at an angle.
+same_observation: from one observation; if such elements face each other apart, they are distinct
+    (:attr:`ElementGraph.cannot_link`).
 """
 
 from __future__ import annotations
@@ -40,12 +43,15 @@ _NUM_COLUMNS = 13
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """Metres and radians. spacing_m: of the points that are compared. max_turn_rad: greatest difference of directions that face.
+    """Configuration of the graph, in metres and radians.
 
-    max_overlap_offset_m: greatest mean offset of an overlap; max_parallel_offset_m: of a parallel. min_interval_m: shortest
-    interval of either, or half of the shorter element. max_gap_m, max_gap_turn_rad: of ends that continue, aside by at most aside_m
-    + aside_share times the gap. min_crossing_angle_rad: least angle of a crossing. min_separation_m: offset from which elements of
-    one observation are two.
+    spacing_m: distance of the compared points. max_turn_rad: largest angle between lines that face each other.
+    max_overlap_offset_m: largest mean offset of an overlap; max_parallel_offset_m: of a parallel.
+    min_interval_m: shortest interval of either, or half of the shorter element.
+    max_gap_m, max_gap_turn_rad: of ends that continue; their lateral offset is at most max_lateral_m + lateral_slope times the
+        gap.
+    min_crossing_angle_rad: smallest angle of a crossing.
+    min_separation_m: offset from which elements of one observation are distinct.
     """
 
     spacing_m: float = 1.0
@@ -88,7 +94,7 @@ class ElementGraph:
         return len(self.edge)
 
     def select_relation(self, relation: str) -> ElementGraph:
-        """The edges of one relation."""
+        """Return the edges of one relation."""
         if relation not in RELATIONS:
             raise ConfigError(
                 f"ElementGraph: expected a relation of {', '.join(RELATIONS)}; got {relation!r}. Choose one."

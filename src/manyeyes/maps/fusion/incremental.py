@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map that takes in one observation at a time, for latency; the fold over all observations stays the canonical map.
+"""Incremental map update, one observation at a time, for low latency; the batch fusion remains the reference.
 
-An observation is aligned to the map as to one more neighbour (stages 1 and 2 of specs/maps.md 3.4, the map standing
-still), then each station it could see gains or loses log-odds and is drawn a little across towards what was seen, and
-what no station explains becomes candidate stations. What that costs against the fold is told by :func:`compute_map_fscore`.
-Differences on purpose: earlier observations are not moved again, what an agent said of a station before the one
-observation last heard is forgotten when its daily sum is capped, and crossings keep their shape.
+An observation is aligned to the fixed map by the coarse search and Gauss-Newton steps of the batch fusion. Each station that it
+covers gains or loses log-odds and is shifted laterally towards the detection. Points that match no station become candidate
+stations. :func:`compute_map_fscore` measures the difference from the batch fusion. By design, earlier poses are not corrected
+again, the daily bound keeps only the last agent's sum per station, and crossings keep their shape.
 """
 
 from __future__ import annotations
@@ -50,13 +49,15 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _CELL_M = 1.25
-_NO_OBSERVATION = -1  # the observation that the map's own points belong to: none
+_NO_OBSERVATION = -1  # the observation index of the map's own points: none
 
 
 @dataclass(frozen=True)
 class IncrementalConfig:
-    """fusion: of the fold. gates_m, kernels_m: of the steps to the map. max_candidates: candidates that wait before the grid is
-    built anew.
+    """Configuration of the incremental map.
+
+    fusion: configuration of the batch fusion. gates_m, kernels_m: of the alignment steps.
+    max_candidates: number of candidate stations after which they are merged into the main grid.
     """
 
     fusion: MapFusionConfig = field(default_factory=MapFusionConfig)
@@ -67,7 +68,7 @@ class IncrementalConfig:
 
 @dataclass(frozen=True, eq=False)
 class UpdateResult:
-    """What one observation did: its pose (3,) and covariance (3, 3), stations it confirmed, missed and began."""
+    """Result of one update: pose (3,) and covariance (3, 3) of the observation, stations confirmed, missed and created."""
 
     pose: Floats
     covariance: Floats
@@ -77,7 +78,7 @@ class UpdateResult:
 
 
 class IncrementalMap:
-    """A map in memory that observations are added to; holds its own copy of everything."""
+    """A map in memory that observations are added to; it copies the initial map."""
 
     def __init__(self, start: VectorMap, config: IncrementalConfig = IncrementalConfig()) -> None:
         self.config, self.frame = config, start.frame
@@ -94,16 +95,16 @@ class IncrementalMap:
         self._observation_ids = [row.tobytes() for row in start.observations]
         self._origin = np.repeat(lines, start.elements.counts[lines])[order]
         self._start = start
-        # Of a map nobody knows where its observations looked, but under its lines somebody did.
+        # The views of the initial map are unknown; the cells under its lines are observed.
         kept = start.elements.take(lines)
         self._observed_cells = [find_cells_under_lines(kept.points, kept.offsets)]
-        # Candidates are sorted anew with every observation; what was heard of them counts them as they came.
+        # Candidates are sorted again after every observation; the support log counts them in order of creation.
         self._candidate_order = np.zeros(0, np.int64)
         self._support_log: list[tuple[Ints, bool, int]] = []
         self._observation_rows = {name: k for k, name in enumerate(self._observation_ids)}
 
     def update(self, observation: Observation) -> UpdateResult:
-        """Add one observation; one that the map holds already changes nothing."""
+        """Add one observation; an observation that the map already contains changes nothing."""
         raw = bytes.fromhex(observation.id)
         s = to_observation_arrays([observation], self.config.fusion.pose_solver.spacing_m)
         if raw in self._observation_rows:
@@ -134,7 +135,7 @@ class IncrementalMap:
         return UpdateResult(pose[0], covariance[0], confirmed, missed, len(unexplained))
 
     def build_map(self) -> VectorMap:
-        """The map as it stands, linked to lines."""
+        """Build the map from the current stations, linked to lines."""
         self._merge_candidates()
         station_grid, count = self._merged_stations, len(self._merged_stations)
         sources_of_station: list[list[int]] = [[] for _ in range(count)]
@@ -165,7 +166,7 @@ class IncrementalMap:
         return assemble_map(StationTable.cat([table]), self.config.fusion, self.frame)
 
     def _estimate_pose(self, s: ObservationArrays) -> tuple[Floats, Floats]:
-        """Pose (1, 3) and covariance (1, 3, 3) of the one observation against the map."""
+        """Estimate the pose (1, 3) and covariance (1, 3, 3) of one observation against the map."""
         config, station_grid, home = self.config.fusion.pose_solver, self._merged_stations, np.zeros(1, np.int64)
         one = replace(config, gates_m=self.config.gates_m, kernels_m=self.config.kernels_m, damping=1.0)
         pose, covariance = np.array(s.pose), np.array(s.covariance)
@@ -201,7 +202,7 @@ class IncrementalMap:
         return pose, covariance
 
     def _update_crossings(self, s: ObservationArrays, pose: Floats, confirmed: int, missed: int) -> tuple[int, int]:
-        """Evidence for crossings: overlapped by one of the observation's, or in clear view without."""
+        """Update the crossings that overlap one of the observation's, or that it covers without a detection."""
         config, rows = self.config.fusion.stations, np.flatnonzero(np.asarray(s.elements.kind) == CROSSING)
         moved = s.elements.transform(*(float(v) for v in pose[0]))
         own_hulls = [compute_convex_hull(np.asarray(moved.polyline(int(k)))) for k in rows]
@@ -235,7 +236,7 @@ class IncrementalMap:
     def _add_candidates(
         self, s: ObservationArrays, xy: Floats, tangent: Floats, points: Ints, score_weight: Floats
     ) -> None:
-        """New candidates from points that no station explains, each worth a share of a hit."""
+        """Add candidate stations at points that match no station; score_weight: (N,) weight of each detection."""
         if not len(xy):
             return
         count = len(self._candidate_stations)
@@ -250,7 +251,7 @@ class IncrementalMap:
         self._support_log.append((np.arange(count, len(xy)), False, len(self._observation_ids) - 1))
 
     def _merge_candidates(self) -> None:
-        """Make candidates part of the main ground, and what was looked at one whole."""
+        """Merge the candidate stations into the main grid, and the observed cells into one set of runs."""
         self._observed_cells = [merge_runs(np.concatenate(self._observed_cells))]
         if not len(self._candidate_stations):
             return
@@ -273,7 +274,7 @@ class IncrementalMap:
 
 @dataclass(eq=False)
 class _EvidenceRows:
-    """Evidence columns that change; row by row with stations or rings."""
+    """Mutable evidence columns, row by row with stations or rings."""
 
     kind: Ints
     sigma: Floats
@@ -290,14 +291,14 @@ class _EvidenceRows:
 
     @classmethod
     def of(cls, m: VectorMap, rows: Ints) -> _EvidenceRows:
-        """Of the elements ``rows``, one row each."""
+        """Make one row for each of the elements ``rows``."""
         columns = (m.log_odds, m.supporters, m.agents, m.state, m.t_first, m.t_last)
         sigma = np.array([m.elements.sigma[m.elements.offsets[k]] for k in rows.tolist()])
         return cls._of(m.elements.kind[rows], sigma, tuple(c[rows] for c in columns), m.elements.style[rows])
 
     @classmethod
     def of_points(cls, m: VectorMap, rows: Ints) -> _EvidenceRows:
-        """Of the points of the elements ``rows``."""
+        """Make one row for each point of the elements ``rows``."""
         _, points = take_rows(m.elements.offsets, rows)
         owner = m.elements.element_of_point[points]
         t = m.point_evidence
@@ -327,17 +328,17 @@ class _EvidenceRows:
 
     @classmethod
     def cat(cls, one: _EvidenceRows, two: _EvidenceRows) -> _EvidenceRows:
-        """Both, in order."""
+        """Concatenate two tables, in order."""
         return cls(*(np.concatenate((getattr(one, n), getattr(two, n))) for n in cls.__dataclass_fields__))
 
     def take(self, order: Ints) -> _EvidenceRows:
-        """The chosen rows, in the order given."""
+        """Return the chosen rows, in the order given."""
         return _EvidenceRows(*(getattr(self, n)[order] for n in self.__dataclass_fields__))
 
     def append_created(
         self, kind: Ints, score_weight: Floats, s: ObservationArrays, config: IncrementalConfig
     ) -> _EvidenceRows:
-        """With rows begun by an observation: their kinds (N,) and which share of a hit each is worth (N,)."""
+        """Append rows that an observation creates: their kinds (N,) and the weights of the detections (N,)."""
         evidence, time, count = config.fusion.stations.evidence, int(s.time_ns[0]), len(kind)
         odds = np.minimum(evidence.log_odds_hit * score_weight, evidence.max_daily_change)
         state = np.where(bool(s.trusted[0]) & (odds >= evidence.publish_threshold(kind)), PUBLISHED, 0)
@@ -361,9 +362,7 @@ class _EvidenceRows:
     def add_log_odds(
         self, rows: Ints, log_odds_change: float | Floats, s: ObservationArrays, hit: bool, config: IncrementalConfig
     ) -> None:
-        """Add to the log-odds of rows: decayed since they were last heard of, capped by agent and day, clamped; then
-        their state.
-        """
+        """Add to the log-odds of rows, with decay, daily bound per agent and clamping; then update their state."""
         evidence, time = config.fusion.stations.evidence, int(s.time_ns[0])
         kinds = np.arange(len(KINDS))
         _add_log_odds(
@@ -396,7 +395,7 @@ class _EvidenceRows:
         )
 
     def to_table(self, sources_of_row: Sequence[Sequence[int]], ids: NDArray[np.uint8]) -> EvidenceTable:
-        """As the fold's table; ``sources_of_row``: the observations (rows of ids) of each row."""
+        """Convert to the table of the batch fusion; sources_of_row: observations (rows of ids) of each row."""
         digests, place = np.unique(ids, axis=0, return_inverse=True)
         sources = [np.unique(place.reshape(-1)[np.array(one, np.int64)]) for one in sources_of_row]
         return EvidenceTable(
@@ -431,7 +430,7 @@ class _UpdatedColumns(NamedTuple):
 
 
 class _Update(NamedTuple):
-    """What one observation says of rows: when (ns and day), of which agent, whether it saw them, whether it is surveyed."""
+    """One observation as an update of rows: time (ns) and day, agent, whether it is a detection, whether it is surveyed."""
 
     time_ns: int
     day: int
@@ -441,7 +440,7 @@ class _Update(NamedTuple):
 
 
 class _UpdateLimits(NamedTuple):
-    """Bounds of log-odds; decay_s and publish: (4,) by kind, seconds to 1/e and log-odds from which a row is published."""
+    """Bounds of log-odds; decay_s and publish: (4,) by kind, time to 1/e and log-odds from which a row is published."""
 
     max_daily_change: float
     max_log_odds: float
@@ -479,7 +478,7 @@ def _add_log_odds(
 
 
 class _PlacedObservation(NamedTuple):
-    """One observation at its pose (1, 3), as :func:`_match_stations` reads it; order: where its points stand among all."""
+    """One observation at its pose (1, 3) for :func:`_match_stations`; order: rows of its line points among all its points."""
 
     pose: F64x2
     order: I64x1
@@ -521,6 +520,7 @@ class _StationGrid:
 
     @classmethod
     def of(cls, xy: Floats, tangent: Floats, rows: _EvidenceRows) -> _StationGrid:
+        """Sort stations into a grid; rows: their evidence."""
         xy, tangent = np.ascontiguousarray(xy), np.ascontiguousarray(tangent)
         grid = build_grid(xy[:, 0], xy[:, 1], rows.kind, _CELL_M)
         no_observation = np.full(len(xy), _NO_OBSERVATION, np.int64)
@@ -529,7 +529,7 @@ class _StationGrid:
 
     @cached_property
     def coarse_grid(self) -> tuple[Ints, Ints, Floats, Floats, Ints]:
-        """The stations as the gross search reads them, where they stood when they were first asked for."""
+        """The stations for the coarse search, at their positions when this was first read."""
         grid = build_grid(self.xy[:, 0], self.xy[:, 1], self.rows.kind, 8.0)
         return grid.keys, grid.offsets, self.xy[grid.order], self.tangent[grid.order], self.observation_of_point
 
@@ -539,8 +539,8 @@ class _StationGrid:
     def update(
         self, s: ObservationArrays, placed: _PlacedObservation, config: IncrementalConfig
     ) -> tuple[Ints, int, NDArray[np.bool_]]:
-        """Evidence of one observation: rows confirmed, how many missed, and which of its points (P,) some station
-        explains.
+        """Add the evidence of one observation: rows confirmed, number of rows missed, and which of its points (P,) match a
+        station.
         """
         evidence, explained_points = config.fusion.stations.evidence, np.zeros(len(s.xy), bool)
         if not len(self) or not len(explained_points):
@@ -564,7 +564,7 @@ class _StationGrid:
 
 
 class _GridStations(NamedTuple):
-    """Stations in the order of their grid of _CELL_M: its keys and starts, places (K, 2) and unit tangents (K, 2)."""
+    """Stations in the order of their grid of _CELL_M: its keys and offsets, positions (K, 2) and unit tangents (K, 2)."""
 
     keys: I64x1
     start: I64x1
@@ -573,8 +573,8 @@ class _GridStations(NamedTuple):
 
 
 class _ObservationPoints(NamedTuple):
-    """Points of one observation's lines in the order of their grid of _CELL_M: its keys and starts, places and unit
-    tangents (P, 2) in the map's frame, weights (P,) and shares of a hit (P,).
+    """Points of one observation's lines in the order of their grid of _CELL_M: its keys and offsets, positions and unit
+    tangents (P, 2) in the map's frame, weights (P,) and detection weights (P,).
     """
 
     keys: I64x1
@@ -593,8 +593,8 @@ class _ViewBounds(NamedTuple):
 
 
 class _Comparison(NamedTuple):
-    """N stations that one observation could see or has a line at: rows; lateral offset (m) of its line there; weight of
-    that, -1: no line; visibility; share of a hit. explained: (P,) which of its points, in their grid's order, have a station.
+    """N stations that one observation covers or detects: rows; lateral offset (m) of its line; weight of that, -1: no line;
+    visibility; detection weight. explained: (P,) which of its points, in the order of their grid, match a station.
     """
 
     rows: I64x1
@@ -609,7 +609,9 @@ class _Comparison(NamedTuple):
 def _match_stations(
     stations: _GridStations, placed: _PlacedObservation, kinds: int
 ) -> _Comparison:  # pragma: no cover - compiled
-    """Compare the stations in the box of a view with the points seen; those with a line only a little aside are left out."""
+    """Match the stations in the box of a view with the observed points; those with a line only at a small lateral offset are
+    left out.
+    """
     keys, start, xy, tangent = stations
     pkeys, pstart, pxy, ptangent, pweight, pscore_weight = placed.points
     params, (low, high) = placed.kernel_params, placed.box
@@ -674,15 +676,15 @@ def _match_stations(
 
 @njit(cache=True, nogil=True)
 def _resize(values: F64x1, size: int) -> F64x1:  # pragma: no cover - compiled
-    """The same values at the start of an array of that size."""
+    """Copy values to the start of an array of another size."""
     out = np.empty(size)
     out[: len(values)] = values
     return out
 
 
 def compute_map_fscore(one: VectorMap, two: VectorMap, threshold_m: float = 0.5) -> float:
-    """F-score of two maps' published lines: harmonic mean of the shares of points of each within a distance of the
-    other's kind.
+    """Compute the F-score of the published lines of two maps: the harmonic mean of the fractions of points of each that lie
+    within a distance of the other's lines of the same kind.
     """
     fractions = []
     for a, b in ((one.select_published(), two.select_published()), (two.select_published(), one.select_published())):
@@ -698,6 +700,7 @@ def compute_map_fscore(one: VectorMap, two: VectorMap, threshold_m: float = 0.5)
 
 
 def _to_search_arguments(s: ObservationArrays, home: Ints, other_points: tuple, config: PoseSolverConfig) -> tuple:
+    """Convert one observation and the stations to arguments of the compiled coarse search."""
     search_config = config.coarse_search
     return (
         home,
@@ -719,7 +722,7 @@ def _to_search_arguments(s: ObservationArrays, home: Ints, other_points: tuple, 
 
 
 def _points_and_tangents(elements: MapElements) -> tuple[Floats, Floats]:
-    """Points and unit tangents (P, 2): the chord over both neighbours."""
+    """Compute points and unit tangents (P, 2): the chord over both neighbours."""
     points = np.array(elements.points)
     index = np.arange(len(points))
     first, last = elements.offsets[:-1][elements.element_of_point], elements.offsets[1:][elements.element_of_point] - 1
@@ -728,9 +731,10 @@ def _points_and_tangents(elements: MapElements) -> tuple[Floats, Floats]:
 
 
 def _order(xy: Floats, kind: Ints) -> Ints:
+    """Return the order of points in their grid."""
     return build_grid(xy[:, 0], xy[:, 1], kind, _CELL_M).order
 
 
 def _hash_agent(s: ObservationArrays) -> int:
-    """A number for the agent's name that is the same in every process."""
+    """Hash the agent's name to an integer that is the same in every process."""
     return int.from_bytes(s.agents[int(s.agent[0])].encode()[-7:], "little")

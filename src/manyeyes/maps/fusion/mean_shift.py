@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ridges: points of many noisy lines slide sideways to where most lines agree, and are thinned to about one a metre.
+"""Ridges by subspace-constrained mean shift: points of many noisy lines move laterally to the mode and are thinned.
 
-Stages 3 and 4 of specs/maps.md 3.4: mean shift confined to the normal (subspace-constrained mean shift; Ozertem and
-Erdogmus, "Locally defined principal curves and surfaces", JMLR 2011). Distances go along the mean normal of the two
-lines, so that a bend of constant radius does not shrink. Lines closer than the bandwidth become one ridge, lines a lane
-apart never do.
+Mean shift is confined to the normal (Ozertem and Erdogmus, "Locally defined principal curves and surfaces", JMLR 2011). Offsets
+are measured along the mean normal of the two lines, so that a bend of constant radius does not shrink. Lines closer than the
+bandwidth become one ridge; lines a lane apart stay separate.
 """
 
 from __future__ import annotations
@@ -28,11 +27,12 @@ _THIN_CELL_M = 2.0
 
 @dataclass(frozen=True)
 class RidgeConfig:
-    """longitudinal_extent_m, lateral_extent_m: half extents of the kernel. longitudinal_sigma_m, lateral_sigma_m: its Gaussian
-    scales. max_heading_rad: largest turn.
+    """Configuration of mean shift and thinning.
 
-    num_iterations: of mean shift. spacing_m: between the points that stay; min_separation_m: points closer across than this are one
-    ridge.
+    longitudinal_extent_m, lateral_extent_m: half extents of the kernel.
+    longitudinal_sigma_m, lateral_sigma_m: its Gaussian scales. max_heading_rad: heading gate.
+    num_iterations: of mean shift. spacing_m: distance of the points that remain.
+    min_separation_m: lateral distance below which points belong to one ridge.
     """
 
     longitudinal_extent_m: float = 2.5
@@ -48,8 +48,9 @@ class RidgeConfig:
 def mean_shift_to_ridges(
     seeds: Ints, xy: Floats, tangent: Floats, kind: Ints, weight: Floats, config: RidgeConfig = RidgeConfig()
 ) -> tuple[Floats, Floats, Floats]:
-    """Points ``seeds`` (S,) of all points (P,) moved to their ridges: positions (S, 2), unit tangents (S, 2) and
-    density (S,).
+    """Move points ``seeds`` (S,) of all points (P,) to their ridges.
+
+    Returns positions (S, 2), unit tangents (S, 2) and density (S,).
     """
     grid = build_grid(xy[:, 0], xy[:, 1], kind, _SHIFT_CELL_M)
     order = grid.order
@@ -94,7 +95,7 @@ class _Kernel(NamedTuple):
 def _shift(
     xy: F64x2, tangent: F64x2, kind: I64x1, points: _WeightedPoints, params: _Kernel, rounds: int
 ) -> tuple[F64x2, F64x2, F64x1]:  # pragma: no cover - compiled
-    """Positions (S, 2), unit tangents (S, 2) and density (S,) of points after some rounds of mean shift along normals."""
+    """Run mean shift along normals: positions (S, 2), unit tangents (S, 2) and density (S,) of the points."""
     keys, start, rxy, rtangent, rweight = points
     reach, across, sigma_along, sigma_across, cosine = params
     place, turned, density = xy.copy(), tangent.copy(), np.zeros(len(xy))
@@ -138,10 +139,9 @@ def _shift(
 def thin_ridges(
     xy: Floats, tangent: Floats, kind: Ints, priority: NDArray[np.uint64], config: RidgeConfig = RidgeConfig()
 ) -> Ints:
-    """Which of the ridge points (S,) stay: walked by priority, a point stays unless one that stays is close along and
-    across.
+    """Select ridge points (S,) in order of priority: a point is kept unless a kept one is within both distances.
 
-    Since priorities are as good as random, what happens to a point depends on few others near it, on no tile's border.
+    Priorities are pseudo-random, so the result for a point depends on few neighbours and on no tile border.
     """
     grid = build_grid(xy[:, 0], xy[:, 1], kind, _THIN_CELL_M)
     place = np.empty(len(xy), np.int64)

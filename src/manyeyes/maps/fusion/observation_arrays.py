@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A set of observations as columns: sorted, each once, its elements sampled to points, its views ready to be asked."""
+"""A set of observations as arrays: sorted, without duplicates, elements sampled to points, views ready for queries."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ DAY_NS = 86_400_000_000_000
 
 
 class ObservationRings(NamedTuple):
-    """Polygons of O observations: ring r is ``xy[first[r]:first[r + 1]]``, rings of o are ``observation_offsets[o]:of[o + 1]``;
-    agents' frames.
+    """Polygons of O observations, in the agents' frames.
+
+    Ring r is ``xy[ring_offsets[r]:ring_offsets[r + 1]]``; observation o has rings
+    ``observation_offsets[o]:observation_offsets[o + 1]``.
     """
 
     xy: F64x2
@@ -33,7 +35,7 @@ class ObservationRings(NamedTuple):
 
 
 class FieldsOfView(NamedTuple):
-    """What O observations could see: the polygons of their views, and the occluders that hid parts of them."""
+    """Visible areas of O observations: the polygons of their views, and the occluders that hide parts of them."""
 
     views: ObservationRings
     occluders: ObservationRings
@@ -43,12 +45,13 @@ class FieldsOfView(NamedTuple):
 class ObservationArrays:
     """O observations, ordered by time and then by id, and the P points of their E elements, in the agents' frames.
 
-    ids: (O,) hexadecimal. drives: (O,) names of drives, each one agent's. agent, time_ns: (O,). pose: (O, 3) and
-    covariance (O, 3, 3) as claimed. trusted: (O,).
-    radius_m: (O,) from the agent to the farthest point or corner of view. observation_offsets: (O + 1,) offsets of points.
-    observation_of_point, element_of_point, kind_of_point: (P,). xy, tangent: (P, 2). sigma: (P,) metres. priority: (P,) of
-    associate.content_priority. elements: all, agents' frames; observation_of_element: (E,). element_offsets: (E + 1,)
-    offsets of points. agents: names, ascending; ``agent`` counts in them.
+    ids: (O,) hexadecimal. drives: (O,) names; a drive belongs to one agent. agent, time_ns, trusted: (O,).
+    pose: (O, 3) prior pose; covariance: (O, 3, 3) of it.
+    radius_m: (O,) from the agent to the farthest point or corner of the view.
+    observation_offsets: (O + 1,) offsets of points. observation_of_point, element_of_point, kind_of_point: (P,).
+    xy, tangent: (P, 2). sigma: (P,) metres. priority: (P,) of :func:`~manyeyes.maps.fusion.point_grid.hash_coordinates`.
+    elements: all; observation_of_element: (E,); element_offsets: (E + 1,) offsets of points.
+    agents: names, ascending; ``agent`` counts in them.
     """
 
     ids: tuple[str, ...]
@@ -78,11 +81,11 @@ class ObservationArrays:
         return len(self.ids)
 
     def to_world(self, pose: Floats) -> tuple[Floats, Floats]:
-        """Points and tangents (P, 2) in the map's frame when the agents stand at pose (O, 3)."""
+        """Transform points and tangents (P, 2) to the map's frame with agents at pose (O, 3)."""
         return _to_world(self.xy, self.tangent, self.observation_offsets, np.ascontiguousarray(pose))
 
     def view_corners_in_world(self, pose: Floats) -> Floats:
-        """Corners (Q, 2) of all views in the map's frame when the agents stand at pose (O, 3)."""
+        """Transform the corners (Q, 2) of all views to the map's frame with agents at pose (O, 3)."""
         owner = np.repeat(
             np.repeat(np.arange(len(self)), np.diff(self.view.observation_offsets)), np.diff(self.view.ring_offsets)
         )
@@ -96,7 +99,7 @@ class ObservationArrays:
 def _to_world(
     xy: F64x2, tangent: F64x2, offsets: I64x1, pose: F64x2
 ) -> tuple[F64x2, F64x2]:  # pragma: no cover - compiled
-    """Points and tangents (P, 2) of observations, those of o from first[o] on, that stand at pose (O, 3)."""
+    """Transform points and tangents (P, 2) of observations, those of o from first[o] on, at pose (O, 3) to the map's frame."""
     out, turned = np.empty_like(xy), np.empty_like(tangent)
     for o in range(len(offsets) - 1):
         c, s = np.cos(pose[o, 2]), np.sin(pose[o, 2])
@@ -108,9 +111,9 @@ def _to_world(
 
 
 def to_observation_arrays(observations: Sequence[Observation], spacing_m: float) -> ObservationArrays:
-    """Observations as columns, whatever their order and however often each is given.
+    """Convert observations to arrays, independent of their order and of duplicates.
 
-    Elements are sampled about every spacing_m along them. Observations stand in the order of time, then id.
+    Elements are sampled about every spacing_m. Observations are ordered by time, then id.
     """
     unique = {o.id: o for o in observations}
     chosen = sorted(unique.values(), key=lambda o: (o.time_ns, o.id))
@@ -167,11 +170,9 @@ def is_line(kind: Ints) -> Flags:
 def compute_visibility(
     x: float, y: float, o: int, view: ObservationRings, occluders: ObservationRings, margin: float
 ) -> float:  # pragma: no cover - compiled
-    """How well observation o could see the point x, y of its own frame: 0 outside its view or behind an occluder, 1
-    well inside.
+    """Compute the visibility of point x, y, in its own frame, from observation o: from 0 (outside or occluded) to 1.
 
-    Within ``margin`` metres of the border of what can
-    be seen it rises linearly: there a missing line says little.
+    It rises linearly within ``margin`` metres of the border, where a miss is less significant.
     """
     xy, ring_offsets, observation_offsets = view
     best = -1.0
@@ -192,7 +193,7 @@ def compute_visibility(
 
 @njit(cache=True, nogil=True)
 def _inside(x: float, y: float, xy: F64x2, a: int, b: int) -> tuple[bool, float]:  # pragma: no cover - compiled
-    """Whether x, y lies in the ring of points a..b, and how far from its border."""
+    """Return whether x, y lies in the ring of points a..b, and its distance from the border."""
     inside, nearest = False, np.inf
     j = b - 1
     for i in range(a, b):
@@ -210,7 +211,7 @@ def _inside(x: float, y: float, xy: F64x2, a: int, b: int) -> tuple[bool, float]
 
 @njit(cache=True, nogil=True)
 def _occludes(x: float, y: float, xy: F64x2, a: int, b: int) -> bool:  # pragma: no cover - compiled
-    """Whether the sight line from the agent, who stands at the origin, to x, y meets an edge of the ring a..b."""
+    """Return whether the line of sight from the origin to x, y meets an edge of the ring a..b."""
     j = b - 1
     for i in range(a, b):
         x0, y0, x1, y1 = xy[j, 0], xy[j, 1], xy[i, 0], xy[i, 1]

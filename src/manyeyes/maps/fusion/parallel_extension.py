@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lines that end where few looked go on beside a neighbour that was seen: lanes run side by side.
+"""Extend a polyline parallel to a neighbour across poorly covered gaps.
 
-A drop-out hides one line and not the next. Where a chain of stations ends, a line beside it that ran parallel so far may
-lead on, its guide: stations are inferred at the same distance from it, until they arrive at another part of the same
-line, or, if they arrive nowhere, for a short way. They are inferred only where the guide was in view at least once, so
-that the ground was seen, and not often, so that nobody's having seen the line is likely chance. Source: this project's
-(specs/maps.md 3.4 stage 5 bridges straight gaps alone).
+A missed detection hides one line and not its neighbour. Where a chain of stations ends, a line beside it that has been parallel
+so far serves as a guide. Stations are inferred at constant distance from the guide until they arrive at another part of the
+same line or, if they do not arrive, for a limited length. They are inferred only where the guide is covered at least once and
+at most ``max_coverage`` times, so that missing the line by chance is plausible. The method is this project's own.
 """
 
 from __future__ import annotations
@@ -29,12 +28,15 @@ _MAX_LONGITUDINAL_M = 0.8  # along a line, within which a point of it lies besid
 
 @dataclass(frozen=True)
 class ParallelExtensionConfig:
-    """min_guide_m, max_guide_m: of a guide. max_spacing_change_m: how much its distance may change over the last back_m of the
-    line. max_heading_rad: largest turn against it.
+    """Configuration of the extension.
 
-    max_coverage: how often a place may have been in view (summed visibility). max_lateral_m: how far aside of the line's other part
-    the way may arrive. max_bridge_m: longest way that arrives; max_open_m: by kind, longest that does not (divider, boundary,
-    crossing, stop line).
+    min_guide_m, max_guide_m: lateral distance of a guide.
+    max_spacing_change_m: largest change of that distance over the last parallel_length_m of the line.
+    max_heading_rad: largest angle between line and guide.
+    max_coverage: largest summed visibility of an inferred station.
+    max_lateral_m: largest lateral offset on arrival at the other part of the line.
+    max_bridge_m: largest length that arrives; max_open_m: by kind, largest length that does not (divider, boundary, crossing,
+        stop line).
     """
 
     min_guide_m: float = 2.0
@@ -57,7 +59,7 @@ def extend_parallel(
 ) -> tuple[Floats, Floats, Ints]:
     """Inferred stations (V, 2), their unit tangents and the end station (V,) that each continues.
 
-    xy, kind, coverage: (K,) stations, as in linking.link, whose answer is ``chains``.
+    xy, kind, coverage: (K,) stations, as in :func:`~manyeyes.maps.fusion.polyline_linking.link_stations`, which returns ``chains``.
     """
     offsets, members = chains
     chain, place = np.empty(len(xy), np.int64), np.empty(len(xy), np.int64)
@@ -84,7 +86,7 @@ class _Chains(NamedTuple):
 
 
 class _ExtensionLimits(NamedTuple):
-    """The fields of BesideConfig, all as floats, heading_rad as a cosine; max_open_m: (4,) by kind."""
+    """The fields of ParallelExtensionConfig, all as floats, max_heading_rad as a cosine; max_open_m: (4,) by kind."""
 
     min_distance_m: float
     max_distance_m: float
@@ -167,7 +169,7 @@ def _extend_chains(
 def _find_guides(
     end: int, inward: int, lines: _Chains, grid: PointGrid, params: _ExtensionLimits
 ) -> list[int]:  # pragma: no cover - compiled
-    """Points within _BESIDE_M, along it, of the end of a chain, on lines that run beside it there and did so before."""
+    """Points within _MAX_LONGITUDINAL_M, along it, of the end of a chain, on lines that run beside it there and did so before."""
     offsets, line, chord, kind, _, chain = lines
     keys, start, order = grid.keys, grid.offsets, grid.order
     nearest, farthest, even = params.min_distance_m, params.max_distance_m, params.max_distance_change_m

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who is near whom: map elements as points with tangents, a sorted grid over them, and a bound on how many count.
+"""Neighbourhoods of map points: elements as points with tangents, a sorted grid, and a limit per cell.
 
-Everything here is local and free of input order: a cell of the grid is anchored at the map's origin, points of a cell
-stand in the order of their observations, and which observations of a crowded cell are kept depends on that cell alone.
-So a sum over neighbours has the same terms in the same order whichever tile it is computed in. Source: specs/maps.md
-3.4, 3.5.
+All of it is local and independent of input order. Cells are anchored at the map's origin, points of a cell keep the order of
+their observations, and the limit of a crowded cell depends on that cell alone. So a sum over neighbours has the same terms in
+the same order for any tiling.
 """
 
 from __future__ import annotations
@@ -24,8 +23,9 @@ _SHIFT = 30
 
 
 class PointGrid(NamedTuple):
-    """Points sorted by (kind, cell): ``keys`` (U,) of the occupied cells, ``offsets`` (U+1,) and ``order`` (P,) into the
-    points. Points of the cell with key ``keys[c]`` are ``order[start[c]:start[c + 1]]``.
+    """Points sorted by (kind, cell): keys (U,) of the occupied cells, offsets (U+1,) and order (P,) of the points.
+
+    The cell with key ``keys[c]`` has points ``order[offsets[c]:offsets[c + 1]]``.
     """
 
     cell_m: float
@@ -35,7 +35,7 @@ class PointGrid(NamedTuple):
 
 
 def build_grid(x: Floats, y: Floats, kind: Ints, cell_m: float) -> PointGrid:
-    """The grid of cell size cell_m over points (P,); within a cell the points keep their order."""
+    """Sort points (P,) into a grid of cells of cell_m; within a cell the points keep their order."""
     key = cell_key(kind, x, y, cell_m)
     order = np.argsort(key, kind="stable")
     ordered = key[order]
@@ -44,7 +44,7 @@ def build_grid(x: Floats, y: Floats, kind: Ints, cell_m: float) -> PointGrid:
 
 
 def cell_key(kind: Ints, x: Floats, y: Floats, cell_m: float) -> Ints:
-    """One integer (P,) for kind and cell; along y neighbouring cells have neighbouring keys."""
+    """Compute one integer (P,) for kind and cell; neighbouring cells along y have neighbouring keys."""
     ix = np.floor(x / cell_m).astype(np.int64) + _BIAS
     iy = np.floor(y / cell_m).astype(np.int64) + _BIAS
     return (kind.astype(np.int64) << (2 * _SHIFT)) | (ix << _SHIFT) | iy
@@ -54,7 +54,7 @@ def cell_key(kind: Ints, x: Floats, y: Floats, cell_m: float) -> Ints:
 def find_cell_range(
     keys: I64x1, start: I64x1, kind: int, ix: int, iy0: int, iy1: int
 ) -> tuple[int, int]:  # pragma: no cover - compiled
-    """The range in a grid's order of the points of cells (ix, iy0..iy1) of a kind."""
+    """Find the range in a grid's order of the points of cells (ix, iy0..iy1) of a kind."""
     base = (kind << 60) | ((ix + 536870912) << 30)
     low = lower_bound(keys, base | (iy0 + 536870912))
     high, end = low, base | (iy1 + 536870912)
@@ -65,7 +65,7 @@ def find_cell_range(
 
 @njit(cache=True, nogil=True)
 def lower_bound(keys: I64x1, key: int) -> int:  # pragma: no cover - compiled
-    """The first place in ascending keys whose key is at least this one."""
+    """Return the first index in ascending keys whose key is not smaller than this one."""
     low, high = 0, len(keys)
     while low < high:
         middle = (low + high) >> 1
@@ -80,11 +80,11 @@ def lower_bound(keys: I64x1, key: int) -> int:  # pragma: no cover - compiled
 def resample_lines(
     offsets: I64x1, points: F64x2, sigma: F64x1, closed: Boolx1, spacing_m: float
 ) -> tuple[I64x1, F64x2, F64x2, F64x1]:  # pragma: no cover - compiled
-    """Elements (E) as points at equal arc length, about ``spacing_m`` apart, with unit tangents and sigma.
+    """Resample elements (E) at equal arc length, about ``spacing_m`` apart, with unit tangents and sigma.
 
-    Returns first (E+1,), points (P, 2), tangents (P, 2) and sigma (P,). A closed ring is walked once and its first
-    point is not repeated; an element without length gives no points. The tangent is the chord over the two neighbours:
-    noise of a vertex counts half.
+    Returns offsets (E+1,), points (P, 2), tangents (P, 2) and sigma (P,). A closed ring does not repeat its first point; an
+    element without length gives no points. The tangent is the chord over the two neighbours, which halves the noise of a
+    vertex.
     """
     count = len(offsets) - 1
     sizes = np.zeros(count + 1, np.int64)
@@ -139,14 +139,13 @@ def resample_lines(
 def limit_observations(
     key: Ints, observation: Ints, agent: Ints, rank: Ints, max_observations: int
 ) -> NDArray[np.bool_]:
-    """Which points (P,) stay when a cell may hold at most ``max_observations`` observations.
+    """Select the points (P,) that remain when a cell may contain at most ``max_observations`` observations.
 
-    ``key`` (P,) names the cell (kind, place and heading), ``observation`` (P,) its observation, ``agent`` and ``rank``
-    (O,) its agent and its place among all (lower is better: more information, then newer, then smaller id). Agents take
-    turns, each with its best observation first, so that one busy agent cannot crowd out the others. Source:
-    specs/maps.md 3.5.
+    key: (P,) of the cell (kind, place and heading). observation: (P,). agent, rank: (O,) agent and rank of each observation;
+    lower is better: more information, then newer, then smaller id. Agents alternate, each with its best observation first, so
+    that one agent cannot displace the others.
     """
-    # Points come along lines, so runs of one cell and one observation are looked at, not points.
+    # Points come along lines, so the loop runs over runs of one cell and one observation, not over points.
     begins = np.ones(len(key), bool)
     begins[1:] = (key[1:] != key[:-1]) | (observation[1:] != observation[:-1])
     run = np.cumsum(begins) - 1
@@ -163,7 +162,7 @@ def limit_observations(
 
 
 def _rank_in_group(group: tuple[Ints, ...], value: Ints) -> Ints:
-    """For each row, how many rows of its group have a smaller value."""
+    """Count, for each row, the rows of its group with a smaller value."""
     order = np.lexsort((value, *reversed(group)))
     new = np.zeros(len(value), bool)
     new[:1] = True
@@ -177,10 +176,9 @@ def _rank_in_group(group: tuple[Ints, ...], value: Ints) -> Ints:
 
 
 def hash_coordinates(xy: Floats) -> NDArray[np.uint64]:
-    """A number (P,) that looks random and depends on the point's coordinates in its agent's frame alone (splitmix64 of
-    their bits).
+    """Hash the coordinates of points in their agent's frame (splitmix64 of their bits) to an integer (P,).
 
-    It orders points where an order is needed that no motion of the world, no tile and no other observation changes.
+    It gives an order that no motion of the world, no tile and no other observation changes.
     """
     bits = np.ascontiguousarray(xy + 0.0, np.float64).view(np.uint64).reshape(-1, 2)
     with np.errstate(over="ignore"):

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stations become lines: mutual best neighbours are linked, lines are smoothed without shrinking bends, and nothing
-else is invented.
+"""Link stations to polylines: mutual best neighbours are linked and the lines are smoothed without shrinking bends.
 
-Stage 5 of specs/maps.md 3.4. Two stations are linked when each is the other's best in that direction, so that a line
-never passes through another's station and three lines never become one. Gaps and turns are judged along the mean normal
-of the two: a bend of constant radius has no lateral gap.
+Two stations are linked if each is the other's best partner in that direction. So a line never passes through another's station
+and three lines never become one. Gaps and turns are measured along the mean normal of the two: a bend of constant radius has no
+lateral gap.
 """
 
 from __future__ import annotations
@@ -28,15 +27,18 @@ _FRONT, _BEHIND = 0, 1
 
 @dataclass(frozen=True)
 class LinkConfig:
-    """max_gap_m: largest gap between linked stations; max_join_gap_m: between ends of lines in the second round; max_dashed_gap_m:
-    between ends of dashed lines; max_low_coverage_gap_m: between ends that were in view at most ``max_coverage`` times (summed
-    visibility), where that nobody saw more is likely chance.
+    """Configuration of linking and smoothing.
 
-    max_lateral_m, lateral_slope: largest lateral gap between linked stations at no gap, and how it grows;
-    max_end_lateral_m, end_lateral_slope: between ends, which few saw, so that they scatter more. heading_rad,
-    heading_slope: largest turn and its growth a metre of gap; max_low_coverage_heading_rad: over the gaps of far_m. lateral_cost:
-    metres of gap that a metre of lateral gap costs. smoothing_sigma: Gaussian scale, in stations, of the local parabola that
-    smooths.
+    max_gap_m: largest gap between linked stations; max_join_gap_m: between line ends in the second round.
+    max_dashed_gap_m: between ends of dashed lines.
+    max_low_coverage_gap_m: between ends whose summed visibility is at most max_coverage, where missing a line by chance is
+        plausible.
+    max_lateral_m, lateral_slope: largest lateral gap between linked stations at no gap, and its growth per metre.
+    max_end_lateral_m, end_lateral_slope: the same between line ends, which have fewer detections and so more scatter.
+    max_heading_rad, heading_slope: largest turn at no gap, and its growth per metre.
+    max_low_coverage_heading_rad: largest turn over gaps of max_low_coverage_gap_m.
+    lateral_cost: metres of gap that a metre of lateral gap costs.
+    smoothing_sigma: Gaussian scale, in stations, of the local parabola.
     """
 
     max_gap_m: float = 6.0
@@ -64,10 +66,9 @@ def link_stations(
     coverage: Floats,
     config: LinkConfig = LinkConfig(),
 ) -> tuple[Ints, Ints]:
-    """Stations (K,) as chains: offsets (L + 1,) and station rows in order along each chain; every station is in one
-    chain.
+    """Link stations (K,) to chains: offsets (L + 1,) and station rows in order along each chain.
 
-    ``coverage`` (K,) is how often each was in view. A closed loop is opened at its weakest station.
+    Every station is in exactly one chain. coverage: (K,) summed visibility. A closed loop is opened at its weakest station.
     """
     pair = _find_links(xy, tangent, kind, config.max_gap_m, config)
     offsets, members = _trace_chains(pair, log_odds)

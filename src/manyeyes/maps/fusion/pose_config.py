@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the pose optimization, and the schedule of its steps."""
+"""Configuration of the pose optimization, and the schedule of its steps."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ from manyeyes.maps.fusion.coarse_search import CoarseSearchConfig
 
 @dataclass(frozen=True)
 class SolverStep:
-    """gate_and_kernel_m: gate and kernel of a sweep, metres; None: the search once more. reinstates: those whom nobody believed
-    before may be believed again after it. point_stride: every n-th point of an observation has its vote.
+    """One step of the schedule.
+
+    gate_and_kernel_m: gate and kernel of a sweep, metres; None: repeat the coarse search.
+    is_rejection_pass: whether the step belongs to a rejection pass.
+    reinstates: whether rejected agents are re-evaluated after it.
+    point_stride: every n-th point of an observation is used.
     """
 
     gate_and_kernel_m: tuple[float, float] | None
@@ -22,18 +26,25 @@ class SolverStep:
 
 @dataclass(frozen=True)
 class PoseSolverConfig:
-    """gates_m: how far across a line a neighbour may be, one number a sweep; kernels_m: the Geman-McClure scale of each
-    sweep. rejection_gates_m, rejection_kernels_m: of the sweeps that only tell whom to believe, trials times, by every
-    trial_stride-th point; after each all begins again.
+    """Configuration of the pose optimization.
 
-    max_longitudinal_m, max_heading_rad: how far along and how turned a neighbour may be. sigma_m: what lines of other observations
-    scatter. points_per_independent: points of one line that count as one. damping: share of a step taken. prior_scale: corrections
-    beyond about so many standard deviations stop pulling back. max_variance_ratio: posterior over prior variance above which
-    a direction stays as claimed. max_observations_per_cell: observations that count in a cell of 8 m, class and heading.
-    gauge_radius_m: within which distance what all were moved alike is taken back; gauge_scale: standard deviations beyond which a
-    correction has little say in that, trial_gauge_scale in the trial; agent_scale: beyond which an agent's mean correction makes
-    its lines weigh little, and agent_limit next to nothing; drive_correlation: part of the variance of claims that is one error of
-    a whole drive; drive_scale: standard deviations beyond which such an error is no longer held to be small.
+    spacing_m: distance of the sampled points.
+    rejection_gates_m, rejection_kernels_m: lateral gate and Geman-McClure scale of each sweep of a rejection pass;
+        num_rejection_passes: number of such passes, each followed by a restart; rejection_point_stride: every n-th point is
+        used in them.
+    gates_m, kernels_m: lateral gate and Geman-McClure scale of each sweep of the final pass.
+    max_longitudinal_m, max_heading_rad: longitudinal and heading gate of neighbours.
+    sigma_m: standard deviation of lines of other observations. points_per_independent: points of one line that count as one.
+    damping: fraction of a step that is taken. prior_scale: Geman-McClure scale of the prior, in standard deviations.
+    max_variance_ratio: posterior over prior variance above which a direction keeps the prior.
+    max_observations_per_cell: observations that count per cell of 8 m, class and heading.
+    gauge_radius_m: radius of the gauge offset; gauge_scale, rejection_gauge_scale: its Geman-McClure scale in standard
+        deviations, in the final and the rejection passes.
+    agent_scale: Geman-McClure scale of an agent's mean correction, in standard deviations; rejection_agent_scale: limit of
+        rejection.
+    drive_correlation: fraction of the prior variance that is common to a drive; drive_scale: Geman-McClure scale of that bias,
+        in standard deviations.
+    coarse_search: configuration of the coarse search.
     """
 
     spacing_m: float = 1.0
@@ -62,7 +73,7 @@ class PoseSolverConfig:
 
     @property
     def schedule(self) -> tuple[SolverStep, ...]:
-        """What follows the first search: the sweeps of each trial and the search once more, then the sweeps."""
+        """The steps after the first search: for each rejection pass its sweeps and a search, then the final sweeps."""
         rejection_widths, last = (
             tuple(zip(self.rejection_gates_m, self.rejection_kernels_m)),
             len(self.rejection_gates_m) - 1,
@@ -78,7 +89,7 @@ class PoseSolverConfig:
 
     @property
     def num_steps(self) -> int:
-        """How many follow the first search."""
+        """The number of steps after the first search."""
         return len(self.schedule)
 
 

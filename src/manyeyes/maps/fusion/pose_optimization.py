@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where each observation really stood: one robust rigid motion an observation, that all its lines must agree on.
+"""Joint pose correction of all observations: robust, damped Gauss-Newton on point-to-line residuals with a pose prior.
 
-Stages 1 and 2 of specs/maps.md 3.4. Each sweep moves every observation a damped Gauss-Newton step towards the lines of
-the others as they stood before the sweep (Jacobi), so that the order of observations does not matter. Residuals count
-across lines only, along the mean normal of both lines, which has no bias on a bend; each point has at most one vote;
-the prior is the claimed pose, less what the lines around its other looks tell of its drive (drive_error). What no line
-tells (along a straight road) stays as claimed.
+Each sweep moves every observation towards the lines of the others as they were before the sweep (Jacobi iteration), so the
+order of observations has no effect. Residuals are lateral, along the mean normal of both lines, which has no bias on a bend.
+Each point has a total weight of at most one. The prior is the prior pose, corrected by the bias of the drive
+(:mod:`manyeyes.maps.fusion.drive_bias`). Directions that no line determines, such as along a straight road, keep the prior.
 
-It is done three times. A few sweeps, the trial, tell whose claims are off alike by more than honest errors explain; then
-all begins again from the claims, and those agents pull nobody. So a lie that was found out leaves no trace, neither in the
-search nor in poses that have come halfway back. The second trial is held among those who were believed, and judges all
-anew at its end: whom liars had made look a liar is heard again. Once liars are out, the mode of corrections that is taken
-back is wider, which errs less.
+The solution runs in passes. A rejection pass is a few sweeps after which agents are rejected whose corrections share an offset
+beyond what their covariance explains. Then the solution starts again from the prior poses without the lines of those agents, so
+that a rejected agent influences neither the coarse search nor intermediate poses. The second rejection pass uses inlier agents
+alone and re-evaluates all agents at its end, so that wrongly rejected agents are reinstated. The final pass uses a wider kernel
+for the gauge offset, which is more accurate once malicious agents are rejected.
 
-A step of an observation reads only observations that overlap it. So a city is solved tile by tile with the result of
-one piece: :func:`search_coarse_poses` and each :func:`run_step` are run for the home observations of each tile, given all
-observations that :func:`find_overlapping` names and the poses after the step before, and :func:`merge_solutions` joins the tiles'
-answers; :func:`solve_poses` is that with one tile.
+A step of an observation depends only on observations that overlap it. So a large area can be solved tile by tile with the same
+result: :func:`search_coarse_poses` and each :func:`run_step` run for the home observations of each tile, given all observations
+that :func:`find_overlapping` returns and the poses after the previous step. :func:`merge_solutions` joins the results of the
+tiles. :func:`solve_poses` is the case of one tile.
 """
 
 from __future__ import annotations
@@ -51,17 +50,22 @@ _SWEEP_CELL_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class PoseSolution:
-    """Corrected poses, ids ascending: ids: (O,) hexadecimal. pose: (O, 3), covariance: (O, 3, 3) of it.
+    """Corrected poses of O observations, ids ascending.
 
-    initial_pose: (O, 3) after the gross search, the claimed pose where it moved nothing. scale: (O,) metres, how far the lines
-    of the observation's agent lie from others' (robust). observability: (O, 3) from 0 (only the prior speaks) to 1,
-    ascending, of the three directions of the pose. residual: (O,) and matched (O,): weighted square residual (m²) and
-    number of points with neighbours. relative_offset: (O, 2) metres moved more than those around. agent_weight: (O,) in (0, 1], how
-    well the claims of the observation's agent and others' fit. prior_covariance: (O, 3, 3) covariance of the claimed pose.
-    gauge_weight: (O,) how much that claim counts for where all stand, 0 if the search moved it. is_surveyed: (O,) 1 for surveyed
-    poles. search_shift: (O, 2) metres that the gross search moved. information_matrix: (O, 3, 3) and urge (O, 3): information of
-    the lines on the pose, and that times the move from start that they ask for. prior_mean: (O, 3) from start, where the prior has
-    its mode. drives: (O,) names of drives, each one agent's.
+    ids: (O,) hexadecimal. agents, drives: (O,) names; a drive belongs to one agent.
+    prior_covariance: (O, 3, 3) of the prior pose. initial_pose: (O, 3) after the coarse search, the prior pose where it found
+        no shift.
+    pose: (O, 3) and covariance: (O, 3, 3) of it.
+    scale: (O,) metres, robust residual scale of the agent's lines.
+    observability: (O, 3) from 0 (prior alone) to 1, ascending, of the three principal directions of the pose.
+    residual: (O,) m², weighted sum of squared residuals; num_matched: (O,) number of points with neighbours.
+    relative_offset: (O, 2) metres, correction relative to observations nearby.
+    agent_weight: (O,) in (0, 1], see :func:`~manyeyes.maps.fusion.agent_weights.estimate_agent_weights`.
+    gauge_weight: (O,) weight of the prior pose in the gauge offset; 0 if the search shifted it.
+    is_surveyed: (O,) 1 for surveyed poles. search_shift: (O, 2) metres, shift by the coarse search.
+    information_matrix: (O, 3, 3) of the lines; information_vector: (O, 3), that times the correction of initial_pose that they
+        give.
+    prior_mean: (O, 3) mode of the prior, relative to initial_pose.
     """
 
     ids: tuple[str, ...]
@@ -85,12 +89,12 @@ class PoseSolution:
     prior_mean: Floats
 
     def row_indices(self, ids: Sequence[str]) -> Ints:
-        """Where these ids stand."""
+        """Return the rows of these ids."""
         place = {name: k for k, name in enumerate(self.ids)}
         return np.array([place[name] for name in ids], np.int64)
 
     def take(self, rows: Ints) -> PoseSolution:
-        """The chosen rows, in the order given."""
+        """Return the chosen rows, in the order given."""
         return PoseSolution(
             tuple(self.ids[k] for k in rows.tolist()),
             tuple(self.agents[k] for k in rows.tolist()),
@@ -123,7 +127,7 @@ _COLUMNS = (
 
 
 def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = DEFAULT_ALIGN) -> PoseSolution:
-    """The corrected pose of each observation; a pure function of the set."""
+    """Solve for the pose of each observation; a pure function of the set."""
     arrays = to_observation_arrays(observations, config.spacing_m)
     home = np.arange(len(arrays))
     state = merge_solutions([search_coarse_poses(arrays, home, config)], config)
@@ -131,7 +135,7 @@ def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = 
     for number in range(config.num_steps):
         if (
             number == 0 or config.schedule[number - 1].gate_and_kernel_m is None
-        ):  # after a search, which alone moves the starts
+        ):  # after a search, which alone changes the initial poses
             keep = limit_per_cell(
                 arrays, state.initial_pose[state.row_indices(arrays.ids)], config.max_observations_per_cell
             )
@@ -142,7 +146,7 @@ def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = 
 def find_overlapping(
     observations: Sequence[Observation], home_observations: Sequence[Observation], margin_m: float = 45.0
 ) -> list[Observation]:
-    """Those of the observations that any step of the home observations reads, themselves included, ids ascending."""
+    """Find the observations that any step of the home observations reads, themselves included, ids ascending."""
     if not len(home_observations):
         return []
     radius_of = {o.id: _bounding_radius(o) for o in (*observations, *home_observations)}
@@ -157,7 +161,7 @@ def find_overlapping(
 
 
 def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:
-    """The observations where they claim to stand, ids ascending."""
+    """Make the solution at the prior poses, ids ascending."""
     count = len(arrays)
     pose = np.array(arrays.pose)
     start = PoseSolution(
@@ -187,7 +191,7 @@ def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:
 def search_coarse_poses(
     arrays: ObservationArrays, home: Ints, config: PoseSolverConfig = DEFAULT_ALIGN
 ) -> PoseSolution:
-    """The home observations (H,) rows of the sightings after the gross search, ids ascending."""
+    """Run the coarse search for the home observations, rows (H,) of the arrays; ids ascending."""
     state = _select_home(make_initial_solution(arrays), arrays, home)
     rows = _rows_in(arrays, state)
     keep = limit_per_cell(arrays, np.asarray(arrays.pose), config.max_observations_per_cell)
@@ -202,8 +206,10 @@ def run_step(
     config: PoseSolverConfig = DEFAULT_ALIGN,
     keep: NDArray[np.bool_] | None = None,
 ) -> PoseSolution:
-    """The home observations after one more step, ids ascending; ``state`` holds all of the sightings after the step
-    before. keep: (P,) the points that count in a sweep, :func:`limit_per_cell` at the state's starts; None: found here.
+    """Run one more step for the home observations; ids ascending.
+
+    state: all observations of the arrays after the previous step. keep: (P,) points that count in a sweep,
+    :func:`limit_per_cell` at the initial poses of the state; None: computed here.
     """
     step = config.schedule[number]
     if step.gate_and_kernel_m is None:
@@ -218,9 +224,7 @@ def run_step(
 def _repeat_search(
     arrays: ObservationArrays, state: PoseSolution, home: Ints, config: PoseSolverConfig
 ) -> PoseSolution:
-    """The home observations where they claim to stand, or where the search finds them among those alone who are believed now:
-    the others leave no trace.
-    """
+    """Reset the home observations to their prior poses and search again among inlier agents alone."""
     initial = _select_home(make_initial_solution(arrays), arrays, home)
     initial = replace(
         initial,
@@ -232,18 +236,18 @@ def _repeat_search(
 
 
 def _select_home(state: PoseSolution, arrays: ObservationArrays, home: Ints) -> PoseSolution:
-    """The rows of a state that are at home, ids ascending."""
+    """Return the rows of a state for the home observations, ids ascending."""
     return state.take(state.row_indices(sorted(arrays.ids[k] for k in home.tolist())))
 
 
 def _rows_in(arrays: ObservationArrays, state: PoseSolution) -> Ints:
-    """Where the state's observations stand among the sightings."""
+    """Return the rows of the arrays for the observations of a state."""
     place = {name: k for k, name in enumerate(arrays.ids)}
     return np.array([place[name] for name in state.ids], np.int64)
 
 
 def _apply_search(state: PoseSolution, found_pose: Floats) -> PoseSolution:
-    """A state at the claimed poses, moved to those that the search found."""
+    """Move a state from the prior poses to those of the coarse search."""
     unmoved = (found_pose == state.pose).all(1)
     shift = (found_pose - state.pose)[:, :2]
     return replace(
@@ -263,7 +267,7 @@ def _sweep(
     home: Ints,
     config: PoseSolverConfig,
 ) -> PoseSolution:
-    """The home observations after one sweep with this gate, kernel and stride among the points ``keep``."""
+    """Run one sweep for the home observations with this gate, kernel and stride among the points ``keep``."""
     gate, kernel, stride = gate_kernel_stride
     rows = state.row_indices(arrays.ids)
     start, prior_mean, pose = state.initial_pose[rows], state.prior_mean[rows], state.pose[rows]
@@ -295,8 +299,9 @@ def _sweep(
 def merge_solutions(
     parts: Sequence[PoseSolution], config: PoseSolverConfig = DEFAULT_ALIGN, number: int | None = None
 ) -> PoseSolution:
-    """Home observations of all tiles as one after a step (None: the first search), ids ascending; after a sweep with
-    each agent's scale from all its residuals and its faith from all its offsets, after the trial with each drive's error.
+    """Merge the home observations of all tiles after a step (None: the first search), ids ascending.
+
+    After a sweep, update each agent's residual scale and weight. After the rejection passes, also update each drive's bias.
     """
     ids = [name for part in parts for name in part.ids]
     agents = [name for part in parts for name in part.agents]
@@ -314,7 +319,7 @@ def merge_solutions(
     names, agent = np.unique(np.array(whole.agents), return_inverse=True)
     residual = np.bincount(agent, whole.residual, len(names))
     matched = np.bincount(agent, whole.num_matched, len(names))
-    # Two points of prior knowledge keep an agent that nobody else saw at the usual scatter.
+    # A prior of 20 points keeps the scale of an agent without matches at 0.2 m.
     variance = (residual + 20.0 * 0.04) / (matched + 20.0)
     prior_covariance = whole.prior_covariance[:, :2, :2]
     observability = compute_observability(whole.covariance, prior_covariance)
@@ -332,7 +337,7 @@ def merge_solutions(
         config.drive_correlation,
     )
     agent_weight = estimate_agent_weights(offset + whole.search_shift, observability, mean_variance, agent, limits)
-    # Whom a trial did not believe is not heard until the next one ends.
+    # An agent that a rejection pass rejected stays rejected until the next one ends.
     stays_rejected = (whole.agent_weight <= REJECTED_WEIGHT) & (not step.reinstates)
     agent_weight = np.where(whole.is_surveyed > 0, 1.0, np.where(stays_rejected, REJECTED_WEIGHT, agent_weight))
     prior_mean = whole.prior_mean if step.is_rejection_pass else _estimate_prior_mean(whole, common, config)
@@ -347,7 +352,7 @@ def merge_solutions(
 
 
 def _estimate_prior_mean(whole: PoseSolution, common: Floats, config: PoseSolverConfig) -> Floats:
-    """(O, 3) from start, where each observation stands by its claim and the error of its drive."""
+    """Estimate the mode of the prior (O, 3), relative to initial_pose, from the bias of each drive."""
     drive = np.unique(np.array(whole.drives), return_inverse=True)[1]
     from_claim = np.zeros((len(drive), 3))
     from_claim[:, :2] = whole.search_shift - common
@@ -365,8 +370,9 @@ def _estimate_prior_mean(whole: PoseSolution, common: Floats, config: PoseSolver
 
 
 def limit_per_cell(arrays: ObservationArrays, pose: Floats, max_observations: int) -> NDArray[np.bool_]:
-    """Which points (P,) count when the agents stand at pose (O, 3): at most ``max_observations`` observations a class, heading and
-    cell of 8 m.
+    """Select the points (P,) that count with agents at pose (O, 3).
+
+    At most ``max_observations`` observations count per class, heading and cell of 8 m.
     """
     xy, tangent = arrays.to_world(pose)
     bins = np.floor(np.arctan2(tangent[:, 1], tangent[:, 0]) / np.pi % 1.0 * 6.0).astype(np.int64) % 6

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From aligned observations to stations: the local half of the fusion, which a tile can do alone.
+"""Build the stations of an area from aligned observations: the local part of the fusion, which a tile can do alone.
 
-Stages 3, 4, 6 and 7 of specs/maps.md 3.4. What a station is depends on observations within a few tens of metres and on
-nothing else, so the stations of an area are the same whether it is one tile or four.
+A station depends only on observations within a few tens of metres. So the stations of an area are the same for any tiling.
 """
 
 from __future__ import annotations
@@ -37,14 +36,17 @@ Area = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class StationConfig:
-    """max_observations_per_cell: observations that shape a ridge in a cell of 8 m, class and heading. halo_m: of an area, where
-    ridges are found too.
+    """Configuration of the stations.
 
-    min_inlier_agents: what an agent whom nobody believes says of lines counts only where fewer believed agents looked. min_support:
-    observations that a station needs, where at least seen_by (summed visibility) could have seen it.
-    conflict_radius_m: stations of two kinds of line this close across, or of one kind within rival_far_m, exclude each other
-    unless the same observations saw both: the one with the smaller log-odds goes if the ratio of supports, or the
-    difference of log-odds, is that large.
+    max_observations_per_cell: observations that shape a ridge per cell of 8 m, class and heading.
+    halo_m: margin around an area within which ridges are found too.
+    min_inlier_agents: points of rejected agents count only where fewer inlier agents cover the place.
+    min_support: detections that a station needs if its summed visibility is at least min_support_coverage.
+    conflict_radius_m, same_kind_conflict_radius_m: lateral distances within which stations of two kinds, or of one kind,
+        exclude each other, unless the same observations detected both.
+    conflict_support_ratio, conflict_log_odds: advantage of the station that remains, as a ratio of supports (two kinds) or a
+        difference of log-odds (one kind).
+    ridge, evidence, polygon: configurations of mean shift, existence and crossings.
     """
 
     max_observations_per_cell: int = 32
@@ -63,8 +65,9 @@ class StationConfig:
 
 @dataclass(frozen=True, eq=False)
 class EvidenceTable:
-    """What K stations or crossings share: columns as in evidence.Witness; ``sources`` count in observations (U, 16),
-    each station's and the observations ascending.
+    """The columns that K stations or crossings share, as in :class:`~manyeyes.maps.fusion.existence.StationEvidence`.
+
+    sources: rows of observations (U, 16), ascending for each station; observations: ids, ascending.
     """
 
     kind: Ints
@@ -82,7 +85,7 @@ class EvidenceTable:
     observations: Digests
 
     def take(self, rows: Ints) -> EvidenceTable:
-        """The chosen rows, in the order given."""
+        """Return the chosen rows, in the order given."""
         first, places = take_rows(self.source_offsets, rows)
         columns = {name: getattr(self, name)[rows] for name in _PER_ROW}
         return EvidenceTable(
@@ -91,7 +94,7 @@ class EvidenceTable:
 
     @classmethod
     def cat(cls, tables: Sequence[EvidenceTable]) -> EvidenceTable:
-        """Several as one, in order, their observations merged."""
+        """Concatenate tables, in order, and merge their observations."""
         digests, place = np.unique(np.concatenate([e.observations for e in tables]), axis=0, return_inverse=True)
         seen = np.cumsum([0, *(len(e.observations) for e in tables)])
         counts = np.concatenate([np.diff(e.source_offsets) for e in tables])
@@ -110,9 +113,9 @@ _PER_ROW = tuple(f.name for f in fields(EvidenceTable) if f.name not in ("source
 class StationTable:
     """Stations of lines and whole crossings of an area, with their evidence.
 
-    xy, tangent: (K, 2) metres and unit, map frame; line_evidence: (K,) their evidence. ring_offsets: (C + 1,), ring_xy: crossings'
-    rings; ring_evidence: (C,) their evidence. observed_cells: (R, 3) runs of ground that was in some view (maps.looked); none: not
-    known.
+    xy, tangent: (K, 2) metres and unit, map frame; line_evidence: (K,) their evidence.
+    ring_offsets: (C + 1,), ring_xy: rings of the crossings; ring_evidence: (C,) their evidence.
+    observed_cells: (R, 3) runs of observed ground (:mod:`manyeyes.maps.fusion.coverage`); empty: unknown.
     """
 
     xy: Floats
@@ -128,9 +131,7 @@ class StationTable:
 
     @classmethod
     def cat(cls, tables: Sequence[StationTable]) -> StationTable:
-        """The stations of several areas that do not overlap as one table, in an order that does not depend on the
-        areas.
-        """
+        """Merge the stations of disjoint areas into one table, in an order that does not depend on the areas."""
         xy = np.concatenate([t.xy for t in tables])
         tangent = np.concatenate([t.tangent for t in tables])
         line, ring = (
@@ -142,19 +143,19 @@ class StationTable:
         start = np.concatenate(([0], np.cumsum(sizes))).astype(np.int64)
         order = np.lexsort((xy[:, 1], xy[:, 0], line.kind))
         rings = np.lexsort((points[start[:-1], 1], points[start[:-1], 0])) if len(sizes) else np.zeros(0, np.int64)
-        ring_start, places = take_rows(start, rings)
+        ring_offsets, places = take_rows(start, rings)
         observed_cells = merge_runs(np.concatenate([t.observed_cells for t in tables]))
         return cls(
-            xy[order], tangent[order], line.take(order), ring_start, points[places], ring.take(rings), observed_cells
+            xy[order], tangent[order], line.take(order), ring_offsets, points[places], ring.take(rings), observed_cells
         )
 
 
 def build_stations(
     arrays: ObservationArrays, solution: PoseSolution, area: Area | None = None, config: StationConfig = StationConfig()
 ) -> StationTable:
-    """Stations and crossings in area (x0, y0, x1, y1), lower sides included, upper excluded; None is everywhere.
+    """Build the stations and crossings in area (x0, y0, x1, y1), lower sides included, upper excluded; None: everywhere.
 
-    ``arrays`` are all observations that reach into the area widened by the halo; ``pose`` has them all.
+    arrays: all observations that reach into the area widened by the halo. solution: contains all of their poses.
     """
     rows = solution.row_indices(arrays.ids)
     pose, covariance = solution.pose[rows], solution.covariance[rows]
@@ -178,8 +179,9 @@ def _build_line_stations(
     area: Area | None,
     config: StationConfig,
 ) -> tuple[Floats, Floats, EvidenceTable]:
-    """Positions, tangents and evidence of line stations in the area. observation_weights: weight and belief (O,) of
-    observations.
+    """Build positions, tangents and evidence of line stations in the area.
+
+    observation_weights: weight (O,) and inlier flag (O,) of the observations.
     """
     xy, tangent = arrays.to_world(pose)
     weight, is_inlier = observation_weights
@@ -220,6 +222,7 @@ def _build_line_stations(
 
 
 def _to_table(found: StationEvidence | FusedCrossings, kind: Ints, arrays: ObservationArrays) -> EvidenceTable:
+    """Convert evidence to a table whose sources are rows of the sorted ids."""
     names = [name for name in _PER_ROW if name != "kind"]
     ids = np.frombuffer(bytes.fromhex("".join(arrays.ids)), np.uint8).reshape(-1, 16)
     digests, place = np.unique(ids, axis=0, return_inverse=True)
@@ -236,7 +239,7 @@ def _to_table(found: StationEvidence | FusedCrossings, kind: Ints, arrays: Obser
 
 
 def _publish_low_coverage(table: EvidenceTable, config: EvidenceConfig) -> EvidenceTable:
-    """The table with those candidates published that few could have seen and that are likely enough for that."""
+    """Publish candidates of low coverage whose log-odds reach their own threshold."""
     low_coverage = (table.coverage <= config.low_coverage) & (table.log_odds >= config.publish_low_coverage_log_odds)
     low_coverage &= (table.state == CANDIDATE) & (table.agents >= config.min_publish_agents)
     return replace(table, state=np.where(low_coverage, PUBLISHED, table.state))
@@ -245,7 +248,7 @@ def _publish_low_coverage(table: EvidenceTable, config: EvidenceConfig) -> Evide
 def _compute_point_weights(
     arrays: ObservationArrays, xy: Floats, tangent: Floats, pose: Floats, covariance: Floats
 ) -> Floats:
-    """(P,) 1 / variance across the line, by detection and pose, in units of that of a point seen to 0.2 m."""
+    """Compute (P,) 1 / lateral variance by detection and pose, relative to that of a point with sigma 0.2 m."""
     owner = arrays.observation_of_point
     normal = np.stack((-tangent[:, 1], tangent[:, 0]), 1)
     lever = xy - pose[owner, :2]
@@ -262,7 +265,7 @@ def _within(xy: Floats, area: Area | None, halo: float) -> NDArray[np.bool_]:
 
 
 def _find_conflicts(xy: Floats, tangent: Floats, table: EvidenceTable, config: StationConfig) -> NDArray[np.bool_]:
-    """(K,) which stations lose against another that cannot be true at the same time."""
+    """Find the stations (K,) that lose against another one that excludes them."""
     grid = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _CONFLICT_CELL_M)
     params = _ConflictLimits(
         config.conflict_radius_m,
@@ -277,7 +280,7 @@ def _find_conflicts(xy: Floats, tangent: Floats, table: EvidenceTable, config: S
 
 
 class _ConflictColumns(NamedTuple):
-    """The columns of :class:`EvidenceTable` that decide which of two stations stays."""
+    """The columns of :class:`EvidenceTable` that decide which of two stations remains."""
 
     kind: I64x1
     log_odds: F64x1
@@ -288,8 +291,8 @@ class _ConflictColumns(NamedTuple):
 
 
 class _ConflictLimits(NamedTuple):
-    """Lateral distances (m) within which stations of two kinds, and of one kind, exclude each other; least advantages of
-    the one that stays: ratio of supports, difference of log-odds.
+    """Lateral distances (m) within which stations of two kinds, and of one kind, exclude each other; minimum advantages of the
+    one that remains: ratio of supports, difference of log-odds.
     """
 
     max_lateral_m: float
@@ -302,7 +305,7 @@ class _ConflictLimits(NamedTuple):
 def _find_losers(
     xy: F64x2, tangent: F64x2, columns: _ConflictColumns, grid: PointGrid, params: _ConflictLimits
 ) -> Boolx1:  # pragma: no cover - compiled
-    """(K,) which stations, at xy (K, 2) with unit tangents (K, 2), lose against another."""
+    """Find the stations (K,), at xy (K, 2) with unit tangents (K, 2), that lose against another one."""
     kind, odds, support, state, first, sources = columns
     keys, start, order = grid.keys, grid.offsets, grid.order
     near, far, ratio, difference = params
@@ -324,7 +327,7 @@ def _find_losers(
                     wins = aside < near and support[q] > ratio * support[k] and odds[q] >= odds[k]
                 else:
                     wins = odds[q] > odds[k] + difference and support[q] >= 3
-                # Two lines that the same observations saw are two lines; else they are two readings of one.
+                # Two lines that the same observations detected are two lines; else they are two estimates of one.
                 if wins and 4 * _count_shared(sources, first, k, q) < min(support[k], support[q]):
                     loses[k] = True
     return loses

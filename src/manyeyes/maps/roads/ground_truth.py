@@ -2,16 +2,16 @@
 """The true vector map of a road network: each physical line once, whole, and cut where junctions begin.
 
 Files store a line as often as lanes border on it, in pieces as long as a road's record, and with lines through junctions that
-nobody painted. What each element of the truth is depends on the choices below; benchmarks publish them with their figures
-(specs: "each of those choices moves AP of dividers").
+are not painted. The elements of the ground truth depend on the choices below, each of which changes the AP of dividers;
+benchmarks publish them with their results.
 
 1. divider: painted lines. A double line is its middle, style "double". Paint inside junctions is virtual and is dropped.
 2. boundary: the edge of the paved ground, out of the file's edges (Argoverse 2, Lanelet2) or as the outline of the union of
    all paved lanes and their shoulders (OpenDRIVE, whose curbs are incomplete). Where the map itself ends there is no edge, and
-   edges farther than ``beside_m`` from any drivable lane (Argoverse 2 has ground without lanes) belong to no road.
+   edges farther than ``max_lane_distance_m`` from any drivable lane (Argoverse 2 has ground without lanes) belong to no road.
 3. A line within ``merge_radius_m`` and ``max_merge_heading_rad`` of a longer one of its class is the same line; what of it stands
 out stays.
-4. Lines whose ends lie within ``gap_m`` and continue each other's direction are one line.
+4. Lines whose ends lie within ``max_gap_m`` and continue each other's direction are one line.
 5. Cut policy ``junction``: lines are cut at the outline of each junction's lanes, widened by ``junction_margin_m``.
    :func:`cut_elements` does the same to anybody's map. Attributes (style) do not cut.
 6. crossing: open rings, anticlockwise. stop_line: as drawn.
@@ -106,7 +106,7 @@ def compute_junction_region(network: RoadNetwork, margin_m: float) -> BaseGeomet
 def cut_elements(elements: MapElements, region: BaseGeometry, min_line_length_m: float = 5.0) -> MapElements:
     """The elements with lines cut where they enter or leave the region; crossings stay whole, pieces keep score and style.
 
-    A cut that would leave a piece shorter than min_line_m is not made.
+    A cut that would leave a piece shorter than min_line_length_m is not made.
     """
     shapely = _shapely()
     if not len(elements):
@@ -151,7 +151,7 @@ def merge_duplicates(lines: Sequence[_StyledLine], policy: GroundTruthPolicy) ->
 
 
 def _is_duplicate(points: Array, shape: BaseGeometry, policy: GroundTruthPolicy) -> NDArray[np.bool_]:
-    """(M,) whether each point lies within merge_m beside a line, not beyond its ends, and has its direction."""
+    """(M,) whether each point lies within merge_radius_m beside a line, not beyond its ends, and has its direction."""
     shapely = _shapely()
     probe = shapely.points(points)
     close = shapely.distance(probe, shape) <= policy.merge_radius_m
@@ -351,7 +351,7 @@ def _split_line(line: _StyledLine, region: BaseGeometry, min_length_m: float) ->
 
 
 def _split(points: Array, region: BaseGeometry, min_length_m: float) -> list[Array]:
-    """The stretches of a line outside and inside a region, in the line's order, none cut shorter than least_m."""
+    """The stretches of a line outside and inside a region, in the line's order, none cut shorter than min_length_m."""
     shapely = _shapely()
     shape = shapely.LineString(points)
     if not region.intersects(shape) or region.contains(shape):

@@ -43,11 +43,11 @@ class Executor(Protocol):
 
 @dataclass(frozen=True)
 class InlineExecutor:
-    """One block after the other in this process: the slow twin of the others, and what a debugger wants."""
+    """Run one block after the other in this process: reference of the other executors, and suited to debugging."""
 
     @contextmanager
     def open(self) -> Iterator[ExecutorSession]:
-        """Nothing is started."""
+        """Return this executor, which needs no engine."""
         yield self
 
     def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An index of an observation log in SQLite (write-ahead log): where each observation stands, and where on the ground.
+"""SQLite index of an observation log (write-ahead log): file position and map position of each observation.
 
-The files of the log are the truth; the index can be made again from them and says nothing that they do not.
+The files of the log are authoritative; the index contains nothing that cannot be rebuilt from them.
 """
 
 from __future__ import annotations

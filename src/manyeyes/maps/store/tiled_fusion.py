@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fusion of a city, tile by tile, with the map that one piece would give.
+"""Tiled fusion of large areas, with the same result as fusion in one piece.
 
-Phase A solves the pose of each observation in the block of tiles that it stands in (its home), given all observations that
-its lines can meet: a gross search, then sweeps, each of which starts from what all blocks found in the sweep before. Phase B
-finds the stations of each block from all observations that reach into it. Then one program links the stations of all blocks,
-which are few, so that no line is cut at a border. Every step is a pure function of a block's inputs; its result is kept under
-a hash of them, so that a run that was killed, or one after a few more observations, does only what is new.
-Source: specs/maps.md 3.5 and 5.2.
+Phase A solves the pose of each observation in the block of tiles that contains it (its home), given all observations that its
+lines can meet: a coarse search, then sweeps, each of which starts from the poses of all blocks after the previous one. Phase B
+builds the stations of each block from all observations that reach into it. Then one process links the stations of all blocks,
+which are few, so that no line is cut at a border. Every step is a pure function of a block's inputs. Its result is stored under
+a hash of them, so that a run after an interruption, or with a few more observations, computes only what is new.
 """
 
 from __future__ import annotations
@@ -47,11 +46,13 @@ StepProgress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class TiledFusionConfig:
-    """tile_size_m: side of a tile. tiles_per_block: tiles along a block's side; a block is what one worker does at a time.
+    """Configuration of the tiles.
 
-    margin_m: beyond their reaches, how far apart two observations may claim to stand and still influence each other's pose:
-    two gross searches of 4.5 m along each axis, the cells of the bound on observations, and the radius in which the looks of
-    one agent are counted. halo_m: how far outside a block an observation's lines may lie and still shape the block's stations.
+    tile_size_m: side of a tile. tiles_per_block: tiles along the side of a block, the unit of work of a worker.
+    margin_m: largest distance, beyond their radii, of the prior positions of two observations that influence each other's pose.
+        It covers two coarse searches of 4.5 m along each axis, the cells of the limit per cell, and the radius in which
+        observations of one agent count as redundant.
+    halo_m: largest distance from a block of an observation whose lines shape the block's stations.
     """
 
     tile_size_m: float = TILE_M
@@ -66,10 +67,10 @@ class TiledFusionConfig:
 
 @dataclass(frozen=True, eq=False)
 class TileBlock:
-    """One worker's part: which observations it reads, which of them are at home in it, and its ground.
+    """One unit of work: the observations that it reads, the home observations among them, and its area.
 
-    log_folder: the folder of segments. observations: rows of the index that it reads, ids ascending. home_ids: ids of those at
-    home. area: (x0, y0, x1, y1) metres. work_folder: folder for results of steps.
+    log_folder: folder of segments. observations: rows of the index that it reads, ids ascending.
+    home_ids: ids of the home observations. area: (x0, y0, x1, y1) metres. work_folder: folder for results of steps.
     """
 
     log_folder: Path
@@ -81,7 +82,7 @@ class TileBlock:
 
     @property
     def key(self) -> str:
-        """Hash of what the block is about: its observations, its home, its area, the settings, the code of the steps."""
+        """Hash of the block's observations, home, area and configuration, and of the code of the steps."""
         code = f"{ALGORITHM} {source_digest(__name__)}"
         text = "|".join(
             (code, repr(self.config), repr(self.area), ",".join(self.home_ids), ",".join(self.observations.ids))
@@ -91,7 +92,7 @@ class TileBlock:
 
 @dataclass(frozen=True, eq=False)
 class _BlockStep:
-    """A block with what the step before found: number -1 is the gross search, then sweeps; None: stations."""
+    """A block with the solution of the previous step; number -1 is the coarse search, then sweeps; None: stations."""
 
     block: TileBlock
     solution: PoseSolution | None
@@ -99,7 +100,7 @@ class _BlockStep:
 
     @property
     def path(self) -> Path:
-        """Where the result is kept."""
+        """The path of the result."""
         digest = hashlib.blake2b(self.block.key.encode(), digest_size=16)
         digest.update(str(self.number).encode())
         if self.solution is not None:
@@ -121,15 +122,13 @@ def fuse_tiles(
     executor: Executor | None = None,
     progress: StepProgress | None = None,
 ) -> VectorMap:
-    """The map of the log's observations that ``active`` lists; ``log_folder`` and ``work_folder`` are folders that all workers
-    see.
-    """
+    """Fuse the observations of the log that ``active`` lists; all workers can access ``log_folder`` and ``work_folder``."""
     config = config or MapFusionConfig()
     blocks = make_blocks(log_folder, active, work_folder, config, tile_config)
     used: set[str] = set()
     with (executor or ProcessExecutor()).open() as runner:
         tables = _run_steps(blocks, config, runner, progress, used)
-    # Steps that this map did not need are those of maps before it; sightings are large and quickly made again.
+    # Unused results belong to previous maps; observation arrays are large and cheap to recompute.
     for path in sorted(work_folder.glob("*.npz")):
         if path.name not in used:
             path.unlink()
@@ -143,7 +142,7 @@ def make_blocks(
     config: MapFusionConfig,
     tile_config: TiledFusionConfig,
 ) -> list[TileBlock]:
-    """Every block that an observation stands in or reaches into, by column and row; empty ones are left out."""
+    """Make every block that contains an observation or that one reaches into, by column and row; empty ones are left out."""
     size = tile_config.tile_size_m * tile_config.tiles_per_block
     home = tile_indices(active.xy, size)
     radius = active.radius_m + tile_config.halo_m
@@ -204,7 +203,7 @@ def _select_block(state: PoseSolution, block: TileBlock) -> PoseSolution:
 
 
 def _load_result(step: _BlockStep, fn: Callable[[_BlockStep], None], kind: type[T]) -> T:
-    """What a step left in the work folder; done here where it left nothing whole, as after a loss of power."""
+    """Load the result of a step from the work folder; compute it here if the file is missing or damaged."""
     found = load_columns(step.path, kind)
     if found is None:
         step.path.unlink(missing_ok=True)
@@ -216,7 +215,7 @@ def _load_result(step: _BlockStep, fn: Callable[[_BlockStep], None], kind: type[
 
 
 def _run_pose_step(step: _BlockStep) -> None:
-    """Do the search or a sweep for a block's home, unless its result is there."""
+    """Run the search or a sweep for a block's home, unless its result is stored."""
     if step.path.exists():
         return
     arrays = _load_arrays(step.block)
@@ -230,7 +229,7 @@ def _run_pose_step(step: _BlockStep) -> None:
 
 
 def _run_station_step(step: _BlockStep) -> None:
-    """Find a block's stations, unless they are there."""
+    """Build a block's stations, unless they are stored."""
     if step.solution is None or step.path.exists():
         return
     table = build_stations(_load_arrays(step.block), step.solution, step.block.area, step.block.config.stations)
@@ -238,7 +237,7 @@ def _run_station_step(step: _BlockStep) -> None:
 
 
 def _load_arrays(block: TileBlock) -> ObservationArrays:
-    """The block's observations as columns, kept in the work folder for the next step of this fusion."""
+    """Load the block's observations as arrays from the work folder, or make and store them."""
     path = block.work_folder / f"{block.key}.arrays.npz"
     found = load_columns(path, ObservationArrays)
     if found is None:
@@ -251,7 +250,7 @@ def _load_arrays(block: TileBlock) -> ObservationArrays:
 
 
 def _reaches_area(active: ActiveObservations, area: Area, halo_m: float) -> NDArray[np.bool_]:
-    """(O,) whether an observation reaches into the area widened by the halo."""
+    """Return (O,) whether each observation reaches into the area widened by the halo."""
     x, y = active.xy[:, 0], active.xy[:, 1]
     dx = np.maximum(np.maximum(area[0] - x, x - area[2]), 0.0)
     dy = np.maximum(np.maximum(area[1] - y, y - area[3]), 0.0)
@@ -259,7 +258,7 @@ def _reaches_area(active: ActiveObservations, area: Area, halo_m: float) -> NDAr
 
 
 def _may_interact(active: ActiveObservations, home: Ints, margin_m: float) -> NDArray[np.bool_]:
-    """(O,) whether an observation's lines can meet those of one at home."""
+    """Return (O,) whether each observation's lines can meet those of a home observation."""
     out = np.zeros(len(active), bool)
     if not len(home):
         return out
