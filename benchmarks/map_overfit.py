@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map preset overfits a few tiles of a recording: mAP on those tiles, by steps and seconds of training.
 
-The bar (issue: "Seeing the map"): map-tiny above 0.9 on 16 tiles in five minutes on two cores. One process, or for two cores
+The bar: map-tiny above 0.9 on 16 tiles in five minutes on two cores. One process, or for two cores
 
 torchrun --nproc-per-node 2 benchmarks/map_overfit.py [--data data/streets] [--split train] [--tiles 16] [--steps 800]
     [--batch 4] [--rate 4e-3] [--threads 1] [--every 200] [--preset map-tiny]

@@ -45,7 +45,7 @@ def test_01_bytes_between_two_agents() -> None:
 def test_02_judge_a_drive(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
     out = run("02_judge_a_drive.py", str(tmp_path / "drive"))
-    assert [line.split()[0] for line in out.strip().splitlines()] == ["alone", "late", "intermediate", "early"]
+    assert [line.split()[0] for line in out.strip().splitlines()] == ["none", "late", "intermediate", "early"]
 
 
 @pytest.mark.skipif(not (SHARED / "av2").is_dir(), reason="../shared/data/av2 is not beside this repository")
