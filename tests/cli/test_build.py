@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a recording to a map: on a crossroads of arithmetic, and by the verb."""
+"""From a recording to a map: on a synthetic crossroads, and by the command."""
 
 import json
 from dataclasses import dataclass, replace
@@ -143,7 +143,7 @@ def test_the_demos_map_is_that_of_its_drive_where_a_model_ships(weights, tmp_pat
 
 def test_the_map_of_a_drive_is_summarised_in_one_line(built) -> None:
     summary = describe_drive_map(built.stats)
-    assert f"mAP {built.numbers.quality.mean_ap():.2f}" in summary and "unfused" in summary and summary.count("\n") == 0
+    assert f"mAP {built.stats.scores.mean_ap():.2f}" in summary and "unfused" in summary and summary.count("\n") == 0
 
 
 def test_the_oracle_needs_a_true_map() -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verbs on a small recording with weights that were never trained: every file is written, every error is one line."""
+"""The commands on a small recording with untrained weights: every file is written, every error is one line."""
 
 import json
 import shutil
@@ -161,8 +161,8 @@ def test_a_spoilt_recording_is_one_line_that_names_the_thing(data, weights, tmp_
     [
         (("simulate", "--preset", "moon"), ("moon", "towns-small")),
         (("train", "--data", ".", "--preset", "moon"), ("moon", "costr-small")),
-        (("run", ".", "--channel", "smoke"), ("smoke", "its-g5")),
-        (("run", ".", "--methods", "guess"), ("guess", "intermediate")),
+        (("replay", ".", "--channel", "smoke"), ("smoke", "its-g5")),
+        (("replay", ".", "--methods", "guess"), ("guess", "intermediate")),
         (("demo", "--weights", "moon"), ("moon", ".safetensors")),
         (("evaluate", "--data", ".", "--protocol", "moon"), ("moon", "opencood")),
         (("view", ".", "--out", "film.mp4"), ("film.mp4", ".gif")),
@@ -177,7 +177,7 @@ def test_an_unknown_name_is_one_line_that_lists_the_known(words, named, capsys, 
 
 
 def test_an_unknown_scenario_or_frame_lists_the_known(data, weights, tmp_path, capsys) -> None:
-    common = ("run", data, "--split", "test", "--weights", weights, "--out", tmp_path)
+    common = ("replay", data, "--split", "test", "--weights", weights, "--out", tmp_path)
     assert run(*common, "--scenario", "z") == 1
     assert "it has a, b" in capsys.readouterr().err
     assert run(*common, "--frame", 0) == 1

@@ -47,7 +47,7 @@ def test_an_unknown_command_lists_the_known(capsys) -> None:
     assert cli.main(["demmo"]) == 2
     assert capsys.readouterr().err == (
         "manyeyes: there is no command 'demmo'; did you mean demo? Known commands: "
-        "demo, simulate, train, quantise, evaluate, run, view, align, map, doctor.\n"
+        "demo, simulate, train, fit-codebook, evaluate, replay, view, pose, map, doctor.\n"
     )
 
 

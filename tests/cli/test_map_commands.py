@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map verbs one after the other on a generated crossroads: every file is written, every error is one line."""
+"""The map commands in sequence on a generated crossroads: every file is written, every error is one line."""
 
 import json
 from pathlib import Path
@@ -132,11 +132,11 @@ def spoil_cut(folder: Path) -> Path:
     ("words", "named"),
     [
         (("simulate", "moon"), ("moon", "Town03")),
-        (("simulate", "cross", "--crowd", "shy"), ("shy", "colluding-liars")),
+        (("simulate", "cross", "--crowd", "shy"), ("shy", "colluding-malicious")),
         (("fuse", "{here}"), ("{here}", "Parquet")),
         (("fuse", "{here}", "--method", "guess"), ("guess", "chamfer-nms")),
         (("evaluate",), ("--study",)),
-        (("evaluate", "--study", "moon"), ("moon", "table3")),
+        (("evaluate", "--study", "moon"), ("moon", "crowdmap-table3")),
         (("evaluate", "--study", "fusion", "--methods", "guess"), ("guess", "union")),
         (("evaluate", "{here}"), ("truth", "--truth")),
         (("view", "{here}"), ("{here}", "lines.parquet")),

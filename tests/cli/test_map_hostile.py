@@ -291,7 +291,7 @@ def test_a_store_of_an_older_version_recovers_from_what_it_holds(indexed, store,
         assert [row[:3] for row in log.index.list_rejected()] == [
             ("00000007-0123456789abcdef.parquet", k, 1) for k in range(3)
         ]
-    # What is known is not said again, and can be retracted.
+    # A known rejection is not reported again, and can be retracted.
     assert retract(store, "--agent", "hostile", "--reason", "made up") == 0
     output = capsys.readouterr().out
     assert (
@@ -386,10 +386,10 @@ def test_everything_can_be_retracted(store, honest, capsys) -> None:
     [
         (("--ids", "0" * 32), ("0" * 32, "no observation")),
         (("--ids", "xyz"), ("xyz", "hexadecimal")),
-        (("--agent", "nobody"), ("nobody",)),
+        (("--agent", "unknown-agent"), ("unknown-agent",)),
         (("--pass-id", "nowhere"), ("nowhere",)),
         ((), ("--ids", "--agent")),
-        (("--ids", "ab", "--agent", "nobody"), ("--ids", "--agent")),
+        (("--ids", "ab", "--agent", "unknown-agent"), ("--ids", "--agent")),
     ],
 )
 def test_what_cannot_be_retracted_is_one_line_and_changes_nothing(words, named, store, capsys) -> None:

@@ -230,7 +230,7 @@ def run_pose(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
 
 def run_replay(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
     words = (
-        "run",
+        "replay",
         data,
         "--split",
         "test",
@@ -247,12 +247,34 @@ def run_replay(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
 
 
 def run_fit_codebook(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
-    words = ("quantise", "--data", data, "--split", "test", "--weights", weights, "--out", out / "coded.safetensors")
+    words = (
+        "fit-codebook",
+        "--data",
+        data,
+        "--split",
+        "test",
+        "--weights",
+        weights,
+        "--out",
+        out / "coded.safetensors",
+    )
     return (*words, "--stages", 1, "--frame-stride", 1)
 
 
 def run_study(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
-    words = ("evaluate", "--data", data, "--split", "test", "--weights", weights, "--study", "agents", "--workers", 1)
+    words = (
+        "evaluate",
+        "--data",
+        data,
+        "--split",
+        "test",
+        "--weights",
+        weights,
+        "--study",
+        "num-agents",
+        "--workers",
+        1,
+    )
     return (*words, "--methods", "none", "late", "--frame-stride", 2, "--out", out)
 
 
@@ -272,10 +294,10 @@ def missing_in_card(out: Path) -> dict:
 @pytest.mark.parametrize(
     ("command", "held"),
     [
-        (run_pose, missing_in("align.json")),
+        (run_pose, missing_in("pose.json")),
         (run_replay, missing_in("results.json")),
         (run_fit_codebook, missing_in_card),
-        (run_study, missing_in("agents.json")),
+        (run_study, missing_in("num-agents.json")),
         (run_train, missing_in("train.json")),
     ],
 )
@@ -330,12 +352,12 @@ def test_cells_of_an_incomplete_recording_are_kept_apart(whole: Path, weights: P
     path.unlink()
     words = (*run_study(data, weights, tmp_path / "out"), "--frame-stride", 1)
     assert run(*words, "--allow-missing") == 0
-    damaged = json.loads((tmp_path / "out" / "agents.json").read_text())["result"]
+    damaged = json.loads((tmp_path / "out" / "num-agents.json").read_text())["result"]
     path.write_text(text)
     assert run(*words) == 0
-    whole_one = json.loads((tmp_path / "out" / "agents.json").read_text())["result"]
+    whole_one = json.loads((tmp_path / "out" / "num-agents.json").read_text())["result"]
     assert (damaged["missing"]["count"], whole_one["missing"]["count"]) == (1, 0)
-    assert damaged["rows"][-1]["instant_bytes"] < whole_one["rows"][-1]["instant_bytes"]
+    assert damaged["rows"][-1]["mean_snapshot_bytes"] < whole_one["rows"][-1]["mean_snapshot_bytes"]
 
 
 def test_view_stays_tolerant(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verb align on a street of parked cars that two agents see, with a detector that is told what to see."""
+"""The command pose on a street of parked cars that two agents detect, with a detector of known output."""
 
 import json
 import math
@@ -77,10 +77,10 @@ def test_an_unknown_pose_is_found_and_a_noisy_prior_improved(drive, capsys) -> N
     assert (
         "voting" in output
         and "identity" in output
-        and "align.json" in output
+        and "pose.json" in output
         and "agent -1: sound over 2 frames" in output
     )
-    free, noisy = (json.loads((p / "align.json").read_text())["result"] for p in (out, out / "noisy"))
+    free, noisy = (json.loads((p / "pose.json").read_text())["result"] for p in (out, out / "noisy"))
     for answer in free["answers"]:
         assert answer["status"] == "corrected" and answer["inliers"] == len(PLACES) and answer["common"] == len(PLACES)
         assert answer["error_m"] < 1e-3
@@ -101,7 +101,7 @@ def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
     monkeypatch.setitem(CLOUD_CORRECTORS, "scan-registration", cloud)
     words = ("--split", "test", "--weights", weights, "--out", out, "--correctors", "scan-registration", "voting")
     assert run("pose", data, *words) == 0
-    answers = json.loads((out / "align.json").read_text())["result"]["answers"]
+    answers = json.loads((out / "pose.json").read_text())["result"]["answers"]
     assert [a["corrector"] for a in answers] == ["scan-registration", "voting"] * len(sizes) and len(sizes) > 0
     assert [tuple(a["landmarks"]) for a in answers[::2]] == sizes and answers[0]["status"] == "no match"
 
@@ -109,4 +109,4 @@ def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
 def test_an_unknown_corrector_lists_the_known(drive, capsys) -> None:
     data, weights, out = drive
     assert run("pose", data, "--split", "test", "--weights", weights, "--out", out, "--correctors", "magic") == 1
-    assert "known: vote, given, coalign" in capsys.readouterr().err
+    assert "known: voting, identity, coalign" in capsys.readouterr().err

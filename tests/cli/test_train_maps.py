@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verb train on a map preset: from a simulated recording of generated towns to weights that draw tiles."""
+"""The command train on a map preset: from a simulated recording of generated towns to weights that draw tiles."""
 
 import json
 from pathlib import Path
@@ -36,7 +36,7 @@ def test_train_then_judge(recorded, tmp_path, capsys):
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["generated-1"] and card["command"]
     study = ("map", "evaluate", "--study", "semi-global", "--data", recorded, "--weights", weights, "--workers", 1)
-    common = [str(word) for word in (*study, "--seeds", 1, "--frame-stride", 2, "--out", tmp_path / "study")]
+    common = [str(word) for word in (*study, "--seeds", 1, "--scenario-stride", 2, "--out", tmp_path / "study")]
     assert cli.main(common) == 0
     rows = json.loads((tmp_path / "study" / "semi-global.json").read_text())["result"]["rows"]["LiDAR"]
     assert [row["name"] for row in rows] == ["1", "2", "5", "10"] and (tmp_path / "study" / "semi-global.png").exists()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verb train with FeaKM's presets: views are kept once and shared, the run resumes, the weights load."""
+"""The command train with FeaKM's presets: views are kept once and shared, the run resumes, the weights load."""
 
 import json
 from pathlib import Path

@@ -100,7 +100,7 @@ def test_the_best_baseline_is_that_of_the_requested_metric() -> None:
 
 def test_margins_are_compared_with_measurements() -> None:
     held = {(v.group, v.description.split(";")[0]): v for v in check_margins(CONFIG, RESULTS)}
-    gain = held["60 observations", "mAP (exact, narrow) above the best rival"]
+    gain = held["60 observations", "mAP (exact, narrow) above the best baseline"]
     assert gain.baseline == "union" and gain.value == pytest.approx(0.4) and gain.verdict == "met"
     dividers = held["60 observations", "AP of dividers"]
     assert (
@@ -140,7 +140,7 @@ def test_an_unknown_method_lists_the_known_and_oracles_are_no_methods() -> None:
     with pytest.raises(ConfigError, match="union"):
         check_method("guess")
     check_method("oracle-pose")
-    with pytest.raises(ConfigError, match="told more than observations"):
+    with pytest.raises(ConfigError, match="needs more than observations"):
         fuse_observations("oracle-pose", [], MethodSettings())
 
 
@@ -218,7 +218,11 @@ def test_displacement_by_attack_is_compared_with_displacement_without_attack(mon
     fused_inputs = []
 
     def carried_out(trial: FleetTrial) -> SimpleNamespace:
-        seen = (0.0, 0.0, 0.15 + trial.fleet_config.malicious_offset_m[0])  # where each says that the line lies
+        seen = (
+            0.0,
+            0.0,
+            0.15 + trial.fleet_config.malicious_offset_m[0],
+        )  # the lateral position of the line in each observation
         crowd = SimpleNamespace(roles=(HONEST, HONEST, MALICIOUS))
         return SimpleNamespace(observations=seen, fleet=crowd, place=SimpleNamespace(frame=None))
 
@@ -239,7 +243,7 @@ def test_displacement_by_attack_is_compared_with_displacement_without_attack(mon
         (1, 2, 2, 2, 2),
     ]
     assert found[0].max_m == pytest.approx(1.15) and math.isnan(found[1].max_m)
-    assert len(fused_inputs) == 6, "what the honest say is fused once, and the truth of all once"
+    assert len(fused_inputs) == 6, "honest observations are fused once, and the truth of all once"
     again = run_adversarial_jobs(units, InlineExecutor())
     assert repr(again) == repr(found) and len(fused_inputs) == 6, "a study that was stopped goes on"
 

@@ -145,7 +145,7 @@ def test_pose_noise_moves_others_features_and_the_corrector_gets_boxes(map_model
 
     class FixedBoxesFusion:
         def compose_message(self, cache, frame):
-            return type("Said", (), {"objects": car})
+            return type("Content", (), {"objects": car})
 
     monkeypatch.setattr(tile_drawing, "_make_cache", lambda *_: object())
     monkeypatch.setattr(tile_drawing, "LateFusion", FixedBoxesFusion)

@@ -63,5 +63,5 @@ def test_what_has_no_truth_is_no_part_of_the_mean():
     row = table.make_row("row")
     assert row.mean_ap[0].value == 1.0 and np.isnan(row.ap[0][0].value) and row.bytes_per_frame == 0.0
     assert table.check_margin("row - row", "row", "row", 0.0).verdict == "inconclusive", (
-        "one scenario says nothing of others"
+        "one scenario does not generalise to others"
     )

@@ -156,7 +156,7 @@ def test_more_frames_against_one(weights, tmp_path, monkeypatch):
     assert (
         rows["2"]["bytes_per_tile"] == 2000 and rows["2"]["num_tiles"] == 6 and len(rows["2"]["mean_ap_by_seed"]) == 2
     )
-    assert get_verdicts(result)["LiDAR: 10 looks - one vehicle"] == "met" and " +0.300 |" in text
+    assert get_verdicts(result)["LiDAR: 10 frames - one vehicle"] == "met" and " +0.300 |" in text
     assert text.count("not run") == 2, "cameras, and both"
 
 
@@ -184,8 +184,8 @@ def test_local_maps_have_a_row_for_each_kind_of_agent(weights, tmp_path, monkeyp
 
 def test_the_corrector_is_held_against_half_of_the_loss(weights, tmp_path, monkeypatch):
     rows = {SINGLE_VEHICLE: 1, CLEAN: 5, NOISY: 2, CORRECTED: 5, CLEAN_CORRECTED: 5}
-    monkeypatch.setattr(pose, "PoseNoisePredictor", lambda aligner: make_predictor(rows))
-    result, text = study("pose", weights, tmp_path)
+    monkeypatch.setattr(pose, "PoseNoisePredictor", lambda pose_correction: make_predictor(rows))
+    result, text = study("map-pose-noise", weights, tmp_path)
     half = "LiDAR: corrected - (clean + noisy) / 2"
     assert get_verdicts(result)[half] == get_verdicts(result)["LiDAR: corrected without errors - clean"] == "met"
     assert "off by 0.5 m and 1 degrees" in text
@@ -195,14 +195,14 @@ def test_the_corrector_is_held_against_half_of_the_loss(weights, tmp_path, monke
 
 
 def test_full_maps_by_map_mode_and_method_against_one_truth(weights, tmp_path, monkeypatch):
-    """The oracle draws: what follows is the fusion of what was said, over bytes, and its judging."""
+    """The oracle predicts elements; their bytes are fused and evaluated."""
     town_map = TownMap("cross", Crossroads.scenarios, "cross", (0.0, 0.0))
     monkeypatch.setattr(whole, "group_by_town", lambda *_: [town_map])
     made = []
     monkeypatch.setattr(
         crowd,
         "MapBuildConfig",
-        lambda mapper, survey, every: made.append(survey) or MapBuildConfig(None, survey, every),
+        lambda map_model, map_mode, frame_stride: made.append(map_mode) or MapBuildConfig(None, map_mode, frame_stride),
     )
     result, text = study("full-map", weights, tmp_path, "--methods", "manyeyes", "union", "chamfer-nms", seeds=1)
     rows = {(row["map_mode"], row["method"]): row for row in result["rows"]}
@@ -240,4 +240,4 @@ def test_what_is_missing_or_twice_is_one_line(weights, tmp_path, capsys, monkeyp
     both = save(tmp_path / "both.safetensors", ("lidar", "camera"))
     assert "takes one model" in refused("full-map", "--data", tmp_path, "--weights", weights, both)
     trained = save(tmp_path / "taught.safetensors", towns=("Cross",))
-    assert "Split by place" in refused("pose", "--data", tmp_path, "--weights", trained)
+    assert "Split by place" in refused("map-pose-noise", "--data", tmp_path, "--weights", trained)

@@ -82,21 +82,21 @@ def evaluate(data, out, study, *words):
 
 def test_every_corrector_with_every_fusion_under_the_requested_levels(data, tmp_path) -> None:
     words = ("--methods", "none", "intermediate", "--frame-stride", 2, "--perturbations", "2°, 2 m", "0.8 m")
-    held = evaluate(data, tmp_path, "pose", *words)
+    held = evaluate(data, tmp_path, "pose-noise-ap", *words)
     assert [(r["corrector"], r["method"]) for r in held["rows"][::3]] == [
         ("identity", "intermediate"),
         ("voting", "intermediate"),
     ]
-    assert held["num_frames"] == {"0 to 3": 0, "4 to 7": 0, "8 and more": 2}
+    assert held["frames"] == {"0 to 3": 0, "4 to 7": 0, "8 and more": 2}
     assert all(len(r["ap_by_common_objects"]) == 3 and r["gain_over_no_fusion"] for r in held["rows"])
     descriptions = [c["description"] for c in held["margin_tests"]]
     assert descriptions[:3] == [
-        "vote, perfect: corrected - true claims",
-        "vote, 0.8 m: corrected - true claims",
-        "vote, 2°, 2 m, 8 and more in common: corrected - true claims",
+        "voting, perfect: corrected - true claims",
+        "voting, 0.8 m: corrected - true claims",
+        "voting, 2°, 2 m, 8 and more in common: corrected - true claims",
     ]
-    assert descriptions[3].startswith("vote, worst level (") and descriptions[3].endswith(
-        "8 and more in common: corrected - alone"
+    assert descriptions[3].startswith("voting, worst level (") and descriptions[3].endswith(
+        "8 and more in common: corrected - none"
     )
     assert [c["margin"] for c in held["margin_tests"]] == [-0.002, -0.044, -0.01, 0.0]
     assert {name: len(at5) for name, at5, _ in held["paper"]["rows"]}["FeaKM, 4 pairs"] == 11
@@ -112,14 +112,19 @@ def test_baseline_fusions_are_rows_with_uncorrected_priors(data, tmp_path) -> No
     with torch.random.fork_rng():
         torch.manual_seed(0)
         baseline = Detector(replace(COSTR_TINY, fusion="v2x-vit"))
-        checkpoint.save(baseline, data / "rival.safetensors", {})
+        checkpoint.save(baseline, data / "baseline.safetensors", {})
     words = ("--methods", "intermediate", "--frame-stride", 2, "--correctors", "identity", "--perturbations", "2°, 2 m")
-    held = evaluate(data, tmp_path, "pose", *words, "--checkpoints", f"V2X-ViT={data / 'rival.safetensors'}")
+    held = evaluate(
+        data, tmp_path, "pose-noise-ap", *words, "--checkpoints", f"V2X-ViT={data / 'baseline.safetensors'}"
+    )
     assert [(r["corrector"], r["method"]) for r in held["rows"]] == 2 * [("identity", "intermediate")] + 2 * [
         ("identity", "V2X-ViT")
     ]
     assert held["rows"][2]["ap_drop"][0]["value"] == 0.0
-    assert "| given" in (tmp_path / "pose.md").read_text() and "V2X-ViT" in (tmp_path / "pose.md").read_text()
+    assert (
+        "| identity" in (tmp_path / "pose-noise-ap.md").read_text()
+        and "V2X-ViT" in (tmp_path / "pose-noise-ap.md").read_text()
+    )
 
 
 def write_net(data, name: str, detector: str = "", max_keypoints: int = 64) -> str:
@@ -153,7 +158,7 @@ def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path)
     net = write_net(data, "few.safetensors", max_keypoints=5)
     options = ("--frame-stride", 2, "--perturbations", "perfect", "--correctors", "identity", net, f"{net}@8")
     words = ("--methods", "intermediate", *options)
-    held = evaluate(data, tmp_path, "pose", *words)
+    held = evaluate(data, tmp_path, "pose-noise-ap", *words)
     plain, four, eight = (r["bytes_per_message"] for r in held["rows"])
     # Five objects with a descriptor each; a section's own bytes and a packet more may come with them.
     assert 5 * 45 <= four - plain <= 5 * 49 + 100 and four == eight
@@ -187,12 +192,12 @@ def test_poses_are_evaluated_by_error_and_common_objects_and_stored(data, tmp_pa
         and rows["identity", "none", 0.0]["score"]["coverage"] == 0.0
     )
     # Off by 2.5 m where 0.5 m is stated, eight objects in common: each is contradicted, none of the honest is.
-    assert rows["voting", "offset", 0.5]["score"]["conflicts"] == 1.0
-    assert rows["voting", "gaussian", 0.8]["score"]["conflicts"] == 0.0
+    assert rows["voting", "offset", 0.5]["score"]["conflict_rate"] == 1.0
+    assert rows["voting", "gaussian", 0.8]["score"]["conflict_rate"] == 0.0
     conflict = list(map(list, rows["voting", "offset", 0.5]["confusion"]))[2]
     assert conflict == [0, 0, 4, 0, 0]
     assert {r["common_range"][0] for r in held["rows"] if r["common_range"]} == {8}
-    assert all(100 < r["bytes_per_message"] < 400 and len(r["risk"]) == 20 for r in held["rows"])
+    assert all(100 < r["bytes_per_message"] < 400 and len(r["risk_by_coverage"]) == 20 for r in held["rows"])
     calls.clear()
     again = evaluate(data, tmp_path, "pose-estimation", "--correctors", "identity", "voting", "coalign")
     assert not calls and again["rows"] == held["rows"]

@@ -64,7 +64,7 @@ def test_the_commit_is_that_of_the_package_and_marks_changed_files(tmp_path, mon
     (package / "apps" / "provenance.py").write_text("")
     monkeypatch.setattr(provenance, "__file__", str(package / "apps" / "provenance.py"))
     git(tmp_path, "init", "-q")
-    git(tmp_path, "commit", "-q", "--allow-empty", "-m", "somebody else's")
+    git(tmp_path, "commit", "-q", "--allow-empty", "-m", "another project's")
     assert git_commit() is None
     git(tmp_path, "add", "manyeyes")
     git(tmp_path, "commit", "-q", "-m", "ours")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verbs on a recording in DAIR-V2X's layout, which they know by its folders."""
+"""The commands on a recording in DAIR-V2X's layout, which they recognise by its folders."""
 
 import json
 import math
@@ -95,13 +95,13 @@ def test_evaluate_scores_pairs_with_infrastructure_messages(data: Path, weights:
     early = held["stats"][2]
     assert early["communication"]["bytes_per_message"] > 0
     assert early["age_ms"] == pytest.approx(30, abs=5), (
-        "heard within the wait of 50 ms, 20 ms after the vehicle's sweep"
+        "received within the latency budget of 50 ms, 20 ms after the vehicle's sweep"
     )
 
 
 def test_run_and_view_take_the_layout(data: Path, weights: Path, tmp_path: Path) -> None:
     words = ("--weights", weights, "--methods", "early", "--out", tmp_path / "run")
-    assert run("run", data, "--scenario", "1", *words) == 0
+    assert run("replay", data, "--scenario", "1", *words) == 0
     assert {"early.png", "report.html", "results.json"} <= {p.name for p in (tmp_path / "run").iterdir()}
     assert run("view", data, "--split", "test", "--width", 480, "--out", tmp_path / "frame.png") == 0
     with Image.open(tmp_path / "frame.png") as image:

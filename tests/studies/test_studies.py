@@ -157,7 +157,7 @@ def test_baseline_fusions_are_compared_with_ours_under_each_perturbation(
     assert [(r["method"], r["perturbation"]["delay_s"]) for r in held["rows"]] == [
         ("intermediate", 0), ("same", 0), ("intermediate", 0.4), ("same", 0.4),
     ]  # fmt: skip
-    # A rival of the same weights is as good, and loses as much.
+    # A baseline of the same weights has the same AP and AP drop.
     for ours, same in (held["rows"][:2], held["rows"][2:]):
         assert ours["ap"] == same["ap"] and ours["ap_drop"] == same["ap_drop"]
     against = [c for c in held["margin_tests"] if "intermediate - same" in c["description"]]

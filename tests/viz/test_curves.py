@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Curves as a picture: what is drawn depends on what is said, and nothing is left behind."""
+"""Curves as an image: the drawn parts depend on the input, and no temporary file is left."""
 
 import math
 from itertools import pairwise

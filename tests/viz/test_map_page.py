@@ -22,7 +22,7 @@ CONFIDENT, UNCERTAIN, MISSED = (12, 44, 132), (215, 48, 31), (243, 132, 186)
 
 
 def made_page() -> MapPage:
-    """Two dividers 20 m apart, the upper one sure, the lower one not; a crossing that nobody fused."""
+    """Two dividers 20 m apart, the upper one with a high score, the lower one with a low one; a crossing that was not fused."""
     lines = [[(0, 10), (100, 10)], [(0, -10), (100, -10)]]
     ring = [(48, -30), (52, -30), (52, 30), (48, 30)]
     truth = MapElements.of([*lines, ring], [DIVIDER, DIVIDER, CROSSING])

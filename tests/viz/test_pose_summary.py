@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a drive's report says of senders' claimed poses."""
+"""The pose summary in a drive's report."""
 
 import numpy as np
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What meets a person: the command line, its verbs, the viewer."""
+"""The command line and its commands."""

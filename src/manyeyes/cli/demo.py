@@ -45,7 +45,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Simulate a drive, evaluate the methods on it, and write a report."""
     from rich.console import Console
 
     from manyeyes.datasets.opv2v import Opv2vRecording

@@ -137,7 +137,7 @@ def _make_chapter(stats: DemoMapStats, out: Path) -> Chapter:
 
 def _make_pair_panels(experiment: FleetExperiment, solution: PoseSolution) -> list[MapPanel]:
     """The two neighbouring observations that disagree most, before and after."""
-    before, after = _find_most_different_pair(experiment.observations)
+    before, after = _find_largest_difference(experiment.observations)
     rows = solution.row_indices([before.id, after.id])
     panels = []
     for title, poses in (
@@ -151,7 +151,7 @@ def _make_pair_panels(experiment: FleetExperiment, solution: PoseSolution) -> li
     return panels
 
 
-def _find_most_different_pair(observations: tuple[Observation, ...]) -> tuple[Observation, Observation]:
+def _find_largest_difference(observations: tuple[Observation, ...]) -> tuple[Observation, Observation]:
     """Of different agents, at most 15 m apart: the pair with the longest arrows in sum."""
     best, pair = -1.0, (observations[0], observations[-1])
     for i, one in enumerate(observations):

@@ -31,7 +31,7 @@ EXTRAS = {
 
 @dataclass(frozen=True)
 class Options:
-    """What to print, and where to look for towns."""
+    """Output format and the folder of town files."""
 
     json: bool = False
     """Print one JSON object instead of a table."""
@@ -57,7 +57,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Everything that doctor says."""
+    """The diagnosis of an installation."""
 
     versions: dict[str, str | None]
     git_commit: str | None
@@ -74,7 +74,7 @@ class Diagnosis:
 
 
 def diagnose(towns: Path | None = None) -> Diagnosis:
-    """Looks at this installation; nothing is changed and nothing is fetched."""
+    """Inspect this installation; nothing is changed or downloaded."""
     import torch
 
     found = find_towns(towns)
@@ -120,7 +120,7 @@ def find_towns(folder: Path | None = None) -> tuple[tuple[str, ...], str]:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Print the diagnosis of this installation."""
     diagnosis = diagnose(options.towns)
     if options.json:
         sys.stdout.write(json.dumps(provenance.to_plain(diagnosis), indent=2) + "\n")

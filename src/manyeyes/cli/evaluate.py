@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Evaluate methods on a split, or run a study."""
     from rich.console import Console
 
     from manyeyes._io import atomic_write_text
@@ -87,7 +87,7 @@ def main(options: Options) -> None:
 def _measure_times(
     result: MethodResult, recording: Recording, detector: Detector, config: ReplayConfig, num_frames: int
 ) -> MethodResult:
-    """The result with times of the method alone: while judging, methods look at each cloud once between them."""
+    """Measure times of one method by itself: in an evaluation, methods share the processing of each cloud."""
     from manyeyes.agents.replay import replay
 
     if num_frames == 0:

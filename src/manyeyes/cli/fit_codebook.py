@@ -24,7 +24,7 @@ class Options:
     stages: int = 4
     """Bytes for the features of a token."""
     frame_stride: int = 10
-    """Of how many judged frames one is looked at."""
+    """Use every n-th of the evaluated frames."""
     seed: int = 0
     """Of the first centres."""
     checks: FileChecks = field(default_factory=FileChecks)
@@ -32,7 +32,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Fit a codebook and write weights that hold it."""
     import torch
     from rich.console import Console
 

@@ -53,7 +53,7 @@ class Options:
     seed: int = 0
     """Of pose errors."""
     out: Path = Path("out/align")
-    """Folder for align.json."""
+    """Folder for pose.json."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""
 
@@ -75,7 +75,7 @@ class CorrectorResult:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Evaluate pose correction on a recording."""
     from rich.console import Console
 
     from manyeyes.agents.perception_cache import PerceptionCache
@@ -106,12 +106,12 @@ def main(options: Options) -> None:
         title = f"{display_name(options.weights)} on {drive.scenario}: {len(results) // len(options.correctors)} pairs of agents"
         console.print(_make_table(scores, title))
     if missing.count:
-        console.print(missing_footer(missing.count, "align.json"), highlight=False, soft_wrap=True)
+        console.print(missing_footer(missing.count, "pose.json"), highlight=False, soft_wrap=True)
     health = run_pose_monitor([f for f in results if f.corrector == "voting"])
     for agent, report in health.items():
         console.print(f"agent {agent}: {report.health.value} over {report.num_frames} frames", highlight=False)
     provenance.write_json(
-        options.out / "align.json",
+        options.out / "pose.json",
         {
             "scores": {name: asdict(s) for name, s in scores.items()},
             "health": {str(agent): report.health.value for agent, report in health.items()},
@@ -121,7 +121,7 @@ def main(options: Options) -> None:
         {"options": options},
         options.seed,
     )
-    console.print(f"\nEvery answer is in {options.out / 'align.json'}", highlight=False, soft_wrap=True)
+    console.print(f"\nEvery answer is in {options.out / 'pose.json'}", highlight=False, soft_wrap=True)
 
 
 def _run_correctors(
@@ -170,7 +170,7 @@ def _evaluate(estimate: PoseEstimate, snapshot: Snapshot, row: int) -> PoseEvalu
 
 
 def run_pose_monitor(results: list[CorrectorResult]) -> dict[int, PoseReport]:
-    """What a watchman says of each agent after its last frame."""
+    """Run the pose monitor of each agent up to its last frame."""
     from manyeyes.pose.pose_monitor import PoseMonitorState, update_monitor
 
     states: dict[int, PoseMonitorState] = {}
@@ -188,7 +188,7 @@ def _make_table(scores: dict[str, PoseScore], title: str) -> Table:
 
     table = Table(title=title)
     for head in ("", "within 1 m, 1°", "2 m, 2°", "answered", "right", "wrong", "error m", "error °", "objects off m"):
-        table.add_column(head, justify="right" if head else "left")
+        table.add_column(head, justify="right" if head else "left", no_wrap=not head)
     for name, s in scores.items():
         shares = (*s.success_rate[:2], s.coverage, s.precision, s.false_accept_rate)
         lengths = (s.median_translation_error_m, s.median_rotation_error_deg, s.mean_displacement_m)

@@ -40,7 +40,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Replay a drive and write a report."""
     from rich.console import Console
 
     from manyeyes.models import pretrained

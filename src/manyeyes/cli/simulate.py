@@ -27,7 +27,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Simulate scenes of a preset."""
     import json
 
     from rich.console import Console

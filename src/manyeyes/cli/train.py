@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Train a model of a preset."""
     import torch
     import torch.distributed as dist
     from rich.console import Console

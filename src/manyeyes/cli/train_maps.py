@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains a map model on a recording of towns whose true maps are known; the part of the verb train that its presets ask for."""
+"""Trains a map model on a recording of towns whose true maps are known; the part of the command train for these presets."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains FeaKM's net on what a frozen detector sees; the part of the verb train that its presets ask for."""
+"""Trains FeaKM's net on what a frozen detector sees; the part of the command train for these presets."""
 
 from __future__ import annotations
 

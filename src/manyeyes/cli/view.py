@@ -23,7 +23,7 @@ SUFFIXES = (".png", ".gif", ".webp")
 
 @dataclass(frozen=True)
 class Options:
-    """What to draw."""
+    """The frame to draw, and the output file."""
 
     recording: tyro.conf.Positional[Path]
     """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout; or a root in DAIR-V2X's."""
@@ -50,7 +50,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Draw a frame or an animation."""
     from rich.console import Console
 
     from manyeyes.studies.recordings import open_recording

@@ -84,7 +84,7 @@ def run_conditions(
     """Every method of every condition: the cell kept in the folder, or played now and kept.
 
     progress counts scenarios of conditions that are still to be played. Conditions of one configuration but for its methods
-    should be one: methods of one condition look at each cloud once between them.
+    should be one: methods of one condition process each cloud once.
     """
     recording_hash = hash_recording(open_recording())
     paths = {
@@ -116,7 +116,7 @@ def result_path(folder: Path, config: BenchmarkConfig, method: str, recording_ha
 
 
 def hash_recording(recording: Recording) -> str:
-    """What a recording holds, as far as each scenario's first judged snapshot tells: agents, poses, clouds, truth."""
+    """Hash the first evaluated snapshot of each scenario: agents, poses, clouds, truth."""
     digest = hashlib.blake2b(digest_size=8)
     for scenario in recording.scenarios:
         eval_indices = recording.eval_indices(scenario)

@@ -33,7 +33,7 @@ SpeedRange = tuple[float, float]
 class BusVolume:
     """Bytes handed to the bus. max_message_bytes: one agent's at one instant; instant: of all senders together, mean and most.
 
-    Where the first agent alone is judged, its own message is none that it could hear and is not counted.
+    Where the first agent alone is judged, its own message is not received by it and is not counted.
     """
 
     max_message_bytes: int
@@ -54,7 +54,7 @@ class StudyResult:
 
     @property
     def bytes_per_message(self) -> float:
-        """The mean length of what another agent sent for an ego's frame; 0 for who says nothing."""
+        """The mean length of another agent's message for an ego's frame; 0 without messages."""
         return self.communication.bytes_per_message if self.communication.num_messages else 0.0
 
     def select_matches(
@@ -69,7 +69,7 @@ class StudyResult:
 def filter_by_speed(match: FrameMatch, speed: Tensor, speed_range: SpeedRange) -> FrameMatch:
     """The frame with the true boxes (G,) of one class of speeds alone."""
     inside = (speed >= speed_range[0]) & (speed < speed_range[1])
-    # A row of -1 looks at the last entry: a false positive stays one.
+    # Row -1 indexes the last entry, which is kept: a false positive stays one.
     mask = torch.cat((inside, torch.ones(1, dtype=torch.bool)))[match.truth_row]
     return FrameMatch(match.scenario, match.index, match.score[mask], match.truth_row[mask], int(inside.sum()))
 

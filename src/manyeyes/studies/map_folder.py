@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What 'map simulate' leaves behind and the other verbs find: observations, truth in view, and where maps are cut."""
+"""The folder that 'map simulate' writes and other commands read: observations, truth in view, and the cut policy."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class MapFolder:
             write_observations(folder / f"part-{part:05d}.parquet", observations[start : start + ROWS_PER_FILE], frame)
 
     def read_cut_policy(self) -> CutPolicy | None:
-        """The cut that maps get before they are judged; None where the folder says none."""
+        """The cut policy for maps before evaluation; None where the folder holds none."""
         import shapely
 
         from manyeyes.evaluation.maps.experiment import CutPolicy
@@ -82,7 +82,7 @@ def find_observation_files(path: Path) -> Path:
 
 
 def load_observations(path: Path, console: Console) -> LoadedObservations:
-    """The observations of a file, a folder of files, or a simulated folder; what was put aside is said, one line each."""
+    """The observations of a file, a folder of files, or a simulated folder; rejected ones are printed, one line each."""
     from manyeyes.maps.elements.observation_file import read_observations
 
     loaded = read_observations(find_observation_files(path))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From sensors to a map: every agent of a recording surveys, a cartographer hears, the fused map is judged and drawn."""
+"""From sensors to a map: agents of a recording predict and send map elements, a map server fuses them, the map is evaluated."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ MARGIN_M = 20.0
 
 @dataclass(frozen=True)
 class MapBuildConfig:
-    """How a recording becomes a map. map_model: draws; None: the true map does, seen with the errors of a simulated crowd.
+    """Configuration of a map build. map_model: predicts elements; None: the true map with the errors of a simulated fleet does.
 
-    map_mode: local or semi-global. frame_stride: agents look at every n-th frame. channel: a preset's name. pose_sigma_m: of errors
-    added to claimed positions, anew at each look; headings err in proportion, 1 degree a metre.
+    map_mode: local or semi-global. frame_stride: every n-th frame is used. channel: a preset's name. pose_sigma_m: of errors
+    added to prior positions, independently in each frame; headings err in proportion, 1 degree a metre.
     """
 
     map_model: MapModel | None
@@ -56,7 +56,7 @@ class MapBuildConfig:
     def __post_init__(self) -> None:
         get_map_share_config(self.map_mode)
         if self.frame_stride < 1:
-            raise ConfigError(f"Agents look at every n-th frame, n of 1 or more; got {self.frame_stride}.")
+            raise ConfigError(f"frame_stride is 1 or more; got {self.frame_stride}.")
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ class MapScores:
 
 @dataclass(frozen=True)
 class MapBuildStats:
-    """What came of one ground. num_messages: with a map; bytes of them, and of looks, a message. num_lost: sent and never whole
-    there.
+    """Statistics of one town map. num_messages: with a map; bytes_per_message, bytes_per_frame: of these, and of feature messages.
+    num_lost: sent and not completely received.
 
     incremental_fscore: F of published lines at 0.5 m between the map as it grew, observation by observation, and the fold over all.
     scores, union_scores: of the map, and of all observations as they are; None where the true map is not known. missing: files of
@@ -127,7 +127,7 @@ class _BuildLog:
 def build_map(
     recording: Recording, town_map: TownMap, config: MapBuildConfig, on_snapshot: Callable[[], None] = lambda: None
 ) -> BuiltMap:
-    """The map of one ground; looked is called after each instant."""
+    """Build the map of one town; on_snapshot is called after each snapshot."""
     map_server = MapServer(
         town_map.frame, town_map.origin_xy, config=IncrementalConfig(fusion=make_tuned_settings().ours)
     )
@@ -145,7 +145,7 @@ def build_map(
 
 
 def count_snapshots(recording: Recording, town_map: TownMap, frame_stride: int) -> int:
-    """How many instants are looked at."""
+    """Count the snapshots that are used."""
     return sum(len(range(0, recording.length(s), frame_stride)) for s in town_map.scenarios)
 
 

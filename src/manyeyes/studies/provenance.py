@@ -49,7 +49,7 @@ def git_commit() -> str | None:
             return None
         return done.stdout.strip() if done.returncode == 0 else None
 
-    # A package installed inside somebody else's repository must not claim that repository's commit.
+    # A package installed inside another project's repository must not report that repository's commit.
     if git("ls-files", "--error-unmatch", "__init__.py") is None:
         return None
     commit = git("rev-parse", "HEAD")
@@ -57,7 +57,7 @@ def git_commit() -> str | None:
 
 
 def cpu_name() -> str:
-    """The processor's name as the system says it."""
+    """The processor's name as the system reports it."""
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):

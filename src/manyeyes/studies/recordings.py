@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from manyeyes.datasets.base import Recording
     from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 
-# Half of DAIR-V2X's period: a pair's later sweep is heard, and the next pair has not begun.
+# Half of DAIR-V2X's period: a pair's later sweep arrives in time, and the next pair has not begun.
 PAIRS_LATENCY_BUDGET_S = 0.05
 _MAX_NOTES = 8
 
@@ -90,7 +90,7 @@ def adapt_to_dataset(config: ReplayConfig, options: ReplayOptions, recording: Re
     """The configuration with the wait and the reach that suit the recording; a wait that the user chose stays.
 
     The two sweeps of a DAIR-V2X pair are some ten milliseconds apart, either way: an ego that does not wait would never
-    hear an infrastructure whose sweep is the later one. And its pairs collaborate at any distance, by its own protocol.
+    receive an infrastructure message whose sweep is the later one. And its pairs collaborate at any distance, by its own protocol.
     """
     if not isinstance(recording, DairRecording):
         return config

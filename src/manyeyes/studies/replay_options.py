@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the verbs that read a recording have in common: options, an excerpt, how long an ego waits."""
+"""Common parts of commands that read a recording: options, excerpts, latency budgets."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ReplayOptions:
     methods: tuple[str, ...] = ALL_METHODS
     """What is compared: any of alone, late, intermediate, early."""
     channel: str = "ideal"
-    """The air between agents: ideal, its-g5, its-g5-27, lte-v2x, nr-sidelink, cellular."""
+    """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
     latency_budget_ms: float | None = None
     """How long an ego waits for messages after its own sweep; by default 0 on the ideal channel, else one period, 100."""
     budget_bytes: int = 1 << 17
@@ -36,11 +36,11 @@ class ReplayOptions:
     """How tokens are written: their features as numbers, or all of them as the codes of the weights' codebook; by default as
     codes where the weights have one, else as float16."""
     request_maps: bool = False
-    """Messages of tokens say where their sender needs no help; what came lately weighs what is sent."""
+    """Send request maps with token messages, and weight tokens by the latest received ones (Where2comm)."""
     pose_correction: str | None = None
-    """Correct where others say they are before fusing, by the objects that both see; leave out whom nobody can place. By whom:
-    vote, feakm, a .safetensors file of FeaKM, or a rival: given, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist,
-    v2x-reg-oiou, mash."""
+    """Correct the poses of senders before fusion, by objects that both agents detect; leave out messages without a usable pose.
+    Corrector: voting, feakm, a .safetensors file of FeaKM, or a baseline: identity, coalign, fpv-rcnn, feaco, icp, vips,
+    v2x-reg-odist, v2x-reg-oiou, mash."""
 
     def make_replay_config(self, seed: int, all_egos: bool = False) -> ReplayConfig:
         """The same as the player takes it; unknown names are refused here, before any work."""
@@ -91,7 +91,7 @@ class Excerpt:
 
     @property
     def scenarios(self) -> tuple[str, ...]:
-        """The one."""
+        """The replayed scenario only."""
         return (self.scenario,)
 
     def length(self, scenario: str) -> int:

@@ -130,11 +130,11 @@ def replay_and_report(drive: Excerpt, detector: Detector, spec: ReportSpec, cons
 def _make_pose_chapters(pose_summaries: Mapping[str, PoseCorrectionSummary]) -> tuple[Chapter, ...]:
     """What was found of senders' claimed poses, for each method that aligns."""
     text = (
-        "Before it fuses, the ego compares where others say they are with what both detect. Claims that objects refute are "
-        "replaced; messages that nobody can place are left out; a claim that moves off is named."
+        "Before fusion, the ego matches objects that both agents detect. Prior poses that contradict the match are replaced; "
+        "messages without a usable pose are left out; drifting priors are listed."
     )
     return tuple(
-        Chapter(f"Who is where, {name}", text, table=(HEADINGS, *summary.make_rows()))
+        Chapter(f"Pose correction, {name}", text, table=(HEADINGS, *summary.make_rows()))
         for name, summary in pose_summaries.items()
         if summary.senders
     )

@@ -34,7 +34,7 @@ NO_FUSION, OURS, UPPER_BOUND = "none", "intermediate", "early"
 TOKEN_SELECTION_METHODS = ("intermediate", "intermediate-confidence", "intermediate-random")
 PAPER_NOTE = (
     'The column "paper" holds CoSTr\'s own figures: another data set (OPV2V), unknown protocol; they are '
-    "no bar and no rival."
+    "for reference only."
 )
 
 

@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 @dataclass(frozen=True)
 class TownMap:
     """Scenarios of one piece of world. town: whose true map is known by name. map_file: a file of the true map of elsewhere, in the
-    recording's world; without either nobody knows what is true.
+    recording's world; without either no ground truth is known.
 
     start_xy: where the first agent begins, world metres.
     """
@@ -64,7 +64,7 @@ class TownMap:
         return None if self.place is None else CutPolicy(self.place.junctions, self.place.area)
 
     def observed_truth(self, observations: Sequence[Observation], true_poses: Floats) -> MapElements | None:
-        """The true elements that were in somebody's view, at true poses (N, 3) in the map's frame; cut."""
+        """The true elements that were in view of any agent, at true poses (N, 3) in the map's frame; cut."""
         from manyeyes.evaluation.maps.observed_area import MIN_PART_LENGTH_M, clip_to_area, compute_observed_area
 
         if self.place is None or self.cut_policy is None:

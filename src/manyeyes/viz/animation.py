@@ -28,7 +28,7 @@ def stack_images(images: Sequence[Image]) -> Image:
 
 
 def save_animation(images: Iterable[Image], path: Path, frame_ms: int = 200) -> int:
-    """Writes the pictures as an animation that repeats; how many frames it has. The suffix says the format."""
+    """Write images as a looping animation; returns the number of frames. The suffix selects the format."""
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         raise ConfigError(f"An animation is one of {', '.join(FORMATS)}; got {path.name}.")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One instant from above, in the ego's frame: points by agent, true boxes, detections, who stands where.
 
-The ego looks to the right; its left is up. Points are moved by the poses that the agents claim, true boxes by the ego's
+The ego's forward direction is right; its left is up. Points are moved by the poses that the agents claim, true boxes by the ego's
 true pose, so a pose error shows as it is.
 """
 
@@ -47,7 +47,7 @@ HEADER_HEIGHT, FOOTER_HEIGHT = 58, 44
 class SceneAgent:
     """One agent as the picture shows it; cloud and ego_from_agent are in the ego's frame.
 
-    has_message: whether the ego had anything of it; points that it never heard of are pale.
+    has_message: whether the ego received a message of it; points of other agents are pale.
     """
 
     agent_id: int
@@ -89,7 +89,7 @@ def make_scene(snapshot: Snapshot, detections: Boxes, ego: int = 0, missing_ids:
         )
     if snapshot.truth is None:
         return BirdsEyeScene(tuple(agents), Boxes.empty(), torch.zeros(0, dtype=torch.bool), detections)
-    # Nobody is asked to find itself: its marker stands for the ego's own body.
+    # The ego's own box is not evaluated: its marker stands for it.
     others = snapshot.truth.boxes.id != snapshot.frames[ego].agent_id
     true_boxes = snapshot.truth.boxes[others].transform(snapshot.truth.world_from_agent[ego].inverse())
     return BirdsEyeScene(tuple(agents), true_boxes, snapshot.truth.seen.any(0)[others], detections)

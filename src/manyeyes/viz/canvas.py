@@ -53,7 +53,7 @@ class Viewport:
 
     @property
     def scale(self) -> float:
-        """Pixels per metre."""
+        """Pixels per metre of the canvas."""
         return self.width / (self.x_max - self.x_min)
 
     @property
@@ -132,7 +132,7 @@ class Pen:
             self.line(points, edge, width, closed=True)
 
     def disc(self, centre: np.ndarray, radius: float, fill: Colour, edge: Colour, width: float = 1.0) -> None:
-        """A filled circle."""
+        """Draw a filled circle in metres."""
         low, high = (np.asarray(centre) - radius) * SUPERSAMPLE, (np.asarray(centre) + radius) * SUPERSAMPLE
         self._draw.ellipse([*low, *high], fill=fill, outline=edge, width=round(width * SUPERSAMPLE))
 

@@ -18,7 +18,7 @@ from manyeyes.viz.table import format_markdown_lines
 HEADINGS = (
     "method", "AP ped", "AP div", "mAP exact", "mAP maptr", "mAP smn, wide", "F@0.5 div", "dup", "frag", "lat m", "end m", "s",
 )  # fmt: skip
-MARGIN_HEADINGS = ("bar", "rival", "value", "95 % interval", "at least", "verdict")
+MARGIN_HEADINGS = ("margin test", "baseline", "value", "95 % interval", "at least", "verdict")
 
 
 def make_kinds_table(ap: Sequence[ApRow], kinds: Sequence[KindRow], title: str) -> Table:
@@ -67,7 +67,7 @@ def make_study_table(summaries: Sequence[MethodSummary], group: str) -> Table:
 
 
 def make_margin_table(margin_tests: Sequence[StudyMarginTest]) -> Table:
-    """The bars."""
+    """Tabulate margin tests with values and verdicts."""
     table = _make_table("Bars", ("group", *MARGIN_HEADINGS))
     for margin_test in margin_tests:
         table.add_row(margin_test.group, *_margin_cells(margin_test))
@@ -93,7 +93,7 @@ def format_study(title: str, summaries: Sequence[MethodSummary], margin_tests: S
 ADVERSARIAL_HEADINGS = (
     "place",
     "seed",
-    "liars",
+    "malicious",
     "offset m",
     "stations",
     "moved > 0.1 m",
@@ -105,8 +105,10 @@ ADVERSARIAL_HEADINGS = (
 
 
 def make_adversarial_table(results: Sequence[AdversarialResult]) -> Table:
-    """What liars moved."""
-    table = _make_table("Stations that five or more agents saw, with liars against without", ADVERSARIAL_HEADINGS)
+    """Tabulate displacements by malicious agents."""
+    table = _make_table(
+        "Stations observed by five or more agents: displacement by malicious agents", ADVERSARIAL_HEADINGS
+    )
     for result in results:
         table.add_row(*_adversarial_cells(result))
     return table

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What aligning egos said of each sender during a drive: how its claims were, what became of its messages."""
+"""Summary of pose correction by sender over a drive: health of its prior poses and use of its messages."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class PoseCorrectionSummary:
 
 
 def _worst_health(sender: _SenderSummary) -> PoseHealth:
-    """What is worst and lasting: a doubtful frame now and then is honest."""
+    """The worst lasting state; single suspect frames are expected of sound senders."""
     for health in (*FAULTS, PoseHealth.SOUND, PoseHealth.SUSPECT):
         if health in sender.first_frame:
             return health

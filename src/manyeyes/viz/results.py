@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a comparison of methods says: its rows, its paired differences, and the same as plain values for JSON."""
+"""Results of a comparison of methods: rows, paired differences, and both as plain values for JSON."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class MethodRow:
 
 
 def make_row(result: MethodResult) -> MethodRow:
-    """The row of a measured method. Who says nothing has sent 0 bytes."""
+    """The row of a measured method; without messages it has sent 0 bytes."""
     return MethodRow(
         result.method,
         result.intervals[0],

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes a map of a recording: agents draw what their sensors see, send it as bytes, and a cartographer fuses what it hears.
+"""Build a map of a recording: agents predict map elements from sensor data, send them as bytes, and a map server fuses them.
 
-Scenarios that are named after a town (town05_0066, generated-1_0) are judged against its true map; of others a map is made as well.
+Maps of scenarios that are named after a town (town05_0066, generated-1_0) are evaluated against its true map; others are built too.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """What is mapped, by whom, and where it goes."""
+    """The recording, the map model and the output folder."""
 
     recording: tyro.conf.Positional[Path]
     """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout; or a root in DAIR-V2X's."""
@@ -38,12 +38,12 @@ class Options:
     weights: str | None = None
     """Of the map model: a shipped name or a .safetensors file of 'manyeyes train --preset map-small-lidar'."""
     map_mode: Literal["local", "semi-global"] = "local"
-    """local: what lies ahead, 30 x 30 m of a vehicle, 50 x 30 m of a roadside unit, each by its own look. semi-global: 120 x 60 m
-    about each agent, together with the looks of the others."""
+    """local: 30 x 30 m ahead of a vehicle, 50 x 30 m ahead of a roadside unit, each from its own frame. semi-global: 120 x 60 m
+    around each agent, with the features of the others."""
     frame_stride: int = 5
-    """Agents look at every n-th frame."""
+    """Use every n-th frame."""
     channel: str = "ideal"
-    """The air between all: ideal, its-g5, its-g5-27, lte-v2x, nr-sidelink, cellular."""
+    """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
     pose_sigma: float = 0.0
     """Standard deviation of errors added to claimed positions, metres; headings err in proportion, 1 degree a metre."""
     map: Path | None = None
@@ -58,7 +58,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Build a map of a recording for each town."""
     from rich.console import Console
 
     from manyeyes.comms.channel import channel_preset

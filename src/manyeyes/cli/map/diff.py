@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Says what changed from one map to another: elements by id, metres by place; optionally as a web page."""
+"""List what changed from one map to another: elements by id, length by location; optionally as a web page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Compare two maps and write the changes."""
     from rich.console import Console
 
     from manyeyes.datatypes import ConfigError

@@ -23,7 +23,7 @@ STUDIES = ("fusion", "fleet-pose-noise", "crowdmap-table3", "adversarial", "tuni
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Evaluate a map, or run a study of maps."""
     from rich.console import Console
 
     if options.study is not None and options.study not in STUDIES:

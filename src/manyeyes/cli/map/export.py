@@ -26,7 +26,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Write a map in another format."""
     from rich.console import Console
 
     from manyeyes.maps.formats.export import export_map

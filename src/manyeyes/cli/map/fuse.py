@@ -38,7 +38,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Fuse observations to a map, with a method or a store."""
     import time
 
     from rich.console import Console

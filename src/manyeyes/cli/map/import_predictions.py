@@ -17,7 +17,7 @@ class Options:
     """What is read, and what the file does not say."""
 
     results: tyro.conf.Positional[Path]
-    """nuscmap_results.json of MapTR, or submission_vector.json of StreamMapNet; told apart by their layout."""
+    """nuscmap_results.json of MapTR, or submission_vector.json of StreamMapNet; recognised by their layout."""
     poses: Path | None = None
     """A CSV with token, agent, pass_id, time_ns, x, y, yaw and, if known, sigma_x, sigma_y, sigma_yaw."""
     origin: tuple[float, float] | None = None
@@ -41,7 +41,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Convert result files of map models to observations."""
     from rich.console import Console
 
     from manyeyes.maps.elements.observation import MapFrame

@@ -37,7 +37,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Remove observations of a store and publish the map."""
     from rich.console import Console
 
     from manyeyes.cli.map.fuse import publish_release

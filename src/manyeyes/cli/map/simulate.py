@@ -18,7 +18,8 @@ class Options:
     observations: int = 60
     """How many; the first of a larger crowd are those of a smaller one."""
     crowd: str = "local"
-    """Errors and habits: local, semi-global, perfect, independent-liars, colluding-liars, stale, with-poles."""
+    """Observation noise and fleet: local, semi-global, perfect, independent-malicious, colluding-malicious, outdated,
+    with-infrastructure."""
     pose_sigma: float | None = None
     """Another standard deviation of claimed positions, metres; headings err in proportion, 1 degree a metre."""
     size: float = 300.0
@@ -30,7 +31,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Simulate a fleet and write observations and ground truth."""
     from dataclasses import replace
 
     from rich.console import Console

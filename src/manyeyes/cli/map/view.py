@@ -13,7 +13,7 @@ from manyeyes.datatypes import ConfigError
 
 @dataclass(frozen=True)
 class Options:
-    """What to draw."""
+    """The map and the output file."""
 
     folder: tyro.conf.Positional[Path]
     """The map's folder, of 'map fuse'."""
@@ -24,11 +24,11 @@ class Options:
     out: Path | None = None
     """The page (.html) or picture (.png); map.html in the map's folder by default."""
     max_observations: int = 500
-    """At most so many observations are drawn: a page of a million lines helps nobody."""
+    """Draw at most so many observations, which bounds the size of the page."""
 
 
 def main(options: Options) -> None:
-    """Run the command."""
+    """Draw a map as a page or an image."""
     from rich.console import Console
 
     from manyeyes.datatypes.map_element import MapElements

@@ -49,7 +49,7 @@ class MetricAccumulator:
     """What one method did so far, in the little that judging needs: no cloud is kept.
 
     speeds: (G,) m/s of each frame's true boxes. Messages are those that other agents sent for an ego's frame, arrived or not.
-    share_s counts calls that said something.
+    share_s counts calls that returned a message.
     """
 
     method: str
@@ -96,7 +96,7 @@ class MetricAccumulator:
         return tuple(tuple(match_frame(frame, iou, self.protocol) for frame in self.frames) for iou in IOU_THRESHOLDS)
 
     def summarize_communication(self) -> Communication:
-        """What was sent."""
+        """Summarise what was sent, in bytes a message."""
         return summarize_messages(self.messages, len(self.frames))
 
     def mean_age_ms(self) -> float:

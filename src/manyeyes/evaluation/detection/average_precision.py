@@ -2,7 +2,7 @@
 """Average precision of cooperative detection. This text is the definition of the metric.
 
 **Frame.** Detections and truth are in the ego's own, physical frame (x forward, y left, z = 0 on the road). Errors of
-claimed poses displace what collaborators said; they never move the truth.
+claimed poses displace the content of collaborators' messages; they never move the truth.
 
 **Truth of an ego** (:func:`select_ego_truth`): the union of the boxes listed by every agent whose *true* position lies within
 ``com_range_m`` of the ego's (in the plane, the ego included), one box per id, without the ego's own body, moved into the
@@ -32,7 +32,7 @@ code, whose rules differ; where a source does not say (score thresholds of ``spa
 100 truth boxes a frame is not reproduced. ``coalign`` is CoAlign's setting for DAIR-V2X, and ``dair`` that of its authors.
 By the same rules as CoAlign, other ranges on DAIR-V2X: ``heal-dair`` (HEAL), ``sparsealign-dair`` (SparseAlign's rules and its
 test range), and CoSTr's 102.4 m × 102.4 m, which the paper does not place: ``costr-dair`` ahead of the vehicle, where the original
-labels are, ``costr-dair-centred`` around it; both by the legacy AP, which its numbers suggest (detection.md 1.7, inferred).
+labels are, ``costr-dair-centred`` around it; both by the legacy AP, which its published numbers suggest.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ def _count_points(snapshot: Snapshot, near: Tensor) -> Tensor:
 
 
 def _select_unique_ids(ids: Tensor, listed: Tensor) -> Tensor:
-    """Rows (K,) that are listed (N,), the first of each id; -1 names nobody and is always kept."""
+    """Rows (K,) that are listed (N,), the first of each id; -1 marks a box without id, which is always kept."""
     seen_ids: set[int] = set()
     rows: list[int] = []
     for row in listed.nonzero()[:, 0].tolist():
@@ -297,7 +297,7 @@ def match_frame(frame: FrameResult | FrameIou, iou: float, protocol: DetectionPr
 def _match_greedily(table: np.ndarray, threshold: float, allow_taken: bool) -> np.ndarray:
     """Pairs (K, 2) of row and column: each row in turn takes its best free column, where that is >= the threshold.
 
-    allow_taken: a row looks at taken columns too, and gets nothing when its best is one of them.
+    allow_taken: a row considers taken columns too, and gets nothing when its best is one of them.
     """
     pairs: list[tuple[int, int]] = []
     free = np.ones(table.shape[1], dtype=bool)

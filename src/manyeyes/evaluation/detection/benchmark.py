@@ -74,7 +74,7 @@ def run_scenario(
 ) -> list[list[MetricAccumulator]]:
     """All methods of each configuration on one scenario; a function of its arguments alone.
 
-    The configurations have the same weights, view and history: each sweep is read and looked at once between them.
+    The configurations have the same weights, view and history: each sweep is read and processed once for all of them.
     """
     torch.set_num_threads(1)
     first = configs[0]

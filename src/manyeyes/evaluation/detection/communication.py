@@ -4,7 +4,7 @@
 A record is one message as it left its sender (header, sections, checksums: everything), whether or not it arrived. An
 empty message counts as 0 bytes in every mean. ``ab_log2_of_mean`` is the papers' "AB": the base-2 logarithm of the mean
 bytes of a message; ``ab_mean_of_log2`` averages the logarithms and is smaller (Jensen), and is over non-empty messages
-only, since an empty one has no logarithm. Rates suppose ten frames a second unless told otherwise.
+only, since an empty one has no logarithm. Rates assume ten frames a second by default.
 
 :func:`compute_paper_bytes` is CoSTr's Eq. 13: float32 features and two float32 indices for each token; no header, no pose.
 """

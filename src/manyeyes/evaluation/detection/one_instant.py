@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording in which everybody looks once a scenario, at an instant of the seed: a crowd of drivers, not a film."""
+"""A recording with one snapshot a scenario, at an index drawn from the seed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SingleFramePerScenario:
         return self.recording.scenarios
 
     def length(self, scenario: str) -> int:
-        """One."""
+        """Return 1, the number of snapshots."""
         return 1
 
     def eval_indices(self, scenario: str) -> range:

@@ -78,14 +78,14 @@ class CachedRecording:
 class NearestAgents:
     """The ego and the agents that are truly nearest to it when a scenario's first judged frame comes, ``num_agents`` in all.
 
-    Scenarios that have fewer are left out. The choice holds for the whole scenario, so that nobody comes and goes. The truth
-    stays that of everybody: what is to be found does not shrink with the number of those who look. Its rows of agents that
+    Scenarios that have fewer are left out. The choice holds for the whole scenario, so that the set of agents
+    is constant. The ground truth stays that of all agents, whatever num_agents is. Its rows of agents that
     are left out stand behind those of the frames.
     """
 
     def __init__(self, recording: Recording, num_agents: int) -> None:
         if num_agents < 1:
-            raise ConfigError(f"At least one agent looks; got {num_agents}.")
+            raise ConfigError(f"num_agents is at least 1; got {num_agents}.")
         self._recording, self._num_agents = recording, num_agents
         self._chosen: dict[str, frozenset[int]] = {}
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do liars move the map? What honest agents alone agree on, against what the same agents and the liars give.
+"""Displacement of a fused map by malicious agents, against the map of the honest agents alone.
 
-A crowd of 200 in which a share of agents is malicious (their elements are moved by 1 to 4 m, each its own way or all the same
-way) is fused three times: without the malicious agents' observations, with them, and with the same observations free of their
-lie. Judged are the stations of published lines of the honest map that five or more agents saw: how far across the nearest
+A fleet of 200 observations with a fraction of malicious agents (their elements are moved by 1 to 4 m, independently or all alike)
+is fused three times: without the malicious agents' observations, with them, and with the same observations without the
+attack. Evaluated are the stations of published lines of the honest map that five or more agents saw: how far across the nearest
 published line of its kind in the other map each lies (along a line there is no place to be moved from). Where no such line is
 within 2 m the station is lost, which counts as moved. More observations move a map even when they are true, since it lies where
-claims that scatter have their mode: ``num_displaced_without_attack`` counts that, and is what ``moved`` is to be held against.
+claims that scatter have their mode: ``num_displaced_without_attack`` counts that, and is the reference of ``num_displaced``.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ ATTACKS = ("independent", "colluding")
 
 @dataclass(frozen=True)
 class AdversarialResult:
-    """One crowd with liars. num_stations: judged; num_lost: with no line near; num_displaced: beyond the bar, lost included.
+    """One trial with malicious agents. num_stations: evaluated; num_lost: without a line nearby; num_displaced: beyond the
+    threshold, lost ones included.
 
-    num_displaced_without_attack: as moved, when the same agents say the same without their lie.
+    num_displaced_without_attack: as num_displaced, for the same observations without the attack.
     """
 
     place: str
@@ -117,7 +118,7 @@ def load_or_run_job(job: AdversarialJob) -> AdversarialResult:
 
 
 def run_adversarial_job(job: AdversarialJob) -> AdversarialResult:
-    """One trial."""
+    """Run one trial of an attack."""
     trial, experiment = job.trial, run_trial(job.trial)
     honest_map, num_displaced_without_attack = _fuse_without_attack(_without_attack(trial), job.settings)
     displacement_m = measure_displacement(
@@ -141,14 +142,14 @@ def run_adversarial_job(job: AdversarialJob) -> AdversarialResult:
 
 
 def _without_attack(trial: FleetTrial) -> FleetTrial:
-    """The trial whose malicious agents say what they saw: one and the same for every manner and size of lie."""
+    """The trial without displacement of elements; the same for every kind and size of attack."""
     fleet_config = replace(trial.fleet_config, attack_mode="independent", malicious_offset_m=(0.0, 0.0))
     return replace(trial, view_label="truthful", fleet_config=fleet_config)
 
 
 @lru_cache(maxsize=1)
 def _fuse_without_attack(trial: FleetTrial, settings: MethodSettings) -> tuple[VectorMap, int]:
-    """The map of the honest agents alone, and how many of its stations the others move by telling the truth."""
+    """The map of the honest agents alone, and how many of its stations the other agents displace without an attack."""
     experiment = run_trial(trial)
     honest_observations = [o for o, role in zip(experiment.observations, experiment.fleet.roles) if role != MALICIOUS]
     honest_map, full_map = (

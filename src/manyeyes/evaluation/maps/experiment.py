@@ -68,17 +68,17 @@ class FleetExperiment:
 
     @property
     def place(self) -> Place:
-        """Where it is."""
+        """The place of the trial, read once."""
         return self.fleet.place
 
     @property
     def observations(self) -> tuple[Observation, ...]:
-        """All that a method is told."""
+        """The observations that a method receives."""
         return self.fleet.observations
 
     @cached_property
     def truth(self) -> MapElements:
-        """The true elements that were in somebody's view, at the time of the last observation."""
+        """The true elements that were in view of any agent, at the time of the last observation."""
         last = max((o.time_ns for o in self.observations), default=0)
         full_map = self.place.clip_to_area(self.fleet.changing_map.at(last), min_line_m=MIN_PART_LENGTH_M)
         area = compute_observed_area([o.view for o in self.observations], self.fleet.true_poses)

@@ -2,8 +2,8 @@
 """Tuning every method with the same budget, on places that no study judges.
 
 Each method gets the same number of configurations: its defaults, then draws from the table below, keyed by its name, so that more
-trials extend fewer. A configuration's worth is the mean mAP (exact, narrow; crossing and divider) over the tuning places and
-counts, one seed that no study uses; of equal ones the first stays. Fields that all rivals share (pre-filter, score and state:
+trials extend fewer. A configuration is scored by the mean mAP (exact, narrow; crossing and divider) over the tuning places and
+counts, one seed that no study uses; of equal ones the first stays. Fields that all baselines share (pre-filter, score and state:
 ``rules.``) are drawn too. Our own method is tuned by the same draws.
 """
 

@@ -183,7 +183,7 @@ def read_map_result(path: Path) -> MapStudyResult | None:
 
 
 def evaluate_map_rows(elements: MapElements, truth: MapElements) -> tuple[tuple[ApRow, ...], tuple[KindRow, ...]]:
-    """The numbers of a map that is no cell: somebody's own, against somebody's own truth."""
+    """Evaluate a map against a ground-truth map, outside of a study."""
     metrics = evaluate_map(elements, truth)
     return tuple(make_ap_rows(metrics)), tuple(make_kind_rows(metrics))
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where maps disagree, as pieces of lines: what one says and nothing of the same kind of another lies within a distance of.
+"""Differences of two maps as pieces of lines: parts of one map without an element of the same kind in the other nearby.
 
-Lines are looked at every 0.5 m; neighbouring samples beyond the distance form a piece, and pieces below 1.5 m are left out.
+Lines are sampled every 0.5 m; neighbouring samples beyond the distance form a piece, and pieces below 1.5 m are left out.
 """
 
 from __future__ import annotations

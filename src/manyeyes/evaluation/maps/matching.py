@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chamfer distance between map elements in three named ways, and who matches whom. The definition stands in map_quality."""
+"""Chamfer distance between map elements in three named ways, and the matching by it. evaluation.maps.metrics defines both."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Lines:
         return self.points[self.offsets[row] : self.offsets[row + 1]]
 
     def lengths(self) -> Floats:
-        """(N,) metres."""
+        """Length of each line, (N,) metres."""
         step = np.hypot(*np.diff(self.points, axis=0).T) if len(self.points) > 1 else np.zeros(0)
         line, start = segments_of(self.offsets)
         return np.bincount(line, weights=step[start], minlength=len(self)).astype(np.float64)
@@ -142,7 +142,7 @@ def rank_lines(lines: Lines) -> Ints:
 def match_lines(table: Floats, order: Ints, threshold_m: float) -> Ints:
     """(N,) the truth row that each prediction takes, -1 for a false positive.
 
-    Predictions in their order look only at their nearest truth (of equally near ones the first), and take it when it is
+    Predictions in their order consider only their nearest truth (of equally near ones the first), and take it when it is
     free and within the threshold; there is no second choice.
     """
     taken = np.full(table.shape[0], -1, dtype=np.int64)

@@ -3,7 +3,7 @@
 
 **What is judged.** Two tables of map elements in one metric frame, kind by kind (divider, boundary, crossing, stop_line);
 kinds never mix. A crossing enters as its closed ring. Elements with fewer than two points or without length are left out.
-Nothing is clipped here: whoever calls cuts the truth to what was observed (evaluation.observed) and says so.
+Nothing is clipped here: the caller clips the truth to the observed area (evaluation.maps.observed_area).
 
 **Average precision** (after MapTR, ICLR 2023; StreamMapNet, WACV 2024). The Chamfer distance of two elements is half the sum
 of the two directed mean distances, Euclidean, in the plane. It is measured in three named ways:
@@ -15,7 +15,7 @@ of the two directed mean distances, Euclidean, in the plane. It is measured in t
   of about a quarter of the sample spacing, 0.76 m on a line of 300 m, which no map can get below; this one has none.
 
 Predictions are walked by descending score; ties by descending length, then by the smallest x, then y, of the element, so that
-the order in which a map is stored never matters. Each looks only at its nearest truth, and is a true positive when that
+the order in which a map is stored never matters. Each considers only its nearest truth, and is a true positive when that
 distance is at most the threshold and the truth is still free; else it is a false positive: there is no second choice. With
 hits cumulated along that walk, r = tp / n_truth, p = tp / (tp + fp), p made non-increasing from the right, AP = sum of
 (r_i - r_{i-1}) p_i. The AP of a kind is the mean over the thresholds .5, 1, 1.5 m (or 1, 1.5, 2 m: ``wide``). mAP is the mean

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of the truth that was there to be seen: the union of all views, after GlobalMapNet's protocol (2024).
 
-Views are placed by the *true* poses: an agent saw what it saw, wherever it believes that it was. Open lines are cut at the
+Views are placed by the *true* poses: the sensors measured from there, whatever the prior poses were. Open lines are cut at the
 border of the area and keep parts of at least 2 m; a crossing is kept whole when at least half of its area lies inside, since
 half a crossing is no truth that any map should be held against.
 """

@@ -2,9 +2,9 @@
 """What the best map could be if one thing were known: rows of a study that no method may enter.
 
 ``oracle-cuts``: the truth, each line cut in the middle: what cutting alone costs. ``oracle-pose``: our own fusion, every
-observation at its true pose. ``oracle-association``: who shows what is known, poses are as claimed: every observed point is
-laid onto its true element by the true pose, and each metre of that element moves across by the mean of what the claimed poses
-say; metres that nobody saw are left out where they are more than 6 m. A crossing moves as a whole.
+observation at its true pose. ``oracle-association``: the true associations are known, poses are the priors: every observed point is
+laid onto its true element by the true pose, and each metre of that element moves across by the mean offset at the
+prior poses; metres without observation are left out where they are more than 6 m. A crossing moves as a whole.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def split_in_half(elements: MapElements) -> MapElements:
 
 
 def fuse_with_true_association(experiment: FleetExperiment) -> MapElements:
-    """Every true element that somebody saw, moved by the mean of what the claimed poses say about it."""
+    """Every observed true element, moved by the mean offset of its observations at the prior poses."""
     truth = experiment.place.truth
     points_by_element: dict[int, list[Floats]] = {}
     for k, (observation, pose) in enumerate(zip(experiment.observations, experiment.fleet.true_poses)):

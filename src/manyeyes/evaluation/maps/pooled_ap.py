@@ -157,7 +157,7 @@ def average_samples(bootstraps: Sequence[BootstrapSamples]) -> BootstrapSamples:
 
 @dataclass(frozen=True)
 class MapMarginTest:
-    """A paired difference of mAP and a bar; the verdict says whether the whole interval is at or above it."""
+    """A paired difference of mAP and its margin; the verdict compares the whole interval with the margin."""
 
     description: str
     difference: Interval

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ways to make a map of observations that studies compare, by name, with the settings that tuning found.
 
-A method is told the observations and the frame, nothing else. Oracles, which are told more, are named in map_oracle.
+A method receives the observations and the frame, nothing else. Oracles receive more; evaluation.maps.oracles names them.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class MethodSettings:
 
 ConfigChanges = tuple[tuple[str, Any], ...]
 # What ``manyeyes map evaluate --study tuning`` found, as changes of the defaults; a method that is not here stays with its own.
-# Ours: one agent's word publishes, as it does for every rival, since average precision ranks: a line that one agent saw costs
-# nothing behind those that many saw.
+# Ours: one agent suffices to publish, as in every baseline. Average precision ranks by score, so a line of one agent with a low
+# score costs nothing behind lines of many agents.
 TUNED_CHANGES: dict[str, ConfigChanges] = {
     OURS: (
         ("stations.evidence.publish_log_odds", 1.0),
@@ -106,7 +106,7 @@ def fuse_observations(
     if method == OURS:
         return fuse(observations, settings.ours, frame)
     if method not in BASELINES:
-        raise ConfigError(f"{method!r} is told more than observations; known: {', '.join(METHODS)}.")
+        raise ConfigError(f"{method!r} needs more than observations; known: {', '.join(METHODS)}.")
     baseline = importlib.import_module(f"manyeyes.maps.baselines.{BASELINE_MODULES[method][0]}")
     config = settings.config_of(method)
     return baseline.fuse(observations, make_default_config(method) if config is None else config, frame)

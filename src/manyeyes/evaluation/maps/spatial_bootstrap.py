@@ -4,8 +4,8 @@
 The ground is divided into squares of 64 m, anchored at the frame's origin. True and predicted elements belong to the square of
 their middle (of the truth that it hit, for a true positive, so that a hit is never without its truth), pieces of length to the
 square where they lie. Squares are drawn with replacement, 1,000 times; AP is recomputed on each draw from the ranking of the whole
-map. Source: Efron and Tibshirani 1993, ch. 13; blocks, since neighbours share observations and hence errors. It says how much
-the number depends on the ground that was mapped, not on which observations came: for that, a study repeats with other seeds.
+map. Source: Efron and Tibshirani 1993, ch. 13; blocks, since neighbours share observations and hence errors. The interval
+covers the choice of the mapped ground, not that of the observations: for that, a study repeats with other seeds.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Studies of map fusion: methods side by side over places, counts of observations and seeds, held against bars.
+"""Studies of map fusion: methods side by side over places, counts of observations and seeds, compared with margins.
 
 A cell is a place and a seed; intervals are percentile bootstraps over cells (Efron and Tibshirani, 1993), 95 %, and a difference
-of two methods is paired over the same cells. The best rival at a count is the one with the greatest mean there. A bar is judged
-by the whole interval, as everywhere: where it straddles the bar, the table says "not resolved".
+of two methods is paired over the same cells. The best baseline at a count has the greatest mean there. A margin is met
+or not met by the whole interval; where the interval contains the margin, the verdict is "inconclusive".
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class MethodSummary:
 
 @dataclass(frozen=True)
 class StudyMarginTest:
-    """A bar of the study, what was measured against it, and the word on it: reached, missed or not resolved."""
+    """A margin of the study, the measured value and its interval, and the verdict."""
 
     group: str
     description: str
@@ -204,7 +204,7 @@ def _check_best_baseline(
     if baseline is None:
         return []
     gain = compute_paired_difference(results, OURS, baseline, "mean_ap", protocol, thresholds)
-    description = f"mAP ({protocol}, {thresholds}) above the best rival"
+    description = f"mAP ({protocol}, {thresholds}) above the best baseline"
     return [
         StudyMarginTest(
             group,
@@ -220,7 +220,7 @@ def _check_best_baseline(
 
 
 def _check_dividers(group: str, results: Sequence[MapStudyResult], methods: Sequence[str]) -> list[StudyMarginTest]:
-    """AP of dividers: twice the best rival's, or half of its remaining error."""
+    """AP of dividers: twice the best baseline's, or half of its remaining error."""
     baseline = find_best_baseline(results, methods, "divider", "exact", "narrow")
     if baseline is None:
         return []
@@ -245,7 +245,7 @@ def _check_dividers(group: str, results: Sequence[MapStudyResult], methods: Sequ
 def find_best_baseline(
     results: Sequence[MapStudyResult], methods: Sequence[str], kind: str, protocol: str, thresholds: str
 ) -> str | None:
-    """The rival with the greatest mean AP; of equal ones the first. Oracles are no rivals."""
+    """The baseline with the greatest mean AP; of equal ones the first. Oracles are no baselines."""
     baselines = [m for m in methods if m != OURS and m not in ORACLES]
     means = [_mean([c.get_ap(kind, protocol, thresholds) for c in results if c.method == m]) for m in baselines]
     known = [(-mean, k) for k, mean in enumerate(means) if not math.isnan(mean)]

@@ -34,8 +34,8 @@ COMPUTED_BY = (__name__, "manyeyes.evaluation.maps.tile_prediction")
 
 @dataclass(frozen=True, eq=False)
 class TilePrediction:
-    """One tile as one row of a table draws it. predicted, truth: in the tile's frame; frame_bytes: bytes of each look that came
-    to it.
+    """The prediction of one tile for one row of a table. predicted, truth: in the tile's frame; frame_bytes: bytes of each frame
+    that the tile was predicted from.
     """
 
     row_name: str

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What studies of the map model draw: local maps, tiles from one look and from more, and tiles under errors of claimed poses.
+"""Predictions for the studies of the map model: local maps, tiles from one or more frames, and tiles under pose noise.
 
-Every look reaches its tile as packets, an agent's own too (agents.mapping). Sources: CrowdMap Tables 1 and 2; specs: maps.md 1.5.
+Features of every frame are encoded as packets, those of the first agent too (agents.map_features). Sources: CrowdMap, Tables 1
+and 2.
 """
 
 from __future__ import annotations
@@ -40,14 +41,14 @@ SINGLE_VEHICLE = "one vehicle"
 
 @dataclass(frozen=True)
 class LocalPredictor:
-    """What lies ahead of each agent of a scenario, from its own look alone; a row for vehicles and one for roadside units.
+    """Predict the local map ahead of each agent of a scenario; one row for vehicles and one for roadside units.
 
-    The model draws its whole tile about the agent, and what lies in the window is cut out of it, as agents do who survey locally.
+    The model predicts its whole tile around the agent; the window is cut out of it, as in the map mode local.
     """
 
     @property
     def cache_key(self) -> str:
-        """Nothing to set."""
+        """The configuration, which names stored results."""
         return repr(self)
 
     def __call__(self, map_model: MapModel, source: TileSource, scenario: str, seed: int) -> Sequence[TilePrediction]:
@@ -69,17 +70,17 @@ class LocalPredictor:
 
 @dataclass(frozen=True)
 class SemiGlobalPredictor:
-    """The tile about a scenario's first agent from one look, and from more of a crowd; a row for each number of looks."""
+    """Predict the tile around a scenario's first agent from one frame and from more; one row for each number of frames."""
 
     frame_counts: tuple[int, ...] = (1, 2, 5, 10)
 
     @property
     def cache_key(self) -> str:
-        """The numbers of looks."""
+        """The configuration, which names stored results."""
         return repr(self)
 
     def __call__(self, map_model: MapModel, source: TileSource, scenario: str, seed: int) -> Sequence[TilePrediction]:
-        """One drawing a number of looks; all share what they are a part of."""
+        """One prediction for each number of frames; all share the frames of the tile."""
         config = map_model.config
         tile = sample_fleet_tile(source, scenario, seed, max(self.frame_counts), config.tile, config.bev.grid)
         received = [_ReceivedFeatures.of(map_model, frame) for frame in tile.frames]
@@ -95,7 +96,7 @@ class PoseNoisePredictor:
 
     sigma_m: of each axis; headings err by as many degrees times deg_per_m. The first agent knows its own pose, in whose frame the
     tile lies. pose_correction: corrects others' poses by objects that both detect; what it leaves out is not drawn from.
-    detector_weights: the weights that detect; in every row boxes travel with looks, and are in their bytes.
+    detector_weights: the weights that detect; in every row boxes are sent with the features and count in the bytes.
     """
 
     sigma_m: float = 0.5
@@ -140,7 +141,7 @@ class PoseNoisePredictor:
 
 @dataclass(frozen=True)
 class _ReceivedFeatures:
-    """A look as it came through the air. messages: its message, none where nothing was seen; num_bytes: its bytes."""
+    """The received features of a frame. messages: its message, none without features; num_bytes: the bytes of that message."""
 
     messages: tuple[Message, ...]
     num_bytes: tuple[int, ...]
@@ -162,7 +163,7 @@ def _predict(
 
 
 def _make_cache(detector: str, frame: AgentFrame, previous_frames: Sequence[AgentFrame]) -> PerceptionCache:
-    """An agent's eyes that saw its sweep before this one."""
+    """A perception cache that has processed the agent's previous sweeps."""
     cache = PerceptionCache(_load_detector(detector))
     for earlier in previous_frames:
         if earlier.agent_id == frame.agent_id:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which looks a tile is drawn from, seed by seed: a crowd's, those that meet at one instant, or one agent's own.
+"""Sample the frames of a tile by seed: of a fleet, of the agents of one snapshot, or of one agent.
 
-A map stands still, so looks of any time at a place, of other scenarios of the town too, are looks at the same thing (CrowdMap
-section 3.1: random scans of vehicles and infrastructure). Of a crowd, looks that newly cover more of the tile come more often and
-sooner (specs: maps.md 1.5), judged by rectangles on the ground and not by the truth; the first is the agent's own, about whom the
-tile lies, and a smaller number of looks takes the first of them.
+A map is static, so frames of any time and of other scenarios of the town observe the same elements (CrowdMap, section 3.1: random
+scans of vehicles and infrastructure). Frames of a fleet are drawn with weights: those that newly cover more of the tile are drawn
+more often and earlier. Coverage is measured by rectangles on the ground, not by the truth. The first frame is that of the agent at
+the centre of the tile; a smaller number of frames takes the first ones.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from manyeyes.ops.keyed_random import keyed_generator
 Floats = NDArray[np.float64]
 
 MIN_COVERAGE, RASTER_SIZE_M = 0.1, 2.0
-"""The share of a tile below which a look is none at it, and the raster on which shares are counted."""
+"""The fraction of a tile that a frame covers at least, and the cell size for counting it."""
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,9 @@ class TileSource:
 def sample_fleet_tile(
     source: TileSource, scenario: str, seed: int, max_frames: int, tile: BevGrid, view_area: BevGrid
 ) -> Tile:
-    """The tile about a scenario's first agent at an instant of the seed, and at most so many looks at it.
+    """The tile about a scenario's first agent at an index drawn from the seed, with at most max_frames frames.
 
-    view_area: the ground that a look covers, in its agent's frame.
+    view_area: the ground that a frame covers, in its agent's frame.
     """
     rng = keyed_generator("crowd", seed, scenario)
     own_frame = source.sample_snapshot(scenario, rng).frames[0]
@@ -99,7 +99,7 @@ def sample_meeting(source: TileSource, scenario: str, seed: int) -> Snapshot:
 
 
 def make_local_tile(source: TileSource, snapshot: Snapshot, row: int) -> tuple[Tile, BevGrid]:
-    """What lies ahead of one agent, from its own look alone: 30 m by 30 m of a vehicle, 50 m by 30 m of a roadside unit."""
+    """Make the tile of one agent's own frame: 30 m by 30 m ahead of a vehicle, 50 m by 30 m ahead of a roadside unit."""
     frame = snapshot.frames[row]
     x0, y0, x1, y1 = MAP_MODES["local"].window(frame)
     window = BevGrid(x0, y0, -5.0, x1, y1, 5.0, pillar=1.0)

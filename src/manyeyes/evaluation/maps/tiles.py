@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tiles of a drive: where they lie, who looked at them and when, and what is truly there.
+"""Tiles of a drive: their places, the frames that observe them, and their ground truth.
 
-A tile is judged against all that the true map has within it, seen or not: what one vehicle cannot see is what others are for.
-Training leaves out what no look met (training.map_targets), else a model learns to invent. Lines are cut at the tile's border,
+A tile is evaluated against all elements of the true map within it, observed or not, since collaboration is to recover what one
+vehicle cannot see. Training leaves out elements that no frame observed (training.maps.targets), to avoid false positives.
+Lines are cut at the tile's border,
 rings too, and stay rings; parts of lines below 2 m and of rings below 3 m² are no elements.
 """
 
@@ -30,7 +31,7 @@ MAP_SPACING_M = 1000.0
 
 @dataclass(frozen=True)
 class Tile:
-    """A tile of one scenario's town. world_from_tile: upright, float64. frames: who looked, in the order in which they are taken.
+    """A tile of one scenario's town. world_from_tile: upright, float64. frames: the observing frames, in the order of use.
 
     truth: in the tile's frame, cut to it.
     """

@@ -106,7 +106,7 @@ def iterate_landmark_pairs(
 ) -> Iterator[LandmarkPair]:
     """The first agent and each other, at every so many-th judged instant of every scenario.
 
-    Landmarks are boxes of at least score_min; net: who describes them, for correctors that go by their looks.
+    Landmarks are boxes of at least min_score. net: computes their descriptors, for correctors that use them.
     """
     for scenario in recording.scenarios:
         caches: dict[int, PerceptionCache] = {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well FeaKM finds poses, beside correctors that look at boxes alone, on the same keypoints and claims."""
+"""Pose errors of FeaKM and of correctors that use boxes only, on the same keypoints and prior poses."""
 
 from __future__ import annotations
 

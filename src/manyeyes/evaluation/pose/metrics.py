@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good an estimated relative pose is, and how well an estimator knows when not to answer (specs/pose.md 3.3).
+"""Metrics of an estimated relative pose: success, errors, coverage, consistency of the covariance, and risk-coverage.
 
 A frame is *answered* where objects gave the pose (status OK, CORRECTED or CONFLICT). RTE is the length of the
 translation's error (m), RRE the size of the yaw's (deg). *Success at l* is the share of ALL frames answered with RTE
@@ -29,7 +29,7 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3
 Floats = NDArray[np.float64]
 
 COMMON_OBJECT_BUCKETS = ((0, 0), (1, 1), (2, 2), (3, 4), (5, 7), (8, 10**9))
-"""Numbers of common objects by which results are listed (specs/pose.md 3.2)."""
+"""Ranges of the number of common objects by which results are listed."""
 CHI2_3DOF_95 = 7.815
 
 
@@ -197,14 +197,14 @@ def make_oracle_estimate(truth: Floats, prior: PosePrior | None) -> PoseEstimate
 
 @dataclass(frozen=True)
 class PriorNoise:
-    """Errors of a claimed relative pose (specs/pose.md 3.2). sigma_m, sigma_deg: their size; drawn by (seed, scene,
+    """Errors of a prior relative pose. sigma_m, sigma_deg: their size; drawn by (seed, scene,
     frame), the same unit draw at every size.
 
     kind: ``gaussian`` (of the other agent); ``gaussian_all`` (of both, in the world, so that the ego's yaw moves the
     other by its distance); ``laplace`` (scale sigma, so sqrt 2 as wide); ``bias`` (one offset a scene); ``walk``
     (each frame adds a tenth); ``latency`` (along the other's heading, sigma_m at most); ``heavy`` (one claim in ten
     is ten times as far off); ``offset`` (five sigma_m off in any direction); ``no_prior`` (anywhere within 100 m, any
-    yaw, and says so); ``none`` (no claim).
+    yaw, with the covariance of that); ``none`` (no prior).
     """
 
     kind: str = "gaussian"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How sure a number is: percentile bootstrap over *scenarios*, and the verdict on a bar.
+"""Confidence intervals by percentile bootstrap over *scenarios*, and the verdict on a margin.
 
 Frames of one scenario are strongly correlated, so whole scenarios are drawn with replacement, never frames. A scenario
 drawn k times stands k times in the list of detections and in the count of truth; since its copies have equal scores,
@@ -175,7 +175,7 @@ def mean_interval(
 
 
 def compare_to_margin(margin: float, low: float, high: float) -> MarginVerdict:
-    """The verdict on a bar: reached when the whole interval is at or above it, missed when it is below, else undecided."""
+    """Compare an interval with a margin: met when all of it is at or above, not met when all is below, else inconclusive."""
     if low >= margin:
         return "met"
     return "not met" if high < margin else "inconclusive"

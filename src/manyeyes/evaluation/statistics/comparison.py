@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Methods side by side, held against the bars that they are to clear.
+"""Methods side by side, compared by paired differences and margins.
 
-A bar is judged on the paired difference over scenarios: "reached" when the whole 95 % interval is at or above it, "missed"
-when it is below, else "inconclusive". One scenario alone resolves nothing.
+A margin is tested on the paired difference over scenarios: "met" when the whole 95 % interval is at or above it, "not met" when
+it is below, else "inconclusive". One scenario alone is always inconclusive.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from manyeyes.evaluation.statistics.bootstrap import Interval, MarginVerdict, co
 
 @dataclass(frozen=True)
 class Margin:
-    """What a method is to be better than a rival by, in AP at an IoU threshold."""
+    """The margin by which a method is to be better than a baseline, in AP at an IoU threshold."""
 
     method: str
     baseline: str
@@ -34,7 +34,7 @@ MARGINS = (
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """AP of a method less that of a rival, on the same resampled scenarios; bar and verdict are None where none is set."""
+    """AP of a method less that of a baseline, on the same resampled scenarios; margin and verdict are None where none is set."""
 
     method: str
     baseline: str

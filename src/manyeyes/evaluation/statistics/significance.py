@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Claims of a study: a paired difference between two of its cells, held against a bar where one is set."""
+"""Margin tests of a study: a paired difference between two of its results, compared with a margin."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from manyeyes.evaluation.study import ResultGrid, ResultKey
 
 @dataclass(frozen=True)
 class MarginTest:
-    """AP of one cell minus that of another; the verdict says whether the whole interval is at or above the bar."""
+    """AP of one result minus that of another, and the verdict on the margin."""
 
     description: str
     iou: float
@@ -24,7 +24,7 @@ class MarginTest:
 def check_margin(
     description: str, results: ResultGrid, key: ResultKey, baseline_key: ResultKey, iou: int, margin: float
 ) -> MarginTest:
-    """The claim that a cell's AP minus another's is at least the bar. iou counts the thresholds of IOUS."""
+    """Test that a result's AP minus the baseline's is at least the margin. iou: row of IOU_THRESHOLDS."""
     difference = results.paired_difference(key, baseline_key, iou)
     has_several_scenarios = difference.num_scenarios > 1
     verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_scenarios else "inconclusive"

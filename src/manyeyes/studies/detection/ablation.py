@@ -78,7 +78,7 @@ def _parse_variant(name: str, weights: str, max_bytes: str) -> _AblationVariant:
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the ablation study and write its report."""
     variants = [
         _parse_variant(name, *words.partition("@")[::2])
         for name, words in parse_checkpoints(options.checkpoints, files="weights.safetensors[@BYTES]").items()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AP against bytes a message, for each way to choose tokens and each way to write them: CoSTr, Fig. 3.
+"""AP against bytes a message, for each token selection and each token encoding: CoSTr, Fig. 3.
 
 Bytes are those handed to the bus: headers, indices, scales, checksums and all, mean over messages. The budget of a message goes
 down to one packet. "all" is every token that the trained pruning left; at float32 it is what the others are held against.
@@ -59,7 +59,7 @@ class BandwidthRow:
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the bandwidth study and write its report."""
     context, methods = prepare_study(options, console), resolve_token_selection(options)
     encodings = _resolve_encodings(options)
     budgets = (*sorted(options.budgets or BUDGETS), None)
@@ -148,7 +148,7 @@ def check_margins(
     budgets: Sequence[int | None],
     methods: Sequence[str],
 ) -> tuple[MarginTest, ...]:
-    """What is claimed of our selection: little lost at few bytes, never worse than a rival at equal budgets."""
+    """Test our token selection: a small AP drop at few bytes, and not below a baseline at equal budgets."""
     if OURS not in methods:
         return ()
     out: list[MarginTest] = []

@@ -42,7 +42,7 @@ class NumAgentsRow:
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the study of numbers of agents and write its report."""
     if get_protocol(options.protocol).min_points_in_gt:
         raise ConfigError(f"The study 'agents' cannot count points in true boxes, as protocol {options.protocol} does.")
     context = prepare_study(options, console)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One frame under errors, methods side by side: CoSTr, Fig. 4, at 0.1 s, 0.2 degrees, 0.2 m.
 
-The frame is the middle one of the first scenario that has the most agents: none is chosen for its looks.
+The frame is the middle one of the first scenario that has the maximum number of agents; it is not selected by results.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class QualitativeRow:
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the qualitative study and write its image."""
     context = prepare_study(options, console)
     config, recording = COMBINED.apply_to(context.base), context.opener()
     scenario = max(recording.scenarios, key=lambda name: len(recording.agents(name)))
@@ -68,7 +68,7 @@ def run(options: Options, console: Console) -> None:
     ]
     result_rows = [_make_row(step, protocol) for step in steps]
     images = [_draw_image(step, row, detector.config.detection_range) for step, row in zip(steps, result_rows)]
-    save_png(_tile_images(images), options.out / "picture.png")
+    save_png(_tile_images(images), options.out / "qualitative.png")
     results_table = _make_results_table(f"{scenario}, frame {frame_index}, {COMBINED.name}", result_rows)
     condition = Condition(COMBINED.name, config)
     payload: dict[str, object] = {"scenario": scenario, "frame": frame_index, "rows": result_rows}

@@ -2,8 +2,8 @@
 """How much delay, errors of pose and lost packets cost each method: CoSTr, Table II, with loss and all together beside.
 
 Oracle rows tell what is lost to geometry from what is lost to the model: of each joint disturbance, the row with true poses has
-its delay and loss alone, the row without delay its errors of pose alone. Early fusion is the bound. Ego alone hears nobody,
-hence is the same under every disturbance: it is played once. --checkpoints name=weights.safetensors adds
+its delay and loss alone, the row without delay its errors of pose alone. Early fusion is the bound. No fusion receives nothing,
+hence is the same under every perturbation: it is run once. --checkpoints name=weights.safetensors adds
 baselines, such as variants of the ablation; for a fair comparison --weights is then the variant of as many steps.
 """
 
@@ -87,7 +87,7 @@ class RobustnessRow:
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the robustness study and write its report."""
     context = prepare_study(options, console)
     methods = context.base.methods
     collaborative = tuple(m for m in methods if m != NO_FUSION)
@@ -132,7 +132,7 @@ def run(options: Options, console: Console) -> None:
 
 
 def _result_key(perturbation: Perturbation, method: str, baselines: Sequence[str]) -> ResultKey:
-    """Where a method, or a rival's weights, lies in the sweep."""
+    """The result key of a method, or of a baseline's weights."""
     return (f"{method}: {perturbation.name}", OURS) if method in baselines else (perturbation.name, method)
 
 

@@ -2,7 +2,7 @@
 """The system as a whole: every agent judged as ego in turn, all senders within one budget of the channel (CoSTr, Eq. 2).
 
 What is maximised is the AP of all egos together, their detections in one list. What one sender does not need of its part goes
-to the others (comms/bandwidth.py). A broadcast is heard by everybody and counted once. The largest budget is what 27 Mbit/s
+to the others (comms/bandwidth.py). A broadcast is received by all agents and counted once. The largest budget is what 27 Mbit/s
 carry in 100 ms. Ways of collaboration that know no budget stand beside.
 """
 
@@ -50,7 +50,7 @@ class SharedBandwidthRow:
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the study of shared bandwidth and write its report."""
     context, selected = prepare_study(options, console, all_egos=True), resolve_token_selection(options)
     others = tuple(m for m in context.base.methods if m not in selected)
     conditions = [

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """CrowdMap's Table 3: {local, semi-global} maps of agents x every way to fuse them, on the map of each town; and its Fig. 4.
 
-Every agent looks once a scenario, at an instant of the seed, and what it says reaches the map as bytes. All rows of a town are
-held against one truth, that in view of anybody's tile, for a short view is part of what a local map is; "in own view" holds each
-against what its agents could see.
+Every agent sends one frame a scenario, at an index drawn from the seed, as bytes. All rows of a town are evaluated against one
+ground truth, the union of all tiles, since a short range is part of a local map; "in own view" evaluates each row in its own view.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ MAP_MODES = (SEMI_GLOBAL, LOCAL)
 TARGET_MARGIN = 0.10
 FIGURE_HALF_SIZE_M = 150.0
 PAPER_TABLE = StudyTable(
-    "CrowdMap's Table 3: two crossroads of DAIR-V2X; no bar and no rival",
+    "CrowdMap's Table 3: two crossroads of DAIR-V2X; for reference only",
     ("method", "Map-06 AP ped", "AP div", "mAP", "Map-13 AP ped", "AP div", "mAP"),
     (
         ("MapTR + PolyMerge", "0.148", "0.085", "0.117", "0.618", "0.081", "0.350, printed 0.399"),
@@ -106,7 +105,7 @@ class TownResults:
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the study of full maps and write its report."""
     model, *others = resolve_models(options)
     if others:
         raise ConfigError(f"The study 'whole' takes one model: name it with --weights; got {1 + len(others)}.")
@@ -183,7 +182,7 @@ def _make_row(town: TownResults, key: MapKey, mean_ap: BootstrapSamples) -> Full
 
 
 def _check_margins(means: dict[str, dict[MapKey, BootstrapSamples]], methods: Sequence[str]) -> list[MapMarginTest]:
-    """The whole, semi-global and our fusion, less each local row with a rival's fusion, as the mean over towns."""
+    """Test semi-global maps with our fusion against each local row with a baseline fusion, as the mean over towns."""
     if OURS not in methods:
         return []
 
@@ -243,7 +242,7 @@ def _make_table(town: str, rows: Sequence[FullMapRow]) -> StudyTable:
 def _make_panels(
     town_results: Sequence[TownResults], means: dict[str, dict[MapKey, BootstrapSamples]]
 ) -> list[MapPanel]:
-    """For each town the truth, the best local row of a rival, and the whole, about the middle of what is true."""
+    """Draw for each town the truth, the best local baseline row, and the full map, centred on the truth."""
     out = []
     for town in town_results:
         local_values = {key: d.value for key, d in means[town.name].items() if key[0] == LOCAL and key[1] != OURS}

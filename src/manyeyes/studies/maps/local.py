@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CrowdMap's Table 1: what an agent draws ahead from its own look, 30 m by 30 m of a vehicle, 50 m by 30 m of a roadside unit.
+"""CrowdMap's Table 1: local maps of single agents, 30 m by 30 m ahead of a vehicle, 50 m by 30 m ahead of a roadside unit.
 
 The paper trains a MapTR for each kind of agent; here one model of tiles draws for both, and the window is cut out of its tile.
 Pictures: the paper's Fig. 2, drawings over the truth in pale.
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 WINDOWS = {VEHICLE: MAP_MODES["local"].vehicle_window, ROADSIDE: MAP_MODES["local"].roadside_window}
 PAPER_TABLE = StudyTable(
-    "CrowdMap's Table 1: DAIR-V2X, one camera an agent; no bar and no rival",
+    "CrowdMap's Table 1: DAIR-V2X, one camera an agent; for reference only",
     ("range", "agent", "AP ped", "AP div", "mAP"),
     (("30 x 30 m", VEHICLE, "0.745", "0.909", "0.827"), ("50 x 30 m", ROADSIDE, "0.772", "0.785", "0.778")),
 )
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the study of local maps and write its report."""
     models_used = resolve_models(options)
     tile_tables = predict_tables(options, console, models_used, LocalPredictor())
     names = tuple(WINDOWS)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tiles under errors of claimed poses, 0.5 m and 1 degree: clean, noisy, and noisy behind the corrector of claimed poses.
 
-Looks are those of agents that meet at one instant: the corrector goes by vehicles that both detect, and at other times they stand
-elsewhere. What the corrector wins back is held against half of what the errors cost: corrected - (clean + noisy) / 2 is at least 0.
+Frames are those of one snapshot, since the corrector matches vehicles that both agents detect, which move between snapshots.
+The corrector is to recover at least half of the AP drop: corrected - (clean + noisy) / 2 is at least 0.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ ROW_NAMES = (SINGLE_VEHICLE, CLEAN, NOISY, CORRECTED, CLEAN_CORRECTED)
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the study of map tiles under pose noise and write its report."""
     models_used = resolve_models(options)
     predictor = PoseNoisePredictor(pose_correction=PoseCorrection(options.pose_correction))
     tile_tables = predict_tables(options, console, models_used, predictor)

@@ -13,7 +13,7 @@ from manyeyes.studies.replay_options import FileChecks
 
 @dataclass(frozen=True)
 class Options:
-    """What is judged."""
+    """The map to evaluate, or the study to run."""
 
     folder: tyro.conf.Positional[Path | None] = None
     """The map's folder, of 'map fuse'; or nothing, with --study."""
@@ -43,7 +43,7 @@ class Options:
     scenario_stride: int = 1
     """Only every n-th scenario of it."""
     pose_correction: str = "voting"
-    """Who corrects claimed poses in the study 'map-pose-noise', by name."""
+    """Pose corrector of the study 'map-pose-noise', by name."""
     out: Path = Path("out/map-study")
     """Folder for a study: cells are kept there, and a study that was stopped goes on."""
     checks: FileChecks = field(default_factory=FileChecks)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a crowd says of a town, and the map that each method makes of it: one unit of the study 'whole', kept as files."""
+"""Observations of a recorded fleet in a town and the map of each method: one job of the study 'full-map', stored as files."""
 
 from __future__ import annotations
 

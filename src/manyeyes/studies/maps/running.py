@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 SENSORS = {("lidar",): "LiDAR", ("camera",): "camera", ("lidar", "camera"): "both"}
 """The rows of a table, whether there are weights for them or not."""
-HEADINGS = ("sensors", "row", "AP ped", "AP div", "mAP", "exact", "AP edge", "looks", "B/look", "B/tile")
+HEADINGS = ("sensors", "row", "AP ped", "AP div", "mAP", "exact", "AP edge", "frames", "B/frame", "B/tile")
 """AP and mAP in the way maptr, over crossings and dividers; exact: mAP in that way; edge: boundaries; B: bytes."""
 
 
@@ -180,7 +180,7 @@ def make_margin_table(margin_tests: Sequence[MapMarginTest], resampled_unit: str
 def select_for_figure(
     results: Sequence[TileStudyResult], size_of: Callable[[TileStudyResult], int], max_results: int = 3
 ) -> list[TileStudyResult]:
-    """So many cells of the first seed for a picture, evenly spaced in the order of what they weigh, not chosen for their looks."""
+    """Select results of the first seed for a figure, evenly spaced in the order of size, not by quality."""
     first_seed = sorted((c for c in results if c.seed == results[0].seed), key=lambda c: (size_of(c), c.scenario))
     indices = np.unique(np.linspace(0, len(first_seed) - 1, max_results + 2)[1:-1].round().astype(int))
     return [first_seed[index] for index in indices.tolist()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CrowdMap's Table 2: tiles of 120 m by 60 m from one vehicle's look, and together from more; with what that takes in bytes."""
+"""CrowdMap's Table 2: tiles of 120 m by 60 m from one vehicle's frame and from more frames, with their bytes."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 MARGIN, TARGET_MARGIN = 0.20, 0.30
 TILE_AREA = (-60.0, -30.0, 60.0, 30.0)
 PAPER_TABLE = StudyTable(
-    "CrowdMap's Table 2: DAIR-V2X, cameras; no bar and no rival",
-    ("looks", "method", "AP ped", "AP div", "mAP"),
+    "CrowdMap's Table 2: DAIR-V2X, cameras; for reference only",
+    ("frames", "method", "AP ped", "AP div", "mAP"),
     (("1", "MapTR", "0.182", "0.103", "0.143"), ("10", "CrowdMap", "0.599", "0.682", "0.641")),
 )
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the study of semi-global tiles and write its report."""
     models_used = resolve_models(options)
     predictor = SemiGlobalPredictor()
     tile_tables = predict_tables(options, console, models_used, predictor)
@@ -47,11 +47,11 @@ def run(options: Options, console: Console) -> None:
         for margin_test in check_margins(sensors, table, predictor.frame_counts)
     ]
     study_tables = [
-        make_rows_table("Tiles, by sensors and looks", rows),
+        make_rows_table("Tiles, by sensors and frames", rows),
         make_margin_table(margin_tests, "scenarios"),
         PAPER_TABLE,
     ]
-    titles = {names[0]: "one vehicle", names[-1]: f"{names[-1]} looks"}
+    titles = {names[0]: "one vehicle", names[-1]: f"{names[-1]} frames"}
     results = next(iter(tile_tables.values())).results
     panels = [
         panel
@@ -70,10 +70,10 @@ def run(options: Options, console: Console) -> None:
 
 
 def check_margins(sensors: str, table: TileTable, frame_counts: tuple[int, ...]) -> list[MapMarginTest]:
-    """More looks against one: the bar and the goal for the most, and that none is worse."""
+    """Test more frames against one: margin and target at the largest number, and no number below one frame."""
     one, *more = map(str, frame_counts)
     margins = ((more[-1], MARGIN, ""), (more[-1], TARGET_MARGIN, ", goal"), *((name, 0.0, "") for name in more))
     return [
-        table.check_margin(f"{sensors}: {name} looks - one vehicle{suffix}", name, one, margin)
+        table.check_margin(f"{sensors}: {name} frames - one vehicle{suffix}", name, one, margin)
         for name, margin, suffix in margins
     ]

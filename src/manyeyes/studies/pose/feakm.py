@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from manyeyes.studies.options import Options
 
-PAPER_NOTE = "The last table is FeaKM's own: DAIR-V2X, AP@0.5, CoAlign's protocol; it is no bar and no rival."
+PAPER_NOTE = "The last table is FeaKM's own: DAIR-V2X, AP@0.5, CoAlign's protocol; it is for reference only."
 PAPER_ROWS = (
     ("neither", 0.741, 0.704, 0.682, 0.678),
     ("several scales", 0.780, 0.716, 0.682, 0.666),
@@ -45,7 +45,7 @@ PAPER_ROWS = (
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the ablation of FeaKM and write its report."""
     named = parse_checkpoints(options.checkpoints, "feakm", "detector.safetensors,net.safetensors[@8]")
     variants = [(_parse_variant(name, files), files.partition("@")[2]) for name, files in named.items()]
     context = prepare_study(options, console)
@@ -89,7 +89,7 @@ def make_rows(context: StudyContext, variants: Sequence[tuple[FeakmVariant, str]
                 new_rows = run_ablation(recording, [variant], SIGMAS, protocol=protocol, seed=seed, report=report)
                 atomic_write(path, json.dumps([asdict(row) for row in new_rows]).encode())
             stored = json.loads(path.read_text(encoding="utf-8"))
-            out += [FeakmVariantRow(**(row | {"branch": variant.name, "ap": tuple(row["ap"])})) for row in stored]
+            out += [FeakmVariantRow(**(row | {"variant": variant.name, "ap": tuple(row["ap"])})) for row in stored]
     return out
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """AP against errors of claimed poses, for each way to fuse and each corrector before it: FeaKM, Tables 1 and 2.
 
---checkpoints name=weights.safetensors adds rival fusions, which believe every claim: the paper's rows F-Cooper (preset
-branch-se-dast, the maximum) and V2X-ViT (branch-v2x-vit). Buckets are of judged frames, by the fewest objects that the ego shares
-with any agent within reach of its radio: the corrector has that much to go by. Ego alone hears nobody and is played once. "given"
-believes every claim; with true ones it is the oracle that losses are taken from. --perturbations plays some levels alone.
+--checkpoints name=weights.safetensors adds baseline fusions without pose correction: the paper's rows F-Cooper (preset
+ablation/se-dast, the maximum) and V2X-ViT (ablation/v2x-vit). Buckets are of evaluated frames, by the minimum number of objects
+that the ego shares with an agent in communication range: these are what the corrector can match. No fusion receives nothing and
+is run once. "identity" keeps every prior; with true poses it is the reference of AP drops. --perturbations selects levels.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ ALL_LEVELS = (*LEVELS, *SINGLE_ERROR_LEVELS)
 LISTED_LEVELS = (CLEAN, LEVELS[4], LEVELS[-1])
 """Levels whose frames are listed by objects in common."""
 MAX_SINGLE_ERROR_AP_DROP = dict(zip(SINGLE_ERROR_LEVELS, (0.054, 0.044)))
-PAPER_NOTE = "The last tables are FeaKM's own: DAIR-V2X, CoAlign's protocol; they are no bar and no rival."
+PAPER_NOTE = "The last tables are FeaKM's own: DAIR-V2X, CoAlign's protocol; they are for reference only."
 PAPER_AP = (
     ("MASH", (.400,) * 11, (.244,) * 11),
     ("F-Cooper", (.740, .723, .703, .693, .676, .672, .670, .662, .659, .658, .650),
@@ -76,7 +76,7 @@ PAPER_AP = (
 
 @dataclass(frozen=True)
 class PoseNoiseRow:
-    """A way to fuse (a method, or a rival's weights) behind a corrector, under a level of error. ap: at each IoU; ap_drop: AP less
+    """A method, or a baseline's weights, with a corrector at a noise level. ap: at each IoU; ap_drop: AP less
     than the same way to fuse has with true poses and no corrector; gain_over_no_fusion: more than ego alone. ap_by_common_objects:
     AP@0.5 of each bucket of COMMON.
     """
@@ -92,7 +92,7 @@ class PoseNoiseRow:
 
 
 def run(options: Options, console: Console) -> None:
-    """The study."""
+    """Run the study of AP under pose noise and write its report."""
     context = prepare_study(options, console)
     names, levels = (
         options.correctors or (IDENTITY, DEFAULT_CORRECTOR),
@@ -109,7 +109,7 @@ def run(options: Options, console: Console) -> None:
         for level in levels
         if collaborative
     ]
-    baselines = parse_checkpoints(options.checkpoints, "pose") if options.checkpoints else {}
+    baselines = parse_checkpoints(options.checkpoints, "pose-noise-ap") if options.checkpoints else {}
     for baseline, weights in baselines.items():
         base = replace(context.base, methods=(OURS,), weights=weights)
         conditions += [Condition(condition_name(baseline, level), level.apply_to(base)) for level in levels]
@@ -167,7 +167,7 @@ def make_rows(
     common_objects_by_frame: dict[tuple[str, int], int],
     baselines: Sequence[str] = (),
 ) -> tuple[PoseNoiseRow, ...]:
-    """The table, corrector by corrector, method by method, level by level; then rival fusions, which believe every claim."""
+    """The table, corrector by corrector, method by method, level by level; then baseline fusions without correction."""
     out = []
     for name in names:
         methods = [method for condition, method in results.results if condition == condition_name(name, CLEAN)]
@@ -251,7 +251,7 @@ def _check_corrector(
     results: ResultGrid, name: str, common_objects_by_frame: dict[tuple[str, int], int]
 ) -> Iterator[MarginTest]:
     """Nothing is lost where claims are true, little where heading or place alone is off; at the worst, little where enough
-    objects are shared; and at no level does it pay to hear nobody.
+    objects are shared; and at no level is no fusion better.
     """
     clean_key, corrector_name, evaluated = (
         (condition_name(IDENTITY, CLEAN), OURS),
