@@ -1,2 +1,4 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has weights: from clouds to tokens, from tokens of many agents to boxes."""
+"""Neural networks: from point clouds and images to tokens, and from the tokens of several agents to boxes and map
+elements.
+"""

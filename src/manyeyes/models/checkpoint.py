@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights on disk: safetensors with the whole configuration inside, loaded strictly."""
+"""Read and write weights: safetensors files that hold the whole configuration, loaded strictly."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models.detector.detector import Detector, DetectorConfig
 
 FORMAT = "manyeyes-detector-1"
-"""Of a detector's file; models of other kinds have formats of their own."""
+"""Format name in the metadata of a detector's file; models of other types have their own."""
 
 Config = TypeVar("Config")
 Model = TypeVar("Model", bound=nn.Module)
 
 
 def config_to_json(config: Any) -> str:
-    """A nested frozen dataclass as JSON with sorted keys."""
+    """Serialise a nested frozen dataclass to JSON with sorted keys."""
     return json.dumps(dataclasses.asdict(config), sort_keys=True)
 
 
 def config_from_json(kind: type, text: str) -> Any:
-    """The inverse of config_to_json; an unknown field is an error, and so is a missing one that has no default."""
+    """Invert config_to_json; unknown fields, and missing fields without a default, are errors."""
     return _build(kind, json.loads(text))
 
 
@@ -55,14 +55,16 @@ def _build(kind: Any, value: Any) -> Any:
 
 
 def _alternative(kind: Any, value: Any) -> Any:
-    """Of a union of dataclasses the one whose fields are all that the value names, else the first."""
+    """Select from a union of dataclasses the one whose field names equal the keys of value, else the first."""
     kinds = [k for k in typing.get_args(kind) if dataclasses.is_dataclass(k)]
     named = set(value) if isinstance(value, dict) else set()
     return next((k for k in kinds if named == {f.name for f in dataclasses.fields(k)}), kinds[0] if kinds else kind)
 
 
 def fingerprint(model: nn.Module) -> bytes:
-    """8 bytes that name a configuration and its weights; tokens are only understood by the weights that made them."""
+    """Hash a model's configuration and weights to 8 bytes; only models with equal fingerprints can decode each
+    other's tokens.
+    """
     digest = hashlib.blake2b(config_to_json(model.config).encode(), digest_size=8)
     for name, value in sorted(_tensors(model).items()):
         digest.update(name.encode())
@@ -71,12 +73,12 @@ def fingerprint(model: nn.Module) -> bytes:
 
 
 def _tensors(model: nn.Module) -> dict[str, torch.Tensor]:
-    """Everything that changes what the model says: how many batches a norm has seen does not."""
+    """Return the tensors that affect the output, so without the batch counters of normalisation layers."""
     return {k: v for k, v in model.state_dict().items() if not k.endswith("num_batches_tracked")}
 
 
 def save(model: nn.Module, path: Path, card: dict[str, Any], half: bool = False, format: str = FORMAT) -> None:
-    """Write weights, the model's config and a model card (command, seed, time, result) to one file, atomically."""
+    """Write weights, configuration and model card (command, seed, time, result) to one file, atomically."""
     state = {k: (v.half() if half and v.is_floating_point() else v).contiguous() for k, v in _tensors(model).items()}
     with atomic_replace(path, durable=False) as temporary:
         save_file(
@@ -85,14 +87,14 @@ def save(model: nn.Module, path: Path, card: dict[str, Any], half: bool = False,
 
 
 def load(path: Path) -> Detector:
-    """A detector in evaluation mode, from its own file alone."""
+    """Load a detector in evaluation mode."""
     model = load_as(path, FORMAT, DetectorConfig, Detector)
     model.fingerprint = fingerprint(model)
     return model
 
 
 def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config], Model]) -> Model:
-    """A model in evaluation mode, built from the configuration in its own file; build: from a configuration of that kind."""
+    """Load a model in evaluation mode; build makes it from the configuration stored in its file."""
     state, metadata = _read(path, format)
     try:
         model = build(config_from_json(kind, metadata["config"]))
@@ -120,12 +122,12 @@ def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config
 
 
 def read_state(path: Path, format: str = FORMAT) -> dict[str, torch.Tensor]:
-    """The tensors of a file of weights by name, as they are stored."""
+    """Read the tensors of a weights file by name, in their stored dtype."""
     return _read(path, format)[0]
 
 
 def read_card(path: Path, format: str = FORMAT) -> dict[str, Any]:
-    """The model card inside a file of weights."""
+    """Read the model card of a weights file."""
     return json.loads(_read(path, format)[1]["card"])
 
 

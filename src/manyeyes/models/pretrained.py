@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights that ship with the package, by name; anything else is a path."""
+"""Load the weights that ship with the package by name, or other weights by path."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from manyeyes.models.pose import feakm
 
 DEFAULT_DETECTOR = "costr-small"
 DEFAULT_FEAKM = "feakm-small"
-"""The shipped net that recognises objects; no detector, so that it is not among the names."""
+"""The shipped FeaKM network. It is not a detector, so list_detectors leaves it out."""
 DEFAULT_MAP_MODEL = "map-small-lidar"
-"""The map model of agents with LiDAR; those with cameras are map-small-camera and map-small-fusion."""
+"""The map model for LiDAR; map-small-camera and map-small-fusion take images, or both."""
 _MAP_PREFIX = "map-"
 
 
 def list_detectors() -> tuple[str, ...]:
-    """The shipped detectors."""
+    """List the names of the shipped detectors."""
     return tuple(name for name in _shipped() if name != DEFAULT_FEAKM and not name.startswith(_MAP_PREFIX))
 
 
 def list_map_models() -> tuple[str, ...]:
-    """The shipped map models."""
+    """List the names of the shipped map models."""
     return tuple(name for name in _shipped() if name.startswith(_MAP_PREFIX))
 
 
@@ -43,9 +43,11 @@ def _shipped() -> tuple[str, ...]:
 
 
 def load(name_or_path: str | Path = DEFAULT_DETECTOR) -> Detector:
-    """A detector for inference, norms folded in: a shipped name, or a .safetensors file of 'manyeyes train'.
+    """Load a detector for inference, with its norms folded into the convolutions.
 
-    To train on from a file, or to look at its weights as they are, use checkpoint.load.
+    name_or_path: a shipped name, or a .safetensors file written by 'manyeyes train'. To continue training, or to
+    inspect the stored
+    weights, use checkpoint.load.
     """
     if str(name_or_path) in list_detectors():
         with as_file(files("manyeyes.models") / "weights" / f"{name_or_path}.safetensors") as path:
@@ -60,7 +62,7 @@ def load(name_or_path: str | Path = DEFAULT_DETECTOR) -> Detector:
 
 
 def load_feakm(name_or_path: str | Path = DEFAULT_FEAKM) -> feakm.FeakmNet:
-    """FeaKM's net: the shipped one by its name, or a .safetensors file of 'manyeyes train --preset feakm-small'."""
+    """Load FeaKM's network: the shipped one by name, or a .safetensors file of 'manyeyes train --preset feakm-small'."""
     if str(name_or_path) != DEFAULT_FEAKM:
         return feakm.load(Path(name_or_path))
     shipped = files("manyeyes.models") / "weights" / f"{DEFAULT_FEAKM}.safetensors"
@@ -73,7 +75,9 @@ def load_feakm(name_or_path: str | Path = DEFAULT_FEAKM) -> feakm.FeakmNet:
 
 
 def load_map_model(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> MapModel:
-    """A map model for inference: a shipped name, or a .safetensors file of 'manyeyes train --preset map-small-lidar'."""
+    """Load a map model for inference: a shipped name, or a .safetensors file of 'manyeyes train --preset
+    map-small-lidar'.
+    """
     with _map_model_file(name_or_path) as path:
         model = checkpoint.load_as(path, FORMAT, MapModelConfig, MapModel)
     model.fingerprint = checkpoint.fingerprint(model)
@@ -81,13 +85,13 @@ def load_map_model(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> MapModel:
 
 
 def read_training_towns(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> tuple[str, ...]:
-    """The towns whose maps taught a map model, as its card says."""
+    """Read the names of the training towns of a map model from its card."""
     with _map_model_file(name_or_path) as path:
         return tuple(checkpoint.read_card(path, FORMAT)["towns"])
 
 
 def load_map_model_state(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> dict[str, Tensor]:
-    """The tensors of a map model by name, to begin a training from."""
+    """Read the tensors of a map model by name, to initialise training."""
     with _map_model_file(name_or_path) as path:
         return checkpoint.read_state(path, FORMAT)
 

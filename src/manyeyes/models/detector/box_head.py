@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A centre head on occupied cells: one box a cell, and the detector's own word on its error."""
+"""A centre head on occupied cells: one box per cell, with predicted standard deviations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SPEED_UNIT = 10.0
 
 
 class RawBoxLayout:
-    """Where each quantity of RawBoxes stands in a row of numbers."""
+    """Columns of each quantity of RawBoxes in a row vector."""
 
     def __init__(self) -> None:
         ends = list(accumulate(WIDTHS, initial=0))
@@ -36,14 +36,22 @@ BOX_LAYOUT = RawBoxLayout()
 
 @dataclass(frozen=True, eq=False)
 class RawBoxes:
-    """What the head says of each of N sites, before decoding.
+    """Head outputs at N sites, before decoding.
 
-    heatmap_logit: (N,) logit that a box is centred here. offset: (N, 2), x and y from the cell's centre, in cells. z: (N,) metres.
-    log_size: (N, 3) of size / TYPICAL_SIZE. axis: (N, 2), cosine and sine of twice the yaw: the body's axis modulo pi.
-    direction: (N, 2): its product with a unit vector along the axis is the logit that the vehicle faces that way; turning the
-    vector by pi turns the sign, so there is no seam. class_logits: (N, labels) logits.
-    log_sigma_xy, log_sigma_yaw: (N,), m and rad. iou_logit: (N,) logit of the IoU that the box will have.
-    velocity: (N, 2) over the ground along x and y, in SPEED_UNIT.
+    Attributes:
+        sites: the cells.
+        heatmap_logit: (N,) logit that a box is centred here.
+        offset: (N, 2) from the cell centre to the box centre, in cells.
+        z: (N,) height of the box centre, metres.
+        log_size: (N, 3) log(size / TYPICAL_SIZE).
+        axis: (N, 2) cosine and sine of twice the yaw, the box axis modulo pi.
+        direction: (N, 2) its dot product with a unit vector along the axis is the heading logit; it has no seam, as
+            turning the vector by pi flips the sign.
+        class_logits: (N, labels).
+        log_sigma_xy: (N,) of metres.
+        log_sigma_yaw: (N,) of radians.
+        iou_logit: (N,) logit of the expected IoU of the box.
+        velocity: (N, 2) over the ground, in SPEED_UNIT.
     """
 
     sites: Sites
@@ -61,7 +69,7 @@ class RawBoxes:
 
     @classmethod
     def of(cls, rows: Tensor, sites: Sites) -> RawBoxes:
-        """From rows (N, RAW.total)."""
+        """Split rows (N, BOX_LAYOUT.total) into the quantities."""
         heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap, velocity = rows.split(WIDTHS, 1)
         return cls(
             sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind,
@@ -69,30 +77,32 @@ class RawBoxes:
         )  # fmt: skip
 
     def to_rows(self) -> Tensor:
-        """(N, RAW.total): all quantities side by side."""
+        """Concatenate all quantities to rows (N, BOX_LAYOUT.total)."""
         values = (self.heatmap_logit, self.offset, self.z, self.log_size, self.axis, self.direction, self.class_logits)
         values = (*values, self.log_sigma_xy, self.log_sigma_yaw, self.iou_logit, self.velocity)
         return torch.cat([v[:, None] if v.dim() == 1 else v for v in values], 1)
 
     def bev(self) -> Tensor:
-        """(N, 5): x, y, length, width, yaw (of the axis) of every site's box, differentiable."""
+        """Return (N, 5) x, y, length, width, axis yaw of every site's box, differentiable."""
         xy = self.sites.xy + self.offset * self.sites.grid.cell_size_m
         size = torch.tensor(TYPICAL_SIZE[:2]) * self.log_size[:, :2].clamp(-3, 3).exp()
         return torch.cat((xy, size, axis_yaw(self.axis)[:, None]), 1)
 
     def select(self, mask: Tensor) -> RawBoxes:
-        """Some of the sites."""
+        """Select a subset of the sites."""
         sites = Sites(self.sites.key[mask], self.sites.grid, self.sites.batch_size)
         return RawBoxes.of(self.to_rows()[mask], sites)
 
 
 def axis_yaw(axis: Tensor) -> Tensor:
-    """Yaw in (-pi/2, pi/2] of (N, 2) cosine and sine of twice the yaw."""
+    """Return yaw in (-pi/2, pi/2] of (N, 2) cosine and sine of twice the yaw."""
     return torch.atan2(axis[:, 1], axis[:, 0]) / 2
 
 
 def heading_logit(raw: RawBoxes) -> Tensor:
-    """(N,) logit that the vehicle faces along axis_yaw and not along its opposite; no gradient to the axis."""
+    """Return the logit (N,) that the vehicle points along axis_yaw, not opposite to it; no gradient flows to the
+    axis.
+    """
     yaw = axis_yaw(raw.axis).detach()
     return raw.direction[:, 0] * yaw.cos() + raw.direction[:, 1] * yaw.sin()
 
@@ -104,7 +114,7 @@ def _trunk(inputs: int, channels: int) -> nn.Sequential:
 
 
 class BoxHead(nn.Module):
-    """Two submanifold layers and one linear map to all quantities of RawBoxes."""
+    """Two submanifold layers and one linear layer to all quantities of RawBoxes."""
 
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
@@ -116,12 +126,12 @@ class BoxHead(nn.Module):
             self.out.bias[0] = -2.19
 
     def forward(self, x: SparseBev) -> RawBoxes:
-        """Features to raw boxes, one a site."""
+        """Predict one raw box per site."""
         return RawBoxes.of(self.out(self.shared(x).features), x.sites)
 
 
 class RefineHead(nn.Module):
-    """A centre head that is given boxes and says what to add to them; nothing, before it has learned."""
+    """A centre head that predicts residuals to given boxes; zero-initialised."""
 
     def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
@@ -131,13 +141,15 @@ class RefineHead(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, x: SparseBev, proposals: Tensor) -> RawBoxes:
-        """Features, and the boxes (N, RAW.total) given of the same sites, to better boxes."""
+        """Refine proposals (N, BOX_LAYOUT.total) of the same sites."""
         return RawBoxes.of(proposals + self.out(self.shared(x).features), x.sites)
 
 
 @dataclass(frozen=True)
 class DecodeConfig:
-    """score_threshold and nms_iou as in the evaluation's protocol; iou_score_weight: score = heat^(1-p) * IoU^p."""
+    """Decoding of boxes: the score is heat^(1 - p) * IoU^p with p = iou_score_weight; nms_iou as in the evaluation
+    protocol.
+    """
 
     score_threshold: float = 0.05
     nms_iou: float = 0.15
@@ -146,7 +158,7 @@ class DecodeConfig:
 
 
 def decode(raw: RawBoxes, config: DecodeConfig) -> list[Boxes]:
-    """Boxes of every grid in the batch, in its agent's frame, best first."""
+    """Decode the boxes of every grid of the batch, in the agent's frame, in descending order of score."""
     heatmap, iou = torch.sigmoid(raw.heatmap_logit.detach()), torch.sigmoid(raw.iou_logit.detach())
     score = heatmap ** (1 - config.iou_score_weight) * iou**config.iou_score_weight
     batch, found = raw.sites.batch, []

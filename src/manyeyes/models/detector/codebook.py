@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tokens as a few bytes: features by residual vector quantisation, proposals by fixed rules.
+"""Encode tokens in a few bytes: features by residual vector quantisation, proposals by fixed rules.
 
-Stage k names, in one byte, the centre nearest to what the stages before it left over (Juang and Gray, ICASSP 1982; on tokens:
-detection.md A.12). The centres are fitted to tokens of training scenes (``training/detector/codebook.py``) and are part of the
-weights: a detector's fingerprint names them, so sender and receiver mean the same by a byte.
+Each stage stores in one byte the index of the nearest centre to the residual of the stages before (Juang and Gray,
+ICASSP 1982). The
+centres are fitted to tokens of training scenes (``training/detector/codebook.py``) and are part of the weights. The
+detector's
+fingerprint covers them, so sender and receiver decode a byte alike.
 """
 
 from __future__ import annotations
@@ -18,12 +20,12 @@ from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.proposal_codes import PROPOSAL_CODES, proposal_from_codes, proposal_to_codes
 
 FREQUENCY_TOTAL = 4096
-"""Sum of the frequencies of one byte of a row, as ``comms.entropy`` reads them."""
+"""Sum of the frequencies of one byte of a row, as required by ``comms.entropy``."""
 
 
 @dataclass(frozen=True)
 class CodebookConfig:
-    """stages: bytes for a token's features; size: centres a stage, at most 256."""
+    """stages: number of bytes of a token's features; size: number of centres per stage, at most 256."""
 
     stages: int = 4
     size: int = 256
@@ -34,9 +36,9 @@ class CodebookConfig:
 
 
 class Codebook(nn.Module):
-    """centres: (stages, size, C). frequencies: (W, 256) int16, how often each value of each byte of a row occurs, of 4,096.
+    """Quantiser of tokens to rows of W = stages + PROPOSAL_CODES bytes: the centre indices, then the proposal.
 
-    A row has W = stages + PROPOSAL_CODES bytes: the stages' centres, then the proposal.
+    centres: (stages, size, C). frequencies: (W, 256) int16, of each value of each byte, with sum 4,096 per byte.
     """
 
     centres: Tensor
@@ -50,25 +52,27 @@ class Codebook(nn.Module):
         self.register_buffer("frequencies", uniform)
 
     def encode(self, tokens: Tensor) -> Tensor:
-        """What is told, rows (N, C + PROPOSAL), as rows (N, W) uint8."""
+        """Encode tokens (N, C + PROPOSAL_DIM) to codes (N, W) uint8."""
         features = tokens[:, :-PROPOSAL_DIM]
         if features.shape[1] != self.centres.shape[2]:
             raise ShapeError(f"This codebook is of {self.centres.shape[2]} features; got {features.shape[1]}.")
         return torch.cat((residual_codes(features, self.centres), proposal_to_codes(tokens[:, -PROPOSAL_DIM:])), 1)
 
     def decode(self, codes: Tensor) -> Tensor:
-        """The inverse of write, within the error of the centres; any bytes (N, W) can be read."""
+        """Invert encode up to the quantisation error; any bytes (N, W) are valid."""
         stages, size, _ = self.centres.shape
         if codes.shape[1] != self.width:
             raise ShapeError(f"This codebook reads rows of {self.width} bytes; got {codes.shape[1]}.")
-        # Where there are fewer than 256 centres, nobody writes the bytes beyond, and they must not break the reader.
+        # With fewer than 256 centres, higher byte values are never encoded, but must not break decoding.
         index = codes[:, :stages].long().clamp_max(size - 1)
         features = self.centres[torch.arange(stages), index].sum(1)
         return torch.cat((features, proposal_from_codes(codes[:, stages:])), 1)
 
 
 def residual_codes(features: Tensor, centres: Tensor) -> Tensor:
-    """(N, C) to (N, stages) uint8: stage by stage the nearest of centres (stages, size, C) to what is left over."""
+    """Quantise features (N, C) to (N, stages) uint8: per stage the nearest of centres (stages, size, C) to the
+    residual.
+    """
     residual, codes = features, []
     for stage in centres:
         code = nearest_centre(residual, stage)
@@ -78,5 +82,5 @@ def residual_codes(features: Tensor, centres: Tensor) -> Tensor:
 
 
 def nearest_centre(x: Tensor, centres: Tensor) -> Tensor:
-    """(N,) int64: which of centres (K, C) is nearest to each row of x (N, C), the first where two are."""
+    """Return the index (N,) int64 of the nearest of centres (K, C) to each row of x (N, C); the first of ties."""
     return (centres.square().sum(1) - 2 * (x @ centres.T)).argmin(1)

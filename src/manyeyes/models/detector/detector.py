@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The detector: see (one agent's cloud to tokens), look (its own boxes), fuse (tokens of all agents to boxes around the ego)."""
+"""The detector: extract_features (point cloud to tokens), predict (own boxes), fuse (tokens of all agents to boxes)."""
 
 from __future__ import annotations
 
@@ -29,10 +29,15 @@ from manyeyes.models.fusion.v2x_vit import V2xVitFusion
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """grid: what an agent sees and tells, and the pillar size. prune_threshold: probability of lying near an object below which
-    a cell is dropped. output_range: the range in which its boxes are asked for, where that is less than it sees; None: all of it.
-    sweeps: how many an agent looks at together, its last one or two. codebook: of the bytes that its tokens are sent as; None
-    where none was fitted.
+    """Settings of a detector.
+
+    Attributes:
+        grid: perception range of an agent and pillar size.
+        pillars: type of the pillar encoder.
+        prune_threshold: cells with a lower probability of lying near an object are dropped.
+        output_range: range of the reported boxes where it is smaller than grid; None for all of grid.
+        sweeps: number of consecutive sweeps in the input.
+        codebook: of the token encoding; None before one is fitted.
     """
 
     grid: BevGrid
@@ -51,13 +56,13 @@ class DetectorConfig:
 
     @property
     def detection_range(self) -> BevGrid:
-        """Where boxes are asked for."""
+        """The range in which boxes are reported."""
         return self.output_range or self.grid
 
 
 @dataclass(frozen=True)
 class ExtractedFeatures:
-    """What a batch of agents made of their own clouds: tokens to keep or send, and pruning's decisions."""
+    """Features of a batch of agents: tokens to fuse or send, and the decisions of the pruning layers."""
 
     tokens: SparseBev
     pruned: tuple[PruneOutput, ...]
@@ -65,7 +70,7 @@ class ExtractedFeatures:
 
 
 class Detector(nn.Module):
-    """CoSTr's path on sparse features: pillars, encoder with focal pruning, DAST, a centre head; fusion and a second look."""
+    """CoSTr on sparse features: pillars, encoder with focal pruning, DAST, centre head, fusion and box refinement."""
 
     def __init__(self, config: DetectorConfig) -> None:
         super().__init__()
@@ -84,7 +89,7 @@ class Detector(nn.Module):
 
     @property
     def token_grid(self) -> BevGrid:
-        """The lattice of the tokens."""
+        """The grid of the tokens."""
         return self.config.grid.at(self.config.encoder.head_stride)
 
     def extract_features(
@@ -93,8 +98,9 @@ class Detector(nn.Module):
         previous_clouds: list[PointCloud] | None = None,
         prune_threshold: float | None = None,
     ) -> ExtractedFeatures:
-        """Clouds in their agents' frames to tokens on a batch of as many grids. previous_clouds: the sweeps before, in the same
-        frames.
+        """Encode one point cloud per agent, in its own frame, to tokens on one grid per agent.
+
+        previous_clouds: the previous sweeps, transformed to the same frames.
         """
         threshold = self.config.prune_threshold if prune_threshold is None else prune_threshold
         encoded = self.encoder(self.pillars(clouds, previous_clouds), threshold)
@@ -105,27 +111,27 @@ class Detector(nn.Module):
         return ExtractedFeatures(kept, (*encoded.pruned, decision), encoded.sites_per_stride)
 
     def predict(self, tokens: SparseBev) -> RawBoxes:
-        """What each agent makes of its own tokens, in its own frame."""
+        """Predict boxes from each agent's own tokens, in its own frame."""
         return self.head(tokens)
 
     def make_tokens(self, tokens: SparseBev, raw: RawBoxes) -> SparseBev:
-        """What is sent: features (N, C) and, behind them, the proposals of raw, the agent's own view of these tokens."""
+        """Concatenate features (N, C) and the proposals of raw to the shared tokens (N, C + PROPOSAL_DIM)."""
         return tokens.with_features(torch.cat((tokens.features, make_proposals(raw)), 1))
 
     def score_tokens(self, tokens: SparseBev) -> Tensor:
-        """(N,) logits of how much each token is worth to others; a budget sends the highest."""
+        """Return importance logits (N,) of the tokens; under a budget the highest are sent."""
         return self.selector(tokens)
 
     def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
-        """Tokens of all agents around each ego, its own among them, to raw boxes in the ego's frame.
+        """Fuse the tokens of all agents around each ego, its own included, to raw boxes in the ego's frame.
 
-        past: what the ego itself told at its last instants, moved into its frame of now.
+        past: the ego's tokens of earlier instants, transformed to its current frame.
         """
         fused = self.fuse_tokens(tokens, past)
         return self.refine(fused.bev, fused.merged_proposals)
 
     def fuse_tokens(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
-        """The first half of fuse: one feature and one merged box a cell."""
+        """First half of fuse: one feature and one merged proposal per cell."""
         return self.fusion(tokens, past)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sparse encoder (CoSTr section III-B): strides 1 to 32, the merge of Eq. 3, and the way up to the head's stride."""
+"""The sparse encoder (CoSTr section III-B): strides 1 to 32, the merge of Eq. 3, and upsampling to the head's stride."""
 
 from __future__ import annotations
 
@@ -17,12 +17,16 @@ STRIDES: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """channels and layers: one entry a stride 1 … 32; the last three channels are equal, because Eq. 3 sums them.
+    """Settings of the encoder.
 
-    prune_strides: levels with a focal pruning layer. head_stride: stride of the tokens that are fused, sent and decoded;
-    8 is the paper's letter, 4 the default. dilating: spconv's strided active set instead of parents only.
-    use_coarse_strides: whether strides 16 and 32 take part (Eq. 3); without them the merge has stride 8 alone.
-    token_channels: tokens are projected to so many channels before attention; None keeps those of their stride.
+    Attributes:
+        channels: per stride 1 … 32; the last three are equal, because Eq. 3 sums them.
+        layers: submanifold layers per stride 1 … 32.
+        prune_strides: strides with a focal pruning layer.
+        head_stride: stride of the tokens that are fused, sent and decoded; 8 in the paper.
+        dilating: use spconv's strided active set instead of parents only.
+        token_channels: width to which tokens are projected before attention; None keeps that of their stride.
+        use_coarse_strides: use strides 16 and 32 (Eq. 3); without them the merge has stride 8 alone.
     """
 
     channels: tuple[int, ...] = (32, 64, 128, 128, 128, 128)
@@ -46,7 +50,7 @@ class EncoderConfig:
 
 @dataclass(frozen=True)
 class EncoderOutput:
-    """Tokens at the head's stride, what every pruning layer decided on, and the number of sites at each stride."""
+    """Tokens at the head's stride, the pruning decisions, and the number of sites at each stride."""
 
     tokens: SparseBev
     pruned: tuple[PruneOutput, ...]
@@ -54,7 +58,7 @@ class EncoderOutput:
 
 
 class SparseEncoder(nn.Module):
-    """Pillars at stride 1 to tokens at the head's stride."""
+    """Encode pillars at stride 1 to tokens at the head's stride."""
 
     def __init__(self, inputs: int, config: EncoderConfig) -> None:
         super().__init__()
@@ -77,7 +81,7 @@ class SparseEncoder(nn.Module):
         )
 
     def forward(self, x: SparseBev, prune_threshold: float) -> EncoderOutput:
-        """prune_threshold: probability below which a cell is dropped; 0 drops none."""
+        """Encode pillars; cells with a probability below prune_threshold are dropped, 0 drops none."""
         levels: dict[int, SparseBev] = {}
         pruned: list[PruneOutput] = []
         for stride, down, stage in zip(self.strides, self.down, self.stages):

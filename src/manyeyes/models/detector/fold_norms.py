@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A detector for inference: what its norms do to every row alike is done to the weights before them, once."""
+"""Fold normalisation layers with running statistics into the preceding weights, for inference."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from manyeyes.models.detector.transformer import WindowBlock
 
 
 def fold_norms(model: Detector) -> Detector:
-    """A copy in evaluation mode, without gradients, whose convolutions hold their norms: the same answers, sooner.
+    """Copy a detector in evaluation mode, without gradients, with its norms folded into the convolutions.
 
-    It keeps configuration and fingerprint, so that it understands the messages of the model it was made of; it is not a
-    model to save or to train.
+    Outputs are equal and inference is faster. Configuration and fingerprint are kept, so that messages of the
+    original model can be
+    decoded. The copy cannot be saved or trained.
     """
     copied = copy.deepcopy(model).eval().requires_grad_(False)
     for layer in copied.modules():

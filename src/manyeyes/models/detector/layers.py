@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layers on occupied cells: normalisation that survives empty input, and convolutions that keep their weights."""
+"""Layers on occupied cells: normalisation that accepts empty input, and sparse convolutions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ActiveNorm(nn.BatchNorm1d):
         super().__init__(channels, eps=1e-3, momentum=0.02)
 
     def forward(self, input: Tensor) -> Tensor:
-        """(N, C) to (N, C)."""
+        """Normalise features (N, C) to (N, C)."""
         if self.training and input.shape[0] < 2:
             return nn.functional.batch_norm(
                 input, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps
@@ -31,7 +31,9 @@ class ActiveNorm(nn.BatchNorm1d):
 
 
 def fold_norm(weight: Tensor, norm: ActiveNorm) -> tuple[Tensor, Tensor]:
-    """A linear weight (outputs, ...) with the running statistics of the norm after it folded in, and the bias (outputs,)."""
+    """Fold the running statistics of the following norm into a linear weight (outputs, ...); returns weight and bias
+    (outputs,).
+    """
     assert norm.running_mean is not None
     assert norm.running_var is not None
     scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
@@ -39,26 +41,26 @@ def fold_norm(weight: Tensor, norm: ActiveNorm) -> tuple[Tensor, Tensor]:
 
 
 def conv_weight(outputs: int, inputs: int, kernel: int) -> nn.Parameter:
-    """An (outputs, inputs, kernel, kernel) kernel with He initialisation over its inputs * kernel^2 inputs."""
+    """Make an (outputs, inputs, kernel, kernel) kernel with He initialisation over its inputs * kernel^2 inputs."""
     return _tap_by_tap(torch.randn(outputs, inputs, kernel, kernel) * math.sqrt(2.0 / (inputs * kernel * kernel)))
 
 
 def _tap_by_tap(weight: Tensor) -> nn.Parameter:
-    """The same (outputs, inputs, k, k), laid out in memory as the matrices that the product reads: no copy at each call."""
+    """Reorder (outputs, inputs, k, k) in memory to one matrix per tap, so that no call copies it."""
     return nn.Parameter(weight.permute(2, 3, 1, 0).contiguous().permute(3, 2, 0, 1))
 
 
 def _rectified(y: Tensor, skip: Tensor | None) -> Tensor:
-    """ReLU of y, a tensor that nobody else holds, plus skip; in its place where no gradient needs it."""
+    """ReLU of y plus skip, in place where no gradient needs y; the caller must own y."""
     if torch.is_grad_enabled():
         return torch.relu(y if skip is None else y + skip)
     return torch.relu_(y if skip is None else y.add_(skip))
 
 
 class SubmanifoldLayer(nn.Module):
-    """Submanifold convolution, norm, optional skip, ReLU: the sites stay as they are.
+    """Submanifold convolution, norm, optional skip connection, ReLU; the sites are unchanged.
 
-    norm: ActiveNorm, or LayerNorm where the same weights meet sets of different statistics (one agent, many agents).
+    norm: ActiveNorm, or LayerNorm where inputs of different statistics share the weights (one agent, several agents).
     """
 
     bias: Tensor | None
@@ -73,16 +75,16 @@ class SubmanifoldLayer(nn.Module):
         self.folded: FoldedConvs | NormedConv | None = None
 
     def forward(self, x: SparseBev) -> SparseBev:
-        """(N, inputs) to (N, outputs) on the same sites."""
+        """Map (N, inputs) to (N, outputs) on the same sites."""
         if self.folded is not None and is_supported(x.features):
             return x.with_features(self.folded(x.features, same_sites_map(x.sites, self.weight.shape[2])))
         y = self.norm(submanifold_conv(x, self.weight, self.bias).features)
         return x.with_features(_rectified(y, x.features if self.skip else None))
 
     def fold(self) -> None:
-        """Take the norm's running statistics into the weight, and the skip into its middle tap, for good.
+        """Fold the norm's running statistics into the weight, and the skip into its centre tap, permanently.
 
-        A LayerNorm has no running statistics: it stays, and so does the skip that comes after it, in the same compiled call.
+        A LayerNorm has no running statistics: it stays, and so does the skip after it, in the same compiled call.
         """
         if isinstance(self.norm, nn.LayerNorm):
             self.folded = NormedConv.of(self.weight, self.norm, self.skip)
@@ -97,20 +99,20 @@ class SubmanifoldLayer(nn.Module):
 
 
 class SubmanifoldStage(nn.Sequential):
-    """So many layers of equal width on the same sites, one after another."""
+    """A sequence of layers of equal width on the same sites."""
 
     def __init__(self, channels: int, layers: int) -> None:
         super().__init__(*(SubmanifoldLayer(channels, channels) for _ in range(layers)))
         self.folded: FoldedConvs | None = None
 
     def forward(self, input: SparseBev) -> SparseBev:
-        """(N, channels) to (N, channels)."""
+        """Map (N, channels) to (N, channels)."""
         if self.folded is not None and is_supported(input.features):
             return input.with_features(self.folded(input.features, same_sites_map(input.sites, kernel=3)))
         return super().forward(input)
 
     def fold(self) -> None:
-        """Fold every layer, for good, into weights that one compiled call goes through."""
+        """Fold every layer permanently into the weights of one compiled call."""
         layers = [layer for layer in self if isinstance(layer, SubmanifoldLayer)]
         for layer in layers:
             layer.fold()
@@ -121,7 +123,9 @@ class SubmanifoldStage(nn.Sequential):
 
 
 class DownLayer(nn.Module):
-    """3x3 convolution of stride 2, norm, ReLU; ``dilating`` chooses spconv's active set, else parents of active cells."""
+    """3x3 convolution of stride 2, norm, ReLU; ``dilating`` selects spconv's active set, else parents of active
+    cells.
+    """
 
     bias: Tensor | None
 
@@ -133,7 +137,7 @@ class DownLayer(nn.Module):
         self.folded: FoldedConvs | None = None
 
     def forward(self, x: SparseBev) -> SparseBev:
-        """Features at twice the stride."""
+        """Compute features at twice the stride."""
         if self.folded is not None and is_supported(x.features):
             sites, table = strided_map(x.sites, Window(3, 2, 1), self.dilating)
             return SparseBev(self.folded(x.features, table), sites)
@@ -141,7 +145,7 @@ class DownLayer(nn.Module):
         return y.with_features(_rectified(self.norm(y.features), None))
 
     def fold(self) -> None:
-        """Take the norm's running statistics into the weight, for good."""
+        """Fold the norm's running statistics into the weight, permanently."""
         if isinstance(self.norm, ActiveNorm):
             weight, self.bias = fold_norm(self.weight.detach(), self.norm)
             self.weight, self.norm = nn.Parameter(weight, requires_grad=False), nn.Identity()
@@ -149,7 +153,7 @@ class DownLayer(nn.Module):
 
 
 class UpLayer(nn.Module):
-    """Inverse convolution back to a finer set of sites, norm, added to a projection of what was there, ReLU."""
+    """Inverse convolution to finer sites, norm, added to a lateral projection, ReLU."""
 
     bias: Tensor | None
 
@@ -162,13 +166,13 @@ class UpLayer(nn.Module):
         self.register_buffer("bias", None, persistent=False)
 
     def forward(self, coarse: SparseBev, fine: SparseBev) -> SparseBev:
-        """Coarse features on the sites of ``fine``."""
+        """Upsample coarse features to the sites of ``fine``."""
         sites: Sites = fine.sites
         y = inverse_conv(coarse, self.weight, sites, self.bias, stride=2, padding=1)
         return fine.with_features(torch.relu(self.norm(y.features + self.lateral(fine.features))))
 
     def fold(self) -> None:
-        """Take the norm's running statistics into both weights, for good."""
+        """Fold the norm's running statistics into both weights, permanently."""
         if isinstance(self.norm, ActiveNorm):
             weight, self.bias = fold_norm(self.weight.detach().transpose(0, 1), self.norm)
             self.lateral.weight = nn.Parameter(fold_norm(self.lateral.weight.detach(), self.norm)[0], False)

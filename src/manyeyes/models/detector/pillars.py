@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From points to features on pillars, without caps on points or pillars."""
+"""Encode points to pillar features, without limits on the number of points or pillars."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ NUM_MOMENTS = 12
 
 
 class PointPillars(nn.Module):
-    """Per-point linear layer and maximum over each pillar (PointPillars, Lang et al. 2019, eq. in section 2.1).
+    """Per-point linear layer and maximum over each pillar (PointPillars, Lang et al. 2019, section 2.1).
 
-    With two sweeps a point's age, in sweeps, is an input more.
+    With two sweeps, the age of a point in sweeps is another input.
     """
 
     def __init__(self, channels: int, sweeps: int = 1) -> None:
@@ -29,7 +29,7 @@ class PointPillars(nn.Module):
         self.linear, self.norm = nn.Linear(9 + sweeps, channels, bias=False), ActiveNorm(channels)
 
     def forward(self, xyz: Tensor, intensities: Tensor, is_previous: Tensor, pillars: Pillars) -> Tensor:
-        """Kept points (P, 3), their intensities (P,) and whether they are of the sweep before (P,) to (N, channels)."""
+        """Encode points (P, 3), their intensities (P,) and is_previous (P,) bool to (N, channels)."""
         intensity = (
             intensities[:, None]
             if self.sweeps == 1
@@ -43,15 +43,15 @@ class PointPillars(nn.Module):
         return segment_max(torch.relu(self.norm(self.linear(inputs))), row, len(sites))
 
     def infer(self, clouds: list[PointCloud], previous_clouds: list[PointCloud], grid: BevGrid) -> SparseBev:
-        """The same numbers of whole clouds, float32 in the CPU's memory, with the norm folded in: for inference."""
+        """Encode whole clouds for inference, with the norm folded in; float32 on the CPU, same values as forward."""
         weight, bias = fold_norm(self.linear.weight, self.norm)
         return pillar_maxima(clouds, previous_clouds, grid, nn.functional.pad(weight, (0, 2 - self.sweeps)), bias)
 
 
 class MomentPillars(nn.Module):
-    """A two-layer perceptron on twelve statistics of each pillar: no gradient through points, so training it costs less.
+    """A two-layer perceptron on twelve moments of each pillar; without gradients through points, so cheap to train.
 
-    With two sweeps there are twelve of each.
+    With two sweeps there are twelve moments of each.
     """
 
     def __init__(self, channels: int, sweeps: int = 1) -> None:
@@ -64,14 +64,14 @@ class MomentPillars(nn.Module):
         self.norm = ActiveNorm(channels)
 
     def forward(self, xyz: Tensor, intensities: Tensor, is_previous: Tensor, pillars: Pillars) -> Tensor:
-        """Kept points (P, 3), their intensities (P,) and whether they are of the sweep before (P,) to (N, channels)."""
+        """Encode points (P, 3), their intensities (P,) and is_previous (P,) bool to (N, channels)."""
         sweeps = (~is_previous, is_previous) if self.sweeps == 2 else (slice(None),)
         moments = torch.cat([pillar_moments(xyz[s], intensities[s], pillars.row[s], pillars.sites) for s in sweeps], 1)
         return torch.relu(self.norm(self.layers(self.scale(moments))))
 
 
 class PillarEncoder(nn.Module):
-    """Clouds of a batch of agents, and with two sweeps those before them, to features at stride 1."""
+    """Encode the clouds of a batch of agents, and with two sweeps the previous ones, at stride 1."""
 
     def __init__(self, grid: BevGrid, channels: int, kind: PillarKind, sweeps: int = 1) -> None:
         super().__init__()
@@ -79,9 +79,10 @@ class PillarEncoder(nn.Module):
         self.net = PointPillars(channels, sweeps) if kind == "points" else MomentPillars(channels, sweeps)
 
     def forward(self, clouds: list[PointCloud], previous_clouds: list[PointCloud] | None = None) -> SparseBev:
-        """One cloud an agent, each in that agent's frame, to (N, channels) on a batch of as many grids.
+        """Encode one cloud per agent, in that agent's frame, to (N, channels) on one grid per agent.
 
-        previous_clouds: the sweep before each, moved into the same frame; left out where the net looks at one sweep only.
+        previous_clouds: the previous sweeps, transformed to the same frames; omitted where the network takes one
+        sweep.
         """
         before = previous_clouds if previous_clouds is not None and self.sweeps == 2 else []
         many, agents = [*clouds, *before], [*range(len(clouds)), *range(len(before))]
@@ -98,10 +99,10 @@ class PillarEncoder(nn.Module):
 
 
 def _plain(clouds: list[PointCloud]) -> bool:
-    """Whether compiled loops can read them."""
+    """Whether compiled loops can read these tensors."""
     return all(cloud.xyz.dtype == torch.float32 and cloud.xyz.device.type == "cpu" for cloud in clouds)
 
 
 def _joined(parts: list[Tensor]) -> Tensor:
-    """All rows as one tensor; a single part is not copied."""
+    """Concatenate rows; a single part is not copied."""
     return parts[0] if len(parts) == 1 else torch.cat(parts)

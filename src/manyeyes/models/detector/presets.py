@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detector settings by name."""
+"""Named configurations of the detector."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SMALL_GRID = BevGrid(-70.4, -38.4, -5.0, 70.4, 38.4, 6.0)
 OPV2V_GRID = BevGrid(-140.8, -38.4, -3.0, 140.8, 38.4, 3.0)
 
 SMALL_SQUARE_GRID = BevGrid(-70.4, -70.4, -5.0, 70.4, 70.4, 6.0)
-"""As far to the sides as ahead: what lies beside an agent may lie ahead of another."""
+"""Equal range in all directions: what lies beside one agent may lie ahead of another."""
 
 COSTR_SMALL = DetectorConfig(
     grid=SMALL_GRID,
@@ -26,7 +26,7 @@ COSTR_SMALL = DetectorConfig(
     fusion="fast",
     sweeps=2,
 )
-"""Half of OPV2V's length, narrow: trains on two cores in about an hour."""
+"""Half of OPV2V's range and a narrow network: trains on two CPU cores in about an hour."""
 
 COSTR_OPV2V = DetectorConfig(
     grid=OPV2V_GRID,
@@ -38,7 +38,7 @@ COSTR_OPV2V = DetectorConfig(
     fusion="fast",
     sweeps=2,
 )
-"""The paper's range and widths; head stride 8 is its letter."""
+"""Range and widths of the paper, with its head stride 8."""
 
 COSTR_TINY = DetectorConfig(
     grid=BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0),
@@ -51,6 +51,6 @@ COSTR_TINY = DetectorConfig(
     fusion="fast",
     sweeps=2,
 )
-"""For tests and examples: seconds, not minutes."""
+"""For tests and examples, trains in seconds."""
 
 DETECTORS = {"costr-small": COSTR_SMALL, "costr-opv2v": COSTR_OPV2V, "costr-tiny": COSTR_TINY}

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A proposal as bytes: each quantity by a fixed rule of one byte, the same for all weights.
+"""Encode proposals in bytes: each quantity by a fixed rule of one byte, equal for all weights.
 
-What the receiver reads is within half a step of what was said: 1.4 cm in each of x and y at a cell of 1.6 m, 2 cm in z, 0.35
-degrees, 0.63 % of each size, 0.125 m/s; the sigmas within 22 %. Values beyond 127 steps saturate. The logit of a direction is
-kept along the body's axis, where alone it is read; of the kinds' logits, the best and by how much it leads. The length of
-``axis`` is not sent: it is 1 where the head is sure.
+The quantisation error is at most half a step: 1.4 cm in x and y at a cell of 1.6 m, 2 cm in z, 0.35 degrees, 0.63 %
+of each size,
+0.125 m/s; the sigmas within 22 %. Values beyond 127 steps saturate. The heading logit is stored along the box axis.
+Of the class
+logits, the best and its lead are stored. The length of ``axis`` is not sent; it is 1 for a confident head.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from manyeyes.models.detector.proposal import PROPOSAL_DIM
 
 _STEPS = (
     (BOX_LAYOUT.heatmap_logit, 1 / 16),
-    # Beyond fusion.settle.REACH_CELLS a proposal is not followed: what saturates stays beyond.
+    # Offsets beyond MAX_OFFSET_CELLS of fusion.token_merge are not followed; saturated values stay beyond it.
     (BOX_LAYOUT.offset, 2.25 / 127),
     (BOX_LAYOUT.z, 0.04),
     (BOX_LAYOUT.log_size, 0.0125),
@@ -34,18 +35,18 @@ _SIGMA_LOW, _SIGMA_STEP = -4.0, 0.4
 
 
 def _table() -> tuple[Tensor, Tensor]:
-    """The columns of a proposal that are written one by one, and the step of each."""
+    """Columns of a proposal that are encoded one by one, and their quantisation steps."""
     pairs = [(column, step) for span, step in _STEPS for column in range(span.start, span.stop)]
     return torch.tensor([c for c, _ in pairs]), torch.tensor([s for _, s in pairs])
 
 
 _COLUMNS, _COLUMN_STEPS = _table()
 PROPOSAL_CODES = len(_COLUMNS) + 4
-"""Bytes of a coded proposal: the single columns, then axis, direction, kind, and both sigmas in one."""
+"""Bytes of an encoded proposal: the single columns, then axis, direction, class, and both sigmas in one."""
 
 
 def proposal_to_codes(proposal: Tensor) -> Tensor:
-    """(N, PROPOSAL) to (N, PROPOSAL_CODES) uint8."""
+    """Encode proposals (N, PROPOSAL_DIM) to (N, PROPOSAL_CODES) uint8."""
     single = _signed(proposal[:, _COLUMNS], _COLUMN_STEPS)
     axis = torch.remainder(torch.round(axis_yaw(proposal[:, BOX_LAYOUT.axis]) * (256 / math.pi)), 256)
     facing = (proposal[:, BOX_LAYOUT.direction] * _along(axis)).sum(1)
@@ -58,7 +59,7 @@ def proposal_to_codes(proposal: Tensor) -> Tensor:
 
 
 def proposal_from_codes(codes: Tensor) -> Tensor:
-    """The inverse: (N, PROPOSAL_CODES) uint8 to (N, PROPOSAL) float32; any bytes stand for some proposal."""
+    """Decode (N, PROPOSAL_CODES) uint8 to (N, PROPOSAL_DIM) float32; any bytes are valid."""
     code = codes.float()
     axis, facing, kind, sigma = code[:, -4:].unbind(1)
     proposal = code.new_zeros(len(code), PROPOSAL_DIM)
@@ -66,7 +67,7 @@ def proposal_from_codes(codes: Tensor) -> Tensor:
     turn = axis * (2 * math.pi / 256)
     proposal[:, BOX_LAYOUT.axis] = torch.stack((turn.cos(), turn.sin()), 1)
     proposal[:, BOX_LAYOUT.direction] = ((facing - 128) * _FACING_STEP)[:, None] * _along(axis)
-    # The middle of its step: never 0, so that the best stays the best.
+    # The middle of its step: never 0, so that the best class stays the best.
     lead = (torch.remainder(kind, _LEADS) + 0.5) * (_LEAD_STEP / 2)
     named = torch.arange(len(LABELS)) == kind.div(_LEADS, rounding_mode="floor")[:, None]
     proposal[:, BOX_LAYOUT.class_logits] = torch.where(named, lead[:, None], -lead[:, None])
@@ -76,11 +77,11 @@ def proposal_from_codes(codes: Tensor) -> Tensor:
 
 
 def _signed(value: Tensor, step: Tensor | float) -> Tensor:
-    """Whole steps from 0 as 1 … 255; 0 is 128."""
+    """Encode whole steps as 1 … 255, with 128 for 0."""
     return torch.round(value / step).clamp(-127, 127) + 128
 
 
 def _along(axis: Tensor) -> Tensor:
-    """(N, 2): a unit vector along the axis of a code (N,); which of the two makes no difference to what is written along it."""
+    """Return a unit vector (N, 2) along the axis of a code (N,); either sign gives the same code."""
     yaw = axis * (math.pi / 256)
     return torch.stack((yaw.cos(), yaw.sin()), 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Focal pruning (CoSTr section III-B): drop the cells that cannot belong to an object."""
+"""Focal pruning (CoSTr section III-B): drop cells that do not belong to an object."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from manyeyes.datatypes import Sites, SparseBev
 
 @dataclass(frozen=True)
 class PruneOutput:
-    """What one pruning layer saw: its sites before pruning and the logit (N,) of each lying near an object."""
+    """Input of one pruning layer: its sites and the logit (N,) of each lying near an object."""
 
     sites: Sites
     logit: Tensor
 
 
 class FocalPrune(nn.Module):
-    """A logit a cell, trained with focal loss on whether the cell's centre lies near a box; keeps logits above a threshold."""
+    """One logit per cell, trained with focal loss on whether the cell's centre lies near a box; keeps cells above a
+    threshold.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -28,7 +30,7 @@ class FocalPrune(nn.Module):
         nn.init.constant_(self.score.bias, -2.19)
 
     def forward(self, x: SparseBev, threshold: float) -> tuple[SparseBev, PruneOutput]:
-        """Cells whose probability exceeds threshold (0 keeps all), as a new set, and what was decided on."""
+        """Keep the cells whose probability exceeds threshold (0 keeps all); returns them and the logits of all cells."""
         logit = self.score(x.features)[:, 0]
         pruned = PruneOutput(x.sites, logit)
         if threshold <= 0:

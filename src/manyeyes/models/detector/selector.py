@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which tokens are worth their bytes (CoSTr section III-E): one score a token, learned; a budget sends the highest."""
+"""Token selection (CoSTr section III-E): one learned score per token; under a budget the highest are sent."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from manyeyes.models.fusion.token_merge import PROPOSAL_SCALE, target_cell_keys
 class Selector(nn.Module):
     """The mask of Eq. 12 as a function of each token: m = sigmoid(score).
 
-    The score starts as the sender's confidence that the token is the middle of an object, less what it costs that others of
-    its own tokens, surer than it, speak of the same object already: a second word on one vehicle is worth less than a first
-    word on another. What is learned is added to it.
+    The score starts as the heatmap logit of the token minus a penalty for redundancy, which counts the sender's own
+    higher-scored
+    tokens that propose the same cell. A learned function of the token is added.
     """
 
     def __init__(self, channels: int, hidden: int = 64) -> None:
@@ -27,7 +27,7 @@ class Selector(nn.Module):
         nn.init.zeros_(self.outer.bias)
 
     def forward(self, tokens: SparseBev) -> Tensor:
-        """(N, C + PROPOSAL) on one grid or a batch of them to logits (N,); no gradient reaches what is told."""
+        """Map tokens (N, C + PROPOSAL_DIM) on one or more grids to logits (N,); no gradient reaches the tokens."""
         rows = tokens.features.detach()
         proposal = rows[:, -PROPOSAL_DIM:]
         heat = proposed_heat(proposal)
@@ -38,7 +38,7 @@ class Selector(nn.Module):
 
 
 def rank_in_group(key: Tensor, value: Tensor) -> Tensor:
-    """(N,) how many of the same key have a higher value, ties by row, as value's type."""
+    """Count, for each element (N,), those of equal key with a higher value; ties by row, dtype of value."""
     by_value = value.sort(descending=True, stable=True).indices
     group, by_key = key[by_value].sort(stable=True)
     order = by_value[by_key]

@@ -17,10 +17,14 @@ from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_
 
 @dataclass(frozen=True)
 class AttentionConfig:
-    """window: edge S of a window in cells of the token grid; blocks alternate regular and shifted windows.
+    """Settings of window attention.
 
-    density_thresholds: shares of S^2 up to which a window's number of tokens is Low, and Medium; above it is High (Eq. 5).
-    separate_weights: a block has weights for each level, the paper's letter; shared ones do not ask for the level.
+    Attributes:
+        window: edge S of a window, in cells of the token grid.
+        blocks: number of blocks, with regular and shifted windows in turn.
+        density_thresholds: fractions of S^2 up to which the number of tokens is Low, and Medium; above it is High
+            (Eq. 5).
+        separate_weights: use separate weights per density level, as in the paper.
     """
 
     window: int = 8
@@ -39,10 +43,11 @@ class AttentionConfig:
 
 
 class WindowBlock(nn.Module):
-    """Pre-norm attention within a window and a feed-forward net, both residual (Eq. 6, 7).
+    """Pre-norm attention within a window and a feed-forward network, both residual (Eq. 6, 7).
 
-    The relative position encoding (Eq. 4) enters queries and keys, measured from the middle of the window that is in force,
-    shifted or not. Padding buckets are an affair of ``ops`` alone.
+    The relative position encoding (Eq. 4) enters queries and keys, measured from the centre of the regular or shifted
+    window. Padding is
+    internal to ``ops``.
     """
 
     def __init__(self, channels: int, config: AttentionConfig, shifted: bool) -> None:
@@ -62,9 +67,9 @@ class WindowBlock(nn.Module):
     def forward(
         self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
     ) -> Tensor:
-        """features (N, C) of tokens at xy (N, 2), metres, in grids batch (N,), to (N, C).
+        """Map features (N, C) of tokens at xy (N, 2), metres, in grids batch (N,), to (N, C).
 
-        cache: of the sites that xy and batch belong to, where they belong to any: their windows are found once.
+        cache: of the sites that xy and batch belong to, if any, so that their windows are computed once.
         """
         cache = {} if cache is None else cache
         name = ("windows", self.window, self.shifted)
@@ -89,15 +94,15 @@ class WindowBlock(nn.Module):
         return features + self.ffn(self.norm_ffn(features))
 
     def fold(self) -> None:
-        """Copy the weights to where one compiled call finds them, for good: those of the layers are no longer asked."""
+        """Copy the weights permanently to one compiled call; those of the layers are unused afterwards."""
         linears = [self.query, self.key, self.value, self.out, self.ffn[0], self.ffn[2]]
         self.folded = BlockWeights.of(linears, [self.norm, self.norm_ffn], self.heads)
 
 
 class RoutedBlock(nn.Module):
-    """Three blocks of attention, one for windows of Low, Medium and High density each (Eq. 5 to the letter).
+    """Three attention blocks, one each for windows of Low, Medium and High density (Eq. 5).
 
-    All tokens of a window go through the weights of its level; one token more may send them all through others.
+    All tokens of a window use the weights of its level, so one more token may change the weights of all of them.
     """
 
     def __init__(self, channels: int, config: AttentionConfig, shifted: bool) -> None:
@@ -108,7 +113,7 @@ class RoutedBlock(nn.Module):
     def forward(
         self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
     ) -> Tensor:
-        """(N, C) to (N, C); see WindowBlock. cache is not used: each level has tokens of its own."""
+        """Map (N, C) to (N, C), see WindowBlock; cache is unused, because each level has its own tokens."""
         edge = self.config.window * grid.cell_size_m
         ids = window_ids(xy, batch, (grid.x_min, grid.y_min), edge, edge / 2 if self.shifted else 0.0)
         level = density_levels(ids, self.config.window**2, self.config.density_thresholds)
@@ -121,9 +126,10 @@ class RoutedBlock(nn.Module):
 
 
 def density_levels(window: Tensor, cells: int, thresholds: tuple[float, float]) -> Tensor:
-    """(N,) int64: 0 Low, 1 Medium, 2 High, by how many tokens n_w the window (N,) of each holds (CoSTr Eq. 5).
+    """Return the density level (N,) int64 of each token's window (N,): 0 Low, 1 Medium, 2 High (CoSTr Eq. 5).
 
-    Low: n_w / cells at most levels[0]; Medium: at most levels[1]; tokens at continuous places may be more than cells.
+    Low: tokens / cells is at most thresholds[0]; Medium: at most thresholds[1]. Continuous positions allow more
+    tokens than cells.
     """
     _, row, count = window.unique(return_inverse=True, return_counts=True)
     share = count[row].double() / cells
@@ -138,7 +144,7 @@ def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:
 
 
 def _plain(x: Tensor) -> bool:
-    """Whether compiled loops may take it: no gradient is asked for, and it is float32 in the CPU's memory."""
+    """Whether compiled loops apply: no gradient is required, and the tensor is float32 on the CPU."""
     return not torch.is_grad_enabled() and x.device.type == "cpu" and x.dtype == torch.float32
 
 
@@ -153,7 +159,7 @@ class WindowTransformer(nn.Module):
     def forward(
         self, features: Tensor, xy: Tensor, batch: Tensor, grid: BevGrid, cache: dict[Any, Any] | None = None
     ) -> Tensor:
-        """(N, C) to (N, C); see WindowBlock."""
+        """Map (N, C) to (N, C); see WindowBlock."""
         for block in self.blocks:
             features = block(features, xy, batch, grid, cache)
         return features

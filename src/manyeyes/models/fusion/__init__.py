@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fusion of several agents' tokens; one published idea a file."""
+"""Intermediate fusion of the tokens of several agents; one published method per file."""

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FAST: self-attention over the tokens of all agents, cross-attention to the ego's own past, merge (CoSTr section III-D)."""
+"""FAST, flow-aware fusion: self-attention over all agents' tokens, cross-attention to the ego's past, merge (CoSTr
+III-D).
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,10 @@ from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_
 
 
 class PastAttention(nn.Module):
-    """Pre-norm attention of tokens to the past in their window, and a feed-forward net; both residual, both zero at the start.
+    """Pre-norm attention of tokens to past tokens in their window, and a feed-forward network; both residual and
+    zero-initialised.
 
-    A token whose window holds nothing of the past stays exactly as it is: no softmax is taken over an empty set.
+    A token whose window holds no past token is returned unchanged, so no softmax is taken over an empty set.
     """
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
@@ -31,7 +34,9 @@ class PastAttention(nn.Module):
             nn.init.zeros_(nothing)
 
     def forward(self, features: Tensor, tokens: Tokens, past_features: Tensor, past: Tokens) -> Tensor:
-        """features (N, C) of tokens and remembered (M, C) of the past, placed and timed, to (N, C)."""
+        """Update features (N, C) of tokens by attention to past_features (M, C), both position-encoded; returns (N,
+        C).
+        """
         edge, cell = self.window * tokens.grid.cell_size_m, tokens.grid.cell_size_m
         origin = (tokens.grid.x_min, tokens.grid.y_min)
         query_window, past_window = (window_ids(t.xy, t.ego, origin, edge) for t in (tokens, past))
@@ -53,7 +58,9 @@ class PastAttention(nn.Module):
 
 
 class FastFusion(nn.Module):
-    """Tokens attend to each other where their objects should be by now, then to what the ego itself saw, then settle."""
+    """Self-attention at the velocity-compensated positions, cross-attention to the ego's own past tokens, then
+    TokenMerge.
+    """
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
@@ -62,7 +69,7 @@ class FastFusion(nn.Module):
         self.merge = TokenMerge(channels, "softmax")
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
-        """Tokens of all agents, and those of the ego's own last instants, to one feature and one box a cell."""
+        """Fuse the tokens of all agents and the ego's past tokens to one feature and one box per cell."""
         key, place = assign_cells(tokens)
         attended = self.transformer(self.encoding(tokens.features, tokens, place), tokens.xy, tokens.ego, tokens.grid)
         if past is not None and len(past.features):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Element-wise maximum over agents, cell by cell (F-Cooper, Chen et al. 2019), on tokens moved metrically."""
+"""Element-wise maximum over agents, cell by cell (F-Cooper, Chen et al. 2019), on metrically transformed tokens."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from manyeyes.models.fusion.transform_tokens import Tokens
 
 
 class MaxFusion(nn.Module):
-    """Every agent's feature on the cell where it settles; the maximum of each channel."""
+    """Channel-wise maximum over the tokens assigned to each cell."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.encoding, self.merge = SpatioTemporalEncoding(channels), TokenMerge(channels, "max")
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
-        """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
+        """Fuse the tokens of all agents to one feature and one box per cell; past is ignored."""
         key, place = assign_cells(tokens)
         return self.merge(self.encoding(tokens.features, tokens, place), tokens, key, place)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fusion at several scales (FeaKM section 4.3, Eq. 7): what a wrong pose pulls apart on fine cells still meets on coarse ones."""
+"""Multi-scale fusion (FeaKM section 4.3, Eq. 7): tokens that a pose error separates on fine cells share a coarse
+cell.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,12 @@ from manyeyes.ops.voxelize import segment_max
 
 
 class MultiScaleFusion(nn.Module):
-    """The maximum over agents on cells of the tokens' stride, twice it, and so on; the scales side by side, projected.
+    """Maximum over agents at the token stride and at multiples of it, concatenated and projected.
 
-    Eq. 7a downsamples each agent's map and 7b fuses: here one maximum over a coarse cell does both, since the maximum over
-    agents of each agent's maximum is the maximum of all its tokens. Starts as MaximumFusion does: coarser scales weigh nothing.
+    Eq. 7a downsamples each agent's map and Eq. 7b fuses them. One maximum over a coarse cell does both, because the
+    maximum over agents
+    of per-agent maxima is the maximum over all tokens. Initialised to equal MaxFusion: coarser scales have weight
+    zero.
     """
 
     def __init__(self, channels: int, levels: int = 3) -> None:
@@ -33,7 +37,7 @@ class MultiScaleFusion(nn.Module):
             self.out.weight.copy_(torch.eye(channels, levels * channels))
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
-        """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
+        """Fuse the tokens of all agents to one feature and one box per cell; past is ignored."""
         key, place = assign_cells(tokens)
         placed = self.encoding(tokens.features, tokens, place)
         fine = self.merge(placed, tokens, key, place)
@@ -44,7 +48,7 @@ class MultiScaleFusion(nn.Module):
 
 
 class CoarseScale(nn.Module):
-    """One coarser scale: tokens of a cell times as wide become one, look around, and are told to the fine cells within."""
+    """One coarser scale: max-pool tokens to cells several times as wide, convolve, and copy back to the fine cells."""
 
     def __init__(self, channels: int, times: int) -> None:
         super().__init__()
@@ -53,7 +57,7 @@ class CoarseScale(nn.Module):
         self.conv = SubmanifoldLayer(channels, channels, norm=nn.LayerNorm)
 
     def forward(self, features: Tensor, row: Tensor, sites: Sites) -> Tensor:
-        """features: (N, C) of tokens that rest on fine sites row (N,); to (sites, C)."""
+        """Map features (N, C) of tokens on the fine sites row (N,) to (sites, C)."""
         grid = sites.grid.at(sites.grid.stride * self.times)
         rows, columns = grid.shape
         yx = grid.cells(sites.xy)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a feature must be told of where and when it comes from (CoSTr Eq. 8, 9, with continuous places)."""
+"""Spatio-temporal encoding of received tokens (CoSTr Eq. 8, 9, at continuous positions)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from manyeyes.models.fusion.token_merge import PROPOSAL_SCALE
 from manyeyes.models.fusion.transform_tokens import POSE_CONTEXT_DIM, Tokens
 
 FRAME_CONTEXT_DIM = 3
-"""The first cues: height and turn of the sender."""
+"""Number of pose-context columns that describe the sender's frame: height, sine and cosine - 1 of its yaw."""
 
 
 class SpatioTemporalEncoding(nn.Module):
-    """Tells a feature where it landed: its place in its cell, its sender's frame, doubt and age, and what the sender proposed.
+    """Encode position in the cell, sender frame, position sigma, age and proposal, and add them to a feature.
 
-    The age enters as sines and cosines too (Eq. 9; exponent with floor(k / 2), unit 100 ms). Both ways end in zeros, so that
-    fusion starts as if without.
+    The age also enters as sines and cosines (Eq. 9, exponent with floor(k / 2), unit 100 ms). Both branches end in
+    zero-initialised
+    layers, so that training starts without encoding.
     """
 
     def __init__(self, channels: int) -> None:
@@ -30,7 +31,7 @@ class SpatioTemporalEncoding(nn.Module):
         nn.init.zeros_(self.temporal.weight)
 
     def forward(self, features: Tensor, tokens: Tokens, cell_offset: Tensor) -> Tensor:
-        """(N, C) to (N, C); place (N, 2) from the cell's centre, in cells."""
+        """Encode features (N, C); cell_offset (N, 2) is measured from the cell centre, in cells. Returns (N, C)."""
         context = (
             tokens.pose_context[:, :FRAME_CONTEXT_DIM],
             cell_offset,
@@ -42,9 +43,9 @@ class SpatioTemporalEncoding(nn.Module):
 
 
 def temporal_encoding(age: Tensor, channels: int) -> Tensor:
-    """(N, channels): sines and cosines - 1 of age (N,), in its units, at frequencies 10000^(-2 floor(k / 2) / channels).
+    """Sines and cosines - 1 of age (N,) at frequencies 10000^(-2 floor(k / 2) / channels); returns (N, channels).
 
-    Cosine less one, so that the encoding of now is zero and changes nothing.
+    Age is in units of 100 ms. Subtracting one from the cosine makes the encoding of age zero vanish.
     """
     k = torch.arange(channels // 2, device=age.device, dtype=age.dtype)
     angle = age[:, None] * 10000.0 ** (-2.0 * k / channels)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-attention over the tokens of all agents in windows of the ego's frame: DAST in FAST's place (CoSTr Table III)."""
+"""Self-attention over the tokens of all agents in windows of the ego's frame: DAST in place of FAST (CoSTr Table
+III).
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from manyeyes.models.fusion.transform_tokens import Tokens
 
 
 class SelfAttentionFusion(nn.Module):
-    """Tokens attend to each other where they are, then settle, and those that meet become one by trust."""
+    """Window self-attention over all agents' tokens, then TokenMerge with softmax weights."""
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
@@ -20,7 +22,7 @@ class SelfAttentionFusion(nn.Module):
         self.merge = TokenMerge(channels, "softmax")
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
-        """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
+        """Fuse the tokens of all agents to one feature and one box per cell; past is ignored."""
         key, place = assign_cells(tokens)
         placed = self.encoding(tokens.features, tokens, place)
         attended = self.transformer(placed, tokens.xy, tokens.ego, tokens.grid)

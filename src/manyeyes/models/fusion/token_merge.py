@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where tokens of several agents come to rest: on the cell of the object's centre that each of them proposes."""
+"""Assign the tokens of several agents to the cells of their proposed object centres and merge the tokens of each
+cell.
+"""
 
 from __future__ import annotations
 
@@ -17,23 +19,23 @@ from manyeyes.ops.sparse_index import distinct
 from manyeyes.ops.voxelize import segment_max, segment_sum
 
 MIN_VOTE_LOGIT = -3.0
-"""Logit from which a token is taken at its word and settles where it says that its object is; others stay where they are."""
+"""Minimum heatmap logit with which a token moves to its proposed centre; other tokens stay in their cell."""
 DRIFT_MPS = 1.0
-"""How fast a remembered or delayed box is taken to become uncertain: what is left of a velocity's error."""
+"""Growth of a box's position sigma with its age: the residual velocity error."""
 MAX_OFFSET_CELLS = 2.0
-"""A proposal that points farther, in cells, is not followed: at stride 4 heads learn centres up to 1.5 cells away."""
+"""Maximum proposed offset, in cells, that a token follows; heads at stride 4 learn centres up to 1.5 cells away."""
 
 
 @dataclass(frozen=True, eq=False)
 class FusedBev:
-    """One feature a cell (N, C), and the agents' boxes for it (N, PROPOSAL), merged: where the second look starts from."""
+    """One feature per cell (N, C) and the merged proposals (N, PROPOSAL_DIM) from which box refinement starts."""
 
     bev: SparseBev
     merged_proposals: Tensor
 
 
 def assign_cells(tokens: Tokens) -> tuple[Tensor, Tensor]:
-    """Key (N,) of the cell where each token comes to rest, and the token's own place (N, 2) from that cell's centre, in cells."""
+    """Return the key (N,) of the cell of each token, and the token's offset (N, 2) from that cell's centre, in cells."""
     key = target_cell_keys(tokens.xy, tokens.proposal, tokens.ego, tokens.grid)
     rows, columns = tokens.grid.shape
     within = key.remainder(rows * columns)
@@ -42,7 +44,7 @@ def assign_cells(tokens: Tokens) -> tuple[Tensor, Tensor]:
 
 
 def target_cell_keys(xy: Tensor, proposal: Tensor, grid_of: Tensor, grid: BevGrid) -> Tensor:
-    """(N,) int64, ``(grid_of * rows + row) * columns + column`` of the cell where tokens at xy (N, 2) come to rest."""
+    """Return ``(grid_of * rows + row) * columns + column`` (N,) int64 of the target cell of tokens at xy (N, 2)."""
     offset = proposed_offset(proposal)
     votes = (proposed_heat(proposal) > MIN_VOTE_LOGIT) & (offset.abs().amax(1) <= MAX_OFFSET_CELLS)
     goal = xy + offset * votes[:, None] * grid.cell_size_m
@@ -53,12 +55,14 @@ def target_cell_keys(xy: Tensor, proposal: Tensor, grid_of: Tensor, grid: BevGri
 
 
 class TokenMerge(nn.Module):
-    """Tokens of a cell become one: a mean by trust, or the maximum, of features; a mean by trust of their boxes.
+    """Merge the tokens of a cell: softmax-weighted mean or maximum of features, softmax-weighted mean of boxes.
 
-    Trust is a softmax within the cell of what the tokens propose (heat, own word on overlap and error) and of their features;
-    it starts as heat plus overlap less log sigma, so that the first guess is a box averaged by what its senders claim; sigma
-    holds the doubt of the sender's place and what its box may have moved by since, beside the error of the box itself. How many
-    tokens met, how sure they are together and how far apart their boxes lie is told to the feature: no mean could.
+    The softmax runs within a cell, over a learned function of proposal (heatmap, IoU, log sigma) and feature. It
+    starts as heatmap
+    logit plus IoU logit minus log sigma. Sigma combines the box error, the position error of the sender's pose and
+    the drift since the
+    observation. The number of tokens, their joint score and the spread of their boxes are added to the feature, as a
+    mean loses them.
     """
 
     def __init__(self, channels: int, reduce: Literal["softmax", "max"]) -> None:
@@ -72,7 +76,7 @@ class TokenMerge(nn.Module):
         nn.init.zeros_(self.feature_weight.weight)
 
     def forward(self, features: Tensor, tokens: Tokens, key: Tensor, cell_offset: Tensor) -> FusedBev:
-        """Features (N, C) of tokens that rest on cells key (N,), their places from there (N, 2)."""
+        """Merge features (N, C) of tokens on cells key (N,), at cell_offset (N, 2) from their centres."""
         rows, columns = tokens.grid.shape
         found, row = distinct(key, tokens.batch_size * rows * columns)
         n = found.shape[0]
@@ -106,7 +110,7 @@ def _proposal_scale() -> Tensor:
 
 
 PROPOSAL_SCALE = _proposal_scale()
-"""Brings a proposal's logits to a few units."""
+"""Scale of each proposal column that brings its logits to a few units."""
 
 
 def _softmax(logit: Tensor, row: Tensor, n: int) -> Tensor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tokens of several agents in the ego's frame, at continuous metric positions (CoSTr section III-D.1)."""
+"""Transform the tokens of several agents to the ego's frame, at continuous metric positions (CoSTr section III-D.1)."""
 
 from __future__ import annotations
 
@@ -14,17 +14,23 @@ from manyeyes.models.detector.proposal import PROPOSAL_DIM, move_proposal, propo
 
 POSE_CONTEXT_DIM = 5
 MAX_SPEED_MPS = 40.0
-"""A proposal that claims a higher speed is not moved by it."""
+"""Maximum proposed speed that is used to compensate motion; faster proposals are not moved."""
 
 
 @dataclass(frozen=True, eq=False)
 class AgentTokens:
-    """What one agent told of one instant, for one ego of a batch.
+    """Tokens that one agent shared of one instant with one ego of a batch.
 
-    tokens: (n, C + PROPOSAL); xy: (n, 2), metres in the sender's frame. ego_from_sender: from the sender's frame when it looked
-    to the ego's now; None: the ego's own, of now. age_s: how long ago that was. sigma_xy_m, sigma_yaw_rad: standard deviations
-    of that motion, as claimed. selection_mask: (n,), ones through which the gradient of having been selected flows; None: no
-    selection.
+    Attributes:
+        ego: index of the receiving ego in the batch.
+        tokens: (n, C + PROPOSAL_DIM).
+        xy: (n, 2) positions in the sender's frame, metres.
+        ego_from_sender: from the sender's frame at that instant to the ego's current frame; None for the ego's own
+            current tokens.
+        age_s: time since the observation.
+        sigma_xy_m: standard deviation of the reported position.
+        sigma_yaw_rad: standard deviation of the reported heading.
+        selection_mask: (n,) ones that carry the gradient of the selection; None without selection.
     """
 
     ego: int
@@ -41,10 +47,14 @@ class AgentTokens:
 class Tokens:
     """N tokens around a batch of egos; cells of different agents may coincide.
 
-    features: (N, C); xy: (N, 2) metres in the ego's frame, where their object should be by now; ego: (N,) int64, which ego of
-    the batch. pose_context: (N, CUES), how the sender's frame differs from the ego's there: height in metres, sine and cosine - 1
-    of the relative yaw, doubt (one standard deviation of the place, metres), age (units of 100 ms); zero for the ego's own of now.
-    proposal: (N, PROPOSAL) in the ego's axes, from the token's own place. selection_mask: (N,) as in Part.
+    Attributes:
+        features: (N, C).
+        xy: (N, 2) motion-compensated positions in the ego's frame, metres.
+        ego: (N,) int64, index of the ego in the batch.
+        pose_context: (N, POSE_CONTEXT_DIM) height [m], sine and cosine - 1 of the relative yaw, position sigma [m],
+            age [100 ms]; zero for the ego's own current tokens.
+        proposal: (N, PROPOSAL_DIM) in the ego's axes, relative to the token.
+        selection_mask: (N,) as in AgentTokens.
     """
 
     features: Tensor
@@ -58,19 +68,20 @@ class Tokens:
 
     @property
     def sigma_m(self) -> Tensor:
-        """(N,) metres."""
+        """(N,) position standard deviations, metres."""
         return self.pose_context[:, 3]
 
     @property
     def age(self) -> Tensor:
-        """(N,) in units of 100 ms (detection.md, Eq. 9)."""
+        """(N,) token ages in units of 100 ms, the time step of CoSTr Eq. 9."""
         return self.pose_context[:, 4]
 
 
 def rotate_vectors(features: Tensor, yaw: Tensor) -> Tensor:
-    """The first half of the channels are pairs (x, y) of vectors in the sender's frame: turn them by yaw, a scalar.
+    """Rotate the vector channels of features (N, C) by a scalar yaw.
 
-    A position moves when it changes frames; a direction must turn. Scalar channels, the second half, stay as they are.
+    The first half of the channels are (x, y) pairs of vectors in the sender's frame; the second half are scalars and
+    stay.
     """
     channels = features.shape[1]
     pairs = features[:, : channels // 2].reshape(features.shape[0], channels // 4, 2)
@@ -80,7 +91,9 @@ def rotate_vectors(features: Tensor, yaw: Tensor) -> Tensor:
 
 
 def to_ego_frame(agent_tokens: Iterable[AgentTokens], grid: BevGrid, batch_size: int) -> Tokens:
-    """All parts in their egos' frames; tokens that fall outside the ego's range are dropped. grid: the lattice of all tokens."""
+    """Transform the tokens of all agents to their egos' frames and drop those outside the ego's range; grid: of all
+    tokens.
+    """
     columns = [_transform_part(part, grid) for part in agent_tokens]
     features, places, egos, cues, proposals, kept = (torch.cat(column) for column in zip(*columns))
     return Tokens(features, places, egos, cues, proposals, kept, grid, batch_size)

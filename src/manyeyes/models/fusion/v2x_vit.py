@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""V2X-ViT's fusion (Xu et al., ECCV 2022, section 3.2) on sparse tokens: heterogeneous attention between agents at one place,
-then attention of each over windows of several sizes.
+"""V2X-ViT fusion (Xu et al., ECCV 2022, section 3.2) on sparse tokens: heterogeneous multi-agent attention, then
+multi-scale window attention.
 
-Its maps have every agent's feature at every cell; here agents meet on the cells where their tokens come to rest. Its kinds of
-agents are vehicle and roadside unit; a token does not say what sent it, and in the towns all are vehicles, so that kinds here are
-the ego itself and whom it hears. Its delay-aware encoding of positions is Placement's; its warp is that of gather.
+The paper uses dense maps of all agents; here agents attend to each other on the cells where their tokens are
+assigned. The paper's
+agent types are vehicle and roadside unit. A token does not name its sender's type, so the types here are ego and
+other. The
+delay-aware positional encoding is SpatioTemporalEncoding; the spatial warp is to_ego_frame.
 """
 
 from __future__ import annotations
@@ -21,29 +23,31 @@ from manyeyes.ops.voxelize import segment_sum
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
 
 NUM_AGENT_TYPES = 2
-"""The ego's own tokens, and those that it heard."""
+"""Agent types: the ego's own tokens, and received tokens."""
 
 
 class PerAgentType(nn.Module):
-    """A linear map of its own for each kind of agent (the paper's Dense_c)."""
+    """A separate linear layer for each agent type (the paper's Dense_c)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.maps = nn.ModuleList(nn.Linear(channels, channels) for _ in range(NUM_AGENT_TYPES))
 
     def forward(self, features: Tensor, agent_type: Tensor) -> Tensor:
-        """(N, C) of agents of kind (N,) to (N, C)."""
+        """Map features (N, C) of agent types (N,) to (N, C)."""
         return torch.stack([each(features) for each in self.maps])[
             agent_type, torch.arange(len(agent_type), device=agent_type.device)
         ]
 
 
 class AgentAttention(nn.Module):
-    """Attention between tokens at one place: queries, keys and values by the kind of their agent, and a matrix a head for each
-    kind of edge, in the logits and in the messages.
+    """Heterogeneous attention between tokens of one cell: projections per agent type, and a matrix per head and edge
+    type in
+    logits and messages.
 
-    The softmax runs over all keys at once although the matrices differ by edge: keys and values are held as what they mean to
-    a query of either kind, side by side, and a query is zero on the other kind's side.
+    One softmax covers all keys although the matrices differ by edge type. Keys and values are stored side by side for
+    queries of either
+    type, and a query is zero in the columns of the other type.
     """
 
     def __init__(self, channels: int, heads: int) -> None:
@@ -56,18 +60,18 @@ class AgentAttention(nn.Module):
         _zero_init(self.out)
 
     def forward(self, features: Tensor, key: Tensor, agent_type: Tensor) -> Tensor:
-        """(N, C) of agents of kind (N,) that meet where key (N,) is the same, to (N, C)."""
+        """Map features (N, C) of agent types (N,) to (N, C); tokens with equal key (N,) attend to each other."""
 
         def split(x: Tensor) -> Tensor:
             return x.unflatten(1, (self.heads, -1))
 
         def to_both(x: Tensor, by_edge: Tensor) -> Tensor:
-            """(N, heads, KINDS * d): rows x (N, heads, d) as queries of each kind are told of them."""
+            """Transform x (N, heads, d) for queries of each agent type: (N, heads, NUM_AGENT_TYPES * d)."""
             return torch.einsum("nhd,qnhde->nhqe", x, by_edge[:, agent_type]).flatten(2)
 
         query = split(self.query(features, agent_type))
         one_hot = torch.nn.functional.one_hot(agent_type, NUM_AGENT_TYPES).to(query.dtype)
-        # The wider head would be scaled by the root of its own width.
+        # Scale for the width of one head, not for the doubled width.
         query = (query[:, :, None] * one_hot[:, None, :, None]).flatten(2) * NUM_AGENT_TYPES**0.5
         keys = to_both(split(self.key(features, agent_type)), self.attention_matrix)
         messages = to_both(split(self.value(features, agent_type)), self.message_matrix)
@@ -78,7 +82,7 @@ class AgentAttention(nn.Module):
 
 
 class WindowScale(nn.Module):
-    """Attention among one agent's tokens in windows of one size."""
+    """Attention among the tokens of one agent in windows of one size."""
 
     def __init__(self, channels: int, heads: int, window: int) -> None:
         super().__init__()
@@ -87,11 +91,11 @@ class WindowScale(nn.Module):
         _zero_init(self.out)
 
     def forward(self, features: Tensor, tokens: Tokens, agent: Tensor) -> Tensor:
-        """(N, C) of agents (N,) to (N, C)."""
+        """Map features (N, C) of agents (N,) to (N, C)."""
         cell, origin = tokens.grid.cell_size_m, (tokens.grid.x_min, tokens.grid.y_min)
         ids = window_ids(tokens.xy, agent, origin, self.window * cell)
         place = sincos_encoding(window_offsets(tokens.xy, origin, self.window * cell, cell), features.shape[1])
-        # The place is told to queries and keys; values are what is there.
+        # The position encoding enters queries and keys, not values.
         weight, bias = self.qkv.weight, self.qkv.bias
         query, key, value = (
             torch.nn.functional.linear(x, w, b).unflatten(1, (self.heads, -1))
@@ -101,8 +105,10 @@ class WindowScale(nn.Module):
 
 
 class MultiScaleWindows(nn.Module):
-    """Windows half, once and twice as wide, more heads in the smaller, and how much each counts: split attention, a softmax a
-    channel over the scales of what an agent's scales sum up to on average.
+    """Windows of half, one and two times the width, combined by split attention.
+
+    Smaller windows have more heads. The scale weights are a channel-wise softmax of a function of each agent's mean
+    summed feature.
     """
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
@@ -116,7 +122,7 @@ class MultiScaleWindows(nn.Module):
         self.inner, self.outer = nn.Linear(channels, channels), nn.Linear(channels, len(shapes) * channels)
 
     def forward(self, features: Tensor, tokens: Tokens, agent: Tensor, agents: int) -> Tensor:
-        """(N, C) of agents (N,), so many, to (N, C)."""
+        """Map features (N, C) of agents (N,) to (N, C); the last argument is the number of agents."""
         scales = torch.stack([scale(features, tokens, agent) for scale in self.scales], 1)
         count = segment_sum(scales.new_ones(len(agent), 1), agent, agents).clamp_min(1)
         mean = segment_sum(scales.sum(1), agent, agents) / count
@@ -125,7 +131,7 @@ class MultiScaleWindows(nn.Module):
 
 
 class V2xVitLayer(nn.Module):
-    """One layer: between agents, over windows, and a feed-forward net; pre-norm, residual, and silent at the start."""
+    """One layer: agent attention, window attention, feed-forward network; pre-norm, residual, zero-initialised."""
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
@@ -140,7 +146,7 @@ class V2xVitLayer(nn.Module):
         _zero_init(last)
 
     def forward(self, features: Tensor, tokens: Tokens, key: Tensor, agent_type: Tensor) -> Tensor:
-        """(N, C) to (N, C)."""
+        """Map features (N, C) to (N, C)."""
         between, within, alone = self.norms
         features = features + self.agent_attention(between(features), key, agent_type)
         agent = tokens.ego * NUM_AGENT_TYPES + agent_type
@@ -151,7 +157,7 @@ class V2xVitLayer(nn.Module):
 
 
 class V2xVitFusion(nn.Module):
-    """Layers of both attentions; then, as for every fusion here, tokens of a cell become one by trust."""
+    """V2X-ViT layers, then TokenMerge with softmax weights as in the other fusions."""
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
@@ -164,7 +170,7 @@ class V2xVitFusion(nn.Module):
         self.layers = nn.ModuleList(V2xVitLayer(channels, config) for _ in range(config.blocks))
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
-        """Tokens of all agents to one feature and one box a cell; the past is not looked at."""
+        """Fuse the tokens of all agents to one feature and one box per cell; past is ignored."""
         key, place = assign_cells(tokens)
         features, agent_type = self.encoding(tokens.features, tokens, place), agent_types(tokens)
         for layer in self.layers:
@@ -173,7 +179,9 @@ class V2xVitFusion(nn.Module):
 
 
 def agent_types(tokens: Tokens) -> Tensor:
-    """(N,) int64: 0 the ego's own of now, whose cues are zero, 1 what was heard."""
+    """Return the agent type (N,) int64 of tokens: 0 for the ego's current tokens (zero pose context), 1 for received
+    ones.
+    """
     return tokens.pose_context.any(1).long()
 
 

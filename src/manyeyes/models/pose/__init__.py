@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Nets that match objects of two agents."""
+"""Networks that match the objects of two agents."""

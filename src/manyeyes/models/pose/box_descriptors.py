@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FeaKM's keypoints, mended: decoded boxes, each described by the tokens around it in the box's own axes.
+"""Improved FeaKM keypoints: decoded boxes with descriptors of the tokens around them, in the axes of the box.
 
-Against the published ones (models/pose/keypoint_net.py): places are box centres, finer than a cell and without the half pixel;
-each view is described alone, every token scaled by its own length; the samples turn with the box, and so do the channels
-that are vectors, so that a descriptor does not depend on where its agent looks (specs/pose.md 1.11).
+Differences to the published keypoints (models/pose/keypoint_net.py): positions are box centres, without cell
+quantisation and
+half-pixel shift. Views are described independently, each token scaled by its own norm. Samples and vector channels
+rotate with the
+box, so that a descriptor does not depend on the agent's heading.
 """
 
 from __future__ import annotations
@@ -23,16 +25,22 @@ from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.ops.sparse_sample import bilinear
 
 BOX_FEATURES_DIM = 5
-"""Of a box itself: three sizes, score, its word on its error."""
+"""Features of the box itself: three sizes, score, position sigma."""
 
 
 @dataclass(frozen=True)
 class BoxKeypointConfig:
-    """in_channels: channels of the tokens, half of them pairs of a vector. descriptor_dim: its length, which is its bytes on the
-    wire.
+    """Settings of the box descriptors.
 
-    hidden_channels: of the net in between. min_score, max_keypoints: which boxes are points, the best. num_longitudinal_samples,
-    num_lateral_samples: samples by the box's axes, pitch_m apart: a car and a lane beside it.
+    Attributes:
+        in_channels: channels of the tokens, half of them (x, y) pairs of vectors.
+        descriptor_dim: length of a descriptor, and its bytes in a message.
+        hidden_channels: width of the hidden layer.
+        min_score: minimum score of a box to be a keypoint.
+        max_keypoints: maximum number of keypoints, the highest scores first.
+        num_longitudinal_samples: samples along the box.
+        num_lateral_samples: samples across the box.
+        sample_spacing_m: distance between samples; the default covers a car and a lane on either side.
     """
 
     in_channels: int = 64
@@ -46,7 +54,7 @@ class BoxKeypointConfig:
 
 
 class BoxKeypointNet(nn.Module):
-    """Samples around each box, and a small net on them; see the module."""
+    """Sample tokens around each box and encode them with a small network."""
 
     def __init__(self, config: BoxKeypointConfig) -> None:
         super().__init__()
@@ -58,12 +66,12 @@ class BoxKeypointNet(nn.Module):
         )
 
     def forward(self, views: Sequence[DetectorView], group_size: int = 0) -> list[Keypoints]:
-        """The boxes that are sure enough, of each view by itself, however many are given together."""
+        """Describe the boxes of each view with at least min_score; group_size has no effect."""
         return [self._describe(view) for view in views]
 
     def _describe(self, view: DetectorView) -> Keypoints:
         boxes = view.boxes[view.boxes.score >= self.config.min_score][: self.config.max_keypoints]
-        # Behind the features how much of a sample is occupied: an empty cell and a feature of zero are told apart.
+        # An occupancy channel distinguishes an empty cell from a feature of zero.
         rows = functional.rms_norm(view.tokens.features, (self.config.in_channels,))
         tokens = view.tokens.with_features(torch.cat((rows, rows.new_ones(len(rows), 1)), 1))
         sample_xy = boxes.center[:, None, :2].float() + self._offsets(boxes.yaw.float())
@@ -77,7 +85,7 @@ class BoxKeypointNet(nn.Module):
         return Keypoints(boxes, functional.normalize(descriptor))
 
     def _offsets(self, yaw: Tensor) -> Tensor:
-        """(N, samples, 2) metres in the agent's axes."""
+        """Return the sample positions (N, samples, 2) relative to the box centres, metres in the agent's axes."""
         config = self.config
         longitudinal, lateral = (
             (torch.arange(n) - (n - 1) / 2) * config.sample_spacing_m

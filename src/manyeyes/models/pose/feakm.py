@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FeaKM's net, whole: keypoints of views and matches between them, as published and mended behind one interface."""
+"""FeaKM's network: keypoints of views and matches between them, published and improved variants behind one interface."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ FORMAT = "manyeyes-feakm-1"
 
 @dataclass(frozen=True)
 class FeakmConfig:
-    """Where keypoints come from and how they are matched. detector: fingerprint (hex) of the weights whose views it was taught
-    on; views of others mean nothing to it.
+    """Settings of keypoints and matcher.
+
+    detector: fingerprint (hex) of the detector whose views the network was trained on; empty accepts any.
     """
 
     keypoints: DenseKeypointConfig | BoxKeypointConfig
@@ -34,14 +35,14 @@ class FeakmConfig:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """pairs: (P, 2) rows of two sets of keypoints, no row twice on either side; probability: (P,)."""
+    """Matches between two sets of keypoints. pairs: (P, 2) rows, unique on either side; probability: (P,)."""
 
     pairs: Tensor
     probability: Tensor
 
 
 class FeakmNet(nn.Module):
-    """describe is what each agent does at home; match is what the ego does with what it was sent."""
+    """Keypoint descriptors and matcher: senders call describe, the ego calls match on what it received."""
 
     def __init__(self, config: FeakmConfig) -> None:
         super().__init__()
@@ -51,14 +52,16 @@ class FeakmNet(nn.Module):
         self.matcher = Matcher(config.matcher)
 
     def describe(self, views: Sequence[DetectorView], group_size: int = 0) -> list[Keypoints]:
-        """Keypoints of views, described in groups of so many together (0: all): one, as a sender does, or a pair, as FeaKM's
-        code does; only as published does it make a difference.
+        """Compute keypoints of views in groups of group_size (0: all).
+
+        A sender describes one view; FeaKM's code describes pairs. The group size matters only for the published
+        descriptors.
         """
         return self.keypoints(views, group_size)
 
     @torch.no_grad()
     def match(self, ego_keypoints: KeypointBatch, other_keypoints: KeypointBatch) -> Matches:
-        """Points of one view each that are one object, by what they look like and how they stand; no pose is given."""
+        """Match the keypoints of one view each by descriptors and relative geometry, without a prior pose."""
         if not ego_keypoints.mask.any() or not other_keypoints.mask.any():
             return Matches(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0))
         return Matches(
@@ -68,7 +71,7 @@ class FeakmNet(nn.Module):
         )
 
     def check_views(self, detector: bytes) -> None:
-        """Refuse views of a detector of that fingerprint, where the net was taught on another's."""
+        """Raise ConfigError where the network was trained on views of another detector than this fingerprint."""
         if self.config.detector and self.config.detector != detector.hex():
             raise ConfigError(
                 f"This net of FeaKM was taught on views of the weights {self.config.detector}, these are {detector.hex()}; "
@@ -91,11 +94,11 @@ FEAKM_SMALL = FeakmConfig(
         neighbour_geometry=NeighbourGeometryConfig(),
     ),
 )
-"""Mended, and at most 2 M parameters."""
+"""The improved variant, at most 2 M parameters."""
 
 FEAKM = {"feakm-paper": FEAKM_PAPER, "feakm-small": FEAKM_SMALL}
 
 
 def load(path: Path) -> FeakmNet:
-    """A net in evaluation mode, from its own file alone."""
+    """Load a network in evaluation mode."""
     return checkpoint.load_as(path, FORMAT, FeakmConfig, FeakmNet)

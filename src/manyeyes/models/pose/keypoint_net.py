@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FeaKM's keypoints as published: peaks of the confidence map, descriptors from a dense net at an eighth of its resolution.
+"""FeaKM's published keypoints: peaks of the confidence map, descriptors of a dense network at an eighth of its
+resolution.
 
-FeaKM section 4.2.1; what the paper leaves open follows its public code as specs/pose.md 1.1 to 1.3 describe it, its defects
-among them: a point is the corner of its cell, where its centre is meant; channels are scaled by the largest value of *all*
-views that are described together, so that one agent's descriptors depend on the other's features; and every list is filled
-up to its full length with copies of the lattice's first cell, which nothing marks as padding.
+FeaKM section 4.2.1. Where the paper is silent, the behaviour of its public code is reproduced with its defects: a
+keypoint is the
+corner of its cell, not its centre; channels are scaled by the largest value of all views that are described together,
+so that the
+descriptors of one agent depend on the other; and lists are filled up with unmarked copies of the first grid cell.
 """
 
 from __future__ import annotations
@@ -23,13 +25,14 @@ from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
 
 DESCRIPTOR_STRIDE = 8
-"""Cells of the lattice to one of the descriptors' map."""
+"""Grid cells per cell of the descriptor map."""
 
 
 @dataclass(frozen=True, eq=False)
 class DetectorView:
-    """What keypoints are taken from: one agent's tokens (N, C), how sure its detector is of an object at each (N,) in [0, 1],
-    and its decoded boxes, best first; all in its own frame.
+    """Input of the keypoint networks: one agent's tokens (N, C), their heatmap probabilities (N,) and its decoded
+    boxes in
+    descending order of score, all in its own frame.
     """
 
     tokens: SparseBev
@@ -45,19 +48,25 @@ class DetectorView:
 
     @classmethod
     def of(cls, shared_tokens: SparseBev, boxes: Boxes) -> DetectorView:
-        """From what an agent tells (N, C + PROPOSAL) and its own boxes."""
+        """Make a view from shared tokens (N, C + PROPOSAL_DIM) and the agent's own boxes."""
         features, proposal = shared_tokens.features[:, :-PROPOSAL_DIM], shared_tokens.features[:, -PROPOSAL_DIM:]
         return cls(shared_tokens.with_features(features), torch.sigmoid(proposed_heat(proposal)), boxes)
 
 
 @dataclass(frozen=True)
 class DenseKeypointConfig:
-    """in_channels: channels of the tokens. widths: of the three blocks, each of which halves the resolution; descriptor_dim: its
-    length.
+    """Settings of the dense keypoints.
 
-    min_score: least confidence of a point. nms_radius_m: distance within which only the peak stays; border_cells: cells left out at
-    the edge; num_keypoints: points of a view. saliency: the map whose peaks are taken, "confidence" or the length of the "feature":
-    the paper's Table 3 without a confidence map.
+    Attributes:
+        in_channels: channels of the tokens.
+        widths: channels of the three blocks, each of which halves the resolution.
+        descriptor_dim: length of a descriptor.
+        min_score: minimum confidence of a keypoint.
+        nms_radius_m: distance within which only the peak is kept.
+        border_cells: cells ignored at the edge of the grid.
+        num_keypoints: number of keypoints of a view.
+        saliency: map whose peaks are taken, "confidence" or the norm of the "feature" (Table 3 without confidence
+            map).
     """
 
     in_channels: int = 64
@@ -75,7 +84,7 @@ class DenseKeypointConfig:
 
 
 class DenseKeypointNet(nn.Module):
-    """Dense convolutions over the whole grid; see the module."""
+    """Dense convolutions over the whole grid, as published."""
 
     def __init__(self, config: DenseKeypointConfig) -> None:
         super().__init__()
@@ -92,9 +101,9 @@ class DenseKeypointNet(nn.Module):
         )
 
     def forward(self, views: Sequence[DetectorView], group_size: int = 0) -> list[Keypoints]:
-        """Exactly `most` points of each view, the best first and then padding.
+        """Return exactly num_keypoints keypoints of each view, the best first, then padding.
 
-        group_size: views are scaled by the largest value in groups of so many, one after the other; 0: all of them.
+        group_size: number of consecutive views that are scaled by one common maximum; 0 for all.
         """
         features = torch.cat([v.tokens.dense() for v in views]).unflatten(0, (-1, group_size or len(views)))
         scale = features.abs().amax((1, 3, 4), keepdim=True).clamp_min(1e-6)
@@ -116,7 +125,7 @@ class DenseKeypointNet(nn.Module):
         cell = torch.cat((best, best.new_zeros(config.num_keypoints - len(best))))
         yx = torch.stack((cell // grid.shape[1], cell % grid.shape[1]), 1)
         score = torch.cat((score[best], score.new_zeros(config.num_keypoints - len(best))))
-        # The published half pixel: where a cell begins, not its centre.
+        # The published half-pixel shift: the corner of the cell, not its centre.
         xy = grid.centers(yx) - grid.cell_size_m / 2
         return Keypoints(
             make_point_boxes(xy, score, grid.cell_size_m / math.sqrt(12)), _sample_descriptors(described, yx)
@@ -124,7 +133,7 @@ class DenseKeypointNet(nn.Module):
 
 
 def make_point_boxes(xy: Tensor, score: Tensor, sigma_xy_m: float) -> Boxes:
-    """Boxes without size or heading at places (N, 2)."""
+    """Make boxes without size and heading at positions (N, 2)."""
     n = len(xy)
     center = torch.cat((xy, xy.new_zeros(n, 1)), 1)
     boxes = Boxes.of(center, torch.zeros_like(center), xy.new_zeros(n), score.to(xy.dtype))
@@ -133,9 +142,9 @@ def make_point_boxes(xy: Tensor, score: Tensor, sigma_xy_m: float) -> Boxes:
 
 
 def local_maxima(score: Tensor, radius_cells: int, rounds: int = 3) -> Tensor:
-    """(B, H, W) bool of scores (B, H, W) > 0: greedy suppression within a square of radius cells, in so many rounds.
+    """Return the mask (B, H, W) of local maxima of scores (B, H, W) > 0: non-maximum suppression within radius_cells.
 
-    Each round keeps what is largest around it among what no kept cell suppresses.
+    Each round keeps the maxima among the cells that no kept cell suppresses.
     """
     size = 2 * radius_cells + 1
     kept = torch.zeros_like(score, dtype=torch.bool)
@@ -153,8 +162,9 @@ def _convolutions(inputs: int, outputs: int) -> list[nn.Module]:
 
 
 def _sample_descriptors(described: Tensor, yx: Tensor) -> Tensor:
-    """(N, D) of a map (D, h, w) at cells (N, 2), of length 1: SuperPoint's formula, which maps the middle of the first
-    stride to the corner of the map.
+    """Sample unit descriptors (N, D) from a map (D, h, w) at cells (N, 2).
+
+    Uses SuperPoint's formula, which maps the centre of the first stride to the corner of the map.
     """
     h, w = described.shape[1:]
     extent = torch.tensor([w, h]) * DESCRIPTOR_STRIDE - DESCRIPTOR_STRIDE / 2 - 0.5

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which keypoints of two agents are the same object: stacked self- and cross-attention, and an assignment matrix.
+"""Match the keypoints of two agents: stacked self- and cross-attention, and an assignment matrix.
 
-FeaKM section 4.2.2 (Eq. 4, 5) with its reference for rotary positions (Su et al., RoFormer); the assignment is LightGlue's
-(Lindenberger et al. 2023), which FeaKM's code uses unchanged: log P_ij = log softmax over j + log softmax over i of the
-similarity, + log sigmoid of each side's matchability (specs/pose.md 1.4).
+FeaKM section 4.2.2 (Eq. 4, 5) with rotary position encoding (Su et al., RoFormer). The assignment is that of
+LightGlue (Lindenberger
+et al. 2023), used unchanged by FeaKM's code: log P_ij is the row-wise plus the column-wise log softmax of the
+similarity, plus the
+log sigmoid of both matchabilities.
 """
 
 from __future__ import annotations
@@ -20,14 +22,22 @@ from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.pose.neighbour_geometry import NeighbourGeometryConfig, NeighbourGeometryEncoder
 
 MASKED_LOGIT = -1e4
-"""Logit of what may not be attended to or assigned; finite, so that an empty set gives no NaN."""
+"""Logit of masked entries; finite, so that an empty set gives no NaN."""
 
 
 @dataclass(frozen=True)
 class MatcherConfig:
-    """descriptor_dim: length of what comes in; width, layers, heads: of the attention. position_unit_m: in which positions are
-    measured, and frequency: spread of the angles that a unit turns, before they are learned. min_match_prob: least probability of a
-    match. neighbour_geometry: points are also told how those around them stand, whichever way their agent looks; None as published.
+    """Settings of the matcher.
+
+    Attributes:
+        descriptor_dim: length of an input descriptor.
+        width: channels of the attention blocks.
+        layers: number of self- and cross-attention blocks.
+        heads: of the attention.
+        position_unit_m: unit of the positions.
+        frequency_std: initial standard deviation of the rotary frequencies, radians per unit.
+        min_match_prob: minimum probability of a match.
+        neighbour_geometry: settings of the rotation-invariant neighbour encoding; None as published.
     """
 
     descriptor_dim: int = 256
@@ -46,8 +56,9 @@ class MatcherConfig:
 
 @dataclass(frozen=True, eq=False)
 class KeypointBatch:
-    """Keypoints of B views as one batch. descriptor: (B, N, D); xy: (B, N, 2) m; yaw: (B, N); size: (B, N, 2) m; mask: (B, N)
-    bool, which are points and not padding.
+    """Padded keypoints of B views.
+
+    descriptor: (B, N, D). xy: (B, N, 2) m. yaw: (B, N). size: (B, N, 2) m. mask: (B, N) bool, false for padding.
     """
 
     descriptor: Tensor
@@ -58,7 +69,7 @@ class KeypointBatch:
 
     @classmethod
     def of(cls, keypoints: Sequence[Keypoints]) -> KeypointBatch:
-        """Padded to the longest."""
+        """Pad the keypoints of several views to the longest list."""
 
         def pad(values: Sequence[Tensor]) -> Tensor:
             return nn.utils.rnn.pad_sequence([v.float() for v in values], batch_first=True)
@@ -74,7 +85,7 @@ class KeypointBatch:
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """log_p: (B, N, M) of a match; log_unmatched_a, log_unmatched_b: (B, N), (B, M) that a point has none."""
+    """Log probabilities of matches log_p (B, N, M), and of no match log_unmatched_a (B, N), log_unmatched_b (B, M)."""
 
     log_p: Tensor
     log_unmatched_a: Tensor
@@ -82,7 +93,9 @@ class Assignment:
 
 
 def find_mutual_matches(assignment: Assignment, min_prob: float) -> list[tuple[Tensor, Tensor]]:
-    """Of each pair of views: rows (P, 2) that are each other's best with a probability above the threshold, and that (P,)."""
+    """Return, per pair of views, mutual best matches (P, 2) with a probability above min_prob, and these
+    probabilities (P,).
+    """
     found = []
     for log_p in assignment.log_p:
         if not log_p.numel():
@@ -96,7 +109,7 @@ def find_mutual_matches(assignment: Assignment, min_prob: float) -> list[tuple[T
 
 
 class Matcher(nn.Module):
-    """Layers of self- and cross-attention, each with its own assignment, so that every layer can be taught."""
+    """Layers of self- and cross-attention, each with its own assignment for deep supervision."""
 
     def __init__(self, config: MatcherConfig) -> None:
         super().__init__()
@@ -113,7 +126,7 @@ class Matcher(nn.Module):
         self.assignment_heads = nn.ModuleList(AssignmentHead(d) for _ in range(config.layers))
 
     def forward(self, a: KeypointBatch, b: KeypointBatch) -> list[Assignment]:
-        """Pairs of views to the assignment of every layer, the last of which is the answer; see mutual."""
+        """Return the assignment of every layer; the last is the result, see find_mutual_matches."""
         (x, turn_x), (y, turn_y) = self._embed(a), self._embed(b)
         found = []
         for self_block, cross_block, assignment_head in zip(self.self_blocks, self.cross_blocks, self.assignment_heads):
@@ -131,8 +144,9 @@ class Matcher(nn.Module):
 
 
 def apply_rotary(x: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
-    """Pairs of channels of (B, heads, N, c) turned by angles whose cosine and sine are (B, 1, N, c / 2): the product of two
-    such depends on the difference of their places alone (RoFormer, Eq. 14).
+    """Rotate channel pairs of (B, heads, N, c) by angles given as cosine and sine (B, 1, N, c / 2).
+
+    The product of two rotated vectors depends on the difference of their positions only (RoFormer, Eq. 14).
     """
     c, s = turn
     u, v = x[..., 0::2], x[..., 1::2]
@@ -146,17 +160,17 @@ def _make_ffn(width: int) -> nn.Sequential:
 
 
 def _split(x: Tensor, heads: int) -> Tensor:
-    """(B, N, d) to (B, heads, N, d / heads)."""
+    """Split (B, N, d) to (B, heads, N, d / heads)."""
     return x.unflatten(-1, (heads, -1)).transpose(1, 2)
 
 
 def _bias(mask: Tensor) -> Tensor:
-    """(B, 1, 1, N) to add to attention's logits."""
+    """Return the additive attention mask (B, 1, 1, N)."""
     return (~mask).float()[:, None, None] * MASKED_LOGIT
 
 
 class SelfAttentionBlock(nn.Module):
-    """Points of one view attend to each other, by content and relative place."""
+    """Self-attention among the keypoints of one view, by content and relative position."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -164,14 +178,14 @@ class SelfAttentionBlock(nn.Module):
         self.qkv, self.out, self.ffn = nn.Linear(width, 3 * width), nn.Linear(width, width), _make_ffn(width)
 
     def forward(self, x: Tensor, turn: tuple[Tensor, Tensor], mask: Tensor) -> Tensor:
-        """(B, N, d) to (B, N, d)."""
+        """Map (B, N, d) to (B, N, d)."""
         q, k, v = (_split(part, self.heads) for part in self.qkv(x).chunk(3, -1))
         attended = functional.scaled_dot_product_attention(apply_rotary(q, turn), apply_rotary(k, turn), v, _bias(mask))
         return x + self.ffn(torch.cat((x, self.out(attended.transpose(1, 2).flatten(-2))), -1))
 
 
 class CrossAttentionBlock(nn.Module):
-    """Points of two views attend to each other, by content alone; one projection serves as query and key of both."""
+    """Cross-attention between two views by content; one projection serves as query and key of both."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -180,7 +194,7 @@ class CrossAttentionBlock(nn.Module):
         self.ffn = _make_ffn(width)
 
     def forward(self, x: Tensor, y: Tensor, mask_x: Tensor, mask_y: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, N, d), (B, M, d) to the same."""
+        """Map (B, N, d) and (B, M, d) to the same shapes."""
         key_x, key_y = (_split(self.key(z), self.heads) for z in (x, y))
         value_x, value_y = (_split(self.value(z), self.heads) for z in (x, y))
         to_x = functional.scaled_dot_product_attention(key_x, key_y, value_y, _bias(mask_y))
@@ -192,14 +206,14 @@ class CrossAttentionBlock(nn.Module):
 
 
 class AssignmentHead(nn.Module):
-    """Similarity of two sets of points, each point's chance to have a counterpart at all, and both as one matrix."""
+    """Similarity of two sets of keypoints and the matchability of each keypoint, as one assignment matrix."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.project, self.matchable = nn.Linear(width, width), nn.Linear(width, 1)
 
     def forward(self, x: Tensor, y: Tensor, mask_x: Tensor, mask_y: Tensor) -> Assignment:
-        """(B, N, d), (B, M, d) to (B, N, M)."""
+        """Map (B, N, d) and (B, M, d) to an assignment (B, N, M)."""
         similar = self.project(x) @ self.project(y).mT / x.shape[-1] ** 0.5
         z_x, z_y = self.matchable(x)[..., 0], self.matchable(y)[..., 0]
         by_row = similar.masked_fill(~mask_y[:, None], MASKED_LOGIT).log_softmax(2)

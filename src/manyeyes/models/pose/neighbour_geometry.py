@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the objects around an object stand, in its own axes: what two agents see alike wherever they are and look.
+"""Encode the relative geometry of the objects around an object, invariant to the agent's pose.
 
-Rotary positions hold when a frame is shifted, not when it is turned. Distances, bearings from the object's own axis and
-relative headings hold under both; headings are known modulo pi, so that angles enter doubled (specs/pose.md 1.11, 4.9).
+Rotary positions are invariant to translation, not to rotation. Distances, bearings from the object's axis and
+relative headings are
+invariant to both. Headings are known modulo pi, so angles are doubled.
 """
 
 from __future__ import annotations
@@ -13,20 +14,20 @@ import torch
 from torch import Tensor, nn
 
 WAVELENGTHS_M = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-"""Wavelengths by which a distance is written."""
+"""Wavelengths of the sine encoding of distances."""
 RELATION_DIM = 2 * len(WAVELENGTHS_M) + 4 + 2
 
 
 @dataclass(frozen=True)
 class NeighbourGeometryConfig:
-    """max_distance_m: objects farther away have no part. hidden: width in between."""
+    """max_distance_m: objects farther away are ignored. hidden: width of the hidden layer."""
 
     max_distance_m: float = 60.0
     hidden: int = 64
 
 
 class NeighbourGeometryEncoder(nn.Module):
-    """A small net on the relation to each other object, and the largest value and the sum of each channel over them."""
+    """A small network on the relation to every other object, followed by channel-wise maximum and sum."""
 
     def __init__(self, width: int, config: NeighbourGeometryConfig) -> None:
         super().__init__()
@@ -37,7 +38,7 @@ class NeighbourGeometryEncoder(nn.Module):
         self.out = nn.Linear(2 * config.hidden, width)
 
     def forward(self, xy: Tensor, yaw: Tensor, size: Tensor, mask: Tensor) -> Tensor:
-        """(B, N, 2) m, (B, N) rad, (B, N, 2) m and which are objects (B, N) to (B, N, width)."""
+        """Encode xy (B, N, 2) m, yaw (B, N) rad, size (B, N, 2) m with mask (B, N) to (B, N, width)."""
         distance = torch.cdist(xy, xy)
         near = mask[:, :, None] & mask[:, None] & (distance < self.config.max_distance_m)
         near &= ~torch.eye(xy.shape[1], dtype=torch.bool)
@@ -47,7 +48,7 @@ class NeighbourGeometryEncoder(nn.Module):
 
 
 def relative_geometry(xy: Tensor, yaw: Tensor, size: Tensor, distance: Tensor) -> Tensor:
-    """(B, N, N, RELATION) of the second object as the first sees it; distance: (B, N, N) their distances."""
+    """Return (B, N, N, RELATION_DIM), the second object relative to the first; distance: (B, N, N) metres."""
     delta = xy[:, None] - xy[:, :, None]
     bearing = 2 * (torch.atan2(delta[..., 1], delta[..., 0]) - yaw[:, :, None])
     turn = 2 * (yaw[:, None] - yaw[:, :, None])
