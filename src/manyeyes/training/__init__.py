@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What changes weights."""
+"""Training of detectors, map models and pose matchers."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a training run is made of besides its loss: model, average, optimiser and count, kept in a folder and resumed from it."""
+"""State of a training run: model, averaged model, optimiser and step count, saved to a folder and resumed from it."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ Model = TypeVar("Model", bound=nn.Module)
 
 
 class LogLine(Protocol):
-    """What a step tells: one line of the log."""
+    """Progress of one step that can be written to the log."""
 
     def to_record(self) -> dict[str, float]:
-        """By name; "step" is one of them."""
+        """Return the values by name; "step" is one of them."""
         ...
 
 
@@ -34,10 +34,11 @@ Line = TypeVar("Line", bound=LogLine)
 
 
 class RunState(Generic[Model]):
-    """One process, or one of several that share every batch.
+    """State of one process, or of one of several that share every batch.
 
-    config: a frozen dataclass that names the run; a folder of another run, or of another seed, is refused, and of other weights
-    where the model was given some to begin from. beta2: decay of Adam's mean square of gradients.
+    config: a frozen dataclass that identifies the run. A folder of another configuration, seed or, with from_weights,
+    other initial weights
+    is refused. beta2: decay of Adam's second moment.
     """
 
     def __init__(
@@ -65,11 +66,11 @@ class RunState(Generic[Model]):
 
     @property
     def path(self) -> Path:
-        """Where the run is kept between saves."""
+        """The file of the saved training state."""
         return self.folder / "last.pt"
 
     def sample_numbers(self, batch: int) -> range:
-        """The samples of the coming step that this process takes, of a run's endless stream; it starts the step's clock."""
+        """Return the sample numbers of this process for the next step, and start the step's clock."""
         if batch % self.world_size:
             raise ConfigError(f"A batch of {batch} samples cannot be shared by {self.world_size} processes evenly.")
         self._since = time.monotonic()
@@ -78,7 +79,7 @@ class RunState(Generic[Model]):
         return range(first, first + share)
 
     def backward(self, loss: Tensor, share: float = 1.0) -> float:
-        """The gradient of a loss that counts for this share of the step's, added to what is there; returns its part of the loss."""
+        """Accumulate the gradient of a loss that is this fraction of the step's; returns its part of the loss."""
         value = float(loss.detach())
         if not math.isfinite(value):
             raise ConfigError(
@@ -88,7 +89,7 @@ class RunState(Generic[Model]):
         return value * share
 
     def optimiser_step(self, rate: float, clip: float, decay: float) -> None:
-        """One step down the mean loss of all processes; the average follows with this decay, faster at the start."""
+        """Step down the mean loss of all processes and update the average with this decay, faster at the start."""
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self._average_gradients()
@@ -100,7 +101,7 @@ class RunState(Generic[Model]):
         self.seconds += time.monotonic() - self._since
 
     def _average_gradients(self) -> None:
-        """The mean over processes of gradients and of running statistics: one flat exchange each."""
+        """Average gradients and running statistics over processes, in one flat all-reduce each."""
         if self.world_size == 1:
             return
         for p in self.model.parameters():
@@ -119,7 +120,7 @@ class RunState(Generic[Model]):
     def run_to_end(
         self, steps: int, save_every: int, advance: Callable[[], Line], report: Callable[[Line], None]
     ) -> None:
-        """Advance to the end, a line of log.jsonl and a word to report for every step, both by the first process alone."""
+        """Advance to the last step; the first process writes a line of log.jsonl and calls report at every step."""
         while self.step < steps:
             progress = advance()
             if not self.rank:
@@ -131,7 +132,7 @@ class RunState(Generic[Model]):
                 self.save()
 
     def save(self) -> None:
-        """Everything that the run needs to go on as if it had not stopped; atomic."""
+        """Save everything that is needed to resume as if uninterrupted, atomically."""
         if self.rank:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -158,19 +159,19 @@ class RunState(Generic[Model]):
 
 
 def parameter_groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
-    """What an optimiser is given: matrices, whose weights decay, and the rest, whose do not."""
+    """Return optimiser groups: matrices with weight decay, and the other parameters without."""
     matrices = [p for p in model.parameters() if p.dim() > 1]
     rest = [p for p in model.parameters() if p.dim() <= 1]
     return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
 
 
 def warmup_cosine(warmup_steps: int, step: int, steps: int) -> float:
-    """A share of the peak: linear growth over warm_up steps, and a cosine to zero over all."""
+    """Return the learning rate as a fraction of its peak: linear warm-up over warmup_steps, times a cosine to zero."""
     return min(1.0, (step + 1) / max(1, warmup_steps)) * 0.5 * (1 + math.cos(math.pi * step / steps))
 
 
 def _mean_in_place(tensors: list[Tensor], world: int) -> None:
-    """Each tensor becomes its mean over world processes, in one flat exchange."""
+    """Replace each tensor by its mean over world processes, in one flat all-reduce."""
     if not tensors:
         return
     flat = torch.cat([t.flatten() for t in tensors])
@@ -181,7 +182,7 @@ def _mean_in_place(tensors: list[Tensor], world: int) -> None:
 
 
 def _trim_log(path: Path, step: int) -> None:
-    """Drop the lines that a killed run wrote after its last save, the last of them perhaps cut: they will be written again."""
+    """Drop log lines written after the last save, which may be truncated; they will be written again."""
     if path.exists():
         kept = [line for line in path.read_text().splitlines() if 0 < _step_of(line) <= step]
         atomic_write_text(path, "".join(line + "\n" for line in kept))

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map model: sensors to map elements."""
+"""The map model: from sensor data to map elements."""

@@ -1,16 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From features of a tile to map elements: a fixed number of queries, each one element of a fixed number of points.
+"""Decode map elements from the features of a tile: a fixed number of queries, each one element of a fixed number of
+points.
 
-Sources: MapTR (Liao et al., ICLR 2023): hierarchical queries, an instance's and a point's embedding added, and reference points
-refined layer by layer; MapTRv2 (IJCV 2024): self-attention among instances and within each in turn, and a second group of queries
-for one-to-many matching in training; Deformable DETR (ICLR 2021): attention to a few learned places, and queries that begin as a
-first stage's proposals (section 4.2); DAB-DETR (ICLR 2022): each layer is told where its points lie by now. The two groups never
-attend to each other, which here is said by running the same layers on each.
+Sources: MapTR (Liao et al., ICLR 2023): hierarchical queries as sums of instance and point embeddings, reference
+points refined layer
+by layer. MapTRv2 (IJCV 2024): decoupled self-attention among and within instances, and a second group of queries for
+one-to-many
+matching in training. Deformable DETR (ICLR 2021): deformable attention, and queries initialised with first-stage
+proposals (section
+4.2). DAB-DETR (ICLR 2022): each layer receives the current point positions. The two groups never attend to each
+other; the same layers
+run on each.
 
-What differs from MapTR, so that little data and few steps teach much: an element begins as a line that a sketch of the tile
-shows (models/maps/line_field_head.py), of the kind and as sure as it is there, and layers say what to change; their places are
-told to every layer, and to what moves them; points move by shares of the tile, not by logits, which are flat at the tile's
-border, where lines are cut; and a layer looks at the ground before it compares what was seen.
+Differences to MapTR, for small data sets and few steps: an element starts as a line of the predicted line field
+(models/maps/line_field_head.py) with its class and score, and layers predict residuals. Positions enter every layer
+and the point
+branches. Points move by fractions of the tile, not by logits, whose gradients vanish at the tile's border, where
+lines are cut. A
+layer attends to the ground before it compares queries.
 """
 
 from __future__ import annotations
@@ -32,20 +39,28 @@ from manyeyes.ops.deformable import sample_weighted
 QueryGroup = Literal["one", "many"]
 
 MOVE_SCALE = 0.1
-"""What one unit of a move's output is, as a share of the tile."""
+"""Point displacement of one output unit, as a fraction of the tile."""
 
 _FREQUENCIES = math.pi * 2.0 ** torch.arange(8)
 
 
 @dataclass(frozen=True)
 class MapHeadConfig:
-    """kinds: of elements that are told apart, by name. num_queries, num_points: queries of one-to-one matching, and points of each;
-    num_one_to_many_queries: queries of one-to-many matching, in training only. num_learned_queries: of the former's number, those
-    that begin as lines of their own rather than the sketch's, as MapTR's do. num_seeds: cells from which lines are followed that
-    queries begin as, no fewer than these; min_trace_score: how sure a cell is at least for a line to run on through it.
-    num_sampling_points: looked at by each of the heads, a point and layer.
+    """Settings of the map head.
 
-    max_elements, score_threshold: at most so many answers, by score over all elements and kinds, and those of at least that score.
+    Attributes:
+        kinds: names of the element classes.
+        num_queries: queries of one-to-one matching.
+        num_points: points of a query.
+        num_one_to_many_queries: queries of one-to-many matching, in training only.
+        num_learned_queries: those of num_queries that start as learned lines as in MapTR, not as lines of the line
+            field.
+        num_seeds: minimum number of cells from which lines are traced.
+        min_trace_score: minimum line probability of a cell for a trace to continue.
+        feedforward_channels: hidden width of the feed-forward networks.
+        num_sampling_points: sampled positions per attention head, point and layer.
+        max_elements: maximum number of decoded elements, over all classes.
+        score_threshold: minimum score of a decoded element.
     """
 
     kinds: tuple[str, ...] = ("divider", "boundary", "crossing")
@@ -80,14 +95,14 @@ class MapHeadConfig:
 
 @dataclass(frozen=True, eq=False)
 class RawMap:
-    """What one layer says of B tiles: logit (B, I, kinds) and point (B, I, P, 2), shares of the tile, in it from 0 to 1."""
+    """Output of one layer for B tiles: logit (B, I, kinds) and point (B, I, P, 2) as fractions of the tile."""
 
     logit: Tensor
     point: Tensor
 
 
 class _SelfAttention(nn.Module):
-    """Attention among the rows of each sequence; places are added to what is compared, not to what is told."""
+    """Attention among the rows of each sequence; positions are added to queries and keys, not to values."""
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
@@ -96,7 +111,7 @@ class _SelfAttention(nn.Module):
         self.out = nn.Linear(channels, channels)
 
     def forward(self, x: Tensor, place: Tensor) -> Tensor:
-        """(..., L, C) to (..., L, C), place of a shape that broadcasts."""
+        """Map (..., L, C) to (..., L, C); place broadcasts to the input."""
         query, key = self.query_key(x + place).chunk(2, -1)
         query, key, value = (t.unflatten(-1, (self.heads, -1)).transpose(-2, -3) for t in (query, key, self.value(x)))
         mixed = F.scaled_dot_product_attention(query, key, value)
@@ -104,14 +119,14 @@ class _SelfAttention(nn.Module):
 
 
 class DeformableAttention(nn.Module):
-    """Each query looks at a few places around its reference point, which it chooses itself (Deformable DETR, Eq. 2)."""
+    """Deformable attention: each query samples at learned offsets from its reference point (Deformable DETR, Eq. 2)."""
 
     def __init__(self, channels: int, heads: int, num_points: int) -> None:
         super().__init__()
         self.heads, self.num_points = heads, num_points
         self.value, self.out = nn.Linear(channels, channels), nn.Linear(channels, channels)
         self.offset, self.weight = nn.Linear(channels, heads * num_points * 2), nn.Linear(channels, heads * num_points)
-        # Heads start by looking in as many directions, each place a cell farther.
+        # Heads start with offsets in as many directions, one cell farther per sampling point.
         angle = torch.arange(heads) * (2 * math.pi / heads)
         ring = torch.stack((angle.cos(), angle.sin()), -1)
         ring = ring / ring.abs().amax(-1, keepdim=True)
@@ -123,7 +138,9 @@ class DeformableAttention(nn.Module):
             self.offset.bias.copy_(steps.flatten())
 
     def forward(self, query: Tensor, reference: Tensor, ground: Tensor) -> Tensor:
-        """query (B, Q, C), reference (B, Q, 2) as shares of the ground, ground (B, rows, columns, C), to (B, Q, C)."""
+        """Attend from query (B, Q, C) at reference (B, Q, 2), fractions of the tile, to ground (B, rows, columns, C);
+        (B, Q, C).
+        """
         b, q, channels = query.shape
         rows, columns = ground.shape[1:3]
         values = self.value(ground).view(b, rows, columns, self.heads, channels // self.heads).permute(0, 3, 4, 1, 2)
@@ -134,9 +151,10 @@ class DeformableAttention(nn.Module):
 
 
 class MapDecoderLayer(nn.Module):
-    """To the ground, within each instance, among instances, and each point by itself; a norm after each.
+    """Deformable attention, attention within and among instances, feed-forward network; a norm after each.
 
-    The ground comes first, not third as in MapTR: there the first layer compares queries before any has seen something.
+    Deformable attention comes first, not third as in MapTR, where the first layer compares queries without image
+    evidence.
     """
 
     def __init__(self, config: MapHeadConfig) -> None:
@@ -150,7 +168,9 @@ class MapDecoderLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(c) for _ in range(4))
 
     def forward(self, x: Tensor, place: Tensor, reference: Tensor, ground: Tensor) -> Tensor:
-        """x and place (B, I, P, C), reference (B, I, P, 2), ground (B, rows, columns, C), to (B, I, P, C)."""
+        """Update x (B, I, P, C) with positions place (B, I, P, C), reference (B, I, P, 2) and ground (B, rows,
+        columns, C).
+        """
         attended = self.deformable_attention((x + place).flatten(1, 2), reference.flatten(1, 2), ground)
         x = self.norms[0](x + attended.view_as(x))
         x = self.norms[1](x + self.point_attention(x, place))
@@ -160,7 +180,7 @@ class MapDecoderLayer(nn.Module):
 
 
 class MapHead(nn.Module):
-    """A sketch; queries that begin as its lines; layers, and after each layer kinds and points."""
+    """Line field, queries initialised with its lines, and decoder layers with class and point branches."""
 
     def __init__(self, config: MapHeadConfig) -> None:
         super().__init__()
@@ -178,9 +198,11 @@ class MapHead(nn.Module):
         self.point_branches = nn.ModuleList(_point_branch(c) for _ in range(config.layers))
 
     def forward(self, ground: Tensor, line_field: RawLineField, group: QueryGroup = "one") -> tuple[RawMap, ...]:
-        """Features of B tiles (B, C, rows, columns) and their sketch to one RawMap a layer, the last the best; group: of queries.
+        """Decode features of B tiles (B, C, rows, columns) and their line field to one RawMap per layer, the last the
+        best.
 
-        The first group begins as each line of the sketch once, the second as all that were followed, copies too.
+        Queries of group "one" start as distinct lines; those of group "many" start as all traced lines, duplicates
+        included.
         """
         reference, logit, kind = self.init_queries(line_field, group)
         each = self.class_embedding[kind]
@@ -192,16 +214,17 @@ class MapHead(nn.Module):
         for layer, class_branch, point_branch in zip(self.layers, self.class_branches, self.point_branches):
             place = embedded + self.position_encoder(encode_position(reference))
             x = layer(x, place, reference, ground)
-            # How far a point has still to go depends on where it is by now, which x alone does not say.
+            # The remaining displacement depends on the current position, which x alone does not hold.
             point = reference + MOVE_SCALE * point_branch(x + place)
             out.append(RawMap(logit + class_branch(x.mean(2)), point))
             reference = point.detach()
         return tuple(out)
 
     def init_queries(self, line_field: RawLineField, group: QueryGroup = "one") -> tuple[Tensor, Tensor, Tensor]:
-        """What queries begin as: points (B, I, P, 2), logits (B, I, kinds) and kinds of those from the sketch, which come first.
+        """Return the initial points (B, I, P, 2), logits (B, I, kinds), and classes of the queries from the line
+        field.
 
-        Nothing of the sketch has gradients.
+        Queries from the line field come first and carry no gradient.
         """
         config = self.config
         rings = torch.tensor([is_ring(kind) for kind in config.kinds])
@@ -214,7 +237,7 @@ class MapHead(nn.Module):
             line_field, rings, count, config.num_points, max(config.num_seeds, count), config.min_trace_score, apart
         )
         own = F.one_hot(found.kind, len(config.kinds)).to(found.score)
-        # Few queries are elements of a kind that the sketch does not say: a probability of 0.01 (focal loss, Lin et al. 2017).
+        # Prior probability 0.01 of the classes that the line field does not predict (focal loss, Lin et al. 2017).
         point, logit = found.point, own * (torch.logit(found.score) + math.log(99))[..., None] - math.log(99)
         if config.num_learned_queries and group == "one":
             point = torch.cat((point, self.start_points.expand(len(point), *self.start_points.shape)), 1)
@@ -225,9 +248,9 @@ class MapHead(nn.Module):
 
 
 def make_start_lines(count: int, points: int) -> Tensor:
-    """(count, points, 2) straight lines all over the tile, in shares of it, 0.3 long, of all directions.
+    """Make (count, points, 2) straight lines spread over the tile, 0.3 of it long, in all directions.
 
-    Middles and directions are the additive recurrence of least discrepancy in three dimensions (Roberts 2018).
+    Centres and directions are a low-discrepancy additive recurrence in three dimensions (Roberts 2018).
     """
     ratio = torch.tensor(1.2207440846).double() ** -torch.arange(1, 4)
     x, y, way = ((0.5 + torch.arange(count)[:, None] * ratio) % 1).unbind(-1)
@@ -237,7 +260,9 @@ def make_start_lines(count: int, points: int) -> Tensor:
 
 
 def encode_position(place: Tensor) -> Tensor:
-    """Places (..., 2), shares of the tile, as (..., 32) sines and cosines of waves from twice the tile to a 64th of it."""
+    """Encode positions (..., 2), fractions of the tile, as (..., 32) sines and cosines; wavelengths 2 to 1/64 of the
+    tile.
+    """
     phase = (place[..., None] * _FREQUENCIES.to(place)).flatten(-2)
     return torch.cat((phase.sin(), phase.cos()), -1)
 
@@ -258,7 +283,10 @@ def _point_branch(channels: int) -> nn.Sequential:
 
 
 def decode_elements(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[MapElements]:
-    """The elements of each tile, in its frame, metres, within it, best first; a query may answer under two kinds, as in MapTR."""
+    """Decode the elements of each tile, in its frame, metres, in descending order of score.
+
+    A query may yield elements of two classes, as in MapTR.
+    """
     score = raw.logit.detach().sigmoid()
     low = np.array([tile.x_min, tile.y_min])
     size = np.array([tile.x_max, tile.y_max]) - low
@@ -274,5 +302,5 @@ def decode_elements(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[M
 
 
 def is_ring(kind: str) -> bool:
-    """Whether the last point of such an element joins its first."""
+    """Whether elements of this kind are closed rings."""
     return KINDS.index(kind) == CROSSING

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures to features at an eighth of their size, or a quarter: a residual network and a feature pyramid, both our own.
+"""Encode images to features at an eighth or a quarter of their size: a residual network and a feature pyramid.
 
-Sources: He et al., CVPR 2016 (basic and bottleneck blocks); Lin et al., CVPR 2017 (top-down pyramid). Norms are of the batch, by
-running statistics once learnt, so that what one agent makes of its picture never depends on whose pictures share the batch. A norm
-over channels together does not learn from rasters, most of whose cells are empty: docs/mapper.md.
+Sources: He et al., CVPR 2016 (basic and bottleneck blocks); Lin et al., CVPR 2017 (top-down pyramid). Batch norms use
+running
+statistics after training, so that the features of one agent do not depend on the rest of the batch. A norm over
+channels does not
+train on rasters, most of whose cells are empty: docs/mapper.md.
 """
 
 from __future__ import annotations
@@ -23,14 +25,17 @@ from manyeyes.datatypes import ConfigError
 
 @dataclass(frozen=True)
 class ImageEncoderConfig:
-    """blocks: residual blocks at strides 4, 8, 16, …, two stages or more; stem_channels: channels of the first stage, doubled by
-    each.
+    """Settings of the image encoder.
 
-    bottleneck: 1-3-1 blocks with four times the channels (ResNet-50 is (3, 4, 6, 3), 64, True); else 3-3 blocks
-    (ResNet-18 is (2, 2, 2, 2), 64, False). channels: of the pyramid and of what comes out. stride: pixels of the picture a pixel of
-    what comes out, along each axis, 8 or 4; feature o is centred on pixel stride * o. gradient_checkpointing: training keeps what
-    blocks begin from and computes the rest again for its gradients, the same to the last bit: more time for a fraction of the
-    memory.
+    Attributes:
+        blocks: residual blocks at strides 4, 8, 16, …; two stages or more.
+        stem_channels: channels of the first stage, doubled by each further stage.
+        bottleneck: 1-3-1 blocks with four times the channels (ResNet-50 is (3, 4, 6, 3), 64, True); else 3-3 blocks
+            (ResNet-18 is (2, 2, 2, 2), 64, False).
+        channels: of the pyramid and the output.
+        stride: of the output, 8 or 4; feature o is centred on pixel stride * o.
+        gradient_checkpointing: recompute block activations in the backward pass, bitwise equal; saves memory for
+            time.
     """
 
     blocks: tuple[int, ...] = (2, 2, 2, 2)
@@ -50,7 +55,7 @@ class ImageEncoderConfig:
 
 
 def conv_norm(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Convolution and norm; sizes are divided by the stride, rounded up."""
+    """Make a convolution and norm; sizes are divided by the stride, rounded up."""
     return nn.Sequential(
         nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, bias=False), nn.BatchNorm2d(outputs)
     )
@@ -78,20 +83,21 @@ class ResidualBlock(nn.Module):
         self.stride = stride
 
     def forward(self, x: Tensor) -> Tensor:
-        """(N, inputs, h, w) to (N, outputs, ceil(h / stride), ceil(w / stride))."""
-        # Not as a strided convolution: of 12 channels, innermost in memory, its gradient overran its buffer (torch 2.13, CPU).
+        """Map (N, inputs, h, w) to (N, outputs, ceil(h / stride), ceil(w / stride))."""
+        # Not a strided convolution: with 12 channels in channels_last, its gradient overran its buffer (torch 2.13,
+        # CPU).
         return torch.relu(self.shortcut(x[..., :: self.stride, :: self.stride]) + self.inner(x))
 
 
 def upsample(x: Tensor, size: tuple[int, int]) -> Tensor:
-    """(N, C, h, w) at twice the density, cut to size, bilinear: cell o comes to lie on cell 2 o, where strided layers took it."""
+    """Upsample (N, C, h, w) by two, bilinear, cropped to size; cell o maps to cell 2 o, as in strided layers."""
     h, w = x.shape[-2:]
     padded = F.pad(x, (0, 1, 0, 1), mode="replicate")
     return F.interpolate(padded, (2 * h + 1, 2 * w + 1), mode="bilinear", align_corners=True)[..., : size[0], : size[1]]
 
 
 class FeaturePyramid(nn.Module):
-    """Maps of falling size as one map of the size of the first: each level is told what the coarser ones saw."""
+    """Merge maps of decreasing size, top-down, to one map of the size of the first."""
 
     def __init__(self, inputs: tuple[int, ...], channels: int) -> None:
         super().__init__()
@@ -99,7 +105,7 @@ class FeaturePyramid(nn.Module):
         self.smooth = conv_norm(channels, channels, 3)
 
     def forward(self, levels: list[Tensor]) -> Tensor:
-        """(N, inputs[i], h_i, w_i), finest first, to (N, channels, h_0, w_0)."""
+        """Map (N, inputs[i], h_i, w_i), finest first, to (N, channels, h_0, w_0)."""
         laterals = [lateral(level) for lateral, level in zip(self.lateral, levels)]
         down = laterals[-1]
         for level in laterals[-2::-1]:
@@ -108,7 +114,7 @@ class FeaturePyramid(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Colour pictures to features of the configured stride."""
+    """Encode colour images to features of the configured stride."""
 
     def __init__(self, config: ImageEncoderConfig) -> None:
         super().__init__()
@@ -127,7 +133,7 @@ class ImageEncoder(nn.Module):
         self.gradient_checkpointing = config.gradient_checkpointing
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """(V, 3, h, w) uint8, or floats in [0, 255], to (V, channels, ceil(h / stride), ceil(w / stride))."""
+        """Map (V, 3, h, w) uint8, or floats in [0, 255], to (V, channels, ceil(h / stride), ceil(w / stride))."""
         x = self._run(self.stem, rgb.to(torch.float32) / 64 - 2)
         levels = []
         for stage in self.stages:
@@ -147,7 +153,7 @@ class ImageEncoder(nn.Module):
 
 @contextmanager
 def _freeze_norm_statistics(part: nn.Module) -> Iterator[None]:
-    """While it is computed again, a norm has told its running statistics already."""
+    """Do not update running statistics a second time during recomputation."""
     norms = [module for module in part.modules() if isinstance(module, nn.BatchNorm2d)]
     before = [(norm, norm.momentum, norm.num_batches_tracked) for norm in norms]
     for norm in norms:

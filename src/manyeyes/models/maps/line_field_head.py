@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A first sketch of a tile: what every cell says of the lines that run by it, and the lines that are followed from there.
+"""Predict a line field on a tile, offset and direction of the nearest line at every cell, and trace lines in it.
 
-The decoder's queries begin as these lines: the two stages of Deformable DETR (Zhu et al., ICLR 2021, section 4.2) with a proposal
-that is a whole polyline. It learns from few tiles, since each cell of each tile teaches it, which a matched query does not; the
-decoder has only to refine. Fields of nearest points and directions along lines are known from lane detection; walking them, and
-dropping what lies on a line that is surer, is the plain way to lines.
+The lines initialise the decoder's queries: the two stages of Deformable DETR (Zhu et al., ICLR 2021, section 4.2)
+with whole polylines
+as proposals. The field trains on few tiles, because every cell is supervised; the decoder only refines. Offset and
+direction fields
+are known from lane detection; lines are traced along them, and those that overlap a higher-scored line are
+suppressed.
 
-A ring is sketched as the line along its middle with its half width, and proposed as the rectangle about that.
+A ring is represented by its middle line and half width, and proposed as the rectangle around that line.
 """
 
 from __future__ import annotations
@@ -22,20 +24,25 @@ from manyeyes.models.maps.image_encoder import conv_norm
 from manyeyes.ops.line_tracing import TracingField, distance_to_lines, resample_evenly, trace_lines
 
 MAX_LINE_OFFSET = 1.5
-"""Cells from a line within which a cell knows where it runs."""
+"""Maximum distance from a line, in cells, at which a cell predicts its position."""
 TRACE_STEP = 1.2
-"""Cells a stride."""
+"""Step length of a trace, in cells."""
 DUPLICATE_DISTANCE = 1.25
-"""Cells within which a place that lines are followed from lies on a line of its kind already."""
+"""Distance in cells within which a seed counts as lying on a traced line of its class."""
 DUPLICATE_SCORE = 0.01
-"""What a proposal is held for that lies on a surer one."""
+"""Score assigned to a proposal that overlaps a higher-scored one."""
 
 
 @dataclass(frozen=True, eq=False)
 class RawLineField:
-    """What B tiles' cells say, kind by kind. line_logit: (B, K, rows, columns) logits that a line runs here; end_logit: likewise,
-    that one ends here; offset_to_line: (B, K, 2, rows, columns) cells to its nearest point, x and y; direction: likewise, cosine
-    and sine of twice its direction, not of length one; half_width: (B, K, rows, columns) cells, half the width of a ring.
+    """Predicted line fields of B tiles, for K classes.
+
+    Attributes:
+        line_logit: (B, K, rows, columns) logit that a line passes through the cell.
+        end_logit: (B, K, rows, columns) logit that a line ends here.
+        offset_to_line: (B, K, 2, rows, columns) offset to the nearest point of the line, x and y, in cells.
+        direction: (B, K, 2, rows, columns) cosine and sine of twice the line's direction, not normalised.
+        half_width: (B, K, rows, columns) half the width of a ring, in cells.
     """
 
     line_logit: Tensor
@@ -47,8 +54,11 @@ class RawLineField:
 
 @dataclass(frozen=True, eq=False)
 class LineProposals:
-    """I lines a tile to begin with, the best first. point: (B, I, P, 2) shares of the tile; kind: (B, I) int64; score: (B, I), in
-    (0, 1), how sure the cells were along it."""
+    """I proposed lines per tile, in descending order of score.
+
+    point: (B, I, P, 2) fractions of the tile. kind: (B, I) int64. score: (B, I), mean line probability along the
+    trace.
+    """
 
     point: Tensor
     kind: Tensor
@@ -56,7 +66,7 @@ class LineProposals:
 
 
 class LineFieldHead(nn.Module):
-    """Two convolutions."""
+    """A convolution block and a convolution to all quantities of RawLineField."""
 
     def __init__(self, channels: int, kinds: int) -> None:
         super().__init__()
@@ -65,12 +75,12 @@ class LineFieldHead(nn.Module):
         self.out = nn.Conv2d(channels, 7 * kinds, 1)
         with torch.no_grad():
             self.out.weight.mul_(0.1)
-            # Few cells have a line, or its end: each starts at a probability of 0.05.
+            # Few cells have a line or an end: prior probability 0.05.
             if self.out.bias is not None:
                 self.out.bias.copy_(torch.where(torch.arange(7 * kinds) < 2 * kinds, -math.log(19), 0.0))
 
     def forward(self, ground: Tensor) -> RawLineField:
-        """Features (B, C, rows, columns)."""
+        """Predict the line field of features (B, C, rows, columns)."""
         k = self.kinds
         ink, end, half, foot, way = self.out(self.inner(ground)).split((k, k, k, 2 * k, 2 * k), 1)
         return RawLineField(ink, end, foot.unflatten(1, (k, 2)), way.unflatten(1, (k, 2)), half)
@@ -86,11 +96,16 @@ def propose_lines(
     min_score: float,
     duplicate_distance: float = DUPLICATE_DISTANCE,
 ) -> LineProposals:
-    """The lines that the sketch shows, each once: from the surest cells, those that are followed farthest and surest come first.
+    """Trace lines from the cells of highest probability and suppress duplicates.
 
-    ring_kinds: (K,) bool, which kinds are rings. count: how many; where fewer are found, the rest are copies, held unsure.
-    num_seeds: cells to follow lines from. min_score: how sure a cell is at least. duplicate_distance: 0 leaves copies as sure as
-    they are.
+    Args:
+        line_field: predicted fields of B tiles.
+        ring_kinds: (K,) bool, classes that are rings.
+        count: number of proposals; missing ones are duplicates with low scores.
+        num_points: points of a proposal.
+        num_seeds: number of cells from which lines are traced.
+        min_score: minimum line probability along a trace.
+        duplicate_distance: of duplicates, in cells; 0 keeps their scores.
     """
     b, kinds, rows, columns = line_field.line_logit.shape
     score = line_field.line_logit.sigmoid() * (-line_field.end_logit).sigmoid()
@@ -121,7 +136,9 @@ def propose_lines(
 
 
 def outline_rectangles(first: Tensor, last: Tensor, half_width: Tensor, points: int) -> Tensor:
-    """(..., P, 2) points, equally spaced, around rectangles: middle lines from first to last (..., 2), half widths half (...)."""
+    """Sample (..., P, 2) equally spaced points on rectangles with middle lines first to last (..., 2) and half_width
+    (...).
+    """
     axis = last - first
     length = axis.norm(dim=-1, keepdim=True)
     unit = torch.where(length > 1e-6, axis / length.clamp_min(1e-6), axis.new_tensor([1.0, 0.0]))
@@ -140,8 +157,9 @@ def _decode_field(line_field: RawLineField, score: Tensor) -> TracingField:
 
 
 def suppress_duplicates(overlaps: Tensor, order: Tensor) -> Tensor:
-    """(B, N) bool: what no other drops. overlaps: (B, N, N), does row drop column? If it comes first in order (B, N), and is
-    kept.
+    """Greedy suppression: returns the mask (B, N) of kept rows; overlaps (B, N, N), order (B, N).
+
+    A row suppresses a column that it overlaps if it precedes it in order and is kept itself.
     """
     n = order.shape[1]
     ordered = overlaps.gather(1, order[..., None].expand(-1, -1, n)).gather(2, order[:, None].expand(-1, n, -1)).triu(1)

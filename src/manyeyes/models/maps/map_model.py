@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The semi-global map model: see (an agent's sensors to tokens), fuse (tokens of many looks to a tile), draw (its elements).
+"""The semi-global map model: extract_features (sensors to tokens), fuse (tokens to a tile), predict_elements.
 
-Source: CrowdMap section 2.2. What an agent saw reaches the tile as tokens, its own too: cells of its ground with a feature each,
-moved by its claimed pose. A look is one agent at one time: ten looks at a tile may be ten agents, or one that drove by.
+Source: CrowdMap section 2.2. All observations, the ego's included, reach the tile as tokens: ground cells with a
+feature each, warped by
+the reported pose. A frame is one agent at one time: ten frames of a tile may be ten agents, or one agent that passed.
 """
 
 from __future__ import annotations
@@ -22,14 +23,19 @@ from manyeyes.models.maps.line_field_head import RawLineField
 from manyeyes.ops.bev_warp import masked_max, warp_bev
 
 FRAMES_PER_TILE = 10
-"""Looks at a tile, CrowdMap section 3.1."""
+"""Frames per tile, CrowdMap section 3.1."""
 
 
 @dataclass(frozen=True)
 class MapModelConfig:
-    """bev: what an agent sees. tile: the piece of map that is drawn, in its own frame, 120 m by 60 m in the paper.
+    """Settings of the map model.
 
-    token_channels: of what is sent. neck_blocks: residual blocks on the tile, at its own, twice and four times its cells.
+    Attributes:
+        bev: encoder of one agent's sensors.
+        tile: area of the predicted map in its own frame, 120 m by 60 m in the paper.
+        token_channels: channels of the shared tokens.
+        neck_blocks: residual blocks on the fused tile, at one, two and four times its cell size.
+        head: of the map elements.
     """
 
     bev: BevConfig
@@ -45,10 +51,9 @@ class MapModelConfig:
 
 @dataclass(frozen=True, eq=False)
 class MapFeatures:
-    """What a batch of looks made of their own sensors: tokens (N, C), one grid a look, and of what kinds each cell is.
+    """Features of a batch of frames: tokens (N, C) on one grid per frame.
 
-    line_logits: (N, kinds) logits that an element of a kind runs through the cell; cell_score: (N,) the greatest probability, by
-    which tokens are chosen where bytes are few.
+    line_logits: (N, kinds) logits that an element of a class passes through the cell.
     """
 
     tokens: SparseBev
@@ -56,12 +61,12 @@ class MapFeatures:
 
     @property
     def cell_score(self) -> Tensor:
-        """(N,) in (0, 1)."""
+        """(N,) maximum class probability; under a budget the highest are sent."""
         return self.line_logits.detach().sigmoid().amax(1)
 
 
 class MapModel(nn.Module):
-    """Sensors of many looks to the elements of tiles."""
+    """Predict the map elements of tiles from the sensor data of several frames."""
 
     def __init__(self, config: MapModelConfig) -> None:
         super().__init__()
@@ -75,7 +80,7 @@ class MapModel(nn.Module):
         nn.init.constant_(self.line_classifier.bias, -3.0)
         self.empty_feature = nn.Parameter(torch.zeros(tokens))
         widths = tuple(min(head.channels, 2 * tokens * 2**i) for i in range(len(config.neck_blocks)))
-        # Beside the features: how many looks saw the cell, and each cell's place in the tile.
+        # Inputs beside the features: the number of frames that observed the cell, and its coordinates in the tile.
         inputs, stages = tokens + 3, []
         for i, (count, width) in enumerate(zip(config.neck_blocks, widths)):
             blocks = [ResidualBlock(inputs, width, 2 if i else 1)] + [
@@ -86,7 +91,8 @@ class MapModel(nn.Module):
         self.neck = nn.ModuleList(stages)
         self.pyramid = FeaturePyramid(widths, head.channels)
         self.head = MapHead(head)
-        # Of each kind's logits, once training is done (training/maps/score_calibration.py): scores are then shares that are true.
+        # Per class, set after training (training/maps/score_calibration.py), so that scores are calibrated
+        # probabilities.
         self.logit_scale, self.logit_shift = (
             nn.Buffer(torch.ones(len(head.kinds))),
             nn.Buffer(torch.zeros(len(head.kinds))),
@@ -94,15 +100,15 @@ class MapModel(nn.Module):
 
     @property
     def token_grid(self) -> BevGrid:
-        """The lattice of the tokens, in each agent's frame."""
+        """The grid of the tokens, in each agent's frame."""
         return self.config.bev.token_grid
 
     def extract_features(
         self, clouds: Sequence[PointCloud] = (), images: Sequence[Sequence[CameraImage]] = ()
     ) -> MapFeatures:
-        """A cloud each, pictures each, or both, of N looks in their agents' frames; tokens lie where a sensor saw the ground.
+        """Encode clouds, images, or both, of N frames in their agents' frames; tokens cover the observed ground.
 
-        A model of both sensors takes either alone: the other then saw nothing.
+        A model of both sensors accepts either alone.
         """
         branches = [
             net(inputs) for net, inputs in ((self.lidar, clouds), (self.camera, images)) if net is not None and inputs
@@ -117,20 +123,27 @@ class MapModel(nn.Module):
         return MapFeatures(tokens, self.line_classifier(tokens.features))
 
     def fuse(self, tokens: SparseBev, tile_from_agent: Transform, tile_index: Tensor, num_tiles: int) -> Tensor:
-        """Tokens of N looks, as they were received, to features of tiles (tiles, C, rows, columns); arguments as for
+        """Fuse the received tokens of N frames to tile features (tiles, C, rows, columns); arguments as for
         ``warp_tokens``.
 
-        The order of looks does not count, nor does a look that sees nothing of its tile.
+        The result does not depend on the order of frames, nor on frames without coverage of their tile.
         """
         return self.fuse_features(*self.warp_tokens(tokens, tile_from_agent, tile_index, num_tiles))
 
     def warp_tokens(
         self, tokens: SparseBev, tile_from_agent: Transform, tile_index: Tensor, num_tiles: int
     ) -> tuple[Tensor, Tensor]:
-        """Tokens of N looks on the cells of their tiles: features (tiles, K, C, rows, columns) of at most K looks a tile, and what
-        each sees (tiles, K, rows, columns).
+        """Warp the tokens of N frames to the cells of their tiles.
 
-        tile_from_agent: N motions, by claimed or corrected poses; tile_index: (N,) int64, which tile each look is of.
+        Args:
+            tokens: of N frames, one grid each.
+            tile_from_agent: N transforms, from reported or corrected poses.
+            tile_index: (N,) int64, the tile of each frame.
+            num_tiles: number of tiles.
+
+        Returns:
+            Features (tiles, K, C, rows, columns) of at most K frames per tile, and the observed mask (tiles, K, rows,
+            columns).
         """
         rows, columns = self.config.tile.shape
         dense = tokens.dense()
@@ -139,7 +152,7 @@ class MapModel(nn.Module):
         moved, seen = warp_bev(
             dense, there.view(dense.shape[0], *dense.shape[2:]), tokens.grid, self.config.tile, tile_from_agent
         )
-        # The n-th look at its tile takes the n-th place there; places that are left over see nothing.
+        # The n-th frame of a tile takes its n-th slot; empty slots observe nothing.
         place = (tile_index[:, None] == tile_index[None]).tril(-1).sum(1)
         max_frames = int(place.max()) + 1 if len(tile_index) else 1
         slot = tile_index * max_frames + place
@@ -148,7 +161,7 @@ class MapModel(nn.Module):
         return features.unflatten(0, (num_tiles, max_frames)), views.unflatten(0, (num_tiles, max_frames))
 
     def fuse_features(self, features: Tensor, seen: Tensor) -> Tensor:
-        """Features (B, K, C, rows, columns) of K looks on the cells of their tiles, and what they see, to (B, D, rows, columns)."""
+        """Fuse features (B, K, C, rows, columns) of K frames with their observed masks to (B, D, rows, columns)."""
         fused = masked_max(features, seen, self.empty_feature)
         coverage = seen.sum(1, keepdim=True).to(fused.dtype).log1p()
         b, _, rows, columns = fused.shape
@@ -162,15 +175,16 @@ class MapModel(nn.Module):
         return self.pyramid(levels)
 
     def predict_line_field(self, ground: Tensor) -> RawLineField:
-        """What the cells of tiles (B, D, rows, columns) say of the lines that run by them."""
+        """Predict the line field of tile features (B, D, rows, columns)."""
         return self.head.line_field_head(ground)
 
     def predict_elements(
         self, ground: Tensor, group: QueryGroup = "one", line_field: RawLineField | None = None
     ) -> tuple[RawMap, ...]:
-        """Elements of tiles (B, D, rows, columns), one RawMap a layer, the last the best, its scores calibrated when not training.
+        """Predict the elements of tile features (B, D, rows, columns): one RawMap per layer, the last the best.
 
-        line_field: of this ground, if known.
+        line_field: of these features, if already computed. Outside training, the scores of the last layer are
+        calibrated.
         """
         *before, last = self.head(ground, self.predict_line_field(ground) if line_field is None else line_field, group)
         if not self.training:
@@ -178,8 +192,8 @@ class MapModel(nn.Module):
         return (*before, last)
 
     def forward(self, features: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """The part that is exported: looks on the cells of their tiles, as for ``fuse_features``, to the last layer's logits
-        and points.
+        """Map warped frames, as for ``fuse_features``, to the last layer's logits and points; the exported part of
+        the model.
         """
         raw = self.predict_elements(self.fuse_features(features, seen))[-1]
         return raw.logit, raw.point

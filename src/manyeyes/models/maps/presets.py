@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Map models by name and sensors."""
+"""Named configurations of the map model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from manyeyes.models.maps.map_model import MapModelConfig
 from manyeyes.models.maps.view_transform import DepthBins
 
 FORMAT = "manyeyes-mapper-1"
-"""Of a mapper's file of weights."""
+"""Format name in the metadata of a map model's file."""
 
 
 def _tile(cell_m: float) -> BevGrid:
@@ -37,7 +37,7 @@ MAP_TINY = MapModelConfig(
         num_queries=80, num_points=10, num_learned_queries=60, channels=64, feedforward_channels=128, layers=2, heads=4
     ),
 )
-"""For tests, and to learn a few tiles by heart: lines of its own learn those sooner than a sketch does."""
+"""For tests and overfitting a few tiles, which learned queries do faster than queries from the line field."""
 
 MAP_SMALL = MapModelConfig(
     BevConfig(
@@ -55,7 +55,7 @@ MAP_SMALL = MapModelConfig(
     neck_blocks=(1, 1, 1, 1),
     head=MapHeadConfig(num_queries=60, num_points=20, channels=64, feedforward_channels=128, layers=2, heads=4),
 )
-"""For two cores: a look is read with few layers, since the ground around it is read again where all looks have met."""
+"""For two CPU cores: few layers per frame, because the fused tile is processed again."""
 
 MAP_PAPER = MapModelConfig(
     BevConfig(
@@ -74,13 +74,13 @@ MAP_PAPER = MapModelConfig(
         num_queries=100, num_points=20, num_one_to_many_queries=300, channels=256, feedforward_channels=512, layers=6
     ),
 )
-"""ResNet-50, 120 m by 60 m, 100 queries of 20 points: CrowdMap section 3.1, and MapTRv2's decoder where it is silent. For GPUs."""
+"""ResNet-50, 120 m by 60 m, 100 queries of 20 points (CrowdMap section 3.1), MapTRv2's decoder elsewhere. For GPUs."""
 
 MAP_MODELS = {"tiny": MAP_TINY, "small": MAP_SMALL, "paper": MAP_PAPER}
 
 
 def get_map_model_config(name: str, sensors: tuple[Sensor, ...] = ("lidar",)) -> MapModelConfig:
-    """A preset by its name in MAP_MODELS, for agents that carry these sensors."""
+    """Return a preset of MAP_MODELS for agents with these sensors."""
     if name not in MAP_MODELS:
         raise ConfigError(f"No map model is called {name!r}; choose one of {', '.join(MAP_MODELS)}.")
     config = MAP_MODELS[name]

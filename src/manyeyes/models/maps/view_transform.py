@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Features of pictures to features of the ground: every cell of the ground asks the pictures what they saw of it.
+"""Transform image features to ground features: every ground cell samples the images that observe it.
 
-Two ways with one signature. ``lift_ground`` takes the cell for a piece of a flat road and looks up its pixel (inverse
-perspective mapping): no parameters, the plain twin. ``lift_depth`` asks at several heights and believes a pixel as far as it
-holds the point's depth for likely: Lift-Splat-Shoot (Philion and Fidler, ECCV 2020) pulled instead of pushed, so that one
-bilinear look-up replaces the scatter (specs: maps.md 1.4). Cells that several cameras see are their mean.
+Two methods share one signature. ``lift_ground`` projects the cell as a piece of flat road (inverse perspective
+mapping), without
+parameters. ``lift_depth`` projects points at several heights and weights each by the predicted likelihood of its
+depth:
+Lift-Splat-Shoot (Philion and Fidler, ECCV 2020) as a gather, so that one bilinear sampling replaces the scatter.
+Cells observed by
+several cameras are averaged.
 """
 
 from __future__ import annotations
@@ -23,12 +26,12 @@ from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Transform
 from manyeyes.datatypes.camera import Camera
 
 MIN_DEPTH_M = 0.5
-"""Nearer to a camera than this, nothing is looked up."""
+"""Minimum depth of a projected point."""
 
 
 @dataclass(frozen=True)
 class DepthBins:
-    """count depths in equal steps, the first near_m and the last far_m along the optical axis."""
+    """num_bins depths at equal steps from near_m to far_m along the optical axis."""
 
     near_m: float = 1.0
     far_m: float = 49.0
@@ -41,8 +44,11 @@ class DepthBins:
 
 @dataclass(frozen=True)
 class _ProjectedCells:
-    """Of V cameras, the cells of a grid that each sees, M at most: cell (V, M) int64, row by row; place (V, M, 2) in the features,
-    as grid_sample counts; depth_m (V, M); valid (V, M): false where a camera sees fewer than M.
+    """Ground cells that V cameras observe, padded to M per camera.
+
+    cell: (V, M) int64, row-major. place: (V, M, 2) in the features, grid_sample coordinates. depth_m: (V, M). valid:
+    (V, M), false for
+    padding.
     """
 
     cell: Tensor
@@ -53,7 +59,9 @@ class _ProjectedCells:
 
 @dataclass(frozen=True)
 class _LiftGeometry:
-    """What a look-up depends on but the camera. features: their height and width; their cell o is centred on pixel stride * o."""
+    """Parameters of a projection beside the camera; features: (height, width), feature o is centred on pixel stride *
+    o.
+    """
 
     grid: BevGrid
     height_m: float
@@ -63,7 +71,7 @@ class _LiftGeometry:
 
 
 def _project_cells(cameras: Sequence[Camera], geometry: _LiftGeometry) -> _ProjectedCells:
-    """Where cells of the ground, height_m above the road, lie in the features of each camera."""
+    """Project ground cells at height_m above the road to the features of each camera."""
     found = [_cells_in(_camera_key(camera), camera.width, camera.height, geometry) for camera in cameras]
     cells, places, depths = (pad_sequence(list(part), batch_first=True) for part in zip(*found))
     valid = torch.arange(cells.shape[1]) < torch.tensor([[len(one[0])] for one in found])
@@ -80,7 +88,7 @@ def _camera_key(camera: Camera) -> tuple[float, ...]:
 def _cells_in(
     key: tuple[float, ...], width: int, height: int, geometry: _LiftGeometry
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cells (M,), places (M, 2) and depths (M,) of one camera, kept: a rig looks the same way from look to look."""
+    """Return cells (M,), places (M, 2) and depths (M,) of one camera, cached, as the rig is constant over frames."""
     values = torch.tensor(key, dtype=torch.float64)
     camera = Camera(values[:9].view(3, 3), Transform(values[9:18].view(3, 3), values[18:]), width, height)
     rows, columns = geometry.grid.shape
@@ -97,7 +105,9 @@ def _cells_in(
 
 
 def _pixel_footprint(camera: Camera, points: Tensor) -> Tensor:
-    """(N,) metres of a level plane through each point (N, 3) that one pixel covers along the ray; vast above the camera."""
+    """Return the ground length (N,) in metres that one pixel covers along the ray at points (N, 3); large above the
+    camera.
+    """
     offset = points - camera.agent_from_camera.translation
     return offset.square().sum(1) / (-offset[:, 2] * camera.intrinsic[1, 1]).clamp_min(1e-9)
 
@@ -111,10 +121,19 @@ def lift_ground(
     stride: int,
     max_pixel_footprint_m: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
-    """Features (V, C, h, w) of V cameras to (agents, C, rows, columns), zero where unseen, and what is seen, bool.
+    """Lift features (V, C, h, w) of V cameras by a flat-ground projection.
 
-    agent_of_camera: (V,) int64, whose camera it is. stride: pixels a feature, the first centred on the first pixel.
-    max_pixel_footprint_m: ground of which one pixel covers more than this along its ray is unseen.
+    Args:
+        features: of the images.
+        cameras: V cameras.
+        agent_of_camera: (V,) int64.
+        num_agents: number of agents.
+        grid: ground cells in the agent's frame.
+        stride: pixels per feature; the first feature is centred on the first pixel.
+        max_pixel_footprint_m: cells of which one pixel covers more along its ray are not observed.
+
+    Returns:
+        Features (agents, C, rows, columns), zero where not observed, and the observed mask.
     """
     _check(features, cameras, agent_of_camera)
     projected = _project_cells(cameras, _LiftGeometry(grid, 0.0, max_pixel_footprint_m, _size(features), stride))
@@ -134,10 +153,12 @@ def lift_depth(
     bins: DepthBins,
     heights_m: Sequence[float],
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`lift_ground`, with depth (V, bins.count, h, w), a distribution a pixel, over heights above the road.
+    """Lift as in :func:`lift_ground`, with a depth distribution (V, bins.num_bins, h, w) per pixel, at heights_m
+    above the road.
 
-    A point takes its pixel's feature times the likelihood of the point's depth there, linear between bins; a cell is the sum over
-    heights. Places beyond the bins are unseen.
+    A point takes its pixel's feature times the likelihood of its depth, interpolated linearly; a cell sums over
+    heights. Points outside
+    the depth range are not observed.
     """
     _check(features, cameras, agent_of_camera)
     if depth.shape != (features.shape[0], bins.num_bins, *features.shape[-2:]):
@@ -160,7 +181,7 @@ def _size(features: Tensor) -> tuple[int, int]:
 
 
 def _sample(values: Tensor, place: Tensor) -> Tensor:
-    """(V, M, C) of values (V, C, ...) at place (V, ..., M, coordinates), bilinear."""
+    """Sample values (V, C, ...) at place (V, ..., M, coordinates), bilinear; returns (V, M, C)."""
     found = F.grid_sample(values, place[:, None], mode="bilinear", padding_mode="border", align_corners=False)
     return found.flatten(2).mT
 
@@ -168,7 +189,7 @@ def _sample(values: Tensor, place: Tensor) -> Tensor:
 def _average_cameras(
     found: Sequence[tuple[_ProjectedCells, Tensor, Tensor]], agent_of_camera: Tensor, num_agents: int, grid: BevGrid
 ) -> tuple[Tensor, Tensor]:
-    """Sums of what was found, (V, M, C) where within (V, M), on the cells of agents, over the number of cameras that see a cell."""
+    """Average found features (V, M, C), where within (V, M), over the cameras that observe a cell of an agent."""
     rows, columns = grid.shape
     cells, channels = rows * columns, found[0][2].shape[2]
     total = found[0][2].new_zeros(num_agents * cells, channels)
@@ -183,7 +204,7 @@ def _average_cameras(
         .view(num_agents, rows, columns)
     )
     mean = total.view(num_agents, rows, columns, channels) / count.clamp_min(1)[..., None]
-    # Channels stay innermost in memory, as convolutions like them.
+    # channels_last suits the convolutions.
     return mean.permute(0, 3, 1, 2), count > 0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fits the codebook of a detector to the tokens that it tells of training scenes. The detector itself stays as it is."""
+"""Fit the codebook of a detector to the tokens that it shares in training scenes; other weights are unchanged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,9 @@ _KMEANS_ITERATIONS = 20
 
 
 def fit_centres(features: Tensor, config: CodebookConfig, seed: int) -> Tensor:
-    """Centres (stages, size, C) of residual vector quantisation of features (N, C): k-means of what each stage leaves over."""
+    """Fit centres (stages, size, C) of residual vector quantisation to features (N, C): k-means of each stage's
+    residuals.
+    """
     residual, stages = features, []
     for stage in range(config.stages):
         centres = k_means(residual, config.size, (seed, "codebook", stage))
@@ -32,10 +34,10 @@ def fit_centres(features: Tensor, config: CodebookConfig, seed: int) -> Tensor:
 
 
 def k_means(x: Tensor, size: int, key: tuple[int | str, ...], iterations: int = _KMEANS_ITERATIONS) -> Tensor:
-    """Centres (size, C) of rows x (N, C): Lloyd's rounds (1982) from k-means++ (Arthur and Vassilvitskii 2007) drawn by key.
+    """Cluster rows x (N, C) to centres (size, C): Lloyd (1982) from k-means++ (Arthur and Vassilvitskii 2007), drawn
+    by key.
 
-    A centre that nobody is nearest to is put where the error is largest. Where there are fewer rows than centres, some
-    centres are the same.
+    An empty cluster is moved to the row of largest error. With fewer rows than centres, some centres are equal.
     """
     centres = _init_centres(x, size, key)
     for _ in range(iterations):
@@ -51,7 +53,7 @@ def k_means(x: Tensor, size: int, key: tuple[int | str, ...], iterations: int = 
 
 
 def _init_centres(x: Tensor, size: int, key: tuple[int | str, ...]) -> Tensor:
-    """Rows to begin with: each is drawn with the square of its distance from those before it."""
+    """Draw initial centres, each with probability proportional to the squared distance from those before it."""
     draws = keyed_uniform((size,), *key)
     chosen = [int(draws[0] * len(x))]
     distance = (x - x[chosen[0]]).square().sum(1)
@@ -64,11 +66,14 @@ def _init_centres(x: Tensor, size: int, key: tuple[int | str, ...]) -> Tensor:
 
 
 def fit_frequencies(codes: Tensor) -> Tensor:
-    """How often each value occurs in each column of codes (N, W) uint8: (W, 256) int16, none 0, a column FREQUENCY_TOTAL."""
+    """Count the values of each column of codes (N, W) uint8: (W, 256) int16, none 0, with sum FREQUENCY_TOTAL per
+    column.
+    """
     columns = []
     for column in codes.T:
         share = torch.bincount(column.long(), minlength=256).double() / max(1, len(column))
-        # One for every value, so that all can be written; the rest by share, what rounding leaves to the most frequent.
+        # One for every value, so that all can be encoded; the rest in proportion, the rounding error to the most
+        # frequent.
         spare = FREQUENCY_TOTAL - 256
         frequency = 1 + (share * spare).floor().long()
         frequency[frequency.argmax()] += FREQUENCY_TOTAL - frequency.sum()
@@ -77,7 +82,10 @@ def fit_frequencies(codes: Tensor) -> Tensor:
 
 
 def collect_shared_tokens(detector: Detector, recording: Recording, frame_stride: int) -> Iterator[Tensor]:
-    """Rows (n, C + PROPOSAL) that each agent tells at every such judged frame, having seen the frame before it too."""
+    """Yield the shared tokens (n, C + PROPOSAL_DIM) of each agent at every frame_stride-th evaluated frame.
+
+    The agent processes the preceding frame too.
+    """
     for number, (scenario, index) in enumerate(iter_eval_frames(recording)):
         if number % frame_stride:
             continue
@@ -99,9 +107,9 @@ def fit_codebook(
     frame_stride: int = 10,
     report: Callable[[int], None] = lambda tokens: None,
 ) -> Detector:
-    """The detector with a codebook fitted to every such judged frame of a recording; its fingerprint is another.
+    """Fit a codebook to every frame_stride-th evaluated frame; returns the detector with it, under a new fingerprint.
 
-    report: is told how many tokens have been gathered.
+    report: called with the number of tokens collected so far.
     """
     rows: list[Tensor] = []
     for tokens in collect_shared_tokens(detector, recording, frame_stride):
@@ -115,10 +123,10 @@ def fit_codebook(
 
 
 def with_codebook(detector: Detector, tokens: Tensor, seed: int, config: CodebookConfig) -> Detector:
-    """The detector with a codebook fitted to told rows (N, C + PROPOSAL)."""
+    """Fit a codebook to shared tokens (N, C + PROPOSAL_DIM) and return the detector with it."""
     fitted = Detector(replace(detector.config, codebook=config))
     book = Codebook(tokens.shape[1] - PROPOSAL_DIM, config)
-    # As files of half precision keep them, so that saving changes nothing.
+    # Rounded to float16 as in the file, so that saving changes nothing.
     book.centres.copy_(fit_centres(tokens[:, :-PROPOSAL_DIM], config, seed).half())
     book.frequencies.copy_(fit_frequencies(book.encode(tokens)))
     weights = {k: v for k, v in detector.state_dict().items() if not k.startswith("codebook.")}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The training loop: plain, keyed, resumable; fork it."""
+"""The training loop of the detector: keyed randomness, resumable."""
 
 from __future__ import annotations
 
@@ -25,11 +25,18 @@ from manyeyes.training.detector.targets import TargetConfig
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A run. steps, or epochs over the judged frames when steps is 0; batch: samples a step over all processes.
+    """Settings of a training run.
 
-    warmup_steps: steps of linear growth of the learning rate, then a cosine to zero. prune_warmup_start, prune_warmup_end: the
-    pruning threshold grows from 0 to the detector's between these shares of the run. ema_decay: decay of the averaged weights that
-    are saved.
+    Attributes:
+        detector: configuration of the model.
+        steps: number of optimiser steps; 0 to use epochs.
+        epochs: passes over the evaluated frames.
+        batch: samples per step over all processes.
+        warmup_steps: steps of linear growth of the learning rate, before a cosine to zero.
+        max_grad_norm: at which gradients are clipped.
+        ema_decay: decay of the averaged weights, which are saved.
+        prune_warmup_start: fraction of the run at which the pruning threshold starts to grow from 0.
+        prune_warmup_end: fraction of the run at which it reaches that of the detector.
     """
 
     detector: DetectorConfig
@@ -52,7 +59,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class DetectorProgress:
-    """One line of the log."""
+    """Progress of one step: one line of the log."""
 
     step: int
     steps: int
@@ -62,24 +69,24 @@ class DetectorProgress:
     seconds: float
 
     def to_record(self) -> dict[str, float]:
-        """As it stands in log.jsonl."""
+        """Return the line of log.jsonl."""
         terms = {name: round(float(value.detach()), 5) for name, value in vars(self.terms).items()}
         return {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
 
 
 def learning_rate(config: TrainConfig, step: int, steps: int) -> float:
-    """Linear warm-up, then a cosine to zero."""
+    """Return the learning rate: linear warm-up, then a cosine to zero."""
     return config.learning_rate * warmup_cosine(config.warmup_steps, step, steps)
 
 
 def prune_threshold(config: TrainConfig, step: int, steps: int) -> float:
-    """The detector's threshold, approached linearly between prune_from and prune_full of the run; 0 before."""
+    """Return the pruning threshold: 0, then linear growth from prune_warmup_start to prune_warmup_end of the run."""
     ramp = (step / steps - config.prune_warmup_start) / max(1e-9, config.prune_warmup_end - config.prune_warmup_start)
     return config.detector.prune_threshold * min(1.0, max(0.0, ramp))
 
 
 class DetectorRun:
-    """One training run of the detector, in a folder from which it resumes."""
+    """A resumable training run of the detector in a folder."""
 
     def __init__(
         self, config: TrainConfig, recording: Recording, folder: Path, seed: int, start: Path | None = None
@@ -95,7 +102,7 @@ class DetectorRun:
         self.state = RunState(model, config, seed, folder, config.weight_decay, from_weights=start is not None)
 
     def advance(self) -> DetectorProgress:
-        """One step of the optimiser."""
+        """Run one optimiser step."""
         config, state = self.config, self.state
         samples = [self.stream.draw(number) for number in state.sample_numbers(config.batch)]
         model = state.model.train()
@@ -116,11 +123,11 @@ def train_detector(
     report: Callable[[DetectorProgress], None] = lambda progress: None,
     start: Path | None = None,
 ) -> Path:
-    """Train, or go on where the run in folder stopped; returns the file of averaged weights.
+    """Train, or resume the run in folder; returns the file of averaged weights.
 
-    start: a file of weights to begin from instead of random ones; its settings may differ where they shape no tensor.
+    start: weights file that initialises the model; its configuration may differ where tensor shapes agree.
 
-    Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
+    Writes last.pt (training state), log.jsonl (one object per step) and weights.safetensors (float16).
     """
     run = DetectorRun(config, recording, folder, seed, start)
     state = run.state
@@ -133,9 +140,12 @@ def train_detector(
 
 
 def _load_weights(model: Detector, start: Path) -> None:
-    """Begin from a file. Where the model has grown, by a part or by rows and columns at their ends, what is new starts as if
-    it were not there: a new part as it is built, new rows and columns of a matrix at zero. Parts that the model lacks are left out,
-    as an ablation does."""
+    """Initialise the model from a file.
+
+    New modules keep their initialisation, and new rows and columns of a matrix start at zero, so that both have no
+    effect at first. Modules
+    that the model lacks are skipped, as in an ablation.
+    """
     state, own = checkpoint.read_state(start), model.state_dict()
     begun = {name: _grow(value, state[name]) for name, value in own.items() if name in state}
     odd = sorted(name for name, value in begun.items() if value is None)
@@ -148,7 +158,7 @@ def _load_weights(model: Detector, start: Path) -> None:
 
 
 def _grow(new: Tensor, old: Tensor) -> Tensor | None:
-    """The old values at the start of the new tensor, None where they do not fit into it."""
+    """Copy old values to the start of the new tensor; None where they do not fit."""
     if new.dim() != old.dim() or any(n < o for n, o in zip(new.shape, old.shape)):
         return None
     grown = torch.zeros_like(new) if new.dim() > 1 else new.clone()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Losses of the centre head, of pruning, and of the detector's word on its own error (detection.md A.8, 4.2)."""
+"""Losses of the centre head, of focal pruning, and of the predicted standard deviations."""
 
 from __future__ import annotations
 
@@ -16,16 +16,27 @@ from manyeyes.training.detector.mutual_information import InformationTarget
 from manyeyes.training.detector.targets import Targets
 
 MAX_CELL_WEIGHT = 8.0
-"""At most so many times a cell's fair share, so that an object of one cell does not speak for a whole batch."""
+"""Maximum weight of a cell relative to the mean, so that an object of one cell does not dominate a batch."""
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the terms. iou: of 1 - IoU itself, for boxes that nearly fit already; off at the start, where none do.
+    """Weights of the loss terms.
 
-    mask_l1, information: of the selector's L1 and InfoNCE (CoSTr Eq. 12). fusion_weight: the share of what egos make of all that
-    they hear, the rest is what agents make of their own view. target: what the information is measured against; own_task, but for
-    studies.
+    Attributes:
+        heat: centre heatmap.
+        shape: offsets, height, size and axis.
+        direction: heading along the axis.
+        classification: object class.
+        sigma: likelihood of the predicted standard deviations.
+        iou_score: predicted IoU.
+        iou: 1 - IoU, for boxes that already overlap; 0 at the start of training.
+        velocity: of the object.
+        prune: focal pruning.
+        mask_l1: L1 norm of the selector's mask (CoSTr Eq. 12).
+        information: InfoNCE of the selector (CoSTr Eq. 12).
+        fusion_weight: fraction of the fused boxes' loss; the rest is that of single-agent boxes.
+        target: reference of the mutual information; other values than own_task are for studies.
     """
 
     heat: float = 1.0
@@ -45,7 +56,7 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class LossTerms:
-    """Unweighted terms, scalars."""
+    """Unweighted loss terms of one batch, as scalars; fields as in LossConfig."""
 
     heat: Tensor
     shape: Tensor
@@ -60,12 +71,12 @@ class LossTerms:
     information: Tensor
 
     def mix(self, other: LossTerms, share: float) -> LossTerms:
-        """So much of the other, the rest of this."""
+        """Interpolate linearly: this fraction of the other terms, the rest of these."""
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return LossTerms(*((1 - share) * mine + share * theirs for mine, theirs in pairs))
 
     def total(self, config: LossConfig) -> Tensor:
-        """The weighted sum."""
+        """Return the weighted sum of all terms."""
         return torch.stack([getattr(self, f.name) * getattr(config, f.name) for f in fields(self)]).sum()
 
 
@@ -78,10 +89,12 @@ def centre_focal(logit: Tensor, heat: Tensor, positive: Tensor) -> Tensor:
 
 
 def prune_focal(pruned: PruneOutput, near: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
-    """Sigmoid focal loss (Lin et al. 2017) on whether a cell lies near an object, divided by max(1, number that do).
+    """Sigmoid focal loss (Lin et al. 2017) on whether a cell lies near an object, divided by max(1, number of such
+    cells).
 
-    near: (N,), of objects_near. Every object has one voice, however many cells it fills: a vehicle of two cells is lost
-    as soon as they are, one of two hundred hardly.
+    near: (N,), of find_nearby_objects. Every object has equal weight, however many cells it covers, because pruning a
+    few cells removes a
+    small object.
     """
     found, row, cells = near.unique(return_inverse=True, return_counts=True)
     is_near = near >= 0
@@ -95,7 +108,7 @@ def prune_focal(pruned: PruneOutput, near: Tensor, alpha: float = 0.25, gamma: f
 
 
 def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, information: Tensor) -> LossTerms:
-    """All terms of one batch; every one is finite and zero where there is nothing to learn from."""
+    """Compute all terms of one batch; each is finite, and zero without targets."""
     heat = centre_focal(raw.heatmap_logit, targets.heat, targets.positive)
     rows = (targets.box >= 0).nonzero()[:, 0]
     if not len(rows):
@@ -115,7 +128,7 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, 
     axis = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1)
     off = (some.offset - offset).abs().sum(1) + (some.z - truth.center[:, 2]).abs() * 0.2
     shape = off + (some.log_size - log_size).abs().sum(1) + (some.axis - axis).abs().sum(1) * 0.5
-    # The axis is known modulo pi; which way along it the vehicle faces is a question of its own.
+    # The axis is known modulo pi; the heading along it is a separate classification.
     yaw = axis_yaw(some.axis).detach()
     turn = truth.yaw - yaw
     ahead = (turn.cos() > 0).float()
@@ -134,6 +147,8 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, 
 
 
 def _gaussian_nll(error: Tensor, log_sigma: Tensor) -> Tensor:
-    """Mean over axes of the negative log-likelihood of errors (N, d) under an isotropic sigma (N,); errors carry no gradient."""
+    """Mean over axes of the negative log-likelihood of errors (N, d) under an isotropic sigma (N,); no gradient to
+    errors.
+    """
     bounded = log_sigma.clamp(-5, 3)[:, None]
     return (0.5 * (error * torch.exp(-bounded)) ** 2 + bounded).mean(1)

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the selector is taught beside detection itself: to say little (L1), and to say what matters (CoSTr Eq. 10 to 12).
+"""Losses of the token selector: L1 norm of the mask and mutual information of the kept tokens (CoSTr Eq. 10 to 12).
 
-The letter of Eq. 10 compares an aggregate with itself and teaches nothing (detection.md 5.2 has the audit and the toy). Here the
-masked words of a window are compared with what its own task says matters there, by an un-normalised product: a mask that
-withholds what matters lowers the agreement, and no scale of the mask cancels. For study there are two more targets: what the
-receiver sees itself (the paper, repaired: it drops what only the sender sees), and the letter.
+Eq. 10 as printed compares an aggregate with itself, so its gradient carries no information. Here the masked tokens of
+a window are
+compared with its relevant tokens according to the detector's own targets, by an unnormalised product. Masking
+relevant tokens lowers
+the agreement, and no scale of the mask cancels. Two more targets are for studies: the receiver's own features, which
+is the corrected
+paper but drops what only the sender observes, and Eq. 10 as printed.
 """
 
 from __future__ import annotations
@@ -27,7 +30,9 @@ InformationTarget = Literal["own_task", "receiver", "literal"]
 
 
 def mutual_information_loss(tokens: SparseBev, mask: Tensor, relevance: Tensor) -> tuple[Tensor, Tensor]:
-    """(mean of the mask, InfoNCE in nats) of told tokens (N, C + PROPOSAL); mask (N,), matters (N,) in [0, 1] from the truth."""
+    """Return the mean mask and InfoNCE in nats of tokens (N, C + PROPOSAL_DIM); mask (N,), ground-truth relevance
+    (N,) in [0, 1].
+    """
     if not len(mask):
         zero = mask.sum()
         return zero, zero
@@ -39,10 +44,12 @@ def mutual_information_loss(tokens: SparseBev, mask: Tensor, relevance: Tensor) 
 
 
 def window_mutual_information(features: Tensor, mask: Tensor, relevance: Tensor, row: Tensor) -> Tensor:
-    """Symmetric InfoNCE, scalar, between the masked and the mattering part of each window; features (N, C), row (N,) windows.
+    """Symmetric InfoNCE, scalar, between the masked and the relevant part of each window; features (N, C), row (N,)
+    windows.
 
-    z^X is the mean over a window of mask * feature, not divided by the sum of the mask; z^Y that of matters * feature, which
-    carries no gradient. Windows without anything that matters are negatives only.
+    z^X is the window mean of mask * feature, not divided by the sum of the mask. z^Y is that of relevance * feature
+    and carries no gradient.
+    Windows without relevant tokens are negatives only.
     """
     windows = int(row.max()) + 1
     count = torch.bincount(row, minlength=windows).to(mask.dtype)[:, None]
@@ -56,8 +63,9 @@ def window_mutual_information(features: Tensor, mask: Tensor, relevance: Tensor,
 class AgentPairTokens:
     """Senders' and receivers' tokens in the receivers' windows, for the study targets.
 
-    sent (N, C) and own (M, C): unit features, the receivers' own turned axes; sent_mask (N,); sent_row (N,) and own_row (M,):
-    windows, numbered from 0.
+    sent (N, C) and own (M, C): unit features, rotated to the receivers' axes; sent_mask (N,); sent_row (N,) and
+    own_row (M,): window
+    numbers from 0.
     """
 
     sent: Tensor
@@ -68,9 +76,9 @@ class AgentPairTokens:
 
 
 def receiver_mutual_information(pairs: AgentPairTokens) -> Tensor:
-    """Symmetric InfoNCE, scalar, between what is sent of a window and what the receiver itself has there.
+    """Symmetric InfoNCE, scalar, between the sent tokens and the receiver's own tokens of each window.
 
-    Windows that only one of them has cannot be compared and take no part: what only the sender sees is worth nothing here.
+    Windows with tokens of one side only are ignored, so tokens that only the sender has gain nothing.
     """
     windows = _count_windows(pairs)
     sent, own = (torch.bincount(row, minlength=windows) for row in (pairs.sent_row, pairs.own_row))
@@ -83,7 +91,9 @@ def receiver_mutual_information(pairs: AgentPairTokens) -> Tensor:
 
 
 def paper_mutual_information(pairs: AgentPairTokens) -> Tensor:
-    """Minus Eq. 11 of the joint aggregate of Eq. 10, scalar: each window's unit vector against itself and all others."""
+    """Negative of Eq. 11 with the joint aggregate of Eq. 10, scalar: each window's unit vector against itself and all
+    others.
+    """
     windows = _count_windows(pairs)
     if not windows:
         return pairs.sent_mask.sum() * 0
@@ -102,7 +112,7 @@ def _count_windows(pairs: AgentPairTokens) -> int:
 
 
 def _info_nce(x: Tensor, y: Tensor, some: Tensor) -> Tensor:
-    """Windows (W, C) of one side against those of the other; only some are asked for, all are negatives."""
+    """InfoNCE of windows (W, C) of one side against the other; anchors are a subset, negatives are all windows."""
     agree = x @ y.mT / TEMPERATURE
     right = functional.cross_entropy(agree[some], some)
     return (right + functional.cross_entropy(agree.mT[some], some)) / 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training settings by name."""
+"""Named training configurations of the detector."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _BRANCH = replace(
 
 
 def _branch(**changes: Any) -> TrainConfig:
-    """One row of CoSTr's Table III: the whole model trained on, with a part of it changed."""
+    """One row of CoSTr's Table III: the final stage trained on, with a part of the model changed."""
     return replace(_BRANCH, detector=replace(_BRANCH.detector, **changes))
 
 

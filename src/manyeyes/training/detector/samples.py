@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From snapshots with truth to what one training step sees; augmentation is one motion of each agent's frame.
+"""Make training samples from snapshots with ground truth; augmentation moves each agent's frame.
 
-What goes wrong on the road is drawn here too, for each collaborator by itself: it looked some frames ago, its claimed pose is
-off, packets were lost, and a budget let it send a part of its tokens only.
+Degradations are drawn per collaborator: delay, pose noise, packet loss, and a budget that limits the number of sent
+tokens.
 """
 
 from __future__ import annotations
@@ -22,11 +22,15 @@ from manyeyes.ops.keyed_random import keyed_generator
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """max_yaw_rad: each agent's frame is turned by a uniform angle up to this, its pose with it, so that relative headings vary.
+    """Augmentation of a sample.
 
-    max_scale_change: everything is enlarged by a uniform factor within 1 ± scale; flip: mirrored left to right half of the time.
-    max_point_dropout: share of points dropped, uniform up to this. early_fusion_prob: samples whose clouds are merged into the
-    ego's, as early fusion does. max_agents: at most so many, ego included, a random number of them; from 99 on all that there are.
+    Attributes:
+        max_yaw_rad: maximum rotation of each agent's frame, pose included, so that relative headings vary.
+        max_scale_change: maximum deviation of the scale factor from 1.
+        flip: mirror left to right with probability 0.5.
+        max_point_dropout: maximum fraction of dropped points.
+        early_fusion_prob: probability that all clouds are merged into the ego's, as in early fusion.
+        max_agents: maximum number of agents, ego included, of a random number; from 99 on all agents.
     """
 
     max_yaw_rad: float = math.pi / 4
@@ -38,19 +42,26 @@ class AugmentConfig:
 
     @classmethod
     def none(cls) -> AugmentConfig:
-        """Samples as they were recorded, all agents, each with its own cloud."""
+        """Disable augmentation: recorded samples, all agents, each with its own cloud."""
         return cls(0.0, 0.0, False, 0.0, 0.0, 99)
 
 
 @dataclass(frozen=True)
 class DegradationConfig:
-    """What goes wrong, drawn anew for every sample (issue: training for the real world; detection.md 5.3).
+    """Degradation of communication and poses, drawn anew for every sample.
 
-    ego_history: instants before now that the ego looks back at. sender_history: messages of each collaborator before its last that
-    the ego remembers. delay_prob: of collaborators that looked 1 … late_frames ago.
-    pose_noise_prob: of samples whose collaborators' claims are off, with deviations uniform up to xy_m and yaw_rad, each of which
-    is nothing half of the time. packet_loss_prob: of collaborators that lose packets, up to lost of their tokens. budget_prob: of
-    collaborators under a budget, which leaves them from few tokens to all, uniform in the logarithm.
+    Attributes:
+        ego_history: number of earlier instants of the ego in its fusion input.
+        sender_history: number of earlier messages of each collaborator in the fusion input.
+        delay_prob: probability that a collaborator is delayed.
+        max_delay_frames: maximum delay; the minimum is one frame.
+        pose_noise_prob: probability of pose noise in a sample.
+        max_sigma_xy_m: maximum standard deviation of positions; zero for half of the noisy samples.
+        max_sigma_yaw_rad: maximum standard deviation of headings; zero for half of the noisy samples.
+        packet_loss_prob: probability that a collaborator loses packets.
+        max_loss_fraction: maximum fraction of lost tokens.
+        budget_prob: probability that a collaborator is under a budget.
+        min_budget_tokens: minimum budget; budgets are log-uniform up to all tokens.
     """
 
     ego_history: int = 0
@@ -68,11 +79,18 @@ class DegradationConfig:
 
 @dataclass(frozen=True)
 class AgentView:
-    """One look of one agent. cloud and previous_cloud: its last two sweeps, in its frame of then.
+    """Observation of one agent at one instant.
 
-    ego_from_view: from there to the ego's frame of now, as claimed. age_s: how long ago. sigma_xy_m, sigma_yaw_rad: of the claim.
-    visible_boxes: what the agent listed then, in its frame. loss_fraction: share of its tokens that do not arrive; max_tokens: how
-    many of them a budget lets it send, None for all.
+    Attributes:
+        cloud: its sweep, in its frame at that instant.
+        previous_cloud: the sweep before, in the same frame.
+        ego_from_view: from that frame to the ego's current frame, by the reported poses.
+        age_s: time since the observation.
+        visible_boxes: ground truth that the agent observed, in its frame.
+        sigma_xy_m: standard deviation of the reported position.
+        sigma_yaw_rad: standard deviation of the reported heading.
+        loss_fraction: fraction of its tokens that are lost.
+        max_tokens: budget in tokens, None without budget.
     """
 
     cloud: PointCloud
@@ -88,10 +106,14 @@ class AgentView:
 
 @dataclass(frozen=True)
 class Sample:
-    """One ego and its collaborators: views[0] is the ego's own. ego_history: the ego's own looks before, newest first.
+    """One ego and its collaborators.
 
-    sender_history: what each collaborator looked at before, newest first, agent by agent. merged_gt_boxes: what any of the agents
-    lists now, in the ego's frame. key: of draws that follow.
+    Attributes:
+        views: the ego's own view first.
+        merged_gt_boxes: boxes that any of the agents observes now, in the ego's frame.
+        ego_history: the ego's earlier views, newest first.
+        sender_history: earlier views of each collaborator, newest first, agent by agent.
+        key: of subsequent random draws.
     """
 
     views: tuple[AgentView, ...]
@@ -109,9 +131,9 @@ def make_sample(
     key: tuple[int | str, ...],
     degradation: DegradationConfig | None = None,
 ) -> Sample:
-    """The sample with this ego, a row of the last moment; every random choice follows from key.
+    """Make the sample of this ego, a row of the last snapshot; key determines every random choice.
 
-    snapshots: consecutive snapshots, oldest first; the last is now. Where they reach back less far than asked, so does the sample.
+    snapshots: consecutive snapshots, oldest first; the last is the current one. Too few of them shorten the history.
     """
     degradation = degradation or DegradationConfig()
     rng = keyed_generator("augment", *key)
@@ -119,7 +141,7 @@ def make_sample(
     now = snapshots[-1]
     others = [i for i in range(len(now.frames)) if i != ego]
     max_others = min(len(others), config.max_agents - 1)
-    # The larger of two draws: few collaborators are met too, many more often.
+    # The larger of two draws: many collaborators are more frequent than few.
     num_others = int(rng.integers(0, max_others + 1, 2).max()) if config.max_agents < 99 else len(others)
     chosen = [ego, *(others[i] for i in rng.permutation(len(others))[:num_others])]
     ids = [now.frames[i].agent_id for i in chosen]
@@ -182,7 +204,7 @@ def make_sample(
 
 
 class _AugmentedScene:
-    """The moments of one sample, with every agent's frame turned by an angle of its own."""
+    """The snapshots of one sample, with every agent's frame rotated by its own angle."""
 
     def __init__(self, moments: Sequence[Snapshot], rng: np.random.Generator, config: AugmentConfig) -> None:
         self._moments, self._rng, self._config = moments, rng, config
@@ -198,14 +220,14 @@ class _AugmentedScene:
         return ids.index(agent_id) if agent_id in ids else None
 
     def pose(self, back: int, agent_id: int) -> Transform | None:
-        """World from the turned frame of an agent, so many moments ago; None where it was not there."""
+        """Return the pose of an agent's rotated frame back snapshots ago; None where it was absent."""
         row = self._row(back, agent_id)
         if row is None:
             return None
         return self._moments[-1 - back].frames[row].world_from_agent @ self._turn[agent_id]
 
     def cloud(self, back: int, agent_id: int) -> PointCloud | None:
-        """Its sweep, in its turned frame of then, thinned."""
+        """Return the agent's sweep in its rotated frame at that time, with points dropped out."""
         row = self._row(back, agent_id)
         if row is None:
             return None
@@ -216,7 +238,9 @@ class _AugmentedScene:
         return cloud
 
     def view(self, back: int, agent_id: int, ego: Transform, off: np.ndarray | None = None) -> AgentView:
-        """The look of an agent so many moments ago, which must be there; off: of its claim in x, y (m) and yaw (rad)."""
+        """Return the view of an agent back snapshots ago, which must exist; off: pose error in x, y (m) and yaw
+        (rad).
+        """
         snapshot, row = self._moments[-1 - back], self._row(back, agent_id)
         pose, now = self.pose(back, agent_id), self.cloud(back, agent_id)
         assert row is not None
@@ -231,7 +255,7 @@ class _AugmentedScene:
         )
 
     def merge(self, agent_ids: Sequence[int], ego: Transform, merged_gt_boxes: Boxes) -> AgentView:
-        """The clouds of all agents as the ego's own, now and the moment before."""
+        """Merge the current and previous clouds of all agents to one view of the ego."""
         clouds, earlier = [], []
         for one in agent_ids:
             pose, cloud = self.pose(0, one), self.cloud(0, one)
@@ -242,7 +266,7 @@ class _AugmentedScene:
         return AgentView(PointCloud.cat(clouds), PointCloud.cat(earlier), ego.inverse() @ ego, 0.0, merged_gt_boxes)
 
     def _previous_cloud(self, back: int, agent_id: int, frame: Transform) -> PointCloud:
-        """An agent's sweep of the moment before, moved by its own motion into a frame; empty where there is none."""
+        """Return an agent's previous sweep, motion-compensated to a frame; empty where there is none."""
         pose, cloud = self.pose(back + 1, agent_id), self.cloud(back + 1, agent_id)
         if pose is None or cloud is None:
             return PointCloud.of(torch.zeros(0, 3))
@@ -302,7 +326,7 @@ def _resize_boxes(boxes: Boxes, scale: float, flip: bool) -> Boxes:
 
 @dataclass(frozen=True)
 class SampleStream:
-    """An endless, keyed stream: sample i of a run is the same whatever the number of processes that draw it."""
+    """An endless, keyed stream: sample i of a run does not depend on the number of processes."""
 
     recording: Recording
     grid: BevGrid
@@ -311,7 +335,7 @@ class SampleStream:
     degradation: DegradationConfig = DegradationConfig()
 
     def draw(self, number: int) -> Sample:
-        """Sample of that number: a scenario, a frame with what the road asks for before it, and an ego, all uniform."""
+        """Draw the sample of this number: scenario, frame with the required history, and ego, all uniform."""
         rng = keyed_generator("sample", self.seed, number)
         scenarios = self.recording.scenarios
         scenario = scenarios[int(rng.integers(len(scenarios)))]
@@ -326,5 +350,5 @@ class SampleStream:
 
 
 def epoch_length(recording: Recording) -> int:
-    """Judged frames of a recording: one epoch."""
+    """Return the number of evaluated frames of a recording: one epoch."""
     return sum(1 for _ in iter_eval_frames(recording))

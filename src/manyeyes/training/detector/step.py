@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One forward pass as training sees it: every agent alone, and every ego with its collaborators, in one batch."""
+"""Forward pass and losses of one training step: single-agent and fused detection in one batch."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from manyeyes.training.detector.samples import AgentView, Sample
 from manyeyes.training.detector.targets import TargetConfig, assign_targets, find_nearby_objects
 
 TOKENS_PER_PACKET = 8
-"""How many tokens are lost together: what a packet of 1,398 bytes holds of float16 features, about."""
+"""Number of tokens lost together: a packet of 1,398 bytes holds about as many float16 features."""
 
 
 @dataclass(frozen=True)
 class ForwardOutput:
-    """What one batch of samples gave: every agent's own view (alone), and every ego's with all it hears (together).
+    """Outputs for one batch of samples: single-agent boxes of every view and fused boxes of every ego.
 
-    shared_tokens: what each view tells, on a batch of grids. mask: (N,) in (0, 1), how much of it the selector would keep.
+    shared_tokens: of each view, on a batch of grids. mask: (N,) in (0, 1), the selector's mask.
     """
 
     features: ExtractedFeatures
@@ -46,9 +46,9 @@ class ForwardOutput:
 
 
 def forward(model: Detector, samples: list[Sample], prune_threshold: float | None = None) -> ForwardOutput:
-    """Every agent looks as ego, then tells; every sample's ego fuses (CoSTr section III-A).
+    """Encode every view as ego and fuse the shared tokens of every sample (CoSTr section III-A).
 
-    The tokens take the very path that they take as bytes: seen in the sender's frame, moved metrically, fused, decoded.
+    Tokens are processed as in deployment: computed in the sender's frame, transformed metrically, fused, decoded.
     """
     views = [view for sample in samples for view in sample.views]
     seen = model.extract_features([v.cloud for v in views], [v.previous_cloud for v in views], prune_threshold)
@@ -83,12 +83,12 @@ def _agent_tokens(ego: int, view: AgentView, features: Tensor, xy: Tensor) -> Ag
 
 
 def _select_delivered(rows: Tensor, score: Tensor, view: AgentView, key: tuple[int | str, ...]) -> Tensor:
-    """The rows of a view's tokens that a budget sends and the air does not lose, packet by packet."""
+    """Select the rows of a view's tokens that fit its budget and are not lost, packet by packet."""
     if view.max_tokens is None and not view.loss_fraction:
         return rows
     rng = keyed_generator("arriving", *key)
     if view.max_tokens is not None:
-        # Near ties are drawn by chance, so that what is just left out is tried too.
+        # Noise exchanges tokens of similar score, so that those just below the budget are explored.
         noise = torch.from_numpy(rng.gumbel(size=len(rows))).float()
         order = (score[rows] + 0.5 * noise).sort(descending=True, stable=True).indices
         rows = rows[order[: view.max_tokens]]
@@ -101,7 +101,7 @@ def _select_delivered(rows: Tensor, score: Tensor, view: AgentView, key: tuple[i
 def _history_tokens(
     model: Detector, samples: list[Sample], which: Literal["past", "said"], prune_threshold: float | None
 ) -> list[AgentTokens]:
-    """What egos, or those that they hear, told at instants before, as memory holds it: no gradient reaches it."""
+    """Compute the tokens of earlier instants, of egos ("past") or collaborators ("said"), without gradient."""
     views = [
         (ego, view)
         for ego, sample in enumerate(samples)
@@ -128,9 +128,10 @@ def loss_terms(
     fusion_weight: float = 0.5,
     target: InformationTarget = "own_task",
 ) -> LossTerms:
-    """Losses of one batch: egos against the union of what their agents list, each agent against its own list.
+    """Compute the losses of one batch: fused boxes against the merged ground truth, single-agent boxes against each
+    agent's own.
 
-    fusion_weight: the share of the former. target: what the selector's information is measured against.
+    fusion_weight: fraction of the former. target: reference of the selector's mutual information.
     """
     out = forward(model, samples, prune_threshold)
     listed: list[Boxes] = [view.visible_boxes for sample in samples for view in sample.views]
@@ -148,7 +149,9 @@ def loss_terms(
 
 
 def pair_agent_tokens(out: ForwardOutput, samples: list[Sample]) -> AgentPairTokens:
-    """What collaborators tell and what their egos see themselves, in windows of the egos' frames; no gradient but the mask's."""
+    """Pair the collaborators' tokens with the egos' own in windows of the egos' frames; only the mask carries a
+    gradient.
+    """
     shared, batch, xy = out.shared_tokens, out.shared_tokens.sites.batch, out.shared_tokens.sites.xy
     views = [(ego, i, view) for ego, sample in enumerate(samples) for i, view in enumerate(sample.views)]
     sides: tuple[list[AgentTokens], list[AgentTokens]] = ([], [])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the detector should have said: centre heat, the box that each cell answers for, and where objects are."""
+"""Targets of the detector: centre heatmap, box assignment of each cell, and cells near objects."""
 
 from __future__ import annotations
 
@@ -13,10 +13,14 @@ from manyeyes.datatypes import Boxes, Sites
 
 @dataclass(frozen=True)
 class TargetConfig:
-    """heat_sigma_m: spread of the heat around a centre, metres (the metric form of detection.md 4.1's warning).
+    """Settings of the target assignment.
 
-    assign_radius_m: cells up to here from a box's centre also learn its shape, with a weight that falls off as a Gaussian of
-    shape_sigma_m. prune_margin_m: boxes are enlarged by at least this before asking whether a cell lies near one.
+    Attributes:
+        heat_sigma_m: standard deviation of the heatmap around a centre, in metres and so independent of the cell
+            size.
+        assign_radius_m: maximum distance from a box centre at which a cell learns the box's shape.
+        shape_sigma_m: standard deviation of the Gaussian weight of the shape loss.
+        prune_margin_m: minimum enlargement of boxes for the cells near objects.
     """
 
     heat_sigma_m: float = 0.6
@@ -27,10 +31,11 @@ class TargetConfig:
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """For N sites and M boxes of all grids of a batch, concatenated.
+    """Targets of N sites and M boxes, concatenated over the grids of a batch.
 
-    heat: (N,), exactly 1 at one site a box, unique. box: (N,) int64, row of the box that the site learns, -1 for none.
-    weight: (N,), of its shape loss. boxes: the M boxes. positive: (N,) bool, heat is exactly 1.
+    heat: (N,), exactly 1 at one distinct site per box. box: (N,) int64, row of the assigned box, -1 for none. weight:
+    (N,), of the shape
+    loss. boxes: the M boxes. positive: (N,) bool, where heat is exactly 1.
     """
 
     heat: Tensor
@@ -41,10 +46,11 @@ class Targets:
 
 
 def assign_targets(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Targets:
-    """Truth of each grid of the batch to its sites: the nearest site of a box is its centre, no site serves two boxes.
+    """Assign ground truth boxes to sites: the nearest site of a box is its centre; no site serves two boxes.
 
-    Pairs are taken from the nearest on (ties by site, then box), so that a box whose nearest site is taken gets the next one.
-    A box with no site within reach_m has no centre: nothing that was seen could stand for it.
+    Pairs are taken in ascending order of distance (ties by site, then box), so that a box whose nearest site is taken
+    gets the next. A box
+    without site within assign_radius_m has no centre.
     """
     n, batch, xy = len(sites), sites.batch, sites.xy
     heat, weight = torch.zeros(n), torch.zeros(n)
@@ -81,9 +87,9 @@ def _unique_pairs(distance: Tensor, reach_m: float) -> list[tuple[int, int]]:
 
 
 def find_nearby_objects(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Tensor:
-    """(N,) int64: the box, a row of all grids' boxes, that a cell's centre lies in, -1 for none (detection.md section 4.2).
+    """Return the box (N,) int64, a row over all grids, that contains a cell's centre, -1 for none.
 
-    Boxes are enlarged by max(margin, half a cell) on every side; of several the one whose centre is nearest.
+    Boxes are enlarged by max(prune_margin_m, half a cell) on every side; of several, the nearest centre wins.
     """
     margin = max(config.prune_margin_m, sites.grid.cell_size_m / 2)
     batch, xy = sites.batch, sites.xy

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a sketch of a tile should say, and what it costs to say otherwise.
+"""Targets and loss of the line field of a tile.
 
-A direction has no sign: it is told as the cosine and sine of twice its angle.
+Directions have no sign and are represented by cosine and sine of twice the angle.
 """
 
 from __future__ import annotations
@@ -24,22 +24,28 @@ from manyeyes.ops.polyline import headings, resample_spaced
 Floats = NDArray[np.float64]
 
 LINE_SIGMA = 0.6
-"""Cells: at so far from a line a cell is held for drawn at exp(-1/2)."""
+"""Standard deviation of the line probability across a line, in cells."""
 SAMPLE_SPACING = 0.25
-"""Cells between the points that stand for a line."""
+"""Spacing of the sampled points of a line, in cells."""
 MIN_NORMALISER = 20.0
-"""Cells of ink, or of ends, for which a kind counts that has fewer in a batch: one short line."""
+"""Minimum normaliser of a class in a batch, in cells of lines or ends: one short line."""
 OBSERVED_MARGIN_M = 4.0
-"""So far beyond what was seen, lines are still asked for: gaps between beams, and what stands behind a car."""
+"""Distance beyond the observed cells at which lines are still targets: gaps between beams, and occlusion by cars."""
 END_RADIUS = 0.75
-"""Cells from the end of a line within which a cell says that it ends here, where it is not the tile's border that cuts it."""
+"""Distance from the end of a line, in cells, at which a cell is labelled as end; cuts at the tile border are no ends."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineFieldTarget:
-    """One tile's truth as its cells should tell it. line_prob: (K, rows, columns) in [0, 1]; end_mask: likewise, 0 or 1; near_line:
-    likewise, bool, within REACH of a line, where alone the others mean something: foot, way (K, 2, rows, columns) and half (K,
-    rows, columns) as in a sketch.
+    """Line field of one tile's ground truth, for K classes.
+
+    Attributes:
+        line_prob: (K, rows, columns) in [0, 1].
+        end_mask: (K, rows, columns) 0 or 1.
+        near_line: (K, rows, columns) bool, within MAX_LINE_OFFSET of a line; elsewhere the following have no meaning.
+        offset_to_line: (K, 2, rows, columns) as in RawLineField.
+        direction: (K, 2, rows, columns) as in RawLineField.
+        half_width: (K, rows, columns) as in RawLineField.
     """
 
     line_prob: Tensor
@@ -50,20 +56,20 @@ class LineFieldTarget:
     half_width: Tensor
 
     def mask_unobserved(self, seen: Tensor) -> LineFieldTarget:
-        """Without lines where nothing was seen (rows, columns) bool."""
+        """Remove lines outside the observed mask (rows, columns)."""
         return replace(
             self, line_prob=self.line_prob * seen, end_mask=self.end_mask * seen, near_line=self.near_line & seen
         )
 
 
 def dilate_observed(seen: Tensor, tile: BevGrid) -> Tensor:
-    """(B, rows, columns) bool: cells within BEYOND_M of one that was seen (B, rows, columns), along either axis."""
+    """Dilate the observed mask (B, rows, columns) by OBSERVED_MARGIN_M along both axes."""
     reach = round(OBSERVED_MARGIN_M / tile.cell_size_m)
     return F.max_pool2d(seen[:, None].float(), 2 * reach + 1, 1, reach)[:, 0] > 0
 
 
 def make_line_field_target(truth: MapElements, tile: BevGrid, kinds: Sequence[str]) -> LineFieldTarget:
-    """The elements of those kinds, in the tile's frame, metres."""
+    """Make the target of the elements of these kinds, in the tile's frame, metres."""
     rows, columns = tile.shape
     ink = torch.zeros(len(kinds), rows, columns)
     foot, way = (torch.zeros(len(kinds), 2, rows, columns) for _ in range(2))
@@ -89,7 +95,9 @@ def make_line_field_target(truth: MapElements, tile: BevGrid, kinds: Sequence[st
 
 
 def fit_middle_line(ring: Floats) -> tuple[Floats, float]:
-    """A ring (K, 2) as the line (2, 2) along the middle of the rectangle about it, along its longest edge, and half its width."""
+    """Return the middle line (2, 2) of the rectangle around a ring (K, 2), along its longest edge, and its half
+    width.
+    """
     edges = np.roll(ring, -1, axis=0) - ring
     unit = edges[int(np.argmax(np.hypot(*edges.T)))]
     unit = unit / max(float(np.hypot(*unit)), 1e-9)
@@ -104,7 +112,7 @@ def fit_middle_line(ring: Floats) -> tuple[Floats, float]:
 
 
 def _tips(lines: Sequence[Floats], rows: int, columns: int) -> NDArray[np.float32]:
-    """(rows, columns) 1 within TIP of an end of a line in cells; rings and what the border cuts have none."""
+    """Return (rows, columns), 1 within END_RADIUS of an end of a line in cells; rings and border cuts have no ends."""
     open_lines = [line for line in lines if np.hypot(*(line[0] - line[-1])) > 0.1]
     ends = np.array([end for line in open_lines for end in (line[0], line[-1])]).reshape(-1, 2)
     ends = ends[((ends > 0.5) & (ends < [columns - 0.5, rows - 0.5])).all(1)]
@@ -116,7 +124,9 @@ def _tips(lines: Sequence[Floats], rows: int, columns: int) -> NDArray[np.float3
 def _nearest(
     lines: Sequence[Floats], rows: int, columns: int
 ) -> tuple[NDArray[np.int64], Floats, Floats, NDArray[np.int64]]:
-    """Cells (Q, 2), row and column, within REACH of lines in cells; the nearest point (Q, 2), its heading, and its line's row."""
+    """Return cells (Q, 2), row and column, within MAX_LINE_OFFSET of lines in cells, with nearest point (Q, 2),
+    heading and line.
+    """
     first = np.concatenate(([0], np.cumsum([len(line) for line in lines])))
     points, first = resample_spaced(np.concatenate(lines), first, SAMPLE_SPACING)
     angle, line = headings(points, first), np.repeat(np.arange(len(lines)), np.diff(first))
@@ -135,8 +145,11 @@ def _nearest(
 
 
 def line_field_loss(line_field: RawLineField, targets: Sequence[LineFieldTarget]) -> Tensor:
-    """Of a batch of tiles: ink and ends by cross entropy per unit of true ink, or end, of each kind by itself, since crossings are
-    few; foot (cells), way and half (cells), absolute, means over the cells near a line.
+    """Return the loss of a batch of tiles.
+
+    Line and end probabilities: cross entropy per unit of ground truth and class, as crossings are few. Offset,
+    direction and half width:
+    absolute error, mean over cells near a line.
     """
     ink, end, near, foot, way, half = (
         torch.stack([getattr(target, name) for target in targets])
@@ -150,6 +163,8 @@ def line_field_loss(line_field: RawLineField, targets: Sequence[LineFieldTarget]
 
 
 def _per_unit(logit: Tensor, share: Tensor) -> Tensor:
-    """Cross entropy (B, K, rows, columns) per unit of what is true, FEW units at least, kind by kind; the mean over kinds."""
+    """Cross entropy (B, K, rows, columns) per class, divided by max(sum of the target, MIN_NORMALISER); mean over
+    classes.
+    """
     each = F.binary_cross_entropy_with_logits(logit, share, reduction="none").sum((0, 2, 3))
     return (each / share.sum((0, 2, 3)).clamp_min(MIN_NORMALISER)).mean()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map model's training loop: plain, keyed, resumable, in one process or several; the schedule is the detector's."""
+"""The training loop of the map model: keyed randomness, resumable, one or more processes; the detector's schedule."""
 
 from __future__ import annotations
 
@@ -26,16 +26,21 @@ _CALIBRATION_TENSORS = ("logit_scale", "logit_shift")
 
 @dataclass(frozen=True)
 class MapTrainConfig:
-    """A run. batch: tiles a step over all processes. warmup_steps: steps of linear growth of the learning rate, then a cosine to
-    zero.
+    """Settings of a training run.
 
-    max_token_dropout: the greatest share of a look's tokens that is left out, those of least worth, as a budget in bytes would;
-    uniform, so that the model knows tiles of many bytes and of few. ema_decay: decay of the averaged weights that are saved. beta2:
-    decay of Adam's mean square; at the usual 0.999 it still divides by the great gradients of the start when half of a short run is
-    over. line_field_steps: first steps in which the decoder is not taught, since what it would begin from shows nothing yet.
-    calibration_tiles: tiles that follow those of the last step, by which scores are brought to what is true in the end; without any
-    they stay as they are. micro_batch: tiles that a process holds in memory together; parts of a batch are normed each by itself,
-    as those of several processes are.
+    Attributes:
+        map_model: configuration of the model.
+        batch: tiles per step over all processes.
+        beta2: decay of Adam's second moment; with 0.999, the large initial gradients still dominate at half of a
+            short run.
+        warmup_steps: steps of linear growth of the learning rate, before a cosine to zero.
+        max_grad_norm: at which gradients are clipped.
+        ema_decay: decay of the averaged weights, which are saved.
+        max_token_dropout: maximum fraction of a frame's tokens that are dropped, lowest scores first, as under a byte
+            budget; uniform.
+        line_field_steps: first steps without training of the decoder, while the line field is still uninformative.
+        calibration_tiles: tiles after those of the last step that calibrate the scores; 0 disables calibration.
+        micro_batch: tiles that a process holds in memory together; batch norms see one part at a time.
     """
 
     map_model: MapModelConfig
@@ -58,7 +63,7 @@ class MapTrainConfig:
 
 @dataclass(frozen=True)
 class MapProgress:
-    """One line of the log."""
+    """Progress of one step: one line of the log."""
 
     step: int
     steps: int
@@ -68,13 +73,13 @@ class MapProgress:
     seconds: float
 
     def to_record(self) -> dict[str, float]:
-        """As it stands in log.jsonl."""
+        """Return the line of log.jsonl."""
         terms = {name: round(float(value.detach()), 5) for name, value in vars(self.terms).items()}
         return {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
 
 
 class MapRun:
-    """One training run of the map model, in a folder from which it resumes."""
+    """A resumable training run of the map model in a folder."""
 
     def __init__(
         self,
@@ -92,7 +97,7 @@ class MapRun:
         self.state = RunState(model, config, seed, folder, config.weight_decay, config.beta2, bool(start))
 
     def advance(self) -> MapProgress:
-        """One step of the optimiser."""
+        """Run one optimiser step."""
         config, state = self.config, self.state
         numbers = state.sample_numbers(config.batch)
         loss, parts = 0.0, []
@@ -118,10 +123,11 @@ def train_map_model(
     report: Callable[[MapProgress], None] = lambda progress: None,
     start: Sequence[Mapping[str, torch.Tensor]] = (),
 ) -> Path:
-    """Train, or go on where the run in folder stopped; returns the file of averaged weights, whose card names the towns.
+    """Train, or resume the run in folder; returns the file of averaged weights, whose card names the towns.
 
-    start: tensors of map models to begin from, in place of random ones where they fit; the first that has one has the say.
-    Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
+    start: tensors of map models that initialise the model where names and shapes agree; earlier ones take precedence.
+    Writes last.pt
+    (training state), log.jsonl (one object per step) and weights.safetensors (float16).
     """
     run = MapRun(config, samples, folder, seed, start)
     state = run.state
@@ -144,10 +150,10 @@ def train_map_model(
 
 
 def _begin_from(model: MapModel, start: Sequence[Mapping[str, torch.Tensor]]) -> None:
-    """Tensors of these names and shapes are taken over: a model of other sensors has its tiles and its drawing in common."""
+    """Copy tensors of equal name and shape, such as tile and head of a model of other sensors."""
     own = model.state_dict()
     for state in reversed(start):
-        # Scores are calibrated in the end; what is taught is what comes before.
+        # Calibration follows training, so its tensors start anew.
         fitting = {
             k: v.float()
             for k, v in state.items()

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Losses of the map head: who answers for which element, and how far off it is, whatever order either is drawn in.
+"""Losses of the map head: matching of queries to elements, and point errors modulo equivalent point orders.
 
-Sources: MapTR (ICLR 2023) and MapTRv2 (IJCV 2024), weights as published there but for ink, ten times
-as much (docs/mapper.md); focal loss, Lin et al., ICCV 2017. Terms of points are sums over an element's points, means over elements.
+Sources: MapTR (ICLR 2023) and MapTRv2 (IJCV 2024), with their published weights but for segmentation, which weighs
+ten times as much
+(docs/mapper.md); focal loss, Lin et al., ICCV 2017. Point terms are sums over an element's points and means over
+elements.
 """
 
 from __future__ import annotations
@@ -23,12 +25,14 @@ ALPHA, GAMMA = 0.25, 2.0
 
 @dataclass(frozen=True)
 class MapLossConfig:
-    """Weights of the terms. one_to_many_repeats: how often each element is wanted of the one-to-many queries; one_to_many: their
-    share of the loss.
+    """Weights of the loss terms.
 
-    max_match_distance: mean over an element's points of the L1 distance, in shares of the tile, beyond which no query answers for
-    it: where no line of the sketch comes near, only the sketch has something to learn, and a query that was drawn there would
-    unlearn. Queries that begin as lines of their own have to be drawn from anywhere.
+    Attributes:
+        one_to_many_repeats: number of one-to-many queries per element.
+        one_to_many: weight of the one-to-many queries.
+        max_match_distance: maximum mean L1 distance of an element's points, in fractions of the tile, at which a
+            query is matched. Without a nearby line in the line field, only the line field has something to learn.
+            Learned queries need an infinite distance.
     """
 
     classification: float = 2.0
@@ -43,9 +47,10 @@ class MapLossConfig:
 
 @dataclass(frozen=True)
 class MapLossTerms:
-    """Scalars, each a sum over the head's layers where it has any; line_field: of what queries begin from
-    (training/maps/line_field_targets.py);
-    one_to_many: all terms of the one-to-many queries, weighed already.
+    """Loss terms of one batch, as scalars, summed over the head's layers.
+
+    line_field: see training/maps/line_field_targets.py. one_to_many: all terms of the one-to-many queries, already
+    weighted.
     """
 
     classification: Tensor
@@ -57,21 +62,21 @@ class MapLossTerms:
 
     @classmethod
     def without_elements(cls, segmentation: Tensor, line_field: Tensor) -> MapLossTerms:
-        """Where nothing was drawn."""
+        """Make the terms of a step without decoder."""
         nothing = line_field.new_zeros(())
         return cls(nothing, nothing, nothing, segmentation, line_field, nothing)
 
     def scale(self, fraction: float) -> MapLossTerms:
-        """What they count where they are of this share of a batch, without their gradients."""
+        """Scale the detached terms to this fraction of a batch."""
         return MapLossTerms(**{name: fraction * value.detach() for name, value in vars(self).items()})
 
     @classmethod
     def add_up(cls, parts: Sequence[MapLossTerms]) -> MapLossTerms:
-        """The terms of a batch from those of its parts."""
+        """Sum the terms of the parts of a batch."""
         return cls(**{f.name: torch.stack([getattr(part, f.name) for part in parts]).sum() for f in fields(cls)})
 
     def total(self, config: MapLossConfig) -> Tensor:
-        """The loss."""
+        """Return the weighted sum of all terms."""
         own = (
             config.classification * self.classification + config.point * self.point + config.direction * self.direction
         )
@@ -85,7 +90,9 @@ class MapLossTerms:
 
 @dataclass(frozen=True, eq=False)
 class QueryMatch:
-    """In one tile: query (M,) and element (M,) int64 of each pair, and the points (M, P, 2) in the order that fits the query."""
+    """Matches of one tile: query (M,) and element (M,) int64, and the points (M, P, 2) in the order that fits the
+    query.
+    """
 
     query: Tensor
     element: Tensor
@@ -93,9 +100,9 @@ class QueryMatch:
 
 
 def match_queries(logit: Tensor, point: Tensor, target: MapTarget, config: MapLossConfig) -> QueryMatch:
-    """One query an element, at the least cost over all pairs: focal cost of the kind plus the L1 distance in the best order.
+    """Match one query per element with minimum total cost: focal class cost plus L1 distance in the best point order.
 
-    logit (I, kinds), point (I, P, 2). Distances are of shares of the tile, summed over points.
+    logit (I, kinds), point (I, P, 2). Distances are in fractions of the tile, summed over points.
     """
     elements, orders = target.orders.shape[:2]
     if elements == 0:
@@ -115,7 +122,9 @@ def match_queries(logit: Tensor, point: Tensor, target: MapTarget, config: MapLo
 def head_terms(
     layers: Sequence[RawMap], targets: Sequence[MapTarget], config: MapLossConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(kind, point, direction) of one group of queries, each layer matched anew, summed over layers."""
+    """Return (classification, point, direction) of one group of queries, each layer matched separately, summed over
+    layers.
+    """
     queries = layers[0].logit.shape[1]
     num_matches = max(1, sum(min(len(target), queries) for target in targets))
     kind = point = direction = layers[0].logit.new_zeros(())
@@ -132,13 +141,15 @@ def head_terms(
 
 
 def direction_loss(predicted: Tensor, target: Tensor, ring: Tensor) -> Tensor:
-    """(M,) sums of 1 - cosine between the edges of two figures (M, P, 2); a ring (M,) has its closing edge too."""
+    """Return (M,) sums of 1 - cosine between the edges of two polylines (M, P, 2); rings (M,) include the closing
+    edge.
+    """
     gap = 1 - F.cosine_similarity(predicted.roll(-1, 1) - predicted, target.roll(-1, 1) - target, dim=2, eps=1e-6)
     return gap[:, :-1].sum(1) + gap[:, -1] * ring
 
 
 def focal_loss(logit: Tensor, hot: Tensor) -> Tensor:
-    """Focal loss of each logit against 0 or 1."""
+    """Compute the focal loss of each logit against 0 or 1."""
     likely = torch.sigmoid(logit)
     miss = torch.where(hot > 0, 1 - likely, likely)
     weight = torch.where(hot > 0, ALPHA, 1 - ALPHA) * miss**GAMMA
@@ -146,12 +157,12 @@ def focal_loss(logit: Tensor, hot: Tensor) -> Tensor:
 
 
 def _focal_cost(logit: Tensor) -> Tensor:
-    """What it costs a query to say a kind rather than not: the focal loss as it would be less the loss as it is without."""
+    """Return the class cost of a match: the focal loss as a positive minus that as a negative."""
     return focal_loss(logit, torch.ones_like(logit)) - focal_loss(logit, torch.zeros_like(logit))
 
 
 def segmentation_loss(logit: Tensor, occupied: Tensor) -> Tensor:
-    """Of tokens (N, kinds), whether an element of each kind runs through their cells (MapTRv2's segmentation, weight 4)."""
+    """Loss of the line logits of tokens (N, kinds) against occupied cells (MapTRv2's segmentation, weight 4)."""
     return F.binary_cross_entropy_with_logits(logit, occupied, pos_weight=logit.new_full((), 4.0))
 
 
@@ -163,7 +174,7 @@ def map_terms(
     targets: Sequence[MapTarget],
     config: MapLossConfig,
 ) -> MapLossTerms:
-    """All terms of one batch of tiles; many is empty where the head has no such queries."""
+    """Compute all terms of one batch of tiles; many is empty without one-to-many queries."""
     kind, point, direction = head_terms(one, targets, config)
     extra = kind.new_zeros(())
     if many:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training settings of map models by name."""
+"""Named training configurations of map models."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tiles to learn from: a place that agents of a recording drove by, some of their looks at it, and the true map there.
+"""Make training tiles: an area that agents of a recording passed, some of their frames, and the ground truth map.
 
-A map stands still, so looks of any time at a place are looks at the same thing: those of other scenarios of the town count as well.
-Source of the protocol: CrowdMap sections 2.2 and 3.1 (ten random looks at a tile of 120 m by 60 m); what it leaves open is chosen
-in specs: maps.md 1.5. Split by town, asserted.
+A map is static, so frames of any time and of other scenarios of the same town are combined. Source: CrowdMap sections
+2.2 and 3.1 (ten
+random frames of a tile of 120 m by 60 m). The split is by town and asserted.
 """
 
 from __future__ import annotations
@@ -33,10 +33,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class MapSample:
-    """One tile. frames: frames as they were seen; tile_from_agent: one motion each, by claimed poses.
+    """One training tile.
 
-    truth: in the tile's frame. line_mask: (looks, kinds, rows, columns) bool, where elements run through the cells of each look's
-    tokens.
+    Attributes:
+        frames: observations of agents.
+        tile_from_agent: one transform per frame, from reported poses.
+        truth: elements in the tile's frame.
+        line_mask: (frames, kinds, rows, columns) bool, cells of each frame's tokens that an element passes through.
     """
 
     frames: tuple[AgentFrame, ...]
@@ -50,19 +53,26 @@ class MapSamples(Protocol):
 
     @property
     def towns(self) -> tuple[str, ...]:
-        """Whose maps the samples show."""
+        """Names of the towns of the samples."""
         ...
 
     def draw(self, number: int) -> MapSample:
-        """Sample of that number, the same whenever it is drawn."""
+        """Draw the sample of this number, deterministically."""
         ...
 
 
 @dataclass(frozen=True)
 class MapAugmentConfig:
-    """min_frames, max_frames: looks at a tile, uniform. max_yaw_rad: of the tile against the heading of the agent it is put about;
-    max_shift_m: of its middle, along and across. sigma_xy_m, sigma_yaw_rad: of the error of claimed poses; flip: mirrored left to
-    right half of the time.
+    """Augmentation of a tile.
+
+    Attributes:
+        min_frames: minimum number of frames of a tile.
+        max_frames: maximum number; the number is uniform.
+        max_yaw_rad: maximum rotation of the tile against the heading of the central agent.
+        max_shift_m: maximum longitudinal and lateral shift of its centre.
+        sigma_xy_m: position error of reported poses.
+        sigma_yaw_rad: heading error of reported poses.
+        flip: mirror left to right with probability 0.5.
     """
 
     min_frames: int = 1
@@ -76,7 +86,9 @@ class MapAugmentConfig:
 
 @dataclass(frozen=True)
 class TileStream:
-    """Tiles of a recording. maps: the truth of each town, world frame. held_out: towns that later judge, which may not be here."""
+    """Tiles of a recording. maps: ground truth of each town, world frame. held_out: evaluation towns, which must not
+    occur.
+    """
 
     recording: Recording
     maps: Mapping[str, MapElements]
@@ -90,7 +102,7 @@ class TileStream:
 
     @property
     def towns(self) -> tuple[str, ...]:
-        """The towns of all scenarios."""
+        """Names of the towns of all scenarios."""
         return tuple(sorted({self._town(s) for s in self.recording.scenarios}))
 
     def _town(self, scenario: str) -> str:
@@ -102,14 +114,14 @@ class TileStream:
 
     @cached_property
     def _places(self) -> dict[str, Floats]:
-        """(agents, 2) where the agents of each scenario begin, world."""
+        """Initial positions (agents, 2) of the agents of each scenario, world frame."""
         first = {s: self.recording.snapshot(s, 0).frames for s in self.recording.scenarios}
         return {
             s: np.array([f.world_from_agent.translation[:2].tolist() for f in frames]) for s, frames in first.items()
         }
 
     def draw(self, number: int) -> MapSample:
-        """A scenario, a frame and an agent, all uniform; a tile about it; looks at it, of poles before those of others."""
+        """Draw a tile around a uniform scenario, frame and agent, and frames of it, roadside units first."""
         rng, augment = keyed_generator("tile", self.seed, number), self.augment
         scenarios = self.recording.scenarios
         scenario = scenarios[int(rng.integers(len(scenarios)))]
@@ -125,7 +137,7 @@ class TileStream:
         return self._sample(scenario, world_from_tile, frames, rng)
 
     def _sample_frames(self, scenario: str, middle: Floats, count: int, rng: np.random.Generator) -> list[AgentFrame]:
-        """So many looks of agents that were near, each at an instant of its own; a pole's first, where there is one."""
+        """Draw frames of nearby agents, each at its own instant; one of a roadside unit first, where there is one."""
         town, reach = self._town(scenario), self.map_model.tile.x_max + self.map_model.bev.grid.x_max / 2
         near = [
             (s, row)
@@ -134,7 +146,7 @@ class TileStream:
             for row in np.flatnonzero(np.hypot(*(places - middle).T) <= reach).tolist()
         ]
         order = rng.permutation(len(near))
-        # The agents of this very scenario first in half of the tiles: so do drivers meet.
+        # In half of the tiles, agents of the same scenario come first, as in traffic.
         if rng.random() < 0.5:
             order = sorted(order.tolist(), key=lambda k: near[k][0] != scenario)
         found: list[AgentFrame] = []
@@ -172,7 +184,7 @@ class TileStream:
 
 
 def rasterise_elements(elements: MapElements, grid: BevGrid, kinds: Sequence[str]) -> Tensor:
-    """(kinds, rows, columns) bool: the cells of a grid that elements of each kind, in its frame, run through; crossings filled."""
+    """Rasterise elements in the grid's frame to (kinds, rows, columns) bool; crossings are filled."""
     rows, columns = grid.shape
     out = torch.zeros(len(kinds), rows, columns, dtype=torch.bool)
     for layer, kind in enumerate(kinds):
@@ -189,7 +201,7 @@ def rasterise_elements(elements: MapElements, grid: BevGrid, kinds: Sequence[str
 
 
 def _filled(ring: Floats, step_m: float) -> Floats:
-    """(Q, 2) points of a lattice within a ring (K, 2), by the even-odd rule, and its corners."""
+    """Return grid points (Q, 2) inside a ring (K, 2), by the even-odd rule, and its vertices."""
     low, high = ring.min(0), ring.max(0)
     axes = [np.arange(a, b + step_m, step_m) for a, b in zip(low, high)]
     points = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
@@ -204,13 +216,13 @@ _MIRROR = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
 
 
 def mirror_frame(frame: AgentFrame) -> AgentFrame:
-    """The look seen in a mirror: left is right in its frame, its cloud, its cameras and their pictures."""
+    """Mirror a frame left to right: its cloud, its cameras and their images."""
     cloud = replace(frame.points, xyz=frame.points.xyz * _MIRROR.to(frame.points.xyz.dtype))
     return replace(frame, points=cloud, images=tuple(_mirrored_image(image) for image in frame.images))
 
 
 def _mirrored_image(image: CameraImage) -> CameraImage:
-    """What a camera on the other side would have taken of a mirrored world: columns swapped, and no axis of it the wrong way."""
+    """Return the image of the mirrored camera in the mirrored world: columns swapped, right-handed axes."""
     camera, pose = image.camera, image.camera.agent_from_camera
     # Mirrored in the agent's y and in the camera's x: two mirrors are a rotation.
     rotation = _MIRROR[:, None] * pose.rotation * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
@@ -221,7 +233,7 @@ def _mirrored_image(image: CameraImage) -> CameraImage:
 
 
 def mirror_transform(motion: Transform) -> Transform:
-    """The motion between two frames that are both mirrored."""
+    """Return the transform between two mirrored frames."""
     return Transform(_MIRROR[:, None] * motion.rotation * _MIRROR, motion.translation * _MIRROR)
 
 

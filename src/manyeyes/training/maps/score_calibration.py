@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map model's scores are worth: after training they are brought to the share of an element that is true, and new.
+"""Calibrate the scores of a map model after training to the fraction of an element that is correct and not a
+duplicate.
 
-Whoever fuses maps believes a score (maps/fusion/existence.py), so that it has to mean the same whoever drew. Training ranks
-queries and makes no such promise. A line that is drawn twice is no news the second time. Source: Platt, "Probabilistic outputs
-for support vector machines", 1999: a line through the logits, here for each kind.
+Map fusion (maps/fusion/existence.py) uses scores of several models as probabilities, which training does not provide.
+A repeated line
+carries no new information. Source: Platt, "Probabilistic outputs for support vector machines", 1999: a linear
+function of the logits,
+here per class.
 """
 
 from __future__ import annotations
@@ -23,16 +26,16 @@ from manyeyes.training.maps.samples import MapSample
 from manyeyes.training.maps.step import extract_features, warp_tokens
 
 MATCH_RADIUS_M, SPACING_M = 1.0, 0.5
-"""What lies so near to a true element of its kind is true; points of elements are so far apart."""
+"""Maximum distance to a ground truth element of the same class, and spacing of the sampled points."""
 PRIOR_WEIGHT = 3.0
-"""Elements that the identity counts as, against those that were drawn."""
+"""Weight of the identity in the fit, as a number of elements."""
 MIN_SLOPE = 0.1
-"""Least slope of a line: calibration never changes the ranking within a kind."""
+"""Minimum slope: calibration never changes the ranking within a class."""
 
 
 @torch.no_grad()
 def calibrate_scores(model: MapModel, samples: Iterable[MapSample]) -> None:
-    """Set the model's scale and shift of logits by what it draws of the samples, from as many looks as they have."""
+    """Set logit_scale and logit_shift of the model from its predictions on the samples."""
     config, was = model.config, model.training
     model.eval()
     model.logit_scale.fill_(1.0)
@@ -52,9 +55,10 @@ def calibrate_scores(model: MapModel, samples: Iterable[MapSample]) -> None:
 
 
 def novel_fraction(drawn: MapElements, truth: MapElements) -> NDArray[np.float64]:
-    """(N,) how much of each element's length lies within NEAR_M of a true one of its kind, and of none that is drawn before it.
+    """Return the fraction (N,) of each element's length that is correct and not covered by an element before it.
 
-    drawn: the best first.
+    drawn: predictions in descending order of score. Correct is within MATCH_RADIUS_M of a ground truth element of the
+    same class.
     """
     out = np.zeros(len(drawn))
     for kind in np.unique(drawn.kind):
@@ -73,7 +77,7 @@ def novel_fraction(drawn: MapElements, truth: MapElements) -> NDArray[np.float64
 
 
 def fit_platt(logit: Tensor, fraction: Tensor) -> tuple[float, float]:
-    """Scale and shift of logits (N,) for which the cross entropy against shares (N,) is least; few of them stay as they are."""
+    """Fit scale and shift of logits (N,) by cross entropy against fractions (N,), regularised towards the identity."""
     start = torch.tensor([1.0, 0.0], dtype=torch.float64)
     x = torch.stack((logit.double(), torch.ones_like(logit, dtype=torch.float64)), 1)
     line = start.clone()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A step of the map model's training, forward: each look by itself, its tokens, the tiles they fall on, what is drawn, losses.
+"""Forward pass and losses of one training step of the map model: features of each frame, fusion on tiles, decoding.
 
-Nothing reaches a tile but tokens.
+Tiles receive tokens only.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from manyeyes.training.maps.targets import make_map_target, select_observed
 
 
 def extract_features(model: MapModel, samples: Sequence[MapSample]) -> MapFeatures:
-    """Every look of all samples by itself, with the sensors that the model has."""
+    """Extract features of every frame of all samples with the model's sensors."""
     frames = [frame for sample in samples for frame in sample.frames]
     sensors = model.config.bev.sensors
     clouds = [frame.points for frame in frames] if "lidar" in sensors else []
@@ -28,9 +28,7 @@ def extract_features(model: MapModel, samples: Sequence[MapSample]) -> MapFeatur
 
 
 def warp_tokens(model: MapModel, tokens: SparseBev, samples: Sequence[MapSample]) -> tuple[Tensor, Tensor]:
-    """Tokens of all looks in order on the cells of all samples' tiles, and what each look sees there, as
-    ``MapModel.fuse_features`` wants.
-    """
+    """Warp the tokens of all frames to the tiles of all samples; returns the arguments of ``MapModel.fuse_features``."""
     poses = [sample.tile_from_agent for sample in samples]
     motion = Transform(torch.cat([p.rotation for p in poses]), torch.cat([p.translation for p in poses]))
     tile = torch.repeat_interleave(torch.arange(len(samples)), torch.tensor([len(s.frames) for s in samples]))
@@ -38,7 +36,7 @@ def warp_tokens(model: MapModel, tokens: SparseBev, samples: Sequence[MapSample]
 
 
 def subsample_tokens(tokens: SparseBev, score: Tensor, drop_fraction: Tensor) -> SparseBev:
-    """The tokens without the share (looks,) of least worth (N,) of each look."""
+    """Drop the fraction (frames,) of tokens with the lowest score (N,) of each frame."""
     batch = tokens.sites.batch
     order = score.argsort(stable=True)
     order = order[batch[order].argsort(stable=True)]
@@ -55,8 +53,10 @@ def loss_terms(
     drop_fraction: Tensor | None = None,
     train_decoder: bool = True,
 ) -> MapLossTerms:
-    """Losses of one batch of tiles; drop_fraction (looks,): how much of each look's tokens is left out; train_decoder: is the
-    decoder taught?
+    """Compute the losses of one batch of tiles.
+
+    drop_fraction: (frames,) fraction of each frame's tokens that is dropped. train_decoder: whether to compute
+    decoder losses.
     """
     extracted = extract_features(model, samples)
     occupied = (

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Truth as the map head learns it: every element as points of equal spacing, in every order that draws the same figure.
+"""Targets of the map head: every element as equally spaced points, in every equivalent point order.
 
-Source: MapTR (ICLR 2023), permutation-equivalent modelling: a line may be drawn from either end, a ring from any of its points and
-either way round. The points of a ring are equally spaced around it, none twice, so that each order is an exact permutation.
+Source: MapTR (ICLR 2023), permutation-equivalent modelling: a line has two directions; a ring has any start point and
+two directions.
+The points of a ring are equally spaced without repetition, so that each order is an exact permutation.
 """
 
 from __future__ import annotations
@@ -21,15 +22,16 @@ from manyeyes.models.maps.head import is_ring
 from manyeyes.ops.polyline import resample, resample_spaced
 
 MIN_OBSERVED_FRACTION = 0.3
-"""Of an element's length: what looks must have seen for it to be asked of them (specs: maps.md 1.5)."""
+"""Minimum observed fraction of an element's length for it to be a target."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapTarget:
     """G elements of one tile. kind: (G,) int64, index into the head's kinds; ring: (G,) bool.
 
-    orders: (G, 2 P, P, 2), the same P points in 2 P orders, x and y as shares of the tile: a ring's shifts both ways round; a
-    line's two directions, over and over, which changes no minimum.
+    orders: (G, 2 P, P, 2), the same P points in 2 P orders, as fractions of the tile. A ring has all shifts in both
+    directions; a line
+    repeats its two directions, which changes no minimum.
     """
 
     kind: Tensor
@@ -40,12 +42,12 @@ class MapTarget:
         return self.kind.shape[0]
 
     def repeat(self, times: int) -> MapTarget:
-        """Every element so many times, for one-to-many matching."""
+        """Repeat every element, for one-to-many matching."""
         return MapTarget(*(column.repeat(times, *(1,) * (column.dim() - 1)) for column in vars(self).values()))
 
 
 def make_map_target(truth: MapElements, tile: BevGrid, kinds: Sequence[str], points: int) -> MapTarget:
-    """The elements of those kinds, in the tile's frame and within it, as targets of that many points each."""
+    """Make targets with this number of points from the elements of these kinds, in the tile's frame and within it."""
     shares, kind, ring = [], [], []
     size = np.array([tile.x_max - tile.x_min, tile.y_max - tile.y_min])
     for row in range(len(truth)):
@@ -61,7 +63,9 @@ def make_map_target(truth: MapElements, tile: BevGrid, kinds: Sequence[str], poi
 
 
 def select_observed(truth: MapElements, seen: Tensor, tile: BevGrid) -> MapElements:
-    """Those elements of a tile of which cells that are seen (rows, columns) hold MET_SHARE of the length or more."""
+    """Select the elements of which at least MIN_OBSERVED_FRACTION of the length lies in observed cells (rows,
+    columns).
+    """
     if not len(truth):
         return truth
     points, first = resample_spaced(truth.points, truth.offsets, tile.cell_size_m / 2)
@@ -72,7 +76,9 @@ def select_observed(truth: MapElements, seen: Tensor, tile: BevGrid) -> MapEleme
 
 
 def resample_evenly(line: NDArray[np.float64], points: int, ring: bool) -> NDArray[np.float64]:
-    """(points, 2) at equal arc length: of a line, both ends among them; of a ring (K, 2), from its least corner."""
+    """Resample to (points, 2) at equal arc length: a line with both ends; a ring from its lexicographically first
+    vertex.
+    """
     if ring:
         line = np.roll(line, -int(np.lexsort(line.T[::-1])[0]), axis=0)
         line = np.concatenate((line, line[:1]))
@@ -81,7 +87,7 @@ def resample_evenly(line: NDArray[np.float64], points: int, ring: bool) -> NDArr
 
 
 def enumerate_orders(points: Tensor, ring: Tensor) -> Tensor:
-    """(G, 2 P, P, 2) of points (G, P, 2): all orders in which an element may be drawn; see MapTarget."""
+    """Enumerate the equivalent orders of points (G, P, 2): (G, 2 P, P, 2); see MapTarget."""
     count = points.shape[1]
     place = torch.arange(count)
     shifts = (place[:, None] + place) % count

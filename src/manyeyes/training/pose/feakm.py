@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FeaKM's net is taught which keypoints of two agents are one object: truth, loss, augmentation, and the loop.
+"""Train FeaKM's network to match the keypoints of two agents: ground truth, loss, augmentation, and the loop.
 
-Truth is geometry: the other's points are moved by the true pose; two points that are each other's nearest within near_m are
-one object, a point with nothing within far_m is alone, the rest is left open. The loss is half the mean of -log P of the
-true pairs and half that of the points that are alone, of each layer alike (specs/pose.md 1.5). The schedule is the house's:
-linear growth, then a cosine.
+Ground truth is geometric: the other agent's keypoints are transformed by the true pose. Mutual nearest neighbours
+within match_radius_m
+match; keypoints without neighbour within unmatched_radius_m are unmatched; others are ignored. The loss averages -log
+P of the matches
+and of the unmatched points with weight one half each, over all layers. The learning rate grows linearly and follows a
+cosine to zero.
 """
 
 from __future__ import annotations
@@ -32,9 +34,14 @@ from manyeyes.training.pose.feakm_cache import FeatureCache, ViewPair
 
 @dataclass(frozen=True)
 class KeypointAugmentConfig:
-    """random_yaw: each agent's frame is turned by any angle. flip_prob: share of headings turned by pi before they are described.
+    """Augmentation of keypoints.
 
-    max_drop_fraction: points left out, a share uniform up to this. sigma_xy_m, sigma_yaw_rad: errors added to places and headings.
+    Attributes:
+        random_yaw: rotate each agent's frame by a uniform angle.
+        flip_prob: probability that a heading is turned by pi before description.
+        max_drop_fraction: maximum fraction of dropped keypoints, uniform.
+        sigma_xy_m: noise added to positions.
+        sigma_yaw_rad: noise added to headings.
     """
 
     random_yaw: bool = True
@@ -45,14 +52,22 @@ class KeypointAugmentConfig:
 
     @classmethod
     def none(cls) -> KeypointAugmentConfig:
-        """Pairs as they were seen."""
+        """Disable augmentation of the pairs."""
         return cls(False, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class FeakmTrainConfig:
-    """A run of steps with batch pairs each. match_radius_m, unmatched_radius_m: see the module. ema_decay: decay of the
-    averaged weights that are saved.
+    """Settings of a training run.
+
+    Attributes:
+        net: configuration of the network.
+        batch: pairs of views per step.
+        warmup_steps: steps of linear growth of the learning rate.
+        max_grad_norm: at which gradients are clipped.
+        ema_decay: decay of the averaged weights, which are saved.
+        match_radius_m: maximum distance of matching keypoints.
+        unmatched_radius_m: minimum distance of an unmatched keypoint to every other.
     """
 
     net: FeakmConfig
@@ -85,12 +100,14 @@ FEAKM_TRAINING_PRESETS: dict[str, FeakmTrainConfig] = {
     ),
     "feakm-paper": FeakmTrainConfig(FEAKM_PAPER, steps=15000, batch=16, learning_rate=2e-4, weight_decay=0.0),
 }
-"""feakm-small: the shipped weights. feakm-paper: 15 M parameters, as published but for the shape of the schedule."""
+"""feakm-small: the shipped weights. feakm-paper: 15 M parameters, as published but for the schedule's shape."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundTruthMatches:
-    """Of B pairs of views. pairs: (B, N, M) bool, one object; unmatched_a: (B, N), alone_b: (B, M) bool, surely without one."""
+    """Ground truth of B pairs of views. pairs: (B, N, M) bool, matches; unmatched_a: (B, N), unmatched_b: (B, M)
+    bool.
+    """
 
     pairs: Tensor
     unmatched_a: Tensor
@@ -104,7 +121,7 @@ def match_ground_truth(
     match_radius_m: float,
     unmatched_radius_m: float,
 ) -> GroundTruthMatches:
-    """What the matcher should have said, padded to the longest list on either side."""
+    """Return the ground truth matches, padded to the longest list on either side."""
     shape = len(a), max(map(len, a)), max(map(len, b))
     pairs = torch.zeros(shape, dtype=torch.bool)
     unmatched_a, unmatched_b = torch.zeros(shape[:2], dtype=torch.bool), torch.zeros(shape[::2], dtype=torch.bool)
@@ -125,7 +142,9 @@ def match_ground_truth(
 
 
 def matching_loss(layers: Sequence[Assignment], truth: GroundTruthMatches) -> Tensor:
-    """Half of the true pairs', half of the lonely points' mean -log P, over layers and pairs of views; 0 where there is none."""
+    """Return the mean -log P of matches and of unmatched keypoints, weight one half each, over layers; 0 where there
+    is none.
+    """
     total = layers[0].log_p.new_zeros(())
     for layer in layers:
         matched = _mean(-layer.log_p, truth.pairs)
@@ -138,14 +157,14 @@ def matching_loss(layers: Sequence[Assignment], truth: GroundTruthMatches) -> Te
 
 
 def _mean(value: Tensor, mask: Tensor) -> Tensor:
-    """(B,) of values (B, ...) where the mask is."""
+    """Masked mean (B,) of values (B, ...)."""
     value, mask = value.flatten(1), mask.flatten(1)
     return torch.where(mask, value, 0.0).sum(1) / mask.sum(1).clamp_min(1)
 
 
 @dataclass(frozen=True)
 class MatchProgress:
-    """One line of the log. recall: found of the true pairs; precision: right among those found; of this step's batch."""
+    """Progress of one step: one line of the log; recall and precision are of this step's batch."""
 
     step: int
     steps: int
@@ -156,13 +175,13 @@ class MatchProgress:
     seconds: float
 
     def to_record(self) -> dict[str, float]:
-        """As it stands in log.jsonl."""
+        """Return the line of log.jsonl."""
         record = {"step": self.step, "loss": round(self.loss, 5), "lr": self.learning_rate}
         return record | {"recall": round(self.recall, 4), "precision": round(self.precision, 4)}
 
 
 class FeakmRun:
-    """One training run on cached views."""
+    """A resumable training run on cached views in a folder."""
 
     def __init__(self, config: FeakmTrainConfig, cache: FeatureCache, folder: Path, seed: int) -> None:
         self.config, self.cache, self.seed = config, cache, seed
@@ -172,7 +191,7 @@ class FeakmRun:
         self.state = RunState(model, config, seed, folder, config.weight_decay)
 
     def advance(self) -> MatchProgress:
-        """One step of the optimiser."""
+        """Run one optimiser step."""
         config, state = self.config, self.state
         state.model.train()
         numbers = state.sample_numbers(config.batch)
@@ -192,7 +211,7 @@ class FeakmRun:
     def _keypoints(
         self, pairs: Sequence[ViewPair], first: int
     ) -> tuple[list[Keypoints], list[Keypoints], list[Transform]]:
-        """Points as they are described, some left out; still in the frames that the true motions belong to."""
+        """Describe keypoints with flipped headings and dropout, in the frames of the true transforms."""
         augment = self.config.augment
         views = []
         for i, both in enumerate(pairs):
@@ -207,7 +226,7 @@ class FeakmRun:
         return kept[::2], kept[1::2], [both.ego_from_other for both in pairs]
 
     def _perturb(self, many: Sequence[Keypoints], side: str, first: int) -> list[Keypoints]:
-        """The same points, their frames turned and their places and headings off by a little."""
+        """Rotate the frames of keypoints and add noise to positions and headings."""
         augment = self.config.augment
         found = []
         for i, points in enumerate(many):
@@ -225,7 +244,7 @@ class FeakmRun:
 def matching_recall_precision(
     assignment: Assignment, truth: GroundTruthMatches, threshold: float
 ) -> tuple[float, float]:
-    """Recall and precision of the matches of a batch; 1 where there is nothing to find, or nothing found."""
+    """Return recall and precision of the matches of a batch; 1 without ground truth, or without matches."""
     correct = found = 0
     for (pairs, _), true in zip(find_mutual_matches(assignment, threshold), truth.pairs):
         found += len(pairs)
@@ -235,7 +254,7 @@ def matching_recall_precision(
 
 
 def _flip_headings(view: DetectorView, share: float, rng: np.random.Generator) -> DetectorView:
-    """With some headings off by pi, as a detector errs."""
+    """Turn some headings by pi, as detectors err."""
     turned = torch.from_numpy(rng.random(len(view.boxes)) < share)
     return replace(view, boxes=replace(view.boxes, yaw=view.boxes.yaw + math.pi * turned))
 
@@ -248,9 +267,9 @@ def train_feakm(
     card: dict[str, Any] | None = None,
     report: Callable[[MatchProgress], None] = lambda progress: None,
 ) -> Path:
-    """Train, or go on where the run in folder stopped; returns the file of averaged weights.
+    """Train, or resume the run in folder; returns the file of averaged weights.
 
-    Writes last.pt (to resume), log.jsonl (one object a step) and weights.safetensors (float16).
+    Writes last.pt (training state), log.jsonl (one object per step) and weights.safetensors (float16).
     """
     run = FeakmRun(config, cache, folder, seed)
     state = run.state

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frozen detector sees of a recording, kept on disk: FeaKM's matcher is trained on it, never on clouds.
+"""Cache the outputs of a frozen detector on a recording, on which FeaKM's matcher is trained.
 
-One file a snapshot, written under a temporary name and renamed, in a folder named by the fingerprint of the weights: views of
-other weights are never taken for these. A build that was stopped goes on where it was.
+One file per snapshot, written atomically, in a folder named by the detector's fingerprint, so that views of other
+weights are never
+mixed. An interrupted build resumes.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from manyeyes.ops.keyed_random import keyed_generator
 
 @dataclass(frozen=True)
 class CachedSnapshot:
-    """views of all agents at one instant, each in its own frame, and their true poses, batch shape (agents,)."""
+    """Views of all agents at one instant, each in its own frame, and their true poses, batch shape (agents,)."""
 
     views: tuple[DetectorView, ...]
     world_from_agent: Transform
@@ -44,7 +45,7 @@ class CachedSnapshot:
 
 @dataclass(frozen=True)
 class ViewPair:
-    """Views of two agents at one instant and where the second truly is, seen from the first."""
+    """Views of two agents at one instant and their true relative pose."""
 
     ego: DetectorView
     other: DetectorView
@@ -53,24 +54,24 @@ class ViewPair:
 
 @dataclass(frozen=True)
 class FeatureCache:
-    """Snapshots (scenario, index) whose views lie in a folder."""
+    """Snapshots (scenario, index) whose views are stored in a folder."""
 
     folder: Path
     snapshots: tuple[tuple[str, int], ...]
 
     def load_snapshot(self, number: int) -> CachedSnapshot:
-        """All agents of the snapshot of that number."""
+        """Load the snapshot of this number with all agents."""
         return read_cached_snapshot(_file(self.folder, *self.snapshots[number]))
 
     def draw(self, seed: int, number: int) -> ViewPair:
-        """Pair of that number of an endless, keyed stream: a snapshot and two of its agents, uniform."""
+        """Draw the pair of this number from an endless, keyed stream: a snapshot and two of its agents, uniform."""
         rng = keyed_generator("feakm pair", seed, number)
         scene = self.load_snapshot(int(rng.integers(len(self.snapshots))))
         ego, other = rng.permutation(len(scene.views))[:2].tolist()
         return make_pair(scene, ego, other)
 
     def pairs(self) -> Iterator[ViewPair]:
-        """Every two agents of every snapshot, the first of them as ego."""
+        """Iterate over pairs of the first agent of every snapshot, as ego, and each other agent."""
         for number in range(len(self.snapshots)):
             scene = self.load_snapshot(number)
             for other in range(1, len(scene.views)):
@@ -78,13 +79,13 @@ class FeatureCache:
 
 
 def make_pair(scene: CachedSnapshot, ego: int, other: int) -> ViewPair:
-    """Two agents of a scene."""
+    """Pair two agents of a snapshot."""
     poses = scene.world_from_agent
     return ViewPair(scene.views[ego], scene.views[other], poses[ego].inverse() @ poses[other])
 
 
 def select_snapshots(recording: Recording, frame_stride: int = 3) -> list[tuple[str, int]]:
-    """Every so many judged snapshots of at least two agents: neighbours in time show nearly the same."""
+    """Select every frame_stride-th evaluated snapshot with at least two agents; consecutive ones are nearly equal."""
     if frame_stride < 1:
         raise ConfigError(f"Every how many snapshots is at least 1; got {frame_stride}.")
     found = [
@@ -99,9 +100,9 @@ def select_snapshots(recording: Recording, frame_stride: int = 3) -> list[tuple[
 
 
 def build_cache(recording: Recording, detector: Detector, root: Path, frame_stride: int = 3) -> Iterator[FeatureCache]:
-    """See what is not yet kept under root, giving what is there after each snapshot; the last one given is the whole.
+    """Run the detector on snapshots that are not yet cached under root, and yield the growing cache after each.
 
-    Each agent sees the snapshot before as well, so that a detector of several sweeps has both.
+    Each agent processes the preceding snapshot too, for detectors with several sweeps.
     """
     folder, done = root / detector.fingerprint.hex(), []
     for scenario, index in select_snapshots(recording, frame_stride):
@@ -136,7 +137,7 @@ def _file(folder: Path, scenario: str, index: int) -> Path:
 
 
 def write_cached_snapshot(path: Path, scene: CachedSnapshot) -> None:
-    """One snapshot's views: features and confidence as float16, boxes as they are."""
+    """Write the views of one snapshot: features and confidence as float16, boxes unchanged."""
     state: dict[str, Tensor] = {"world_from_agent": scene.world_from_agent.matrix().contiguous()}
     for i, view in enumerate(scene.views):
         state |= {
@@ -150,7 +151,7 @@ def write_cached_snapshot(path: Path, scene: CachedSnapshot) -> None:
 
 
 def read_cached_snapshot(path: Path) -> CachedSnapshot:
-    """The inverse of write_scene."""
+    """Read a file of write_cached_snapshot."""
     try:
         with safe_open(path, "pt") as file:
             grid = BevGrid(**json.loads(file.metadata()["grid"]))
