@@ -20,10 +20,10 @@ export OMP_NUM_THREADS ?= 1
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo    make a drive, share bytes, perceive, judge: table, pictures, report in $(OUT)"
+	@echo "make demo    simulate a drive, evaluate the methods on it: table, figures, report in $(OUT)"
 	@echo "make test    every test"
 	@echo "make check   formatting, lint, types, floors"
-	@echo "make wheel   build the wheel and run demo, align and map fuse from it in an empty environment"
+	@echo "make wheel   build the wheel and run demo, pose and map fuse from it in an empty environment"
 	@echo "make format  rewrite the sources in the house format"
 	@echo "make bench   the speed benchmarks, each with its stored result"
 	@echo "make clean   remove the environment, outputs and caches"

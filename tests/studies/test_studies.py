@@ -214,7 +214,7 @@ def test_agents_are_judged_on_the_scenarios_that_have_them(data, weights, tmp_pa
     assert rows[1]["gain_over_no_fusion"]["value"] == 0 and rows[2]["gain_over_one_fewer"]["num_scenarios"] == 2
     assert rows[3]["gain_over_no_fusion"]["num_scenarios"] == 1
     assert [(p.ylabel, c.label, c.x) for p in panels for c in p.curves] == [
-        ("AP@0.5", "late", (1, 2, 3)), ("AP@0.5 over ego alone", "late", (1, 2, 3)),
+        ("AP@0.5", "late", (1, 2, 3)), ("AP@0.5 over no fusion", "late", (1, 2, 3)),
     ]  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 """Makes a drive that the shipped weights never saw, lets every agent share bytes and perceive, and judges the result.
 
 Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. What is found is
-compared for ego alone, late, intermediate and early fusion on the same channel. Beside it a map is made: of the drive, where a map
+compared for no fusion, late, intermediate and early fusion on the same channel. Beside it a map is made: of the drive, where a map
 model ships; else of a crossroads by a simulated crowd.
 """
 

@@ -52,7 +52,7 @@ class Options:
     """Shipped weights by name, or a .safetensors file of 'manyeyes train'."""
     seed: int = 0
     """Of pose errors."""
-    out: Path = Path("out/align")
+    out: Path = Path("out/pose")
     """Folder for pose.json."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""

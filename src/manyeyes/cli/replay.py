@@ -25,7 +25,7 @@ class Options:
     """At most so many judged frames."""
     frame: int | None = None
     """Index of the instant that is pictured; the middle one by default."""
-    out: Path = Path("out/run")
+    out: Path = Path("out/replay")
     """Folder for pictures, animation, report and JSON."""
     seed: int = 0
     """Of the channel's losses and jitter."""

@@ -42,7 +42,7 @@ class Options:
     width: int = 1280
     """Of the picture, pixels."""
     detect: str | None = None
-    """Also draw what one method finds: alone, late, intermediate or early."""
+    """Also draw what one method finds: none, late, intermediate or early."""
     min_score: float = 0.4
     """Detections below this score are not drawn."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)

@@ -25,7 +25,7 @@ class ReplayOptions:
     weights: str = "costr-small"
     """Shipped weights by name, or a .safetensors file of 'manyeyes train'."""
     methods: tuple[str, ...] = ALL_METHODS
-    """What is compared: any of alone, late, intermediate, early."""
+    """What is compared: any of none, late, intermediate, early."""
     channel: str = "ideal"
     """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
     latency_budget_ms: float | None = None

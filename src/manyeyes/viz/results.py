@@ -114,5 +114,5 @@ def _check_targets(rows: Sequence[MethodRow]) -> tuple[str, ...]:
     if no_fusion and no_fusion.ap50 is not None:
         low, high = NO_FUSION_AP_RANGE
         verdict = "met" if low <= no_fusion.ap50.value <= high else "not met"
-        out.append(f"alone: AP@0.5 {no_fusion.ap50.value:.3f} between {low:.2f} and {high:.2f}: {verdict}")
+        out.append(f"none: AP@0.5 {no_fusion.ap50.value:.3f} between {low:.2f} and {high:.2f}: {verdict}")
     return tuple(out)

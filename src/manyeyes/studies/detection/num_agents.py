@@ -2,7 +2,7 @@
 """What each further agent brings: the ego with the nearest so many others, one to five in all.
 
 A row of n agents is judged on the scenarios that have as many, against the truth of everybody that is there; what it gains over
-one agent fewer and over ego alone is judged on those same scenarios.
+one agent fewer and over no fusion is judged on those same scenarios.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def _make_row(results: ResultGrid, num_agents: int, method: str) -> NumAgentsRow
 
 def _make_results_table(result_rows: Sequence[NumAgentsRow]) -> StudyTable:
     headings = (
-        "agents", "method", "scenarios", "AP@0.5", "AP@0.7", "over one fewer @0.5", "over alone @0.5", "bytes/message",
+        "agents", "method", "scenarios", "AP@0.5", "AP@0.7", "over one fewer @0.5", "over no fusion @0.5", "bytes/message",
         "bytes/instant",
     )  # fmt: skip
     lines = tuple(
@@ -109,7 +109,7 @@ def _make_results_table(result_rows: Sequence[NumAgentsRow]) -> StudyTable:
 
 
 def make_panels(result_rows: Sequence[NumAgentsRow]) -> list[CurvePanel]:
-    """AP by number of agents on all scenarios that have them, and what that is over ego alone on the same scenarios."""
+    """AP by number of agents on all scenarios that have them, and what that is over no fusion on the same scenarios."""
     methods = [m for m in dict.fromkeys(row.method for row in result_rows) if m != NO_FUSION]
     ap_curves, gain_curves = [], []
     for method in methods:
@@ -122,5 +122,5 @@ def make_panels(result_rows: Sequence[NumAgentsRow]) -> list[CurvePanel]:
             gain_curves.append(Curve(method, tuple(y for y, _ in gains), tuple(x for _, x in gains)))
     out = [CurvePanel("Scenarios that have them", "agents", "AP@0.5", tuple(ap_curves))] if ap_curves else []
     return out + (
-        [CurvePanel("The same scenarios", "agents", "AP@0.5 over ego alone", tuple(gain_curves))] if gain_curves else []
+        [CurvePanel("The same scenarios", "agents", "AP@0.5 over no fusion", tuple(gain_curves))] if gain_curves else []
     )

@@ -69,7 +69,7 @@ PAPER_AP50 = {
 
 @dataclass(frozen=True)
 class RobustnessRow:
-    """A method under a disturbance. ap_drop: AP less than without any; gain_over_no_fusion: more than ego alone; two IoUs each.
+    """A method under a disturbance. ap_drop: AP less than without any; gain_over_no_fusion: AP more than no fusion; two IoUs each.
 
     ap_by_speed: AP@0.5 of each class of SPEEDS, where messages are late. paper_ap: CoSTr's own AP@0.5.
     """
@@ -196,7 +196,7 @@ def _make_results_table(title: str, result_rows: Sequence[RobustnessRow], group:
         "AP@0.7",
         "lost @0.5",
         "lost @0.7",
-        "over alone @0.5",
+        "over no fusion @0.5",
         "bytes/message",
         "age ms",
     )
@@ -243,7 +243,7 @@ def make_panels(result_rows: Sequence[RobustnessRow]) -> list[CurvePanel]:
 
 
 def _make_curve(method: str, y: Sequence[Interval | None], x: tuple[float, ...]) -> Curve | None:
-    """A line through the levels that were played, a level where one alone was: ego alone."""
+    """A line through the evaluated levels, a constant where there is one level: no fusion."""
     known = [(v, x_value) for v, x_value in zip(y, x) if v is not None]
     values = tuple(v for v, _ in known)
     if len(known) > 1:

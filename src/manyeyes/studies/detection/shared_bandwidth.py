@@ -95,7 +95,7 @@ def _make_results_table(result_rows: Sequence[SharedBandwidthRow]) -> StudyTable
         "ego frames",
         "AP@0.5",
         "AP@0.7",
-        "over alone @0.5",
+        "over no fusion @0.5",
         "bytes/instant",
         "most",
     )

@@ -77,7 +77,7 @@ PAPER_AP = (
 @dataclass(frozen=True)
 class PoseNoiseRow:
     """A method, or a baseline's weights, with a corrector at a noise level. ap: at each IoU; ap_drop: AP less
-    than the same way to fuse has with true poses and no corrector; gain_over_no_fusion: more than ego alone. ap_by_common_objects:
+    than the same way to fuse has with true poses and no corrector; gain_over_no_fusion: AP more than no fusion. ap_by_common_objects:
     AP@0.5 of each bucket of COMMON.
     """
 
@@ -291,7 +291,7 @@ def _check_corrector(
             worst_level = min(gains, key=lambda level: gains[level].value)
             description = (
                 f"{corrector_name}, worst level ({worst_level.name}), {_format_range(bucket)} in common: "
-                "corrected - alone"
+                "corrected - none"
             )
             yield _check_margin(description, gains[worst_level], 0.0)
 
@@ -331,7 +331,7 @@ def _make_common_objects_table(result_rows: Sequence[PoseNoiseRow]) -> StudyTabl
     )
     buckets = tuple(f"{_format_range(b)} in common" for b in COMMON_OBJECT_RANGES)
     return StudyTable(
-        "AP@0.5 by objects in common", ("corrector", "fusion", "errors", *buckets, "lost", "over alone"), lines
+        "AP@0.5 by objects in common", ("corrector", "fusion", "errors", *buckets, "lost", "over no fusion"), lines
     )
 
 
