@@ -94,8 +94,8 @@ def test_doctor_looks_for_what_the_extras_install(capsys: pytest.CaptureFixture[
     wanted = {name: {MODULES.get(m, m).lower() for m in modules} for name, modules in LOOKED_FOR.items()}
     assert wanted == EXTRAS
     assert cli.main(["doctor", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert {entry["name"] for entry in said["extras"]} == set(EXTRAS)
+    report = json.loads(capsys.readouterr().out)
+    assert {entry["name"] for entry in report["extras"]} == set(EXTRAS)
 
 
 def test_the_package_imports_no_extra_before_it_is_needed() -> None:

@@ -54,7 +54,7 @@ class Drive:
         return torch.cat((moved.flatten(0, 1), ground.double()))
 
     def frame(self, agent: int, index: int) -> AgentFrame:
-        """One agent's frame; its pose is believed to be exact."""
+        """One agent's frame; its pose has zero covariance."""
         starts = ((0.0, 0.0, 0.0, 0.0), (6.0, -3.0, 0.0, 0.7), (-9.0, 4.0, 0.2, -2.0))
         x, y, z, yaw = starts[agent]
         ahead = 0.1 * index * self.agent_mps
@@ -81,7 +81,7 @@ def drive() -> type[Drive]:
 
 
 def tiny_detector() -> Detector:
-    """Tiny weights whose norms have seen something, and prune little; all that starts at zero speaks, the second look as well."""
+    """Tiny weights with calibrated norms and little pruning; layers that start at zero are random, those of the refinement too."""
     torch.manual_seed(0)
     model = Detector(replace(COSTR_TINY, prune_threshold=0.08))
     moments, road = (
@@ -130,12 +130,12 @@ TINY_MAPPER = MapModelConfig(
         score_threshold=0.0,
     ),
 )
-"""Looks of 16 m by 16 m, tiles of 32 m by 16 m; no guess is too unsure to be followed and drawn."""
+"""Grids of 16 m by 16 m, tiles of 32 m by 16 m; all predictions are kept."""
 
 
 @pytest.fixture(scope="session")
 def mapper() -> MapModel:
-    """A map model that has learnt nothing."""
+    """A map model with random weights."""
     torch.manual_seed(0)
     model = MapModel(TINY_MAPPER).requires_grad_(False)
     # Its norms know how features are spread, as after training; nothing else is learnt.

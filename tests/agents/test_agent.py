@@ -24,7 +24,7 @@ NOW = 5
 
 
 class RecordingCache(PerceptionCache):
-    """Keeps what the ego fused last; looks back at so many instants, and states velocities as the detector does."""
+    """Stores the last fused tokens; uses num_frames previous frames, and the detector's own velocities."""
 
     raw: RawBoxes
     fused_tokens: Tokens
@@ -46,7 +46,7 @@ class RecordingCache(PerceptionCache):
 def packets_and_messages(
     drive, detector: Detector, views: Sequence[AgentView], first: int
 ) -> tuple[list[bytes], list[Message]]:
-    """Packets of those who had these views, and what they say: each looked when, and claims to be where, its view has it."""
+    """Packets and messages of the agents of these views, with the timestamp and prior pose of each view."""
     ego, packets, inbox = drive.frame(0, NOW).world_from_agent, [], Inbox(detector.fingerprint)
     for view in views:
         then = NOW - round(view.age_s / 0.1)
@@ -68,7 +68,7 @@ def packets_and_messages(
 
 
 def with_received_sigmas(drive, views: Sequence[AgentView], messages: list[Message]) -> tuple[AgentView, ...]:
-    """The views with the doubts that arrived: a standard deviation travels as a code of one byte."""
+    """The views with the received standard deviations, which are sent as codes of one byte."""
     ego, result = drive.frame(0, NOW).world_from_agent, []
     for view in views:
         place = (ego @ view.ego_from_view).translation
@@ -87,8 +87,8 @@ ROADS = {
     "past": (2, 4, DegradationConfig(ego_history=2)),
     "alone with a past": (1, 4, DegradationConfig(ego_history=2)),
     "late": (3, 4, DegradationConfig(delay_prob=1.0, max_delay_frames=2)),
-    "astray": (2, 2, DegradationConfig(pose_noise_prob=1.0)),
-    "said before": (3, 4, DegradationConfig(ego_history=2, sender_history=1)),
+    "pose noise": (2, 2, DegradationConfig(pose_noise_prob=1.0)),
+    "sender history": (3, 4, DegradationConfig(ego_history=2, sender_history=1)),
     "all": (
         3,
         5,
@@ -121,7 +121,7 @@ def test_training_forward_equals_share_bytes_perceive(drive, detector: Detector,
     for index in range(first, NOW):
         ego.perceive(some.frame(0, index), before if index == NOW - 1 else ())
     ego.perceive(some.frame(0, NOW), packets)
-    # The case is what its name says, and there is something to compare.
+    # The case matches its name, and there are tokens to compare.
     fused_tokens = cache.fused_tokens
     assert len(sample.views) == agents and len(sample.ego_history) == road.ego_history and len(trained.sites) > 20
     aged = bool(road.delay_prob or road.ego_history or road.sender_history)
@@ -154,7 +154,7 @@ def test_a_message_never_exceeds_its_budget(drive, detector: Detector) -> None:
     free = sum(map(len, Agent(detector, budget_bytes=None).share(frame)))
     for budget in (0, 200, 1000, free // 2, free):
         sent = sum(map(len, Agent(detector, budget_bytes=budget).share(frame)))
-        # An agent with no room for a cell still says where it is: the header.
+        # An agent without room for a cell still sends the header.
         assert sent <= max(budget, 200), (budget, sent)
 
 
@@ -178,7 +178,7 @@ def test_an_agent_ignores_its_own_message_and_its_own_body(drive, detector: Dete
 
 
 def test_late_fusion_keeps_one_box_of_two_that_overlap(drive, detector: Detector) -> None:
-    """What another says of the very same boxes adds none; the same boxes aside add all that lie in the ego's range."""
+    """Received copies of the same boxes add none; displaced copies add all within the ego's range."""
     frame = drive(1).frame(0, 3)
     cache, late = PerceptionCache(detector), get_strategy("late")
     message = late.compose_message(cache, frame)

@@ -113,7 +113,7 @@ def test_nets_with_other_descriptors_or_other_weights_are_refused(drive, detecto
 
 
 class DescriptorMatcher(FeakmNet):
-    """Takes points for one object that look alike, and cannot err."""
+    """Matches points with equal descriptors, without error."""
 
     def match(self, ego_keypoints: KeypointBatch, other_keypoints: KeypointBatch) -> Matches:
         alike = ego_keypoints.descriptor[0] @ other_keypoints.descriptor[0].mT
@@ -123,7 +123,7 @@ class DescriptorMatcher(FeakmNet):
 
 
 def test_a_wrong_prior_pose_is_corrected_by_descriptors_alone(drive, detector, weights, monkeypatch):
-    """Twelve cars, of which both see eight; bytes in between."""
+    """Twelve cars, of which both agents detect eight; exchanged as packets."""
     rng = np.random.default_rng(0)
     ego_pose, pose = Transform.from_xyz_yaw(100, 50, 0, 0.3), Transform.from_xyz_yaw(112, 58, 0, 2.8)
     center = np.column_stack((100 + rng.uniform(-25, 25, 12), 50 + rng.uniform(-25, 25, 12), np.full(12, 0.8)))
@@ -139,7 +139,7 @@ def test_a_wrong_prior_pose_is_corrected_by_descriptors_alone(drive, detector, w
     message = Message(2, 0, off, torch.eye(3).double() * 36, objects=objects, descriptors=descriptors[theirs])
     message = decode_message(detector, wire.encode(message))
     points = Keypoints(world[own].transform(ego_pose.inverse()), descriptors[own])
-    monkeypatch.setattr(module, "extract_own_keypoints", lambda net, eyes, frame: points)
+    monkeypatch.setattr(module, "extract_own_keypoints", lambda net, cache, frame: points)
     by_descriptors = FeakmCorrector.of(DescriptorMatcher(NET))
     monkeypatch.setattr(module, "load_corrector", lambda name: by_descriptors)
     found = PoseCorrection(weights).correct(frame, PerceptionCache(detector), [message], {})

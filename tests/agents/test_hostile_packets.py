@@ -124,7 +124,7 @@ def test_a_sender_whose_content_breaks_fusion_is_rejected_by_name_and_the_rest_i
 
         def fuse(self, cache, frame, messages):
             if any(m.agent_id in (66, 68) for m in messages):
-                raise RuntimeError("a shape that nobody foresaw")
+                raise RuntimeError("an unexpected shape")
             return intermediate.fuse(cache, frame, messages)
 
     some = drive(2)
@@ -133,7 +133,7 @@ def test_a_sender_whose_content_breaks_fusion_is_rejected_by_name_and_the_rest_i
     ego, other = Agent(detector, Fragile()), Agent(detector)
     perception = ego.perceive(some.frame(0, 2), packets)
     assert [(r.agent_id, r.reason) for r in perception.rejected] == [(66, "content_error"), (68, "content_error")]
-    assert "RuntimeError: a shape that nobody foresaw" in perception.rejected[0].text
+    assert "RuntimeError: an unexpected shape" in perception.rejected[0].text
     assert {r.message.agent_id for r in perception.received} == {1, 67}
     wanted = other.perceive(some.frame(0, 2), [*honest, forged(honest[0], 67)])
     assert torch.equal(perception.boxes.bev(), wanted.boxes.bev())

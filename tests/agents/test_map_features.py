@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks as bytes: what a tile is drawn from is what came through the air, and nothing else."""
+"""Map features as packets: tiles are predicted from received features only."""
 
 import dataclasses
 import math

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What agents say of the map: within what looks cover, sound, and by way of bytes; and a team of them with its service."""
+"""Local maps of agents: clipped to the view, valid, exchanged as packets; and a replay with a map server."""
 
 import math
 from dataclasses import replace
@@ -117,7 +117,7 @@ def test_windows_are_those_of_the_paper():
 
 
 def predict_one_line(own: AgentFrame, received=()) -> LocalMap:
-    """A survey that always sees one line ahead."""
+    """A map predictor that always predicts one line ahead."""
     return LocalMap(MapElements.of([[[0.0, 1.0], [30.0, 1.0]]], DIVIDER), rectangle((0.0, -15.0, 30.0, 15.0)))
 
 
@@ -145,7 +145,9 @@ def test_agents_predict_jointly_from_sent_tokens(mapper):
         map_predictor, service, encode_features=partial(encode_map_features, mapper), fingerprint=mapper.fingerprint
     )
     records = team.step([frame(1), frame(2, 3.0), frame(3, points=0)])
-    assert senders_of == {1: [2], 2: [1], 3: [1, 2]}, "nobody hears itself, who saw nothing hears the others"
+    assert senders_of == {1: [2], 2: [1], 3: [1, 2]}, (
+        "no agent receives itself; an agent without features receives the others"
+    )
     assert [one.feature_bytes > 500 for one in records] == [True, True, False] and records[2].num_elements > 0
     assert len(service.observations) == 3 and service.observations[0].model == mapper.fingerprint.hex()
 
@@ -184,7 +186,7 @@ def test_an_agent_without_fusion_may_still_send_its_map(drive, detector):
     assert Agent(detector, NoFusion()).share(drive().frame(1, 0)) == []
     (packet,) = Agent(detector, NoFusion(), map_predictor=predict_one_line).share(drive().frame(1, 0))
     assert len(packet) < 130
-    silent = Agent(detector, NoFusion(), map_predictor=lambda frame, heard: None)
+    silent = Agent(detector, NoFusion(), map_predictor=lambda frame, received: None)
     assert silent.share(drive().frame(1, 0)) == []
 
 

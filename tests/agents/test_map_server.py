@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map service that hears bytes: what it takes, what it refuses, and the map that comes of it."""
+"""The map server: accepted and rejected messages, and the resulting map."""
 
 from dataclasses import replace
 
@@ -24,14 +24,14 @@ ORIGIN = (5000.0, -3000.0)
 
 
 def frame(agent: int, x: float, time_ns: int = 0, error: float = 0.0) -> AgentFrame:
-    """An agent on a road along the world's x, which claims to stand aside of where it is."""
+    """An agent on a road along the world's x, with a lateral error of its prior pose."""
     pose = WORLD @ Transform.from_xyz_yaw(x, error, 0.0, 0.0)
     made = AgentFrame.of(PointCloud.of(torch.zeros(0, 3)), pose, agent, time_ns)
     return replace(made, pose_covariance=torch.diag(torch.tensor([0.16, 0.16, 1e-4], dtype=torch.float64)))
 
 
 def street(x: float, **more) -> LocalMap:
-    """Four lines of a road of 120 m and its crossing, as they are seen from x."""
+    """Four lines of a road of 120 m and its crossing, observed from x."""
     along = np.arange(max(0.0, x - 30.0), min(120.0, x + 30.0) + 0.1, 2.0) - x
     lines = [np.stack((along, np.full(len(along), y)), 1) for y in (-5.25, -1.75, 1.75, 5.25)]
     kinds = [BOUNDARY, DIVIDER, DIVIDER, BOUNDARY]

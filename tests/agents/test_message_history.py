@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was said before is heard again: the last few messages of each sender, newest first, and nothing from long ago."""
+"""Message history: the last few messages of each sender, newest first, without old ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def message_of(at: int, agent: int = 1) -> Message:
 def update(
     memory: MessageHistory, *messages: Message, at: int | None = None, untrusted: tuple[int, ...] = ()
 ) -> list[Message]:
-    """What is heard at a tenth of a second; None: that of the newest message."""
+    """The history at a tenth of a second; None: that of the newest message."""
     now = max(m.timestamp_ns for m in messages) if at is None else at * TENTH_NS
     return memory.update_and_get(messages, now, untrusted)
 
@@ -86,7 +86,7 @@ def test_silent_senders_are_dropped_although_a_late_message_arrives():
 
 
 def test_a_silent_sender_is_kept_for_half_a_second():
-    """Its packets were lost, or nobody could say from where it spoke."""
+    """Its packets were lost, or its pose was uncertain."""
     memory = MessageHistory()
     for at in (0, 1, 2):
         update(memory, message_of(at, 1), message_of(at, 2))

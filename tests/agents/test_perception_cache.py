@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an agent remembers of itself: moved by its odometry, forgotten where another scenario begins."""
+"""History of an agent's own frames: propagated by odometry, cleared at a new scenario."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ TENTH_NS = 100_000_000
 
 
 def same(a: PerceptionCache, frame: AgentFrame, b: PerceptionCache, other: AgentFrame) -> bool:
-    """Whether both tell the very same."""
+    """Whether both caches give the same tokens."""
     one, two = a.process(frame).shared_tokens, b.process(other).shared_tokens
     return torch.equal(one.sites.key, two.sites.key) and torch.equal(one.features, two.features)
 
 
 def with_pose_error(frame: AgentFrame, x: float) -> AgentFrame:
-    """The same frame, its claim off, its odometry as it was."""
+    """The same frame with an error of its prior pose and correct odometry."""
     pose = frame.world_from_agent
     return replace(frame, world_from_agent=Transform.from_xyz_yaw(x, 0.0) @ pose, odometry=pose)
 
@@ -45,7 +45,7 @@ def test_the_sweep_before_takes_part_and_only_once(drive, detector: Detector) ->
 
 
 def test_the_sweep_before_is_moved_by_odometry_and_not_by_the_claims(drive, detector: Detector) -> None:
-    """Claims that jump by 4 m from one instant to the next change nothing of what is seen or remembered."""
+    """Prior poses that jump by 4 m between frames change no output and no history."""
     before, now = drive().frame(0, 2), drive().frame(0, 3)
     honest, shaken = PerceptionCache(detector), PerceptionCache(detector)
     honest.process(before), shaken.process(with_pose_error(before, 2.0))
@@ -79,7 +79,7 @@ def test_the_past_is_the_last_two_instants_newest_first(drive, detector: Detecto
 
 
 def discontinuous_frames(frame: AgentFrame) -> dict[str, AgentFrame]:
-    """Frames that do not go on from one."""
+    """Frames that are not consecutive to one."""
     at, away = frame.timestamp_ns, Transform.from_xyz_yaw(MAX_EGO_STEP_M + 1, 0.0)
     return {
         "time goes back": replace(frame, timestamp_ns=at - TENTH_NS),
@@ -141,7 +141,7 @@ def test_the_previous_merged_cloud_is_returned_in_the_new_frame(drive, detector:
 
 
 def test_an_empty_sweep_is_a_past_with_nothing_in_it(drive, detector: Detector) -> None:
-    """An agent that was blind an instant ago perceives as one that was not there."""
+    """A previous frame without points is equivalent to no previous frame."""
     now = drive(1).frame(0, 3)
     blind = replace(drive(1).frame(0, 2), points=PointCloud.of(torch.zeros(0, 3)))
     agent, fresh = Agent(detector), Agent(detector)
@@ -151,7 +151,7 @@ def test_an_empty_sweep_is_a_past_with_nothing_in_it(drive, detector: Detector) 
 
 
 def test_multi_hop_messages_echo_the_receivers_own_tokens(drive, detector: Detector) -> None:
-    """CoSTr Eq. 1 to the letter: A hears of its own car through B. What B saw itself holds nothing of A's."""
+    """CoSTr Eq. 1 to the letter: A receives its own car through B. B's own tokens contain none of A's."""
     first, then = drive(2).frames(2), drive(2).frames(3)
     blind = PointCloud.of(torch.zeros(0, 3))
     for name, echoes in (("intermediate", False), ("intermediate-multihop", True)):
@@ -163,7 +163,7 @@ def test_multi_hop_messages_echo_the_receivers_own_tokens(drive, detector: Detec
         received_tokens = [m.tokens for m in inbox.messages() if m.tokens is not None]
         assert (sum(len(t.sites) for t in received_tokens) > 0) == echoes
         if echoes:
-            # Dated as what it tells of: a tenth of a second before it was sent.
+            # The timestamp of its content: a tenth of a second before it was sent.
             assert [m.timestamp_ns for m in inbox.messages()] == [first[1].timestamp_ns]
 
 
@@ -206,7 +206,7 @@ def test_tokens_are_as_fast_as_the_box_that_they_propose_and_what_is_no_box_stan
     assert torch.allclose(proposed_velocity(features[:, -PROPOSAL_DIM:]), want)
     silent = output_of(cells[:1], cells[:1], heat=-9.0)
     assert torch.equal(silent.with_velocity(torch.zeros(0, 2)).raw.velocity, torch.zeros(1, 2))
-    # Of what is told, nothing else changes.
+    # No other part of the tokens changes.
     speeds = list(range(features.shape[1]))[4:][BOX_LAYOUT.velocity]
     rest = [c for c in range(features.shape[1]) if c not in speeds]
     sent = torch.cat((before[:, :4], make_proposals(output.raw)), 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an ego makes of others' claimed poses before it fuses: a street of cars, eyes that are told what to see."""
+"""Pose correction of received messages: a street of cars, and a perception cache with fixed boxes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def cars(count: int, seed: int) -> Boxes:
 
 
 class FixedBoxesCache(PerceptionCache):
-    """An ego that sees given boxes and decodes as the detector does."""
+    """A perception cache with fixed boxes that decodes as the detector does."""
 
     def __init__(self, boxes: Boxes, detector: Detector | None = None) -> None:
         super().__init__(detector or Detector(COSTR_TINY))
@@ -71,7 +71,7 @@ def message_of(
     sigma: float = 1.0,
     time_ns: int = 0,
 ) -> Message:
-    """Boxes of the world as seen from a pose, claimed to be seen from a pose that is off by x, y (m), yaw (rad)."""
+    """Boxes of the world as seen from a pose, with a prior pose that is off by x, y (m), yaw (rad)."""
     x, y, yaw = off
     prior_pose = Transform(
         Transform.from_xyz_yaw(0, 0, 0, yaw).rotation @ pose.rotation,
@@ -82,7 +82,7 @@ def message_of(
 
 
 def pose_error(message: Message, pose: Transform) -> tuple[float, float]:
-    """Metres and degrees between what a message says of its pose and the pose."""
+    """Metres and degrees between a message's pose and the true pose."""
     turn = float((message.world_from_agent.yaw - pose.yaw + math.pi) % (2 * math.pi) - math.pi)
     return float((message.world_from_agent.translation - pose.translation).norm()), math.degrees(abs(turn))
 
@@ -128,7 +128,7 @@ def test_an_uncertain_heading_counts_at_a_distance() -> None:
 
 
 def test_objects_seen_earlier_are_moved_to_now() -> None:
-    """All cars drove on by 3 m since the sender looked; without their velocity the fit would be off by as much."""
+    """All cars drove on by 3 m since the sender's frame; without their velocity the fit would be off by as much."""
     world = cars(12, 3)
     then = replace(world, velocity=torch.tensor([[10.0, 0.0]], dtype=torch.float64).expand(12, 2))
     message = message_of(then, OTHERS[1], off=(0.5, 0.5, 0.0))
@@ -191,7 +191,7 @@ def test_an_inconsistent_agent_is_left_out() -> None:
 
 
 def monitored(offsets: Sequence[float], world: Boxes, last: Boxes) -> Any:
-    """Verdicts over time about a sender whose claim is off by so much in x; in the last frame its boxes are others."""
+    """Corrections over time of a sender with a prior pose error in x; in the last frame its boxes differ."""
     states, found = {}, None
     for n, off in enumerate(offsets):
         visible = last if n == len(offsets) - 1 else world
@@ -254,7 +254,7 @@ def test_an_agent_fuses_boxes_from_where_their_sender_is() -> None:
     "strategy, uses_history", [(LateFusion(), False), (LateFusion("remembering", history_frames=2), True)]
 )
 def test_history_bridges_an_unlocalised_or_lost_message(strategy: LateFusion, uses_history: bool) -> None:
-    """First all is well; then the claim says nothing and there is no object in common; then nothing comes."""
+    """A valid prior at first; then an uninformative prior without common objects; then no message."""
     known, hidden = cars(12, 13), cars(3, 14)
     detector = Detector(COSTR_TINY).eval()
     wanted = hidden.transform(EGO.inverse()).center[:, :2]
@@ -280,7 +280,7 @@ def test_history_bridges_an_unlocalised_or_lost_message(strategy: LateFusion, us
 
 
 def propagated_run(drive: Sequence[Boxes], steps_ms: Sequence[int], **settings: Any) -> list[Any]:
-    """What becomes of a sender that drives on by 1 m a message, its claims 1.5 m off; drive: what it sees at each."""
+    """Corrections of a sender that moves 1 m a message with a prior error of 1.5 m; drive: its boxes at each message."""
     landmarks, states, found = cars(12, 13), {}, []
     at_ms = 0
     for n, (visible, step) in enumerate(zip(drive, steps_ms)):
@@ -331,7 +331,7 @@ def body(pose: Transform) -> Boxes:
 
 
 def mutual_detection(pole: bool, late_ns: int) -> Any:
-    """Ego and sender share one car, and see each other; a claim 0.8 m off."""
+    """Ego and sender share one car and detect each other; a prior error of 0.8 m."""
     shared, sender = cars(1, 14), OTHERS[0]
     sent_boxes = Boxes.cat([shared, body(EGO)])
     message = replace(message_of(sent_boxes, sender, off=(0.6, -0.5, 0.01)), is_infrastructure=pole)

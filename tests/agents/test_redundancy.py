@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The order in which tokens are said: the surest word on each object, and on those first that were not spoken of just now."""
+"""Redundancy-aware token scores: the most confident token of each object first, objects not sent recently before others."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GRID = BevGrid(-32.0, -32.0, -2.0, 32.0, 32.0, 2.0, pillar=0.5).at(4)
 
 
 def make_tokens(xy: list[tuple[float, float]], confidence: list[float], speed: float = 0.0) -> SparseBev:
-    """Tokens whose objects stand at xy, each in the cell there, sure of themselves as told, driving along x."""
+    """Tokens of objects at xy, each in its cell, with the given confidence, moving along x."""
     at, proposal = torch.tensor(xy), torch.zeros(len(xy), PROPOSAL_DIM)
     yx = GRID.cells(at)
     proposal[:, BOX_LAYOUT.heatmap_logit] = torch.logit(torch.tensor(confidence))[:, None]
@@ -43,7 +43,7 @@ def frame(index: int, x: float = 0.0, yaw: float = 0.0, agent: int = 1) -> Agent
 
 
 def cache_of(*views: tuple[AgentFrame, SparseBev]) -> PerceptionCache:
-    """Eyes that need no detector: what they make of these frames is known."""
+    """A perception cache with fixed outputs for these frames, without a detector."""
     nothing = cast(RawBoxes, None)
     feature_cache = {(f.agent_id, f.timestamp_ns): AgentOutput(t, t, nothing, DecodeConfig()) for f, t in views}
     return PerceptionCache(cast(Detector, None), feature_cache=feature_cache)
@@ -69,7 +69,7 @@ def test_redundant_tokens_of_one_object_are_discounted():
 
 
 def test_recently_sent_objects_are_discounted_at_their_predicted_position():
-    """Vehicles at 15 m/s; the agent drives 1 m and turns by 90 degrees: one was said, of the other it was not spoken."""
+    """Vehicles at 15 m/s; the agent drives 1 m and turns by 90 degrees: one was sent, the other was not."""
     then, now = frame(4), frame(5, x=1.0, yaw=math.pi / 2)
     before = make_tokens([(10.0, 4.0)], [0.9], speed=15.0)
     # (10 + 1.5, 4) in the frame of then is (10.5, 4) from the agent's new place, turned: (4, -10.5).
@@ -114,7 +114,7 @@ def test_after_a_gap_a_leap_or_another_agent_all_is_new(later: AgentFrame):
 
 
 def test_against_loops_over_tokens(drive, detector: Detector):
-    """Token by token: how many surer ones of this message, and whether any of the last two, speak of the same place."""
+    """Token by token: the number of more confident tokens of the same object in this message, and in the last two messages."""
     frames = [drive().frame(1, i) for i in range(4)]
     cache = PerceptionCache(detector)
     rng = torch.Generator().manual_seed(0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boxes of a moment ago take part where they should be by now, less sure with every tenth of a second."""
+"""Boxes of previous frames: propagated by their velocity, with scores that decay by age."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FixedOutput:
 
 
 class FixedCache:
-    """Eyes that saw these boxes, newest first, a tenth of a second apart, while the agent drove on at 1 m a sweep."""
+    """A perception cache with these boxes, newest first, a tenth of a second apart, while the agent drove on at 1 m a sweep."""
 
     grid = BevGrid(-100.0, -40.0, -3.0, 100.0, 40.0, 1.0)
 
@@ -95,7 +95,7 @@ def test_late_fusion_as_papers_have_it_knows_only_what_is_newest() -> None:
 
 
 def test_boxes_of_others_are_cropped_and_capped_before_they_are_ranked() -> None:
-    """Beyond 100 m nobody is asked; of 200 boxes within, the best 128 of the message take part, and the ego's own stands."""
+    """Boxes beyond 100 m are cropped; of 200 boxes within, the best 128 of the message and the ego's own are ranked."""
     crowd = replace(boxes(*torch.linspace(-98, 98, 40).tolist() * 5), score=torch.linspace(0.1, 0.9, 200))
     rows = torch.arange(200)
     crowd = replace(crowd, center=crowd.center + torch.stack((0 * rows, 10 + 4.0 * (rows // 40), 0 * rows), 1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boxes followed back through an agent's last sweeps: the line is that of least squares, and what is no motion is none."""
+"""Velocity estimation: the fit is that of least squares, and insignificant velocities are 0."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from manyeyes.datatypes import Boxes, Transform
 
 CONFIG = VelocityConfig()
 EXACT = VelocityConfig(sigma_position_m=1e-3)
-"""Places that are believed to the millimetre: what is stated counts for nothing."""
+"""Positions with a standard deviation of millimetres: the detector's velocity has no weight."""
 
 
 def cars(xy: list[tuple[float, float]] | Tensor, yaw: float = 0.0, velocity: Tensor | None = None) -> Boxes:
@@ -27,7 +27,7 @@ def cars(xy: list[tuple[float, float]] | Tensor, yaw: float = 0.0, velocity: Ten
 
 
 def with_sigma(boxes: Boxes, sigma_m: float) -> Boxes:
-    """The same, of which the detector says how sure it is."""
+    """The same boxes with a position standard deviation."""
     return replace(boxes, sigma_xy=torch.full((len(boxes),), sigma_m))
 
 
@@ -52,7 +52,7 @@ def test_two_places_by_hand() -> None:
 
 
 def plain(now: Boxes, places: list[Tensor], sigmas: list[float], config: VelocityConfig) -> Tensor:
-    """The slow twin, for one box: start and velocity of one line by least squares, a row for everything known."""
+    """Reference implementation for one box: start and velocity of one line by least squares, a row for everything known."""
     ahead = torch.stack((now.yaw.cos(), now.yaw.sin()), 1)[0].double()
     aside = torch.stack((-ahead[1], ahead[0]))
     rows, goals = [], []
@@ -102,7 +102,7 @@ def test_velocities_turn_with_the_frame() -> None:
 
 
 def test_a_car_that_stands_stands_whatever_is_stated() -> None:
-    """Places jitter by 5 cm and the detector says 1.5 m/s; over half a second that is no motion, in one sweep it is not known."""
+    """Positions jitter by 5 cm and the detector gives 1.5 m/s: insignificant over half a second, undecided in one sweep."""
     rng = torch.Generator().manual_seed(2)
     now = cars([(5, 5)], velocity=torch.tensor([[1.5, 0.0]]))
     then = [
@@ -160,7 +160,7 @@ def test_points_correct_a_wrong_longitudinal_speed(speed: float) -> None:
 
 @pytest.mark.parametrize("aside", (-0.35, 0.35))
 def test_points_correct_a_hidden_lateral_speed(aside: float) -> None:
-    """Boxes, and their heading, say straight ahead; points do not. Below DRIVES_MPS nobody asks them."""
+    """Boxes and headings move straight ahead, points do not. Below MIN_LATERAL_SEARCH_MPS there is no lateral search."""
     for speed in (8.0, 0.8):
         now, earlier = cars([(0.0, 0.0)]), drive((speed, 0), 5)
         for k in (1, 2):

@@ -179,7 +179,7 @@ def test_a_damaged_body_is_a_map_or_a_packet_error(seed, data):
     except PacketError:
         return
     assert back is not None and (np.abs(back.elements.points) <= 327.67).all()
-    # What was read can be said again: nothing of it is out of the format.
+    # What was read can be encoded again: all of it is within the format.
     again = wire.assemble(wire.decode_packet(p) for p in wire.encode(message(back), mtu=65535)).local_map
     assert again is not None
     np.testing.assert_allclose(np.sort(again.elements.points, 0), np.sort(back.elements.points, 0), atol=1e-9)
@@ -198,7 +198,7 @@ def test_a_line_that_announces_more_points_than_there_are_bytes_takes_no_room():
 def test_lines_that_cannot_be_are_implausible(line):
     (packet,) = wire.encode(message(LocalMap(MapElements.empty(), VIEW)))
     body = packet[wire.HEADER_BYTES - 4 : -4] + bytes([0, 255, 255, 2, *line])
-    with pytest.raises(PacketError, match="stands still"):
+    with pytest.raises(PacketError, match="repeats a point"):
         wire.decode_packet(sealed(packet, body))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be said of any recording."""
+"""Functions on any recording."""
 
 from __future__ import annotations
 

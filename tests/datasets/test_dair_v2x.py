@@ -140,7 +140,7 @@ def write_root(root: Path) -> Path:
         dump(pole / "calib/virtuallidar_to_world" / f"{i}.json", {**motion(stated), **blank})
         dump(vehicle / "label/lidar" / f"{v}.json", [cone, flat, *(side_label(n, LIDAR) for n in VEHICLE_LISTS)])
         dump(pole / "label/virtuallidar" / f"{i}.json", [as_text(side_label(n, POLE)) for n in POLE_LISTS])
-        # Nothing but type and corners is to be believed here.
+        # Only type and corners are valid here.
         wrong = {
             "rotation": 0.019,
             "3d_dimensions": {"h": 1.0, "w": 1.0, "l": 1.0},

@@ -410,7 +410,7 @@ def test_a_faulty_yaml_names_file_and_key(
     assert message_match in str(caught.value) and str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["lidar_pose: [1, 2", "- 1\n- 2\n", "", "lidar_pose: *nobody\n"])
+@pytest.mark.parametrize("text", ["lidar_pose: [1, 2", "- 1\n- 2\n", "", "lidar_pose: *unknown\n"])
 def test_a_file_that_is_no_yaml_mapping_is_named(scenario: Path, text: str) -> None:
     (scenario / "641" / "00068.yaml").write_text(text)
     with pytest.raises(RecordingError, match=r"00068\.yaml: expected .*yaml.*found"):
@@ -464,7 +464,7 @@ def test_the_height_of_a_pole_is_estimated_from_its_cloud_without_a_pose(scenari
 
 
 def drive_frame(index: int = 0, agents: tuple[int, ...] = (1, 10, 9, -2)) -> Snapshot:
-    """Four agents anywhere, boxes with ids in order, every box seen by somebody."""
+    """Four agents anywhere, boxes with ids in order, every box seen by an agent."""
     rng = np.random.default_rng(index)
     count = 12
     boxes = Boxes.of(

@@ -267,7 +267,7 @@ def test_ascii_clouds_are_kept_until_the_file_changes(tmp_path: Path) -> None:
     write_ascii(path, xyz, red)
     first = read_pcd(path, cache=cache)
     (entry,) = (tmp_path / "cache").rglob("*.npy")
-    np.save(entry, np.zeros((1, 4), np.float32))  # whoever reads this has not parsed the file again
+    np.save(entry, np.zeros((1, 4), np.float32))  # a reader of this entry has not parsed the file again
     assert len(read_pcd(path, cache=cache).xyz) == 1
     write_ascii(path, 2 * xyz, red)
     changed = read_pcd(path, cache=cache)

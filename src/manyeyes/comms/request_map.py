@@ -2,7 +2,7 @@
 """Request maps: a receiver's confidence on a coarse grid, and the weights of a sender's tokens that follow from it.
 
 A receiver broadcasts one byte a window (``RequestMap``). A sender transforms its tokens to each receiver's frame, by the prior
-poses of the messages, and lowers the scores of tokens in confident windows. The maximum weight counts, since one message serves all.
+poses of the messages, and lowers the scores of tokens in confident windows. The maximum weight counts: one message serves all.
 Compare Where2comm's request map (Hu et al., NeurIPS 2022, section 3.3), which is dense and as fine as the features.
 """
 
