@@ -76,9 +76,8 @@ PAPER_AP = (
 
 @dataclass(frozen=True)
 class PoseNoiseRow:
-    """A method, or a baseline's weights, with a corrector at a noise level. ap: at each IoU; ap_drop: AP less
-    than the same way to fuse has with true poses and no corrector; gain_over_no_fusion: AP more than no fusion. ap_by_common_objects:
-    AP@0.5 of each bucket of COMMON.
+    """A method, or a baseline's weights, with a corrector at a noise level. ap: at each IoU; ap_drop: AP less than with true poses
+    and no corrector; gain_over_no_fusion: AP more than no fusion. ap_by_common_objects: AP@0.5 of each bucket of objects in common.
     """
 
     corrector: str
