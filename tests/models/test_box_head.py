@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From boxes to what the head should say and back, at every head stride; decoding of odd batches."""
+"""Encoding and decoding of boxes at every head stride; decoding of unusual batches."""
 
 import math
 
@@ -30,7 +30,7 @@ def some_boxes(n: int = 6, seed: int = 0) -> Boxes:
 
 
 def encode(boxes: Boxes, sites: Sites) -> RawBoxes:
-    """The raw boxes that a perfect head would say: the inverse of decode."""
+    """The raw boxes of a perfect head: the inverse of decode."""
     targets = assign_targets(sites, [boxes], TargetConfig(assign_radius_m=sites.grid.cell_size_m * 1.5))
     n, at, truth = len(sites), targets.positive.nonzero()[:, 0], boxes[targets.box[targets.positive]]
     values = [torch.zeros(n, w) for w in WIDTHS]
@@ -65,7 +65,7 @@ def test_decode_inverts_encode(stride):
     assert (found.p_flip < 1e-3).all() and (found.score > 0.99).all()
 
 
-def test_a_centre_half_a_cell_away_would_be_seen():
+def test_half_cell_shift_of_centres_is_detected():
     # What the field often gets wrong: (o + 0.5) * stride * pillar. Were the grid to say so, boxes would move by 1.4 m.
     sites = every_site(8)
     wrong = GRID.x_min + (sites.yx[:, 1] + 0.5) * 8 * GRID.pillar
@@ -85,7 +85,7 @@ def test_opposite_heading_gives_same_rectangle_and_flip_probability():
     assert torch.allclose(back.p_flip, torch.full((len(found),), p_flip), atol=1e-5)
 
 
-def test_traffic_across_the_way_has_a_heading_without_a_seam():
+def test_heading_is_continuous_at_ninety_degrees():
     """A hair of error in the axis at ±90 degrees turns its representative by pi; the heading stays."""
     for yaw in (math.pi / 2 - 1e-3, math.pi / 2 + 1e-3, -math.pi / 2 - 1e-3, -math.pi / 2 + 1e-3):
         box = Boxes.of(torch.tensor([[3.0, 4.0, 0.8]]), torch.tensor([[4.5, 1.9, 1.6]]), torch.tensor([yaw]))
@@ -98,7 +98,7 @@ def test_traffic_across_the_way_has_a_heading_without_a_seam():
             assert float(found.p_flip[0]) < 1e-3
 
 
-def test_grids_of_a_batch_may_hold_no_few_and_too_many_boxes():
+def test_batch_with_none_few_and_too_many_boxes():
     sites = every_site(8, batch_size=3)
     per_grid = len(sites) // 3
     heat = torch.full((len(sites),), -20.0)
@@ -118,7 +118,7 @@ def test_no_sites_no_boxes():
     assert [len(b) for b in decode(raw, DecodeConfig())] == [0, 0]
 
 
-def test_scores_fall_and_mix_heat_with_overlap():
+def test_scores_descend_and_combine_heatmap_with_iou():
     sites = every_site(8)
     raw = encode(some_boxes(), sites)
     heat = torch.where(raw.heatmap_logit > 0, torch.linspace(0.1, 2.0, len(sites)), raw.heatmap_logit)
@@ -129,7 +129,7 @@ def test_scores_fall_and_mix_heat_with_overlap():
     assert float(found.score[0]) == pytest.approx(float((best * 0.5) ** 0.5), abs=1e-6)
 
 
-def test_a_fresh_head_expects_few_boxes():
+def test_untrained_head_predicts_few_boxes():
     torch.manual_seed(0)
     head = BoxHead(8, 16).eval()
     with torch.no_grad():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights on disk: what is saved is what is loaded, and anything else is a line that says what is wrong."""
+"""Weights files: round trips, and errors that name the file and the cause."""
 
 import dataclasses
 import json
@@ -48,7 +48,7 @@ def rewrite(path: Path, change) -> None:
     save_file(state, path, metadata)
 
 
-def test_what_is_saved_is_loaded(model, path):
+def test_save_and_load_round_trip(model, path):
     loaded = checkpoint.load(path)
     assert loaded.config == model.config and not loaded.training
     for name, value in model.state_dict().items():
@@ -74,7 +74,7 @@ def test_half_precision_halves_the_file_and_rounds_to_it(model, path, tmp_path):
     assert loaded.fingerprint != fingerprint(model)
 
 
-def test_the_fingerprint_names_weights_and_configuration(model):
+def test_fingerprint_depends_on_weights_and_configuration(model):
     other = Detector(COSTR_TINY)
     other.load_state_dict(model.state_dict())
     assert fingerprint(other) == fingerprint(model)
@@ -91,7 +91,7 @@ def test_weights_of_another_shape_name_the_tensor(path):
     assert "tensor head.out.weight is (3, 5) in the file" in error(path)
 
 
-def test_a_missing_and_a_strange_tensor_are_named(path):
+def test_missing_and_unexpected_tensors_are_named(path):
     rewrite(path, lambda state, _: state.pop("token_prune.score.bias"))
     assert "tensor token_prune.score.bias is nothing in the file" in error(path)
     rewrite(path, lambda state, _: state.update({"aaa": torch.zeros(1), "token_prune.score.bias": torch.zeros(1)}))
@@ -158,13 +158,13 @@ def test_a_path_is_loaded_as_it_is(model, path):
 
 @pytest.mark.skipif(not pretrained.list_detectors(), reason="no weights are shipped yet")
 @pytest.mark.parametrize("name", pretrained.list_detectors())
-def test_shipped_weights_load_and_see(name):
+def test_shipped_weights_load_and_predict(name):
     loaded = pretrained.load(name)
     assert len(loaded.extract_features([cloud()]).tokens.features) >= 0
     assert checkpoint.read_card(Path(pretrained.__file__).parent / "weights" / f"{name}.safetensors")
 
 
-def test_a_configuration_with_an_option_comes_back_and_an_older_one_gets_its_default():
+def test_optional_configuration_field_round_trips_and_defaults_when_absent():
     area = BevGrid(-10.0, -5.0, -3.0, 10.0, 5.0, 3.0)
     config = DetectorConfig(BevGrid(-10.0, -10.0, -3.0, 10.0, 10.0, 3.0), output_range=area)
     text = config_to_json(config)

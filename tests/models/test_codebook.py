@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tokens as bytes and back: what a box keeps, what quantisation does to features, and any bytes can be read."""
+"""Token codes: error of boxes and features after a round trip, and decoding of arbitrary bytes."""
 
 import math
 
@@ -20,7 +20,7 @@ GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, 0.4, 4)
 
 
 def proposals(seed: int, count: int = 200) -> torch.Tensor:
-    """What a head that is sure of itself says, over the whole range of each quantity."""
+    """Proposals of a confident head over the whole range of each quantity."""
     g = torch.Generator().manual_seed(seed)
 
     def uniform(low: float, high: float, width: int = 1) -> torch.Tensor:
@@ -44,7 +44,7 @@ def proposals(seed: int, count: int = 200) -> torch.Tensor:
 
 @QUICK
 @given(st.integers(0, 10**6))
-def test_a_box_comes_back_within_3_cm_and_half_a_degree(seed):
+def test_box_round_trip_error_is_below_3_cm_and_half_a_degree(seed):
     """Centre in three dimensions, on the shipped models' lattice; sizes within 1 %; velocity within 0.125 m/s an axis."""
     original = proposals(seed)
     codes = proposal_to_codes(original)
@@ -72,7 +72,7 @@ def test_a_box_comes_back_within_3_cm_and_half_a_degree(seed):
 
 @QUICK
 @given(st.integers(0, 10**6), st.floats(-3, 3))
-def test_what_is_decoded_is_the_same_box_facing_the_same_way_in_any_frame(seed, yaw):
+def test_decoded_box_and_heading_are_equal_in_any_frame(seed, yaw):
     """Also after the receiver has turned it: the seams of axis and direction are nowhere."""
     original = proposals(seed)
     back = proposal_from_codes(proposal_to_codes(original))
@@ -89,7 +89,7 @@ def test_what_is_decoded_is_the_same_box_facing_the_same_way_in_any_frame(seed, 
     assert abs(len(one) - len(two)) <= 3
 
 
-def test_standing_still_is_written_as_it_is_and_fast_saturates():
+def test_zero_velocity_is_exact_and_high_velocity_saturates():
     rows = torch.zeros(2, PROPOSAL_DIM)
     rows[:, BOX_LAYOUT.axis] = torch.tensor([1.0, 0.0])
     rows[1, BOX_LAYOUT.velocity] = torch.tensor([9.0, -9.0])
@@ -101,7 +101,7 @@ def test_standing_still_is_written_as_it_is_and_fast_saturates():
     assert back[1, BOX_LAYOUT.offset].tolist() == pytest.approx([2.25, -2.25])
 
 
-def test_any_bytes_are_some_proposal_and_writing_it_again_keeps_it():
+def test_any_bytes_decode_and_reencode_unchanged():
     codes = torch.randint(0, 256, (500, PROPOSAL_CODES), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     back = proposal_from_codes(codes)
     assert torch.isfinite(back).all()
@@ -135,7 +135,7 @@ def test_nearest_is_the_nearest():
     assert torch.equal(nearest_centre(x, centres), slow)
 
 
-def test_each_stage_leaves_less_over_and_sums_of_centres_are_exact():
+def test_each_stage_reduces_the_residual_and_sums_of_centres_are_exact():
     g = torch.Generator().manual_seed(2)
     x = torch.cat((torch.randn(400, 8, generator=g), proposals(0, 400)), 1)
     errors = [(filled(k).decode(filled(k).encode(x)) - x)[:, :8].square().mean() for k in (1, 2, 3, 4)]
@@ -145,7 +145,7 @@ def test_each_stage_leaves_less_over_and_sums_of_centres_are_exact():
     assert torch.equal(book.decode(book.encode(exact))[:, :8], book.centres[0])
 
 
-def test_any_bytes_are_read_also_where_there_are_few_centres():
+def test_any_bytes_decode_with_few_centres():
     book = filled(2, size=3)
     rows = torch.randint(0, 256, (100, book.width), generator=torch.Generator().manual_seed(3)).to(torch.uint8)
     assert torch.isfinite(book.decode(rows)).all()

@@ -96,7 +96,7 @@ def test_pruned_cells_are_gone_from_all_coarser_strides():
 
 
 @pytest.mark.parametrize("head_stride", (2, 4, 8))
-def test_nothing_seen_or_all_pruned_is_an_empty_set(head_stride):
+def test_empty_or_fully_pruned_input_gives_no_tokens(head_stride):
     model = encoder(replace(CONFIG, head_stride=head_stride))
     for cloud, threshold in ((PointCloud.of(torch.zeros(0, 3)), 0.0), (clumps(0), 1.0)):
         tokens = model(pillars([cloud]), threshold).tokens

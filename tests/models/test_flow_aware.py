@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FAST: when and where a token comes from, what the ego saw before, and what each may change."""
+"""FAST: encoding of time and sender, attention to the ego's past, and their invariances."""
 
 import dataclasses
 import math
@@ -39,7 +39,7 @@ def own(seed: int = 0, n: int = 60) -> Tokens:
 
 
 def past(seed: int = 7, n: int = 60, x: float = -0.8, age_s: float = 0.1) -> Tokens:
-    """What the ego told a moment ago, moved by its own drive."""
+    """The ego's tokens of an earlier instant, moved by its ego-motion."""
     some = random_tokens(seed, n)
     return to_ego_frame([AgentTokens(0, some.features, some.sites.xy, Transform.from_xyz_yaw(x, 0.0), age_s)], GRID, 1)
 
@@ -78,8 +78,8 @@ def test_every_tenth_of_a_second_has_distinct_encoding():
     assert float(torch.pdist(temporal_encoding(torch.arange(5.0) / 10, 64)).min()) < 0.3
 
 
-def test_a_fresh_placement_is_the_literal_model():
-    """A11: frame, doubt, age and proposal are told by ways that end in zeros."""
+def test_untrained_encoding_is_zero():
+    """The untrained encoding of frame, sigma, age and proposal is zero."""
     tokens = past(age_s=0.3)
     tokens = dataclasses.replace(tokens, pose_context=torch.randn_like(tokens.pose_context))
     placed = SpatioTemporalEncoding(CHANNELS)(tokens.features, tokens, torch.rand(len(tokens.xy), 2))
@@ -176,7 +176,7 @@ def test_windows_with_more_past_than_cells_lose_none_of_it():
         assert bool(((model(tokens.features, tokens, loud, before) - out).abs().amax(1) > 1e-6).all())
 
 
-def test_egos_of_a_batch_do_not_remember_for_each_other():
+def test_past_of_one_ego_does_not_affect_another():
     model, a, b = attention(), random_tokens(0), random_tokens(7)
     tokens = to_ego_frame([AgentTokens(0, a.features, a.sites.xy), AgentTokens(1, a.features, a.sites.xy)], GRID, 2)
     before = to_ego_frame([AgentTokens(1, b.features, b.sites.xy, Transform.identity(), 0.1)], GRID, 2)
@@ -186,7 +186,7 @@ def test_egos_of_a_batch_do_not_remember_for_each_other():
     assert torch.equal(out[first], tokens.features[first]) and not torch.equal(out[second], tokens.features[second])
 
 
-def test_a_fresh_fusion_with_a_past_is_self_attention():
+def test_untrained_fusion_with_a_past_equals_self_attention():
     """T = I, one agent, whatever it remembers: before it has learned, FAST is DAST in its place."""
     torch.manual_seed(0)
     flow = FastFusion(CHANNELS, CONFIG).eval()
@@ -223,7 +223,7 @@ def moving(x: float, y: float, vx: float, vy: float, age_s: float = 0.4, yaw: fl
     return to_ego_frame([AgentTokens(0, row, torch.tensor([[x, y]]), sender, age_s, **sigmas)], GRID, 1)
 
 
-def test_a_late_token_stands_where_its_object_is_by_now():
+def test_delayed_token_is_motion_compensated():
     assert moving(2.0, 1.0, 10.0, -5.0).xy[0].tolist() == pytest.approx([6.0, -1.0], abs=1e-5)
     turned = moving(2.0, 1.0, 10.0, -5.0, yaw=math.pi / 2)
     assert turned.xy[0].tolist() == pytest.approx([1.0, 6.0], abs=1e-5)
@@ -237,11 +237,11 @@ def test_implausible_speed_is_ignored():
     )
 
 
-def test_what_has_driven_out_of_range_by_now_is_dropped():
+def test_motion_compensated_token_out_of_range_is_dropped():
     assert len(moving(24.0, 0.0, 10.0, 0.0).xy) == 0 and len(moving(24.0, 0.0, 0.0, 0.0).xy) == 1
 
 
-def test_there_and_back_again():
+def test_transform_and_inverse_restore_positions():
     """A10: a rigid motion and its inverse give the places back."""
     motion = Transform.from_xyz_yaw(3.0, -2.0, 0.4, 1.1)
     xy = torch.rand(50, 2).double() * 10
@@ -250,7 +250,7 @@ def test_there_and_back_again():
 
 
 def merged_x(x: float, **prior: float) -> float:
-    """Where the merged box of two tokens on one cell lies: one at 0.2 that is certain, one that says x under a claim."""
+    """The x of the merged box of two tokens on one cell: a certain one at 0.2 and one at x with this prior."""
     rows = torch.zeros(2, CHANNELS + PROPOSAL_DIM)
     box = rows[:, CHANNELS:]
     box[:, BOX_LAYOUT.heatmap_logit], box[:, BOX_LAYOUT.log_sigma_xy] = 2.0, math.log(0.2)
@@ -267,7 +267,7 @@ def merged_x(x: float, **prior: float) -> float:
 
 
 def test_pose_sigma_and_age_lower_the_merge_weight():
-    # Trust starts as a softmax of - log sigma: shares go as one over the standard deviations.
+    # The merge starts as a softmax of -log sigma: weights are inverse to the standard deviations.
     assert merged_x(0.8) == pytest.approx(0.5, abs=1e-5)
     for prior, moved in (({"sigma_xy_m": 0.6}, 0.6), ({"age_s": 0.4}, 0.4 * DRIFT_MPS)):
         sigma = math.hypot(0.2, moved)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folded detector says what its model says, keeps the model as it was, and holds no batch norm in its convolutions."""
+"""A folded detector gives equal outputs, leaves the original unchanged, and has no batch norm in its convolutions."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tokens of several agents in one frame: laws that hold whoever speaks first, wherever the world is."""
+"""Fusion in one frame: invariance to the order of agents and to the world's frame."""
 
 import dataclasses
 import math
@@ -51,7 +51,7 @@ def fusion(name: str, random_placement: bool = True) -> torch.nn.Module:
 
 
 def random_tokens(seed: int, n: int = 60) -> SparseBev:
-    """What an agent tells: features and, behind them, proposals."""
+    """Shared tokens of an agent: features and proposals."""
     random = torch.Generator().manual_seed(seed)
     rows, columns = GRID.shape
     key = torch.randperm(rows * columns, generator=random)[:n]
@@ -60,7 +60,7 @@ def random_tokens(seed: int, n: int = 60) -> SparseBev:
 
 
 def silent(x: SparseBev) -> SparseBev:
-    """The same tokens, none of which believes in an object: they stay where they are."""
+    """The same tokens with low heatmap logits, so that they stay in their cells."""
     features = x.features.clone()
     features[:, CHANNELS] = -9.0
     return x.with_features(features)
@@ -97,7 +97,7 @@ def test_fusion_is_invariant_to_agent_order(name):
 
 @pytest.mark.parametrize("name", FUSIONS)
 @pytest.mark.parametrize("agents", (1, 2, 3, 5))
-def test_every_agent_adds_what_it_has(name, agents):
+def test_every_agent_contributes_its_tokens(name, agents):
     tokens = tokens_of(list(range(agents)))
     out = fusion(name)(tokens)
     key, _ = assign_cells(tokens)
@@ -116,7 +116,7 @@ def test_an_agent_without_tokens_changes_nothing(name):
 
 
 @pytest.mark.parametrize("name", FUSIONS)
-def test_moving_the_whole_world_changes_nothing(name):
+def test_fusion_is_invariant_to_world_motion(name):
     model = fusion(name)
     world = Transform.from_xyz_yaw(4321.0, -987.0, 12.0, 2.5)
     here, there = model(tokens_of([0, 1, 2])), model(tokens_of([0, 1, 2], world))
@@ -160,7 +160,7 @@ def test_untrained_encoding_is_identity_and_trained_one_is_not(name):
     assert torch.equal(SpatioTemporalEncoding(CHANNELS)(tokens.features, tokens, zeros), tokens.features)
 
 
-def test_turning_and_turning_back_is_nothing():
+def test_rotation_and_inverse_restore_features():
     features = torch.randn(20, CHANNELS, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     yaw = torch.tensor(0.7, dtype=torch.float64)
     turned = rotate_vectors(features, yaw)
@@ -171,7 +171,7 @@ def test_turning_and_turning_back_is_nothing():
     assert torch.allclose(*norms, atol=1e-12)
 
 
-def test_a_direction_in_a_token_turns_as_the_thing_itself():
+def test_vector_channels_rotate_with_the_object():
     # Each token carries, as its first vector, the way to a landmark; after the move it must still point there.
     own, landmark = random_tokens(0), torch.tensor([5.0, 3.0])
     features = own.features.clone()
@@ -193,7 +193,7 @@ def test_pose_context_holds_height_yaw_sigma_and_age_and_is_zero_for_the_ego():
     wanted = torch.tensor([1.5, math.sin(0.3), math.cos(0.3) - 1]).expand(len(pose_context) - n, 3)
     assert torch.allclose(pose_context[n:, :3], wanted, atol=1e-6)
     assert torch.equal(tokens.age[n:], torch.full((len(pose_context) - n,), 2.5))
-    # A claim's doubt in heading moves what is far from its sender more than what is near to it.
+    # A heading error moves tokens far from their sender more than near ones.
     reach = tokens.xy[n:].norm(dim=1)
     assert torch.allclose(tokens.sigma_m[n:], (0.3**2 + (0.01 * reach) ** 2).sqrt(), atol=1e-5)
 
@@ -232,7 +232,7 @@ def test_a_proposed_box_moves_as_the_box_itself():
     assert torch.allclose(proposed_velocity(moved.proposal), turned, atol=1e-4)
 
 
-def test_which_way_a_proposal_faces_turns_with_it():
+def test_proposed_heading_rotates_with_the_frame():
     proposal, xy = torch.zeros(1, CHANNELS + PROPOSAL_DIM), torch.zeros(1, 2)
     box = proposal[:, CHANNELS:]
     box[:, BOX_LAYOUT.axis] = torch.tensor([[math.cos(2 * 1.2), math.sin(2 * 1.2)]])
@@ -245,7 +245,7 @@ def test_which_way_a_proposal_faces_turns_with_it():
 
 
 def one_object(*observations: tuple[float, float, float, float]) -> Tokens:
-    """Tokens at (x, y) of as many agents, each saying with a heat that there is a box at (centre, y)."""
+    """Tokens at (x, y), one per agent, each proposing a box at (centre, y) with a heatmap logit."""
     parts = []
     for x, y, centre, heat in observations:
         row = torch.zeros(1, CHANNELS + PROPOSAL_DIM)
@@ -258,7 +258,7 @@ def one_object(*observations: tuple[float, float, float, float]) -> Tokens:
 
 
 @pytest.mark.parametrize("name", FUSIONS)
-def test_tokens_of_one_object_meet_on_its_centre_and_the_surer_counts_more(name):
+def test_tokens_of_one_object_merge_at_its_centre_weighted_by_score(name):
     # Cells are 1.6 m wide with centres at 0.2 + 1.6 k: the tokens lie in two cells, both mean the cell of x = 0.2.
     tokens = one_object((0.2, 0.2, 0.5, 2.0), (1.8, 0.2, 0.8, 0.0))
     out = fusion(name, random_placement=False)(tokens)

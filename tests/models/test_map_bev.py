@@ -58,7 +58,7 @@ def test_frame_is_independent_of_the_rest_of_its_batch():
 
 
 @pytest.mark.parametrize("view_transform", ["depth", "ground"])
-def test_pictures_reach_the_ground_ahead_and_learn(view_transform):
+def test_image_features_reach_the_ground_ahead_and_have_gradients(view_transform):
     net = CameraBev(BevConfig(**{**vars(CONFIG), "view_transform": view_transform}))
     features, seen = net([[photo()], [], [photo(10), photo(200)]])
     assert features.shape == (3, 16, 16, 16)

@@ -50,7 +50,7 @@ def test_every_layer_answers_for_every_query_of_its_group():
     assert 0.001 < float(start.detach().mean()) < 0.1
 
 
-def test_one_group_knows_nothing_of_the_other():
+def test_query_groups_are_independent():
     few, more = MapHead(TINY).eval(), MapHead(dataclasses.replace(TINY, num_one_to_many_queries=12)).eval()
     more.load_state_dict(few.state_dict())
     ground = torch.randn(1, 16, 10, 20)
@@ -61,7 +61,7 @@ def test_one_group_knows_nothing_of_the_other():
     assert float(many[1].sigmoid().amax(2).min()) > 0.011
 
 
-def test_tiles_of_a_batch_know_nothing_of_each_other():
+def test_tiles_of_a_batch_are_independent():
     head, ground = MapHead(TINY).eval(), torch.randn(3, 16, 10, 20)
     together, alone = drawn(head, ground)[-1], drawn(head, ground[1:2])[-1]
     assert torch.allclose(together.point[1], alone.point[0], atol=1e-5)
@@ -97,7 +97,7 @@ def test_deformable_attention_samples_at_its_offsets():
     assert out[4:].tolist() == pytest.approx([2.5 / 8] * 4, abs=1e-5)
 
 
-def test_answers_come_best_first_in_metres_and_only_those_sure_enough():
+def test_decoded_elements_are_sorted_thresholded_and_metric():
     config = MapHeadConfig(num_queries=3, num_points=2, channels=8, max_elements=3, score_threshold=0.3)
     logit = torch.logit(torch.tensor([[[0.1, 0.9, 0.4], [0.2, 0.1, 0.6], [0.35, 0.0, 0.0]]]), 1e-6)
     point = torch.tensor([[[0.0, 0.5], [1.0, 1.0]], [[0.25, 0.25], [0.5, 0.25]], [[0.5, 0.5], [0.75, 0.5]]])[None]
@@ -116,7 +116,7 @@ def test_points_beyond_the_tile_are_drawn_at_its_border():
     np.testing.assert_allclose(decode_elements(raw, TILE, config)[0].polyline(0), [[-20, 0], [0, 0], [20, 10]])
 
 
-def test_before_anything_is_learnt_every_layer_answers_with_the_lines_of_the_sketch():
+def test_untrained_layers_return_the_lines_of_the_line_field():
     head, ground = MapHead(TINY), torch.randn(1, 16, 10, 20)
     start, logit, kind = head.init_queries(head.line_field_head(ground))
     for raw in drawn(head, ground):
@@ -125,7 +125,7 @@ def test_before_anything_is_learnt_every_layer_answers_with_the_lines_of_the_ske
     assert torch.allclose(logit.sum(2, keepdim=True) - own, torch.tensor(-2 * math.log(99)), atol=1e-4)
 
 
-def test_queries_begin_without_gradients_and_the_sketch_learns_from_its_own_loss_alone():
+def test_initial_queries_carry_no_gradient_to_the_line_field():
     head, ground = MapHead(TINY), torch.randn(1, 16, 10, 20)
     assert not any(part.requires_grad for part in head.init_queries(head.line_field_head(ground)))
     raw = drawn(head, ground)[-1]
@@ -133,7 +133,7 @@ def test_queries_begin_without_gradients_and_the_sketch_learns_from_its_own_loss
     assert all(p.grad is None for p in head.line_field_head.parameters())
 
 
-def test_learned_lines_follow_those_of_the_sketch_and_learn_where_they_begin():
+def test_learned_queries_follow_those_of_the_line_field_and_have_gradients():
     config = dataclasses.replace(TINY, num_queries=10, num_learned_queries=4)
     head, ground = MapHead(config), torch.randn(2, 16, 10, 20)
     sketch = head.line_field_head(ground)
@@ -155,7 +155,7 @@ def test_learned_lines_follow_those_of_the_sketch_and_learn_where_they_begin():
     assert drawn(head, ground, "many")[0].point.shape[1] == 9
 
 
-def test_waves_tell_places_apart_to_a_hundredth_of_the_tile():
+def test_position_encoding_resolves_a_hundredth_of_the_tile():
     x, y = torch.meshgrid(torch.linspace(0, 1, 101), torch.linspace(0, 1, 51), indexing="ij")
     code = encode_position(torch.stack((x, y), -1)).flatten(0, 1)
     assert code.shape == (5151, 32)
@@ -177,7 +177,7 @@ def at_three_places(monkeypatch, head, shift):
 
 
 def with_random_branches(head):
-    """The same head with branches that say something."""
+    """The same head with random branches."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for branch in (*head.point_branches, *head.class_branches):
@@ -194,9 +194,7 @@ def test_layer_depends_on_point_positions(monkeypatch):
 def test_point_branch_depends_on_point_position(monkeypatch):
     head = with_random_branches(MapHead(TINY))
     for layer in head.layers:
-        for norm in layer.get_submodule(
-            "norms"
-        ).children():  # a layer that says nothing at all: x is 0, whatever it was told
+        for norm in layer.get_submodule("norms").children():  # layers with zero output: x is 0
             for part in norm.parameters():
                 part.zero_()
     (first, here), (second, there) = (at_three_places(monkeypatch, head, shift) for shift in (0.0, 0.05))
@@ -205,7 +203,7 @@ def test_point_branch_depends_on_point_position(monkeypatch):
     assert torch.equal(moved[0, 0], again[0, 0])
 
 
-def test_nothing_sure_is_an_empty_map():
+def test_low_scores_give_an_empty_map():
     raw = RawMap(torch.full((2, 6, 3), -9.0), torch.rand(2, 6, 5, 2))
     assert [len(found) for found in decode_elements(raw, TILE, TINY)] == [0, 0]
 

@@ -24,7 +24,7 @@ def test_features_are_an_eighth_or_a_quarter_rounded_up(config, size):
     assert bool((out >= 0).all()) and float(out.detach().std()) > 0
 
 
-def test_one_picture_does_not_depend_on_the_others_of_its_batch():
+def test_image_is_independent_of_the_rest_of_its_batch():
     net = ImageEncoder(TINY).eval()
     rgb = torch.rand(3, 3, 40, 56) * 255
     assert torch.allclose(net(rgb)[1:2], net(rgb[1:2]), atol=1e-5)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a line_field to lines: every line once, rings as rectangles, copies unsure; who drops whom against a loop."""
+"""Line proposals from a line field: every line once, rings as rectangles, duplicates with low scores; suppression
+against a loop.
+"""
 
 import dataclasses
 import math
@@ -34,7 +36,7 @@ TRUTH = MapElements.of(
 
 
 def perfect(truth=TRUTH):
-    """What a line_field would be that says the truth."""
+    """The line field of the ground truth."""
     target = make_line_field_target(truth, TILE, KINDS)
     ink, end = (torch.logit(share.clamp(0.001, 0.999))[None] for share in (target.line_prob, target.end_mask))
     return RawLineField(ink, end, target.offset_to_line[None], target.direction[None], target.half_width[None])
@@ -44,7 +46,7 @@ def proposed(line_field, count=5, seeds=40):
     return propose_lines(line_field, RINGS, count, 8, seeds, 0.3)
 
 
-def test_every_line_of_a_true_sketch_is_proposed_once():
+def test_every_line_of_a_true_field_is_proposed_once():
     found = proposed(perfect())
     sure = found.score[0] > 2 * DUPLICATE_SCORE
     assert sorted(found.kind[0, sure].tolist()) == [0, 1, 2]
@@ -59,7 +61,7 @@ def test_every_line_of_a_true_sketch_is_proposed_once():
     assert torch.allclose(ring.amax(0), torch.tensor([12.0, 6.0]), atol=1.2)
 
 
-def test_the_surest_and_longest_come_first_and_copies_are_held_unsure():
+def test_proposals_descend_by_score_and_length_and_duplicates_score_low():
     found = proposed(perfect(), count=40)
     sure = found.score[0]
     own = sure > 2 * DUPLICATE_SCORE
@@ -101,7 +103,7 @@ def test_a_rectangle_is_drawn_about_its_middle_line():
     assert bool(torch.isfinite(nothing).all())
 
 
-def test_what_is_kept_is_what_a_loop_keeps():
+def test_suppression_equals_a_loop():
     rng = np.random.default_rng(4)
     on = torch.from_numpy(rng.random((3, 12, 12)) < 0.25)
     order = torch.stack([torch.from_numpy(rng.permutation(12)) for _ in range(3)])

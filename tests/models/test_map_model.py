@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map model's laws: looks have no order, blind looks no say, sensors share one ground; it exports and comes back from disk."""
+"""The map model: invariance to frame order and empty frames, shared ground of sensors, export, and round trips to
+disk.
+"""
 
 import dataclasses
 import math
@@ -69,7 +71,7 @@ def mapper():
     return net.eval()
 
 
-def test_tokens_lie_where_the_ground_was_seen(mapper):
+def test_tokens_cover_the_observed_ground(mapper):
     features = mapper.extract_features(clouds(2))
     assert features.tokens.features.shape[1] == 8 and features.tokens.sites.batch_size == 2
     assert features.tokens.grid == TINY.bev.token_grid and 20 < len(features.tokens.sites) < 2 * 256
@@ -109,13 +111,13 @@ def test_frames_of_other_tiles_change_nothing(mapper):
         1,
     )
     assert torch.allclose(both[0], one[0], atol=1e-5)
-    # The last tile had no look: all of it is what nobody saw.
+    # The last tile has no frame, so all of it is unobserved.
     blind = mapper.extract_features([PointCloud.of(torch.zeros(0, 3))]).tokens
     empty = mapper.fuse(blind, FOUR[:1], torch.zeros(1, dtype=torch.int64), 1)
     assert torch.allclose(both[2], empty[0], atol=1e-5)
 
 
-def test_moving_everything_by_one_motion_changes_nothing(mapper):
+def test_fusion_is_invariant_to_a_common_motion(mapper):
     tokens, tile = mapper.extract_features(clouds(4)).tokens, torch.zeros(4, dtype=torch.int64)
     world_from_tile = Transform.from_xyz_yaw(3000.0, -900.0, 0.0, 2.2)
     world_from_agent = world_from_tile @ FOUR
@@ -123,7 +125,7 @@ def test_moving_everything_by_one_motion_changes_nothing(mapper):
     assert torch.allclose(mapper.fuse(tokens, FOUR, tile, 1), mapper.fuse(tokens, back, tile, 1), atol=1e-4)
 
 
-def test_what_is_drawn_depends_on_what_was_seen(mapper):
+def test_predicted_elements_depend_on_the_input(mapper):
     tokens = mapper.extract_features(clouds(2)).tokens
     ground = mapper.fuse(tokens, FOUR[:2], torch.tensor([0, 1]), 2)
     raw = mapper.predict_elements(ground)[-1]
@@ -131,7 +133,7 @@ def test_what_is_drawn_depends_on_what_was_seen(mapper):
     assert mapper.predict_elements(ground, "many")[-1].logit.shape == (2, 4, 3)
 
 
-def test_scores_are_calibrated_when_drawing_and_not_when_learning():
+def test_scores_are_calibrated_in_evaluation_and_not_in_training():
     net = MapModel(TINY).eval().requires_grad_(False)
     ground = torch.randn(1, TINY.head.channels, 16, 32)
     plain = net.predict_elements(ground)
@@ -142,12 +144,12 @@ def test_scores_are_calibrated_when_drawing_and_not_when_learning():
         last.point, plain[-1].point
     )
     assert all(torch.equal(a.logit, b.logit) for a, b in zip(before, plain))
-    # The net learns what it says uncalibrated. Its norms stay as they are, so that nothing else differs.
+    # Training uses uncalibrated logits. The norms stay in evaluation mode, so that nothing else differs.
     net.training = True
     assert torch.equal(net.predict_elements(ground)[-1].logit, plain[-1].logit)
 
 
-def test_both_sensors_share_one_ground_and_either_alone_will_do(photo):
+def test_sensors_share_one_ground_and_either_alone_suffices(photo):
     torch.manual_seed(1)
     both = MapModel(dataclasses.replace(TINY, bev=dataclasses.replace(TINY.bev, sensors=("lidar", "camera"))))
     seen = clouds(1)
@@ -169,7 +171,7 @@ def test_the_tile_part_exports(mapper):
         assert torch.allclose(mine, theirs, atol=1e-5)
 
 
-def test_weights_come_back_from_disk_and_are_no_detector(mapper, tmp_path):
+def test_weights_round_trip_and_are_no_detector(mapper, tmp_path):
     path = tmp_path / "weights.safetensors"
     checkpoint.save(mapper, path, {"towns": ["Town01"]}, format=FORMAT)
     again = checkpoint.load_as(path, FORMAT, MapModelConfig, MapModel)

@@ -91,7 +91,7 @@ def test_values_and_gradients_are_those_of_the_loop(way):
         assert torch.allclose(mine, theirs, atol=1e-3)
 
 
-def test_what_stands_at_a_pixel_comes_to_lie_where_the_road_is():
+def test_pixel_is_lifted_to_its_position_on_the_road():
     # Two metres up, looking straight ahead at 90 degrees: the road 8 m ahead is 2 / 8 * 32 = 8 rows below the middle.
     cam = camera(pitch=0.0)
     row, column = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
@@ -104,7 +104,7 @@ def test_what_stands_at_a_pixel_comes_to_lie_where_the_road_is():
     assert bev[0, 1, :, 0].tolist() == pytest.approx([40.0, 36.0, 32.0, 28.0, 24.0], abs=1e-3)
 
 
-def test_ground_of_which_a_pixel_covers_too_much_is_unseen():
+def test_ground_beyond_the_maximum_pixel_footprint_is_not_observed():
     # Two metres up, 32 pixels a unit of slope: a pixel d metres ahead covers (d^2 + 4) / 64 m of a level road.
     cam, owner = camera(pitch=0.0), torch.zeros(1, dtype=torch.int64)
     grid = BevGrid(0.0, -0.5, -1.0, 16.0, 0.5, 1.0, pillar=1.0)
@@ -128,7 +128,7 @@ def test_a_certain_depth_puts_the_feature_there_and_nowhere_else():
     assert bool(seen[0, 3, 4:7].all()) and not bool(seen[0, 3, 0])
 
 
-def test_each_agent_has_its_own_cameras_and_one_without_sees_nothing():
+def test_cameras_belong_to_their_agent_and_agents_without_observe_nothing():
     features = torch.stack((torch.full((1, *SIZE), 2.0), torch.full((1, *SIZE), -3.0)))
     bev, seen = lift_ground(features, [camera(), camera()], torch.tensor([2, 0]), 3, GRID, STRIDE)
     assert torch.equal(seen[0], seen[2]) and not bool(seen[1].any())
@@ -138,6 +138,6 @@ def test_each_agent_has_its_own_cameras_and_one_without_sees_nothing():
     assert float(bev[1].abs().max()) == 0
 
 
-def test_a_camera_less_is_refused():
-    with pytest.raises(ShapeError, match="for each of 1 cameras"):
+def test_missing_camera_is_refused():
+    with pytest.raises(ShapeError, match="for 1 cameras"):
         lift_ground(torch.zeros(2, 1, *SIZE), [camera()], torch.zeros(1, dtype=torch.int64), 1, GRID, STRIDE)

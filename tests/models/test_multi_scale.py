@@ -70,7 +70,7 @@ def test_it_starts_as_maximum_fusion():
     assert not torch.equal(fusion()(some).bev.features, plain(some).bev.features)
 
 
-def test_the_order_of_tokens_does_not_matter_and_egos_do_not_meet():
+def test_invariant_to_token_order_and_egos_are_independent():
     some, model = tokens(), fusion()
     order = torch.randperm(50, generator=torch.Generator().manual_seed(1))
     columns = ("features", "xy", "ego", "pose_context", "proposal", "selection_mask")
@@ -86,7 +86,7 @@ def test_the_order_of_tokens_does_not_matter_and_egos_do_not_meet():
     )
 
 
-def test_a_collaborator_a_cell_off_still_meets_the_ego_at_the_coarser_scale():
+def test_pose_error_of_one_cell_shares_a_cell_at_the_coarser_scale():
     """Cells (8, 8) and (8, 9) at stride 4 are apart; at stride 8 both lie nearest to one centre, columns 9 and 10 do not."""
     own, other = GRID.centers(torch.tensor([[8, 9]])), GRID.centers(torch.tensor([[8, 10]]))
     wide = GRID.at(8)

@@ -38,7 +38,7 @@ def boxed(**more) -> BoxKeypointNet:
 
 def test_it_has_as_many_weights_as_the_published_extractor():
     net = DenseKeypointNet(DenseKeypointConfig(in_channels=128))
-    assert sum(p.numel() for p in net.parameters()) == 3_312_640  # specs/pose.md 0.2
+    assert sum(p.numel() for p in net.parameters()) == 3_312_640  # parameters of the published code
 
 
 def test_greedy_suppression_by_hand():
@@ -49,7 +49,7 @@ def test_greedy_suppression_by_hand():
     assert not local_maxima(torch.zeros(1, 4, 4), 1).any()
 
 
-def test_published_points_are_peaks_at_the_corners_of_their_cells_and_padding():
+def test_published_keypoints_are_peaks_at_cell_corners_and_padding():
     cells = [(20, 30), (20, 31), (40, 12), (50, 50), (1, 30)]
     made = view(cells, [0.9, 0.8, 0.5, 0.1, 0.99])
     (points,) = dense(num_keypoints=6)([made])
@@ -70,7 +70,7 @@ def test_without_a_confidence_map_peaks_of_the_features_are_taken():
     assert int((dense(num_keypoints=4)([made])[0].boxes.score > 0).sum()) == 0
 
 
-def test_a_published_descriptor_depends_on_the_other_agent_and_a_mended_one_does_not():
+def test_published_descriptor_depends_on_the_other_agent_and_improved_one_does_not():
     boxes = Boxes.of(torch.tensor([[0.4, 1.2, 0.0]]), torch.tensor([[4.5, 1.9, 1.6]]), torch.tensor([0.3]))
     one = view([(32, 32), (33, 33)], [0.9, 0.1], boxes)
     loud = view([(20, 20)], [0.9])
@@ -84,7 +84,7 @@ def test_a_published_descriptor_depends_on_the_other_agent_and_a_mended_one_does
     assert len(mended([loud])[0]) == 0
 
 
-def test_a_mended_descriptor_turns_with_its_agent():
+def test_improved_descriptor_is_invariant_to_agent_rotation():
     """A quarter turn maps cells of a square lattice onto cells: tokens, their vectors and boxes turn, descriptors stay."""
     shift = 25.4  # centres lie at -25.4 + 0.8 k; a quarter turn about the middle of the lattice keeps them
     grid = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=1)
@@ -108,7 +108,7 @@ def test_a_mended_descriptor_turns_with_its_agent():
     assert float((unturned.descriptor - here.descriptor).norm(dim=1).min()) > 1e-2
 
 
-def test_mended_points_are_the_best_boxes():
+def test_improved_keypoints_are_the_best_boxes():
     n = 5
     boxes = Boxes.of(torch.rand(n, 3) * 10, torch.ones(n, 3), torch.zeros(n), torch.tensor([0.9, 0.8, 0.5, 0.3, 0.1]))
     (points,) = boxed(max_keypoints=3)([view([(32, 32)], [0.5], boxes)])

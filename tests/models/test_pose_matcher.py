@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The matcher's laws: what a plain loop says, permutation, motion, padding, and an assignment by hand."""
+"""The matcher against a plain loop; permutation, motion, padding, and an assignment by hand."""
 
 import math
 from dataclasses import replace
@@ -48,7 +48,7 @@ def last(net: Matcher, a: Keypoints, b: Keypoints) -> torch.Tensor:
 
 
 def test_it_has_as_many_weights_as_the_published_matcher():
-    # specs/pose.md 0.2, less the 8 * 257 of the heads that the published settings switch off.
+    # Parameters of the published code, less the 8 * 257 of the heads that its settings switch off.
     assert sum(p.numel() for p in Matcher(MatcherConfig()).parameters()) == 11_851_601 - 8 * 257
 
 
@@ -120,7 +120,7 @@ def test_padding_changes_nothing(around):
     assert float(both.log_p[0, 3:].max()) < -1000 and float(both.log_p[1, :, 3:].max()) < -1000
 
 
-def test_rotary_positions_hold_under_a_shift_and_not_under_a_turn_and_the_constellation_under_both():
+def test_rotary_encoding_is_invariant_to_shifts_and_neighbour_geometry_also_to_rotation():
     a, b, net = keypoints(6), keypoints(4, 1), matcher()
     shift, turn = Transform.from_xyz_yaw(30.0, -12.0), Transform.from_xyz_yaw(0.0, 0.0, 0.0, 1.0)
     torch.testing.assert_close(last(net, a.transform(shift), b), last(net, a, b), atol=1e-4, rtol=1e-4)
@@ -181,8 +181,8 @@ def test_the_shipped_net_has_a_name_of_its_own(tmp_path, monkeypatch):
         pretrained.load("feakm-small")
 
 
-def test_the_net_that_ships_is_of_the_detector_that_ships():
-    """A detector that is trained anew leaves the shipped net without meaning: it has to be taught again."""
+def test_shipped_matcher_belongs_to_the_shipped_detector():
+    """A retrained detector requires a retrained matcher."""
     net = pretrained.load_feakm()
     net.check_views(pretrained.load().fingerprint)
     assert not net.training and sum(p.numel() for p in net.parameters()) <= 2_000_000

@@ -14,7 +14,7 @@ from manyeyes.models.maps.presets import FORMAT, MAP_TINY
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
-    """A package that ships one map model, beside files that are told apart by their names alone."""
+    """A package with one map model, beside files that only their names distinguish."""
     torch.manual_seed(0)
     small = replace(
         MAP_TINY, head=replace(MAP_TINY.head, num_queries=5, num_learned_queries=0, num_one_to_many_queries=5)
@@ -45,7 +45,7 @@ def test_a_shipped_map_model_comes_ready_with_its_fingerprint(package):
     assert mapper.fingerprint == checkpoint.fingerprint(mapper) != bytes(8)
 
 
-def test_an_unknown_map_model_names_those_that_ship(package):
+def test_unknown_map_model_error_lists_the_shipped_ones(package):
     with pytest.raises(CheckpointError, match="map-small-camera, map-small-lidar"):
         pretrained.load_map_model("map-large")
     with pytest.raises(CheckpointError, match="no such file"):

@@ -45,8 +45,9 @@ def test_rank_in_group_against_a_loop():
     assert rank_in_group(key, value).tolist() == [float(w) for w in wanted]
 
 
-def test_a_fresh_selector_is_confidence_less_repetition():
-    # Two tokens mean the cell (5, 5), the surer from beside it; the third speaks of its own, the fourth believes nothing.
+def test_untrained_selector_is_confidence_minus_redundancy():
+    # Two tokens propose the cell (5, 5), the better from beside it; the third proposes its own cell, the fourth has a
+    # low score.
     some = make_tokens((5, 4, 2.0, 1), (5, 5, 1.0, 0), (20, 20, 0.5, 0), (9, 9, -8.0, 0))
     score = Selector(CHANNELS)(some).detach()
     wanted = torch.tensor([2.0, 1.0 - 2.0 * math.log(2.0), -8.0, 0.5])
@@ -57,7 +58,7 @@ def test_a_fresh_selector_is_confidence_less_repetition():
     assert score.argsort(descending=True).tolist() == [0, 3, 1, 2]
 
 
-def test_what_is_learned_is_added_and_senders_of_a_batch_do_not_repeat_each_other():
+def test_learned_score_is_added_and_senders_of_a_batch_are_independent():
     some = make_tokens((5, 4, 2.0, 1), (5, 5, 1.0, 0))
     selector = Selector(CHANNELS)
     fresh = selector(some).detach()
@@ -96,5 +97,5 @@ def test_the_same_tokens_get_the_same_scores_and_a_larger_budget_keeps_the_small
     assert all(kept(score, n) < kept(score, n + 1) for n in range(39))
 
 
-def test_nothing_to_choose_from():
+def test_selection_of_no_tokens():
     assert Selector(CHANNELS)(make_tokens()).shape == (0,)

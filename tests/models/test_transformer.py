@@ -127,8 +127,8 @@ def test_no_tokens_and_one_token(separate):
 
 
 @pytest.mark.parametrize("separate", (False, True))
-def test_tokens_may_be_permuted_and_moved_by_whole_windows(separate):
-    """A3, A4: their order is nobody's business, and only where a token stands in its window is told."""
+def test_invariant_to_permutation_and_shifts_by_whole_windows(separate):
+    """Outputs do not depend on token order, and only on the position within the window."""
     model, (xy, batch) = transformer(separate_weights=separate), places()
     x, order = features(len(xy)), torch.randperm(len(xy), generator=torch.Generator().manual_seed(2))
     with torch.no_grad():
@@ -158,5 +158,7 @@ def test_the_counters_of_eq_14_order_as_they_must():
 
 
 def test_levels_that_fall_are_an_error():
-    with pytest.raises(ConfigError, match=r"levels are two ascending shares of a window's cells; got \(0.3, 0.2\)"):
+    with pytest.raises(
+        ConfigError, match=r"density_thresholds are two ascending fractions of a window's cells; got \(0.3, 0.2\)"
+    ):
         AttentionConfig(density_thresholds=(0.3, 0.2))

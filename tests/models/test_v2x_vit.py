@@ -88,7 +88,7 @@ def test_windows_of_three_sizes_are_weighed_by_split_attention():
         torch.testing.assert_close(found[i], sum(s * b[i] for s, b in zip(share, branches)), atol=1e-4, rtol=1e-4)
 
 
-def test_it_starts_as_tokens_that_settle_by_trust():
+def test_untrained_fusion_equals_softmax_merge():
     torch.manual_seed(0)
     some, model = tokens(), V2xVitFusion(CHANNELS, CONFIG).eval().requires_grad_(False)
     plain = TokenMerge(CHANNELS, "softmax")
@@ -100,7 +100,7 @@ def test_it_starts_as_tokens_that_settle_by_trust():
 
 
 def test_received_tokens_use_their_own_weights():
-    """The same two tokens on one cell, once both its own and once one heard from the ego's very place, 3 m below."""
+    """The same two tokens on one cell, once both the ego's and once one received from the same place, 3 m below."""
     some, model = tokens(2, 1), speaking(AgentAttention(CHANNELS, HEADS))
     key = torch.zeros(2, dtype=torch.int64)
     own = model(some.features, key, torch.tensor([0, 0]))
@@ -111,7 +111,7 @@ def test_received_tokens_use_their_own_weights():
     assert agent_types(replace(some, pose_context=cue)).tolist() == [0, 1]
 
 
-def test_egos_do_not_meet_and_gradients_reach_every_layer():
+def test_egos_are_independent_and_gradients_reach_every_layer():
     some, model = tokens(), speaking(V2xVitFusion(CHANNELS, CONFIG))
     columns = ("features", "xy", "ego", "pose_context", "proposal", "selection_mask")
     first = model(replace(some, **{name: getattr(some, name)[some.ego == 0] for name in columns}))

@@ -92,5 +92,5 @@ def test_fit_without_tokens_is_refused(detector, toy):
     blind = Detector(detector.config)
     blind.load_state_dict(detector.state_dict())
     blind.eval().requires_grad_(False).token_prune.score.bias.fill_(-100.0)
-    with pytest.raises(ConfigError, match="nothing to fit"):
+    with pytest.raises(ConfigError, match="no codebook can be fitted"):
         fit_codebook(blind, empty)

@@ -130,7 +130,7 @@ def test_a_tensor_grows_at_its_ends_by_zeros_and_a_vector_keeps_its_own():
     assert half is not None and half.dtype == torch.float32 and torch.equal(half, old)
 
 
-def test_what_a_model_has_grown_by_starts_as_if_it_were_not_there(toy, tmp_path):
+def test_added_modules_start_without_effect(toy, tmp_path):
     """From one sweep and plain self-attention to two sweeps and a past: the same boxes, before the first step."""
     plain = dataclasses.replace(COSTR_TINY, sweeps=1, fusion="self-attention", prune_threshold=0.0)
     first = train_detector(dataclasses.replace(TINY, detector=plain, steps=2), small(toy), tmp_path / "first", seed=1)
@@ -178,7 +178,7 @@ def test_a_folder_of_another_run_or_a_cut_state_is_refused(toy, tmp_path):
         DetectorRun(TINY, small(toy), tmp_path, 3)
 
 
-def test_a_loss_that_is_no_number_stops_the_run_and_names_the_step(toy, tmp_path):
+def test_non_finite_loss_stops_the_run_and_names_the_step(toy, tmp_path):
     run = DetectorRun(TINY, small(toy), tmp_path, seed=3)
     with torch.no_grad():
         run.state.model.head.out.bias.fill_(torch.nan)
@@ -252,7 +252,7 @@ def two_processes(folder: Path) -> list[dict]:
     return [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(2)]
 
 
-def test_two_processes_are_one_with_their_batch(toy, tmp_path):
+def test_two_processes_equal_one_with_their_batch(toy, tmp_path):
     """Equal where it can be equal: each process normalises by its own samples (batch statistics, number of boxes, windows to
     tell apart), so one process of four samples and two of two agree to rounding only when those agree, here because all
     samples are alike."""

@@ -42,7 +42,7 @@ def one_box(yaw: float = 0.4) -> Boxes:
 def terms_of(
     some: RawBoxes, targets: Targets, prune: float = 0.0, kept: float = 0.0, information: float = 0.0
 ) -> LossTerms:
-    """All terms, where nothing is pruned or selected unless said."""
+    """All terms, without pruning and selection losses by default."""
     return head_terms(some, targets, *map(torch.tensor, (prune, kept, information)))
 
 
@@ -72,7 +72,7 @@ def test_prune_focal_by_a_loop():
     assert float(got) == pytest.approx(total / 3, rel=1e-5)
 
 
-def test_prune_focal_gives_an_object_of_one_cell_no_more_than_eight_voices():
+def test_prune_focal_limits_the_weight_of_a_cell_to_eight():
     near = torch.tensor([0] + [1] * 99)
     logit = torch.zeros(100, requires_grad=True)
     prune_focal(PruneOutput(Sites(torch.arange(100), GRID), logit), near).backward()
@@ -108,7 +108,7 @@ def test_no_sites_at_all():
     assert float(terms.total(LossConfig()).detach()) == 0.0
 
 
-def test_the_stated_sigma_is_best_where_it_is_the_true_one():
+def test_predicted_sigma_is_optimal_at_the_true_value():
     random = torch.Generator().manual_seed(0)
     errors = torch.randn(20000, 2, generator=random) * 0.37
     log_sigma = torch.linspace(-3, 1, 401)
@@ -119,7 +119,7 @@ def test_the_stated_sigma_is_best_where_it_is_the_true_one():
 
 
 def perfect(truth: Boxes) -> RawBoxes:
-    """Every site says exactly the one box."""
+    """Every site predicts exactly the one box."""
     n = len(SITES)
     values = [torch.zeros(n, w) for w in WIDTHS]
     values[1] = (truth.center[:, :2] - SITES.xy) / GRID.cell_size_m
@@ -134,7 +134,7 @@ def perfect(truth: Boxes) -> RawBoxes:
 
 
 @pytest.mark.parametrize("yaw", (0.4, -1.5, 2.8, -2.9, math.pi / 2 - 1e-3))
-def test_a_perfect_answer_costs_nothing_and_its_opposite_only_direction(yaw):
+def test_perfect_prediction_has_zero_loss_and_opposite_heading_only_direction_loss(yaw):
     truth = one_box(yaw)
     targets = assign_targets(SITES, [truth], TargetConfig())
     terms = terms_of(perfect(truth), targets)

@@ -108,7 +108,7 @@ def test_loss_of_the_truth_is_its_entropy_and_every_part_counts():
         assert float(line_field_loss(RawLineField(*off), [target])) > best + 0.3
 
 
-def test_lines_are_asked_for_where_something_was_seen_and_a_little_beyond():
+def test_lines_are_targets_in_observed_cells_and_a_margin():
     target = make_line_field_target(MapElements.of([np.array([[-20.0, 1.0], [20.0, 1.0]])], [DIVIDER]), TILE, KINDS)
     seen = torch.zeros(1, 10, 20, dtype=torch.bool)
     seen[0, 5, 3] = True

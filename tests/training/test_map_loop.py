@@ -116,7 +116,7 @@ def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path):
         MapRun(CONFIG, Streets(), tmp_path / "broken", seed=4)
 
 
-def test_a_run_remembers_the_weights_that_it_began_from(tmp_path):
+def test_run_state_includes_the_initial_weights(tmp_path):
     one, other = (MapRun(CONFIG, Streets(), tmp_path / "x", seed=n).state.model.state_dict() for n in (1, 2))
     run = MapRun(CONFIG, Streets(), tmp_path / "run", seed=3, start=[one])
     run.advance()
@@ -243,7 +243,7 @@ def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tm
     random = MapRun(config, Streets(), tmp_path / "random", seed=0).state.model.state_dict()
     begun = MapRun(config, Streets(), tmp_path / "begun", 0, [lidar.state_dict(), camera.state_dict()]).state
     state, first, second = (m.state_dict() for m in (begun.model, lidar, camera))
-    # The first that has a tensor has the say; calibration is begun anew; the average begins where the model does.
+    # The first model with a tensor takes precedence; calibration starts anew; the average starts as the model.
     assert all(torch.equal(state[k], v) for k, v in first.items() if k not in ("logit_scale", "logit_shift"))
     assert all(torch.equal(state[k], v) for k, v in second.items() if k.startswith("camera."))
     assert torch.equal(state["logit_scale"], torch.ones(3)) and same_state(begun.average, begun.model)
@@ -277,7 +277,7 @@ def test_subsampling_drops_the_lowest_scores_of_each_frame():
     assert torch.equal(subsample_tokens(tokens, worth, torch.zeros(3)).features, tokens.features)
 
 
-def test_the_decoder_is_taught_after_the_sketch(tmp_path):
+def test_decoder_trains_after_the_line_field(tmp_path):
     run = MapRun(dataclasses.replace(CONFIG, line_field_steps=1), Streets(), tmp_path, seed=0)
     before = {name: p.clone() for name, p in run.state.model.named_parameters()}
     first, second = run.advance(), run.advance()
@@ -293,7 +293,7 @@ def test_the_decoder_is_taught_after_the_sketch(tmp_path):
     assert not any(name.startswith("head.line_field_head") for name in same)
 
 
-def test_two_streets_are_learnt_by_heart(tmp_path):
+def test_two_tiles_can_be_overfitted(tmp_path):
     mapper = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, num_one_to_many_queries=0))
     config = MapTrainConfig(
         mapper,
@@ -327,7 +327,7 @@ def quality(model, streets, truth):
 def test_every_weight_of_the_lidar_path_learns():
     torch.manual_seed(0)
     model = MapModel(TINY)
-    # Branches of the head begin by saying nothing, and what lies before a zero waits for one step.
+    # Branches of the head are zero-initialised, and layers before a zero weight learn one step later.
     with torch.no_grad():
         for branch in (*model.head.class_branches, *model.head.point_branches):
             list(branch.parameters())[-2].normal_(std=0.1)

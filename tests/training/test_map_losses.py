@@ -42,7 +42,7 @@ def random_case(seed, elements=3, queries=5, points=6):
     return where, ring, raw
 
 
-def test_the_loss_does_not_know_from_which_end_a_line_or_where_a_ring_was_begun():
+def test_loss_is_invariant_to_line_direction_and_ring_start():
     where, ring, raw = random_case(0)
     kind = [0, 2, 1]
     total = None
@@ -155,7 +155,7 @@ def test_focal_loss_is_its_formula():
     torch.testing.assert_close(focal_loss(logit, torch.zeros_like(logit)), -0.75 * p**2 * (1 - p).log())
 
 
-def test_a_tile_without_elements_teaches_silence_only():
+def test_tile_without_elements_has_only_negative_classification_loss():
     raw = RawMap(torch.zeros(1, 4, 3, requires_grad=True), torch.rand(1, 4, 6, 2, requires_grad=True))
     empty = MapTarget(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool), torch.zeros(0, 12, 6, 2))
     kind, point, direction = head_terms([raw], [empty], CONFIG)
@@ -180,7 +180,7 @@ def test_of_the_many_queries_each_element_has_several():
     assert float(thrice.total(CONFIG)) == pytest.approx(float(thrice.one_to_many), abs=1e-4)
 
 
-def test_ink_weighs_what_is_drawn_four_times():
+def test_segmentation_weights_positives_four_times():
     logit = torch.zeros(2, 1)
     on, off = (float(segmentation_loss(logit, torch.full((2, 1), v))) for v in (1.0, 0.0))
     assert on == pytest.approx(4 * math.log(2)) and off == pytest.approx(math.log(2))

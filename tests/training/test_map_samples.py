@@ -113,13 +113,13 @@ def test_pose_errors_move_frames_and_not_the_truth():
     assert torch.equal(exact.line_mask, moved.line_mask)
 
 
-def test_a_town_that_judges_may_not_teach():
+def test_evaluation_town_is_refused_in_training():
     assert stream(held_out=("Cton",)).towns == ("Aton", "Bton")
     with pytest.raises(ConfigError, match="bton"):
         stream(held_out=("Bton",))
 
 
-def test_ink_lies_on_the_cells_of_lines_and_fills_crossings():
+def test_line_mask_covers_lines_and_fills_crossings():
     grid = BevGrid(-4.0, -4.0, -1.0, 4.0, 4.0, 1.0, pillar=0.5, stride=2)
     square = [[-1.4, -1.4], [1.4, -1.4], [1.4, 1.4], [-1.4, 1.4]]
     elements = MapElements.of([[[-9.0, 0.1], [9.0, 0.1]], square], [DIVIDER, CROSSING])

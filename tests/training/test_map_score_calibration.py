@@ -12,7 +12,7 @@ LINE = [[0.0, 0.0], [20.0, 0.0]]
 RING = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]]
 
 
-def test_what_is_true_is_length_near_a_line_of_the_same_kind():
+def test_novel_fraction_is_length_near_a_line_of_the_same_kind():
     truth = MapElements.of([LINE, np.array(RING) + [30.0, 0.0]], [DIVIDER, CROSSING])
     beside, half = np.array(LINE) + [0.0, 0.9], np.array(LINE) + [11.0, 0.0]
     drawn = [MapElements.of([line], [DIVIDER]) for line in (beside, np.array(LINE) + [0.0, 1.1], half)]
@@ -24,13 +24,13 @@ def test_what_is_true_is_length_near_a_line_of_the_same_kind():
     assert not novel_fraction(rings, empty).any() and novel_fraction(empty, truth).shape == (0,)
 
 
-def test_what_is_drawn_twice_is_news_once():
+def test_duplicate_is_not_novel():
     truth = MapElements.of([LINE], [DIVIDER])
     first_half, again = np.array([[0.0, 0.3], [10.0, 0.3]]), np.array(LINE) + [0.0, -0.3]
     share = novel_fraction(MapElements.of([first_half, again, LINE], [DIVIDER] * 3), truth)
     # Of the second, what lies beyond the first's reach; of the third, nothing.
     assert share == pytest.approx([1.0, 0.46, 0.0], abs=0.04)
-    # A crossing along a divider tells nothing of the divider.
+    # A crossing beside a divider does not match the divider.
     both = MapElements.of([RING, LINE], [CROSSING, DIVIDER])
     assert novel_fraction(both, truth)[1] == 1.0
 

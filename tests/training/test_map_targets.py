@@ -18,7 +18,7 @@ def test_a_line_has_equal_steps_and_both_its_ends():
     np.testing.assert_allclose(resample_evenly(bent, 5, ring=False), [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]])
 
 
-def test_a_ring_has_no_point_twice_and_does_not_know_where_it_was_begun():
+def test_ring_has_distinct_points_and_is_invariant_to_its_start():
     expected = [[0, 0], [1, 0], [2, 0], [2, 1], [2, 2], [1, 2], [0, 2], [0, 1]]
     for shift in range(4):
         np.testing.assert_allclose(resample_evenly(np.roll(SQUARE, shift, axis=0), 8, ring=True), expected)
@@ -47,7 +47,7 @@ def test_the_set_of_orders_is_that_of_the_reversed_and_of_the_turned(ring):
     assert (same == turned) == ring
 
 
-def test_targets_are_shares_of_the_tile_and_only_of_kinds_that_are_asked_for():
+def test_targets_are_tile_fractions_and_only_of_requested_kinds():
     truth = MapElements.of(
         [[[-10.0, 0.0], [10.0, 0.0]], [[0.0, 0.0], [1.0, 1.0]], SQUARE, [[0.0, -5.0], [0.0, 5.0]]],
         [DIVIDER, STOP_LINE, CROSSING, BOUNDARY],

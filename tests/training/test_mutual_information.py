@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the selector is taught: own task keeps what matters, the receiver's view drops what only the sender sees, the letter all.
+"""Losses of the selector: its own task keeps relevant tokens, the receiver target drops what only the sender sees,
+Eq. 10 drops all.
 
-The toy of detection.md 5.2: 30 windows of three tokens of an object and three of background; the receiver sees half of them.
+The toy: 30 windows of three object tokens and three background tokens; the receiver observes half of them.
 """
 
 from __future__ import annotations
@@ -69,18 +70,18 @@ def test_toy_own_task_keeps_relevant_tokens_for_any_receiver():
     assert shared_ground < 0.1 and own_ground < 0.1
 
 
-def test_the_toy_the_receivers_view_drops_what_the_sender_alone_sees():
+def test_toy_receiver_target_drops_what_only_the_sender_observes():
     shared, shared_ground, own, own_ground = learned(lambda m: receiver_mutual_information(met(m)), 1.0)
     assert shared > 0.5 and own < 0.1 and own_ground < 0.1
     assert shared_ground < shared
 
 
-def test_the_toy_the_letter_drops_everything():
+def test_toy_paper_target_drops_everything():
     assert max(learned(lambda m: paper_mutual_information(met(m)), 1.0)) < 0.1
 
 
 @pytest.mark.parametrize("related", (True, False))
-def test_the_letter_cannot_tell_related_from_unrelated(related):
+def test_paper_information_cannot_separate_related_from_unrelated(related):
     """M1: Eq. 11 of unit z at tau = 0.1 lies within 0.05 of zero, whatever the two sides have to do with each other."""
     random = torch.Generator().manual_seed(1)
     one = functional.normalize(torch.randn(WINDOWS, 64, generator=random), dim=1)
@@ -141,7 +142,7 @@ def test_without_two_windows_to_compare_only_the_price_is_left():
         assert not grad.any()
 
 
-def test_windows_are_those_of_the_tokens_places_and_nothing_learns_but_the_mask():
+def test_windows_follow_token_positions_and_only_the_mask_has_gradients():
     grid = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
     yx = torch.tensor([[0, 0], [7, 7], [8, 8], [31, 31]])
     rows = torch.randn(4, 8 + PROPOSAL_DIM, generator=torch.Generator().manual_seed(0)).requires_grad_()

@@ -11,7 +11,7 @@ from manyeyes.training.detector.samples import AugmentConfig
 from manyeyes.training.detector.step import forward
 
 
-def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):
+def test_one_frame_can_be_overfitted(toy, tmp_path):
     recording = toy(agents_n=2, scenarios=("toy_0",), frames=1, ground_points=100)
     schedule = {"steps": 160, "batch": 1, "learning_rate": 8e-3, "warmup_steps": 10, "ema_decay": 0.9}
     run = DetectorRun(TrainConfig(COSTR_TINY, augment=AugmentConfig.none(), **schedule), recording, tmp_path, seed=0)
@@ -33,7 +33,7 @@ def test_one_frame_is_learnt_to_the_last_box(toy, tmp_path):
     truth = sample.merged_gt_boxes[nearest]
     assert sorted(nearest.tolist()) == [*range(6)]
     assert float(best.score.min()) > 0.3 and not (together.score[6:] > 0.5 * best.score.min()).any()
-    # The heading too, and not only the axis, is right where the detector says that it knows; it knows most of them.
+    # The heading too, and not only the axis, is right where p_flip is low; it is low for most boxes.
     sure = best.p_flip < 0.3
     assert int(sure.sum()) >= 4 and bool(((best.yaw - truth.yaw.float()).cos()[sure] > 0.95).all())
     error = (best.center[:, :2] - truth.center[:, :2].float()).norm(dim=1)

@@ -139,7 +139,7 @@ def test_cached_snapshot_round_trip_and_damaged_file_error(tmp_path):
         read_cached_snapshot(path)
 
 
-def test_views_are_kept_by_the_weights_that_made_them_and_made_once(toy, tmp_path, monkeypatch):
+def test_views_are_cached_once_per_detector_fingerprint(toy, tmp_path, monkeypatch):
     recording = toy(agents_n=2, frames=3, points_per_car=20, ground_points=60)
     assert select_snapshots(recording, 2) == [("toy_0", 0), ("toy_0", 2), ("toy_1", 0), ("toy_1", 2)]
     torch.manual_seed(0)
@@ -208,7 +208,7 @@ def test_augmentation_moves_points_and_keeps_truth(cache, tmp_path):
     assert all(torch.equal(a.xy, b.xy) for a, b in zip(plain._perturb(full, "ego", 0), full, strict=True))
 
 
-def test_a_batch_is_learnt_by_heart_and_gives_the_pose(cache, tmp_path):
+def test_batch_can_be_overfitted_and_gives_the_pose(cache, tmp_path):
     config = replace(TINY, steps=150, batch=4, learning_rate=3e-3, warmup_steps=5, ema_decay=0.9)
     run = FeakmRun(config, cache, tmp_path, 0)
     first, *_, last = [run.advance() for _ in range(150)]
@@ -236,5 +236,5 @@ def test_the_published_net_takes_a_step_and_resumes(cache, tmp_path):
 
 
 def test_settings_that_contradict_each_other_are_refused():
-    with pytest.raises(ConfigError, match="near_m <= far_m"):
+    with pytest.raises(ConfigError, match="match_radius_m <= unmatched_radius_m"):
         replace(TINY, match_radius_m=3.0)

@@ -57,7 +57,7 @@ def test_every_box_still_holds_its_points(toy, name):
 
 
 @pytest.mark.parametrize("name", AUGMENTS)
-def test_what_others_saw_lands_in_the_boxes_of_the_union(toy, name):
+def test_points_of_others_lie_in_the_merged_boxes(toy, name):
     for number in range(6):
         some = sample(toy(), AUGMENTS[name], number)
         for view in some.views:
@@ -84,7 +84,7 @@ def test_motions_stay_rigid_and_the_ego_is_first(toy):
             assert torch.allclose(turn @ turn.mT, torch.eye(3).double(), atol=1e-9) and float(torch.det(turn)) > 0
 
 
-def test_turning_changes_relative_headings_and_scale_changes_sizes(toy):
+def test_rotation_changes_relative_headings_and_scale_changes_sizes(toy):
     plain, turned = (sample(toy(), AUGMENTS[n], 3) for n in ("none", "turn"))
     yaw = [float(s.views[-1].ego_from_view.yaw) for s in (plain, turned)]
     assert len(turned.views) > 1 and abs(yaw[0] - yaw[1]) > 0.01
@@ -119,7 +119,7 @@ def test_early_fusion_merges_the_clouds_in_the_ego_frame_now_and_before(toy):
     assert inside(view.visible_boxes.after(-0.1), view.previous_cloud.xyz).tolist() == [180] * 6
 
 
-def test_boxes_beyond_the_range_and_the_ego_itself_are_not_asked_for(toy):
+def test_boxes_out_of_range_and_the_ego_itself_are_no_targets(toy):
     small = BevGrid(-8.0, -8.0, -3.0, 8.0, 8.0, 5.0)
     snapshot = toy().snapshot("toy_0", 0)
     some = make_sample([snapshot], 0, small, NONE, ("test", 0))
@@ -170,7 +170,7 @@ def test_an_epoch_is_the_judged_frames(toy):
     assert epoch_length(toy(frames=3)) == 6
 
 
-def test_claimed_poses_are_what_the_network_trains_with(toy):
+def test_training_uses_reported_poses(toy):
     # A displaced claim moves the tokens, never the truth.
     snapshot = toy().snapshot("toy_0", 0)
     off = Transform.from_xyz_yaw(1.5, 0.0)
@@ -239,7 +239,7 @@ def without(snapshot: Snapshot, row: int) -> Snapshot:
     return dataclasses.replace(snapshot, frames=tuple(snapshot.frames[i] for i in keep), truth=left)
 
 
-def test_an_agent_that_was_not_there_yet_speaks_of_now(toy):
+def test_agent_absent_in_the_past_is_undelayed(toy):
     moments = [without(toy().snapshot("toy_0", i), 1) for i in range(4)] + [toy().snapshot("toy_0", 4)]
     some = make_sample(moments, 0, GRID, NONE, ("test", 0), LATE)
     (fresh,) = (view for view in some.views[1:] if view.age_s == 0)
@@ -247,7 +247,7 @@ def test_an_agent_that_was_not_there_yet_speaks_of_now(toy):
     assert len(some.views) == 3 and any(view.age_s > 0 for view in some.views)
 
 
-def test_an_ego_that_was_not_there_yet_has_no_past(toy):
+def test_ego_absent_in_the_past_has_no_history(toy):
     moments = [without(toy().snapshot("toy_0", i), 0) for i in range(4)] + [toy().snapshot("toy_0", 4)]
     some = make_sample(moments, 0, GRID, NONE, ("test", 0), LATE)
     assert some.ego_history == () and not len(some.views[0].previous_cloud)
@@ -295,7 +295,7 @@ def test_pose_errors_match_their_reported_sigmas(toy):
     assert float((yaw > 0).float().mean()) == pytest.approx(0.75 * 0.5, abs=0.07)
 
 
-def test_shares_of_the_late_the_lost_and_the_few(toy):
+def test_frequencies_of_delay_loss_and_budget(toy):
     recording = toy(cars=1, points_per_car=1, ground_points=1)
     moments = [recording.snapshot("toy_0", i) for i in range(5)]
     road = DegradationConfig(
@@ -324,7 +324,7 @@ def test_shares_of_the_late_the_lost_and_the_few(toy):
     assert below == pytest.approx(0.5, abs=0.08)
 
 
-def test_a_plain_road_leaves_everything_as_it_is(toy):
+def test_no_degradation_changes_nothing(toy):
     for view in driven(toy(), TURN, DegradationConfig()).views:
         assert (view.age_s, view.sigma_xy_m, view.sigma_yaw_rad, view.loss_fraction, view.max_tokens) == (
             0,

@@ -54,7 +54,7 @@ def arriving(view: AgentView, score: Tensor, number: int = 0) -> list[int]:
     return _select_delivered(rows, torch.cat((torch.full((100,), 99.0), score)), view, ("test", number)).tolist()
 
 
-def test_a_budget_lets_the_best_through_and_near_ties_by_chance(sample):
+def test_budget_selects_the_best_and_near_ties_at_random(sample):
     view = replace(sample.views[1], max_tokens=10)
     score = torch.linspace(-10, 10, 40)[torch.randperm(40, generator=torch.Generator().manual_seed(0))]
     best = set((100 + score.sort(descending=True).indices[:10]).tolist())
@@ -67,14 +67,14 @@ def test_a_budget_lets_the_best_through_and_near_ties_by_chance(sample):
     assert int(counts.min()) > 20 and int(counts.max()) < 90
 
 
-def test_a_budget_larger_than_the_message_and_none_at_all_take_everything(sample):
+def test_large_or_absent_budget_selects_everything(sample):
     view, score = sample.views[1], torch.randn(30)
     for keep in (None, 30, 1000):
         assert arriving(replace(view, max_tokens=keep), score) == [*range(100, 130)]
     assert arriving(replace(view, max_tokens=5, loss_fraction=0.5), score[:0]) == []
 
 
-def test_what_is_lost_is_lost_by_packets(sample):
+def test_loss_is_per_packet(sample):
     view, score = replace(sample.views[1], loss_fraction=0.4), torch.arange(400.0)
     left = 0
     for number in range(20):
@@ -94,7 +94,7 @@ def test_budget_fills_packets_by_descending_score(sample):
     assert {row - 100 for row in rows} == {t for p in packets for t in range(8 * p, min(8 * p + 8, 20))}
 
 
-def test_the_same_key_loses_the_same(sample):
+def test_packet_loss_is_keyed(sample):
     view, score = (
         replace(sample.views[1], max_tokens=20, loss_fraction=0.5),
         torch.randn(100, generator=torch.Generator().manual_seed(1)),
@@ -103,7 +103,9 @@ def test_the_same_key_loses_the_same(sample):
 
 
 def test_selection_passes_its_gradient_straight_through_and_changes_no_value(detector, sample):
-    """M6: under a budget the selector's weights learn from the boxes of the hearer; values are those of plain tokens."""
+    """Under a budget the selector's weights receive gradients from the fused boxes; values equal those of plain
+    tokens.
+    """
     model = detector.eval()
     n = int((forward(model, [sample]).shared_tokens.sites.batch == 1).sum())
     assert n > 40
@@ -121,7 +123,9 @@ def test_selection_passes_its_gradient_straight_through_and_changes_no_value(det
 
 def test_ego_history_is_used_without_gradient(detector, sample):
     model = detector.eval()
-    ego_history, sender_history = (_history_tokens(model, [sample], which, 0.0) for which in ("past", "said"))
+    ego_history, sender_history = (
+        _history_tokens(model, [sample], which, 0.0) for which in ("ego_history", "sender_history")
+    )
     assert [round(part.age_s, 6) for part in ego_history] == [0.1, 0.2] and [
         round(part.age_s, 6) for part in sender_history
     ] == [0.1]
@@ -144,14 +148,14 @@ def test_ego_history_is_used_without_gradient(detector, sample):
 
 def test_budget_and_packet_loss_also_apply_to_sender_history(detector, sample):
     model = detector.eval()
-    whole = _history_tokens(model, [sample], "said", 0.0)[0]
+    whole = _history_tokens(model, [sample], "sender_history", 0.0)[0]
     cut = replace(sample, sender_history=tuple(replace(view, max_tokens=5) for view in sample.sender_history))
-    few = _history_tokens(model, [cut], "said", 0.0)[0]
+    few = _history_tokens(model, [cut], "sender_history", 0.0)[0]
     assert len(few.tokens) == 5 < len(whole.tokens)
     detector.train()
 
 
-def test_every_part_of_the_model_learns_from_a_step_on_the_road(detector, sample):
+def test_every_parameter_has_a_gradient_under_degradation(detector, sample):
     detector.train().zero_grad()
     past = detector.fusion.past_attention
     torch.nn.init.normal_(past.out.weight, std=0.1)
@@ -170,7 +174,7 @@ def test_every_part_of_the_model_learns_from_a_step_on_the_road(detector, sample
     assert all(bool(torch.isfinite(p.grad).all()) for p in detector.parameters() if p.grad is not None)
 
 
-def test_study_targets_meet_in_the_egos_windows_and_teach_the_selector_alone(detector, sample):
+def test_study_targets_use_the_egos_windows_and_train_only_the_selector(detector, sample):
     model = detector.eval()
     model.zero_grad()
     torch.nn.init.normal_(model.selector.outer.weight, std=0.1)

@@ -47,7 +47,7 @@ def test_two_boxes_of_one_cell_get_a_token_each(stride):
     assert targets.box[len(sites) // 2 + 2] == 0
 
 
-def test_a_box_whose_cells_were_not_seen_takes_the_nearest_within_reach_or_none():
+def test_box_without_observed_cells_takes_the_nearest_within_the_radius_or_none():
     grid = GRID.at(4)
     some = Sites(torch.tensor([0, 1]), grid)
     x, y = some.xy[1].tolist()

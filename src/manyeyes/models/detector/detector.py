@@ -34,7 +34,7 @@ class DetectorConfig:
     Attributes:
         grid: perception range of an agent and pillar size.
         pillars: type of the pillar encoder.
-        prune_threshold: cells with a lower probability of lying near an object are dropped.
+        prune_threshold: cells with a lower probability of being near an object are dropped.
         output_range: range of the reported boxes where it is smaller than grid; None for all of grid.
         sweeps: number of consecutive sweeps in the input.
         codebook: of the token encoding; None before one is fitted.

@@ -13,7 +13,7 @@ from manyeyes.datatypes import Sites, SparseBev
 
 @dataclass(frozen=True)
 class PruneOutput:
-    """Input of one pruning layer: its sites and the logit (N,) of each lying near an object."""
+    """Input of one pruning layer: its sites and the logit (N,) of each being near an object."""
 
     sites: Sites
     logit: Tensor

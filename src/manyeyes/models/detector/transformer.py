@@ -38,7 +38,8 @@ class AttentionConfig:
         low, medium = self.density_thresholds
         if not 0 <= low <= medium:
             raise ConfigError(
-                f"AttentionConfig.levels are two ascending shares of a window's cells; got {self.density_thresholds}."
+                "AttentionConfig.density_thresholds are two ascending fractions of a window's cells; got "
+                f"{self.density_thresholds}."
             )
 
 

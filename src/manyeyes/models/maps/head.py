@@ -87,7 +87,7 @@ class MapHeadConfig:
             raise ConfigError(f"MapHeadConfig needs channels divisible by heads and two points or more; got {self}.")
         if not 0 <= self.num_learned_queries < self.num_queries:
             raise ConfigError(
-                f"MapHeadConfig.learned are fewer than its {self.num_queries} elements; got {self.num_learned_queries}."
+                f"MapHeadConfig.num_learned_queries must be below num_queries ({self.num_queries}); got {self.num_learned_queries}."
             )
         if not self.kinds or not set(self.kinds) <= set(KINDS) or len(set(self.kinds)) != len(self.kinds):
             raise ConfigError(f"MapHeadConfig.kinds are some of {', '.join(KINDS)}; got {self.kinds}.")

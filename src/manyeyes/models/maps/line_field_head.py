@@ -28,7 +28,7 @@ MAX_LINE_OFFSET = 1.5
 TRACE_STEP = 1.2
 """Step length of a trace, in cells."""
 DUPLICATE_DISTANCE = 1.25
-"""Distance in cells within which a seed counts as lying on a traced line of its class."""
+"""Distance in cells within which a seed belongs to a traced line of its class."""
 DUPLICATE_SCORE = 0.01
 """Score assigned to a proposal that overlaps a higher-scored one."""
 

@@ -46,7 +46,7 @@ class MapModelConfig:
 
     def __post_init__(self) -> None:
         if self.tile.stride != 1:
-            raise ConfigError(f"MapperConfig.tile is given at stride 1; got {self.tile.stride}.")
+            raise ConfigError(f"MapModelConfig.tile is given at stride 1; got {self.tile.stride}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class MapModel(nn.Module):
             net(inputs) for net, inputs in ((self.lidar, clouds), (self.camera, images)) if net is not None and inputs
         ]
         if not branches:
-            raise ConfigError(f"This mapper has {', '.join(self.config.bev.sensors)}; give what they saw.")
+            raise ConfigError(f"This map model has {', '.join(self.config.bev.sensors)}; give their data.")
         features, seen = torch.stack([e[0] for e in branches], 1), torch.stack([e[1] for e in branches], 1)
         merged = self.token_projection(masked_max(features, seen, features.new_zeros(features.shape[2])))
         flat = merged.permute(0, 2, 3, 1).flatten(0, 2)

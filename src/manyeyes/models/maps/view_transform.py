@@ -211,6 +211,6 @@ def _average_cameras(
 def _check(features: Tensor, cameras: Sequence[Camera], agent_of_camera: Tensor) -> None:
     if features.dim() != 4 or len(cameras) != features.shape[0] or agent_of_camera.shape != (len(cameras),):
         raise ShapeError(
-            f"Lifting needs features (V, C, h, w) and an owner (V,) for each of {len(cameras)} cameras; got "
+            f"Lifting needs features (V, C, h, w) and agent_of_camera (V,) for {len(cameras)} cameras; got "
             f"{tuple(features.shape)} and {tuple(agent_of_camera.shape)}."
         )

@@ -74,7 +74,7 @@ class FeakmNet(nn.Module):
         """Raise ConfigError where the network was trained on views of another detector than this fingerprint."""
         if self.config.detector and self.config.detector != detector.hex():
             raise ConfigError(
-                f"This net of FeaKM was taught on views of the weights {self.config.detector}, these are {detector.hex()}; "
+                f"This FeaKM network was trained on views of the weights {self.config.detector}, these are {detector.hex()}; "
                 "train it on this detector: manyeyes train --preset feakm-small --weights DETECTOR."
             )
 

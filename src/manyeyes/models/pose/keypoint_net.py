@@ -42,7 +42,7 @@ class DetectorView:
     def __post_init__(self) -> None:
         if self.confidence.shape != (len(self.tokens.sites),) or self.tokens.sites.batch_size != 1:
             raise ShapeError(
-                f"A View is of one agent and needs confidence ({len(self.tokens.sites)},); got "
+                f"A DetectorView is of one agent and needs confidence ({len(self.tokens.sites)},); got "
                 f"{tuple(self.confidence.shape)} on {self.tokens.sites.batch_size} grids."
             )
 
@@ -80,7 +80,9 @@ class DenseKeypointConfig:
 
     def __post_init__(self) -> None:
         if 2 ** len(self.widths) != DESCRIPTOR_STRIDE:
-            raise ConfigError(f"DenseKeypoints.widths needs three widths, one a halving; got {self.widths}.")
+            raise ConfigError(
+                f"DenseKeypointConfig.widths needs three widths, one per downsampling; got {self.widths}."
+            )
 
 
 class DenseKeypointNet(nn.Module):

@@ -117,7 +117,7 @@ def fit_codebook(
         report(sum(map(len, rows)))
     if not any(map(len, rows)):
         raise ConfigError(
-            "No agent tells a token in these frames, so there is nothing to fit a codebook to: train first."
+            "No agent shares a token in these frames, so no codebook can be fitted: train the detector first."
         )
     return with_codebook(detector, torch.cat(rows), seed, config or CodebookConfig())
 

@@ -152,7 +152,7 @@ def _load_weights(model: Detector, start: Path) -> None:
     if odd or not begun:
         raise CheckpointError(
             f"{start}: cannot start this preset, tensor {(odd or sorted(state))[0]} does not fit; "
-            "start from weights of its own kind."
+            "start from weights of the same architecture."
         )
     model.load_state_dict(begun, strict=False)
 

@@ -276,7 +276,7 @@ class _AugmentedScene:
 def _truth(snapshot: Snapshot) -> GroundTruth:
     if snapshot.truth is None:
         raise ConfigError(
-            f"Scenario {snapshot.scenario}, frame {snapshot.index} has no truth: it cannot train or judge a detector."
+            f"Scenario {snapshot.scenario}, frame {snapshot.index} has no truth: it cannot be used for training or evaluation."
         )
     return snapshot.truth
 

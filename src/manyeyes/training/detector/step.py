@@ -30,6 +30,9 @@ from manyeyes.training.detector.targets import TargetConfig, assign_targets, fin
 TOKENS_PER_PACKET = 8
 """Number of tokens lost together: a packet of 1,398 bytes holds about as many float16 features."""
 
+_HISTORY_KEYS = {"ego_history": "past", "sender_history": "said"}
+"""Parts of random keys; other values would change every training run."""
+
 
 @dataclass(frozen=True)
 class ForwardOutput:
@@ -71,7 +74,7 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
             parts.append(part)
             number += 1
     ego_history, sender_history = (
-        _history_tokens(model, samples, which, prune_threshold) for which in ("past", "said")
+        _history_tokens(model, samples, which, prune_threshold) for which in ("ego_history", "sender_history")
     )
     tokens = to_ego_frame([*parts, *ego_history, *sender_history], shared.grid, len(samples))
     ego_past = to_ego_frame(ego_history, shared.grid, len(samples)) if ego_history else None
@@ -99,14 +102,13 @@ def _select_delivered(rows: Tensor, score: Tensor, view: AgentView, key: tuple[i
 
 @torch.no_grad()
 def _history_tokens(
-    model: Detector, samples: list[Sample], which: Literal["past", "said"], prune_threshold: float | None
+    model: Detector,
+    samples: list[Sample],
+    which: Literal["ego_history", "sender_history"],
+    prune_threshold: float | None,
 ) -> list[AgentTokens]:
-    """Compute the tokens of earlier instants, of egos ("past") or collaborators ("said"), without gradient."""
-    views = [
-        (ego, view)
-        for ego, sample in enumerate(samples)
-        for view in getattr(sample, {"past": "ego_history", "said": "sender_history"}[which])
-    ]
+    """Compute the tokens of earlier instants, of egos or of collaborators, without gradient."""
+    views = [(ego, view) for ego, sample in enumerate(samples) for view in getattr(sample, which)]
     if not views:
         return []
     seen = model.extract_features([v.cloud for _, v in views], [v.previous_cloud for _, v in views], prune_threshold)
@@ -114,7 +116,7 @@ def _history_tokens(
     score, batch, xy = model.score_tokens(shared), shared.sites.batch, shared.sites.xy
     parts = []
     for number, (ego, view) in enumerate(views):
-        key = (*samples[ego].key, which, number)
+        key = (*samples[ego].key, _HISTORY_KEYS[which], number)
         rows = _select_delivered((batch == number).nonzero()[:, 0], score, view, key)
         parts.append(_agent_tokens(ego, view, shared.features[rows], xy[rows]))
     return parts

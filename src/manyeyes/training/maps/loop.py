@@ -161,6 +161,6 @@ def _begin_from(model: MapModel, start: Sequence[Mapping[str, torch.Tensor]]) ->
         }
         if not fitting:
             raise ConfigError(
-                "None of the given weights' tensors fits this preset; begin from a map model of its size."
+                "None of the given weights' tensors fits this preset; start from a map model of its size."
             )
         model.load_state_dict(fitting, strict=False)

@@ -85,7 +85,9 @@ class FeakmTrainConfig:
 
     def __post_init__(self) -> None:
         if not 0 < self.match_radius_m <= self.unmatched_radius_m or self.steps < 1 or self.batch < 1:
-            raise ConfigError("FeakmTrainConfig needs 0 < near_m <= far_m, steps >= 1 and batch >= 1.")
+            raise ConfigError(
+                "FeakmTrainConfig needs 0 < match_radius_m <= unmatched_radius_m, steps >= 1 and batch >= 1."
+            )
 
 
 FEAKM_TRAINING_PRESETS: dict[str, FeakmTrainConfig] = {

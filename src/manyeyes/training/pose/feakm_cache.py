@@ -87,7 +87,7 @@ def make_pair(scene: CachedSnapshot, ego: int, other: int) -> ViewPair:
 def select_snapshots(recording: Recording, frame_stride: int = 3) -> list[tuple[str, int]]:
     """Select every frame_stride-th evaluated snapshot with at least two agents; consecutive ones are nearly equal."""
     if frame_stride < 1:
-        raise ConfigError(f"Every how many snapshots is at least 1; got {frame_stride}.")
+        raise ConfigError(f"frame_stride must be at least 1; got {frame_stride}.")
     found = [
         (scenario, index)
         for scenario in recording.scenarios
@@ -127,7 +127,7 @@ def _run_detectors(caches: dict[int, PerceptionCache], snapshot: Snapshot) -> li
 def _poses(snapshot: Snapshot) -> Transform:
     if snapshot.truth is None:
         raise RecordingError(
-            f"Snapshot {snapshot.index} of '{snapshot.scenario}' has no truth; a matcher is taught by true poses."
+            f"Snapshot {snapshot.index} of '{snapshot.scenario}' has no truth; a matcher is trained with true poses."
         )
     return snapshot.truth.world_from_agent
 
@@ -157,9 +157,7 @@ def read_cached_snapshot(path: Path) -> CachedSnapshot:
             grid = BevGrid(**json.loads(file.metadata()["grid"]))
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
-        raise RecordingError(
-            f"{path}: not a whole file of views ({error}); delete it, and it is made again."
-        ) from error
+        raise RecordingError(f"{path}: not a whole file of views ({error}); delete it to have it rebuilt.") from error
     poses = Transform.from_matrix(state["world_from_agent"])
     views = []
     for i in range(len(poses.translation)):
