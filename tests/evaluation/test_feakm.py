@@ -117,7 +117,7 @@ def test_a_net_of_another_detector_is_refused():
     net = FeakmNet(replace(one.corrector.net.config, detector="00" * 8))
     FeakmVariant("a", one.detector, FeakmCorrector(net, solve_with_ransac))
     net = FeakmNet(replace(one.corrector.net.config, detector="ab" * 8))
-    with pytest.raises(ConfigError, match="taught on views of the weights abab"):
+    with pytest.raises(ConfigError, match="trained on views of the weights abab"):
         FeakmVariant("a", one.detector, FeakmCorrector(net, solve_with_ransac))
 
 
