@@ -22,7 +22,6 @@ from manyeyes.maps.baselines import (
 )
 from manyeyes.maps.baselines._common import LOG_ODDS_HIT, LOG_ODDS_MISS, MAX_LOG_ODDS, BaselineRules, filter_elements
 from manyeyes.maps.baselines._raster import find_longest_walks, label_components, skeletonize
-from manyeyes.maps.baselines.assignment import assign
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, VectorMap
 
@@ -266,19 +265,6 @@ def test_the_builder_matches_one_to_one_adds_the_rest_and_suppresses_what_lies_o
     assert (first[0].tolist(), first[-1].tolist()) == ([0.0, 0.5], [40.0, 0.8])
     # 10.5 matches nothing (1.5 m from 9.0) and, more confident, suppresses it: their buffers overlap.
     assert lines_in(made)[2][0, 1] == 10.5
-
-
-def test_the_cheapest_assignment_agrees_with_scipy() -> None:
-    optimize = pytest.importorskip("scipy.optimize")
-    rng = np.random.default_rng(1)
-    for shape in ((1, 1), (4, 4), (3, 7), (9, 5), (12, 12), (0, 3), (3, 0)):
-        cost = rng.uniform(0, 9, shape)
-        cost[cost > 6] = 1e4
-        got = assign(cost)
-        rows = np.flatnonzero(got >= 0)
-        assert len(rows) == min(shape) == len(set(got[rows].tolist()))
-        want = cost[optimize.linear_sum_assignment(cost)].sum() if min(shape) else 0.0
-        assert cost[rows, got[rows]].sum() == pytest.approx(want, abs=1e-9)
 
 
 def test_the_heat_map_joins_pieces_into_one_line_between_them() -> None:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from manyeyes.datatypes import MissingExtraError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements, Polygons
@@ -29,7 +30,6 @@ from manyeyes.maps.baselines._common import (
     filter_elements,
     to_vector_map,
 )
-from manyeyes.maps.baselines.assignment import assign
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.ops.polyline import close_rings, cut_line, project_onto_line, resample, simplify
@@ -104,7 +104,9 @@ def _add_observation(
         ]
         shapes = [pool.elements.polyline(r) for r in local]
         cost = _match_costs(shapes, [built[k].points for k in known_rows], kind, config)
-        matched_column = assign(cost)
+        matched_column = np.full(len(shapes), -1)
+        matched, columns = linear_sum_assignment(cost)
+        matched_column[matched] = columns
         for shape, row, column in zip(shapes, local.tolist(), matched_column.tolist()):
             score, weight = float(pool.elements.score[row]), float(lengths[row])
             if column < 0 or cost[local.tolist().index(row), column] > config.max_match_m[kind]:

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
-from manyeyes.ops.assignment import assign
 from manyeyes.pose.baselines._common import fit_pose, make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
@@ -60,8 +60,8 @@ def _assigned(here: np.ndarray, there: np.ndarray, config: FeacoConfig) -> np.nd
     )
     if not len(rows) or not len(columns):
         return np.zeros((0, 2), np.int64)
-    pairs = assign(apart[np.ix_(rows, columns)])
-    pairs = np.stack((rows[pairs[:, 0]], columns[pairs[:, 1]]), 1)
+    row, column = linear_sum_assignment(apart[np.ix_(rows, columns)])
+    pairs = np.stack((rows[row], columns[column]), 1)
     cost = apart[pairs[:, 0], pairs[:, 1]]
     off = np.abs(cost - np.median(cost))
     return pairs[off <= config.max_deviations * max(float(np.median(off)), 1e-9)]

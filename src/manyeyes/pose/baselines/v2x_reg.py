@@ -13,8 +13,8 @@ from typing import Literal
 
 import numpy as np
 import torch
+from scipy.optimize import linear_sum_assignment
 
-from manyeyes.ops.assignment import assign
 from manyeyes.ops.box_iou import pairwise_iou
 from manyeyes.pose.baselines._common import fit_pose, make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
@@ -45,7 +45,7 @@ def correct(
         return no_estimate(prior)
     a, b = ego[rows_e], other[rows_o]
     affinity = _affinity(a, b, config)
-    pairs = assign(-affinity)
+    pairs = np.stack(linear_sum_assignment(-affinity), 1)
     found = affinity[pairs[:, 0], pairs[:, 1]]
     min_affinity = found.max() if found.max() <= config.max_weak_affinity else config.min_affinity
     pairs, weight = pairs[(found >= min_affinity) & (found > 0)], found[(found >= min_affinity) & (found > 0)]

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
-from manyeyes.ops.assignment import assign
 from manyeyes.pose.baselines._common import fit_pose, make_estimate
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
@@ -45,7 +45,7 @@ def correct(
         vector = affinity @ vector
         vector /= np.linalg.norm(vector)
     weight = vector.reshape(len(a), len(b))
-    pairs = assign(-weight)
+    pairs = np.stack(linear_sum_assignment(-weight), 1)
     strong = weight[pairs[:, 0], pairs[:, 1]]
     pairs, strong = (
         pairs[strong >= config.min_weight_fraction * strong.max()],

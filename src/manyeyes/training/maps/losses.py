@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from manyeyes.models.maps.head import RawMap
-from manyeyes.ops.assignment import assign
 from manyeyes.training.maps.targets import MapTarget
 
 ALPHA, GAMMA = 0.25, 2.0
@@ -112,7 +113,7 @@ def match_queries(logit: Tensor, point: Tensor, target: MapTarget, config: MapLo
         distance = torch.cdist(point.flatten(1), target.orders.flatten(0, 1).flatten(1), p=1).view(-1, elements, orders)
         min_distance, best = distance.min(2)
         cost = config.classification * _focal_cost(logit)[:, target.kind] + config.point * min_distance
-        pairs = torch.from_numpy(assign(cost.double().numpy()).copy())
+        pairs = torch.from_numpy(np.stack(linear_sum_assignment(cost.double().numpy()), 1))
         query, element = pairs[
             min_distance[pairs[:, 0], pairs[:, 1]] <= config.max_match_distance * point.shape[1]
         ].unbind(1)
