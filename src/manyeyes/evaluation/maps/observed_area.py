@@ -9,16 +9,19 @@ half a crossing is no truth that any map should be held against.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import MissingExtraError
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.datatypes.map_element import CROSSING, MapElements
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
+
+_shapely = partial(import_extra, "shapely", "map", "cutting the truth to what was observed")
 
 Floats = NDArray[np.float64]
 MIN_PART_LENGTH_M, MIN_CROSSING_FRACTION = 2.0, 0.5
@@ -26,7 +29,7 @@ MIN_PART_LENGTH_M, MIN_CROSSING_FRACTION = 2.0, 0.5
 
 def compute_observed_area(views: Sequence[Floats], poses: Floats) -> BaseGeometry:
     """The union of field-of-view polygons (K, 2), agents' frames, at true poses (N, 3) of x, y, yaw."""
-    shapely = _import_shapely()
+    shapely = _shapely()
     polygons = []
     for view, (x, y, yaw) in zip(views, np.asarray(poses, dtype=np.float64)):
         c, s = np.cos(yaw), np.sin(yaw)
@@ -36,7 +39,7 @@ def compute_observed_area(views: Sequence[Floats], poses: Floats) -> BaseGeometr
 
 def clip_to_area(elements: MapElements, area: BaseGeometry) -> MapElements:
     """The elements inside an area; scores and styles are kept."""
-    shapely = _import_shapely()
+    shapely = _shapely()
     shapely.prepare(area)
     rows: list[int] = []
     parts: list[Floats] = []
@@ -69,11 +72,3 @@ def replace_geometry(elements: MapElements, rows: Sequence[int], parts: Sequence
     mean = np.add.reduceat(elements.sigma, elements.offsets[:-1]) / elements.counts if len(elements) else np.zeros(0)
     sigma = np.repeat(mean[index], [len(part) for part in parts]) if len(parts) else np.zeros(0)
     return MapElements.of(parts, elements.kind[index], elements.score[index], sigma, elements.style[index])
-
-
-def _import_shapely() -> Any:
-    try:
-        import shapely
-    except ImportError as error:
-        raise MissingExtraError("map", "cutting the truth to what was observed") from error
-    return shapely

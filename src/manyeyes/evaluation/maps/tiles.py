@@ -11,17 +11,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, MissingExtraError, Transform
+from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, Transform
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.datatypes.map_element import CROSSING, MapElements
 from manyeyes.evaluation.maps.observed_area import MIN_PART_LENGTH_M, replace_geometry
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
+
+_shapely = partial(import_extra, "shapely", "map", "cutting the true map to tiles")
 
 Floats = NDArray[np.float64]
 
@@ -61,7 +65,7 @@ def check_town_split(training_towns: Sequence[str], evaluation_towns: Sequence[s
 
 def crop_to_tile(truth: MapElements, world_from_tile: Transform, tile: BevGrid) -> MapElements:
     """What of the elements (world) lies in the tile, in the tile's frame."""
-    shapely = _import_shapely()
+    shapely = _shapely()
     x, y, yaw = to_xy_yaw(world_from_tile.inverse())
     local = truth.transform(x, y, yaw)
     box = shapely.box(tile.x_min, tile.y_min, tile.x_max, tile.y_max)
@@ -83,7 +87,7 @@ def place_side_by_side(maps: Sequence[MapElements]) -> MapElements:
 
 
 def _clip_to_box(points: Floats, ring: bool, box: BaseGeometry) -> list[Floats]:
-    shapely = _import_shapely()
+    shapely = _shapely()
     if ring:
         shape = shapely.make_valid(shapely.polygons(points))
         found = shapely.get_parts(shapely.intersection(shape, box))
@@ -97,11 +101,3 @@ def to_xy_yaw(transform: Transform) -> tuple[float, float, float]:
     """x, y and yaw of a motion."""
     x, y, _ = transform.translation.tolist()
     return x, y, float(transform.yaw)
-
-
-def _import_shapely() -> Any:
-    try:
-        import shapely
-    except ImportError as error:
-        raise MissingExtraError("map", "cutting the true map to tiles") from error
-    return shapely

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from manyeyes.datatypes import MissingExtraError
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements, Polygons
 from manyeyes.maps.baselines._common import (
     BaselineRules,
@@ -34,6 +35,8 @@ from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.ops.polyline import close_rings, cut_line, project_onto_line, resample, simplify
 from manyeyes.ops.polyline_distance import directed_distance
+
+_shapely = partial(import_extra, "shapely", "map", "Building a map observation by observation")
 
 _FAR_M = 1e4
 
@@ -172,11 +175,3 @@ def _view_polygon(observation: Observation) -> Any:
     view = Polygons.of([observation.view])
     ring = MapElements.of([view.ring(0)], CROSSING).transform(*observation.pose.tolist())
     return _shapely().Polygon(ring.points).buffer(1.0)
-
-
-def _shapely() -> Any:
-    try:
-        import shapely
-    except ImportError as error:
-        raise MissingExtraError("map", "Building a map observation by observation") from error
-    return shapely

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
 
 import numpy as np
 
-from manyeyes.datatypes import MissingExtraError
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.datatypes.map_element import CROSSING
 from manyeyes.maps.baselines._common import (
     BaselineRules,
@@ -35,6 +35,8 @@ from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.roads.lane_links import connected_components
 from manyeyes.ops.polyline import find_near_pairs, points_at_stations, project_onto_line, simplify
 from manyeyes.ops.polyline_distance import min_distance
+
+_shapely = partial(import_extra, "shapely", "map", "Merging crossings")
 
 
 @dataclass(frozen=True)
@@ -159,11 +161,3 @@ def blur_image(image: Floats, sigma_cells: float) -> Floats:
         windows = np.lib.stride_tricks.sliding_window_view(padded, len(kernel), axis=axis)
         image = windows @ kernel
     return image
-
-
-def _shapely() -> Any:
-    try:
-        import shapely
-    except ImportError as error:
-        raise MissingExtraError("map", "Merging crossings") from error
-    return shapely

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._io import atomic_replace
-from manyeyes.datatypes import MissingExtraError, ShapeError
+from manyeyes.datatypes import ShapeError
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.datatypes.map_element import DEFAULT_SIGMA_M, KINDS, NO_STYLE, STYLES, MapElements, Polygons
 from manyeyes.maps.elements.observation import (
     FORMAT_VERSION,
@@ -26,6 +28,8 @@ from manyeyes.maps.elements.observation import (
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+_pyarrow = partial(import_extra, "pyarrow", "map", "Observations as Parquet")
 
 METADATA_KEY = b"manyeyes"
 CRS = "local transverse Mercator, WGS 84, scale 1"
@@ -111,7 +115,7 @@ def read_observations(source: Path | str, frame: MapFrame | None = None) -> Load
 
 def observation_table(observations: Sequence[Observation], frame: MapFrame) -> pa.Table:
     """Observations as an Arrow table whose metadata name the format, its version and the frame."""
-    pa = _arrow()
+    pa = _pyarrow()
     elements = MapElements.cat([o.elements for o in observations])
     at_point = pa.StructArray.from_arrays(
         [*(pa.array(elements.points[:, k]) for k in range(2)), pa.array(elements.sigma)], ["x", "y", "sigma"]
@@ -182,7 +186,7 @@ def _open(
     file: Path, expected: MapFrame | None
 ) -> tuple[MapFrame, Iterator[tuple[int, Observation | tuple[int, str]]]]:
     """The frame that a file states and its rows; raises ObservationError where the file as a whole cannot be used."""
-    pa, pq = _arrow(), _parquet()
+    pa, pq = _pyarrow(), _parquet()
     try:
         opened = pq.ParquetFile(file, page_checksum_verification=True)
     except (pa.ArrowException, OSError) as error:
@@ -196,7 +200,7 @@ def _open(
 
 def _iterate_file_rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[int, str]]]:
     """Row by row; a group of rows that cannot be decoded is put aside as one."""
-    pa = _arrow()
+    pa = _pyarrow()
     start = 0
     for group in range(opened.num_row_groups):
         count = opened.metadata.row_group(group).num_rows
@@ -243,7 +247,7 @@ class _ObservationColumns:
     """A table's nested columns, taken apart once; rows are cut out of them as views."""
 
     def __init__(self, table: pa.Table) -> None:
-        pa = _arrow()
+        pa = _pyarrow()
         schema = _schema(pa)
         self.columns: dict[str, Any] = {}
         for wanted in schema:
@@ -415,16 +419,8 @@ def _line(error: BaseException) -> str:
     return " ".join(str(error).split())
 
 
-def _arrow() -> Any:
-    try:
-        import pyarrow
-    except ImportError as error:
-        raise MissingExtraError("map", "Observations as Parquet") from error
-    return pyarrow
-
-
 def _parquet() -> Any:
-    _arrow()
+    _pyarrow()
     import pyarrow.parquet
 
     return pyarrow.parquet

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._io import atomic_replace
-from manyeyes.datatypes import ManyeyesError, MissingExtraError
+from manyeyes.datatypes import ManyeyesError
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, take_rows
 from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import STATES, PointEvidence, Topology, VectorMap
@@ -25,6 +27,10 @@ from manyeyes.maps.formats.attributes import Attributes, to_degrees, to_hex_ids
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+_shapely = partial(import_extra, "shapely", "map", "Maps as WKB geometry")
+
+_pyarrow = partial(import_extra, "pyarrow", "map", "Maps as GeoParquet")
 
 FORMAT_VERSION = 1
 _ROW_GROUP_SIZE = 8192
@@ -384,19 +390,3 @@ def _write(table: pa.Table, path: Path) -> None:
 
     with atomic_replace(path) as temporary:
         parquet.write_table(table, temporary, compression="zstd", row_group_size=_ROW_GROUP_SIZE, store_schema=True)
-
-
-def _pyarrow() -> Any:
-    try:
-        import pyarrow
-    except ImportError:
-        raise MissingExtraError("map", "Maps as GeoParquet") from None
-    return pyarrow
-
-
-def _shapely() -> Any:
-    try:
-        import shapely
-    except ImportError:
-        raise MissingExtraError("map", "Maps as WKB geometry") from None
-    return shapely

@@ -13,15 +13,19 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import ManyeyesError, MissingExtraError
+from manyeyes.datatypes import ManyeyesError
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.maps.roads.lane_links import build_junctions, complete_lane_links, resample_borders
 from manyeyes.maps.roads.road_network import PAVED, Crossing, Lane, RoadMark, RoadNetwork
+
+_shapely = partial(import_extra, "shapely", "map", "Reading V2X-Seq maps")
 
 Array = NDArray[np.float64]
 
@@ -156,14 +160,6 @@ def _borders(lanes: Sequence[Lane]) -> list[RoadMark]:
         else:
             marks.append(RoadMark(line, "curb", "", 0.0))
     return marks
-
-
-def _shapely() -> Any:
-    try:
-        import shapely
-    except ImportError:
-        raise MissingExtraError("map", "Reading V2X-Seq maps") from None
-    return shapely
 
 
 __all__ = ["V2xSeqMapError", "read_v2x_seq_map"]

@@ -23,17 +23,20 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from functools import partial
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import MissingExtraError
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements
 from manyeyes.maps.roads.road_network import PAVED, Lane, RoadMark, RoadNetwork
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
+
+_shapely = partial(import_extra, "shapely", "map", "The truth of a map")
 
 Array = NDArray[np.float64]
 
@@ -422,14 +425,6 @@ def _lane_polygons(lanes: Sequence[Lane]) -> NDArray[np.object_]:
 
 def _one_hot_style(name: str) -> Array:
     return np.eye(len(STYLES))[STYLES.index(name)]
-
-
-def _shapely() -> Any:
-    try:
-        import shapely
-    except ImportError:
-        raise MissingExtraError("map", "The truth of a map") from None
-    return shapely
 
 
 __all__ = ["GroundTruthPolicy", "build_ground_truth_map", "compute_junction_region", "cut_elements"]

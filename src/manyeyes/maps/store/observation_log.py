@@ -17,6 +17,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._io import atomic_replace, atomic_write, remove_unfinished
-from manyeyes.datatypes import ManyeyesError, MissingExtraError
+from manyeyes.datatypes import ManyeyesError
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.maps.elements.observation import MapFrame, Observation, shorten
 from manyeyes.maps.elements.observation_file import (
     InvalidRow,
@@ -35,6 +37,8 @@ from manyeyes.maps.elements.observation_file import (
 )
 from manyeyes.maps.elements.observation_limits import LIMITS
 from manyeyes.maps.store.log_index import ActiveObservations, IndexRow, InvalidEntry, LogIndex
+
+_parquet = partial(import_extra, "pyarrow.parquet", "map", "A log of observations")
 
 TILE_M = 256.0
 # Observations of a tile stand together, so that reading a tile decodes little else.
@@ -296,11 +300,3 @@ def _groups(path: Path) -> int:
     except (ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{path}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
-
-
-def _parquet() -> Any:
-    try:
-        from pyarrow import parquet
-    except ImportError:
-        raise MissingExtraError("map", "A log of observations") from None
-    return parquet

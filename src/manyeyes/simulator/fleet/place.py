@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import ConfigError, MissingExtraError
+from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes.extras import import_extra
 from manyeyes.datatypes.map_element import CROSSING, MapElements
 from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.formats.argoverse2_map import read_argoverse2_map, read_argoverse2_poses
@@ -28,6 +29,8 @@ from manyeyes.simulator.scene.towns import GENERATED, TOWNS, load_town
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
+
+_shapely = partial(import_extra, "shapely", "map", "A place to map")
 
 Array = NDArray[np.float64]
 
@@ -198,11 +201,3 @@ def _data(data: str | None) -> Path:
     raise ConfigError(
         "The real maps are not here: give data= or set MANYEYES_MAPS, a folder with 'av2' and 'lanelet2'; 'grid' needs no file."
     )
-
-
-def _shapely() -> Any:
-    try:
-        import shapely
-    except ImportError:
-        raise MissingExtraError("map", "A place to map") from None
-    return shapely
