@@ -107,7 +107,12 @@ def cut_line(line: Floats, start_m: float, end_m: float) -> Floats:
 
 def simplify(line: Floats, tolerance_m: float) -> Floats:
     """(K', 2) by Douglas and Peucker (1973): no point left out lies farther than the tolerance from what stays."""
-    return line[_simplify(freeze(line, np.float64), tolerance_m)]
+    return line[select_vertices(line, tolerance_m)]
+
+
+def select_vertices(line: Floats, tolerance_m: float) -> NDArray[np.bool_]:
+    """(K,) which vertices of a line (K, 2) stay when it is simplified; both ends do."""
+    return _simplify(freeze(line, np.float64), tolerance_m)
 
 
 def find_near_pairs(bounds: Floats, max_gap_m: float) -> Ints:

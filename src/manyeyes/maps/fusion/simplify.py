@@ -6,11 +6,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x2, I64x1, njit
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.ops.polyline import select_vertices
 
 
 def simplify_map(vector_map: VectorMap, tolerance_m: float) -> VectorMap:
@@ -21,7 +22,11 @@ def simplify_map(vector_map: VectorMap, tolerance_m: float) -> VectorMap:
     if not tolerance_m >= 0:
         raise ConfigError(f"Expected a tolerance of 0 m or more; got {tolerance_m}.")
     e = vector_map.elements
-    kept = _select_points(e.points, e.offsets, e.closed, tolerance_m)
+    kept = np.zeros(len(e.points), np.bool_)
+    for start, end, closed in zip(e.offsets, e.offsets[1:], e.closed):
+        if start < end:
+            points = e.points[start:end]
+            kept[start:end] = _select_ring(points, tolerance_m) if closed else select_vertices(points, tolerance_m)
     # A ring that would fall together into a line stays as it is.
     flat = e.closed & (np.bincount(e.element_of_point, kept, len(e)) < 3)
     kept |= flat[e.element_of_point]
@@ -30,52 +35,11 @@ def simplify_map(vector_map: VectorMap, tolerance_m: float) -> VectorMap:
     return replace(vector_map, elements=elements, point_evidence=vector_map.point_evidence.take(np.flatnonzero(kept)))
 
 
-@njit(cache=True)
-def _select_points(
-    points: F64x2, offsets: I64x1, closed: Boolx1, tolerance: float
-) -> Boolx1:  # pragma: no cover - compiled
-    """(P,) bool: the points that stay."""
+def _select_ring(points: NDArray[np.float64], tolerance_m: float) -> NDArray[np.bool_]:
+    """(P,) which points of a ring stay: it is cut at its first point and at the one farthest from that."""
+    far = int(np.square(points - points[0]).sum(1).argmax())
+    there, back = points[: far + 1], np.concatenate((points[far:], points[:1]))
     kept = np.zeros(len(points), np.bool_)
-    stack = np.zeros((2 * len(points) + 4, 2), np.int64)
-    for row in range(len(offsets) - 1):
-        start, end = offsets[row], offsets[row + 1]
-        if end <= start:
-            continue
-        last = end - 1
-        kept[start] = True
-        depth = 0
-        if closed[row]:
-            far, max_squared = start, -1.0
-            for k in range(start, end):
-                squared = (points[k, 0] - points[start, 0]) ** 2 + (points[k, 1] - points[start, 1]) ** 2
-                if squared > max_squared:
-                    far, max_squared = k, squared
-            kept[far] = True
-            stack[0, 0], stack[0, 1] = start, far
-            # ``end`` stands for the first point again: the ring's closing edge.
-            stack[1, 0], stack[1, 1] = far, end
-            depth = 2
-        else:
-            kept[last] = True
-            stack[0, 0], stack[0, 1] = start, last
-            depth = 1
-        while depth:
-            depth -= 1
-            a, b = stack[depth, 0], stack[depth, 1]
-            ax, ay = points[a]
-            bx, by = points[start] if b == end else points[b]
-            dx, dy = bx - ax, by - ay
-            square = dx * dx + dy * dy
-            far, max_squared = -1, tolerance * tolerance
-            for k in range(a + 1, b):
-                px, py = points[k, 0] - ax, points[k, 1] - ay
-                along = 0.0 if square == 0.0 else min(max((px * dx + py * dy) / square, 0.0), 1.0)
-                squared = (px - along * dx) ** 2 + (py - along * dy) ** 2
-                if squared > max_squared:
-                    far, max_squared = k, squared
-            if far >= 0:
-                kept[far] = True
-                stack[depth, 0], stack[depth, 1] = a, far
-                stack[depth + 1, 0], stack[depth + 1, 1] = far, b
-                depth += 2
+    kept[: far + 1] = select_vertices(there, tolerance_m)
+    kept[far:] |= select_vertices(back, tolerance_m)[:-1]
     return kept
