@@ -22,7 +22,7 @@ export OMP_NUM_THREADS ?= 1
 help:
 	@echo "make demo    simulate a drive, evaluate the methods on it: table, figures, report in $(OUT)"
 	@echo "make test    every test"
-	@echo "make check   formatting, lint, types, floors"
+	@echo "make check   formatting, lint, types, layers"
 	@echo "make wheel   build the wheel and run demo, pose and map fuse from it in an empty environment"
 	@echo "make format  rewrite the sources in the house format"
 	@echo "make bench   the speed benchmarks, each with its stored result"
