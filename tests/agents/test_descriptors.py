@@ -107,7 +107,7 @@ def test_nets_with_other_descriptors_or_other_weights_are_refused(drive, detecto
     long = FeakmNet(replace(NET, keypoints=BoxKeypointConfig(CHANNELS, 64, 16), matcher=MatcherConfig(64, 16, 1, 1)))
     with pytest.raises(ConfigError, match="32 numbers each; this net has 64"):
         extract_own_keypoints(long, cache, frame)
-    with pytest.raises(ConfigError, match="taught on views of the weights abab"):
+    with pytest.raises(ConfigError, match="trained on views of the weights abab"):
         extract_own_keypoints(FeakmNet(replace(NET, detector="ab" * 8)), cache, frame)
     extract_own_keypoints(FeakmNet(replace(NET, detector=detector.fingerprint.hex())), cache, frame)
 
