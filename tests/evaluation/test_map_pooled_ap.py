@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many maps judged as one list: the numbers are map_quality's, intervals are over blocks, differences are paired."""
+"""Many maps judged as one list: the numbers are those of ``metrics``, intervals are over blocks, differences are paired."""
 
 import math
 

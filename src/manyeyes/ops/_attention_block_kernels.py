@@ -2,7 +2,7 @@
 """A whole block of window attention (CoSTr Eq. 4, 6, 7) in one compiled call: for inference on the CPU.
 
 A few hundred tokens are little work for each of the thirty tensor operations of a block; here products run at the rate of
-``pair_loops``, and norms, encodings and activations are loops that a compiler turns into vectors.
+``_sparse_conv_kernels``, and norms, encodings and activations are loops that a compiler turns into vectors.
 ``models.detector.transformer`` is the twin with gradients.
 """
 

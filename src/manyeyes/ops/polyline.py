@@ -116,7 +116,7 @@ def select_vertices(line: Floats, tolerance_m: float) -> NDArray[np.bool_]:
 
 
 def find_near_pairs(bounds: Floats, max_gap_m: float) -> Ints:
-    """(K, 2) pairs of rows i < j, ascending, whose boxes (N, 4) are at most reach_m apart along both axes."""
+    """(K, 2) pairs of rows i < j, ascending, whose boxes (N, 4) are at most max_gap_m apart along both axes."""
     boxes = np.array(bounds, np.float64)
     boxes[:, :2] -= max_gap_m / 2
     boxes[:, 2:] += max_gap_m / 2
@@ -142,7 +142,7 @@ def find_near_pairs(bounds: Floats, max_gap_m: float) -> Ints:
 
 
 def find_near_pairs_between(a_bounds: Floats, b_bounds: Floats, max_gap_m: float) -> Ints:
-    """(K, 2) rows of a and of b, ascending, whose boxes are at most reach_m apart along both axes."""
+    """(K, 2) rows of a and of b, ascending, whose boxes are at most max_gap_m apart along both axes."""
     pairs = find_near_pairs(np.concatenate((a_bounds, b_bounds)), max_gap_m)
     between_sets = pairs[(pairs[:, 0] < len(a_bounds)) & (pairs[:, 1] >= len(a_bounds))]
     return between_sets - (0, len(a_bounds))

@@ -39,7 +39,7 @@ def find_discrepancies(
     observed: MapElements | None = None,
     max_distance_m: float = 1.0,
 ) -> MapDiscrepancy:
-    """Where a fused map, the truth and the observations (all in the map's frame) are farther apart than within_m."""
+    """Where a fused map, the truth and the observations (all in the map's frame) are farther apart than max_distance_m."""
     return MapDiscrepancy(
         false_positives=[] if truth is None else find_unmatched_segments(fused, truth, max_distance_m),
         false_negatives=[] if truth is None else find_unmatched_segments(truth, fused, max_distance_m),

@@ -102,9 +102,9 @@ def resample_lines(lines: Lines, protocol: MatchingProtocol) -> Lines:
 
 
 def compute_chamfer(predicted: Lines, truth: Lines, protocol: MatchingProtocol, max_distance_m: float) -> Floats:
-    """(N, M) Chamfer distances; inf where the bounding boxes are farther apart than reach_m, or the way sees no pair.
+    """(N, M) Chamfer distances; inf where the boxes are farther apart than max_distance_m, or the protocol leaves the pair out.
 
-    No Chamfer distance is below the gap between the boxes, so that thresholds up to reach_m are judged exactly.
+    No Chamfer distance is below the gap between the boxes, so that thresholds up to max_distance_m are judged exactly.
     """
     table = np.full((len(predicted), len(truth)), np.inf)
     if table.size == 0:
@@ -169,7 +169,7 @@ def compute_all_point_ap(ranked: NDArray[np.bool_], n_truth: int) -> float:
 
 
 def _find_nearby_pairs(a: Floats, b: Floats, max_distance_m: float) -> Ints:
-    """(K, 2) pairs of rows whose boxes are at most reach_m apart."""
+    """(K, 2) pairs of rows whose boxes are at most max_distance_m apart."""
     gap_x = np.maximum(np.maximum(a[:, None, 0] - b[None, :, 2], b[None, :, 0] - a[:, None, 2]), 0.0)
     gap_y = np.maximum(np.maximum(a[:, None, 1] - b[None, :, 3], b[None, :, 1] - a[:, None, 3]), 0.0)
     return np.argwhere(np.hypot(gap_x, gap_y) <= max_distance_m).astype(np.int64)
