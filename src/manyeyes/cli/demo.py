@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from manyeyes._bounds import Fraction, PositiveInt, Seed
 from manyeyes.datatypes import ConfigError
 from manyeyes.studies.replay_options import ReplayOptions, display_name, make_excerpt
 
@@ -30,15 +31,15 @@ class Options:
 
     out: Path = Path("out/demo")
     """Folder for the recording, pictures, animation, report and JSON."""
-    seed: int = 0
+    seed: Seed = 0
     """Another seed, another drive."""
     towns: Path | None = None
     """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
-    frames: int | None = None
+    frames: PositiveInt | None = None
     """At most so many judged frames, instead of all."""
     animate: bool = True
     """Draw the animation of the drive."""
-    min_score: float = 0.4
+    min_score: Fraction = 0.4
     """Detections below this score are not drawn; they count all the same."""
     replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(channel="its-g5-27mbps"))
     """How agents collaborate."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from manyeyes._bounds import PositiveInt, Seed
 from manyeyes.studies.replay_options import FileChecks
 
 
@@ -21,11 +22,11 @@ class Options:
     """Weights that 'manyeyes train' wrote. They are kept as they are; a codebook that they have is replaced."""
     split: str | None = "train"
     """Which split of a dataset: a folder inside it."""
-    stages: int = 4
+    stages: PositiveInt = 4
     """Bytes for the features of a token."""
-    frame_stride: int = 10
+    frame_stride: PositiveInt = 10
     """Use every n-th of the evaluated frames."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the first centres."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""

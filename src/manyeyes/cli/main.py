@@ -102,6 +102,7 @@ def _run_command(command: str, arguments: Sequence[str]) -> int:
     try:
         import tyro
 
+        from manyeyes.cli.bounds import find_violation
         from manyeyes.datatypes.errors import ManyeyesError
 
         module = importlib.import_module(module_of(command))
@@ -111,7 +112,10 @@ def _run_command(command: str, arguments: Sequence[str]) -> int:
         # Options of a nested dataclass keep their short names: --channel, not --playing.channel.
         tyro_config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
         prog, about = f"manyeyes {command}", module.__doc__
-        module.main(tyro.cli(module.Options, args=list(arguments), prog=prog, description=about, config=tyro_config))
+        options = tyro.cli(module.Options, args=list(arguments), prog=prog, description=about, config=tyro_config)
+        if violation := find_violation(options):
+            return _fail(violation, 2)
+        module.main(options)
     except ManyeyesError as error:
         return _fail(" ".join(str(error).split()), 1)
     except OSError as error:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
+from manyeyes._bounds import Fraction, NonNegativeFloat, PositiveInt, Seed
 from manyeyes.studies.replay_options import FileChecks, display_name, make_excerpt
 
 if TYPE_CHECKING:
@@ -35,22 +36,22 @@ class Options:
     """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
     scenario: str | None = None
     """Which scenario; the first by default."""
-    frames: int = 60
+    frames: PositiveInt = 60
     """At most so many judged frames."""
     correctors: tuple[str, ...] = ("identity", "voting")
     """Any of vote, given, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist, v2x-reg-oiou, mash, feakm, or a .safetensors
     file of FeaKM; of whole clouds register and gicp."""
-    noise_xy_m: float = 0.0
+    noise_xy_m: NonNegativeFloat = 0.0
     """Standard deviation of errors of collaborators' claimed positions."""
-    noise_yaw_deg: float = 0.0
+    noise_yaw_deg: NonNegativeFloat = 0.0
     """Standard deviation of errors of collaborators' claimed headings, degrees."""
     no_prior: bool = False
     """Claim nothing: correctors get no pose to start from."""
-    min_score: float = 0.3
+    min_score: Fraction = 0.3
     """Detections below this score are no landmarks."""
     weights: str = "costr-small"
     """Shipped weights by name, or a .safetensors file of 'manyeyes train'."""
-    seed: int = 0
+    seed: Seed = 0
     """Of pose errors."""
     out: Path = Path("out/pose")
     """Folder for pose.json."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import tyro
 
+from manyeyes._bounds import Fraction, NonNegativeInt, PositiveInt, Seed
 from manyeyes.studies.replay_options import FileChecks, ReplayOptions, display_name, make_excerpt
 
 
@@ -21,17 +22,17 @@ class Options:
     """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
     scenario: str | None = None
     """Which scenario; the first by default."""
-    frames: int = 60
+    frames: PositiveInt = 60
     """At most so many judged frames."""
-    frame: int | None = None
+    frame: NonNegativeInt | None = None
     """Index of the instant that is pictured; the middle one by default."""
     out: Path = Path("out/replay")
     """Folder for pictures, animation, report and JSON."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the channel's losses and jitter."""
     animate: bool = True
     """Draw the animation of the drive."""
-    min_score: float = 0.4
+    min_score: Fraction = 0.4
     """Detections below this score are not drawn; they count all the same."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate."""

@@ -7,6 +7,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from manyeyes._bounds import PositiveInt, Seed
+
 
 @dataclass(frozen=True)
 class Options:
@@ -16,9 +18,9 @@ class Options:
     """Which set of scenarios; an unknown name lists the known ones."""
     out: Path | None = None
     """Folder for the splits and the manifest, data/PRESET or data/PRESET-cameras; a run that was stopped goes on there."""
-    seed: int = 0
+    seed: Seed = 0
     """Another seed, other scenes."""
-    workers: int = os.cpu_count() or 1
+    workers: PositiveInt = os.cpu_count() or 1
     """How many processes share the work."""
     towns: Path | None = None
     """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""

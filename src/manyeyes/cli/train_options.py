@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from manyeyes._bounds import NonNegativeFloat, PositiveInt, Seed
 from manyeyes.studies.replay_options import FileChecks
 
 
@@ -21,19 +22,19 @@ class Options:
     """Settings by name; an unknown name lists the known ones."""
     out: Path | None = None
     """Folder of the run, runs/PRESET by default: weights.safetensors, log.jsonl, loss.png, train.json, last.pt to go on from."""
-    seed: int = 0
+    seed: Seed = 0
     """Of weights, samples and augmentation."""
-    steps: int | None = None
+    steps: PositiveInt | None = None
     """Steps of the optimiser, instead of the preset's."""
-    batch: int | None = None
+    batch: PositiveInt | None = None
     """Samples a step over all processes, instead of the preset's."""
-    learning_rate: float | None = None
+    learning_rate: NonNegativeFloat | None = None
     """Instead of the preset's."""
     weights: tuple[Path, ...] = ()
     """Weights to begin from instead of random ones, such as those of the stage before. Of a map model several, each what it has in
     common with the preset, the first before the others. For feakm and feakm-paper the detector whose view they match, a shipped
     one by default."""
-    threads: int = 1
+    threads: PositiveInt = 1
     """Threads of torch in each process; the result is the same only for the same number."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""

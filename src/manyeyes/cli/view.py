@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from manyeyes._bounds import Fraction, NonNegativeInt, PositiveFloat, PositiveInt
 from manyeyes.datatypes import BevGrid, Boxes, ConfigError, Snapshot
 from manyeyes.studies.replay_options import ReplayOptions, make_excerpt
 
@@ -31,19 +32,19 @@ class Options:
     """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
     scenario: str | None = None
     """Which scenario; the first by default."""
-    frame: int | None = None
+    frame: NonNegativeInt | None = None
     """Index of the frame; the first judged one by default. An animation starts there."""
-    frames: int = 60
+    frames: PositiveInt = 60
     """At most so many frames of an animation."""
     out: Path = Path("out/view.png")
     """The file: .png for a frame, .gif or .webp for the drive."""
-    half_extent_m: tuple[float, float] = (70.4, 38.4)
+    half_extent_m: tuple[PositiveFloat, PositiveFloat] = (70.4, 38.4)
     """How far the picture reaches ahead and aside, metres; with --detect the detector's range counts."""
-    width: int = 1280
+    width: PositiveInt = 1280
     """Of the picture, pixels."""
     detect: str | None = None
     """Also draw what one method finds: none, late, intermediate or early."""
-    min_score: float = 0.4
+    min_score: Fraction = 0.4
     """Detections below this score are not drawn."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate, with --detect."""

@@ -7,6 +7,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from manyeyes._bounds import NonNegativeFloat, NonNegativeInt, PositiveInt, Seed
 from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 
 
@@ -23,21 +24,21 @@ class Options:
     protocol: str = "global-sort"
     """Evaluation protocol: global-sort, opencood, coalign, sparsealign; on DAIR-V2X also dair, heal-dair, costr-dair,
     sparsealign-dair."""
-    noise_xy_m: float = 0.0
+    noise_xy_m: NonNegativeFloat = 0.0
     """Standard deviation of errors of collaborators' claimed positions."""
-    noise_yaw_deg: float = 0.0
+    noise_yaw_deg: NonNegativeFloat = 0.0
     """Standard deviation of errors of collaborators' claimed headings, degrees."""
     all_egos: bool = False
     """Judge every agent as ego, not only the first."""
-    seed: int = 0
+    seed: Seed = 0
     """Of losses, jitter and pose errors."""
-    workers: int = os.cpu_count() or 1
+    workers: PositiveInt = os.cpu_count() or 1
     """How many processes share the scenarios; results do not depend on it."""
-    timing_frames: int = 10
+    timing_frames: NonNegativeInt = 10
     """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate."""
-    frame_stride: int = 1
+    frame_stride: PositiveInt = 1
     """Judge each so many-th frame of those that the recording judges."""
     study: str | None = None
     """robustness, bandwidth, num-agents, ablation, shared-bandwidth, pose-noise-ap, pose-estimation, feakm or qualitative; finished
@@ -45,7 +46,7 @@ class Options:
     perturbations: tuple[str, ...] = ()
     """Those that the studies 'robustness' and 'pose-noise-ap' play, by the names of their tables, such as "0.4 s" "30 % lost"
     or "2°, 2 m" "0.8 m"; by default all."""
-    budgets: tuple[int, ...] = ()
+    budgets: tuple[PositiveInt, ...] = ()
     """Budgets in bytes: of a message in the study 'bandwidth', of all messages of a snapshot in 'shared-bandwidth'; by default the
     study's own."""
     token_selection: tuple[str, ...] = ()

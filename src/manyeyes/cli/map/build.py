@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from manyeyes._bounds import NonNegativeFloat, PositiveInt, Seed
 from manyeyes.datatypes import ConfigError
 from manyeyes.studies.replay_options import FileChecks
 
@@ -31,7 +32,7 @@ class Options:
     """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout; or a root in DAIR-V2X's."""
     split: str | None = None
     """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
-    scenarios: int | None = None
+    scenarios: PositiveInt | None = None
     """At most so many scenarios, the first ones; all by default."""
     source: Literal["model", "truth"] = "model"
     """What draws: a map model; or, as an oracle for all that follows, the true map with the errors of a simulated crowd."""
@@ -40,16 +41,16 @@ class Options:
     map_mode: Literal["local", "semi-global"] = "local"
     """local: 30 x 30 m ahead of a vehicle, 50 x 30 m ahead of a roadside unit, each from its own frame. semi-global: 120 x 60 m
     around each agent, with the features of the others."""
-    frame_stride: int = 5
+    frame_stride: PositiveInt = 5
     """Use every n-th frame."""
     channel: str = "ideal"
     """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
-    pose_sigma: float = 0.0
+    pose_sigma: NonNegativeFloat = 0.0
     """Standard deviation of errors added to claimed positions, metres; headings err in proportion, 1 degree a metre."""
     map: Path | None = None
     """The true map of a recording that no town is named after, in its world: an intersection of V2X-Seq (.json), a map of Argoverse
     2 (log_map_archive_*.json), or Lanelet2's .osm; without it such a map is made, not judged."""
-    seed: int = 0
+    seed: Seed = 0
     """Of errors and losses."""
     out: Path = Path("out/map-build")
     """Folder for the maps, one a town: observations, truth, map, page, picture; and build.json."""

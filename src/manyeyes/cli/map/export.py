@@ -8,6 +8,8 @@ from pathlib import Path
 
 import tyro
 
+from manyeyes._bounds import NonNegativeFloat
+
 
 @dataclass(frozen=True)
 class Options:
@@ -19,7 +21,7 @@ class Options:
     """The file; .geojson, .gpkg, .parquet, .osm and .pmtiles name their format, .json needs --format."""
     format: str | None = None
     """geojson, geopackage, geoparquet, lanelet2, argoverse2, nuscenes or pmtiles, where the file's ending does not say it."""
-    simplify_m: float = 0.05
+    simplify_m: NonNegativeFloat = 0.05
     """Lines may leave their stations by so much, metres; 0 writes every station."""
     include_unpublished: bool = False
     """Also what is not published: candidates, deprecated and retired elements."""

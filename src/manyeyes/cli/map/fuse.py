@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from manyeyes._bounds import PositiveInt
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ class Options:
     """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release."""
     executor: str = "process"
     """What fuses a store's tiles: inline, process, dask or ray."""
-    workers: int | None = None
+    workers: PositiveInt | None = None
     """How many processes; one a core by default. The map does not depend on it."""
 
 

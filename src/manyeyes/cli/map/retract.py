@@ -11,6 +11,7 @@ from pathlib import Path
 
 import tyro
 
+from manyeyes._bounds import PositiveInt
 from manyeyes.datatypes import ConfigError
 
 
@@ -32,7 +33,7 @@ class Options:
     """Fuse and publish a release at once; else the next fusion leaves them out."""
     executor: str = "process"
     """What fuses the tiles: inline, process, dask or ray."""
-    workers: int | None = None
+    workers: PositiveInt | None = None
     """How many processes; one a core by default. The map does not depend on it."""
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import tyro
 
+from manyeyes._bounds import NonNegativeFloat, PositiveFloat, PositiveInt, Seed
+
 
 @dataclass(frozen=True)
 class Options:
@@ -15,16 +17,16 @@ class Options:
 
     place: tyro.conf.Positional[str] = "cross"
     """A CARLA town, av2-miami, av2-pittsburgh, lanelet2, cross, grid, or grid-N with N crossroads a side."""
-    observations: int = 60
+    observations: PositiveInt = 60
     """How many; the first of a larger crowd are those of a smaller one."""
     crowd: str = "local"
     """Observation noise and fleet: local, semi-global, perfect, independent-malicious, colluding-malicious, outdated,
     with-infrastructure."""
-    pose_sigma: float | None = None
+    pose_sigma: NonNegativeFloat | None = None
     """Another standard deviation of claimed positions, metres; headings err in proportion, 1 degree a metre."""
-    size: float = 300.0
+    size: PositiveFloat = 300.0
     """Side of the area, metres; generated places and logs are never larger than they are."""
-    seed: int = 0
+    seed: Seed = 0
     """Another seed, other drives."""
     out: Path | None = None
     """Folder for observations and truth, out/map/PLACE by default."""

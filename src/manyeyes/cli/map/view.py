@@ -8,6 +8,7 @@ from pathlib import Path
 
 import tyro
 
+from manyeyes._bounds import PositiveInt
 from manyeyes.datatypes import ConfigError
 
 
@@ -23,7 +24,7 @@ class Options:
     """Observations to draw behind it; a folder 'observations' beside the map is found by itself."""
     out: Path | None = None
     """The page (.html) or picture (.png); map.html in the map's folder by default."""
-    max_observations: int = 500
+    max_observations: PositiveInt = 500
     """Draw at most so many observations, which bounds the size of the page."""
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import tyro
 
+from manyeyes._bounds import PositiveInt
 from manyeyes.studies.replay_options import FileChecks
 
 
@@ -24,15 +25,15 @@ class Options:
     map-pose-noise."""
     places: tuple[str, ...] = ()
     """Only these places of a study."""
-    observation_counts: tuple[int, ...] = ()
+    observation_counts: tuple[PositiveInt, ...] = ()
     """Only these counts of observations of the study 'fusion'."""
-    seeds: int = 3
+    seeds: PositiveInt = 3
     """How many seeds of a study."""
     methods: tuple[str, ...] = ()
     """Only these methods of a study."""
     oracles: bool = False
     """Add the oracle rows to a study: truth cut again, true poses, known association."""
-    workers: int = 2
+    workers: PositiveInt = 2
     """Processes that share a study; results do not depend on it."""
     data: Path | None = None
     """Of the map model's studies: a dataset of towns, as 'manyeyes simulate' leaves one."""
@@ -40,7 +41,7 @@ class Options:
     """Which split of it: towns that did not teach."""
     weights: tuple[str, ...] = ()
     """Map models, one a set of sensors: shipped names or .safetensors files; by default all that ship."""
-    scenario_stride: int = 1
+    scenario_stride: PositiveInt = 1
     """Only every n-th scenario of it."""
     pose_correction: str = "voting"
     """Pose corrector of the study 'map-pose-noise', by name."""
