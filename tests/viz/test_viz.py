@@ -192,7 +192,14 @@ def test_the_terminal_table_fits_80_columns() -> None:
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
     console.print(make_terminal_table(ROWS, "title"))
     text = console.export_text()
-    assert "…" not in text and ".750-.860" in text and "32,768" in text and "perceive" in text
+    assert (
+        "…" not in text
+        and "0.750-0.860" in text
+        and "(bytes)" in text
+        and "[ms]" in text
+        and "32,768" in text
+        and "perceive" in text
+    )
 
 
 def make_report(tmp_path) -> HtmlReport:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One HTML file that holds a whole run: table, pictures, animation, commands, configuration. It fetches nothing."""
+"""Self-contained HTML report of a run: tables, images, animation, commands, configuration."""
 
 from __future__ import annotations
 
@@ -14,7 +14,16 @@ from typing import Any
 from manyeyes._io import atomic_write_text
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.statistics.comparison import PairedDifference
-from manyeyes.viz.table import DIFFERENCE_HEADINGS, HEADINGS, NOT_RUN, MethodRow, format_cells, format_difference_cells
+from manyeyes.viz.table import (
+    DATA_AGE,
+    DIFFERENCE_HEADINGS,
+    HEADINGS,
+    LOG2_BYTES,
+    NOT_RUN,
+    MethodRow,
+    format_cells,
+    format_difference_cells,
+)
 
 MIME = {".png": "image/png", ".gif": "image/gif", ".webp": "image/webp", ".svg": "image/svg+xml"}
 
@@ -50,18 +59,18 @@ dt { font-weight: 600; } dd { margin: 0; color: var(--soft); }
 """
 
 COLUMN_DESCRIPTIONS = (
-    ("AP@0.5, AP@0.7", "average precision at rotated bird's-eye IoU 0.5 and 0.7, all frames sorted together by score, "
-     "with the 95 % interval over scenarios where there is more than one"),
-    ("bytes/message", "the mean length of what one agent sent at one instant, all packets and headers counted"),
-    ("AB log2", "the same as a base-2 logarithm, the papers' unit"),
-    ("age ms", "the mean age of received data at the moment of use: capture, share and the channel"),
-    ("share, perceive ms", "mean compute of one agent's call on this machine"),
+    ("AP@0.5, AP@0.7", "average precision at rotated bird's-eye IoU 0.5 and 0.7, detections of all frames sorted by score, "
+     "with the 95 % confidence interval over scenarios where there is more than one"),
+    ("bytes/message", "mean size of an agent's message, with all packets and headers"),
+    (LOG2_BYTES, "the base-2 logarithm of bytes/message"),
+    (DATA_AGE, "mean age of received data when it is fused: capture, share and channel"),
+    ("share [ms], perceive [ms]", "mean computing time of one call on this machine"),
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class ReportImage:
-    """An image file for the report; wide ones take the whole width, the others stand in pairs."""
+    """Image file of a report; wide ones take the whole width, others are placed in pairs."""
 
     path: Path
     caption: str
@@ -70,7 +79,7 @@ class ReportImage:
 
 @dataclass(frozen=True)
 class Chapter:
-    """A part of a report of its own: heading, text, a table (its first line the headings), pictures."""
+    """Chapter of a report: title, text, a table whose first line is the headings, and images."""
 
     title: str
     text: str
@@ -80,7 +89,7 @@ class Chapter:
 
 @dataclass(frozen=True)
 class HtmlReport:
-    """All that the page shows. facts: short (name, value) pairs; provenance: what write_json wrote beside it."""
+    """Content of a report. facts: short (name, value) pairs; provenance: as returned by write_json."""
 
     title: str
     lead: str
@@ -95,7 +104,7 @@ class HtmlReport:
 
 
 def render(report: HtmlReport) -> str:
-    """The page as text; images are read and embedded."""
+    """Render the page as HTML with embedded images."""
     parts = [f"<h1>{_escape(report.title)}</h1>", f'<p class="lead">{_escape(report.lead)}</p>']
     if report.facts:
         items = "".join(f"<li><b>{_escape(name)}</b>{_escape(value)}</li>" for name, value in report.facts)
@@ -105,16 +114,19 @@ def render(report: HtmlReport) -> str:
         parts += [
             "<h2>Results</h2>",
             _table(HEADINGS, [format_cells(row) for row in report.rows]),
-            f"<details><summary>What the columns mean</summary><dl>{columns}</dl></details>",
+            f"<details><summary>Definitions of columns</summary><dl>{columns}</dl></details>",
         ]
     if report.differences:
         parts += [_table(DIFFERENCE_HEADINGS, [format_difference_cells(d) for d in report.differences])]
     parts += [f"<p>{_escape(note)}</p>" for note in report.notes]
     wide, pairs = [p for p in report.pictures if p.wide], [p for p in report.pictures if not p.wide]
     if wide:
-        parts += ["<h2>The drive</h2>", *(_figure(p) for p in wide)]
+        parts += ["<h2>Animation</h2>", *(_figure(p) for p in wide)]
     if pairs:
-        parts += ["<h2>One instant, from above</h2>", f'<div class="pair">{"".join(_figure(p) for p in pairs)}</div>']
+        parts += [
+            "<h2>One frame, bird's-eye view</h2>",
+            f'<div class="pair">{"".join(_figure(p) for p in pairs)}</div>',
+        ]
     for chapter in report.chapters:
         parts += [
             f"<h2>{_escape(chapter.title)}</h2>",
@@ -124,10 +136,10 @@ def render(report: HtmlReport) -> str:
         if chapter.table:
             parts.append(_table(chapter.table[0], chapter.table[1:]))
     if report.commands:
-        parts += ["<h2>Again, on your machine</h2>", f"<pre>{_escape(chr(10).join(report.commands))}</pre>"]
+        parts += ["<h2>Commands</h2>", f"<pre>{_escape(chr(10).join(report.commands))}</pre>"]
     if report.provenance:
         dump = _escape(json.dumps(report.provenance, indent=2, default=str))
-        parts += ["<h2>Where these numbers come from</h2>"]
+        parts += ["<h2>Provenance</h2>"]
         parts += [f"<details><summary>Configuration, seed, versions, commit</summary><pre>{dump}</pre></details>"]
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_escape(report.title)}</title>'
     body = "\n".join(parts)
@@ -137,7 +149,7 @@ def render(report: HtmlReport) -> str:
 
 
 def save_report(report: HtmlReport, path: Path) -> None:
-    """The page as a file, whole or not at all."""
+    """Write the page atomically."""
     atomic_write_text(path, render(report))
 
 

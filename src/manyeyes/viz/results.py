@@ -16,13 +16,10 @@ from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import PairedDifference, compare_methods
 from manyeyes.viz.table import MethodRow, make_differences_table, make_row, make_terminal_table, missing_footer
 
-MAX_MESSAGE_BYTES = 1 << 17
-NO_FUSION_AP_RANGE = (0.50, 0.85)
-
 
 @dataclass(frozen=True)
 class ApSummary:
-    """AP at one IoU threshold. ap is the protocol's own; recall and precision stand at its score threshold."""
+    """AP at one IoU threshold. ap: by the protocol; recall, precision: at its score threshold."""
 
     iou: float
     ap: Interval
@@ -36,7 +33,7 @@ class ApSummary:
 
 @dataclass(frozen=True)
 class MethodStats:
-    """All numbers of one method, without the frames behind them."""
+    """Metrics of one method, without its frames."""
 
     method: str
     ap_summaries: tuple[ApSummary, ...]
@@ -48,30 +45,29 @@ class MethodStats:
 
 @dataclass(frozen=True)
 class MethodComparison:
-    """A comparison, ready to be shown. protocol: whose rules AP follows, over which range. missing: files of the recording."""
+    """Comparison of methods. protocol: rules and range of AP. missing: missing files of the recording."""
 
     protocol: DetectionProtocol
     stats: tuple[MethodStats, ...]
     rows: tuple[MethodRow, ...]
     differences: tuple[PairedDifference, ...]
-    checks: tuple[str, ...]
     missing: MissingFiles = NONE_MISSING
 
     @property
     def footer(self) -> str:
-        """What a reader of the table must know of missing files; empty where there are none."""
+        """Format the note on missing files; empty where there are none."""
         return missing_footer(self.missing.count)
 
     @property
     def has_several_scenarios(self) -> bool:
-        """Whether there are scenarios enough to compare over; one drive resolves nothing."""
+        """Whether there is more than one scenario to compare over."""
         return any(number.ap_summaries[0].ap.num_scenarios > 1 for number in self.stats)
 
 
 def summarize_comparison(
     results: Sequence[MethodResult], protocol: DetectionProtocol, missing: MissingFiles = NONE_MISSING
 ) -> MethodComparison:
-    """The outcome of measured methods."""
+    """Summarize measured methods: rows, metrics and paired differences."""
     stats = []
     for result in results:
         columns = zip(IOU_THRESHOLDS, result.intervals, result.ap)
@@ -82,37 +78,14 @@ def summarize_comparison(
         sent = result.communication
         stats.append(MethodStats(result.method, ap_summaries, sent, result.age_ms, result.share_ms, result.perceive_ms))
     rows = tuple(make_row(result) for result in results)
-    return MethodComparison(
-        protocol, tuple(stats), rows, compare_methods(results, protocol), _check_targets(rows), missing
-    )
+    return MethodComparison(protocol, tuple(stats), rows, compare_methods(results, protocol), missing)
 
 
 def print_comparison(console: Console, comparison: MethodComparison, title: str) -> None:
-    """Table, differences and checks in the terminal."""
+    """Print the table of methods and the paired differences."""
     console.print(make_terminal_table(comparison.rows, title))
     if comparison.footer:
         console.print(comparison.footer, highlight=False, soft_wrap=True)
-    if not comparison.has_several_scenarios:
-        return
-    if comparison.differences:
+    if comparison.has_several_scenarios and comparison.differences:
         console.print()
         console.print(make_differences_table(comparison.differences))
-    for check in comparison.checks:
-        console.print(check, highlight=False, soft_wrap=True)
-
-
-def _check_targets(rows: Sequence[MethodRow]) -> tuple[str, ...]:
-    """Whether messages are small enough, and whether the drives are neither too easy nor too hard to tell methods apart."""
-    by_name = {row.method: row for row in rows}
-    out = []
-    fused, no_fusion = by_name.get("intermediate"), by_name.get("none")
-    if fused and fused.bytes_per_message is not None:
-        verdict = "met" if fused.bytes_per_message <= MAX_MESSAGE_BYTES else "not met"
-        out.append(
-            f"intermediate: {fused.bytes_per_message:,.0f} bytes a message, at most {MAX_MESSAGE_BYTES:,}: {verdict}"
-        )
-    if no_fusion and no_fusion.ap50 is not None:
-        low, high = NO_FUSION_AP_RANGE
-        verdict = "met" if low <= no_fusion.ap50.value <= high else "not met"
-        out.append(f"none: AP@0.5 {no_fusion.ap50.value:.3f} between {low:.2f} and {high:.2f}: {verdict}")
-    return tuple(out)

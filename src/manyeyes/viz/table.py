@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A benchmark's rows, for the terminal, for Markdown and for JSON; what was not measured reads "not run"."""
+"""Tables of methods for the terminal, Markdown and JSON, and the words of columns; unmeasured values read "not run"."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ from dataclasses import dataclass
 
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from manyeyes.evaluation.detection.accumulator import MethodResult
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import PairedDifference
 
 NOT_RUN = "not run"
+# Words of columns that several tables have.
+LOG2_BYTES, DATA_AGE, AP_DIFFERENCE, AP_DROP = "log2(bytes)", "data age [ms]", "ΔAP [95 % CI]", "ΔAP vs. clean"
+AP_CROSSING, AP_DIVIDER, AP_BOUNDARY = "AP crossing", "AP divider", "AP boundary"
 
 
 @dataclass(frozen=True)
 class MethodRow:
-    """One method on one set of drives.
+    """Metrics of one method on one set of drives.
 
     ap50, ap70: average precision at rotated bird's-eye IoU 0.5 and 0.7. bytes_per_message: the mean length of what an
     agent sent at one instant, packets and headers included. age_ms: the mean age of received data when it was used.
@@ -36,12 +40,12 @@ class MethodRow:
 
     @property
     def log2_bytes(self) -> float | None:
-        """The papers' "AB": the base-2 logarithm of the bytes a message."""
+        """Compute the base-2 logarithm of the bytes per message."""
         return math.log2(self.bytes_per_message) if self.bytes_per_message else None
 
 
 def make_row(result: MethodResult) -> MethodRow:
-    """The row of a measured method; without messages it has sent 0 bytes."""
+    """Make the row of a measured method; without messages it has 0 bytes."""
     return MethodRow(
         result.method,
         result.intervals[0],
@@ -53,11 +57,14 @@ def make_row(result: MethodResult) -> MethodRow:
     )
 
 
-HEADINGS = ("method", "AP@0.5", "AP@0.7", "bytes/message", "AB log2", "age ms", "share ms", "perceive ms")
+HEADINGS = (
+    "method", "AP@0.5", "AP@0.7", "bytes/message", LOG2_BYTES, DATA_AGE, "share [ms]", "perceive [ms]",
+)  # fmt: skip
+DIFFERENCE_HEADINGS = ("paired difference", "AP at IoU", AP_DIFFERENCE)
 
 
 def format_cells(row: MethodRow) -> tuple[str, ...]:
-    """A row as text, in the order of HEADINGS."""
+    """Format a row in the order of HEADINGS."""
     return (
         row.method,
         _format_interval(row.ap50),
@@ -70,25 +77,31 @@ def format_cells(row: MethodRow) -> tuple[str, ...]:
     )
 
 
-def make_terminal_table(rows: Sequence[MethodRow], title: str = "") -> Table:
-    """The table for a terminal of 80 columns: units and intervals stand on a second line."""
+def make_table(title: str, headings: Sequence[str], num_left: int = 1, wraps: bool = False) -> Table:
+    """Create a table for the terminal; the first num_left columns are aligned left, headings wrap at spaces where asked."""
     table = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.padding = (0, 1, 0, 0)
-    for heading in HEADINGS:
-        words = heading.replace("/", "/ ").split(" ")
-        table.add_column("\n".join(words), justify="left" if heading == "method" else "right", no_wrap=True)
+    for column, heading in enumerate(headings):
+        text = Text(heading.replace(" ", "\n") if wraps else heading)
+        table.add_column(text, justify="left" if column < num_left else "right", no_wrap=wraps or column < num_left)
+    return table
+
+
+def make_terminal_table(rows: Sequence[MethodRow], title: str = "") -> Table:
+    """Create the table of methods for 80 columns: units and intervals are on a second line."""
+    table = make_table(title, [heading.replace("/", "/ ").replace("(", " (") for heading in HEADINGS], wraps=True)
     for row in rows:
         table.add_row(*(_two_lines(cell) for cell in format_cells(row)))
     return table
 
 
 def format_markdown(rows: Sequence[MethodRow]) -> str:
-    """The table for a document, aligned."""
+    """Format the table of methods as aligned Markdown."""
     return format_markdown_lines([HEADINGS, *(format_cells(row) for row in rows)])
 
 
 def missing_footer(count: int, listed_in: str = "results.json") -> str:
-    """The footer of a table whose recording lacks files; empty where it lacks none."""
+    """Format the footer of a table whose recording lacks files; empty where it lacks none."""
     if not count:
         return ""
     files = "1 file" if count == 1 else f"{count:,} files"
@@ -96,33 +109,22 @@ def missing_footer(count: int, listed_in: str = "results.json") -> str:
 
 
 def make_differences_table(differences: Sequence[PairedDifference]) -> Table:
-    """Paired differences for a terminal."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for heading in DIFFERENCE_HEADINGS:
-        table.add_column(heading, justify="left" if heading in ("paired difference", "verdict") else "right")
+    """Create the table of paired differences for the terminal."""
+    table = make_table("", DIFFERENCE_HEADINGS)
     for difference in differences:
         table.add_row(*format_difference_cells(difference))
     return table
 
 
-DIFFERENCE_HEADINGS = ("paired difference", "AP at IoU", "value, 95 % interval", "bar", "verdict")
-
-
 def format_difference_cells(difference: PairedDifference) -> tuple[str, ...]:
-    """A paired difference as text, in the order of DIFFERENCE_HEADINGS."""
+    """Format a paired difference in the order of DIFFERENCE_HEADINGS."""
     value = difference.interval
     spread = f" [{value.low:+.3f}, {value.high:+.3f}]" if value.num_scenarios > 1 else ""
-    return (
-        f"{difference.method} - {difference.baseline}",
-        f"{difference.iou:g}",
-        f"{value.value:+.3f}{spread}",
-        "" if difference.margin is None else f"{difference.margin:.2f}",
-        difference.verdict or "",
-    )
+    return f"{difference.method} - {difference.baseline}", f"{difference.iou:g}", f"{value.value:+.3f}{spread}"
 
 
 def format_markdown_lines(body: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, aligned; the first line is the heading, the first column stands to the left."""
+    """Format aligned Markdown; the first line is the heading, the first column is aligned left."""
     widths = [max(len(line[i]) for line in body) for i in range(len(body[0]))]
     text = [
         "| " + " | ".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths))) + " |"
@@ -134,7 +136,7 @@ def format_markdown_lines(body: Sequence[Sequence[str]]) -> str:
 
 def _two_lines(cell: str) -> str:
     value, bracket, interval = cell.partition(" [")
-    return f"{value}\n{interval.rstrip(']').replace('0.', '.').replace(', ', '-')}" if bracket else cell
+    return f"{value}\n{interval.rstrip(']').replace(', ', '-')}" if bracket else cell
 
 
 def _format_interval(value: Interval | None) -> str:
