@@ -2,8 +2,8 @@
 """Communication volume, from the bytes that were really sent.
 
 A record is one message as it left its sender (header, sections, checksums: everything), whether or not it arrived. An
-empty message counts as 0 bytes in every mean. ``ab_log2_of_mean`` is the papers' "AB": the base-2 logarithm of the mean
-bytes of a message; ``ab_mean_of_log2`` averages the logarithms and is smaller (Jensen), and is over non-empty messages
+empty message counts as 0 bytes in every mean. ``log2_mean_bytes`` is the papers' "AB": the base-2 logarithm of the mean
+bytes of a message; ``mean_log2_bytes`` averages the logarithms and is smaller (Jensen), and is over non-empty messages
 only, since an empty one has no logarithm. Rates assume ten frames a second by default.
 
 :func:`compute_paper_bytes` is CoSTr's Eq. 13: float32 features and two float32 indices for each token; no header, no pose.
@@ -42,7 +42,7 @@ class Communication:
     """What a run sent; NaN where nothing was.
 
     bytes_per_message: mean over messages. bytes_per_ego_frame: all senders of an ego's frame together, mean over ego
-    frames. megabits_per_s: the latter at the frame rate. paper_ab: log2 of the mean of Eq. 13 over the same messages.
+    frames. megabits_per_s: the latter at the frame rate. log2_paper_bytes: log2 of the mean of Eq. 13 over the same messages.
     """
 
     num_messages: int
@@ -51,9 +51,9 @@ class Communication:
     bytes_per_message: float
     bytes_per_ego_frame: float
     megabits_per_s: float
-    ab_log2_of_mean: float
-    ab_mean_of_log2: float
-    paper_ab: float
+    log2_mean_bytes: float
+    mean_log2_bytes: float
+    log2_paper_bytes: float
     tokens_per_message: float
 
 
@@ -80,9 +80,11 @@ def summarize_messages(
         bytes_per_message=mean,
         bytes_per_ego_frame=_ratio(total, num_frames),
         megabits_per_s=_ratio(total, num_frames) * 8 * rate_hz / 1e6,
-        ab_log2_of_mean=_log2(mean),
-        ab_mean_of_log2=_ratio(sum(logarithms), len(logarithms)),
-        paper_ab=_log2(_ratio(sum(compute_paper_bytes(r.num_tokens, r.num_channels) for r in records), len(records))),
+        log2_mean_bytes=_log2(mean),
+        mean_log2_bytes=_ratio(sum(logarithms), len(logarithms)),
+        log2_paper_bytes=_log2(
+            _ratio(sum(compute_paper_bytes(r.num_tokens, r.num_channels) for r in records), len(records))
+        ),
         tokens_per_message=_ratio(sum(r.num_tokens for r in records), len(records)),
     )
 
