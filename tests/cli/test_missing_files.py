@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from manyeyes.cli import main as cli
-from manyeyes.datasets.dair_writer import DairWriter, write_dair_index
+from manyeyes.datasets.dair_v2x.writer import DairWriter, write_dair_index
 from manyeyes.datasets.opv2v import Opv2vWriter
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint

@@ -103,7 +103,7 @@ def test_a_verdict_is_kept_until_a_file_changes(root: Path, tmp_path: Path, monk
         calls.append(name)
         return []
 
-    monkeypatch.setattr("manyeyes.datasets.opv2v.find_mismatched_files", check)
+    monkeypatch.setattr("manyeyes.datasets.opv2v.reader.find_mismatched_files", check)
     for _ in range(2):
         Opv2vRecording(root, cache_folder=tmp_path / "cache").verify()
     assert calls == ["a", "b"]

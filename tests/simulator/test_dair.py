@@ -15,9 +15,8 @@ import torch
 
 pytest.importorskip("libsumo", reason="scenarios need the sim extra")
 
-from manyeyes.datasets import dair_json, dair_v2x
-from manyeyes.datasets.dair_v2x import DairRecording
-from manyeyes.datasets.pcd import PcdCloud, read_table
+from manyeyes.datasets.dair_v2x import DairRecording, json_files, reader
+from manyeyes.datasets.formats.pcd import PcdCloud, read_table
 from manyeyes.datatypes import ConfigError, RecordingError, Transform
 from manyeyes.simulator import dair
 from manyeyes.simulator.dair import record_dair
@@ -101,7 +100,7 @@ def test_the_simulators_own_truth_comes_back(made: Path) -> None:
 
 def test_a_mirrored_or_transposed_reader_shows(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert unmet(DairRecording(made)) == 0
-    read_pcd, motion = dair_v2x.read_pcd, dair_json._motion
+    read_pcd, motion = reader.read_pcd, json_files._motion
 
     def mirrored(path: Path, drop_nan: bool = False) -> PcdCloud:
         found = read_pcd(path, drop_nan)
@@ -112,13 +111,13 @@ def test_a_mirrored_or_transposed_reader_shows(made: Path, monkeypatch: pytest.M
         return Transform(found.rotation.mT, found.translation)
 
     with monkeypatch.context() as patch:
-        patch.setattr(dair_v2x, "read_pcd", mirrored)
+        patch.setattr(reader, "read_pcd", mirrored)
         assert unmet(DairRecording(made)) > 5
     # Points and labels of one side turn together: it is the two sides that no longer agree.
     whole = DairRecording(made).snapshot("0", 1).truth
     assert whole is not None
     with monkeypatch.context() as patch:
-        patch.setattr(dair_json, "_motion", transposed)
+        patch.setattr(json_files, "_motion", transposed)
         truth = DairRecording(made).snapshot("0", 1).truth
         assert truth is not None
         assert int((truth.seen & whole.seen).sum()) < int(whole.seen.sum()) // 2

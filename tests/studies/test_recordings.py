@@ -11,7 +11,7 @@ from PIL import Image
 
 from manyeyes.cli import main as cli
 from manyeyes.datasets.dair_v2x import DairRecording
-from manyeyes.datasets.dair_writer import DairWriter, write_dair_index
+from manyeyes.datasets.dair_v2x.writer import DairWriter, write_dair_index
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint

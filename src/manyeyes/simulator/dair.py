@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from manyeyes.datasets.dair_writer import DairRows, DairWriter, list_index_files, list_pair_files, write_dair_index
+from manyeyes.datasets.dair_v2x.writer import DairRows, DairWriter, list_index_files, list_pair_files, write_dair_index
 from manyeyes.datasets.manifest import (
     BATCHES,
     MANIFEST,

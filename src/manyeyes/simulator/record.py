@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 import torch
 
 from manyeyes._io import atomic_write_text
-from manyeyes.datasets.dair_index import find_dair_root
+from manyeyes.datasets.dair_v2x.index import find_dair_root
 from manyeyes.datasets.manifest import (
     BATCHES,
     MANIFEST,
@@ -38,7 +38,8 @@ from manyeyes.datasets.manifest import (
     read_manifest,
 )
 from manyeyes.datasets.missing import FileProblem
-from manyeyes.datasets.opv2v import Opv2vWriter, has_frames
+from manyeyes.datasets.opv2v import Opv2vWriter
+from manyeyes.datasets.opv2v.scan import has_frames
 from manyeyes.datatypes import ConfigError, ManyeyesError, RecordingError
 from manyeyes.maps.roads.road_network import RoadNetwork
 from manyeyes.simulator.scene.scenario import NoSceneError, ScenarioSpec, SimulatedScenario, make_scenario

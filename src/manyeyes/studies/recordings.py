@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from manyeyes.datasets.dair_index import find_dair_root
 from manyeyes.datasets.dair_v2x import DairRecording
+from manyeyes.datasets.dair_v2x.index import find_dair_root
 from manyeyes.datasets.missing import MissingFiles
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import ConfigError, RecordingError

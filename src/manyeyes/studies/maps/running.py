@@ -13,7 +13,7 @@ from rich.console import Console
 
 from manyeyes._io import atomic_write_text
 from manyeyes.datasets.base import Recording
-from manyeyes.datasets.dair_index import find_dair_root
+from manyeyes.datasets.dair_v2x.index import find_dair_root
 from manyeyes.datasets.missing import MissingFiles
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.maps.pooled_ap import MapMarginTest

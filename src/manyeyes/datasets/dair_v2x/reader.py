@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datasets.base import require_index
-from manyeyes.datasets.dair_index import (
+from manyeyes.datasets.dair_v2x.index import (
     DairIndex,
     DairPair,
     SideFrame,
@@ -27,18 +27,18 @@ from manyeyes.datasets.dair_index import (
     read_index,
     read_split_ids,
 )
-from manyeyes.datasets.dair_json import (
+from manyeyes.datasets.dair_v2x.json_files import (
     read_calibration,
     read_infrastructure_calibration,
     read_side_labels,
     read_world_labels,
 )
-from manyeyes.datasets.dair_writer import list_pair_files
+from manyeyes.datasets.dair_v2x.writer import list_pair_files
+from manyeyes.datasets.formats.pcd import PcdCloud, read_pcd
 from manyeyes.datasets.ground_height import estimate_sensor_height
 from manyeyes.datasets.manifest import BATCHES, Digests
 from manyeyes.datasets.mismatch import find_copied_files
 from manyeyes.datasets.missing import FileProblem, MissingFiles
-from manyeyes.datasets.pcd import PcdCloud, read_pcd
 from manyeyes.datatypes import (
     AgentFrame,
     Boxes,

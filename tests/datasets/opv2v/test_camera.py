@@ -9,9 +9,9 @@ import yaml
 
 pytest.importorskip("PIL", reason="pictures need the view extra")
 
-from manyeyes.datasets.image_io import read_image, write_png
+from manyeyes.datasets.formats.image_io import read_image, write_png
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
-from manyeyes.datasets.opv2v_camera import read_cameras
+from manyeyes.datasets.opv2v.camera import read_cameras
 from manyeyes.datatypes import AgentFrame, Camera, CameraImage, PointCloud, RecordingError, Snapshot, Transform
 
 # world_from_camera of a level camera that looks along the agent's x: right is -y, down is -z.

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from manyeyes._io import atomic_write_text
-from manyeyes.datasets.dair_index import SIDES, SPLIT_FILE
-from manyeyes.datasets.pcd import PcdTable, write_table
+from manyeyes.datasets.dair_v2x.index import SIDES, SPLIT_FILE
+from manyeyes.datasets.formats.pcd import PcdTable, write_table
 from manyeyes.datatypes import LABELS, AgentFrame, Boxes, RecordingError, Snapshot, Transform
 
 # Chosen: the receiver's y axis points ahead and it is mounted a little askew, so that no calibration is its own transpose.

@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 import torch
 
-from manyeyes.datasets import dair_json, dair_v2x
 from manyeyes.datasets.base import count_points_in_listed_boxes, iter_eval_frames
-from manyeyes.datasets.dair_v2x import DairRecording
-from manyeyes.datasets.pcd import PcdCloud, PcdTable, write_table
+from manyeyes.datasets.dair_v2x import DairRecording, json_files, reader
+from manyeyes.datasets.formats.pcd import PcdCloud, PcdTable, write_table
 from manyeyes.datatypes import ConfigError, RecordingError, Transform
 
 
@@ -220,23 +219,23 @@ def test_the_scene_comes_out_as_it_was_put_in(dataset: Path) -> None:
 
 
 def transposed(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = dair_json._motion
+    true = json_files._motion
 
     def wrong(path: Path, content: Any) -> Transform:
         found = true(path, content)
         return Transform(found.rotation.mT, found.translation)
 
-    monkeypatch.setattr(dair_json, "_motion", wrong)
+    monkeypatch.setattr(json_files, "_motion", wrong)
 
 
 def mirrored(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = dair_v2x.read_pcd
+    true = reader.read_pcd
 
     def wrong(path: Path, drop_nan: bool = False) -> PcdCloud:
         found = true(path, drop_nan)
         return PcdCloud(found.xyz * np.float32([1, -1, 1]), found.intensity, found.time_s)
 
-    monkeypatch.setattr(dair_v2x, "read_pcd", wrong)
+    monkeypatch.setattr(reader, "read_pcd", wrong)
 
 
 def without_correction(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,17 +245,17 @@ def without_correction(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def turned_labels(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = dair_v2x.read_side_labels
+    true = reader.read_side_labels
 
     def wrong(path: Path) -> Any:
         found = true(path)
         return type(found).of(found.center, found.size, -found.yaw, label=found.label, id=found.id)
 
-    monkeypatch.setattr(dair_v2x, "read_side_labels", wrong)
+    monkeypatch.setattr(reader, "read_side_labels", wrong)
 
 
 def labels_by_rotation(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dair_v2x, "read_world_labels", dair_v2x.read_side_labels)
+    monkeypatch.setattr(reader, "read_world_labels", reader.read_side_labels)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from manyeyes._io import atomic_write
-from manyeyes.datasets.cache import ArrayCache, default_cache_folder
+from manyeyes.datasets.formats.cache import ArrayCache, default_cache_folder
 
 
 def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:

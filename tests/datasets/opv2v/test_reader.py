@@ -15,12 +15,11 @@ import pytest
 import torch
 import yaml
 
-from manyeyes.datasets import opv2v, opv2v_yaml
 from manyeyes.datasets.base import count_points_in_listed_boxes, iter_eval_frames
+from manyeyes.datasets.formats.pcd import write_pcd
 from manyeyes.datasets.frame_reader import as_frame_reader
-from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
-from manyeyes.datasets.pcd import write_pcd
-from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
+from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter, reader
+from manyeyes.datatypes import LABELS, AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 # CARLA's world, left-handed, degrees: [x, y, z, roll, yaw, pitch]. Nothing here is symmetric, so no sign can hide.
 LIDARS = {
@@ -180,7 +179,7 @@ def test_the_scene_in_right_handed_terms(dataset: Path) -> None:
     assert bus.center[0].tolist() == pytest.approx([112.0, -61.0, 0.3 + 2.1])
     assert bus.size[0].tolist() == pytest.approx([10.4, 3.8, 4.2])
     assert bus.yaw[0].item() == pytest.approx(-math.radians(118.0))
-    assert [opv2v_yaml.LABELS[i] for i in truth.boxes.label.tolist()] == ["car", "car", "bus", "car", "van", "car"]
+    assert [LABELS[i] for i in truth.boxes.label.tolist()] == ["car", "car", "bus", "car", "van", "car"]
 
 
 def test_the_road_is_at_zero_in_every_agents_frame(dataset: Path) -> None:
@@ -219,7 +218,7 @@ def _right_handed_pose(pose: tuple[float, ...]) -> Transform:
 def test_a_mirrored_reader_fails_that_test(
     dataset: Path, monkeypatch: pytest.MonkeyPatch, name: str, wrong: Any
 ) -> None:
-    monkeypatch.setattr(opv2v, name, wrong)
+    monkeypatch.setattr(reader, name, wrong)
     snapshot = Opv2vRecording(dataset / "train").snapshot("2021_08_16_22_26_54", 0)
     assert snapshot.truth is not None
     counts = count_points_in_listed_boxes(snapshot)
@@ -228,7 +227,7 @@ def test_a_mirrored_reader_fails_that_test(
 
 
 def opv2v_mirror(pose: tuple[float, ...], entry: int) -> Transform:
-    from manyeyes.datasets.carla import transform_from_carla
+    from manyeyes.datasets.opv2v.carla import transform_from_carla
 
     return transform_from_carla([-v if i == entry else v for i, v in enumerate(pose)])
 
@@ -270,7 +269,7 @@ def test_yaml_is_parsed_once_and_again_when_it_changes(scenario: Path, monkeypat
         calls.append(path)
         return yaml.safe_load(path.read_text())
 
-    monkeypatch.setattr(opv2v_yaml, "load_yaml", counting)
+    monkeypatch.setattr("manyeyes.datasets.opv2v.metadata.load_yaml", counting)
     first = Opv2vRecording(scenario).snapshot("drive", 0)
     parsed = [p for p in calls if p.name != "data_protocol.yaml"]
     assert len(parsed) == 3

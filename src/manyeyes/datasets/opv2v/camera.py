@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from manyeyes.datasets.cache import ArrayCache
-from manyeyes.datasets.carla import carla_from_transform, transform_from_carla
-from manyeyes.datasets.image_io import read_image
-from manyeyes.datasets.opv2v_yaml import load_yaml
+from manyeyes.datasets.formats.cache import ArrayCache
+from manyeyes.datasets.formats.image_io import read_image
+from manyeyes.datasets.opv2v.carla import carla_from_transform, transform_from_carla
+from manyeyes.datasets.opv2v.metadata import load_yaml
 from manyeyes.datatypes import Camera, CameraImage, RecordingError, Transform
 
 _KIND, _COLUMNS = "opv2v-cameras1", 16

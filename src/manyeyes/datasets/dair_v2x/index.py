@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from manyeyes.datasets.dair_json import REMEDY, get_number, get_offset, get_text, load_json, load_list
+from manyeyes.datasets.dair_v2x.json_files import REMEDY, get_number, get_offset, get_text, load_json, load_list
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datatypes import RecordingError
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from manyeyes._io import atomic_write
-from manyeyes.datasets.cache import ArrayCache
+from manyeyes.datasets.formats.cache import ArrayCache
 from manyeyes.datatypes import RecordingError
 
 _KINDS = {"F": "f", "U": "u", "I": "i"}
@@ -105,7 +105,7 @@ def write_pcd(path: Path, xyz: np.ndarray, intensity: np.ndarray) -> None:
 
 def write_table(path: Path, table: PcdTable) -> None:
     """Write every field (N,) in its own type, one field after the other, as ``DATA binary_compressed``."""
-    from manyeyes.datasets.lzf import lzf_compress
+    from manyeyes.datasets.formats.lzf import lzf_compress
 
     columns = [np.ascontiguousarray(c, c.dtype.newbyteorder("<")) for c in table.columns]
     sizes = {c.shape for c in columns}
@@ -235,7 +235,9 @@ def _compressed(path: Path, header: _PcdHeader, body: memoryview) -> PcdTable:
         raise _truncated(path, "bytes of uncompressed points", size, unpacked)
     if len(body) - 8 < packed:
         raise _truncated(path, "bytes of compressed points", packed, len(body) - 8)
-    from manyeyes.datasets.lzf import lzf_decompress  # numba is slow to import, and few recordings are compressed
+    from manyeyes.datasets.formats.lzf import (
+        lzf_decompress,
+    )  # numba is slow to import, and few recordings are compressed
 
     plain = lzf_decompress(body[8 : 8 + packed], size) if size else b""
     if plain is None:

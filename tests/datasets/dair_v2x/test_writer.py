@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from manyeyes.datasets.dair_v2x import DairRecording
-from manyeyes.datasets.dair_writer import DairWriter, write_dair_index
-from manyeyes.datasets.pcd import read_table
+from manyeyes.datasets.dair_v2x.writer import DairWriter, write_dair_index
+from manyeyes.datasets.formats.pcd import read_table
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 CAR, TRUCK, OWN, UNSEEN = 40, 41, 37, 50

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from manyeyes.datasets.cache import ArrayCache
-from manyeyes.datasets.lzf import lzf_decompress
-from manyeyes.datasets.pcd import read_pcd, read_table, write_pcd
+from manyeyes.datasets.formats.cache import ArrayCache
+from manyeyes.datasets.formats.lzf import lzf_decompress
+from manyeyes.datasets.formats.pcd import read_pcd, read_table, write_pcd
 from manyeyes.datatypes import RecordingError
 
 OPV2V_HEADER = """# .PCD v0.7 - Point Cloud Data file format

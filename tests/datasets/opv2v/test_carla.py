@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from manyeyes.datasets.carla import carla_from_transform, mirror_points, transform_from_carla
+from manyeyes.datasets.opv2v.carla import carla_from_transform, mirror_points, transform_from_carla
 
 ANGLE = st.floats(-179, 179)
 POSES = st.tuples(*[st.floats(-1e4, 1e4)] * 3, ANGLE, ANGLE, st.floats(-85, 85))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from manyeyes.datasets import opv2v_yaml
+from manyeyes.datasets.opv2v import metadata
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Size:
     ids=lambda v: f"{v.label} {v.lwh[0]}",
 )
 def test_labels_by_size(vehicle: Size) -> None:
-    assert opv2v_yaml.LABELS[opv2v_yaml._label({}, np.array(vehicle.lwh))] == vehicle.label
+    assert metadata.LABELS[metadata._label({}, np.array(vehicle.lwh))] == vehicle.label
 
 
 def test_labels_by_name_come_before_size() -> None:
     size = np.array([4.5, 1.9, 1.5])
-    assert opv2v_yaml.LABELS[opv2v_yaml._label({"obj_type": "Truck"}, size)] == "truck"
-    assert opv2v_yaml.LABELS[opv2v_yaml._label({"bp_id": "vehicle.mercedes.sprinter"}, size)] == "van"
+    assert metadata.LABELS[metadata._label({"obj_type": "Truck"}, size)] == "truck"
+    assert metadata.LABELS[metadata._label({"bp_id": "vehicle.mercedes.sprinter"}, size)] == "van"

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from manyeyes._io import atomic_write_text
-from manyeyes.datasets.cache import ArrayCache
+from manyeyes.datasets.formats.cache import ArrayCache
 from manyeyes.datatypes import LABELS, RecordingError
 
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from manyeyes.datasets.lzf import lzf_compress, lzf_decompress
-from manyeyes.datasets.pcd import PcdTable, read_pcd, read_table, write_table
+from manyeyes.datasets.formats.lzf import lzf_compress, lzf_decompress
+from manyeyes.datasets.formats.pcd import PcdTable, read_pcd, read_table, write_table
 from manyeyes.datatypes import RecordingError
 
 

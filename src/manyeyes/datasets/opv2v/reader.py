@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""OPV2V and V2XSet, read and written: ``<split>/<scenario>/<agent>/<stem>.{pcd,yaml}``, and ``<stem>_camera0.png`` ….
+
+On disk everything is left-handed, in degrees and km/h, and points lie in the LiDAR's frame. What comes out is
+right-handed, in radians and m/s, and points lie in the agent's frame, whose z = 0 is the road. The format has neither
+the time of a point, nor an agent's estimate of its own error (both read as zero), nor vehicles that no agent lists.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from manyeyes.datasets.base import require_index
+from manyeyes.datasets.formats.cache import ArrayCache, default_cache_folder
+from manyeyes.datasets.formats.pcd import PcdCloud, read_pcd
+from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, estimate_sensor_height
+from manyeyes.datasets.manifest import SCENARIO, Digests, list_scenario_files
+from manyeyes.datasets.mismatch import find_mismatched_files
+from manyeyes.datasets.missing import FileProblem, MissingFiles
+from manyeyes.datasets.opv2v.camera import (
+    read_images,
+)
+from manyeyes.datasets.opv2v.carla import mirror_points, transform_from_carla
+from manyeyes.datasets.opv2v.metadata import (
+    AgentRecord,
+    DataProtocol,
+    read_protocol,
+    read_record,
+)
+from manyeyes.datasets.opv2v.scan import (
+    AgentFiles,
+    ScenarioFiles,
+    compare_with_manifest,
+    find_scenario_folders,
+    scan_scenario,
+)
+from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
+
+_AGENT = re.compile(r"-?\d+")
+_KMH = 3.6
+_MAX_CACHED_RECORDS = 20_000
+
+
+class Opv2vRecording:
+    """Scenarios of OPV2V's layout under a root: a dataset (name the split), a folder of scenarios, or one scenario.
+
+    The ego is the first agent by string order, infrastructure comes last, and the ego's frames are the snapshots; an
+    agent that lacks a frame is left out of that snapshot. What is missing stands in ``missing_summary``, one line each; with
+    strict it is an error instead. Clouds are read when a snapshot is asked for; pictures too, with images=True.
+    cache_folder: where parsed yaml and ascii clouds are kept (default: the user's cache folder); None with ``use_cache=False``.
+
+    All agents of a scenario have the same stems in OPV2V and V2XSet: their public reader finds every agent by the ego's
+    stems. A stem that any agent has is hence expected of all, the ego included; ``verify`` names each file that is absent,
+    and each whose content does not belong to its frame.
+    """
+
+    def __init__(
+        self,
+        root: Path | str,
+        split: str | None = None,
+        *,
+        strict: bool = False,
+        drop_nan: bool = False,
+        use_cache: bool = True,
+        cache_folder: Path | None = None,
+        images: bool = False,
+    ) -> None:
+        self.root = Path(root)
+        self.split = split
+        self._with_images = images
+        self._drop_nan = drop_nan
+        self._cache = ArrayCache(cache_folder or default_cache_folder()) if use_cache else None
+        problems: list[str] = []
+        missing: list[FileProblem] = []
+        folders = find_scenario_folders(self.root, split)
+        found = [scan_scenario(folder, problems, missing, images) for folder in folders]
+        self._scenarios = {s.folder.name: s for s in found if s is not None}
+        if folders[0] not in (self.root, self.root / str(split)):  # one scenario may be opened by itself
+            compare_with_manifest(folders, problems, missing)
+        self.missing_summary = tuple(problems)
+        self._missing = tuple(missing)
+        if not self._scenarios or (strict and problems):
+            more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
+            first = f"{problems[0]}{more}" if problems else "it is empty"
+            raise RecordingError(f"{self.root}: expected whole scenarios; {first}. Download what is missing.")
+        self._records: dict[Path, AgentRecord] = {}
+        self._protocols: dict[str, DataProtocol] = {}
+        self._heights: dict[Path, float] = {}
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """The names of all scenarios, sorted."""
+        return tuple(self._scenarios)
+
+    def length(self, scenario: str) -> int:
+        """How many snapshots the scenario has."""
+        return len(self._scenario(scenario).stems)
+
+    def eval_indices(self, scenario: str) -> range:
+        """All indices but the first ``history_frames`` of data_protocol.yaml."""
+        return range(min(self._protocol(scenario).history_frames, self.length(scenario)), self.length(scenario))
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        """The ids of all agents of the scenario, the ego first and infrastructure last."""
+        return tuple(agent.id for agent in self._scenario(scenario).agents)
+
+    @property
+    def unreadable_scenarios(self) -> frozenset[str]:
+        """The names of the scenarios of which nothing can be read."""
+        return frozenset(problem.scenario for problem in self._missing) - self._scenarios.keys()
+
+    def verify(
+        self, scenarios: Collection[str] | None = None, progress: Callable[[int, int], None] | None = None
+    ) -> MissingFiles:
+        """Name the files that are missing, or whose content does not belong to their frame.
+
+        Scenarios of the simulator are compared with their digests, others by ``find_mismatched_files``. The verdict on a scenario
+        is kept in the cache while its files stay as they are.
+
+        Args:
+            scenarios: names of the scenarios to verify; None for all.
+            progress: called with the number of scenarios that are verified, and of all.
+        """
+        names = [name for name in self.scenarios if scenarios is None or name in scenarios]
+        found = [problem for problem in self._missing if scenarios is None or problem.scenario in scenarios]
+        for count, name in enumerate(names, 1):
+            found += self._verify_contents(name)
+            if progress is not None:
+                progress(count, len(names))
+        return MissingFiles.of(found)
+
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        """All agents that have this frame; the truth is the union of what they list, in the order of ids."""
+        return self._snapshot(scenario, index, self._with_images)
+
+    def _snapshot(self, scenario: str, index: int, images: bool) -> Snapshot:
+        stem, present = self._present(scenario, index)
+        frames = tuple(self._frame(scenario, agent, stem, images) for agent in present)
+        records = [self._record(agent.folder / f"{stem}.yaml") for agent in present]
+        return Snapshot(scenario, index, frames, _truth(frames, records))
+
+    def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
+        """The ids of the agents that have this frame, in the order of the snapshot's frames."""
+        return tuple(agent.id for agent in self._present(scenario, index)[1])
+
+    def frame(self, scenario: str, index: int, agent_id: int) -> AgentFrame:
+        """The frame of one agent as it stands in the snapshot; no other agent's files are read."""
+        stem, present = self._present(scenario, index)
+        found = [agent for agent in present if agent.id == agent_id]
+        if not found:
+            ids = ", ".join(str(agent.id) for agent in present)
+            raise RecordingError(f"Agent {agent_id} has no frame {index} of '{scenario}'; choose one of {ids}.")
+        return self._frame(scenario, found[0], stem, self._with_images)
+
+    def _verify_contents(self, name: str) -> list[FileProblem]:
+        """Compare the contents of a scenario's files, unless the cache has them as sound."""
+        folder = self._scenarios[name].folder
+        files = list_scenario_files(folder)
+        kind = f"sound1{'-pictures' if self._with_images else ''}"
+        state = _state(files, folder)
+        kept = self._cache.load(folder, kind) if self._cache is not None else None
+        if kept is not None and np.array_equal(kept, state):
+            return []
+        digests, found = Digests.read(folder / SCENARIO), []
+        if digests is not None and digests.by_path is None and any(p.scenario == name for p in self._missing):
+            digests = None  # a total digest cannot check files if some are absent
+        if digests is not None:
+            suffixes = (".pcd", ".yaml", *((".png",) if self._with_images else ()))
+            found = digests.check(folder, name, files, used=lambda path: path.endswith(suffixes))
+        if digests is None or (found and digests.by_path is None):
+            found = (
+                find_mismatched_files(lambda index: self._snapshot(name, index, False), name, self._clouds(name))
+                or found
+            )
+        if self._cache is not None and not found:
+            self._cache.store(folder, kind, state)
+        return found
+
+    def _clouds(self, name: str) -> list[dict[int, Path]]:
+        """The paths of the clouds of each snapshot, by agent."""
+        scenario = self._scenarios[name]
+        return [
+            {agent.id: agent.folder / f"{stem}.pcd" for agent in scenario.agents if stem in agent.stems}
+            for stem in scenario.stems
+        ]
+
+    def _present(self, scenario: str, index: int) -> tuple[str, list[AgentFiles]]:
+        """The stem of an instant's files, and the agents that have them."""
+        require_index(self, scenario, index)
+        stem = self._scenarios[scenario].stems[index]
+        return stem, [agent for agent in self._scenarios[scenario].agents if stem in agent.stems]
+
+    def _scenario(self, name: str) -> ScenarioFiles:
+        if name not in self._scenarios:
+            require_index(self, name, 0)
+        return self._scenarios[name]
+
+    def _protocol(self, scenario: str) -> DataProtocol:
+        if scenario not in self._protocols:
+            self._protocols[scenario] = read_protocol(self._scenario(scenario).folder)
+        return self._protocols[scenario]
+
+    def _record(self, path: Path) -> AgentRecord:
+        if path not in self._records:
+            if len(self._records) >= _MAX_CACHED_RECORDS:
+                self._records.clear()
+            self._records[path] = read_record(path, self._cache)
+        return self._records[path]
+
+    def _cloud(self, agent: AgentFiles, stem: str) -> PcdCloud:
+        return read_pcd(agent.folder / f"{stem}.pcd", self._drop_nan, self._cache)
+
+    def _frame(self, scenario: str, agent: AgentFiles, stem: str, images: bool) -> AgentFrame:
+        record, cloud = self._record(agent.folder / f"{stem}.yaml"), self._cloud(agent, stem)
+        world_from_lidar = transform_from_carla(record.lidar_pose)
+        height = self._sensor_height(agent, record, world_from_lidar)
+        xyz = mirror_points(cloud.xyz)
+        xyz[:, 2] += np.float32(height)
+        world_from_agent = world_from_lidar @ Transform.from_xyz_yaw(0, 0, -height)
+        yaml = agent.folder / f"{stem}.yaml"
+        return AgentFrame(
+            agent_id=agent.id,
+            timestamp_ns=round(int(stem) * self._protocol(scenario).fixed_delta_s * 1e9),
+            points=PointCloud.of(torch.from_numpy(xyz), torch.from_numpy(cloud.intensity)),
+            world_from_agent=world_from_agent,
+            pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
+            sensor_height_m=height,
+            speed_mps=record.speed_kmh / _KMH,
+            is_infrastructure=record.is_infrastructure,
+            images=read_images(yaml, world_from_agent, self._cache) if images else (),
+        )
+
+    def _sensor_height(self, agent: AgentFiles, record: AgentRecord, world_from_lidar: Transform) -> float:
+        """Metres from the road up to the LiDAR along the LiDAR's z axis.
+
+        By the two poses where they say something plausible. Where a pole's place is its sensor's own, the ground is
+        searched in the agent's first cloud, once, so that the height is the same in every frame.
+        """
+        stated = _stated_height(record, world_from_lidar)
+        if stated is not None:
+            return stated
+        if agent.folder not in self._heights:
+            self._heights[agent.folder] = estimate_sensor_height(self._cloud(agent, min(agent.stems)).xyz)
+        return self._heights[agent.folder]
+
+
+def _stated_height(record: AgentRecord, world_from_lidar: Transform) -> float | None:
+    if not np.isfinite(record.ego_pose).all():
+        return None
+    offset = world_from_lidar.translation - transform_from_carla(record.ego_pose).translation
+    # Along the LiDAR's axis, not the world's: exact on a slope, with the LiDAR mounted before or behind the middle.
+    height = float(offset @ world_from_lidar.rotation[:, 2])
+    low, high = PLAUSIBLE_HEIGHT_M
+    return height if low <= height <= high and float(offset.norm()) <= high else None
+
+
+def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> GroundTruth:
+    """The union of all lists by id, first agent's copy, in the order of ids."""
+    listed = [np.where(r.id != f.agent_id)[0] for f, r in zip(frames, records)]
+    id = np.concatenate([r.id[rows] for r, rows in zip(records, listed)])
+    _, first = np.unique(id, return_index=True)
+    seen = np.stack([np.isin(id[first], r.id[rows]) for r, rows in zip(records, listed)])
+
+    def column(name: str) -> torch.Tensor:
+        return torch.from_numpy(np.concatenate([getattr(r, name)[rows] for r, rows in zip(records, listed)])[first])
+
+    center = column("location") + column("center")
+    center[:, 1] *= -1
+    yaw = -column("angle")[:, 1] * (math.pi / 180)
+    velocity = torch.stack((yaw.cos(), yaw.sin()), 1) * (column("speed") / _KMH)[:, None]
+    boxes = Boxes.of(center, 2 * column("extent"), yaw, None, column("label"), torch.from_numpy(id[first]), velocity)
+    return GroundTruth(boxes, torch.from_numpy(seen), Transform.stack([f.world_from_agent for f in frames]))
+
+
+def _state(files: Sequence[Path], folder: Path) -> np.ndarray:
+    """(32,) uint8 digest of names, sizes and times of files; replacing any of them changes it."""
+    lines = []
+    for path in files:
+        stat = path.stat()
+        lines.append(f"{path.relative_to(folder).as_posix()} {stat.st_size} {stat.st_mtime_ns} {stat.st_ctime_ns}")
+    return np.frombuffer(hashlib.sha256("\n".join(lines).encode()).digest(), np.uint8)

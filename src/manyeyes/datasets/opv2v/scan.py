@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a folder in OPV2V's layout holds, by the names of its files: scenarios, agents, frames, and what is missing."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from manyeyes.datasets.manifest import PARTIAL, list_scenarios
+from manyeyes.datasets.missing import FileProblem
+from manyeyes.datasets.opv2v.camera import describe_missing_images, find_missing_images, image_path
+from manyeyes.datatypes import RecordingError
+
+_AGENT = re.compile(r"-?\d+")
+
+
+@dataclass(frozen=True)
+class AgentFiles:
+    """One agent's files. stems: of frames with a cloud and metadata; pictures: stems that a camera lacks, by its number."""
+
+    id: int
+    folder: Path
+    clouds: frozenset[str]
+    records: frozenset[str]
+    pictures: Mapping[int, Sequence[str]]
+
+    @cached_property
+    def stems(self) -> frozenset[str]:
+        """Stems of the frames that have both files."""
+        return self.clouds & self.records
+
+
+@dataclass(frozen=True)
+class ScenarioFiles:
+    """One scenario's files. stems: of the ego's frames, ascending."""
+
+    folder: Path
+    agents: tuple[AgentFiles, ...]
+    stems: tuple[str, ...]
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    with os.scandir(folder) as entries:  # knows folders from files without asking the disk again
+        return sorted(folder / e.name for e in entries if e.is_dir() and not e.name.startswith("."))
+
+
+def _is_scenario(folder: Path) -> bool:
+    return any(_AGENT.fullmatch(p.name) and not _is_scenario(p) for p in _subfolders(folder))
+
+
+def has_frames(folder: Path) -> bool:
+    """Whether a folder has agents with clouds or metadata, that is, whether it is a scenario with anything in it."""
+    agents = [p for p in _subfolders(folder) if _AGENT.fullmatch(p.name)]
+    return any(p.suffix in (".pcd", ".yaml") and p.stem.isdecimal() for agent in agents for p in agent.iterdir())
+
+
+def find_scenario_folders(root: Path, split: str | None) -> list[Path]:
+    """The folders to scan, after the root was checked; the text of every error lists what is there instead."""
+    if not root.is_dir():
+        raise RecordingError(f"{root}: no such folder, expected a recording in OPV2V's layout; check the path.")
+    folder = root if split is None else root / split
+    if split is not None and not folder.is_dir():
+        there = [p.name for p in _subfolders(root)]
+        if any(_is_scenario(p) for p in _subfolders(root)) or _is_scenario(root):
+            raise RecordingError(f"{root}: no split '{split}': the folder holds scenarios itself; name no split.")
+        raise RecordingError(f"{root}: no split '{split}'; it has {', '.join(there) or 'none'}: choose one of them.")
+    if _is_scenario(folder):
+        return [folder]
+    inside = _subfolders(folder)
+    if any(_is_scenario(p) for p in inside):
+        return inside
+    splits = [p.name for p in inside if any(_is_scenario(q) for q in _subfolders(p))]
+    if splits:
+        raise RecordingError(f"{folder}: holds several splits ({', '.join(splits)}), expected scenarios; name a split.")
+    raise RecordingError(
+        f"{folder}: no scenario in it, expected <scenario>/<agent>/<stem>.pcd and .yaml; check the path."
+    )
+
+
+def scan_scenario(folder: Path, problems: list[str], missing: list[FileProblem], images: bool) -> ScenarioFiles | None:
+    """What a scenario's folder holds, by names alone; what is missing is added to problems and to missing."""
+    if folder.name.endswith(PARTIAL):
+        reason = "an interrupted run of 'manyeyes simulate' left it unfinished"
+        problems.append(f"{folder}: {reason}, the scenario is left out")
+        missing.append(FileProblem(folder, "missing", folder.name.removesuffix(PARTIAL), reason))
+        return None
+    names = [p for p in _subfolders(folder) if _AGENT.fullmatch(p.name)]
+    ordered = [p for p in names if int(p.name) >= 0] + [p for p in names if int(p.name) < 0]
+    everyone = [_scan_agent(p, problems, images) for p in ordered]
+    missing += _absent_files(folder, everyone)
+    agents = [a for a in everyone if a.stems]
+    if not agents:
+        problems.append(f"{folder}: no agent with a whole frame, the scenario is left out")
+        return None
+    stems = tuple(sorted(agents[0].stems, key=int))
+    for agent in agents[1:]:
+        lacking = sorted(agents[0].stems - agent.stems, key=int)
+        surplus = sorted(agent.stems - agents[0].stems, key=int)
+        if lacking:
+            text = (
+                f"lacks {len(lacking)} of the ego's {len(stems)} frames, the first is {lacking[0]}; it is absent there"
+            )
+            problems.append(f"{agent.folder}: {text}")
+        if surplus:
+            text = f"has {len(surplus)} frames that the ego {agents[0].id} lacks, the first is {surplus[0]}; left out"
+            problems.append(f"{agent.folder}: {text}")
+    return ScenarioFiles(folder, tuple(agents), stems)
+
+
+def _scan_agent(folder: Path, problems: list[str], images: bool) -> AgentFiles:
+    everything = list(folder.iterdir())
+    files = [p for p in everything if p.stem.isdecimal()]
+    clouds = frozenset(p.stem for p in files if p.suffix == ".pcd")
+    records = frozenset(p.stem for p in files if p.suffix == ".yaml")
+    if not clouds and not records:
+        problems.append(f"{folder}: holds neither pcd nor yaml, the agent is left out")
+    for there, suffix in ((clouds - records, "yaml"), (records - clouds, "pcd")):
+        if there:
+            count = f"{len(there)} of {len(clouds | records)} frames"
+            problems.append(f"{folder}: {count} lack their {suffix}, the first is {min(there, key=int)}; left out")
+    stems = sorted(clouds & records, key=int)
+    if images:
+        problems += [f"{folder}: {line}" for line in describe_missing_images(everything, stems)]
+    return AgentFiles(
+        int(folder.name), folder, clouds, records, find_missing_images(everything, stems) if images else {}
+    )
+
+
+def _absent_files(folder: Path, agents: Sequence[AgentFiles]) -> Iterator[FileProblem]:
+    """The files that a scenario lacks: every stem of any agent is expected of all."""
+    stems = frozenset[str]().union(*(agent.clouds | agent.records for agent in agents))
+    # A folder of something else may stand beside the scenarios; an empty one was a scenario.
+    if not stems and (agents or (folder / "data_protocol.yaml").is_file() or not any(folder.iterdir())):
+        yield FileProblem(folder, "missing", folder.name, "no agent of the scenario has a frame")
+    for agent in agents:
+        for stem in sorted(stems, key=int):
+            for there, beside, suffix in ((agent.clouds, agent.records, "pcd"), (agent.records, agent.clouds, "yaml")):
+                if stem not in there:
+                    reason = "the other file of its frame is there" if stem in beside else "other agents have the frame"
+                    yield FileProblem(agent.folder / f"{stem}.{suffix}", "missing", folder.name, reason)
+        for number, lacking in agent.pictures.items():
+            for stem in lacking:
+                path = image_path(agent.folder, stem, number)
+                yield FileProblem(path, "missing", folder.name, "the camera has pictures of other frames")
+
+
+def compare_with_manifest(folders: Sequence[Path], problems: list[str], missing: list[FileProblem]) -> None:
+    """Add the scenarios of a split that the manifest of the simulator lists and that are not there."""
+    split = folders[0].parent
+    root = split.absolute().parent
+    absent = set(list_scenarios(root, split.absolute().name)) - {folder.name for folder in folders}
+    for name in sorted(absent - {problem.scenario for problem in missing}):
+        reason = "the recording's manifest lists this scenario"
+        problems.append(f"{split / name}: not there, and {reason}")
+        missing.append(FileProblem(split / name, "missing", name, reason))
