@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes import BevGrid, Boxes, Sites, SparseBev, Transform
+from manyeyes.datatypes import BevGrid, Boxes, ConfigError, Sites, SparseBev, Transform
 from manyeyes.models.detector.box_head import (
     BOX_LAYOUT,
     SPEED_UNIT,
@@ -18,15 +18,14 @@ from manyeyes.models.detector.box_head import (
     axis_yaw,
     heading_logit,
 )
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_velocity
 from manyeyes.models.detector.transformer import AttentionConfig
-from manyeyes.models.fusion.flow_aware import FastFusion
-from manyeyes.models.fusion.max_fusion import MaxFusion
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
-from manyeyes.models.fusion.self_attention import SelfAttentionFusion
+from manyeyes.models.fusion.registry import build_fusion, list_fusion_modules, register_fusion
 from manyeyes.models.fusion.token_merge import MIN_VOTE_LOGIT, assign_cells
 from manyeyes.models.fusion.transform_tokens import POSE_CONTEXT_DIM, AgentTokens, Tokens, rotate_vectors, to_ego_frame
-from manyeyes.models.fusion.v2x_vit import V2xVitFusion
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0).at(4)
 CHANNELS = 16
@@ -35,13 +34,7 @@ FUSIONS = ("max", "self-attention", "fast", "v2x-vit")
 
 def fusion(name: str, random_placement: bool = True) -> torch.nn.Module:
     torch.manual_seed(0)
-    attention = AttentionConfig(heads=2)
-    model = {
-        "max": lambda: MaxFusion(CHANNELS),
-        "self-attention": lambda: SelfAttentionFusion(CHANNELS, attention),
-        "fast": lambda: FastFusion(CHANNELS, attention),
-        "v2x-vit": lambda: V2xVitFusion(CHANNELS, attention),
-    }[name]()
+    model = build_fusion(name, CHANNELS, AttentionConfig(heads=2))
     if random_placement:
         torch.nn.init.normal_(model.encoding.outer.weight, std=0.3)
         torch.nn.init.normal_(model.encoding.temporal.weight, std=0.3)
@@ -284,3 +277,23 @@ def test_untrained_refinement_is_identity_and_trained_one_is_not(name):
     assert torch.equal(head(fused.bev, fused.merged_proposals).to_rows(), fused.merged_proposals)
     torch.nn.init.normal_(head.out.weight)
     assert not torch.allclose(head(fused.bev, fused.merged_proposals).to_rows(), fused.merged_proposals, atol=1e-2)
+
+
+def test_fusion_modules_are_registered_each_in_its_own_file():
+    assert {*FUSIONS, "multi-scale"} <= set(list_fusion_modules())
+
+
+def test_a_registered_fusion_module_is_built_by_name():
+    @register_fusion("own-mean")
+    class OwnFusion(torch.nn.Module):
+        def __init__(self, channels: int, attention: AttentionConfig) -> None:
+            super().__init__()
+            self.channels, self.attention = channels, attention
+
+    detector = Detector(dataclasses.replace(COSTR_TINY, fusion="own-mean"))
+    assert isinstance(detector.fusion, OwnFusion) and detector.fusion.attention == COSTR_TINY.fusion_attention
+
+
+def test_an_unknown_fusion_module_lists_the_known_ones():
+    with pytest.raises(ConfigError, match=r"No fusion module is called 'telepathy'; known: .*max, multi-scale"):
+        Detector(dataclasses.replace(COSTR_TINY, fusion="telepathy"))

@@ -39,7 +39,7 @@ def tokens(n: int = 50, batch: int = 2, seed: int = 0) -> Tokens:
 
 def fusion(levels: int = 3, trained: bool = True) -> MultiScaleFusion:
     torch.manual_seed(0)
-    model = MultiScaleFusion(CHANNELS, levels).eval().requires_grad_(False)
+    model = MultiScaleFusion(CHANNELS, levels=levels).eval().requires_grad_(False)
     if trained:
         torch.nn.init.normal_(model.out.weight)
     return model
@@ -115,4 +115,4 @@ def test_gradients_reach_every_scale_and_empty_input_passes():
 
 def test_one_level_is_refused():
     with pytest.raises(ConfigError, match="at least two levels"):
-        MultiScaleFusion(CHANNELS, 1)
+        MultiScaleFusion(CHANNELS, levels=1)

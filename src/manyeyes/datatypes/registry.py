@@ -17,11 +17,12 @@ import pkgutil
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from types import ModuleType
-from typing import Generic, TypeVar
+from typing import Generic, TypeVar, cast
 
 from manyeyes.datatypes.errors import ConfigError
 
 T = TypeVar("T")
+Item = TypeVar("Item")
 
 
 class Registry(Generic[T]):
@@ -40,19 +41,19 @@ class Registry(Generic[T]):
         self._entry_points: dict[str, EntryPoint] | None = None
         self._has_own = False
 
-    def register(self, name: str) -> Callable[[T], T]:
+    def register(self, name: str) -> Callable[[Item], Item]:
         """Return a decorator that registers an item under a name.
 
         Raises:
             ConfigError: another item has the name.
         """
 
-        def decorate(item: T) -> T:
+        def decorate(item: Item) -> Item:
             if name in self._items and not _is_same(self._items[name], item):
                 raise ConfigError(
                     f"A {self.kind} called {name!r} is registered already, by {_origin(self._items[name])}; choose another name."
                 )
-            self._items[name] = item
+            self._items[name] = cast(T, item)
             return item
 
         return decorate

@@ -18,13 +18,9 @@ from manyeyes.models.detector.proposal import make_proposals
 from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.models.detector.selector import Selector
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
-from manyeyes.models.fusion.flow_aware import FastFusion
-from manyeyes.models.fusion.max_fusion import MaxFusion
-from manyeyes.models.fusion.multi_scale import MultiScaleFusion
-from manyeyes.models.fusion.self_attention import SelfAttentionFusion
+from manyeyes.models.fusion.registry import build_fusion
 from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import Tokens
-from manyeyes.models.fusion.v2x_vit import V2xVitFusion
 
 
 @dataclass(frozen=True)
@@ -34,6 +30,7 @@ class DetectorConfig:
     Attributes:
         grid: perception range of an agent and pillar size.
         pillars: type of the pillar encoder.
+        fusion: name of the fusion module (``models.fusion.registry``).
         prune_threshold: cells with a lower probability of being near an object are dropped.
         output_range: range of the reported boxes where it is smaller than grid; None for all of grid.
         sweeps: number of consecutive sweeps in the input.
@@ -45,7 +42,7 @@ class DetectorConfig:
     pillar_channels: int = 32
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     dast: AttentionConfig = field(default_factory=AttentionConfig)
-    fusion: Literal["fast", "self-attention", "max", "multi-scale", "v2x-vit"] = "self-attention"
+    fusion: str = "self-attention"
     fusion_attention: AttentionConfig = field(default_factory=AttentionConfig)
     head_channels: int = 64
     prune_threshold: float = 0.1
@@ -82,7 +79,7 @@ class Detector(nn.Module):
         self.dast = WindowTransformer(channels, config.dast)
         self.token_prune = FocalPrune(channels)
         self.selector = Selector(channels)
-        self.fusion = _build_fusion(channels, config)
+        self.fusion = build_fusion(config.fusion, channels, config.fusion_attention)
         self.head = BoxHead(channels, config.head_channels)
         self.refine = RefineHead(channels, config.head_channels)
         self.codebook = None if config.codebook is None else Codebook(channels, config.codebook)
@@ -133,14 +130,3 @@ class Detector(nn.Module):
     def fuse_tokens(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """First half of fuse: one feature and one merged proposal per cell."""
         return self.fusion(tokens, past)
-
-
-_ATTENTION_FUSIONS = {"fast": FastFusion, "self-attention": SelfAttentionFusion, "v2x-vit": V2xVitFusion}
-
-
-def _build_fusion(
-    channels: int, config: DetectorConfig
-) -> FastFusion | SelfAttentionFusion | MaxFusion | MultiScaleFusion | V2xVitFusion:
-    if config.fusion in _ATTENTION_FUSIONS:
-        return _ATTENTION_FUSIONS[config.fusion](channels, config.fusion_attention)
-    return MaxFusion(channels) if config.fusion == "max" else MultiScaleFusion(channels)

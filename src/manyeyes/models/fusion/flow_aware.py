@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.registry import register_fusion
 from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
@@ -57,6 +58,7 @@ class PastAttention(nn.Module):
         return features.index_copy(0, has_past, some + self.ffn(self.norm_ffn(some)))
 
 
+@register_fusion("fast")
 class FastFusion(nn.Module):
     """Self-attention at the velocity-compensated positions, cross-attention to the ego's own past tokens, then
     TokenMerge.

@@ -5,15 +5,18 @@ from __future__ import annotations
 
 from torch import nn
 
+from manyeyes.models.detector.transformer import AttentionConfig
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.registry import register_fusion
 from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 
 
+@register_fusion("max")
 class MaxFusion(nn.Module):
-    """Channel-wise maximum over the tokens assigned to each cell."""
+    """Channel-wise maximum over the tokens assigned to each cell; it has no attention."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, attention: AttentionConfig | None = None) -> None:
         super().__init__()
         self.encoding, self.merge = SpatioTemporalEncoding(channels), TokenMerge(channels, "max")
 

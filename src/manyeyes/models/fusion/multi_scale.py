@@ -10,23 +10,26 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import ConfigError, Sites, SparseBev
 from manyeyes.models.detector.layers import SubmanifoldLayer
+from manyeyes.models.detector.transformer import AttentionConfig
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.registry import register_fusion
 from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.sparse_index import distinct
 from manyeyes.ops.voxelize import segment_max
 
 
+@register_fusion("multi-scale")
 class MultiScaleFusion(nn.Module):
     """Maximum over agents at the token stride and at multiples of it, concatenated and projected.
 
     Eq. 7a downsamples each agent's map and Eq. 7b fuses them. One maximum over a coarse cell does both, because the
     maximum over agents
     of per-agent maxima is the maximum over all tokens. Initialised to equal MaxFusion: coarser scales have weight
-    zero.
+    zero. It has no attention.
     """
 
-    def __init__(self, channels: int, levels: int = 3) -> None:
+    def __init__(self, channels: int, attention: AttentionConfig | None = None, levels: int = 3) -> None:
         super().__init__()
         if levels < 2:
             raise ConfigError(f"MultiScaleFusion needs at least two levels; got {levels}. Maximum fusion has one.")

@@ -9,10 +9,12 @@ from torch import nn
 
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.registry import register_fusion
 from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 
 
+@register_fusion("self-attention")
 class SelfAttentionFusion(nn.Module):
     """Window self-attention over all agents' tokens, then TokenMerge with softmax weights."""
 

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from manyeyes.datatypes import ConfigError
 from manyeyes.models.detector.transformer import AttentionConfig
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.registry import register_fusion
 from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.voxelize import segment_sum
@@ -156,6 +157,7 @@ class V2xVitLayer(nn.Module):
         return features + self.ffn(alone(features))
 
 
+@register_fusion("v2x-vit")
 class V2xVitFusion(nn.Module):
     """V2X-ViT layers, then TokenMerge with softmax weights as in the other fusions."""
 
