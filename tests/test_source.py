@@ -50,3 +50,9 @@ def test_files_that_a_hand_kept_list_missed_are_in_the_closure() -> None:
 def test_a_module_that_is_not_there_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"no module manyeyes\.moon"):
         import_closure("manyeyes.moon")
+
+
+def test_a_public_name_stands_for_the_module_that_defines_it() -> None:
+    names = {path.relative_to(PACKAGE).as_posix() for path in import_closure("manyeyes.datasets.perturbation")}
+    assert {"datatypes/__init__.py", "datatypes/transform.py", "_lazy.py"} <= names
+    assert "datatypes/map_element.py" not in names

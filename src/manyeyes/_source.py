@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
+from manyeyes._lazy import Definition, find_public_names
+
 PACKAGE = Path(__file__).resolve().parent
 
 
@@ -50,6 +52,7 @@ class _Parsed:
     def __init__(self, text: str) -> None:
         tree = ast.parse(text)
         self.imports = tuple(sorted(set(_imports(tree))))
+        self.public_names = find_public_names(tree)
         self.digest = hashlib.blake2b(ast.dump(_Statements().visit(tree)).encode(), digest_size=16).digest()
 
 
@@ -84,8 +87,14 @@ def _imports(node: ast.AST) -> Iterator[str]:
             yield from _imports(child)
 
 
+def _public_names(init: Path) -> dict[str, Definition]:
+    return _parsed(init.read_text(encoding="utf-8")).public_names
+
+
 def _files_of(name: str, package: Path, required: bool = False) -> list[Path]:
-    """The file of a module and those of the packages that hold it, without the outermost; none of another package's names."""
+    """The file of a module, or of the one that defines a public name of a package, and those of the packages that hold it,
+    without the outermost; none of another package's names.
+    """
     first, *parts = name.split(".")
     if first != package.name:
         return []
@@ -95,6 +104,8 @@ def _files_of(name: str, package: Path, required: bool = False) -> list[Path]:
         if place.with_suffix(".py").is_file():
             return [*files, place.with_suffix(".py")]
         if not place.is_dir():
+            home = _public_names(place.parent / "__init__.py").get(part)
+            files += _files_of(home.module, package) if home else []
             break
         files.append(place / "__init__.py")
     if required and (not parts or not place.is_dir()):

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from manyeyes.cli import main as cli
-from manyeyes.cli import train
+from manyeyes.cli import main as cli, train
 from manyeyes.cli.map import evaluate as map_evaluate
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import ConfigError

@@ -2,8 +2,7 @@
 """Shares of a channel: never exceeded, fair, nothing left over."""
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from manyeyes.comms.bandwidth import allocate_equal_share, allocate_max_min_fair
 from manyeyes.datatypes import ConfigError

@@ -7,8 +7,7 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, Transmission, channel_preset
 from manyeyes.comms.local_bus import LocalBus

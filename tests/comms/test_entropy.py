@@ -8,8 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from manyeyes.comms import wire
 from manyeyes.comms.entropy import TOTAL, CodeTables, count_fitting_coded_cells, pack_coded, unpack_coded

@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
-from manyeyes.comms import map_payload as elements
-from manyeyes.comms import wire
+from manyeyes.comms import map_payload as elements, wire
 from manyeyes.comms.inbox import Inbox
 from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import Boxes, Message, ShapeError, Transform, WireError

@@ -3,8 +3,7 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import encode

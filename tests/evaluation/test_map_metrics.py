@@ -6,8 +6,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, KINDS, MapElements
 from manyeyes.evaluation.maps.metrics import evaluate_map, find_branches, frechet

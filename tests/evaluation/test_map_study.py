@@ -13,8 +13,7 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps import adversarial as map_malice
-from manyeyes.evaluation.maps import map_cells
+from manyeyes.evaluation.maps import adversarial as map_malice, map_cells
 from manyeyes.evaluation.maps.adversarial import make_adversarial_jobs, measure_displacement, run_adversarial_jobs
 from manyeyes.evaluation.maps.experiment import FleetTrial, replace_poses, run_trial
 from manyeyes.evaluation.maps.hyperparameter_search import SEARCH_SPACE, sample_changes

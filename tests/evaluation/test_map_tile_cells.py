@@ -13,8 +13,7 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 from manyeyes.comms import wire
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
-from manyeyes.evaluation.maps import tile_cells
-from manyeyes.evaluation.maps import tile_prediction as tile_drawing
+from manyeyes.evaluation.maps import tile_cells, tile_prediction as tile_drawing
 from manyeyes.evaluation.maps.tile_cells import RecordingSource, TilePrediction, run_tile_study
 from manyeyes.evaluation.maps.tile_prediction import (
     CLEAN,

@@ -5,8 +5,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from manyeyes.datatypes import LABELS, BevGrid, ConfigError, ShapeError, Sites
 from manyeyes.models.detector.box_head import BOX_LAYOUT, DecodeConfig, RawBoxes, axis_yaw, decode, heading_logit

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.ops.nearest_line import find_nearest_line, find_nearest_line_slow, segments_of
 

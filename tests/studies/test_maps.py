@@ -33,10 +33,14 @@ from manyeyes.models.maps.head import MapHeadConfig
 from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.studies.map_pipeline import MapBuildConfig
-from manyeyes.studies.maps import full_map as whole
-from manyeyes.studies.maps import local, running, semi_global
-from manyeyes.studies.maps import map_pose_noise as pose
-from manyeyes.studies.maps import recorded_fleet as crowd
+from manyeyes.studies.maps import (
+    full_map as whole,
+    local,
+    map_pose_noise as pose,
+    recorded_fleet as crowd,
+    running,
+    semi_global,
+)
 from manyeyes.studies.town_maps import TownMap
 
 CONFIG = MapModelConfig(

@@ -21,9 +21,7 @@ from manyeyes.models.pose.box_descriptors import BoxKeypointConfig
 from manyeyes.models.pose.feakm import FORMAT, FeakmConfig, FeakmNet
 from manyeyes.models.pose.matcher import MatcherConfig
 from manyeyes.studies.detection.perturbations import Perturbation
-from manyeyes.studies.pose import feakm
-from manyeyes.studies.pose import pose_estimation as pose_accuracy
-from manyeyes.studies.pose import pose_noise_ap as pose
+from manyeyes.studies.pose import feakm, pose_estimation as pose_accuracy, pose_noise_ap as pose
 
 PLACES = torch.tensor(
     [

@@ -23,8 +23,7 @@ def main(options: Options) -> None:
     import torch.distributed as dist
     from rich.console import Console
 
-    from manyeyes.cli import train_maps as train_map
-    from manyeyes.cli import train_pose as train_feakm
+    from manyeyes.cli import train_maps as train_map, train_pose as train_feakm
     from manyeyes.datatypes import ConfigError
     from manyeyes.studies.recordings import check_files, open_recording
     from manyeyes.training.detector.presets import TRAINING_PRESETS

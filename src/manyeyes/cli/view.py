@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 import tyro
 
 from manyeyes._bounds import Fraction, NonNegativeInt, PositiveFloat, PositiveInt
-from manyeyes.datatypes import BevGrid, Boxes, ConfigError, Snapshot
+from manyeyes.datatypes import ConfigError
 from manyeyes.studies.replay_options import ReplayOptions, make_excerpt
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
     from manyeyes.agents.replay import ReplayConfig
+    from manyeyes.datatypes import BevGrid, Boxes, Snapshot
     from manyeyes.studies.replay_options import Excerpt
 
 SUFFIXES = (".png", ".gif", ".webp")
@@ -77,6 +78,7 @@ def main(options: Options) -> None:
 
 
 def _draw_images(options: Options, drive: Excerpt, indices: range) -> list[Image]:
+    from manyeyes.datatypes import BevGrid, Boxes
     from manyeyes.viz.birds_eye import draw_scene, make_scene
 
     snapshots = [drive.snapshot(drive.scenario, i) for i in (indices or (indices.start,))]

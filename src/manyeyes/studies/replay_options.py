@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from manyeyes._bounds import NonNegativeFloat, PositiveInt
-from manyeyes.datatypes import ConfigError, Snapshot
+from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.base import Recording
+    from manyeyes.datatypes import Snapshot
 
 ALL_METHODS = ("none", "late", "intermediate", "early")
 FRAME_PERIOD_MS = 100.0

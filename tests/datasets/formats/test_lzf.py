@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from manyeyes.datasets.formats.lzf import lzf_compress, lzf_decompress
 from manyeyes.datasets.formats.pcd import PcdTable, read_pcd, read_table, write_table

@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.datasets.opv2v.carla import carla_from_transform, mirror_points, transform_from_carla
 
