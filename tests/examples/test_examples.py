@@ -33,60 +33,60 @@ def test_every_example_is_run_here() -> None:
     assert [name for name in examples if f'run("{name}"' not in tested] == []
 
 
-def test_01_bytes_between_two_agents() -> None:
-    sent, alone, together = run("01_bytes_between_two_agents.py").strip().splitlines()
+def test_01_two_agents() -> None:
+    sent, no_fusion, fused = run("01_two_agents.py").strip().splitlines()
     assert "from 1 agent" in sent and int(sent.split()[0]) > 80
-    # One car stands hidden behind another; the pole sees it.
-    assert alone.startswith("alone: 5 of 6 cars") and "(18, 3)" not in alone
-    assert together.startswith("together: 6 of 6 cars") and "(18, 3)" in together
+    # One car is occluded for the ego; the roadside unit detects it.
+    assert no_fusion.startswith("no fusion: 5 of 6 cars") and "(18, 3)" not in no_fusion
+    assert fused.startswith("fused: 6 of 6 cars") and "(18, 3)" in fused
 
 
 @pytest.mark.slow
-def test_02_judge_a_drive(tmp_path: Path) -> None:
+def test_02_evaluate_recording(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
-    out = run("02_judge_a_drive.py", str(tmp_path / "drive"))
+    out = run("02_evaluate_recording.py", str(tmp_path / "drive"))
     assert [line.split()[0] for line in out.strip().splitlines()] == ["none", "late", "intermediate", "early"]
 
 
 @pytest.mark.skipif(not (SHARED / "av2").is_dir(), reason="../shared/data/av2 is not beside this repository")
-def test_03_two_real_sweeps(tmp_path: Path) -> None:
+def test_03_argoverse2(tmp_path: Path) -> None:
     picture = tmp_path / "pair.png"
-    out = run("03_two_real_sweeps.py", str(SHARED / "av2"), str(picture))
+    out = run("03_argoverse2.py", str(SHARED / "av2"), str(picture))
     assert "99466 real points" in out
     assert picture.stat().st_size > 50_000
 
 
-def test_04_one_map_from_many_drives(tmp_path: Path) -> None:
+def test_04_map_fusion(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="the 'map' extra is not installed")
     pytest.importorskip("shapely", reason="the 'map' extra is not installed")
     page = tmp_path / "crossroads.html"
-    fused, union, last = run("04_one_map_from_many_drives.py", str(page)).strip().splitlines()
-    assert fused.startswith("fused: ") and union.startswith("union: ") and last.endswith("shows it")
+    fused, union, last = run("04_map_fusion.py", str(page)).strip().splitlines()
+    assert fused.startswith("fused: ") and union.startswith("union: ") and last.startswith("wrote ")
     assert float(fused.split("mAP ")[1][:4]) > float(union.split("mAP ")[1][:4])
     assert page.stat().st_size > 1_000_000
 
 
 @pytest.mark.slow
-def test_05_late_and_few_bytes(tmp_path: Path) -> None:
+def test_05_delay_and_bandwidth(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
-    lines = run("05_late_and_few_bytes.py", str(tmp_path / "drive")).strip().splitlines()
+    lines = run("05_delay_and_bandwidth.py", str(tmp_path / "drive")).strip().splitlines()
     assert len(lines) == 3
     assert "with 0 bytes" in lines[0] and "with 0 bytes" not in lines[1]
 
 
-def test_06_a_map_from_messages() -> None:
-    *lines, last = run("06_a_map_from_messages.py").strip().splitlines()
+def test_06_map_server() -> None:
+    *lines, last = run("06_map_server.py").strip().splitlines()
     score = [float(line.rsplit("mAP ", 1)[1]) for line in (*lines, last)]
     assert len(lines) == 8 and " 96 messages" in lines[-1]
     assert score[-1] > 0.9 and score[-2] > 0.8 > score[0]
 
 
 @pytest.mark.slow
-def test_07_a_street_from_sweeps(tmp_path: Path) -> None:
+def test_07_map_model(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
     picture = tmp_path / "street.png"
-    alone, together = run("07_a_street_from_sweeps.py", str(picture)).strip().splitlines()
-    assert alone.startswith("1 frames") and together.startswith("5 frames")
+    single, several = run("07_map_model.py", str(picture)).strip().splitlines()
+    assert single.startswith("1 frames") and several.startswith("5 frames")
     # The AP of dividers is higher from five frames than from one.
-    assert float(together.split("divider ")[1].split(",")[0]) > float(alone.split("divider ")[1].split(",")[0])
+    assert float(several.split("divider ")[1].split(",")[0]) > float(single.split("divider ")[1].split(",")[0])
     assert picture.stat().st_size > 10_000

@@ -77,7 +77,7 @@ DETECTOR_BOXES_CONFIG = CorrectorConfig(
     VoteConfig(common_variance_fraction=0.05, lateral_sigma_ratio=0.6), AcceptanceTest(conflict_margin=5.0)
 )
 """For boxes of detectors: errors of one view are correlated, since a sensor observes one side of a vehicle, and longitudinal errors
-are larger than lateral ones, since the far end is seldom observed. Vehicles in a queue agree by chance (docs/pose.md).
+are larger than lateral ones, since the far end is seldom observed. Vehicles in a queue agree by chance (docs/pose/index.md).
 """
 
 

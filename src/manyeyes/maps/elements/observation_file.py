@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observations as Parquet, one row each (docs/observation.md), and reading that puts aside what cannot be used."""
+"""Observations as Parquet, one row each (docs/maps/observation.md), and reading that puts aside what cannot be used."""
 
 from __future__ import annotations
 
@@ -194,7 +194,9 @@ def _open(
     frame = _read_frame(file, opened.schema_arrow.metadata or {}, expected)
     missing = [name for name in _REQUIRED if name not in opened.schema_arrow.names]
     if missing:
-        raise ObservationError(f"{file}: expected the columns of docs/observation.md; {', '.join(missing)} missing.")
+        raise ObservationError(
+            f"{file}: expected the columns of docs/maps/observation.md; {', '.join(missing)} missing."
+        )
     return frame, _iterate_file_rows(opened)
 
 
@@ -221,7 +223,7 @@ def _read_frame(file: Path, stored: dict[bytes, bytes], expected: MapFrame | Non
         geographic = origin["crs"]
     except (KeyError, ValueError, TypeError) as error:
         raise ObservationError(
-            f"{file}: expected metadata 'manyeyes' with format, version, crs and origin as in docs/observation.md; "
+            f"{file}: expected metadata 'manyeyes' with format, version, crs and origin as in docs/maps/observation.md; "
             f"{type(error).__name__} {_line(error)}."
         ) from error
     if kind != "observation" or not isinstance(version, int) or not 1 <= version <= FORMAT_VERSION:
@@ -391,7 +393,7 @@ def _xy(pa: Any, rings: Sequence[NDArray[np.float64]]) -> Any:
 
 
 def _schema(pa: Any) -> Any:
-    """The columns of docs/observation.md."""
+    """The columns of docs/maps/observation.md."""
     number, text = pa.float64(), pa.string()
     xy = pa.struct([("x", number), ("y", number)])
     point = pa.struct([("x", number), ("y", number), ("sigma", number)])

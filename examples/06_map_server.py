@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Twelve vehicles send local maps of a crossroads, a few hundred bytes each, and a map server fuses them online.
+"""Twelve vehicles send local maps of a crossroads, a few hundred bytes each, and a map server fuses them incrementally.
 
 The local maps are the true map with the errors of a simulated fleet; on a recording, 'manyeyes map build' takes a map model.
 """
@@ -18,12 +18,12 @@ from manyeyes.simulator.fleet.place import clip_to_box, load_place
 where = load_place("cross", size_m=100.0)
 truth = where.clip_to_area()
 predictor, window = SimulatedMapPredictor(where.truth, crowd_config("local")), MAP_MODES["local"].vehicle_window
-service, inbox = MapServer(where.frame), Inbox()
+server, inbox = MapServer(where.frame), Inbox()
 
-spent = 0
+num_bytes = 0
 for instant in range(8):
     for vehicle in range(12):
-        # Three vehicles come in on each of four arms, one behind the other, at 10 m/s, and send once a second.
+        # Three vehicles approach on each of four arms at 10 m/s, one behind the other, and send once a second.
         heading, away = vehicle % 4 * np.pi / 2, 30.0 + 12.0 * (vehicle // 4) - 10.0 * instant
         pose = np.array([-away * np.cos(heading), -away * np.sin(heading), heading])
         local_map = predictor.predict(pose, window, vehicle, instant)
@@ -38,17 +38,17 @@ for instant in range(8):
             pose_covariance=torch.diag(torch.tensor([0.09, 0.09, 2.5e-5], dtype=torch.float64)),
         )
         packets = encode_map_message(frame, local_map)
-        spent += sum(map(len, packets))
+        num_bytes += sum(map(len, packets))
         for packet in packets:
             inbox.push(packet)
-        service.ingest(inbox.received_messages())
-    now = service.map().select_published()
-    quality = evaluate_map(clip_to_box(now.elements, where.area), truth)
+        server.ingest(inbox.received_messages())
+    fused = server.map().select_published()
+    quality = evaluate_map(clip_to_box(fused.elements, where.area), truth)
     print(
-        f"{instant} s: {len(service.observations)} messages, {spent} bytes, {len(now)} elements, mAP {quality.mean_ap():.2f}"
+        f"{instant} s: {len(server.observations)} messages, {num_bytes} bytes, {len(fused)} elements, mAP {quality.mean_ap():.2f}"
     )
 
-made = service.rebuild().select_published()
+fused = server.rebuild().select_published()
 print(
-    f"all at once: {len(made)} elements, mAP {evaluate_map(clip_to_box(made.elements, where.area), truth).mean_ap():.2f}"
+    f"batch fusion: {len(fused)} elements, mAP {evaluate_map(clip_to_box(fused.elements, where.area), truth).mean_ap():.2f}"
 )

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One map from many drives: fuse sixty noisy local maps of a crossroads, evaluate the result and draw it.
+"""Fuse sixty noisy local maps of a crossroads into one map, evaluate the result and draw it.
 
-python examples/04_one_map_from_many_drives.py out/crossroads.html
+python examples/04_map_fusion.py out/crossroads.html
 """
 
 import sys
@@ -22,7 +22,7 @@ page.parent.mkdir(parents=True, exist_ok=True)
 where = load_place("cross", size_m=160.0)
 crowd = simulate_crowd(where, 60, seed=1)
 
-# Yours would come from a file, as docs/observation.md describes it: one row an observation.
+# Observations of your own are read from a file in the format of docs/maps/observation.md: one row per observation.
 file = page.with_name("observations.parquet")
 write_observations(file, crowd.observations, where.frame)
 observations = read_observations(file).observations
@@ -39,4 +39,4 @@ for name, elements in (("fused", made.elements), ("union", union)):
     )
 
 save_map_page(make_page("Crossroads", made, truth, union, len(observations)), page)
-print(f"{page} shows it")
+print(f"wrote {page}")

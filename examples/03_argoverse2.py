@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real LiDAR: two sweeps of one Argoverse 2 log as two agents; the second's bytes, and both clouds in one picture."""
+"""Share and fuse two sweeps of an Argoverse 2 log as two agents, and draw both clouds with the detections."""
 
 import sys
 from pathlib import Path
@@ -17,11 +17,9 @@ first, second = snapshot.frames
 packets = Agent(detector).share(second)
 perception = Agent(detector).perceive(first, packets)
 print(f"{sum(map(len, packets))} bytes from {len(second.points)} real points, {len(perception.boxes)} boxes")
-picture = Path(sys.argv[2] if len(sys.argv) > 2 else "two_real_sweeps.png")
+picture = Path(sys.argv[2] if len(sys.argv) > 2 else "argoverse2.png")
 save_png(
-    draw_scene(
-        make_scene(snapshot, perception.boxes), detector.config.grid, "Two real sweeps as two agents", min_score=0.6
-    ),
+    draw_scene(make_scene(snapshot, perception.boxes), detector.config.grid, "Two sweeps as two agents", min_score=0.6),
     picture,
 )
 print(picture)
