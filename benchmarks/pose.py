@@ -27,11 +27,11 @@ from pathlib import Path
 import numpy as np
 
 from manyeyes.evaluation.pose.metrics import PoseEvaluation, PoseScore, PriorNoise, evaluate_pose, summarize_evaluations
-from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_pose
+from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_by_voting
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.multi_frame import TimedLandmarks, accumulate
 from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorState, update_monitor
-from manyeyes.pose.registry import CORRECTORS
+from manyeyes.pose.registry import list_correctors, load_corrector
 from manyeyes.pose.types import PoseCorrector, PoseStatus
 from manyeyes.simulator.fleet.landmark_scenes import (
     BoxNoise,
@@ -114,7 +114,7 @@ def run(
 def success(scenes: int, nulls: int) -> Iterator[Row]:
     """The best candidate, accepted or not."""
     for common in (3, 4, 5, 6, 8):
-        spec, guess = LandmarkSpec(common, 8, 10), partial(correct_pose, config=GUESS)
+        spec, guess = LandmarkSpec(common, 8, 10), partial(correct_by_voting, config=GUESS)
         for kind, sigma in (("none", 0.0), ("gaussian", 1.0), ("gaussian", 4.0), ("unknown", 0.0)):
             yield run("success", "voting", guess, spec, PriorNoise(kind, sigma, sigma), scenes, 0)
 
@@ -130,7 +130,7 @@ def answers(scenes: int, nulls: int) -> Iterator[Row]:
             (LandmarkSpec(0, 22, 28, error, disjoint=True, num_instants=5), 5),
             (LandmarkSpec(noise=error, num_instants=5), 5),
         ):
-            yield run("answers", "voting", correct_pose, spec, none, nulls // divisor, 1)
+            yield run("answers", "voting", correct_by_voting, spec, none, nulls // divisor, 1)
 
 
 def displacement(scenes: int, nulls: int) -> Iterator[Row]:
@@ -138,15 +138,15 @@ def displacement(scenes: int, nulls: int) -> Iterator[Row]:
     for sigma in (0.1, 0.2, 0.5):
         for method in ("identity", "voting"):
             noise = PriorNoise("gaussian", sigma, sigma)
-            yield run("displacement", method, CORRECTORS[method], LandmarkSpec(), noise, scenes, 4)
+            yield run("displacement", method, load_corrector(method), LandmarkSpec(), noise, scenes, 4)
 
 
 def baselines(scenes: int, nulls: int) -> Iterator[Row]:
     """All correctors, against the noise of the prior."""
     for sigma in (0.0, 0.4, 0.8, 1.2, 2.0):
-        for method, corrector in CORRECTORS.items():
+        for method in list_correctors("landmarks"):
             noise = PriorNoise("gaussian", sigma, sigma)
-            yield run("baselines", method, corrector, LandmarkSpec(6, 8, 10), noise, scenes // 2, 5)
+            yield run("baselines", method, load_corrector(method), LandmarkSpec(6, 8, 10), noise, scenes // 2, 5)
 
 
 def monitor(scenes: int, nulls: int) -> Iterator[Row]:
@@ -156,7 +156,7 @@ def monitor(scenes: int, nulls: int) -> Iterator[Row]:
             for kind in ("offset", "gaussian"):
                 for sigma in (0.2, 0.5, 1.0):
                     spec, noise = LandmarkSpec(common, ego_extra, other_extra), PriorNoise(kind, sigma, sigma)
-                    yield run("monitor", "voting", correct_pose, spec, noise, scenes, 7)
+                    yield run("monitor", "voting", correct_by_voting, spec, noise, scenes, 7)
 
     for kind in ("offset", "bias", "gaussian"):
         for sigma in (0.2, 0.5, 1.0):
@@ -177,7 +177,7 @@ def run_monitor(spec: LandmarkSpec, noise: PriorNoise, scenes: int, seed: int) -
             truth = relative_pose(scene.ego_from_then[instant], scene.ego_from_other)
             prior = noise.make_prior(truth, n, instant if noise.kind == "gaussian" else 0)
             begin = time.process_time()
-            estimate = correct_pose(*(Landmarks.of_boxes(b[instant]) for b in (scene.ego, scene.other)), prior)
+            estimate = correct_by_voting(*(Landmarks.of_boxes(b[instant]) for b in (scene.ego, scene.other)), prior)
             state, report = update_monitor(state, estimate, prior, -instant * spec.period_s)
             spent.append(1e3 * (time.process_time() - begin))
             is_flagged = report.health in (PoseHealth.OFFSET, PoseHealth.DRIFTING)
@@ -202,7 +202,7 @@ def run_monitor(spec: LandmarkSpec, noise: PriorNoise, scenes: int, seed: int) -
 
 def speed(scenes: int, nulls: int) -> Iterator[Row]:
     """40 by 40 objects."""
-    yield run("speed", "voting", correct_pose, LandmarkSpec(8, 32, 32), PriorNoise("none"), 40, 6)
+    yield run("speed", "voting", correct_by_voting, LandmarkSpec(8, 32, 32), PriorNoise("none"), 40, 6)
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,11 @@ def test_files_that_a_hand_kept_list_missed_are_in_the_closure() -> None:
     assert {"ops/keyed_random.py", "datatypes/map_element.py", "maps/formats/opendrive.py"} <= names
 
 
+def test_the_modules_of_a_registry_are_in_the_closure() -> None:
+    names = {path.relative_to(PACKAGE).as_posix() for path in import_closure("manyeyes.pose.registry")}
+    assert {"pose/corrector.py", "pose/feakm.py", "pose/baselines/vips.py", "models/pose/matcher.py"} <= names
+
+
 def test_a_module_that_is_not_there_is_an_error() -> None:
     with pytest.raises(ValueError, match=r"no module manyeyes\.moon"):
         import_closure("manyeyes.moon")

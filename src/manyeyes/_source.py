@@ -19,7 +19,7 @@ def source_digest(*modules: str, package: Path = PACKAGE) -> str:
     """Hash the import closure of modules of the package, as it was when first asked for.
 
     Comments, docstrings and layout do not count, statements do. Imports inside functions count, those for type checkers do not;
-    what is imported by a computed name is to be given as a module of its own.
+    what is imported by a computed name is to be given as a module of its own; all modules of a Registry count.
 
     Args:
         modules: full names, such as ``manyeyes.evaluation.detection.benchmark``. package: the folder of ``manyeyes``.
@@ -84,6 +84,8 @@ def _imports(node: ast.AST) -> Iterator[str]:
             yield str(child.module)
             yield from (f"{child.module}.{alias.name}" for alias in child.names)
         else:
+            if isinstance(child, ast.Call) and ast.unparse(child.func).startswith("Registry"):
+                yield from (f"{argument.value}.*" for argument in child.args if isinstance(argument, ast.Constant))
             yield from _imports(child)
 
 
@@ -93,13 +95,15 @@ def _public_names(init: Path) -> dict[str, Definition]:
 
 def _files_of(name: str, package: Path, required: bool = False) -> list[Path]:
     """The file of a module, or of the one that defines a public name of a package, and those of the packages that hold it,
-    without the outermost; none of another package's names.
+    without the outermost; none of another package's names. A last part * stands for all modules of a package.
     """
     first, *parts = name.split(".")
     if first != package.name:
         return []
     files, place = [], package
     for part in parts:
+        if part == "*":
+            return [*files, *sorted(place.glob("*.py"))]
         place = place / part
         if place.with_suffix(".py").is_file():
             return [*files, place.with_suffix(".py")]

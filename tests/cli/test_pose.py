@@ -15,7 +15,7 @@ from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snaps
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.pose.registry import CLOUD_CORRECTORS
+from manyeyes.pose.registry import POSE_CORRECTORS, RegisteredCorrector
 from manyeyes.pose.types import no_estimate
 
 PLACES = [
@@ -98,7 +98,8 @@ def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
         sizes.append((len(ego), len(other)))
         return no_estimate(prior)
 
-    monkeypatch.setitem(CLOUD_CORRECTORS, "scan-registration", cloud)
+    POSE_CORRECTORS.get("scan-registration")
+    monkeypatch.setitem(POSE_CORRECTORS._items, "scan-registration", RegisteredCorrector(cloud, "clouds"))
     words = ("--split", "test", "--weights", weights, "--out", out, "--correctors", "scan-registration", "voting")
     assert run("pose", data, *words) == 0
     answers = json.loads((out / "pose.json").read_text())["result"]["answers"]
@@ -109,4 +110,4 @@ def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
 def test_an_unknown_corrector_lists_the_known(drive, capsys) -> None:
     data, weights, out = drive
     assert run("pose", data, "--split", "test", "--weights", weights, "--out", out, "--correctors", "magic") == 1
-    assert "known: voting, identity, coalign" in capsys.readouterr().err
+    assert "known: coalign, feaco, feakm, fpv-rcnn" in capsys.readouterr().err

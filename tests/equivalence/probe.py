@@ -28,7 +28,7 @@ from manyeyes.evaluation.maps.registry import fuse_observations, make_tuned_sett
 from manyeyes.models import pretrained
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.registry import CORRECTORS
+from manyeyes.pose.registry import list_correctors, load_corrector
 from manyeyes.pose.types import PosePrior
 from manyeyes.simulator.fleet.landmark_scenes import BoxNoise, LandmarkSpec, make_landmark_scene
 from manyeyes.training.detector.loop import DetectorRun, TrainConfig
@@ -98,9 +98,9 @@ def corrected_poses(data: Path) -> Arrays:
         ego, other = Landmarks.of_boxes(scene.ego[0]), Landmarks.of_boxes(scene.other[0])
         x, y, yaw = (scene.ego_from_other + np.array([0.8, -0.5, 0.02])).tolist()
         wrong = Transform.from_xyz_yaw(x, y, 0.0, yaw)
-        for key, corrector in CORRECTORS.items():
+        for key in list_correctors("landmarks"):
             for prior_key, prior in (("prior", PosePrior(wrong, np.diag([0.5, 0.5, 0.01]))), ("none", None)):
-                found = corrector(ego, other, prior)
+                found = load_corrector(key)(ego, other, prior)
                 pose = np.full(3, np.nan) if found.pose is None else np.asarray(found.pose)
                 numbers = [found.inliers, found.runner_up, found.margin, found.mahalanobis_squared]
                 yield f"pose/{key}/{prior_key}/{number}", np.concatenate((pose, found.covariance.ravel(), numbers))

@@ -22,7 +22,7 @@ from manyeyes.models.pose.box_descriptors import BoxKeypointConfig
 from manyeyes.models.pose.feakm import FeakmConfig, FeakmNet
 from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.models.pose.matcher import MatcherConfig
-from manyeyes.pose.corrector import correct_pose
+from manyeyes.pose.corrector import correct_by_voting
 from manyeyes.pose.feakm import FeakmCorrector, RansacConfig, solve_with_ransac
 from manyeyes.pose.types import no_estimate
 from manyeyes.simulator.fleet.landmark_scenes import LandmarkSpec, make_landmark_scene
@@ -128,7 +128,7 @@ def test_correctors_are_evaluated_on_the_same_pairs_and_priors():
         x, y, yaw = made.ego_from_other.tolist()
         points = [Keypoints(boxes, torch.zeros(len(boxes), 1)) for boxes in (made.ego[0], made.other[0])]
         pairs.append((*points, Transform.from_xyz_yaw(x, y, 0.0, yaw)))
-    finders = {"voting": correct_pose, "claim": lambda ego, other, prior: no_estimate(prior)}
+    finders = {"voting": correct_by_voting, "claim": lambda ego, other, prior: no_estimate(prior)}
     found = evaluate_correctors(pairs, finders, PriorNoise("gaussian", 1.0, 1.0))
     assert all(len(frames) == 4 for frames in found.values())
     assert [f.num_common for f in found["voting"]] == [f.num_common for f in found["claim"]] and found["voting"][

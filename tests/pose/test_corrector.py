@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from manyeyes.datatypes import ConfigError, Transform
-from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_pose, fuse_estimates, rank_candidates
+from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_by_voting, fuse_estimates, rank_candidates
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PosePrior, PoseStatus, pose_difference
 from manyeyes.pose.voting import VoteConfig, find_candidates
@@ -43,7 +43,7 @@ def row(places, yaw=0.0, sigma=0.1, flip=0.03):
 def test_the_pose_is_found_from_nowhere_and_its_pairs_are_the_common_objects():
     for scene in range(4):
         ego, other, made = views(scene=scene)
-        found = correct_pose(ego, other, None)
+        found = correct_by_voting(ego, other, None)
         assert found.status is PoseStatus.CORRECTED and found.pose is not None
         assert max(off(found.pose, made.ego_from_other)) < 1.0
         common = set(map(tuple, made.common_pairs))
@@ -55,7 +55,7 @@ def test_its_own_noise_free_view_is_recovered_exactly():
     ego, _, _ = views()
     pose = np.array([31.0, -12.0, 2.5])
     back = Transform.from_xyz_yaw(31.0, -12.0, 0.0, 2.5).inverse()
-    found = correct_pose(ego, ego.transform(np.array([*back.translation[:2].tolist(), float(back.yaw)])), None)
+    found = correct_by_voting(ego, ego.transform(np.array([*back.translation[:2].tolist(), float(back.yaw)])), None)
     np.testing.assert_allclose(pose_difference(found.pose, pose), 0, atol=1e-9)
     assert found.inliers == len(ego)
 
@@ -64,13 +64,13 @@ def test_nothing_little_and_nothing_in_common_give_no_pose():
     ego, other, _ = views()
     few = np.array([0])
     for one, two in ((Landmarks.empty(), other), (ego, Landmarks.empty()), (ego[few], other[few])):
-        assert correct_pose(one, two, None).status is PoseStatus.NO_MATCH
+        assert correct_by_voting(one, two, None).status is PoseStatus.NO_MATCH
     strangers = [views(scene=s, disjoint=True, ego_extra=22, other_extra=28) for s in range(6)]
     for ego, other, _ in strangers:
-        found = correct_pose(ego, other, None)
+        found = correct_by_voting(ego, other, None)
         assert not found.status.has_estimate and found.pose is None
         prior = make_prior([5.0, 1.0, 0.3])
-        kept = correct_pose(ego, other, prior)
+        kept = correct_by_voting(ego, other, prior)
         if not kept.status.has_estimate:
             np.testing.assert_allclose(kept.pose, prior.pose)
             np.testing.assert_allclose(kept.covariance, prior.covariance)
@@ -78,7 +78,7 @@ def test_nothing_little_and_nothing_in_common_give_no_pose():
 
 def test_an_evenly_spaced_queue_is_ambiguous():
     queue = row([(8.0 * k, 0.02 * k) for k in range(9)])
-    found = correct_pose(queue, queue.transform(np.array([3.0, 2.0, 0.5])), None)
+    found = correct_by_voting(queue, queue.transform(np.array([3.0, 2.0, 0.5])), None)
     assert found.status is PoseStatus.AMBIGUOUS and found.pose is None and found.runner_up >= 8
 
 
@@ -86,23 +86,23 @@ def test_a_four_way_layout_that_fits_turned_by_pi_is_ambiguous_without_headings_
     places = np.array([(20, 3), (33, 3), (45, 7), (-3, 18), (-3, 29), (-7, 41)], float)
     places = np.concatenate((places, -places))
     blind = row(places, flip=0.5)
-    assert correct_pose(blind, blind.transform(np.array([1.0, 2.0, 0.4])), None).status is PoseStatus.AMBIGUOUS
+    assert correct_by_voting(blind, blind.transform(np.array([1.0, 2.0, 0.4])), None).status is PoseStatus.AMBIGUOUS
     seeing = row(places, flip=0.03)
-    found = correct_pose(seeing, seeing.transform(np.array([0.0, 0.0, 0.4])), None)
+    found = correct_by_voting(seeing, seeing.transform(np.array([0.0, 0.0, 0.4])), None)
     assert found.status is PoseStatus.CORRECTED and max(off(found.pose, [0.0, 0.0, -0.4])) < 1e-6
 
 
 def test_a_mirrored_scene_is_not_matched_by_a_reflection():
     ego, other, _ = views(common=12)
     mirrored = replace(other, xy=other.xy * [1.0, -1.0], yaw=-other.yaw)
-    assert not correct_pose(ego, mirrored, None).status.has_estimate
+    assert not correct_by_voting(ego, mirrored, None).status.has_estimate
 
 
 def test_duplicates_and_flipped_headings_do_no_harm():
     ego, other, made = views(common=9)
     twice = Landmarks.cat([other, replace(other, xy=other.xy + 0.3)])
     turned = replace(ego, yaw=ego.yaw + np.pi * (np.arange(len(ego)) % 10 == 0))
-    found = correct_pose(turned, twice, None)
+    found = correct_by_voting(turned, twice, None)
     assert found.status.has_estimate and max(off(found.pose, made.ego_from_other)) < 1.0
     assert len(set(found.pairs[:, 0])) == len(set(found.pairs[:, 1])) == found.inliers
 
@@ -111,7 +111,7 @@ def test_duplicates_and_flipped_headings_do_no_harm():
 def test_a_wrong_prior_is_a_conflict_and_not_used(metres, degrees):
     ego, other, made = views()
     wrong = make_prior(made.ego_from_other + [metres, 0.0, math.radians(degrees)])
-    found = correct_pose(ego, other, wrong)
+    found = correct_by_voting(ego, other, wrong)
     assert found.status is PoseStatus.CONFLICT and found.mahalanobis_squared > 16.27
     np.testing.assert_allclose(found.pose, found.measured, atol=1e-12)
     assert max(off(found.pose, made.ego_from_other)) < 1.0
@@ -120,19 +120,23 @@ def test_a_wrong_prior_is_a_conflict_and_not_used(metres, degrees):
 def test_conflict_margin_applies_to_candidates_that_contradict_the_prior():
     ego, other, made = views(common=5, ego_extra=3, other_extra=3)
     wrong = make_prior(made.ego_from_other + np.array([9.0, -6.0, 0.8]))
-    plain = correct_pose(ego, other, wrong)
+    plain = correct_by_voting(ego, other, wrong)
     assert plain.status is PoseStatus.CONFLICT
     ranked = rank_candidates(find_candidates(ego, other, VoteConfig(), wrong), wrong, AcceptanceTest().prior_volume)
     for more, status in ((0.9, PoseStatus.CONFLICT), (1.1, PoseStatus.NO_MATCH)):
         enough = more * (ranked.score - AcceptanceTest().min_score)
-        asked = correct_pose(
+        asked = correct_by_voting(
             ego, other, wrong, CorrectorConfig(accept=AcceptanceTest(conflict_margin=enough, min_margin=0.0))
         )
         assert asked.status is status
     # A prior that objects agree with needs no such margin.
     right = make_prior(made.ego_from_other)
     much = CorrectorConfig(accept=AcceptanceTest(conflict_margin=1e3))
-    assert correct_pose(ego, other, right, much).status is correct_pose(ego, other, right).status is PoseStatus.OK
+    assert (
+        correct_by_voting(ego, other, right, much).status
+        is correct_by_voting(ego, other, right).status
+        is PoseStatus.OK
+    )
     with pytest.raises(ConfigError, match="conflict_margin"):
         AcceptanceTest(conflict_margin=-1.0)
 
@@ -140,7 +144,7 @@ def test_conflict_margin_applies_to_candidates_that_contradict_the_prior():
 def test_a_good_prior_is_fused_and_reduces_both_covariances():
     ego, other, made = views()
     prior = make_prior(made.ego_from_other + [0.1, -0.1, 0.002], sigma=0.2)
-    found = correct_pose(ego, other, prior)
+    found = correct_by_voting(ego, other, prior)
     assert found.status is PoseStatus.OK and found.mahalanobis_squared < 7.82
     for alone in (prior.covariance, found.measured_covariance):
         assert np.linalg.eigvalsh(alone - found.covariance).min() > -1e-12
@@ -149,7 +153,7 @@ def test_a_good_prior_is_fused_and_reduces_both_covariances():
 def test_a_prior_without_error_stays_while_objects_agree():
     ego, other, made = views()
     exact = PosePrior(transform(made.ego_from_other), np.zeros((3, 3)))
-    found = correct_pose(ego, other, exact)
+    found = correct_by_voting(ego, other, exact)
     if found.status is PoseStatus.OK:
         np.testing.assert_allclose(pose_difference(found.pose, made.ego_from_other), 0, atol=1e-9)
     assert found.status in (PoseStatus.OK, PoseStatus.CORRECTED)
@@ -157,8 +161,8 @@ def test_a_prior_without_error_stays_while_objects_agree():
 
 def test_a_prior_allows_an_estimate_from_few_objects():
     ego, other, made = views(common=3, scene=1)
-    assert not correct_pose(ego, other, None).status.has_estimate
-    found = correct_pose(ego, other, make_prior(made.ego_from_other, 0.3))
+    assert not correct_by_voting(ego, other, None).status.has_estimate
+    found = correct_by_voting(ego, other, make_prior(made.ego_from_other, 0.3))
     assert found.status is PoseStatus.OK
 
 
@@ -169,7 +173,7 @@ def test_height_and_tilt_are_those_of_the_prior():
         torch.tensor([pose[0], pose[1], 4.0], dtype=torch.float64),
         *torch.tensor([0.02, -0.03, pose[2]], dtype=torch.float64),
     )
-    found = correct_pose(ego, other, PosePrior.of(tilted, 0.5, 0.01)).ego_from_other
+    found = correct_by_voting(ego, other, PosePrior.of(tilted, 0.5, 0.01)).ego_from_other
     assert float(found.translation[2]) == 4.0
     up = tilted.rotation[2], found.rotation[2]
     assert float(up[0][2]) == pytest.approx(float(up[1][2]), abs=1e-12)
@@ -179,17 +183,17 @@ def test_height_and_tilt_are_those_of_the_prior():
 def test_estimates_are_equivariant_to_frames_order_and_exchange(lateral_sigma_ratio):
     ego, other, _ = views()
     config = CorrectorConfig(VoteConfig(lateral_sigma_ratio=lateral_sigma_ratio))
-    found = correct_pose(ego, other, None, config)
+    found = correct_by_voting(ego, other, None, config)
     step, turn = np.array([4.0, -7.0, 1.1]), np.array([-30.0, 12.0, -2.0])
-    moved = correct_pose(ego.transform(step), other.transform(turn), None, config)
+    moved = correct_by_voting(ego.transform(step), other.transform(turn), None, config)
     wanted = transform(step) @ transform(found.pose) @ transform(turn).inverse()
     np.testing.assert_allclose(moved.ego_from_other.matrix(), wanted.matrix(), atol=1e-6)
     rng = np.random.default_rng(0)
     one, two = rng.permutation(len(ego)), rng.permutation(len(other))
-    mixed = correct_pose(ego[one], other[two], None, config)
+    mixed = correct_by_voting(ego[one], other[two], None, config)
     assert (mixed.pose == found.pose).all() and (mixed.covariance == found.covariance).all()
     assert set(zip(one[mixed.pairs[:, 0]], two[mixed.pairs[:, 1]])) == set(map(tuple, found.pairs))
-    back = correct_pose(other, ego, None, config)
+    back = correct_by_voting(other, ego, None, config)
     np.testing.assert_allclose(back.ego_from_other.matrix(), found.ego_from_other.inverse().matrix(), atol=1e-6)
     assert back.inliers == found.inliers and back.margin == pytest.approx(found.margin, abs=1e-6)
 
@@ -245,12 +249,12 @@ def test_invalid_landmarks_are_ignored_and_the_number_is_bounded():
     ego, other, _ = views(common=12)
     junk = replace(other, xy=other.xy.copy(), yaw=other.yaw.copy())
     junk.xy[-1], junk.yaw[-2], junk.xy[-3] = np.nan, np.inf, 1e9
-    assert correct_pose(ego, junk, None).ego_from_other is not None
+    assert correct_by_voting(ego, junk, None).ego_from_other is not None
     rng = np.random.default_rng(0)
     crowd = row(rng.uniform(-100, 100, (10_000, 2)), flip=0.5)
     crowd = replace(crowd, yaw=rng.uniform(-3, 3, 10_000), score=rng.random(10_000))
     few = CorrectorConfig(VoteConfig(max_landmarks=40))
-    assert len(correct_pose(crowd, crowd[::-1].transform(np.array([1e3, 0.0, 0.0])), None, few).pairs) <= 40
+    assert len(correct_by_voting(crowd, crowd[::-1].transform(np.array([1e3, 0.0, 0.0])), None, few).pairs) <= 40
 
 
 def test_fusion_weights_by_information_and_wraps_angles():

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.pose.corrector import correct_pose
+from manyeyes.pose.corrector import correct_by_voting
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.multi_frame import TimedLandmarks, accumulate
 from manyeyes.pose.types import PoseStatus, pose_difference
@@ -31,8 +31,8 @@ def both(scene):
 
 def test_five_frames_match_where_one_does_not():
     scene = make_landmark_scene(LandmarkSpec(3, 6, 6, num_instants=5), 4, 1)
-    one = correct_pose(Landmarks.of_boxes(scene.ego[0]), Landmarks.of_boxes(scene.other[0]), None)
-    five = correct_pose(*both(scene), None)
+    one = correct_by_voting(Landmarks.of_boxes(scene.ego[0]), Landmarks.of_boxes(scene.other[0]), None)
+    five = correct_by_voting(*both(scene), None)
     assert one.status is PoseStatus.NO_MATCH and five.status is PoseStatus.CORRECTED
     error = pose_difference(five.pose, scene.ego_from_other)
     assert np.hypot(*error[:2]) < 1.0 and abs(error[2]) < 0.0175
@@ -40,7 +40,7 @@ def test_five_frames_match_where_one_does_not():
 
 def test_objects_of_different_instants_are_never_paired():
     ego, other = both(make_landmark_scene(LandmarkSpec(4, 3, 3, num_instants=3), 4, 2))
-    found = correct_pose(ego, other, None)
+    found = correct_by_voting(ego, other, None)
     assert len(found.pairs) and (ego.instant[found.pairs[:, 0]] == other.instant[found.pairs[:, 1]]).all()
 
 

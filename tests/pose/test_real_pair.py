@@ -9,7 +9,7 @@ import pytest
 from manyeyes.datasets.argoverse2 import Argoverse2Recording
 from manyeyes.datatypes import Transform
 from manyeyes.ops.keyed_random import keyed_normal, keyed_uniform
-from manyeyes.pose.corrector import correct_pose
+from manyeyes.pose.corrector import correct_by_voting
 from manyeyes.pose.landmarks import DetectorUncertainty, Landmarks
 from manyeyes.pose.types import PosePrior, lift_to_se3, pose_difference, project_to_se2
 
@@ -55,7 +55,7 @@ def test_a_hundred_starts_of_any_yaw_and_up_to_twenty_metres():
         seen = disturbed(other, 0, "other", start).transform(project_to_se2(turned))
         far = np.array([20 * np.cos(2 * np.pi * u[1]), 20 * np.sin(2 * np.pi * u[1]), 2 * np.pi * u[2]])
         prior = PosePrior(lift_to_se3(truth + far, None), np.diag([100.0, 100.0, 3.0]))
-        found = correct_pose(disturbed(ego, 0, "ego", start), seen, prior)
+        found = correct_by_voting(disturbed(ego, 0, "ego", start), seen, prior)
         if found.status.has_estimate:
             error = pose_difference(found.pose, truth)
             good = np.hypot(error[0], error[1]) < 1.0 and abs(error[2]) < np.radians(1.0)

@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_pose
+from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_by_voting
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.threshold_calibration import calibrate_acceptance
 from manyeyes.simulator.fleet.landmark_scenes import LandmarkSpec, make_landmark_scene
@@ -19,10 +19,10 @@ def null_scenes(count):
 def test_exactly_the_allowed_fraction_is_accepted_and_one_more_below_the_limit():
     pairs = list(null_scenes(20))
     limit = calibrate_acceptance(pairs, 0.1, CorrectorConfig(accept=AcceptanceTest(25.0, 0.0, 1, 0.0)))
-    answers = [correct_pose(*p, None, CorrectorConfig(accept=limit)).status.has_estimate for p in pairs]
+    answers = [correct_by_voting(*p, None, CorrectorConfig(accept=limit)).status.has_estimate for p in pairs]
     assert sum(answers) == 2
     looser = replace(limit, min_score=limit.min_score - 1e-6)
-    assert sum(correct_pose(*p, None, CorrectorConfig(accept=looser)).status.has_estimate for p in pairs) == 3
+    assert sum(correct_by_voting(*p, None, CorrectorConfig(accept=looser)).status.has_estimate for p in pairs) == 3
 
 
 def test_a_rate_too_small_for_the_number_of_scenes_raises():

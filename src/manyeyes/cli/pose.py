@@ -83,15 +83,14 @@ def main(options: Options) -> None:
     from manyeyes.datasets.perturbation import PoseNoise
     from manyeyes.evaluation.pose.metrics import summarize_evaluations
     from manyeyes.models import pretrained
-    from manyeyes.pose.registry import CLOUD_CORRECTORS, load_corrector
+    from manyeyes.pose.registry import find_corrector
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import check_files, open_recording, select_checked_scenarios
     from manyeyes.viz.table import missing_footer
 
     console = Console()
     for name in options.correctors:
-        if name not in CLOUD_CORRECTORS:
-            load_corrector(name)
+        find_corrector(name)
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
     recording = open_recording(options.recording, options.split)
     drive = make_excerpt(recording, options.scenario, options.frames)
@@ -130,14 +129,12 @@ def _run_correctors(
 ) -> Iterator[CorrectorResult]:
     """Every corrector's answer about every collaborator in every judged frame."""
     from manyeyes.agents.pose_correction import PoseCorrection
-    from manyeyes.pose.registry import CLOUD_CORRECTORS, load_corrector
+    from manyeyes.pose.registry import find_corrector
     from manyeyes.pose.types import PosePrior
 
     names = options.correctors
-    aligners = {name: PoseCorrection(name, options.min_score) for name in names if name not in CLOUD_CORRECTORS}
-    correctors: dict[str, Any] = {
-        name: CLOUD_CORRECTORS[name] if name in CLOUD_CORRECTORS else load_corrector(name) for name in names
-    }
+    correctors = {name: find_corrector(name) for name in names}
+    aligners = {n: PoseCorrection(n, options.min_score) for n, c in correctors.items() if c.kind == "landmarks"}
     for index in drive.eval_indices(drive.scenario):
         snapshot = drive.snapshot(drive.scenario, index)
         perturbed = noise.apply(snapshot, 0)
@@ -151,7 +148,7 @@ def _run_correctors(
         for row in range(1, len(perturbed.frames)):
             prior = None if options.no_prior else PosePrior.between(perturbed.frames[0], perturbed.frames[row])
             for name, agent_inputs in inputs.items():
-                estimate = correctors[name](agent_inputs[0], agent_inputs[row], prior)
+                estimate = correctors[name].function(agent_inputs[0], agent_inputs[row], prior)
                 counts, other = (len(agent_inputs[0]), len(agent_inputs[row])), perturbed.frames[row]
                 evaluation, time_s = _evaluate(estimate, snapshot, row), other.timestamp_ns * 1e-9
                 yield CorrectorResult(index, time_s, other.agent_id, name, counts, prior, estimate, evaluation)

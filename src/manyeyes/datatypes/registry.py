@@ -31,12 +31,12 @@ class Registry(Generic[T]):
     Args:
         kind: what an item is called in error texts, such as "fusion module".
         group: the group of entry points, such as "manyeyes.fusion".
-        package: the package whose modules register our own items, such as "manyeyes.models.fusion"; modules whose names begin with
-            an underscore are left out.
+        packages: what registers our own items: modules, or packages such as "manyeyes.models.fusion" with all their modules but
+            those whose names begin with an underscore.
     """
 
-    def __init__(self, kind: str, group: str, package: str) -> None:
-        self.kind, self.group, self.package = kind, group, package
+    def __init__(self, kind: str, group: str, *packages: str) -> None:
+        self.kind, self.group, self.packages = kind, group, packages
         self._items: dict[str, T] = {}
         self._entry_points: dict[str, EntryPoint] | None = None
         self._has_own = False
@@ -72,9 +72,9 @@ class Registry(Generic[T]):
         return self._items[name]
 
     def names(self) -> tuple[str, ...]:
-        """Return all names: ours in the order of their modules, then those of third parties."""
+        """Return all names: ours, then those of third parties, each in alphabetical order."""
         self._import_own()
-        return tuple(dict.fromkeys((*self._items, *sorted(self._offered()))))
+        return (*sorted(self._items.keys() - self._offered().keys()), *sorted(self._offered()))
 
     def __contains__(self, name: str) -> bool:
         return name in self.names()
@@ -91,10 +91,10 @@ class Registry(Generic[T]):
         if self._has_own:
             return
         self._has_own = True
-        package = importlib.import_module(self.package)
-        for module in pkgutil.iter_modules(package.__path__):
-            if not module.name.startswith("_"):
-                importlib.import_module(f"{self.package}.{module.name}")
+        for name in self.packages:
+            for module in pkgutil.iter_modules(getattr(importlib.import_module(name), "__path__", ())):
+                if not module.name.startswith("_"):
+                    importlib.import_module(f"{name}.{module.name}")
 
     def _offered(self) -> dict[str, EntryPoint]:
         if self._entry_points is None:

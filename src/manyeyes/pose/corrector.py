@@ -13,12 +13,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import (
     PoseEstimate,
     PosePrior,
@@ -81,13 +83,16 @@ are larger than lateral ones, since the far end is seldom observed. Vehicles in 
 """
 
 
-def correct_pose(
+def correct_by_voting(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: CorrectorConfig | None = None
 ) -> PoseEstimate:
     """Estimate ego_from_other from the common objects of two agents and an optional prior."""
     config = config or CorrectorConfig()
     num_instants = len(np.unique(ego.instant))
     return decide(find_candidates(ego, other, config.vote, prior), prior, config.accept, num_instants)
+
+
+register_pose_corrector("voting")(partial(correct_by_voting, config=DETECTOR_BOXES_CONFIG))
 
 
 @dataclass(frozen=True)

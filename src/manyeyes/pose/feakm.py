@@ -29,6 +29,7 @@ from manyeyes.ops.rigid import fit_se2
 from manyeyes.pose.baselines._common import fit_pose, make_estimate, pose_information
 from manyeyes.pose.corrector import AcceptanceTest, decide
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import FEAKM, register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, no_estimate, pose_difference
 from manyeyes.pose.voting import Candidate, transform_point
 
@@ -241,6 +242,7 @@ def _points(landmarks: Landmarks, descriptors: Floats) -> KeypointBatch:
     return KeypointBatch(descriptor, xy, yaw, size, mask.bool())
 
 
+@register_pose_corrector(FEAKM, "weights")
 @cache
 def load_feakm_corrector(weights: str, min_pairs: int = 4) -> FeakmCorrector:
     """The corrector with the weights of a shipped name or a file; loaded once per process."""

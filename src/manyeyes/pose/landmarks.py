@@ -8,10 +8,12 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import Boxes, ConfigError, ShapeError
 from manyeyes.datatypes.keypoints import Keypoints
+from manyeyes.datatypes.numbers import Numbers, as_tensor
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -73,6 +75,24 @@ class Landmarks:
             shape = value.shape
             if shape != wanted.get(field.name, (n,)):
                 raise ShapeError(f"Landmarks.{field.name} needs shape {wanted.get(field.name, (n,))}; got {shape}.")
+
+    @classmethod
+    def of(cls, objects: Landmarks | Boxes | Numbers) -> Landmarks:
+        """Landmarks of boxes, or of an array (N, 7) of their centre x, y, z and length, width, height (m) and yaw (rad).
+
+        Raises:
+            ShapeError: the array has another shape.
+        """
+        if isinstance(objects, Landmarks):
+            return objects
+        if not isinstance(objects, Boxes):
+            rows = as_tensor(objects, "Landmarks.of", torch.float64)
+            if rows.ndim != 2 or rows.shape[1] != 7:
+                raise ShapeError(
+                    f"Landmarks.of needs boxes (N, 7): x, y, z, length, width, height, yaw; got {tuple(rows.shape)}."
+                )
+            objects = Boxes.of(rows[:, :3], rows[:, 3:6], rows[:, 6])
+        return cls.of_boxes(objects)
 
     @classmethod
     def of_boxes(cls, boxes: Boxes, error: DetectorUncertainty | None = None) -> Landmarks:

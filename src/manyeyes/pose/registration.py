@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError, PointCloud
 from manyeyes.pose.corrector import mahalanobis_squared
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3, no_estimate, pose_difference
 
 Floats = NDArray[np.float64]
@@ -97,6 +98,7 @@ class LikelihoodField:
         return total
 
 
+@register_pose_corrector("scan-registration", "clouds")
 def register_clouds(
     ego: PointCloud, other: PointCloud, prior: PosePrior | None, config: RegistrationConfig | None = None
 ) -> PoseEstimate:

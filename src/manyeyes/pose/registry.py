@@ -1,52 +1,123 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default corrector and the baselines by name.
+"""Pose correctors by name: the default, the baselines and those of third parties; and the function that uses one.
 
-FeaKM has weights: ``feakm`` is the shipped net, a path that ends in .safetensors one of 'manyeyes train'; ``@8`` after either
-requires eight pairs instead of four. CLOUD_CORRECTORS take whole clouds instead of landmarks.
+A corrector of landmarks or of whole clouds is a function of ego, other and prior. A corrector with weights is registered as
+the function that loads it: of a shipped name or a file, and of the minimum number of pairs. ``feakm`` is FeaKM's shipped net,
+a path that ends in .safetensors one of 'manyeyes train'; ``@8`` after either requires eight pairs instead of four.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
 
-from manyeyes.datatypes import ConfigError, PointCloud
-from manyeyes.pose.baselines import coalign, feaco, fpv_rcnn, gicp, icp, identity, mash, v2x_reg, vips
-from manyeyes.pose.baselines.v2x_reg import V2xRegConfig
-from manyeyes.pose.corrector import DETECTOR_BOXES_CONFIG, correct_pose
-from manyeyes.pose.feakm import load_feakm_corrector
-from manyeyes.pose.registration import register_clouds
+from manyeyes.datatypes import Boxes, ConfigError, PointCloud
+from manyeyes.datatypes.numbers import Numbers
+from manyeyes.datatypes.registry import Registry
+from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PoseCorrector, PoseEstimate, PosePrior
 
 FEAKM = "feakm"
-CORRECTORS: dict[str, PoseCorrector] = {
-    "voting": partial(correct_pose, config=DETECTOR_BOXES_CONFIG),
-    "identity": identity.correct,
-    "coalign": coalign.correct,
-    "fpv-rcnn": fpv_rcnn.correct,
-    "feaco": feaco.correct,
-    "icp": icp.correct,
-    "vips": vips.correct,
-    "v2x-reg-odist": v2x_reg.correct,
-    "v2x-reg-oiou": partial(v2x_reg.correct, config=V2xRegConfig("oIoU")),
-    "mash": mash.correct,
-}
+Kind = Literal["landmarks", "clouds", "weights"]
+Function = TypeVar("Function", bound=Callable[..., Any])
 
-CLOUD_CORRECTORS: dict[str, Callable[[PointCloud, PointCloud, PosePrior | None], PoseEstimate]] = {
-    "scan-registration": register_clouds,
-    "gicp": gicp.correct,
-}
+
+@dataclass(frozen=True)
+class RegisteredCorrector:
+    """A registered function and what it compares, landmarks or clouds; or weights: it loads a corrector of landmarks."""
+
+    function: Callable[..., Any]
+    kind: Kind
+
+
+POSE_CORRECTORS: Registry[RegisteredCorrector] = Registry(
+    "pose corrector",
+    "manyeyes.pose_corrector",
+    "manyeyes.pose.corrector",
+    "manyeyes.pose.registration",
+    "manyeyes.pose.feakm",
+    "manyeyes.pose.baselines",
+)
+
+
+def register_pose_corrector(name: str, kind: Kind = "landmarks") -> Callable[[Function], Function]:
+    """Register a corrector under a name, as a decorator.
+
+    Args:
+        name: what commands and ``correct_pose`` call it. kind: what the function compares; see RegisteredCorrector.
+
+    Raises:
+        ConfigError: another corrector has the name.
+    """
+
+    def decorate(function: Function) -> Function:
+        POSE_CORRECTORS.register(name)(RegisteredCorrector(function, kind))
+        return function
+
+    return decorate
+
+
+def list_correctors(*kinds: Kind) -> tuple[str, ...]:
+    """The names of all correctors of these kinds."""
+    return tuple(name for name, found in POSE_CORRECTORS.load_all().items() if found.kind in kinds)
+
+
+def find_corrector(name: str) -> RegisteredCorrector:
+    """The corrector of a name, of landmarks or of clouds; weights are loaded.
+
+    Raises:
+        ConfigError: no corrector has the name, or what follows @ is no number of pairs.
+    """
+    weights, _, min_pairs = name.partition("@")
+    key = FEAKM if weights.endswith(".safetensors") else weights
+    found = POSE_CORRECTORS.get(key)
+    if found.kind == "weights" and (min_pairs.isdecimal() or not min_pairs):
+        return RegisteredCorrector(found.function(weights, int(min_pairs or 4)), "landmarks")
+    if min_pairs:
+        raise ConfigError(
+            f"{name!r}: after the @ of a corrector with weights, give the minimum number of pairs, the paper's 4 or 8."
+        )
+    return found
 
 
 def load_corrector(name: str) -> PoseCorrector:
-    """The corrector of a name; ConfigError lists the known names."""
-    weights, _, min_pairs = name.partition("@")
-    if weights == FEAKM or weights.endswith(".safetensors"):
-        if min_pairs and not min_pairs.isdecimal():
-            raise ConfigError(f"{name!r}: after @, give the minimum number of pairs, the paper's 4 or 8.")
-        return load_feakm_corrector(weights, int(min_pairs or 4))
-    if name not in CORRECTORS:
-        raise ConfigError(
-            f"No corrector is called {name!r}; known: {', '.join(CORRECTORS)}, {FEAKM}, or a .safetensors file of FeaKM."
-        )
-    return CORRECTORS[name]
+    """The corrector of landmarks of a name.
+
+    Raises:
+        ConfigError: no corrector of landmarks has the name.
+    """
+    found = find_corrector(name)
+    if found.kind != "landmarks":
+        known = ", ".join(list_correctors("landmarks", "weights"))
+        raise ConfigError(f"{name!r} compares whole clouds, not landmarks; choose one of {known}.")
+    return found.function
+
+
+def correct_pose(
+    ego: Landmarks | Boxes | PointCloud | Numbers,
+    other: Landmarks | Boxes | PointCloud | Numbers,
+    prior: PosePrior | None = None,
+    corrector: str = "voting",
+) -> PoseEstimate:
+    """Estimate ego_from_other, the other agent's pose in the ego's frame, from what both observe at one instant.
+
+    Args:
+        ego, other: each in its own frame: boxes, or an array (N, 7) of their centre x, y, z and length, width, height (m) and yaw
+            (rad). For a corrector of clouds: clouds, or arrays (N, 3), metres.
+        prior: what is known of the pose before; see ``PosePrior.of``.
+        corrector: a registered name.
+
+    Returns:
+        The pose to use with its covariance, and the status of the comparison with the prior.
+
+    Raises:
+        ConfigError: the corrector is not known. ShapeError: an array has another shape.
+    """
+    found = find_corrector(corrector)
+    convert = _as_cloud if found.kind == "clouds" else Landmarks.of
+    return found.function(convert(ego), convert(other), prior)
+
+
+def _as_cloud(points: Any) -> PointCloud:
+    return points if isinstance(points, PointCloud) else PointCloud.of(points)

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, ShapeError, Transform
+from manyeyes.datatypes.numbers import Numbers, as_tensor
 from manyeyes.pose.landmarks import Landmarks
 
 Floats = NDArray[np.float64]
@@ -58,8 +59,17 @@ class PosePrior:
             )
 
     @classmethod
-    def of(cls, ego_from_other: Transform, sigma_xy_m: float, sigma_yaw_rad: float) -> PosePrior:
-        """A prior whose errors in x, y and yaw are independent."""
+    def of(cls, ego_from_other: Transform | Numbers, sigma_xy_m: float, sigma_yaw_rad: float) -> PosePrior:
+        """A prior whose errors in x, y and yaw are independent; of a transform, or of x, y (m) and yaw (rad).
+
+        Raises:
+            ShapeError: the pose is neither. ConfigError: a value is not finite.
+        """
+        if not isinstance(ego_from_other, Transform):
+            pose = as_tensor(ego_from_other, "PosePrior.of", torch.float64)
+            if pose.shape != (3,):
+                raise ShapeError(f"PosePrior.of needs a transform, or x, y and yaw (3,); got {tuple(pose.shape)}.")
+            ego_from_other = Transform.from_xyz_yaw(float(pose[0]), float(pose[1]), 0.0, float(pose[2]))
         return cls(ego_from_other, np.diag([sigma_xy_m**2, sigma_xy_m**2, sigma_yaw_rad**2]))
 
     @classmethod

@@ -2,7 +2,7 @@
 """Average precision of many maps as one list, its interval over what they are maps of, and claims that compare two such lists.
 
 A block is what is drawn with replacement: a scenario with all its tiles and seeds, or a square of a town. Matching is within each
-map; the ranking is one over all of them, by the rule of ``metrics``. A true positive belongs to the block of the truth that it hit, so
+map; the ranking is one over all of them, by the rule of ``metrics``. A true positive belongs to the block of the truth it hit, so
 that no draw has a hit without its truth; a false one to its own. Differences are paired: both sides see the same draws.
 Source: Efron and Tibshirani 1993, ch. 13, as in bootstrap.
 """

@@ -16,6 +16,7 @@ from torch import Tensor
 from manyeyes.ops.se2 import PoseGraphEdges, solve_pose_graph
 from manyeyes.pose.baselines._common import make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
@@ -30,6 +31,7 @@ class CoalignConfig:
     max_yaw_variance_rad2: float = 0.2
 
 
+@register_pose_corrector("coalign")
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: CoalignConfig | None = None
 ) -> PoseEstimate:

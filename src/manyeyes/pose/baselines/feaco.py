@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from manyeyes.pose.baselines._common import fit_pose, make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
@@ -29,6 +30,7 @@ class FeacoConfig:
     num_iterations: int = 2
 
 
+@register_pose_corrector("feaco")
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: FeacoConfig | None = None
 ) -> PoseEstimate:

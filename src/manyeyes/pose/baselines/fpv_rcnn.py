@@ -14,6 +14,7 @@ import numpy as np
 
 from manyeyes.pose.baselines._common import fit_pose, make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
@@ -35,6 +36,7 @@ class FpvRcnnConfig:
     min_accurate: int = 2
 
 
+@register_pose_corrector("fpv-rcnn")
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: FpvRcnnConfig | None = None
 ) -> PoseEstimate:

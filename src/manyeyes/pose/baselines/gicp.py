@@ -15,6 +15,7 @@ import torch
 
 from manyeyes.datatypes import MissingExtraError, PointCloud, Transform
 from manyeyes.pose.corrector import mahalanobis_squared
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, no_estimate, project_to_se2
 
 
@@ -31,6 +32,7 @@ class GicpConfig:
     sigma_yaw_rad: float = 0.005
 
 
+@register_pose_corrector("gicp", "clouds")
 def correct(
     ego: PointCloud, other: PointCloud, prior: PosePrior | None, config: GicpConfig | None = None
 ) -> PoseEstimate:

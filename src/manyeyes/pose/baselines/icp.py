@@ -9,6 +9,7 @@ import numpy as np
 
 from manyeyes.pose.baselines._common import fit_pose, make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate, pose_difference
 
 
@@ -23,6 +24,7 @@ class IcpConfig:
     max_iterations: int = 30
 
 
+@register_pose_corrector("icp")
 def correct(ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: IcpConfig | None = None) -> PoseEstimate:
     """Iterate closest pairs and their fit to convergence; NO_MATCH without a prior or enough pairs."""
     config = config or IcpConfig()

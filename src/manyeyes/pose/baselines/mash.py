@@ -13,6 +13,7 @@ import numpy as np
 
 from manyeyes.pose.baselines._common import fit_pose, make_estimate
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
@@ -28,6 +29,7 @@ class MashConfig:
     min_pairs: int = 3
 
 
+@register_pose_corrector("mash")
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: MashConfig | None = None
 ) -> PoseEstimate:

@@ -9,6 +9,7 @@ Without matches there is no estimate, not the identity.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from manyeyes.ops.box_iou import pairwise_iou
 from manyeyes.pose.baselines._common import fit_pose, make_estimate, match_mutual_nearest
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
@@ -35,6 +37,7 @@ class V2xRegConfig:
     max_weak_affinity: int = 5
 
 
+@register_pose_corrector("v2x-reg-odist")
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: V2xRegConfig | None = None
 ) -> PoseEstimate:
@@ -54,6 +57,9 @@ def correct(
     corners = [_corners(x)[r].reshape(-1, 2) for x, r in ((a, pairs[:, 0]), (b, pairs[:, 1]))]
     pose = fit_pose(corners[0], corners[1], np.repeat(weight, 4))
     return make_estimate(ego, other, pose, np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1), prior)
+
+
+register_pose_corrector("v2x-reg-oiou")(partial(correct, config=V2xRegConfig("oIoU")))
 
 
 def _largest(x: Landmarks, config: V2xRegConfig) -> np.ndarray:

@@ -15,6 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from manyeyes.pose.baselines._common import fit_pose, make_estimate
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.registry import register_pose_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, no_estimate
 
 
@@ -30,6 +31,7 @@ class VipsConfig:
     num_iterations: int = 50
 
 
+@register_pose_corrector("vips")
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: VipsConfig | None = None
 ) -> PoseEstimate:
