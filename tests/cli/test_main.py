@@ -56,12 +56,6 @@ def test_a_group_lists_its_commands_and_no_other(capsys) -> None:
     assert "did you mean fuse? Known commands: build, simulate, import, fuse" in capsys.readouterr().err
 
 
-def test_wrong_arguments_exit_with_2(capsys) -> None:
-    with pytest.raises(SystemExit) as stop:
-        cli.main(["doctor", "--colour"])
-    assert stop.value.code == 2 and "--colour" in capsys.readouterr().err
-
-
 def test_a_designed_error_is_one_line_and_exits_with_1(monkeypatch, capsys) -> None:
     from manyeyes.cli import doctor
     from manyeyes.datatypes import RecordingError

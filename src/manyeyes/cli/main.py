@@ -100,22 +100,16 @@ def _report_unknown(word: str, known: Iterable[str]) -> int:
 
 def _run_command(command: str, arguments: Sequence[str]) -> int:
     try:
-        import tyro
-
-        from manyeyes.cli.bounds import find_violation
+        from manyeyes.cli.arguments import UsageError, parse_options
         from manyeyes.datatypes.errors import ManyeyesError
 
         module = importlib.import_module(module_of(command))
     except KeyboardInterrupt:
         return _fail("stopped.", INTERRUPTED_EXIT_CODE)
     try:
-        # Options of a nested dataclass keep their short names: --channel, not --playing.channel.
-        tyro_config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-        prog, about = f"manyeyes {command}", module.__doc__
-        options = tyro.cli(module.Options, args=list(arguments), prog=prog, description=about, config=tyro_config)
-        if violation := find_violation(options):
-            return _fail(violation, 2)
-        module.main(options)
+        module.main(parse_options(module.Options, f"manyeyes {command}", module.__doc__, arguments))
+    except UsageError as error:
+        return _fail(str(error), 2)
     except ManyeyesError as error:
         return _fail(" ".join(str(error).split()), 1)
     except OSError as error:
