@@ -27,11 +27,12 @@ from manyeyes.models.maps.map_model import MapModel
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.studies.map_recordings import load_true_maps, open_sensor_recording
 from manyeyes.training.maps.line_field_targets import dilate_observed
-from manyeyes.training.maps.loop import MapRun
 from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
 from manyeyes.training.maps.samples import MapAugmentConfig, MapSample, TileStream
 from manyeyes.training.maps.step import extract_features, warp_tokens
 from manyeyes.training.maps.targets import select_observed
+from manyeyes.training.maps.task import MapTask
+from manyeyes.training.trainer import Trainer
 
 
 @dataclass(frozen=True)
@@ -101,13 +102,13 @@ def main() -> None:
         line_field_steps=0 if preset.map_model.head.num_learned_queries else options.steps // 4,
     )
     with tempfile.TemporaryDirectory() as folder:
-        run = MapRun(config, few, Path(folder), seed=0)
-        while run.state.step < config.steps:
+        run = Trainer(MapTask(config, few), Path(folder))
+        while run.step < config.steps:
             progress = run.advance()
-            at_last = run.state.step == config.steps
-            if not run.state.rank and (at_last or run.state.step % options.every == 0):
-                found = mean_ap(run.state.average, few.samples)
-                print(f"{run.state.step}: loss {progress.loss:.2f}, {found}, {run.state.seconds:.0f} s", flush=True)
+            at_last = run.step == config.steps
+            if not run.rank and (at_last or run.step % options.every == 0):
+                found = mean_ap(run.average, few.samples)
+                print(f"{run.step}: loss {progress.loss:.2f}, {found}, {run.seconds:.0f} s", flush=True)
     if dist.is_initialized():
         dist.destroy_process_group()
 

@@ -19,9 +19,10 @@ from pathlib import Path
 import torch
 
 from manyeyes.studies.map_recordings import load_true_maps, open_sensor_recording
-from manyeyes.training.maps.loop import MapRun
 from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
 from manyeyes.training.maps.samples import TileStream
+from manyeyes.training.maps.task import MapTask
+from manyeyes.training.trainer import Trainer
 
 GIB = 1 << 30
 
@@ -41,22 +42,22 @@ def main() -> None:
     stream = TileStream(recording, load_true_maps(recording), config.map_model, config.augment, 0)
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(2):
-            run = MapRun(config, stream, Path(folder), seed=0)
-            begun, spent = run.state.step, run.state.seconds
+            run = Trainer(MapTask(config, stream), Path(folder))
+            begun, spent = run.step, run.seconds
             if not begun:
-                size = sum(p.numel() for p in run.state.model.parameters())
+                size = sum(p.numel() for p in run.model.parameters())
                 print(
                     f"{options.preset}: {size:,} parameters, batch of {config.batch}, {config.micro_batch} at once",
                     flush=True,
                 )
             progress = run.advance()
-            run.state.save()
+            run.save()
             terms = ", ".join(
                 f"{name} {value:.3f}" for name, value in progress.to_record().items() if name not in ("step", "lr")
             )
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / GIB
             print(
-                f"step {begun} to {run.state.step}: {terms}; {run.state.seconds - spent:.0f} s, peak {peak:.1f} GiB",
+                f"step {begun} to {run.step}: {terms}; {run.seconds - spent:.0f} s, peak {peak:.1f} GiB",
                 flush=True,
             )
             del run

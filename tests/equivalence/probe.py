@@ -31,8 +31,9 @@ from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.registry import list_correctors, load_corrector
 from manyeyes.pose.types import PosePrior
 from manyeyes.simulator.fleet.landmark_scenes import BoxNoise, LandmarkSpec, make_landmark_scene
-from manyeyes.training.detector.loop import DetectorRun, TrainConfig
 from manyeyes.training.detector.samples import AugmentConfig
+from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
+from manyeyes.training.trainer import Trainer
 
 Arrays = Iterator[tuple[str, np.ndarray]]
 
@@ -117,11 +118,12 @@ def fused_maps(data: Path) -> Arrays:
 
 def trained_weights(data: Path) -> Arrays:
     """Weights after 20 training steps, in the order of the state dictionary."""
-    config = TrainConfig(COSTR_TINY, steps=20, batch=1, augment=AugmentConfig(max_agents=2))
-    run = DetectorRun(config, Opv2vRecording(data / "tiny", "train", use_cache=False), fresh(data / "run"), seed=5)
+    config = DetectorTrainConfig(COSTR_TINY, steps=20, batch=1, augment=AugmentConfig(max_agents=2))
+    task = DetectorTask(config, Opv2vRecording(data / "tiny", "train", use_cache=False), seed=5)
+    run = Trainer(task, fresh(data / "run"))
     for step in range(20):
         yield f"training/loss/{step}", np.array([*flat(run.advance())][:2])
-    for number, value in enumerate(run.state.model.state_dict().values()):
+    for number, value in enumerate(run.model.state_dict().values()):
         yield f"training/weights/{number}", value.numpy()
 
 

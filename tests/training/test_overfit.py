@@ -6,24 +6,26 @@ import torch
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameResult, average_precision
 from manyeyes.models.detector.box_head import DecodeConfig, decode
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.training.detector.loop import DetectorRun, TrainConfig
 from manyeyes.training.detector.samples import AugmentConfig
 from manyeyes.training.detector.step import forward
+from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
+from manyeyes.training.trainer import Trainer
 
 
 def test_one_frame_can_be_overfitted(toy, tmp_path):
     recording = toy(agents_n=2, scenarios=("toy_0",), frames=1, ground_points=100)
     schedule = {"steps": 160, "batch": 1, "learning_rate": 8e-3, "warmup_steps": 10, "ema_decay": 0.9}
-    run = DetectorRun(TrainConfig(COSTR_TINY, augment=AugmentConfig.none(), **schedule), recording, tmp_path, seed=0)
-    losses = [run.advance() for _ in range(run.steps)]
-    heats = [float(progress.terms.heat.detach()) for progress in (losses[0], losses[-1])]
+    config = DetectorTrainConfig(COSTR_TINY, augment=AugmentConfig.none(), **schedule)
+    run = Trainer(DetectorTask(config, recording), tmp_path)
+    losses = [run.advance() for _ in range(config.steps)]
+    heats = [progress.terms["heat"] for progress in (losses[0], losses[-1])]
     assert heats[1] < 0.01 * heats[0]
-    sample = run.stream.draw(0)
+    sample = run.task.draw(0)
     with torch.no_grad():
         # At this rate of learning the running statistics lag behind the weights by some tens of steps: let them catch up.
         for _ in range(100):
-            forward(run.state.average.train(), [sample])
-        outcome = forward(run.state.average.eval(), [sample])
+            forward(run.average.train(), [sample])
+        outcome = forward(run.average.eval(), [sample])
     together = decode(outcome.fused_boxes, DecodeConfig())[0]
     frame = FrameResult("toy_0", 0, together, sample.merged_gt_boxes)
     for iou in (0.5, 0.7):

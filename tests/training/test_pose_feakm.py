@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from manyeyes.datatypes import BevGrid, Boxes, CheckpointError, ConfigError, RecordingError, SparseBev, Transform
+from manyeyes.datatypes import BevGrid, Boxes, ConfigError, RecordingError, SparseBev, Transform
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -23,12 +23,11 @@ from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import project_to_se2
 from manyeyes.training.pose.feakm import (
     FEAKM_TRAINING_PRESETS,
-    FeakmRun,
+    FeakmTask,
     FeakmTrainConfig,
     KeypointAugmentConfig,
     match_ground_truth,
     matching_loss,
-    train_feakm,
 )
 from manyeyes.training.pose.feakm_cache import (
     CachedSnapshot,
@@ -39,6 +38,7 @@ from manyeyes.training.pose.feakm_cache import (
     select_snapshots,
     write_cached_snapshot,
 )
+from manyeyes.training.trainer import Trainer
 
 CHANNELS = 8
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=4)
@@ -158,33 +158,13 @@ def test_views_are_cached_once_per_detector_fingerprint(toy, tmp_path, monkeypat
         select_snapshots(toy(agents_n=1))
 
 
-def test_a_run_that_was_killed_ends_as_if_it_had_not_been(cache, tmp_path):
-    whole = FeakmRun(TINY, cache, tmp_path / "whole", 3)
-    for _ in range(4):
-        whole.advance()
-    broken = FeakmRun(TINY, cache, tmp_path / "broken", 3)
-    broken.advance()
-    broken.advance()
-    broken.state.save()
-    broken.advance()
-    resumed = FeakmRun(TINY, cache, tmp_path / "broken", 3)
-    assert resumed.state.step == 2
-    for _ in range(2):
-        resumed.advance()
-    for name, value in whole.state.model.state_dict().items():
-        assert torch.equal(value, resumed.state.model.state_dict()[name]), name
-    for name, value in whole.state.average.state_dict().items():
-        assert torch.equal(value, resumed.state.average.state_dict()[name]), name
-    with pytest.raises(CheckpointError, match="another configuration or seed"):
-        FeakmRun(TINY, cache, tmp_path / "broken", 4)
-    (tmp_path / "broken" / "last.pt").write_bytes(b"cut")
-    with pytest.raises(CheckpointError, match="not a whole training state"):
-        FeakmRun(TINY, cache, tmp_path / "broken", 3)
+def test_a_run_that_was_killed_ends_as_if_it_had_not_been(cache, tmp_path, check_resumption):
+    check_resumption(lambda: FeakmTask(TINY, cache, 3), tmp_path)
 
 
 def test_training_writes_weights_and_a_log(cache, tmp_path):
     reports = []
-    path = train_feakm(TINY, cache, tmp_path / "run", 1, {"command": "x"}, reports.append)
+    path = Trainer(FeakmTask(TINY, cache, 1), tmp_path / "run").run({"command": "x"}, reports.append)
     lines = [json.loads(line) for line in (path.parent / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [1, 2, 3, 4] == [p.step for p in reports]
     assert set(lines[0]) == {"step", "loss", "lr", "recall", "precision"}
@@ -192,17 +172,18 @@ def test_training_writes_weights_and_a_log(cache, tmp_path):
     assert {p.name for p in path.parent.iterdir()} == {"last.pt", "log.jsonl", "weights.safetensors"}
 
 
-def test_augmentation_moves_points_and_keeps_truth(cache, tmp_path):
-    plain = FeakmRun(TINY, cache, tmp_path, 0)
-    config = replace(TINY, augment=KeypointAugmentConfig(max_drop_fraction=0.5))
-    run = FeakmRun(config, cache, tmp_path, 0)
+def test_augmentation_moves_points_and_keeps_truth(cache):
+    plain = FeakmTask(TINY, cache)
+    task = FeakmTask(replace(TINY, augment=KeypointAugmentConfig(max_drop_fraction=0.5)), cache)
+    torch.manual_seed(0)
+    model = task.make_model()
     pairs = [cache.draw(0, i) for i in range(2)]
-    ego, other, motions = run._keypoints(pairs, 0)
-    full = plain._keypoints(pairs, 0)[0]
+    ego, other, motions = task._keypoints(model, pairs, 0)
+    full = plain._keypoints(model, pairs, 0)[0]
     assert sum(map(len, ego)) < sum(map(len, full))
     truth = match_ground_truth(ego, other, motions, 1.5, 2.4)
     assert truth.pairs.any() and truth.unmatched_a.any()
-    moved = run._perturb(ego, "ego", 0)
+    moved = task._perturb(ego, "ego", 0)
     assert float((moved[0].xy - ego[0].xy).abs().max()) > 1
     assert float((torch.cdist(moved[0].xy, moved[0].xy) - torch.cdist(ego[0].xy, ego[0].xy)).abs().max()) < 2
     assert all(torch.equal(a.xy, b.xy) for a, b in zip(plain._perturb(full, "ego", 0), full, strict=True))
@@ -210,10 +191,10 @@ def test_augmentation_moves_points_and_keeps_truth(cache, tmp_path):
 
 def test_batch_can_be_overfitted_and_gives_the_pose(cache, tmp_path):
     config = replace(TINY, steps=150, batch=4, learning_rate=3e-3, warmup_steps=5, ema_decay=0.9)
-    run = FeakmRun(config, cache, tmp_path, 0)
+    run = Trainer(FeakmTask(config, cache, 0), tmp_path)
     first, *_, last = [run.advance() for _ in range(150)]
-    assert first.loss > 3 * last.loss and last.recall > 0.95 and last.precision > 0.95
-    net = run.state.average.eval()
+    assert first.loss > 3 * last.loss and min(last.terms.values()) > 0.95
+    net = run.average.eval()
     for both in cache.pairs():
         ego, other = (Landmarks.of_keypoints(points) for points in net.describe([both.ego, both.other]))
         estimate = FeakmCorrector.of(net)(ego, other, None)
@@ -226,13 +207,13 @@ def test_the_published_net_takes_a_step_and_resumes(cache, tmp_path):
     """All its layers and widths but the lists' length, which costs time alone."""
     net = replace(FEAKM_PAPER, keypoints=DenseKeypointConfig(CHANNELS, num_keypoints=12))
     config = replace(FEAKM_TRAINING_PRESETS["feakm-paper"], net=net, batch=1, steps=2)
-    run = FeakmRun(config, cache, tmp_path, 0)
-    assert sum(p.numel() for p in run.state.model.parameters()) > 14_900_000
-    before = run.state.model.matcher.self_blocks[0].qkv.weight.clone()
+    run = Trainer(FeakmTask(config, cache, 0), tmp_path)
+    assert sum(p.numel() for p in run.model.parameters()) > 14_900_000
+    before = run.model.matcher.self_blocks[0].qkv.weight.clone()
     assert math.isfinite(run.advance().loss)
-    assert not torch.equal(before, run.state.model.matcher.self_blocks[0].qkv.weight)
-    run.state.save()
-    assert FeakmRun(config, cache, tmp_path, 0).advance().step == 2
+    assert not torch.equal(before, run.model.matcher.self_blocks[0].qkv.weight)
+    run.save()
+    assert Trainer(FeakmTask(config, cache, 0), tmp_path).advance().step == 2
 
 
 def test_settings_that_contradict_each_other_are_refused():

@@ -13,11 +13,9 @@ from manyeyes._bounds import Bounds
 def find_violation(options: Any) -> str | None:
     """Describe the first option of a dataclass whose number is outside its bounds; None where all fit."""
     for name, hint in get_type_hints(type(options), include_extras=True).items():
-        value = getattr(options, name)
-        if is_dataclass(value):
-            violation = find_violation(value)
-            if violation is not None:
-                return violation
+        value: Any = getattr(options, name)
+        if is_dataclass(value) and (violation := find_violation(value)):
+            return violation
         for bounds in _bounds_of(hint):
             for number in value if isinstance(value, tuple) else (value,):
                 if number is not None and not bounds.contains(number):

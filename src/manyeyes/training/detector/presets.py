@@ -7,11 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 from manyeyes.models.detector.presets import COSTR_OPV2V, COSTR_SMALL, COSTR_TINY, SMALL_GRID, SMALL_SQUARE_GRID
-from manyeyes.training.detector.loop import TrainConfig
 from manyeyes.training.detector.losses import LossConfig
 from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig
+from manyeyes.training.detector.task import DetectorTrainConfig
 
-_DEGRADED = TrainConfig(
+_DEGRADED = DetectorTrainConfig(
     replace(COSTR_SMALL, grid=SMALL_SQUARE_GRID, output_range=SMALL_GRID, prune_threshold=0.08),
     steps=5200,
     batch=4,
@@ -43,7 +43,7 @@ _BRANCH = replace(
 )
 
 
-def _branch(**changes: Any) -> TrainConfig:
+def _branch(**changes: Any) -> DetectorTrainConfig:
     """One row of CoSTr's Table III: the final stage trained on, with a part of the model changed."""
     return replace(_BRANCH, detector=replace(_BRANCH.detector, **changes))
 
@@ -52,8 +52,8 @@ _FINE_ONLY = replace(COSTR_SMALL.encoder, use_coarse_strides=False, prune_stride
 _NO_BLOCKS = replace(COSTR_SMALL.dast, blocks=0)
 _PLAIN = {"dast": _NO_BLOCKS, "fusion": "max"}
 
-TRAINING_PRESETS: dict[str, TrainConfig] = {
-    "costr-small/stage1": TrainConfig(
+DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
+    "costr-small/stage1": DetectorTrainConfig(
         COSTR_SMALL,
         steps=9000,
         batch=4,
@@ -63,7 +63,7 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
         prune_warmup_start=0.02,
         prune_warmup_end=0.10,
     ),
-    "costr-small/stage2": TrainConfig(
+    "costr-small/stage2": DetectorTrainConfig(
         replace(COSTR_SMALL, grid=SMALL_SQUARE_GRID, output_range=SMALL_GRID, prune_threshold=0.08),
         steps=3000,
         batch=4,
@@ -85,8 +85,8 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
     "ablation/se-dast-fast": _BRANCH,
     "ablation/v2x-vit": _branch(fusion="v2x-vit"),
     "ablation/multi-scale": _branch(fusion="multi-scale"),
-    "costr-opv2v": TrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
-    "costr-tiny": TrainConfig(
+    "costr-opv2v": DetectorTrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
+    "costr-tiny": DetectorTrainConfig(
         COSTR_TINY,
         steps=60,
         batch=2,

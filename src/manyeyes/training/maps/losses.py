@@ -10,7 +10,7 @@ elements.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -66,15 +66,6 @@ class MapLossTerms:
         """Make the terms of a step without decoder."""
         nothing = line_field.new_zeros(())
         return cls(nothing, nothing, nothing, segmentation, line_field, nothing)
-
-    def scale(self, fraction: float) -> MapLossTerms:
-        """Scale the detached terms to this fraction of a batch."""
-        return MapLossTerms(**{name: fraction * value.detach() for name, value in vars(self).items()})
-
-    @classmethod
-    def add_up(cls, parts: Sequence[MapLossTerms]) -> MapLossTerms:
-        """Sum the terms of the parts of a batch."""
-        return cls(**{f.name: torch.stack([getattr(part, f.name) for part in parts]).sum() for f in fields(cls)})
 
     def total(self, config: MapLossConfig) -> Tensor:
         """Return the weighted sum of all terms."""

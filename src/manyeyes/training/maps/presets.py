@@ -7,9 +7,9 @@ import math
 from dataclasses import replace
 
 from manyeyes.models.maps.presets import get_map_model_config
-from manyeyes.training.maps.loop import MapTrainConfig
 from manyeyes.training.maps.losses import MapLossConfig
 from manyeyes.training.maps.samples import MapAugmentConfig
+from manyeyes.training.maps.task import MapTrainConfig
 
 _NOISY = MapAugmentConfig(sigma_xy_m=0.2, sigma_yaw_rad=math.radians(0.3))
 _SMALL = MapTrainConfig(

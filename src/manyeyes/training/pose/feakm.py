@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train FeaKM's network to match the keypoints of two agents: ground truth, loss, augmentation, and the loop.
+"""Train FeaKM's network to match the keypoints of two agents: ground truth, loss, augmentation, and the task.
 
 Ground truth is geometric: the other agent's keypoints are transformed by the true pose. Mutual nearest neighbours
 within match_radius_m
 match; keypoints without neighbour within unmatched_radius_m are unmatched; others are ignored. The loss averages -log
 P of the matches
-and of the unmatched points with weight one half each, over all layers. The learning rate grows linearly and follows a
-cosine to zero.
+and of the unmatched points with weight one half each, over all layers.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
 import torch
@@ -23,13 +20,12 @@ from torch import Tensor
 
 from manyeyes.datatypes import ConfigError, Transform
 from manyeyes.datatypes.keypoints import Keypoints
-from manyeyes.models import checkpoint
 from manyeyes.models.pose.feakm import FEAKM_PAPER, FEAKM_SMALL, FORMAT, FeakmConfig, FeakmNet
 from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.models.pose.matcher import Assignment, KeypointBatch, find_mutual_matches
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.training.checkpointing import RunState, warmup_cosine
 from manyeyes.training.pose.feakm_cache import FeatureCache, ViewPair
+from manyeyes.training.trainer import Task, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -57,28 +53,20 @@ class KeypointAugmentConfig:
 
 
 @dataclass(frozen=True)
-class FeakmTrainConfig:
-    """Settings of a training run.
+class FeakmTrainConfig(TrainConfig):
+    """Settings of a training run of FeaKM's network.
 
     Attributes:
         net: configuration of the network.
         batch: pairs of views per step.
-        warmup_steps: steps of linear growth of the learning rate.
-        max_grad_norm: at which gradients are clipped.
-        ema_decay: decay of the averaged weights, which are saved.
         match_radius_m: maximum distance of matching keypoints.
         unmatched_radius_m: minimum distance of an unmatched keypoint to every other.
     """
 
     net: FeakmConfig
-    steps: int
+    _: KW_ONLY
     batch: int = 16
-    learning_rate: float = 2e-4
-    weight_decay: float = 1e-2
-    warmup_steps: int = 100
     max_grad_norm: float = 5.0
-    ema_decay: float = 0.999
-    save_every: int = 200
     match_radius_m: float = 2.4
     unmatched_radius_m: float = 2.4
     augment: KeypointAugmentConfig = field(default_factory=KeypointAugmentConfig.none)
@@ -164,54 +152,39 @@ def _mean(value: Tensor, mask: Tensor) -> Tensor:
     return torch.where(mask, value, 0.0).sum(1) / mask.sum(1).clamp_min(1)
 
 
-@dataclass(frozen=True)
-class MatchProgress:
-    """Progress of one step: one line of the log; recall and precision are of this step's batch."""
+@dataclass
+class FeakmTask(Task[FeakmTrainConfig, FeakmNet, ViewPair]):
+    """Train FeaKM's network on cached views; the log holds recall and precision of each step's batch."""
 
-    step: int
-    steps: int
-    loss: float
-    recall: float
-    precision: float
-    learning_rate: float
-    seconds: float
+    format = FORMAT
+    shown_terms = ("recall", "precision")
 
-    def to_record(self) -> dict[str, float]:
-        """Return the line of log.jsonl."""
-        record = {"step": self.step, "loss": round(self.loss, 5), "lr": self.learning_rate}
-        return record | {"recall": round(self.recall, 4), "precision": round(self.precision, 4)}
+    config: FeakmTrainConfig
+    cache: FeatureCache
+    seed: int = 0
 
+    def make_model(self) -> FeakmNet:
+        """Make the network with random weights."""
+        return FeakmNet(self.config.net)
 
-class FeakmRun:
-    """A resumable training run on cached views in a folder."""
+    def draw(self, number: int) -> ViewPair:
+        """Draw the pair of views of this number."""
+        return self.cache.draw(self.seed, number)
 
-    def __init__(self, config: FeakmTrainConfig, cache: FeatureCache, folder: Path, seed: int) -> None:
-        self.config, self.cache, self.seed = config, cache, seed
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            model = FeakmNet(config.net)
-        self.state = RunState(model, config, seed, folder, config.weight_decay)
-
-    def advance(self) -> MatchProgress:
-        """Run one optimiser step."""
-        config, state = self.config, self.state
-        state.model.train()
-        numbers = state.sample_numbers(config.batch)
-        first = numbers.start
-        pairs = [self.cache.draw(self.seed, number) for number in numbers]
-        ego, other, motions = self._keypoints(pairs, first)
+    def loss(
+        self, model: FeakmNet, samples: list[ViewPair], numbers: range, step: int
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the matching loss of augmented pairs."""
+        config = self.config
+        ego, other, motions = self._keypoints(model, samples, numbers.start)
         truth = match_ground_truth(ego, other, motions, config.match_radius_m, config.unmatched_radius_m)
-        ego, other = (self._perturb(side, name, first) for side, name in ((ego, "ego"), (other, "other")))
-        layers = state.model.matcher(KeypointBatch.of(ego), KeypointBatch.of(other))
-        loss = matching_loss(layers, truth)
-        rate = config.learning_rate * warmup_cosine(config.warmup_steps, state.step, config.steps)
-        state.backward(loss)
-        state.optimiser_step(rate, config.max_grad_norm, config.ema_decay)
-        recall, precision = matching_recall_precision(layers[-1], truth, config.net.matcher.min_match_prob)
-        return MatchProgress(state.step, config.steps, float(loss.detach()), recall, precision, rate, state.seconds)
+        ego, other = (self._perturb(side, name, numbers.start) for side, name in ((ego, "ego"), (other, "other")))
+        layers = model.matcher(KeypointBatch.of(ego), KeypointBatch.of(other))
+        measures = matching_recall_precision(layers[-1], truth, config.net.matcher.min_match_prob)
+        return matching_loss(layers, truth), dict(zip(self.shown_terms, torch.tensor(measures, dtype=torch.float64)))
 
     def _keypoints(
-        self, pairs: Sequence[ViewPair], first: int
+        self, model: FeakmNet, pairs: Sequence[ViewPair], first: int
     ) -> tuple[list[Keypoints], list[Keypoints], list[Transform]]:
         """Describe keypoints with flipped headings and dropout, in the frames of the true transforms."""
         augment = self.config.augment
@@ -219,7 +192,7 @@ class FeakmRun:
         for i, both in enumerate(pairs):
             rng = keyed_generator("feakm flip", self.seed, first + i)
             views += [_flip_headings(view, augment.flip_prob, rng) for view in (both.ego, both.other)]
-        described = self.state.model.describe(views, group_size=2)
+        described = model.describe(views, group_size=2)
         kept = []
         for i, points in enumerate(described):
             rng = keyed_generator("feakm drop", self.seed, first * 2 + i)
@@ -259,25 +232,3 @@ def _flip_headings(view: DetectorView, share: float, rng: np.random.Generator) -
     """Turn some headings by pi, as detectors err."""
     turned = torch.from_numpy(rng.random(len(view.boxes)) < share)
     return replace(view, boxes=replace(view.boxes, yaw=view.boxes.yaw + math.pi * turned))
-
-
-def train_feakm(
-    config: FeakmTrainConfig,
-    cache: FeatureCache,
-    folder: Path,
-    seed: int = 0,
-    card: dict[str, Any] | None = None,
-    report: Callable[[MatchProgress], None] = lambda progress: None,
-) -> Path:
-    """Train, or resume the run in folder; returns the file of averaged weights.
-
-    Writes last.pt (training state), log.jsonl (one object per step) and weights.safetensors (float16).
-    """
-    run = FeakmRun(config, cache, folder, seed)
-    state = run.state
-    state.run_to_end(config.steps, config.save_every, run.advance, report)
-    weights = folder / "weights.safetensors"
-    if not state.rank:
-        about = {"seed": seed, "steps": config.steps, "train_seconds": round(state.seconds), "config": asdict(config)}
-        checkpoint.save(state.average, weights, {**about, **(card or {})}, half=True, format=FORMAT)
-    return weights

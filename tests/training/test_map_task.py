@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map model's loop: resumes bit by bit, logs, and thins as a budget would."""
+"""Training of the map model: resumes bit by bit, starts from other models, calibrates, and thins as a budget would."""
 
 import dataclasses
 import json
@@ -29,10 +29,12 @@ from manyeyes.models.maps.head import MapHeadConfig, decode_elements
 from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.ops.keyed_random import keyed_generator, keyed_uniform
-from manyeyes.training.maps.loop import MapRun, MapTrainConfig, train_map_model
+from manyeyes.training.maps.losses import MapLossTerms
 from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
 from manyeyes.training.maps.samples import MapSample, rasterise_elements
 from manyeyes.training.maps.step import extract_features, loss_terms, subsample_tokens, warp_tokens
+from manyeyes.training.maps.task import MapTask, MapTrainConfig
+from manyeyes.training.trainer import Trainer
 
 TINY = MapModelConfig(
     BevConfig(
@@ -98,41 +100,27 @@ def same_state(a, b):
     return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
 
 
-def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path):
-    whole = MapRun(CONFIG, Streets(), tmp_path / "whole", seed=3)
-    for _ in range(4):
-        whole.advance()
-    broken = MapRun(CONFIG, Streets(), tmp_path / "broken", seed=3)
-    for _ in range(3):
-        broken.advance()
-        if broken.state.step == 2:
-            broken.state.save()
-    resumed = MapRun(CONFIG, Streets(), tmp_path / "broken", seed=3)
-    assert resumed.state.step == 2 and not same_state(resumed.state.model, broken.state.model)
-    for _ in range(2):
-        resumed.advance()
-    assert same_state(resumed.state.model, whole.state.model) and same_state(resumed.state.average, whole.state.average)
-    with pytest.raises(CheckpointError, match="another configuration or seed"):
-        MapRun(CONFIG, Streets(), tmp_path / "broken", seed=4)
+def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path, check_resumption):
+    check_resumption(lambda: MapTask(CONFIG, Streets(), 3), tmp_path)
 
 
 def test_run_state_includes_the_initial_weights(tmp_path):
-    one, other = (MapRun(CONFIG, Streets(), tmp_path / "x", seed=n).state.model.state_dict() for n in (1, 2))
-    run = MapRun(CONFIG, Streets(), tmp_path / "run", seed=3, start=[one])
+    one, other = (Trainer(MapTask(CONFIG, Streets(), n), tmp_path / "x").model.state_dict() for n in (1, 2))
+    run = Trainer(MapTask(CONFIG, Streets(), 3, [one]), tmp_path / "run")
     run.advance()
-    run.state.save()
-    assert MapRun(CONFIG, Streets(), tmp_path / "run", seed=3, start=[one]).state.step == 1
+    run.save()
+    assert Trainer(MapTask(CONFIG, Streets(), 3, [one]), tmp_path / "run").step == 1
     for start in ([other], []):
         with pytest.raises(CheckpointError, match="began from other weights"):
-            MapRun(CONFIG, Streets(), tmp_path / "run", seed=3, start=start)
+            Trainer(MapTask(CONFIG, Streets(), 3, start), tmp_path / "run")
 
 
 def test_a_batch_in_parts_goes_down_the_mean_of_its_parts(tmp_path):
     config = dataclasses.replace(CONFIG, batch=4, micro_batch=3)
-    run = MapRun(config, Streets(), tmp_path, seed=3)
+    run = Trainer(MapTask(config, Streets(), 3), tmp_path)
     losses, gradients = [], []
     for part in (range(3), range(3, 4)):
-        model = MapRun(config, Streets(), tmp_path / "alone", seed=3).state.model.train()
+        model = Trainer(MapTask(config, Streets(), 3), tmp_path / "alone").model.train()
         samples = [Streets().draw(number) for number in part]
         num_frames = sum(len(sample.frames) for sample in samples)
         thin = config.max_token_dropout * keyed_uniform((num_frames,), "thin", 3, part.start).float()
@@ -141,14 +129,15 @@ def test_a_batch_in_parts_goes_down_the_mean_of_its_parts(tmp_path):
         losses.append(float(loss.detach()))
         gradients.append([torch.zeros_like(p) if p.grad is None else p.grad for p in model.parameters()])
     seen = []
-    run.state.optimiser.register_step_pre_hook(
+    run.optimiser.register_step_pre_hook(
         lambda *_: seen.extend(
-            torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in run.state.model.parameters()
+            torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in run.model.parameters()
         )
     )
     progress = run.advance()
     assert progress.loss == pytest.approx(0.75 * losses[0] + 0.25 * losses[1], rel=1e-6)
-    assert float(progress.terms.total(config.loss)) == pytest.approx(progress.loss, rel=1e-5)
+    terms = MapLossTerms(**{name: torch.tensor(value) for name, value in progress.terms.items()})
+    assert float(terms.total(config.loss)) == pytest.approx(progress.loss, rel=1e-5)
     expected = [0.75 * a + 0.25 * b for a, b in zip(*gradients)]
     length = float(torch.stack([g.square().sum() for g in expected]).sum().sqrt())
     shrink = min(1.0, config.max_grad_norm / length)
@@ -201,20 +190,20 @@ class Photos:
 def test_the_papers_model_takes_a_step_and_resumes(tmp_path):
     config = shrunk_paper()
     samples = Photos(config.map_model)
-    run = MapRun(config, samples, tmp_path, seed=0)
+    run = Trainer(MapTask(config, samples, 0), tmp_path)
     first = run.advance()
-    assert math.isfinite(first.loss) and float(first.terms.one_to_many.detach()) > 0
-    run.state.save()
+    assert math.isfinite(first.loss) and first.terms["one_to_many"] > 0
+    run.save()
     run.advance()
-    resumed = MapRun(config, samples, tmp_path, seed=0)
-    assert resumed.state.step == 1
+    resumed = Trainer(MapTask(config, samples, 0), tmp_path)
+    assert resumed.step == 1
     resumed.advance()
-    assert same_state(resumed.state.model, run.state.model) and same_state(resumed.state.average, run.state.average)
+    assert same_state(resumed.model, run.model) and same_state(resumed.average, run.average)
 
 
 def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
     reports = []
-    weights = train_map_model(CONFIG, Streets(), tmp_path, seed=1, card={"command": "x"}, report=reports.append)
+    weights = Trainer(MapTask(CONFIG, Streets(), 1), tmp_path).run({"command": "x"}, reports.append)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [1, 2, 3, 4] == [p.step for p in reports]
     assert all(
@@ -226,8 +215,6 @@ def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
     assert card["towns"] == ["Nowhere"] and card["steps"] == 4 and card["command"] == "x"
     again = checkpoint.load_as(weights, FORMAT, MapModelConfig, MapModel)
     assert again.config == TINY and torch.equal(again.logit_scale, torch.ones(3))
-    train_map_model(CONFIG, Streets(), tmp_path, seed=1)
-    assert len((tmp_path / "log.jsonl").read_text().splitlines()) == 4
 
 
 def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tmp_path):
@@ -240,8 +227,8 @@ def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tm
     )
     lidar.logit_scale.add_(1.0)
     config = dataclasses.replace(CONFIG, map_model=seeing)
-    random = MapRun(config, Streets(), tmp_path / "random", seed=0).state.model.state_dict()
-    begun = MapRun(config, Streets(), tmp_path / "begun", 0, [lidar.state_dict(), camera.state_dict()]).state
+    random = Trainer(MapTask(config, Streets(), 0), tmp_path / "random").model.state_dict()
+    begun = Trainer(MapTask(config, Streets(), 0, [lidar.state_dict(), camera.state_dict()]), tmp_path / "begun")
     state, first, second = (m.state_dict() for m in (begun.model, lidar, camera))
     # The first model with a tensor takes precedence; calibration starts anew; the average starts as the model.
     assert all(torch.equal(state[k], v) for k, v in first.items() if k not in ("logit_scale", "logit_shift"))
@@ -249,16 +236,17 @@ def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tm
     assert torch.equal(state["logit_scale"], torch.ones(3)) and same_state(begun.average, begun.model)
     assert not torch.equal(random["token_projection.weight"], state["token_projection.weight"])
     with pytest.raises(ConfigError, match="of its size"):
-        MapRun(config, Streets(), tmp_path / "none", 0, [{"lidar.stem.0.0.weight": torch.zeros(3)}])
+        Trainer(MapTask(config, Streets(), 0, [{"lidar.stem.0.0.weight": torch.zeros(3)}]), tmp_path / "none")
 
 
 def test_scores_are_calibrated_at_the_end_and_training_is_the_same(tmp_path):
     # Without a threshold even a model that has learnt nothing draws something.
     mapper = dataclasses.replace(TINY, head=dataclasses.replace(TINY.head, score_threshold=0.0))
     plain, calibrated = (
-        train_map_model(
-            dataclasses.replace(CONFIG, map_model=mapper, calibration_tiles=count), Streets(), tmp_path / str(count)
-        )
+        Trainer(
+            MapTask(dataclasses.replace(CONFIG, map_model=mapper, calibration_tiles=count), Streets()),
+            tmp_path / str(count),
+        ).run()
         for count in (0, 3)
     )
     plain, calibrated = (checkpoint.load_as(file, FORMAT, MapModelConfig, MapModel) for file in (plain, calibrated))
@@ -278,17 +266,14 @@ def test_subsampling_drops_the_lowest_scores_of_each_frame():
 
 
 def test_decoder_trains_after_the_line_field(tmp_path):
-    run = MapRun(dataclasses.replace(CONFIG, line_field_steps=1), Streets(), tmp_path, seed=0)
-    before = {name: p.clone() for name, p in run.state.model.named_parameters()}
+    run = Trainer(MapTask(dataclasses.replace(CONFIG, line_field_steps=1), Streets(), 0), tmp_path)
+    before = {name: p.clone() for name, p in run.model.named_parameters()}
     first, second = run.advance(), run.advance()
-    assert (
-        float(first.terms.classification) == 0 == float(first.terms.one_to_many)
-        and float(first.terms.line_field.detach()) > 0
-    )
-    assert float(second.terms.classification.detach()) > 0 and float(second.terms.one_to_many.detach()) > 0
-    only = MapRun(dataclasses.replace(CONFIG, line_field_steps=1), Streets(), tmp_path / "only", seed=0)
+    assert first.terms["classification"] == 0 == first.terms["one_to_many"] and first.terms["line_field"] > 0
+    assert second.terms["classification"] > 0 and second.terms["one_to_many"] > 0
+    only = Trainer(MapTask(dataclasses.replace(CONFIG, line_field_steps=1), Streets(), 0), tmp_path / "only")
     only.advance()
-    same = {name for name, p in only.state.model.named_parameters() if torch.equal(p, before[name])}
+    same = {name for name, p in only.model.named_parameters() if torch.equal(p, before[name])}
     assert any(name.startswith("head.layers") for name in same)
     assert not any(name.startswith("head.line_field_head") for name in same)
 
@@ -305,13 +290,13 @@ def test_two_tiles_can_be_overfitted(tmp_path):
         max_token_dropout=0.0,
         line_field_steps=20,
     )
-    run = MapRun(config, Streets(2), tmp_path, seed=0)
+    run = Trainer(MapTask(config, Streets(2), 0), tmp_path)
     streets = [Streets(2).draw(k) for k in range(2)]
     truth = place_side_by_side([street.truth for street in streets])
-    before = quality(run.state.average, streets, truth)
+    before = quality(run.average, streets, truth)
     for _ in range(config.steps):
         run.advance()
-    after = quality(run.state.average, streets, truth)
+    after = quality(run.average, streets, truth)
     assert before < 0.1 and after > 0.9, (before, after)
 
 

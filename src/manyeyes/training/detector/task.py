@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training of the detector as a task: settings, samples, loss, initial weights."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from manyeyes.datasets.base import Recording
+from manyeyes.datatypes import CheckpointError
+from manyeyes.models import checkpoint
+from manyeyes.models.detector.detector import Detector, DetectorConfig
+from manyeyes.training.detector.losses import LossConfig
+from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig, Sample, SampleStream, epoch_length
+from manyeyes.training.detector.step import loss_terms
+from manyeyes.training.detector.targets import TargetConfig
+from manyeyes.training.trainer import Task, TrainConfig
+
+
+@dataclass(frozen=True)
+class DetectorTrainConfig(TrainConfig):
+    """Settings of a training run of the detector.
+
+    Attributes:
+        detector: configuration of the model.
+        steps: number of optimiser steps; 0 to use epochs.
+        epochs: passes over the evaluated frames.
+        prune_warmup_start: fraction of the run at which the pruning threshold starts to grow from 0.
+        prune_warmup_end: fraction of the run at which it reaches that of the detector.
+    """
+
+    detector: DetectorConfig
+    _: KW_ONLY
+    steps: int = 0
+    epochs: float = 90.0
+    warmup_steps: int = 500
+    prune_warmup_start: float = 0.03
+    prune_warmup_end: float = 0.10
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    degradation: DegradationConfig = field(default_factory=DegradationConfig)
+    targets: TargetConfig = field(default_factory=TargetConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+
+
+def prune_threshold(config: DetectorTrainConfig, step: int, steps: int) -> float:
+    """Return the pruning threshold: 0, then linear growth from prune_warmup_start to prune_warmup_end of the run."""
+    ramp = (step / steps - config.prune_warmup_start) / max(1e-9, config.prune_warmup_end - config.prune_warmup_start)
+    return config.detector.prune_threshold * min(1.0, max(0.0, ramp))
+
+
+class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
+    """Train a detector on samples of a recording.
+
+    start: weights file that initialises the model; its configuration may differ where tensor shapes agree.
+    """
+
+    format = checkpoint.FORMAT
+
+    def __init__(
+        self, config: DetectorTrainConfig, recording: Recording, seed: int = 0, start: Path | None = None
+    ) -> None:
+        self.config, self.seed, self._start = config, seed, start
+        self._steps = config.steps or math.ceil(config.epochs * epoch_length(recording) / config.batch)
+        self.stream = SampleStream(recording, config.detector.grid, config.augment, seed, config.degradation)
+
+    @property
+    def is_initialised(self) -> bool:
+        """Whether a weights file is given."""
+        return self._start is not None
+
+    @property
+    def steps(self) -> int:
+        """Number of optimiser steps, of all epochs where the configuration gives none."""
+        return self._steps
+
+    def make_model(self) -> Detector:
+        """Make the detector, random or from the weights file."""
+        model = Detector(self.config.detector)
+        if self._start is not None:
+            _load_weights(model, self._start)
+        return model
+
+    def draw(self, number: int) -> Sample:
+        """Draw the sample of this number."""
+        return self.stream.draw(number)
+
+    def loss(
+        self, model: Detector, samples: list[Sample], numbers: range, step: int
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the losses of single-agent and fused boxes."""
+        config = self.config
+        threshold = prune_threshold(config, step, self.steps)
+        terms = loss_terms(model, samples, config.targets, threshold, config.loss.fusion_weight, config.loss.target)
+        return terms.total(config.loss), vars(terms)
+
+
+def _load_weights(model: Detector, start: Path) -> None:
+    """Initialise the model from a file.
+
+    New modules keep their initialisation, and new rows and columns of a matrix start at zero, so that both have no
+    effect at first. Modules
+    that the model lacks are skipped, as in an ablation.
+    """
+    state, own = checkpoint.read_state(start), model.state_dict()
+    begun = {name: _grow(value, state[name]) for name, value in own.items() if name in state}
+    odd = sorted(name for name, value in begun.items() if value is None)
+    if odd or not begun:
+        raise CheckpointError(
+            f"{start}: cannot start this preset, tensor {(odd or sorted(state))[0]} does not fit; "
+            "start from weights of the same architecture."
+        )
+    model.load_state_dict(begun, strict=False)
+
+
+def _grow(new: Tensor, old: Tensor) -> Tensor | None:
+    """Copy old values to the start of the new tensor; None where they do not fit."""
+    if new.dim() != old.dim() or any(n < o for n, o in zip(new.shape, old.shape)):
+        return None
+    grown = torch.zeros_like(new) if new.dim() > 1 else new.clone()
+    grown[tuple(slice(0, o) for o in old.shape)] = old.to(new.dtype)
+    return grown

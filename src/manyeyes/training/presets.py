@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Named training configurations of all tasks."""
+
+from __future__ import annotations
+
+from manyeyes.training.detector.presets import DETECTOR_TRAINING_PRESETS
+from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
+from manyeyes.training.pose.feakm import FEAKM_TRAINING_PRESETS
+from manyeyes.training.trainer import TrainConfig
+
+TRAINING_PRESETS: dict[str, TrainConfig] = {
+    **DETECTOR_TRAINING_PRESETS,
+    **FEAKM_TRAINING_PRESETS,
+    **MAP_TRAINING_PRESETS,
+}

@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training of any task: keyed randomness, resumable, one or more processes, averaged weights."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import signal
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from manyeyes._io import atomic_replace, atomic_write_text
+from manyeyes.datatypes import CheckpointError, ConfigError
+from manyeyes.models import checkpoint
+
+Config = TypeVar("Config", bound="TrainConfig")
+Model = TypeVar("Model", bound=nn.Module)
+Sample = TypeVar("Sample")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Settings that all tasks share.
+
+    Attributes:
+        steps: number of optimiser steps.
+        batch: samples per step over all processes.
+        learning_rate: its peak.
+        beta2: decay of Adam's second moment.
+        warmup_steps: steps of linear growth of the learning rate, before a cosine to zero.
+        max_grad_norm: at which gradients are clipped.
+        ema_decay: decay of the averaged weights, which are saved.
+        micro_batch: samples that a process holds in memory together, None for all of its batch; batch norms see one part at a time.
+        save_every: steps between two saves of the training state.
+    """
+
+    steps: int
+    batch: int = 4
+    learning_rate: float = 2e-4
+    weight_decay: float = 1e-2
+    beta2: float = 0.999
+    warmup_steps: int = 100
+    max_grad_norm: float = 10.0
+    ema_decay: float = 0.999
+    micro_batch: int | None = None
+    save_every: int = 200
+
+
+class Task(ABC, Generic[Config, Model, Sample]):
+    """What is trained: a model, an endless keyed stream of samples, and a loss.
+
+    Attributes:
+        format: format name in the metadata of the weights file.
+        shown_terms: names of the loss terms that a progress bar shows.
+        config: settings, which identify the run together with the seed.
+    """
+
+    format: ClassVar[str]
+    shown_terms: ClassVar[tuple[str, ...]] = ()
+    config: Config
+    seed: int
+
+    @property
+    def is_initialised(self) -> bool:
+        """Whether make_model starts from given weights."""
+        return False
+
+    @property
+    def steps(self) -> int:
+        """Number of optimiser steps."""
+        return self.config.steps
+
+    @abstractmethod
+    def make_model(self) -> Model:
+        """Make the model before the first step; torch's random state is seeded."""
+
+    @abstractmethod
+    def draw(self, number: int) -> Sample:
+        """Draw the sample of this number, deterministically."""
+
+    @abstractmethod
+    def loss(self, model: Model, samples: list[Sample], numbers: range, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Compute the loss of samples with these numbers, and the terms for the log, as scalars."""
+
+    def finish(self, model: Model) -> dict[str, Any]:
+        """Adjust the averaged model after the last step; returns additions to its card."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress of one step: one line of the log. terms: of the loss, and measures of the batch."""
+
+    step: int
+    steps: int
+    loss: float
+    terms: dict[str, float]
+    learning_rate: float
+    seconds: float
+
+    def to_record(self) -> dict[str, float]:
+        """Return the line of log.jsonl."""
+        terms = {name: round(value, 5) for name, value in self.terms.items()}
+        return {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
+
+
+class Trainer(Generic[Model, Sample]):
+    """A resumable training run in a folder, of one process or of one of several that share every batch.
+
+    The folder holds last.pt (training state), log.jsonl (one object per step) and weights.safetensors (float16).
+
+    Raises:
+        CheckpointError: the folder holds a run of another configuration, seed or initial weights, or a damaged state.
+    """
+
+    def __init__(self, task: Task[Any, Model, Sample], folder: Path) -> None:
+        self.task, self.folder = task, folder
+        self.rank, self.world_size = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
+        with torch.random.fork_rng():
+            torch.manual_seed(task.seed)
+            self.model = task.make_model()
+        self.average = copy.deepcopy(self.model).requires_grad_(False)
+        groups = parameter_groups(self.model, task.config.weight_decay)
+        self.optimiser = torch.optim.AdamW(groups, betas=(0.9, task.config.beta2))
+        self.step, self.seconds = 0, 0.0
+        begun = checkpoint.fingerprint(self.model).hex() if task.is_initialised else ""
+        self._name = {"config": checkpoint.config_to_json(task.config), "seed": task.seed, "begun": begun}
+        if self.path.exists():
+            self._resume()
+        if not self.rank:
+            _trim_log(self.folder / "log.jsonl", self.step)
+
+    @property
+    def path(self) -> Path:
+        """The file of the saved training state."""
+        return self.folder / "last.pt"
+
+    def run(
+        self, card: dict[str, Any] | None = None, report: Callable[[Progress], None] = lambda progress: None
+    ) -> Path:
+        """Train to the last step; returns the file of averaged weights, with this card.
+
+        The first process writes the log and calls report at every step. SIGINT and SIGTERM end the run after its current step,
+        which is saved.
+        """
+        with _defer_interrupts() as interrupted:
+            while self.step < self.task.steps:
+                progress = self.advance()
+                if not self.rank:
+                    self.folder.mkdir(parents=True, exist_ok=True)
+                    with (self.folder / "log.jsonl").open("a") as log:
+                        log.write(json.dumps(progress.to_record()) + "\n")
+                    report(progress)
+                if not self.step % self.task.config.save_every or self.step == self.task.steps or interrupted.is_set():
+                    self.save()
+                if interrupted.is_set():
+                    raise KeyboardInterrupt
+        weights = self.folder / "weights.safetensors"
+        if not self.rank:
+            about = {"seed": self.task.seed, "steps": self.task.steps, **self.task.finish(self.average)}
+            about |= {"train_seconds": round(self.seconds), "config": asdict(self.task.config)}
+            checkpoint.save(self.average, weights, about | (card or {}), half=True, format=self.task.format)
+        return weights
+
+    def advance(self) -> Progress:
+        """Run one optimiser step."""
+        config, began = self.task.config, time.monotonic()
+        numbers = self._sample_numbers(config.batch)
+        self.model.train()
+        total, parts = 0.0, []
+        for part in _split(numbers, config.micro_batch or len(numbers)):
+            samples = [self.task.draw(number) for number in part]
+            loss, terms = self.task.loss(self.model, samples, part, self.step)
+            fraction = len(part) / len(numbers)
+            total += self._backward(loss, fraction)
+            parts.append({name: fraction * value.detach() for name, value in terms.items()})
+        rate = config.learning_rate * warmup_cosine(config.warmup_steps, self.step, self.task.steps)
+        self._optimiser_step(rate)
+        self.seconds += time.monotonic() - began
+        mean = {name: float(torch.stack([part[name] for part in parts]).sum()) for name in parts[0]}
+        return Progress(self.step, self.task.steps, total, mean, rate, self.seconds)
+
+    def save(self) -> None:
+        """Save everything that is needed to resume as if uninterrupted, atomically."""
+        if self.rank:
+            return
+        parts = {name: getattr(self, name).state_dict() for name in ("model", "average", "optimiser")}
+        with atomic_replace(self.path) as temporary:
+            torch.save({**self._name, **parts, "step": self.step, "seconds": self.seconds}, temporary)
+
+    def _sample_numbers(self, batch: int) -> range:
+        """Return the sample numbers of this process for the next step."""
+        if batch % self.world_size:
+            raise ConfigError(f"A batch of {batch} samples cannot be shared by {self.world_size} processes evenly.")
+        count = batch // self.world_size
+        first = self.step * batch + self.rank * count
+        return range(first, first + count)
+
+    def _backward(self, loss: Tensor, fraction: float) -> float:
+        """Accumulate the gradient of a loss that is this fraction of the step's; returns its part of the loss."""
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise ConfigError(
+                f"The loss is {value} at step {self.step}; lower the learning rate, or resume from an older save."
+            )
+        (loss * fraction).backward()
+        return value * fraction
+
+    def _optimiser_step(self, rate: float) -> None:
+        """Step down the mean loss of all processes and update the averaged weights, faster at the start."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self._average_gradients()
+        nn.utils.clip_grad_norm_(self.model.parameters(), self.task.config.max_grad_norm)
+        self.optimiser.step()
+        self.optimiser.zero_grad(set_to_none=True)
+        self._update_average(min(self.task.config.ema_decay, (1 + self.step) / (10 + self.step)))
+        self.step += 1
+
+    def _average_gradients(self) -> None:
+        """Average gradients and running statistics over processes, in one flat all-reduce each."""
+        if self.world_size == 1:
+            return
+        for p in self.model.parameters():
+            p.grad = torch.zeros_like(p) if p.grad is None else p.grad
+        _mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world_size)
+        _mean_in_place([b for b in self.model.buffers() if b.is_floating_point()], self.world_size)
+
+    @torch.no_grad()
+    def _update_average(self, decay: float) -> None:
+        for mean, value in zip(self.average.state_dict().values(), self.model.state_dict().values()):
+            if mean.is_floating_point():
+                mean.lerp_(value, 1 - decay)
+            else:
+                mean.copy_(value)
+
+    def _resume(self) -> None:
+        try:
+            state = torch.load(self.path, weights_only=True)
+        except Exception as error:
+            raise CheckpointError(
+                f"{self.path}: not a whole training state ({type(error).__name__}); delete it to start anew."
+            ) from error
+        if {name: state.get(name, "") for name in self._name} != self._name:
+            raise CheckpointError(
+                f"{self.path}: belongs to a run of another configuration or seed, or that began from other weights; give another "
+                "--out, or delete it."
+            )
+        for name in ("model", "average", "optimiser"):
+            getattr(self, name).load_state_dict(state[name])
+        self.step, self.seconds = state["step"], state["seconds"]
+
+
+def parameter_groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
+    """Return optimiser groups: matrices with weight decay, and the other parameters without."""
+    matrices = [p for p in model.parameters() if p.dim() > 1]
+    rest = [p for p in model.parameters() if p.dim() <= 1]
+    return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
+
+
+def warmup_cosine(warmup_steps: int, step: int, steps: int) -> float:
+    """Return the learning rate as a fraction of its peak: linear warm-up over warmup_steps, times a cosine to zero."""
+    return min(1.0, (step + 1) / max(1, warmup_steps)) * 0.5 * (1 + math.cos(math.pi * step / steps))
+
+
+def _split(numbers: range, size: int) -> Iterator[range]:
+    return (numbers[first : first + size] for first in range(0, len(numbers), size))
+
+
+@contextmanager
+def _defer_interrupts() -> Iterator[threading.Event]:
+    """Yield an event that the first SIGINT or SIGTERM sets; a second one acts as before. Only the main thread can."""
+    interrupted, numbers = threading.Event(), (signal.SIGINT, signal.SIGTERM)
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupted
+        return
+
+    def restore() -> None:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+    def defer(number: int, frame: object) -> None:
+        interrupted.set()
+        restore()
+
+    handlers = {number: signal.signal(number, defer) for number in numbers}
+    try:
+        yield interrupted
+    finally:
+        restore()
+
+
+def _mean_in_place(tensors: Sequence[Tensor], world: int) -> None:
+    """Replace each tensor by its mean over world processes, in one flat all-reduce."""
+    if not tensors:
+        return
+    flat = torch.cat([t.flatten() for t in tensors])
+    dist.all_reduce(flat)
+    flat /= world
+    for tensor, part in zip(tensors, flat.split([t.numel() for t in tensors])):
+        tensor.copy_(part.view_as(tensor))
+
+
+def _trim_log(path: Path, step: int) -> None:
+    """Drop log lines written after the last save, which may be truncated; they will be written again."""
+    if path.exists():
+        kept = [line for line in path.read_text().splitlines() if 0 < _step_of(line) <= step]
+        atomic_write_text(path, "".join(line + "\n" for line in kept))
+
+
+def _step_of(line: str) -> int:
+    try:
+        return int(json.loads(line)["step"])
+    except (json.JSONDecodeError, KeyError, TypeError):
+        return 0
