@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page on refused messages names every reason, and the bounds that the code has."""
+"""The page on message validation lists every reason, and the bounds that the code has."""
 
 from dataclasses import fields
 from pathlib import Path
