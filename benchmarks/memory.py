@@ -33,6 +33,7 @@ from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.fold_norms import fold_norms
 from manyeyes.models.detector.presets import COSTR_SMALL
+from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.studies.provenance import write_json
 
@@ -64,7 +65,7 @@ class CountingCache(PerceptionCache):
 
     tokens = 0
 
-    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
+    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> tuple[FusedBev, RawBoxes]:
         self.tokens = len(tokens.features)
         return super().fuse(tokens, past)
 

@@ -36,7 +36,7 @@ from street import street
 from torch import Tensor
 
 from manyeyes.agents.agent import EGO_HALF_SIZE_M, Agent
-from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
+from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.agents.strategies.intermediate import gather_ego_tokens
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.redundancy import novelty_score
@@ -265,7 +265,7 @@ def staged(model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -
         raw = model.predict(tokens)
         shared_tokens = model.make_tokens(tokens, raw)
         stopwatch.lap("head")
-        output = AgentOutput(shared_tokens, shared_tokens, raw, model.config.decode)
+        output = TokenOutput(shared_tokens, shared_tokens, raw, model.config.decode)
         cache = PerceptionCache(model, feature_cache={(frame.agent_id, frame.timestamp_ns): output})
         some, score = select_within_budget(shared_tokens, novelty_score(cache, frame), 1 << 17, "float16")
         stopwatch.lap("selection")
@@ -315,7 +315,7 @@ def aim_threshold(model: Detector, frames: list[AgentFrame], kept: list[Kept] | 
         shared_tokens = cache.run_detector(frame.points).shared_tokens
         motion = frames[0].world_from_agent.inverse() @ frame.world_from_agent if i else None
         parts.append(AgentTokens(0, shared_tokens.features, shared_tokens.sites.xy, motion))
-    raw = cache.fuse(to_ego_frame(parts, model.token_grid, 1))
+    _, raw = cache.fuse(to_ego_frame(parts, model.token_grid, 1))
     power = DecodeConfig().iou_score_weight
     best = (
         (torch.sigmoid(raw.heatmap_logit) ** (1 - power) * torch.sigmoid(raw.iou_logit) ** power)

@@ -20,7 +20,9 @@ import torch
 
 from manyeyes import Agent, Opv2vRecording, load_detector
 from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
-from manyeyes.agents.strategies import FusionStrategy, IntermediateFusion, LateFusion
+from manyeyes.agents.strategies.intermediate import IntermediateFusion
+from manyeyes.agents.strategies.late import LateFusion
+from manyeyes.agents.strategies.registry import FusionStrategy
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot
 from manyeyes.evaluation.detection.average_precision import (
     FrameResult,
@@ -44,7 +46,7 @@ class RedecodingCache(PerceptionCache):
         self._cache, self._setting = cache, setting
 
     def process(self, frame: AgentFrame) -> AgentOutput:
-        return replace(self._cache.process(frame), config=self._setting)
+        return replace(self._cache.process_tokens(frame), config=self._setting)
 
     def previous_tokens(self, frame: AgentFrame, num_frames: int = 2) -> list[AgentTokens]:
         return self._cache.previous_tokens(frame, num_frames)
@@ -86,7 +88,7 @@ def main() -> None:
         print(f"not run: {options.data} is absent; make it with 'manyeyes simulate --preset towns-small'")
         return
     detector, recording = load_detector(options.weights), Opv2vRecording(options.data, options.split)
-    grid, base = detector.config.detection_range, detector.config.decode
+    grid, base = detector.detection_range, detector.config.decode
     box = (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
     protocol = get_protocol("manyeyes").with_range(box)
     found: dict[tuple[str, float, float], list[FrameResult]] = defaultdict(list)

@@ -19,7 +19,7 @@ perception = Agent(detector).perceive(first, packets)
 print(f"{sum(map(len, packets))} bytes from {len(second.points)} real points, {len(perception.boxes)} boxes")
 picture = Path(sys.argv[2] if len(sys.argv) > 2 else "argoverse2.png")
 save_png(
-    draw_scene(make_scene(snapshot, perception.boxes), detector.config.grid, "Two sweeps as two agents", min_score=0.6),
+    draw_scene(make_scene(snapshot, perception.boxes), detector.grid, "Two sweeps as two agents", min_score=0.6),
     picture,
 )
 print(picture)

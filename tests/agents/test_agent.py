@@ -11,11 +11,12 @@ import torch
 
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.perception_cache import PerceptionCache
-from manyeyes.agents.strategies import STRATEGIES, get_strategy
+from manyeyes.agents.strategies.registry import get_strategy, list_strategies
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, PointCloud, Transform
 from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.detector import Detector
+from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens
 from manyeyes.training.detector.samples import AgentView, AugmentConfig, DegradationConfig, make_sample
 from manyeyes.training.detector.step import forward
@@ -37,10 +38,10 @@ class RecordingCache(PerceptionCache):
     def previous_tokens(self, frame: AgentFrame, num_frames: int = 2) -> list[AgentTokens]:
         return super().previous_tokens(frame, self.num_frames)
 
-    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
+    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> tuple[FusedBev, RawBoxes]:
         self.fused_tokens, self.fused_past = tokens, past
-        self.raw = super().fuse(tokens, past)
-        return self.raw
+        fused, self.raw = super().fuse(tokens, past)
+        return fused, self.raw
 
 
 def packets_and_messages(
@@ -140,7 +141,7 @@ def test_collaborators_change_what_the_ego_sees(drive, detector: Detector) -> No
     assert len(Agent(detector).perceive(blind, packets).boxes) > len(Agent(detector).perceive(blind).boxes)
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", list_strategies())
 def test_an_empty_cloud_and_an_empty_inbox_give_no_error(detector: Detector, name: str) -> None:
     empty = AgentFrame.of(PointCloud.of(torch.zeros(0, 3)), Transform.identity(), agent_id=7)
     agent = Agent(detector, get_strategy(name))
@@ -161,10 +162,9 @@ def test_a_message_never_exceeds_its_budget(drive, detector: Detector) -> None:
 def test_tokens_of_other_weights_change_nothing(drive, detector: Detector) -> None:
     frames = drive(2).frames()
     packets = Agent(detector).share(frames[1])
-    ego = Agent(detector)
-    alone = ego.perceive(frames[0]).boxes
+    alone = Agent(detector).perceive(frames[0]).boxes
     detector.fingerprint = b"othertes"
-    strange = ego.perceive(frames[0], packets)
+    strange = Agent(detector).perceive(frames[0], packets)
     detector.fingerprint = b"testtest"
     assert torch.equal(alone.bev(), strange.boxes.bev())
 
@@ -194,5 +194,7 @@ def test_late_fusion_keeps_one_box_of_two_that_overlap(drive, detector: Detector
 
 
 def test_an_unknown_strategy_lists_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match=", ".join(STRATEGIES)):
+    with pytest.raises(
+        ConfigError, match="No strategy is called 'telepathy'; known: .*" + ", ".join(list_strategies())
+    ):
         get_strategy("telepathy")

@@ -14,7 +14,7 @@ from manyeyes.agents.agent import Agent
 from manyeyes.agents.descriptors import extract_message_keypoints, extract_own_keypoints
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.pose_correction import MessageUse, PoseCorrection
-from manyeyes.agents.strategies import STRATEGIES
+from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message, PointCloud, Transform
@@ -79,7 +79,7 @@ def test_a_budget_holds_with_what_is_described(drive, detector, weights):
 def test_boxes_that_are_sent_anyway_are_described_and_stay(drive, detector, weights):
     frame, net = drive().frame(1, 3), PoseCorrection(weights).net
     plain, describing = (
-        Agent(detector, STRATEGIES["late"], pose_correction=a) for a in (None, PoseCorrection(weights))
+        Agent(detector, get_strategy("late"), pose_correction=a) for a in (None, PoseCorrection(weights))
     )
     was, message = decode_message(detector, plain.share(frame)), decode_message(detector, describing.share(frame))
     torch.testing.assert_close(message.objects.center, was.objects.center)
@@ -95,7 +95,7 @@ def test_boxes_that_are_sent_anyway_are_described_and_stay(drive, detector, weig
 
 def test_messages_of_another_time_or_without_objects_get_no_descriptors(drive, detector, weights):
     frame, aligner, cache = drive().frame(1, 3), PoseCorrection(weights), PerceptionCache(detector)
-    message = replace(STRATEGIES["intermediate"].compose_message(cache, frame), timestamp_ns=frame.timestamp_ns - 1)
+    message = replace(get_strategy("intermediate").compose_message(cache, frame), timestamp_ns=frame.timestamp_ns - 1)
     assert aligner.attach_descriptors(frame, cache, message) is message and extract_message_keypoints(message) is None
     assert PoseCorrection().attach_descriptors(frame, cache, message) is message
     found = aligner.correct(drive().frame(0, 3), PerceptionCache(detector), [message], {})

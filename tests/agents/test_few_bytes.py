@@ -11,7 +11,7 @@ import torch
 
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.replay import ReplayConfig, replay
-from manyeyes.agents.token_codec import encode_tokens
+from manyeyes.agents.token_codec import quantise_tokens
 from manyeyes.comms.inbox import Inbox
 from manyeyes.comms.local_bus import LocalBus
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Sites, Snapshot, Transform
@@ -133,14 +133,14 @@ def test_codes_need_a_codebook_on_both_sides(detector):
         Agent(plain, token_encoding="codebook")
     frames = Plane().snapshot("plane", 0).frames
     with pytest.raises(ConfigError, match="manyeyes fit-codebook"):
-        encode_tokens(Agent(plain).perception_cache.process(frames[0]).shared_tokens, plain)
+        quantise_tokens(Agent(plain).perception_cache.process(frames[0]).shared_tokens, plain)
     packets = Agent(detector, token_encoding="codebook").share(frames[1])
     # Without the tables coded packets are of other weights; and rows of another width mean nothing here.
     inbox = Inbox(detector.fingerprint)
     for packet in packets:
         inbox.push(packet)
     assert inbox.dropped.wrong_model == len(packets)
-    inbox = Inbox(tables=Agent(detector)._tables)
+    inbox = Inbox(tables=Agent(detector).token_format.tables)
     inbox.push(packets[0])
     assert Agent(plain).perceive(frames[0], inbox).received[0].message.tokens is None
 

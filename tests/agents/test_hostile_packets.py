@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from manyeyes import Agent, AgentFrame, Boxes, Inbox
-from manyeyes.agents.strategies import STRATEGIES, get_strategy
+from manyeyes.agents.strategies.registry import FusionStrategy, get_strategy, list_strategies
 
 BODY, CHANNELS, CELLS, KEYS = 64, 80, 82, 84
 TENTH_NS = 100_000_000
@@ -116,11 +116,8 @@ def test_a_sender_whose_content_breaks_fusion_is_rejected_by_name_and_the_rest_i
     """A fusion of one's own that cannot bear something: the sender is named, the honest one still counts, no history is kept."""
     intermediate = get_strategy("intermediate")
 
-    class Fragile:
-        name, uses_history = "fragile", True
-
-        def compose_message(self, cache, frame):
-            return intermediate.compose_message(cache, frame)
+    class Fragile(FusionStrategy):
+        uses_history = True
 
         def fuse(self, cache, frame, messages):
             if any(m.agent_id in (66, 68) for m in messages):
@@ -142,12 +139,7 @@ def test_a_sender_whose_content_breaks_fusion_is_rejected_by_name_and_the_rest_i
 
 
 def test_an_error_of_the_agents_own_is_raised(drive, detector) -> None:
-    class Broken:
-        name, uses_history = "broken", False
-
-        def compose_message(self, cache, frame):
-            return None
-
+    class Broken(FusionStrategy):
         def fuse(self, cache, frame, messages):
             raise ValueError("a defect")
 
@@ -204,7 +196,7 @@ def test_a_stranger_that_covers_an_own_box_from_the_side_does_not_take_its_place
     assert float(torch.cdist(alone.center[:, :2], found.center[:, :2]).min(1).values.max()) <= 1.0
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", list_strategies())
 def test_no_bytes_make_perceive_raise(drive, detector, name: str) -> None:
     """Bytes of honest packets at random places, with checksums made right: everything decodable is fused or rejected."""
     some, random = drive(2), np.random.default_rng(20)

@@ -21,7 +21,7 @@ from manyeyes.agents.map_perception import (
 )
 from manyeyes.agents.map_replay import MapReplay
 from manyeyes.agents.map_server import MapServer
-from manyeyes.agents.strategies import NoFusion
+from manyeyes.agents.strategies.no_fusion import NoFusion
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, ConfigError, PointCloud, Transform
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements

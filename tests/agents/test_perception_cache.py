@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.perception_cache import MAX_EGO_STEP_M, MAX_GAP_NS, AgentOutput, PerceptionCache, is_consecutive
-from manyeyes.agents.strategies import get_strategy
+from manyeyes.agents.perception_cache import MAX_EGO_STEP_M, MAX_GAP_NS, PerceptionCache, TokenOutput, is_consecutive
+from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.agents.velocity import DEFAULT_VELOCITY_CONFIG, VelocityConfig
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, BevGrid, PointCloud, Sites, SparseBev, Transform
@@ -171,7 +171,7 @@ GRID = BevGrid(-40, -40, -1, 40, 40, 3, 1.0)
 Places = list[tuple[float, float]]
 
 
-def output_of(cells: Places, cars: Places, heat: float = 4.0) -> AgentOutput:
+def output_of(cells: Places, cars: Places, heat: float = 4.0) -> TokenOutput:
     """A token in each cell that proposes the middle of a car; nothing moves, as far as it states."""
     yx = GRID.cells(torch.tensor(cells))
     order = (yx[:, 0] * GRID.shape[1] + yx[:, 1]).argsort()
@@ -187,7 +187,7 @@ def output_of(cells: Places, cars: Places, heat: float = 4.0) -> AgentOutput:
     columns[:, BOX_LAYOUT.axis.start] = columns[:, BOX_LAYOUT.direction.start] = 1
     raw = RawBoxes.of(columns, sites)
     tokens = SparseBev(torch.cat((torch.ones(len(cells), 4), make_proposals(raw)), 1), sites)
-    return AgentOutput(tokens, tokens, raw, DecodeConfig())
+    return TokenOutput(tokens, tokens, raw, DecodeConfig())
 
 
 def test_tokens_are_as_fast_as_the_box_that_they_propose_and_what_is_no_box_stands() -> None:
@@ -219,13 +219,13 @@ class ScriptedCache(PerceptionCache):
     def __init__(
         self,
         detector: Detector,
-        script: list[AgentOutput],
+        script: list[TokenOutput],
         velocity_config: VelocityConfig | None = DEFAULT_VELOCITY_CONFIG,
     ) -> None:
         super().__init__(detector, velocity_config=velocity_config)
         self.script = iter(script)
 
-    def run_detector(self, cloud: PointCloud, earlier: PointCloud | None = None) -> AgentOutput:
+    def run_detector(self, cloud: PointCloud, earlier: PointCloud | None = None) -> TokenOutput:
         return next(self.script)
 
 

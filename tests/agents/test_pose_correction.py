@@ -15,7 +15,7 @@ import torch
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.pose_correction import MessageUse, PoseCorrection, extract_message_boxes
-from manyeyes.agents.strategies import LateFusion
+from manyeyes.agents.strategies.late import LateFusion
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message, PointCloud, SparseBev, Transform
 from manyeyes.models.detector.box_head import BOX_LAYOUT, DecodeConfig, RawBoxes, decode
 from manyeyes.models.detector.detector import Detector
@@ -250,9 +250,7 @@ def test_an_agent_fuses_boxes_from_where_their_sender_is() -> None:
     assert missed[False] < 0.1 and missed[True] > 1.0
 
 
-@pytest.mark.parametrize(
-    "strategy, uses_history", [(LateFusion(), False), (LateFusion("remembering", history_frames=2), True)]
-)
+@pytest.mark.parametrize("strategy, uses_history", [(LateFusion(), False), (LateFusion(uses_history=True), True)])
 def test_history_bridges_an_unlocalised_or_lost_message(strategy: LateFusion, uses_history: bool) -> None:
     """A valid prior at first; then an uninformative prior without common objects; then no message."""
     known, hidden = cars(12, 13), cars(3, 14)

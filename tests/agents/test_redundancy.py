@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
-from manyeyes.agents.strategies import get_strategy
+from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.agents.strategies.intermediate import confidence_score
 from manyeyes.agents.strategies.redundancy import REDUNDANCY_DECAY, SAME_OBJECT_M, novelty_score, proposed_centres
+from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.datatypes import AgentFrame, BevGrid, PointCloud, SparseBev, Transform
 from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT, DecodeConfig, RawBoxes
 from manyeyes.models.detector.detector import Detector
@@ -45,7 +45,7 @@ def frame(index: int, x: float = 0.0, yaw: float = 0.0, agent: int = 1) -> Agent
 def cache_of(*views: tuple[AgentFrame, SparseBev]) -> PerceptionCache:
     """A perception cache with fixed outputs for these frames, without a detector."""
     nothing = cast(RawBoxes, None)
-    feature_cache = {(f.agent_id, f.timestamp_ns): AgentOutput(t, t, nothing, DecodeConfig()) for f, t in views}
+    feature_cache = {(f.agent_id, f.timestamp_ns): TokenOutput(t, t, nothing, DecodeConfig()) for f, t in views}
     return PerceptionCache(cast(Detector, None), feature_cache=feature_cache)
 
 

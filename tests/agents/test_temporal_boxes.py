@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from manyeyes.agents.strategies import get_strategy
 from manyeyes.agents.strategies.early import EarlyFusion
 from manyeyes.agents.strategies.late import LateFusion
+from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.agents.strategies.temporal_boxes import SCORE_DECAY_PER_100MS, decay_scores, merge_boxes_nms
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, Message, PointCloud, Transform
 
@@ -38,7 +39,7 @@ class FixedOutput:
 class FixedCache:
     """A perception cache with these boxes, newest first, a tenth of a second apart, while the agent drove on at 1 m a sweep."""
 
-    grid = BevGrid(-100.0, -40.0, -3.0, 100.0, 40.0, 1.0)
+    detector = SimpleNamespace(grid=BevGrid(-100.0, -40.0, -3.0, 100.0, 40.0, 1.0))
 
     def __init__(self, *views: Boxes) -> None:
         self.views = [(frame(9 - i, -float(i)), FixedOutput(view)) for i, view in enumerate(views)]

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.strategies import STRATEGIES
+from manyeyes.agents.strategies.registry import get_strategy, list_strategies
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import Transform
@@ -76,9 +76,11 @@ def strategies(data: Path) -> Arrays:
     snapshots = [recording.snapshot(scenario, index) for index in range(recording.length(scenario))]
     for number, frame in enumerate(snapshots[0].frames):
         yield f"simulator/points/{number}", frame.points.xyz.numpy()
-    for key, strategy in STRATEGIES.items():
+    for key in list_strategies():
         for encoding in ("float32", "float16", "int8", "codebook"):
-            agents = {f.agent_id: Agent(detector, strategy, token_encoding=encoding) for f in snapshots[0].frames}
+            agents = {
+                f.agent_id: Agent(detector, get_strategy(key), token_encoding=encoding) for f in snapshots[0].frames
+            }
             for time, snapshot in enumerate(snapshots):
                 sent = {f.agent_id: agents[f.agent_id].share(f) for f in snapshot.frames}
                 yield f"packets/{key}/{encoding}/{time}", content([p for packets in sent.values() for p in packets])

@@ -168,9 +168,9 @@ def test_optional_configuration_field_round_trips_and_defaults_when_absent():
     area = BevGrid(-10.0, -5.0, -3.0, 10.0, 5.0, 3.0)
     config = DetectorConfig(BevGrid(-10.0, -10.0, -3.0, 10.0, 10.0, 3.0), output_range=area)
     text = config_to_json(config)
-    assert config_from_json(DetectorConfig, text) == config and config.detection_range == area
+    assert config_from_json(DetectorConfig, text) == config and Detector(config).detection_range == area
     older = {k: v for k, v in json.loads(text).items() if k != "output_range"}
     read = config_from_json(DetectorConfig, json.dumps(older))
-    assert read.output_range is None and read.detection_range == read.grid
+    assert read.output_range is None and Detector(read).detection_range == read.grid
     with pytest.raises(ConfigError):
         config_from_json(DetectorConfig, json.dumps({k: v for k, v in older.items() if k != "grid"}))

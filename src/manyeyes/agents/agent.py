@@ -13,32 +13,29 @@ import torch
 from manyeyes.agents.message_history import MessageHistory
 from manyeyes.agents.perception_cache import History, PerceptionCache
 from manyeyes.agents.pose_correction import CorrectionOutcome, PoseCorrection, SenderState
-from manyeyes.agents.strategies import FusionStrategy, IntermediateFusion
+from manyeyes.agents.strategies.intermediate import IntermediateFusion
 from manyeyes.agents.strategies.message_header import make_header
+from manyeyes.agents.strategies.registry import FusionStrategy
+from manyeyes.agents.strategies.request_maps import make_request_map
 from manyeyes.agents.token_codec import (
     decode_tokens,
     default_token_encoding,
-    encode_tokens,
-    make_code_tables,
     make_token_format,
+    quantise_tokens,
     require_codebook,
 )
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox, ReceivedMessage, Rejection
-from manyeyes.comms.request_map import build_request_map, compute_request_weights
-from manyeyes.comms.token_format import TokenFormat, clamp_features
+from manyeyes.comms.token_format import clamp_features
 from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import TokenEncoding
-from manyeyes.datatypes import AgentFrame, Boxes, Message
-from manyeyes.datatypes.message import RequestMap
-from manyeyes.models.detector.detector import Detector
+from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
+from manyeyes.models.detector.protocols import BoxDetector, check_detector, require_tokens
 
 if TYPE_CHECKING:
     from manyeyes.agents.map_perception import MapPredictor
 
 EGO_HALF_SIZE_M = (2.6, 1.3)
-REQUEST_MAP_STRIDE = 32
-"""Pillars on an edge of a window of a request map."""
 
 
 @dataclass(frozen=True)
@@ -66,18 +63,18 @@ class _State:
 
 
 class Agent:
-    """A detector, a fusion strategy, and a byte budget for each message.
+    """A detector, the shipped one or your own, a fusion strategy, and a byte budget for each message.
 
     Agents exchange nothing but the packets of share; frames carry no labels, so ground truth cannot leak by type.
     token_encoding: of the tokens; None: the default of these weights (``agents.token_codec``).
     send_request_map: messages with tokens carry a request map, one byte a window (``comms.request_map``).
     pose_correction: corrects prior poses of senders before fusion; None uses the prior poses. map_predictor: predicts the local map
-    that the agent sends (``agents.map_perception``); None sends no map.
+    that the agent sends (``agents.map_perception``); None sends no map. token_format: of the tokens that the agent can fuse.
     """
 
     def __init__(
         self,
-        detector: Detector,
+        detector: BoxDetector,
         strategy: FusionStrategy | None = None,
         token_encoding: TokenEncoding | None = None,
         budget_bytes: int | None = 1 << 17,
@@ -86,13 +83,16 @@ class Agent:
         send_request_map: bool = False,
         map_predictor: MapPredictor | None = None,
     ) -> None:
+        check_detector(detector)
         self.perception_cache, self.message_history = perception_cache or PerceptionCache(detector), MessageHistory()
         self.pose_correction, self._sender_states = pose_correction, dict[int, SenderState]()
         self.strategy = strategy or IntermediateFusion()
+        if self.strategy.needs_tokens:
+            require_tokens(detector)
         self.token_encoding: TokenEncoding = token_encoding or default_token_encoding(detector)
         self.budget_bytes = budget_bytes
         self.send_request_map, self.map_predictor = send_request_map, map_predictor
-        self._tables = make_code_tables(detector)
+        self.token_format = make_token_format(detector)
         if token_encoding == "codebook":
             require_codebook(detector)
 
@@ -106,50 +106,42 @@ class Agent:
         those with a request map weight the tokens by the sender's lack of confidence there.
         """
         budget = min((b for b in (self.budget_bytes, budget_bytes) if b is not None), default=None)
-        message = self.strategy.compose_message(self.perception_cache, frame)
+        message = self._compose(frame, requests)
+        if message is None:
+            return []
+        bodies = wire.encode_other_sections(message)
+        if message.tokens is None:
+            return wire.make_packets(message, bodies)
+        left = None if budget is None else budget - wire.count_bytes(bodies)
+        kept, encoded = self._select(message, message.tokens, left)
+        bodies += wire.encode_tokens(encoded, token_encoding=self.token_encoding, tables=self.token_format.tables)
+        packets = wire.make_packets(message, bodies)
+        self.strategy.record_sent(self.perception_cache, frame, kept)
+        return [] if budget is not None and sum(map(len, packets)) > budget else packets
+
+    def _compose(self, frame: AgentFrame, requests: Sequence[Message]) -> Message | None:
+        """The message of the strategy, with the local map, descriptors and request map that the agent adds."""
+        message = self.strategy.compose_message(self.perception_cache, frame, requests)
         local_map = None if self.map_predictor is None else self.map_predictor(frame, requests)
         if local_map is not None:
             message = replace(
                 message or make_header(frame, self.perception_cache.detector.fingerprint), local_map=local_map
             )
-        if message is None:
-            return []
-        if self.pose_correction is not None:
+        if message is not None and self.pose_correction is not None:
             message = self.pose_correction.attach_descriptors(frame, self.perception_cache, message)
-        if message.tokens is not None and message.token_score is not None:
-            shared_tokens = message.tokens.with_features(clamp_features(message.tokens.features))
-            tokens = (
-                encode_tokens(shared_tokens, self.perception_cache.detector)
-                if self.token_encoding == "codebook"
-                else shared_tokens
-            )
-            score = message.token_score * compute_request_weights(tokens.sites.xy, frame.world_from_agent, requests)
-            left = budget
-            if self.send_request_map:
-                message = replace(message, request=self._make_request_map(frame))
-            if any(part is not None for part in (message.request, message.objects, message.local_map)):
-                encoded = wire.encode(replace(message, tokens=None), token_encoding=self.token_encoding)
-                left = None if budget is None else budget - sum(map(len, encoded))
-            tokens, score = select_within_budget(tokens, score, left, self.token_encoding, tables=self._tables)
-            self.perception_cache.record_sent(
-                frame, shared_tokens.keep(torch.isin(shared_tokens.sites.key, tokens.sites.key))
-            )
-            message = replace(message, tokens=tokens, token_score=score)
-        packets = wire.encode(message, token_encoding=self.token_encoding, tables=self._tables)
-        too_long = budget is not None and message.tokens is not None and sum(map(len, packets)) > budget
-        return [] if too_long else packets
+        if message is not None and message.tokens is not None and self.send_request_map:
+            message = replace(message, request=make_request_map(self.perception_cache, frame))
+        return message
 
-    def _make_request_map(self, frame: AgentFrame) -> RequestMap:
-        """The confidence of the agent's own objects, in windows of the coarsest stride."""
-        boxes = self.perception_cache.process(frame).boxes
-        return build_request_map(
-            boxes.center[:, :2], boxes.score, self.perception_cache.detector.config.grid.at(REQUEST_MAP_STRIDE)
-        )
-
-    @property
-    def token_format(self) -> TokenFormat:
-        """The token format that this agent can fuse."""
-        return make_token_format(self.perception_cache.detector, self._tables)
+    def _select(self, message: Message, tokens: SparseBev, budget_bytes: int | None) -> tuple[Message, Message]:
+        """The message with the tokens that fit into a budget, as the detector made them, and as they are encoded."""
+        tokens = tokens.with_features(clamp_features(tokens.features))
+        is_coded, tables = self.token_encoding == "codebook", self.token_format.tables
+        encoded = quantise_tokens(tokens, self.perception_cache.detector) if is_coded else tokens
+        score = torch.ones(len(tokens.sites)) if message.token_score is None else message.token_score
+        encoded, score = select_within_budget(encoded, score, budget_bytes, self.token_encoding, tables=tables)
+        kept = tokens.keep(torch.isin(tokens.sites.key, encoded.sites.key))
+        return replace(message, tokens=kept, token_score=score), replace(message, tokens=encoded, token_score=score)
 
     def inbox(self, expire_ns: int | None = None) -> Inbox:
         """An inbox that accepts only tokens that this agent can fuse."""
@@ -168,10 +160,10 @@ class Agent:
             packets, inbox = inbox, self.inbox()
             for packet in packets:
                 inbox.push(packet)
-        rejected, received, token_format = list(inbox.take_rejections()), list[ReceivedMessage](), self.token_format
+        rejected, received = list(inbox.take_rejections()), list[ReceivedMessage]()
         for reception in inbox.received_messages(now_ns):
             if reception.message.agent_id != frame.agent_id:
-                decoded, rejection = decode_tokens(reception, self.perception_cache.detector, token_format)
+                decoded, rejection = decode_tokens(reception, self.perception_cache.detector, self.token_format)
                 received.append(decoded)
                 rejected += [] if rejection is None else [rejection]
         perception, failed = self._perceive(frame, received)

@@ -31,7 +31,7 @@ def extract_own_keypoints(
             "--study feakm takes any net."
         )
     net.check_views(cache.detector.fingerprint)
-    output = cache.process(frame)
+    output = cache.process_tokens(frame)
     with torch.inference_mode():
         return net.describe([DetectorView.of(output.shared_tokens, output.boxes if boxes is None else boxes)])[0]
 

@@ -11,10 +11,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from manyeyes.agents.velocity import DEFAULT_VELOCITY_CONFIG, PastDetections, VelocityConfig, estimate_velocities
-from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, PointCloud, SparseBev
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, SparseBev
 from manyeyes.models.detector.box_head import SPEED_UNIT, DecodeConfig, RawBoxes, decode
-from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, make_proposals
+from manyeyes.models.detector.protocols import BoxDetector, TokenDetector, has_tokens, require_tokens
+from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens
 
 MAX_GAP_NS = 250_000_000
@@ -30,8 +31,19 @@ MAX_TOKEN_TO_BOX_M = 2.0
 
 
 @dataclass(frozen=True)
-class AgentOutput:
-    """Detector output on one agent's own frame: tokens to share (N, C + PROPOSAL), and raw boxes.
+class BoxOutput:
+    """Output of a BoxDetector on one agent's own frame: boxes in its frame, by falling score."""
+
+    boxes: Boxes
+
+    def with_velocity(self, velocity: Tensor) -> BoxOutput:
+        """The same boxes with velocities (N, 2) m/s."""
+        return BoxOutput(replace(self.boxes, velocity=velocity))
+
+
+@dataclass(frozen=True)
+class TokenOutput:
+    """Output of a TokenDetector on one agent's own frame: tokens to share (N, C + PROPOSAL), and raw boxes.
 
     tokens_raw_velocity: the tokens with the detector's own velocities, which the token selector was trained on.
     """
@@ -46,7 +58,7 @@ class AgentOutput:
         """The agent's own boxes, in its frame, by falling score; decoded at first use, because few strategies send them."""
         return decode(self.raw, self.config)[0]
 
-    def with_velocity(self, velocity: Tensor) -> AgentOutput:
+    def with_velocity(self, velocity: Tensor) -> TokenOutput:
         """The same output with box velocities (M, 2) m/s, for their tokens too; tokens without a box get velocity 0."""
         place = self.raw.sites.xy + self.raw.offset * self.raw.sites.grid.cell_size_m
         distance = torch.cdist(place, self.boxes.center[:, :2])
@@ -60,6 +72,8 @@ class AgentOutput:
         return output
 
 
+AgentOutput = BoxOutput | TokenOutput
+"""Output of any detector: it has ``boxes``."""
 History = tuple[tuple[AgentFrame, PointCloud] | None, tuple[AgentFrame, SparseBev] | None]
 """The last merged cloud and the last fused tokens, each with its frame."""
 
@@ -75,7 +89,7 @@ class PerceptionCache:
 
     def __init__(
         self,
-        detector: Detector,
+        detector: BoxDetector,
         max_frames: int = 8,
         feature_cache: dict[tuple[int, int], AgentOutput] | None = None,
         velocity_config: VelocityConfig | None = DEFAULT_VELOCITY_CONFIG,
@@ -88,9 +102,9 @@ class PerceptionCache:
         self.last_fused: tuple[AgentFrame, SparseBev] | None = None
 
     @property
-    def grid(self) -> BevGrid:
-        """The grid of the detector around the agent."""
-        return self.detector.config.grid
+    def token_detector(self) -> TokenDetector:
+        """The detector; ConfigError if it has no tokens."""
+        return require_tokens(self.detector)
 
     def process(self, frame: AgentFrame) -> AgentOutput:
         """Detector output on a frame, with its previous sweep if there is one."""
@@ -109,6 +123,14 @@ class PerceptionCache:
             self._feature_cache[key] = output
         self._outputs = [*self._outputs, (frame, output)][-self._max_frames :]
         return output
+
+    def process_tokens(self, frame: AgentFrame) -> TokenOutput:
+        """``process`` by a detector with tokens; ConfigError if it has none."""
+        output = self.process(frame)
+        if isinstance(output, TokenOutput):
+            return output
+        require_tokens(self.detector)
+        raise TypeError("A TokenDetector gives a TokenOutput.")
 
     def _with_estimated_velocity(self, frame: AgentFrame, output: AgentOutput) -> AgentOutput:
         """The output with velocities estimated over the last frames that have boxes."""
@@ -140,16 +162,9 @@ class PerceptionCache:
         """The agent's own tokens of the frames before this one, newest first, for ego 0."""
         parts = []
         for before, output in self.previous_outputs(frame, num_frames):
-            age_s = (frame.timestamp_ns - before.timestamp_ns) / 1e9
-            parts.append(
-                AgentTokens(
-                    0,
-                    output.shared_tokens.features,
-                    output.shared_tokens.sites.xy,
-                    frame.now_from_earlier(before),
-                    age_s,
-                )
-            )
+            if isinstance(output, TokenOutput):
+                tokens, age_s = output.shared_tokens, (frame.timestamp_ns - before.timestamp_ns) / 1e9
+                parts.append(AgentTokens(0, tokens.features, tokens.sites.xy, frame.now_from_earlier(before), age_s))
         return parts
 
     def record_sent(self, frame: AgentFrame, tokens: SparseBev) -> None:
@@ -180,20 +195,25 @@ class PerceptionCache:
     def run_detector(self, cloud: PointCloud, earlier: PointCloud | None = None) -> AgentOutput:
         """Detector output on any cloud in an agent's frame and on the previous one in the same frame; not cached."""
         with torch.inference_mode():
-            before = PointCloud.of(torch.zeros(0, 3)) if earlier is None else earlier
-            extracted = self.detector.extract_features([cloud], [before])
-            raw = self.detector.predict(extracted.tokens)
-            shared_tokens = self.detector.make_tokens(extracted.tokens, raw)
-            return AgentOutput(shared_tokens, shared_tokens, raw, self.detector.config.decode)
+            if has_tokens(self.detector):
+                tokens, raw = self.detector.extract_tokens(cloud, earlier)
+                return TokenOutput(tokens, tokens, raw, self.detector.decode_config)
+            boxes = self.detector.detect(cloud, earlier)
+        if not isinstance(boxes, Boxes):
+            raise ConfigError(
+                f"{type(self.detector).__name__}.detect needs to return Boxes; got {type(boxes).__name__}."
+            )
+        return BoxOutput(boxes[boxes.score.argsort(descending=True, stable=True)].to(cloud.xyz.dtype))
 
-    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
-        """Raw boxes around one ego from fused tokens."""
+    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> tuple[FusedBev, RawBoxes]:
+        """Fused tokens around one ego, and raw boxes from them."""
         with torch.inference_mode():
-            return self.detector.fuse(tokens, past)
+            fused = self.token_detector.fuse_tokens(tokens, past)
+            return fused, self.token_detector.refine(fused.bev, fused.merged_proposals)
 
     def decode(self, raw: RawBoxes) -> Boxes:
         """Decoded boxes around one ego, in its frame, by falling score."""
-        return decode(raw, self.detector.config.decode)[0]
+        return decode(raw, self.token_detector.decode_config)[0]
 
 
 def is_consecutive(frame: AgentFrame, before: AgentFrame) -> bool:

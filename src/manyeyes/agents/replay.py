@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.perception_cache import HISTORY_FRAMES, TRACK_FRAMES, AgentOutput, PerceptionCache
 from manyeyes.agents.pose_correction import PoseCorrection
-from manyeyes.agents.strategies import get_strategy
+from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.comms.bandwidth import allocate_max_min_fair
 from manyeyes.comms.channel import Channel, ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
@@ -19,7 +19,7 @@ from manyeyes.comms.local_bus import LocalBus
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
-from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.protocols import BoxDetector
 
 EXPIRE_NS = 500_000_000
 WARMUP_FRAMES = TRACK_FRAMES + HISTORY_FRAMES
@@ -105,7 +105,7 @@ class DetectionReplay:
     """
 
     method: str
-    detector: Detector
+    detector: BoxDetector
     config: ReplayConfig
     feature_cache: CachedOutputs | None = None
     _agents: dict[int, Agent] = field(default_factory=dict)
@@ -197,7 +197,7 @@ def _antenna_positions(snapshot: Snapshot) -> dict[int, tuple[float, float]]:
 def replay(
     recording: Recording,
     scenario: str,
-    detector: Detector,
+    detector: BoxDetector,
     methods: Sequence[str],
     config: ReplayConfig,
     perturb: Callable[[Snapshot], Snapshot] = lambda snapshot: snapshot,

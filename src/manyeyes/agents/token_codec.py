@@ -11,47 +11,43 @@ from manyeyes.comms.token_format import TokenFormat
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import ConfigError, SparseBev
 from manyeyes.models.detector.codebook import Codebook
-from manyeyes.models.detector.detector import Detector
-from manyeyes.models.detector.proposal import PROPOSAL_DIM
+from manyeyes.models.detector.protocols import BoxDetector, has_tokens, require_tokens
 
 
-def require_codebook(detector: Detector) -> Codebook:
+def require_codebook(detector: BoxDetector) -> Codebook:
     """The codebook of a detector; ConfigError without one."""
-    if detector.codebook is None:
+    codebook = require_tokens(detector).codebook
+    if codebook is None:
         raise ConfigError(
             "These weights have no codebook, so they cannot send codes: fit one by 'manyeyes fit-codebook'."
         )
-    return detector.codebook
+    return codebook
 
 
-def default_token_encoding(detector: Detector) -> TokenEncoding:
+def default_token_encoding(detector: BoxDetector) -> TokenEncoding:
     """The default token encoding: codebook if the weights have one (a tenth of the bytes), else float16."""
-    return "float16" if detector.codebook is None else "codebook"
+    return "codebook" if has_tokens(detector) and detector.codebook is not None else "float16"
 
 
-def make_code_tables(detector: Detector) -> CodeTables | None:
-    """Entropy coding tables of these weights; None without a codebook."""
-    if detector.codebook is None:
-        return None
-    return CodeTables(detector.fingerprint, detector.codebook.frequencies.numpy())
+def make_token_format(detector: BoxDetector) -> TokenFormat:
+    """The format of the tokens that a detector can fuse, with its coding tables; a BoxDetector can fuse none."""
+    if not has_tokens(detector):
+        return TokenFormat(detector.fingerprint, detector.grid, 0)
+    codebook = detector.codebook
+    tables = None if codebook is None else CodeTables(detector.fingerprint, codebook.frequencies.numpy())
+    return TokenFormat(detector.fingerprint, detector.token_grid, detector.token_channels, tables)
 
 
-def make_token_format(detector: Detector, tables: CodeTables | None) -> TokenFormat:
-    """The token format of these weights; tables: those of ``make_code_tables``."""
-    channels = detector.encoder.out_channels + PROPOSAL_DIM
-    return TokenFormat(detector.fingerprint, detector.token_grid, channels, tables)
-
-
-def encode_tokens(tokens: SparseBev, detector: Detector) -> SparseBev:
+def quantise_tokens(tokens: SparseBev, detector: BoxDetector) -> SparseBev:
     """Token rows (N, C + PROPOSAL) as codebook bytes (N, W) on the same cells."""
     return tokens.with_features(require_codebook(detector).encode(tokens.features))
 
 
 def decode_tokens(
-    received: ReceivedMessage, detector: Detector, token_format: TokenFormat
+    received: ReceivedMessage, detector: BoxDetector, token_format: TokenFormat
 ) -> tuple[ReceivedMessage, Rejection | None]:
     """The message with tokens decoded to rows of floats; tokens of another format are dropped and rejected."""
-    message, codebook = received.message, detector.codebook
+    message, codebook = received.message, detector.codebook if has_tokens(detector) else None
     tokens = message.tokens
     if tokens is None:
         return received, None

@@ -107,4 +107,4 @@ def _run_detector(options: Options, drive: Excerpt, snapshots: list[Snapshot]) -
     config: ReplayConfig = adapt_to_dataset(replay_options.make_replay_config(0), replay_options, drive.recording)
     detector = pretrained.load(replay_options.weights)
     player = DetectionReplay(replay_options.methods[0], detector, config)
-    return detector.config.detection_range, [step.boxes for snapshot in snapshots for step in player.step(snapshot)]
+    return detector.detection_range, [step.boxes for snapshot in snapshots for step in player.step(snapshot)]

@@ -90,10 +90,10 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -121,6 +121,7 @@ _POSITION_UNITS = 1 << 20
 _POSITION_BYTES = 6
 _MAX_POSITION_M = 1e8
 _SIGMA_M, _SIGMA_RAD = (1e-3, 1e4), (1e-5, 10.0)
+_SENDING_ORDER = (payloads.OBJECTS, payloads.REQUEST, payloads.TOKENS, payloads.ELEMENTS, payloads.POINTS)
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,13 @@ class MessageHeader:
     fingerprint: bytes
     pose: tuple[float, ...]
     covariance_codes: tuple[int, ...]
+
+
+class EncodedBody(NamedTuple):
+    """The body of one packet. kind: of its section, ``payloads.TOKENS`` ..."""
+
+    kind: int
+    content: bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,37 +168,66 @@ def encode(
 
     tables: those of the weights that the message names; with them, codes are entropy-coded.
     """
-    token_codec = TokenCodec(token_encoding, tables)
+    tokens = encode_tokens(message, token_encoding=token_encoding, mtu=mtu, tables=tables)
+    return make_packets(message, [*encode_other_sections(message, mtu), *tokens])
+
+
+def encode_other_sections(message: Message, mtu: int = DEFAULT_MTU) -> list[EncodedBody]:
+    """The sections of a message apart from its tokens, as the bodies of packets."""
+    capacity, bodies = _body_capacity(mtu), dict[int, list[bytes]]()
+    if message.objects is not None:
+        bodies[payloads.OBJECTS] = payloads.pack_object_bodies(message.objects, message.descriptors, capacity)
+    if message.request is not None:
+        bodies[payloads.REQUEST] = [payloads.pack_request_body(message.request, capacity)]
+    if message.local_map is not None:
+        bodies[payloads.ELEMENTS] = pack_element_bodies(message.local_map, capacity)
+    if message.points is not None:
+        bodies[payloads.POINTS] = payloads.pack_point_bodies(message.points, capacity)
+    return [EncodedBody(kind, content) for kind, contents in bodies.items() for content in contents]
+
+
+def encode_tokens(
+    message: Message,
+    *,
+    token_encoding: TokenEncoding = "float16",
+    mtu: int = DEFAULT_MTU,
+    tables: CodeTables | None = None,
+) -> list[EncodedBody]:
+    """The tokens of a message as the bodies of packets, none without tokens; arguments and errors as in :func:`encode`."""
+    token_codec, capacity = TokenCodec(token_encoding, tables), _body_capacity(mtu)
+    if message.tokens is None:
+        return []
+    if tables is not None and tables.fingerprint != message.fingerprint:
+        raise WireError(
+            f"Tables of weights {tables.fingerprint.hex()} do not code tokens of {message.fingerprint.hex()}."
+        )
+    rows = payloads.pack_token_bodies(message.tokens, message.token_score, token_codec, capacity)
+    return [EncodedBody(payloads.TOKENS, content) for content in rows]
+
+
+def _body_capacity(mtu: int) -> int:
     if not HEADER_BYTES + payloads.TOKENS_BYTES < mtu <= 65535:
         raise ConfigError(f"mtu is from {HEADER_BYTES + payloads.TOKENS_BYTES + 1} to 65535 bytes; got {mtu}.")
-    capacity = mtu - HEADER_BYTES
-    bodies: list[tuple[int, bytes]] = []
-    if message.objects is not None:
-        rows = payloads.pack_object_bodies(message.objects, message.descriptors, capacity)
-        bodies += [(payloads.OBJECTS, body) for body in rows]
-    if message.request is not None:
-        bodies.append((payloads.REQUEST, payloads.pack_request_body(message.request, capacity)))
-    if message.tokens is not None:
-        if tables is not None and tables.fingerprint != message.fingerprint:
-            raise WireError(
-                f"Tables of weights {tables.fingerprint.hex()} do not code tokens of {message.fingerprint.hex()}."
-            )
-        rows = payloads.pack_token_bodies(message.tokens, message.token_score, token_codec, capacity)
-        bodies += [(payloads.TOKENS, body) for body in rows]
-    if message.local_map is not None:
-        bodies += [(payloads.ELEMENTS, body) for body in pack_element_bodies(message.local_map, capacity)]
-    if message.points is not None:
-        bodies += [(payloads.POINTS, body) for body in payloads.pack_point_bodies(message.points, capacity)]
-    bodies = bodies or [(payloads.NONE, b"")]
+    return mtu - HEADER_BYTES
+
+
+def count_bytes(bodies: Iterable[EncodedBody]) -> int:
+    """Bytes of the packets of these bodies."""
+    return sum(HEADER_BYTES + len(body.content) for body in bodies)
+
+
+def make_packets(message: Message, bodies: Sequence[EncodedBody]) -> list[bytes]:
+    """Packets of the bodies of a message, in the order of their kinds; without any body one packet of kind 0."""
+    bodies = sorted(bodies, key=lambda body: _SENDING_ORDER.index(body.kind)) or [EncodedBody(payloads.NONE, b"")]
     if len(bodies) > 65535:
         raise WireError(
             f"A message has at most 65535 packets; this one needs {len(bodies)}: send less or raise the mtu."
         )
     common = _common_fields(message)
     rest, count, packets = _COMMON.pack(*common.rest), len(bodies), []
-    for number, (kind, body) in enumerate(bodies):
+    for number, (kind, content) in enumerate(bodies):
         start = _START.pack(_MAGIC, VERSION, common.flags | kind, number, count)
-        packet = b"".join((start, rest, body))
+        packet = b"".join((start, rest, content))
         packets.append(packet + _CRC.pack(zlib.crc32(packet)))
     return packets
 

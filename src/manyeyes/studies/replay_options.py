@@ -48,7 +48,7 @@ class ReplayOptions:
         """The same as the player takes it; unknown names are refused here, before any work."""
         from manyeyes.agents.pose_correction import PoseCorrection
         from manyeyes.agents.replay import WARMUP_FRAMES, ReplayConfig
-        from manyeyes.agents.strategies import get_strategy
+        from manyeyes.agents.strategies.registry import get_strategy
         from manyeyes.comms.channel import channel_preset
 
         channel_preset(self.channel)

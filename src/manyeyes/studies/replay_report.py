@@ -16,7 +16,7 @@ from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import DetectionProtocol, get_protocol
-from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.studies import provenance
 from manyeyes.studies.replay_options import Excerpt
 from manyeyes.viz.animation import save_animation, stack_images
@@ -75,14 +75,14 @@ class _Film:
             self.pending = {}
 
 
-def replay_and_report(drive: Excerpt, detector: Detector, spec: ReportSpec, console: Console) -> HtmlReport:
+def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, console: Console) -> HtmlReport:
     """Play the drive and write everything under showing.out; the report as it was saved, to which chapters can be added."""
     eval_indices = drive.eval_indices(drive.scenario)
     pictured_index = eval_indices[len(eval_indices) // 2] if spec.frame is None else spec.frame
     if pictured_index not in eval_indices:
         valid_range = f"{eval_indices.start} to {eval_indices[-1]}"
         raise ConfigError(f"Frame {pictured_index} of {drive.scenario} is not judged; choose one of {valid_range}.")
-    grid, protocol = detector.config.detection_range, make_protocol(detector)
+    grid, protocol = detector.detection_range, make_protocol(detector)
     metrics = {name: MetricAccumulator(name, protocol) for name in spec.methods}
     film = _Film(_select_animated(spec.methods) if spec.animate else ())
     pictured_steps: list[ReplayStep] = []
@@ -140,9 +140,9 @@ def _make_pose_chapters(pose_summaries: Mapping[str, PoseCorrectionSummary]) -> 
     )
 
 
-def make_protocol(detector: Detector) -> DetectionProtocol:
+def make_protocol(detector: BoxDetector) -> DetectionProtocol:
     """The project's own protocol over the range that the detector sees."""
-    grid = detector.config.detection_range
+    grid = detector.detection_range
     return get_protocol("global-sort").with_range(
         (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
     )
@@ -196,7 +196,7 @@ def _save_pictures(
     return tuple(out)
 
 
-def _make_facts(drive: Excerpt, detector: Detector, spec: ReportSpec) -> tuple[tuple[str, str], ...]:
+def _make_facts(drive: Excerpt, detector: BoxDetector, spec: ReportSpec) -> tuple[tuple[str, str], ...]:
     return (
         *spec.facts,
         ("Scenario", drive.scenario),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from manyeyes._io import atomic_write_text
-from manyeyes.agents.strategies import STRATEGIES, get_strategy
+from manyeyes.agents.strategies.registry import get_strategy, list_strategies
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datatypes import ConfigError
@@ -90,7 +90,7 @@ def resolve_token_selection(options: Options) -> tuple[str, ...]:
     """The ways to choose tokens that are compared: those asked for, or those of SELECTORS that there are."""
     for name in options.token_selection:
         get_strategy(name)
-    return options.token_selection or tuple(name for name in TOKEN_SELECTION_METHODS if name in STRATEGIES)
+    return options.token_selection or tuple(name for name in TOKEN_SELECTION_METHODS if name in list_strategies())
 
 
 def run_study(context: StudyContext, conditions: Sequence[Condition]) -> ResultGrid:

@@ -4,21 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import ego_from_sender, make_header
+from manyeyes.agents.strategies.registry import FusionStrategy, register_strategy
 from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud
 
 
-@dataclass(frozen=True)
-class EarlyFusion:
+@register_strategy("early")
+class EarlyFusion(FusionStrategy):
     """The points of every agent's last two sweeps, quantised by the wire to a centimetre."""
 
-    name: str = "early"
-    uses_history: bool = False
-
-    def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
+    def compose_message(
+        self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
+    ) -> Message | None:
         """A message with the agent's whole cloud."""
         return replace(make_header(frame, cache.detector.fingerprint), points=frame.points)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,7 +13,9 @@ from torch import Tensor
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import age_s, ego_from_sender, make_header
 from manyeyes.agents.strategies.redundancy import novelty_score
-from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
+from manyeyes.agents.strategies.registry import FusionStrategy, register_strategy
+from manyeyes.comms.request_map import compute_request_weights
+from manyeyes.datatypes import AgentFrame, Boxes, Message
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
 from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens, to_ego_frame
 from manyeyes.ops.keyed_random import keyed_uniform
@@ -21,52 +24,61 @@ from manyeyes.ops.keyed_random import keyed_uniform
 def mask_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
     """Score of the trained mask (CoSTr section III-E)."""
     with torch.inference_mode():
-        return torch.sigmoid(cache.detector.score_tokens(cache.process(frame).tokens_raw_velocity))
+        return torch.sigmoid(cache.token_detector.score_tokens(cache.process_tokens(frame).tokens_raw_velocity))
 
 
 def confidence_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
     """Confidence of the sender that the token is the centre of an object: the rule of Where2comm, on tokens."""
-    return torch.sigmoid(proposed_heat(cache.process(frame).shared_tokens.features[:, -PROPOSAL_DIM:]))
+    return torch.sigmoid(proposed_heat(cache.process_tokens(frame).shared_tokens.features[:, -PROPOSAL_DIM:]))
 
 
 def random_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
     """A uniform draw for every token, keyed by sender and time."""
     return keyed_uniform(
-        (len(cache.process(frame).shared_tokens.sites),), 0, "selection", frame.agent_id, frame.timestamp_ns
+        (len(cache.process_tokens(frame).shared_tokens.sites),), 0, "selection", frame.agent_id, frame.timestamp_ns
     ).float()
 
 
+@register_strategy("intermediate")
 @dataclass(frozen=True)
-class IntermediateFusion:
+class IntermediateFusion(FusionStrategy):
     """Fusion of tokens of the ego's own weights; the inbox rejects others. score: order in which a budget keeps tokens."""
 
-    name: str = "intermediate"
     score: Callable[[PerceptionCache, AgentFrame], Tensor] = novelty_score
     uses_history: bool = True
+    needs_tokens: bool = True
 
-    def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
+    def compose_message(
+        self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
+    ) -> Message | None:
         """The pruned tokens with their proposals, and their scores for selection within a budget."""
-        tokens = cache.process(frame).shared_tokens
-        return replace(
-            make_header(frame, cache.detector.fingerprint), tokens=tokens, token_score=self.score(cache, frame)
-        )
+        tokens, header = cache.process_tokens(frame).shared_tokens, make_header(frame, cache.detector.fingerprint)
+        weights = compute_request_weights(tokens.sites.xy, frame.world_from_agent, requests)
+        return replace(header, tokens=tokens, token_score=self.score(cache, frame) * weights)
+
+    def record_sent(self, cache: PerceptionCache, frame: AgentFrame, message: Message) -> None:
+        """Record the sent tokens, which reduce the scores of later ones (``strategies.redundancy``)."""
+        if message.tokens is not None:
+            cache.record_sent(frame, message.tokens)
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the fused tokens, with the agent's own tokens of the last two frames."""
-        return cache.decode(
-            cache.fuse(
-                *gather_ego_tokens(frame, cache.process(frame).shared_tokens, cache.previous_tokens(frame), messages)
-            )
-        )
+        return cache.decode(cache.fuse(*gather_ego_tokens(cache, frame, messages))[1])
+
+
+register_strategy("intermediate-mi")(partial(IntermediateFusion, mask_score))
+register_strategy("intermediate-confidence")(partial(IntermediateFusion, confidence_score))
+register_strategy("intermediate-random")(partial(IntermediateFusion, random_score))
 
 
 def gather_ego_tokens(
-    frame: AgentFrame, own: SparseBev, past: Sequence[AgentTokens], messages: Sequence[Message]
+    cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]
 ) -> tuple[Tokens, Tokens | None]:
     """The ego's current and past tokens with those of every message on the same lattice; and its own past tokens alone.
 
     Older tokens are propagated by their proposed velocity, and weighted by their age (``models.fusion.token_merge``).
     """
+    own, past = cache.process_tokens(frame).shared_tokens, cache.previous_tokens(frame)
     on_grid = [(m, m.tokens) for m in messages if m.tokens is not None and m.tokens.grid == own.grid]
     received = [_to_agent_tokens(frame, message, tokens.features, tokens.sites.xy) for message, tokens in on_grid]
     tokens = to_ego_frame([AgentTokens(0, own.features, own.sites.xy), *received, *past], own.grid, 1)

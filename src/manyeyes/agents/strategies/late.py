@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import age_s, ego_from_sender, lag_behind_newest_s, make_header
+from manyeyes.agents.strategies.registry import FusionStrategy, register_strategy
 from manyeyes.agents.strategies.temporal_boxes import DUPLICATE_IOU, decay_scores, merge_boxes_nms, propagate_boxes
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 
@@ -23,26 +25,23 @@ DISPLACED_SCORE_FACTOR = 0.5
 """Factor on the score of an own box that was suppressed by a box farther away."""
 
 
+@register_strategy("late")
 @dataclass(frozen=True)
-class LateFusion:
+class LateFusion(FusionStrategy):
     """Exchange of boxes.
 
     nms_iou: boxes with a larger IoU are one object; min_score: of a sent box; max_boxes: of a message, by falling score, within the
-    ego's range. history_frames: previous frames of the ego, and of the senders, that are fused too; 0 is the late fusion of papers.
+    ego's range. uses_history: the last HISTORY_FRAMES frames of the ego, and of the senders, are fused too, unlike in papers.
     """
 
-    name: str = "late"
     nms_iou: float = DUPLICATE_IOU
     min_score: float = 0.05
     max_boxes: int = 128
-    history_frames: int = 0
+    uses_history: bool = False
 
-    @property
-    def uses_history(self) -> bool:
-        """Whether previous frames are fused too."""
-        return self.history_frames > 0
-
-    def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
+    def compose_message(
+        self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
+    ) -> Message | None:
         """A message with the agent's own boxes."""
         found = cache.process(frame).boxes
         return replace(make_header(frame, cache.detector.fingerprint), objects=found[found.score > self.min_score])
@@ -56,13 +55,15 @@ class LateFusion:
         for m, lag_s in zip(messages, lag_behind_newest_s(messages)):
             if m.objects is not None:
                 there = m.objects.after(age_s(frame, m)).transform(ego_from_sender(frame, m))
-                near = there[cache.grid.contains(there.center[:, :2])]
+                near = there[cache.detector.grid.contains(there.center[:, :2])]
                 best = near[near.score.argsort(descending=True, stable=True)[: self.max_boxes]]
                 others.append(decay_scores(best.to(own.center.dtype), lag_s))
-        ranked = merge_boxes_nms(
-            [own, *propagate_boxes(frame, cache.previous_outputs(frame, self.history_frames)), *others], self.nms_iou
-        )
+        earlier = propagate_boxes(frame, cache.previous_outputs(frame)) if self.uses_history else []
+        ranked = merge_boxes_nms([own, *earlier, *others], self.nms_iou)
         return _restore_own_boxes(ranked, own)
+
+
+register_strategy("late-temporal")(partial(LateFusion, uses_history=True))
 
 
 def _restore_own_boxes(ranked: Boxes, own: Boxes) -> Boxes:

@@ -14,32 +14,31 @@ import torch
 from manyeyes.agents.perception_cache import PerceptionCache, is_consecutive
 from manyeyes.agents.strategies.intermediate import IntermediateFusion, gather_ego_tokens
 from manyeyes.agents.strategies.message_header import make_header
+from manyeyes.agents.strategies.registry import register_strategy
+from manyeyes.comms.request_map import compute_request_weights
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 
 
+@register_strategy("intermediate-multihop")
 @dataclass(frozen=True)
-class MultiHopFusion:
+class MultiHopFusion(IntermediateFusion):
     """Sends the fused tokens of the last perception with its timestamp; own tokens before the first perception."""
 
-    name: str = "intermediate-multihop"
-    uses_history: bool = True
-
-    def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
+    def compose_message(
+        self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
+    ) -> Message | None:
         """The fused tokens of the previous frame if it is consecutive, else the agent's own tokens."""
         cache.process(frame)
         if cache.last_fused is None or not is_consecutive(frame, cache.last_fused[0]):
-            return IntermediateFusion().compose_message(cache, frame)
+            return super().compose_message(cache, frame, requests)
         then, tokens = cache.last_fused
-        score = torch.sigmoid(cache.detector.score_tokens(tokens))
+        weights = compute_request_weights(tokens.sites.xy, frame.world_from_agent, requests)
+        score = torch.sigmoid(cache.token_detector.score_tokens(tokens)) * weights
         return replace(make_header(then, cache.detector.fingerprint), tokens=tokens, token_score=score)
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Boxes of the fused tokens; the tokens are stored for the next message."""
+        fused, raw = cache.fuse(*gather_ego_tokens(cache, frame, messages))
         with torch.inference_mode():
-            around = gather_ego_tokens(
-                frame, cache.process(frame).shared_tokens, cache.previous_tokens(frame), messages
-            )
-            fused = cache.detector.fuse_tokens(*around)
-            raw = cache.detector.refine(fused.bev, fused.merged_proposals)
-            cache.last_fused = frame, cache.detector.make_tokens(fused.bev, raw)
+            cache.last_fused = frame, cache.token_detector.make_tokens(fused.bev, raw)
         return cache.decode(raw)

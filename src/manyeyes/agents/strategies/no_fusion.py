@@ -4,20 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from manyeyes.agents.perception_cache import PerceptionCache
+from manyeyes.agents.strategies.registry import FusionStrategy, register_strategy
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 
 
-@dataclass(frozen=True)
-class NoFusion:
+@register_strategy("none")
+class NoFusion(FusionStrategy):
     """Single-agent perception without messages."""
 
-    name: str = "none"
-    uses_history: bool = False
-
-    def compose_message(self, cache: PerceptionCache, frame: AgentFrame) -> Message | None:
+    def compose_message(
+        self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
+    ) -> Message | None:
         """None, since nothing is sent."""
         return None
 

@@ -24,7 +24,7 @@ SAME_OBJECT_M = 2.0
 
 def novelty_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
     """(N,) in [0, 1], of the shared tokens of a frame: sigmoid(heat) * REDUNDANCY_DECAY^(earlier tokens of the object)."""
-    tokens = cache.process(frame).shared_tokens
+    tokens = cache.process_tokens(frame).shared_tokens
     place, heat = proposed_centres(tokens), proposed_heat(tokens.features[:, -PROPOSAL_DIM:])
     rank = heat.argsort(descending=True, stable=True).argsort()
     more_confident = rank[None, :] < rank[:, None]

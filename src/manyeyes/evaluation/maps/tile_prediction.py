@@ -31,7 +31,7 @@ from manyeyes.evaluation.maps.tile_sampling import (
 from manyeyes.evaluation.maps.tiles import crop_to_tile
 from manyeyes.models import pretrained
 from manyeyes.models.checkpoint import fingerprint
-from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.models.maps.map_model import MapModel
 
 VEHICLE, ROADSIDE = "vehicle", "roadside unit"
@@ -172,5 +172,5 @@ def _make_cache(detector: str, frame: AgentFrame, previous_frames: Sequence[Agen
 
 
 @lru_cache(maxsize=2)
-def _load_detector(name: str) -> Detector:
+def _load_detector(name: str) -> BoxDetector:
     return pretrained.load(name)

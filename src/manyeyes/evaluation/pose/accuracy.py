@@ -35,7 +35,7 @@ from manyeyes.evaluation.pose.metrics import (
     evaluate_pose,
     summarize_evaluations,
 )
-from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.models.pose.feakm import FeakmNet
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.registry import load_corrector
@@ -102,7 +102,11 @@ class AccuracyRow:
 
 
 def iterate_landmark_pairs(
-    recording: Recording, detector: Detector, min_score: float = 0.3, frame_stride: int = 1, net: FeakmNet | None = None
+    recording: Recording,
+    detector: BoxDetector,
+    min_score: float = 0.3,
+    frame_stride: int = 1,
+    net: FeakmNet | None = None,
 ) -> Iterator[LandmarkPair]:
     """The first agent and each other, at every so many-th judged instant of every scenario.
 

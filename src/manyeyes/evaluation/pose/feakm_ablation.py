@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 
 from manyeyes.agents.agent import EGO_HALF_SIZE_M
-from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
+from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Snapshot
@@ -123,9 +123,9 @@ class _CachedViews:
         caches = {
             frame.agent_id: PerceptionCache(variant.detector) for snapshot in snapshots for frame in snapshot.frames
         }
-        outputs: list[AgentOutput] = []
+        outputs: list[TokenOutput] = []
         for snapshot in snapshots:
-            outputs = [caches[frame.agent_id].process(frame) for frame in snapshot.frames]
+            outputs = [caches[frame.agent_id].process_tokens(frame) for frame in snapshot.frames]
         self.ego_cache, self.outputs = caches[snapshots[-1].frames[0].agent_id], outputs
         self.past_tokens = self.ego_cache.previous_tokens(snapshots[-1].frames[0])
         views = [DetectorView.of(sight.shared_tokens, sight.boxes) for sight in outputs]
@@ -146,8 +146,7 @@ class _CachedViews:
                 sigma_xy_m, sigma_yaw_rad = math.sqrt(variances[:2].mean()), math.sqrt(variances[2])
                 parts.append(AgentTokens(0, features, xy, estimate.ego_from_other, 0.0, sigma_xy_m, sigma_yaw_rad))
         past_cells = to_ego_frame(self.past_tokens, own.grid, 1) if self.past_tokens else None
-        boxes = self.ego_cache.decode(
-            self.ego_cache.fuse(to_ego_frame([*parts, *self.past_tokens], own.grid, 1), past_cells)
-        )
+        _, raw = self.ego_cache.fuse(to_ego_frame([*parts, *self.past_tokens], own.grid, 1), past_cells)
+        boxes = self.ego_cache.decode(raw)
         outside_ego = (boxes.center[:, 0].abs() > EGO_HALF_SIZE_M[0]) | (boxes.center[:, 1].abs() > EGO_HALF_SIZE_M[1])
         return boxes if frames[0].is_infrastructure else boxes[outside_ego], is_found

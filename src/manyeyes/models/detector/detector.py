@@ -9,12 +9,12 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
-from manyeyes.models.detector.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead
+from manyeyes.datatypes import BevGrid, Boxes, PointCloud, SparseBev
+from manyeyes.models.detector.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead, decode
 from manyeyes.models.detector.codebook import Codebook, CodebookConfig
 from manyeyes.models.detector.encoder import EncoderConfig, SparseEncoder
 from manyeyes.models.detector.pillars import PillarEncoder, PillarKind
-from manyeyes.models.detector.proposal import make_proposals
+from manyeyes.models.detector.proposal import PROPOSAL_DIM, make_proposals
 from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.models.detector.selector import Selector
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
@@ -32,7 +32,7 @@ class DetectorConfig:
         pillars: type of the pillar encoder.
         fusion: name of the fusion module (``models.fusion.registry``).
         prune_threshold: cells with a lower probability of being near an object are dropped.
-        output_range: range of the reported boxes where it is smaller than grid; None for all of grid.
+        output_range: range in which boxes are evaluated where it is smaller than grid; None for all of grid.
         sweeps: number of consecutive sweeps in the input.
         codebook: of the token encoding; None before one is fitted.
     """
@@ -51,11 +51,6 @@ class DetectorConfig:
     sweeps: Literal[1, 2] = 1
     codebook: CodebookConfig | None = None
 
-    @property
-    def detection_range(self) -> BevGrid:
-        """The range in which boxes are reported."""
-        return self.output_range or self.grid
-
 
 @dataclass(frozen=True)
 class ExtractedFeatures:
@@ -72,6 +67,7 @@ class Detector(nn.Module):
     def __init__(self, config: DetectorConfig) -> None:
         super().__init__()
         self.config = config
+        self.grid, self.detection_range = config.grid, config.output_range or config.grid
         self.fingerprint = bytes(8)
         self.pillars = PillarEncoder(config.grid, config.pillar_channels, config.pillars, config.sweeps)
         self.encoder = SparseEncoder(config.pillar_channels, config.encoder)
@@ -88,6 +84,28 @@ class Detector(nn.Module):
     def token_grid(self) -> BevGrid:
         """The grid of the tokens."""
         return self.config.grid.at(self.config.encoder.head_stride)
+
+    @property
+    def token_channels(self) -> int:
+        """Number of columns of a shared token."""
+        return self.encoder.out_channels + PROPOSAL_DIM
+
+    @property
+    def decode_config(self) -> DecodeConfig:
+        """Settings by which raw boxes are decoded."""
+        return self.config.decode
+
+    def detect(self, points: PointCloud, previous: PointCloud | None = None) -> Boxes:
+        """Detect the boxes of a point cloud, in its frame, by falling score; previous: the sweep before, in the same frame."""
+        with torch.inference_mode():
+            return decode(self.extract_tokens(points, previous)[1], self.config.decode)[0]
+
+    def extract_tokens(self, points: PointCloud, previous: PointCloud | None = None) -> tuple[SparseBev, RawBoxes]:
+        """Encode one point cloud to the tokens that its agent shares (N, token_channels), and to raw boxes."""
+        before = PointCloud.of(torch.zeros(0, 3)) if previous is None else previous
+        tokens = self.extract_features([points], [before]).tokens
+        raw = self.predict(tokens)
+        return self.make_tokens(tokens, raw), raw
 
     def extract_features(
         self,

@@ -67,7 +67,7 @@ def run(options: Options, console: Console) -> None:
         if step.snapshot.index == frame_index
     ]
     result_rows = [_make_row(step, protocol) for step in steps]
-    images = [_draw_image(step, row, detector.config.detection_range) for step, row in zip(steps, result_rows)]
+    images = [_draw_image(step, row, detector.detection_range) for step, row in zip(steps, result_rows)]
     save_png(_tile_images(images), options.out / "qualitative.png")
     results_table = _make_results_table(f"{scenario}, frame {frame_index}, {COMBINED.name}", result_rows)
     condition = Condition(COMBINED.name, config)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from manyeyes.agents.strategies import STRATEGIES
+from manyeyes.agents.strategies.registry import list_strategies
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.significance import MarginTest, check_margin
@@ -97,7 +97,7 @@ def run(options: Options, console: Console) -> None:
         if d == CLEAN or collaborative
     ]
     baselines = parse_checkpoints(options.checkpoints, "robustness") if options.checkpoints else {}
-    if name_clashes := sorted(set(baselines) & set(STRATEGIES)):
+    if name_clashes := sorted(set(baselines) & set(list_strategies())):
         raise ConfigError(
             f"The study 'robustness' has methods of the names {', '.join(name_clashes)}; call these branches otherwise."
         )

@@ -96,7 +96,7 @@ def collect_shared_tokens(detector: Detector, recording: Recording, frame_stride
             for before in earlier.frames if earlier else ():
                 if before.agent_id == frame.agent_id:
                     cache.process(before)
-            yield cache.process(frame).shared_tokens.features
+            yield cache.process_tokens(frame).shared_tokens.features
 
 
 def fit_codebook(

@@ -18,7 +18,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from manyeyes._io import atomic_write
-from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
+from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import (
     BevGrid,
@@ -30,7 +30,7 @@ from manyeyes.datatypes import (
     SparseBev,
     Transform,
 )
-from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.ops.keyed_random import keyed_generator
 
@@ -99,7 +99,9 @@ def select_snapshots(recording: Recording, frame_stride: int = 3) -> list[tuple[
     return found
 
 
-def build_cache(recording: Recording, detector: Detector, root: Path, frame_stride: int = 3) -> Iterator[FeatureCache]:
+def build_cache(
+    recording: Recording, detector: BoxDetector, root: Path, frame_stride: int = 3
+) -> Iterator[FeatureCache]:
     """Run the detector on snapshots that are not yet cached under root, and yield the growing cache after each.
 
     Each agent processes the preceding snapshot too, for detectors with several sweeps.
@@ -120,8 +122,8 @@ def build_cache(recording: Recording, detector: Detector, root: Path, frame_stri
         yield FeatureCache(folder, tuple(done))
 
 
-def _run_detectors(caches: dict[int, PerceptionCache], snapshot: Snapshot) -> list[AgentOutput]:
-    return [caches[frame.agent_id].process(frame) for frame in snapshot.frames]
+def _run_detectors(caches: dict[int, PerceptionCache], snapshot: Snapshot) -> list[TokenOutput]:
+    return [caches[frame.agent_id].process_tokens(frame) for frame in snapshot.frames]
 
 
 def _poses(snapshot: Snapshot) -> Transform:

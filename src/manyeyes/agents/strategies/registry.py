@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Strategies by name: ours, and those of third parties (entry points of the group manyeyes.strategy)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from manyeyes.agents.perception_cache import PerceptionCache
+from manyeyes.datatypes import AgentFrame, Boxes, Message
+from manyeyes.datatypes.registry import Registry
+
+
+class FusionStrategy(Protocol):
+    """Composition and fusion of messages of one collaboration scheme; a class may derive from it, which gives the defaults.
+
+    Attributes:
+        uses_history: older messages of each sender are fused too, also of senders without a current message.
+        needs_tokens: it needs a TokenDetector.
+    """
+
+    uses_history: bool = False
+    needs_tokens: bool = False
+
+    def compose_message(
+        self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
+    ) -> Message | None:
+        """Compose the message of a frame, before selection and encoding; None sends nothing.
+
+        The tokens of highest ``Message.token_score`` are kept within a budget. requests: received messages, whose request maps
+        may weight that score.
+        """
+        ...
+
+    def record_sent(self, cache: PerceptionCache, frame: AgentFrame, message: Message) -> None:
+        """Record the message of a frame as it was sent, with the selected tokens only."""
+
+    def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
+        """Boxes in the agent's frame, from its own cloud and received messages."""
+        ...
+
+
+_STRATEGIES: Registry[Callable[[], FusionStrategy]] = Registry(
+    "strategy", "manyeyes.strategy", "manyeyes.agents.strategies"
+)
+
+register_strategy = _STRATEGIES.register
+"""Return a decorator that registers a strategy, a class or function without arguments, under a name."""
+list_strategies = _STRATEGIES.names
+
+
+def get_strategy(name: str) -> FusionStrategy:
+    """Make the strategy of a name, one object for each agent.
+
+    Raises:
+        ConfigError: no strategy has the name.
+    """
+    return _STRATEGIES.get(name)()
