@@ -12,7 +12,7 @@ from manyeyes._source import PACKAGE, import_closure, source_digest
 
 ROOTS = {
     "detection": ("manyeyes.evaluation.detection.benchmark",),
-    "map fusion": ("manyeyes.evaluation.maps.map_cells", "manyeyes.maps.baselines.union"),
+    "map fusion": ("manyeyes.evaluation.maps.map_cells",),
 }
 
 

@@ -34,7 +34,7 @@ def test_simulate_and_fuse_leave_observations_truth_and_a_map(folder) -> None:
     assert len(truth) > 20 and len(made.select_published()) > 5 and made.frame == truth.frame
     held = json.loads((folder / "map" / "fuse.json").read_text())
     assert held["result"]["observations"] == 24 and held["result"]["hash"] == made.quantised_hash()
-    assert held["provenance"]["config"]["settings"]["ours"]["pose_solver"]["spacing_m"] == 1.0
+    assert held["provenance"]["config"]["settings"]["pose_solver"]["spacing_m"] == 1.0
 
 
 def test_the_same_seed_is_the_same_map(folder, tmp_path) -> None:

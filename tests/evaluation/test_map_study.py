@@ -28,8 +28,6 @@ from manyeyes.evaluation.maps.map_cells import (
 )
 from manyeyes.evaluation.maps.oracles import fuse_with_true_association, split_in_half
 from manyeyes.evaluation.maps.registry import (
-    METHODS,
-    OURS,
     TUNED_CHANGES,
     MethodSettings,
     apply_changes,
@@ -49,6 +47,7 @@ from manyeyes.evaluation.maps.study import (
 )
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import MapFusionConfig
+from manyeyes.maps.registry import OURS, list_map_fusions
 from manyeyes.maps.store.executors import InlineExecutor
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.simulate import HONEST, MALICIOUS
@@ -160,9 +159,7 @@ def test_a_stored_result_is_read_back_and_not_repeated(experiment, tmp_path, mon
     assert read_map_result(path) is None
     other = replace(
         unit,
-        settings=MethodSettings(
-            baseline_configs=(("union", apply_changes(make_default_config("union"), (("rules.min_score", 0.5),))),)
-        ),
+        settings=MethodSettings((("union", apply_changes(make_default_config("union"), (("rules.min_score", 0.5),))),)),
     )
     assert map_result_path(other, "union") != path and map_result_path(other, "oracle-cuts") == map_result_path(
         unit, "oracle-cuts"
@@ -248,8 +245,8 @@ def test_displacement_by_attack_is_compared_with_displacement_without_attack(mon
 
 
 def test_every_method_is_searched_over_its_own_fields_defaults_first() -> None:
-    assert set(SEARCH_SPACE) == set(METHODS)
-    for method in METHODS:
+    assert set(SEARCH_SPACE) == set(list_map_fusions())
+    for method in list_map_fusions():
         assert sample_changes(method, 0) == ()
         config = make_default_config(method)
         draws = [apply_changes(config, sample_changes(method, k)) for k in range(6)]
@@ -257,11 +254,10 @@ def test_every_method_is_searched_over_its_own_fields_defaults_first() -> None:
         assert {name for name, _ in sample_changes(method, 1)} == set(SEARCH_SPACE[method]), "a choice names no field"
     changed = apply_changes(MapFusionConfig(), (("stations.evidence.publish_log_odds", 9.0),))
     assert changed.stations.evidence.publish_log_odds == 9.0 and changed.pose_solver == MapFusionConfig().pose_solver
-    assert make_tuned_settings().ours.stations.evidence.min_publish_agents == 1
-    assert (
-        make_tuned_settings().config_of("polymerge").min_fraction == 0.3
-        and make_tuned_settings().config_of("union") is None
-    )
+    assert make_tuned_settings().config_of(OURS).stations.evidence.min_publish_agents == 1
+    assert make_tuned_settings().config_of("polymerge").min_fraction == 0.3 and make_tuned_settings().config_of(
+        "union"
+    ) == make_default_config("union")
     for method, changes in TUNED_CHANGES.items():
         assert all(value in SEARCH_SPACE[method][name] for name, value in changes), "tuning never drew this"
 

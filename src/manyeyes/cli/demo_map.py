@@ -13,9 +13,10 @@ from manyeyes.datasets.base import Recording
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.evaluation.maps.experiment import FleetExperiment, FleetTrial, run_trial
 from manyeyes.evaluation.maps.metrics import MapMetrics, evaluate_map
-from manyeyes.evaluation.maps.registry import OURS, fuse_experiment, fuse_observations, make_tuned_settings
+from manyeyes.evaluation.maps.registry import fuse_experiment, fuse_observations, make_tuned_settings
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.fusion.pose_optimization import PoseSolution, solve_poses
+from manyeyes.maps.registry import OURS
 from manyeyes.models.maps.map_model import MapModel
 from manyeyes.simulator.fleet.config import crowd_config
 from manyeyes.studies.map_folder import MapFolder, write_vector_map
@@ -95,7 +96,7 @@ def map_crossing(out: Path, seed: int = 0) -> tuple[DemoMapStats, Chapter]:
     )
     save_map_page(page, out / "map.html")
     save_figure(
-        _make_pair_panels(experiment, solve_poses(experiment.observations, settings.ours.pose_solver)),
+        _make_pair_panels(experiment, solve_poses(experiment.observations, settings.config_of(OURS).pose_solver)),
         out / "misalignment.png",
     )
     area = experiment.place.area

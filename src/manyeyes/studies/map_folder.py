@@ -76,14 +76,9 @@ class MapFolder:
             ) from error
 
 
-def find_observation_files(path: Path) -> Path:
-    """Where observations lie: the folder of that name in a folder that has one, else the path itself."""
-    return path / "observations" if (path / "observations").is_dir() else path
-
-
 def load_observations(path: Path, console: Console) -> LoadedObservations:
     """The observations of a file, a folder of files, or a simulated folder; rejected ones are printed, one line each."""
-    from manyeyes.maps.elements.observation_file import read_observations
+    from manyeyes.maps.elements.observation_file import find_observation_files, read_observations
 
     loaded = read_observations(find_observation_files(path))
     report_rejected(loaded.rejected, console)

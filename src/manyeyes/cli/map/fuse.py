@@ -29,7 +29,7 @@ class Options:
     out: Path | None = None
     """Folder for the map, two GeoParquet files; 'map' beside the observations by default."""
     method: str = "manyeyes"
-    """manyeyes, or a baseline: union, chamfer-nms, crowdmap-literal, polymerge, frechet-clustering, heatmap-buffer, ..."""
+    """A registered method: manyeyes, or a baseline such as union, chamfer-nms, polymerge; an unknown name lists all."""
     store: Path | None = None
     """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release."""
     executor: str = "process"
@@ -44,11 +44,11 @@ def main(options: Options) -> None:
 
     from rich.console import Console
 
-    from manyeyes.evaluation.maps.registry import MethodSettings, check_method, fuse_observations
+    from manyeyes.maps.registry import MAP_FUSION_METHODS, fuse_maps
     from manyeyes.studies import provenance
     from manyeyes.studies.map_folder import load_observations, write_vector_map
 
-    check_method(options.method)
+    config = MAP_FUSION_METHODS.get(options.method).config_class()
     console = Console()
     if options.store is not None:
         _fuse_into_store(options, options.store, console)
@@ -58,7 +58,7 @@ def main(options: Options) -> None:
     out = options.out or base / ("map" if options.method == "manyeyes" else options.method)
     start = time.perf_counter()
     with console.status(f"Fusing {len(loaded.observations)} observations"):
-        fused = fuse_observations(options.method, loaded.observations, MethodSettings(), loaded.frame)
+        fused = fuse_maps(loaded.observations, options.method, config, loaded.frame)
     seconds = time.perf_counter() - start
     write_vector_map(fused, out)
     published = len(fused.select_published())
@@ -70,7 +70,7 @@ def main(options: Options) -> None:
         "hash": fused.quantised_hash(),
         "seconds": seconds,
     }
-    provenance.write_json(out / "fuse.json", payload, {"options": options, "settings": MethodSettings()}, None)
+    provenance.write_json(out / "fuse.json", payload, {"options": options, "settings": config}, None)
     console.print(
         f"{out}: {published} published elements of {len(fused)} from {len(loaded.observations)} observations in {seconds:.1f} s",
         highlight=False,
@@ -80,10 +80,10 @@ def main(options: Options) -> None:
 
 def _fuse_into_store(options: Options, folder: Path, console: Console) -> None:
     """Takes the observations into a store's log and publishes a release, tile by tile."""
-    from manyeyes.maps.elements.observation_file import read_observations
+    from manyeyes.maps.elements.observation_file import find_observation_files, read_observations
     from manyeyes.maps.store.executors import make_executor
     from manyeyes.maps.store.store import MapStore
-    from manyeyes.studies.map_folder import find_observation_files, report_rejected
+    from manyeyes.studies.map_folder import report_rejected
 
     if options.method != "manyeyes":
         raise ConfigError(f"A store is fused by manyeyes' own method; fuse without --store for {options.method}.")

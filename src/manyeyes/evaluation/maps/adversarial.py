@@ -25,8 +25,9 @@ from manyeyes.datatypes.map_element import KINDS
 from manyeyes.evaluation.maps.experiment import FleetTrial, run_trial
 from manyeyes.evaluation.maps.map_cells import MapStudyJob, map_result_path, restore_row, to_plain
 from manyeyes.evaluation.maps.metrics import select_lines
-from manyeyes.evaluation.maps.registry import OURS, MethodSettings, fuse_observations
+from manyeyes.evaluation.maps.registry import MethodSettings, fuse_observations
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.registry import OURS
 from manyeyes.maps.store.executors import Executor, map_blocks
 from manyeyes.ops.nearest_line import find_nearest_line
 from manyeyes.simulator.fleet.config import CROWDS

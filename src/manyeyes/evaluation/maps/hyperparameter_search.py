@@ -18,7 +18,8 @@ import numpy as np
 
 from manyeyes.evaluation.maps.experiment import FleetTrial
 from manyeyes.evaluation.maps.map_cells import MapStudyJob, run_study_job
-from manyeyes.evaluation.maps.registry import OURS, MethodSettings, apply_changes, make_default_config
+from manyeyes.evaluation.maps.registry import MethodSettings, apply_changes, make_default_config
+from manyeyes.maps.registry import OURS
 from manyeyes.maps.store.executors import Executor, map_blocks
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.fleet.config import CROWDS
@@ -93,7 +94,7 @@ def sample_changes(method: str, config_index: int) -> tuple[tuple[str, Any], ...
 
 def make_settings(method: str, config: Any) -> MethodSettings:
     """Settings in which one method is configured so."""
-    return MethodSettings(ours=config) if method == OURS else MethodSettings(baseline_configs=((method, config),))
+    return MethodSettings(((method, config),))
 
 
 def run_random_search(

@@ -7,9 +7,11 @@ import dataclasses
 import hashlib
 import json
 import math
+import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from inspect import getsource
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,9 @@ from manyeyes._source import source_digest
 from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.evaluation.maps.experiment import FleetExperiment, FleetTrial, run_trial
 from manyeyes.evaluation.maps.metrics import THRESHOLDS, MapMetrics, evaluate_map
-from manyeyes.evaluation.maps.registry import BASELINE_MODULES, MethodSettings, fuse_experiment
+from manyeyes.evaluation.maps.oracles import ORACLES
+from manyeyes.evaluation.maps.registry import MethodSettings, fuse_experiment
+from manyeyes.maps.registry import MAP_FUSION_METHODS
 
 
 @dataclass(frozen=True)
@@ -102,8 +106,9 @@ def map_result_path(job: MapStudyJob, method: str) -> Path:
 
 def hash_map_sources(method: str) -> str:
     """A hash of the code that a cell of a method follows from."""
-    modules = [f"manyeyes.maps.baselines.{BASELINE_MODULES[method][0]}"] if method in BASELINE_MODULES else []
-    return source_digest("manyeyes.evaluation.maps.map_cells", *modules)
+    code = source_digest("manyeyes.evaluation.maps.map_cells")
+    # A method of another distribution is not in the closure.
+    return code if method in ORACLES else code + getsource(sys.modules[MAP_FUSION_METHODS.get(method).fuse.__module__])
 
 
 def run_study_job(job: MapStudyJob) -> list[MapStudyResult]:

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ways to make a map of observations that studies compare, by name, with the settings that tuning found.
+"""What studies run the methods of maps with: the settings that tuning found, and oracles beside the methods.
 
 A method receives the observations and the frame, nothing else. Oracles receive more; evaluation.maps.oracles names them.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from manyeyes.datatypes import ConfigError
@@ -17,35 +16,19 @@ from manyeyes.evaluation.maps.experiment import FleetExperiment
 from manyeyes.evaluation.maps.oracles import ORACLES, run_oracle
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
-
-OURS = "manyeyes"
-BASELINE_MODULES = {
-    "union": ("union", "UnionConfig"),
-    "chamfer-nms": ("chamfer_nms", "ChamferNmsConfig"),
-    "crowdmap-literal": ("crowdmap_literal", "CrowdMapLiteralConfig"),
-    "polymerge": ("polymerge", "PolyMergeConfig"),
-    "frechet-clustering": ("frechet_clustering", "FrechetClusteringConfig"),
-    "heatmap-buffer": ("heatmap_buffer", "HeatmapBufferConfig"),
-    "global-map-builder": ("global_map_builder", "GlobalMapBuilderConfig"),
-}
-"""The module below ``manyeyes.maps.baselines`` and the configuration class of each baseline."""
-BASELINES = tuple(BASELINE_MODULES)
-METHODS = (OURS, *BASELINES)
+from manyeyes.maps.registry import MAP_FUSION_METHODS, OURS, list_map_fusions
 
 
 @dataclass(frozen=True)
 class MethodSettings:
-    """Configurations by method's name; a method that is not listed runs with its defaults."""
+    """Configurations by method's name; a method that is not listed runs with its defaults, an oracle as our own method."""
 
-    baseline_configs: tuple[tuple[str, Any], ...] = ()
-    ours: MapFusionConfig = field(default_factory=MapFusionConfig)
+    configs: tuple[tuple[str, Any], ...] = ()
 
     def config_of(self, method: str) -> Any:
-        """The configuration of a method; None: its defaults."""
-        if method == OURS or method in ORACLES:
-            return self.ours
-        return dict(self.baseline_configs).get(method)
+        """The configuration of a method."""
+        method = OURS if method in ORACLES else method
+        return dict(self.configs).get(method) or make_default_config(method)
 
 
 ConfigChanges = tuple[tuple[str, Any], ...]
@@ -73,16 +56,12 @@ TUNED_CHANGES: dict[str, ConfigChanges] = {
 def make_tuned_settings() -> MethodSettings:
     """The settings that studies use."""
     configs = {method: apply_changes(make_default_config(method), changes) for method, changes in TUNED_CHANGES.items()}
-    ours = configs.pop(OURS)
-    return MethodSettings(tuple(sorted(configs.items())), ours)
+    return MethodSettings(tuple(sorted(configs.items())))
 
 
 def make_default_config(method: str) -> Any:
     """A method's configuration as it comes."""
-    if method == OURS:
-        return MapFusionConfig()
-    module, config_class = BASELINE_MODULES[method]
-    return getattr(importlib.import_module(f"manyeyes.maps.baselines.{module}"), config_class)()
+    return MAP_FUSION_METHODS.get(method).config_class()
 
 
 def apply_changes(config: Any, changes: ConfigChanges) -> Any:
@@ -95,27 +74,23 @@ def apply_changes(config: Any, changes: ConfigChanges) -> Any:
 
 def check_method(method: str) -> None:
     """ConfigError for a method that is not known."""
-    if method not in METHODS and method not in ORACLES:
-        raise ConfigError(f"No method is called {method!r}; known: {', '.join((*METHODS, *ORACLES))}.")
+    if method not in ORACLES and method not in MAP_FUSION_METHODS:
+        raise ConfigError(f"No method is called {method!r}; known: {', '.join((*list_map_fusions(), *ORACLES))}.")
 
 
 def fuse_observations(
     method: str, observations: Sequence[Observation], settings: MethodSettings, frame: MapFrame | None = None
 ) -> VectorMap:
     """The map that a method makes of observations."""
-    if method == OURS:
-        return fuse(observations, settings.ours, frame)
-    if method not in BASELINES:
-        raise ConfigError(f"{method!r} needs more than observations; known: {', '.join(METHODS)}.")
-    baseline = importlib.import_module(f"manyeyes.maps.baselines.{BASELINE_MODULES[method][0]}")
-    config = settings.config_of(method)
-    return baseline.fuse(observations, make_default_config(method) if config is None else config, frame)
+    if method in ORACLES:
+        raise ConfigError(f"{method!r} needs more than observations; known: {', '.join(list_map_fusions())}.")
+    return MAP_FUSION_METHODS.get(method).fuse(observations, settings.config_of(method), frame)
 
 
 def fuse_experiment(method: str, experiment: FleetExperiment, settings: MethodSettings) -> MapElements:
     """The published elements of a method's map of a scene."""
     if method in ORACLES:
-        return run_oracle(method, experiment, settings.ours)
+        return run_oracle(method, experiment, settings.config_of(method))
     return (
         fuse_observations(method, experiment.observations, settings, experiment.place.frame).select_published().elements
     )

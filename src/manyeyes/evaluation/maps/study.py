@@ -19,8 +19,9 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.maps.experiment import FleetTrial
 from manyeyes.evaluation.maps.map_cells import MapStudyJob, MapStudyResult, run_study_job
 from manyeyes.evaluation.maps.oracles import ORACLES
-from manyeyes.evaluation.maps.registry import BASELINES, OURS, MethodSettings
+from manyeyes.evaluation.maps.registry import MethodSettings
 from manyeyes.evaluation.statistics.bootstrap import Interval, MarginVerdict, compare_to_margin, mean_interval
+from manyeyes.maps.registry import OURS, list_map_fusions
 from manyeyes.maps.store.executors import Executor, map_blocks
 from manyeyes.simulator.fleet.config import CROWDS
 
@@ -42,7 +43,7 @@ class MapStudyConfig:
     observation_counts: tuple[int, ...] = OBSERVATION_COUNTS
     seeds: tuple[int, ...] = SEEDS
     noise_sigmas_m: tuple[float, ...] = NOISE_SIGMAS_M
-    methods: tuple[str, ...] = (OURS, *BASELINES)
+    methods: tuple[str, ...] = field(default_factory=list_map_fusions)
     settings: MethodSettings = field(default_factory=MethodSettings)
 
 

@@ -18,6 +18,7 @@ from manyeyes.maps.baselines._common import (
 )
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.registry import register_map_fusion
 from manyeyes.ops.polyline import find_near_pairs, resample
 from manyeyes.ops.polyline_distance import chamfer_distance
 
@@ -33,6 +34,7 @@ class ChamferNmsConfig:
     rules: BaselineRules = field(default_factory=BaselineRules)
 
 
+@register_map_fusion("chamfer-nms", ChamferNmsConfig)
 def fuse(
     observations: Sequence[Observation], config: ChamferNmsConfig = ChamferNmsConfig(), frame: MapFrame | None = None
 ) -> VectorMap:

@@ -23,6 +23,7 @@ from manyeyes.maps.baselines.chamfer_nms import find_overlaps
 from manyeyes.maps.baselines.cpd import CpdConfig, register
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.registry import register_map_fusion
 from manyeyes.ops.polyline import project_onto_line, resample
 from manyeyes.ops.polyline_distance import chamfer_distance
 
@@ -48,6 +49,7 @@ class CrowdMapLiteralConfig:
             raise ConfigError(f"crowdmap_literal.merge: expected keep or mean; got {self.merge!r}. Choose one of them.")
 
 
+@register_map_fusion("crowdmap-literal", CrowdMapLiteralConfig)
 def fuse(
     observations: Sequence[Observation],
     config: CrowdMapLiteralConfig = CrowdMapLiteralConfig(),

@@ -28,6 +28,7 @@ from manyeyes.maps.baselines._common import (
 )
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.registry import register_map_fusion
 from manyeyes.maps.roads.lane_links import connected_components
 from manyeyes.ops.polyline import find_near_pairs, resample
 from manyeyes.ops.polyline_distance import frechet_distance
@@ -55,6 +56,7 @@ class FrechetClusteringConfig:
             )
 
 
+@register_map_fusion("frechet-clustering", FrechetClusteringConfig)
 def fuse(
     observations: Sequence[Observation],
     config: FrechetClusteringConfig = FrechetClusteringConfig(),

@@ -33,6 +33,7 @@ from manyeyes.maps.baselines._common import (
 )
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.registry import register_map_fusion
 from manyeyes.ops.polyline import close_rings, cut_line, project_onto_line, resample, simplify
 from manyeyes.ops.polyline_distance import directed_distance
 
@@ -72,6 +73,7 @@ class _BuiltElement:
     source_rows: tuple[int, ...]
 
 
+@register_map_fusion("global-map-builder", GlobalMapBuilderConfig)
 def fuse(
     observations: Sequence[Observation],
     config: GlobalMapBuilderConfig = GlobalMapBuilderConfig(),

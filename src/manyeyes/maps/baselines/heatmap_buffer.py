@@ -31,6 +31,7 @@ from manyeyes.maps.baselines._raster import draw_lines, draw_rings, find_longest
 from manyeyes.maps.baselines.polymerge import blur_image, fit_rectangle
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.registry import register_map_fusion
 from manyeyes.ops.polyline import find_near_pairs_between, project_onto_line, resample_spaced, simplify
 
 _MAX_CELLS = 64_000_000
@@ -73,6 +74,7 @@ class _RasterGrid:
         return self.origin + (cells + 0.5) * self.cell_m
 
 
+@register_map_fusion("heatmap-buffer", HeatmapBufferConfig)
 def fuse(
     observations: Sequence[Observation],
     config: HeatmapBufferConfig = HeatmapBufferConfig(),

@@ -32,6 +32,7 @@ from manyeyes.maps.baselines._common import (
 )
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.registry import register_map_fusion
 from manyeyes.maps.roads.lane_links import connected_components
 from manyeyes.ops.polyline import find_near_pairs, points_at_stations, project_onto_line, simplify
 from manyeyes.ops.polyline_distance import min_distance
@@ -53,6 +54,7 @@ class PolyMergeConfig:
     rules: BaselineRules = field(default_factory=BaselineRules)
 
 
+@register_map_fusion("polymerge", PolyMergeConfig)
 def fuse(
     observations: Sequence[Observation], config: PolyMergeConfig = PolyMergeConfig(), frame: MapFrame | None = None
 ) -> VectorMap:

@@ -11,6 +11,7 @@ import numpy as np
 from manyeyes.maps.baselines._common import BaselineRules, MergedElement, filter_elements, to_vector_map
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.registry import register_map_fusion
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class UnionConfig:
     rules: BaselineRules = field(default_factory=BaselineRules)
 
 
+@register_map_fusion("union", UnionConfig)
 def fuse(
     observations: Sequence[Observation], config: UnionConfig = UnionConfig(), frame: MapFrame | None = None
 ) -> VectorMap:

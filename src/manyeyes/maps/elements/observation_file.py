@@ -88,6 +88,11 @@ def write_observations(path: Path | str, observations: Sequence[Observation], fr
         )
 
 
+def find_observation_files(path: Path) -> Path:
+    """Where observations lie: the folder of that name in a folder that has one, else the path itself."""
+    return path / "observations" if (path / "observations").is_dir() else path
+
+
 def read_observations(source: Path | str, frame: MapFrame | None = None) -> LoadedObservations:
     """Read a file, or every ``*.parquet`` of a folder by name; without a frame, the first file that states one decides."""
     source = Path(source)

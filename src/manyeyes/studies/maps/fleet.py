@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from manyeyes._io import atomic_write_text
 from manyeyes.evaluation.maps.oracles import ORACLES
-from manyeyes.evaluation.maps.registry import METHODS, check_method, make_tuned_settings
+from manyeyes.evaluation.maps.registry import check_method, make_tuned_settings
 from manyeyes.evaluation.maps.study import (
     TEST_PLACES,
     MapStudyConfig,
@@ -16,6 +16,7 @@ from manyeyes.evaluation.maps.study import (
     run_map_study,
     summarize_methods,
 )
+from manyeyes.maps.registry import list_map_fusions
 from manyeyes.maps.store.executors import Executor, InlineExecutor, ProcessExecutor
 from manyeyes.studies import provenance
 from manyeyes.viz.map_table import (
@@ -58,7 +59,7 @@ def choose_executor(workers: int) -> Executor:
 
 def _run_fusion_study(options: Options, console: Console) -> None:
     name = str(options.study)
-    methods = (*(options.methods or METHODS), *(ORACLES if options.oracles else ()))
+    methods = (*(options.methods or list_map_fusions()), *(ORACLES if options.oracles else ()))
     config = MapStudyConfig(name, methods=methods, settings=make_tuned_settings())
     config = restrict_study(config, options.places, options.observation_counts, options.seeds)
     with make_progress_bars(console) as progress:
@@ -84,7 +85,7 @@ def _run_fusion_study(options: Options, console: Console) -> None:
 def _run_search(options: Options, console: Console) -> None:
     from manyeyes.evaluation.maps.hyperparameter_search import NUM_CONFIGS, SEARCH_SPACE, run_random_search
 
-    methods = options.methods or METHODS
+    methods = options.methods or list_map_fusions()
     with make_progress_bars(console) as progress:
         task = progress.add_task("Cells", total=None)
         search_trials = run_random_search(

@@ -24,10 +24,10 @@ from manyeyes.evaluation.maps.pooled_ap import (
     check_map_margin,
     collect_blocks,
 )
-from manyeyes.evaluation.maps.registry import BASELINES, METHODS, OURS
 from manyeyes.evaluation.maps.spatial_bootstrap import BLOCK_SIZE_M
 from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval
 from manyeyes.evaluation.study import hash_recording
+from manyeyes.maps.registry import OURS, list_map_fusions
 from manyeyes.maps.store.executors import map_blocks
 from manyeyes.studies.maps.fleet import choose_executor
 from manyeyes.studies.maps.recorded_fleet import FleetMap, FleetMapJob, run_fleet_job
@@ -109,7 +109,7 @@ def run(options: Options, console: Console) -> None:
     model, *others = resolve_models(options)
     if others:
         raise ConfigError(f"The study 'whole' takes one model: name it with --weights; got {1 + len(others)}.")
-    methods = options.methods or METHODS
+    methods = options.methods or list_map_fusions()
     town_results = _build_town_results(options, console, model, methods)
     means = {town.name: {key: _bootstrap_mean_ap(town, key, town.blocks) for key in town.maps} for town in town_results}
     rows = [_make_row(town, key, means[town.name][key]) for town in town_results for key in town.maps]
@@ -190,7 +190,7 @@ def _check_margins(means: dict[str, dict[MapKey, BootstrapSamples]], methods: Se
         return average_samples([bootstraps[key] for bootstraps in means.values()])
 
     full_map = over_towns((SEMI_GLOBAL, OURS))
-    baselines = {method: over_towns((LOCAL, method)) for method in methods if method in BASELINES}
+    baselines = {method: over_towns((LOCAL, method)) for method in methods if method != OURS}
     out = [
         check_map_margin(f"the whole - local + {method}", full_map.paired_difference(baseline), 0.0)
         for method, baseline in baselines.items()

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Methods that make a map of observations, by name: our own, the baselines and those of third parties.
+
+A method is a function of observations, its configuration and the frame, and receives nothing else.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes.registry import Registry
+from manyeyes.maps.elements.observation import MapFrame, Observation
+from manyeyes.maps.elements.observation_file import find_observation_files, read_observations
+from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
+
+OURS = "manyeyes"
+FuseFunction = Callable[[Sequence[Observation], Any, MapFrame | None], VectorMap]
+Fuse = TypeVar("Fuse", bound=FuseFunction)
+
+
+@dataclass(frozen=True)
+class MapFusionMethod:
+    """A registered function and the class of its configuration, whose defaults are those of the method."""
+
+    fuse: FuseFunction
+    config_class: Callable[[], Any]
+
+
+MAP_FUSION_METHODS: Registry[MapFusionMethod] = Registry(
+    "map fusion method", "manyeyes.map_fusion", "manyeyes.maps.baselines"
+)
+
+
+def register_map_fusion(name: str, config_class: Callable[[], Any]) -> Callable[[Fuse], Fuse]:
+    """Register a function of observations, configuration and frame under a name, as a decorator.
+
+    Args:
+        name: what commands, studies and ``fuse_maps`` call it. config_class: makes the default configuration without arguments.
+
+    Raises:
+        ConfigError: another method has the name.
+    """
+
+    def decorate(function: Fuse) -> Fuse:
+        MAP_FUSION_METHODS.register(name)(MapFusionMethod(function, config_class))
+        return function
+
+    return decorate
+
+
+register_map_fusion(OURS, MapFusionConfig)(fuse)
+
+
+def list_map_fusions() -> tuple[str, ...]:
+    """The names of all methods, our own first."""
+    return (OURS, *(name for name in MAP_FUSION_METHODS.names() if name != OURS))
+
+
+def fuse_maps(
+    observations: Sequence[Observation] | Path | str,
+    method: str = OURS,
+    config: Any = None,
+    frame: MapFrame | None = None,
+) -> VectorMap:
+    """Fuse observations of many agents into one map.
+
+    Args:
+        observations: the observations, or a Parquet file, a folder of them, or a folder of 'map simulate'. Rows that cannot be
+            used are left out with a warning.
+        method: a registered name. config: of the method's class; its defaults without. frame: the map's origin on earth; by
+            default that of the files, or none.
+
+    Returns:
+        All elements with their states; ``select_published`` gives the map to use.
+
+    Raises:
+        ConfigError: the method is not known, or there is no usable observation. ObservationError: no file can be read.
+    """
+    chosen = MAP_FUSION_METHODS.get(method)
+    if isinstance(observations, Path | str):
+        loaded = read_observations(find_observation_files(Path(observations)), frame)
+        if loaded.rejected:
+            first = loaded.rejected[0]
+            warnings.warn(
+                f"{len(loaded.rejected)} rows were put aside; the first, {first.file}: {first.reason}", stacklevel=2
+            )
+        if not loaded.observations:
+            raise ConfigError(f"{observations} holds no usable observation; 'manyeyes map simulate' makes some.")
+        observations, frame = loaded.observations, loaded.frame
+    return chosen.fuse(observations, chosen.config_class() if config is None else config, frame)
