@@ -16,17 +16,20 @@ endif
 export PYTHONWARNINGS := ignore:::pip
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help venv demo test check wheel format bench clean
+.PHONY: help venv demo test test-fast test-nightly coverage check wheel format bench clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo    simulate a drive, evaluate the methods on it: table, figures, report in $(OUT)"
-	@echo "make test    every test"
-	@echo "make check   formatting, lint, types, layers"
-	@echo "make wheel   build the wheel and run demo, pose and map fuse from it in an empty environment"
-	@echo "make format  rewrite the sources in the house format"
-	@echo "make bench   the speed benchmarks, each with its stored result"
-	@echo "make clean   remove the environment, outputs and caches"
+	@echo "make demo          simulate a drive, evaluate the methods on it: table, figures, report in $(OUT)"
+	@echo "make test-fast     tests without training and without slow ones, in two minutes; 20 hypothesis examples each"
+	@echo "make test          every test; 200 hypothesis examples each"
+	@echo "make test-nightly  every test; 2,000 hypothesis examples each, other ones in every run"
+	@echo "make coverage      every test, and the fraction of statements that they run, by module"
+	@echo "make check         formatting, lint, types, layers"
+	@echo "make wheel         build the wheel and run demo, pose and map fuse from it in an empty environment"
+	@echo "make format        rewrite the sources in the house format"
+	@echo "make bench         the speed benchmarks, each with its stored result"
+	@echo "make clean         remove the environment, outputs and caches"
 
 venv: $(STAMP)
 
@@ -42,6 +45,15 @@ demo: $(STAMP)
 
 test: $(STAMP)
 	@$(BIN)/python -m pytest
+
+test-fast: $(STAMP)
+	@HYPOTHESIS_PROFILE=fast $(BIN)/python -m pytest -m "not slow and not training"
+
+test-nightly: $(STAMP)
+	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest
+
+coverage: $(STAMP)
+	@$(BIN)/python -m pytest --cov=manyeyes --cov-report=term:skip-covered
 
 check: $(STAMP)
 	@$(BIN)/ruff format --check --quiet .

@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One torch thread for every test; hypothesis draws the same examples every time; real maps are read where they are."""
+"""One torch thread for every test; profiles of hypothesis; real maps are read where they are."""
 
 import os
 from pathlib import Path
 
-import hypothesis
 import torch
+from hypothesis import HealthCheck, settings
 
 torch.set_num_threads(1)
-hypothesis.settings.register_profile("manyeyes", deadline=None, derandomize=True, max_examples=50)
-hypothesis.settings.load_profile("manyeyes")
+
+# The same examples in every run of "ci" and "fast"; other ones in every run of "nightly".
+CI = settings(deadline=None, derandomize=True, max_examples=200, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("ci", CI)
+settings.register_profile("fast", CI, max_examples=20)
+settings.register_profile("nightly", CI, max_examples=2000, derandomize=False, print_blob=True)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 _MAPS = Path(__file__).resolve().parents[2] / "shared" / "data"
 if _MAPS.is_dir():

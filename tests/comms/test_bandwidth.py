@@ -2,12 +2,11 @@
 """Shares of a channel: never exceeded, fair, nothing left over."""
 
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.comms.bandwidth import allocate_equal_share, allocate_max_min_fair
 from manyeyes.datatypes import ConfigError
 
-QUICK = settings(max_examples=200, derandomize=True, deadline=None)
 wants = st.lists(st.integers(0, 5000), max_size=8)
 
 
@@ -20,7 +19,6 @@ def test_by_hand():
     assert allocate_equal_share(1000, 3) == 333
 
 
-@QUICK
 @given(st.integers(0, 20_000), wants)
 def test_the_total_is_used_and_never_exceeded(total, requested):
     shares = allocate_max_min_fair(total, requested)
@@ -28,7 +26,6 @@ def test_the_total_is_used_and_never_exceeded(total, requested):
     assert all(0 <= s <= w for s, w in zip(shares, requested))
 
 
-@QUICK
 @given(st.integers(0, 20_000), wants)
 def test_a_limited_sender_gets_the_largest_share(total, requested):
     shares = allocate_max_min_fair(total, requested)
@@ -37,14 +34,12 @@ def test_a_limited_sender_gets_the_largest_share(total, requested):
             assert share >= max(shares) - 1
 
 
-@QUICK
 @given(st.integers(0, 20_000), st.integers(0, 500), wants)
 def test_a_larger_total_lowers_no_share_by_more_than_a_byte(total, more, requested):
     before, after = allocate_max_min_fair(total, requested), allocate_max_min_fair(total + more, requested)
     assert all(b >= a - 1 for a, b in zip(before, after))
 
 
-@QUICK
 @given(st.integers(0, 20_000), wants, st.randoms(use_true_random=False))
 def test_the_order_of_senders_changes_a_byte_at_most(total, requested, random):
     order = list(range(len(requested)))

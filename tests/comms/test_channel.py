@@ -7,7 +7,7 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, Transmission, channel_preset
 from manyeyes.comms.local_bus import LocalBus
@@ -17,7 +17,6 @@ MS = 1_000_000
 SLOW = ChannelPreset("slow", 8e6, mtu=1000, busy_ratio_limit=0.5)
 LOSSY = ChannelPreset("lossy", math.inf, loss_at_m=((0.0, 0.0), (100.0, 0.3)), mean_burst_packets=3)
 HERE = (0.0, 0.0)
-QUICK = settings(max_examples=40, derandomize=True, deadline=None)
 
 
 def packets(count: int, size: int = 1000, mark: int = 0) -> tuple[bytes, ...]:
@@ -96,7 +95,6 @@ def test_a_budgeted_message_fits_a_frame_of_its_g5_and_a_dense_one_does_not():
     assert max(d.arrival_ns for d in dense) > 160 * MS
 
 
-@QUICK
 @given(st.integers(0, 10**6), st.integers(1, 300), st.floats(0, 0.95), st.floats(0, 0.95), st.floats(1, 8))
 def test_losses_are_paired_across_levels(seed, count, one, other, burst):
     low, high = sorted((one, other))
@@ -179,7 +177,6 @@ def test_asking_at_the_instant_of_sending_settles_nothing():
     assert early.deliver(9, HERE, 50 * MS) == late.deliver(9, HERE, 50 * MS)
 
 
-@QUICK
 @given(st.lists(st.integers(0, 60), min_size=1, max_size=12), st.integers(0, 1000))
 def test_how_often_one_asks_makes_no_difference(instants, seed):
     preset = replace(SLOW, jitter_s=0.005).with_loss(0.3)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.comms.inbox import DropCounts, Inbox
 from manyeyes.comms.wire import encode
@@ -15,7 +15,6 @@ from manyeyes.datatypes import BevGrid, Boxes, Message, Sites, SparseBev, Transf
 torch.set_num_threads(1)
 GRID = BevGrid(-140.8, -38.4, -3.0, 140.8, 38.4, 1.0, 0.4, 8)
 MODEL, OTHER = b"model-01", b"model-02"
-QUICK = settings(max_examples=40, derandomize=True, deadline=None)
 
 
 def make_message(
@@ -86,7 +85,6 @@ def test_tokens_of_another_model_are_refused_and_the_objects_are_used():
     assert filled(packets, fingerprint=OTHER).dropped.total == 0
 
 
-@QUICK
 @given(st.lists(st.binary(max_size=200), max_size=20), st.randoms(use_true_random=False))
 def test_garbage_copies_and_order_change_nothing(noise, random):
     clean = [p for agent in (1, 2, 3) for p in packets_of(make_message(agent))]
@@ -99,7 +97,6 @@ def test_garbage_copies_and_order_change_nothing(noise, random):
     assert inbox.dropped.total == len(mixed) - len(clean)
 
 
-@QUICK
 @given(st.data())
 def test_a_flipped_bit_is_never_taken(data):
     packets = packets_of(make_message())

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.comms import map_payload as elements, wire
 from manyeyes.comms.inbox import Inbox
@@ -16,7 +16,6 @@ from manyeyes.datatypes import Boxes, Message, ShapeError, Transform, WireError
 from manyeyes.datatypes.map_element import CROSSING, DASHED, DIVIDER, KINDS, STYLES, MapElements, Polygons
 from manyeyes.datatypes.message import LocalMap
 
-QUICK = settings(max_examples=25, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 VIEW = np.array([[0.0, -15.0], [30.0, -15.0], [30.0, 15.0], [0.0, 15.0]])
 HALF_A_UNIT = elements.UNIT_M / 2 + 1e-9
 
@@ -49,7 +48,6 @@ def through(sent: Message, **options) -> Message:
     return wire.assemble(wire.decode_packet(p) for p in wire.encode(sent, **options))
 
 
-@QUICK
 @given(st.integers(0, 10**6), st.integers(0, 120), st.integers(600, 3000))
 def test_round_trip(seed, count, mtu):
     local_map = random_map(seed, count)
@@ -74,7 +72,6 @@ def test_round_trip(seed, count, mtu):
     np.testing.assert_allclose(back.elements.style.sum(1), 1.0)
 
 
-@QUICK
 @given(st.integers(0, 10**6), st.integers(30, 120))
 def test_each_packet_decodes_alone_to_whole_elements_of_the_one_view(seed, count):
     local_map = random_map(seed, count)
@@ -151,7 +148,6 @@ def sealed(packet: bytes, body: bytes) -> bytes:
     return start + body + zlib.crc32(start + body).to_bytes(4, "little")
 
 
-@QUICK
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_map_or_a_packet_error(body):
     (packet,) = wire.encode(message(LocalMap(MapElements.empty(), VIEW)))
@@ -164,7 +160,6 @@ def test_any_bytes_are_a_map_or_a_packet_error(body):
     assert np.isfinite(back.elements.points).all() and (back.elements.counts >= 2 + back.elements.closed).all()
 
 
-@QUICK
 @given(st.integers(0, 10**6), st.data())
 def test_a_damaged_body_is_a_map_or_a_packet_error(seed, data):
     (packet, *_) = wire.encode(message(random_map(seed, 10)))

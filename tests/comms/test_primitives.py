@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.comms import primitives
 from manyeyes.datatypes import WireError
@@ -33,7 +33,6 @@ def test_a_varint_has_a_range(value):
         primitives.pack_varints(np.array([value]))
 
 
-@settings(max_examples=100, derandomize=True, deadline=None)
 @given(keys)
 def test_cells_round_trip_in_the_size_foretold(key):
     layout, data = primitives.pack_cells(key)
@@ -42,7 +41,6 @@ def test_cells_round_trip_in_the_size_foretold(key):
     assert (back.tolist(), used) == (key.tolist(), len(data))
 
 
-@settings(max_examples=100, derandomize=True, deadline=None)
 @given(keys, st.integers(0, 4000))
 def test_one_more_cell_lowers_the_size_by_one_byte_at_most(key, extra):
     more = np.union1d(key, [extra])
@@ -64,7 +62,6 @@ def test_bitmaps_that_lie_are_refused():
             primitives.unpack_cells(layout, wrong, count)
 
 
-@settings(max_examples=60, derandomize=True, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 50), st.floats(-14, 12))
 def test_int8_is_within_half_a_step_that_is_at_most_nine_percent_coarse(seed, rows, octave):
     values = np.random.default_rng(seed).normal(size=(rows, 6)).astype(np.float32) * np.float32(2.0**octave)

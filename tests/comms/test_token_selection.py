@@ -3,7 +3,7 @@
 
 import pytest
 import torch
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import encode
@@ -11,7 +11,6 @@ from manyeyes.datatypes import BevGrid, ConfigError, Message, Sites, SparseBev, 
 
 torch.set_num_threads(1)
 GRID = BevGrid(-140.8, -38.4, -3.0, 140.8, 38.4, 1.0, 0.4, 4)
-QUICK = settings(max_examples=60, derandomize=True, deadline=None)
 
 
 def scene(seed: int, count: int, channels: int, levels: int = 10) -> tuple[SparseBev, torch.Tensor]:
@@ -37,7 +36,6 @@ cases = (
 )
 
 
-@QUICK
 @given(*cases, st.integers(0, 30000))
 def test_the_packets_never_exceed_the_budget(seed, count, channels, precision, mtu, budget):
     bev, score = scene(seed, count, channels)
@@ -53,7 +51,6 @@ def test_the_packets_never_exceed_the_budget(seed, count, channels, precision, m
         assert cost(bev.keep(mask), score[mask], precision, mtu) > budget
 
 
-@QUICK
 @given(*cases, st.integers(0, 20000), st.integers(0, 5000))
 def test_a_larger_budget_keeps_all_that_a_smaller_one_keeps(seed, count, channels, precision, mtu, budget, more):
     bev, score = scene(seed, count, channels)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.comms import payloads, wire
 from manyeyes.datatypes import (
@@ -26,7 +26,6 @@ from manyeyes.datatypes import (
 from manyeyes.datatypes.message import DESCRIPTOR_DIM, RequestMap
 
 torch.set_num_threads(1)
-QUICK = settings(max_examples=40, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 GRID = BevGrid(-140.8, -38.4, -3.0, 140.8, 38.4, 1.0, 0.4, 8)
 
 
@@ -86,7 +85,6 @@ def through(message: Message, **options) -> Message:
 sizes = st.one_of(st.none(), st.integers(0, 300))
 
 
-@QUICK
 @given(st.integers(0, 10**6), sizes, sizes, sizes, st.sampled_from(payloads.TOKEN_ENCODINGS), st.integers(300, 3000))
 def test_round_trip(seed, tokens, objects, points, precision, mtu):
     message = random_message(seed, tokens, objects, points)
@@ -281,7 +279,6 @@ def test_a_lost_packet_of_points_thins_the_cloud_evenly():
     assert angle.diff().max() < 3 * 6.2 / 2000
 
 
-@QUICK
 @given(st.integers(0, 10**6), st.randoms(use_true_random=False))
 def test_order_and_copies_do_not_matter(seed, random):
     packets = wire.encode(random_message(seed, 120, 150, 300), token_encoding="float32", mtu=600)
@@ -295,7 +292,6 @@ def same(a: Message, b: Message) -> bool:
     return wire.encode(a, token_encoding="float32", mtu=60000) == wire.encode(b, token_encoding="float32", mtu=60000)
 
 
-@QUICK
 @given(st.binary(max_size=300))
 def test_garbage_is_refused(data):
     with pytest.raises(wire.PacketError):
@@ -304,7 +300,6 @@ def test_garbage_is_refused(data):
         wire.decode_packet(b"ME\x02" + data)
 
 
-@QUICK
 @given(st.integers(0, 10**6), st.data())
 def test_every_flipped_bit_and_every_cut_is_noticed(seed, data):
     packet = data.draw(st.sampled_from(wire.encode(random_message(seed, 10, 3, 10))))
@@ -325,7 +320,6 @@ def forge(packet: bytes, at: int, data: bytes) -> bytes:
     return changed + zlib.crc32(changed).to_bytes(4, "little")
 
 
-@QUICK
 @given(st.integers(0, 1000), st.data())
 def test_a_faulty_sender_never_crashes_the_reader(seed, data):
     packet = data.draw(st.sampled_from(wire.encode(random_message(seed, 10, 3, 10))))

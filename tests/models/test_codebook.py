@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.datatypes import LABELS, BevGrid, ConfigError, ShapeError, Sites
 from manyeyes.models.detector.box_head import BOX_LAYOUT, DecodeConfig, RawBoxes, axis_yaw, decode, heading_logit
@@ -14,7 +14,6 @@ from manyeyes.models.detector.proposal import PROPOSAL_DIM, make_proposals, move
 from manyeyes.models.detector.proposal_codes import PROPOSAL_CODES, proposal_from_codes, proposal_to_codes
 
 torch.set_num_threads(1)
-QUICK = settings(max_examples=10, derandomize=True, deadline=None)
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, 0.4, 4)
 
 
@@ -41,7 +40,6 @@ def proposals(seed: int, count: int = 200) -> torch.Tensor:
     return rows
 
 
-@QUICK
 @given(st.integers(0, 10**6))
 def test_box_round_trip_error_is_below_3_cm_and_half_a_degree(seed):
     """Centre in three dimensions, on the shipped models' lattice; sizes within 1 %; velocity within 0.125 m/s an axis."""
@@ -69,7 +67,6 @@ def test_box_round_trip_error_is_below_3_cm_and_half_a_degree(seed):
     assert torch.equal(back[:, BOX_LAYOUT.class_logits].argmax(1), original[:, BOX_LAYOUT.class_logits].argmax(1))
 
 
-@QUICK
 @given(st.integers(0, 10**6), st.floats(-3, 3))
 def test_decoded_box_and_heading_are_equal_in_any_frame(seed, yaw):
     """Also after the receiver has turned it: the seams of axis and direction are nowhere."""

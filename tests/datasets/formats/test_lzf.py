@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 
 from manyeyes.datasets.formats.lzf import lzf_compress, lzf_decompress
 from manyeyes.datasets.formats.pcd import PcdTable, read_pcd, read_table, write_table
 from manyeyes.datatypes import RecordingError
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.binary(max_size=5), st.integers(1, 400)), max_size=12))
 def test_what_is_compressed_unpacks_to_itself(parts: list[tuple[bytes, int]]) -> None:
     plain = b"".join(part * count for part, count in parts)
