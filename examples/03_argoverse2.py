@@ -10,7 +10,7 @@ from manyeyes.viz.birds_eye import draw_scene, make_scene, save_png
 root = Path(sys.argv[1] if len(sys.argv) > 1 else "../shared/data/av2")
 if not root.is_dir():
     sys.exit(f"{root}: no Argoverse 2 logs here; give their folder.")
-recording = Argoverse2Recording(root)
+recording = Argoverse2Recording(root, gap=1)
 snapshot = recording.snapshot(recording.scenarios[0], 0)
 detector = load_detector()
 first, second = snapshot.frames

@@ -14,6 +14,7 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.cli import main as cli
 from manyeyes.cli.demo_map import describe_drive_map
+from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.map_element import KINDS
 from manyeyes.maps.elements.observation_file import read_observations
@@ -22,7 +23,6 @@ from manyeyes.models.maps.map_model import MapModel
 from manyeyes.models.maps.presets import FORMAT, MAP_TINY
 from manyeyes.studies.map_folder import MapFolder, read_vector_map
 from manyeyes.studies.map_pipeline import MapBuildConfig, build_map, count_snapshots, write_built_map
-from manyeyes.studies.recordings import open_recording
 from manyeyes.studies.town_maps import TownMap, find_named_town, group_by_town
 
 NOTHING = Boxes.of(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,9 +12,13 @@ import numpy as np
 import pytest
 import torch
 
+from manyeyes.cli.main import main
 from manyeyes.datasets.argoverse2 import Argoverse2Recording
 from manyeyes.datasets.base import count_points_in_listed_boxes
-from manyeyes.datatypes import LABELS, MissingExtraError, RecordingError, Snapshot
+from manyeyes.datatypes import LABELS, ConfigError, MissingExtraError, RecordingError, Snapshot
+from manyeyes.models import checkpoint
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.presets import COSTR_TINY
 
 pyarrow = pytest.importorskip("pyarrow", reason="needs the 'av2' extra")
 from pyarrow import feather  # noqa: E402
@@ -26,7 +31,7 @@ real = pytest.mark.skipif(not SHARED.is_dir(), reason="the real Argoverse 2 log 
 
 @pytest.fixture(scope="module")
 def recording() -> Argoverse2Recording:
-    return Argoverse2Recording(SHARED)
+    return Argoverse2Recording(SHARED, gap=1)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +144,7 @@ def log(tmp_path: Path) -> Path:
 
 
 def test_a_log_by_hand(log: Path) -> None:
-    recording = Argoverse2Recording(log.parent)
+    recording = Argoverse2Recording(log.parent, gap=1)
     assert recording.scenarios == ("abc",) and recording.length("abc") == 2
     snapshot = recording.snapshot("abc", 1)
     assert [f.timestamp_ns for f in snapshot.frames] == [1_100_000_000, 1_200_000_000]
@@ -159,7 +164,17 @@ def test_a_log_by_hand(log: Path) -> None:
     # Two sweeps apart, and no label is no truth.
     assert Argoverse2Recording(log, gap=2).snapshot("abc", 0).frames[1].timestamp_ns == 1_200_000_000
     (log / "annotations.feather").unlink()
-    assert Argoverse2Recording(log).snapshot("abc", 0).truth is None
+    assert Argoverse2Recording(log, gap=1).snapshot("abc", 0).truth is None
+
+
+def test_without_a_gap_a_log_has_one_agent(log: Path) -> None:
+    recording = Argoverse2Recording(log)
+    assert recording.length("abc") == 3 and recording.agents("abc") == (0,)
+    snapshot = recording.snapshot("abc", 2)
+    assert [(f.agent_id, f.timestamp_ns) for f in snapshot.frames] == [(0, 1_200_000_000)]
+    assert snapshot.truth is not None and snapshot.truth.seen.tolist() == [[True, True]]
+    with pytest.raises(ConfigError, match="gap of at least 0 sweeps; got -1"):
+        Argoverse2Recording(log, gap=-1)
 
 
 def test_a_track_of_the_later_sweep_alone_is_in_the_truth(log: Path) -> None:
@@ -169,7 +184,7 @@ def test_a_track_of_the_later_sweep_alone_is_in_the_truth(log: Path) -> None:
         for t, n in zip(*(table[k].to_pylist() for k in ("track_uuid", "timestamp_ns")))
     ]
     feather.write_feather(table.filter(pyarrow.array(keep)), log / "annotations.feather")
-    truth = Argoverse2Recording(log).snapshot("abc", 0).truth
+    truth = Argoverse2Recording(log, gap=1).snapshot("abc", 0).truth
     assert truth is not None and truth.seen.tolist() == [[True, False], [True, True]]
 
 
@@ -209,7 +224,7 @@ def _shift_poses(log: Path) -> None:
 def test_damage_is_named(log: Path, damage: Callable[[Path], object], message_match: str) -> None:
     damage(log)
     with pytest.raises(RecordingError) as caught:
-        Argoverse2Recording(log.parent).snapshot("abc", 0)
+        Argoverse2Recording(log.parent, gap=1).snapshot("abc", 0)
     assert message_match in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -221,10 +236,41 @@ def test_a_root_without_logs_is_refused(log: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="No scenario 'x'"):
         Argoverse2Recording(log.parent).length("x")
     with pytest.raises(RecordingError, match="index from 0 to 1"):
-        Argoverse2Recording(log.parent).snapshot("abc", 2)
+        Argoverse2Recording(log.parent, gap=1).snapshot("abc", 2)
+
+
+def test_splits_are_folders_of_logs(log: Path) -> None:
+    assert Argoverse2Recording(log.parent.parent, "logs").scenarios == ("abc",)
+    with pytest.raises(RecordingError, match="it has splits: logs"):
+        Argoverse2Recording(log.parent.parent)
+    with pytest.raises(RecordingError, match=r"val: no such folder.*check the path and the split"):
+        Argoverse2Recording(log.parent, "val")
+
+
+def test_view_replay_and_evaluate_open_a_log_of_one_agent_and_say_so(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        checkpoint.save(Detector(COSTR_TINY), tmp_path / "tiny.safetensors", {})
+    played = ("--weights", tmp_path / "tiny.safetensors", "--methods", "none", "early", "--out", tmp_path / "out")
+    timing = ("--workers", 1, "--timing-frames", 0)
+    for words in (
+        ("view", log, "--out", tmp_path / "frame.png", "--width", 320),
+        ("replay", log.parent, "--no-animate", *played),
+        ("evaluate", "--data", log.parent.parent, "--split", "logs", *timing, *played),
+    ):
+        assert main([str(word) for word in words]) == 0
+        text = " ".join(capsys.readouterr().out.split())
+        assert "note: no scenario has a second agent: nothing is shared" in text
+    assert main(["pose", str(log), "--out", str(tmp_path)]) == 1
+    assert "'abc' has one agent, poses are corrected between two" in capsys.readouterr().err
+    none, early = json.loads((tmp_path / "out" / "results.json").read_text())["result"]["stats"]
+    # The car of three sweeps; the bus is out of range.
+    assert none["ap_summaries"] == early["ap_summaries"] and none["ap_summaries"][0]["n_gt"] == 3
 
 
 def test_without_pyarrow_the_extra_is_named(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'manyeyes\[av2\]'"):
-        Argoverse2Recording(log.parent).snapshot("abc", 0)
+        Argoverse2Recording(log.parent, gap=1).snapshot("abc", 0)

@@ -2,8 +2,9 @@
 """The page on the architecture lists the layers of the import contract and the extension points of the code."""
 
 import re
-import tomllib
 from pathlib import Path
+
+import tomllib
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "docs" / "development" / "architecture.md").read_text(encoding="utf-8")

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.skipif(not LOG.is_dir(), reason=f"{LOG} is absent: the 
 
 def views():
     """What both sweeps' vehicles are, and ego_from_other between the sweeps' own frames."""
-    recording = Argoverse2Recording(LOG)
+    recording = Argoverse2Recording(LOG, gap=1)
     scenario = recording.scenarios[0]
     sweeps = recording.sweeps(scenario)[:2]
     marks = []

@@ -13,11 +13,12 @@ from manyeyes.cli import main as cli
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.dair_v2x.writer import DairWriter, write_dair_index
 from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
+from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.studies.recordings import adapt_to_dataset, open_recording
+from manyeyes.studies.recordings import adapt_to_dataset
 from manyeyes.studies.replay_options import ReplayOptions
 
 

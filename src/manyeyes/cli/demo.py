@@ -49,7 +49,7 @@ def main(options: Options) -> None:
     """Simulate a drive, evaluate the methods on it, and write a report."""
     from rich.console import Console
 
-    from manyeyes.datasets.opv2v import Opv2vRecording
+    from manyeyes.datasets.registry import open_recording
     from manyeyes.models import pretrained
     from manyeyes.simulator.presets import simulate
     from manyeyes.simulator.record import RecordingProgress
@@ -68,7 +68,7 @@ def main(options: Options) -> None:
             progress.update(task, total=at.total, completed=at.done)
 
         simulate(PRESET, folder, options.seed, 1, report_scene, options.towns)
-    drive = make_excerpt(Opv2vRecording(folder, "test"), None, options.frames)
+    drive = make_excerpt(open_recording(folder, "test"), None, options.frames)
     town = drive.scenario.rpartition("_")[0]
     if len(drive.eval_indices(drive.scenario)) == 0:
         raise ConfigError(f"{folder}: the drive has no judged frame; remove the folder and run the demo again.")

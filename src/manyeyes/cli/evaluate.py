@@ -29,10 +29,11 @@ def main(options: Options) -> None:
 
     from manyeyes._io import atomic_write_text
     from manyeyes.datasets.perturbation import PoseNoise
+    from manyeyes.datasets.registry import open_recording
     from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, resolve_protocol, run_benchmark
     from manyeyes.models import pretrained
     from manyeyes.studies import provenance
-    from manyeyes.studies.recordings import adapt_to_dataset, check_files, open_recording
+    from manyeyes.studies.recordings import adapt_to_dataset, check_files
     from manyeyes.viz.progress import make_progress_bars
     from manyeyes.viz.results import print_comparison, summarize_comparison
     from manyeyes.viz.table import DIFFERENCE_HEADINGS, format_difference_cells, format_markdown, format_markdown_lines

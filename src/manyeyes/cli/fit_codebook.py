@@ -15,7 +15,7 @@ class Options:
     """Which weights, which scenes, where to."""
 
     data: Path
-    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario; or a root in DAIR-V2X's layout."""
+    """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
     out: Path
     """The file of the new weights; it may be the old one."""
     weights: Path
@@ -37,10 +37,11 @@ def main(options: Options) -> None:
     import torch
     from rich.console import Console
 
+    from manyeyes.datasets.registry import open_recording
     from manyeyes.models import checkpoint
     from manyeyes.models.detector.codebook import CodebookConfig
     from manyeyes.studies import provenance
-    from manyeyes.studies.recordings import check_files, open_recording
+    from manyeyes.studies.recordings import check_files
     from manyeyes.training.detector.codebook import fit_codebook
 
     torch.set_num_threads(1)

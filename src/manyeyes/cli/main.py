@@ -16,7 +16,7 @@ COMMANDS = {
     "train": "train a detector on a recording",
     "fit-codebook": "fit the codebook that quantises the tokens of trained weights",
     "evaluate": "evaluate methods on a split: AP with intervals, bytes, paired differences; or run a study",
-    "replay": "replay your own recording in OPV2V's layout as demo does",
+    "replay": "replay your own recording as demo does",
     "view": "draw a frame of a recording, or animate a drive",
     "pose": "evaluate pose correction from detected objects: prior and corrected poses",
     "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",

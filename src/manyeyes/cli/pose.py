@@ -31,9 +31,9 @@ class Options:
     """Which drive, which correctors, how wrong the claims."""
 
     recording: tyro.conf.Positional[Path]
-    """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout; or a root in DAIR-V2X's."""
+    """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
     split: str | None = None
-    """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
+    """Which split of a data set, such as test: a folder inside it; with DAIR-V2X one of its split file."""
     scenario: str | None = None
     """Which scenario; the first by default."""
     frames: PositiveInt = 60
@@ -81,11 +81,13 @@ def main(options: Options) -> None:
 
     from manyeyes.agents.perception_cache import PerceptionCache
     from manyeyes.datasets.perturbation import PoseNoise
+    from manyeyes.datasets.registry import open_recording
+    from manyeyes.datatypes import ConfigError
     from manyeyes.evaluation.pose.metrics import summarize_evaluations
     from manyeyes.models import pretrained
     from manyeyes.pose.registry import find_corrector
     from manyeyes.studies import provenance
-    from manyeyes.studies.recordings import check_files, open_recording, select_checked_scenarios
+    from manyeyes.studies.recordings import check_files, select_checked_scenarios
     from manyeyes.viz.table import missing_footer
 
     console = Console()
@@ -94,6 +96,10 @@ def main(options: Options) -> None:
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
     recording = open_recording(options.recording, options.split)
     drive = make_excerpt(recording, options.scenario, options.frames)
+    if len(drive.agents(drive.scenario)) < 2:
+        raise ConfigError(
+            f"{options.recording}: '{drive.scenario}' has one agent, poses are corrected between two; choose another."
+        )
     scenarios = select_checked_scenarios(recording, drive.scenario, options.scenario)
     missing = check_files(recording, options.checks, console, scenarios)
     cache = PerceptionCache(pretrained.load(options.weights))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Replays your own recording, in OPV2V's or DAIR-V2X's layout, with every method: table, pictures, animation, report, JSON."""
+"""Replays a recording with every method: table, pictures, animation, report, JSON."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Options:
     """Which drive, and how it is played."""
 
     recording: tyro.conf.Positional[Path]
-    """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout; or a root in DAIR-V2X's."""
+    """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
     split: str | None = None
-    """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
+    """Which split of a data set, such as test: a folder inside it; with DAIR-V2X one of its split file."""
     scenario: str | None = None
     """Which scenario; the first by default."""
     frames: PositiveInt = 60
@@ -44,8 +44,9 @@ def main(options: Options) -> None:
     """Replay a drive and write a report."""
     from rich.console import Console
 
+    from manyeyes.datasets.registry import open_recording
     from manyeyes.models import pretrained
-    from manyeyes.studies.recordings import adapt_to_dataset, check_files, open_recording, select_checked_scenarios
+    from manyeyes.studies.recordings import adapt_to_dataset, check_files, select_checked_scenarios
     from manyeyes.studies.replay_report import REPORT, ReportSpec, replay_and_report
 
     console = Console()

@@ -33,7 +33,7 @@ class Options:
     """Which recording, which settings, where to."""
 
     data: Path
-    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario; or a root in DAIR-V2X's layout."""
+    """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
     split: str | None = "train"
     """Which split of a dataset: a folder inside it."""
     preset: str = "costr-small/stage1"

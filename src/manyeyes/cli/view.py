@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,9 +28,9 @@ class Options:
     """The frame to draw, and the output file."""
 
     recording: tyro.conf.Positional[Path]
-    """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout; or a root in DAIR-V2X's."""
+    """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
     split: str | None = None
-    """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
+    """Which split of a data set, such as test: a folder inside it; with DAIR-V2X one of its split file."""
     scenario: str | None = None
     """Which scenario; the first by default."""
     frame: NonNegativeInt | None = None
@@ -55,7 +55,8 @@ def main(options: Options) -> None:
     """Draw a frame or an animation."""
     from rich.console import Console
 
-    from manyeyes.studies.recordings import open_recording
+    from manyeyes.datasets.registry import open_recording
+    from manyeyes.studies.recordings import adapt_to_dataset, print_notes
     from manyeyes.viz.animation import save_animation
     from manyeyes.viz.birds_eye import save_png
 
@@ -67,9 +68,12 @@ def main(options: Options) -> None:
     first = drive.eval_indices(drive.scenario).start if options.frame is None else options.frame
     last = min(drive.length(drive.scenario), first + (1 if single else options.frames))
     console = Console()
-    for problem in recording.missing_summary:
-        console.print(f"note: {problem}", highlight=False, markup=False, soft_wrap=True)
-    images = _draw_images(options, drive, range(first, last))
+    print_notes(recording, console)
+    config: ReplayConfig | None = None
+    if options.detect is not None:
+        replay_options = replace(options.replay_options, methods=(options.detect,))
+        config = adapt_to_dataset(replay_options.make_replay_config(0), replay_options, recording)
+    images = _draw_images(options, drive, range(first, last), config)
     if single:
         save_png(images[0], options.out)
     else:
@@ -77,15 +81,15 @@ def main(options: Options) -> None:
     console.print(f"{options.out}: {drive.scenario}, frames {first} to {last - 1}", highlight=False, soft_wrap=True)
 
 
-def _draw_images(options: Options, drive: Excerpt, indices: range) -> list[Image]:
+def _draw_images(options: Options, drive: Excerpt, indices: range, config: ReplayConfig | None) -> list[Image]:
     from manyeyes.datatypes import BevGrid, Boxes
     from manyeyes.viz.birds_eye import draw_scene, make_scene
 
     snapshots = [drive.snapshot(drive.scenario, i) for i in (indices or (indices.start,))]
     grid = BevGrid(-options.half_extent_m[0], -options.half_extent_m[1], -5.0, *options.half_extent_m, 6.0)
     detections = [Boxes.empty()] * len(snapshots)
-    if options.detect is not None:
-        grid, detections = _run_detector(options, drive, snapshots)
+    if config is not None:
+        grid, detections = _run_detector(options, config, snapshots)
     images = []
     for snapshot, boxes in zip(snapshots, detections):
         caption = f"frame {snapshot.index} · {len(snapshot.frames)} agents"
@@ -95,16 +99,11 @@ def _draw_images(options: Options, drive: Excerpt, indices: range) -> list[Image
     return images
 
 
-def _run_detector(options: Options, drive: Excerpt, snapshots: list[Snapshot]) -> tuple[BevGrid, list[Boxes]]:
+def _run_detector(options: Options, config: ReplayConfig, snapshots: list[Snapshot]) -> tuple[BevGrid, list[Boxes]]:
     """The detector's range, and what the ego finds at each instant."""
-    from dataclasses import replace
-
     from manyeyes.agents.replay import DetectionReplay
     from manyeyes.models import pretrained
-    from manyeyes.studies.recordings import adapt_to_dataset
 
-    replay_options = replace(options.replay_options, methods=(str(options.detect),))
-    config: ReplayConfig = adapt_to_dataset(replay_options.make_replay_config(0), replay_options, drive.recording)
-    detector = pretrained.load(replay_options.weights)
-    player = DetectionReplay(replay_options.methods[0], detector, config)
+    detector = pretrained.load(options.replay_options.weights)
+    player = DetectionReplay(str(options.detect), detector, config)
     return detector.detection_range, [step.boxes for snapshot in snapshots for step in player.step(snapshot)]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Argoverse 2 sensor logs: two sweeps of one vehicle, read as two agents with a true relative pose.
+"""Argoverse 2 sensor logs: one vehicle, or two of its sweeps read as two agents with a true relative pose.
 
-A pair of real clouds. Layout: ``<log>/sensors/lidar/<ns>.feather``, ``annotations.feather`` and
+Layout: ``<log>/sensors/lidar/<ns>.feather``, ``annotations.feather`` and
 ``city_SE3_egovehicle.feather``. AV2's ego frame has its origin at the middle of the rear axle, 0.33 m above the road
 (median over a Pittsburgh log's 2,706 poses and its map's ground height); the agent's frame here is that one moved down.
 The world is the log's city frame.
@@ -9,7 +9,6 @@ The world is the log's city frame.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,11 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes.datasets.base import require_index
+from manyeyes.datasets.base import RecordingReader, require_index
+from manyeyes.datasets.registry import register_dataset
 from manyeyes.datatypes import (
     LABELS,
     AgentFrame,
     Boxes,
+    ConfigError,
     GroundTruth,
     MissingExtraError,
     PointCloud,
@@ -30,6 +31,7 @@ from manyeyes.datatypes import (
     Transform,
 )
 
+_POSES = "city_SE3_egovehicle.feather"
 _AXLE_HEIGHT_M = 0.33
 _LIDAR_ABOVE_AXLE_M = 1.64
 _REMEDY = "copy or download the file again"
@@ -62,53 +64,55 @@ class Annotations:
     interior_points: Tensor
 
 
-class Argoverse2Recording:
-    """Logs under a root (or one log): snapshot i shows sweep i as agent 0, the ego, and sweep i + gap as agent 1.
+def contains_logs(path: Path) -> bool:
+    """Whether a folder is a log, holds some, or holds splits with some, by the file of poses."""
+    return any(next(path.glob(f"{below}{_POSES}"), None) is not None for below in ("", "*/", "*/*/"))
 
-    True boxes are the vehicles at the ego's time, and those that only the later sweep has; an agent has seen those that
-    hold a point of its sweep. Logs without enough sweeps are named in ``missing_summary``.
+
+@register_dataset("argoverse2", matches=contains_logs, layout=f"logs <log>/sensors/lidar/<ns>.feather with {_POSES}")
+class Argoverse2Recording(RecordingReader):
+    """Logs under a root or its split (or one log): snapshot i shows sweep i as agent 0, the ego.
+
+    A log has one vehicle. With a gap above 0, sweep i + gap is agent 1: a pair of real clouds for Python; in a replay the later
+    sweep comes too late for the ego. True boxes are the vehicles at the ego's time, and those that only the later sweep has; an
+    agent has seen those that hold a point of its sweep. Logs without enough sweeps are named in ``missing_summary``.
     """
 
-    def __init__(self, root: Path | str, gap: int = 1) -> None:
+    def __init__(self, root: Path | str, split: str | None = None, *, gap: int = 0) -> None:
+        if gap < 0:
+            raise ConfigError(f"Argoverse2Recording needs a gap of at least 0 sweeps; got {gap}.")
         self.root = Path(root)
         self._gap = gap
-        if not self.root.is_dir():
-            raise RecordingError(f"{self.root}: no such folder, expected Argoverse 2 logs; check the path.")
-        with os.scandir(self.root) as entries:
-            below = sorted(self.root / e.name for e in entries if e.is_dir() and not e.name.startswith("."))
-        folders = [self.root] if (self.root / "city_SE3_egovehicle.feather").is_file() else below
+        folder = self.root if split is None else self.root / split
+        if not folder.is_dir():
+            raise RecordingError(f"{folder}: no such folder, expected Argoverse 2 logs; check the path and the split.")
         self._folders: dict[str, Path] = {}
         self._sweeps: dict[str, tuple[int, ...]] = {}
         problems = []
-        for folder in folders:
-            sweeps = tuple(sorted(int(p.stem) for p in folder.glob("sensors/lidar/*.feather") if p.stem.isdecimal()))
+        for log in [folder] if (folder / _POSES).is_file() else _list_folders(folder):
+            sweeps = tuple(sorted(int(p.stem) for p in log.glob("sensors/lidar/*.feather") if p.stem.isdecimal()))
             if len(sweeps) > gap:
-                self._folders[folder.name], self._sweeps[folder.name] = folder, sweeps
+                self._folders[log.name], self._sweeps[log.name] = log, sweeps
             else:
-                problems.append(f"{folder}: {len(sweeps)} sweeps in sensors/lidar, expected more than {gap}; left out")
+                problems.append(f"{log}: {len(sweeps)} sweeps in sensors/lidar, expected more than {gap}; left out")
+        self.scenarios = tuple(self._folders)
         self.missing_summary = tuple(problems)
         if not self._folders:
-            first = problems[0] if problems else "it is empty"
-            raise RecordingError(f"{self.root}: no usable Argoverse 2 log ({first}); check the path or the download.")
+            splits = [p.name for p in _list_folders(folder) if contains_logs(p) and not (p / _POSES).is_file()]
+            first = f"it has splits: {', '.join(splits)}" if splits else problems[0] if problems else "it is empty"
+            raise RecordingError(
+                f"{folder}: no usable Argoverse 2 log ({first}); check the path, the split or the download."
+            )
         self._tables: dict[tuple[Path, tuple[str, ...]], tuple[np.ndarray, ...]] = {}
 
-    @property
-    def scenarios(self) -> tuple[str, ...]:
-        """The names of all usable logs, sorted."""
-        return tuple(self._folders)
-
     def length(self, scenario: str) -> int:
-        """How many pairs of sweeps the log has."""
+        """How many sweeps the log has, less the gap."""
         return len(self.sweeps(scenario)) - self._gap
 
-    def eval_indices(self, scenario: str) -> range:
-        """All indices of the log."""
-        return range(self.length(scenario))
-
     def agents(self, scenario: str) -> tuple[int, ...]:
-        """Always 0 and 1."""
+        """Agent 0, and 1 with a gap."""
         self.sweeps(scenario)
-        return (0, 1)
+        return (0, 1) if self._gap else (0,)
 
     def sweeps(self, scenario: str) -> tuple[int, ...]:
         """Time stamps of the log's sweeps, nanoseconds, ascending."""
@@ -117,13 +121,13 @@ class Argoverse2Recording:
         return self._sweeps[scenario]
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
-        """Two sweeps as two agents; without truth where the log has no annotations."""
+        """One sweep, or two as two agents; without truth where the log has no annotations."""
         require_index(self, scenario, index)
         sweeps = self._sweeps[scenario]
-        pair = (sweeps[index], sweeps[index + self._gap])
-        frames = tuple(self._frame(scenario, i, time) for i, time in enumerate(pair))
+        times = tuple(sweeps[index + agent * self._gap] for agent in self.agents(scenario))
+        frames = tuple(self._frame(scenario, agent, time) for agent, time in enumerate(times))
         labelled = (self._folders[scenario] / "annotations.feather").is_file()
-        return Snapshot(scenario, index, frames, self._truth(scenario, pair, frames) if labelled else None)
+        return Snapshot(scenario, index, frames, self._truth(scenario, times, frames) if labelled else None)
 
     def points(self, scenario: str, timestamp_ns: int) -> PointCloud:
         """One sweep in AV2's own ego frame."""
@@ -176,13 +180,13 @@ class Argoverse2Recording:
 
     def _poses(self, scenario: str) -> tuple[np.ndarray, ...]:
         names = ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-        return self._table(self._folders[scenario] / "city_SE3_egovehicle.feather", names)
+        return self._table(self._folders[scenario] / _POSES, names)
 
     def _city_from_ego(self, scenario: str, timestamp_ns: int) -> Transform:
         time, *parts = self._poses(scenario)
         row = np.flatnonzero(time == timestamp_ns)
         if not len(row):
-            path = self._folders[scenario] / "city_SE3_egovehicle.feather"
+            path = self._folders[scenario] / _POSES
             raise RecordingError(f"{path}: no pose at the sweep's time {timestamp_ns}; {_REMEDY}.")
         values = torch.tensor([float(p[row[0]]) for p in parts], dtype=torch.float64)
         return Transform(_rotation(values[:4]), values[4:])
@@ -196,10 +200,10 @@ class Argoverse2Recording:
         elapsed = float(span[1] - span[0]) * 1e-9
         return float(np.linalg.norm(np.diff(place))) / elapsed if elapsed > 0 else 0.0
 
-    def _truth(self, scenario: str, pair: tuple[int, int], frames: tuple[AgentFrame, ...]) -> GroundTruth:
+    def _truth(self, scenario: str, times: tuple[int, ...], frames: tuple[AgentFrame, ...]) -> GroundTruth:
         """Vehicles in the city frame: the ego's copy of a track where it has one, in the order of ids."""
         boxes, met = [], []
-        for time in pair:
+        for time in times:
             labelled = self.annotations(scenario, time)
             boxes.append(labelled.boxes[labelled.is_vehicle].transform(self._city_from_ego(scenario, time)))
             met.append(labelled.boxes.id[labelled.is_vehicle & (labelled.interior_points > 0)])
@@ -214,6 +218,10 @@ class Argoverse2Recording:
         if (path, names) not in self._tables:
             self._tables[path, names] = _columns(path, names)
         return self._tables[path, names]
+
+
+def _list_folders(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
 
 
 def _rotation(quaternion: Tensor) -> Tensor:

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interface of all readers of recordings, and functions on any recording."""
+"""Interface of recordings, base of their readers, and functions on any recording."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
 
+from manyeyes.datasets.missing import FileProblem, MissingFiles
 from manyeyes.datatypes import RecordingError, Snapshot
 
 
@@ -35,6 +38,72 @@ class Recording(Protocol):
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         """All agents at one instant."""
         ...
+
+
+class RecordingReader(ABC):
+    """Base of readers: a :class:`Recording` with what commands ask of it. A reader has ``scenarios``, ``length`` and ``snapshot``.
+
+    A reader is constructed with the folder and the name of a split or None, and registered by
+    :func:`manyeyes.datasets.registry.register_dataset`; commands then open its recordings.
+    """
+
+    scenarios: tuple[str, ...]
+    """The names of all scenarios, in a fixed order; the constructor sets them."""
+    matches: ClassVar[Callable[[Path], bool]]
+    """Whether a folder is in the reader's layout; set by the registration, like ``layout``: what is recognised, in words."""
+    layout: ClassVar[str]
+    reads_images: ClassVar[bool] = False
+    """Whether the constructor takes ``images``: True reads the pictures of cameras."""
+    comm_range_m: float | None = None
+    """The range in which agents of a replay exchange messages, metres; None: that of the replay."""
+    latency_budget_s: float | None = None
+    """How long the ego of a replay waits for messages after its own sweep; None: as the channel needs."""
+    missing_summary: tuple[str, ...] = ()
+    """What was missing when the recording was opened; one line for each kind of thing."""
+    missing_files: tuple[FileProblem, ...] = ()
+    """The files that were missing when the recording was opened."""
+
+    @abstractmethod
+    def length(self, scenario: str) -> int:
+        """How many snapshots the scenario has."""
+
+    @abstractmethod
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        """All agents at one instant."""
+
+    def eval_indices(self, scenario: str) -> range:
+        """The indices that evaluation counts: all by default."""
+        return range(self.length(scenario))
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        """The ids of all agents of the scenario, the ego first: by default those of its first snapshot."""
+        return tuple(frame.agent_id for frame in self.snapshot(scenario, 0).frames)
+
+    @property
+    def unreadable_scenarios(self) -> frozenset[str]:
+        """The names of the scenarios of which nothing can be read; the empty name stands for files of an unknown scenario."""
+        return frozenset(problem.scenario for problem in self.missing_files) - frozenset(self.scenarios)
+
+    def verify(
+        self, scenarios: Collection[str] | None = None, progress: Callable[[int, int], None] | None = None
+    ) -> MissingFiles:
+        """Name the files that are missing, or whose content does not belong to their frame.
+
+        Args:
+            scenarios: names of the scenarios to verify; None for all.
+            progress: called with the number of scenarios that are verified, and of all.
+        """
+        names = [name for name in self.scenarios if scenarios is None or name in scenarios]
+        found = [problem for problem in self.missing_files if scenarios is None or problem.scenario in scenarios]
+        for count, name in enumerate(names, 1):
+            found += self.verify_contents(name)
+            if progress is not None:
+                progress(count, len(names))
+        return MissingFiles.of(found)
+
+    def verify_contents(self, scenario: str) -> list[FileProblem]:
+        """Find the files of a scenario whose content does not belong to their frame: none are searched by default."""
+        return []
 
 
 def iter_eval_frames(recording: Recording) -> Iterator[tuple[str, int]]:

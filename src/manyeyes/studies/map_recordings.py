@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from manyeyes.datasets.base import Recording
-    from manyeyes.datasets.dair_v2x import DairRecording
-    from manyeyes.datasets.opv2v import Opv2vRecording
+    from manyeyes.datasets.base import Recording, RecordingReader
     from manyeyes.datatypes.map_element import MapElements
 
 
-def open_sensor_recording(data: Path, split: str | None, sensors: Sequence[str]) -> Opv2vRecording | DairRecording:
+def open_sensor_recording(data: Path, split: str | None, sensors: Sequence[str]) -> RecordingReader:
     """The recording with what these sensors took: pictures are read where a model has cameras, and must then be there."""
+    from manyeyes.datasets.registry import open_recording
     from manyeyes.datatypes import ConfigError
-    from manyeyes.studies.recordings import open_recording
 
     recording = open_recording(data, split, images="camera" in sensors)
     if "camera" in sensors and not has_images(recording):

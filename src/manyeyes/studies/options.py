@@ -16,9 +16,9 @@ class Options:
     """Which recording, which methods, whose rules."""
 
     data: Path
-    """A dataset in OPV2V's layout, a folder of scenarios, or one scenario; or a root in DAIR-V2X's layout."""
+    """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
     split: str | None = None
-    """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
+    """Which split of a data set, such as test: a folder inside it; with DAIR-V2X one of its split file."""
     out: Path = Path("out/evaluate")
     """Folder for results.json and results.md."""
     protocol: str = "global-sort"

@@ -13,12 +13,13 @@ from manyeyes._io import atomic_write_text
 from manyeyes.agents.strategies.registry import get_strategy, list_strategies
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
+from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
 from manyeyes.evaluation.statistics.significance import MarginTest
 from manyeyes.evaluation.study import Condition, ResultGrid, run_conditions
 from manyeyes.studies import provenance
-from manyeyes.studies.recordings import adapt_to_dataset, check_files, choose_results_folder, open_recording
+from manyeyes.studies.recordings import adapt_to_dataset, check_files, choose_results_folder
 from manyeyes.studies.replay_options import display_name
 from manyeyes.viz.curves import CurvePanel, save_curves
 from manyeyes.viz.progress import make_progress_bars

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from manyeyes.datasets.base import count_points_in_listed_boxes, iter_eval_frames
-from manyeyes.datasets.dair_v2x import DairRecording, json_files, reader
+from manyeyes.datasets.dair_v2x import DairOptions, DairRecording, json_files, reader
 from manyeyes.datasets.formats.pcd import PcdCloud, PcdTable, write_table
 from manyeyes.datatypes import ConfigError, RecordingError, Transform
 
@@ -314,7 +314,7 @@ def test_splits_are_those_of_the_users_file(dataset: Path, tmp_path: Path) -> No
     assert DairRecording(dataset, "val").scenarios == ("3",)
     bare = tmp_path / "bare.json"
     bare.write_text('["000011", "000099"]')
-    recording = DairRecording(dataset, "mine", split_file=bare)
+    recording = DairRecording(dataset, "mine", DairOptions(split_file=bare))
     assert recording.length("12") == 1
     assert "1 of the split's 2 frames are not in it, the first is 000099" in recording.missing_summary[0]
     with pytest.raises(RecordingError, match=r"no split 'test'; it has train, val: choose"):
@@ -322,7 +322,7 @@ def test_splits_are_those_of_the_users_file(dataset: Path, tmp_path: Path) -> No
     with pytest.raises(
         RecordingError, match=r"official cooperative-split-data.json there \(pairs: train 4813, val 1783"
     ):
-        DairRecording(dataset, "mine", split_file=tmp_path / "none.json")
+        DairRecording(dataset, "mine", DairOptions(split_file=tmp_path / "none.json"))
 
 
 def test_the_official_archives_folder_is_found(dataset: Path, tmp_path: Path) -> None:
@@ -331,7 +331,7 @@ def test_the_official_archives_folder_is_found(dataset: Path, tmp_path: Path) ->
 
 
 def test_an_older_sweep_of_the_pole(dataset: Path) -> None:
-    recording = DairRecording(dataset, delay_frames=1)
+    recording = DairRecording(dataset, options=DairOptions(delay_frames=1))
     assert recording.scenarios == ("12",)
     vehicle, pole = recording.snapshot("12", 0).frames
     assert vehicle.timestamp_ns - pole.timestamp_ns == (100_000 + 17_749) * 1000
@@ -339,7 +339,7 @@ def test_an_older_sweep_of_the_pole(dataset: Path) -> None:
 
 
 def test_the_reported_roadside_pose_lacks_the_correction(dataset: Path) -> None:
-    snapshot = DairRecording(dataset, native_pose_error=True).snapshot("12", 0)
+    snapshot = DairRecording(dataset, options=DairOptions(native_pose_error=True)).snapshot("12", 0)
     assert snapshot.truth is not None
     gap = snapshot.truth.world_from_agent.translation[1] - snapshot.frames[1].world_from_agent.translation
     torch.testing.assert_close(gap, torch.tensor([*OFFSET, 0.0], dtype=torch.float64))
@@ -382,7 +382,7 @@ def test_lidar_i2v_stands_in_for_a_lost_calibration(root: Path) -> None:
 
 
 def test_labels_of_the_sides_as_truth(dataset: Path) -> None:
-    truth = DairRecording(dataset, labels="sides").snapshot("12", 0).truth
+    truth = DairRecording(dataset, options=DairOptions(labels="sides")).snapshot("12", 0).truth
     assert truth is not None
     assert truth.boxes.label.tolist() == [0, 2, 3, 0, 1], (
         "each vehicle once: a, b, d by the vehicle, own and c by the pole"
@@ -394,7 +394,7 @@ def test_labels_of_the_sides_as_truth(dataset: Path) -> None:
 def test_another_release_of_the_labels(root: Path) -> None:
     shutil.copytree(root / "cooperative/label_world", root / "cooperative/label_world_backup")
     edit(root / "cooperative/label_world_backup/000010.json", lambda rows: rows[:2])
-    truth = DairRecording(root, label_folder="label_world_backup").snapshot("12", 0).truth
+    truth = DairRecording(root, options=DairOptions(label_folder="label_world_backup")).snapshot("12", 0).truth
     assert truth is not None
     assert len(truth.boxes) == 2
 
@@ -459,7 +459,7 @@ def test_nothing_usable_is_an_error(root: Path, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"missing: cooperative/data_info.json. Download what is missing"):
         DairRecording(root)
     with pytest.raises(ConfigError, match="labels 'cooperative' or 'sides' and delay_frames >= 0"):
-        DairRecording(root, delay_frames=-1)
+        DairRecording(root, options=DairOptions(delay_frames=-1))
 
 
 def set_in(*keys: Any, to: Any) -> Callable[[Any], None]:

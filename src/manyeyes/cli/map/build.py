@@ -29,9 +29,9 @@ class Options:
     """The recording, the map model and the output folder."""
 
     recording: tyro.conf.Positional[Path]
-    """A dataset, a folder of scenarios, or one scenario, in OPV2V's layout; or a root in DAIR-V2X's."""
+    """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
     split: str | None = None
-    """Which split of a dataset: a folder inside it, such as test; with DAIR-V2X one of its split file."""
+    """Which split of a data set, such as test: a folder inside it; with DAIR-V2X one of its split file."""
     scenarios: PositiveInt | None = None
     """At most so many scenarios, the first ones; all by default."""
     source: Literal["model", "truth"] = "model"
@@ -63,9 +63,10 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.comms.channel import channel_preset
+    from manyeyes.datasets.registry import open_recording
     from manyeyes.studies import provenance
     from manyeyes.studies.map_pipeline import MapBuildConfig, build_map, count_snapshots, write_built_map
-    from manyeyes.studies.recordings import check_files, open_recording
+    from manyeyes.studies.recordings import check_files
     from manyeyes.studies.town_maps import group_by_town
     from manyeyes.viz.progress import make_progress_bars
     from manyeyes.viz.table import missing_footer

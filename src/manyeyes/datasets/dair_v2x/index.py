@@ -7,11 +7,11 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from manyeyes.datasets.dair_v2x.json_files import REMEDY, get_number, get_offset, get_text, load_json, load_list
 from manyeyes.datasets.missing import FileProblem
-from manyeyes.datatypes import RecordingError
+from manyeyes.datatypes import ConfigError, RecordingError
 
 ARCHIVE = "cooperative-vehicle-infrastructure"
 SPLIT_FILE = "cooperative-split-data.json"
@@ -21,6 +21,32 @@ SIDES = ("vehicle-side", "infrastructure-side")
 _LABEL_FOLDER = {"vehicle-side": "lidar", "infrastructure-side": "virtuallidar"}
 _LABEL_KEYS = ("label_lidar_std_path", "label_lidar_path", "label_virtuallidar_path")
 _MOTIONS = {"vehicle-side": ("novatel_to_world", "lidar_to_novatel"), "infrastructure-side": ("virtuallidar_to_world",)}
+
+
+@dataclass(frozen=True)
+class DairOptions:
+    """Which of the data set's variants is read."""
+
+    split_file: Path | str | None = None
+    """The list of frames of splits; None: the official file in the root."""
+    labels: Literal["cooperative", "sides"] = "cooperative"
+    """The truth: the cooperative label, or the union of what the two sides list."""
+    label_folder: str = "label_world"
+    """Where the cooperative labels lie, such as ``label_world_backup`` of the complemented release."""
+    delay_frames: int = 0
+    """The infrastructure's sweep is so many sweeps older than the paired one (vic-async)."""
+    native_pose_error: bool = False
+    """The infrastructure's prior pose is that of its calibration, without the correction by hand that the truth keeps."""
+
+    def __post_init__(self) -> None:
+        if self.delay_frames < 0 or self.labels not in ("cooperative", "sides"):
+            raise ConfigError(
+                f"DairOptions needs labels 'cooperative' or 'sides' and delay_frames >= 0; got {self.labels!r}, "
+                f"{self.delay_frames}."
+            )
+
+
+DEFAULT_OPTIONS = DairOptions()
 
 
 @dataclass(frozen=True)
@@ -138,11 +164,8 @@ class Sides:
         self.vehicle, self.infrastructure = (_Side.read(root, name) for name in SIDES)
 
 
-def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frames: int, label_folder: str) -> DairIndex:
-    """The pairs whose files are all there; ids: of the vehicle's frames that count, None for all.
-
-    delay_frames: the infrastructure's sweep is so many sweeps older than the paired one (vic-async).
-    """
+def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, options: DairOptions) -> DairIndex:
+    """The pairs whose files are all there; ids: of the vehicle's frames that count, None for all."""
     path = root / "cooperative" / "data_info.json"
     there = _Listing()
     missing_counts = _MissingCounts()
@@ -164,12 +187,14 @@ def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, delay_frame
             missing += _absent_entries(sides, vehicle, infrastructure)
             continue
         second: SideFrame | None = sides.infrastructure.frame(infrastructure)
-        if delay_frames:
-            second = sides.infrastructure.before(second, delay_frames)
+        if options.delay_frames:
+            second = sides.infrastructure.before(second, options.delay_frames)
             if second is None:
-                missing_counts.note(f"an infrastructure sweep {delay_frames} earlier", f"the first is frame {vehicle}")
+                missing_counts.note(
+                    f"an infrastructure sweep {options.delay_frames} earlier", f"the first is frame {vehicle}"
+                )
                 continue
-        pair = _pair(root, path, entry, row, sides.vehicle.frame(vehicle), second, label_folder)
+        pair = _pair(root, path, entry, row, sides.vehicle.frame(vehicle), second, options.label_folder)
         missing += _absent_files(pair, there)
         gone = next((f for f in _needed(pair, there) if not there.has(f)), None)
         if gone is not None:
@@ -292,9 +317,9 @@ class _MissingCounts:
         ]
 
 
-def read_split_ids(root: Path, split: str, split_file: Path | None) -> frozenset[str]:
+def read_split_ids(root: Path, split: str, split_file: Path | str | None) -> frozenset[str]:
     """Ids of the vehicle's frames of a split: under ``cooperative_split`` of the official file, or a bare list of ids."""
-    places = (split_file,) if split_file is not None else (root / SPLIT_FILE, root / f"{split}.json")
+    places = (Path(split_file),) if split_file is not None else (root / SPLIT_FILE, root / f"{split}.json")
     path = next((p for p in places if p.is_file()), None)
     if path is None:
         official = ", ".join(f"{name} {count}" for name, count in OFFICIAL_PAIRS.items())

@@ -9,17 +9,18 @@ pair have their own time stamps. The format has neither the height of a LiDAR (f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+import math
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes.datasets.base import require_index
+from manyeyes.datasets.base import RecordingReader, require_index
 from manyeyes.datasets.dair_v2x.index import (
+    DEFAULT_OPTIONS,
     DairIndex,
+    DairOptions,
     DairPair,
     SideFrame,
     Sides,
@@ -38,11 +39,11 @@ from manyeyes.datasets.formats.pcd import PcdCloud, read_pcd
 from manyeyes.datasets.ground_height import estimate_sensor_height
 from manyeyes.datasets.manifest import BATCHES, Digests
 from manyeyes.datasets.mismatch import find_copied_files
-from manyeyes.datasets.missing import FileProblem, MissingFiles
+from manyeyes.datasets.missing import FileProblem
+from manyeyes.datasets.registry import register_dataset
 from manyeyes.datatypes import (
     AgentFrame,
     Boxes,
-    ConfigError,
     GroundTruth,
     PointCloud,
     RecordingError,
@@ -59,30 +60,33 @@ _SAME_IOU = 0.05
 _VEHICLE_RANGE_M, _POLE_RANGE_M = 15.0, 40.0
 _MAX_CACHED_POSES = 20_000
 
-Labels = Literal["cooperative", "sides"]
 
-
-class DairRecording:
+@register_dataset(
+    "dair-v2x",
+    matches=lambda path: find_dair_root(path) is not None,
+    layout="folders vehicle-side and infrastructure-side",
+)
+class DairRecording(RecordingReader):
     """Pairs under a root in DAIR-V2X's layout; the drives (``batch_id``, ``sequence_id``) are the scenarios.
 
-    split: of the official cooperative-split-data.json, expected in the root unless split_file is given. labels: the truth
-    is the cooperative label, or the union of what the two sides list. label_folder: where the cooperative labels lie, such
-    as ``label_world_backup`` of the complemented release. delay_frames: the infrastructure's sweep is so many sweeps older.
-    native_pose_error: the infrastructure claims the pose of its calibration, without the correction by hand that the truth
-    keeps. A pair that lacks a file is left out and named in ``missing_summary``, one line a kind; with strict it is an error.
-    ``verify`` names each file that is absent, and each whose content does not belong to its frame.
+    split: of the official cooperative-split-data.json, expected in the root unless the options name a file. A pair that lacks a
+    file is left out and named in ``missing_summary``, one line a kind; with strict it is an error. ``verify`` names each file
+    that is absent, and each whose content does not belong to its frame.
+
+    Replays: pairs collaborate at any distance, by the data set's own protocol. The two sweeps of a pair are some ten milliseconds
+    apart, either way: an ego that does not wait would never receive an infrastructure message whose sweep is the later one. It
+    waits for half the period, so that the later sweep arrives in time, and the next pair has not begun.
     """
+
+    comm_range_m = math.inf
+    latency_budget_s = 0.05
 
     def __init__(
         self,
         root: Path | str,
         split: str | None = None,
+        options: DairOptions = DEFAULT_OPTIONS,
         *,
-        split_file: Path | str | None = None,
-        labels: Labels = "cooperative",
-        label_folder: str = "label_world",
-        delay_frames: int = 0,
-        native_pose_error: bool = False,
         strict: bool = False,
         drop_nan: bool = False,
     ) -> None:
@@ -91,78 +95,42 @@ class DairRecording:
             raise RecordingError(
                 f"{root}: expected a folder with vehicle-side and infrastructure-side; check the path."
             )
-        if delay_frames < 0 or labels not in ("cooperative", "sides"):
-            raise ConfigError(
-                f"DairRecording needs labels 'cooperative' or 'sides' and delay_frames >= 0; got {labels!r}, {delay_frames}."
-            )
         self.root = found
         self.split = split
-        self._labels = labels
-        self._native_pose_error = native_pose_error
+        self._options = options
         self._drop_nan = drop_nan
         self._sides = Sides(found)
-        ids = None if split is None else read_split_ids(found, split, Path(split_file) if split_file else None)
-        self._index: DairIndex = read_index(found, self._sides, ids, delay_frames, label_folder)
-        self.missing_summary = self._index.missing_summary
-        if not self._index.pairs or (strict and self.missing_summary):
+        ids = None if split is None else read_split_ids(found, split, options.split_file)
+        self._index: DairIndex = read_index(found, self._sides, ids, options)
+        self.scenarios = tuple(self._index.pairs)
+        self.missing_summary, self.missing_files = self._index.missing_summary, self._index.missing_files
+        if not self.scenarios or (strict and self.missing_summary):
             more = f" and {len(self.missing_summary) - 1} more" if len(self.missing_summary) > 1 else ""
             first = f"{self.missing_summary[0]}{more}" if self.missing_summary else "no pair is listed"
             raise RecordingError(f"{found}: expected whole pairs of sweeps; {first}. Download what is missing.")
         self._heights: dict[tuple[str, bool], float] = {}
         self._poses: dict[tuple[Path, ...], Transform] = {}
 
-    @property
-    def scenarios(self) -> tuple[str, ...]:
-        """The names of all drives that have a usable pair, numbers in their order."""
-        return tuple(self._index.pairs)
-
     def length(self, scenario: str) -> int:
         """How many pairs the drive has."""
         return len(self._pairs(scenario))
-
-    def eval_indices(self, scenario: str) -> range:
-        """All indices of the drive."""
-        return range(self.length(scenario))
 
     def agents(self, scenario: str) -> tuple[int, ...]:
         """The vehicle and the infrastructure, always 0 and -1."""
         self._pairs(scenario)
         return (VEHICLE_ID, INFRASTRUCTURE_ID)
 
-    @property
-    def unreadable_scenarios(self) -> frozenset[str]:
-        """The names of the drives of which nothing can be read; the empty name stands for frames whose drive is not known."""
-        return frozenset(problem.scenario for problem in self._index.missing_files) - self._index.pairs.keys()
-
-    def verify(
-        self, scenarios: Collection[str] | None = None, progress: Callable[[int, int], None] | None = None
-    ) -> MissingFiles:
-        """Name the files that are missing, or whose content does not belong to their frame.
-
-        Drives of the simulator are compared with their digests; of others a cloud that is a copy of another is mismatched.
-
-        Args:
-            scenarios: names of the drives to verify; None for all.
-            progress: called with the number of drives that are verified, and of all.
-        """
-        names = [name for name in self.scenarios if scenarios is None or name in scenarios]
-        found = [p for p in self._index.missing_files if scenarios is None or p.scenario in scenarios]
-        for count, name in enumerate(names, 1):
-            found += self._verify_contents(name)
-            if progress is not None:
-                progress(count, len(names))
-        return MissingFiles.of(found)
-
-    def _verify_contents(self, name: str) -> list[FileProblem]:
-        pairs = self._index.pairs[name]
-        number = f"{int(name):06d}.json" if name.isdecimal() else ""
+    def verify_contents(self, scenario: str) -> list[FileProblem]:
+        """Compare a drive of the simulator with its digests; of others find the clouds that are copies of another."""
+        pairs = self._index.pairs[scenario]
+        number = f"{int(scenario):06d}.json" if scenario.isdecimal() else ""
         digests = Digests.read(self.root / BATCHES / number) if number else None
-        whole = not any(problem.scenario == name for problem in self._index.missing_files)
+        whole = not any(problem.scenario == scenario for problem in self.missing_files)
         if digests is not None and (digests.by_path is not None or whole):
             files = sorted(path for pair in pairs for path in list_pair_files(self.root, pair.vehicle.id))
-            return digests.check(self.root, name, files, f"{BATCHES}/{number}")
+            return digests.check(self.root, scenario, files, f"{BATCHES}/{number}")
         clouds = {path: None for pair in pairs for path in (pair.vehicle.cloud, pair.infrastructure.cloud)}
-        return find_copied_files(clouds, name)
+        return find_copied_files(clouds, scenario)
 
     def pair(self, scenario: str, index: int) -> DairPair:
         """Which files a snapshot comes from."""
@@ -174,7 +142,7 @@ class DairRecording:
         pair = self.pair(scenario, index)
         poses = self.lidar_poses(pair)
         reported_poses = poses
-        if self._native_pose_error and pair.offset is not None:
+        if self._options.native_pose_error and pair.offset is not None:
             reported_poses = (poses[0], self._uncorrected(pair))
         sides = (pair.vehicle, pair.infrastructure)
         heights = [self._height(scenario, side, pole) for side, pole in zip(sides, (False, True))]
@@ -279,10 +247,12 @@ class DairRecording:
         self, pair: DairPair, poses: tuple[Transform, Transform], world_from_agent: Transform
     ) -> GroundTruth | None:
         have_sides = pair.vehicle.label.is_file() and pair.infrastructure.label.is_file()
-        if (self._labels == "cooperative" and pair.label is None) or (self._labels == "sides" and not have_sides):
+        if (self._options.labels == "cooperative" and pair.label is None) or (
+            self._options.labels == "sides" and not have_sides
+        ):
             return None
         listed = self._listed(pair, poses) if have_sides else (Boxes.empty(torch.float64), Boxes.empty(torch.float64))
-        if self._labels == "sides":
+        if self._options.labels == "sides":
             boxes = _union(*listed)
         elif pair.offset_in_world and pair.label is not None:
             boxes = read_world_labels(pair.label)

@@ -11,19 +11,19 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from manyeyes.datasets.base import require_index
+from manyeyes.datasets.base import RecordingReader, require_index
 from manyeyes.datasets.formats.cache import ArrayCache, default_cache_folder
 from manyeyes.datasets.formats.pcd import PcdCloud, read_pcd
 from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, estimate_sensor_height
 from manyeyes.datasets.manifest import SCENARIO, Digests, list_scenario_files
 from manyeyes.datasets.mismatch import find_mismatched_files
-from manyeyes.datasets.missing import FileProblem, MissingFiles
+from manyeyes.datasets.missing import FileProblem
 from manyeyes.datasets.opv2v.camera import (
     read_images,
 )
@@ -38,9 +38,11 @@ from manyeyes.datasets.opv2v.scan import (
     AgentFiles,
     ScenarioFiles,
     compare_with_manifest,
+    contains_scenarios,
     find_scenario_folders,
     scan_scenario,
 )
+from manyeyes.datasets.registry import register_dataset
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 _AGENT = re.compile(r"-?\d+")
@@ -48,7 +50,12 @@ _KMH = 3.6
 _MAX_CACHED_RECORDS = 20_000
 
 
-class Opv2vRecording:
+@register_dataset(
+    "opv2v",
+    matches=contains_scenarios,
+    layout="folders <scenario>/<agent>/<stem>.pcd and .yaml, agents named by numbers",
+)
+class Opv2vRecording(RecordingReader):
     """Scenarios of OPV2V's layout under a root: a dataset (name the split), a folder of scenarios, or one scenario.
 
     The ego is the first agent by string order, infrastructure comes last, and the ego's frames are the snapshots; an
@@ -60,6 +67,8 @@ class Opv2vRecording:
     stems. A stem that any agent has is hence expected of all, the ego included; ``verify`` names each file that is absent,
     and each whose content does not belong to its frame.
     """
+
+    reads_images = True
 
     def __init__(
         self,
@@ -84,8 +93,9 @@ class Opv2vRecording:
         self._scenarios = {s.folder.name: s for s in found if s is not None}
         if folders[0] not in (self.root, self.root / str(split)):  # one scenario may be opened by itself
             compare_with_manifest(folders, problems, missing)
+        self.scenarios = tuple(self._scenarios)
         self.missing_summary = tuple(problems)
-        self._missing = tuple(missing)
+        self.missing_files = tuple(missing)
         if not self._scenarios or (strict and problems):
             more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
             first = f"{problems[0]}{more}" if problems else "it is empty"
@@ -93,11 +103,6 @@ class Opv2vRecording:
         self._records: dict[Path, AgentRecord] = {}
         self._protocols: dict[str, DataProtocol] = {}
         self._heights: dict[Path, float] = {}
-
-    @property
-    def scenarios(self) -> tuple[str, ...]:
-        """The names of all scenarios, sorted."""
-        return tuple(self._scenarios)
 
     def length(self, scenario: str) -> int:
         """How many snapshots the scenario has."""
@@ -110,31 +115,6 @@ class Opv2vRecording:
     def agents(self, scenario: str) -> tuple[int, ...]:
         """The ids of all agents of the scenario, the ego first and infrastructure last."""
         return tuple(agent.id for agent in self._scenario(scenario).agents)
-
-    @property
-    def unreadable_scenarios(self) -> frozenset[str]:
-        """The names of the scenarios of which nothing can be read."""
-        return frozenset(problem.scenario for problem in self._missing) - self._scenarios.keys()
-
-    def verify(
-        self, scenarios: Collection[str] | None = None, progress: Callable[[int, int], None] | None = None
-    ) -> MissingFiles:
-        """Name the files that are missing, or whose content does not belong to their frame.
-
-        Scenarios of the simulator are compared with their digests, others by ``find_mismatched_files``. The verdict on a scenario
-        is kept in the cache while its files stay as they are.
-
-        Args:
-            scenarios: names of the scenarios to verify; None for all.
-            progress: called with the number of scenarios that are verified, and of all.
-        """
-        names = [name for name in self.scenarios if scenarios is None or name in scenarios]
-        found = [problem for problem in self._missing if scenarios is None or problem.scenario in scenarios]
-        for count, name in enumerate(names, 1):
-            found += self._verify_contents(name)
-            if progress is not None:
-                progress(count, len(names))
-        return MissingFiles.of(found)
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         """All agents that have this frame; the truth is the union of what they list, in the order of ids."""
@@ -159,9 +139,9 @@ class Opv2vRecording:
             raise RecordingError(f"Agent {agent_id} has no frame {index} of '{scenario}'; choose one of {ids}.")
         return self._frame(scenario, found[0], stem, self._with_images)
 
-    def _verify_contents(self, name: str) -> list[FileProblem]:
+    def verify_contents(self, scenario: str) -> list[FileProblem]:
         """Compare the contents of a scenario's files, unless the cache has them as sound."""
-        folder = self._scenarios[name].folder
+        folder = self._scenarios[scenario].folder
         files = list_scenario_files(folder)
         kind = f"sound1{'-pictures' if self._with_images else ''}"
         state = _state(files, folder)
@@ -169,14 +149,16 @@ class Opv2vRecording:
         if kept is not None and np.array_equal(kept, state):
             return []
         digests, found = Digests.read(folder / SCENARIO), []
-        if digests is not None and digests.by_path is None and any(p.scenario == name for p in self._missing):
+        if digests is not None and digests.by_path is None and any(p.scenario == scenario for p in self.missing_files):
             digests = None  # a total digest cannot check files if some are absent
         if digests is not None:
             suffixes = (".pcd", ".yaml", *((".png",) if self._with_images else ()))
-            found = digests.check(folder, name, files, used=lambda path: path.endswith(suffixes))
+            found = digests.check(folder, scenario, files, used=lambda path: path.endswith(suffixes))
         if digests is None or (found and digests.by_path is None):
             found = (
-                find_mismatched_files(lambda index: self._snapshot(name, index, False), name, self._clouds(name))
+                find_mismatched_files(
+                    lambda index: self._snapshot(scenario, index, False), scenario, self._clouds(scenario)
+                )
                 or found
             )
         if self._cache is not None and not found:

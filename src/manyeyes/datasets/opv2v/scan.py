@@ -52,6 +52,18 @@ def _is_scenario(folder: Path) -> bool:
     return any(_AGENT.fullmatch(p.name) and not _is_scenario(p) for p in _subfolders(folder))
 
 
+def contains_scenarios(path: Path) -> bool:
+    """Whether a folder is a scenario, holds some, or holds splits with some, by names alone."""
+    if not path.is_dir():
+        return False
+    inside = _subfolders(path)
+    return (
+        _is_scenario(path)
+        or any(map(_is_scenario, inside))
+        or any(_is_scenario(q) for p in inside for q in _subfolders(p))
+    )
+
+
 def has_frames(folder: Path) -> bool:
     """Whether a folder has agents with clouds or metadata, that is, whether it is a scenario with anything in it."""
     agents = [p for p in _subfolders(folder) if _AGENT.fullmatch(p.name)]

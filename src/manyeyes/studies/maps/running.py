@@ -13,8 +13,8 @@ from rich.console import Console
 
 from manyeyes._io import atomic_write_text
 from manyeyes.datasets.base import Recording
-from manyeyes.datasets.dair_v2x.index import find_dair_root
 from manyeyes.datasets.missing import MissingFiles
+from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.maps.pooled_ap import MapMarginTest
 from manyeyes.evaluation.maps.tile_cells import RecordingSource, TilePredictor, TileStudyResult, run_tile_study
@@ -24,7 +24,7 @@ from manyeyes.models import pretrained
 from manyeyes.studies import provenance
 from manyeyes.studies.map_recordings import has_images, load_true_maps, open_sensor_recording
 from manyeyes.studies.maps.fleet import choose_executor
-from manyeyes.studies.recordings import check_files, choose_results_folder, open_recording
+from manyeyes.studies.recordings import check_files, choose_results_folder
 from manyeyes.viz.map_figures import MapPanel, save_figure
 from manyeyes.viz.progress import make_progress_bars
 from manyeyes.viz.study_table import (
@@ -106,9 +106,8 @@ def _select_shipped(options: Options) -> tuple[str, ...]:
     assert options.data is not None
     if not pretrained.list_map_models():
         return ()
-    has_camera = find_dair_root(options.data) is None and has_images(
-        open_recording(options.data, options.split, images=True)
-    )
+    recording = open_recording(options.data, options.split)
+    has_camera = recording.reads_images and has_images(open_recording(options.data, options.split, images=True))
     return tuple(
         name
         for name in pretrained.list_map_models()
