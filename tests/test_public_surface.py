@@ -20,9 +20,10 @@ PACKAGES = [
 NAMES = """
 Agent AgentFrame Argoverse2Recording BenchmarkConfig BevGrid BoxDetector Boxes DairRecording Inbox
 ManyeyesError MapElements Message Observation Opv2vRecording Perception PointCloud PoseEstimate PosePrior
-Recording Snapshot SparseBev TokenDetector Transform VectorMap correct_pose fuse_maps get_strategy
-list_correctors list_detectors list_fusion_modules list_map_fusions list_strategies load_detector
-read_observations register_fusion register_map_fusion register_pose_corrector register_strategy run_benchmark
+Recording RecordingReader Snapshot SparseBev TokenDetector Transform VectorMap correct_pose fuse_maps
+get_strategy list_correctors list_detectors list_fusion_modules list_map_fusions list_strategies load_detector
+open_recording read_observations register_dataset register_fusion register_map_fusion register_pose_corrector
+register_strategy run_benchmark
 """
 
 

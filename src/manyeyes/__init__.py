@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     )
     from manyeyes.comms.inbox import Inbox as Inbox
     from manyeyes.datasets.argoverse2 import Argoverse2Recording as Argoverse2Recording
-    from manyeyes.datasets.base import Recording as Recording
+    from manyeyes.datasets.base import Recording as Recording, RecordingReader as RecordingReader
     from manyeyes.datasets.dair_v2x.reader import DairRecording as DairRecording
     from manyeyes.datasets.opv2v.reader import Opv2vRecording as Opv2vRecording
+    from manyeyes.datasets.registry import open_recording as open_recording, register_dataset as register_dataset
     from manyeyes.datatypes.boxes import Boxes as Boxes
     from manyeyes.datatypes.errors import ManyeyesError as ManyeyesError
     from manyeyes.datatypes.grid import BevGrid as BevGrid
