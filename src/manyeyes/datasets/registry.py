@@ -66,8 +66,7 @@ def open_recording(path: Path | str, split: str | None = None, *, images: bool =
         )
         raise RecordingError(f"{root}: {what} ({layouts}); {remedy}.")
     reader = readers[found[0]]
-    if not images:
-        return reader(root, split)
-    if not reader.reads_images:
+    if images and not reader.reads_images:
         raise ConfigError(f"{root}: the reader of {found[0]} reads no pictures; choose a model of agents with LiDAR.")
-    return reader(root, split, images=True)
+    construct: Callable[..., RecordingReader] = reader
+    return construct(root, split, images=True) if images else construct(root, split)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.numbers import Numbers, as_tensor
 from manyeyes.datatypes.transform import Transform
 
 LABELS = ("car", "van", "truck", "bus")
@@ -38,7 +39,7 @@ class Boxes:
     velocity: Tensor
 
     def __post_init__(self) -> None:
-        n = self.center.shape[0]
+        n = self.center.shape[0] if self.center.ndim else 0
         expected = {"center": (n, 3), "size": (n, 3), "velocity": (n, 2)}
         for field in fields(self):
             shape = tuple(getattr(self, field.name).shape)
@@ -48,27 +49,42 @@ class Boxes:
     @classmethod
     def of(
         cls,
-        center: Tensor,
-        size: Tensor,
-        yaw: Tensor,
-        score: Tensor | None = None,
-        label: Tensor | None = None,
-        id: Tensor | None = None,
-        velocity: Tensor | None = None,
+        center: Numbers,
+        size: Numbers,
+        yaw: Numbers,
+        score: Numbers | None = None,
+        label: Numbers | None = None,
+        id: Numbers | None = None,
+        velocity: Numbers | None = None,
     ) -> Boxes:
-        """Boxes with the rest at its default: score 1, label 0, id -1, no stated uncertainty."""
-        n, zeros = center.shape[0], torch.zeros(center.shape[0], dtype=center.dtype)
+        """Build boxes from tensors, numpy arrays or lists; the rest is score 1, label 0, id -1, velocity 0, no uncertainty.
+
+        Shapes and units are those of the class. Tensors keep their type. Of other input, centers are float32 if they are an array
+        of float32, else float64; labels and ids are int64; everything else is of the type of the centers.
+
+        Raises:
+            ShapeError: a shape does not fit the number of centers, or a value is not a number.
+        """
+        center = as_tensor(center, "Boxes.center", None)
+        n = center.shape[0] if center.ndim else 0
+        zeros, zero_ids = torch.zeros(n, dtype=center.dtype), torch.zeros(n, dtype=torch.int64)
+
+        def column(name: str, value: Numbers | None, default: Tensor) -> Tensor:
+            if value is None or isinstance(value, Tensor):
+                return default if value is None else value
+            return as_tensor(value, f"Boxes.{name}", default.dtype)
+
         return cls(
             center,
-            size,
-            yaw,
-            zeros + 1 if score is None else score,
-            torch.zeros(n, dtype=torch.int64) if label is None else label,
-            torch.full((n,), -1, dtype=torch.int64) if id is None else id,
+            column("size", size, zeros),
+            column("yaw", yaw, zeros),
+            column("score", score, zeros + 1),
+            column("label", label, zero_ids),
+            column("id", id, zero_ids - 1),
             zeros,
             zeros,
             zeros,
-            torch.zeros(n, 2, dtype=center.dtype) if velocity is None else velocity,
+            column("velocity", velocity, torch.zeros(n, 2, dtype=center.dtype)),
         )
 
     @classmethod
@@ -123,9 +139,9 @@ class Boxes:
         x, y = local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c
         return torch.stack((x, y, local[..., 2]), -1) + self.center[:, None, :]
 
-    def contains(self, points: Tensor, margin_m: float = 0.0) -> Tensor:
+    def contains(self, points: Numbers, margin_m: float = 0.0) -> Tensor:
         """(N, P) bool: which of the points (P, 3) lie in each box, enlarged by margin_m on every side."""
-        delta = points[None] - self.center[:, None]
+        delta = as_tensor(points, "Boxes.contains", None)[None] - self.center[:, None]
         c, s = self.yaw.cos()[:, None], self.yaw.sin()[:, None]
         local = torch.stack(
             (delta[..., 0] * c + delta[..., 1] * s, delta[..., 1] * c - delta[..., 0] * s, delta[..., 2]), -1

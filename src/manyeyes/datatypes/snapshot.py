@@ -11,6 +11,7 @@ from torch import Tensor
 from manyeyes.datatypes.boxes import Boxes
 from manyeyes.datatypes.camera import CameraImage
 from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.numbers import Numbers, as_tensor
 from manyeyes.datatypes.point_cloud import PointCloud
 from manyeyes.datatypes.transform import Transform
 
@@ -47,10 +48,32 @@ class AgentFrame:
 
     @classmethod
     def of(
-        cls, points: PointCloud, world_from_agent: Transform, agent_id: int = 0, timestamp_ns: int = 0
+        cls,
+        points: PointCloud | Numbers,
+        world_from_agent: Transform | Numbers,
+        agent_id: int = 0,
+        timestamp_ns: int = 0,
+        pose_covariance: Numbers | None = None,
+        sensor_height_m: float = 1.9,
+        speed_mps: float = 0.0,
     ) -> AgentFrame:
-        """A frame from a cloud and a pose, with zero covariance."""
-        return cls(agent_id, timestamp_ns, points, world_from_agent, torch.zeros(3, 3, dtype=torch.float64))
+        """Build a frame from a cloud or its points (N, 3), and a pose or its matrix (4, 4): tensors, numpy arrays or lists.
+
+        Points become float32, poses and covariances float64; without a covariance it is zero.
+
+        Raises:
+            ShapeError: another shape, NaN or infinite values, or a matrix that is not a rigid motion.
+        """
+        covariance = torch.zeros(3, 3) if pose_covariance is None else pose_covariance
+        return cls(
+            agent_id,
+            timestamp_ns,
+            points if isinstance(points, PointCloud) else PointCloud.of(points),
+            world_from_agent if isinstance(world_from_agent, Transform) else Transform.from_matrix(world_from_agent),
+            as_tensor(covariance, "AgentFrame.pose_covariance", torch.float64),
+            sensor_height_m,
+            speed_mps,
+        )
 
     def now_from_earlier(self, earlier: AgentFrame) -> Transform:
         """From the agent's own frame of an earlier instant to this one, by its odometry."""
@@ -70,10 +93,25 @@ class GroundTruth:
     seen: Tensor
     world_from_agent: Transform
 
+    @classmethod
+    def of(cls, boxes: Boxes, world_from_agent: Transform | Numbers, seen: Numbers | None = None) -> GroundTruth:
+        """Build ground truth from poses or their matrices (agents, 4, 4): tensors, numpy arrays or lists.
+
+        Without ``seen`` every agent lists every box. Boxes and poses become float64.
+
+        Raises:
+            ShapeError: a shape does not fit, or a matrix is not a rigid motion.
+        """
+        poses = world_from_agent if isinstance(world_from_agent, Transform) else Transform.from_matrix(world_from_agent)
+        listed = torch.ones(*poses.translation.shape[:-1], len(boxes)) if seen is None else seen
+        return cls(boxes.to(torch.float64), as_tensor(listed, "GroundTruth.seen", torch.bool), poses.double())
+
     def __post_init__(self) -> None:
-        agents = self.world_from_agent.translation.shape[0]
-        if self.seen.shape != (agents, len(self.boxes)):
-            raise ShapeError(f"GroundTruth.seen needs ({agents}, {len(self.boxes)}); got {tuple(self.seen.shape)}.")
+        agents = tuple(self.world_from_agent.translation.shape[:-1])
+        if len(agents) != 1:
+            raise ShapeError(f"GroundTruth.world_from_agent needs the batch shape (agents,); got {agents}.")
+        if self.seen.shape != (*agents, len(self.boxes)):
+            raise ShapeError(f"GroundTruth.seen needs ({agents[0]}, {len(self.boxes)}); got {tuple(self.seen.shape)}.")
 
 
 @dataclass(frozen=True)

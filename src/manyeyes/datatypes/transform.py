@@ -98,8 +98,11 @@ class Transform:
         rotation = self.rotation @ other.rotation
         return Transform(rotation.expand(*moved.shape[:-1], 3, 3), moved)
 
-    def apply(self, points: Tensor) -> Tensor:
-        """Points (..., N, 3) in the source frame to the target frame, dtype of the points."""
+    def apply(self, points: Numbers) -> Tensor:
+        """Points (..., N, 3) in the source frame to the target frame, dtype of the points; float64 of lists."""
+        points = as_tensor(points, "Transform.apply", None)
+        if points.shape[-1:] != (3,):
+            raise ShapeError(f"Transform.apply needs points (..., N, 3); got {tuple(points.shape)}.")
         rotation, translation = self.rotation.to(points.dtype), self.translation.to(points.dtype)
         return points @ rotation.mT + translation[..., None, :]
 
