@@ -13,6 +13,7 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, MapElements, Polygons
 from manyeyes.maps.baselines import (
     chamfer_nms,
+    crowdmap_graph,
     crowdmap_literal,
     frechet_clustering,
     global_map_builder,
@@ -44,7 +45,16 @@ def lines_in(made: VectorMap, kind: int = DIVIDER) -> list[np.ndarray]:
     return [made.elements.polyline(i) for i in np.flatnonzero(made.elements.kind == kind).tolist()]
 
 
-BASELINES = [union, chamfer_nms, crowdmap_literal, polymerge, frechet_clustering, heatmap_buffer, global_map_builder]
+BASELINES = [
+    union,
+    chamfer_nms,
+    crowdmap_graph,
+    crowdmap_literal,
+    polymerge,
+    frechet_clustering,
+    heatmap_buffer,
+    global_map_builder,
+]
 
 
 @pytest.mark.parametrize("baseline", BASELINES, ids=lambda r: r.__name__.split(".")[-1])
@@ -166,6 +176,33 @@ def test_the_literal_pipeline_keeps_the_most_confident_or_takes_the_mean_after_r
     mean = crowdmap_literal.fuse(many, crowdmap_literal.CrowdMapLiteralConfig(merge="mean"))
     # Registered onto it, the others lie on the anchor: the mean is the anchor, not the middle of the offsets.
     assert np.abs(mean.elements.polyline(0)[:, 1]).max() < 0.05 and len(mean.elements.polyline(0)) == 50
+
+
+def test_crowdmap_graph_keeps_the_covering_line_then_the_surer_and_separates_lines_of_one_observation() -> None:
+    short = make_observation(0, [line(0.0, 0, 20)], score=0.8)
+    long = make_observation(1, [line(0.2)], score=0.6)
+    # Half of the long line is not most of it, so the long one takes the short one's place.
+    made = crowdmap_graph.fuse([short, long])
+    assert [(p[0].tolist(), p[-1].tolist()) for p in lines_in(made)] == [([0.0, 0.2], [40.0, 0.2])]
+    assert made.sources_of(0) == sorted([short.id, long.id])
+    # Both lines of one observation overlap it, 1.1 m apart: the surer one joins, the other is a line of its own.
+    for score, kept in ((0.5, 0.2), (0.9, 0.3)):
+        two = make_observation(2, [line(0.3), line(-0.8)], score=[score, 0.4])
+        made = crowdmap_graph.fuse([short, long, two])
+        ordinates = [float(p[0, 1]) for p in lines_in(made)]
+        assert sorted(ordinates) == [-0.8, kept]
+        assert sorted(made.supporters.tolist()) == [1, 3]
+
+
+def test_crowdmap_graph_registers_the_common_interval_before_it_merges() -> None:
+    straight, other = make_observation(0, [line(0.0)]), make_observation(1, [line(0.9)])
+    bent = make_observation(1, [[[float(x), 1.0 - abs(x - 20) / 10] for x in range(0, 41, 2)]])
+    assert len(lines_in(crowdmap_graph.fuse([straight, other]))) == 1, "0.9 m aside: registration removes it"
+    config = crowdmap_graph.CrowdMapGraphConfig(max_registered_chamfer_m=0.3)
+    assert len(lines_in(crowdmap_graph.fuse([straight, bent]))) == 1
+    assert len(lines_in(crowdmap_graph.fuse([straight, bent], config))) == 2, "no motion makes a bent line straight"
+    opposite = make_observation(1, [line(0.9, 40.0, 0.0)])
+    assert len(lines_in(crowdmap_graph.fuse([straight, opposite], config))) == 1
 
 
 def test_the_literal_pipeline_has_no_edge_between_a_line_and_its_part() -> None:

@@ -201,6 +201,27 @@ def test_gdal_reads_the_vector_tiles_back(two_lanes, tmp_path):
     assert shapely.hausdorff_distance(divider, shapely.LineString(m.elements.polyline(1))) < 0.2
 
 
+def test_the_graph_has_elements_as_nodes_and_their_relations_as_edges(tmp_path):
+    # Two dividers that continue each other 2 m apart, and a boundary 3.5 m to their left.
+    lines = [[[0.0, 0.0], [20.0, 0.0]], [[22.0, 0.0], [40.0, 0.0]], [[0.0, 3.5], [40.0, 3.5]]]
+    m = VectorMap.of(MapElements.of(lines, [0, 0, 1]), MapFrame(49.0, 8.0), log_odds=np.array([0.0, 2.0, -2.0]))
+    export_map(m, tmp_path / "graph.npz")
+    with np.load(tmp_path / "graph.npz") as graph:
+        relation = graph["relation_names"][graph["relation"]].tolist()
+        assert list(zip(map(tuple, graph["edge"].tolist()), relation)) == [
+            ((0, 1), "continues"),
+            ((0, 2), "parallel"),
+            ((1, 2), "parallel"),
+        ]
+        assert graph["gap"][0] == 2.0 and graph["ends"].tolist() == [[1, 0], [-1, -1], [-1, -1]]
+        np.testing.assert_allclose(graph["lateral"][1:], 3.5)
+        np.testing.assert_allclose(graph["interval"][1:], [[0, 20, 0, 20], [0, 18, 22, 40]], atol=1e-9)
+        np.testing.assert_allclose(graph["existence_prob"], [0.5, 0.880797, 0.119203])
+        assert graph["offsets"].tolist() == [0, 2, 4, 6] and graph["points"].shape == (6, 2)
+        assert graph["kind_names"][graph["kind"]].tolist() == ["divider", "divider", "boundary"]
+        assert graph["origin"].tolist() == [49.0, 8.0] and graph["id"].tolist() == to_hex_ids(m.id)
+
+
 def test_unknown_format_or_ambiguous_suffix_lists_known_formats(two_lanes, tmp_path):
     with pytest.raises(ConfigError, match=", ".join(FORMATS)):
         export_map(two_lanes(), tmp_path / "m.osm", "kml")

@@ -10,10 +10,7 @@ import pytest
 
 from manyeyes.datatypes import ConfigError, ShapeError
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.maps.elements.observation import Observation
-from manyeyes.maps.fusion.graph import GraphConfig, build_element_graph, build_observation_graph
-
-VIEW = np.array([[-10.0, -20.0], [60.0, -20.0], [60.0, 20.0], [-10.0, 20.0]])
+from manyeyes.maps.fusion.graph import GraphConfig, build_element_graph
 
 
 def line(y: float, x0: float = 0.0, x1: float = 40.0) -> list[list[float]]:
@@ -94,22 +91,15 @@ def test_rings_on_each_other_overlap() -> None:
 
 
 def test_separate_elements_of_one_observation_cannot_link() -> None:
-    def make_observation(k: int, lines: list) -> Observation:
-        elements = MapElements.of(lines, DIVIDER)
-        return Observation(f"car-{k}", "p", k, np.zeros(3), np.eye(3) * 0.1, VIEW, elements)
-
-    first, second = make_observation(0, [line(0.0), line(1.1)]), make_observation(1, [line(0.1), line(0.3, 0, 20)])
-    graph = build_observation_graph([second, first], MapElements.of([line(0.05)], DIVIDER))
-    assert graph.observation.tolist() == [-1, 0, 0, 1, 1]
+    lines = [line(0.05), line(0.0), line(1.1), line(0.1), line(0.3, 0, 20)]
+    graph = build_element_graph(MapElements.of(lines, DIVIDER), [-1, 0, 0, 1, 1])
     assert graph.select_relation("same_observation").edge.tolist() == [[1, 2], [3, 4]]
     assert graph.edge[graph.cannot_link].tolist() == [[1, 2]]
-    again = build_observation_graph([first, second, first], MapElements.of([line(0.05)], DIVIDER))
-    assert np.array_equal(again.edge, graph.edge) and np.array_equal(again.interval, graph.interval, equal_nan=True)
 
 
 def test_no_elements_no_edges_and_an_unknown_relation_is_named() -> None:
     graph = build_element_graph(MapElements.empty())
-    assert len(graph) == 0 and len(build_observation_graph([])) == 0
+    assert len(graph) == 0
     with pytest.raises(ConfigError, match="overlap, continues, parallel"):
         graph.select_relation("beside")
     with pytest.raises(ShapeError, match="two points"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a map for others: GeoJSON, GeoPackage, GeoParquet, Lanelet2, Argoverse 2, nuScenes, PMTiles."""
+"""Writes a map for others: GeoJSON, GeoPackage, GeoParquet, Lanelet2, Argoverse 2, nuScenes, PMTiles, or its graph."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Options:
     folder: tyro.conf.Positional[Path]
     """The map's folder, of 'map fuse'."""
     file: tyro.conf.Positional[Path]
-    """The file; .geojson, .gpkg, .parquet, .osm and .pmtiles name their format, .json needs --format."""
+    """The file; .geojson, .gpkg, .parquet, .osm, .pmtiles and .npz name their format, .json needs --format."""
     format: str | None = None
-    """geojson, geopackage, geoparquet, lanelet2, argoverse2, nuscenes or pmtiles, where the file's ending does not say it."""
+    """geojson, geopackage, geoparquet, lanelet2, argoverse2, nuscenes, pmtiles or graph, where the ending does not say it."""
     simplify_m: NonNegativeFloat = 0.05
     """Lines may leave their stations by so much, metres; 0 writes every station."""
     include_unpublished: bool = False

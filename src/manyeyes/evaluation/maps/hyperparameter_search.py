@@ -56,6 +56,12 @@ SEARCH_SPACE: dict[str, SearchSpace] = {
         "cpd.outlier_fraction": (0.0, 0.1, 0.3),
         **_RULES,
     },
+    "crowdmap-graph": {
+        "graph.max_overlap_offset_m": _DISTANCES_M,
+        "min_overlap_fraction": (0.4, 0.6, 0.8),
+        "max_registered_chamfer_m": _DISTANCES_M,
+        **_RULES,
+    },
     "polymerge": {"max_vertex_distance_m": _DISTANCES_M, "min_fraction": (0.3, 0.5), **_RULES},
     "frechet-clustering": {
         "max_frechet_m": (1.0, 1.5, 1.75, 2.0, 3.0),

@@ -9,6 +9,7 @@ from pathlib import Path
 from manyeyes.datatypes import ConfigError
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.argoverse2_writer import write_argoverse2
+from manyeyes.maps.formats.element_graph import write_element_graph
 from manyeyes.maps.formats.geojson import write_geojson
 from manyeyes.maps.formats.geopackage import write_geopackage
 from manyeyes.maps.formats.geoparquet import write_geoparquet
@@ -27,6 +28,7 @@ _WRITERS: dict[str, tuple[str, Writer]] = {
     "argoverse2": (".json", write_argoverse2),
     "nuscenes": (".json", write_nuscenes),
     "pmtiles": (".pmtiles", write_pmtiles),
+    "graph": (".npz", write_element_graph),
 }
 #: Names of all formats, as the command line takes them.
 FORMATS: tuple[str, ...] = tuple(_WRITERS)

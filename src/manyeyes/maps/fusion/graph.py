@@ -16,7 +16,6 @@ same_observation: from one observation; if such elements face each other apart, 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -26,7 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
 from manyeyes.datatypes import ConfigError, ShapeError
 from manyeyes.datatypes.map_element import MapElements, freeze
-from manyeyes.maps.elements.observation import Observation
 from manyeyes.ops.polyline import close_rings, find_near_pairs, headings, resample_spaced
 
 Floats = NDArray[np.float64]
@@ -113,16 +111,6 @@ class ElementGraph:
     def cannot_link(self) -> NDArray[np.bool_]:
         """(E,) pairs of one observation that face each other farther apart than one thing is wide."""
         return (self.relation == SAME_OBSERVATION) & (np.abs(self.lateral) > self.min_separation_m)
-
-
-def build_observation_graph(
-    observations: Sequence[Observation], map_elements: MapElements | None = None, config: GraphConfig = GraphConfig()
-) -> ElementGraph:
-    """The graph of all elements of observations at their claimed poses, ordered by time and id, after those of a map."""
-    chosen = sorted({o.id: o for o in observations}.values(), key=lambda o: (o.time_ns, o.id))
-    sets = [map_elements or MapElements.empty(), *(o.elements_in_map() for o in chosen)]
-    owner = np.repeat(np.arange(-1, len(chosen)), [len(s) for s in sets])
-    return build_element_graph(MapElements.cat(sets), owner, config)
 
 
 def build_element_graph(
