@@ -41,10 +41,9 @@ class Recording(Protocol):
 
 
 class RecordingReader(ABC):
-    """Base of readers: a :class:`Recording` with what commands ask of it. A reader has ``scenarios``, ``length`` and ``snapshot``.
+    """Base of readers: a :class:`Recording` with what commands ask of it; all but three methods have defaults.
 
-    A reader is constructed with the folder and the name of a split or None, and registered by
-    :func:`manyeyes.datasets.registry.register_dataset`; commands then open its recordings.
+    :func:`manyeyes.datasets.registry.register_dataset` registers a reader; commands then open its recordings.
     """
 
     scenarios: tuple[str, ...]
@@ -62,6 +61,10 @@ class RecordingReader(ABC):
     """What was missing when the recording was opened; one line for each kind of thing."""
     missing_files: tuple[FileProblem, ...] = ()
     """The files that were missing when the recording was opened."""
+
+    @abstractmethod
+    def __init__(self, root: Path | str, split: str | None = None, *, images: bool = False) -> None:
+        """Open a folder and set ``scenarios``; a reader that reads no images does not take them."""
 
     @abstractmethod
     def length(self, scenario: str) -> int:

@@ -68,5 +68,4 @@ def open_recording(path: Path | str, split: str | None = None, *, images: bool =
     reader = readers[found[0]]
     if images and not reader.reads_images:
         raise ConfigError(f"{root}: the reader of {found[0]} reads no pictures; choose a model of agents with LiDAR.")
-    construct: Callable[..., RecordingReader] = reader
-    return construct(root, split, images=True) if images else construct(root, split)
+    return reader(root, split, images=True) if images else reader(root, split)
