@@ -1,14 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OPV2V and V2XSet: reader and writer."""
+"""OPV2V and V2XSet: reader and writer. Importing the package registers the reader, so its names are imported at once."""
 
-from __future__ import annotations
+from manyeyes.datasets.opv2v.reader import Opv2vRecording
+from manyeyes.datasets.opv2v.writer import Opv2vWriter
 
-from typing import TYPE_CHECKING
-
-from manyeyes._lazy import attach
-
-if TYPE_CHECKING:
-    from manyeyes.datasets.opv2v.reader import Opv2vRecording as Opv2vRecording
-    from manyeyes.datasets.opv2v.writer import Opv2vWriter as Opv2vWriter
-
-__getattr__, __dir__ = attach(__name__)
+__all__ = ["Opv2vRecording", "Opv2vWriter"]
