@@ -29,7 +29,7 @@ def source_digest(*modules: str, package: Path = PACKAGE) -> str:
     """
     digest = hashlib.blake2b(digest_size=8)
     for file in import_closure(*modules, package=package):
-        digest.update(file.relative_to(package).as_posix().encode() + _parsed(file.read_text(encoding="utf-8")).digest)
+        digest.update(file.relative_to(package).as_posix().encode() + _parse(file.read_text(encoding="utf-8")).digest)
     return digest.hexdigest()
 
 
@@ -41,7 +41,7 @@ def import_closure(*modules: str, package: Path = PACKAGE) -> list[Path]:
         file = left.pop()
         if file not in found:
             found.add(file)
-            names = _parsed(file.read_text(encoding="utf-8")).imports
+            names = _parse(file.read_text(encoding="utf-8")).imports
             left += [other for name in names for other in _files_of(name, package)]
     return sorted(found)
 
@@ -57,7 +57,7 @@ class _Parsed:
 
 
 @lru_cache(maxsize=1024)
-def _parsed(text: str) -> _Parsed:
+def _parse(text: str) -> _Parsed:
     return _Parsed(text)
 
 
@@ -90,7 +90,7 @@ def _imports(node: ast.AST) -> Iterator[str]:
 
 
 def _public_names(init: Path) -> dict[str, Definition]:
-    return _parsed(init.read_text(encoding="utf-8")).public_names
+    return _parse(init.read_text(encoding="utf-8")).public_names
 
 
 def _files_of(name: str, package: Path, required: bool = False) -> list[Path]:

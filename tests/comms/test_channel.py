@@ -110,7 +110,7 @@ def test_losses_are_paired_across_levels(seed, count, one, other, burst):
 @pytest.mark.parametrize(("loss", "burst"), [(0.1, 3.0), (0.3, 3.0), (0.2, 1.0), (0.6, 5.0)])
 def test_long_run_loss_and_burst_length(loss, burst):
     channel = Channel(replace(LOSSY, mean_burst_packets=burst).with_loss(loss), seed=3)
-    lost = np.concatenate([channel._lost(1, 2, t, 200, loss) for t in range(200)])
+    lost = np.concatenate([channel._draw_losses(1, 2, t, 200, loss) for t in range(200)])
     assert lost.mean() == pytest.approx(loss, abs=0.02)
     runs = np.diff(np.flatnonzero(np.diff(np.concatenate(([0], lost.astype(int), [0])))))[::2]
     assert runs.mean() == pytest.approx(max(burst, 1 / (1 - loss)), rel=0.1)

@@ -111,7 +111,7 @@ def test_feaco_rejects_by_the_median_deviation_and_accepts_one_pair():
     # Costs 1, 1.125, 0.875, 1, 4: the median is 1, the median deviation 0.125; the last goes.
     ego = layout(yaw=np.zeros(5))
     shift = np.array([1.0, 1.125, 0.875, 1.0, 4.0])[:, None] * [1.0, 0.0]
-    pairs = feaco._assigned(ego.xy, ego.xy + shift, feaco.FeacoConfig())
+    pairs = feaco._assign(ego.xy, ego.xy + shift, feaco.FeacoConfig())
     assert set(pairs[:, 0]) == {0, 1, 2, 3}
     one = ego[np.array([1])]
     found = feaco.correct(one, one.transform(np.array([-2.0, 1.0, 0.0])), ORIGIN)

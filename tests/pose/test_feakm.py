@@ -141,7 +141,7 @@ def test_two_poses_that_fit_equally_are_ambiguous():
 
 def test_at_most_max_refined_hypotheses_are_refined(monkeypatch):
     ego, other, calls = make_landmarks(40), make_landmarks(40, seed=7), []
-    monkeypatch.setattr(feakm, "_refined", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr(feakm, "_refine", lambda *arguments: calls.append(arguments))
     for max_refined in (2, 4):
         calls.clear()
         assert (

@@ -270,7 +270,7 @@ class Channel:
         for (sender, sent_ns), items in messages.items():
             count = 1 + max(item.number for item in items)
             distance = math.dist(items[0].transmission.position_xy, receiver_xy)
-            lost = self._lost(sender, receiver_id, sent_ns, count, self.preset.loss(distance))
+            lost = self._draw_losses(sender, receiver_id, sent_ns, count, self.preset.loss(distance))
             latency_ns = self._latency_ns(sender, receiver_id, sent_ns, count)
             for item in items:
                 if not lost[item.number]:
@@ -279,7 +279,7 @@ class Channel:
                     got.append((arrival, sender, item.number, delivery))
         return tuple(delivery for *_, delivery in sorted(got, key=lambda row: row[:3]))
 
-    def _lost(self, sender: int, receiver: int, sent_ns: int, count: int, loss: float) -> NDArray[np.bool_]:
+    def _draw_losses(self, sender: int, receiver: int, sent_ns: int, count: int, loss: float) -> NDArray[np.bool_]:
         """(count,) which packets of a message are lost: a chain of good and bad spells with that stationary loss.
 
         P(bad after bad) = 1 - 1/B and P(bad after good) = loss / (B (1 - loss)), B the mean burst, at least

@@ -58,13 +58,13 @@ def pillar_maxima(
     """
     clouds, (rows, columns) = [*now, *before], grid.shape
     limits = _Limits(grid.x_min, grid.y_min, grid.z_min, grid.z_max)
-    xyz, bright = (_joined(part).numpy() for part in zip(*((cloud.xyz, cloud.intensity) for cloud in clouds)))
+    xyz, bright = (_concatenate(part).numpy() for part in zip(*((cloud.xyz, cloud.intensity) for cloud in clouds)))
     key, end = np.empty(len(xyz), np.int32), 0
     for agent, cloud in zip((*range(len(now)), *range(len(before))), clouds):
         start, end = end, end + len(cloud)
         part, first = key[start:end], agent * rows * columns
         _point_keys(xyz[start:end].reshape(-1), limits, grid.pillar, float(rows), float(columns), first, part)
-    found, rank = _occupied(key, len(now) * rows * columns)
+    found, rank = _find_occupied(key, len(now) * rows * columns)
     middle = _middles(found, rows, columns, limits, grid.pillar)
     # Within a pillar only five of the eleven inputs differ from point to point.
     place, light, to_mean, to_middle, age = weight.split((3, 1, 3, 3, 1), 1)
@@ -75,7 +75,7 @@ def pillar_maxima(
     return SparseBev(torch.from_numpy(out), Sites(torch.from_numpy(found), grid, len(now)))
 
 
-def _joined(parts: Sequence[Tensor]) -> Tensor:
+def _concatenate(parts: Sequence[Tensor]) -> Tensor:
     """All rows as one tensor without gaps; a single part is not copied."""
     return (parts[0] if len(parts) == 1 else torch.cat(list(parts))).contiguous()
 
@@ -99,7 +99,7 @@ def _point_keys(
 
 
 @njit(cache=True, nogil=True)
-def _occupied(key: I32x1, size: int) -> tuple[I64x1, I32x1]:  # pragma: no cover
+def _find_occupied(key: I32x1, size: int) -> tuple[I64x1, I32x1]:  # pragma: no cover
     """Ascending distinct keys of key (P,) from 0 on, and the number (size,) of each among them."""
     marks = np.zeros(size // 8 * 8 + 8, np.uint8)
     for k in key:

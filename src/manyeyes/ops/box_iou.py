@@ -22,7 +22,7 @@ def pairwise_iou(a: Tensor, b: Tensor) -> Tensor:
 
     Differentiable in both; zero where a box is degenerate or not finite. Matching is done in float64 by its callers.
     """
-    a, b = _checked(a), _checked(b)
+    a, b = _check_boxes(a), _check_boxes(b)
     with torch.no_grad():
         row, column = near_pairs(a, b).nonzero(as_tuple=True)
     overlap = _iou(a[row], b[column])
@@ -31,7 +31,7 @@ def pairwise_iou(a: Tensor, b: Tensor) -> Tensor:
 
 def aligned_iou(a: Tensor, b: Tensor) -> Tensor:
     """Rotated bird's-eye IoU (N,) of box i of a (N, 5) with box i of b (N, 5); differentiable, for a loss."""
-    a, b = _checked(a), _checked(b)
+    a, b = _check_boxes(a), _check_boxes(b)
     if a.shape != b.shape:
         raise ShapeError(f"aligned_iou needs as many boxes on both sides; got {a.shape[0]} and {b.shape[0]}.")
     with torch.no_grad():
@@ -48,7 +48,7 @@ def near_pairs(a: Tensor, b: Tensor) -> Tensor:
     return close & _solid(a)[:, None] & _solid(b)[None]
 
 
-def _checked(boxes: Tensor) -> Tensor:
+def _check_boxes(boxes: Tensor) -> Tensor:
     if boxes.ndim != 2 or boxes.shape[1] != 5 or not boxes.is_floating_point():
         raise ShapeError(f"Boxes for an IoU are floats (N, 5): x, y, length, width, yaw; got {tuple(boxes.shape)}.")
     return boxes

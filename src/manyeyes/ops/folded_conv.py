@@ -74,7 +74,9 @@ class NormedConv:
         """(N, C) to (M, D)."""
         rows, weight, scale, shift = (t.numpy() for t in (x.contiguous(), self.weight, self.scale, self.shift))
         norm = _RowNorm(scale, shift, self.eps, self.is_skipped)
-        return torch.from_numpy(_normed(rows, weight, norm, table.pairs, table.is_symmetric, table.n_out))
+        return torch.from_numpy(
+            _convolve_and_normalize(rows, weight, norm, table.pairs, table.is_symmetric, table.n_out)
+        )
 
 
 def is_supported(x: Tensor) -> bool:
@@ -96,7 +98,7 @@ def _layers(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "nnan", "reassoc"})
-def _normed(
+def _convolve_and_normalize(
     x: F32x2, weight: F32x4, norm: _RowNorm, pairs: Pairs, is_symmetric: bool, rows: int
 ) -> F32x2:  # pragma: no cover
     scale, shift, eps, is_skipped = norm

@@ -27,12 +27,12 @@ def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, max_candidat
             f"rotated_nms needs boxes (N, 5) and score (N,); got {tuple(boxes.shape)}, {tuple(score.shape)}."
         )
     order = score.argsort(descending=True, stable=True)[:max_candidates]
-    standing = _standing(np.ascontiguousarray(boxes[order].double().cpu().numpy()), float(iou_threshold))
+    standing = _find_kept(np.ascontiguousarray(boxes[order].double().cpu().numpy()), float(iou_threshold))
     return order[torch.from_numpy(standing).to(order.device)]
 
 
 @njit(cache=True, nogil=True)
-def _standing(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
+def _find_kept(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
     """Which of boxes (N, 5), best first, no better one that stands overlaps by more than the threshold."""
     n = boxes.shape[0]
     standing = np.ones(n, np.bool_)
@@ -51,7 +51,7 @@ def _standing(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
             dx, dy, reach = boxes[j, 0] - boxes[i, 0], boxes[j, 1] - boxes[i, 1], radius[i] + radius[j]
             if dx * dx + dy * dy > reach * reach:
                 continue
-            shared = _shared_area(boxes[i], boxes[j], ring, clipped)
+            shared = _compute_shared_area(boxes[i], boxes[j], ring, clipped)
             union = boxes[i, 2] * boxes[i, 3] + boxes[j, 2] * boxes[j, 3] - shared
             if union > 1e-9 and shared / union > threshold:
                 standing[j] = False
@@ -59,7 +59,7 @@ def _standing(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _shared_area(a: F64x1, b: F64x1, ring: F64x2, clipped: F64x2) -> float:  # pragma: no cover
+def _compute_shared_area(a: F64x1, b: F64x1, ring: F64x2, clipped: F64x2) -> float:  # pragma: no cover
     """Area that two solid boxes (5,) share; ring and clipped: (20, 2) to work in."""
     c, s = np.cos(a[4]), np.sin(a[4])
     dx, dy = b[0] - a[0], b[1] - a[1]

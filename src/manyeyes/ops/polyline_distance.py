@@ -24,12 +24,12 @@ def chamfer_distance(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pai
 
 def directed_distance(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> tuple[Floats, Floats]:
     """(K,) the mean and (K,) the greatest distance from the points of a's line to the segments of b's."""
-    return _directed(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))[:2]
+    return _compute_directed(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))[:2]
 
 
 def min_distance(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> Floats:
     """(K,) the least distance from a point of a's line to a segment of b's."""
-    return _directed(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))[2]
+    return _compute_directed(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))[2]
 
 
 def frechet_distance(
@@ -70,7 +70,7 @@ def _chamfer(
 
 
 @njit(cache=True)
-def _directed(
+def _compute_directed(
     a: F64x2, a_offsets: I64x1, b: F64x2, b_offsets: I64x1, pairs: I64x2
 ) -> tuple[F64x1, F64x1, F64x1]:  # pragma: no cover - compiled
     mean, max_distance, smallest = np.empty(len(pairs)), np.zeros(len(pairs)), np.full(len(pairs), np.inf)

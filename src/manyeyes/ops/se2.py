@@ -192,12 +192,12 @@ def _check(initial: Tensor, edges: PoseGraphEdges, fixed: Tensor, huber: float |
         raise ConfigError(f"huber is a number of standard deviations above 0, or None; got {huber}.")
 
 
-def _squared(error: Tensor, edges: PoseGraphEdges) -> Tensor:
+def _square_errors(error: Tensor, edges: PoseGraphEdges) -> Tensor:
     return torch.einsum("ea,eab,eb->e", error, edges.information, error)
 
 
 def _cost(poses: Tensor, edges: PoseGraphEdges, huber: float | None) -> float:
-    squared = _squared(edge_error(poses, edges), edges)
+    squared = _square_errors(edge_error(poses, edges), edges)
     if huber is not None:
         squared = torch.where(squared <= huber**2, squared, 2 * huber * squared.sqrt() - huber**2)
     return float(squared.sum()) / 2
@@ -209,7 +209,7 @@ def _normal_equations(poses: Tensor, edges: PoseGraphEdges, huber: float | None)
     error, (by_i, by_j) = edge_error(poses, edges), edge_jacobians(poses, edges)
     information = edges.information
     if huber is not None:
-        size = _squared(error, edges).sqrt()
+        size = _square_errors(error, edges).sqrt()
         information = information * torch.where(size > huber, huber / size.clamp_min(huber), 1.0)[:, None, None]
     gradient = torch.zeros(n, 3, dtype=poses.dtype)
     curvature = torch.zeros(n * n, 3, 3, dtype=poses.dtype)

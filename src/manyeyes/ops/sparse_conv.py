@@ -80,7 +80,7 @@ def inverse_conv(
 ) -> SparseBev:
     """Back to the finer sites ``target``: ``conv_transpose2d`` read there; weight (in, out, k, k)."""
     kernel = _kernel(weight, x.features.shape[1], axis=0)
-    table = _pair_map(target, x.sites, _checked(target, Window(kernel, stride, padding)))
+    table = _pair_map(target, x.sites, _check_window(target, Window(kernel, stride, padding)))
     if target.grid.at(target.grid.stride * stride) != x.grid or target.batch_size != x.sites.batch_size:
         raise ShapeError(
             f"inverse_conv by {stride} needs a target on the grid before it; got {target.grid} from {x.grid}."
@@ -141,7 +141,7 @@ def strided_map(sites: Sites, window: Window, dilating: bool = False) -> tuple[S
     """The coarser sites of a strided layer and what they meet; built once, so that equal layers share one set."""
     name = ("strided", window, dilating)
     if name not in sites.cache:
-        _checked(sites, window)
+        _check_window(sites, window)
         if not dilating and window.kernel // 2 < window.stride - 1:
             raise ConfigError(f"A kernel of {window.kernel} does not reach all children at stride {window.stride}.")
         shape, batch_size = sites.grid.shape, sites.batch_size
@@ -165,7 +165,7 @@ def _pair_map(fine: Sites, coarse: Sites, window: Window) -> NeighbourMap:
     return fine.cache[name][0]
 
 
-def _checked(sites: Sites, window: Window) -> Window:
+def _check_window(sites: Sites, window: Window) -> Window:
     if (
         window.kernel % 2 == 0
         or window.padding != window.kernel // 2
@@ -265,7 +265,7 @@ def _block_rows(x: Tensor) -> int:
     return BLOCK_ROWS if x.device.type == "cpu" else 1 << 30
 
 
-def _padded(x: Tensor, value: float = 0.0) -> Tensor:
+def _pad_row(x: Tensor, value: float = 0.0) -> Tensor:
     return torch.cat((x, x.new_full((1, x.shape[1]), value)))
 
 
@@ -279,7 +279,7 @@ class _GatherMax(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, table: NeighbourMap) -> Tensor:
-        padded, out = _padded(x, -torch.inf), x.new_full((table.n_out, x.shape[1]), -torch.inf)
+        padded, out = _pad_row(x, -torch.inf), x.new_full((table.n_out, x.shape[1]), -torch.inf)
         for rows, index in _row_blocks(table.index, x):
             for tap in index:
                 torch.maximum(out[rows], padded.index_select(0, tap), out=out[rows])
@@ -290,11 +290,11 @@ class _GatherMax(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
         x, out = ctx.saved_tensors
-        padded, ties, dx = _padded(x, -torch.inf), torch.zeros_like(out), torch.zeros_like(x)
+        padded, ties, dx = _pad_row(x, -torch.inf), torch.zeros_like(out), torch.zeros_like(x)
         for rows, index in _row_blocks(ctx.table.index, x):
             for tap in index:
                 ties[rows] += padded.index_select(0, tap).eq_(out[rows])
-        share, top = _padded(grads[0] / ties), _padded(out, torch.nan)
+        share, top = _pad_row(grads[0] / ties), _pad_row(out, torch.nan)
         for rows, index in _row_blocks(ctx.table.back, x):
             for tap in index:
                 dx[rows].addcmul_(share.index_select(0, tap), top.index_select(0, tap).eq_(x[rows]))

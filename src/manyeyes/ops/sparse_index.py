@@ -137,7 +137,9 @@ class NeighbourMap:
     def pairs(self) -> Pairs:
         """Which inputs lead to which outputs, on the CPU."""
         if _in_loops(self.in_key):
-            bordered = _BorderedImages(self.batch_size, *_bordered(self.out_shape, self.in_shape, self.window))
+            bordered = _BorderedImages(
+                self.batch_size, *_compute_bordered_shape(self.out_shape, self.in_shape, self.window)
+            )
             out_key, in_key = self.out_key.numpy(), self.in_key.numpy()
             return _pairs(out_key, in_key, self.out_shape, self.in_shape, bordered, self.window, self._taps)
         return Pairs(*(part.numpy() for part in self._met))
@@ -255,7 +257,7 @@ def neighbours(
     wrap from the last column to the next row.
     """
     kernel, stride, padding, dilation = window
-    rows, columns = _bordered(out_shape, in_shape, window)
+    rows, columns = _compute_bordered_shape(out_shape, in_shape, window)
     device, n_in = in_key.device, in_key.shape[0]
     image = torch.full((batch_size * rows * columns,), n_in, dtype=torch.int32, device=device)
     batch, y, x = split(in_key, in_shape)
@@ -268,7 +270,7 @@ def neighbours(
     return image.index_select(0, (first[:, None] + taps).flatten()).view(first.shape[0], kernel * kernel)
 
 
-def _bordered(out_shape: tuple[int, int], in_shape: tuple[int, int], window: Window) -> tuple[int, int]:
+def _compute_bordered_shape(out_shape: tuple[int, int], in_shape: tuple[int, int], window: Window) -> tuple[int, int]:
     """Rows and columns of an index image with a border that no tap leaves."""
     kernel, stride, padding, dilation = window
     reach = dilation * (kernel - 1)

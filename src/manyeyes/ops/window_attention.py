@@ -50,7 +50,7 @@ def window_places(
             window_ids(xy, batch, origin, window_m, shift_m),
             window_offsets(xy, origin, window_m, cell_m, shift_m),
         )
-    _checked(window_m)
+    _check_window_size(window_m)
     ids, offsets = torch.empty(len(xy), dtype=torch.int64), torch.empty(len(xy), 2)
     where, whose = xy.contiguous().numpy(), batch.contiguous().numpy()
     windows = _WindowGrid(*map(float, (*origin, window_m, cell_m, shift_m)))
@@ -80,11 +80,11 @@ def _place(xy: F32x2, batch: I64x1, windows: _WindowGrid, ids: I64x1, offsets: F
 
 
 def _window_at(xy: Tensor, origin: tuple[float, float], window_m: float, shift_m: float) -> Tensor:
-    _checked(window_m)
+    _check_window_size(window_m)
     return ((xy.double() - xy.new_tensor(origin, dtype=torch.float64) + shift_m) / window_m).floor()
 
 
-def _checked(window_m: float) -> None:
+def _check_window_size(window_m: float) -> None:
     if window_m <= 0:
         raise ConfigError(f"A window needs an edge above 0 m; got {window_m}.")
 

@@ -161,7 +161,7 @@ def _candidates(ego: Landmarks, other: Landmarks, pairs: Ints, config: Consensus
         best = int(scores.argmax())
         if len(found) == 2 or not scores[best] > 0:
             break
-        candidate = _refined(poses[best], a, b, pairs, config)
+        candidate = _refine(poses[best], a, b, pairs, config)
         # A hypothesis that is refined to a pose already found is not distinct.
         if candidate is not None and not any(_alike(candidate.pose[None], f.pose, middle, config)[0] for f in found):
             found.append(candidate)
@@ -189,7 +189,7 @@ def _gains(poses: Floats, a: Landmarks, b: Landmarks, config: ConsensusConfig) -
     return np.maximum(max_gain - _misfits(poses, a, b) / 2, 0.0)
 
 
-def _refined(pose: Floats, a: Landmarks, b: Landmarks, pairs: Ints, config: ConsensusConfig) -> Candidate | None:
+def _refine(pose: Floats, a: Landmarks, b: Landmarks, pairs: Ints, config: ConsensusConfig) -> Candidate | None:
     """The weighted fit on all inlier pairs, iterated until these no longer change; None for fewer than two."""
     weight = 1 / (a.sigma_xy**2 + b.sigma_xy**2)
     agree = np.zeros(len(pairs), bool)

@@ -69,7 +69,7 @@ def optimize_poses(
         ordered, max_cycle_chi2, [_prior_distance(ego, n, priors) for n in ordered]
     )
     agents = sorted({ego, *priors, *(a for n in ordered for a in (n.i, n.j))})
-    reached = _reached(ego, kept, priors)
+    reached = _find_reached(ego, kept, priors)
     poses, covariance = _solve(ego, [a for a in agents if a in reached], kept, priors, huber)
     joined = {a for n in kept for a in (n.i, n.j)}
     isolated = tuple(sorted({a for n in rejected for a in (n.i, n.j)} - joined - {ego}))
@@ -167,7 +167,7 @@ def _compose_jacobians(a: Floats, b: Floats) -> tuple[Floats, Floats]:
     return by_a, by_b
 
 
-def _reached(ego: int, edges: Sequence[RelativePoseEdge], priors: Mapping[int, PosePrior]) -> set[int]:
+def _find_reached(ego: int, edges: Sequence[RelativePoseEdge], priors: Mapping[int, PosePrior]) -> set[int]:
     """Agents that edges or priors connect to the ego."""
     reached = {ego, *priors}
     while True:

@@ -108,10 +108,10 @@ def register_clouds(
     if min(len(here), len(there)) < 3:
         return no_estimate(prior)
     field = LikelihoodField.of(here, config.max_range_m, config.fine_step_m, config.blur_m)
-    refined = [_climbed(pose, there, field) for pose in _peaks(here, there, config)]
+    refined = [_climb(pose, there, field) for pose in _peaks(here, there, config)]
     refined.sort(key=lambda found: -found[1])
     (pose, inlier_fraction), *others = refined
-    other_scores = [s for p, s in others if not _alike(p, pose, config)]
+    other_scores = [s for p, s in others if not _is_alike(p, pose, config)]
     margin = inlier_fraction - max(other_scores, default=0.0)
     if inlier_fraction < config.min_inlier_fraction:
         return no_estimate(prior)
@@ -151,7 +151,7 @@ def _peaks(here: Floats, there: Floats, config: RegistrationConfig) -> list[Floa
     for k in range(config.num_yaw_steps):
         yaw = 2 * math.pi * k / config.num_yaw_steps
         drawn = np.zeros((side, side), np.float32)
-        at = np.floor((_turned(there, yaw) + config.max_range_m) / config.cell_m).astype(int)
+        at = np.floor((_rotate(there, yaw) + config.max_range_m) / config.cell_m).astype(int)
         at = at[((at >= 0) & (at < side)).all(1)]
         drawn[at[:, 1], at[:, 0]] = 1
         drawn /= max(float(drawn.sum()), 1.0)
@@ -165,19 +165,19 @@ def _peaks(here: Floats, there: Floats, config: RegistrationConfig) -> list[Floa
             overlap[near[0][:, None], near[1]] = -1
     kept: list[Floats] = []
     for _, pose in sorted(found, key=lambda f: -f[0]):
-        if len(kept) < config.num_candidates and not any(_alike(pose, other, config) for other in kept):
+        if len(kept) < config.num_candidates and not any(_is_alike(pose, other, config) for other in kept):
             kept.append(pose)
     return kept
 
 
-def _climbed(pose: Floats, there: Floats, field: LikelihoodField) -> tuple[Floats, float]:
+def _climb(pose: Floats, there: Floats, field: LikelihoodField) -> tuple[Floats, float]:
     """Hill climbing from a pose by steps that halve, and the mean of the field at the columns there."""
     step = np.array([1.0, 1.0, 0.03])
-    best, height = pose, float(field.sample(_moved(there, pose)).mean())
+    best, height = pose, float(field.sample(_transform(there, pose)).mean())
     moves = np.concatenate((np.eye(3), -np.eye(3)))
     while step[0] > 0.01:
         tried = best + moves * step
-        heights = [float(field.sample(_moved(there, p)).mean()) for p in tried]
+        heights = [float(field.sample(_transform(there, p)).mean()) for p in tried]
         top = int(np.argmax(heights))
         if heights[top] > height:
             best, height = tried[top], heights[top]
@@ -186,16 +186,16 @@ def _climbed(pose: Floats, there: Floats, field: LikelihoodField) -> tuple[Float
     return np.array([best[0], best[1], (best[2] + np.pi) % (2 * np.pi) - np.pi]), height
 
 
-def _turned(xy: Floats, yaw: float) -> Floats:
+def _rotate(xy: Floats, yaw: float) -> Floats:
     c, s = math.cos(yaw), math.sin(yaw)
     return xy @ np.array([[c, s], [-s, c]])
 
 
-def _moved(xy: Floats, pose: Floats) -> Floats:
-    return _turned(xy, float(pose[2])) + pose[:2]
+def _transform(xy: Floats, pose: Floats) -> Floats:
+    return _rotate(xy, float(pose[2])) + pose[:2]
 
 
-def _alike(a: Floats, b: Floats, config: RegistrationConfig) -> bool:
+def _is_alike(a: Floats, b: Floats, config: RegistrationConfig) -> bool:
     apart = pose_difference(a, b)
     return bool(np.hypot(apart[0], apart[1]) < config.min_separation_m and abs(apart[2]) < config.min_separation_rad)
 

@@ -106,7 +106,7 @@ def find_candidates(
         total = float(misfit.sum())
         covariance = _covariance(information, len(pairs), total, dof, config)
         if swapped:
-            pose, covariance, pairs = *_inverted(pose, covariance), pairs[:, ::-1]
+            pose, covariance, pairs = *_invert(pose, covariance), pairs[:, ::-1]
         rows = np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1)
         out.append(Candidate(pose, (covariance + covariance.T) / 2, rows[np.lexsort(rows.T)], score, total, dof))
     return out
@@ -251,7 +251,7 @@ def _inverse(pose: Floats) -> Floats:
     return np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
 
 
-def _inverted(pose: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+def _invert(pose: Floats, covariance: Floats) -> tuple[Floats, Floats]:
     """The inverse pose and its covariance."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     back = _inverse(pose)

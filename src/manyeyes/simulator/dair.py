@@ -80,7 +80,7 @@ def record_dair(
         raise ConfigError("Two drives of one split have one name; give each its own.")
     starts = [sum(job.spec.frames for job in jobs[:i]) for i in range(len(jobs))]
     work = [DairJob(job, i, start) for i, (job, start) in enumerate(zip(jobs, starts))]
-    plan = RecordingPlan("DAIR-V2X", settings or {}, {_place(one): _asked(one) for one in work}, names)
+    plan = RecordingPlan("DAIR-V2X", settings or {}, {_place(one): _make_request(one) for one in work}, names)
     finished = {p.relative_to(root).as_posix(): _content(p) for p in sorted((root / BATCHES).glob("*.json"))}
     require_own_folder(root, plan, {place: content["asked"] for place, content in finished.items()})
     require_sound(root, {place: _check(root, place, content) for place, content in finished.items()})
@@ -127,7 +127,7 @@ def record_drive(one: DairJob, root: Path) -> ManifestEntry:
         bytes=sum(p.stat().st_size for p in files),
         sha256=compute_total_digest(digests),
     )
-    content = {"asked": _asked(one), "entry": asdict(entry), "rows": asdict(rows), "files": digests}
+    content = {"asked": _make_request(one), "entry": asdict(entry), "rows": asdict(rows), "files": digests}
     (root / BATCHES).mkdir(exist_ok=True)
     write_json(root / _place(one), content)
     return entry
@@ -152,7 +152,7 @@ def _place(one: DairJob) -> str:
     return f"{BATCHES}/{one.batch_id:06d}.json"
 
 
-def _asked(one: DairJob) -> dict[str, Any]:
+def _make_request(one: DairJob) -> dict[str, Any]:
     asked = {"split": one.job.split, "first_frame": one.first_frame, "spec": asdict(one.job.spec)}
     return json.loads(json.dumps(asked))
 

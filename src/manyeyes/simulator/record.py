@@ -222,7 +222,7 @@ def require_own_folder(root: Path, plan: RecordingPlan, finished: Mapping[str, M
             f"wrote, the first is {foreign[0]}. {_UNCHANGED}"
         )
     other = [place for place, asked in finished.items() if plan.requested_specs.get(place) != asked]
-    there = "of a run without a manifest" if content is None else _described(content)
+    there = "of a run without a manifest" if content is None else _describe(content)
     if same_run and not other:
         if content is None or content.get("asked", wanted["asked"]) == wanted["asked"]:
             return
@@ -231,7 +231,7 @@ def require_own_folder(root: Path, plan: RecordingPlan, finished: Mapping[str, M
     count = len(list(root.glob(f"*/*/{SCENARIO}"))) + len(list(root.glob(f"{BATCHES}/*.json")))
     raise ConfigError(
         f"{root} holds {_count(count, 'finished scenario')} {there}; this run makes {len(plan.names)} "
-        f"{_described(wanted)}{why}. {_UNCHANGED}"
+        f"{_describe(wanted)}{why}. {_UNCHANGED}"
     )
 
 
@@ -255,7 +255,7 @@ def _folders(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".") and p.suffix != PARTIAL)
 
 
-def _described(content: Mapping[str, Any]) -> str:
+def _describe(content: Mapping[str, Any]) -> str:
     """Settings and layout of a manifest as text."""
     settings = ", ".join(f"{name} {value!r}" for name, value in content["settings"].items()) or "no named settings"
     return f"of {settings} in the layout of {content['format']}"
@@ -265,14 +265,16 @@ def _difference(place: str, finished: Mapping[str, Mapping[str, Any]], plan: Rec
     """What of a finished scenario is not that of the plan."""
     if place not in plan.requested_specs:
         only = next((other for other in plan.requested_specs if other not in finished), "")
-        instead = f", which has {_shown(only)}" if only else ""
-        return f"{_shown(place)} is not one of this run{instead}; do both runs find the roads of the same towns?"
+        instead = f", which has {_format_scenario(only)}" if only else ""
+        return (
+            f"{_format_scenario(place)} is not one of this run{instead}; do both runs find the roads of the same towns?"
+        )
     there, wanted = _flat(finished[place]), _flat(plan.requested_specs[place])
     name = next(name for name in {**there, **wanted} if there.get(name) != wanted.get(name))
-    return f"{_shown(place)} has {name} {there.get(name)!r} instead of {wanted.get(name)!r}"
+    return f"{_format_scenario(place)} has {name} {there.get(name)!r} instead of {wanted.get(name)!r}"
 
 
-def _shown(place: str) -> str:
+def _format_scenario(place: str) -> str:
     return place.removesuffix(f"/{SCENARIO}")
 
 

@@ -176,7 +176,7 @@ def _table(m: VectorMap, rows: NDArray[np.int64], closed: bool) -> pa.Table:
     columns |= {name: pyarrow.array(getattr(m, name)[rows]) for name in _ROW_COLUMNS}
     columns |= {_AT_POINT + n: _lists(pyarrow, e.offsets, v) for n, v in zip(_POINT_COLUMNS, per_point)}
     for name in _PAIR_COLUMNS:
-        columns[name] = _related_ids(pyarrow, getattr(m.topology, name), rows, m.id)
+        columns[name] = _collect_related_ids(pyarrow, getattr(m.topology, name), rows, m.id)
     columns["branch"] = _branches(pyarrow, m.topology, rows, len(m))
     named = pyarrow.array(to_hex_ids(m.observations[m.sources[sources]]), pyarrow.string())
     columns["sources"] = pyarrow.ListArray.from_arrays(pyarrow.array(offsets, pyarrow.int32()), named)
@@ -196,17 +196,21 @@ def _geoarrow(pyarrow: Any, e: MapElements, closed: bool) -> pa.Array:
         first = e.offsets + np.arange(len(e) + 1)
         points = np.insert(e.points, e.offsets[1:], e.points[e.offsets[:-1]], axis=0) if len(e) else e.points
     x, y = (pyarrow.array(np.ascontiguousarray(points[:, k])) for k in (0, 1))
-    vertex = pyarrow.StructArray.from_arrays([x, y], fields=[_required(pyarrow, n, pyarrow.float64()) for n in "xy"])
+    vertex = pyarrow.StructArray.from_arrays(
+        [x, y], fields=[_make_required_field(pyarrow, n, pyarrow.float64()) for n in "xy"]
+    )
     out = pyarrow.ListArray.from_arrays(
-        pyarrow.array(first, pyarrow.int32()), vertex, pyarrow.list_(_required(pyarrow, "vertices", vertex.type))
+        pyarrow.array(first, pyarrow.int32()),
+        vertex,
+        pyarrow.list_(_make_required_field(pyarrow, "vertices", vertex.type)),
     )
     if not closed:
         return out
     one_each = pyarrow.array(np.arange(len(e) + 1), pyarrow.int32())
-    return pyarrow.ListArray.from_arrays(one_each, out, pyarrow.list_(_required(pyarrow, "rings", out.type)))
+    return pyarrow.ListArray.from_arrays(one_each, out, pyarrow.list_(_make_required_field(pyarrow, "rings", out.type)))
 
 
-def _required(pyarrow: Any, name: str, kind: Any) -> Any:
+def _make_required_field(pyarrow: Any, name: str, kind: Any) -> Any:
     return pyarrow.field(name, kind, nullable=False)
 
 
@@ -221,7 +225,9 @@ def _lists(pyarrow: Any, offsets: NDArray[np.int64], values: NDArray) -> pa.Arra
     return pyarrow.ListArray.from_arrays(pyarrow.array(offsets, pyarrow.int32()), pyarrow.array(values))
 
 
-def _related_ids(pyarrow: Any, pairs: NDArray[np.int64], rows: NDArray[np.int64], ids: NDArray[np.uint8]) -> pa.Array:
+def _collect_related_ids(
+    pyarrow: Any, pairs: NDArray[np.int64], rows: NDArray[np.int64], ids: NDArray[np.uint8]
+) -> pa.Array:
     """Per row the ids of its partners, in the order of the pairs."""
     order = np.argsort(pairs[:, 0], kind="stable")
     first = np.searchsorted(pairs[order, 0], np.arange(len(ids) + 1))
@@ -265,8 +271,8 @@ class _TableColumns:
         self.state = np.array([STATES.index(k) for k in _column(table, "state").to_pylist()], np.int64)
         self.rows = {name: _column(table, name).to_numpy() for name in _ROW_COLUMNS}
         self.id = _digests(_column(table, "id"))
-        self.pairs = {name: _ragged(table, name) for name in _PAIR_COLUMNS}
-        self.sources = _ragged(table, "sources")
+        self.pairs = {name: _read_ragged(table, name) for name in _PAIR_COLUMNS}
+        self.sources = _read_ragged(table, "sources")
         branch = _column(table, "branch")
         self.branch_count = branch.value_lengths().to_numpy()
         self.branch_xy = np.stack([branch.flatten().field(k).to_numpy() for k in (0, 1)], 1)
@@ -282,7 +288,7 @@ def _digests(texts: Any) -> NDArray[np.uint8]:
     return np.frombuffer(bytes.fromhex("".join(texts.to_pylist())), np.uint8).reshape(-1, 16)
 
 
-def _ragged(table: pa.Table, name: str) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+def _read_ragged(table: pa.Table, name: str) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """Counts (N,) and all digests of a column of lists of ids."""
     column = _column(table, name)
     return column.value_lengths().to_numpy().astype(np.int64), _digests(column.flatten())

@@ -170,7 +170,7 @@ def _lanelets(root: ET.Element, path: Path, ways: dict[str, _OsmWay]) -> tuple[t
         context = f"{path}: lanelet {relation.get('id')}"
         left, left_ends = _border(relation, "left", ways, context)
         right, right_ends = _border(relation, "right", ways, context)
-        left, right, left_ends, right_ends = _aligned(left, right, left_ends, right_ends)
+        left, right, left_ends, right_ends = _align_borders(left, right, left_ends, right_ends)
         if tags.get("subtype") == "crosswalk":
             crossings.append(Crossing(np.concatenate((left, right[::-1])), "", "crosswalk"))
             continue
@@ -206,7 +206,7 @@ def _border(relation: ET.Element, role: str, ways: dict[str, _OsmWay], context: 
     return points, ends
 
 
-def _aligned(
+def _align_borders(
     left: Array, right: Array, left_ends: tuple[str, str], right_ends: tuple[str, str]
 ) -> tuple[Array, Array, tuple[str, str], tuple[str, str]]:
     """Both borders turned along the lanelet's direction, in which the left one lies on the left."""

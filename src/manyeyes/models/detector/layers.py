@@ -50,7 +50,7 @@ def _tap_by_tap(weight: Tensor) -> nn.Parameter:
     return nn.Parameter(weight.permute(2, 3, 1, 0).contiguous().permute(3, 2, 0, 1))
 
 
-def _rectified(y: Tensor, skip: Tensor | None) -> Tensor:
+def _apply_relu(y: Tensor, skip: Tensor | None) -> Tensor:
     """ReLU of y plus skip, in place where no gradient needs y; the caller must own y."""
     if torch.is_grad_enabled():
         return torch.relu(y if skip is None else y + skip)
@@ -79,7 +79,7 @@ class SubmanifoldLayer(nn.Module):
         if self.folded is not None and is_supported(x.features):
             return x.with_features(self.folded(x.features, same_sites_map(x.sites, self.weight.shape[2])))
         y = self.norm(submanifold_conv(x, self.weight, self.bias).features)
-        return x.with_features(_rectified(y, x.features if self.skip else None))
+        return x.with_features(_apply_relu(y, x.features if self.skip else None))
 
     def fold(self) -> None:
         """Fold the norm's running statistics into the weight, and the skip into its centre tap, permanently.
@@ -142,7 +142,7 @@ class DownLayer(nn.Module):
             sites, table = strided_map(x.sites, Window(3, 2, 1), self.dilating)
             return SparseBev(self.folded(x.features, table), sites)
         y = strided_conv(x, self.weight, self.bias, stride=2, padding=1, dilating=self.dilating)
-        return y.with_features(_rectified(self.norm(y.features), None))
+        return y.with_features(_apply_relu(self.norm(y.features), None))
 
     def fold(self) -> None:
         """Fold the norm's running statistics into the weight, permanently."""

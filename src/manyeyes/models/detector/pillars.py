@@ -88,8 +88,11 @@ class PillarEncoder(nn.Module):
         many, agents = [*clouds, *before], [*range(len(clouds)), *range(len(before))]
         if isinstance(self.net, PointPillars) and not self.training and not torch.is_grad_enabled() and _plain(many):
             return self.net.infer(clouds, before, self.grid)
-        xyz, intensities = _joined([cloud.xyz for cloud in many]), _joined([cloud.intensity for cloud in many])
-        batch = _joined([torch.full((len(cloud),), agent) for cloud, agent in zip(many, agents)])
+        xyz, intensities = (
+            _concatenate([cloud.xyz for cloud in many]),
+            _concatenate([cloud.intensity for cloud in many]),
+        )
+        batch = _concatenate([torch.full((len(cloud),), agent) for cloud, agent in zip(many, agents)])
         pillars = pillar_sites(xyz, batch, self.grid, len(clouds))
         kept = pillars.inside.nonzero()[:, 0]
         is_previous = kept >= sum(map(len, clouds))
@@ -103,6 +106,6 @@ def _plain(clouds: list[PointCloud]) -> bool:
     return all(cloud.xyz.dtype == torch.float32 and cloud.xyz.device.type == "cpu" for cloud in clouds)
 
 
-def _joined(parts: list[Tensor]) -> Tensor:
+def _concatenate(parts: list[Tensor]) -> Tensor:
     """Concatenate rows; a single part is not copied."""
     return parts[0] if len(parts) == 1 else torch.cat(parts)

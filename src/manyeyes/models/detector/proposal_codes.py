@@ -47,14 +47,19 @@ PROPOSAL_CODES = len(_COLUMNS) + 4
 
 def proposal_to_codes(proposal: Tensor) -> Tensor:
     """Encode proposals (N, PROPOSAL_DIM) to (N, PROPOSAL_CODES) uint8."""
-    single = _signed(proposal[:, _COLUMNS], _COLUMN_STEPS)
+    single = _encode_signed(proposal[:, _COLUMNS], _COLUMN_STEPS)
     axis = torch.remainder(torch.round(axis_yaw(proposal[:, BOX_LAYOUT.axis]) * (256 / math.pi)), 256)
     facing = (proposal[:, BOX_LAYOUT.direction] * _along(axis)).sum(1)
     best = proposal[:, BOX_LAYOUT.class_logits].topk(2, dim=1)
     lead = torch.floor((best.values[:, 0] - best.values[:, 1]) / _LEAD_STEP).clamp(0, _LEADS - 1)
     sigma = [proposal[:, c][:, 0] for c in (BOX_LAYOUT.log_sigma_xy, BOX_LAYOUT.log_sigma_yaw)]
     nibbles = [torch.round((s - _SIGMA_LOW) / _SIGMA_STEP).clamp(0, 15) for s in sigma]
-    rest = (axis, _signed(facing, _FACING_STEP), best.indices[:, 0] * _LEADS + lead, nibbles[0] * 16 + nibbles[1])
+    rest = (
+        axis,
+        _encode_signed(facing, _FACING_STEP),
+        best.indices[:, 0] * _LEADS + lead,
+        nibbles[0] * 16 + nibbles[1],
+    )
     return torch.cat((single, torch.stack(rest, 1)), 1).to(torch.uint8)
 
 
@@ -76,7 +81,7 @@ def proposal_from_codes(codes: Tensor) -> Tensor:
     return proposal
 
 
-def _signed(value: Tensor, step: Tensor | float) -> Tensor:
+def _encode_signed(value: Tensor, step: Tensor | float) -> Tensor:
     """Encode whole steps as 1 … 255, with 128 for 0."""
     return torch.round(value / step).clamp(-127, 127) + 128
 

@@ -160,7 +160,7 @@ class CameraBev(_RasterEncoder):
         agent_of_camera = torch.repeat_interleave(torch.arange(len(images)), torch.tensor([len(one) for one in images]))
         height, width = config.image_size
         cameras = [image.camera.resize(width, height) for image in flat]
-        rgb = torch.cat([_resized(image.rgb, config.image_size) for image in flat])
+        rgb = torch.cat([_resize(image.rgb, config.image_size) for image in flat])
         outputs = self.project(self.encoder(rgb.contiguous(memory_format=torch.channels_last)))
         features, stride = outputs[:, : config.raster_channels], config.image_encoder.stride
         if config.view_transform == "ground":
@@ -188,5 +188,5 @@ class CameraBev(_RasterEncoder):
         return self.encode(raster.contiguous(memory_format=torch.channels_last)), near
 
 
-def _resized(rgb: Tensor, size: tuple[int, int]) -> Tensor:
+def _resize(rgb: Tensor, size: tuple[int, int]) -> Tensor:
     return F.interpolate(rgb[None].float(), size, mode="bilinear", align_corners=False, antialias=True)

@@ -39,7 +39,7 @@ def correct(
     if prior is None or not len(ego) or not len(other):
         return no_estimate(prior)
     pose = prior.pose
-    pairs = _assigned(ego.xy, other.transform(pose).xy, config)
+    pairs = _assign(ego.xy, other.transform(pose).xy, config)
     for round_ in range(config.num_iterations):
         if round_:
             pairs = match_mutual_nearest(ego.xy, other.transform(pose).xy, config.max_distance_m / 2)
@@ -54,7 +54,7 @@ def correct(
     return make_estimate(ego, other, pose, pairs, prior)
 
 
-def _assigned(here: np.ndarray, there: np.ndarray, config: FeacoConfig) -> np.ndarray:
+def _assign(here: np.ndarray, there: np.ndarray, config: FeacoConfig) -> np.ndarray:
     apart = np.hypot(*(here[:, None] - there[None]).transpose(2, 0, 1))
     rows, columns = (
         np.flatnonzero(apart.min(1) <= config.max_distance_m),

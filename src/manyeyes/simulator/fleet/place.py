@@ -94,7 +94,7 @@ def load_place(name: str, size_m: float | None = 300.0, data: Path | str | None 
 @lru_cache(maxsize=16)
 def _load_place(name: str, size_m: float | None, data: str | None) -> Place:
     if name in _PLANS or name.startswith("grid-"):
-        return _generated(name, size_m)
+        return _generate_place(name, size_m)
     if name in TOWNS or name.startswith(GENERATED):
         folder = None if data is None or name.startswith(GENERATED) else Path(data) / "carla_opendrive"
         network = load_town(name, folder)
@@ -138,7 +138,7 @@ def make_place(
         half = np.full(2, size_m / 2)
     truth = build_ground_truth_map(network, policy).transform(-middle[0], -middle[1], 0.0)
     routes = Routes.of_network(network, middle).within(-half, half)
-    ground = _moved(compute_junction_region(network, policy.junction_margin_m), middle)
+    ground = _shift(compute_junction_region(network, policy.junction_margin_m), middle)
     latitude, longitude = degrees_from_metres(middle, origin).tolist()
     area = (-float(half[0]), -float(half[1]), float(half[0]), float(half[1]))
     return Place(
@@ -169,7 +169,7 @@ def clip_to_box(elements: MapElements, box: tuple[float, float, float, float], m
     return MapElements.of(parts, kinds, scores, np.concatenate(sigmas), np.array(styles))
 
 
-def _generated(name: str, size_m: float | None) -> Place:
+def _generate_place(name: str, size_m: float | None) -> Place:
     """A lattice of streets; ``grid-<n>`` has n × n crossroads."""
     shapely = _shapely()
     plan = _PLANS.get(name)
@@ -187,7 +187,7 @@ def _generated(name: str, size_m: float | None) -> Place:
     return Place(name, truth, routes.within(-half, half), ground, area, MapFrame(*_CARLA_ORIGIN))
 
 
-def _moved(ground: BaseGeometry, origin: Array) -> BaseGeometry:
+def _shift(ground: BaseGeometry, origin: Array) -> BaseGeometry:
     shapely = _shapely()
     return shapely.transform(ground, lambda points: points - origin)
 

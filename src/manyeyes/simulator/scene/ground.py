@@ -125,7 +125,7 @@ def _paint_surface(surface: NDArray[np.uint8], network: RoadNetwork, x0: float, 
     _close_gaps(surface, round(_GAP_M / cell))
     for mark in network.marks:
         if mark.is_paint and reaches(mark.line):
-            for left, right in _painted_strips(mark, cell):
+            for left, right in _make_painted_strips(mark, cell):
                 _fill_strip(surface, left, right, x0, y0, cell, PAINT)
     for crossing in network.crossings:
         if reaches(crossing.polygon):
@@ -159,7 +159,7 @@ def _widen(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     return mask
 
 
-def _painted_strips(mark: RoadMark, cell: float) -> list[tuple[Array, Array]]:
+def _make_painted_strips(mark: RoadMark, cell: float) -> list[tuple[Array, Array]]:
     """Left and right edges of each painted piece of a line: one when solid, a dash each when broken.
 
     A line thinner than a cell is widened to one, so that no gaps appear where it runs obliquely.

@@ -123,7 +123,7 @@ class SimulatedScenario:
     @property
     def moving_fraction(self) -> float:
         """Share of the first frame's vehicles that are elsewhere in the last; frames of the lead do not count."""
-        return float(_moving(self.states[self.spec.lead_frames :]).mean())
+        return float(_find_moving(self.states[self.spec.lead_frames :]).mean())
 
     def snapshot(self, index: int) -> Snapshot:
         """What every agent senses at one instant, and the truth: claimed poses are the true ones."""
@@ -264,15 +264,15 @@ def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> SimulatedScenario
         if len(agents) < spec.vehicles or not all((s.id == a).any() for a in agents for s in near):
             continue
         # Cheap refusals before the ground is drawn: a jam, and roads over roads.
-        if _moving(near[lead:]).mean() < 0.5 or is_multilevel(network, middle, 1.5 * _NEAR_M):
+        if _find_moving(near[lead:]).mean() < 0.5 or is_multilevel(network, middle, 1.5 * _NEAR_M):
             continue
         field = to_height_field(build_ground(network, middle, _HALF_SIZE_M))
         plot = PlacementGrid.of(field)
         states = tuple(s[np.abs(plot.height(s.position[:, :2]) - s.position[:, 2]) < _LEVEL_GAP_M] for s in near)
         parked = parked_cars(network, spec.seed, middle, 110.0, float(random.uniform(0.1, 0.6)))
-        parked = _parked(states[lead:], parked, random)
+        parked = _select_parked(states[lead:], parked, random)
         states = tuple(VehicleStates.cat([now, parked]) for now in states)
-        if _moving(states[lead:]).mean() < 0.5 or not all((s.id == a).any() for a in agents for s in states):
+        if _find_moving(states[lead:]).mean() < 0.5 or not all((s.id == a).any() for a in agents for s in states):
             continue
         return _place_static_objects(spec, network, field, plot, states, agents, middle, random)
     raise NoSceneError(
@@ -281,7 +281,7 @@ def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> SimulatedScenario
     )
 
 
-def _moving(states: tuple[VehicleStates, ...]) -> NDArray[np.bool_]:
+def _find_moving(states: tuple[VehicleStates, ...]) -> NDArray[np.bool_]:
     """(N,) of the first instant: whether a vehicle is elsewhere at the last one; who left the scene moved."""
     last = {int(i): row for row, i in enumerate(states[-1].id)}
     moved = np.ones(len(states[0]), bool)
@@ -323,9 +323,11 @@ def _choose_agents(
     return tuple(sorted(first.id[chosen].tolist()))
 
 
-def _parked(states: tuple[VehicleStates, ...], parked: VehicleStates, random: np.random.Generator) -> VehicleStates:
+def _select_parked(
+    states: tuple[VehicleStates, ...], parked: VehicleStates, random: np.random.Generator
+) -> VehicleStates:
     """Some of the parked cars, at most so many that half of all vehicles move."""
-    moving = _moving(states)
+    moving = _find_moving(states)
     room = max(0, int(2 * moving.sum() - len(moving)))
     return parked[np.sort(random.permutation(len(parked))[:room])]
 

@@ -108,7 +108,7 @@ def simulate_traffic(
     everything = _to_states(network, vehicle[shown], state[shown], heading[shown], kind, size, lateral_offset)
     everything = replace(everything, speed=_speeds(step, vehicle, state, step_s)[shown])
     frames = tuple(everything[step[shown] == before + k] for k in range(-lead_steps, steps))
-    touching = np.unique(np.concatenate([_touching(frame) for frame in frames[lead_steps:]]))
+    touching = np.unique(np.concatenate([_find_touching(frame) for frame in frames[lead_steps:]]))
     return tuple(frame[~np.isin(frame.id, touching)] for frame in frames)
 
 
@@ -299,7 +299,7 @@ def _speeds(step: NDArray[np.int64], vehicle: NDArray[np.int64], state: Array, s
     return speed
 
 
-def _touching(frame: VehicleStates) -> NDArray[np.int64]:
+def _find_touching(frame: VehicleStates) -> NDArray[np.int64]:
     """Ids of vehicles that overlap one with a smaller id: SUMO lets corners touch where tracks meet at an angle."""
     corners, found = frame.corners(_TOUCH_MARGIN_M), []
     reach = np.linalg.norm(frame.size[:, :2], axis=1) / 2

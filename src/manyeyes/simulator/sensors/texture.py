@@ -189,7 +189,7 @@ def solid_rgb(material: int, spots: SolidPoints, seed: int) -> tuple[Real, Real]
     """Albedo (N, 3) and gloss (N,), the share of a mirror's reflection, of points of one material."""
     painter = {
         FACADE: _facade, WALL: _wall, HEDGE: _foliage, LEAVES: _foliage, BARK: _bark, PLATE: _plate, SIGNAL: _signal,
-        PAINTWORK: _paintwork, GLAZED: _glazed, GLASS: _glass, TARPAULIN: _tarpaulin, RUBBER: _tyre,
+        PAINTWORK: _paintwork, GLAZED: _shade_cabin, GLASS: _glass, TARPAULIN: _tarpaulin, RUBBER: _tyre,
     }.get(material, _plain)  # fmt: skip
     albedo, gloss = painter(spots, seed)
     return albedo.astype(np.float32), gloss.astype(np.float32)
@@ -400,7 +400,7 @@ def _tyre(spots: SolidPoints, seed: int) -> tuple[Real, Real]:
     return _wheels(0.4 * spots.rgb, np.zeros(len(x), np.float32), spots, x, z, spots.axis == 1)
 
 
-def _glazed(spots: SolidPoints, seed: int) -> tuple[Real, Real]:
+def _shade_cabin(spots: SolidPoints, seed: int) -> tuple[Real, Real]:
     """A cabin: windows between pillars under a painted roof."""
     del seed
     x, y, z = _at(spots)
