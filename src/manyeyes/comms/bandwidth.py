@@ -15,7 +15,7 @@ from manyeyes.datatypes import ConfigError
 
 
 def allocate_max_min_fair(total_bytes: int, requested_bytes: Sequence[int]) -> tuple[int, ...]:
-    """Bytes that each sender may send, in the order of requested_bytes (0: sends nothing).
+    """Return bytes that each sender may send, in the order of requested_bytes (0: sends nothing).
 
     They sum to total_bytes, or to all requested bytes if these are fewer. No sender gets more than it requests, and a sender with
     less than it requests gets, within a byte, the maximum share. Indivisible bytes go to the first senders.
@@ -33,7 +33,7 @@ def allocate_max_min_fair(total_bytes: int, requested_bytes: Sequence[int]) -> t
 
 
 def allocate_equal_share(total_bytes: int, num_senders: int) -> int:
-    """Bytes for each of num_senders, without knowledge of their requests."""
+    """Return bytes for each of num_senders, without knowledge of their requests."""
     if total_bytes < 0 or num_senders < 1:
         raise ConfigError(
             f"An equal share is of 0 bytes or more, for one sender or more; got {total_bytes}, {num_senders}."

@@ -62,11 +62,11 @@ class ChannelPreset:
         return float(np.interp(distance_m, distances, losses))
 
     def with_loss(self, probability: float) -> ChannelPreset:
-        """The same radio with one loss at every distance, for studies."""
+        """Return the same radio with one loss at every distance, for studies."""
         return replace(self, loss_at_m=((0.0, probability),))
 
     def airtime_ns(self, packet_bytes: int) -> int:
-        """How long one packet is on the air."""
+        """Return how long one packet is on the air."""
         bits = 8 * (packet_bytes + self.per_packet_overhead_bytes)
         return 0 if math.isinf(self.rate_bps) else math.ceil(bits * NS_PER_S / self.rate_bps)
 
@@ -133,7 +133,7 @@ CHANNELS: tuple[ChannelPreset, ...] = (
 
 
 def channel_preset(name: str) -> ChannelPreset:
-    """The preset of that name from CHANNELS."""
+    """Return the preset of that name from CHANNELS."""
     for preset in CHANNELS:
         if preset.name == name:
             return preset
@@ -197,7 +197,7 @@ class SharedMedium:
         self._offered.append((transmission, number))
 
     def run(self, until_ns: float) -> list[PacketInFlight]:
-        """Packets that begin before until_ns, in order of time.
+        """Return packets that begin before until_ns, in order of time.
 
         What begins at until_ns exactly cannot have arrived by then, and is left open because others may still offer at
         that instant; a medium of infinite rate has no queue and settles it too.
@@ -228,7 +228,7 @@ class SharedMedium:
             self._waiting[transmission.agent_id] = _Queue(transmission, first_number)
 
     def _serve(self, start: int) -> PacketInFlight:
-        """The next packet in turn: of the lowest id above the last one served, else of the lowest."""
+        """Return the next packet in turn: of the lowest id above the last one served, else of the lowest."""
         agent = min(self._waiting, key=lambda i: (i <= self._last_served, i))
         queue = self._waiting[agent]
         packet = queue.transmission.packets[queue.at]
@@ -280,7 +280,7 @@ class Channel:
         return tuple(delivery for *_, delivery in sorted(got, key=lambda row: row[:3]))
 
     def _draw_losses(self, sender: int, receiver: int, sent_ns: int, count: int, loss: float) -> NDArray[np.bool_]:
-        """(count,) which packets of a message are lost: a chain of good and bad spells with that stationary loss.
+        """Return (count,) which packets of a message are lost: a chain of good and bad spells with that stationary loss.
 
         P(bad after bad) = 1 - 1/B and P(bad after good) = loss / (B (1 - loss)), B the mean burst, at least
         1 / (1 - loss), where both equal the loss. Both grow with the loss and the first is never the smaller one:
@@ -299,7 +299,7 @@ class Channel:
         return lost
 
     def _latency_ns(self, sender: int, receiver: int, sent_ns: int, count: int) -> NDArray[np.int64]:
-        """(count,) nanoseconds from antenna to application."""
+        """Return (count,) nanoseconds from antenna to application."""
         spread = np.zeros(count)
         if self.preset.jitter_s:
             spread = keyed_uniform((count,), self.seed, "jitter", sender, receiver, sent_ns).numpy()

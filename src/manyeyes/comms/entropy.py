@@ -66,7 +66,7 @@ class _ByteTables(NamedTuple):
 
     @classmethod
     def of(cls, tables: CodeTables) -> _ByteTables:
-        """The arrays of the tables, not copied."""
+        """Return the arrays of the tables, not copied."""
         return cls(tables.starts, np.asarray(tables.frequencies, np.int32), tables.values)
 
 
@@ -83,7 +83,7 @@ class _BodyLimits(NamedTuple):
 
 
 def pack_coded(key: NDArray[np.int64], rows: NDArray[np.uint8], shape: tuple[int, int], tables: CodeTables) -> bytes:
-    """Ascending keys (n,) on a grid of shape (rows, columns), and their rows (n, W), as one stream."""
+    """Return ascending keys (n,) on a grid of shape (rows, columns), and their rows (n, W), as one stream."""
     symbols = np.empty((_room(key, rows), 2), np.int32)
     count = _symbols(key, rows, shape[0], shape[1], _ByteTables.of(tables), symbols)
     out = np.empty(2 * count + STATE_BYTES, np.uint8)
@@ -98,7 +98,7 @@ def _room(key: NDArray[np.int64], rows: NDArray[np.uint8]) -> int:
 def unpack_coded(
     data: bytes, count: int, shape: tuple[int, int], tables: CodeTables
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """The inverse of :func:`pack_coded` for count cells: keys (count,) and rows (count, W)."""
+    """Return the inverse of :func:`pack_coded` for count cells: keys (count,) and rows (count, W)."""
     key, rows = np.empty(count, np.int64), np.empty((count, tables.width), np.uint8)
     raw = np.frombuffer(data, np.uint8)
     if not _read(raw, shape[0], shape[1], _ByteTables.of(tables), key, rows):
@@ -159,7 +159,7 @@ def _counts(
 
 @njit(cache=True)
 def _context(named: Boolx1, at: int, row: int, column: int, height: int, width: int) -> int:  # pragma: no cover
-    """Which neighbours of a cell are named: left, above, above aside, two away."""
+    """Return which neighbours of a cell are named: left, above, above aside, two away."""
     left = column > 0 and named[at - 1]
     above = row > 0 and named[at - width]
     aside = (row > 0 and column > 0 and named[at - width - 1]) or (
@@ -171,7 +171,7 @@ def _context(named: Boolx1, at: int, row: int, column: int, height: int, width: 
 
 @njit(cache=True)
 def _prior(count: int, cells: int) -> I64x2:  # pragma: no cover
-    """Counts (contexts, 2) to begin with of cells that are not and that are named."""
+    """Return counts (contexts, 2) to begin with of cells that are not and that are named."""
     counts = np.ones((_CONTEXTS, 2), np.int64)
     counts[0, 0] = 2 * max(1, cells // max(1, count))
     counts[1:, 0] = 2
@@ -221,7 +221,7 @@ def _symbols(
 
 @njit(cache=True)
 def _size(symbols: I32x2) -> int:  # pragma: no cover
-    """Bytes that _write makes."""
+    """Return bytes that _write makes."""
     state, size = np.int64(_MIN_STATE), STATE_BYTES
     for i in range(symbols.shape[0] - 1, -1, -1):
         start, frequency = np.int64(symbols[i, 0]), np.int64(symbols[i, 1])

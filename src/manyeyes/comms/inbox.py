@@ -48,7 +48,7 @@ class DropCounts:
         return sum(getattr(self, f.name) for f in fields(self))
 
     def increment(self, reason: DropReason) -> DropCounts:
-        """One more packet of that reason."""
+        """Return one more packet of that reason."""
         return replace(self, **{reason: getattr(self, reason) + 1})
 
 
@@ -66,7 +66,7 @@ class Rejection:
 
 
 def token_rejection(agent_id: int, reason: TokenRefusal) -> Rejection:
-    """The rejection of a sender's tokens."""
+    """Return the rejection of a sender's tokens."""
     return Rejection(agent_id, reason, _TOKEN_TEXTS[reason])
 
 
@@ -93,7 +93,7 @@ class ReceivedMessage:
         return self.received_packets == self.expected_packets
 
     def age_ns(self, now_ns: int) -> int:
-        """Age of information: now less the time of capture."""
+        """Return the age of information: now less the time of capture."""
         return now_ns - self.message.timestamp_ns
 
 
@@ -155,7 +155,7 @@ class Inbox:
             self._dropped = self._dropped.increment(refusal)
 
     def received_messages(self, now_ns: int | None = None) -> tuple[ReceivedMessage, ...]:
-        """The newest message of each agent with how much of it came, by agent id. Those expired by now_ns are let go."""
+        """Return the newest message of each agent with how much of it came, by agent id. Those expired by now_ns are dropped."""
         if now_ns is not None:
             self._held = {
                 k: v for k, v in self._held.items() if not self._is_old(v.assembly.header.timestamp_ns, now_ns)
@@ -180,7 +180,7 @@ class Inbox:
         self._held.pop(agent_id, None)
 
     def messages(self, now_ns: int | None = None) -> tuple[Message, ...]:
-        """The newest message of each agent, as far as it came, by agent id."""
+        """Return the newest message of each agent, as far as it came, by agent id."""
         return tuple(reception.message for reception in self.received_messages(now_ns))
 
     def _is_old(self, timestamp_ns: int, now_ns: int) -> bool:
@@ -234,7 +234,7 @@ class Inbox:
         return None
 
     def _make_room(self, stamp: int) -> bool:
-        """True where a new agent whose message is of that time may be held; the stalest agent gives way."""
+        """Return whether a new agent whose message is of that time may be held; the stalest agent gives way."""
         if len(self._held) < self._max_agents:
             return True
         stalest = min(self._held, key=lambda agent: (self._held[agent].assembly.header.timestamp_ns, agent))

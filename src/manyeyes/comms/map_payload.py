@@ -43,7 +43,7 @@ class ElementRows:
 
 
 def pack_element_bodies(local_map: LocalMap, capacity: int) -> list[bytes]:
-    """Bodies of whole elements, the highest score first, each with all rings; no elements are one body with rings alone.
+    """Return bodies of whole elements, the highest score first, each with all rings; no elements are one body with rings alone.
 
     An element that is shorter than the unit is left out.
     """
@@ -77,7 +77,7 @@ def _pack_rings(rings: Sequence[Floats]) -> bytes:
 
 
 def _pack_elements(elements: MapElements) -> list[bytes]:
-    """Each element's bytes, the highest score first; none of one that is too short to be sent."""
+    """Return each element's bytes, the highest score first; none of one that is too short to be sent."""
     if not all(np.isfinite(column).all() for column in (elements.score, elements.sigma, elements.style)):
         raise WireError("Message.local_map has NaN or infinite values; drop those elements before sending.")
     likeliest = elements.style.argmax(1)
@@ -104,7 +104,7 @@ def _pack_elements(elements: MapElements) -> list[bytes]:
 
 
 def _units(points: Floats, ring: bool) -> Ints:
-    """(n, 2) whole units, none as the one before it; of a ring the first is not as the last."""
+    """Return (n, 2) whole units, none as the one before it; of a ring the first is not as the last."""
     codes = np.rint(np.asarray(points, np.float64) / UNIT_M)
     if not (np.abs(codes) <= _MAX_UNITS).all():
         raise WireError(
@@ -121,7 +121,7 @@ def _pack_line(line: Ints) -> bytes:
 
 
 def read_elements(body: bytes) -> ElementRows:
-    """The rows of a body, checked; whatever is wrong is a PacketError with a reason."""
+    """Return the rows of a body, checked; whatever is wrong is a PacketError with a reason."""
     if not body or not 1 <= body[0] <= MAX_RINGS:
         raise PacketError("garbage", f"A body of map elements begins with its rings, 1 to {MAX_RINGS}.")
     at = 1
@@ -138,7 +138,7 @@ def read_elements(body: bytes) -> ElementRows:
 
 
 def _read_line(body: bytes, at: int, ring: bool) -> tuple[Ints, int]:
-    """A line (n, 2) of whole units from a place in a body on, and the place after it."""
+    """Return a line (n, 2) of whole units from a place in a body on, and the place after it."""
     (count,), used = primitives.unpack_varints(body[at : at + 5], 1)
     min_points = 2 + ring
     # Each point takes two bytes or more: what is announced beyond that is not read, hence not made room for.
@@ -154,7 +154,7 @@ def _read_line(body: bytes, at: int, ring: bool) -> tuple[Ints, int]:
 
 
 def merge_elements(parts: list[ElementRows]) -> LocalMap | None:
-    """The elements of several packets of one message, in that order; None of none."""
+    """Return the elements of several packets of one message, in that order; None of none."""
     if not parts:
         return None
     rings, at = [], 1

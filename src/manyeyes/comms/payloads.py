@@ -90,7 +90,7 @@ Body = TokenRows | ObjectRows | PointRows | RequestMap | ElementRows | None
 
 
 def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int16]:
-    """Metres as int16 centimetres; what does not fit is a WireError that names it."""
+    """Convert metres to int16 centimetres; what does not fit is a WireError that names it."""
     codes = np.rint(metres.astype(np.float64) * 100)
     bad = ~(np.abs(codes) <= 32767)
     if bad.any():
@@ -101,13 +101,13 @@ def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int
 
 
 def _object_type(flags: int) -> np.dtype[Any]:
-    """The row of an object, with what the flags of its body add."""
+    """Return the row of an object, with what the flags of its body add."""
     velocity = [("velocity", "i1", 2)] if flags & _VELOCITY else []
     return np.dtype(_OBJECT.descr + velocity + ([("descriptor", "i1", DESCRIPTOR_DIM)] if flags & _DESCRIPTOR else []))
 
 
 def pack_object_bodies(boxes: Boxes, descriptors: Tensor | None, capacity: int) -> list[bytes]:
-    """Bodies of whole objects, the highest score first; no objects are one body without rows.
+    """Return bodies of whole objects, the highest score first; no objects are one body without rows.
 
     Velocities are sent where any of them is not 0, descriptors where there are any.
     """
@@ -162,7 +162,7 @@ def _descriptor_codes(descriptors: Tensor, count: int) -> NDArray[np.int8]:
 
 
 def pack_point_bodies(cloud: PointCloud, capacity: int) -> list[bytes]:
-    """Bodies of whole points, dealt out in turn; no points are one empty body."""
+    """Return bodies of whole points, dealt out in turn; no points are one empty body."""
     rows = np.zeros(len(cloud), _POINT)
     rows["xyz"] = _centimetres(cloud.xyz.cpu().numpy(), "Points")
     rows["intensity"] = np.rint(np.clip(np.nan_to_num(cloud.intensity.cpu().numpy()), 0, 1) * 255)
@@ -171,7 +171,7 @@ def pack_point_bodies(cloud: PointCloud, capacity: int) -> list[bytes]:
 
 
 def token_order(tokens: SparseBev, score: Tensor | None) -> NDArray[np.int64]:
-    """(N,) rows of tokens by falling score, ties and a missing score by key: the order in which they are sent."""
+    """Return (N,) rows of tokens by falling score, ties and a missing score by key: the order in which they are sent."""
     if tokens.sites.batch_size != 1:
         raise WireError(f"A message has the tokens of one grid; got a batch of {tokens.sites.batch_size}.")
     if score is None:
@@ -193,7 +193,7 @@ class TokenCodec:
             raise ConfigError(f"token encoding is one of {', '.join(TOKEN_ENCODINGS)}; got {self.encoding!r}.")
 
     def select_tables(self, tokens: SparseBev) -> CodeTables | None:
-        """The tables, where these tokens are to be coded by them; tokens of another encoding are a WireError."""
+        """Return the tables, where these tokens are to be coded by them; tokens of another encoding are a WireError."""
         codes = tokens.features.dtype == torch.uint8
         if codes != (self.encoding == "codebook"):
             raise WireError(
@@ -218,7 +218,7 @@ def count_cells_per_packet(
     header_bytes: int = 0,
     budget_bytes: int | None = None,
 ) -> list[int]:
-    """How many cells each tokens packet takes, in that order (N,) of rows: bodies of at most capacity bytes.
+    """Return how many cells each tokens packet takes, in that order (N,) of rows: bodies of at most capacity bytes.
 
     Bodies with header_bytes each take at most budget_bytes altogether. Each packet is filled before the next is begun,
     so a smaller budget keeps a prefix of what a larger one keeps.
@@ -244,7 +244,7 @@ def count_cells_per_packet(
 
 
 def _grid_fields(grid: BevGrid) -> tuple[int, ...]:
-    """The grid as the integers of the format; a grid that they do not name exactly is a WireError."""
+    """Return the grid as the integers of the format; a grid that they do not name exactly is a WireError."""
     ends = (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
     fields = (*(round(v * 100) for v in ends), round(grid.pillar * 1000), grid.stride)
     rows, columns = grid.shape
@@ -275,7 +275,7 @@ def _grid_and_cells(fields: tuple[int, ...]) -> tuple[BevGrid, int]:
 
 
 def pack_token_bodies(tokens: SparseBev, score: Tensor | None, token_codec: TokenCodec, capacity: int) -> list[bytes]:
-    """The bodies of the tokens packets, the cells of highest score in the first."""
+    """Return the bodies of the tokens packets, the cells of highest score in the first."""
     order = token_order(tokens, score)
     key, encoding = tokens.sites.key.cpu().numpy()[order], token_codec.encoding
     features = tokens.features.detach().cpu()
@@ -312,7 +312,7 @@ def pack_token_bodies(tokens: SparseBev, score: Tensor | None, token_codec: Toke
 
 
 def pack_request_body(request: RequestMap, capacity: int) -> bytes:
-    """The body of the one packet of a request map."""
+    """Return the body of the one packet of a request map."""
     confidence = request.confidence.detach().double().cpu()
     if not bool(((confidence >= 0) & (confidence <= 1)).all()):
         raise WireError("Message.request.confidence is from 0 to 1; this is not.")
@@ -324,7 +324,7 @@ def pack_request_body(request: RequestMap, capacity: int) -> bytes:
 
 
 def _values(features: Tensor, encoding: TokenEncoding, counts: list[int]) -> tuple[bytes, list[bytes]]:
-    """Features (N, C) as the bytes of their rows, and the bytes of each body's scales; counts: the rows of each body."""
+    """Return features (N, C) as the bytes of their rows, and the bytes of each body's scales; counts: the rows of each body."""
     if encoding == "int8":
         codes, steps = primitives.quantise_int8_runs(features.numpy(), counts)
         return steps.tobytes(), [code.tobytes() for code in codes]
@@ -336,7 +336,7 @@ def _values(features: Tensor, encoding: TokenEncoding, counts: list[int]) -> tup
 
 
 def read_body(kind: int, body: bytes, fingerprint: bytes, tables: CodeTables | None) -> Body:
-    """The rows of a body, checked; whatever is wrong is a PacketError with a reason.
+    """Return the rows of a body, checked; whatever is wrong is a PacketError with a reason.
 
     tables: of the reader's weights; coded tokens can only be read by those that the packet's fingerprint names.
     """
@@ -377,7 +377,7 @@ def _read_objects(body: bytes) -> ObjectRows:
 
 
 def _read_grid(body: bytes) -> tuple[BevGrid, int]:
-    """The grid that a body begins with, and its cells."""
+    """Return the grid that a body begins with, and its cells."""
     if len(body) < _GRID.size:
         raise PacketError("garbage", f"A grid has {_GRID.size} bytes; got {len(body)}.")
     try:
@@ -427,7 +427,7 @@ def _read_tokens(body: bytes, fingerprint: bytes, tables: CodeTables | None) -> 
 
 
 def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
-    """The cells of several packets, all of one form, as one set, by key; None of none."""
+    """Return the cells of several packets, all of one form, as one set, by key; None of none."""
     if not parts:
         return None
     key = np.concatenate([p.key for p in parts])
@@ -437,7 +437,7 @@ def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
 
 
 def _features(parts: list[TokenRows]) -> NDArray[Any]:
-    """(n, C) float32, or uint8 of codes, of the rows of several packets of one form."""
+    """Return (n, C) float32, or uint8 of codes, of the rows of several packets of one form."""
     dtype, channels = _FEATURE_TYPES[parts[0].encoding], parts[0].channels
     # A copy that may be written to, in the machine's own order of bytes.
     values = np.frombuffer(b"".join(p.values for p in parts), dtype).astype(dtype.newbyteorder("="))
@@ -451,7 +451,7 @@ def _features(parts: list[TokenRows]) -> NDArray[Any]:
 
 
 def merge_objects(parts: list[NDArray[Any]]) -> Boxes | None:
-    """The objects of several packets, in that order, with height and z from their labels; None of none."""
+    """Return the objects of several packets, in that order, with height and z from their labels; None of none."""
     if not parts:
         return None
     rows = np.concatenate(parts)
@@ -473,20 +473,20 @@ def merge_objects(parts: list[NDArray[Any]]) -> Boxes | None:
 
 
 def merge_descriptors(parts: list[NDArray[Any]]) -> Tensor | None:
-    """(N, DESCRIPTOR) of the objects of several packets, in that order; None where they have none."""
+    """Return (N, DESCRIPTOR) of the objects of several packets, in that order; None where they have none."""
     if not parts or "descriptor" not in (parts[0].dtype.names or ()):
         return None
     return torch.from_numpy(_column_or_zeros(np.concatenate(parts), "descriptor", DESCRIPTOR_DIM) / np.float32(127))
 
 
 def _column_or_zeros(rows: NDArray[Any], name: str, width: int) -> NDArray[np.float32]:
-    """A column of small integers, zeros where the rows have none."""
+    """Return a column of small integers, zeros where the rows have none."""
     present = name in (rows.dtype.names or ())
     return rows[name].astype(np.float32) if present else np.zeros((len(rows), width), np.float32)
 
 
 def merge_points(parts: list[NDArray[Any]]) -> PointCloud | None:
-    """The points of several packets in the sender's order, less those lost; None of none."""
+    """Return the points of several packets in the sender's order, less those lost; None of none."""
     if not parts:
         return None
     # Packet k of K holds points k, k + K, …: sorting by place within the packet restores the order.

@@ -35,7 +35,7 @@ class PacketError(WireError):
 
 
 def varint_sizes(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Bytes that each of the values (N,) in [0, 2^35) takes as a varint."""
+    """Return bytes that each of the values (N,) in [0, 2^35) takes as a varint."""
     return np.searchsorted(_VARINT_LIMITS, values, side="right") + 1
 
 
@@ -50,7 +50,7 @@ def pack_varints(values: NDArray[np.int64]) -> bytes:
 
 @njit(cache=True)
 def _write_varints(values: I64x1, out: U8x1) -> int:  # pragma: no cover
-    """Bytes written to out; -1 where a value does not fit."""
+    """Return bytes written to out; -1 where a value does not fit."""
     at = 0
     for value in values:
         if value < 0 or value >> 35:
@@ -61,7 +61,7 @@ def _write_varints(values: I64x1, out: U8x1) -> int:  # pragma: no cover
 
 @njit(cache=True)
 def _write_varint(value: int, out: U8x1, at: int) -> int:  # pragma: no cover
-    """The place in out after the value that was written from at on."""
+    """Return the place in out after the value that was written from at on."""
     while value >> 7:
         out[at] = value & 127 | 128
         value >>= 7
@@ -71,7 +71,7 @@ def _write_varint(value: int, out: U8x1, at: int) -> int:  # pragma: no cover
 
 
 def unpack_varints(data: bytes, count: int) -> tuple[NDArray[np.int64], int]:
-    """The first ``count`` varints of data, and how many bytes they took. Padded (non-shortest) forms are refused."""
+    """Return the first ``count`` varints of data, and how many bytes they took. Padded (non-shortest) forms are refused."""
     values = np.zeros(count, np.int64)
     used, whole = _read_varints(np.frombuffer(data, np.uint8), values)
     _check_varints(used, whole, count)
@@ -87,7 +87,7 @@ def _check_varints(used: int, whole: int, count: int) -> None:
 
 @njit(cache=True)
 def _read_varints(raw: U8x1, values: I64x1) -> tuple[int, int]:  # pragma: no cover
-    """Bytes read, -1 where one is too long or padded, and how many values are whole."""
+    """Return bytes read, -1 where one is too long or padded, and how many values are whole."""
     at = 0
     for i in range(values.shape[0]):
         value, shift = 0, 0
@@ -110,7 +110,7 @@ def _read_varints(raw: U8x1, values: I64x1) -> tuple[int, int]:  # pragma: no co
 
 @njit(cache=True)
 def _sizes(key: I64x1) -> tuple[int, int]:  # pragma: no cover
-    """Bytes of sorted keys as gaps and as a bitmap."""
+    """Return bytes of sorted keys as gaps and as a bitmap."""
     gaps, before = 0, -1
     for k in key:
         gaps += _varint_bytes(k - before - 1)
@@ -129,7 +129,7 @@ def _varint_bytes(value: int) -> int:  # pragma: no cover
 
 
 def cells_size(key: NDArray[np.int64]) -> int:
-    """Bytes of :func:`pack_cells` for sorted keys (N,); a further key lowers it by at most one byte (a shorter start)."""
+    """Return bytes of :func:`pack_cells` for sorted keys (N,); a further key lowers it by at most one byte (a shorter start)."""
     return min(_sizes(key)) if key.size else 0
 
 
@@ -137,7 +137,7 @@ def cells_size(key: NDArray[np.int64]) -> int:
 def count_fitting_cells(
     key: I64x1, bytes_per_cell: int, fixed_bytes: int, capacity: int, header_bytes: int, bytes_left: int
 ) -> I64x1:  # pragma: no cover
-    """How many keys (N,), in the order given, each body takes: its cells, each bytes a cell, and fixed bytes.
+    """Return how many keys (N,), in the order given, each body takes: its cells, each bytes a cell, and fixed bytes.
 
     A body has at most capacity bytes and, where left is not negative, all bodies with their headers at most left.
     """
@@ -214,7 +214,7 @@ def _write_cell_runs(key: I64x1, counts: I64x1, out: U8x1, layouts: U8x1, ends: 
 
 
 def unpack_cells(layout: int, data: bytes, count: int) -> tuple[NDArray[np.int64], int]:
-    """The inverse of :func:`pack_cells`: ascending keys (count,) and how many bytes of data they took."""
+    """Return the inverse of :func:`pack_cells`: ascending keys (count,) and how many bytes of data they took."""
     key, raw = np.empty(count, np.int64), np.frombuffer(data, np.uint8)
     if layout == DELTA:
         used, whole = _read_gaps(raw, key)
@@ -245,7 +245,7 @@ def _read_gaps(raw: U8x1, key: I64x1) -> tuple[int, int]:  # pragma: no cover
 
 @njit(cache=True)
 def _read_bitmap(raw: U8x1, start: int, end: int, first: int, key: I64x1) -> int:  # pragma: no cover
-    """How many bits are set from start to end; as many of their keys as there is room for."""
+    """Return how many bits are set from start to end; as many of their keys as there is room for."""
     marked = 0
     for i in range(end - start):
         byte = raw[start + i]
@@ -258,7 +258,7 @@ def _read_bitmap(raw: U8x1, start: int, end: int, first: int, key: I64x1) -> int
 
 
 def are_finite(data: bytes, at: int, size: int) -> bool:
-    """Whether the little-endian floats of size bytes, 2 or 4, that data holds from at on are neither NaN nor infinite."""
+    """Return whether the little-endian floats of size bytes, 2 or 4, that data holds from at on are neither NaN nor infinite."""
     return bool(_are_finite(np.frombuffer(data, np.uint8), at, size))
 
 
@@ -275,7 +275,7 @@ def _are_finite(raw: U8x1, at: int, size: int) -> bool:  # pragma: no cover
 
 
 def max_magnitude(data: bytes, size: int) -> float:
-    """The largest magnitude of little-endian floats of size bytes, 2 or 4, none of them NaN; at least one float."""
+    """Return the largest magnitude of little-endian floats of size bytes, 2 or 4, none of them NaN; at least one float."""
     # Without their signs, the bits of floats are in the order of their values.
     bits = np.frombuffer(data, f"<u{size}") & np.array((1 << 8 * size - 1) - 1, f"<u{size}")
     return float(np.frombuffer(bits.max().tobytes(), f"<f{size}")[0])
@@ -292,7 +292,7 @@ SCALES: NDArray[np.float32] = _scales()
 
 
 def quantise_int8(values: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:
-    """Features (N, C) as scale codes (C,) and steps (N, C) of SCALES[code] / 127; the error is half a step at most.
+    """Return features (N, C) as scale codes (C,) and steps (N, C) of SCALES[code] / 127; the error is half a step at most.
 
     One byte a channel instead of a float: the step is at most 9 % coarser than the ideal one.
     """
@@ -317,18 +317,18 @@ def quantise_int8_runs(values: NDArray[np.float32], counts: list[int]) -> tuple[
 
 
 def dequantise_int8(code: NDArray[np.uint8], steps: NDArray[np.int8]) -> NDArray[np.float32]:
-    """Features (N, C) float32 from scale codes (C,), or (N, C) of each row, and steps (N, C)."""
+    """Return features (N, C) float32 from scale codes (C,), or (N, C) of each row, and steps (N, C)."""
     step = (SCALES[code] / np.float32(127)).astype(np.float32)
     return steps.astype(np.float32) * step
 
 
 def log_codes(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:
-    """Values to 0 … 255: 0 is exactly 0, 1 … 255 are equal ratios from low to high; what lies outside saturates."""
+    """Quantise values to 0 … 255: 0 is exactly 0, 1 … 255 are equal ratios from low to high; what lies outside saturates."""
     ratio = np.log(np.maximum(values, low) / low) / math.log(high / low)
     return np.where(values > 0, 1 + np.rint(np.clip(ratio, 0, 1) * 254), 0).astype(np.uint8)
 
 
 def log_values(codes: NDArray[np.uint8], low: float, high: float) -> NDArray[np.float32]:
-    """The inverse of :func:`log_codes`, within half a step of the logarithm."""
+    """Return the inverse of :func:`log_codes`, within half a step of the logarithm."""
     exponent = (np.maximum(codes, 1).astype(np.float64) - 1) / 254
     return np.where(codes > 0, low * (high / low) ** exponent, 0.0).astype(np.float32)

@@ -18,7 +18,7 @@ from manyeyes.datatypes.message import Message, RequestMap
 
 
 def build_request_map(xy: Tensor, confidence: Tensor, windows: BevGrid) -> RequestMap:
-    """One agent's request map over a coarse grid: the minimum confidence (N,) in [0, 1] of each window, 0 without objects.
+    """Return one agent's request map over a coarse grid: the minimum confidence (N,) in [0, 1] of each window, 0 without objects.
 
     xy: (N, 2) metres in the agent's frame, positions of its objects; confidence: their scores. The minimum requests tokens where
     one of two vehicles is uncertain.
@@ -36,7 +36,7 @@ def build_request_map(xy: Tensor, confidence: Tensor, windows: BevGrid) -> Reque
 def compute_request_weights(
     xy: Tensor, world_from_sender: Transform, requests: Sequence[Message], min_weight: float = 0.1
 ) -> Tensor:
-    """Weights (N,) in [min_weight, 1] of the positive scores of tokens at xy (N, 2), metres in the sender's frame.
+    """Return weights (N,) in [min_weight, 1] of the positive scores of tokens at xy (N, 2), metres in the sender's frame.
 
     requests: messages with a request map; without any, all weights are 1. For one receiver the weight is 1 - confidence of the
     token's window, and 0 outside the map; the maximum over receivers counts. ``min_weight`` keeps the order of tokens that no

@@ -52,7 +52,7 @@ class TokenFormat:
         return None if max_magnitude(rows) <= MAX_TOKEN_VALUE * _ROUNDING else "value"
 
     def check_tokens(self, tokens: SparseBev) -> TokenRefusal | None:
-        """The same of tokens that were read already, rows of floats (N, channels)."""
+        """Return the same of tokens that were read already, rows of floats (N, channels)."""
         if tokens.grid != self.grid:
             return "grid"
         if not tokens.features.is_floating_point() or tokens.features.shape[1] != self.channels:
@@ -63,12 +63,12 @@ class TokenFormat:
 
 
 def clamp_features(features: Tensor) -> Tensor:
-    """Features (N, C) as they may be sent: clamped to MAX_TOKEN_VALUE."""
+    """Return features (N, C) as they may be sent: clamped to MAX_TOKEN_VALUE."""
     return features.clamp(-MAX_TOKEN_VALUE, MAX_TOKEN_VALUE)
 
 
 def max_magnitude(rows: TokenRows) -> float:
-    """The largest magnitude among the float values of a packet; 0 of none."""
+    """Return the largest magnitude among the float values of a packet; 0 of none."""
     if not len(rows.key):
         return 0.0
     if rows.encoding == "int8":

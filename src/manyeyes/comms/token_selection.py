@@ -20,7 +20,7 @@ def select_within_budget(
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
 ) -> tuple[SparseBev, Tensor]:
-    """The cells of highest score (N,), ties by key, whose packets together have at most budget_bytes; None is no limit.
+    """Return the cells of highest score (N,), ties by key, whose packets together have at most budget_bytes; None is no limit.
 
     Header, cell indices, scales and checksums are counted, so that the packets ``wire.encode`` makes of the result
     never exceed the budget. A smaller budget keeps a subset. A budget that holds no cell keeps none: then the section

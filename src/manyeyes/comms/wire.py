@@ -164,7 +164,7 @@ def encode(
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
 ) -> list[bytes]:
-    """A message as packets of at most mtu bytes, the most important first; what does not fit the format is a WireError.
+    """Return a message as packets of at most mtu bytes, the most important first; what does not fit the format is a WireError.
 
     tables: those of the weights that the message names; with them, codes are entropy-coded.
     """
@@ -173,7 +173,7 @@ def encode(
 
 
 def encode_other_sections(message: Message, mtu: int = DEFAULT_MTU) -> list[EncodedBody]:
-    """The sections of a message apart from its tokens, as the bodies of packets."""
+    """Return the sections of a message apart from its tokens, as the bodies of packets."""
     capacity, bodies = _body_capacity(mtu), dict[int, list[bytes]]()
     if message.objects is not None:
         bodies[payloads.OBJECTS] = payloads.pack_object_bodies(message.objects, message.descriptors, capacity)
@@ -193,7 +193,7 @@ def encode_tokens(
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
 ) -> list[EncodedBody]:
-    """The tokens of a message as the bodies of packets, none without tokens; arguments and errors as in :func:`encode`."""
+    """Return the tokens of a message as the bodies of packets, none without tokens; arguments and errors as in :func:`encode`."""
     token_codec, capacity = TokenCodec(token_encoding, tables), _body_capacity(mtu)
     if message.tokens is None:
         return []
@@ -212,12 +212,12 @@ def _body_capacity(mtu: int) -> int:
 
 
 def count_bytes(bodies: Iterable[EncodedBody]) -> int:
-    """Bytes of the packets of these bodies."""
+    """Return bytes of the packets of these bodies."""
     return sum(HEADER_BYTES + len(body.content) for body in bodies)
 
 
 def make_packets(message: Message, bodies: Sequence[EncodedBody]) -> list[bytes]:
-    """Packets of the bodies of a message, in the order of their kinds; without any body one packet of kind 0."""
+    """Return packets of the bodies of a message, in the order of their kinds; without any body one packet of kind 0."""
     bodies = sorted(bodies, key=lambda body: _SENDING_ORDER.index(body.kind)) or [EncodedBody(payloads.NONE, b"")]
     if len(bodies) > 65535:
         raise WireError(
@@ -261,7 +261,7 @@ def _common_fields(message: Message) -> _Common:
 
 
 def _smallest_three(rotation: NDArray[np.float64]) -> tuple[int, list[int]]:
-    """Index of the largest part of the unit quaternion (w, x, y, z), and the other three as integers."""
+    """Return the index of the largest part of the unit quaternion (w, x, y, z), and the other three as integers."""
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     # Each row is the quaternion times four of its parts; the row of the largest part is the best conditioned.
     rows = np.array(
@@ -279,7 +279,7 @@ def _smallest_three(rotation: NDArray[np.float64]) -> tuple[int, list[int]]:
 
 
 def _rotation(q: tuple[float, ...]) -> list[list[float]]:
-    """The rotation matrix of a unit quaternion w, x, y, z."""
+    """Return the rotation matrix of a unit quaternion w, x, y, z."""
     w, x, y, z = q
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -319,7 +319,7 @@ def _encode_covariance(covariance: NDArray[np.float64]) -> list[int]:
 
 
 def _decode_covariance(covariance_codes: tuple[int, ...]) -> NDArray[np.float64]:
-    """The inverse of _encode_covariance; any codes are some covariance."""
+    """Return the inverse of _encode_covariance; any codes are some covariance."""
     codes = np.array(covariance_codes[:3], np.uint8)
     sigma = np.concatenate((log_values(codes[:2], *_SIGMA_M), log_values(codes[2:], *_SIGMA_RAD))).astype(np.float64)
     lower = np.zeros((3, 3))
@@ -331,7 +331,7 @@ def _decode_covariance(covariance_codes: tuple[int, ...]) -> NDArray[np.float64]
 
 
 def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
-    """One packet, checked from its first to its last byte; every fault is a :class:`PacketError` with a reason.
+    """Return one packet, checked from its first to its last byte; every fault is a :class:`PacketError` with a reason.
 
     tables: of the reader's weights, by which coded tokens are read.
     """
@@ -359,7 +359,7 @@ def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
 # The packets of a message come one after another, and what they say alike is read once.
 @lru_cache(maxsize=64)
 def _header(common: bytes, flags: int, count: int) -> MessageHeader:
-    """The fields from the agent id to the fingerprint, checked; flags without the kind of body."""
+    """Return the fields from the agent id to the fingerprint, checked; flags without the kind of body."""
     agent_id, timestamp_ns, place, *rest = _COMMON.unpack(common)
     position = tuple(
         int.from_bytes(place[at : at + _POSITION_BYTES], "little", signed=True) / _POSITION_UNITS
@@ -372,7 +372,7 @@ def _header(common: bytes, flags: int, count: int) -> MessageHeader:
 
 
 def _quaternion(largest: int, codes: list[int]) -> list[float]:
-    """The unit quaternion w, x, y, z of three integers and the index of the part left out."""
+    """Return the unit quaternion w, x, y, z of three integers and the index of the part left out."""
     parts = [v / _QUATERNION_UNIT for v in codes]
     rest = 1 - sum(v * v for v in parts)
     # The part left out is the largest: at least 1/2, up to rounding.
@@ -396,7 +396,7 @@ class Assembly:
         self.add(first)
 
     def add(self, fragment: Fragment) -> bool:
-        """True where the fragment is new, False where it is a copy; one that contradicts is refused (PacketError)."""
+        """Return whether the fragment is new, False where it is a copy; one that contradicts is refused (PacketError)."""
         head, held = self.header, self.fragments.get(fragment.number)
         if held is not None and held.packet == fragment.packet:
             return False
@@ -457,7 +457,7 @@ class Assembly:
 
 
 def assemble(fragments: Iterable[Fragment]) -> Message:
-    """The fragments of one message, in any order, with or without copies and gaps, as that message."""
+    """Return the fragments of one message, in any order, with or without copies and gaps, as that message."""
     assembly: Assembly | None = None
     for fragment in fragments:
         if assembly is None:

@@ -23,7 +23,7 @@ class CellLattice(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def are_valid_keys(key: I64x1, size: int) -> bool:  # pragma: no cover
-    """Whether keys (N,) ascend strictly and lie in [0, size)."""
+    """Return whether keys (N,) ascend strictly and lie in [0, size)."""
     last = np.int64(-1)
     for k in key:
         if k <= last:
@@ -34,7 +34,7 @@ def are_valid_keys(key: I64x1, size: int) -> bool:  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def compute_centers(key: I64x1, lattice: CellLattice) -> F32x2:  # pragma: no cover
-    """(N, 2) float32: ``BevGrid.centers`` of ascending keys (N,)."""
+    """Return (N, 2) float32: ``BevGrid.centers`` of ascending keys (N,)."""
     rows, columns, stride, pillar, x_min, y_min = lattice
     xy = np.empty((key.shape[0], 2), np.float32)
     start, end, y = 0, 0, 0.0

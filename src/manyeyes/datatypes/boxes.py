@@ -89,7 +89,7 @@ class Boxes:
 
     @classmethod
     def empty(cls, dtype: torch.dtype = torch.float32) -> Boxes:
-        """An instance without boxes."""
+        """Return an instance without boxes."""
         return cls.of(torch.zeros(0, 3, dtype=dtype), torch.zeros(0, 3, dtype=dtype), torch.zeros(0, dtype=dtype))
 
     def __len__(self) -> int:
@@ -100,17 +100,17 @@ class Boxes:
 
     @classmethod
     def cat(cls, many: list[Boxes]) -> Boxes:
-        """Several sets of one frame as one."""
+        """Return several sets of one frame as one."""
         return cls(*(torch.cat([getattr(b, f.name) for b in many]) for f in fields(cls))) if many else cls.empty()
 
     def to(self, dtype: torch.dtype) -> Boxes:
-        """The same boxes in another floating-point type."""
+        """Return the same boxes in another floating-point type."""
         return Boxes(
             *(v.to(dtype) if v.is_floating_point() else v for v in (getattr(self, f.name) for f in fields(self)))
         )
 
     def transform(self, target_from_source: Transform) -> Boxes:
-        """The same boxes in another frame; headings and velocities are projected onto the target's ground plane."""
+        """Return the same boxes in another frame; headings and velocities are projected onto the target's ground plane."""
         turn = target_from_source.rotation.to(self.yaw.dtype).mT
         ahead = torch.stack((self.yaw.cos(), self.yaw.sin(), torch.zeros_like(self.yaw)), -1) @ turn
         velocity = (self.velocity.to(turn.dtype) @ turn[:2])[:, :2]
@@ -125,11 +125,11 @@ class Boxes:
         return replace(self, center=center)
 
     def bev(self) -> Tensor:
-        """(N, 5): x, y, length, width, yaw."""
+        """Return (N, 5): x, y, length, width, yaw."""
         return torch.cat((self.center[:, :2], self.size[:, :2], self.yaw[:, None]), -1)
 
     def corners(self) -> Tensor:
-        """(N, 8, 3): front left, front right, rear right, rear left at the bottom, then the same at the top."""
+        """Return (N, 8, 3): front left, front right, rear right, rear left at the bottom, then the same at the top."""
         unit = torch.tensor(
             [[x, y, z] for z in (-0.5, 0.5) for x, y in ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))],
             dtype=self.center.dtype,
@@ -140,7 +140,7 @@ class Boxes:
         return torch.stack((x, y, local[..., 2]), -1) + self.center[:, None, :]
 
     def contains(self, points: Numbers, margin_m: float = 0.0) -> Tensor:
-        """(N, P) bool: which of the points (P, 3) lie in each box, enlarged by margin_m on every side."""
+        """Return (N, P) bool: which of the points (P, 3) lie in each box, enlarged by margin_m on every side."""
         delta = as_tensor(points, "Boxes.contains", None)[None] - self.center[:, None]
         c, s = self.yaw.cos()[:, None], self.yaw.sin()[:, None]
         local = torch.stack(
@@ -150,5 +150,5 @@ class Boxes:
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
-    """Angles to [-pi, pi), radians."""
+    """Wrap angles to [-pi, pi), radians."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi

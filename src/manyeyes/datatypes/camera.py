@@ -35,7 +35,8 @@ class Camera:
             raise ShapeError(f"Camera needs width and height of at least one pixel; got {self.width} x {self.height}.")
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Points (..., N, 3) of the agent's frame as pixels (..., N, 2), u to the right and v down, and depths (..., N) in metres.
+        """Project points (..., N, 3) of the agent's frame to pixels (..., N, 2), u to the right and v down, and depths (..., N)
+        in metres.
 
         Where the depth is not positive the point is behind the camera, and its pixel means nothing.
         """
@@ -44,7 +45,7 @@ class Camera:
         return scaled[..., :2] / scaled[..., 2:], local[..., 2]
 
     def rays(self) -> Tensor:
-        """(height, width, 3) float64: through each pixel's centre, in the agent's axes, of depth one."""
+        """Return (height, width, 3) float64: through each pixel's centre, in the agent's axes, of depth one."""
         v, u = torch.meshgrid(
             torch.arange(self.height, dtype=torch.float64) + 0.5,
             torch.arange(self.width, dtype=torch.float64) + 0.5,
@@ -54,7 +55,7 @@ class Camera:
         return pixel @ torch.linalg.inv(self.intrinsic.double()).mT @ self.agent_from_camera.rotation.double().mT
 
     def resize(self, width: int, height: int) -> Camera:
-        """The same view on another number of pixels."""
+        """Return the same view on another number of pixels."""
         scale = torch.tensor([width / self.width, height / self.height, 1.0], dtype=self.intrinsic.dtype)
         return Camera(scale[:, None] * self.intrinsic, self.agent_from_camera, width, height)
 

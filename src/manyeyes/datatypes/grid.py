@@ -47,7 +47,7 @@ class BevGrid:
         return self.stride * self.pillar
 
     def at(self, stride: int) -> BevGrid:
-        """The same ground at another stride."""
+        """Return the same ground at another stride."""
         return replace(self, stride=stride)
 
     def centers(self, yx: Tensor) -> Tensor:
@@ -56,13 +56,13 @@ class BevGrid:
         return (origin + (yx.flip(-1).double() * self.stride + 0.5) * self.pillar).float()
 
     def cells(self, xy: Tensor) -> Tensor:
-        """Row and column (N, 2) of the nearest cell centre of points (N, 2); clamped to the grid. See :meth:`contains`."""
+        """Return row and column (N, 2) of the nearest cell centre of points (N, 2); clamped to the grid. See :meth:`contains`."""
         origin = torch.tensor([self.x_min, self.y_min], dtype=torch.float64)
         nearest = (((xy.double() - origin) / self.pillar - 0.5) / self.stride + 0.5).floor().long().flip(-1)
         return torch.minimum(nearest.clamp_min(0), torch.tensor(self.shape) - 1)
 
     def contains(self, points: Tensor) -> Tensor:
-        """(N,) bool: which points (N, 2 or 3) lie within the range; half-open, [min, max)."""
+        """Return (N,) bool: which points (N, 2 or 3) lie within the range; half-open, [min, max)."""
         low = torch.tensor([self.x_min, self.y_min, self.z_min], dtype=points.dtype)[: points.shape[-1]]
         high = torch.tensor([self.x_max, self.y_max, self.z_max], dtype=points.dtype)[: points.shape[-1]]
         return ((points >= low) & (points < high)).all(-1)

@@ -40,5 +40,5 @@ class Keypoints:
         return self.boxes.center[:, :2]
 
     def transform(self, target_from_source: Transform) -> Keypoints:
-        """The same points in another frame; descriptors stay as they are."""
+        """Return the same points in another frame; descriptors stay as they are."""
         return Keypoints(self.boxes.transform(target_from_source), self.descriptor)

@@ -23,7 +23,7 @@ DEFAULT_SIGMA_M = 0.12
 
 
 def freeze(values: ArrayLike, dtype: type[np.generic]) -> NDArray:
-    """A contiguous, read-only array of that type; the caller's own array stays writeable."""
+    """Return a contiguous, read-only array of that type; the caller's own array stays writeable."""
     array = np.ascontiguousarray(values, dtype=dtype).view()
     array.flags.writeable = False
     return array
@@ -45,7 +45,7 @@ def check_offsets(name: str, offsets: Ints, total: int) -> None:
 
 
 def take_rows(offsets: Ints, rows: Ints) -> tuple[Ints, Ints]:
-    """The offsets of the chosen rows of a table, and the (P',) places of their entries, row by row."""
+    """Return the offsets of the chosen rows of a table, and the (P',) places of their entries, row by row."""
     counts = offsets[rows + 1] - offsets[rows]
     chosen = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     return chosen, np.arange(chosen[-1]) + np.repeat(offsets[rows] - chosen[:-1], counts)
@@ -65,7 +65,7 @@ class Polygons:
 
     @classmethod
     def of(cls, rings: Sequence[ArrayLike] = ()) -> Polygons:
-        """Rings (K, 2) as columns."""
+        """Return rings (K, 2) as columns."""
         arrays = [np.reshape(np.asarray(ring, np.float64), (-1, 2)) for ring in rings]
         offsets = np.concatenate(([0], np.cumsum([len(a) for a in arrays], dtype=np.int64)))
         return cls(np.concatenate(arrays) if arrays else np.zeros((0, 2)), offsets)
@@ -74,7 +74,7 @@ class Polygons:
         return len(self.offsets) - 1
 
     def ring(self, i: int) -> Floats:
-        """(K, 2) ring i."""
+        """Return (K, 2) ring i."""
         return self.points[self.offsets[i] : self.offsets[i + 1]]
 
 
@@ -120,7 +120,9 @@ class MapElements:
         sigma: ArrayLike = DEFAULT_SIGMA_M,
         style: ArrayLike = NO_STYLE,
     ) -> MapElements:
-        """Elements from lines (K, 2); kind, score and style are one for all or (N,) (style: (N, S) too), sigma one or (P,)."""
+        """Return elements from lines (K, 2); kind, score and style are one for all or (N,) (style: (N, S) too), sigma one or
+        (P,).
+        """
         arrays = [np.reshape(np.asarray(line, np.float64), (-1, 2)) for line in polylines]
         n = len(arrays)
         offsets = np.concatenate(([0], np.cumsum([len(a) for a in arrays], dtype=np.int64)))
@@ -136,12 +138,12 @@ class MapElements:
 
     @classmethod
     def empty(cls) -> MapElements:
-        """An instance without elements."""
+        """Return an instance without elements."""
         return cls.of([], DIVIDER)
 
     @classmethod
     def cat(cls, many: Sequence[MapElements]) -> MapElements:
-        """Several sets of one frame as one, in order."""
+        """Return several sets of one frame as one, in order."""
         if not many:
             return cls.empty()
         starts = np.cumsum([0, *(len(m.points) for m in many)])
@@ -170,11 +172,11 @@ class MapElements:
         return np.repeat(np.arange(len(self)), self.counts)
 
     def polyline(self, i: int) -> Floats:
-        """(K, 2) the points of element i, a ring without its first point repeated."""
+        """Return (K, 2) the points of element i, a ring without its first point repeated."""
         return self.points[self.offsets[i] : self.offsets[i + 1]]
 
     def take(self, rows: ArrayLike) -> MapElements:
-        """The chosen elements, by index in the order given or by a mask (N,)."""
+        """Return the chosen elements, by index in the order given or by a mask (N,)."""
         index = np.asarray(rows)
         index = np.flatnonzero(index) if index.dtype == np.bool_ else index.astype(np.int64)
         offsets, places = take_rows(self.offsets, index)
@@ -183,17 +185,17 @@ class MapElements:
         )
 
     def with_points(self, points: ArrayLike) -> MapElements:
-        """The same elements with each point moved: (P, 2)."""
+        """Return the same elements with each point moved: (P, 2)."""
         return MapElements(self.kind, self.offsets, np.asarray(points), self.score, self.sigma, self.style)
 
     def transform(self, x: float, y: float, yaw: float) -> MapElements:
-        """The same elements in the frame where this one's origin stands at x, y (m) turned by yaw (rad)."""
+        """Return the same elements in the frame where this one's origin stands at x, y (m) turned by yaw (rad)."""
         c, s = np.cos(yaw), np.sin(yaw)
         px, py = self.points[:, 0], self.points[:, 1]
         return self.with_points(np.stack((c * px - s * py + x, s * px + c * py + y), 1))
 
     def segments(self) -> tuple[Ints, Ints, Ints]:
-        """(S,) places in points where segments start and end, and their elements; rings have their closing segment too."""
+        """Return (S,) places in points where segments start and end, and their elements; rings have their closing segment too."""
         element_of_point = self.element_of_point
         start = np.arange(len(self.points))
         last = start + 1 == self.offsets[1:][element_of_point]
@@ -202,13 +204,13 @@ class MapElements:
         return start[keep], end[keep], element_of_point[keep]
 
     def lengths(self) -> Floats:
-        """(N,) metres along each element, the closing edge of a ring included."""
+        """Return (N,) metres along each element, the closing edge of a ring included."""
         start, end, element_of_segment = self.segments()
         step = np.hypot(*(self.points[end] - self.points[start]).T)
         return np.bincount(element_of_segment, step, len(self)).astype(np.float64)
 
     def bounds(self) -> Floats:
-        """(N, 4) minimum x and y, maximum x and y; an element without points: inf, inf, -inf, -inf."""
+        """Return (N, 4) minimum x and y, maximum x and y; an element without points: inf, inf, -inf, -inf."""
         box = np.tile((np.inf, np.inf, -np.inf, -np.inf), (len(self), 1))
         some = self.counts > 0
         starts = self.offsets[:-1][some]

@@ -65,12 +65,12 @@ class PointCloud:
         return PointCloud(self.xyz[index], self.intensity[index], self.time_s[index])
 
     def transform(self, target_from_source: Transform) -> PointCloud:
-        """The same returns in another frame."""
+        """Return the same returns in another frame."""
         return PointCloud(target_from_source.apply(self.xyz), self.intensity, self.time_s)
 
     @classmethod
     def cat(cls, clouds: list[PointCloud]) -> PointCloud:
-        """Several clouds of one frame as one."""
+        """Return several clouds of one frame as one."""
         return cls(
             torch.cat([c.xyz for c in clouds]),
             torch.cat([c.intensity for c in clouds]),

@@ -87,13 +87,13 @@ class SparseBev:
         return SparseBev(features, self.sites)
 
     def keep(self, mask: Tensor) -> SparseBev:
-        """The sites where mask (N,) is true, as a new set."""
+        """Return the sites where mask (N,) is true, as a new set."""
         rows = mask.nonzero()[:, 0]
         sites = Sites(self.sites.key.index_select(0, rows), self.grid, self.sites.batch_size)
         return SparseBev(self.features.index_select(0, rows), sites)
 
     def dense(self) -> Tensor:
-        """(B, C, rows, columns), zero where no site is; for figures, tests and dense baselines."""
+        """Return (B, C, rows, columns), zero where no site is; for figures, tests and dense baselines."""
         rows, columns = self.grid.shape
         out = self.features.new_zeros(self.sites.batch_size * rows * columns, self.features.shape[1])
         out[self.sites.key] = self.features
@@ -101,7 +101,7 @@ class SparseBev:
 
     @classmethod
     def from_cells(cls, features: Tensor, yx: Tensor, grid: BevGrid) -> SparseBev:
-        """One grid's cells (N, 2), each at most once, in any order."""
+        """Return one grid's cells (N, 2), each at most once, in any order."""
         rows, columns = grid.shape
         inside = (yx >= 0).all(-1) & (yx[:, 0] < rows) & (yx[:, 1] < columns)
         if not bool(inside.all()):

@@ -32,7 +32,7 @@ class Transform:
 
     @classmethod
     def identity(cls, *batch: int, dtype: torch.dtype = torch.float64) -> Transform:
-        """The identity motion of a batch shape."""
+        """Return the identity motion of a batch shape."""
         return cls(torch.eye(3, dtype=dtype).expand(*batch, 3, 3), torch.zeros(*batch, 3, dtype=dtype))
 
     @classmethod
@@ -54,7 +54,7 @@ class Transform:
         return cls(rotation, pose[..., :3, 3])
 
     def double(self) -> Transform:
-        """The same motion in float64."""
+        """Return the same motion in float64."""
         if self.rotation.dtype == self.translation.dtype == torch.float64:
             return self
         return Transform(self.rotation.double(), self.translation.double())
@@ -72,7 +72,7 @@ class Transform:
 
     @classmethod
     def from_xyz_yaw(cls, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Transform:
-        """One upright pose, float64."""
+        """Return one upright pose, float64."""
         zero = torch.zeros((), dtype=torch.float64)
         return cls.from_rpy(torch.tensor([x, y, z], dtype=torch.float64), zero, zero, zero + yaw)
 
@@ -88,7 +88,7 @@ class Transform:
         return torch.cat((torch.cat((self.rotation, self.translation[..., None]), -1), bottom), -2)
 
     def inverse(self) -> Transform:
-        """The inverse motion, source_from_target."""
+        """Return the inverse motion, source_from_target."""
         back = self.rotation.mT
         return Transform(back, -(back @ self.translation[..., None])[..., 0])
 
@@ -99,7 +99,7 @@ class Transform:
         return Transform(rotation.expand(*moved.shape[:-1], 3, 3), moved)
 
     def apply(self, points: Numbers) -> Tensor:
-        """Points (..., N, 3) in the source frame to the target frame, dtype of the points; float64 of lists."""
+        """Transform points (..., N, 3) of the source frame to the target frame, dtype of the points; float64 of lists."""
         points = as_tensor(points, "Transform.apply", None)
         if points.shape[-1:] != (3,):
             raise ShapeError(f"Transform.apply needs points (..., N, 3); got {tuple(points.shape)}.")
@@ -111,5 +111,5 @@ class Transform:
 
     @classmethod
     def stack(cls, transforms: list[Transform] | tuple[Transform, ...]) -> Transform:
-        """Several motions of equal batch shape as one, new leading axis."""
+        """Return several motions of equal batch shape as one, new leading axis."""
         return cls(torch.stack([t.rotation for t in transforms]), torch.stack([t.translation for t in transforms]))

@@ -66,7 +66,7 @@ class BlockWeights:
 
     @classmethod
     def of(cls, linears: list[nn.Linear], norms: list[nn.LayerNorm], heads: int) -> BlockWeights | None:
-        """Copies of the weights of six layers and two norms; None where the loops do not know such."""
+        """Return copies of the weights of six layers and two norms; None where the loops do not know such."""
         if any(n.eps != _EPS for n in norms) or any(w.out_features % LANES or w.weight.is_cuda for w in linears):
             return None
         tensors = [*(w.bias for w in linears), *(t for n in norms for t in (n.weight, n.bias))]
@@ -119,7 +119,7 @@ def _block(
 
 @njit(cache=True, nogil=True)
 def _sums(n: int, bias: F32x1) -> F32x2:  # pragma: no cover
-    """(n, outputs): what the products are added to."""
+    """Return (n, outputs): what the products are added to."""
     out = empty_rows(n, bias.shape[0])
     for i in range(n):
         out[i] = bias

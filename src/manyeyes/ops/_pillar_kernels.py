@@ -76,7 +76,7 @@ def pillar_maxima(
 
 
 def _concatenate(parts: Sequence[Tensor]) -> Tensor:
-    """All rows as one tensor without gaps; a single part is not copied."""
+    """Return all rows as one tensor without gaps; a single part is not copied."""
     return (parts[0] if len(parts) == 1 else torch.cat(list(parts))).contiguous()
 
 
@@ -100,7 +100,7 @@ def _point_keys(
 
 @njit(cache=True, nogil=True)
 def _find_occupied(key: I32x1, size: int) -> tuple[I64x1, I32x1]:  # pragma: no cover
-    """Ascending distinct keys of key (P,) from 0 on, and the number (size,) of each among them."""
+    """Return ascending distinct keys of key (P,) from 0 on, and the number (size,) of each among them."""
     marks = np.zeros(size // 8 * 8 + 8, np.uint8)
     for k in key:
         if k >= 0:
@@ -110,7 +110,7 @@ def _find_occupied(key: I32x1, size: int) -> tuple[I64x1, I32x1]:  # pragma: no 
 
 @njit(cache=True, nogil=True)
 def _middles(found: I64x1, rows: int, columns: int, limits: _Limits, pillar: float) -> F32x2:  # pragma: no cover
-    """(N, 3): the middle of each pillar of ascending keys (N,)."""
+    """Return (N, 3): the middle of each pillar of ascending keys (N,)."""
     middle, line = np.empty((found.shape[0], 3), np.float32), 0
     for r in range(found.shape[0]):
         while found[r] >= (line + 1) * columns:

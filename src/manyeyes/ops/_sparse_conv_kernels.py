@@ -56,7 +56,7 @@ def panels(taps: Tensor) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True)
 def empty_rows(rows: int, columns: int) -> F32x2:  # pragma: no cover
-    """(rows, columns) float32 that begins with a line of the cache: a vector across two lines is read twice."""
+    """Return (rows, columns) float32 that begins with a line of the cache: a vector across two lines is read twice."""
     spare = _LINE // 4
     flat = np.empty(rows * columns + spare, np.float32)
     start = -(flat.ctypes.data // 4) % spare

@@ -41,7 +41,7 @@ class WindowRuns:
 
 
 def window_runs(window: Tensor) -> WindowRuns:
-    """Tokens of windows (N,) int64, sorted."""
+    """Return tokens of windows (N,) int64, sorted."""
     ids, order = window.sort(stable=True)
     return WindowRuns(order, torch.from_numpy(_starts(ids.numpy())))
 

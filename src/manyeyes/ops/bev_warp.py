@@ -21,7 +21,7 @@ MIN_SEEN_FRACTION = 0.5
 def warp_bev(
     features: Tensor, seen: Tensor, source: BevGrid, target: BevGrid, target_from_source: Transform
 ) -> tuple[Tensor, Tensor]:
-    """Features (N, C, h, w) on one grid to (N, C, H, W) on another, and which places (N, H, W) are seen there.
+    """Warp features (N, C, h, w) on one grid to (N, C, H, W) on another, and which places (N, H, W) are seen there.
 
     seen: (N, h, w) bool. target_from_source: N motions, of which the planar part counts: x, y and yaw. Each place is the mean of
     the seen cells around it by their bilinear weights; unseen places are zero.
@@ -41,7 +41,7 @@ def warp_bev(
 
 
 def _places(source: BevGrid, target: BevGrid, target_from_source: Transform) -> Tensor:
-    """(N, H, W, 2) where the centres of target's cells lie in source, -1 and 1 being its outer borders; float64."""
+    """Return (N, H, W, 2) where the centres of target's cells lie in source, -1 and 1 being its outer borders; float64."""
     rows, columns = target.shape
     row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     xy = target.centers(torch.stack((row, column), -1).view(-1, 2)).double()
@@ -56,6 +56,6 @@ def _places(source: BevGrid, target: BevGrid, target_from_source: Transform) -> 
 
 
 def masked_max(features: Tensor, seen: Tensor, null: Tensor) -> Tensor:
-    """(B, C, H, W): maximum of features (B, K, C, H, W) over those of K that see a cell (B, K, H, W); else null (C,)."""
+    """Return (B, C, H, W): maximum of features (B, K, C, H, W) over those of K that see a cell (B, K, H, W); else null (C,)."""
     largest = features.masked_fill(~seen[:, :, None], -torch.inf).amax(1)
     return torch.where(seen.any(1)[:, None], largest, null[:, None, None])

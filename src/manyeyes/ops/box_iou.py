@@ -18,7 +18,7 @@ _CORNER_SIGNS = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
 
 
 def pairwise_iou(a: Tensor, b: Tensor) -> Tensor:
-    """Rotated bird's-eye IoU (N, M) of boxes a (N, 5) and b (M, 5), each x, y, length, width (m), yaw (rad).
+    """Return rotated bird's-eye IoU (N, M) of boxes a (N, 5) and b (M, 5), each x, y, length, width (m), yaw (rad).
 
     Differentiable in both; zero where a box is degenerate or not finite. Matching is done in float64 by its callers.
     """
@@ -30,7 +30,7 @@ def pairwise_iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def aligned_iou(a: Tensor, b: Tensor) -> Tensor:
-    """Rotated bird's-eye IoU (N,) of box i of a (N, 5) with box i of b (N, 5); differentiable, for a loss."""
+    """Return rotated bird's-eye IoU (N,) of box i of a (N, 5) with box i of b (N, 5); differentiable, for a loss."""
     a, b = _check_boxes(a), _check_boxes(b)
     if a.shape != b.shape:
         raise ShapeError(f"aligned_iou needs as many boxes on both sides; got {a.shape[0]} and {b.shape[0]}.")
@@ -42,7 +42,7 @@ def aligned_iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def near_pairs(a: Tensor, b: Tensor) -> Tensor:
-    """(N, M) bool: pairs of boxes (N, 5), (M, 5) whose circumscribed circles meet and which both have an area."""
+    """Return (N, M) bool: pairs of boxes (N, 5), (M, 5) whose circumscribed circles meet and which both have an area."""
     difference = a[:, None, :2] - b[None, :, :2]
     close = difference.square().sum(-1) <= (_radius(a)[:, None] + _radius(b)[None]).square()
     return close & _solid(a)[:, None] & _solid(b)[None]
@@ -63,7 +63,7 @@ def _solid(boxes: Tensor) -> Tensor:
 
 
 def _iou(a: Tensor, b: Tensor) -> Tensor:
-    """IoU (P,) of pairs of solid boxes (P, 5)."""
+    """Return IoU (P,) of pairs of solid boxes (P, 5)."""
     shared = _intersection_area(a, b)
     union = a[:, 2] * a[:, 3] + b[:, 2] * b[:, 3] - shared
     solid = union > 1e-9
@@ -71,7 +71,7 @@ def _iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _intersection_area(a: Tensor, b: Tensor) -> Tensor:
-    """Area (P,) shared by pairs of boxes (P, 5), in square metres."""
+    """Return the area (P,) shared by pairs of boxes (P, 5), in square metres."""
     double = torch.promote_types(a.dtype, b.dtype) == torch.float64
     inside_by, parallel_below = (1e-9, 1e-12) if double else (1e-5, 1e-6)
     signs = torch.tensor(_CORNER_SIGNS, dtype=a.dtype, device=a.device)
@@ -84,7 +84,7 @@ def _intersection_area(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _into(points: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Points (P, K, 2) from the frame of box b to that of box a."""
+    """Transform points (P, K, 2) from the frame of box b to that of box a."""
     turn, ca, sa = b[:, 4] - a[:, 4], a[:, 4].cos(), a[:, 4].sin()
     c, s = turn.cos()[:, None], turn.sin()[:, None]
     dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
@@ -94,7 +94,7 @@ def _into(points: Tensor, a: Tensor, b: Tensor) -> Tensor:
 
 
 def _edge_crossings(p: Tensor, q: Tensor, parallel_below: float) -> tuple[Tensor, Tensor]:
-    """Crossings (P, 16, 2) of the edges of two quadrilaterals (P, 4, 2), and which of them exist (P, 16).
+    """Return crossings (P, 16, 2) of the edges of two quadrilaterals (P, 4, 2), and which of them exist (P, 16).
 
     Parallel edges have none: where they overlap, the corners already bound what is shared.
     """
@@ -117,7 +117,7 @@ def _cross(u: Tensor, v: Tensor) -> Tensor:
 
 
 def _hull_area(points: Tensor, valid: Tensor) -> Tensor:
-    """Area (P,) of the convex polygons whose corners are the valid ones of points (P, K, 2), in any order."""
+    """Return the area (P,) of the convex polygons whose corners are the valid ones of points (P, K, 2), in any order."""
     with torch.no_grad():
         count = valid.sum(1, keepdim=True).clamp_min(1)
         middle = (points * valid[..., None]).sum(1, keepdim=True) / count[..., None]

@@ -10,7 +10,7 @@ Floats = NDArray[np.float64]
 
 
 def clip_line(line: Floats, polygon: Floats) -> list[Floats]:
-    """The parts (K, 2) of a line (N, 2) inside an anticlockwise convex polygon (M, 2), in order along it.
+    """Return the parts (K, 2) of a line (N, 2) inside an anticlockwise convex polygon (M, 2), in order along it.
 
     Source: Cyrus and Beck 1978. A part that only touches the polygon is none.
     """
@@ -54,6 +54,6 @@ def clip_ring(ring: Floats, polygon: Floats) -> Floats:
 
 
 def ring_area(ring: Floats) -> float:
-    """The area of an open ring (N, 2), positive where it runs anticlockwise."""
+    """Return the area of an open ring (N, 2), positive where it runs anticlockwise."""
     x, y = ring.T if len(ring) else np.zeros((2, 0))
     return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)

@@ -14,7 +14,7 @@ from manyeyes.datatypes import ShapeError
 
 
 def sample_weighted(values: Tensor, at: Tensor, weight: Tensor) -> Tensor:
-    """(B, Q, heads * C): sums of values at places, each head with its own places and weights.
+    """Return (B, Q, heads * C): sums of values at places, each head with its own places and weights.
 
     values: (B, heads, C, rows, columns). at: (B, Q, heads, P, 2), x along columns and y along rows, 0 and 1 being the outer
     borders of the picture; values are bilinear between the centres of cells and zero outside. weight: (B, Q, heads, P).

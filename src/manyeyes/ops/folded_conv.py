@@ -29,7 +29,7 @@ class FoldedConvs:
 
     @classmethod
     def of(cls, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> FoldedConvs | None:
-        """Copies of weights (D, C, k, k) and biases (D,); None where the loops do not know such."""
+        """Return copies of weights (D, C, k, k) and biases (D,); None where the loops do not know such."""
         if not weights or any(w.shape[0] % LANES or w.dtype != torch.float32 or w.is_cuda for w in weights):
             return None
         taps = (w.detach().permute(2, 3, 1, 0).reshape(-1, w.shape[1], w.shape[0]) for w in weights)
@@ -37,7 +37,7 @@ class FoldedConvs:
 
     @torch.no_grad()
     def __call__(self, x: Tensor, table: NeighbourMap) -> Tensor:
-        """(N, C) to (M, D) through all layers; more than one need a table that leads from a set of sites to itself."""
+        """Apply all layers, (N, C) to (M, D); more than one need a table that leads from a set of sites to itself."""
         rows, weight, bias = (t.numpy() for t in (x.contiguous(), self.weight, self.bias))
         return torch.from_numpy(_layers(rows, weight, bias, table.pairs, table.is_symmetric, table.n_out))
 
@@ -65,13 +65,13 @@ class NormedConv:
 
     @classmethod
     def of(cls, weight: Tensor, norm: nn.LayerNorm, is_skipped: bool) -> NormedConv | None:
-        """Copies of a weight (D, C, k, k) and a norm; None where the loops do not know such."""
+        """Return copies of a weight (D, C, k, k) and a norm; None where the loops do not know such."""
         one = FoldedConvs.of([weight], [norm.bias])
         return one and cls(one.weight[0], norm.weight.detach().clone(), one.bias[0], norm.eps, is_skipped)
 
     @torch.no_grad()
     def __call__(self, x: Tensor, table: NeighbourMap) -> Tensor:
-        """(N, C) to (M, D)."""
+        """Apply the layer, (N, C) to (M, D)."""
         rows, weight, scale, shift = (t.numpy() for t in (x.contiguous(), self.weight, self.scale, self.shift))
         norm = _RowNorm(scale, shift, self.eps, self.is_skipped)
         return torch.from_numpy(
@@ -80,7 +80,7 @@ class NormedConv:
 
 
 def is_supported(x: Tensor) -> bool:
-    """Whether the loops may take it: no gradient is asked for, and it is float32 in the CPU's memory."""
+    """Return whether the loops may take it: no gradient is asked for, and it is float32 in the CPU's memory."""
     return not torch.is_grad_enabled() and x.device.type == "cpu" and x.dtype == torch.float32
 
 

@@ -19,17 +19,17 @@ from manyeyes.datatypes import ConfigError
 
 
 def keyed_generator(*key: int | str) -> np.random.Generator:
-    """A NumPy generator of its own for this key. Source: Salmon et al., SC 2011 (Philox)."""
+    """Return a NumPy generator of its own for this key. Source: Salmon et al., SC 2011 (Philox)."""
     return np.random.Generator(_philox(key))
 
 
 def keyed_torch_generator(*key: int | str) -> torch.Generator:
-    """A torch generator on the CPU for this key, e.g. for initial weights or torch.randperm."""
+    """Return a torch generator on the CPU for this key, e.g. for initial weights or torch.randperm."""
     return torch.Generator().manual_seed(int.from_bytes(_digest(key)[:8], "little") >> 1)
 
 
 def keyed_uniform(shape: tuple[int, ...], *key: int | str) -> Tensor:
-    """Uniform draws in the open interval (0, 1), of the shape, float64: 52 bits each, centred in their bin.
+    """Return uniform draws in the open interval (0, 1), of the shape, float64: 52 bits each, centred in their bin.
 
     Made from Philox's raw words, whose stream NumPy keeps across versions (it does not for its distributions).
     """
@@ -38,7 +38,7 @@ def keyed_uniform(shape: tuple[int, ...], *key: int | str) -> Tensor:
 
 
 def keyed_normal(shape: tuple[int, ...], *key: int | str) -> Tensor:
-    """Standard normal draws of the shape, float64: the inverse distribution function of :func:`keyed_uniform`."""
+    """Return standard normal draws of the shape, float64: the inverse distribution function of :func:`keyed_uniform`."""
     return torch.special.ndtri(keyed_uniform(shape, *key))
 
 

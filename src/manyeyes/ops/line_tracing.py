@@ -80,7 +80,7 @@ class _Tracer:
     max_strides: int
 
     def trace(self, start: Tensor, heading: Tensor, going: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Points (W, strides, 2), how sure (W, strides), and who came home (W,)."""
+        """Return points (W, strides, 2), their probabilities (W, strides), and which lines closed (W,)."""
         at, closed = start, torch.zeros_like(going)
         points, confidences = [], []
         columns, rows = self.size.unbind()
@@ -111,7 +111,9 @@ class _Tracer:
 
 
 def resample_evenly(lines: Tensor, count: int) -> Tensor:
-    """(..., count, 2) points of equal arc length on lines (..., L, 2), both ends among them; repeated points do not matter."""
+    """Return (..., count, 2) points of equal arc length on lines (..., L, 2), both ends among them; repeated points do not
+    matter.
+    """
     step = lines.diff(dim=-2).norm(dim=-1)
     station = torch.cat((torch.zeros_like(step[..., :1]), step.cumsum(-1)), -1)
     wanted = station[..., -1:] * torch.linspace(0, 1, count)
@@ -124,7 +126,7 @@ def resample_evenly(lines: Tensor, count: int) -> Tensor:
 
 
 def distance_to_lines(points: Tensor, lines: Tensor) -> Tensor:
-    """(B, N, M): how far each of places (B, M, 2) lies from each of lines (B, N, P, 2), along the shortest way."""
+    """Return (B, N, M): how far each of places (B, M, 2) lies from each of lines (B, N, P, 2), along the shortest way."""
     nearest = points.new_full((*lines.shape[:2], points.shape[1]), torch.inf)
     # Edge by edge, since all edges at once would take P times the memory.
     for a, b in zip(lines[:, :, None, :-1].unbind(3), lines[:, :, None, 1:].unbind(3)):

@@ -32,7 +32,7 @@ class NearestLines:
 
 
 def find_nearest_line(queries: Floats, points: Floats, offsets: Ints, max_distance_m: float) -> NearestLines:
-    """The nearest line within reach of each query (Q, 2); of equally near ones the lowest row."""
+    """Return the nearest line within reach of each query (Q, 2); of equally near ones the lowest row."""
     queries = np.ascontiguousarray(queries, dtype=np.float64).reshape(-1, 2)
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 2)
     offsets = np.ascontiguousarray(offsets, dtype=np.int64)
@@ -50,7 +50,7 @@ def find_nearest_line(queries: Floats, points: Floats, offsets: Ints, max_distan
 
 
 def find_nearest_line_slow(queries: Floats, points: Floats, offsets: Ints, max_distance_m: float) -> NearestLines:
-    """The slow twin of :func:`find_nearest_line`."""
+    """Return the slow twin of :func:`find_nearest_line`."""
     distance, owner, heading, lateral = [], [], [], []
     line, start = segments_of(offsets)
     for query in np.asarray(queries, dtype=np.float64).reshape(-1, 2):
@@ -113,7 +113,7 @@ def _look_up(
     queries: Floats, points: Floats, start: Ints, line: Ints, place: Floats, shape: Ints, offset: Ints, held: Ints,
     reach: float,
 ) -> tuple[Floats, Ints, Floats, Floats]:  # fmt: skip
-    """Distance, line, heading and offset across of each query's nearest segment in its own cell."""
+    """Return the distance, line, heading and offset across of each query's nearest segment in its own cell."""
     size, columns, rows = place[2], shape[0], shape[1]
     distance = np.full(len(queries), np.inf)
     owner = np.full(len(queries), -1, dtype=np.int64)

@@ -17,7 +17,7 @@ from manyeyes.datatypes import ShapeError
 
 @torch.no_grad()
 def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, max_candidates: int = 1000) -> Tensor:
-    """Rows (K,) int64 of boxes (N, 5: x, y, length, width, yaw) that survive, in descending score (N,).
+    """Return rows (K,) int64 of boxes (N, 5: x, y, length, width, yaw) that survive, in descending score (N,).
 
     The best `max_candidates` boxes are walked from the highest score, equal scores in the order given; each that still stands
     suppresses those after it whose rotated IoU with it is *greater* than the threshold.
@@ -33,7 +33,7 @@ def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, max_candidat
 
 @njit(cache=True, nogil=True)
 def _find_kept(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
-    """Which of boxes (N, 5), best first, no better one that stands overlaps by more than the threshold."""
+    """Return which of boxes (N, 5), best first, no better one that stands overlaps by more than the threshold."""
     n = boxes.shape[0]
     standing = np.ones(n, np.bool_)
     solid = np.empty(n, np.bool_)
@@ -60,7 +60,7 @@ def _find_kept(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def _compute_shared_area(a: F64x1, b: F64x1, ring: F64x2, clipped: F64x2) -> float:  # pragma: no cover
-    """Area that two solid boxes (5,) share; ring and clipped: (20, 2) to work in."""
+    """Return the area that two solid boxes (5,) share; ring and clipped: (20, 2) to work in."""
     c, s = np.cos(a[4]), np.sin(a[4])
     dx, dy = b[0] - a[0], b[1] - a[1]
     x0, y0 = dx * c + dy * s, dy * c - dx * s

@@ -71,7 +71,7 @@ class PinholeHits:
 
 @njit(cache=True)
 def lattice_hash(i: int, j: int, k: int, seed: int) -> float:
-    """A number in [0, 1) of a point of the integer lattice (SplitMix64)."""
+    """Return a number in [0, 1) of a point of the integer lattice (SplitMix64)."""
     x = np.uint64(seed) + np.uint64(i) * np.uint64(_A) + np.uint64(j) * np.uint64(_C) + np.uint64(k) * np.uint64(_D)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(_B)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(_C)
@@ -83,7 +83,7 @@ def lattice_hash(i: int, j: int, k: int, seed: int) -> float:
 def first_leaf(
     o: F64x1, d0: float, d1: float, d2: float, enter: float, leave: float, density: float, seed: int
 ) -> float:
-    """The first t in enter … leave at which the ray o + t d is within a leaf's cube; inf where there is none.
+    """Return the first t in enter … leave at which the ray o + t d is within a leaf's cube; inf where there is none.
 
     The cubes are walked one after the other. Source: Amanatides & Woo, Eurographics 1987.
     """
@@ -110,7 +110,7 @@ def first_leaf(
 def intersect_primitive(
     kind: int, half: F64x1, density: float, o: F64x1, d0: float, d1: float, d2: float, seed: int
 ) -> float:
-    """The t at which the ray o + t d, in a primitive's own frame, meets it from outside; inf where it does not."""
+    """Return the t at which the ray o + t d, in a primitive's own frame, meets it from outside; inf where it does not."""
     if kind == BOX:
         t, _ = hit_box(o, half, d0, d1, d2)
     elif kind == CYLINDER:
@@ -126,7 +126,7 @@ def intersect_primitive(
 def intersect_ground(
     terrain: HeightRaster, highest: float, origin: F64x1, d0: float, d1: float, d2: float, limit: float
 ) -> float:
-    """The t below limit at which the ray origin + t d first sinks under the height field; inf where it does not.
+    """Return the t below limit at which the ray origin + t d first sinks under the height field; inf where it does not.
 
     Steps are 0.4 m or 2 % of the way, then false position inside the step that crosses.
     """
@@ -288,7 +288,7 @@ def cast_pinhole(
     seed: int = 0,
     own: int = 0,
 ) -> PinholeHits:
-    """One picture's depths.
+    """Return one picture's depths.
 
     origin: (3,) and rotation: (3, 3) world_from_camera (x right, y down, z ahead); intrinsic: (3, 3) pixels.
 
@@ -318,7 +318,7 @@ def cast_pinhole_reference(
     seed: int = 0,
     own: int = 0,
 ) -> PinholeHits:
-    """The slow twin of :func:`cast_pinhole`: slabs and quadrics for every pixel, leaves and ground in small steps."""
+    """Return the slow twin of :func:`cast_pinhole`: slabs and quadrics for every pixel, leaves and ground in small steps."""
     v, u = np.mgrid[0:height, 0:width] + 0.5
     ray = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(intrinsic).T @ rotation.T
     depth, owner = np.full((height, width), np.inf), np.full((height, width), NOTHING, np.int32)

@@ -31,7 +31,7 @@ HEIGHT_SCALE = 0.5
 def compute_alignment_costs(
     now: Tensor, then: Tensor, boxes: Boxes, back: Tensor, slack: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """(N, steps), how badly points now and then meet, from 0 to 1, and (N,), the number of points that were asked.
+    """Return (N, steps), how badly points now and then meet, from 0 to 1, and (N,), the number of points that were asked.
 
     now: (P, 3), then: (Q, 3), float32 metres, in the frame of boxes (N). Candidate k has it that an object was ``back`` (N, 2) and
     d_k along its length behind where it is, d evenly from -slack to slack (N,). The cost is the mean over its points now of
@@ -62,7 +62,7 @@ class _Box(NamedTuple):
 def _inside(
     points: F32x2, place: _Box, away_x: float, away_y: float, longitudinal_margin: float
 ) -> F64x2:  # pragma: no cover
-    """(K, 3): points in a box moved by away and made longer at each end, from its middle, in its axes, heights scaled."""
+    """Return (K, 3): points in a box moved by away and made longer at each end, from its middle, in its axes, heights scaled."""
     x0, y0 = place.x + away_x, place.y + away_y
     length, width, height = (
         place.half_length + longitudinal_margin,

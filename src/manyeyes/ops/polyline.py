@@ -22,7 +22,7 @@ MAX_SAMPLES = 2000
 
 
 def close_rings(points: Floats, offsets: Ints, closed: NDArray[np.bool_]) -> tuple[Floats, Ints]:
-    """The same lines, those marked closed (N,) with their first point repeated at the end."""
+    """Return the same lines, those marked closed (N,) with their first point repeated at the end."""
     counts = np.diff(offsets)
     more = (closed & (counts > 0)).astype(np.int64)
     out_offsets = np.concatenate(([0], np.cumsum(counts + more))).astype(np.int64)
@@ -35,7 +35,7 @@ def close_rings(points: Floats, offsets: Ints, closed: NDArray[np.bool_]) -> tup
 
 
 def lengths(points: Floats, offsets: Ints) -> Floats:
-    """(N,) metres along each line."""
+    """Return (N,) metres along each line."""
     row = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     if len(points) < 2:
         return np.zeros(len(offsets) - 1)
@@ -45,7 +45,7 @@ def lengths(points: Floats, offsets: Ints) -> Floats:
 
 
 def resample(points: Floats, offsets: Ints, counts: ArrayLike) -> tuple[Floats, Ints]:
-    """Each line at so many points, one number or (N,), of equal arc length, both its ends included."""
+    """Return each line at so many points, one number or (N,), of equal arc length, both its ends included."""
     wanted = np.broadcast_to(np.asarray(counts, np.int64), (len(offsets) - 1,))
     wanted = np.where(np.diff(offsets) > 0, wanted, 0)
     target = freeze(np.concatenate(([0], np.cumsum(wanted))), np.int64)
@@ -55,13 +55,13 @@ def resample(points: Floats, offsets: Ints, counts: ArrayLike) -> tuple[Floats, 
 def resample_spaced(
     points: Floats, offsets: Ints, spacing_m: float, max_samples: int = MAX_SAMPLES
 ) -> tuple[Floats, Ints]:
-    """Each line at equal steps of at most spacing_m, both ends included, but at no more than so many points."""
+    """Return each line at equal steps of at most spacing_m, both ends included, but at no more than so many points."""
     steps = np.ceil(lengths(points, offsets) / spacing_m - 1e-9).astype(np.int64)
     return resample(points, offsets, np.clip(steps + 1, 2, max_samples))
 
 
 def headings(points: Floats, offsets: Ints) -> Floats:
-    """(P,) radians in [-pi, pi], the direction from the point before to the point after; one-sided at the ends."""
+    """Return (P,) radians in [-pi, pi], the direction from the point before to the point after; one-sided at the ends."""
     p = len(points)
     if p == 0:
         return np.zeros(0)
@@ -91,13 +91,13 @@ def project_onto_line(queries: Floats, line: Floats) -> LineProjection:
 
 
 def points_at_stations(line: Floats, station_m: ArrayLike) -> Floats:
-    """(Q, 2) the points of a line (K, 2) at these metres from its start; beyond its ends, the ends."""
+    """Return (Q, 2) the points of a line (K, 2) at these metres from its start; beyond its ends, the ends."""
     passed = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
     return np.stack([np.interp(np.asarray(station_m, np.float64), passed, line[:, k]) for k in range(2)], -1)
 
 
 def cut_line(line: Floats, start_m: float, end_m: float) -> Floats:
-    """(K', 2) the part of a line between two stations, its own vertices between them kept."""
+    """Return (K', 2) the part of a line between two stations, its own vertices between them kept."""
     passed = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
     start_m, end_m = max(start_m, 0.0), min(end_m, float(passed[-1]))
     inner = line[(passed > start_m + 1e-9) & (passed < end_m - 1e-9)]
@@ -106,17 +106,17 @@ def cut_line(line: Floats, start_m: float, end_m: float) -> Floats:
 
 
 def simplify(line: Floats, tolerance_m: float) -> Floats:
-    """(K', 2) by Douglas and Peucker (1973): no point left out lies farther than the tolerance from what stays."""
+    """Return (K', 2) by Douglas and Peucker (1973): no point left out lies farther than the tolerance from what stays."""
     return line[select_vertices(line, tolerance_m)]
 
 
 def select_vertices(line: Floats, tolerance_m: float) -> NDArray[np.bool_]:
-    """(K,) which vertices of a line (K, 2) stay when it is simplified; both ends do."""
+    """Return (K,) which vertices of a line (K, 2) stay when it is simplified; both ends do."""
     return _simplify(freeze(line, np.float64), tolerance_m)
 
 
 def find_near_pairs(bounds: Floats, max_gap_m: float) -> Ints:
-    """(K, 2) pairs of rows i < j, ascending, whose boxes (N, 4) are at most max_gap_m apart along both axes."""
+    """Return (K, 2) pairs of rows i < j, ascending, whose boxes (N, 4) are at most max_gap_m apart along both axes."""
     boxes = np.array(bounds, np.float64)
     boxes[:, :2] -= max_gap_m / 2
     boxes[:, 2:] += max_gap_m / 2
@@ -142,7 +142,7 @@ def find_near_pairs(bounds: Floats, max_gap_m: float) -> Ints:
 
 
 def find_near_pairs_between(a_bounds: Floats, b_bounds: Floats, max_gap_m: float) -> Ints:
-    """(K, 2) rows of a and of b, ascending, whose boxes are at most max_gap_m apart along both axes."""
+    """Return (K, 2) rows of a and of b, ascending, whose boxes are at most max_gap_m apart along both axes."""
     pairs = find_near_pairs(np.concatenate((a_bounds, b_bounds)), max_gap_m)
     between_sets = pairs[(pairs[:, 0] < len(a_bounds)) & (pairs[:, 1] >= len(a_bounds))]
     return between_sets - (0, len(a_bounds))

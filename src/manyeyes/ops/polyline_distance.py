@@ -18,29 +18,31 @@ Ints = NDArray[np.int64]
 
 
 def chamfer_distance(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> Floats:
-    """(K,) half the sum of both mean distances from a point to the nearest point of the other line."""
+    """Return (K,) half the sum of both mean distances from a point to the nearest point of the other line."""
     return _chamfer(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))
 
 
 def directed_distance(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> tuple[Floats, Floats]:
-    """(K,) the mean and (K,) the greatest distance from the points of a's line to the segments of b's."""
+    """Return (K,) the mean and (K,) the greatest distance from the points of a's line to the segments of b's."""
     return _compute_directed(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))[:2]
 
 
 def min_distance(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> Floats:
-    """(K,) the least distance from a point of a's line to a segment of b's."""
+    """Return (K,) the least distance from a point of a's line to a segment of b's."""
     return _compute_directed(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64))[2]
 
 
 def frechet_distance(
     a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints, either_way: bool = True
 ) -> Floats:
-    """(K,) discrete Frechet distance (Eiter and Mannila 1994) between vertices; the lesser of b's two directions if asked."""
+    """Return (K,) discrete Frechet distance (Eiter and Mannila 1994) between vertices; the lesser of b's two directions if
+    asked.
+    """
     return _frechet(*_columns(a, a_offsets, b, b_offsets), freeze(pairs, np.int64), either_way)
 
 
 def _columns(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints) -> tuple[Floats, Ints, Floats, Ints]:
-    """All read-only and contiguous, so that one compiled form serves every caller."""
+    """Return all arrays read-only and contiguous, so that one compiled form serves every caller."""
     return freeze(a, np.float64), freeze(a_offsets, np.int64), freeze(b, np.float64), freeze(b_offsets, np.int64)
 
 

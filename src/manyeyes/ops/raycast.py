@@ -132,12 +132,12 @@ class Primitives:
 
     @classmethod
     def cat(cls, many: list[Primitives]) -> Primitives:
-        """Several sets as one; at least one set."""
+        """Return several sets as one; at least one set."""
         return cls(*(np.concatenate([getattr(p, f.name) for p in many]) for f in fields(cls)))
 
     @classmethod
     def empty(cls) -> Primitives:
-        """A set without any solid."""
+        """Return a set without any solid."""
         zero = np.zeros
         return cls(zero(0, np.uint8), zero((0, 3)), zero((0, 3, 3)), zero((0, 3)), zero(0), zero(0, np.int64), zero(0))
 
@@ -179,7 +179,9 @@ class Hits:
 
 @njit(cache=True)
 def hash_uniform(seed: np.uint64, primitive: int, ray: int) -> float:
-    """A number in (0, 1] from a counter: the same for a ray and a primitive in whatever order they are met (SplitMix64)."""
+    """Return a number in (0, 1] from a counter: the same for a ray and a primitive in whatever order they are met
+    (SplitMix64).
+    """
     x = seed + np.uint64(_MIX_A) * np.uint64(primitive + 1) + np.uint64(_MIX_B) * np.uint64(ray + 1)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(_MIX_B)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(_MIX_C)
@@ -224,7 +226,7 @@ def _interval(o: F64x1, q: F64x2, half: F64x1, bounds: F64x1) -> None:
 
 @njit(cache=True)
 def hit_box(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tuple[float, float]:
-    """Entry distance and cosine into a box from outside it; (inf, 0) when missed. At most three faces face the sensor."""
+    """Return the entry distance and cosine into a box from outside it; (inf, 0) when missed. At most three faces face the sensor."""
     if abs(o[0]) > half[0] and o[0] * d0 < 0:
         t = ((half[0] if o[0] > 0 else -half[0]) - o[0]) / d0
         if abs(o[1] + t * d1) <= half[1] and abs(o[2] + t * d2) <= half[2]:
@@ -242,7 +244,7 @@ def hit_box(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tuple[flo
 
 @njit(cache=True)
 def hit_cylinder(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tuple[float, float]:
-    """Entry distance and cosine into the side of a cylinder of radius half[0]."""
+    """Return the entry distance and cosine into the side of a cylinder of radius half[0]."""
     a, b = d0 * d0 + d1 * d1, o[0] * d0 + o[1] * d1
     c = o[0] * o[0] + o[1] * o[1] - half[0] * half[0]
     root = b * b - a * c
@@ -256,7 +258,7 @@ def hit_cylinder(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tupl
 
 @njit(cache=True)
 def hit_ellipsoid(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tuple[float, float]:
-    """Entry and exit distance of an ellipsoid, (inf, inf) when missed; entry is 0 from within."""
+    """Return entry and exit distance of an ellipsoid, (inf, inf) when missed; entry is 0 from within."""
     s0, s1, s2 = o[0] / half[0], o[1] / half[1], o[2] / half[2]
     e0, e1, e2 = d0 / half[0], d1 / half[1], d2 / half[2]
     a, b, c = e0 * e0 + e1 * e1 + e2 * e2, s0 * e0 + s1 * e1 + s2 * e2, s0 * s0 + s1 * s1 + s2 * s2 - 1.0
@@ -324,7 +326,7 @@ def _draw(
 
 @njit(cache=True)
 def height_at(field: F32x2, x_min: float, y_min: float, cell: float, x: float, y: float) -> float:
-    """Bilinear height; the border value goes on outside."""
+    """Return the bilinear height; the border value goes on outside."""
     column = min(max((x - x_min) / cell, 0.0), field.shape[1] - 1.001)
     row = min(max((y - y_min) / cell, 0.0), field.shape[0] - 1.001)
     j, i = int(column), int(row)
@@ -452,7 +454,7 @@ def cast_rays(
     max_range: float,
     seed: int = 0,
 ) -> Hits:
-    """One scan. origin: (3,) and rotation: (3, 3) world_from_sensor; elevation: (B,) ascending, radians.
+    """Return one scan. origin: (3,) and rotation: (3, 3) world_from_sensor; elevation: (B,) ascending, radians.
 
     azimuth: (A,) radians, counter-clockwise, equally spaced by 2 pi / per_turn. seed decides where rays end in foliage.
     """
@@ -480,7 +482,9 @@ def cast_rays_reference(
     max_range: float,
     seed: int = 0,
 ) -> Hits:
-    """The slow twin of :func:`cast_rays`: every ray against every primitive by slabs and quadrics; the ground in 2 cm steps."""
+    """Return the slow twin of :func:`cast_rays`: every ray against every primitive by slabs and quadrics; the ground in 2 cm
+    steps.
+    """
     del per_turn
     ce, se = np.cos(elevation)[None], np.sin(elevation)[None]
     sensor = np.stack([ce * np.cos(azimuth)[:, None], ce * np.sin(azimuth)[:, None], se + 0 * azimuth[:, None]], -1)
@@ -515,7 +519,7 @@ def cast_rays_reference(
 
 
 def reference_height(ground: HeightField, x: Array, y: Array) -> Array:
-    """Bilinear heights at points, any shape; the border value goes on outside."""
+    """Return bilinear heights at points, any shape; the border value goes on outside."""
     rows, columns = ground.height.shape
     u = np.clip((x - ground.x_min) / ground.cell, 0, columns - 1.001)
     v = np.clip((y - ground.y_min) / ground.cell, 0, rows - 1.001)
@@ -526,7 +530,7 @@ def reference_height(ground: HeightField, x: Array, y: Array) -> Array:
 
 
 def reference_hit(kind: int, o: Array, d: Array, half: Array) -> tuple[Array, Array, Array]:
-    """Entry distance, exit distance and cosine of rays o + t d (d: (..., 3)) into one primitive in its own frame."""
+    """Return the entry distance, exit distance and cosine of rays o + t d (d: (..., 3)) into one primitive in its own frame."""
     with np.errstate(divide="ignore", invalid="ignore"):
         if kind == BOX:
             one, two = (-half - o) / d, (half - o) / d

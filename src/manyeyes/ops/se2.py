@@ -38,7 +38,7 @@ def between(a: Tensor, b: Tensor) -> Tensor:
 
 
 def exp(tangent: Tensor) -> Tensor:
-    """The pose (..., 3) reached in unit time at constant body velocity vx, vy, omega (..., 3)."""
+    """Return the pose (..., 3) reached in unit time at constant body velocity vx, vy, omega (..., 3)."""
     vx, vy, omega = tangent.unbind(-1)
     sine_factor = torch.sinc(omega / math.pi)
     cosine_factor = omega / 2 * torch.sinc(omega / (2 * math.pi)).square()
@@ -48,7 +48,7 @@ def exp(tangent: Tensor) -> Tensor:
 
 
 def log(pose: Tensor) -> Tensor:
-    """The tangent (..., 3) with |omega| <= pi that :func:`exp` takes to the pose (..., 3)."""
+    """Return the tangent (..., 3) with |omega| <= pi that :func:`exp` takes to the pose (..., 3)."""
     x, y = pose[..., 0], pose[..., 1]
     omega = wrap_angle(pose[..., 2])
     half, k = omega / 2, _half_cot(omega)
@@ -56,14 +56,14 @@ def log(pose: Tensor) -> Tensor:
 
 
 def adjoint(pose: Tensor) -> Tensor:
-    """(..., 3, 3): compose(pose, exp(d)) = compose(exp(adjoint(pose) d), pose)."""
+    """Return (..., 3, 3): compose(pose, exp(d)) = compose(exp(adjoint(pose) d), pose)."""
     c, s = pose[..., 2].cos(), pose[..., 2].sin()
     zero, one = torch.zeros_like(c), torch.ones_like(c)
     return _matrix(((c, -s, pose[..., 1]), (s, c, -pose[..., 0]), (zero, zero, one)))
 
 
 def right_jacobian_inverse(tangent: Tensor) -> Tensor:
-    """(..., 3, 3), the derivative of log(compose(exp(tangent), exp(d))) in d at 0."""
+    """Return (..., 3, 3), the derivative of log(compose(exp(tangent), exp(d))) in d at 0."""
     vx, vy, omega = tangent.unbind(-1)
     k, half = _half_cot(omega), omega / 2
     # (1 - k) / omega; by its series where the difference has lost its digits.
@@ -74,7 +74,7 @@ def right_jacobian_inverse(tangent: Tensor) -> Tensor:
 
 
 def _half_cot(omega: Tensor) -> Tensor:
-    """(omega / 2) cot(omega / 2)."""
+    """Return (omega / 2) cot(omega / 2)."""
     return (omega / 2).cos() / torch.sinc(omega / (2 * math.pi))
 
 
@@ -127,7 +127,7 @@ class PoseGraphSolution:
 def solve_pose_graph(
     initial: Tensor, edges: PoseGraphEdges, fixed: Tensor, huber: float | None = None, iterations: int = 50
 ) -> PoseGraphSolution:
-    """Poses (N, 3) that fit the edges best, by Levenberg-Marquardt from `initial`; those `fixed` (N,) bool stay.
+    """Return poses (N, 3) that fit the edges best, by Levenberg-Marquardt from `initial`; those `fixed` (N,) bool stay.
 
     Minimises 1/2 sum rho(r' information r) over r = log(measured^-1 i^-1 j), rho the identity or Huber's function at
     `huber` standard deviations. The covariance is the inverse of the last Gauss-Newton matrix, in float64.
@@ -223,7 +223,7 @@ def _normal_equations(poses: Tensor, edges: PoseGraphEdges, huber: float | None)
 
 
 def _covariance(poses: Tensor, edges: PoseGraphEdges, free: Tensor, huber: float | None) -> Tensor:
-    """(3 N, 3 N) in x, y, yaw: the inverse of the curvature, turned from each pose's own axes to those of its frame."""
+    """Return (3 N, 3 N) in x, y, yaw: the inverse of the curvature, turned from each pose's own axes to those of its frame."""
     out = torch.zeros(poses.numel(), poses.numel(), dtype=poses.dtype)
     curvature = _normal_equations(poses, edges, huber)[1][free][:, free]
     factor, failed = torch.linalg.cholesky_ex(curvature)

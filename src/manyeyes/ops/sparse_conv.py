@@ -35,7 +35,7 @@ BLOCK_ROWS = 1024
 def coalesce(
     features: Tensor, key: Tensor, grid: BevGrid, batch_size: int, reduce: Literal["sum", "mean", "max"] = "sum"
 ) -> SparseBev:
-    """Rows (N, C) at keys (N,) in any order to a sparse map; rows of one cell are reduced (max starts at -inf)."""
+    """Scatter rows (N, C) at keys (N,) in any order to a sparse map; rows of one cell are reduced (max starts at -inf)."""
     rows, columns = grid.shape
     size = batch_size * rows * columns
     if key.numel() and (int(key.min()) < 0 or int(key.max()) >= size):
@@ -48,7 +48,7 @@ def coalesce(
 
 
 def submanifold_conv(x: SparseBev, weight: Tensor, bias: Tensor | None = None, dilation: int = 1) -> SparseBev:
-    """A convolution on the same sites; weight (out, in, k, k), k odd, implied padding (k // 2) * dilation."""
+    """Return a convolution on the same sites; weight (out, in, k, k), k odd, implied padding (k // 2) * dilation."""
     kernel = _kernel(weight, x.features.shape[1], axis=1)
     if kernel % 2 == 0:
         raise ConfigError(f"submanifold_conv needs an odd kernel; got {kernel}.")
@@ -65,7 +65,7 @@ def strided_conv(
     padding: int = 1,
     dilating: bool = False,
 ) -> SparseBev:
-    """A convolution to a coarser grid; weight (out, in, k, k), k odd, padding k // 2.
+    """Return a convolution to a coarser grid; weight (out, in, k, k), k odd, padding k // 2.
 
     dilating: every output that meets an active cell (spconv's SparseConv2d); otherwise only the parents
     ``floor(i / stride)`` of active cells, a subset with the same values.
@@ -89,7 +89,7 @@ def inverse_conv(
 
 
 def max_pool(x: SparseBev, kernel: int = 3) -> SparseBev:
-    """The maximum over active neighbours (and the site itself), on the same sites; ties share the gradient equally."""
+    """Return the maximum over active neighbours (and the site itself), on the same sites; ties share the gradient equally."""
     if kernel % 2 == 0:
         raise ConfigError(f"max_pool needs an odd kernel; got {kernel}.")
     return x.with_features(_pool(x.features, same_sites_map(x.sites, kernel)))
@@ -98,7 +98,7 @@ def max_pool(x: SparseBev, kernel: int = 3) -> SparseBev:
 def strided_max_pool(
     x: SparseBev, kernel: int = 3, stride: int = 2, padding: int = 1, dilating: bool = False
 ) -> SparseBev:
-    """The maximum over active cells under each output; sites as in :func:`strided_conv`."""
+    """Return the maximum over active cells under each output; sites as in :func:`strided_conv`."""
     sites, table = strided_map(x.sites, Window(kernel, stride, padding), dilating)
     return SparseBev(_pool(x.features, table), sites)
 
@@ -119,7 +119,7 @@ def merge(levels: Sequence[SparseBev], reduce: Literal["sum", "mean", "max"] = "
 
 
 def local_maxima(score: Tensor, sites: Sites, kernel: int = 3) -> Tensor:
-    """(N,) bool: sites that no active neighbour exceeds, nor equals with a lower key (one survivor a tied pair)."""
+    """Return (N,) bool: sites that no active neighbour exceeds, nor equals with a lower key (one survivor a tied pair)."""
     index = same_sites_map(sites, kernel).index.to(score.device)
     around = torch.cat((score, score.new_full((1,), -torch.inf)))[index]
     middle = index.shape[1] // 2
@@ -129,7 +129,7 @@ def local_maxima(score: Tensor, sites: Sites, kernel: int = 3) -> Tensor:
 
 
 def same_sites_map(sites: Sites, kernel: int, dilation: int = 1) -> NeighbourMap:
-    """Neighbours of every site among the sites themselves; built once and kept in ``sites.cache``."""
+    """Return neighbours of every site among the sites themselves; built once and kept in ``sites.cache``."""
     name = ("same", kernel, dilation)
     if name not in sites.cache:
         window, shape = Window(kernel, 1, kernel // 2 * dilation, dilation), sites.grid.shape
@@ -138,7 +138,7 @@ def same_sites_map(sites: Sites, kernel: int, dilation: int = 1) -> NeighbourMap
 
 
 def strided_map(sites: Sites, window: Window, dilating: bool = False) -> tuple[Sites, NeighbourMap]:
-    """The coarser sites of a strided layer and what they meet; built once, so that equal layers share one set."""
+    """Return the coarser sites of a strided layer and what they meet; built once, so that equal layers share one set."""
     name = ("strided", window, dilating)
     if name not in sites.cache:
         _check_window(sites, window)
@@ -186,7 +186,7 @@ def _affine(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 
 def _conv(x: Tensor, weight: Tensor, bias: Tensor | None, table: NeighbourMap, reverse: bool = False) -> Tensor:
-    """Rows (N_in, in) to (N_out, out); weight (out, in, k, k)."""
+    """Convolve rows (N_in, in) to (N_out, out); weight (out, in, k, k)."""
     # (taps, in, out): one matrix for each tap.
     taps = weight.to(x.dtype).permute(2, 3, 1, 0).reshape(-1, weight.shape[1], weight.shape[0])
     table = table.on(x.device)
@@ -218,7 +218,7 @@ class _PairProduct(torch.autograd.Function):
 
 
 def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, bias: Tensor | None = None) -> Tensor:
-    """(rows, D): for each pair of a tap its row of x (N, C) times the matrix (C, D) of the tap, summed where it leads."""
+    """Return (rows, D): for each pair of a tap its row of x (N, C) times the matrix (C, D) of the tap, summed where it leads."""
     bias = x.new_zeros(taps.shape[2]) if bias is None else bias.to(x.dtype)
     if _in_loops(x, taps):
         pairs, out = table.pairs, x.new_empty(table.rows(reverse), taps.shape[2])
@@ -242,13 +242,15 @@ def _pair_product(x: Tensor, taps: Tensor, table: NeighbourMap, reverse: bool, b
 
 
 def _in_loops(x: Tensor, taps: Tensor) -> bool:
-    """The compiled loop does without copies before and after a product: at any number of channels they cost time beside it."""
+    """Compute the products in a compiled loop: without copies before and after a product, which cost time at any number of
+    channels.
+    """
     plain = x.device.type == "cpu" and x.dtype == taps.dtype == torch.float32
     return plain and taps.shape[2] % LANES == 0
 
 
 def _pair_outer(x: Tensor, dy: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
-    """(taps, C, D): for each tap the sum over its pairs of the row of x (N, C), transposed, times the row of dy (M, D)."""
+    """Return (taps, C, D): for each tap the sum over its pairs of the row of x (N, C), transposed, times the row of dy (M, D)."""
     dw = x.new_zeros(table.window.kernel**2, x.shape[1], dy.shape[1])
     if table.is_symmetric:
         torch.mm(x.T, dy, out=dw[dw.shape[0] // 2])

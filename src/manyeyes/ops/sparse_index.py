@@ -36,7 +36,7 @@ class Window(NamedTuple):
         return self.stride == 1 and 2 * self.padding == self.dilation * (self.kernel - 1) and self.kernel % 2 == 1
 
     def out_shape(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """Rows and columns of the output of a convolution."""
+        """Return rows and columns of the output of a convolution."""
         rows, columns = (
             (n + 2 * self.padding - self.dilation * (self.kernel - 1) - 1) // self.stride + 1 for n in shape
         )
@@ -108,7 +108,7 @@ class NeighbourMap:
         return self.out_key is self.in_key and self.window.is_centred
 
     def rows(self, reverse: bool) -> int:
-        """How many rows pairs lead to: outputs, or inputs when they are turned round."""
+        """Return how many rows pairs lead to: outputs, or inputs when they are turned round."""
         return self.n_in if reverse else self.n_out
 
     @cached_property
@@ -155,7 +155,7 @@ class NeighbourMap:
         return by_tap[met].long(), met.nonzero()[:, 1], met.sum(1)
 
     def _cut(self, rows: int) -> list[PairBlock]:
-        """The pairs of every tap, from inputs to outputs, in blocks of so many rows at most, as views."""
+        """Return the pairs of every tap, from inputs to outputs, in blocks of so many rows at most, as views."""
         source, target, counts = self._met
         sizes = [(tap, min(rows, n - at)) for tap, n in enumerate(counts.tolist()) for at in range(0, n, rows)]
         lengths = [size for _, size in sizes]
@@ -169,7 +169,7 @@ class NeighbourMap:
         return blocks
 
     def blocks(self, rows: int, reverse: bool = False) -> tuple[int, tuple[PairBlock, ...]]:
-        """The pairs of every tap in blocks of so many rows at most, and the longest block's rows; cut once and kept."""
+        """Return the pairs of every tap in blocks of so many rows at most, and the longest block's rows; cut once and kept."""
         if (rows, reverse) not in self.cut:
             found = self._cut(rows)
             if reverse:
@@ -178,7 +178,7 @@ class NeighbourMap:
         return self.cut[rows, reverse]
 
     def on(self, device: torch.device) -> NeighbourMap:
-        """The same map on another device; kept."""
+        """Return the same map on another device; kept."""
         if device == self.in_key.device:
             return self
         if device not in self.moved:
@@ -196,7 +196,7 @@ def split(key: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def distinct(key: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Ascending distinct keys (M,) of keys (N,) in [0, size), and the place (N,) int64 of each key among them."""
+    """Return ascending distinct keys (M,) of keys (N,) in [0, size), and the place (N,) int64 of each key among them."""
     if _in_loops(key):
         found, row = _distinct(key.numpy(), np.zeros(size // 8 * 8 + 8, np.uint8))
         return torch.from_numpy(found), torch.from_numpy(row)
@@ -208,7 +208,7 @@ def distinct(key: Tensor, size: int) -> tuple[Tensor, Tensor]:
 
 
 def dilated_sites(key: Tensor, shape: tuple[int, int], batch_size: int, window: Window) -> Tensor:
-    """Keys of every output that meets an active input: the active set of spconv's SparseConv2d."""
+    """Return keys of every output that meets an active input: the active set of spconv's SparseConv2d."""
     kernel, stride, padding, dilation = window
     out = window.out_shape(shape)
     reach = [(n - 1) * stride + 1 for n in out]
@@ -224,7 +224,7 @@ def dilated_sites(key: Tensor, shape: tuple[int, int], batch_size: int, window: 
 
 
 def parent_sites(key: Tensor, shape: tuple[int, int], batch_size: int, stride: int) -> Tensor:
-    """Keys of the cells ``floor(i / stride)`` of active cells i, on a grid of ceil(shape / stride)."""
+    """Return keys of the cells ``floor(i / stride)`` of active cells i, on a grid of ceil(shape / stride)."""
     rows, columns = -(-shape[0] // stride), -(-shape[1] // stride)
     if _in_loops(key):
         return torch.from_numpy(_parents(key.numpy(), *shape, batch_size, rows, columns, stride))
@@ -234,7 +234,7 @@ def parent_sites(key: Tensor, shape: tuple[int, int], batch_size: int, stride: i
 
 
 def finer_keys(key: Tensor, shape: tuple[int, int], finer: tuple[int, int], ratio: int) -> Tensor:
-    """Ascending keys (N,) of the cells ``i * ratio`` on a finer grid, of cells i with ascending keys (N,)."""
+    """Return ascending keys (N,) of the cells ``i * ratio`` on a finer grid, of cells i with ascending keys (N,)."""
     if _in_loops(key):
         out = torch.empty_like(key)
         _finer(key.numpy(), *shape, *finer, ratio, out.numpy())
@@ -251,7 +251,7 @@ def neighbours(
     batch_size: int,
     window: Window,
 ) -> Tensor:
-    """The map (outputs, kernel * kernel) int32 between two sets of sites.
+    """Return the map (outputs, kernel * kernel) int32 between two sets of sites.
 
     An index image with a border that no tap leaves spares all bounds tests, and with them the ghost neighbours that
     wrap from the last column to the next row.
@@ -271,7 +271,7 @@ def neighbours(
 
 
 def _compute_bordered_shape(out_shape: tuple[int, int], in_shape: tuple[int, int], window: Window) -> tuple[int, int]:
-    """Rows and columns of an index image with a border that no tap leaves."""
+    """Return rows and columns of an index image with a border that no tap leaves."""
     kernel, stride, padding, dilation = window
     reach = dilation * (kernel - 1)
     rows, columns = (
@@ -287,7 +287,9 @@ def _in_loops(key: Tensor) -> bool:
 
 @njit(cache=True, nogil=True)
 def mark_ranks(marks: U8x1) -> tuple[I64x1, I32x1]:  # pragma: no cover
-    """Ascending places (M,) int64 of the ones among marks (S,) uint8, S divisible by 8, and (S,) int32: each one's number."""
+    """Return ascending places (M,) int64 of the ones among marks (S,) uint8, S divisible by 8, and (S,) int32: each one's
+    number.
+    """
     n, words = 0, marks.view(np.uint64)
     for w in words:
         # The product's highest byte is the sum of the word's eight.
@@ -304,7 +306,7 @@ def mark_ranks(marks: U8x1) -> tuple[I64x1, I32x1]:  # pragma: no cover
 
 @njit(cache=True, nogil=True)
 def _distinct(key: I64x1, marks: U8x1) -> tuple[I64x1, I64x1]:  # pragma: no cover
-    """Ascending distinct keys and the place of each key among them; marks: zeros for every key there may be."""
+    """Return ascending distinct keys and the place of each key among them; marks: zeros for every key there may be."""
     for k in key:
         marks[k] = 1
     found, rank = mark_ranks(marks)
@@ -353,7 +355,7 @@ def _pairs(
     window: Window,
     taps: int,
 ) -> Pairs:  # pragma: no cover
-    """Pairs of so many taps; bordered: the images that hold the inputs."""
+    """Return pairs of so many taps; bordered: the images that hold the inputs."""
     kernel, stride, padding, dilation = window
     batch_size, rows, columns = bordered
     image = np.full(batch_size * rows * columns, in_key.shape[0], np.int32)

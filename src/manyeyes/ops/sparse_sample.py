@@ -12,8 +12,8 @@ from manyeyes.datatypes import SparseBev
 
 
 def bilinear(x: SparseBev, xy: Tensor) -> Tensor:
-    """(M, C) features at places (M, 2), metres, on the first grid of the batch; empty cells count as zeros. Differentiable in
-    the features.
+    """Return (M, C) features at places (M, 2), metres, on the first grid of the batch; empty cells count as zeros.
+    Differentiable in the features.
     """
     grid, keys = x.grid, x.sites.key
     if not len(keys):

@@ -40,7 +40,7 @@ class Pillars:
 
 
 def pillar_sites(xyz: Tensor, batch: Tensor, grid: BevGrid, batch_size: int) -> Pillars:
-    """The pillars that points (P, 3) of clouds batch (P,) fall into, ``floor((x - x_min) / pillar)`` in float64."""
+    """Return the pillars that points (P, 3) of clouds batch (P,) fall into, ``floor((x - x_min) / pillar)`` in float64."""
     if grid.stride != 1:
         raise ConfigError(f"pillar_sites works at stride 1; got a grid of stride {grid.stride}: use grid.at(1).")
     rows, columns = grid.shape
@@ -70,7 +70,7 @@ def _point_keys(
     inside: np.ndarray,
     key: np.ndarray,
 ) -> int:  # pragma: no cover
-    """Which points lie in range, and the keys of those, one after another; how many there are."""
+    """Return which points lie in range, and the keys of those, one after another; how many there are."""
     x_min, y_min, z_min, z_max, pillar = limits
     kept = 0
     for p in range(xyz.shape[0]):
@@ -85,7 +85,7 @@ def _point_keys(
 
 
 def segment_sum(values: Tensor, row: Tensor, n: int) -> Tensor:
-    """(n, C): the sum of values (P, C) over segments row (P,) in [0, n)."""
+    """Return (n, C): the sum of values (P, C) over segments row (P,) in [0, n)."""
     if _in_numba(values) and values.dim() == 2 and not (torch.is_grad_enabled() and values.requires_grad):
         return torch.from_numpy(_sums(values.detach().contiguous().numpy(), row.numpy(), n))
     return values.new_zeros(n, *values.shape[1:]).index_add(0, row, values)
@@ -102,7 +102,7 @@ def _sums(values: np.ndarray, row: np.ndarray, n: int) -> np.ndarray:  # pragma:
 
 
 def segment_mean(values: Tensor, row: Tensor, n: int) -> Tensor:
-    """(n, C): the mean of values (P, C) over segments row (P,) in [0, n); zero where a segment is empty."""
+    """Return (n, C): the mean of values (P, C) over segments row (P,) in [0, n); zero where a segment is empty."""
     if _in_numba(values) and values.dim() == 2 and not (torch.is_grad_enabled() and values.requires_grad):
         return torch.from_numpy(_means(values.numpy(), row.numpy(), n))
     count = torch.bincount(row, minlength=n).clamp_min(1).to(values.dtype)
@@ -125,7 +125,7 @@ def _means(values: np.ndarray, row: np.ndarray, n: int) -> np.ndarray:  # pragma
 
 
 def segment_max(values: Tensor, row: Tensor, n: int) -> Tensor:
-    """(n, C): the maximum of values (P, C) over segments row (P,) in [0, n), none empty; ties share the gradient."""
+    """Return (n, C): the maximum of values (P, C) over segments row (P,) in [0, n), none empty; ties share the gradient."""
     out: Tensor = _SegmentMax.apply(values, row, n)  # pyright: ignore[reportAssignmentType]
     return out
 
@@ -189,7 +189,7 @@ def _share_among_ties(
 
 @torch.no_grad()
 def pillar_moments(xyz: Tensor, intensity: Tensor, row: Tensor, sites: Sites) -> Tensor:
-    """(N, 12) statistics of the points (P, 3) in each pillar, in the order of ``MOMENTS``; offsets from its centre.
+    """Return (N, 12) statistics of the points (P, 3) in each pillar, in the order of ``MOMENTS``; offsets from its centre.
 
     A pillar without points has zeros.
     """

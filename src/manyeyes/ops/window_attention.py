@@ -23,7 +23,7 @@ _BITS = 20
 
 
 def window_ids(xy: Tensor, batch: Tensor, origin: tuple[float, float], window_m: float, shift_m: float = 0.0) -> Tensor:
-    """(N,) int64: the window of positions (N, 2), metres, of scenes batch (N,).
+    """Return (N,) int64: the window of positions (N, 2), metres, of scenes batch (N,).
 
     Window ``floor((x - x0 + shift) / window)`` on each axis. Ids need no extent: positions out of range, on any
     side, have windows of their own (up to 2**19 of them from the origin).
@@ -35,7 +35,7 @@ def window_ids(xy: Tensor, batch: Tensor, origin: tuple[float, float], window_m:
 def window_offsets(
     xy: Tensor, origin: tuple[float, float], window_m: float, cell_m: float, shift_m: float = 0.0
 ) -> Tensor:
-    """(N, 2): position in the (shifted) window, from its middle, in cells: in [-S / 2, S / 2), S = window / cell."""
+    """Return (N, 2): position in the (shifted) window, from its middle, in cells: in [-S / 2, S / 2), S = window / cell."""
     at = _window_at(xy, origin, window_m, shift_m)
     start = xy.new_tensor(origin, dtype=torch.float64)
     return ((xy.double() - start + shift_m - (at + 0.5) * window_m) / cell_m).to(xy.dtype)
@@ -90,7 +90,7 @@ def _check_window_size(window_m: float) -> None:
 
 
 def sincos_encoding(u: Tensor, channels: int) -> Tensor:
-    """(N, channels): sin, cos of u (N, 2) at falling frequencies 10000^(-2j / (channels / 2)); x half, then y half."""
+    """Return (N, channels): sin, cos of u (N, 2) at falling frequencies 10000^(-2j / (channels / 2)); x half, then y half."""
     if channels % 4:
         raise ConfigError(f"sincos_encoding needs channels divisible by 4; got {channels}.")
     j = torch.arange(channels // 4, device=u.device, dtype=u.dtype)
@@ -153,7 +153,7 @@ def _runs(window: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _common(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Ids in both ascending lists, and their places in each."""
+    """Return ids in both ascending lists, and their places in each."""
     if not a.numel() or not b.numel():
         none = a.new_zeros(0)
         return none, none, none
@@ -163,14 +163,14 @@ def _common(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _slots(order: Tensor, start: Tensor, count: Tensor) -> Tensor:
-    """(windows, slots): the tokens of each window, padded by the number of tokens."""
+    """Return (windows, slots): the tokens of each window, padded by the number of tokens."""
     slot = torch.arange(int(count.max()), device=order.device)
     place = (start[:, None] + slot).clamp_max(order.shape[0] - 1)
     return order[place].masked_fill_(slot >= count[:, None], order.shape[0])
 
 
 def _flat(slots: list[Tensor], order: Tensor) -> tuple[Tensor, Tensor]:
-    """All slots in a row, and the slot of each token."""
+    """Return all slots in a row, and the slot of each token."""
     n = order.shape[0]
     flat = torch.cat([s.flatten() for s in slots]) if slots else order.new_zeros(0)
     place = order.new_full((n + 1,), flat.shape[0])

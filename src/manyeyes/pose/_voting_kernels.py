@@ -77,7 +77,7 @@ class RefinedPose(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def wrap_half_turn(angle: float) -> float:  # pragma: no cover - compiled
-    """An angle modulo pi, in [-pi/2, pi/2)."""
+    """Return an angle modulo pi, in [-pi/2, pi/2)."""
     return (angle + 0.5 * _PI) % _PI - 0.5 * _PI
 
 
@@ -85,7 +85,7 @@ def wrap_half_turn(angle: float) -> float:  # pragma: no cover - compiled
 def build_edge_table(
     xy: F64x2, yaw: F64x1, min_length: float, max_length: float
 ) -> Edges:  # pragma: no cover - compiled
-    """Edges between landmarks whose distance is within min_length and max_length (m)."""
+    """Return edges between landmarks whose distance is within min_length and max_length (m)."""
     n = len(xy)
     size = n * (n - 1) // 2
     ends, heading = np.empty((size, 2), np.int64), np.empty((size, 2))
@@ -109,7 +109,9 @@ def build_edge_table(
 def find_compatible(
     size_a: F64x2, size_b: F64x2, instant_a: I64x1, instant_b: I64x1, gate: float
 ) -> Boolx2:  # pragma: no cover - compiled
-    """(N, M) bool: landmarks of one instant that may be one object: widths within ``gate`` (m), lengths within about twice that."""
+    """Return (N, M) bool: landmarks of one instant that may be one object: widths within ``gate`` (m), lengths within about
+    twice that.
+    """
     ok = np.empty((len(size_a), len(size_b)), np.bool_)
     for i in range(len(size_a)):
         for j in range(len(size_b)):
@@ -131,7 +133,7 @@ def match_edges(
     gate: float,
     max_poses: int,
 ) -> tuple[F64x2, F64x1]:  # pragma: no cover - compiled
-    """Poses (H, 3) a_from_b of edges that agree within ``gate`` standard deviations, and their squared residuals (H,).
+    """Return poses (H, 3) a_from_b of edges that agree within ``gate`` standard deviations, and their squared residuals (H,).
 
     edges_a, edges_b: by ascending length. is_compatible: (N, M) pairs that may be one object. Only the first max_poses are
     returned.
@@ -185,7 +187,7 @@ def match_edges(
 
 @njit(cache=True, nogil=True)
 def build_grid(xy: F64x2, cell: float) -> LandmarkGrid:  # pragma: no cover - compiled
-    """Points (N, 2) by square cells of edge cell; cells grow where there would be too many."""
+    """Sort points (N, 2) into square cells of edge cell; cells grow where there would be too many."""
     x0, y0, x1, y1 = xy[:, 0].min(), xy[:, 1].min(), xy[:, 0].max(), xy[:, 1].max()
     cell = max(cell, max(x1 - x0, y1 - y0) / 1000.0)
     nx, ny = int((x1 - x0) / cell) + 1, int((y1 - y0) / cell) + 1
@@ -209,7 +211,7 @@ def compute_support(
     tau: float,
     turn: float,
 ) -> F64x1:  # pragma: no cover - compiled
-    """(H,) sum over landmarks of b of the best max(0, 1 - d^2 / tau^2) among a's."""
+    """Return (H,) sum over landmarks of b of the best max(0, 1 - d^2 / tau^2) among a's."""
     xy_a, yaw_a, _, _ = a
     xy_b, yaw_b, _, _ = b
     order, start, x0, y0, nx, ny, cell = grid
@@ -242,8 +244,8 @@ def compute_support(
 def select_distinct(
     poses: F64x2, order: I64x1, middle: F64x1, max_count: int, min_separation: float, turn: float
 ) -> I64x1:  # pragma: no cover - compiled
-    """Rows of poses, best first, of which no two agree within ``min_separation`` metres at the middle (2,) of b and ``turn``
-    radians.
+    """Return rows of poses, best first, of which no two agree within ``min_separation`` metres at the middle (2,) of b and
+    ``turn`` radians.
     """
     chosen = np.empty(max_count, np.int64)
     place = np.empty((max_count, 2))
@@ -378,7 +380,7 @@ def refine_pose(
     gate: float,
     rounds: int,
 ) -> RefinedPose:  # pragma: no cover - compiled
-    """Pairs and fit in turn until the pairs stay; wide at first, then as exact as stated."""
+    """Alternate pairing and fitting until the pairs are constant; wide at first, then as exact as stated."""
     information = np.zeros((3, 3))
     before = np.full((1, 2), -1, np.int64)
     for round_ in range(rounds):

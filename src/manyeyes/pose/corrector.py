@@ -185,7 +185,7 @@ def inflate_covariance(prior: PosePrior, distance: float) -> PosePrior:
 
 
 def mahalanobis_squared(pose: Floats, covariance: Floats, prior: PosePrior) -> float:
-    """Squared Mahalanobis distance of a measured pose (3,), (3, 3) from the prior."""
+    """Return the squared Mahalanobis distance of a measured pose (3,), (3, 3) from the prior."""
     delta = pose_difference(pose, prior.pose)
     return float(delta @ np.linalg.solve(covariance + prior.covariance, delta))
 

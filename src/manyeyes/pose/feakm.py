@@ -61,7 +61,9 @@ class RansacConfig:
 def solve_with_ransac(
     ego: Landmarks, other: Landmarks, pairs: Ints, prior: PosePrior | None, config: RansacConfig | None = None
 ) -> PoseEstimate:
-    """The pose with the most inlier pairs; the prior where these are too few, or where it does not differ significantly."""
+    """Return the pose with the most inlier pairs; the prior where these are too few, or where it does not differ
+    significantly.
+    """
     config = config or RansacConfig()
     if len(pairs) < config.min_pairs:
         return no_estimate(prior)
@@ -83,7 +85,7 @@ def solve_with_ransac(
 
 
 def _ransac(target: Floats, source: Floats, config: RansacConfig) -> NDArray[np.bool_]:
-    """(P,) bool: inlier pairs of the best pose among random samples."""
+    """Return (P,) bool: inlier pairs of the best pose among random samples."""
     rng = keyed_generator(config.seed, "feakm ransac", len(target))
     drawn = rng.random((config.num_trials, len(target))).argsort(1)[:, : config.sample_size]
     poses = fit_se2(torch.from_numpy(source[drawn]), torch.from_numpy(target[drawn])).numpy()
@@ -95,7 +97,7 @@ def _ransac(target: Floats, source: Floats, config: RansacConfig) -> NDArray[np.
 
 
 def _residuals_m(poses: Floats, target: Floats, source: Floats) -> Floats:
-    """(H, P) residuals in metres of pairs of positions (P, 2) under poses (H, 3)."""
+    """Return (H, P) residuals in metres of pairs of positions (P, 2) under poses (H, 3)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x = c * source[:, 0] - s * source[:, 1] + poses[:, :1] - target[:, 0]
     y = s * source[:, 0] + c * source[:, 1] + poses[:, 1:2] - target[:, 1]
@@ -135,7 +137,7 @@ class ConsensusConfig:
 def solve_with_consensus(
     ego: Landmarks, other: Landmarks, pairs: Ints, prior: PosePrior | None, config: ConsensusConfig | None = None
 ) -> PoseEstimate:
-    """The pose of largest likelihood over all hypotheses of two pairs, compared with the prior as in corrector.py."""
+    """Return the pose of largest likelihood over all hypotheses of two pairs, compared with the prior as in corrector.py."""
     config = config or ConsensusConfig()
     if len(pairs) < config.min_pairs:
         return no_estimate(prior)
@@ -146,7 +148,7 @@ def solve_with_consensus(
 
 
 def _candidates(ego: Landmarks, other: Landmarks, pairs: Ints, config: ConsensusConfig) -> list[Candidate]:
-    """The best pose and the best distinct other one, refined; every two pairs are a hypothesis."""
+    """Return the best pose and the best distinct other one, refined; every two pairs are a hypothesis."""
     a, b = ego[pairs[:, 0]], other[pairs[:, 1]]
     i, k = np.triu_indices(len(pairs), 1)
     long = np.minimum(*(np.hypot(*(x.xy[i] - x.xy[k]).T) for x in (a, b))) >= config.min_pair_distance_m
@@ -170,27 +172,27 @@ def _candidates(ego: Landmarks, other: Landmarks, pairs: Ints, config: Consensus
 
 
 def _alike(poses: Floats, pose: Floats, middle: Floats, config: ConsensusConfig) -> NDArray[np.bool_]:
-    """(H,) bool: poses (H, 3) within the separation limits of one pose, measured at the objects' centroid."""
+    """Return (H,) bool: poses (H, 3) within the separation limits of one pose, measured at the objects' centroid."""
     apart = np.hypot(*(transform_point(poses, middle) - transform_point(pose[None], middle)).T)
     turn = np.abs(np.remainder(poses[:, 2] - pose[2] + np.pi, 2 * np.pi) - np.pi)
     return (apart < config.min_separation_m) & (turn < config.min_separation_rad)
 
 
 def _misfits(poses: Floats, a: Landmarks, b: Landmarks) -> Floats:
-    """(H, P) squared residuals of each pair's position and heading (modulo pi), 3 degrees of freedom."""
+    """Return (H, P) squared residuals of each pair's position and heading (modulo pi), 3 degrees of freedom."""
     place = np.square(_residuals_m(poses, a.xy, b.xy)) / (a.sigma_xy**2 + b.sigma_xy**2)
     turn = np.remainder(a.yaw - b.yaw - poses[:, 2:] + np.pi / 2, np.pi) - np.pi / 2
     return place + np.square(turn) / (a.sigma_yaw**2 + b.sigma_yaw**2)
 
 
 def _gains(poses: Floats, a: Landmarks, b: Landmarks, config: ConsensusConfig) -> Floats:
-    """(H, P) log-likelihood ratios against chance, never negative."""
+    """Return (H, P) log-likelihood ratios against chance, never negative."""
     max_gain = np.log(config.chance_area_m2 / (2 * np.pi * (a.sigma_xy**2 + b.sigma_xy**2)))
     return np.maximum(max_gain - _misfits(poses, a, b) / 2, 0.0)
 
 
 def _refine(pose: Floats, a: Landmarks, b: Landmarks, pairs: Ints, config: ConsensusConfig) -> Candidate | None:
-    """The weighted fit on all inlier pairs, iterated until these no longer change; None for fewer than two."""
+    """Return the weighted fit on all inlier pairs, iterated until these no longer change; None for fewer than two."""
     weight = 1 / (a.sigma_xy**2 + b.sigma_xy**2)
     agree = np.zeros(len(pairs), bool)
     for _ in range(10):
@@ -236,7 +238,7 @@ class FeakmCorrector:
 
 
 def _points(landmarks: Landmarks, descriptors: Floats) -> KeypointBatch:
-    """One view's landmarks as a batch of the matcher."""
+    """Return one view's landmarks as a batch of the matcher."""
     columns = (descriptors, landmarks.xy, landmarks.yaw, landmarks.size, np.ones(len(landmarks)))
     descriptor, xy, yaw, size, mask = (torch.from_numpy(c).float()[None] for c in columns)
     return KeypointBatch(descriptor, xy, yaw, size, mask.bool())
@@ -245,5 +247,5 @@ def _points(landmarks: Landmarks, descriptors: Floats) -> KeypointBatch:
 @register_pose_corrector(FEAKM, "weights")
 @cache
 def load_feakm_corrector(weights: str, min_pairs: int = 4) -> FeakmCorrector:
-    """The corrector with the weights of a shipped name or a file; loaded once per process."""
+    """Return the corrector with the weights of a shipped name or a file; loaded once per process."""
     return FeakmCorrector.of(pretrained.load_feakm(weights), min_pairs)

@@ -78,7 +78,7 @@ class Landmarks:
 
     @classmethod
     def of(cls, objects: Landmarks | Boxes | Numbers) -> Landmarks:
-        """Landmarks of boxes, or of an array (N, 7) of their centre x, y, z and length, width, height (m) and yaw (rad).
+        """Return landmarks of boxes, or of an array (N, 7) of their centre x, y, z and length, width, height (m) and yaw (rad).
 
         Raises:
             ShapeError: the array has another shape.
@@ -96,7 +96,7 @@ class Landmarks:
 
     @classmethod
     def of_boxes(cls, boxes: Boxes, error: DetectorUncertainty | None = None) -> Landmarks:
-        """Landmarks of decoded boxes; a box that states no error of its own (sigma 0) gets the detector's."""
+        """Return landmarks of decoded boxes; a box that states no error of its own (sigma 0) gets the detector's."""
         error = error or DetectorUncertainty()
         columns = (
             boxes.center[:, :2],
@@ -122,12 +122,12 @@ class Landmarks:
 
     @classmethod
     def of_keypoints(cls, points: Keypoints, error: DetectorUncertainty | None = None) -> Landmarks:
-        """Landmarks of boxes with their descriptors."""
+        """Return the landmarks of boxes with their descriptors."""
         return replace(cls.of_boxes(points.boxes, error), descriptor=points.descriptor.detach().cpu().double().numpy())
 
     @classmethod
     def empty(cls) -> Landmarks:
-        """A set without any landmark."""
+        """Return a set without any landmark."""
         zero = np.zeros(0)
         return cls(np.zeros((0, 2)), zero, np.zeros((0, 2)), zero, zero, zero, zero, np.zeros(0, np.int64))
 
@@ -160,14 +160,14 @@ class Landmarks:
         return Landmarks(*(getattr(self, f.name)[index] for f in fields(self)[:-1]), descriptor=descriptor)
 
     def transform(self, target_from_source: Floats) -> Landmarks:
-        """The same landmarks in another frame; target_from_source: (3,) x, y (m), yaw (rad)."""
+        """Return the same landmarks in another frame; target_from_source: (3,) x, y (m), yaw (rad)."""
         c, s = np.cos(target_from_source[2]), np.sin(target_from_source[2])
         x, y = self.xy[:, 0], self.xy[:, 1]
         there = np.stack((c * x - s * y + target_from_source[0], s * x + c * y + target_from_source[1]), 1)
         return replace(self, xy=there, yaw=self.yaw + target_from_source[2])
 
     def select_indices(self, max_range_m: float, max_count: int) -> Ints:
-        """Indices of usable landmarks, in an order that does not depend on the order given.
+        """Return indices of usable landmarks, in an order that does not depend on the order given.
 
         Usable: all values are finite, the size is that of a vehicle, and the position is within ``max_range_m`` of the median of
         all. At most ``max_count`` are returned, those of the highest score.
@@ -185,7 +185,7 @@ class Landmarks:
         return rows[order] if len(rows) <= max_count else rows[order[self._select_best(rows[order], max_count)]]
 
     def _select_best(self, rows: Ints, max_count: int) -> Ints:
-        """Positions in rows of the highest scores, in the order of rows."""
+        """Return positions in rows of the highest scores, in the order of rows."""
         return np.sort(np.argsort(-self.score[rows], kind="stable")[:max_count])
 
 

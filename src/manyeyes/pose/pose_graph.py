@@ -59,7 +59,7 @@ def optimize_poses(
     max_cycle_chi2: float = CHI2_3DOF_P001,
     huber: float = 3.0,
 ) -> PoseGraphResult:
-    """Poses of all agents that edges or priors connect to the ego. priors: ego_from_agent.
+    """Return poses of all agents that edges or priors connect to the ego. priors: ego_from_agent.
 
     max_cycle_chi2: largest squared Mahalanobis length (3 degrees of freedom) of a consistent cycle. The result does not depend on
     the order of edges.
@@ -109,7 +109,7 @@ def reject_inconsistent_edges(
 
 
 def _prior_distance(ego: int, edge: RelativePoseEdge, priors: Mapping[int, PosePrior]) -> float:
-    """Squared Mahalanobis distance of an edge from the priors of both agents; 0 where one of them has none."""
+    """Return the squared Mahalanobis distance of an edge from the priors of both agents; 0 where one of them has none."""
     known = {**priors, ego: PosePrior.of(Transform.identity(), 0.0, 0.0)}
     if edge.i not in known or edge.j not in known:
         return 0.0
@@ -124,7 +124,7 @@ def _prior_distance(ego: int, edge: RelativePoseEdge, priors: Mapping[int, PoseP
 
 
 def cycle_distance(one: RelativePoseEdge, two: RelativePoseEdge, three: RelativePoseEdge) -> float:
-    """Squared Mahalanobis length of the cycle of three edges that connect three agents."""
+    """Return the squared Mahalanobis length of the cycle of three edges that connect three agents."""
     first = one
     second = two if first.j in (two.i, two.j) else three
     third = three if second is two else two
@@ -150,7 +150,7 @@ def _triangles(edges: Sequence[RelativePoseEdge]) -> list[tuple[int, int, int]]:
 
 
 def _from(edge: RelativePoseEdge, agent: int) -> tuple[Floats, Floats]:
-    """The edge's pose and covariance, directed from one of its agents."""
+    """Return the edge's pose and covariance, directed from one of its agents."""
     if edge.i == agent:
         return edge.pose, edge.covariance
     back = inverse(torch.from_numpy(edge.pose)).numpy()

@@ -70,7 +70,7 @@ class PoseMonitorState:
 
     @classmethod
     def new(cls) -> PoseMonitorState:
-        """The initial state, without measurements."""
+        """Return the initial state, without measurements."""
         return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)), np.zeros(0))
 
 

@@ -75,7 +75,7 @@ class LikelihoodField:
 
     @classmethod
     def of(cls, xy: Floats, half_size_m: float, cell_m: float, blur_m: float) -> LikelihoodField:
-        """The field of columns at (N, 2)."""
+        """Return the field of columns at (N, 2)."""
         side = 2 * math.ceil(half_size_m / cell_m)
         value = np.zeros((side, side), np.float32)
         at = np.floor((xy + half_size_m) / cell_m).astype(int)
@@ -84,7 +84,7 @@ class LikelihoodField:
         return cls(_dilate_gaussian(value, blur_m / cell_m), half_size_m, cell_m)
 
     def sample(self, xy: Floats) -> Floats:
-        """Values at positions (..., 2), bilinear, 0 outside."""
+        """Return values at positions (..., 2), bilinear, 0 outside."""
         place = (xy + self.half_size_m) / self.cell_m - 0.5
         low = np.floor(place).astype(int)
         part = place - low
@@ -126,7 +126,7 @@ def register_clouds(
 
 
 def extract_vertical_structures(cloud: PointCloud, config: RegistrationConfig) -> Floats:
-    """(N, 2) centres of the columns within range whose points differ enough in height."""
+    """Return (N, 2) centres of the columns within range whose points differ enough in height."""
     xyz = cloud.xyz.double().numpy()
     xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) < config.max_range_m]
     cell = np.floor(xyz[:, :2] / config.column_m).astype(np.int64)
@@ -142,7 +142,7 @@ def extract_vertical_structures(cloud: PointCloud, config: RegistrationConfig) -
 
 
 def _peaks(here: Floats, there: Floats, config: RegistrationConfig) -> list[Floats]:
-    """Poses (3,) of the best distinct overlaps among all yaws and all shifts of whole cells."""
+    """Return poses (3,) of the best distinct overlaps among all yaws and all shifts of whole cells."""
     side = 2 * math.ceil(config.max_range_m / config.cell_m)
     own = LikelihoodField.of(here, config.max_range_m, config.cell_m, config.cell_m).value
     # Twice the side, so that no shift wraps around.
@@ -201,7 +201,7 @@ def _is_alike(a: Floats, b: Floats, config: RegistrationConfig) -> bool:
 
 
 def _dilate_gaussian(value: Pixels, sigma: float) -> Pixels:
-    """The maximum of Gaussians around every set cell, to three sigma: 1 where set."""
+    """Return the maximum of Gaussians around every set cell, to three sigma: 1 where set."""
     radius = math.ceil(3 * sigma)
     out = torch.from_numpy(value)[None, None]
     for axis_step in ((1, 0), (0, 1)):

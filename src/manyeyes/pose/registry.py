@@ -59,12 +59,12 @@ def register_pose_corrector(name: str, kind: Kind = "landmarks") -> Callable[[Fu
 
 
 def list_correctors(*kinds: Kind) -> tuple[str, ...]:
-    """The names of all correctors of these kinds."""
+    """Return the names of all correctors of these kinds."""
     return tuple(name for name, found in POSE_CORRECTORS.load_all().items() if found.kind in kinds)
 
 
 def find_corrector(name: str) -> RegisteredCorrector:
-    """The corrector of a name, of landmarks or of clouds; weights are loaded.
+    """Return the corrector of a name, of landmarks or of clouds; weights are loaded.
 
     Raises:
         ConfigError: no corrector has the name, or what follows @ is no number of pairs.
@@ -82,7 +82,7 @@ def find_corrector(name: str) -> RegisteredCorrector:
 
 
 def load_corrector(name: str) -> PoseCorrector:
-    """The corrector of landmarks of a name.
+    """Return the corrector of landmarks of a name.
 
     Raises:
         ConfigError: no corrector of landmarks has the name.

@@ -24,7 +24,7 @@ def calibrate_acceptance(
     max_false_accept_rate: float,
     config: CorrectorConfig | None = None,
 ) -> AcceptanceTest:
-    """The acceptance test whose rate of estimates on null scenes is at most ``max_false_accept_rate``, its other limits as
+    """Return the acceptance test whose rate of estimates on null scenes is at most ``max_false_accept_rate``, its other limits as
     configured.
 
     null_scenes: landmarks of two agents that have no object in common, without a prior. At least 2 / max_false_accept_rate scenes
@@ -44,7 +44,7 @@ def calibrate_acceptance(
 
 
 def _required_min_score(ego: Landmarks, other: Landmarks, config: CorrectorConfig) -> float:
-    """The min_score above which this scene gets no estimate; minus infinity where other limits already reject it."""
+    """Return the min_score above which this scene gets no estimate; minus infinity where other limits already reject it."""
     extra_score = config.accept.extra_score_per_instant * max(len(np.unique(ego.instant)) - 1, 0)
     ranked = rank_candidates(find_candidates(ego, other, config.vote), None, config.accept.prior_volume)
     if ranked is None or ranked.margin < config.accept.min_margin:

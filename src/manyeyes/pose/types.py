@@ -60,7 +60,7 @@ class PosePrior:
 
     @classmethod
     def of(cls, ego_from_other: Transform | Numbers, sigma_xy_m: float, sigma_yaw_rad: float) -> PosePrior:
-        """A prior whose errors in x, y and yaw are independent; of a transform, or of x, y (m) and yaw (rad).
+        """Return a prior whose errors in x, y and yaw are independent; of a transform, or of x, y (m) and yaw (rad).
 
         Raises:
             ShapeError: the pose is neither. ConfigError: a value is not finite.
@@ -74,7 +74,7 @@ class PosePrior:
 
     @classmethod
     def between(cls, ego: AgentFrame | Message, other: AgentFrame | Message) -> PosePrior:
-        """The prior from two agents' reported poses: errors of both, and the ego's yaw error at the other's distance."""
+        """Return the prior from two agents' reported poses: errors of both, and the ego's yaw error at the other's distance."""
         ego_from_other = ego.world_from_agent.inverse() @ other.world_from_agent
         x, y, _ = project_to_se2(ego_from_other)
         c, s = float(ego.world_from_agent.yaw.cos()), float(ego.world_from_agent.yaw.sin())
@@ -143,7 +143,7 @@ def lift_to_se3(pose: Floats, prior: PosePrior | None) -> Transform:
 
 
 def no_estimate(prior: PosePrior | None, status: PoseStatus = PoseStatus.NO_MATCH) -> PoseEstimate:
-    """The estimate where no pose is measured: the prior unchanged, or nothing."""
+    """Return the estimate where no pose is measured: the prior unchanged, or nothing."""
     return PoseEstimate(
         None if prior is None else prior.ego_from_other,
         np.full((3, 3), np.inf) if prior is None else prior.covariance,

@@ -116,7 +116,7 @@ _Found = tuple[Floats, Floats, Ints, Floats, float]
 
 
 def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None) -> list[_Found]:
-    """Distinct refined poses a_from_b, best first."""
+    """Return distinct refined poses a_from_b, best first."""
     numbers_a, numbers_b = _numbers(a), _numbers(b)
     exact_a, exact_b = (
         _with_place_covariance(a, config.lateral_sigma_ratio),
@@ -176,7 +176,7 @@ def _hypotheses(a: Landmarks, b: Landmarks, is_compatible: NDArray[np.bool_], co
 
 
 def _edges(x: Landmarks, config: VoteConfig) -> loops.Edges:
-    """The edges, by length."""
+    """Return the edges, by length."""
     edges = loops.build_edge_table(np.ascontiguousarray(x.xy), x.yaw, config.min_edge_m, config.max_edge_m)
     order = np.argsort(edges.length, kind="stable")[: config.max_edges]
     return loops.Edges(edges.ends[order], edges.length[order], edges.direction[order], edges.heading[order])
@@ -194,8 +194,8 @@ def _score(a: Landmarks, b: Landmarks, pose: Floats, pairs: Ints, misfit: Floats
 
 
 def _keep_static_once(xy: Floats, instant: Ints, gain: Floats, static_radius_m: float) -> NDArray[np.bool_]:
-    """(P,) bool: pairs that count; of those at one place in several instants only the best, since static objects are no new
-    evidence.
+    """Return (P,) bool: pairs that count; of those at one place in several instants only the best, since static objects are no
+    new evidence.
     """
     if not instant.any():
         return np.ones(len(gain), bool)
@@ -209,7 +209,7 @@ def _keep_static_once(xy: Floats, instant: Ints, gain: Floats, static_radius_m: 
 
 
 def _merge_alike(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[_Found]:
-    """The found poses, best first, without those within the separation limits of a better one."""
+    """Return the found poses, best first, without those within the separation limits of a better one."""
     poses = np.array([f[0] for f in found]).reshape(-1, 3)
     kept, gone = [], np.zeros(len(found), bool)
     for n, one in enumerate(found):
@@ -225,14 +225,14 @@ def _merge_alike(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[
 
 
 def transform_point(poses: Floats, point: Floats) -> Floats:
-    """(N, 2) a point (2,) transformed by poses (N, 3)."""
+    """Return (N, 2) a point (2,) transformed by poses (N, 3)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return poses[:, :2] + np.stack((c * point[0] - s * point[1], s * point[0] + c * point[1]), 1)
 
 
 def _covariance(information: Floats, pairs: int, misfit: float, dof: int, config: VoteConfig) -> Floats:
-    """(3, 3): inverse information, scaled by the residuals (the mean of an inverse gamma prior on the scale), plus the variance
-    that all boxes of a view have in common.
+    """Return (3, 3): inverse information, scaled by the residuals (the mean of an inverse gamma prior on the scale), plus the
+    variance that all boxes of a view have in common.
     """
     scale = (config.prior_dof + misfit) / (config.prior_dof + dof)
     covariance = np.asarray(np.linalg.inv(information) * scale, np.float64)
@@ -242,7 +242,7 @@ def _covariance(information: Floats, pairs: int, misfit: float, dof: int, config
 
 
 def _rank(x: Landmarks) -> tuple[float, ...]:
-    """A sort key of a set that does not depend on its frame or order."""
+    """Return a sort key of a set that does not depend on its frame or order."""
     return (len(x), *np.round(np.sort(x.size, 0).sum(0), 9), round(float(x.score.sum()), 9))
 
 
@@ -252,7 +252,7 @@ def _inverse(pose: Floats) -> Floats:
 
 
 def _invert(pose: Floats, covariance: Floats) -> tuple[Floats, Floats]:
-    """The inverse pose and its covariance."""
+    """Return the inverse pose and its covariance."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     back = _inverse(pose)
     by = np.array([[-c, -s, back[1]], [s, -c, -back[0]], [0.0, 0.0, -1.0]])

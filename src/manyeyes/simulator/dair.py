@@ -134,7 +134,7 @@ def record_drive(one: DairJob, root: Path) -> ManifestEntry:
 
 
 def _write(scenario: SimulatedScenario, writer: DairWriter, first_frame: int) -> int:
-    """All pairs of a drive; the number of points."""
+    """Return all pairs of a drive; the number of points."""
     spec, points = scenario.spec, 0
     random = keyed_generator(spec.seed, "dair", spec.town)
     lag = int(random.integers(_MAX_LAG_STEPS + 1))
@@ -148,7 +148,7 @@ def _write(scenario: SimulatedScenario, writer: DairWriter, first_frame: int) ->
 
 
 def _place(one: DairJob) -> str:
-    """The file that marks a drive as finished."""
+    """Return the file that marks a drive as finished."""
     return f"{BATCHES}/{one.batch_id:06d}.json"
 
 
@@ -171,7 +171,7 @@ def _check(root: Path, place: str, content: Mapping[str, Any]) -> list[FileProbl
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """The content of a drive's file, its specification with the defaults of fields that an older version did not have."""
+    """Return the content of a drive's file, its specification with the defaults of fields that an older version did not have."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         asked = {**content["asked"], "spec": asdict(ScenarioSpec(**content["asked"]["spec"]))}

@@ -108,7 +108,7 @@ def iterate_landmark_pairs(
     frame_stride: int = 1,
     net: FeakmNet | None = None,
 ) -> Iterator[LandmarkPair]:
-    """The first agent and each other, at every so many-th judged instant of every scenario.
+    """Yield the first agent and each other, at every so many-th judged instant of every scenario.
 
     Landmarks are boxes of at least min_score. net: computes their descriptors, for correctors that use them.
     """
@@ -170,7 +170,9 @@ def _make_landmark_pairs(
 
 
 def count_common_objects(snapshot: Snapshot, max_range_m: float) -> int:
-    """The fewest true objects that the first agent shares with any other within reach; 0 where there is none, or no truth."""
+    """Return the fewest true objects that the first agent shares with any other within reach; 0 where there is none, or no
+    truth.
+    """
     truth = snapshot.truth
     if truth is None:
         return 0
@@ -182,7 +184,7 @@ def count_common_objects(snapshot: Snapshot, max_range_m: float) -> int:
 
 
 def run_corrector(pairs: Iterable[LandmarkPair], trial: CorrectorTrial) -> CorrectorRun:
-    """A corrector's answers under an error of claims."""
+    """Return a corrector's answers under an error of claims."""
     correct = load_corrector(trial.corrector)
     evaluations, expected, times_ms, sizes = [], [], [], []
     for pair in pairs:
@@ -198,7 +200,7 @@ def run_corrector(pairs: Iterable[LandmarkPair], trial: CorrectorTrial) -> Corre
 
 
 def get_expected_status(kind: str, num_common: int) -> PoseStatus:
-    """The status that an ideal corrector gives: of a claim so wrong, with so many objects in common."""
+    """Return the status that an ideal corrector gives: of a claim so wrong, with so many objects in common."""
     if num_common <= MAX_UNMATCHABLE_OBJECTS:
         return PoseStatus.NO_MATCH
     if kind == "offset":
@@ -207,7 +209,7 @@ def get_expected_status(kind: str, num_common: int) -> PoseStatus:
 
 
 def summarize_run(trial: CorrectorTrial, run: CorrectorRun) -> list[AccuracyRow]:
-    """The numbers over all meetings, then by common objects."""
+    """Return the numbers over all meetings, then by common objects."""
     out = []
     for bucket in (None, *COMMON_OBJECT_BUCKETS):
         keep = [n for n, f in enumerate(run.evaluations) if bucket is None or bucket[0] <= f.num_common <= bucket[1]]
@@ -233,7 +235,7 @@ def summarize_run(trial: CorrectorTrial, run: CorrectorRun) -> list[AccuracyRow]
 
 
 def load_or_run(path: Path, make: Callable[[], CorrectorRun]) -> CorrectorRun:
-    """The answers in a file, or made now and kept there, whole or not at all."""
+    """Return the answers in a file, or made now and kept there, whole or not at all."""
     if path.is_file():
         stored = json.loads(path.read_text(encoding="utf-8"))
         evaluations = tuple(PoseEvaluation(**(f | {"status": PoseStatus(f["status"])})) for f in stored["frames"])

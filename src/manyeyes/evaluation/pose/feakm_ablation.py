@@ -77,7 +77,7 @@ def run_ablation(
     seed: int = 0,
     report: Callable[[str, int], None] = lambda scenario, index: None,
 ) -> tuple[FeakmVariantRow, ...]:
-    """The rows, branch by branch, over every so many judged frames of the recording; the first agent is the ego."""
+    """Return the rows, branch by branch, over every so many judged frames of the recording; the first agent is the ego."""
     accumulators = {(variant.name, sigma): _VariantAccumulator() for variant in variants for sigma in sigmas}
     if len(accumulators) < len(variants) * len(sigmas):
         raise ConfigError(f"Branches have names of their own; got {', '.join(b.name for b in variants)}.")
@@ -133,7 +133,7 @@ class _CachedViews:
             self.keypoints = [variant.corrector.net.describe([views[0], view]) for view in views[1:]]
 
     def fuse_with_poses(self, frames: Sequence[AgentFrame]) -> tuple[Boxes, list[bool]]:
-        """Boxes around the ego, and of which collaborators the pose was found."""
+        """Return boxes around the ego, and of which collaborators the pose was found."""
         own = self.outputs[0].shared_tokens
         parts, is_found = [AgentTokens(0, own.features, own.sites.xy)], []
         for output, frame, points in zip(self.outputs[1:], frames[1:], self.keypoints):

@@ -22,7 +22,8 @@ def evaluate_correctors(
     noise: PriorNoise,
     max_distance_m: float = 1.5,
 ) -> dict[str, list[PoseEvaluation]]:
-    """Every corrector's answers on the same pairs of views (ego, other, true ego_from_other), judged (evaluation/pose/metrics.py).
+    """Return every corrector's answers on the same pairs of views (ego, other, true ego_from_other), judged
+    (evaluation/pose/metrics.py).
 
     Objects in common are those that both detect: mutual nearest within near_m under the true pose.
     """
@@ -47,7 +48,7 @@ def _find_common(ego: Keypoints, other: Keypoints, ego_from_other: Transform, ma
 def describe_pairs(
     net: FeakmNet, pairs: Iterable[tuple[DetectorView, DetectorView, Transform]]
 ) -> Iterator[tuple[Keypoints, Keypoints, Transform]]:
-    """Pairs of views as keypoints."""
+    """Yield pairs of views as keypoints."""
     for ego, other, truth in pairs:
         with torch.no_grad():
             points = net.describe([ego, other])

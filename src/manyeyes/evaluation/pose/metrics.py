@@ -51,7 +51,7 @@ class PoseEvaluation:
     confidence: float
 
     def is_within(self, limit: float) -> bool:
-        """Whether the pose used is within so many metres and degrees."""
+        """Return whether the pose used is within so many metres and degrees."""
         return self.translation_error_m < limit and self.rotation_error_deg < limit
 
 
@@ -80,7 +80,7 @@ class PoseScore:
 
 
 def evaluate_pose(estimate: PoseEstimate, truth: Floats, common_xy: Floats) -> PoseEvaluation:
-    """One answer against the true ego_from_other (3,), with the true places (K, 2) of common objects in the ego's
+    """Return one answer against the true ego_from_other (3,), with the true places (K, 2) of common objects in the ego's
     frame.
     """
     if truth.shape != (3,) or common_xy.ndim != 2 or common_xy.shape[1] != 2:
@@ -105,7 +105,7 @@ def evaluate_pose(estimate: PoseEstimate, truth: Floats, common_xy: Floats) -> P
 
 
 def compute_displacement(pose: Floats, truth: Floats, points_xy: Floats) -> float:
-    """Mean distance (m) by which a pose misplaces objects at true places (K, 2) in the ego's frame; NaN without any."""
+    """Return the mean distance (m) by which a pose misplaces objects at true places (K, 2) in the ego's frame; NaN without any."""
     if not len(points_xy):
         return math.nan
     yaw_error = pose[2] - truth[2]
@@ -116,7 +116,7 @@ def compute_displacement(pose: Floats, truth: Floats, points_xy: Floats) -> floa
 
 
 def summarize_evaluations(evaluations: Sequence[PoseEvaluation]) -> PoseScore:
-    """All numbers over some frames."""
+    """Return all numbers over some frames."""
     n = len(evaluations)
     estimates = [f for f in evaluations if f.status.has_estimate]
     translation_errors_m, rotation_errors_deg = (
@@ -147,7 +147,7 @@ def summarize_evaluations(evaluations: Sequence[PoseEvaluation]) -> PoseScore:
 
 
 def summarize_by_common_objects(evaluations: Sequence[PoseEvaluation]) -> list[tuple[tuple[int, int], PoseScore]]:
-    """The numbers for each bucket of common objects that has a frame."""
+    """Return the numbers for each bucket of common objects that has a frame."""
     evaluations_by_bucket = [
         (b, [f for f in evaluations if b[0] <= f.num_common <= b[1]]) for b in COMMON_OBJECT_BUCKETS
     ]
@@ -170,7 +170,7 @@ def compute_risk_coverage(evaluations: Sequence[PoseEvaluation], limit: float = 
 
 
 def count_confusion(pairs: Sequence[tuple[PoseStatus, PoseStatus]]) -> NDArray[np.int64]:
-    """(5, 5) counts of (injected, reported) statuses, in the order of PoseStatus."""
+    """Return (5, 5) counts of (injected, reported) statuses, in the order of PoseStatus."""
     order = list(PoseStatus)
     table = np.zeros((len(order), len(order)), np.int64)
     for injected, reported in pairs:
@@ -179,7 +179,7 @@ def count_confusion(pairs: Sequence[tuple[PoseStatus, PoseStatus]]) -> NDArray[n
 
 
 def make_oracle_estimate(truth: Floats, prior: PosePrior | None) -> PoseEstimate:
-    """The row that knows: the true pose as an answer. It lives here because nothing below may see truth."""
+    """Return the oracle row: the true pose as estimate. It is here because lower layers have no ground truth."""
     template = no_estimate(prior, PoseStatus.OK)
     return PoseEstimate(
         lift_to_se3(truth, prior),

@@ -82,7 +82,7 @@ class ObservationContent:
         return hashlib.blake2b(self.canonical_bytes(), digest_size=16).hexdigest()
 
     def canonical_bytes(self) -> bytes:
-        """Every field in the order of the class, numbers little-endian, lengths before contents, no negative zero."""
+        """Return every field in the order of the class, numbers little-endian, lengths before contents, no negative zero."""
         e = self.elements
         out = [b"manyeyes.observation", struct.pack("<I", FORMAT_VERSION)]
         for text in (self.agent, self.pass_id, self.model):
@@ -120,7 +120,7 @@ class Observation(ObservationContent):
         _check(self)
 
     def elements_in_map(self, pose: Floats | None = None) -> MapElements:
-        """The elements in the map's frame, at the claimed pose or at another (3,)."""
+        """Return the elements in the map's frame, at the claimed pose or at another (3,)."""
         x, y, yaw = (float(v) for v in (self.pose if pose is None else pose))
         return self.elements.transform(x, y, yaw)
 
@@ -240,7 +240,7 @@ def shorten(value: object) -> str:
 
 
 def _is_covariance(m: Floats) -> bool:
-    """Whether m (3, 3) is symmetric and all its leading minors are positive (Sylvester), relative to its scale."""
+    """Return whether m (3, 3) is symmetric and all its leading minors are positive (Sylvester), relative to its scale."""
     (a, b, c), (d, e, f), (g, h, i) = m.tolist()
     if a <= 0 or e <= 0 or i <= 0:
         return False
@@ -252,13 +252,13 @@ def _is_covariance(m: Floats) -> bool:
 
 
 def is_simple_ring(ring: Floats) -> bool:
-    """Whether no two edges of the open ring (K, 2) cross; edges that only touch at a shared end do not."""
+    """Return whether no two edges of the open ring (K, 2) cross; edges that only touch at a shared end do not."""
     return not has_crossing_edges(ring)
 
 
 @njit(cache=True)
 def has_crossing_edges(ring: F64x2) -> bool:  # pragma: no cover - compiled
-    """Whether two edges of the open ring (K, 2) cross; for other compiled loops, :func:`is_simple_ring` for the rest."""
+    """Return whether two edges of the open ring (K, 2) cross; for other compiled loops, :func:`is_simple_ring` for the rest."""
     n = len(ring)
     for i in range(n):
         ax, ay = ring[i]

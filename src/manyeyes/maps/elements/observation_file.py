@@ -119,7 +119,7 @@ def read_observations(source: Path | str, frame: MapFrame | None = None) -> Load
 
 
 def observation_table(observations: Sequence[Observation], frame: MapFrame) -> pa.Table:
-    """Observations as an Arrow table whose metadata name the format, its version and the frame."""
+    """Return observations as an Arrow table whose metadata name the format, its version and the frame."""
     pa = _pyarrow()
     elements = MapElements.cat([o.elements for o in observations])
     at_point = pa.StructArray.from_arrays(
@@ -172,13 +172,13 @@ def make_file_metadata(frame: MapFrame) -> dict[str, Any]:
 
 
 def iterate_observations(table: pa.Table) -> Iterator[tuple[int, Observation | str]]:
-    """Each row of a table as an observation, or as the reason why it cannot be one."""
+    """Yield each row of a table as an observation, or as the reason why it cannot be one."""
     for row, item in enumerate(iterate_rows(table)):
         yield row, item.reason if isinstance(item, InvalidRow) else item
 
 
 def iterate_rows(table: pa.Table) -> Iterator[Observation | InvalidRow]:
-    """Each row of a table as an observation, or as one that is refused."""
+    """Yield each row of a table as an observation, or as one that is refused."""
     columns = _ObservationColumns(table)
     for row in range(table.num_rows):
         try:
@@ -190,7 +190,7 @@ def iterate_rows(table: pa.Table) -> Iterator[Observation | InvalidRow]:
 def _open(
     file: Path, expected: MapFrame | None
 ) -> tuple[MapFrame, Iterator[tuple[int, Observation | tuple[int, str]]]]:
-    """The frame that a file states and its rows; raises ObservationError where the file as a whole cannot be used."""
+    """Return the frame that a file states and its rows; raises ObservationError where the file as a whole cannot be used."""
     pa, pq = _pyarrow(), _parquet()
     try:
         opened = pq.ParquetFile(file, page_checksum_verification=True)
@@ -206,7 +206,7 @@ def _open(
 
 
 def _iterate_file_rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[int, str]]]:
-    """Row by row; a group of rows that cannot be decoded is put aside as one."""
+    """Yield row by row; a group of rows that cannot be decoded is put aside as one."""
     pa = _pyarrow()
     start = 0
     for group in range(opened.num_row_groups):
@@ -220,7 +220,7 @@ def _iterate_file_rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[i
 
 
 def _read_frame(file: Path, stored: dict[bytes, bytes], expected: MapFrame | None) -> MapFrame:
-    """The frame in a file's metadata, once format, version and CRS are known to be ours."""
+    """Return the frame in a file's metadata, once format, version and CRS are known to be ours."""
     try:
         metadata = json.loads(stored[METADATA_KEY])
         kind, version, crs, origin = (metadata[key] for key in ("format", "version", "crs", "origin"))
@@ -288,7 +288,7 @@ class _ObservationColumns:
         self.sigma = _to_floats(sigma.fill_null(DEFAULT_SIGMA_M))
 
     def make_observation(self, row: int) -> Observation:
-        """The observation of one row; raises ObservationError or ShapeError where it is none."""
+        """Return the observation of one row; raises ObservationError or ShapeError where it is none."""
         content = self.make_content(row)
         made = Observation(**{f.name: getattr(content, f.name) for f in fields(ObservationContent)})
         stated = self.text["id"][row]
@@ -299,7 +299,7 @@ class _ObservationColumns:
         return made
 
     def make_invalid_row(self, row: int, reason: str) -> InvalidRow:
-        """The record of a row that is no observation."""
+        """Return the record of a row that is no observation."""
         try:
             content_id = self.make_content(row).id
         except (ObservationError, ShapeError):
@@ -313,7 +313,7 @@ class _ObservationColumns:
         )
 
     def make_content(self, row: int) -> ObservationContent:
-        """The fields of one row, unchecked; raises ObservationError or ShapeError where they have no such form."""
+        """Return the fields of one row, unchecked; raises ObservationError or ShapeError where they have no such form."""
         a, b = self.element_offsets[row], self.element_offsets[row + 1]
         p, q = self.point_offsets[a], self.point_offsets[b]
         kind = self.kind[a:b]
@@ -345,7 +345,7 @@ class _ObservationColumns:
 
 
 def _square(upper: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) from xx, xy, x yaw, yy, y yaw, yaw yaw."""
+    """Return (3, 3) from xx, xy, x yaw, yy, y yaw, yaw yaw."""
     if len(upper) != 6:
         raise ObservationError(
             f"Observation.covariance: expected 6 numbers, the upper triangle by rows; got {len(upper)}."
@@ -354,7 +354,7 @@ def _square(upper: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _styles(style: Any) -> NDArray[np.float64]:
-    """(N, S) style probabilities; where none are stated: no style for certain; a wrong number of them: NaN."""
+    """Return (N, S) style probabilities; where none are stated: no style for certain; a wrong number of them: NaN."""
     offsets, values = _split_list(style)
     counts = np.diff(offsets)
     out = np.full((len(counts), len(STYLES)), np.nan)
@@ -366,17 +366,17 @@ def _styles(style: Any) -> NDArray[np.float64]:
 
 
 def _split_list(column: Any) -> tuple[NDArray[np.int64], Any]:
-    """Offsets and contents of a list column; a null list is an empty one."""
+    """Return offsets and contents of a list column; a null list is an empty one."""
     return column.offsets.to_numpy().astype(np.int64), column.values
 
 
 def _to_floats(column: Any) -> NDArray[np.float64]:
-    """A column of numbers as float64, null as NaN."""
+    """Return a column of numbers as float64, null as NaN."""
     return column.to_numpy(zero_copy_only=False).astype(np.float64, copy=False)
 
 
 def _to_kind_indices(kind: Any) -> NDArray[np.int64]:
-    """The place of each name in KINDS; -1 for a null or another name."""
+    """Return the place of each name in KINDS; -1 for a null or another name."""
     coded = kind.dictionary_encode()
     known = [KINDS.index(name) if name in KINDS else -1 for name in coded.dictionary.to_pylist()]
     places = coded.indices.fill_null(len(known)).to_numpy(zero_copy_only=False)
@@ -392,13 +392,13 @@ def _list(pa: Any, offsets: NDArray, values: Any) -> Any:
 
 
 def _xy(pa: Any, rings: Sequence[NDArray[np.float64]]) -> Any:
-    """Points of many rings as a struct column x, y."""
+    """Return points of many rings as a struct column x, y."""
     points = np.concatenate([*rings, np.zeros((0, 2))])
     return pa.StructArray.from_arrays([pa.array(points[:, k]) for k in range(2)], ["x", "y"])
 
 
 def _schema(pa: Any) -> Any:
-    """The columns of docs/maps/observation.md."""
+    """Return the columns of docs/maps/observation.md."""
     number, text = pa.float64(), pa.string()
     xy = pa.struct([("x", number), ("y", number)])
     point = pa.struct([("x", number), ("y", number), ("sigma", number)])

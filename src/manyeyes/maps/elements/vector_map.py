@@ -49,7 +49,7 @@ class PointEvidence:
         return len(self.support)
 
     def take(self, rows: Ints) -> PointEvidence:
-        """The chosen points, in the order given."""
+        """Return the chosen points, in the order given."""
         return PointEvidence(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
@@ -144,7 +144,9 @@ class VectorMap:
         times_ns: tuple[ArrayLike, ArrayLike] = (0, 0),
         log_odds: ArrayLike = 0.0,
     ) -> VectorMap:
-        """A published map of elements with the same evidence at all their points; sources: ids of each one's observations."""
+        """Return a published map of elements with the same evidence at all their points; sources: ids of each one's
+        observations.
+        """
         n = len(elements)
         sorted_sources = [sorted(set(s)) for s in sources] if sources is not None else [[] for _ in range(n)]
         observation_ids = sorted({s for one in sorted_sources for s in one})
@@ -184,12 +186,12 @@ class VectorMap:
         return len(self.elements)
 
     def sources_of(self, i: int) -> list[str]:
-        """The ids of the observations that element i came from, in hexadecimal."""
+        """Return the ids of the observations that element i came from, in hexadecimal."""
         rows = self.sources[self.source_offsets[i] : self.source_offsets[i + 1]]
         return [row.tobytes().hex() for row in self.observations[rows]]
 
     def with_state(self, state: ArrayLike) -> VectorMap:
-        """The same map with other states (N,)."""
+        """Return the same map with other states (N,)."""
         return replace(self, state=np.asarray(state))
 
     def select_published(self) -> VectorMap:
@@ -197,7 +199,7 @@ class VectorMap:
         return self.take(self.state == PUBLISHED)
 
     def take(self, rows: ArrayLike) -> VectorMap:
-        """The chosen elements, by index in the order given (each once) or by a mask; relations to others are left out."""
+        """Return the chosen elements, by index in the order given (each once) or by a mask; relations to others are left out."""
         index = np.asarray(rows)
         index = np.flatnonzero(index) if index.dtype == np.bool_ else index.astype(np.int64)
         new_rows = np.full(len(self), -1, np.int64)
@@ -220,7 +222,7 @@ class VectorMap:
 
     @classmethod
     def cat(cls, maps: Sequence[VectorMap], frame: MapFrame | None = None) -> VectorMap:
-        """Maps of one frame as one, in order; an element that stands in two of them stands twice."""
+        """Return maps of one frame as one, in order; an element that stands in two of them stands twice."""
         if not maps:
             return cls.empty(frame)
         if any(m.frame != maps[0].frame for m in maps):
@@ -266,7 +268,7 @@ _COUNTS = ("state", "supporters", "agents", "t_first", "t_last")
 
 
 def compute_content_ids(elements: MapElements) -> Digests:
-    """(N, 16) an id from kind and geometry at 1 cm; equal elements get different ids by their order."""
+    """Return (N, 16) an id from kind and geometry at 1 cm; equal elements get different ids by their order."""
     digests = compute_element_digests(elements, np.zeros(len(elements), np.int64), 1.0)
     _, place, counts = np.unique(digests, axis=0, return_inverse=True, return_counts=True)
     rank = np.zeros(len(elements), np.int64)
@@ -283,7 +285,7 @@ def compute_content_ids(elements: MapElements) -> Digests:
 
 
 def compute_element_digests(elements: MapElements, state: Ints, cell_cm: float) -> Digests:
-    """(N, 16) BLAKE2b-128 of each element's kind, state and points on a grid of cm, the same for a line read backwards."""
+    """Return (N, 16) BLAKE2b-128 of each element's kind, state and points on a grid of cm, the same for a line read backwards."""
     # Neat coordinates (0.5 cm) would sit on the edge of a cell, where the last bit decides; the odd shift moves them off it.
     cells = np.floor(elements.points * (100.0 / cell_cm) + 0.5137).astype("<i8")
     out = np.zeros((len(elements), 16), np.uint8)

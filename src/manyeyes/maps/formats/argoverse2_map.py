@@ -35,7 +35,7 @@ class Argoverse2MapError(ManyeyesError):
 
 
 def read_argoverse2_map(source: Path | str) -> RoadNetwork:
-    """The roads of one log: a ``log_map_archive_*.json``, its ``map`` folder or the log's folder."""
+    """Return the roads of one log: a ``log_map_archive_*.json``, its ``map`` folder or the log's folder."""
     path = _map_file(Path(source))
     try:
         root = json.loads(path.read_bytes())
@@ -52,7 +52,7 @@ def read_argoverse2_map(source: Path | str) -> RoadNetwork:
 
 
 def read_argoverse2_poses(log: Path | str) -> tuple[NDArray[np.int64], Array]:
-    """Times (N,) in nanoseconds, ascending, and poses (N, 3) as x, y, yaw of the vehicle in the city frame."""
+    """Return times (N,) in nanoseconds, ascending, and poses (N, 3) as x, y, yaw of the vehicle in the city frame."""
     path = Path(log)
     path = path / "city_SE3_egovehicle.feather" if path.is_dir() else path
     names = ["timestamp_ns", "tx_m", "ty_m", "qw", "qx", "qy", "qz"]
@@ -78,7 +78,7 @@ class _Argoverse2Reader:
         self.path = path
 
     def points(self, item: dict, field: str, min_points: int = 2) -> Array:
-        """A list of x, y, z as (M, 3); an error that names file, element and field otherwise."""
+        """Return a list of x, y, z as (M, 3); an error that names file, element and field otherwise."""
         context = f"{self.path}: element {item.get('id')} field '{field}'"
         try:
             points = np.array([[p["x"], p["y"], p.get("z", 0.0)] for p in item[field]], np.float64).reshape(-1, 3)
@@ -89,7 +89,7 @@ class _Argoverse2Reader:
         return points
 
     def lanes(self, items: Sequence[dict]) -> tuple[tuple[Lane, ...], tuple[RoadMark, ...]]:
-        """Lanes in the order of their ids, linked, and their paint."""
+        """Return lanes in the order of their ids, linked, and their paint."""
         items = sorted(items, key=lambda item: int(item.get("id", -1)))
         place = {int(item.get("id", -1)): k for k, item in enumerate(items)}
         lefts = [self.points(item, "left_lane_boundary") for item in items]
@@ -123,14 +123,14 @@ class _Argoverse2Reader:
         return complete_lane_links(lanes), tuple(marks)
 
     def crossing(self, item: dict) -> Crossing:
-        """A crossing between two edges, turned so that the ring does not cross itself."""
+        """Return a crossing between two edges, turned so that the ring does not cross itself."""
         one, two = self.points(item, "edge1"), self.points(item, "edge2")
         straight = np.linalg.norm(one[-1] - two[-1]) + np.linalg.norm(one[0] - two[0])
         crossed = np.linalg.norm(one[-1] - two[0]) + np.linalg.norm(one[0] - two[-1])
         return Crossing(np.concatenate((one, two[::-1] if straight <= crossed else two)), "", "edges")
 
     def edges(self, areas: Sequence[dict]) -> tuple[RoadMark, ...]:
-        """The rings of the union of all drivable areas, closed: first point repeated."""
+        """Return the rings of the union of all drivable areas, closed: first point repeated."""
         if not areas:
             return ()
         try:
@@ -152,7 +152,7 @@ class _Argoverse2Reader:
 
 
 def _map_file(path: Path) -> Path:
-    """The one vector map at, or below, a path."""
+    """Return the one vector map at, or below, a path."""
     if path.is_file():
         return path
     found = sorted(path.glob("log_map_archive_*.json")) or sorted(path.glob("map/log_map_archive_*.json"))
@@ -164,7 +164,7 @@ def _map_file(path: Path) -> Path:
 
 
 def _group_junctions(inside: Sequence[bool], lefts: Sequence[Array], rights: Sequence[Array]) -> list[str | None]:
-    """Names of junctions: lanes marked as inside an intersection, joined where their surfaces overlap."""
+    """Return names of junctions: lanes marked as inside an intersection, joined where their surfaces overlap."""
     try:
         import shapely
     except ImportError:
@@ -179,7 +179,9 @@ def _group_junctions(inside: Sequence[bool], lefts: Sequence[Array], rights: Seq
 
 
 def _make_marks(line: Array, kind: str, lane: str, side: str) -> list[RoadMark]:
-    """One mark, or two 0.24 m apart for a double line, of a boundary whose paint Argoverse names e.g. DOUBLE_SOLID_YELLOW."""
+    """Return one mark, or two 0.24 m apart for a double line, of a boundary whose paint Argoverse names e.g.
+    DOUBLE_SOLID_YELLOW.
+    """
     words = kind.split("_")
     color = words[-1].lower()
     strokes = [word for word in words[:-1] if word in ("SOLID", "DASHED")]

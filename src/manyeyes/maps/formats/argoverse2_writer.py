@@ -86,7 +86,7 @@ def _points(line: Floats) -> list[dict[str, float]]:
 
 
 def _offset(line: Floats, left_m: float) -> Floats:
-    """The line moved to its left by so much, point by point along the mean of the two normals."""
+    """Return the line moved to its left by so much, point by point along the mean of the two normals."""
     step = np.diff(line, axis=0)
     step /= np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
     heading = np.concatenate((step[:1], step[:-1] + step[1:], step[-1:]))

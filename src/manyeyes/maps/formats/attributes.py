@@ -39,7 +39,7 @@ class Attributes:
 
     @classmethod
     def of(cls, vector_map: VectorMap) -> Attributes:
-        """The columns of a map, row by row with its elements."""
+        """Return the columns of a map, row by row with its elements."""
         e = vector_map.elements
         count = np.maximum(e.counts, 1)
         return cls(
@@ -64,20 +64,20 @@ class Attributes:
 
 
 def to_hex_ids(digests: NDArray[np.uint8]) -> list[str]:
-    """The rows of (N, 16) bytes as hexadecimal."""
+    """Return the rows of (N, 16) bytes as hexadecimal."""
     text = np.ascontiguousarray(digests).tobytes().hex()
     return [text[k : k + 32] for k in range(0, len(text), 32)]
 
 
 def to_degrees(vector_map: VectorMap) -> MapElements:
-    """The map's elements with points as longitude, latitude (degrees, WGS 84); rings run counter-clockwise."""
+    """Return the map's elements with points as longitude, latitude (degrees, WGS 84); rings run counter-clockwise."""
     elements = orient_counter_clockwise(vector_map.elements)
     origin = (vector_map.frame.latitude, vector_map.frame.longitude)
     return elements.with_points(degrees_from_metres(elements.points, origin)[:, ::-1])
 
 
 def orient_counter_clockwise(elements: MapElements) -> MapElements:
-    """The same elements with every ring counter-clockwise, from the same first point on."""
+    """Return the same elements with every ring counter-clockwise, from the same first point on."""
     rings = np.flatnonzero(elements.closed)
     if not len(rings):
         return elements

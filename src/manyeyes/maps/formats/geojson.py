@@ -22,7 +22,7 @@ def write_geojson(vector_map: VectorMap, path: Path | str) -> None:
 
 
 def geojson_features(vector_map: VectorMap) -> list[str]:
-    """One JSON text a feature, row by row with the map's elements."""
+    """Return one JSON text a feature, row by row with the map's elements."""
     degrees = to_degrees(vector_map)
     columns = [(name, values.tolist()) for name, values in Attributes.of(vector_map).columns()]
     places = degrees.points.round(_DIGITS).tolist()

@@ -56,7 +56,7 @@ def write_geoparquet(vector_map: VectorMap, path: Path | str) -> None:
 
 
 def to_shapely(shapely: Any, elements: MapElements) -> NDArray[np.object_]:
-    """(N,) shapely lines and polygons of elements."""
+    """Return (N,) shapely lines and polygons of elements."""
     out = np.empty(len(elements), object)
     for rows, make in ((~elements.closed, shapely.linestrings), (elements.closed, shapely.linearrings)):
         part = elements.take(rows)
@@ -67,7 +67,7 @@ def to_shapely(shapely: Any, elements: MapElements) -> NDArray[np.object_]:
 
 
 def map_to_tables(vector_map: VectorMap, rows: NDArray[np.int64] | None = None) -> tuple[pa.Table, pa.Table]:
-    """The map, or these rows of it, as two Arrow tables, lines and crossings, with GeoParquet metadata; nothing is lost.
+    """Return the map, or these rows of it, as two Arrow tables, lines and crossings, with GeoParquet metadata; nothing is lost.
 
     Rows keep their relations to rows that are left out, by id: those may stand in another file.
     """
@@ -77,7 +77,7 @@ def map_to_tables(vector_map: VectorMap, rows: NDArray[np.int64] | None = None) 
 
 
 def tables_to_map(tables: list[pa.Table], frame: MapFrame) -> VectorMap:
-    """The map whose elements stand in the tables, in their order; relations to elements of other tables are left out."""
+    """Return the map whose elements stand in the tables, in their order; relations to elements of other tables are left out."""
     parts = [_TableColumns(table) for table in tables if len(table)]
     if not parts:
         return VectorMap.empty(frame)
@@ -91,7 +91,7 @@ def write_map(vector_map: VectorMap, lines: Path, crossings: Path, rows: NDArray
 
 
 def read_map(*paths: Path | str) -> VectorMap:
-    """The map of files in the lossless form, elements by ascending id; one map may stand in many files."""
+    """Return the map of files in the lossless form, elements by ascending id; one map may stand in many files."""
     tables = [read_table(Path(path)) for path in paths]
     frames = {read_frame(table) for table in tables}
     if len(frames) > 1:
@@ -104,7 +104,7 @@ def read_map(*paths: Path | str) -> VectorMap:
 
 
 def read_table(path: Path) -> pa.Table:
-    """One file of the lossless form, checked for version and columns."""
+    """Return one file of the lossless form, checked for version and columns."""
     pyarrow = _pyarrow()
     from pyarrow import parquet
 
@@ -130,7 +130,7 @@ def read_table(path: Path) -> pa.Table:
 
 
 def read_frame(table: pa.Table) -> MapFrame:
-    """The frame that a table's metadata names."""
+    """Return the frame that a table's metadata names."""
     frame = json.loads((table.schema.metadata or {})[_FRAME_KEY])
     return MapFrame(frame["latitude"], frame["longitude"])
 
@@ -157,7 +157,7 @@ _COLUMNS = (
 
 
 def _table(m: VectorMap, rows: NDArray[np.int64], closed: bool) -> pa.Table:
-    """The rows of a map that are lines, or rings."""
+    """Return the rows of a map that are lines, or rings."""
     pyarrow = _pyarrow()
     e = m.elements.take(rows)
     _, places = take_rows(m.elements.offsets, rows)
@@ -228,7 +228,7 @@ def _lists(pyarrow: Any, offsets: NDArray[np.int64], values: NDArray) -> pa.Arra
 def _collect_related_ids(
     pyarrow: Any, pairs: NDArray[np.int64], rows: NDArray[np.int64], ids: NDArray[np.uint8]
 ) -> pa.Array:
-    """Per row the ids of its partners, in the order of the pairs."""
+    """Return per row the ids of its partners, in the order of the pairs."""
     order = np.argsort(pairs[:, 0], kind="stable")
     first = np.searchsorted(pairs[order, 0], np.arange(len(ids) + 1))
     chosen, places = take_rows(first, rows)
@@ -237,7 +237,7 @@ def _collect_related_ids(
 
 
 def _branches(pyarrow: Any, topology: Topology, rows: NDArray[np.int64], total: int) -> pa.Array:
-    """Per row the points of the branch nodes where it ends."""
+    """Return per row the points of the branch nodes where it ends."""
     order = np.argsort(topology.branch[:, 1], kind="stable")
     first = np.searchsorted(topology.branch[order, 1], np.arange(total + 1))
     chosen, places = take_rows(first, rows)
@@ -284,18 +284,18 @@ def _column(table: pa.Table, name: str) -> Any:
 
 
 def _digests(texts: Any) -> NDArray[np.uint8]:
-    """(N, 16) bytes of an Arrow array of hexadecimal texts."""
+    """Return (N, 16) bytes of an Arrow array of hexadecimal texts."""
     return np.frombuffer(bytes.fromhex("".join(texts.to_pylist())), np.uint8).reshape(-1, 16)
 
 
 def _read_ragged(table: pa.Table, name: str) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Counts (N,) and all digests of a column of lists of ids."""
+    """Return counts (N,) and all digests of a column of lists of ids."""
     column = _column(table, name)
     return column.value_lengths().to_numpy().astype(np.int64), _digests(column.flatten())
 
 
 def _assemble(parts: list[_TableColumns], frame: MapFrame) -> VectorMap:
-    """One map of the parts' elements, in order."""
+    """Return one map of the parts' elements, in order."""
     ids = np.concatenate([p.id for p in parts])
     n = len(ids)
     row_of = {key.tobytes(): row for row, key in enumerate(ids)}
@@ -334,7 +334,7 @@ def _types_of(e: MapElements) -> list[str]:
 
 
 def _geo(encoding: str, types: list[str], e: MapElements, frame: MapFrame | None) -> dict[str, Any]:
-    """The ``geo`` metadata of GeoParquet 1.1.0; without a frame the coordinates are OGC:CRS84, the default."""
+    """Return the ``geo`` metadata of GeoParquet 1.1.0; without a frame the coordinates are OGC:CRS84, the default."""
     column: dict[str, Any] = {"encoding": encoding, "geometry_types": types}
     if frame is not None:
         column["crs"] = projjson(frame)
@@ -345,7 +345,7 @@ def _geo(encoding: str, types: list[str], e: MapElements, frame: MapFrame | None
 
 
 def projjson(frame: MapFrame) -> dict[str, Any]:
-    """The frame's coordinate reference system as PROJJSON 0.7."""
+    """Return the frame's coordinate reference system as PROJJSON 0.7."""
 
     def axis(name: str, short: str, direction: str, unit: str) -> dict[str, str]:
         return {"name": name, "abbreviation": short, "direction": direction, "unit": unit}

@@ -63,7 +63,9 @@ class _OsmWay:
 
 
 def read_lanelet2(source: Path | str, origin: tuple[float, float] | None = None) -> RoadNetwork:
-    """The roads of an OSM file; origin: latitude and longitude, degrees, of the frame's zero (see :func:`lanelet2_origin`)."""
+    """Return the roads of an OSM file; origin: latitude and longitude, degrees, of the frame's zero (see
+    :func:`lanelet2_origin`).
+    """
     path = Path(source)
     root = _root(path)
     origin = origin or _middle(root, path)
@@ -74,7 +76,7 @@ def read_lanelet2(source: Path | str, origin: tuple[float, float] | None = None)
 
 
 def lanelet2_origin(source: Path | str) -> tuple[float, float]:
-    """The origin that :func:`read_lanelet2` takes when none is given: latitude, longitude in degrees."""
+    """Return the origin that :func:`read_lanelet2` takes when none is given: latitude, longitude in degrees."""
     path = Path(source)
     return _middle(_root(path), path)
 
@@ -115,7 +117,7 @@ def _tags(element: ET.Element) -> dict[str, str]:
 
 
 def _ways(root: ET.Element, path: Path, origin: tuple[float, float]) -> dict[str, _OsmWay]:
-    """All linestrings of two or more different points, in metres."""
+    """Return all linestrings of two or more different points, in metres."""
     nodes = [node for node in root.findall("node") if node.get("action") != "delete"]
     names = [node.get("id", "") for node in nodes]
     degrees = np.array([[_number(node, "lat", path), _number(node, "lon", path)] for node in nodes]).reshape(-1, 2)
@@ -136,7 +138,7 @@ def _ways(root: ET.Element, path: Path, origin: tuple[float, float]) -> dict[str
 
 
 def _marks(way: _OsmWay, name: str) -> list[RoadMark]:
-    """The paint or the edge that a linestring is; nothing for virtual ones and symbols."""
+    """Return the paint or the edge that a linestring is; nothing for virtual ones and symbols."""
     kind, subtype = way.tags.get("type", ""), way.tags.get("subtype", "")
     color = way.tags.get("color", "white")
     if kind in _EDGES:
@@ -159,7 +161,7 @@ def _marks(way: _OsmWay, name: str) -> list[RoadMark]:
 
 
 def _lanelets(root: ET.Element, path: Path, ways: dict[str, _OsmWay]) -> tuple[tuple[Lane, ...], tuple[Crossing, ...]]:
-    """Lanes in the order of their ids, linked and grouped into junctions, and crossings."""
+    """Return lanes in the order of their ids, linked and grouped into junctions, and crossings."""
     lanes: list[Lane] = []
     crossings: list[Crossing] = []
     ends: list[tuple[tuple[str, str], tuple[str, str]]] = []
@@ -189,7 +191,7 @@ def _lanelets(root: ET.Element, path: Path, ways: dict[str, _OsmWay]) -> tuple[t
 
 
 def _border(relation: ET.Element, role: str, ways: dict[str, _OsmWay], context: str) -> tuple[Array, tuple[str, str]]:
-    """One border of a lanelet: its ways of a role, joined where they share a node."""
+    """Return one border of a lanelet: its ways of a role, joined where they share a node."""
     members = [m.get("ref", "") for m in relation.findall("member") if m.get("role") == role and m.get("type") == "way"]
     missing = [m for m in members if m not in ways]
     if not members or missing:
@@ -209,7 +211,7 @@ def _border(relation: ET.Element, role: str, ways: dict[str, _OsmWay], context: 
 def _align_borders(
     left: Array, right: Array, left_ends: tuple[str, str], right_ends: tuple[str, str]
 ) -> tuple[Array, Array, tuple[str, str], tuple[str, str]]:
-    """Both borders turned along the lanelet's direction, in which the left one lies on the left."""
+    """Return both borders turned along the lanelet's direction, in which the left one lies on the left."""
     same = np.linalg.norm(left[0] - right[0]) + np.linalg.norm(left[-1] - right[-1])
     crossed = np.linalg.norm(left[0] - right[-1]) + np.linalg.norm(left[-1] - right[0])
     if crossed < same:
@@ -222,7 +224,7 @@ def _align_borders(
 
 
 def _junctions(lanes: Sequence[Lane]) -> list[str | None]:
-    """Names of the junctions of drivable lanes: those that overlap another, in connected patches."""
+    """Return names of the junctions of drivable lanes: those that overlap another, in connected patches."""
     try:
         import shapely
     except ImportError:
@@ -244,7 +246,7 @@ def _junctions(lanes: Sequence[Lane]) -> list[str | None]:
 
 
 def _share_ground(one: Lane, two: Lane) -> bool:
-    """Whether two lanes are the two directions of one strip, or a strip and its copy for other traffic."""
+    """Return whether two lanes are the two directions of one strip, or a strip and its copy for other traffic."""
     width = float(np.median(one.width_m))
     middle = np.linalg.norm(one.center[len(one.center) // 2] - two.center[len(two.center) // 2])
     ends = [np.linalg.norm(one.center[a] - two.center[b]) for a, b in ((0, 0), (-1, -1), (0, -1), (-1, 0))]

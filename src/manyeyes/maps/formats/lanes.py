@@ -50,7 +50,7 @@ def find_lane_pairs(vector_map: VectorMap) -> list[LanePair]:
 
 
 def _is_lane(a: Floats, b: Floats) -> bool:
-    """Whether b lies to the right of a, at a lane's distance nearly everywhere, along most of the shorter one."""
+    """Return whether b lies to the right of a, at a lane's distance nearly everywhere, along most of the shorter one."""
     shorter, other, side = (a, b, 1.0) if _length(a) <= _length(b) else (b, a, -1.0)
     offset = side * _offsets_to_left(_resample(shorter), other)
     beside = np.isfinite(offset)
@@ -63,14 +63,14 @@ def _length(line: Floats) -> float:
 
 
 def _resample(line: Floats) -> Floats:
-    """Points on a line about 2 m apart, its ends among them."""
+    """Return points on a line about 2 m apart, its ends among them."""
     along = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
     at = np.linspace(0.0, along[-1], max(int(along[-1] / _SPACING_M), 1) + 1)
     return np.stack([np.interp(at, along, line[:, k]) for k in (0, 1)], 1)
 
 
 def _offsets_to_left(points: Floats, line: Floats) -> Floats:
-    """(N,) distance of each point from the line, positive on its left; NaN beyond its ends."""
+    """Return (N,) distance of each point from the line, positive on its left; NaN beyond its ends."""
     start, step = line[:-1], np.diff(line, axis=0)
     square = np.maximum((step**2).sum(1), 1e-18)
     away = points[:, None] - start

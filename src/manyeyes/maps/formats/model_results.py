@@ -106,7 +106,7 @@ RESULT_OPTIONS = {
 
 
 def read_model_results(source: Path | str, poses: PoseTable, options: ModelResultOptions) -> LoadedObservations:
-    """The samples of a result file of MapTR or StreamMapNet (distinguished by their layout) as observations, by token."""
+    """Return the samples of a result file of MapTR or StreamMapNet (distinguished by their layout) as observations, by token."""
     path = Path(source)
     root = _json(path)
     results = root.get("results") if isinstance(root, dict) else None
@@ -136,7 +136,7 @@ class _Vector:
 
 
 def _samples(results: list[Any] | dict[str, Any]) -> Iterator[tuple[str, list[_Vector] | None]]:
-    """Tokens and vectors of all samples in the file's order; None where a sample has another layout."""
+    """Yield tokens and vectors of all samples in the file's order; None where a sample has another layout."""
     if isinstance(results, list):
         for item in results:
             item = item if isinstance(item, dict) else {}
@@ -192,7 +192,7 @@ def _observation(
 
 
 def _kind(name: Any) -> int | None:
-    """The element's kind; None for classes that are no element here, such as MapTRv2's centerline."""
+    """Return the element's kind; None for classes that are no element here, such as MapTRv2's centerline."""
     if isinstance(name, int) and not isinstance(name, bool):
         return _KIND_OF_LABEL[name] if 0 <= name < len(_KIND_OF_LABEL) else None
     return _KIND_OF_NAME.get(str(name))
@@ -205,7 +205,7 @@ def _score(value: Any, context: str) -> float:
 
 
 def _points(value: Any, context: str) -> Array:
-    """(M, 2) points; a third coordinate is left out."""
+    """Return (M, 2) points; a third coordinate is left out."""
     try:
         points = np.asarray(value, np.float64)
     except (TypeError, ValueError):
@@ -216,7 +216,8 @@ def _points(value: Any, context: str) -> Array:
 
 
 def read_pose_csv(source: Path | str, frame: MapFrame) -> PoseTable:
-    """Poses from a CSV with the columns token, agent, pass_id, time_ns, x, y, yaw and, if there are, sigma_x, sigma_y, sigma_yaw.
+    """Return poses from a CSV with the columns token, agent, pass_id, time_ns, x, y, yaw and, if there are, sigma_x, sigma_y,
+    sigma_yaw.
 
     x, y in metres and yaw in radians in the frame; without sigmas 0.7 m and 0.8°.
     """
@@ -248,7 +249,7 @@ def read_pose_csv(source: Path | str, frame: MapFrame) -> PoseTable:
 
 
 def read_nuscenes_poses(folder: Path | str, location: str, axes: Literal["vehicle", "lidar"] = "vehicle") -> PoseTable:
-    """Poses of a nuScenes data set's samples at one location, from its tables (the folder with ``sample_data.json``).
+    """Return poses of a nuScenes data set's samples at one location, from its tables (the folder with ``sample_data.json``).
 
     The pose at the LiDAR's key frame. The vehicle's frame, or, for results with axes "lidar", the LiDAR's place with the vehicle's
     heading corrected by how the LiDAR is mounted. The four locations have maps of their own, so one table holds one location.
@@ -297,7 +298,7 @@ def _planar(row: dict[str, Any]) -> tuple[float, float, float]:
 
 
 def _table(root: Path, name: str, *fields: str) -> Sequence[dict[str, Any]]:
-    """The rows of one nuScenes table, which hold the fields."""
+    """Return the rows of one nuScenes table, which hold the fields."""
     path = root / f"{name}.json"
     rows = _json(path)
     if not isinstance(rows, list) or any(not isinstance(r, dict) or any(f not in r for f in fields) for r in rows):

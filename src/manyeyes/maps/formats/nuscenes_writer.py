@@ -105,7 +105,7 @@ def _token(owner: str, part: str) -> str:
 
 
 def _strip(line: Floats) -> Floats:
-    """The ring around a line, 0.2 m to each side."""
+    """Return the ring around a line, 0.2 m to each side."""
     step = line[-1] - line[0]
     normal = np.array([-step[1], step[0]]) / max(float(np.hypot(*step)), 1e-9) * _HALF_STRIP_M
     return np.concatenate((line + normal, (line - normal)[::-1]))

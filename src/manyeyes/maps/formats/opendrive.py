@@ -54,7 +54,7 @@ class _Record:
 
 
 def read_opendrive(source: Path | str | bytes, name: str | None = None, step_m: float = STEP_M) -> RoadNetwork:
-    """The roads of a file, or of its bytes, sampled at most step_m apart (half of that in tight curves)."""
+    """Return the roads of a file, or of its bytes, sampled at most step_m apart (half of that in tight curves)."""
     if isinstance(source, bytes):
         label, data = name or "OpenDRIVE bytes", source
     else:
@@ -107,7 +107,7 @@ class _OpenDriveReader:
         )
 
     def number(self, element: ET.Element, attribute: str, context: str, default: float | None = None) -> float:
-        """An attribute as a finite number; an error that names file, element and attribute otherwise."""
+        """Return an attribute as a finite number; an error that names file, element and attribute otherwise."""
         text = element.get(attribute)
         if text is None and default is not None:
             return default
@@ -130,7 +130,7 @@ class _OpenDriveReader:
         return Cubics(table[:, 0], table[:, 1:])
 
     def record(self, road: ET.Element) -> _Record:
-        """A road's reference line, lane offset and speed (1.4H §5.3.1–5.3.5)."""
+        """Return a road's reference line, lane offset and speed (1.4H §5.3.1–5.3.5)."""
         road_id = road.get("id")
         if road_id is None:
             raise OpenDriveError(f"{self.label}: a <road> has no 'id'.")
@@ -156,13 +156,13 @@ class _OpenDriveReader:
         )
 
     def speed(self, element: ET.Element | None, context: str, default: float = _DEFAULT_SPEED_MPS) -> float:
-        """A speed limit in m/s; 'no limit' and 'undefined' give the default."""
+        """Return a speed limit in m/s; 'no limit' and 'undefined' give the default."""
         if element is None or element.get("max", "undefined") in ("no limit", "undefined"):
             return default
         return self.number(element, "max", context) * _SPEED_UNITS.get(element.get("unit", "m/s"), 1.0)
 
     def primitive(self, geometry: ET.Element, context: str) -> Primitive:
-        """One <geometry> of the plan view (1.4H §5.3.4)."""
+        """Return one <geometry> of the plan view (1.4H §5.3.4)."""
         shape = next((child for child in geometry if child.tag in _PARAMETERS), None)
         if shape is None:
             got = ", ".join(f"<{child.tag}>" for child in geometry) or "nothing"
@@ -176,7 +176,7 @@ class _OpenDriveReader:
         return Primitive(s, x, y, heading, length, shape.tag, values)
 
     def road(self, record: _Record) -> Road:
-        """A road's lanes and marks, appended; and the road itself."""
+        """Return a road's lanes and marks, appended; and the road itself."""
         sections = record.element.findall("lanes/laneSection")
         if not sections:
             raise OpenDriveError(f"{self.label}: road {record.id}: <lanes> holds no <laneSection>.")
@@ -272,7 +272,7 @@ class _OpenDriveReader:
                 self.marks.append(RoadMark(line, kind, color, width, dash, gap, record.id, section, lane_id))
 
     def lines(self, mark: ET.Element, context: str, lane_id: int) -> list[tuple[float, str, float, float, float]]:
-        """(lateral offset, kind, width, dash, gap) of each physical line of a <roadMark>.
+        """Return (lateral offset, kind, width, dash, gap) of each physical line of a <roadMark>.
 
         Of a pair, the first named is the inner one; on the centre lane the left one (1.4H §5.3.7.2.1.1.4).
         """
@@ -294,7 +294,7 @@ class _OpenDriveReader:
         ]
 
     def objects(self, record: _Record) -> list[Crossing | ParkingSpace | RoadMark]:
-        """Crossings, parking spaces and painted lines among the road's <object>s (1.4H §5.3.8)."""
+        """Return crossings, parking spaces and painted lines among the road's <object>s (1.4H §5.3.8)."""
         found: list[Crossing | ParkingSpace | RoadMark] = []
         for element in record.element.findall("objects/object"):
             kind, name = (element.get("type") or "").lower(), element.get("name") or ""
@@ -313,7 +313,7 @@ class _OpenDriveReader:
         return found
 
     def outline(self, record: _Record, element: ET.Element) -> Array:
-        """World points (M, 3) of an object's outline, not closed; its length × width rectangle when it has none."""
+        """Return world points (M, 3) of an object's outline, not closed; its length × width rectangle when it has none."""
         context = f"road {record.id} object {element.get('id')}:"
         s, t = self.number(element, "s", context), self.number(element, "t", context)
         corners = [e for e in element.iter() if e.tag == "cornerRoad"]
@@ -337,7 +337,7 @@ class _OpenDriveReader:
 
 
 def _open(points: Array) -> Array:
-    """A ring without its repeated last point."""
+    """Return a ring without its repeated last point."""
     closed = len(points) > 3 and np.linalg.norm(points[0] - points[-1]) < 1e-3
     return points[:-1] if closed else points
 

@@ -25,11 +25,11 @@ class Cubics:
 
     @classmethod
     def constant(cls, value: float) -> Cubics:
-        """The same value everywhere."""
+        """Return the same value everywhere."""
         return cls(np.zeros(1), np.array([[value, 0.0, 0.0, 0.0]]))
 
     def __call__(self, s: Array) -> Array:
-        """Values at stations (M,); the first piece also holds before its start."""
+        """Return values at stations (M,); the first piece also holds before its start."""
         index = np.clip(np.searchsorted(self.start, s + 1e-9, side="right") - 1, 0, None)
         d = s - self.start[index]
         a, b, c, e = self.coefficients[index].T
@@ -134,7 +134,7 @@ class ReferenceLine:
         return x, y, heading
 
     def points(self, s: Array, t: Array) -> Array:
-        """World points (M, 3) at stations s and lateral offsets t (M,), left positive."""
+        """Return world points (M, 3) at stations s and lateral offsets t (M,), left positive."""
         x, y, heading = self.pose(s)
         bank = self.superelevation(s)
         across = t * np.cos(bank)

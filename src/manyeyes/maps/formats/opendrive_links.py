@@ -16,7 +16,7 @@ _End = tuple[int, bool]
 
 
 def link_lanes(root: ET.Element, lanes: Sequence[Lane], left_hand: Set[str]) -> tuple[Lane, ...]:
-    """The lanes with predecessors, successors and neighbours filled in; left_hand: ids of roads with left-hand traffic."""
+    """Return the lanes with predecessors, successors and neighbours filled in; left_hand: ids of roads with left-hand traffic."""
     place = {(lane.road_id, lane.section, lane.lane_id): lane.id for lane in lanes}
     last = {}
     for lane in lanes:
@@ -102,7 +102,7 @@ def _with_links(lanes: Sequence[Lane], touching: set[tuple[_End, _End]], left_ha
 
 
 def read_junctions(root: ET.Element, lanes: Sequence[Lane]) -> tuple[Junction, ...]:
-    """Junctions with the extent of their drivable lanes; those without any are left out."""
+    """Return junctions with the extent of their drivable lanes; those without any are left out."""
     members: dict[str, list[Lane]] = {}
     for lane in lanes:
         if lane.junction_id is not None and lane.is_drivable:

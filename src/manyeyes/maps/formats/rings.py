@@ -10,7 +10,8 @@ Floats = NDArray[np.float64]
 
 
 def split_long_sides(ring: Floats) -> tuple[Floats, Floats]:
-    """Two polylines (K, 2) of an open ring, side by side in one direction, left first: what lies between its two short ends.
+    """Return two polylines (K, 2) of an open ring, side by side in one direction, left first: what lies between its two short
+    ends.
 
     A quadrilateral gives its two longer opposite edges. Any other ring is cut at its two ends along its principal axis.
     """

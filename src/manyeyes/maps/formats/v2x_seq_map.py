@@ -48,7 +48,9 @@ class V2xSeqMapError(ManyeyesError):
 
 
 def read_v2x_seq_map(path: Path | str, offset_xy: tuple[float, float] = (0.0, 0.0)) -> RoadNetwork:
-    """The roads of one intersection. offset_xy: metres that are added to the file's points, to come to a recording's world."""
+    """Return the roads of one intersection. offset_xy: metres that are added to the file's points, to come to a recording's
+    world.
+    """
     path = Path(path)
     try:
         root = json.loads(path.read_bytes())
@@ -76,7 +78,7 @@ class _V2xSeqReader:
         self.path, self.offset = path, offset
 
     def layer(self, root: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-        """The elements of a layer by id; none where the file lacks it."""
+        """Return the elements of a layer by id; none where the file lacks it."""
         found = root.get(name) or {}
         if not isinstance(found, dict):
             raise V2xSeqMapError(
@@ -85,7 +87,7 @@ class _V2xSeqReader:
         return found
 
     def points(self, layer: str, name: str, item: Any, field: str, min_points: int) -> Array:
-        """Points (M, 3), height 0; an error that names file, element and field otherwise."""
+        """Return points (M, 3), height 0; an error that names file, element and field otherwise."""
         context = f"{self.path}: {layer} {name} field '{field}'"
         try:
             rows = [_point(one) for one in item[field]]
@@ -97,7 +99,7 @@ class _V2xSeqReader:
         return np.pad(points, ((0, 0), (0, 1))) + self.offset
 
     def lanes(self, items: Mapping[str, Any], junctions: Mapping[str, Any]) -> tuple[Lane, ...]:
-        """Lanes in the order of their ids, linked; those for which the file gives no borders are left out."""
+        """Return lanes in the order of their ids, linked; those for which the file gives no borders are left out."""
         names = sorted(n for n in items if items[n].get("left_boundary") and items[n].get("right_boundary"))
         place = {name: k for k, name in enumerate(names)}
         inside = self._junctions(junctions)

@@ -76,7 +76,7 @@ class _StyledLine:
 
 
 def build_ground_truth_map(network: RoadNetwork, policy: GroundTruthPolicy = GroundTruthPolicy()) -> MapElements:
-    """All true elements of a road network, in its world frame, by the rules of this module."""
+    """Return all true elements of a road network, in its world frame, by the rules of this module."""
     _shapely()
     region = compute_junction_region(network, policy.junction_margin_m)
     paint = [mark for mark in network.marks if mark.kind in ("solid", "broken")]
@@ -99,7 +99,7 @@ def build_ground_truth_map(network: RoadNetwork, policy: GroundTruthPolicy = Gro
 
 
 def compute_junction_region(network: RoadNetwork, margin_m: float) -> BaseGeometry:
-    """The ground of all junctions' drivable lanes, widened by a margin (shapely geometry, network frame)."""
+    """Return the ground of all junctions' drivable lanes, widened by a margin (shapely geometry, network frame)."""
     shapely = _shapely()
     inside = [lane for lane in network.lanes if lane.junction_id is not None and lane.is_drivable]
     ground = shapely.union_all(shapely.buffer(_lane_polygons(inside), 0.05))
@@ -107,7 +107,7 @@ def compute_junction_region(network: RoadNetwork, margin_m: float) -> BaseGeomet
 
 
 def cut_elements(elements: MapElements, region: BaseGeometry, min_line_length_m: float = 5.0) -> MapElements:
-    """The elements with lines cut where they enter or leave the region; crossings stay whole, pieces keep score and style.
+    """Return the elements with lines cut where they enter or leave the region; crossings stay whole, pieces keep score and style.
 
     A cut that would leave a piece shorter than min_line_length_m is not made.
     """
@@ -131,7 +131,7 @@ def cut_elements(elements: MapElements, region: BaseGeometry, min_line_length_m:
 
 
 def merge_duplicates(lines: Sequence[_StyledLine], policy: GroundTruthPolicy) -> list[_StyledLine]:
-    """Each physical line once: a stretch that runs along a longer line of the list is left out."""
+    """Return each physical line once: a stretch that runs along a longer line of the list is left out."""
     shapely = _shapely()
     ranked = sorted((line for line in lines if line.length_m > 0.1), key=lambda line: (-line.length_m, *_ends(line)))
     if not ranked:
@@ -154,7 +154,7 @@ def merge_duplicates(lines: Sequence[_StyledLine], policy: GroundTruthPolicy) ->
 
 
 def _is_duplicate(points: Array, shape: BaseGeometry, policy: GroundTruthPolicy) -> NDArray[np.bool_]:
-    """(M,) whether each point lies within merge_radius_m beside a line, not beyond its ends, and has its direction."""
+    """Return (M,) whether each point lies within merge_radius_m beside a line, not beyond its ends, and has its direction."""
     shapely = _shapely()
     probe = shapely.points(points)
     close = shapely.distance(probe, shape) <= policy.merge_radius_m
@@ -170,7 +170,7 @@ def _is_duplicate(points: Array, shape: BaseGeometry, policy: GroundTruthPolicy)
 
 
 def chain_lines(lines: Sequence[_StyledLine], policy: GroundTruthPolicy) -> list[_StyledLine]:
-    """Lines joined end to end where two ends are each other's best continuation."""
+    """Return lines joined end to end where two ends are each other's best continuation."""
     shapely = _shapely()
     if not lines:
         return []
@@ -195,7 +195,7 @@ def chain_lines(lines: Sequence[_StyledLine], policy: GroundTruthPolicy) -> list
 
 
 def _join_chains(lines: Sequence[_StyledLine], partner: NDArray[np.int64]) -> list[_StyledLine]:
-    """The chains that the partners of ends (2K,) make; rings begin at their smallest line."""
+    """Return the chains that the partners of ends (2K,) make; rings begin at their smallest line."""
     used = np.zeros(len(lines), bool)
     joined = []
     free = [end for end in range(len(partner)) if partner[end] < 0]
@@ -237,7 +237,7 @@ def _merge_double_lines(marks: Sequence[RoadMark]) -> list[_StyledLine]:
 
 
 def _trace_pavement(network: RoadNetwork, policy: GroundTruthPolicy) -> list[_StyledLine]:
-    """The outline of the union of all paved lanes and shoulders."""
+    """Return the outline of the union of all paved lanes and shoulders."""
     shapely = _shapely()
     paved = [lane for lane in network.lanes if lane.kind in ROADWAY and lane.width_m.max() > 0.05]
     strips = shapely.buffer(_lane_polygons(paved), 0.1, join_style="mitre")
@@ -254,7 +254,7 @@ def _trace_pavement(network: RoadNetwork, policy: GroundTruthPolicy) -> list[_St
 
 
 def _drop_map_ends(lines: Sequence[_StyledLine], network: RoadNetwork) -> list[_StyledLine]:
-    """Edges without those that cross a lane's end where nothing follows: there the map ends, not the road."""
+    """Return edges without those that cross a lane's end where nothing follows: there the map ends, not the road."""
     shapely = _shapely()
     caps = []
     for lane in network.lanes:
@@ -281,7 +281,7 @@ def _drop_map_ends(lines: Sequence[_StyledLine], network: RoadNetwork) -> list[_
 def _keep_near_lanes(
     lines: Sequence[_StyledLine], network: RoadNetwork, policy: GroundTruthPolicy
 ) -> list[_StyledLine]:
-    """Edges near drivable lanes, without what runs through the middle of one: a record's end, not an edge."""
+    """Return edges near drivable lanes, without what runs through the middle of one: a record's end, not an edge."""
     shapely = _shapely()
     lanes = _lane_polygons([lane for lane in network.lanes if lane.is_drivable])
     near = shapely.union_all(shapely.buffer(lanes, policy.max_lane_distance_m))
@@ -289,7 +289,7 @@ def _keep_near_lanes(
 
 
 def _select_crossings(network: RoadNetwork, policy: GroundTruthPolicy) -> list[_StyledLine]:
-    """Rings of crossings, the smaller of two that share half of its ground left out."""
+    """Return rings of crossings, the smaller of two that share half of its ground left out."""
     shapely = _shapely()
     rings = [shapely.make_valid(shapely.Polygon(crossing.polygon[:, :2])) for crossing in network.crossings]
     parts = [part for ring in rings for part in shapely.get_parts(ring) if part.geom_type == "Polygon"]
@@ -308,7 +308,7 @@ def _select_crossings(network: RoadNetwork, policy: GroundTruthPolicy) -> list[_
 
 
 def _to_elements(lines_by_kind: Sequence[tuple[str, _StyledLine]]) -> MapElements:
-    """Lines and rings as a table in canonical order and direction."""
+    """Return lines and rings as a table in canonical order and direction."""
     shapely = _shapely()
     rows = []
     for kind, line in lines_by_kind:
@@ -354,7 +354,7 @@ def _split_line(line: _StyledLine, region: BaseGeometry, min_length_m: float) ->
 
 
 def _split(points: Array, region: BaseGeometry, min_length_m: float) -> list[Array]:
-    """The stretches of a line outside and inside a region, in the line's order, none cut shorter than min_length_m."""
+    """Return the stretches of a line outside and inside a region, in the line's order, none cut shorter than min_length_m."""
     shapely = _shapely()
     shape = shapely.LineString(points)
     if not region.intersects(shape) or region.contains(shape):
@@ -374,7 +374,7 @@ def _split(points: Array, region: BaseGeometry, min_length_m: float) -> list[Arr
 
 
 def _cut_along(points: Array, along: Array) -> list[Array]:
-    """A line cut at distances from its start."""
+    """Return a line cut at distances from its start."""
     station = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     edges = np.concatenate(([0.0], along[(along > 1e-3) & (along < station[-1] - 1e-3)], [station[-1]]))
     parts = []
@@ -385,7 +385,7 @@ def _cut_along(points: Array, along: Array) -> list[Array]:
 
 
 def _densify(points: Array, step_m: float) -> Array:
-    """The line with points at most a step apart; its own points stay."""
+    """Return the line with points at most a step apart; its own points stay."""
     length = np.linalg.norm(np.diff(points, axis=0), axis=1)
     station = np.concatenate(([0.0], np.cumsum(length)))
     count = np.maximum(1, np.ceil(length / step_m)).astype(int)
@@ -417,7 +417,7 @@ def _angle(step: Array) -> Array:
 
 
 def _lane_polygons(lanes: Sequence[Lane]) -> NDArray[np.object_]:
-    """The lanes' surfaces as valid polygons."""
+    """Return the lanes' surfaces as valid polygons."""
     shapely = _shapely()
     rings = [np.concatenate((lane.left, lane.right[::-1]))[:, :2] for lane in lanes if len(lane.left) > 1]
     return shapely.make_valid(np.array([shapely.Polygon(ring) for ring in rings], object))

@@ -17,7 +17,7 @@ _STEP_M = 1.0
 
 
 def resample_borders(left: Array, right: Array, step_m: float = _STEP_M) -> tuple[Array, Array]:
-    """Two borders (A, 3) and (B, 3) as (M, 3) each, row i of both at the same share of their lengths."""
+    """Return two borders (A, 3) and (B, 3) as (M, 3) each, row i of both at the same share of their lengths."""
     longest = max(_lengths(left)[-1], _lengths(right)[-1])
     share = np.linspace(0.0, 1.0, max(2, int(np.ceil(longest / step_m)) + 1))
     return _interpolate_at(left, share), _interpolate_at(right, share)
@@ -33,7 +33,7 @@ def _interpolate_at(line: Array, fractions: Array) -> Array:
 
 
 def connected_components(count: int, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(count,) the smallest member of each node's component; pairs: (E, 2) edges."""
+    """Return (count,) the smallest member of each node's component; pairs: (E, 2) edges."""
     label = np.arange(count)
 
     def root(node: int) -> int:
@@ -49,7 +49,9 @@ def connected_components(count: int, pairs: NDArray[np.int64]) -> NDArray[np.int
 
 
 def complete_lane_links(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
-    """The lanes with predecessors completed by others' successors, and the reverse: files name some links on one side only."""
+    """Return the lanes with predecessors completed by others' successors, and the reverse: files name some links on one side
+    only.
+    """
     before = [set(lane.predecessors) for lane in lanes]
     after = [set(lane.successors) for lane in lanes]
     for lane in lanes:
@@ -64,7 +66,7 @@ def complete_lane_links(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
 
 
 def build_junctions(lanes: Sequence[Lane]) -> tuple[Junction, ...]:
-    """Junctions from the lanes' junction ids, with the extent of their drivable lanes."""
+    """Return junctions from the lanes' junction ids, with the extent of their drivable lanes."""
     members: dict[str, list[Lane]] = {}
     for lane in lanes:
         if lane.junction_id is not None and lane.is_drivable:

@@ -152,7 +152,7 @@ class RoadNetwork:
         return RoadSurface.of_strips([lane.left for lane in drivable], [lane.right for lane in drivable])
 
     def height(self, xy: Array, near_z: Array | float | None = None) -> Array:
-        """(N,) road height under points (N, 2); off the road, that of the nearest lane.
+        """Return (N,) road height under points (N, 2); off the road, that of the nearest lane.
 
         Where roads cross on two levels: the one nearest to near_z, the highest when near_z is None.
         """

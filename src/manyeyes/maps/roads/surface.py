@@ -74,23 +74,23 @@ class RoadSurface:
         return cls(triangles, owner, float(low[0]), float(low[1]), columns, rows, first, member)
 
     def height(self, xy: Array, near_z: Array | float | None = None) -> Array:
-        """(N,) z at points (N, 2): of the triangle above or below, else of the nearest triangle's nearest point.
+        """Return (N,) z at points (N, 2): of the triangle above or below, else of the nearest triangle's nearest point.
 
         Where several cover a point, the one nearest to near_z (one for all, or (N,)); the highest when near_z is None.
         """
         return self._query(xy, near_z).height
 
     def distance(self, xy: Array) -> Array:
-        """(N,) metres from points (N, 2) to the surface in plan; 0 on it, inf when there is none."""
+        """Return (N,) metres from points (N, 2) to the surface in plan; 0 on it, inf when there is none."""
         return self._query(xy, None).distance
 
     def strip_at(self, xy: Array, near_z: Array | float | None = None) -> NDArray[np.int64]:
-        """(N,) the strip of the triangle that :meth:`height` reads; -1 when there is none."""
+        """Return (N,) the strip of the triangle that :meth:`height` reads; -1 when there is none."""
         index = self._query(xy, near_z).triangle
         return np.where(index >= 0, self.strip_index[np.maximum(index, 0)], -1) if len(self.strip_index) else index
 
     def height_range(self, xy: Array) -> Array:
-        """(N,) metres between the lowest and the highest triangle that cover each point; 0 where one or none does."""
+        """Return (N,) metres between the lowest and the highest triangle that cover each point; 0 where one or none does."""
         return _height_range(np.ascontiguousarray(xy, np.float64), self._buckets)
 
     @property
@@ -114,7 +114,7 @@ class _SurfacePoints(NamedTuple):
 
 @njit(cache=True)
 def _fill_buckets(triangles: F64x3, lattice: _Lattice) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
-    """Offsets (B + 1,) of the buckets and the triangles in each, ascending."""
+    """Return offsets (B + 1,) of the buckets and the triangles in each, ascending."""
     x0, y0, columns, rows = lattice
     count = np.zeros(columns * rows + 1, np.int64)
     span = np.empty((len(triangles), 4), np.int64)
@@ -139,7 +139,7 @@ def _fill_buckets(triangles: F64x3, lattice: _Lattice) -> tuple[I64x1, I64x1]:  
 
 @njit(cache=True)
 def _plane_z(corner: F64x2, x: float, y: float) -> tuple[bool, float]:  # pragma: no cover - compiled
-    """(inside, z) of a triangle at a point, by barycentric coordinates; a hair of tolerance closes the seams."""
+    """Return (inside, z) of a triangle at a point, by barycentric coordinates; a hair of tolerance closes the seams."""
     ax, ay = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1]
     bx, by = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1]
     px, py = x - corner[0, 0], y - corner[0, 1]
@@ -151,7 +151,7 @@ def _plane_z(corner: F64x2, x: float, y: float) -> tuple[bool, float]:  # pragma
 
 @njit(cache=True)
 def _edge_nearest(corner: F64x2, x: float, y: float) -> tuple[float, float]:  # pragma: no cover - compiled
-    """(squared distance, z) of the nearest point on a triangle's rim."""
+    """Return (squared distance, z) of the nearest point on a triangle's rim."""
     best, z = np.inf, 0.0
     for k in range(3):
         n = (k + 1) % 3
@@ -168,7 +168,9 @@ def _edge_nearest(corner: F64x2, x: float, y: float) -> tuple[float, float]:  # 
 
 @njit(cache=True)
 def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _SurfacePoints:  # pragma: no cover - compiled
-    """Height, distance and triangle at each point: the own bucket first, then rings of buckets until none can be nearer."""
+    """Return height, distance and triangle at each point: the own bucket first, then rings of buckets until none can be
+    nearer.
+    """
     triangles, (x0, y0, columns, rows), bucket_offsets, member = buckets
     n = len(xy)
     height, distance, index = np.zeros(n), np.full(n, np.inf), np.full(n, -1, np.int64)
@@ -208,7 +210,7 @@ def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _SurfacePoints:  # pr
 
 @njit(cache=True)
 def _height_range(xy: F64x2, buckets: _Buckets) -> F64x1:  # pragma: no cover - compiled
-    """(N,) metres between the lowest and the highest triangle that cover each point; 0 where one or none does."""
+    """Return (N,) metres between the lowest and the highest triangle that cover each point; 0 where one or none does."""
     triangles, (x0, y0, columns, rows), bucket_offsets, member = buckets
     out = np.zeros(len(xy))
     if len(triangles) == 0:

@@ -33,7 +33,7 @@ _INVERSE = (
 
 
 def metres_from_degrees(latitude: ArrayLike, longitude: ArrayLike, origin: tuple[float, float]) -> Array:
-    """(N, 2) metres east and north of an origin (latitude, longitude in degrees) at points (N,) in degrees."""
+    """Return (N, 2) metres east and north of an origin (latitude, longitude in degrees) at points (N,) in degrees."""
     phi = np.radians(np.asarray(latitude, np.float64))
     lam = np.radians(np.asarray(longitude, np.float64) - origin[1])
     conformal = _conformal(phi)
@@ -47,7 +47,7 @@ def metres_from_degrees(latitude: ArrayLike, longitude: ArrayLike, origin: tuple
 
 
 def degrees_from_metres(xy: ArrayLike, origin: tuple[float, float]) -> Array:
-    """(N, 2) latitude and longitude in degrees of points (N, 2) in metres about an origin; the inverse of the above."""
+    """Return (N, 2) latitude and longitude in degrees of points (N, 2) in metres about an origin; the inverse of the above."""
     xy = np.asarray(xy, np.float64) / _RADIUS_M
     xi, eta = xy[..., 1] + _meridian(origin[0]), xy[..., 0]
     north, east = xi.copy(), eta.copy()

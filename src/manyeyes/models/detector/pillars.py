@@ -102,7 +102,7 @@ class PillarEncoder(nn.Module):
 
 
 def _plain(clouds: list[PointCloud]) -> bool:
-    """Whether compiled loops can read these tensors."""
+    """Return whether compiled loops can read these tensors."""
     return all(cloud.xyz.dtype == torch.float32 and cloud.xyz.device.type == "cpu" for cloud in clouds)
 
 

@@ -35,7 +35,7 @@ _SIGMA_LOW, _SIGMA_STEP = -4.0, 0.4
 
 
 def _table() -> tuple[Tensor, Tensor]:
-    """Columns of a proposal that are encoded one by one, and their quantisation steps."""
+    """Return columns of a proposal that are encoded one by one, and their quantisation steps."""
     pairs = [(column, step) for span, step in _STEPS for column in range(span.start, span.stop)]
     return torch.tensor([c for c, _ in pairs]), torch.tensor([s for _, s in pairs])
 

@@ -75,7 +75,7 @@ class TokenDetector(BoxDetector, Protocol):
         ...
 
     def extract_tokens(self, points: PointCloud, previous: PointCloud | None = None) -> tuple[SparseBev, RawBoxes]:
-        """Tokens (N, token_channels) of a point cloud, and the raw boxes of the same N cells."""
+        """Return tokens (N, token_channels) of a point cloud, and the raw boxes of the same N cells."""
         ...
 
     def make_tokens(self, features: SparseBev, raw: RawBoxes) -> SparseBev:
@@ -96,7 +96,7 @@ class TokenDetector(BoxDetector, Protocol):
 
 
 def has_tokens(detector: BoxDetector) -> TypeGuard[TokenDetector]:
-    """Whether a detector is a TokenDetector."""
+    """Return whether a detector is a TokenDetector."""
     return callable(getattr(detector, "extract_tokens", None))
 
 

@@ -145,7 +145,7 @@ def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:
 
 
 def _plain(x: Tensor) -> bool:
-    """Whether compiled loops apply: no gradient is required, and the tensor is float32 on the CPU."""
+    """Return whether compiled loops apply: no gradient is required, and the tensor is float32 on the CPU."""
     return not torch.is_grad_enabled() and x.device.type == "cpu" and x.dtype == torch.float32
 
 

@@ -302,5 +302,5 @@ def decode_elements(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[M
 
 
 def is_ring(kind: str) -> bool:
-    """Whether elements of this kind are closed rings."""
+    """Return whether elements of this kind are closed rings."""
     return KINDS.index(kind) == CROSSING

@@ -23,7 +23,7 @@ def fit_pose(target: Floats, source: Floats, weight: Floats | None = None) -> Fl
 
 
 def make_estimate(ego: Landmarks, other: Landmarks, pose: Floats, pairs: Ints, prior: PosePrior | None) -> PoseEstimate:
-    """The estimate of a pose (3,), with the covariance that its pairs (P, 2) give by their stated errors."""
+    """Return the estimate of a pose (3,), with the covariance that its pairs (P, 2) give by their stated errors."""
     covariance = np.asarray(np.linalg.inv(pose_information(ego, other, pose, pairs)), np.float64)
     distance = float("nan") if prior is None else mahalanobis_squared(pose, covariance, prior)
     return PoseEstimate(
@@ -41,7 +41,7 @@ def make_estimate(ego: Landmarks, other: Landmarks, pose: Floats, pairs: Ints, p
 
 
 def pose_information(ego: Landmarks, other: Landmarks, pose: Floats, pairs: Ints) -> Floats:
-    """(3, 3) information of x, y (m), yaw (rad) from pairs of positions and headings."""
+    """Return (3, 3) information of x, y (m), yaw (rad) from pairs of positions and headings."""
     i, k = pairs.T
     w, v = 1 / (ego.sigma_xy[i] ** 2 + other.sigma_xy[k] ** 2), 1 / (ego.sigma_yaw[i] ** 2 + other.sigma_yaw[k] ** 2)
     arm = other.transform(np.array([0.0, 0.0, pose[2]])).xy[k]
@@ -51,7 +51,7 @@ def pose_information(ego: Landmarks, other: Landmarks, pose: Floats, pairs: Ints
 
 
 def match_mutual_nearest(target: Floats, source: Floats, max_distance_m: float) -> Ints:
-    """Pairs (P, 2) of rows of target (N, 2) and source (M, 2) that are mutual nearest neighbours within a distance."""
+    """Return pairs (P, 2) of rows of target (N, 2) and source (M, 2) that are mutual nearest neighbours within a distance."""
     if not len(target) or not len(source):
         return np.zeros((0, 2), np.int64)
     apart = np.hypot(*(target[:, None] - source[None]).transpose(2, 0, 1))

@@ -35,7 +35,7 @@ class CoalignConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: CoalignConfig | None = None
 ) -> PoseEstimate:
-    """The other's pose in the optimized graph; NO_MATCH without a prior or with too few objects."""
+    """Return the other's pose in the optimized graph; NO_MATCH without a prior or with too few objects."""
     config = config or CoalignConfig()
     if prior is None:
         return no_estimate(None)
@@ -54,7 +54,7 @@ def correct(
 def optimize_pose_graph(
     ego: Landmarks, other: Landmarks, pairs: np.ndarray, prior: PosePrior, turn: np.ndarray
 ) -> Tensor:
-    """Poses (2 + P, 3) of ego, other and objects, in the ego's frame; turn (P,): headings' difference modulo pi."""
+    """Return poses (2 + P, 3) of ego, other and objects, in the ego's frame; turn (P,): headings' difference modulo pi."""
     i, k = pairs.T
     n = len(pairs)
     ego_measured = torch.from_numpy(np.column_stack((ego.xy[i], ego.yaw[i])))

@@ -34,7 +34,7 @@ class FeacoConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: FeacoConfig | None = None
 ) -> PoseEstimate:
-    """The prior, corrected so that assigned positions coincide; NO_MATCH without a prior or near positions."""
+    """Return the prior, corrected so that assigned positions coincide; NO_MATCH without a prior or near positions."""
     config = config or FeacoConfig()
     if prior is None or not len(ego) or not len(other):
         return no_estimate(prior)

@@ -40,7 +40,7 @@ class FpvRcnnConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: FpvRcnnConfig | None = None
 ) -> PoseEstimate:
-    """The grid's best pose, fitted to its accurate matches; NO_MATCH without a prior or enough of them."""
+    """Return the grid's best pose, fitted to its accurate matches; NO_MATCH without a prior or enough of them."""
     config = config or FpvRcnnConfig()
     if prior is None or not len(ego) or not len(other):
         return no_estimate(prior)

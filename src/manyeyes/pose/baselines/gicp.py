@@ -36,7 +36,9 @@ class GicpConfig:
 def correct(
     ego: PointCloud, other: PointCloud, prior: PosePrior | None, config: GicpConfig | None = None
 ) -> PoseEstimate:
-    """The best fit of the clouds near the prior, in six degrees of freedom; NO_MATCH without a prior or without overlap."""
+    """Return the best fit of the clouds near the prior, in six degrees of freedom; NO_MATCH without a prior or without
+    overlap.
+    """
     config = config or GicpConfig()
     gicp = _small_gicp()
     if prior is None or min(len(ego), len(other)) < 3:

@@ -10,5 +10,5 @@ from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, no_estimate
 
 @register_pose_corrector("identity")
 def correct(ego: Landmarks, other: Landmarks, prior: PosePrior | None) -> PoseEstimate:
-    """The prior unchanged; NO_MATCH where there is none."""
+    """Return the prior unchanged; NO_MATCH where there is none."""
     return no_estimate(prior, PoseStatus.NO_MATCH if prior is None else PoseStatus.OK)

@@ -33,7 +33,7 @@ class MashConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: MashConfig | None = None
 ) -> PoseEstimate:
-    """The pose of objects that are mutual best matches in the cost volume; the prior is not used."""
+    """Return the pose of objects that are mutual best matches in the cost volume; the prior is not used."""
     config = config or MashConfig()
     if min(len(ego), len(other)) <= config.num_neighbours:
         return no_estimate(prior)
@@ -48,6 +48,6 @@ def correct(
 
 
 def _descriptors(x: Landmarks, config: MashConfig) -> np.ndarray:
-    """(N, 2 + num_neighbours) scaled descriptors."""
+    """Return (N, 2 + num_neighbours) scaled descriptors."""
     apart = np.sort(np.hypot(*(x.xy[:, None] - x.xy[None]).transpose(2, 0, 1)), 1)[:, 1 : config.num_neighbours + 1]
     return np.column_stack((x.size / config.size_scale_m, apart / config.distance_scale_m))

@@ -41,7 +41,7 @@ class V2xRegConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: V2xRegConfig | None = None
 ) -> PoseEstimate:
-    """The pose from the corners of matched boxes; the prior is not used."""
+    """Return the pose from the corners of matched boxes; the prior is not used."""
     config = config or V2xRegConfig()
     rows_e, rows_o = _largest(ego, config), _largest(other, config)
     if not len(rows_e) or not len(rows_o):
@@ -68,7 +68,7 @@ def _largest(x: Landmarks, config: V2xRegConfig) -> np.ndarray:
 
 
 def _affinity(a: Landmarks, b: Landmarks, config: V2xRegConfig) -> np.ndarray:
-    """(N, M): how many other boxes coincide when box i of a and box j of b are aligned."""
+    """Return (N, M): how many other boxes coincide when box i of a and box j of b are aligned."""
     out = np.zeros((len(a), len(b)))
     for i in range(len(a)):
         for j in range(len(b)):
@@ -84,7 +84,7 @@ def _affinity(a: Landmarks, b: Landmarks, config: V2xRegConfig) -> np.ndarray:
 
 
 def _count_matches(a: Landmarks, moved: Landmarks, max_distance_m: float) -> float:
-    """Boxes matched one to one by their centres and by their corners, the mean of both counts."""
+    """Return boxes matched one to one by their centres and by their corners, the mean of both counts."""
     pairs = match_mutual_nearest(a.xy, moved.xy, max_distance_m)
     apart = _corners(a)[pairs[:, 0]] - _corners(moved)[pairs[:, 1]]
     by_corner = np.hypot(apart[..., 0], apart[..., 1]).mean(1) <= max_distance_m
@@ -92,7 +92,7 @@ def _count_matches(a: Landmarks, moved: Landmarks, max_distance_m: float) -> flo
 
 
 def _count_overlaps(a: Landmarks, moved: Landmarks) -> float:
-    """Boxes that overlap, each with its best, one to one."""
+    """Return boxes that overlap, each with its best, one to one."""
     iou = pairwise_iou(*(torch.from_numpy(np.column_stack((x.xy, x.size, x.yaw))) for x in (a, moved))).numpy()
     best = iou.argmax(1)
     mutual = (iou.argmax(0)[best] == np.arange(len(iou))) & (iou.max(1) > 0)
@@ -100,7 +100,7 @@ def _count_overlaps(a: Landmarks, moved: Landmarks) -> float:
 
 
 def _corners(x: Landmarks) -> np.ndarray:
-    """(N, 4, 2): front left, front right, rear right, rear left."""
+    """Return (N, 4, 2): front left, front right, rear right, rear left."""
     local = np.array([[0.5, 0.5], [0.5, -0.5], [-0.5, -0.5], [-0.5, 0.5]]) * x.size[:, None]
     c, s = np.cos(x.yaw)[:, None], np.sin(x.yaw)[:, None]
     turned = np.stack((c * local[..., 0] - s * local[..., 1], s * local[..., 0] + c * local[..., 1]), -1)

@@ -35,7 +35,7 @@ class VipsConfig:
 def correct(
     ego: Landmarks, other: Landmarks, prior: PosePrior | None, config: VipsConfig | None = None
 ) -> PoseEstimate:
-    """The pose from the matched objects' positions; NO_MATCH where too few match."""
+    """Return the pose from the matched objects' positions; NO_MATCH where too few match."""
     config = config or VipsConfig()
     rows_e, rows_o = ego.select_indices(1e4, config.max_boxes), other.select_indices(1e4, config.max_boxes)
     if min(len(rows_e), len(rows_o)) < config.min_pairs:
@@ -60,7 +60,7 @@ def correct(
 
 
 def compute_affinities(a: Landmarks, b: Landmarks, prior: PosePrior | None) -> np.ndarray:
-    """(N M, N M) affinities, pair (i, i') in row i M + i'; zero for two pairs that share an object."""
+    """Return (N M, N M) affinities, pair (i, i') in row i M + i'; zero for two pairs that share an object."""
     n, m = len(a), len(b)
     node = np.exp(-0.5 * np.square(a.size[:, None] - b.size[None]).sum(-1))
     if prior is not None:

@@ -44,7 +44,7 @@ class ChangingMap:
 
     @classmethod
     def of(cls, truth: MapElements, changes: Sequence[Change] = ()) -> ChangingMap:
-        """A truth with changes, applied in the order of time."""
+        """Return a truth with changes, applied in the order of time."""
         name = list(range(len(truth)))
         start_ns, end_ns = [0] * len(truth), [NEVER_NS] * len(truth)
         moved: list[MapElements] = []
@@ -68,11 +68,11 @@ class ChangingMap:
         return cls(MapElements.cat([truth, *moved]), np.array(name, np.int64), _times(start_ns), _times(end_ns))
 
     def rows_at(self, time_ns: int) -> Indices:
-        """Rows of the versions that exist at a time."""
+        """Return rows of the versions that exist at a time."""
         return np.flatnonzero((self.start_ns <= time_ns) & (time_ns < self.end_ns))
 
     def at(self, time_ns: int) -> MapElements:
-        """The true map at a time."""
+        """Return the true map at a time."""
         return self.elements.take(self.rows_at(time_ns))
 
     @property

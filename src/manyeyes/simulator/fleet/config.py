@@ -161,7 +161,7 @@ CROWDS: dict[str, CrowdConfig] = {
 
 
 def crowd_config(name: str) -> CrowdConfig:
-    """The preset of that name; ConfigError lists the known names."""
+    """Return the preset of that name; ConfigError lists the known names."""
     if name not in CROWDS:
         raise ConfigError(f"Unknown crowd '{name}'; known: {', '.join(CROWDS)}.")
     return CROWDS[name]

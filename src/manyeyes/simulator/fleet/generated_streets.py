@@ -55,7 +55,7 @@ class StreetPlan:
 
 
 def street_truth(plan: StreetPlan) -> MapElements:
-    """The elements of a plan: per street dashed dividers and a double middle, edges, corners, crossings and stop lines."""
+    """Return the elements of a plan: per street dashed dividers and a double middle, edges, corners, crossings and stop lines."""
     lines: list[tuple[int, int, Array]] = []
     for node in _nodes(plan):
         for way in range(4):
@@ -75,7 +75,7 @@ def street_truth(plan: StreetPlan) -> MapElements:
 
 
 def street_routes(plan: StreetPlan) -> Routes:
-    """The lanes of a plan, driven on the right, and how they lead through the crossroads."""
+    """Return the lanes of a plan, driven on the right, and how they lead through the crossroads."""
     lanes: list[Array] = []
     arriving: dict[tuple[int, int, int], list[int]] = {}
     leaving: dict[tuple[int, int, int], list[int]] = {}
@@ -106,7 +106,7 @@ def street_routes(plan: StreetPlan) -> Routes:
 
 
 def street_junctions(plan: StreetPlan) -> list[Array]:
-    """(8, 2) rings, the ground of each crossroads."""
+    """Return (8, 2) rings, the ground of each crossroads."""
     h, w = plan.mouth_m, plan.half_m
     ring = np.array([[h, -w], [h, w], [w, h], [-w, h], [-h, w], [-h, -w], [-w, -h], [w, -h]])
     return [plan.to_local(np.array(node) * plan.block_m + ring) for node in _nodes(plan)]
@@ -132,13 +132,13 @@ def _streets(plan: StreetPlan) -> list[tuple[Array, int, float]]:
 
 
 def _node_at(plan: StreetPlan, mouth: Array, heading: int) -> tuple[int, int]:
-    """The crossroads whose mouth lies at a point, seen along a heading."""
+    """Return the crossroads whose mouth lies at a point, seen along a heading."""
     i, j = np.round((mouth + plan.mouth_m * _TURN[heading]) / plan.block_m, 3)
     return (int(i), int(j)) if i == int(i) and j == int(j) else (-1, -1)
 
 
 def _at_mouth(plan: StreetPlan, node: tuple[int, int], way: int) -> list[tuple[int, int, Array]]:
-    """The crossing, the stop line and the corner on the left of one arm."""
+    """Return the crossing, the stop line and the corner on the left of one arm."""
     middle, out, left = np.array(node, np.float64) * plan.block_m, _TURN[way], _TURN[(way + 1) % 4]
     w, h = plan.half_m, plan.mouth_m
 
@@ -153,7 +153,7 @@ def _at_mouth(plan: StreetPlan, node: tuple[int, int], way: int) -> list[tuple[i
 
 
 def _canonical(kind: int, points: Array) -> Array:
-    """Rings from their smallest corner, lines from their smaller end."""
+    """Return rings from their smallest corner, lines from their smaller end."""
     if kind == CROSSING:
         return np.roll(points, -int(np.lexsort(points.T[::-1])[0]), axis=0)
     return points if tuple(points[0]) <= tuple(points[-1]) else points[::-1]

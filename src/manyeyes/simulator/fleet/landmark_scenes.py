@@ -89,7 +89,7 @@ class _Traffic:
     size: Floats
 
     def at(self, time_s: float) -> Floats:
-        """Poses (N, 3) at a time."""
+        """Return poses (N, 3) at a time."""
         step = time_s * self.speed
         turn = self.pose[:, 2]
         return self.pose + np.stack((step * np.cos(turn), step * np.sin(turn), 0 * step), 1)
@@ -136,7 +136,7 @@ def relative_pose(a: Floats, b: Floats) -> Floats:
 
 
 def _local(poses: Floats, frame: Floats) -> Floats:
-    """Poses (N, 3) as seen from a frame (3,)."""
+    """Return poses (N, 3) as seen from a frame (3,)."""
     c, s = np.cos(frame[2]), np.sin(frame[2])
     dx, dy = poses[:, 0] - frame[0], poses[:, 1] - frame[1]
     yaw = np.remainder(poses[:, 2] - frame[2] + np.pi, 2 * np.pi) - np.pi
@@ -176,7 +176,7 @@ def _traffic(rng: np.random.Generator) -> _Traffic:
 
 
 def _vehicle(rng: np.random.Generator) -> tuple[Floats, float]:
-    """A vehicle's pose and speed, in a lane within 50 m of the crossing."""
+    """Return a vehicle's pose and speed, in a lane within 50 m of the crossing."""
     direction = rng.integers(4) * np.pi / 2
     longitudinal, lateral = rng.uniform(-50, 50), -_LANES_M[rng.integers(3)]
     c, s = np.cos(direction), np.sin(direction)
@@ -184,7 +184,7 @@ def _vehicle(rng: np.random.Generator) -> tuple[Floats, float]:
 
 
 def _roadside(rng: np.random.Generator) -> Floats:
-    """A pole's pose at a corner of the crossing, with a uniform heading."""
+    """Return a pole's pose at a corner of the crossing, with a uniform heading."""
     corner = np.array([rng.choice([-1.0, 1.0]), rng.choice([-1.0, 1.0])]) * rng.uniform(13, 18, 2)
     return np.array([*corner, rng.uniform(-np.pi, np.pi)])
 
@@ -197,7 +197,7 @@ def _select_visible(
     other: tuple[_Traffic, Floats],
     time: float,
 ) -> tuple[Ints, Ints]:
-    """Rows that each agent sees: those in common first."""
+    """Return rows that each agent sees: those in common first."""
     near = [np.hypot(*_local(t.at(time), pose)[:, :2].T) < _RANGE_M for t, pose in (ego, other)]
     if spec.disjoint:
         sets = [rng.permutation(np.flatnonzero(n)) for n in near]

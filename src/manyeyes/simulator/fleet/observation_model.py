@@ -85,7 +85,7 @@ class TrueMapIndex(NamedTuple):
 
 
 def build_map_index(points: list[Array], kind: Indices, style: Indices, name: Indices) -> TrueMapIndex:
-    """Index lines (M, 2) and open rings of N elements with their kinds, styles and names."""
+    """Return index lines (M, 2) and open rings of N elements with their kinds, styles and names."""
     dense = [p if k == CROSSING else _stations(p) for p, k in zip(points, kind.tolist())]
     first = np.concatenate(([0], np.cumsum([len(p) for p in dense]))).astype(np.int64)
     flat = np.concatenate(dense) if dense else np.zeros((0, 2))
@@ -100,7 +100,7 @@ def build_map_index(points: list[Array], kind: Indices, style: Indices, name: In
 
 
 def _stations(line: Array) -> Array:
-    """A line (M, 2) at equal steps of at most STATION_M."""
+    """Return a line (M, 2) at equal steps of at most STATION_M."""
     along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))))
     s = np.linspace(0.0, along[-1], max(2, int(np.ceil(along[-1] / STATION_M)) + 1))
     return np.stack([np.interp(s, along, line[:, axis]) for axis in (0, 1)], 1)
@@ -108,7 +108,7 @@ def _stations(line: Array) -> Array:
 
 @njit(cache=True)
 def hash_uniform(key: np.uint64, element: int, run: int, purpose: int) -> float:
-    """A draw in (0, 1) for a key (uint64) and three counts."""
+    """Return a draw in (0, 1) for a key (uint64) and three counts."""
     z = key
     for part in (element, run, purpose):
         z = z + np.uint64(0x9E3779B97F4A7C15) * (np.uint64(part) + np.uint64(1))
@@ -120,14 +120,14 @@ def hash_uniform(key: np.uint64, element: int, run: int, purpose: int) -> float:
 
 @njit(cache=True)
 def hash_normal(key: np.uint64, element: int, run: int, purpose: int) -> float:
-    """A standard normal draw (Box and Muller 1958) from the purposes ``purpose`` and ``purpose + 1024``."""
+    """Return a standard normal draw (Box and Muller 1958) from the purposes ``purpose`` and ``purpose + 1024``."""
     radius = np.sqrt(-2.0 * np.log(hash_uniform(key, element, run, purpose)))
     return radius * np.cos(2.0 * np.pi * hash_uniform(key, element, run, purpose + 1024))
 
 
 @njit(cache=True)
 def _hidden(x: float, y: float, shadows: F64x3) -> bool:
-    """Whether a point lies in one of the convex anticlockwise quadrilaterals (Q, 4, 2)."""
+    """Return whether a point lies in one of the convex anticlockwise quadrilaterals (Q, 4, 2)."""
     for q in range(shadows.shape[0]):
         inside = True
         for a in range(4):
@@ -169,7 +169,7 @@ def _resample(line: F64x2, count: int, closed: bool, out: F64x2) -> float:
 
 @njit(cache=True)
 def _clip_ring(ring: F64x2, noise: MapModelNoise) -> tuple[F64x2, float]:
-    """A ring (M, 2) cut to the view (Sutherland and Hodgman 1974), and the cut ring's area."""
+    """Return a ring (M, 2) cut to the view (Sutherland and Hodgman 1974), and the cut ring's area."""
     work = ring.copy()
     for side in range(4):
         axis = 0 if side < 2 else 1
@@ -281,7 +281,7 @@ def _emit_false(
 
 @njit(cache=True)
 def _max_range(noise: MapModelNoise) -> float:
-    """The largest distance in view, metres."""
+    """Return the largest distance in view, metres."""
     return np.hypot(max(abs(noise.x_min), abs(noise.x_max)), max(abs(noise.y_min), abs(noise.y_max)))
 
 
@@ -427,7 +427,7 @@ def _observe_line(
 
 @njit(cache=True)
 def _score(top: float, far: float, key: np.uint64, element: int, run: int) -> float:
-    """A confidence that falls with the distance and scatters."""
+    """Return a confidence that falls with the distance and scatters."""
     return min(0.99, max(0.05, top - 0.25 * far + 0.12 * hash_normal(key, element, run, _SCORE)))
 
 

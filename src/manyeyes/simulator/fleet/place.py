@@ -77,12 +77,13 @@ class Place:
     world_xy: tuple[float, float] = (0.0, 0.0)
 
     def clip_to_area(self, elements: MapElements | None = None, min_line_m: float = 5.0) -> MapElements:
-        """Elements (the truth unless others are given) cut to the area, by :func:`clip_to_box`."""
+        """Return elements (the truth unless others are given) cut to the area, by :func:`clip_to_box`."""
         return clip_to_box(self.truth if elements is None else elements, self.area, min_line_m)
 
 
 def load_place(name: str, size_m: float | None = 300.0, data: Path | str | None = None) -> Place:
-    """A place by name: a CARLA town, ``generated-<seed>``, av2-miami, av2-pittsburgh, lanelet2, cross, grid or ``grid-<n>``.
+    """Return a place by name: a CARLA town, ``generated-<seed>``, av2-miami, av2-pittsburgh, lanelet2, cross, grid or
+    ``grid-<n>``.
 
     size_m: side of the square area; in towns it lies about the largest junction, None takes all of the place. Real logs and
     generated streets are never larger than they are. data: the folder with ``carla_opendrive``, ``av2`` and ``lanelet2``; where
@@ -114,7 +115,9 @@ def _load_place(name: str, size_m: float | None, data: str | None) -> Place:
 
 @lru_cache(maxsize=4)
 def load_place_from_map(path: Path) -> Place:
-    """A place out of a file of a real map: an intersection of V2X-Seq, a map (or log) of Argoverse 2, or Lanelet2's .osm."""
+    """Return a place out of a file of a real map: an intersection of V2X-Seq, a map (or log) of Argoverse 2, or Lanelet2's
+    .osm.
+    """
     origin = (0.0, 0.0)
     if path.suffix == ".osm":
         network, origin = read_lanelet2(path), lanelet2_origin(path)
@@ -128,7 +131,7 @@ def load_place_from_map(path: Path) -> Place:
 def make_place(
     network: RoadNetwork, name: str, policy: GroundTruthPolicy, size_m: float | None, origin: tuple[float, float]
 ) -> Place:
-    """A place out of any road network; origin: latitude and longitude of the network's zero, degrees."""
+    """Return a place out of any road network; origin: latitude and longitude of the network's zero, degrees."""
     x0, y0, x1, y1 = network.bounds
     middle = np.round([(x0 + x1) / 2, (y0 + y1) / 2])
     half = np.array([x1 - x0, y1 - y0]) / 2
@@ -147,7 +150,7 @@ def make_place(
 
 
 def clip_to_box(elements: MapElements, box: tuple[float, float, float, float], min_line_m: float = 0.0) -> MapElements:
-    """Lines cut to a box x_min, y_min, x_max, y_max; crossings and stop lines stay whole when their middle lies inside."""
+    """Return lines cut to a box x_min, y_min, x_max, y_max; crossings and stop lines stay whole when their middle lies inside."""
     shapely = _shapely()
     parts, kinds, scores, sigmas, styles = [], [], [], [], []
     for k in range(len(elements)):
@@ -170,7 +173,7 @@ def clip_to_box(elements: MapElements, box: tuple[float, float, float, float], m
 
 
 def _generate_place(name: str, size_m: float | None) -> Place:
-    """A lattice of streets; ``grid-<n>`` has n × n crossroads."""
+    """Return a lattice of streets; ``grid-<n>`` has n × n crossroads."""
     shapely = _shapely()
     plan = _PLANS.get(name)
     if plan is None:
@@ -193,7 +196,7 @@ def _shift(ground: BaseGeometry, origin: Array) -> BaseGeometry:
 
 
 def _data(data: str | None) -> Path:
-    """The folder of real maps."""
+    """Return the folder of real maps."""
     if data is not None:
         return Path(data)
     if os.environ.get("MANYEYES_MAPS"):

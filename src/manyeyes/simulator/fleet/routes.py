@@ -40,7 +40,7 @@ class Routes:
 
     @classmethod
     def of_network(cls, network: RoadNetwork, origin: Array) -> Routes:
-        """The drivable lanes of a road network, moved so that origin (2,) is zero."""
+        """Return the drivable lanes of a road network, moved so that origin (2,) is zero."""
         own = [lane for lane in network.lanes if lane.is_drivable and lane.length_m > 0.5]
         place = {lane.id: k for k, lane in enumerate(own)}
         pairs = [(place[lane.id], place[k]) for lane in own for k in lane.successors if k in place]
@@ -50,7 +50,7 @@ class Routes:
         return len(self.offsets) - 1
 
     def lane(self, i: int) -> Array:
-        """(M, 2) centre line."""
+        """Return (M, 2) centre line."""
         return self.points[self.offsets[i] : self.offsets[i + 1]]
 
     @cached_property
@@ -59,7 +59,7 @@ class Routes:
         return np.array([np.linalg.norm(np.diff(self.lane(i), axis=0), axis=1).sum() for i in range(len(self))])
 
     def within(self, low: Array, high: Array) -> Routes:
-        """The lanes that have a point inside a rectangle, with the links among them."""
+        """Return the lanes that have a point inside a rectangle, with the links among them."""
         inside = np.asarray(np.logical_and(self.points >= low, self.points <= high).all(axis=1))
         kept = [i for i in range(len(self)) if inside[self.offsets[i] : self.offsets[i + 1]].any()]
         place = {old: new for new, old in enumerate(kept)}
@@ -72,7 +72,7 @@ class Routes:
         return Routes.of([self.lane(i) for i in kept], pairs)
 
     def walk(self, lane: int, start_m: float, length_m: float, choose: Callable[[int, int], int]) -> Array:
-        """A path (M, 2) of at most length_m from start_m along a lane; choose(step, count) picks among count followers."""
+        """Return a path (M, 2) of at most length_m from start_m along a lane; choose(step, count) picks among count followers."""
         parts, left, step = [], length_m, 0
         line = _from(self.lane(lane), start_m)
         while True:
@@ -87,7 +87,7 @@ class Routes:
 
 
 def sample_poses(path: Array, station_m: Array) -> Array:
-    """Poses (K, 3) as x, y, yaw at distances (K,) from the start of a path (M, 2)."""
+    """Return poses (K, 3) as x, y, yaw at distances (K,) from the start of a path (M, 2)."""
     length = np.linalg.norm(np.diff(path, axis=0), axis=1)
     station = np.concatenate(([0.0], np.cumsum(length)))
     x, y = (np.interp(station_m, station, path[:, axis]) for axis in (0, 1))
@@ -98,7 +98,7 @@ def sample_poses(path: Array, station_m: Array) -> Array:
 
 
 def _from(line: Array, start_m: float) -> Array:
-    """The part of a line after a distance from its start."""
+    """Return the part of a line after a distance from its start."""
     station = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))))
     start_m = min(max(start_m, 0.0), station[-1] - 0.1)
     at = np.array([[np.interp(start_m, station, line[:, axis]) for axis in (0, 1)]])

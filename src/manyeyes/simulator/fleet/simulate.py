@@ -162,7 +162,7 @@ def _role(agent: int, config: CrowdConfig, offsets: Array) -> int:
 
 
 def _path(place: Place, config: CrowdConfig, key: np.uint64, cumulative_length: Array) -> Array:
-    """The path of one drive: a recorded one, or a random walk over the lanes."""
+    """Return the path of one drive: a recorded one, or a random walk over the lanes."""
     if place.logs and hash_uniform(key, _PASS, 0, 6) < config.recorded_drive_fraction:
         log = place.logs[int(hash_uniform(key, _PASS, 0, 7) * len(place.logs))]
         fresh = np.concatenate(([True], np.linalg.norm(np.diff(log[:, :2], axis=0), axis=1) > 1e-3))
@@ -180,7 +180,7 @@ def _path(place: Place, config: CrowdConfig, key: np.uint64, cumulative_length: 
 def _observation_poses(
     path: Array, area: tuple[float, float, float, float], config: CrowdConfig, key: np.uint64
 ) -> Array:
-    """True poses (K, 3) of one drive's observations: every spacing_m until it leaves the area or ends."""
+    """Return true poses (K, 3) of one drive's observations: every spacing_m until it leaves the area or ends."""
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     low, high = config.spacing_m
     steps = [low + (high - low) * hash_uniform(key, _PASS, k, 1) for k in range(config.max_observations_per_drive - 1)]
@@ -195,7 +195,7 @@ def _observation_poses(
 
 
 def _pole_sites(place: Place) -> Array:
-    """A pole at each junction: on the corner of its bounding box nearest to the ground, facing its centre."""
+    """Return a pole at each junction: on the corner of its bounding box nearest to the ground, facing its centre."""
     sites = []
     for part in getattr(place.junctions, "geoms", [place.junctions]):
         x0, y0, x1, y1 = part.bounds
@@ -240,7 +240,7 @@ class _Observer:
         )
 
     def observe(self, drive: _Drive, k: int, pose: Array) -> tuple[Observation, Indices]:
-        """The k-th observation of a drive at a true pose, and the true element of each of its elements."""
+        """Return the k-th observation of a drive at a true pose, and the true element of each of its elements."""
         config, noise = self.config, self.infrastructure_noise if drive.role == INFRASTRUCTURE else self.noise
         key = _key(self.seed, drive.agent, drive.number, k)
         time = config.start_ns + int(drive.number * config.drive_interval_s * 1e9)
@@ -286,7 +286,7 @@ class _Observer:
         )
 
     def _perturb_pose(self, drive: _Drive, key: np.uint64, pose: Array) -> tuple[Array, Array]:
-        """The reported pose and its covariance."""
+        """Return the reported pose and its covariance."""
         c = self.config
         sigma = np.array([c.pose_sigma_m, c.pose_sigma_m, c.yaw_sigma_rad])
         if drive.role == INFRASTRUCTURE:
@@ -310,7 +310,7 @@ class _Observer:
 
 
 def _offset(key: np.uint64, size: tuple[float, float]) -> Array:
-    """A vector (2,) of uniform direction whose length lies in a range."""
+    """Return a vector (2,) of uniform direction whose length lies in a range."""
     length = size[0] + (size[1] - size[0]) * hash_uniform(key, _AGENT, 0, 0)
     angle = 2 * np.pi * hash_uniform(key, _AGENT, 0, 1)
     return length * np.array([np.cos(angle), np.sin(angle)])
@@ -325,7 +325,7 @@ def _index_map(changing_map: ChangingMap, time_ns: int) -> TrueMapIndex:
 
 
 def _shadows(key: np.uint64, config: CrowdConfig, noise: MapModelNoise) -> Array:
-    """(Q, 4, 2) areas hidden by up to three vehicles on neighbouring lanes, anticlockwise, in the agent's frame."""
+    """Return (Q, 4, 2) areas hidden by up to three vehicles on neighbouring lanes, anticlockwise, in the agent's frame."""
     quads = []
     reach = 2.0 * max(abs(noise.x_min), abs(noise.x_max), abs(noise.y_min), abs(noise.y_max))
     for j in range(3):

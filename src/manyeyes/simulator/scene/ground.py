@@ -45,7 +45,7 @@ class GroundRaster:
         return column, row, u - column, v - row
 
     def height_at(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """Height at points, any shape; metres."""
+        """Return the height at points, any shape; metres."""
         column, row, u, v = self._cell(x, y)
         h = self.height
         near = h[row, column] * (1 - u) + h[row, column + 1] * u
@@ -77,7 +77,7 @@ def build_ground(
     cell_m: float = 0.5,
     surface_cell_m: float = 0.125,
 ) -> GroundRaster:
-    """The square of 2 half_size_m around a centre: heights of the lanes, filled smoothly between them, and their paint.
+    """Return the square of 2 half_size_m around a centre: heights of the lanes, filled smoothly between them, and their paint.
 
     Where roads cross on two levels, the one nearest to the height at the centre is taken; see :func:`is_multilevel`.
     """
@@ -101,7 +101,7 @@ def build_ground(
 
 
 def is_multilevel(network: RoadNetwork, center_xy: ArrayLike, radius_m: float, step_m: float = 2.0) -> bool:
-    """Whether lanes lie over each other, more than 1.5 m apart, within radius_m of a centre."""
+    """Return whether lanes lie over each other, more than 1.5 m apart, within radius_m of a centre."""
     center = np.asarray(center_xy, np.float64).reshape(2)
     axis = np.arange(-radius_m, radius_m + step_m / 2, step_m)
     offsets = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
@@ -145,7 +145,7 @@ def _close_gaps(surface: NDArray[np.uint8], reach: int) -> None:
 
 
 def _widen(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Cells with a true one at most ``reach`` rows and columns away."""
+    """Return cells with a true one at most ``reach`` rows and columns away."""
     for axis in (0, 1):
         total = np.cumsum(mask, axis=axis, dtype=np.int32)
         total = np.pad(total, [(reach + 1, reach) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
@@ -160,7 +160,7 @@ def _widen(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
 
 
 def _make_painted_strips(mark: RoadMark, cell: float) -> list[tuple[Array, Array]]:
-    """Left and right edges of each painted piece of a line: one when solid, a dash each when broken.
+    """Return left and right edges of each painted piece of a line: one when solid, a dash each when broken.
 
     A line thinner than a cell is widened to one, so that no gaps appear where it runs obliquely.
     """

@@ -40,7 +40,7 @@ def parked_cars(
 
 
 def _has_kerb(network: RoadNetwork, lane: Lane) -> bool:
-    """Whether it is the outermost drivable lane of a street where people park."""
+    """Return whether it is the outermost drivable lane of a street where people park."""
     if not lane.is_drivable or lane.junction_id is not None or lane.speed_limit_mps > _MAX_SPEED_LIMIT_MPS:
         return False
     right = lane.right_neighbor
@@ -48,7 +48,7 @@ def _has_kerb(network: RoadNetwork, lane: Lane) -> bool:
 
 
 def _cars_along_lane(network: RoadNetwork, lane: Lane, seed: int, density: float) -> VehicleStates:
-    """Places every 6.6 m beside the right border of a lane, each taken by chance."""
+    """Return places every 6.6 m beside the right border of a lane, each taken by chance."""
     random = keyed_generator(seed, "parked", lane.road_id, lane.section, lane.lane_id)
     border = lane.right
     step = np.linalg.norm(np.diff(border[:, :2], axis=0), axis=1)
@@ -85,7 +85,7 @@ def _cars_along_lane(network: RoadNetwork, lane: Lane, seed: int, density: float
 
 
 def _in_spaces(network: RoadNetwork, seed: int, density: float) -> VehicleStates:
-    """Cars in the file's marked spaces outside junctions, along the longer edge of each."""
+    """Return cars in the file's marked spaces outside junctions, along the longer edge of each."""
     if not network.parking:
         return VehicleStates.empty()
     random = keyed_generator(seed, "parked", "spaces")
@@ -135,7 +135,7 @@ def _without_conflicts(network: RoadNetwork, cars: VehicleStates) -> VehicleStat
 
 
 def _distance_to_ring(points: Array, ring: Array) -> Array:
-    """(N,) distance of points (N, 2) to a closed ring's edges (M, 2)."""
+    """Return (N,) distance of points (N, 2) to a closed ring's edges (M, 2)."""
     start, edge = ring[None], (np.roll(ring, -1, 0) - ring)[None]
     f = ((points[:, None] - start) * edge).sum(-1) / np.maximum((edge * edge).sum(-1), 1e-12)
     foot = start + np.clip(f, 0, 1)[..., None] * edge

@@ -32,7 +32,7 @@ class CrossingSite:
 
 
 def crossing_sites(network: RoadNetwork, min_arms: int = 3, single_level: bool = True) -> tuple[CrossingSite, ...]:
-    """Junctions with at least min_arms arms, largest first; without those near a bridge unless single_level is false."""
+    """Return junctions with at least min_arms arms, largest first; without those near a bridge unless single_level is false."""
     sites = []
     for junction in network.junctions:
         inside = set(junction.lanes)
@@ -52,7 +52,9 @@ def crossing_sites(network: RoadNetwork, min_arms: int = 3, single_level: bool =
 
 
 def _count_arms(angle: Array, min_gap_rad: float = np.radians(35.0)) -> int:
-    """How many groups of angles (N,) lie around the circle, cut where neighbours are more than ``min_gap_rad`` from each other."""
+    """Return how many groups of angles (N,) lie around the circle, cut where neighbours are more than ``min_gap_rad`` from
+    each other.
+    """
     if len(angle) < 2:
         return len(angle)
     ordered = np.sort(np.mod(angle, 2 * np.pi))
@@ -61,17 +63,17 @@ def _count_arms(angle: Array, min_gap_rad: float = np.radians(35.0)) -> int:
 
 
 def distance_to_road(network: RoadNetwork, xy: ArrayLike) -> Array:
-    """(N,) metres from points (N, 2) to the nearest drivable lane; 0 on it."""
+    """Return (N,) metres from points (N, 2) to the nearest drivable lane; 0 on it."""
     return network.drivable_surface.distance(np.asarray(xy, np.float64).reshape(-1, 2))
 
 
 def on_road(network: RoadNetwork, xy: ArrayLike) -> NDArray[np.bool_]:
-    """(N,) whether points (N, 2) lie on a drivable lane."""
+    """Return (N,) whether points (N, 2) lie on a drivable lane."""
     return distance_to_road(network, xy) <= 0.0
 
 
 def lane_at(network: RoadNetwork, xy: ArrayLike, near_z: Array | float | None = None) -> tuple[Lane | None, ...]:
-    """The drivable lane under each point (N, 2); None off the road. Where lanes overlap, as in junctions, one of them."""
+    """Return the drivable lane under each point (N, 2); None off the road. Where lanes overlap, as in junctions, one of them."""
     points = np.asarray(xy, np.float64).reshape(-1, 2)
     drivable = [lane for lane in network.lanes if lane.is_drivable]
     owner = network.drivable_surface.strip_at(points, near_z)
@@ -100,7 +102,7 @@ def roadside_points(
     spacing_m: float = 2.0,
     avoid_walkways: bool = False,
 ) -> RoadsidePoints:
-    """Points of a lattice within radius_m of a centre that lie beside the paved road, from min to max setback off it.
+    """Return points of a lattice within radius_m of a centre that lie beside the paved road, from min to max setback off it.
 
     Poles and roadside units take small setbacks, buildings larger ones; avoid_walkways leaves out pavements and shoulders.
     """

@@ -113,7 +113,7 @@ class PlacementGrid:
         return max(1, round(_CELL / self.ground.surface_cell)) * self.ground.surface_cell
 
     def index(self, xy: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-        """Row, column (clamped) and whether inside, of points (..., 2)."""
+        """Return row, column (clamped) and whether inside, of points (..., 2)."""
         column = np.floor((xy[..., 0] - self.ground.x_min) / self.cell).astype(np.int64)
         row = np.floor((xy[..., 1] - self.ground.y_min) / self.cell).astype(np.int64)
         rows, columns = self.is_occupied.shape
@@ -121,7 +121,7 @@ class PlacementGrid:
         return np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1), inside
 
     def pavement_clearance(self, xy: Array) -> tuple[float, Array]:
-        """Distance to the pavement at one point (2,), and the unit direction in which it grows."""
+        """Return the distance to the pavement at one point (2,), and the unit direction in which it grows."""
         row, column, _ = self.index(xy)
         i, j = (
             min(max(int(row), 2), self.is_occupied.shape[0] - 3),
@@ -137,7 +137,7 @@ class PlacementGrid:
         return float(self.distance_to_pavement_m[i, j]), slope / length if length > 1e-6 else np.array([1.0, 0.0])
 
     def footprint(self, center: Array, half: tuple[float, float], yaw: float) -> Array:
-        """Points (P, 2) that fill an oriented rectangle no coarser than a cell."""
+        """Return points (P, 2) that fill an oriented rectangle no coarser than a cell."""
         nx, ny = (max(2, math.ceil(2 * h / self.cell) + 1) for h in half)
         u, v = np.meshgrid(np.linspace(-half[0], half[0], nx), np.linspace(-half[1], half[1], ny))
         c, s = math.cos(yaw), math.sin(yaw)
@@ -164,7 +164,7 @@ class PlacementGrid:
         self.is_occupied[row[inside], column[inside]] = True
 
     def height(self, xy: Array) -> Array:
-        """Ground height at points (..., 2), nearest node."""
+        """Return the ground height at points (..., 2), nearest node."""
         column = np.clip(
             np.rint((xy[..., 0] - self.ground.x_min) / self.ground.cell), 0, self.ground.height.shape[1] - 1
         )
@@ -198,7 +198,7 @@ class _SolidList:
 
 
 def _band(plot: PlacementGrid, middle: Array, radius: float, low: float, high: float, to: Array) -> Array:
-    """(N, 2) centres of the cells around the middle whose distance ``to`` is within low … high."""
+    """Return (N, 2) centres of the cells around the middle whose distance ``to`` is within low … high."""
     row, column = np.nonzero((to >= low) & (to <= high))
     x, y = plot.ground.x_min + (column + 0.5) * plot.cell, plot.ground.y_min + (row + 0.5) * plot.cell
     xy = np.stack((x, y), -1).astype(np.float64)
@@ -302,7 +302,7 @@ def _trees(
 def place_roadside_objects(
     plot: PlacementGrid, spec: RoadsideObjectSpec, middle: Array, key: tuple[int | str, ...]
 ) -> Primitives:
-    """All that stands beside the roads around middle (2,). Buildings come first, so that nothing else is built over."""
+    """Return all that stands beside the roads around middle (2,). Buildings come first, so that nothing else is built over."""
     heap, random = _SolidList([]), keyed_generator(*key, "clutter")
     _buildings(heap, plot, spec, middle, random)
     _walls(heap, plot, spec, middle, random)
@@ -312,7 +312,7 @@ def place_roadside_objects(
 
 
 def find_pole_sites(plot: PlacementGrid, middle: Array, low_m: float = 0.6, high_m: float = 2.5) -> Array:
-    """(N, 2) free places beside the carriageway, nearest to the middle first: where a roadside unit's pole can stand."""
+    """Return (N, 2) free places beside the carriageway, nearest to the middle first: where a roadside unit's pole can stand."""
     places = _band(plot, middle, 45.0, low_m, high_m, plot.distance_to_road_m)
     row, column, _ = plot.index(places)
     places = places[~plot.is_occupied[row, column]]
@@ -320,7 +320,7 @@ def find_pole_sites(plot: PlacementGrid, middle: Array, low_m: float = 0.6, high
 
 
 def make_pole(xy: Array, z: float, height: float, instance: int) -> Primitives:
-    """A roadside unit's pole: its own instance, so that it is not met by the sensor it carries."""
+    """Return a roadside unit's pole: its own instance, so that it is not met by the sensor it carries."""
     heap = _SolidList([])
     heap.add(
         CYLINDER, (xy[0], xy[1], z + height / 2), (0.1, 0.1, height / 2 + 0.3), instance=instance, reflectivity=0.5

@@ -154,7 +154,7 @@ class SimulatedScenario:
         return Snapshot(spec.name, index, tuple(frames), truth)
 
     def scene(self, index: int) -> RaycastScene:
-        """All that rays can meet at one instant."""
+        """Return all that rays can meet at one instant."""
         states = self.states[index]
         moving = place_vehicle_shapes(
             [self.shapes[int(i)] for i in states.id], states.position, states.yaw, states.pitch, states.id
@@ -162,7 +162,7 @@ class SimulatedScenario:
         return RaycastScene(Primitives.cat([self.static_solids, moving]), self.ground)
 
     def lit_scene(self, index: int) -> LitScene:
-        """The scene at one instant as cameras see it."""
+        """Return the scene at one instant as cameras see it."""
         seed = self.spec.seed
         materials = Materials.cat(
             [
@@ -182,7 +182,7 @@ class SimulatedScenario:
         time: tuple[int, int],
         speed: float,
     ) -> tuple[AgentFrame, torch.Tensor]:
-        """One agent's frame, and which boxes it sees. time: its own in ns, and that which draws are keyed by in ms."""
+        """Return one agent's frame, and which boxes it sees. time: its own in ns, and that which draws are keyed by in ms."""
         time_ns, drawn_ms = time
         key = (self.spec.seed, self.spec.name, drawn_ms, agent)
         points, instance = scan(scene, pose, lidar, key, own=agent)
@@ -207,7 +207,7 @@ def _with_images(frame: AgentFrame, lit_scene: LitScene | None, rig: tuple[Camer
 
 
 def true_boxes(states: VehicleStates) -> Boxes:
-    """The vehicles' boxes in the world frame, float64."""
+    """Return the vehicles' boxes in the world frame, float64."""
     center = box_centers(states.position, states.yaw, states.pitch, states.size[:, 2])
     place = torch.from_numpy(center), torch.from_numpy(states.size), torch.from_numpy(states.yaw)
     return Boxes.of(*place, label=torch.from_numpy(states.kind), id=torch.from_numpy(states.id))
@@ -216,7 +216,7 @@ def true_boxes(states: VehicleStates) -> Boxes:
 def find_visible_boxes(
     points: PointCloud, instance: NDArray[np.int64], pose: Transform, boxes: Boxes, own: int
 ) -> torch.Tensor:
-    """(N,) bool: boxes with at least one return of that vehicle inside (5 cm margin); never the agent's own."""
+    """Return (N,) bool: boxes with at least one return of that vehicle inside (5 cm margin); never the agent's own."""
     met = torch.from_numpy(np.flatnonzero((instance > 0) & (instance != own)))
     visible = torch.zeros(len(boxes), dtype=torch.bool)
     # Each return is asked of its own vehicle's box alone.
@@ -239,7 +239,7 @@ def _pose(states: VehicleStates, row: int) -> Transform:
 
 
 def to_height_field(ground: GroundRaster) -> HeightField:
-    """The ground as rays see it."""
+    """Return the ground as rays see it."""
     return HeightField(ground.height, ground.surface, ground.x0, ground.y0, ground.cell_m, ground.surface_cell_m)
 
 
@@ -282,7 +282,7 @@ def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> SimulatedScenario
 
 
 def _find_moving(states: tuple[VehicleStates, ...]) -> NDArray[np.bool_]:
-    """(N,) of the first instant: whether a vehicle is elsewhere at the last one; who left the scene moved."""
+    """Return (N,) of the first instant: whether a vehicle is elsewhere at the last one; who left the scene moved."""
     last = {int(i): row for row, i in enumerate(states[-1].id)}
     moved = np.ones(len(states[0]), bool)
     for row, id in enumerate(states[0].id.tolist()):
@@ -294,7 +294,7 @@ def _find_moving(states: tuple[VehicleStates, ...]) -> NDArray[np.bool_]:
 def _crossings(
     network: RoadNetwork, traffic: tuple[VehicleStates, ...], spec: ScenarioSpec, random: np.random.Generator
 ) -> list[Junction]:
-    """Crossings of three or more incoming lanes with enough vehicles near, in an order drawn by how many these are."""
+    """Return crossings of three or more incoming lanes with enough vehicles near, in an order drawn by how many these are."""
     xy = traffic[0].position[:, :2]
     found = []
     for junction in network.junctions:
@@ -308,7 +308,7 @@ def _crossings(
 def _choose_agents(
     traffic: tuple[VehicleStates, ...], middle: Array, spec: ScenarioSpec, random: np.random.Generator
 ) -> tuple[int, ...]:
-    """Cars of the traffic around the crossing, drawn one after the other with a gap between any two."""
+    """Return cars of the traffic around the crossing, drawn one after the other with a gap between any two."""
     first = traffic[0]
     distance = np.hypot(*(first.position[:, :2] - middle).T)
     present_throughout = np.ones(len(first), bool)
@@ -336,7 +336,7 @@ def _place_static_objects(
     spec: ScenarioSpec, network: RoadNetwork, field: HeightField, plot: PlacementGrid, states: tuple[VehicleStates, ...],
     agents: tuple[int, ...], middle: Array, random: np.random.Generator,
 ) -> SimulatedScenario:  # fmt: skip
-    """A roadside unit and everything that stands still, put around vehicles that are already there."""
+    """Return a roadside unit and everything that stands still, put around vehicles that are already there."""
     drawn = states[spec.lead_frames]
     still = drawn[drawn.speed == 0]
     for position, size, yaw in zip(still.position, still.size, still.yaw):
@@ -366,7 +366,7 @@ def _place_static_objects(
 def _roadside(
     plot: PlacementGrid, middle: Array, spec: ScenarioSpec, random: np.random.Generator
 ) -> RoadsideUnit | None:
-    """A pole beside the carriageway near the crossing, facing it, 4.5 to 6 m high; None where there is no place."""
+    """Return a pole beside the carriageway near the crossing, facing it, 4.5 to 6 m high; None where there is no place."""
     places = find_pole_sites(plot, middle)
     if not len(places):
         return None

@@ -39,12 +39,12 @@ def assert_disjoint_split(split: dict[str, tuple[str, ...]] = TOWN_SPLIT) -> Non
 
 
 def load_town(name: str, path: Path | str | None = None) -> RoadNetwork:
-    """A town's roads; see :func:`find_town` for the places."""
+    """Return a town's roads; see :func:`find_town` for the places."""
     return read_opendrive(find_town(name, path), name)
 
 
 def find_town(name: str, path: Path | str | None = None) -> Path | bytes:
-    """The OpenDRIVE file of a town, or its bytes where it lies in a wheel or is generated.
+    """Return the OpenDRIVE file of a town, or its bytes where it lies in a wheel or is generated.
 
     name: one of TOWNS, ``generated-<seed>``, or any name when path is a file or a folder that holds ``<name>.xodr[.gz]``.
     Searched in this order: path (a file, a folder, or py123d's wheel), $MANYEYES_TOWNS (the same), ``carla_opendrive`` of the
@@ -91,7 +91,7 @@ def _places() -> Iterator[Path]:
 
 
 def _in_place(name: str, place: Path) -> Path | bytes | None:
-    """The town in a file, a wheel or a folder; None when it is not there."""
+    """Return the town in a file, a wheel or a folder; None when it is not there."""
     if place.is_file():
         return _in_wheel(name, place) if place.suffix in (".whl", ".zip") else place
     if not place.is_dir():
@@ -107,7 +107,7 @@ def _in_place(name: str, place: Path) -> Path | bytes | None:
 
 
 def _in_wheel(name: str, wheel: Path) -> bytes | None:
-    """A town's bytes out of py123d's wheel, or of any zip that holds <name>.xodr[.gz]; nothing is imported."""
+    """Return a town's bytes out of py123d's wheel, or of any zip that holds <name>.xodr[.gz]; nothing is imported."""
     try:
         with zipfile.ZipFile(wheel) as archive:
             for member in archive.namelist():
@@ -126,7 +126,7 @@ def _seed_of(name: str) -> int:
 
 
 def sumo_tool(name: str) -> str:
-    """The path of one of SUMO's programs, from the eclipse-sumo package beside this Python."""
+    """Return the path of one of SUMO's programs, from the eclipse-sumo package beside this Python."""
     try:
         import sumo
     except ImportError as error:
@@ -148,7 +148,7 @@ def run_sumo_tool(name: str, *arguments: str) -> None:
 
 
 def generate_town(seed: int) -> bytes:
-    """OpenDRIVE bytes of a road network from SUMO's netgenerate: a grid, a web or a random net, the seed decides."""
+    """Return OpenDRIVE bytes of a road network from SUMO's netgenerate: a grid, a web or a random net, the seed decides."""
     draw = keyed_generator(seed, "town")
     kind = ("grid", "spider", "rand")[int(draw.integers(3))]
     shape = {

@@ -113,7 +113,7 @@ def simulate_traffic(
 
 
 def sumo_net(network: RoadNetwork) -> Path:
-    """The network converted for SUMO, made once and kept in the cache folder by the content's hash."""
+    """Return the network converted for SUMO, made once and kept in the cache folder by the content's hash."""
     version = _sumo_version()
     key = hashlib.blake2b(network.xodr, digest_size=12)
     key.update(repr((version, _NETCONVERT, _CONVERSION)).encode())
@@ -131,7 +131,8 @@ def sumo_net(network: RoadNetwork) -> Path:
 
 
 def _for_traffic(xodr: bytes) -> bytes:
-    """The same roads as SUMO shall drive them: parking and two-way turning lanes closed, and each lane's speed limit stated.
+    """Return the same roads as SUMO shall drive them: parking and two-way turning lanes closed, and each lane's speed limit
+    stated.
 
     SUMO would drive on parking lanes and take 50 km/h for every road. The CARLA towns allow up to 105 km/h into their
     crossings, so that limits are cut at 60 km/h.
@@ -167,7 +168,7 @@ def _sumo_version() -> str:
 
 
 def _read_edges(net: Path) -> _DrivableEdges:
-    """Edges that cars may use and what follows each, in the file's order."""
+    """Return edges that cars may use and what follows each, in the file's order."""
     root = ET.parse(net).getroot()
     name, length, lanes, limit = [], [], [], []
     for edge in root.findall("edge"):
@@ -192,7 +193,7 @@ def _read_edges(net: Path) -> _DrivableEdges:
 
 
 def _without_dead_ends(following: list[set[int]]) -> list[set[int]]:
-    """The same without dead ends, so that no vehicle vanishes on the road; unchanged where every edge is one."""
+    """Return the same without dead ends, so that no vehicle vanishes on the road; unchanged where every edge is one."""
     kept, lost = [set(after) for after in following], set()
     while True:
         ends = {k for k, after in enumerate(kept) if not after} - lost
@@ -244,7 +245,9 @@ def _write_routes(
 
 
 def _walk(edges: _DrivableEdges, start: int, random: np.random.Generator, seconds: float) -> list[str]:
-    """Edges from start, each drawn among those that follow, until driving them at the limit takes longer than ``seconds``."""
+    """Return edges from start, each drawn among those that follow, until driving them at the limit takes longer than
+    ``seconds``.
+    """
     here, route, left = start, [start], seconds + 20.0
     while left > 0 and edges.following[here]:
         here = int(random.choice(edges.following[here]))
@@ -265,7 +268,7 @@ def _run_worker(path: Path, job: dict[str, object]) -> None:
 
 
 def _headings(vehicle: NDArray[np.int64], state: Array, length: Array) -> Array:
-    """(rows,) headings in radians: from where the front bumper was one wheelbase of way ago to where it is now.
+    """Return (rows,) headings in radians: from where the front bumper was one wheelbase of way ago to where it is now.
 
     SUMO's own angle swings a whole bus by the direction of its bumper while it changes lanes; following the bumper's
     track keeps the rear on it. Before the record began the track goes straight back along SUMO's angle.
@@ -287,7 +290,7 @@ def _headings(vehicle: NDArray[np.int64], state: Array, length: Array) -> Array:
 
 
 def _speeds(step: NDArray[np.int64], vehicle: NDArray[np.int64], state: Array, step_s: float) -> Array:
-    """(rows,) way of the front bumper since the step before over its time; SUMO's speed where there is no such step.
+    """Return (rows,) way of the front bumper since the step before over its time; SUMO's speed where there is no such step.
 
     They differ where the lanes of one edge have unequal lengths: SUMO moves along all of them as if along their mean.
     """
@@ -300,7 +303,7 @@ def _speeds(step: NDArray[np.int64], vehicle: NDArray[np.int64], state: Array, s
 
 
 def _find_touching(frame: VehicleStates) -> NDArray[np.int64]:
-    """Ids of vehicles that overlap one with a smaller id: SUMO lets corners touch where tracks meet at an angle."""
+    """Return ids of vehicles that overlap one with a smaller id: SUMO lets corners touch where tracks meet at an angle."""
     corners, found = frame.corners(_TOUCH_MARGIN_M), []
     reach = np.linalg.norm(frame.size[:, :2], axis=1) / 2
     for n in range(1, len(frame)):

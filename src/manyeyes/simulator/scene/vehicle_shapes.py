@@ -32,7 +32,7 @@ class VehicleShape:
 
 
 def make_vehicle_shape(kind: str, size: tuple[float, float, float], seed: int, id: int) -> VehicleShape:
-    """The body of one vehicle of a kind in LABELS and size (l, w, h); proportions and paint vary with (seed, id)."""
+    """Return the body of one vehicle of a kind in LABELS and size (l, w, h); proportions and paint vary with (seed, id)."""
     if kind not in LABELS:
         raise ConfigError(f"No body for a vehicle of kind '{kind}'; choose one of {', '.join(LABELS)}.")
     random = keyed_generator(seed, "body", id)
@@ -102,7 +102,7 @@ def _bus(paint: float, vary: Array) -> list[_Part]:
 
 
 def rotation_from_yaw_pitch(yaw: Array, pitch: Array) -> Array:
-    """(N, 3, 3) world_from_vehicle: Rz(yaw) Ry(pitch) as Transform.from_rpy has it: uphill is negative."""
+    """Return (N, 3, 3) world_from_vehicle: Rz(yaw) Ry(pitch) as Transform.from_rpy has it: uphill is negative."""
     c, s, cp, sp, zero = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.zeros_like(yaw)
     rows = ((c * cp, -s, c * sp), (s * cp, c, s * sp), (-sp, zero, cp))
     return np.stack([np.stack(row, -1) for row in rows], -2)
@@ -111,7 +111,7 @@ def rotation_from_yaw_pitch(yaw: Array, pitch: Array) -> Array:
 def place_vehicle_shapes(
     shapes: list[VehicleShape], position: Array, yaw: Array, pitch: Array, ids: NDArray[np.int64]
 ) -> Primitives:
-    """Bodies at positions (N, 3) on the road as solids in the world; instance is the vehicle's id."""
+    """Return bodies at positions (N, 3) on the road as solids in the world; instance is the vehicle's id."""
     if not shapes:
         return Primitives.empty()
     counts = np.array([len(b.center) for b in shapes])
@@ -131,5 +131,5 @@ def place_vehicle_shapes(
 
 
 def box_centers(position: Array, yaw: Array, pitch: Array, height: Array) -> Array:
-    """(N, 3) centres of vehicles' boxes: half a height above the road, along the vehicle's own upright axis."""
+    """Return (N, 3) centres of vehicles' boxes: half a height above the road, along the vehicle's own upright axis."""
     return position + rotation_from_yaw_pitch(yaw, pitch)[:, :, 2] * (height / 2)[:, None]

@@ -52,7 +52,7 @@ class VehicleStates:
 
     @classmethod
     def empty(cls) -> VehicleStates:
-        """A set without any vehicle."""
+        """Return a set without any vehicle."""
         whole, real, triple = np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))
         return cls(whole, whole, triple, real, real, real, triple)
 
@@ -68,7 +68,7 @@ class VehicleStates:
         return VehicleStates(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def corners(self, margin_m: float = 0.0) -> Array:
-        """(N, 4, 2) corners of the footprints, enlarged on every side: front left, front right, rear right, rear left."""
+        """Return (N, 4, 2) corners of the footprints, enlarged on every side: front left, front right, rear right, rear left."""
         unit = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
         local = unit * (self.size[:, None, :2] / 2 + margin_m)
         c, s = np.cos(self.yaw)[:, None], np.sin(self.yaw)[:, None]
@@ -79,7 +79,7 @@ class VehicleStates:
 def draw_vehicles(
     random: np.random.Generator, count: int, kind_fractions: tuple[float, ...] = KIND_FRACTIONS
 ) -> tuple[NDArray[np.int64], Array]:
-    """Kinds (N,) by shares over LABELS, and sizes (N, 3); long cars tend to be wide ones."""
+    """Return kinds (N,) by shares over LABELS, and sizes (N, 3); long cars tend to be wide ones."""
     kind = random.choice(len(LABELS), count, p=kind_fractions).astype(np.int64)
     unit = random.random((count, 3))
     unit[:, 1] = (unit[:, 0] + unit[:, 1]) / 2
@@ -88,7 +88,7 @@ def draw_vehicles(
 
 
 def overlaps(corners: Array, others: Array) -> NDArray[np.bool_]:
-    """(N,) which of the rectangles others (N, 4, 2) touch the rectangle corners (4, 2); separating axes."""
+    """Return (N,) which of the rectangles others (N, 4, 2) touch the rectangle corners (4, 2); separating axes."""
     hit = np.ones(len(others), bool)
     both = np.concatenate((np.broadcast_to(corners, others.shape), others), 1)
     for a, b in ((0, 1), (1, 2), (4, 5), (5, 6)):

@@ -74,12 +74,12 @@ class CameraSpec:
         return Camera(intrinsic, Transform(rotation, place), self.width, self.height)
 
     def resized(self, width: int, height: int) -> CameraSpec:
-        """The same view on another number of pixels."""
+        """Return the same view on another number of pixels."""
         u, v = width / self.width, height / self.height
         return replace(self, fx=u * self.fx, fy=v * self.fy, cx=u * self.cx, cy=v * self.cy, width=width, height=height)
 
     def below(self, row: int) -> CameraSpec:
-        """The same view without its rows above row."""
+        """Return the same view without its rows above row."""
         return replace(self, cy=self.cy - row, height=self.height - row)
 
 
@@ -113,7 +113,7 @@ CAMERA_RIGS: dict[str, tuple[CameraSpec, ...]] = {
 
 
 def camera_rig(name: str) -> tuple[CameraSpec, ...]:
-    """The cameras of an agent by their name in CAMERA_RIGS."""
+    """Return the cameras of an agent by their name in CAMERA_RIGS."""
     if name not in CAMERA_RIGS:
         raise ConfigError(f"No cameras '{name}'; choose one of {', '.join(CAMERA_RIGS)}.")
     return CAMERA_RIGS[name]
@@ -130,7 +130,7 @@ class LitScene:
 
     @classmethod
     def of(cls, scene: RaycastScene, materials: Materials, light: Light) -> LitScene:
-        """A stage, with the index of its shadows."""
+        """Return a stage, with the index of its shadows."""
         lowest = float(scene.ground.height.min())
         return cls(scene, materials, light, build_shadow_index(scene.solids, light.sun, lowest, light.seed))
 
@@ -146,7 +146,7 @@ class RenderedImage:
 
 
 def render_image(lit_scene: LitScene, world_from_agent: Transform, spec: CameraSpec, own: int = 0) -> RenderedImage:
-    """The picture of one camera. own: the instance that carries it, which is not seen but throws its shadow."""
+    """Return the picture of one camera. own: the instance that carries it, which is not seen but throws its shadow."""
     camera, n = spec.camera, spec.samples
     dense = camera.resize(n * camera.width, n * camera.height)
     world_from_camera = world_from_agent @ camera.agent_from_camera
@@ -184,14 +184,14 @@ def render_image(lit_scene: LitScene, world_from_agent: Transform, spec: CameraS
 
 
 def _by_pixel(grid: NDArray, n: int) -> NDArray:
-    """(n height, n width, ...) as (height width, n n, ...)."""
+    """Return (n height, n width, ...) as (height width, n n, ...)."""
     rows, columns, *more = grid.shape
     blocks = grid.reshape(rows // n, n, columns // n, n, *more)
     return blocks.swapaxes(1, 2).reshape(-1, n * n, *more)
 
 
 def _world_rays(world_from_camera: Array, camera: Camera) -> Array:
-    """(height, width, 3) of depth one, world axes; world_from_camera: (3, 3)."""
+    """Return (height, width, 3) of depth one, world axes; world_from_camera: (3, 3)."""
     k = camera.intrinsic.numpy()
     x = (np.arange(camera.width) + 0.5 - k[0, 2]) / k[0, 0]
     y = (np.arange(camera.height) + 0.5 - k[1, 2]) / k[1, 1]
@@ -281,7 +281,7 @@ def _fill_ground(
 
 
 def _height(lit_scene: LitScene, x: Array, y: Array) -> Array:
-    """Bilinear heights of the ground at points; the border value goes on outside."""
+    """Return bilinear heights of the ground at points; the border value goes on outside."""
     field = lit_scene.scene.ground
     rows, columns = field.height.shape
     u = np.clip((x - field.x_min) / field.cell, 0, columns - 1.001)

@@ -13,7 +13,9 @@ _SIDE, _WAVES = 1024, 16
 
 @lru_cache(maxsize=1)
 def _tile() -> NDArray[np.float32]:
-    """(1024, 1024) periodic noise of mean 0 and variance 1 whose amplitude falls with frequency: the same in every process."""
+    """Return (1024, 1024) periodic noise of mean 0 and variance 1 whose amplitude falls with frequency: the same in every
+    process.
+    """
     random = np.random.Generator(np.random.Philox(key=7))
     row_frequency, column_frequency = np.fft.fftfreq(_SIDE)[:, None] * _SIDE, np.fft.rfftfreq(_SIDE)[None] * _SIDE
     frequency = np.hypot(row_frequency, column_frequency)
@@ -23,7 +25,8 @@ def _tile() -> NDArray[np.float32]:
 
 
 def fractal_noise(xy: NDArray[np.floating], scale: float, seed: int) -> NDArray[np.floating]:
-    """(N,) about normal values at points (N, 2), bilinear: waves as long as ``scale``, and ever weaker ones down to 1/32 of it.
+    """Return (N,) about normal values at points (N, 2), bilinear: waves as long as ``scale``, and ever weaker ones down to
+    1/32 of it.
 
     It repeats after 16 scales; seed shifts it.
     """

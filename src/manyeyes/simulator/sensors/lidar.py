@@ -104,7 +104,7 @@ LIDAR_PRESETS: dict[str, LidarSpec] = {
 
 
 def lidar_spec(name: str) -> LidarSpec:
-    """A sensor by its name in LIDAR_PRESETS."""
+    """Return a sensor by its name in LIDAR_PRESETS."""
     if name not in LIDAR_PRESETS:
         raise ConfigError(f"No LiDAR '{name}'; choose one of {', '.join(LIDAR_PRESETS)}.")
     return LIDAR_PRESETS[name]
@@ -201,7 +201,8 @@ def _assemble(
 def scan(
     scene: RaycastScene, world_from_agent: Transform, spec: LidarSpec, key: tuple[int | str, ...], own: int = 0
 ) -> tuple[PointCloud, NDArray[np.int64]]:
-    """One sweep from a sensor spec.height_m above the road: the cloud in the agent's frame, and the instance of each return.
+    """Return one sweep from a sensor spec.height_m above the road: the cloud in the agent's frame, and the instance of each
+    return.
 
     own: the instance that carries the sensor, which is not met. key: the same key gives the same noise, drop-out and foliage.
     """

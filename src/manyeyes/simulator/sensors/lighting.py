@@ -109,7 +109,9 @@ def tone_map(radiance: Colour) -> NDArray[np.floating]:
 
 
 def dot(vectors: NDArray[np.floating], axis: Array) -> NDArray[np.floating]:
-    """(N,) products of vectors (N, 3) with one: no matrix product, for its last bit can depend on the number of threads."""
+    """Return (N,) products of vectors (N, 3) with one: no matrix product, for its last bit can depend on the number of
+    threads.
+    """
     x, y, z = axis.astype(np.float32)
     return (vectors[:, 0] * x + vectors[:, 1] * y + vectors[:, 2] * z).astype(np.float32)
 

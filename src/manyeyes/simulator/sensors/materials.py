@@ -48,7 +48,7 @@ class Materials:
 
     @classmethod
     def cat(cls, many: list[Materials]) -> Materials:
-        """Several sets as one; at least one set."""
+        """Return several sets as one; at least one set."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in many]) for f in fields(cls)))
 
 

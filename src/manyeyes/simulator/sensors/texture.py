@@ -52,7 +52,7 @@ def _lerp(one: Real, two: Real, weight: Real) -> Real:
 
 
 def _resolvable_fraction(scale: float, width: Real) -> Real:
-    """How much of a pattern of this scale is left in pixels of this width."""
+    """Return how much of a pattern of this scale is left in pixels of this width."""
     return 1 - smoothstep(0.5, 2.0, width / scale)
 
 
@@ -82,7 +82,7 @@ def ground_cover(field: HeightField, xy: Points, pixel_extent: Points) -> Ground
 
 
 def _classes(field: HeightField, xy: Points, row: int = 0, column: int = 0) -> NDArray[np.uint8]:
-    """Classes of the cells of points, so many rows and columns on; OFF_ROAD outside."""
+    """Return classes of the cells of points, so many rows and columns on; OFF_ROAD outside."""
     rows, columns = field.surface.shape
     j = np.floor((xy[:, 0] - field.x_min) / field.surface_cell).astype(np.int64) + column
     i = np.floor((xy[:, 1] - field.y_min) / field.surface_cell).astype(np.int64) + row
@@ -109,7 +109,7 @@ def _near_cover(field: HeightField, xy: Points) -> GroundCover:
 
 
 def ground_rgb(field: HeightField, xy: Points, pixel_extent: Points, wear: float, seed: int) -> Real:
-    """(N, 3) of the ground at points (N, 2) seen through pixels that reach over ``pixel_extent`` (N, 2) metres."""
+    """Return (N, 3) of the ground at points (N, 2) seen through pixels that reach over ``pixel_extent`` (N, 2) metres."""
     width = np.hypot(pixel_extent[:, 0], pixel_extent[:, 1]).astype(np.float32)
     cover = ground_cover(field, xy, pixel_extent)
     broad, blotch = fractal_noise(xy, 9.0, seed), fractal_noise(xy, 1.6, seed + 1)
@@ -179,7 +179,7 @@ class SolidPoints:
         return SolidPoints(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def face_coordinates(self) -> tuple[Real, Real]:
-        """Metres to the right along the face, and up from its lower edge (across, on a lid), (N,) each."""
+        """Return metres to the right along the face, and up from its lower edge (across, on a lid), (N,) each."""
         right = np.where(self.axis == 0, self.local[:, 1], self.local[:, 0])
         up = np.where(self.axis == 2, self.local[:, 1], self.local[:, 2] + self.half[:, 2])
         return right.astype(np.float32), up.astype(np.float32)
@@ -206,17 +206,17 @@ def _within(value: Real, low: float | Real, high: float | Real, width: Real) -> 
 
 
 def _draw(seed: Real, number: float) -> Real:
-    """(N,) in [0, 1): other draws of one seed."""
+    """Return (N,) in [0, 1): other draws of one seed."""
     return ((seed * 917.13 + number * 0.754877) * 43.17 % 1.0).astype(np.float32)
 
 
 def _cell_draw(one: Real, two: Real, seed: Real) -> Real:
-    """(N,) in [0, 1) for whole numbers one and two."""
+    """Return (N,) in [0, 1) for whole numbers one and two."""
     return (np.abs(np.sin(one * 12.9898 + two * 78.233 + seed * 437.5)) * 4375.8545 % 1.0).astype(np.float32)
 
 
 def _facade(spots: SolidPoints, seed: int) -> tuple[Real, Real]:
-    """Rows of windows with sills, a plinth, a cornice; shop windows below in every third house; gravel on the roof."""
+    """Return rows of windows with sills, a plinth, a cornice; shop windows below in every third house; gravel on the roof."""
     right, up = spots.face_coordinates()
     top = 2 * spots.half[:, 2]
     flat = np.stack((right + 37 * spots.seed, up), -1)
@@ -305,7 +305,7 @@ def _bark(spots: SolidPoints, seed: int) -> tuple[Real, Real]:
 
 
 def _plate(spots: SolidPoints, seed: int) -> tuple[Real, Real]:
-    """A sign's front: a white disc or bar on the colour, or a coloured rim on white; grey behind."""
+    """Return a sign's front: a white disc or bar on the colour, or a coloured rim on white; grey behind."""
     del seed
     right, up = spots.face_coordinates()
     up = up - spots.half[:, 2]
@@ -394,14 +394,14 @@ def _wheels(
 
 
 def _tyre(spots: SolidPoints, seed: int) -> tuple[Real, Real]:
-    """An axle's box: its wheels on the flanks, dark underneath the vehicle about them."""
+    """Return an axle's box: its wheels on the flanks, dark underneath the vehicle about them."""
     del seed
     x, _, z = _at(spots)
     return _wheels(0.4 * spots.rgb, np.zeros(len(x), np.float32), spots, x, z, spots.axis == 1)
 
 
 def _shade_cabin(spots: SolidPoints, seed: int) -> tuple[Real, Real]:
-    """A cabin: windows between pillars under a painted roof."""
+    """Return a cabin: windows between pillars under a painted roof."""
     del seed
     x, y, z = _at(spots)
     length, _, high = spots.size.T
