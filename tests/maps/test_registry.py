@@ -73,7 +73,7 @@ def test_observations_and_their_file_give_one_map(tmp_path: Path) -> None:
         assert fuse_maps(tmp_path, method).quantised_hash() == fused.quantised_hash()
         assert fuse_maps(str(tmp_path), method).frame == frame
     assert len(fuse_maps(observations, "union")) == 2
-    with pytest.raises(ConfigError, match="known: chamfer-nms, crowdmap-literal"):
+    with pytest.raises(ConfigError, match="known: chamfer-nms, crowdmap-graph"):
         fuse_maps(observations, "magic")
 
 
