@@ -34,7 +34,7 @@ def source_digest(*modules: str, package: Path = PACKAGE) -> str:
 
 
 def import_closure(*modules: str, package: Path = PACKAGE) -> list[Path]:
-    """The files that run when these modules, and all that they import of the package, are used; sorted."""
+    """Return the files that run when these modules, and all that they import of the package, are used; sorted."""
     found: set[Path] = set()
     left = [file for module in modules for file in _files_of(module, package, required=True)]
     while left:
@@ -71,7 +71,7 @@ class _Statements(ast.NodeTransformer):
 
 
 def _imports(node: ast.AST) -> Iterator[str]:
-    """Names that are imported at run time; of ``from a import b`` both a and a.b, since b may be a module."""
+    """Yield names that are imported at run time; of ``from a import b`` both a and a.b, since b may be a module."""
     for child in ast.iter_child_nodes(node):
         if isinstance(child, ast.If) and getattr(child.test, "id", "") == "TYPE_CHECKING":
             for other in child.orelse:
@@ -94,7 +94,7 @@ def _public_names(init: Path) -> dict[str, Definition]:
 
 
 def _files_of(name: str, package: Path, required: bool = False) -> list[Path]:
-    """The file of a module, or of the one that defines a public name of a package, and those of the packages that hold it,
+    """Return the file of a module, or of the one that defines a public name of a package, and those of the packages that hold it,
     without the outermost; none of another package's names. A last part * stands for all modules of a package.
     """
     first, *parts = name.split(".")

@@ -99,7 +99,7 @@ class Agent:
     def share(
         self, frame: AgentFrame, budget_bytes: int | None = None, requests: Sequence[Message] = ()
     ) -> list[bytes]:
-        """Packets of this frame, most important first; an empty list if there is nothing to send.
+        """Return packets of this frame, most important first; an empty list if there is nothing to send.
 
         budget_bytes: a limit below the agent's own, for a shared channel. A message with tokens never exceeds it, even if nothing
         is sent; objects, points and the map are not limited, but reduce the bytes left for tokens. requests: received messages;
@@ -120,7 +120,7 @@ class Agent:
         return [] if budget is not None and sum(map(len, packets)) > budget else packets
 
     def _compose(self, frame: AgentFrame, requests: Sequence[Message]) -> Message | None:
-        """The message of the strategy, with the local map, descriptors and request map that the agent adds."""
+        """Return the message of the strategy, with the local map, descriptors and request map that the agent adds."""
         message = self.strategy.compose_message(self.perception_cache, frame, requests)
         local_map = None if self.map_predictor is None else self.map_predictor(frame, requests)
         if local_map is not None:
@@ -134,7 +134,7 @@ class Agent:
         return message
 
     def _select(self, message: Message, tokens: SparseBev, budget_bytes: int | None) -> tuple[Message, Message]:
-        """The message with the tokens that fit into a budget, as the detector made them, and as they are encoded."""
+        """Return the message with the tokens that fit into a budget, as the detector made them, and as they are encoded."""
         tokens = tokens.with_features(clamp_features(tokens.features))
         is_coded, tables = self.token_encoding == "codebook", self.token_format.tables
         encoded = quantise_tokens(tokens, self.perception_cache.detector) if is_coded else tokens
@@ -144,11 +144,11 @@ class Agent:
         return replace(message, tokens=kept, token_score=score), replace(message, tokens=encoded, token_score=score)
 
     def inbox(self, expire_ns: int | None = None) -> Inbox:
-        """An inbox that accepts only tokens that this agent can fuse."""
+        """Return an inbox that accepts only tokens that this agent can fuse."""
         return Inbox(expire_ns=expire_ns, token_format=self.token_format)
 
     def perceive(self, frame: AgentFrame, inbox: Inbox | Iterable[bytes] = (), now_ns: int | None = None) -> Perception:
-        """Boxes around the agent from its own frame and from the messages received so far.
+        """Return boxes around the agent from its own frame and from the messages received so far.
 
         Received content never raises: tokens of another format are excluded, and a sender whose content makes fusion fail is
         excluded as a whole; both are listed in ``Perception.rejected``. A failed perception changes no state.
@@ -209,7 +209,7 @@ class Agent:
         return failed
 
     def _try_perceive(self, frame: AgentFrame, received: Sequence[ReceivedMessage]) -> tuple[Perception, _State]:
-        """One perception and the state after it; the agent's own state is restored, also after an error."""
+        """Return one perception and the state after it; the agent's own state is restored, also after an error."""
         before = _State(copy(self.message_history), self._sender_states, self.perception_cache.history)
         try:
             usable, corrections = self._correct_poses(frame, tuple(received))
@@ -231,7 +231,7 @@ class Agent:
     def _correct_poses(
         self, frame: AgentFrame, received: tuple[ReceivedMessage, ...]
     ) -> tuple[tuple[ReceivedMessage, ...], tuple[CorrectionOutcome, ...]]:
-        """Messages with corrected poses, without those whose pose is uncertain or inconsistent."""
+        """Return messages with corrected poses, without those whose pose is uncertain or inconsistent."""
         if self.pose_correction is None:
             return received, ()
         corrected = self.pose_correction.correct(

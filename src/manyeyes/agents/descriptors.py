@@ -22,7 +22,7 @@ from manyeyes.models.pose.keypoint_net import DetectorView
 def extract_own_keypoints(
     net: FeakmNet, cache: PerceptionCache, frame: AgentFrame, boxes: Boxes | None = None
 ) -> Keypoints:
-    """Keypoints among the agent's own boxes, or among the given ones, by falling score."""
+    """Return keypoints among the agent's own boxes, or among the given ones, by falling score."""
     keypoint_config = net.config.keypoints
     if not isinstance(keypoint_config, BoxKeypointConfig) or keypoint_config.descriptor_dim != DESCRIPTOR_DIM:
         raise ConfigError(
@@ -37,7 +37,7 @@ def extract_own_keypoints(
 
 
 def attach_descriptors(net: FeakmNet, cache: PerceptionCache, frame: AgentFrame, message: Message) -> Message:
-    """The message of a frame with a descriptor for each of its objects, zeros for those that are no keypoints.
+    """Return the message of a frame with a descriptor for each of its objects, zeros for those that are no keypoints.
 
     A message without objects gets the boxes of the keypoints.
     """
@@ -50,7 +50,7 @@ def attach_descriptors(net: FeakmNet, cache: PerceptionCache, frame: AgentFrame,
 
 
 def extract_message_keypoints(message: Message) -> Keypoints | None:
-    """Keypoints of a message; None without descriptors."""
+    """Return keypoints of a message; None without descriptors."""
     if message.objects is None or message.descriptors is None:
         return None
     points = Keypoints(message.objects, message.descriptors)

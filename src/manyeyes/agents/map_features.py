@@ -29,7 +29,7 @@ def encode_map_features(
     budget_bytes: int | None = DEFAULT_BUDGET_BYTES,
     objects: Boxes | None = None,
 ) -> list[bytes]:
-    """Packets of the features of one frame, cells by falling score; an empty list without features.
+    """Return packets of the features of one frame, cells by falling score; an empty list without features.
 
     objects: detections in the agent's frame, for pose correction at the receiver; they are not part of the budget.
     """
@@ -57,7 +57,7 @@ def encode_map_features(
 
 
 def decode_map_features(packets: Iterable[bytes], model: MapModel) -> Message | None:
-    """The message of the received packets of one frame; None without tokens that these weights can fuse."""
+    """Return the message of the received packets of one frame; None without tokens that these weights can fuse."""
     fragments = [wire.decode_packet(packet) for packet in packets]
     if not fragments:
         return None
@@ -66,7 +66,7 @@ def decode_map_features(packets: Iterable[bytes], model: MapModel) -> Message | 
 
 
 def is_compatible(message: Message, model: MapModel) -> bool:
-    """Whether a message has tokens of these weights, on their grid, of their width and within their range."""
+    """Return whether a message has tokens of these weights, on their grid, of their width and within their range."""
     token_format = TokenFormat(model.fingerprint, model.token_grid, model.config.token_channels)
     if message.tokens is None or message.fingerprint != token_format.fingerprint:
         return False
@@ -74,7 +74,9 @@ def is_compatible(message: Message, model: MapModel) -> bool:
 
 
 def predict_tile(model: MapModel, messages: Sequence[Message], world_from_tile: Transform) -> MapElements:
-    """The elements of one tile, in its frame, by falling score, from messages with tokens; without any, from empty features."""
+    """Return the elements of one tile, in its frame, by falling score, from messages with tokens; without any, from empty
+    features.
+    """
     grid = model.token_grid
     tile_from_world = world_from_tile.inverse()
     tokens = [message.tokens for message in messages if message.tokens is not None]
@@ -87,7 +89,7 @@ def predict_tile(model: MapModel, messages: Sequence[Message], world_from_tile: 
 
 
 def _batch(tokens: Sequence[SparseBev], grid_cells: int) -> SparseBev:
-    """Tokens of several messages as a batch of grids."""
+    """Return tokens of several messages as a batch of grids."""
     key = torch.cat([one.sites.key + i * grid_cells for i, one in enumerate(tokens)])
     return SparseBev(torch.cat([one.features for one in tokens]), Sites(key, tokens[0].grid, len(tokens)))
 

@@ -49,7 +49,7 @@ class MapShareConfig:
     simplify_tolerance_m: float = 0.03
 
     def window(self, frame: AgentFrame) -> Window:
-        """The predicted area around this agent."""
+        """Return the predicted area around this agent."""
         return self.roadside_window if frame.is_infrastructure else self.vehicle_window
 
 
@@ -58,7 +58,7 @@ MAP_MODES = {"local": MapShareConfig(), "semi-global": MapShareConfig(_TILE, _TI
 
 
 def get_map_share_config(name: str) -> MapShareConfig:
-    """The settings of a map mode; ConfigError lists the known modes."""
+    """Return the settings of a map mode; ConfigError lists the known modes."""
     if name not in MAP_MODES:
         raise ConfigError(f"No map mode is called {name!r}; known: {', '.join(MAP_MODES)}.")
     return MAP_MODES[name]
@@ -72,7 +72,7 @@ class MapModelPredictor:
     config: MapShareConfig = MapShareConfig()
 
     def __call__(self, frame: AgentFrame, received: Sequence[Message] = ()) -> LocalMap | None:
-        """The elements in the agent's frame; None without own or received features."""
+        """Return the elements in the agent's frame; None without own or received features."""
         own = decode_map_features(encode_map_features(self.model, frame), self.model)
         others = [m for m in received if is_compatible(m, self.model)]
         messages = [
@@ -87,7 +87,7 @@ class MapModelPredictor:
         return LocalMap(clip_to_view(predicted.take(predicted.score >= self.config.min_score), view, self.config), view)
 
     def _view(self, frame: AgentFrame, tile_from_sender: Sequence[Transform]) -> Floats:
-        """The convex hull of the covered ground, clipped to the agent's window: an open ring, anticlockwise."""
+        """Return the convex hull of the covered ground, clipped to the agent's window: an open ring, anticlockwise."""
         grid = self.model.token_grid
         corners = rectangle((grid.x_min, grid.y_min, grid.x_max, grid.y_max))
         placed = [corners @ _rotation_2d(float(m.yaw)).T + m.translation[:2].numpy() for m in tile_from_sender]
@@ -121,12 +121,12 @@ def clip_to_view(elements: MapElements, view: Floats, config: MapShareConfig) ->
 def encode_map_message(
     frame: AgentFrame, local_map: LocalMap, fingerprint: bytes = bytes(8), mtu: int = wire.DEFAULT_MTU
 ) -> list[bytes]:
-    """Packets of a message with a local map only; fingerprint: of the weights that predicted it."""
+    """Return packets of a message with a local map only; fingerprint: of the weights that predicted it."""
     return wire.encode(replace(make_header(frame, fingerprint), local_map=local_map), mtu=mtu)
 
 
 def rectangle(window: Window) -> Floats:
-    """(4, 2) the corners of a window, anticlockwise."""
+    """Return (4, 2) the corners of a window, anticlockwise."""
     x0, y0, x1, y1 = window
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
 

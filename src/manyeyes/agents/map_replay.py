@@ -63,7 +63,7 @@ class MapReplay:
         self._feature_bus, self._map_bus = LocalBus(Channel(radio, self.seed)), LocalBus(Channel(radio, self.seed))
 
     def step(self, frames: Sequence[AgentFrame]) -> tuple[SentRecord, ...]:
-        """One instant: share features, predict and send local maps, and ingest them at the server."""
+        """Replay one instant: share features, predict and send local maps, and ingest them at the server."""
         feature_sizes = [
             self._send(self._feature_bus, frame, [] if self.encode_features is None else self.encode_features(frame))
             for frame in frames
@@ -97,7 +97,7 @@ class MapReplay:
             self.map_server.ingest(self._receive(self._map_bus, SERVER_ID, (x, y)).received_messages(), self.drive)
 
     def _receive(self, bus: LocalBus, receiver_id: int, position_xy: tuple[float, float]) -> Inbox:
-        """The inbox of an agent or of the server, with all packets that have arrived."""
+        """Return the inbox of an agent or of the server, with all packets that have arrived."""
         inbox = self._inboxes.setdefault(receiver_id, Inbox(expire_ns=DRAIN_NS))
         for delivery in bus.deliver(receiver_id, position_xy, self._now_ns):
             inbox.push(delivery.packet, delivery.arrival_ns)

@@ -122,7 +122,7 @@ class MapServer:
         return result
 
     def map(self) -> VectorMap:
-        """The current map, updated with each observation in the order of arrival."""
+        """Return the current map, updated with each observation in the order of arrival."""
         return self._incremental_map.build_map()
 
     def rebuild(self) -> VectorMap:
@@ -130,7 +130,7 @@ class MapServer:
         return fuse(self.observations, self._config.fusion, self.frame)
 
     def _assign_pass_number(self, agent: str, time_ns: int) -> int:
-        """The number of the pass that this observation belongs to."""
+        """Return the number of the pass that this observation belongs to."""
         last, number = self._passes.get(agent, (time_ns, 0))
         number += abs(time_ns - last) > NEW_PASS_NS
         self._passes[agent] = time_ns, number
@@ -140,7 +140,7 @@ class MapServer:
 def make_observation(
     message: Message, agent: str, pass_id: str, origin: Floats | None = None, trusted: bool = False
 ) -> Observation:
-    """The local map of a message as an observation; invalid content raises ObservationError.
+    """Return the local map of a message as an observation; invalid content raises ObservationError.
 
     origin: (3,) x, y of the map's origin in the world (m), and 0. The covariance of the pose is inflated by MIN_SIGMA_M and
     MIN_SIGMA_RAD. Crossings whose rings intersect themselves are dropped.
@@ -166,7 +166,7 @@ def make_observation(
 
 
 def _drop_self_intersecting(local_map: LocalMap) -> MapElements:
-    """The elements without self-intersecting crossings; rings with too many points stay, and are rejected later."""
+    """Return the elements without self-intersecting crossings; rings with too many points stay, and are rejected later."""
     elements = local_map.elements
     rings = np.flatnonzero(elements.closed & (elements.counts <= LIMITS.max_ring_points)).tolist()
     crossed = [row for row in rings if not is_simple_ring(elements.polyline(row))]

@@ -23,8 +23,8 @@ class MessageHistory:
     def update_and_get(
         self, received: Sequence[Message], now_ns: int, untrusted: Collection[int] = ()
     ) -> list[Message]:
-        """Each received message, followed by up to HISTORY_FRAMES older ones of its sender, newest first; then the last messages of
-        senders without a current message, while they are no older than max_age_ns at now_ns.
+        """Return each received message, followed by up to HISTORY_FRAMES older ones of its sender, newest first; then the last
+        messages of senders without a current message, while they are no older than max_age_ns at now_ns.
 
         A message received again with more of its packets replaces itself; a timestamp that decreases clears the history.
         untrusted: senders whose history is cleared.

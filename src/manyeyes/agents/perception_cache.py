@@ -37,7 +37,7 @@ class BoxOutput:
     boxes: Boxes
 
     def with_velocity(self, velocity: Tensor) -> BoxOutput:
-        """The same boxes with velocities (N, 2) m/s."""
+        """Return the same boxes with velocities (N, 2) m/s."""
         return BoxOutput(replace(self.boxes, velocity=velocity))
 
 
@@ -59,7 +59,7 @@ class TokenOutput:
         return decode(self.raw, self.config)[0]
 
     def with_velocity(self, velocity: Tensor) -> TokenOutput:
-        """The same output with box velocities (M, 2) m/s, for their tokens too; tokens without a box get velocity 0."""
+        """Return the same output with box velocities (M, 2) m/s, for their tokens too; tokens without a box get velocity 0."""
         place = self.raw.sites.xy + self.raw.offset * self.raw.sites.grid.cell_size_m
         distance = torch.cdist(place, self.boxes.center[:, :2])
         # One more column for tokens without a box.
@@ -133,7 +133,7 @@ class PerceptionCache:
         raise TypeError("A TokenDetector gives a TokenOutput.")
 
     def _with_estimated_velocity(self, frame: AgentFrame, output: AgentOutput) -> AgentOutput:
-        """The output with velocities estimated over the last frames that have boxes."""
+        """Return the output with velocities estimated over the last frames that have boxes."""
         if self._velocity_config is None:
             return output
         earlier = []
@@ -159,7 +159,7 @@ class PerceptionCache:
         return self._outputs[max(0, at - num_frames) : at][::-1]
 
     def previous_tokens(self, frame: AgentFrame, num_frames: int = HISTORY_FRAMES) -> list[AgentTokens]:
-        """The agent's own tokens of the frames before this one, newest first, for ego 0."""
+        """Return the agent's own tokens of the frames before this one, newest first, for ego 0."""
         parts = []
         for before, output in self.previous_outputs(frame, num_frames):
             if isinstance(output, TokenOutput):
@@ -172,12 +172,12 @@ class PerceptionCache:
         self._sent = [*(s for s in self._sent if s[0] is not frame), (frame, tokens)][-HISTORY_FRAMES - 1 :]
 
     def recently_sent(self, frame: AgentFrame) -> list[tuple[AgentFrame, SparseBev]]:
-        """Tokens sent in the frames before this one, oldest first: those still in the receivers' history."""
+        """Return tokens sent in the frames before this one, oldest first: those still in the receivers' history."""
         earlier = [(then, tokens) for then, tokens in self._sent if then is not frame]
         return [(then, tokens) for then, tokens in earlier[-HISTORY_FRAMES:] if is_consecutive(frame, then)]
 
     def previous_merged_cloud(self, frame: AgentFrame, merged: PointCloud) -> PointCloud | None:
-        """The merged cloud of the previous frame, in this frame; the current one is stored for the next frame."""
+        """Return the merged cloud of the previous frame, in this frame; the current one is stored for the next frame."""
         last, self._merged = self._merged, (frame, merged)
         if last is None or not is_consecutive(frame, last[0]):
             return None
@@ -217,7 +217,7 @@ class PerceptionCache:
 
 
 def is_consecutive(frame: AgentFrame, before: AgentFrame) -> bool:
-    """Whether a frame continues another one: same agent, a small time gap, a small displacement."""
+    """Return whether a frame continues another one: same agent, a small time gap, a small displacement."""
     gap = frame.timestamp_ns - before.timestamp_ns
     if frame.agent_id != before.agent_id or not 0 < gap <= MAX_GAP_NS:
         return False

@@ -198,7 +198,7 @@ class PoseCorrection:
         return attach_descriptors(self.net, cache, frame, message)
 
     def extract_own_landmarks(self, frame: AgentFrame, cache: PerceptionCache) -> Landmarks:
-        """Landmarks of an agent's own frame for the corrector."""
+        """Return landmarks of an agent's own frame for the corrector."""
         if self.net is None:
             landmarks = self._select_landmarks(cache.process(frame).boxes, None, 0.0)
             return landmarks if frame.is_infrastructure else landmarks.with_ego_body()
@@ -206,7 +206,7 @@ class PoseCorrection:
         return self._select_landmarks(points.boxes, points.descriptor, 0.0)
 
     def _message_landmarks(self, cache: PerceptionCache, message: Message, seconds: float) -> Landmarks:
-        """Landmarks of a message of that age; none if the corrector needs descriptors and the message has none."""
+        """Return landmarks of a message of that age; none if the corrector needs descriptors and the message has none."""
         if self.net is None:
             landmarks = self._select_landmarks(extract_message_boxes(cache, message), None, seconds)
             # An older message does not give the sender's own position now: its velocity is not sent.
@@ -215,7 +215,7 @@ class PoseCorrection:
         return Landmarks.empty() if points is None else self._select_landmarks(points.boxes, points.descriptor, seconds)
 
     def _select_landmarks(self, boxes: Boxes, descriptor: Tensor | None, seconds: float) -> Landmarks:
-        """Boxes above min_score, propagated by their age."""
+        """Return boxes above min_score, propagated by their age."""
         confident = boxes.score >= self.min_score
         now = boxes[confident].after(seconds)
         landmarks = (
@@ -324,7 +324,7 @@ def extract_message_boxes(cache: PerceptionCache, message: Message) -> Boxes:
 
 
 def apply_correction(message: Message, frame: AgentFrame, estimate: PoseEstimate) -> Message:
-    """The message with its sender's pose replaced by the estimate, relative to the ego's prior pose."""
+    """Return the message with its sender's pose replaced by the estimate, relative to the ego's prior pose."""
     assert estimate.ego_from_other is not None
     world_from_ego = frame.world_from_agent
     c, s = float(world_from_ego.yaw.cos()), float(world_from_ego.yaw.sin())
@@ -338,7 +338,7 @@ def apply_correction(message: Message, frame: AgentFrame, estimate: PoseEstimate
 
 
 def _make_edge(i: int, j: int, estimate: PoseEstimate) -> RelativePoseEdge | None:
-    """The pose graph edge of two agents; None without a match."""
+    """Return the pose graph edge of two agents; None without a match."""
     if not estimate.status.has_estimate or estimate.measured is None or estimate.measured_covariance is None:
         return None
     return RelativePoseEdge(i, j, estimate.measured, estimate.measured_covariance)

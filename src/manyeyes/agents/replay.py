@@ -116,7 +116,7 @@ class DetectionReplay:
         self._bus = LocalBus(Channel(self.config.radio, self.config.seed))
 
     def step(self, snapshot: Snapshot) -> Iterator[ReplayStep]:
-        """All agents share; the evaluated egos receive and perceive."""
+        """Let all agents share; the evaluated egos receive and perceive."""
         positions = _antenna_positions(snapshot)
         sent = self._share(snapshot.frames, positions)
         egos = range(len(snapshot.frames)) if self.config.all_egos else range(1)
@@ -158,7 +158,7 @@ class DetectionReplay:
         )
 
     def _share_one(self, frame: AgentFrame, budget_bytes: int | None = None) -> tuple[list[bytes], float]:
-        """Packets of one agent, and the duration of share in seconds."""
+        """Return packets of one agent, and the duration of share in seconds."""
         agent, inbox = self._get_agent_and_inbox(frame)
         requests = inbox.messages() if self.config.send_request_map else ()
         began = time.perf_counter()
@@ -185,7 +185,7 @@ class DetectionReplay:
 
 
 def _antenna_positions(snapshot: Snapshot) -> dict[int, tuple[float, float]]:
-    """True positions of the antennas, or prior positions in recordings without ground truth."""
+    """Return true positions of the antennas, or prior positions in recordings without ground truth."""
     poses = (
         snapshot.truth.world_from_agent
         if snapshot.truth

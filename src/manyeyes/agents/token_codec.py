@@ -15,7 +15,7 @@ from manyeyes.models.detector.protocols import BoxDetector, has_tokens, require_
 
 
 def require_codebook(detector: BoxDetector) -> Codebook:
-    """The codebook of a detector; ConfigError without one."""
+    """Return the codebook of a detector; ConfigError without one."""
     codebook = require_tokens(detector).codebook
     if codebook is None:
         raise ConfigError(
@@ -25,12 +25,12 @@ def require_codebook(detector: BoxDetector) -> Codebook:
 
 
 def default_token_encoding(detector: BoxDetector) -> TokenEncoding:
-    """The default token encoding: codebook if the weights have one (a tenth of the bytes), else float16."""
+    """Return the default token encoding: codebook if the weights have one (a tenth of the bytes), else float16."""
     return "codebook" if has_tokens(detector) and detector.codebook is not None else "float16"
 
 
 def make_token_format(detector: BoxDetector) -> TokenFormat:
-    """The format of the tokens that a detector can fuse, with its coding tables; a BoxDetector can fuse none."""
+    """Return the format of the tokens that a detector can fuse, with its coding tables; a BoxDetector can fuse none."""
     if not has_tokens(detector):
         return TokenFormat(detector.fingerprint, detector.grid, 0)
     codebook = detector.codebook
@@ -46,7 +46,7 @@ def quantise_tokens(tokens: SparseBev, detector: BoxDetector) -> SparseBev:
 def decode_tokens(
     received: ReceivedMessage, detector: BoxDetector, token_format: TokenFormat
 ) -> tuple[ReceivedMessage, Rejection | None]:
-    """The message with tokens decoded to rows of floats; tokens of another format are dropped and rejected."""
+    """Return the message with tokens decoded to rows of floats; tokens of another format are dropped and rejected."""
     message, codebook = received.message, detector.codebook if has_tokens(detector) else None
     tokens = message.tokens
     if tokens is None:

@@ -63,7 +63,8 @@ class PastDetections:
 def estimate_velocities(
     boxes: Boxes, past: Sequence[PastDetections], config: VelocityConfig, points: Tensor | None = None
 ) -> Tensor:
-    """(N, 2) m/s of boxes, in their frame, from earlier detections, newest first; the detector's velocity without association.
+    """Return (N, 2) m/s of boxes, in their frame, from earlier detections, newest first; the detector's velocity without
+    association.
 
     Boxes are associated as mutual nearest neighbours of the propagated positions, within the gate. points: (P, 3) float32 of this
     sweep; None uses boxes only.
@@ -95,7 +96,7 @@ def _match_points(
     points: Tensor,
     config: VelocityConfig,
 ) -> Tensor:
-    """Velocities (N, 2) of minimum alignment cost around the given ones; information: as in _LineFit."""
+    """Return velocities (N, 2) of minimum alignment cost around the given ones; information: as in _LineFit."""
     velocity_covariance = torch.linalg.inv(information)
     longitudinal = torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
     lateral = torch.stack((-longitudinal[:, 1], longitudinal[:, 0]), 1)
@@ -147,7 +148,7 @@ class _LineFit:
 
     @classmethod
     def from_boxes(cls, boxes: Boxes, config: VelocityConfig) -> _LineFit:
-        """The fit of the current positions and the prior."""
+        """Return the fit of the current positions and the prior."""
         n, ahead = len(boxes), torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
         longitudinal = ahead[:, :, None] * ahead[:, None, :]
         lateral = torch.eye(2) - longitudinal
@@ -157,7 +158,7 @@ class _LineFit:
         return empty.add(boxes, 0.0, torch.ones(n, dtype=torch.bool))
 
     def add(self, boxes: Boxes, t: float, same: Tensor) -> _LineFit:
-        """The fit with one more position for each associated box; same: (N,) bool."""
+        """Return the fit with one more position for each associated box; same: (N,) bool."""
         weight = same / (self.sigma_position_m**2 + boxes.sigma_xy**2)
         powers = weight[:, None] * torch.tensor([1.0, t, t * t])
         moments = powers[:, :2, None] * (boxes.center[:, :2] - self.origin)[:, None]
@@ -176,6 +177,6 @@ class _LineFit:
         return torch.linalg.solve(self.information, self.prior_vector + slope)
 
     def position_at(self, t: float) -> Tensor:
-        """Positions (N, 2) of the boxes at time t."""
+        """Return positions (N, 2) of the boxes at time t."""
         w, wt = self.sums[:, 0, None], self.sums[:, 1, None]
         return self.origin + self.moments[:, 0] / w + self.velocity * (t - wt / w)

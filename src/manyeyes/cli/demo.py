@@ -100,7 +100,7 @@ def main(options: Options) -> None:
 
 
 def _make_map_chapters(drive: Recording, out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
-    """The map part, or why there is none: it needs an extra of its own."""
+    """Return the map part, or why there is none: it needs an extra of its own."""
     from manyeyes.datatypes import MissingExtraError
     from manyeyes.models import pretrained
 

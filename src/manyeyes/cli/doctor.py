@@ -95,14 +95,14 @@ def diagnose(towns: Path | None = None) -> Diagnosis:
 
 
 def shipped_weights() -> tuple[Weights, ...]:
-    """The weights inside the package, each loaded strictly."""
+    """Return the weights inside the package, each loaded strictly."""
     from manyeyes.models import pretrained
 
     return tuple(Weights(name, pretrained.load(name).fingerprint.hex()) for name in pretrained.list_detectors())
 
 
 def find_towns(folder: Path | None = None) -> tuple[tuple[str, ...], str]:
-    """The CARLA towns that can be read, and where they lie; no town, and what to do, when there is none."""
+    """Return the CARLA towns that can be read, and where they lie; no town, and what to do, when there is none."""
     from manyeyes.simulator.scene.towns import TOWNS, find_town
 
     found: list[str] = []

@@ -133,7 +133,7 @@ def main(options: Options) -> None:
 def _run_correctors(
     drive: Excerpt, cache: PerceptionCache, options: Options, noise: PoseNoise
 ) -> Iterator[CorrectorResult]:
-    """Every corrector's answer about every collaborator in every judged frame."""
+    """Yield every corrector's answer about every collaborator in every judged frame."""
     from manyeyes.agents.pose_correction import PoseCorrection
     from manyeyes.pose.registry import find_corrector
     from manyeyes.pose.types import PosePrior

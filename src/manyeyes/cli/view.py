@@ -100,7 +100,7 @@ def _draw_images(options: Options, drive: Excerpt, indices: range, config: Repla
 
 
 def _run_detector(options: Options, config: ReplayConfig, snapshots: list[Snapshot]) -> tuple[BevGrid, list[Boxes]]:
-    """The detector's range, and what the ego finds at each instant."""
+    """Return the detector's range, and what the ego finds at each instant."""
     from manyeyes.agents.replay import DetectionReplay
     from manyeyes.models import pretrained
 

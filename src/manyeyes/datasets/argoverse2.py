@@ -65,7 +65,7 @@ class Annotations:
 
 
 def contains_logs(path: Path) -> bool:
-    """Whether a folder is a log, holds some, or holds splits with some, by the file of poses."""
+    """Return whether a folder is a log, holds some, or holds splits with some, by the file of poses."""
     return any(next(path.glob(f"{below}{_POSES}"), None) is not None for below in ("", "*/", "*/*/"))
 
 
@@ -106,7 +106,7 @@ class Argoverse2Recording(RecordingReader):
         self._tables: dict[tuple[Path, tuple[str, ...]], tuple[np.ndarray, ...]] = {}
 
     def length(self, scenario: str) -> int:
-        """How many sweeps the log has, less the gap."""
+        """Return how many sweeps the log has, less the gap."""
         return len(self.sweeps(scenario)) - self._gap
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -121,7 +121,7 @@ class Argoverse2Recording(RecordingReader):
         return self._sweeps[scenario]
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
-        """One sweep, or two as two agents; without truth where the log has no annotations."""
+        """Return one sweep, or two as two agents; without truth where the log has no annotations."""
         require_index(self, scenario, index)
         sweeps = self._sweeps[scenario]
         times = tuple(sweeps[index + agent * self._gap] for agent in self.agents(scenario))
@@ -130,7 +130,7 @@ class Argoverse2Recording(RecordingReader):
         return Snapshot(scenario, index, frames, self._truth(scenario, times, frames) if labelled else None)
 
     def points(self, scenario: str, timestamp_ns: int) -> PointCloud:
-        """One sweep in AV2's own ego frame."""
+        """Return one sweep in AV2's own ego frame."""
         path = self._folders[scenario] / "sensors" / "lidar" / f"{timestamp_ns}.feather"
         x, y, z, intensity, offset_ns = _columns(path, ("x", "y", "z", "intensity", "offset_ns"))
         xyz = np.stack((x, y, z), -1).astype(np.float32)
@@ -141,7 +141,7 @@ class Argoverse2Recording(RecordingReader):
         return PointCloud.of(torch.from_numpy(xyz), brightness, torch.from_numpy(offset_ns * 1e-9))
 
     def annotations(self, scenario: str, timestamp_ns: int) -> Annotations:
-        """All labelled objects of one sweep, in AV2's own ego frame."""
+        """Return all labelled objects of one sweep, in AV2's own ego frame."""
         path = self._folders[scenario] / "annotations.feather"
         names = ("tx_m", "ty_m", "tz_m", "length_m", "width_m", "height_m", "qw", "qx", "qy", "qz")
         time, track, category, interior = self._table(
@@ -192,7 +192,7 @@ class Argoverse2Recording(RecordingReader):
         return Transform(_rotation(values[:4]), values[4:])
 
     def _speed(self, scenario: str, timestamp_ns: int) -> float:
-        """Metres per second between the poses 50 ms before and after, or as near as the log goes."""
+        """Return metres per second between the poses 50 ms before and after, or as near as the log goes."""
         time, *parts = self._poses(scenario)
         order = np.argsort(time)
         span = np.clip((timestamp_ns - 50_000_000, timestamp_ns + 50_000_000), time.min(), time.max())
@@ -201,7 +201,7 @@ class Argoverse2Recording(RecordingReader):
         return float(np.linalg.norm(np.diff(place))) / elapsed if elapsed > 0 else 0.0
 
     def _truth(self, scenario: str, times: tuple[int, ...], frames: tuple[AgentFrame, ...]) -> GroundTruth:
-        """Vehicles in the city frame: the ego's copy of a track where it has one, in the order of ids."""
+        """Return vehicles in the city frame: the ego's copy of a track where it has one, in the order of ids."""
         boxes, met = [], []
         for time in times:
             labelled = self.annotations(scenario, time)
@@ -214,7 +214,7 @@ class Argoverse2Recording(RecordingReader):
         return GroundTruth(union, seen, Transform.stack([f.world_from_agent for f in frames]))
 
     def _table(self, path: Path, names: tuple[str, ...]) -> tuple[np.ndarray, ...]:
-        """Columns that belong to the whole log; kept in memory."""
+        """Return columns that belong to the whole log; kept in memory."""
         if (path, names) not in self._tables:
             self._tables[path, names] = _columns(path, names)
         return self._tables[path, names]
@@ -225,7 +225,7 @@ def _list_folders(folder: Path) -> list[Path]:
 
 
 def _rotation(quaternion: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4) as w, x, y, z."""
+    """Return rotation matrices (..., 3, 3) of unit quaternions (..., 4) as w, x, y, z."""
     w, x, y, z = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = (
         torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),

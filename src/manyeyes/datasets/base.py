@@ -24,19 +24,19 @@ class Recording(Protocol):
         ...
 
     def length(self, scenario: str) -> int:
-        """How many snapshots the scenario has."""
+        """Return how many snapshots the scenario has."""
         ...
 
     def eval_indices(self, scenario: str) -> range:
-        """The indices that evaluation counts; those before them are history."""
+        """Return the indices that evaluation counts; those before them are history."""
         ...
 
     def agents(self, scenario: str) -> tuple[int, ...]:
-        """The ids of all agents of the scenario, the ego first."""
+        """Return the ids of all agents of the scenario, the ego first."""
         ...
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
-        """All agents at one instant."""
+        """Return all agents at one instant."""
         ...
 
 
@@ -68,18 +68,18 @@ class RecordingReader(ABC):
 
     @abstractmethod
     def length(self, scenario: str) -> int:
-        """How many snapshots the scenario has."""
+        """Return how many snapshots the scenario has."""
 
     @abstractmethod
     def snapshot(self, scenario: str, index: int) -> Snapshot:
-        """All agents at one instant."""
+        """Return all agents at one instant."""
 
     def eval_indices(self, scenario: str) -> range:
-        """The indices that evaluation counts: all by default."""
+        """Return the indices that evaluation counts: all by default."""
         return range(self.length(scenario))
 
     def agents(self, scenario: str) -> tuple[int, ...]:
-        """The ids of all agents of the scenario, the ego first: by default those of its first snapshot."""
+        """Return the ids of all agents of the scenario, the ego first: by default those of its first snapshot."""
         return tuple(frame.agent_id for frame in self.snapshot(scenario, 0).frames)
 
     @property
@@ -110,7 +110,7 @@ class RecordingReader(ABC):
 
 
 def iter_eval_frames(recording: Recording) -> Iterator[tuple[str, int]]:
-    """Every (scenario, index) that evaluation counts, in order."""
+    """Yield every (scenario, index) that evaluation counts, in order."""
     for scenario in recording.scenarios:
         for index in recording.eval_indices(scenario):
             yield scenario, index
@@ -127,7 +127,7 @@ def require_index(recording: Recording, scenario: str, index: int) -> None:
 
 
 def count_points_in_listed_boxes(snapshot: Snapshot, margin_m: float = 0.1) -> Tensor:
-    """(agents, N) int64: how many of an agent's points lie in each true box that it lists; -1: not listed.
+    """Return (agents, N) int64: how many of an agent's points lie in each true box that it lists; -1: not listed.
 
     Boxes are moved into each agent's frame and enlarged by margin_m. A vehicle that is listed was met by the agent's
     LiDAR, so a zero means that points, poses and boxes do not agree: a wrong sign in a reader shows at once.

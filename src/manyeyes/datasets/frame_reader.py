@@ -15,11 +15,11 @@ class FrameReader(Protocol):
     """A recording that reads frames one by one, as they stand in its snapshots."""
 
     def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
-        """The ids of the agents that have this frame, in the order of the snapshot's frames."""
+        """Return the ids of the agents that have this frame, in the order of the snapshot's frames."""
         ...
 
     def frame(self, scenario: str, index: int, agent_id: int) -> AgentFrame:
-        """The frame of one agent."""
+        """Return the frame of one agent."""
         ...
 
 
@@ -30,15 +30,15 @@ class SnapshotFrameReader:
     recording: Recording
 
     def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
-        """The ids of the agents that have this frame, in the order of the snapshot."""
+        """Return the ids of the agents that have this frame, in the order of the snapshot."""
         return tuple(frame.agent_id for frame in self.recording.snapshot(scenario, index).frames)
 
     def frame(self, scenario: str, index: int, agent_id: int) -> AgentFrame:
-        """The frame of one agent, from the whole snapshot."""
+        """Return the frame of one agent, from the whole snapshot."""
         frames = self.recording.snapshot(scenario, index).frames
         return next(frame for frame in frames if frame.agent_id == agent_id)
 
 
 def as_frame_reader(recording: Recording) -> FrameReader:
-    """The recording itself where it reads frames one by one, else its snapshots taken apart."""
+    """Return the recording itself where it reads frames one by one, else its snapshots taken apart."""
     return recording if isinstance(recording, FrameReader) else SnapshotFrameReader(recording)

@@ -10,7 +10,7 @@ _DEFAULT_HEIGHT_M = 1.9
 
 
 def estimate_sensor_height(xyz: np.ndarray, max_range_m: float = 25.0) -> float:
-    """The height that puts the road at z = 0: the lowest twentieth of what is below the sensor within max_range_m.
+    """Return the height that puts the road at z = 0: the lowest twentieth of what is below the sensor within max_range_m.
 
     xyz: (N, 3) metres in the LiDAR's frame. 1.9 m where fewer than 100 points are below, or the answer is not plausible.
     """

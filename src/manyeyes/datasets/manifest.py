@@ -105,29 +105,29 @@ class Digests:
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
+    """Return SHA-256 of a file's bytes, hexadecimal."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def digest_files(files: Iterable[Path], folder: Path) -> dict[str, str]:
-    """SHA-256 of each file by its path below the folder, in the given order."""
+    """Return SHA-256 of each file by its path below the folder, in the given order."""
     return {path.relative_to(folder).as_posix(): sha256_of(path) for path in files}
 
 
 def compute_total_digest(by_path: Mapping[str, str]) -> str:
-    """SHA-256 of the lines ``<SHA-256 of a file>  <path>``."""
+    """Return SHA-256 of the lines ``<SHA-256 of a file>  <path>``."""
     lines = [f"{digest}  {name}" for name, digest in by_path.items()]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def list_scenario_files(folder: Path) -> list[Path]:
-    """The files of a scenario's folder in the order of paths, without scenario.json and without hidden files."""
+    """Return the files of a scenario's folder in the order of paths, without scenario.json and without hidden files."""
     found = (Path(base) / name for base, _, names in os.walk(folder, followlinks=True) for name in names)
     return sorted(path for path in found if path.name != SCENARIO and not path.name.startswith("."))
 
 
 def read_manifest(root: Path) -> dict[str, Any] | None:
-    """The content of the root's manifest, or of that of an unfinished run; None where there is neither.
+    """Return the content of the root's manifest, or of that of an unfinished run; None where there is neither.
 
     Raises:
         RecordingError: the file is not one of the simulator.
@@ -147,7 +147,7 @@ def read_manifest(root: Path) -> dict[str, Any] | None:
 
 
 def list_scenarios(root: Path, split: str) -> tuple[str, ...]:
-    """Names of the scenarios of a split by the root's manifest in OPV2V's layout; empty where there is none."""
+    """Return names of the scenarios of a split by the root's manifest in OPV2V's layout; empty where there is none."""
     try:
         content = read_manifest(root)
     except RecordingError:

@@ -69,7 +69,7 @@ def find_mismatched_files(
 
 
 def find_mismatched_clouds(fits: Mapping[Path, _Fit]) -> dict[Path, _Fit]:
-    """The clouds that miss too many boxes, in a scenario where that is unusual."""
+    """Return the clouds that miss too many boxes, in a scenario where that is unusual."""
     fractions = sorted(fit.met_fraction for fit in fits.values() if fit.listed)
     if not fractions or fractions[len(fractions) // 2] < _MIN_USUAL_FRACTION:
         return {}
@@ -104,7 +104,7 @@ def find_copied_files(
 
 
 def _fits(snapshot: Snapshot, paths: Mapping[int, Path]) -> Iterator[tuple[Path, _Fit]]:
-    """The fit of each cloud that is a sweep, or is empty although vehicles are listed."""
+    """Yield the fit of each cloud that is a sweep, or is empty although vehicles are listed."""
     if snapshot.truth is None:
         return
     for frame, counts in zip(snapshot.frames, count_points_in_listed_boxes(snapshot)):
@@ -117,6 +117,6 @@ def _unmet_fraction(fit: _Fit | None) -> float:
 
 
 def _same_metadata(one: Path, other: Path) -> bool:
-    """Whether two clouds are of one agent and their metadata have the same bytes."""
+    """Return whether two clouds are of one agent and their metadata have the same bytes."""
     metadata = (one.with_suffix(".yaml"), other.with_suffix(".yaml"))
     return one.parent == other.parent and metadata[0].read_bytes() == metadata[1].read_bytes()

@@ -55,7 +55,7 @@ class PoseNoise:
             )
 
     def apply(self, snapshot: Snapshot, ego: int) -> Snapshot:
-        """The snapshot as agents claim it: poses displaced, their covariance grown by the noise; truth as it was."""
+        """Return the snapshot as agents claim it: poses displaced, their covariance grown by the noise; truth as it was."""
         everyone = self.mode.startswith("all_agents")
         frames = tuple(
             self._displace(frame, self.offset(snapshot.scenario, snapshot.index, frame.agent_id))
@@ -112,7 +112,7 @@ class FrameDelay:
             raise ConfigError(f"FrameDelay counts frames back in time, at least 0; got {self.frames}.")
 
     def apply(self, snapshot: Snapshot, ego: int, history: Sequence[Snapshot]) -> Snapshot:
-        """The snapshot with its collaborators stale. history: the scenario's previous snapshots, oldest first."""
+        """Return the snapshot with its collaborators stale. history: the scenario's previous snapshots, oldest first."""
         begin = max(0, len(history) - self.frames)
         # A lazy sequence is read only where it is needed, oldest wanted frame first.
         candidates = (history[k] if k < len(history) else snapshot for k in range(begin, len(history) + 1))

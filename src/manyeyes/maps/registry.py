@@ -58,7 +58,7 @@ register_map_fusion(OURS, MapFusionConfig)(fuse)
 
 
 def list_map_fusions() -> tuple[str, ...]:
-    """The names of all methods, our own first."""
+    """Return the names of all methods, our own first."""
     return (OURS, *(name for name in MAP_FUSION_METHODS.names() if name != OURS))
 
 

@@ -226,7 +226,7 @@ def _interval(o: F64x1, q: F64x2, half: F64x1, bounds: F64x1) -> None:
 
 @njit(cache=True)
 def hit_box(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tuple[float, float]:
-    """Return the entry distance and cosine into a box from outside it; (inf, 0) when missed. At most three faces face the sensor."""
+    """Return the entry distance and cosine into a box from outside; (inf, 0) when missed. At most three faces face the sensor."""
     if abs(o[0]) > half[0] and o[0] * d0 < 0:
         t = ((half[0] if o[0] > 0 else -half[0]) - o[0]) / d0
         if abs(o[1] + t * d1) <= half[1] and abs(o[2] + t * d2) <= half[2]:

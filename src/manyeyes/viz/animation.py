@@ -18,7 +18,7 @@ FORMATS = {".gif": "GIF", ".webp": "WEBP"}
 
 
 def stack_images(images: Sequence[Image]) -> Image:
-    """Several pictures of one width above each other."""
+    """Return several pictures of one width above each other."""
     out = import_pillow().Image.new("RGB", (images[0].width, sum(i.height for i in images)), "white")
     top = 0
     for image in images:
@@ -42,7 +42,7 @@ def save_animation(images: Iterable[Image], path: Path, frame_ms: int = 200) -> 
 
 
 def _quantise_to_one_palette(images: Iterable[Image]) -> list[Image]:
-    """All pictures in the colours of the first: quick, and nothing flickers from one frame to the next."""
+    """Quantise all images to the palette of the first, so that colours are constant over frames."""
     pil = import_pillow()
     palette, out = None, []
     for image in images:

@@ -74,7 +74,7 @@ class BirdsEyeScene:
 
 
 def make_scene(snapshot: Snapshot, detections: Boxes, ego: int = 0, missing_ids: Collection[int] = ()) -> BirdsEyeScene:
-    """A snapshot as the frame number ``ego`` of it saw it; detections are in that frame already.
+    """Return a snapshot as the frame number ``ego`` of it saw it; detections are in that frame already.
 
     missing_ids: ids of agents of which the ego had nothing.
     """
@@ -96,7 +96,7 @@ def make_scene(snapshot: Snapshot, detections: Boxes, ego: int = 0, missing_ids:
 
 
 def make_viewport(grid: BevGrid, width: int = 1280, margin_m: float = 4.0) -> Viewport:
-    """The window that shows a grid's whole range, with room for a header and a footer."""
+    """Return the window that shows a grid's whole range, with room for a header and a footer."""
     return Viewport(
         grid.x_min - margin_m,
         grid.y_min - margin_m,
@@ -111,7 +111,7 @@ def make_viewport(grid: BevGrid, width: int = 1280, margin_m: float = 4.0) -> Vi
 def draw_scene(
     scene: BirdsEyeScene, grid: BevGrid, title: str = "", caption: str = "", width: int = 1280, min_score: float = 0.0
 ) -> Image:
-    """A picture of the scene; title and caption stand above it, detections below score_min are left out."""
+    """Return a picture of the scene; title and caption stand above it, detections below score_min are left out."""
     viewport = make_viewport(grid, width)
     layers = []
     for index, agent in enumerate(scene.agents):
@@ -137,7 +137,7 @@ def save_png(image: Image, path: Path) -> None:
 
 
 def encode_png(image: Image) -> bytes:
-    """The picture as the bytes of a PNG file."""
+    """Return the picture as the bytes of a PNG file."""
     out = io.BytesIO()
     image.save(out, "PNG")
     return out.getvalue()
@@ -148,7 +148,7 @@ def _agent_colour(index: int) -> Colour:
 
 
 def _outlines(boxes: Boxes) -> np.ndarray:
-    """Ground corners (N, 4, 2): front left, front right, rear right, rear left."""
+    """Return ground corners (N, 4, 2): front left, front right, rear right, rear left."""
     return boxes.corners()[:, :4, :2].double().numpy()
 
 

@@ -20,7 +20,7 @@ SUPERSAMPLE = 2
 
 
 def import_pillow() -> Any:
-    """The Pillow package with its drawing modules, or the error that names the extra."""
+    """Return the Pillow package with its drawing modules, or the error that names the extra."""
     try:
         import PIL.Image
         import PIL.ImageDraw
@@ -71,7 +71,7 @@ class Viewport:
 def draw_points(
     viewport: Viewport, layers: Sequence[tuple[np.ndarray, np.ndarray, Colour]], background: Colour
 ) -> np.ndarray:
-    """An image (H, W, 3) uint8 of points: each layer is xy (N, 2), ink (N,) and a colour.
+    """Return an image (H, W, 3) uint8 of points: each layer is xy (N, 2), ink (N,) and a colour.
 
     Ink adds up in a pixel and saturates; where layers meet, their colours mix by ink.
     """
@@ -145,9 +145,9 @@ class Pen:
         self._draw.text(place, text, fill=colour, font=load_font(size * SUPERSAMPLE), anchor=anchor, **edge)
 
     def width(self, text: str, size: int = 13) -> float:
-        """How wide a line of text will be, pixels."""
+        """Return how wide a line of text will be, pixels."""
         return self._draw.textlength(text, font=load_font(size * SUPERSAMPLE)) / SUPERSAMPLE
 
     def finish(self) -> Image:
-        """The image at its final size."""
+        """Return the image at its final size."""
         return self._big.reduce(SUPERSAMPLE)

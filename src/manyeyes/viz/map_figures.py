@@ -36,7 +36,9 @@ class MapPanel:
 
 
 def compute_misalignment(source: MapElements, target: MapElements) -> Floats:
-    """(K, 4) x, y, dx, dy: from the lines of one observation, every 2 m, to the nearest point of the other's, within 3 m."""
+    """Return (K, 4) x, y, dx, dy: from the lines of one observation, every 2 m, to the nearest point of the other's, within 3
+    m.
+    """
     arrows = []
     for kind in KINDS:
         source_points = resample_lines(
@@ -102,7 +104,7 @@ def _close_rings(elements: MapElements, row: int) -> Floats:
 
 
 def _get_area(panel: MapPanel) -> tuple[float, float, float, float]:
-    """The panel's area, or everything in it with a margin."""
+    """Return the panel's area, or everything in it with a margin."""
     if panel.area is not None:
         return panel.area
     point_sets = [e.points for e in (panel.elements, panel.background) if e is not None and len(e.points)]

@@ -68,7 +68,7 @@ def make_page(
     num_observations: int,
     evaluated: MapElements | None = None,
 ) -> MapPage:
-    """The page of what a map publishes. evaluated: what of it the truth can speak about, where that is not all."""
+    """Return the page of what a map publishes. evaluated: what of it the ground truth covers, where that is not all."""
     published = vector_map.select_published()
     elements = published.elements
     facts = [("Elements", str(len(published))), ("Length", f"{elements.lengths().sum() / 1000:.2f} km")]
@@ -86,7 +86,7 @@ def make_page(
 
 
 def make_change_page(title: str, old: VectorMap, new: VectorMap, change: MapChange) -> MapPage:
-    """The page of a difference: the new map, the old one as its background, what is new and what is gone."""
+    """Return the page of a difference: the new map, the old one as its background, what is new and what is gone."""
     page = make_page(title, new, old.select_published().elements, None, 0)
     facts = [
         (c.kind.replace("_", " "), f"+{c.added_length_m:.0f} m, -{c.removed_length_m:.0f} m")
@@ -98,12 +98,12 @@ def make_change_page(title: str, old: VectorMap, new: VectorMap, change: MapChan
 
 
 def to_lonlat(points: Floats, origin: tuple[float, float]) -> Floats:
-    """(N, 2) longitude and latitude in degrees of metres east and north of an origin (latitude, longitude)."""
+    """Return (N, 2) longitude and latitude in degrees of metres east and north of an origin (latitude, longitude)."""
     return degrees_from_metres(points, origin)[:, ::-1]
 
 
 def render(page: MapPage) -> str:
-    """The page as text."""
+    """Return the page as text."""
     layers = {
         "truth": _features(page.truth, page.origin),
         "observed": _features(page.observed, page.origin),
@@ -143,7 +143,7 @@ def save_map_page(page: MapPage, path: Path) -> None:
 def _features(
     elements: MapElements | None, origin: tuple[float, float], descriptions: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """GeoJSON of elements: rings closed as lines, so that one style draws them all."""
+    """Return GeoJSON of elements: rings closed as lines, so that one style draws them all."""
     features = []
     for row in range(0 if elements is None else len(elements)):
         assert elements is not None
@@ -194,14 +194,14 @@ def _legend(names: dict[str, str]) -> str:
 
 
 def _read_asset(name: str) -> str:
-    """A file beside this one, without MapLibre's comment that points to a source map."""
+    """Return a file beside this one, without MapLibre's comment that points to a source map."""
     text = (resources.files("manyeyes.viz") / name).read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if not line.startswith("//# sourceMappingURL=")]
     return "\n".join(lines).replace("</script", "<\\/script")
 
 
 def _to_safe_json(value: object) -> str:
-    """JSON that cannot end the script element that holds it."""
+    """Return JSON that cannot end the script element that holds it."""
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 

@@ -38,11 +38,11 @@ class PoseCorrectionSummary:
             sender.first_frame.setdefault(correction.health.health, index)
 
     def make_rows(self) -> tuple[tuple[str, ...], ...]:
-        """A line for each sender under HEADINGS: the worst that was seen of it, and when first."""
+        """Return a row under HEADINGS for each sender: its worst state, and the first frame of it."""
         return tuple(_make_row(self.senders[agent]) for agent in sorted(self.senders))
 
     def make_warnings(self) -> tuple[str, ...]:
-        """A sentence for each sender whose claims were found wrong."""
+        """Return a sentence for each sender whose prior poses are inconsistent."""
         out = []
         for agent in sorted(self.senders):
             sender = self.senders[agent]
@@ -55,7 +55,7 @@ class PoseCorrectionSummary:
 
 
 def _worst_health(sender: _SenderSummary) -> PoseHealth:
-    """The worst lasting state; single suspect frames are expected of sound senders."""
+    """Return the worst lasting state; single suspect frames occur for correct priors, too."""
     for health in (*FAULTS, PoseHealth.SOUND, PoseHealth.SUSPECT):
         if health in sender.first_frame:
             return health

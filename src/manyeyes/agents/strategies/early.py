@@ -19,11 +19,11 @@ class EarlyFusion(FusionStrategy):
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
     ) -> Message | None:
-        """A message with the agent's whole cloud."""
+        """Return a message with the agent's whole cloud."""
         return replace(make_header(frame, cache.detector.fingerprint), points=frame.points)
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes of the merged cloud and of the one merged before it."""
+        """Return boxes of the merged cloud and of the one merged before it."""
         received = [m.points.transform(ego_from_sender(frame, m)) for m in messages if m.points is not None]
         merged = PointCloud.cat([frame.points, *received])
         return cache.run_detector(merged, cache.previous_merged_cloud(frame, merged)).boxes

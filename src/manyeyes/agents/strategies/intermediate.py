@@ -33,7 +33,7 @@ def confidence_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
 
 
 def random_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
-    """A uniform draw for every token, keyed by sender and time."""
+    """Return a uniform draw for every token, keyed by sender and time."""
     return keyed_uniform(
         (len(cache.process_tokens(frame).shared_tokens.sites),), 0, "selection", frame.agent_id, frame.timestamp_ns
     ).float()
@@ -51,7 +51,7 @@ class IntermediateFusion(FusionStrategy):
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
     ) -> Message | None:
-        """The pruned tokens with their proposals, and their scores for selection within a budget."""
+        """Return the pruned tokens with their proposals, and their scores for selection within a budget."""
         tokens, header = cache.process_tokens(frame).shared_tokens, make_header(frame, cache.detector.fingerprint)
         weights = compute_request_weights(tokens.sites.xy, frame.world_from_agent, requests)
         return replace(header, tokens=tokens, token_score=self.score(cache, frame) * weights)
@@ -62,7 +62,7 @@ class IntermediateFusion(FusionStrategy):
             cache.record_sent(frame, message.tokens)
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes of the fused tokens, with the agent's own tokens of the last two frames."""
+        """Return boxes of the fused tokens, with the agent's own tokens of the last two frames."""
         return cache.decode(cache.fuse(*gather_ego_tokens(cache, frame, messages))[1])
 
 
@@ -74,7 +74,7 @@ register_strategy("intermediate-random")(partial(IntermediateFusion, random_scor
 def gather_ego_tokens(
     cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]
 ) -> tuple[Tokens, Tokens | None]:
-    """The ego's current and past tokens with those of every message on the same lattice; and its own past tokens alone.
+    """Return the ego's current and past tokens with those of every message on the same lattice; and its own past tokens alone.
 
     Older tokens are propagated by their proposed velocity, and weighted by their age (``models.fusion.token_merge``).
     """
@@ -86,7 +86,7 @@ def gather_ego_tokens(
 
 
 def _to_agent_tokens(frame: AgentFrame, message: Message, features: Tensor, xy: Tensor) -> AgentTokens:
-    """Tokens in the ego's frame; the pose variances of ego and sender add up."""
+    """Return tokens in the ego's frame; the pose variances of ego and sender add up."""
     variance = (frame.pose_covariance + message.pose_covariance).diagonal()
     sigma_xy_m = float((variance[:2].mean()).clamp_min(0).sqrt())
     sigma_yaw_rad = float(variance[2].clamp_min(0).sqrt())

@@ -42,12 +42,12 @@ class LateFusion(FusionStrategy):
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
     ) -> Message | None:
-        """A message with the agent's own boxes."""
+        """Return a message with the agent's own boxes."""
         found = cache.process(frame).boxes
         return replace(make_header(frame, cache.detector.fingerprint), objects=found[found.score > self.min_score])
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """All boxes in the ego's frame, propagated by their velocity, after non-maximum suppression.
+        """Return all boxes in the ego's frame, propagated by their velocity, after non-maximum suppression.
 
         Scores of older boxes decay (``temporal_boxes``).
         """
@@ -67,7 +67,7 @@ register_strategy("late-temporal")(partial(LateFusion, uses_history=True))
 
 
 def _restore_own_boxes(ranked: Boxes, own: Boxes) -> Boxes:
-    """All ranked boxes, and the own boxes without one of them within DUPLICATE_DISTANCE_M, at a reduced score."""
+    """Return all ranked boxes, and the own boxes without one of them within DUPLICATE_DISTANCE_M, at a reduced score."""
     replaced = (torch.cdist(own.center[:, :2], ranked.center[:, :2]) <= DUPLICATE_DISTANCE_M).any(1)
     displaced = own[~replaced]
     found = Boxes.cat([ranked, replace(displaced, score=displaced.score * DISPLACED_SCORE_FACTOR)])

@@ -9,7 +9,7 @@ from manyeyes.datatypes import AgentFrame, Message, Transform
 
 
 def make_header(frame: AgentFrame, fingerprint: bytes) -> Message:
-    """A message of this frame without any section."""
+    """Return a message of this frame without any section."""
     return Message(
         agent_id=frame.agent_id,
         timestamp_ns=frame.timestamp_ns,
@@ -21,7 +21,7 @@ def make_header(frame: AgentFrame, fingerprint: bytes) -> Message:
 
 
 def lag_behind_newest_s(messages: Sequence[Message]) -> list[float]:
-    """Age of each message relative to the newest of its sender, seconds; 0 for the newest."""
+    """Return the age of each message relative to the newest of its sender, seconds; 0 for the newest."""
     newest = {m.agent_id: m.timestamp_ns for m in sorted(messages, key=lambda m: m.timestamp_ns)}
     return [(newest[m.agent_id] - m.timestamp_ns) / 1e9 for m in messages]
 
@@ -32,5 +32,5 @@ def ego_from_sender(frame: AgentFrame, message: Message) -> Transform:
 
 
 def age_s(frame: AgentFrame, message: Message) -> float:
-    """Age of a message relative to the ego's frame, seconds."""
+    """Return the age of a message relative to the ego's frame, seconds."""
     return (frame.timestamp_ns - message.timestamp_ns) / 1e9

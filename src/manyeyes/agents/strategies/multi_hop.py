@@ -27,7 +27,7 @@ class MultiHopFusion(IntermediateFusion):
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
     ) -> Message | None:
-        """The fused tokens of the previous frame if it is consecutive, else the agent's own tokens."""
+        """Return the fused tokens of the previous frame if it is consecutive, else the agent's own tokens."""
         cache.process(frame)
         if cache.last_fused is None or not is_consecutive(frame, cache.last_fused[0]):
             return super().compose_message(cache, frame, requests)
@@ -37,7 +37,7 @@ class MultiHopFusion(IntermediateFusion):
         return replace(make_header(then, cache.detector.fingerprint), tokens=tokens, token_score=score)
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes of the fused tokens; the tokens are stored for the next message."""
+        """Return boxes of the fused tokens; the tokens are stored for the next message."""
         fused, raw = cache.fuse(*gather_ego_tokens(cache, frame, messages))
         with torch.inference_mode():
             cache.last_fused = frame, cache.token_detector.make_tokens(fused.bev, raw)

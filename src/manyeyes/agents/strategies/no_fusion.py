@@ -21,5 +21,5 @@ class NoFusion(FusionStrategy):
         return None
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes of the agent's own cloud."""
+        """Return boxes of the agent's own cloud."""
         return cache.process(frame).boxes

@@ -23,7 +23,7 @@ SAME_OBJECT_M = 2.0
 
 
 def novelty_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
-    """(N,) in [0, 1], of the shared tokens of a frame: sigmoid(heat) * REDUNDANCY_DECAY^(earlier tokens of the object)."""
+    """Return (N,) in [0, 1], of the shared tokens of a frame: sigmoid(heat) * REDUNDANCY_DECAY^(earlier tokens of the object)."""
     tokens = cache.process_tokens(frame).shared_tokens
     place, heat = proposed_centres(tokens), proposed_heat(tokens.features[:, -PROPOSAL_DIM:])
     rank = heat.argsort(descending=True, stable=True).argsort()
@@ -37,12 +37,12 @@ def novelty_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
 
 
 def proposed_centres(tokens: SparseBev) -> Tensor:
-    """(N, 2) metres: the centre of the object that each token (N, C + PROPOSAL) proposes."""
+    """Return (N, 2) metres: the centre of the object that each token (N, C + PROPOSAL) proposes."""
     return tokens.sites.xy + proposed_offset(tokens.features[:, -PROPOSAL_DIM:]) * tokens.grid.cell_size_m
 
 
 def _propagate_centres(frame: AgentFrame, then: AgentFrame, sent: SparseBev) -> Tensor:
-    """(N, 2): proposed centres of an earlier frame's tokens, propagated to this frame."""
+    """Return (N, 2): proposed centres of an earlier frame's tokens, propagated to this frame."""
     seconds = (frame.timestamp_ns - then.timestamp_ns) / 1e9
     xy = proposed_centres(sent) + proposed_velocity(sent.features[:, -PROPOSAL_DIM:]) * seconds
     moved = frame.now_from_earlier(then).apply(torch.cat((xy, xy.new_zeros(len(xy), 1)), 1).double())

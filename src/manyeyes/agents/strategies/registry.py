@@ -36,7 +36,7 @@ class FusionStrategy(Protocol):
         """Record the message of a frame as it was sent, with the selected tokens only."""
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Boxes in the agent's frame, from its own cloud and received messages."""
+        """Return boxes in the agent's frame, from its own cloud and received messages."""
         ...
 
 

@@ -13,6 +13,6 @@ REQUEST_MAP_STRIDE = 32
 
 
 def make_request_map(cache: PerceptionCache, frame: AgentFrame) -> RequestMap:
-    """The confidence of the agent's own objects, in windows of the coarsest stride."""
+    """Return the confidence of the agent's own objects, in windows of the coarsest stride."""
     boxes = cache.process(frame).boxes
     return build_request_map(boxes.center[:, :2], boxes.score, cache.detector.grid.at(REQUEST_MAP_STRIDE))

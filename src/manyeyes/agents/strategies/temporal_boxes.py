@@ -20,12 +20,12 @@ DUPLICATE_IOU = 0.15
 
 
 def decay_scores(boxes: Boxes, seconds: float) -> Boxes:
-    """The same boxes with scores decayed by their age."""
+    """Return the same boxes with scores decayed by their age."""
     return replace(boxes, score=boxes.score * SCORE_DECAY_PER_100MS ** (10 * seconds))
 
 
 def propagate_boxes(frame: AgentFrame, outputs: Iterable[tuple[AgentFrame, AgentOutput]]) -> list[Boxes]:
-    """Boxes of an agent's previous frames, propagated by their velocity to this frame."""
+    """Return boxes of an agent's previous frames, propagated by their velocity to this frame."""
     found = []
     for before, output in outputs:
         seconds = (frame.timestamp_ns - before.timestamp_ns) / 1e9
@@ -35,6 +35,6 @@ def propagate_boxes(frame: AgentFrame, outputs: Iterable[tuple[AgentFrame, Agent
 
 
 def merge_boxes_nms(boxes: list[Boxes], iou: float = DUPLICATE_IOU) -> Boxes:
-    """Boxes by falling score after non-maximum suppression."""
+    """Return boxes by falling score after non-maximum suppression."""
     all_of_them = Boxes.cat(boxes)
     return all_of_them[rotated_nms(all_of_them.bev().double(), all_of_them.score, iou, max_candidates=len(all_of_them))]

@@ -91,7 +91,7 @@ class DairIndex:
 
 
 def find_dair_root(path: Path) -> Path | None:
-    """The folder that holds the two sides: path itself, the official archive's folder in it, or None."""
+    """Return the folder that holds the two sides: path itself, the official archive's folder in it, or None."""
     return next((p for p in (path, path / ARCHIVE) if any((p / side).is_dir() for side in SIDES)), None)
 
 
@@ -136,7 +136,7 @@ class _Side:
         )
 
     def before(self, frame: SideFrame, count: int) -> SideFrame | None:
-        """The sweep that came so many sweeps of the same drive before; None where there is none."""
+        """Return the sweep that came so many sweeps of the same drive before; None where there is none."""
         if frame.batch not in self._batches:
             same = [self.frame(i) for i, e in self.entries.items() if self._is_of(e, frame.batch)]
             self._batches[frame.batch] = sorted(same, key=lambda f: (f.timestamp_ns, f.id))
@@ -165,7 +165,7 @@ class Sides:
 
 
 def read_index(root: Path, sides: Sides, ids: frozenset[str] | None, options: DairOptions) -> DairIndex:
-    """The pairs whose files are all there; ids: of the vehicle's frames that count, None for all."""
+    """Return the pairs whose files are all there; ids: of the vehicle's frames that count, None for all."""
     path = root / "cooperative" / "data_info.json"
     there = _Listing()
     missing_counts = _MissingCounts()
@@ -224,7 +224,7 @@ def _both(sides: Sides, vehicle: str, infrastructure: str) -> tuple[tuple[_Side,
 
 
 def _absent_entries(sides: Sides, vehicle: str, infrastructure: str) -> list[FileProblem]:
-    """The frames of a pair that the index of their side does not have."""
+    """Return the frames of a pair that the index of their side does not have."""
     batch = sides.vehicle.frame(vehicle).batch if vehicle in sides.vehicle.entries else ""
     return [
         FileProblem(
@@ -236,7 +236,7 @@ def _absent_entries(sides: Sides, vehicle: str, infrastructure: str) -> list[Fil
 
 
 def _frame_id(path: Path, entry: Mapping[str, Any], side: str, row: int) -> str:
-    """The frame's id: stated by V2X-Seq, the stem of the cloud in DAIR-V2X."""
+    """Return the frame's id: stated by V2X-Seq, the stem of the cloud in DAIR-V2X."""
     if f"{side}_frame" in entry:
         return get_text(path, entry, f"{side}_frame", f"[{row}]")
     return Path(get_text(path, entry, f"{side}_pointcloud_path", f"[{row}]")).stem
@@ -257,7 +257,7 @@ def _pair(
 
 
 def _needed(pair: DairPair, there: _Listing) -> Iterable[Path]:
-    """Files without which there is no snapshot; lidar_i2v stands in for the infrastructure's own calibration."""
+    """Yield files without which there is no snapshot; lidar_i2v stands in for the infrastructure's own calibration."""
     yield pair.vehicle.cloud
     yield pair.infrastructure.cloud
     yield from pair.vehicle.motions
@@ -266,7 +266,7 @@ def _needed(pair: DairPair, there: _Listing) -> Iterable[Path]:
 
 
 def _absent_files(pair: DairPair, there: _Listing) -> list[FileProblem]:
-    """The files of a pair that are not there.
+    """Return the files of a pair that are not there.
 
     Labels and calibrations of the infrastructure are absent only where their folder has others: some releases have none.
     """
@@ -318,7 +318,7 @@ class _MissingCounts:
 
 
 def read_split_ids(root: Path, split: str, split_file: Path | str | None) -> frozenset[str]:
-    """Ids of the vehicle's frames of a split: under ``cooperative_split`` of the official file, or a bare list of ids."""
+    """Return ids of the vehicle's frames of a split: under ``cooperative_split`` of the official file, or a bare list of ids."""
     places = (Path(split_file),) if split_file is not None else (root / SPLIT_FILE, root / f"{split}.json")
     path = next((p for p in places if p.is_file()), None)
     if path is None:

@@ -23,7 +23,7 @@ _NOT_A_ROTATION = 0.02
 
 
 def load_json(path: Path) -> Any:
-    """The content of a JSON file."""
+    """Return the content of a JSON file."""
     try:
         return json.loads(path.read_bytes())
     except FileNotFoundError:
@@ -36,7 +36,7 @@ def load_json(path: Path) -> Any:
 
 
 def load_list(path: Path) -> list[Mapping[str, Any]]:
-    """The objects of a JSON file that holds a list of them."""
+    """Return the objects of a JSON file that holds a list of them."""
     content = load_json(path)
     if not isinstance(content, list) or not all(isinstance(entry, Mapping) for entry in content):
         found = type(content).__name__ if not isinstance(content, list) else "other things in it"
@@ -45,14 +45,14 @@ def load_list(path: Path) -> list[Mapping[str, Any]]:
 
 
 def get_field(path: Path, content: Any, key: str, json_path: str = "") -> Any:
-    """The value of a key that has to be there."""
+    """Return the value of a key that has to be there."""
     if not isinstance(content, Mapping) or key not in content:
         raise RecordingError(f"{path}: expected the key '{_name(json_path, key)}', found none; {REMEDY}.")
     return content[key]
 
 
 def get_text(path: Path, content: Any, key: str, json_path: str = "") -> str:
-    """A value that has to be a text with something in it."""
+    """Return a value that has to be a text with something in it."""
     found = get_field(path, content, key, json_path)
     if not isinstance(found, str) or not found:
         raise RecordingError(f"{path}: expected a text at '{_name(json_path, key)}', found {found!r}; {REMEDY}.")
@@ -60,7 +60,7 @@ def get_text(path: Path, content: Any, key: str, json_path: str = "") -> str:
 
 
 def get_number(path: Path, content: Any, key: str, json_path: str = "", blank: float | None = None) -> float:
-    """A finite number, written as such or as a string; blank: what an empty string stands for, None: an error."""
+    """Return a finite number, written as such or as a string; blank: what an empty string stands for, None: an error."""
     found = get_field(path, content, key, json_path)
     if found == "" and blank is not None:
         return blank
@@ -85,7 +85,7 @@ def _number(found: object) -> float | None:
 
 
 def _array(path: Path, found: object, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """An array of the shape, from nested lists of numbers or strings in any nesting of as many."""
+    """Return an array of the shape, from nested lists of numbers or strings in any nesting of as many."""
     values = _flat(found)
     if values is None or len(values) != int(np.prod(shape)):
         what = " x ".join(map(str, shape))
@@ -140,7 +140,7 @@ def get_offset(path: Path, found: Any, json_path: str) -> tuple[float, float] | 
 
 
 def read_side_labels(path: Path) -> Boxes:
-    """Vehicles that one side lists, in its LiDAR's frame, float64: ``3d_location`` is the middle, ``rotation`` the yaw."""
+    """Return vehicles that one side lists, in its LiDAR's frame, float64: ``3d_location`` is the middle, ``rotation`` the yaw."""
     places: list[list[float]] = []
     kept: list[tuple[int, int]] = []
     for row, entry, label in _vehicles(path):
@@ -156,7 +156,7 @@ def read_side_labels(path: Path) -> Boxes:
 
 
 def read_world_labels(path: Path) -> Boxes:
-    """Vehicles of a cooperative label in the world frame, float64, by ``world_8_points`` alone.
+    """Return vehicles of a cooperative label in the world frame, float64, by ``world_8_points`` alone.
 
     The corners run front left, front right, rear right, rear left at the bottom, then the same at the top. ``rotation`` is
     not the yaw in the world, and the format's own description calls all but type and corners unusable.
@@ -178,7 +178,7 @@ def read_world_labels(path: Path) -> Boxes:
 
 
 def _axes(corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Edges (N, 3) of boxes' corners (N, 8, 3): from rear to front, from right to left, from bottom to top."""
+    """Return edges (N, 3) of boxes' corners (N, 8, 3): from rear to front, from right to left, from bottom to top."""
 
     def edge(to: list[int], start: list[int]) -> torch.Tensor:
         return corners[:, to].mean(1) - corners[:, start].mean(1)
@@ -200,7 +200,7 @@ def _check_corners(path: Path, corners: np.ndarray, where: str) -> None:
 
 
 def _vehicles(path: Path) -> list[tuple[int, Mapping[str, Any], int]]:
-    """Row, entry and index into LABELS of every vehicle in a label file."""
+    """Return row, entry and index into LABELS of every vehicle in a label file."""
     found = []
     for row, entry in enumerate(load_list(path)):
         name = get_text(path, entry, "type", f"[{row}]").lower()
@@ -227,7 +227,7 @@ def _track(path: Path, entry: Mapping[str, Any], row: int) -> int:
 
 
 def _boxes(center: torch.Tensor, size: torch.Tensor, yaw: torch.Tensor, kept: list[tuple[int, int]]) -> Boxes:
-    """Ids are track_id + 1 where all have one and none has it twice, else rows from 1: id 0 is the ego's own body."""
+    """Return ids: track_id + 1 where all have one and none has it twice, else rows from 1: id 0 is the ego's own body."""
     tracks = [track for _, track in kept]
     whole = min(tracks, default=0) >= 0 and len(set(tracks)) == len(tracks)
     ids = [t + 1 for t in tracks] if whole else list(range(1, len(kept) + 1))

@@ -112,11 +112,11 @@ class DairRecording(RecordingReader):
         self._poses: dict[tuple[Path, ...], Transform] = {}
 
     def length(self, scenario: str) -> int:
-        """How many pairs the drive has."""
+        """Return how many pairs the drive has."""
         return len(self._pairs(scenario))
 
     def agents(self, scenario: str) -> tuple[int, ...]:
-        """The vehicle and the infrastructure, always 0 and -1."""
+        """Return the vehicle and the infrastructure, always 0 and -1."""
         self._pairs(scenario)
         return (VEHICLE_ID, INFRASTRUCTURE_ID)
 
@@ -133,12 +133,12 @@ class DairRecording(RecordingReader):
         return find_copied_files(clouds, scenario)
 
     def pair(self, scenario: str, index: int) -> DairPair:
-        """Which files a snapshot comes from."""
+        """Return which files a snapshot comes from."""
         require_index(self, scenario, index)
         return self._index.pairs[scenario][index]
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
-        """Both agents, each at its own time; the truth is that of the vehicle's time, None without a label."""
+        """Return both agents, each at its own time; the truth is that of the vehicle's time, None without a label."""
         pair = self.pair(scenario, index)
         poses = self.lidar_poses(pair)
         reported_poses = poses
@@ -154,7 +154,7 @@ class DairRecording(RecordingReader):
         return Snapshot(scenario, index, frames, self._truth(pair, poses, Transform.stack(true)))
 
     def lidar_poses(self, pair: DairPair) -> tuple[Transform, Transform]:
-        """World from the vehicle's LiDAR and from the infrastructure's virtual one, as far as the recording knows."""
+        """Return world from the vehicle's LiDAR and from the infrastructure's virtual one, as far as the recording knows."""
         vehicle = self._vehicle_pose(pair.vehicle)
         if not all(path.is_file() for path in pair.infrastructure.motions):
             return vehicle, vehicle @ read_calibration(pair.i2v)  # which holds the correction
@@ -197,13 +197,13 @@ class DairRecording(RecordingReader):
         )
 
     def _cloud(self, side: SideFrame) -> PcdCloud:
-        """The sweep without points at the sensor itself, which are no returns."""
+        """Return the sweep without points at the sensor itself, which are no returns."""
         cloud = read_pcd(side.cloud, self._drop_nan)
         met = cloud.xyz.any(axis=1)
         return PcdCloud(cloud.xyz[met], cloud.intensity[met], None if cloud.time_s is None else cloud.time_s[met])
 
     def _height(self, scenario: str, side: SideFrame, pole: bool) -> float:
-        """Metres from the road up to the LiDAR: stated, or found in the drive's first cloud so that it stays the same."""
+        """Return metres from the road up to the LiDAR: stated, or found in the drive's first cloud so that it stays the same."""
         if side.height_m is not None:
             return side.height_m
         if (scenario, pole) not in self._heights:
@@ -222,7 +222,7 @@ class DairRecording(RecordingReader):
         return self._poses[side.motions]
 
     def _uncorrected(self, pair: DairPair) -> Transform:
-        """World from virtual LiDAR by its own calibration; ``relative_error`` counts where the pair states no offset."""
+        """Return world from virtual LiDAR by its own calibration; ``relative_error`` counts where the pair states no offset."""
         if not all(path.is_file() for path in pair.infrastructure.motions):
             return self._vehicle_pose(pair.vehicle) @ read_calibration(pair.i2v)
         pose, (x, y) = read_infrastructure_calibration(pair.infrastructure.motions[0])
@@ -266,7 +266,7 @@ class DairRecording(RecordingReader):
 
 
 def _match_boxes(boxes: Boxes, others: Boxes) -> Tensor:
-    """(N,) int64: the row of others that is the same vehicle, -1 for none; greatest overlaps first, each row once."""
+    """Return (N,) int64: the row of others that is the same vehicle, -1 for none; greatest overlaps first, each row once."""
     partner = torch.full((len(boxes),), -1, dtype=torch.int64)
     if not len(boxes) or not len(others):
         return partner
@@ -282,14 +282,14 @@ def _match_boxes(boxes: Boxes, others: Boxes) -> Tensor:
 
 
 def _union(vehicle: Boxes, unit: Boxes) -> Boxes:
-    """Both lists, each vehicle once, as the vehicle's side has it; ids are rows from 1."""
+    """Return both lists, each vehicle once, as the vehicle's side has it; ids are rows from 1."""
     both = Boxes.cat([vehicle, unit[_match_boxes(unit, vehicle) < 0]])
     id = torch.arange(1, len(both) + 1)
     return Boxes.of(both.center, both.size, both.yaw, label=both.label, id=id)
 
 
 def _mark_own_body(boxes: Boxes, world_from_lidar: Transform) -> Boxes:
-    """The box around the vehicle's own LiDAR gets the vehicle's id, so that it is not evaluated."""
+    """Return the box around the vehicle's own LiDAR gets the vehicle's id, so that it is not evaluated."""
     local = boxes.transform(world_from_lidar.inverse())
     around = Boxes.of(local.center * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64), local.size, local.yaw)
     own = (

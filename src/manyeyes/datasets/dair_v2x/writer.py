@@ -158,7 +158,7 @@ class DairWriter:
 
 
 def list_pair_files(root: Path, stem: str) -> list[Path]:
-    """The files that DairWriter writes of one pair."""
+    """Return the files that DairWriter writes of one pair."""
     vehicle, infrastructure, cooperative = (
         root / name for name in ("vehicle-side", "infrastructure-side", "cooperative")
     )
@@ -176,7 +176,7 @@ def list_pair_files(root: Path, stem: str) -> list[Path]:
 
 
 def list_index_files(root: Path) -> list[Path]:
-    """The files that write_dair_index writes."""
+    """Return the files that write_dair_index writes."""
     return [root / SPLIT_FILE, *(root / f"{name}/data_info.json" for name in (*SIDES, "cooperative"))]
 
 
@@ -263,7 +263,7 @@ def _label(boxes: Boxes, row: int, rotation: float) -> dict[str, Any]:
 
 
 def _as_strings(value: Any) -> Any:
-    """Every number as the shortest text that reads back the same."""
+    """Return every number as the shortest text that reads back the same."""
     if isinstance(value, dict):
         return {key: _as_strings(inner) for key, inner in value.items()}
     return repr(value) if isinstance(value, (int, float)) else value

@@ -38,7 +38,7 @@ class ArrayCache:
         return self.folder / digest[:2], f"{digest}.{kind}.{stat.st_size:x}-{stat.st_mtime_ns:x}.npy"
 
     def load(self, source: Path, kind: str) -> np.ndarray | None:
-        """The array that was stored for this very state of the file, or None."""
+        """Return the array that was stored for this very state of the file, or None."""
         folder, name = self._entry(source, kind)
         try:
             return np.load(folder / name, allow_pickle=False)

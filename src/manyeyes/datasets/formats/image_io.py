@@ -16,7 +16,7 @@ from manyeyes.datatypes import MissingExtraError, RecordingError
 
 
 def read_image(path: Path) -> Tensor:
-    """(3, height, width) uint8, sRGB, of any format that Pillow knows; transparency is dropped."""
+    """Return (3, height, width) uint8, sRGB, of any format that Pillow knows; transparency is dropped."""
     image = _pillow()
     try:
         with image.open(path) as file:

@@ -48,7 +48,7 @@ def _expand(packed: np.ndarray, out: np.ndarray) -> int:
 
 
 def lzf_decompress(packed: bytes | memoryview, size: int) -> bytes | None:
-    """The ``size`` bytes that ``packed`` stands for, or None where it is damaged or has another length."""
+    """Return the ``size`` bytes that ``packed`` stands for, or None where it is damaged or has another length."""
     out = np.empty(size, np.uint8)
     return out.tobytes() if _expand(np.frombuffer(packed, np.uint8), out) == size else None
 
@@ -100,7 +100,7 @@ def _literals(plain: np.ndarray, start: int, end: int, out: np.ndarray, written:
 
 
 def lzf_compress(plain: bytes | memoryview) -> bytes:
-    """A stream that :func:`lzf_decompress` unpacks to ``plain``; at most 1/32 longer, the same every time."""
+    """Return a stream that :func:`lzf_decompress` unpacks to ``plain``; at most 1/32 longer, the same every time."""
     source = np.frombuffer(plain, np.uint8)
     out = np.empty(source.size + source.size // 32 + 1, np.uint8)
     return out[: _shrink(source, out)].tobytes()

@@ -30,7 +30,7 @@ class PcdTable:
     columns: tuple[np.ndarray, ...]
 
     def column(self, name: str) -> np.ndarray | None:
-        """The column of that name, or None where the file has no such field."""
+        """Return the column of that name, or None where the file has no such field."""
         return self.columns[self.names.index(name)] if name in self.names else None
 
 
@@ -145,7 +145,7 @@ def _read(path: Path) -> tuple[_PcdHeader, PcdTable]:
 
 
 def _parse_header(path: Path, data: bytes) -> tuple[_PcdHeader, int]:
-    """The header and the offset of the first byte after its DATA line."""
+    """Return the header and the offset of the first byte after its DATA line."""
     entries: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in entries:
@@ -209,7 +209,7 @@ def _is_colour(name: str, dtype: np.dtype) -> bool:
 
 
 def _colour_bits(values: np.ndarray) -> np.ndarray:
-    """Bits (N,) of packed colours given as float64; exact even where the processor flushes float32 denormals to zero.
+    """Return bits (N,) of packed colours given as float64; exact even where the processor flushes float32 denormals to zero.
 
     Below 2**-125 all float32 are multiples of 2**-149, and the multiple is the bit pattern.
     """

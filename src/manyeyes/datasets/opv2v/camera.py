@@ -46,7 +46,7 @@ def image_path(folder: Path, stem: str, number: int) -> Path:
 def camera_yaml(
     number: int, camera: Camera, world_from_agent: Transform, world_from_lidar: Transform
 ) -> dict[str, object]:
-    """The camera's entry of the agent's yaml, by its key, in plain numbers."""
+    """Return the camera's entry of the agent's yaml, by its key, in plain numbers."""
     world_from_body = world_from_agent @ camera.agent_from_camera @ _BODY_FROM_CAMERA.inverse()
     body_from_lidar = (world_from_body.inverse() @ world_from_lidar).matrix()
     return {
@@ -74,7 +74,7 @@ def read_images(yaml: Path, world_from_agent: Transform, cache: ArrayCache | Non
 
 
 def read_cameras(yaml: Path, cache: ArrayCache | None = None) -> tuple[CameraRecord, ...]:
-    """The cameras of one agent's yaml, from the cache where it has been read before."""
+    """Return the cameras of one agent's yaml, from the cache where it has been read before."""
     kept = cache.load(yaml, _KIND) if cache is not None and yaml.is_file() else None
     if kept is None or kept.ndim != 2 or kept.shape[1] != _COLUMNS:
         content = load_yaml(yaml)
@@ -101,7 +101,9 @@ def _row(path: Path, key: str, entry: object) -> list[float]:
 
 
 def find_missing_images(files: Sequence[Path], stems: Sequence[str]) -> dict[int, list[str]]:
-    """The stems that a camera lacks while it has pictures of others, by the camera's number; a camera without any is absent."""
+    """Return the stems that a camera lacks while it has pictures of others, by the camera's number; a camera without any is
+    absent.
+    """
     there = {p.name for p in files if p.suffix == ".png"}
     numbers = sorted(
         {int(n.rsplit("_camera", 1)[1][:-4]) for n in there if n.rsplit("_camera", 1)[-1][:-4].isdecimal()}
@@ -111,7 +113,7 @@ def find_missing_images(files: Sequence[Path], stems: Sequence[str]) -> dict[int
 
 
 def describe_missing_images(files: Sequence[Path], stems: Sequence[str]) -> list[str]:
-    """One line for each camera that has pictures of some of an agent's frames and lacks those of others."""
+    """Return one line for each camera that has pictures of some of an agent's frames and lacks those of others."""
     return [
         f"{len(lacking)} of {len(stems)} frames lack the picture of camera {number}, the first is {lacking[0]}; "
         "it is left out there"

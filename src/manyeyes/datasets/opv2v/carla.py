@@ -24,7 +24,7 @@ def transform_from_carla(pose: Sequence[float]) -> Transform:
 
 
 def carla_from_transform(world_from_body: Transform) -> tuple[float, ...]:
-    """The CARLA pose [x, y, z, roll, yaw, pitch] of one rigid motion; the inverse of :func:`transform_from_carla`."""
+    """Return the CARLA pose [x, y, z, roll, yaw, pitch] of one rigid motion; the inverse of :func:`transform_from_carla`."""
     x, y, z = world_from_body.translation.double().tolist()
     r = world_from_body.rotation.double().tolist()
     pitch = math.atan2(r[2][0], math.hypot(r[0][0], r[1][0]))
@@ -33,7 +33,7 @@ def carla_from_transform(world_from_body: Transform) -> tuple[float, ...]:
 
 
 def mirror_points(xyz: np.ndarray) -> np.ndarray:
-    """Points (N, 3) with y to the right as points with y to the left, or back; a copy."""
+    """Return points (N, 3) with y to the right as points with y to the left, or back; a copy."""
     mirrored = np.array(xyz, np.float32)
     mirrored[:, 1] *= -1
     return mirrored

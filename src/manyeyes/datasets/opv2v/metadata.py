@@ -54,7 +54,7 @@ class DataProtocol:
 
 
 def load_yaml(path: Path) -> Mapping[Any, Any]:
-    """The mapping at the top of a yaml file; anchors and aliases are resolved."""
+    """Return the mapping at the top of a yaml file; anchors and aliases are resolved."""
     try:
         content = yaml.load(path.read_bytes(), _Loader)
     except OSError as error:
@@ -68,7 +68,7 @@ def load_yaml(path: Path) -> Mapping[Any, Any]:
 
 
 def read_protocol(folder: Path) -> DataProtocol:
-    """The scenario's protocol, with its defaults where the folder has none or it is silent."""
+    """Return the scenario's protocol, with its defaults where the folder has none or it is silent."""
     path = folder / "data_protocol.yaml"
     if not path.is_file():
         return DataProtocol()
@@ -88,7 +88,7 @@ def read_protocol(folder: Path) -> DataProtocol:
 
 
 def read_record(path: Path, cache: ArrayCache | None = None) -> AgentRecord:
-    """One agent's yaml, from the cache where it has been read before: parsing takes tens of milliseconds."""
+    """Return one agent's yaml, from the cache where it has been read before: parsing takes tens of milliseconds."""
     kept = cache.load(path, "opv2v1") if cache is not None and path.is_file() else None
     if kept is None or kept.ndim != 2 or kept.shape[1] != _COLUMNS:
         kept = _parse(path)
@@ -156,7 +156,7 @@ def _numbers(path: Path, content: Mapping[Any, Any], key: str, count: int, yaml_
 
 
 def _label(vehicle: Mapping[Any, Any], size: np.ndarray) -> int:
-    """Index into LABELS: by name where the file has one, else by size.
+    """Return index into LABELS: by name where the file has one, else by size.
 
     OPV2V names no class. Our writer adds ``obj_type``; some releases have CARLA's blueprint as ``bp_id``. The sizes
     part CARLA's own vehicles: buses from 9 m, trucks from 6.5 m or as wide and high as its 5.2 m delivery truck, vans

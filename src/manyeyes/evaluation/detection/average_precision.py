@@ -82,7 +82,7 @@ class DetectionProtocol:
     drop_first_segment: bool = False
 
     def with_range(self, gt_range: tuple[float, float, float, float, float, float]) -> DetectionProtocol:
-        """The same rules over another range."""
+        """Return the same rules over another range."""
         return replace(self, gt_range=gt_range)
 
 
@@ -149,7 +149,7 @@ PROTOCOLS: dict[str, DetectionProtocol] = {
 
 
 def get_protocol(name: str) -> DetectionProtocol:
-    """The protocol of that name."""
+    """Return the protocol of that name."""
     if name not in PROTOCOLS:
         raise ConfigError(f"No evaluation protocol is called {name!r}; known: {', '.join(PROTOCOLS)}.")
     return PROTOCOLS[name]
@@ -206,7 +206,7 @@ class ApResult:
 
 
 def select_ego_truth(snapshot: Snapshot, ego: int, protocol: DetectionProtocol) -> Boxes:
-    """The truth that frames[ego] is judged by, in its true frame, float64; the rule is in the module's text."""
+    """Return the truth that frames[ego] is judged by, in its true frame, float64; the rule is in the module's text."""
     truth = snapshot.truth
     if truth is None:
         raise RecordingError(
@@ -223,7 +223,7 @@ def select_ego_truth(snapshot: Snapshot, ego: int, protocol: DetectionProtocol) 
 
 
 def _count_points(snapshot: Snapshot, near: Tensor) -> Tensor:
-    """(N,) int64: the returns of the agents that are near (agents,) in each truth box."""
+    """Return (N,) int64: the returns of the agents that are near (agents,) in each truth box."""
     assert snapshot.truth is not None
     count = torch.zeros(len(snapshot.truth.boxes), dtype=torch.int64)
     for row in near.nonzero()[:, 0].tolist():
@@ -233,7 +233,7 @@ def _count_points(snapshot: Snapshot, near: Tensor) -> Tensor:
 
 
 def _select_unique_ids(ids: Tensor, listed: Tensor) -> Tensor:
-    """Rows (K,) that are listed (N,), the first of each id; -1 marks a box without id, which is always kept."""
+    """Return rows (K,) that are listed (N,), the first of each id; -1 marks a box without id, which is always kept."""
     seen_ids: set[int] = set()
     rows: list[int] = []
     for row in listed.nonzero()[:, 0].tolist():
@@ -246,7 +246,7 @@ def _select_unique_ids(ids: Tensor, listed: Tensor) -> Tensor:
 
 
 def is_in_range(boxes: Boxes, protocol: DetectionProtocol, mode: RangeMode) -> Tensor:
-    """(N,) bool: which boxes lie in the protocol's range by centre or by all corners, with or without z; closed."""
+    """Return (N,) bool: which boxes lie in the protocol's range by centre or by all corners, with or without z; closed."""
     axes = 2 if mode.endswith("_xy") else 3
     shift = torch.tensor([0.0, 0.0, protocol.z_origin_m], dtype=torch.float64)
     low, high = torch.tensor(protocol.gt_range, dtype=torch.float64).view(2, 3) + shift
@@ -255,7 +255,7 @@ def is_in_range(boxes: Boxes, protocol: DetectionProtocol, mode: RangeMode) -> T
 
 
 def filter_detections(boxes: Boxes, protocol: DetectionProtocol) -> Boxes:
-    """The detections that count, in descending score (ties in the order given), float64."""
+    """Return the detections that count, in descending score (ties in the order given), float64."""
     boxes = boxes.to(torch.float64)
     boxes = boxes[boxes.score > protocol.score_threshold]
     corners = boxes.corners()
@@ -280,7 +280,7 @@ def compute_frame_iou(result: FrameResult, protocol: DetectionProtocol) -> Frame
 
 
 def match_frame(frame: FrameResult | FrameIou, iou: float, protocol: DetectionProtocol) -> FrameMatch:
-    """Which detections of a frame are true positives at an IoU threshold."""
+    """Return which detections of a frame are true positives at an IoU threshold."""
     if isinstance(frame, FrameResult):
         frame = compute_frame_iou(frame, protocol)
     table = frame.iou.numpy()
@@ -295,7 +295,7 @@ def match_frame(frame: FrameResult | FrameIou, iou: float, protocol: DetectionPr
 
 
 def _match_greedily(table: np.ndarray, threshold: float, allow_taken: bool) -> np.ndarray:
-    """Pairs (K, 2) of row and column: each row in turn takes its best free column, where that is >= the threshold.
+    """Return pairs (K, 2) of row and column: each row in turn takes its best free column, where that is >= the threshold.
 
     allow_taken: a row considers taken columns too, and gets nothing when its best is one of them.
     """
@@ -310,20 +310,20 @@ def _match_greedily(table: np.ndarray, threshold: float, allow_taken: bool) -> n
 
 
 def average_precision(frames: Sequence[FrameResult | FrameIou], iou: float, protocol: DetectionProtocol) -> ApResult:
-    """AP of the frames at an IoU threshold."""
+    """Return AP of the frames at an IoU threshold."""
     return compute_ap([match_frame(frame, iou, protocol) for frame in frames], protocol)
 
 
 def average_precisions(
     frames: Sequence[FrameResult | FrameIou], ious: Sequence[float], protocol: DetectionProtocol
 ) -> tuple[ApResult, ...]:
-    """AP of the frames at each IoU threshold; boxes are filtered and overlapped once."""
+    """Return AP of the frames at each IoU threshold; boxes are filtered and overlapped once."""
     ready = [compute_frame_iou(frame, protocol) if isinstance(frame, FrameResult) else frame for frame in frames]
     return tuple(average_precision(ready, iou, protocol) for iou in ious)
 
 
 def compute_ap(matches: Sequence[FrameMatch], protocol: DetectionProtocol) -> ApResult:
-    """AP of frames that are already matched."""
+    """Return AP of frames that are already matched."""
     matches = sort_by_frame(matches)
     n_gt = sum(count_truth(match, protocol) for match in matches)
     score = np.concatenate([m.score.numpy() for m in matches]) if matches else np.zeros(0)
@@ -344,17 +344,17 @@ def compute_ap(matches: Sequence[FrameMatch], protocol: DetectionProtocol) -> Ap
 
 
 def sort_by_frame(matches: Sequence[FrameMatch]) -> list[FrameMatch]:
-    """Frames by (scenario, index); stable."""
+    """Return frames by (scenario, index); stable."""
     return sorted(matches, key=lambda match: (match.scenario, match.index))
 
 
 def count_truth(match: FrameMatch, protocol: DetectionProtocol) -> int:
-    """How many truth boxes of a frame the protocol counts."""
+    """Return how many truth boxes of a frame the protocol counts."""
     return match.n_gt if len(match.score) or protocol.count_frames_without_det else 0
 
 
 def _compute_area(tp: np.ndarray, n_gt: int, drop_first_segment: bool) -> float:
-    """Area under precision made monotone over recall, for detections (D,) in their order."""
+    """Return the area under precision made monotone over recall, for detections (D,) in their order."""
     if n_gt == 0:
         return math.nan
     hits = np.cumsum(tp)

@@ -58,14 +58,14 @@ class Communication:
 
 
 def compute_paper_bytes(num_tokens: int, num_channels: int) -> int:
-    """Bytes of n tokens of c channels by the papers' formula: n (c + 2) 4. Source: CoSTr, Eq. 13."""
+    """Return bytes of n tokens of c channels by the papers' formula: n (c + 2) 4. Source: CoSTr, Eq. 13."""
     return num_tokens * (num_channels + 2) * 4
 
 
 def summarize_messages(
     records: Sequence[MessageRecord], num_ego_frames: int | None = None, rate_hz: float = 10.0
 ) -> Communication:
-    """The volume of a run. num_ego_frames: how many (ego, frame) there were; without it, those that have a record."""
+    """Return the volume of a run. num_ego_frames: how many (ego, frame) there were; without it, those that have a record."""
     num_recorded_frames = len({(r.scenario, r.index, r.ego) for r in records})
     if num_ego_frames is not None and num_ego_frames < num_recorded_frames:
         raise ConfigError(f"ego_frames is {num_ego_frames}, but the records alone name {num_recorded_frames}.")

@@ -27,7 +27,7 @@ class SingleFramePerScenario:
         return 1
 
     def eval_indices(self, scenario: str) -> range:
-        """The one there is."""
+        """Return the one there is."""
         return range(1)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
@@ -35,7 +35,7 @@ class SingleFramePerScenario:
         return self.recording.agents(scenario)
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
-        """The one there is, counted as 0."""
+        """Return the one scenario, counted as 0."""
         rng = keyed_generator("one instant", self.seed, scenario)
         return replace(
             self.recording.snapshot(scenario, int(rng.choice(self.recording.eval_indices(scenario)))), index=0

@@ -33,7 +33,7 @@ class FrameStride:
         return self.recording.length(scenario)
 
     def eval_indices(self, scenario: str) -> range:
-        """The indices K apart; the range ends behind the last of them, so that nothing is played in vain."""
+        """Return the indices K apart; the range ends behind the last of them, so that no further frame is replayed."""
         indices = self.recording.eval_indices(scenario)[:: self.stride]
         return range(indices.start, indices[-1] + 1, indices.step) if indices else indices
 
@@ -103,11 +103,11 @@ class NearestAgents:
         return self._recording.eval_indices(scenario)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
-        """The ids of those that are left, in their order."""
+        """Return the ids of those that are left, in their order."""
         return tuple(agent for agent in self._recording.agents(scenario) if agent in self._select_nearest(scenario))
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
-        """The frames of those that are left."""
+        """Return the frames of those that are left."""
         full, selected = self._recording.snapshot(scenario, index), self._select_nearest(scenario)
         kept_rows = [row for row, frame in enumerate(full.frames) if frame.agent_id in selected]
         removed_rows = [row for row in range(len(full.frames)) if row not in kept_rows]
@@ -132,6 +132,6 @@ class NearestAgents:
 
 
 def _reorder_agents(truth: GroundTruth, order: list[int]) -> GroundTruth:
-    """The truth with its agents in another order."""
+    """Return the truth with its agents in another order."""
     rows = torch.tensor(order, dtype=torch.int64)
     return replace(truth, seen=truth.seen[rows], world_from_agent=truth.world_from_agent[rows])

@@ -66,11 +66,11 @@ class ElementPool:
     observation_of_element: Ints
 
     def closed_lines(self) -> tuple[Floats, Ints]:
-        """Points and offsets of the elements with rings closed."""
+        """Return points and offsets of the elements with rings closed."""
         return close_rings(self.elements.points, self.elements.offsets, self.elements.closed)
 
     def sort_by_plausibility(self, row_indices: Ints) -> Ints:
-        """The rows from the most plausible on: by score, then length, then least corner."""
+        """Return the rows from the most plausible on: by score, then length, then least corner."""
         low = self.elements.bounds()[row_indices]
         length = np.round(self.elements.lengths()[row_indices], 6)
         return row_indices[np.lexsort((low[:, 1], low[:, 0], -length, -self.elements.score[row_indices]))]
@@ -86,7 +86,7 @@ class MergedElement:
 
 
 def filter_elements(observations: Sequence[Observation], rules: BaselineRules) -> ElementPool:
-    """The observations after the pre-filter, in one order."""
+    """Return the observations after the pre-filter, in one order."""
     unique = {o.id: o for o in observations}
     chosen = tuple(sorted(unique.values(), key=lambda o: (o.time_ns, o.id)))
     elements = MapElements.cat([o.elements_in_map() for o in chosen])
@@ -100,7 +100,7 @@ def filter_elements(observations: Sequence[Observation], rules: BaselineRules) -
 def to_vector_map(
     pool: ElementPool, merged: Sequence[MergedElement], rules: BaselineRules, frame: MapFrame | None
 ) -> VectorMap:
-    """The merged elements as a map in canonical order, with the shared score and state."""
+    """Return the merged elements as a map in canonical order, with the shared score and state."""
     merged = sorted((m for m in merged if len(m.points) >= 2), key=lambda m: (m.kind, m.points.tolist()))
     kind = np.array([m.kind for m in merged], np.int64)
     first = np.concatenate(([0], np.cumsum([len(m.source_rows) for m in merged]))).astype(np.int64)
@@ -139,7 +139,9 @@ def to_vector_map(
 
 
 def compute_log_odds(pool: ElementPool, elements: MapElements, sources: Sequence[Ints]) -> Floats:
-    """(N,) the mean log-odds over places of each element, of which the observations in sources hold it and others may miss it."""
+    """Return (N,) the mean log-odds over places of each element, of which the observations in sources hold it and others may
+    miss it.
+    """
     if not len(elements):
         return np.zeros(0)
     closed = close_rings(elements.points, elements.offsets, elements.closed)
@@ -167,7 +169,7 @@ class _NearObservations(NamedTuple):
 def _compute_log_odds(
     places: F64x2, offsets: I64x1, seen_by: _NearObservations, hit_sum: F64x1, pose: F64x2, fields: FieldsOfView
 ) -> F64x1:  # pragma: no cover - compiled
-    """(N,) mean log-odds over the places (P, 2) of each element, ``places[first[k]:first[k + 1]]``, within the clamp."""
+    """Return (N,) mean log-odds over the places (P, 2) of each element, ``places[first[k]:first[k + 1]]``, within the clamp."""
     observer, observer_offsets, is_source = seen_by
     out = np.zeros(len(offsets) - 1)
     for k in range(len(out)):
@@ -202,7 +204,7 @@ def _visibility_rings(observations: Sequence[Observation]) -> FieldsOfView:
 
 
 def _view_bounds(observations: Sequence[Observation]) -> Floats:
-    """(O, 4) boxes of the views in the map's frame."""
+    """Return (O, 4) boxes of the views in the map's frame."""
     rings = MapElements.of([o.view for o in observations], CROSSING)
     pose = np.repeat(np.reshape([o.pose for o in observations], (-1, 3)), rings.counts, axis=0)
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
@@ -211,14 +213,14 @@ def _view_bounds(observations: Sequence[Observation]) -> Floats:
 
 
 def _group_mean(values: Floats, offsets: Ints) -> Floats:
-    """(N, C) means over the rows of each merged element; none is without rows."""
+    """Return (N, C) means over the rows of each merged element; none is without rows."""
     if len(offsets) == 1:
         return np.zeros((0, values.shape[1]))
     return np.add.reduceat(values, offsets[:-1], axis=0) / np.diff(offsets)[:, None]
 
 
 def _mean_sigma(pool: ElementPool, merged: Sequence[MergedElement]) -> Floats:
-    """(P,) the mean sigma of what was merged, at each of its points."""
+    """Return (P,) the mean sigma of what was merged, at each of its points."""
     sizes = [len(m.points) for m in merged]
     if not merged:
         return np.zeros(0)

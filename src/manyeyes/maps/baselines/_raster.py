@@ -70,7 +70,7 @@ def draw_rings(
 
 @njit(cache=True)
 def _get_neighbours(mask: Boolx2, i: int, j: int) -> Boolx1:  # pragma: no cover - compiled
-    """The eight neighbours of a cell from above on, clockwise; beyond the border is nothing."""
+    """Return the eight neighbours of a cell from above on, clockwise; beyond the border is nothing."""
     out = np.zeros(8, np.bool_)
     for k in range(8):
         u = i + (-1, -1, 0, 1, 1, 1, 0, -1)[k]
@@ -81,7 +81,7 @@ def _get_neighbours(mask: Boolx2, i: int, j: int) -> Boolx1:  # pragma: no cover
 
 @njit(cache=True)
 def skeletonize(mask: Boolx2) -> Boolx2:  # pragma: no cover - compiled
-    """The skeleton of a mask (H, W) by Zhang and Suen (Communications of the ACM 27(3), 1984)."""
+    """Return the skeleton of a mask (H, W) by Zhang and Suen (Communications of the ACM 27(3), 1984)."""
     out = mask.copy()
     cells = np.argwhere(mask)
     changed = True
@@ -137,7 +137,7 @@ def _flood(
 
 @njit(cache=True)
 def label_components(mask: Boolx2) -> I64x2:  # pragma: no cover - compiled
-    """(H, W) the number of each cell's component from 0 on, in the order of rows; -1 outside."""
+    """Return (H, W) the number of each cell's component from 0 on, in the order of rows; -1 outside."""
     label = np.full(mask.shape, -1, np.int64)
     predecessor = np.empty(mask.shape, np.int64)
     cells = np.argwhere(mask)
@@ -154,7 +154,8 @@ def label_components(mask: Boolx2) -> I64x2:  # pragma: no cover - compiled
 def find_longest_walks(
     skeleton: Boolx2, min_cells: int, clear_cells: int, find_all: bool
 ) -> tuple[I64x2, I64x1]:  # pragma: no cover - compiled
-    """Cells (K, 2) and offsets of the longest walks of at least so many cells; find_all: what a component has besides its longest.
+    """Return cells (K, 2) and offsets of the longest walks of at least so many cells; find_all: what a component has besides
+    its longest.
 
     A walk found clears the cells within clear steps of it, so that spurs along it are no walks.
     """

@@ -38,7 +38,7 @@ class ChamferNmsConfig:
 def fuse(
     observations: Sequence[Observation], config: ChamferNmsConfig = ChamferNmsConfig(), frame: MapFrame | None = None
 ) -> VectorMap:
-    """The best of each heap of elements."""
+    """Return the best of each heap of elements."""
     element_pool = filter_elements(observations, config.rules)
     groups = cluster_elements(element_pool, find_overlaps(element_pool, config.max_chamfer_m, config.num_samples))
     merged = [
@@ -49,7 +49,7 @@ def fuse(
 
 
 def find_overlaps(pool: ElementPool, max_chamfer_m: float, num_samples: int) -> Ints:
-    """(K, 2) pairs of elements of one kind whose Chamfer distance is within the gate."""
+    """Return (K, 2) pairs of elements of one kind whose Chamfer distance is within the gate."""
     # No Chamfer distance is below the gap between two boxes along an axis.
     pairs = find_near_pairs(pool.elements.bounds(), max_chamfer_m)
     pairs = pairs[pool.elements.kind[pairs[:, 0]] == pool.elements.kind[pairs[:, 1]]]

@@ -53,12 +53,12 @@ class CpdResult:
     num_iterations: int
 
     def apply(self, points: Floats) -> Floats:
-        """(K, 2) points moved."""
+        """Return (K, 2) points moved."""
         return self.scale * points @ self.rotation.T + self.shift
 
 
 def register(target: Floats, source: Floats, config: CpdConfig = CpdConfig()) -> CpdResult:
-    """The motion that brings source (M, 2) onto target (N, 2)."""
+    """Return the motion that brings source (M, 2) onto target (N, 2)."""
     # Relative to the target's mean: far from the origin the squares would lose precision.
     centre = target.mean(0)
     x, y = freeze(target - centre, np.float64), freeze(source - centre, np.float64)

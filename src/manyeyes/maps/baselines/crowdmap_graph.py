@@ -50,7 +50,7 @@ def fuse(
     config: CrowdMapGraphConfig = CrowdMapGraphConfig(),
     frame: MapFrame | None = None,
 ) -> VectorMap:
-    """The map after the last observation."""
+    """Return the map after the last observation."""
     pool = filter_elements(observations, config.rules)
     bounds = pool.elements.bounds()
     # Rows of the pool that are one element of the map; the first gives its shape.
@@ -108,7 +108,7 @@ def merge_nodes(
 
 
 def _fits(overlaps: ElementGraph, edge: int, config: CrowdMapGraphConfig) -> bool:
-    """Whether registration brings the common interval of the second node onto that of the first."""
+    """Return whether registration brings the common interval of the second node onto that of the first."""
     target, source = (
         _sample_interval(overlaps.nodes, int(node), *overlaps.interval[edge, k : k + 2].tolist(), config.num_samples)
         for node, k in zip(overlaps.edge[edge], (0, 2))
@@ -120,7 +120,7 @@ def _fits(overlaps: ElementGraph, edge: int, config: CrowdMapGraphConfig) -> boo
 
 
 def _sample_interval(elements: MapElements, row: int, start_m: float, end_m: float, num_samples: int) -> Floats:
-    """(num_samples, 2) points of an element between two stations; of the whole of a ring."""
+    """Return (num_samples, 2) points of an element between two stations; of the whole of a ring."""
     line = elements.polyline(row)
     line = np.vstack((line, line[:1])) if elements.closed[row] else cut_line(line, start_m, end_m)
     return resample(line, np.array([0, len(line)]), num_samples)[0]

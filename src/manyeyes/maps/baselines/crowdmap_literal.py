@@ -55,7 +55,7 @@ def fuse(
     config: CrowdMapLiteralConfig = CrowdMapLiteralConfig(),
     frame: MapFrame | None = None,
 ) -> VectorMap:
-    """The literal pipeline's map."""
+    """Return the literal pipeline's map."""
     element_pool = filter_elements(observations, config.rules)
     elements = element_pool.elements
     line = resample(*element_pool.closed_lines(), config.num_samples)[0].reshape(-1, config.num_samples, 2)
@@ -84,7 +84,7 @@ def fuse(
 
 
 def _fits(anchor: Floats, moved: Floats, max_chamfer_m: float) -> np.ndarray:
-    """(K,) which of the registered lines (K, S, 2) lie on the anchor (S, 2)."""
+    """Return (K,) which of the registered lines (K, S, 2) lie on the anchor (S, 2)."""
     count, samples = moved.shape[:2]
     rows: Ints = np.arange(count)
     pairs = np.stack((rows, np.zeros(count, np.int64)), 1)
@@ -93,7 +93,9 @@ def _fits(anchor: Floats, moved: Floats, max_chamfer_m: float) -> np.ndarray:
 
 
 def average_lines(anchor: Floats, others: Floats) -> Floats:
-    """(S, 2) the anchor's points, each the mean of itself and of its feet on those of the other lines (K, S, 2) that reach it."""
+    """Return (S, 2) the anchor's points, each the mean of itself and of its feet on those of the other lines (K, S, 2) that
+    reach it.
+    """
     total, count = anchor.copy(), np.ones(len(anchor))
     for other in others:
         near = project_onto_line(anchor, other)

@@ -62,7 +62,7 @@ def fuse(
     config: FrechetClusteringConfig = FrechetClusteringConfig(),
     frame: MapFrame | None = None,
 ) -> VectorMap:
-    """The map of clusters."""
+    """Return the map of clusters."""
     element_pool = filter_elements(observations, config.rules)
     line = _sample_elements(element_pool, config.num_samples)
     # A Frechet distance is never below the gap between two boxes along an axis; means may hold distances beyond the gate.
@@ -86,7 +86,7 @@ def fuse(
 
 
 def compute_frechet_distances(line: Floats, pairs: Ints, ring: np.ndarray) -> Floats:
-    """(K,) Frechet distances of pairs of sampled lines (N, S, 2); rings (N,) are turned to start beside each other."""
+    """Return (K,) Frechet distances of pairs of sampled lines (N, S, 2); rings (N,) are turned to start beside each other."""
     count, samples = len(line), line.shape[1]
     offsets = np.arange(count + 1) * samples
     out = frechet_distance(line.reshape(-1, 2), offsets, line.reshape(-1, 2), offsets, pairs)
@@ -101,7 +101,7 @@ def compute_frechet_distances(line: Floats, pairs: Ints, ring: np.ndarray) -> Fl
 
 
 def _sample_elements(pool: ElementPool, num_samples: int) -> Floats:
-    """(N, S, 2) equally spaced samples; a ring's stand for its corners from its first on, without the repeated one."""
+    """Return (N, S, 2) equally spaced samples; a ring's stand for its corners from its first on, without the repeated one."""
     closed = pool.elements.closed
     counts = np.where(closed, num_samples + 1, num_samples)
     points, offsets = resample(*pool.closed_lines(), counts)
@@ -111,7 +111,7 @@ def _sample_elements(pool: ElementPool, num_samples: int) -> Floats:
 
 
 def _align_direction(line: Floats, onto: Floats, ring: bool) -> Floats:
-    """The samples (S, 2) in the direction of another's, a ring's from the sample nearest to the other's first on."""
+    """Return the samples (S, 2) in the direction of another's, a ring's from the sample nearest to the other's first on."""
     if not ring:
         straight, turned = (np.square(candidate - onto).sum() for candidate in (line, line[::-1]))
         return line if straight <= turned else line[::-1]
@@ -135,7 +135,9 @@ def _iterate_clusters(label: Ints, pairs: Ints) -> Iterator[tuple[Ints, Ints]]:
 
 
 def _link_clusters(label: Ints, pairs: Ints, gap: Floats, config: FrechetClusteringConfig) -> Ints:
-    """(N,) labels after average or complete linkage within each component; what was not measured counts as twice the gate."""
+    """Return (N,) labels after average or complete linkage within each component; what was not measured counts as twice the
+    gate.
+    """
     max_frechet_m = config.max_frechet_m
     out = label.copy()
     for rows, inner in _iterate_clusters(label, pairs):
@@ -165,7 +167,9 @@ def _link_clusters(label: Ints, pairs: Ints, gap: Floats, config: FrechetCluster
 
 
 def _find_medoid(rows: Ints, pairs: Ints, gap: Floats) -> int:
-    """The row with the least sum of distances to its cluster; a pair that was not measured costs more than any that was."""
+    """Return the row with the least sum of distances to its cluster; a pair that was not measured costs more than any that
+    was.
+    """
     unmeasured = float(gap.max()) + 1.0 if len(gap) else 0.0
     total = np.full(len(rows), unmeasured * (len(rows) - 1))
     for side in range(2):

@@ -79,7 +79,7 @@ def fuse(
     config: GlobalMapBuilderConfig = GlobalMapBuilderConfig(),
     frame: MapFrame | None = None,
 ) -> VectorMap:
-    """The map after the last observation."""
+    """Return the map after the last observation."""
     element_pool = filter_elements(observations, config.rules)
     start = np.searchsorted(element_pool.observation_of_element, np.arange(len(element_pool.observations) + 1))
     built: list[_BuiltElement] = []
@@ -96,7 +96,7 @@ def fuse(
 def _add_observation(
     built: list[_BuiltElement], pool: ElementPool, rows: Ints, view: Any, config: GlobalMapBuilderConfig
 ) -> list[_BuiltElement]:
-    """The map after one observation, whose elements are rows of the pool."""
+    """Return the map after one observation, whose elements are rows of the pool."""
     shapely = _shapely()
     lengths = pool.elements.lengths()
     out = list(built)
@@ -129,7 +129,7 @@ def _add_observation(
 def _match_costs(
     local: Sequence[Floats], known_lines: Sequence[Floats], kind: int, config: GlobalMapBuilderConfig
 ) -> Floats:
-    """(N, M) the lesser directed mean distance between each local and each known element."""
+    """Return (N, M) the lesser directed mean distance between each local and each known element."""
     if not known_lines:
         return np.zeros((len(local), 0))
     elements = MapElements.of([*local, *known_lines], kind)
@@ -143,7 +143,7 @@ def _match_costs(
 
 
 def replace_covered(old: Floats, new: Floats, simplify_m: float) -> Floats:
-    """(K, 2) the old line with the stretch that the new one covers replaced by it, in the old one's direction."""
+    """Return (K, 2): the old line with the stretch that the new one covers replaced by it, in the old one's direction."""
     old, new = simplify(old, simplify_m), simplify(new, simplify_m)
     along = project_onto_line(new[[0, -1]], old).station_m
     if along[0] > along[1] or (along[0] == along[1] and np.dot(new[-1] - new[0], old[-1] - old[0]) < 0):

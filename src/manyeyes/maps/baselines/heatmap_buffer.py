@@ -70,7 +70,7 @@ class _RasterGrid:
     cell_m: float
 
     def cell_centers(self, cells: Ints) -> Floats:
-        """(K, 2) metres of cells (K, 2)."""
+        """Return (K, 2) metres of cells (K, 2)."""
         return self.origin + (cells + 0.5) * self.cell_m
 
 
@@ -80,7 +80,7 @@ def fuse(
     config: HeatmapBufferConfig = HeatmapBufferConfig(),
     frame: MapFrame | None = None,
 ) -> VectorMap:
-    """The map of the picture."""
+    """Return the map of the picture."""
     element_pool = filter_elements(observations, config.rules)
     if not len(element_pool.elements):
         return to_vector_map(element_pool, [], config.rules, frame)
@@ -113,7 +113,7 @@ def _make_raster(pool: ElementPool, config: HeatmapBufferConfig) -> _RasterGrid:
 
 
 def _count_views(observations: Sequence[Observation], raster: _RasterGrid) -> Floats:
-    """(H, W) how many observations' views hold each cell."""
+    """Return (H, W) how many observations' views hold each cell."""
     rings = [MapElements.of([o.view], CROSSING).transform(*o.pose.tolist()).points for o in observations]
     offsets = np.concatenate(([0], np.cumsum([len(r) for r in rings]))).astype(np.int64)
     views = np.zeros(raster.shape)
@@ -122,7 +122,7 @@ def _count_views(observations: Sequence[Observation], raster: _RasterGrid) -> Fl
 
 
 def _threshold_heat(heat: Floats, views: Floats, config: HeatmapBufferConfig) -> np.ndarray:
-    """(H, W) where the smoothed heat reaches the threshold."""
+    """Return (H, W) where the smoothed heat reaches the threshold."""
     smooth = blur_image(heat, config.smoothing_sigma_m / config.cell_m)
     return smooth >= np.maximum(config.min_heat, config.min_view_fraction * views)
 
@@ -130,7 +130,7 @@ def _threshold_heat(heat: Floats, views: Floats, config: HeatmapBufferConfig) ->
 def _extract_lines(
     pool: ElementPool, rows: Ints, raster: _RasterGrid, views: Floats, config: HeatmapBufferConfig
 ) -> list[Floats]:
-    """The lines of one kind in the picture."""
+    """Return the lines of one kind in the picture."""
     part = pool.elements.take(rows)
     heat = np.zeros(raster.shape)
     columns = (np.array(part.points), np.array(part.offsets), np.array(part.score))
@@ -146,7 +146,7 @@ def _extract_lines(
 def _extract_crossings(
     pool: ElementPool, rows: Ints, raster: _RasterGrid, views: Floats, config: HeatmapBufferConfig
 ) -> list[Floats]:
-    """The rectangles of the crossings in the picture."""
+    """Return the rectangles of the crossings in the picture."""
     part = pool.elements.take(rows)
     heat = np.zeros(raster.shape)
     draw_rings(heat, np.array(part.points), np.array(part.offsets), np.array(part.score), raster.origin, raster.cell_m)
@@ -165,7 +165,7 @@ def _extract_crossings(
 def _attach_sources(
     pool: ElementPool, rows: Ints, shapes: Sequence[Floats], kind: int, config: HeatmapBufferConfig
 ) -> list[MergedElement]:
-    """Each shape with the rows that lie along it for half of their length or more; without any it is left out."""
+    """Return each shape with the rows that lie along it for half of their length or more; without any it is left out."""
     part = pool.elements.take(rows)
     drawn = MapElements.of(shapes, kind)
     samples, offsets = resample_spaced(part.points, part.offsets, 1.0)

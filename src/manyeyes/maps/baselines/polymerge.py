@@ -58,7 +58,7 @@ class PolyMergeConfig:
 def fuse(
     observations: Sequence[Observation], config: PolyMergeConfig = PolyMergeConfig(), frame: MapFrame | None = None
 ) -> VectorMap:
-    """The map of components."""
+    """Return the map of components."""
     element_pool = filter_elements(observations, config.rules)
     merged = []
     for rows in group_elements(element_pool, config.max_vertex_distance_m):
@@ -73,7 +73,7 @@ def fuse(
 
 
 def group_elements(pool: ElementPool, max_vertex_distance_m: float) -> list[Ints]:
-    """Rows of the components of one kind, each from the most plausible on."""
+    """Return rows of the components of one kind, each from the most plausible on."""
     points, offsets = pool.closed_lines()
     kind = pool.elements.kind
     pairs = find_near_pairs(pool.elements.bounds(), max_vertex_distance_m)
@@ -96,7 +96,7 @@ def _merge_lines(lines: Sequence[Floats], simplify_m: float) -> Floats:
 
 
 def merge_two_lines(whole: Floats, line: Floats) -> Floats:
-    """(K', 2) two lines as one, ordered along the first: middles where they face each other, their own vertices beyond."""
+    """Return (K', 2) two lines as one, ordered along the first: middles where they face each other, their own vertices beyond."""
     on_whole = project_onto_line(line, whole)
     order = on_whole.station_m[on_whole.is_interior] if on_whole.is_interior.sum() > 1 else on_whole.station_m
     ahead = order[-1] - order[0] if order[-1] != order[0] else np.dot(line[-1] - line[0], whole[-1] - whole[0])
@@ -123,7 +123,7 @@ def merge_two_lines(whole: Floats, line: Floats) -> Floats:
 
 
 def vote_crossing(rings: Sequence[Floats], config: PolyMergeConfig) -> Floats | None:
-    """(4, 2) the least rotated rectangle of where the blurred share of drawn hulls exceeds the config's; None: nowhere."""
+    """Return (4, 2) the least rotated rectangle of where the blurred share of drawn hulls exceeds the config's; None: nowhere."""
     shapely = _shapely()
     hulls = shapely.convex_hull(np.array([shapely.Polygon(ring) for ring in rings], dtype=object))
     margin = 4 * config.blur_sigma_m
@@ -145,14 +145,14 @@ def vote_crossing(rings: Sequence[Floats], config: PolyMergeConfig) -> Floats | 
 
 
 def fit_rectangle(points: Floats) -> Floats:
-    """(4, 2) the corners of the least rotated rectangle around points (K, 2), anticlockwise."""
+    """Return (4, 2) the corners of the least rotated rectangle around points (K, 2), anticlockwise."""
     shapely = _shapely()
     box = shapely.oriented_envelope(shapely.MultiPoint(points))
     return shapely.get_coordinates(shapely.geometry.polygon.orient(box))[:-1]
 
 
 def blur_image(image: Floats, sigma_cells: float) -> Floats:
-    """The image (H, W) under a Gaussian, cut at three sigma and normalised; beyond the border is nothing."""
+    """Return the image (H, W) under a Gaussian, cut at three sigma and normalised; beyond the border is nothing."""
     if sigma_cells <= 0:
         return image
     radius = int(np.ceil(3 * sigma_cells))

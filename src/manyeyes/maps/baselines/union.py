@@ -25,7 +25,7 @@ class UnionConfig:
 def fuse(
     observations: Sequence[Observation], config: UnionConfig = UnionConfig(), frame: MapFrame | None = None
 ) -> VectorMap:
-    """The union of all elements."""
+    """Return the union of all elements."""
     element_pool = filter_elements(observations, config.rules)
     kinds = element_pool.elements.kind.tolist()
     merged = [MergedElement(element_pool.elements.polyline(k), kind, np.array([k])) for k, kind in enumerate(kinds)]

@@ -175,7 +175,7 @@ def _is_observed_between(points: F64x2, i: int, j: int, runs: I64x2) -> bool:  #
 
 @njit(cache=True, nogil=True)
 def _is_observed(runs: I64x2, x: float, y: float) -> bool:  # pragma: no cover - compiled
-    """Whether the cell of a place is in a run."""
+    """Return whether the cell of a place is in a run."""
     ix, iy = int(np.floor(x / CELL_M)), int(np.floor(y / CELL_M))
     low, high = 0, len(runs)
     while low < high:

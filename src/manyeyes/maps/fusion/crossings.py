@@ -157,7 +157,7 @@ class _CrossingEvidence(NamedTuple):
 
 
 def _transform_rings(arrays: ObservationArrays, rows: Ints, owner: Ints, pose: Floats) -> tuple[Ints, Floats]:
-    """Rings of elements ``rows`` in the map's frame: offsets and points."""
+    """Return rings of elements ``rows`` in the map's frame: offsets and points."""
     elements = arrays.elements.take(rows)
     at = pose[np.repeat(owner, elements.counts)]
     c, s = np.cos(at[:, 2]), np.sin(at[:, 2])
@@ -234,7 +234,7 @@ def _areas(first: I64x1, points: F64x2) -> F64x1:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _common(a: F64x2, b: F64x2) -> float:  # pragma: no cover - compiled
-    """Area common to two convex anticlockwise rings (Sutherland and Hodgman's clipping)."""
+    """Return the area common to two convex anticlockwise rings (Sutherland and Hodgman's clipping)."""
     ring = a.copy()
     for k in range(len(b)):
         p, q = b[k], b[(k + 1) % len(b)]
@@ -246,7 +246,7 @@ def _common(a: F64x2, b: F64x2) -> float:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def _half_plane(ring: F64x2, px: float, py: float, nx: float, ny: float) -> F64x2:  # pragma: no cover - compiled
-    """The part of a convex ring where (x - px) nx + (y - py) ny <= 0."""
+    """Return the part of a convex ring where (x - px) nx + (y - py) ny <= 0."""
     out, n = np.empty((len(ring) + 2, 2)), 0
     for i in range(len(ring)):
         a, b = ring[i], ring[(i + 1) % len(ring)]
@@ -305,7 +305,7 @@ def _group_rings(
 
 @njit(cache=True, nogil=True)
 def _touch(low: F64x2, high: F64x2, q: int, r: int) -> bool:  # pragma: no cover - compiled
-    """Whether the boxes of rings q and r meet."""
+    """Return whether the boxes of rings q and r meet."""
     across = low[q, 0] <= high[r, 0] and low[r, 0] <= high[q, 0]
     return across and low[q, 1] <= high[r, 1] and low[r, 1] <= high[q, 1]
 
@@ -356,7 +356,7 @@ def _average_linkage(
 def _mark_cut_points(
     first: I64x1, points: F64x2, owner: I64x1, pose: F64x2, rings: FieldsOfView, cut: float
 ) -> Boolx1:  # pragma: no cover - compiled
-    """(P,) whether each ring point, in the map's frame, lies at the border of its observation's view."""
+    """Return (P,) whether each ring point, in the map's frame, lies at the border of its observation's view."""
     out = np.zeros(len(points), np.bool_)
     for r in range(len(first) - 1):
         o = owner[r]
@@ -378,7 +378,7 @@ def _fuse_shape(
     weight: F64x1,
     rectangle: float,
 ) -> F64x2:  # pragma: no cover - compiled
-    """The fused ring (K, 2), anticlockwise, of the rings ``members``; cut: (P,) points at the border of their view."""
+    """Return the fused ring (K, 2), anticlockwise, of the rings ``members``; cut: (P,) points at the border of their view."""
     cc, ss, mass, mx, my = 0.0, 0.0, 0.0, 0.0, 0.0
     for r in members:
         ring = hulls[hull_first[r] : hull_first[r + 1]]
@@ -422,7 +422,7 @@ def _fuse_shape(
 
 @njit(cache=True, nogil=True)
 def _median(value: F64x1, weight: F64x1) -> float:  # pragma: no cover - compiled
-    """The weighted median, between the two middle values where the halves balance."""
+    """Return the weighted median, between the two middle values where the halves balance."""
     order = np.arange(len(value))
     for i in range(1, len(order)):
         j = i
@@ -441,7 +441,7 @@ def _median(value: F64x1, weight: F64x1) -> float:  # pragma: no cover - compile
 
 @njit(cache=True, nogil=True)
 def _places_in(ring: F64x2) -> F64x2:  # pragma: no cover - compiled
-    """The middle of a ring (K, 2), and the points halfway from it to each corner: (K + 1, 2)."""
+    """Return the middle of a ring (K, 2), and the points halfway from it to each corner: (K + 1, 2)."""
     places = np.empty((1 + len(ring), 2))
     places[0, 0], places[0, 1] = ring[:, 0].mean(), ring[:, 1].mean()
     for i in range(len(ring)):

@@ -383,7 +383,7 @@ def new_agent_scratch(count: int) -> AgentScratch:  # pragma: no cover - compile
 
 @njit(cache=True, nogil=True)
 def doubled(rows: I64x1) -> I64x1:  # pragma: no cover - compiled
-    """The same rows at the start of an array of twice the length."""
+    """Return the same rows at the start of an array of twice the length."""
     bigger = np.empty(2 * len(rows), np.int64)
     bigger[: len(rows)] = rows
     return bigger

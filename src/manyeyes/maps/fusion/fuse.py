@@ -183,7 +183,7 @@ def _build_crossings(table: StationTable) -> _ElementParts:
 
 
 def _to_vector_map(parts: _ElementParts, evidence: EvidenceTable, frame: MapFrame) -> VectorMap:
-    """Elements in canonical order with the evidence of the rows behind them."""
+    """Return elements in canonical order with the evidence of the rows behind them."""
     count = len(parts.offsets) - 1
     evidence = normalize_style(evidence)
     owner = np.repeat(np.arange(count), np.diff(parts.offsets))
@@ -239,7 +239,7 @@ def _build_topology(elements: MapElements, state: Ints) -> Topology:
 
 
 def _collect_sources(owner: Ints, row: Ints, count: int, evidence: EvidenceTable) -> tuple[Ints, Ints]:
-    """Offsets and observations behind each element, each once, ascending."""
+    """Return offsets and observations behind each element, each once, ascending."""
     sizes = np.diff(evidence.source_offsets)[row]
     starts = evidence.source_offsets[row]
     element_rows = np.repeat(owner, sizes)
@@ -257,7 +257,7 @@ def _collect_sources(owner: Ints, row: Ints, count: int, evidence: EvidenceTable
 
 
 def _canonical_order(offsets: Ints, points: Floats) -> tuple[Ints, Ints]:
-    """Offsets and an order of the points in which chains stand by their first point and start at their lesser end."""
+    """Return offsets and an order of the points in which chains stand by their first point and start at their lesser end."""
     if not len(points):
         return np.zeros(1, np.int64), np.zeros(0, np.int64)
     head, tail = points[offsets[:-1]], points[offsets[1:] - 1]
@@ -280,7 +280,7 @@ def _ordered_points(offsets: I64x1, walk: I64x1, turned: Boolx1) -> I64x1:  # pr
 
 
 def _lengths(offsets: Ints, points: Floats) -> Floats:
-    """(L,) metres along each chain."""
+    """Return (L,) metres along each chain."""
     if len(points) == 0:
         return np.zeros(0)
     step = np.concatenate((np.hypot(*np.diff(points, axis=0).T), [0.0]))

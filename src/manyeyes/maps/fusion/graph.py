@@ -116,7 +116,7 @@ class ElementGraph:
 def build_element_graph(
     nodes: MapElements, observation: ArrayLike = -1, config: GraphConfig = GraphConfig()
 ) -> ElementGraph:
-    """The graph of elements in one frame; observation: (N,) or one for all, -1 for elements of a map."""
+    """Return the graph of elements in one frame; observation: (N,) or one for all, -1 for elements of a map."""
     owner = np.array(np.broadcast_to(np.asarray(observation, np.int64), (len(nodes),)))
     if len(nodes) and int(nodes.counts.min()) < 2:
         raise ShapeError(
@@ -132,7 +132,7 @@ def build_element_graph(
 
 
 def _classify(nodes: MapElements, owner: Ints, pairs: Ints, found: Floats, config: GraphConfig) -> ElementGraph:
-    """The edges that the measurements (K, _NUM_COLUMNS) of pairs (K, 2) make."""
+    """Return the edges that the measurements (K, _NUM_COLUMNS) of pairs (K, 2) make."""
     i, j = pairs.T
     length = nodes.lengths()
     min_interval = np.minimum(config.min_interval_m, 0.5 * np.minimum(length[i], length[j]))
@@ -215,7 +215,9 @@ class _Thresholds(NamedTuple):
 def _measure_pairs(
     lines: _Polylines, samples: _Samples, pairs: I64x2, closed: Boolx1, params: _Thresholds
 ) -> F64x2:  # pragma: no cover - compiled
-    """(K, _NUM_COLUMNS) what is measured of each pair; infinity where two ends do not continue or two lines do not cross."""
+    """Return (K, _NUM_COLUMNS) what is measured of each pair; infinity where two ends do not continue or two lines do not
+    cross.
+    """
     points, offsets = lines
     dense, dense_first, heading = samples
     out = np.full((len(pairs), _NUM_COLUMNS), np.inf)
@@ -238,7 +240,7 @@ def _measure_pairs(
 
 @njit(cache=True)
 def _angle_between(ax: float, ay: float, bx: float, by: float) -> float:  # pragma: no cover - compiled
-    """The angle between two directions without regard to sense, [0, pi / 2]."""
+    """Return the angle between two directions without regard to sense, [0, pi / 2]."""
     return np.arctan2(abs(ax * by - ay * bx), abs(ax * bx + ay * by))
 
 

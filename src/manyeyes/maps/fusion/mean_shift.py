@@ -164,7 +164,7 @@ class _ThinningGates(NamedTuple):
 def _thin(
     walk: I64x1, grid: PointGrid, xy: F64x2, tangent: F64x2, kind: I64x1, params: _ThinningGates
 ) -> I64x1:  # pragma: no cover - compiled
-    """Which points stay, ascending; all arrays are in the order of the grid, and walk names places in it."""
+    """Return which points stay, ascending; all arrays are in the order of the grid, and walk names places in it."""
     keys, start = grid.keys, grid.offsets
     spacing, min_separation, cosine = params
     kept = np.zeros(len(xy), np.bool_)

@@ -162,7 +162,7 @@ def to_observation_arrays(observations: Sequence[Observation], spacing_m: float)
 
 
 def is_line(kind: Ints) -> Flags:
-    """Which kinds (N,) are lines; a crossing is a ring."""
+    """Return which kinds (N,) are lines; a crossing is a ring."""
     return np.asarray(kind) != CROSSING
 
 

@@ -114,7 +114,7 @@ def _limits(config: ParallelExtensionConfig) -> _ExtensionLimits:
 
 
 def _chords(line: Floats, offsets: Ints) -> Floats:
-    """(M, 2) unit direction of each chain at its points, over three points on each side."""
+    """Return (M, 2) unit direction of each chain at its points, over three points on each side."""
     at = np.arange(len(line))
     low, high = np.repeat(offsets[:-1], np.diff(offsets)), np.repeat(offsets[1:] - 1, np.diff(offsets))
     step = line[np.minimum(at + 3, high)] - line[np.maximum(at - 3, low)]
@@ -169,7 +169,9 @@ def _extend_chains(
 def _find_guides(
     end: int, inward: int, lines: _Chains, grid: PointGrid, params: _ExtensionLimits
 ) -> list[int]:  # pragma: no cover - compiled
-    """Points within _MAX_LONGITUDINAL_M, along it, of the end of a chain, on lines that run beside it there and did so before."""
+    """Return points within _MAX_LONGITUDINAL_M, along it, of the end of a chain, on lines that run beside it there and did so
+    before.
+    """
     offsets, line, chord, kind, _, chain = lines
     keys, start, order = grid.keys, grid.offsets, grid.order
     nearest, farthest, even = params.min_distance_m, params.max_distance_m, params.max_distance_change_m
@@ -206,7 +208,7 @@ def _find_guides(
 def _lateral_offset(
     x: float, y: float, c: int, offsets: I64x1, line: F64x2, chord: F64x2
 ) -> float:  # pragma: no cover - compiled
-    """How far left of a chain a place lies; inf where it has no foot on it."""
+    """Return how far left of a chain a place lies; inf where it has no foot on it."""
     best, out = np.inf, np.inf
     for q in range(offsets[c], offsets[c + 1]):
         ex, ey = x - line[q, 0], y - line[q, 1]
@@ -222,7 +224,7 @@ def _lateral_offset(
 def _follow_guide(
     end: int, g: int, ahead: int, lines: _Chains, grid: PointGrid, params: _ExtensionLimits, path: F64x2, turn: F64x2
 ) -> tuple[int, float, int]:  # pragma: no cover - compiled
-    """Places beside a guide from its point g on, written to way and turn: their number, the gap across where they
+    """Return places beside a guide from its point g on, written to way and turn: their number, the gap across where they
     arrive, and at which point (-1: nowhere).
     """
     _, line, chord, kind, coverage, chain = lines
@@ -260,7 +262,7 @@ def _follow_guide(
 def _find_arrival(
     x: float, y: float, u: float, v: float, end: int, lines: _Chains, grid: PointGrid, max_lateral: float
 ) -> tuple[int, float]:  # pragma: no cover - compiled
-    """The point of another chain of the end's kind nearest across a way at x, y in direction u, v, and how far left it
+    """Return the point of another chain of the end's kind nearest across a way at x, y in direction u, v, and how far left it
     lies; -1: none.
     """
     _, line, chord, kind, _, chain = lines

@@ -87,7 +87,7 @@ def link_stations(
 
 
 def _find_links(xy: Floats, tangent: Floats, kind: Ints, max_gap: float, config: LinkConfig) -> Ints:
-    """(K, 2) the station linked in front of and behind each one's own tangent, or -1."""
+    """Return (K, 2): the station linked in front of and behind each one's own tangent, or -1."""
     grid = build_grid(xy[:, 0], xy[:, 1], kind, max_gap)
     best = _find_best_partners(
         xy,
@@ -166,7 +166,7 @@ class _LinkGates(NamedTuple):
 def _find_best_partners(
     xy: F64x2, tangent: F64x2, kind: I64x1, free: Boolx2, points: _LinkCandidates, max_gap: float, params: _LinkGates
 ) -> I64x3:  # pragma: no cover - compiled
-    """(K, 2, 2) best partner on each side (_FRONT, _BEHIND): its row and which of its sides faces back; -1 for none."""
+    """Return (K, 2, 2) best partner on each side (_FRONT, _BEHIND): its row and which of its sides faces back; -1 for none."""
     keys, start, order, rxy, rtangent = points
     lateral0, lateral1, heading0, heading1, lateral_cost = params
     best = np.full((len(xy), 2, 2), -1, np.int64)

@@ -15,7 +15,7 @@ from manyeyes.ops.polyline import select_vertices
 
 
 def simplify_map(vector_map: VectorMap, tolerance_m: float) -> VectorMap:
-    """The map with a subset of its points, none of those left out farther than tolerance_m from the line that remains.
+    """Return the map with a subset of its points, none of those left out farther than tolerance_m from the line that remains.
 
     Ends of lines and the first point of a ring stay, with the ring's point that is farthest from it.
     """
@@ -36,7 +36,7 @@ def simplify_map(vector_map: VectorMap, tolerance_m: float) -> VectorMap:
 
 
 def _select_ring(points: NDArray[np.float64], tolerance_m: float) -> NDArray[np.bool_]:
-    """(P,) which points of a ring stay: it is cut at its first point and at the one farthest from that."""
+    """Return (P,) which points of a ring stay: it is cut at its first point and at the one farthest from that."""
     far = int(np.square(points - points[0]).sum(1).argmax())
     there, back = points[: far + 1], np.concatenate((points[far:], points[:1]))
     kept = np.zeros(len(points), np.bool_)

@@ -335,7 +335,7 @@ def _find_losers(
 
 @njit(cache=True, nogil=True)
 def _count_shared(sources: I64x1, first: I64x1, k: int, q: int) -> int:  # pragma: no cover - compiled
-    """How many observations saw both stations; each one's sources ascend."""
+    """Return how many observations saw both stations; each one's sources ascend."""
     both, i, j = 0, first[k], first[q]
     while i < first[k + 1] and j < first[q + 1]:
         if sources[i] == sources[j]:
@@ -366,6 +366,6 @@ def _rings_inside(
 
 
 def normalize_style(table: EvidenceTable) -> EvidenceTable:
-    """The same with style votes as probabilities (K, S); without votes all alike."""
+    """Return the same with style votes as probabilities (K, S); without votes all alike."""
     total = table.style.sum(1, keepdims=True)
     return replace(table, style=np.where(total > 0, table.style / np.maximum(total, 1e-12), 1.0 / len(STYLES)))

@@ -74,7 +74,7 @@ def _find_successors(elements: MapElements, xy: Floats, outward: Floats, owner: 
 
 
 def _find_neighbours(elements: MapElements, lines: Ints, side: float, config: TopologyConfig) -> Ints:
-    """(K, 2) each line and its nearest neighbour on a side (1: left, -1: right)."""
+    """Return (K, 2) each line and its nearest neighbour on a side (1: left, -1: right)."""
     kinds = np.flatnonzero(elements.kind[elements.element_of_point] != CROSSING)
     points, owner = elements.points[kinds], elements.element_of_point[kinds]
     counts = elements.counts[lines]
@@ -134,7 +134,7 @@ def _find_branches(xy: Floats, owner: Ints, radius: float) -> tuple[Ints, Floats
 
 
 def _find_pairs(queries: Floats, points: Floats, radius: float) -> tuple[Ints, Ints]:
-    """All pairs (query, point) at most radius apart, by query; a grid of that size, three cells a row."""
+    """Return all pairs (query, point) at most radius apart, by query; a grid of that size, three cells a row."""
     grid = build_grid(points[:, 0], points[:, 1], np.zeros(len(points), np.int64), radius)
     key = cell_key(np.zeros(len(queries), np.int64), queries[:, 0], queries[:, 1], radius)
     pairs: list[tuple[Ints, Ints]] = []

@@ -29,7 +29,7 @@ class ExecutorSession(Protocol):
     """An engine that is up: runs a function over blocks and yields (index of the block, result) as they finish."""
 
     def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
-        """Every block once, in any order; an exception of the function is raised here."""
+        """Return every block once, in any order; an exception of the function is raised here."""
         ...
 
 
@@ -37,7 +37,7 @@ class Executor(Protocol):
     """Where blocks may run; opening it starts the engine, which then serves any number of calls."""
 
     def open(self) -> AbstractContextManager[ExecutorSession]:
-        """The engine, up until the context ends."""
+        """Return the engine, up until the context ends."""
         ...
 
 
@@ -51,7 +51,7 @@ class InlineExecutor:
         yield self
 
     def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
-        """Every block once, in order."""
+        """Yield every block once, in order."""
         for index, block in enumerate(blocks):
             yield index, fn(block)
 
@@ -93,7 +93,7 @@ class _ProcessSession:
     max_in_flight: int
 
     def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
-        """Every block once, as they finish."""
+        """Yield every block once, as they finish."""
         in_flight: dict[Future[R], int] = {}
         next_block = 0
         while next_block < len(blocks) or in_flight:
@@ -135,7 +135,7 @@ class _DaskSession:
     client: Any
 
     def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
-        """Every block once, as they finish."""
+        """Yield every block once, as they finish."""
         from dask.distributed import as_completed
 
         # pure=False: a block is run, never looked up by a hash of its arguments.
@@ -184,7 +184,7 @@ class _RaySession:
     ray: Any
 
     def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
-        """Every block once, as they finish."""
+        """Yield every block once, as they finish."""
         remote = self.ray.remote(fn)
         index_of = {remote.remote(block): index for index, block in enumerate(blocks)}
         waiting = list(index_of)
@@ -198,7 +198,7 @@ EXECUTORS: tuple[str, ...] = ("inline", "process", "dask", "ray")
 
 
 def make_executor(name: str, workers: int | None = None, address: str | None = None) -> Executor:
-    """The executor of a name from the command line: one of ``EXECUTORS``."""
+    """Return the executor of a name from the command line: one of ``EXECUTORS``."""
     if name == "inline":
         return InlineExecutor()
     if name == "process":

@@ -111,18 +111,18 @@ class LogIndex:
             db.execute(f"PRAGMA user_version = {_VERSION}")
 
     def entries(self) -> set[str]:
-        """Names of the log's files that are indexed."""
+        """Return names of the log's files that are indexed."""
         with self._open() as db:
             return {name for (name,) in db.execute("SELECT name FROM entries")}
 
     def filter_known(self, ids: Iterable[str]) -> set[str]:
-        """Which of these observations are indexed, retracted and refused ones too."""
+        """Return which of these observations are indexed, retracted and refused ones too."""
         return self._filter_ids(
             ids, "SELECT 1 FROM observations WHERE id = ?1 UNION ALL SELECT 1 FROM refused WHERE id = ?1"
         )
 
     def filter_retracted(self, ids: Iterable[str]) -> set[str]:
-        """Which of these observations are retracted."""
+        """Return which of these observations are retracted."""
         return self._filter_ids(ids, "SELECT 1 FROM retracted WHERE id = ?1")
 
     def _filter_ids(self, ids: Iterable[str], query: str) -> set[str]:
@@ -130,18 +130,18 @@ class LogIndex:
             return {name for name in ids if db.execute(query, (bytes.fromhex(name),)).fetchone()}
 
     def ids_between(self, low: str, high: str) -> list[str]:
-        """Ids of indexed and refused observations from low to high, ascending."""
+        """Return ids of indexed and refused observations from low to high, ascending."""
         query = "SELECT id FROM observations WHERE id BETWEEN ?1 AND ?2 UNION SELECT id FROM refused WHERE id BETWEEN ?1 AND ?2"
         return self._ids(query, (bytes.fromhex(low), bytes.fromhex(high)))
 
     def ids_of_sender(self, agent: str | None, pass_id: str | None) -> list[str]:
-        """Ids of indexed and refused observations of an agent, of a pass or of both, ascending; None: of any."""
+        """Return ids of indexed and refused observations of an agent, of a pass or of both, ascending; None: of any."""
         chosen = "(?1 IS NULL OR agent = ?1) AND (?2 IS NULL OR pass_id = ?2)"
         query = f"SELECT id FROM observations WHERE {chosen} UNION SELECT id FROM refused WHERE {chosen}"
         return self._ids(query, (agent, pass_id))
 
     def distinct_values(self, column: str) -> list[str]:
-        """All values of the column ``agent`` or ``pass_id``, ascending."""
+        """Return all values of the column ``agent`` or ``pass_id``, ascending."""
         with self._open() as db:
             rows = db.execute(f"SELECT {column} FROM observations UNION SELECT {column} FROM refused ORDER BY 1")
             return [name for (name,) in rows]
@@ -187,7 +187,7 @@ class LogIndex:
             return list(db.execute("SELECT file, row, count, reason FROM quarantine ORDER BY entry, file, row"))
 
     def active_observations(self) -> ActiveObservations:
-        """All observations that count."""
+        """Return all observations that count."""
         with self._open() as db:
             rows = db.execute(
                 "SELECT id, segment, row_group, time_ns, x, y, reach_m FROM observations "

@@ -46,7 +46,7 @@ class MapDelta:
         return tuple(sorted(set(to_hex_ids(self.changed.id)) - set(self.added)))
 
     def by_tile(self) -> list[tuple[tuple[int, int], int, int, int]]:
-        """(tile, added, modified, deleted) of every tile where anything changed, by tile."""
+        """Return (tile, added, modified, deleted) of every tile where anything changed, by tile."""
         new = set(self.added)
         tiles = [(int(x), int(y)) for x, y in compute_home_tiles(self.changed)]
         names = to_hex_ids(self.changed.id)
@@ -57,7 +57,9 @@ class MapDelta:
 
 
 def compute_home_tiles(vector_map: VectorMap) -> Ints:
-    """(N, 2) the tile that each element is stored in: that of its canonical start, the lesser end or a ring's least point."""
+    """Return (N, 2) the tile that each element is stored in: that of its canonical start, the lesser end or a ring's least
+    point.
+    """
     e = vector_map.elements
     if not len(e):
         return np.zeros((0, 2), np.int64)
@@ -88,7 +90,7 @@ def compute_delta(before: VectorMap, after: VectorMap) -> MapDelta:
 
 
 def apply_delta(before: VectorMap, delta: MapDelta) -> VectorMap:
-    """The map after the delta, elements by ascending id; relations between changed and unchanged elements are left out."""
+    """Return the map after the delta, elements by ascending id; relations between changed and unchanged elements are left out."""
     drop = {*delta.deleted, *to_hex_ids(delta.changed.id)}
     kept = np.array([k for k, name in enumerate(to_hex_ids(before.id)) if name not in drop], np.int64)
     after = VectorMap.cat([before.take(kept), delta.changed])
@@ -108,7 +110,7 @@ def write_delta(delta: MapDelta, folder: Path) -> None:
 
 
 def read_delta(folder: Path) -> MapDelta:
-    """A delta that :func:`write_delta` wrote."""
+    """Return a delta that :func:`write_delta` wrote."""
     try:
         content = json.loads((folder / "delta.json").read_bytes())
         gone = content["deleted"]
@@ -122,7 +124,7 @@ def read_delta(folder: Path) -> MapDelta:
 
 
 def transfer_ids(after: VectorMap, before: VectorMap) -> VectorMap:
-    """The map with the ids of the elements of an earlier one that its own continue; the others keep theirs.
+    """Return the map with the ids of the elements of an earlier one that its own continue; the others keep theirs.
 
     Each old element is continued by at most one new one: the largest share of common points first, then the smaller ids.
     """
@@ -143,7 +145,7 @@ def transfer_ids(after: VectorMap, before: VectorMap) -> VectorMap:
 
 
 def _find_overlaps(a: VectorMap, rows_a: Ints, b: VectorMap, rows_b: Ints) -> list[tuple[float, int, int]]:
-    """(share, row of a, row of b) of elements of one kind that share at least half of the shorter one's points."""
+    """Return (share, row of a, row of b) of elements of one kind that share at least half of the shorter one's points."""
     if not (len(rows_a) and len(rows_b)):
         return []
     try:
@@ -171,7 +173,7 @@ def _find_overlaps(a: VectorMap, rows_a: Ints, b: VectorMap, rows_b: Ints) -> li
 
 @njit(cache=True)
 def _fraction_near(points: F64x2, line: F64x2, radius: float) -> float:  # pragma: no cover - compiled
-    """The share of points (K, 2) within reach metres of a polyline (M, 2)."""
+    """Return the share of points (K, 2) within reach metres of a polyline (M, 2)."""
     near = 0
     for k in range(len(points)):
         for m in range(len(line) - 1):

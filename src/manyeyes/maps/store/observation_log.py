@@ -207,7 +207,7 @@ class ObservationLog:
 
 
 def read_groups(segment: Path, groups: Sequence[int]) -> list[Observation]:
-    """The observations of some row groups of a segment, in their order; rows outside the limits are left out."""
+    """Return the observations of some row groups of a segment, in their order; rows outside the limits are left out."""
     return [item for item in _read_rows(segment, groups) if isinstance(item, Observation)]
 
 
@@ -235,7 +235,7 @@ def _read_rows(segment: Path, groups: Sequence[int]) -> list[Observation | Inval
 
 
 def read_active(folder: Path, active: ActiveObservations, row_indices: NDArray[np.int64]) -> list[Observation]:
-    """The observations in these rows of the index, ids ascending."""
+    """Return the observations in these rows of the index, ids ascending."""
     wanted_ids = {active.ids[row] for row in row_indices.tolist()}
     out: dict[str, Observation] = {}
     for number in np.unique(active.segment[row_indices]).tolist():
@@ -252,7 +252,7 @@ def read_active(folder: Path, active: ActiveObservations, row_indices: NDArray[n
 
 
 def tile_indices(xy: NDArray[np.float64], tile_size_m: float = TILE_M) -> NDArray[np.int64]:
-    """(N, 2) column and row of the tile that each point (N, 2) lies in; tiles are half open and anchored at the origin."""
+    """Return (N, 2) column and row of the tile that each point (N, 2) lies in; tiles are half open and anchored at the origin."""
     return np.floor(np.asarray(xy, np.float64).reshape(-1, 2) / tile_size_m).astype(np.int64)
 
 
@@ -286,7 +286,7 @@ def _to_index_row(o: Observation, group: int) -> IndexRow:
 
 
 def compute_radius(o: Observation) -> float:
-    """Metres from the agent to the farthest point that it saw or could have seen."""
+    """Return metres from the agent to the farthest point that it saw or could have seen."""
     points = np.concatenate((o.view, o.elements.points))
     return float(np.hypot(points[:, 0], points[:, 1]).max())
 

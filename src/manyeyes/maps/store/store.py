@@ -104,7 +104,7 @@ class MapStore:
 
     @classmethod
     def create(cls, folder: Path | str, frame: MapFrame) -> MapStore:
-        """A new, empty store about an origin; a folder that holds one of the same frame is opened."""
+        """Return a new, empty store about an origin; a folder that holds one of the same frame is opened."""
         path = Path(folder) / "store.json"
         if not path.exists():
             content = {"format": "manyeyes.store", "version": STORE_VERSION, **asdict(frame)}
@@ -127,11 +127,11 @@ class MapStore:
             yield self.log
 
     def releases(self) -> tuple[int, ...]:
-        """Numbers of all releases, ascending."""
+        """Return numbers of all releases, ascending."""
         return tuple(sorted(int(path.stem) for path in (self.folder / "releases").glob("[0-9]*.json")))
 
     def manifest(self, number: int | None = None) -> Manifest:
-        """The manifest of a release, the last one if no number is given."""
+        """Return the manifest of a release, the last one if no number is given."""
         known = self.releases()
         if not known:
             raise StoreError(f"{self.folder}: no release yet; fuse and publish one first.")
@@ -141,7 +141,7 @@ class MapStore:
         return _read_manifest(self.folder / "releases" / f"{number:06d}.json")
 
     def read(self, number: int | None = None, area: tuple[float, float, float, float] | None = None) -> VectorMap:
-        """The map of a release, the last one if no number is given, elements by ascending id.
+        """Return the map of a release, the last one if no number is given, elements by ascending id.
 
         area: only elements of tiles that it touches (x0, y0, x1, y1, metres): those that start there.
         """
@@ -260,7 +260,7 @@ class MapStore:
 
 
 def compute_watermark(ids: Sequence[str], times_ns: NDArray[np.int64]) -> Watermark:
-    """The watermark of a set of observations."""
+    """Return the watermark of a set of observations."""
     latest = int(times_ns.max()) if len(times_ns) else -1
     return Watermark(len(ids), _hash("".join(sorted(ids)).encode()), latest)
 

@@ -147,7 +147,7 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, 
 
 
 def _gaussian_nll(error: Tensor, log_sigma: Tensor) -> Tensor:
-    """Mean over axes of the negative log-likelihood of errors (N, d) under an isotropic sigma (N,); no gradient to
+    """Return the mean over axes of the negative log-likelihood of errors (N, d) under an isotropic sigma (N,); no gradient to
     errors.
     """
     bounded = log_sigma.clamp(-5, 3)[:, None]

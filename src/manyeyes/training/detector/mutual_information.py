@@ -44,7 +44,7 @@ def mutual_information_loss(tokens: SparseBev, mask: Tensor, relevance: Tensor) 
 
 
 def window_mutual_information(features: Tensor, mask: Tensor, relevance: Tensor, row: Tensor) -> Tensor:
-    """Symmetric InfoNCE, scalar, between the masked and the relevant part of each window; features (N, C), row (N,)
+    """Return the symmetric InfoNCE, scalar, between the masked and the relevant part of each window; features (N, C), row (N,)
     windows.
 
     z^X is the window mean of mask * feature, not divided by the sum of the mask. z^Y is that of relevance * feature
@@ -76,7 +76,7 @@ class AgentPairTokens:
 
 
 def receiver_mutual_information(pairs: AgentPairTokens) -> Tensor:
-    """Symmetric InfoNCE, scalar, between the sent tokens and the receiver's own tokens of each window.
+    """Return the symmetric InfoNCE, scalar, between the sent tokens and the receiver's own tokens of each window.
 
     Windows with tokens of one side only are ignored, so tokens that only the sender has gain nothing.
     """

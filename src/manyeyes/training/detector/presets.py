@@ -44,7 +44,7 @@ _BRANCH = replace(
 
 
 def _branch(**changes: Any) -> DetectorTrainConfig:
-    """One row of CoSTr's Table III: the final stage trained on, with a part of the model changed."""
+    """Return one row of CoSTr's Table III: the final stage trained on, with a part of the model changed."""
     return replace(_BRANCH, detector=replace(_BRANCH.detector, **changes))
 
 
