@@ -111,7 +111,7 @@ def make_viewport(grid: BevGrid, width: int = 1280, margin_m: float = 4.0) -> Vi
 def draw_scene(
     scene: BirdsEyeScene, grid: BevGrid, title: str = "", caption: str = "", width: int = 1280, min_score: float = 0.0
 ) -> Image:
-    """Return a picture of the scene; title and caption stand above it, detections below score_min are left out."""
+    """Return a picture of the scene; title and caption stand above it, detections below min_score are left out."""
     viewport = make_viewport(grid, width)
     layers = []
     for index, agent in enumerate(scene.agents):
