@@ -134,7 +134,7 @@ def test_training_forward_equals_share_bytes_perceive(drive, detector: Detector,
         assert torch.allclose(a, b, atol=1e-5), (name, float((a - b).abs().max()))
 
 
-def test_collaborators_change_what_the_ego_sees(drive, detector: Detector) -> None:
+def test_messages_of_collaborators_change_the_boxes(drive, detector: Detector) -> None:
     frames = drive(2).frames()
     blind = replace(frames[0], points=PointCloud.of(torch.tensor([[1.0, 1.0, 0.0]])))
     packets = Agent(detector).share(frames[1])

@@ -67,7 +67,7 @@ def test_tokens_gain_45_bytes_an_object_that_the_net_describes(drive, detector, 
     )
 
 
-def test_a_budget_holds_with_what_is_described(drive, detector, weights):
+def test_messages_with_descriptors_are_within_the_budget(drive, detector, weights):
     frame = drive().frame(1, 3)
     agent = Agent(detector, budget_bytes=1800, pose_correction=PoseCorrection(weights))
     packets = agent.share(frame)
@@ -122,7 +122,7 @@ class DescriptorMatcher(FeakmNet):
         return Matches(torch.stack((rows, row[rows]), 1), best[rows])
 
 
-def test_a_wrong_prior_pose_is_corrected_by_descriptors_alone(drive, detector, weights, monkeypatch):
+def test_a_wrong_prior_pose_is_corrected_by_descriptors_only(drive, detector, weights, monkeypatch):
     """Twelve cars, of which both agents detect eight; exchanged as packets."""
     rng = np.random.default_rng(0)
     ego_pose, pose = Transform.from_xyz_yaw(100, 50, 0, 0.3), Transform.from_xyz_yaw(112, 58, 0, 2.8)

@@ -112,7 +112,7 @@ def test_one_whole_packet_of_wrong_tokens_changes_nothing(drive, detector, what:
     assert struck[2][1] == [(66, WRONG[what])]
 
 
-def test_a_sender_whose_content_breaks_fusion_is_rejected_by_name_and_the_rest_is_fused(drive, detector) -> None:
+def test_a_sender_with_invalid_content_is_rejected_and_the_others_are_fused(drive, detector) -> None:
     """A fusion of one's own that cannot bear something: the sender is named, the honest one still counts, no history is kept."""
     intermediate = get_strategy("intermediate")
 
@@ -165,7 +165,7 @@ def with_rows(detector, drive):
 
 @pytest.mark.parametrize("name", ["late", "late-temporal"])
 @pytest.mark.parametrize("x_m", [150.0, 0.0], ids=["out of range", "within range"])
-def test_boxes_of_strangers_erase_none_that_the_ego_detects_itself(drive, detector, name: str, x_m: float) -> None:
+def test_received_boxes_remove_no_own_detection(drive, detector, name: str, x_m: float) -> None:
     """Ten messages of 1,000 boxes at score 1 filled the suppression's list, and no own box was left."""
     frame, honest = with_rows(detector, drive)
     alone = Agent(detector, get_strategy("none")).perceive(frame).boxes
@@ -178,7 +178,7 @@ def test_boxes_of_strangers_erase_none_that_the_ego_detects_itself(drive, detect
         assert torch.equal(found.bev(), alone.bev()) and torch.equal(found.score, alone.score)
 
 
-def test_a_stranger_that_covers_an_own_box_from_the_side_does_not_take_its_place(drive, detector) -> None:
+def test_a_received_box_at_the_side_of_an_own_box_does_not_replace_it(drive, detector) -> None:
     """One box at score 1, 1.5 m beside each own one, suppressed them all."""
     frame, honest = with_rows(detector, drive)
     alone = Agent(detector, get_strategy("none")).perceive(frame).boxes

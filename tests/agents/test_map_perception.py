@@ -38,7 +38,7 @@ def frame(agent, x=0.0, yaw=0.0, points=200, time_ns=0):
     return AgentFrame.of(PointCloud.of(cloud), PLACE @ Transform.from_xyz_yaw(x, 0, 1.5, yaw), agent, time_ns)
 
 
-def test_a_local_map_is_cut_to_what_lies_ahead(mapper):
+def test_a_local_map_is_clipped_to_the_window_ahead(mapper):
     local = MapModelPredictor(
         mapper,
         replace(
@@ -152,7 +152,7 @@ def test_agents_predict_jointly_from_sent_tokens(mapper):
     assert len(service.observations) == 3 and service.observations[0].model == mapper.fingerprint.hex()
 
 
-def test_what_comes_late_is_taken_with_the_next_instant_or_at_the_end():
+def test_delayed_messages_are_ingested_at_the_next_instant_or_at_the_end():
     service = MapServer(origin_xy=(1000.0, -200.0))
     team = MapReplay(predict_one_line, service, channel="cellular", latency_budget_s=0.0)
     first, second = [frame(1)], [frame(1, 5.0, time_ns=5 * 10**8)]

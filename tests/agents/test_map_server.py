@@ -86,7 +86,7 @@ def test_a_street_from_several_agents_is_one_street_and_the_stream_is_near_the_f
     np.testing.assert_allclose(fold.elements.lengths().max(), 95.0, atol=3.0)
 
 
-def test_a_map_that_grows_is_folded_anew_as_often_as_it_doubles(monkeypatch):
+def test_the_map_is_fused_again_whenever_its_observations_double(monkeypatch):
     made, folds = service(), []
     fold = made.rebuild
     monkeypatch.setattr(made, "rebuild", lambda: folds.append(len(made.observations)) or fold())
@@ -118,14 +118,14 @@ def test_an_incomplete_message_is_not_ingested():
     assert len(made.ingest(inbox.received_messages())) == 1 and made.num_incomplete == 0
 
 
-def test_ids_are_per_drive_and_a_long_silence_starts_another_pass():
+def test_ids_are_per_drive_and_a_long_gap_starts_another_pass():
     made = service()
     for drive, time_ns in (("a", 0), ("b", 0), ("a", 10**9), ("a", 10**12)):
         made.ingest(received_of(encode_map_message(frame(1, 30.0, time_ns), street(30.0))), drive)
     assert [o.pass_id for o in made.observations] == ["a/1-p0", "b/1-p0", "a/1-p0", "a/1-p1"]
 
 
-def test_only_poles_that_the_service_knows_are_trusted():
+def test_only_configured_roadside_units_are_trusted():
     made = service(trusted=["3"])
     for agent in (3, 4):
         pole = replace(frame(agent, 30.0), is_infrastructure=True)
@@ -193,7 +193,7 @@ def test_a_message_without_a_map_is_no_observation():
         make_observation(bare.message, "1", "p")
 
 
-def test_the_service_goes_on_from_a_map():
+def test_the_server_continues_from_a_map():
     first = service()
     for k in range(4):
         first.ingest(received_of(encode_map_message(frame(k, 30.0 + k, k), street(30.0 + k))))

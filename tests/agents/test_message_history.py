@@ -62,7 +62,7 @@ def test_a_repeated_message_changes_nothing():
     assert times(update(memory, now)) == times(update(memory, now)) == [(1, 1), (1, 0)]
 
 
-def test_what_is_older_than_half_a_second_is_forgotten():
+def test_messages_older_than_half_a_second_are_dropped():
     apart = MAX_AGE_NS // TENTH_NS
     for gap, length in ((apart, 2), (apart + 1, 1)):
         memory = MessageHistory()
@@ -70,7 +70,7 @@ def test_what_is_older_than_half_a_second_is_forgotten():
         assert len(update(memory, message_of(gap))) == length
 
 
-def test_a_time_that_goes_back_begins_anew():
+def test_a_decreasing_time_resets_the_history():
     memory = MessageHistory()
     update(memory, message_of(50))
     update(memory, message_of(51))
@@ -78,14 +78,14 @@ def test_a_time_that_goes_back_begins_anew():
     assert times(update(memory, message_of(50))) == [(1, 50), (1, 49)]
 
 
-def test_silent_senders_are_dropped_although_a_late_message_arrives():
+def test_absent_senders_are_dropped_although_a_delayed_message_arrives():
     memory = MessageHistory()
     update(memory, *(message_of(0, agent) for agent in range(100)))
     assert times(update(memory, message_of(9, 7), message_of(2, 8))) == [(7, 9), (8, 2), (8, 0)]
     assert list(memory._messages) == [7]
 
 
-def test_a_silent_sender_is_kept_for_half_a_second():
+def test_messages_of_an_absent_sender_are_kept_for_half_a_second():
     """Its packets were lost, or its pose was uncertain."""
     memory = MessageHistory()
     for at in (0, 1, 2):
@@ -96,7 +96,7 @@ def test_a_silent_sender_is_kept_for_half_a_second():
     assert times(update(memory, at=8)) == [(2, 3)] and update(memory, at=9) == []
 
 
-def test_a_late_and_silent_sender_is_kept_no_longer_than_half_a_second():
+def test_delayed_messages_of_an_absent_sender_are_kept_for_half_a_second():
     memory = MessageHistory()
     update(memory, message_of(0, 1), message_of(0, 2), at=4)
     assert times(update(memory, message_of(1, 2), at=5)) == [(2, 1), (2, 0), (1, 0)]
@@ -110,7 +110,7 @@ def test_untrusted_senders_are_dropped():
     assert times(update(memory, message_of(2, 1), message_of(2, 2))) == [(1, 2), (2, 2), (2, 1), (2, 0)]
 
 
-def test_silence_does_not_outlive_a_drive():
+def test_messages_of_absent_senders_are_not_kept_over_drives():
     memory = MessageHistory()
     update(memory, message_of(50))
     assert update(memory, at=49) == []

@@ -44,7 +44,7 @@ def test_the_sweep_before_takes_part_and_only_once(drive, detector: Detector) ->
     assert cache.process(now) is cache.process(now)
 
 
-def test_the_sweep_before_is_moved_by_odometry_and_not_by_the_claims(drive, detector: Detector) -> None:
+def test_the_previous_sweep_is_transformed_by_odometry_not_by_prior_poses(drive, detector: Detector) -> None:
     """Prior poses that jump by 4 m between frames change no output and no history."""
     before, now = drive().frame(0, 2), drive().frame(0, 3)
     honest, shaken = PerceptionCache(detector), PerceptionCache(detector)
@@ -190,7 +190,7 @@ def output_of(cells: Places, cars: Places, heat: float = 4.0) -> TokenOutput:
     return TokenOutput(tokens, tokens, raw, DecodeConfig())
 
 
-def test_tokens_are_as_fast_as_the_box_that_they_propose_and_what_is_no_box_stands() -> None:
+def test_tokens_have_the_velocity_of_their_box_and_others_are_stationary() -> None:
     """Two tokens propose one car, a third another, and a fourth, farther from both than a car is wide, no box that is left."""
     cells = [(0.5, 0.5), (1.5, 0.5), (10.5, 0.5), (0.5, 3.5)]
     output = output_of(cells, [(0.7, 0.5), (0.7, 0.5), (10.5, 0.5), (0.5, 3.5)])
@@ -229,7 +229,7 @@ class ScriptedCache(PerceptionCache):
         return next(self.script)
 
 
-def test_boxes_are_followed_over_the_ground_until_another_scenario_begins(detector: Detector) -> None:
+def test_boxes_are_associated_over_frames_of_one_scenario(detector: Detector) -> None:
     """The agent drives at 5 m/s past a car that stands and behind one that drives at 8 m/s; no velocity is stated."""
     nothing, frames, script = PointCloud.of(torch.zeros(0, 3)), [], []
     for k in range(5):

@@ -127,7 +127,7 @@ def test_an_uncertain_heading_counts_at_a_distance() -> None:
     assert PoseCorrection(lever_arm_m=10.0).correct(frame(), cache_of(cars(9, 2)), [message], {}).messages
 
 
-def test_objects_seen_earlier_are_moved_to_now() -> None:
+def test_earlier_objects_are_propagated_to_the_current_time() -> None:
     """All cars drove on by 3 m since the sender's frame; without their velocity the fit would be off by as much."""
     world = cars(12, 3)
     then = replace(world, velocity=torch.tensor([[10.0, 0.0]], dtype=torch.float64).expand(12, 2))
@@ -337,7 +337,7 @@ def mutual_detection(pole: bool, late_ns: int) -> Any:
     return PoseCorrection().correct(frame(late_ns), cache, [message], {}), sender
 
 
-def test_vehicles_that_see_each_other_are_landmarks_themselves() -> None:
+def test_vehicles_that_detect_each_other_are_landmarks() -> None:
     found, sender = mutual_detection(pole=False, late_ns=0)
     (verdict,) = found.corrections
     assert verdict.use is MessageUse.CORRECTED and verdict.estimate.inliers == 3

@@ -68,7 +68,7 @@ def test_of_boxes_that_overlap_the_best_stays() -> None:
     assert sorted(kept.center[:, 0].tolist()) == [0.5, 20.0, 40.0] and kept.score[0] == pytest.approx(0.7)
 
 
-def test_what_is_hidden_now_stands_where_it_should_be_by_now() -> None:
+def test_an_occluded_object_is_propagated_by_its_velocity() -> None:
     """Seen at 30 m a tenth of a second ago, at 10 m/s: 1 m farther on, 1 m nearer for the agent's own motion."""
     found = get_strategy("late-temporal").fuse(FixedCache(boxes(), boxes(30.0, speed=10.0)), frame(9), ())
     assert found.center[:, 0].tolist() == pytest.approx([30.0]) and float(found.score) == pytest.approx(
@@ -90,7 +90,7 @@ def test_scores_of_earlier_messages_decay_but_not_of_a_late_one() -> None:
     assert by_place == {10.0: pytest.approx(0.8), 50.0: pytest.approx(0.8 * SCORE_DECAY_PER_100MS)}
 
 
-def test_late_fusion_as_papers_have_it_knows_only_what_is_newest() -> None:
+def test_late_fusion_uses_only_the_newest_messages() -> None:
     found = LateFusion().fuse(FixedCache(boxes(), boxes(30.0)), frame(9), [message_of(6, boxes(10.0))])
     assert found.center[:, 0].tolist() == [10.0] and not LateFusion().uses_history
 
@@ -107,7 +107,7 @@ def test_boxes_of_others_are_cropped_and_capped_before_they_are_ranked() -> None
     assert found.center[found.score.argmin()].tolist() == pytest.approx([0.0, 0.0, 0.8])
 
 
-def test_an_own_box_that_gives_way_to_one_elsewhere_returns_at_half_its_score() -> None:
+def test_a_suppressed_own_box_is_restored_at_half_its_score_if_the_other_is_displaced() -> None:
     """At 0 m another box stands 0.9 m aside, the same place; at 20 m it stands 1.5 m aside."""
     own = boxes(0.0, 20.0, score=0.3)
     found = LateFusion().fuse(FixedCache(own), frame(9), [message_of(9, boxes(0.9, 21.5, score=0.9))])

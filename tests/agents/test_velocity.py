@@ -39,7 +39,7 @@ def drive(
     return [PastDetections(cars([(start[0] - velocity[0] * t, start[1] - velocity[1] * t)]), t) for t in times]
 
 
-def test_a_car_that_drives_on_is_as_fast_as_it_drives() -> None:
+def test_constant_velocity_is_recovered() -> None:
     assert estimate_velocities(cars([(0, 0)]), drive((8, 0), 5), EXACT)[0].tolist() == pytest.approx([8, 0], abs=1e-3)
 
 
@@ -101,7 +101,7 @@ def test_velocities_turn_with_the_frame() -> None:
     assert torch.allclose(a @ torch.tensor([[c, s], [-s, c]]), b, atol=1e-3) and a.norm(dim=1).max() > 3
 
 
-def test_a_car_that_stands_stands_whatever_is_stated() -> None:
+def test_a_stationary_car_has_velocity_zero() -> None:
     """Positions jitter by 5 cm and the detector gives 1.5 m/s: insignificant over half a second, undecided in one sweep."""
     rng = torch.Generator().manual_seed(2)
     now = cars([(5, 5)], velocity=torch.tensor([[1.5, 0.0]]))
@@ -112,7 +112,7 @@ def test_a_car_that_stands_stands_whatever_is_stated() -> None:
     assert estimate_velocities(now, then, CONFIG).tolist() == [[0, 0]]
 
 
-def test_without_a_past_it_is_as_stated() -> None:
+def test_without_history_the_predicted_velocity_is_kept() -> None:
     now = cars([(0, 0), (9, 9)], velocity=torch.tensor([[6.0, 1.0], [0.1, 0.0]]))
     for nothing in ([], [PastDetections(Boxes.empty(), 0.1)]):
         assert torch.equal(estimate_velocities(now, nothing, CONFIG), now.velocity)
@@ -159,7 +159,7 @@ def test_points_correct_a_wrong_longitudinal_speed(speed: float) -> None:
 
 
 @pytest.mark.parametrize("aside", (-0.35, 0.35))
-def test_points_correct_a_hidden_lateral_speed(aside: float) -> None:
+def test_points_correct_an_unobserved_lateral_velocity(aside: float) -> None:
     """Boxes and headings move straight ahead, points do not. Below MIN_LATERAL_SEARCH_MPS there is no lateral search."""
     for speed in (8.0, 0.8):
         now, earlier = cars([(0.0, 0.0)]), drive((speed, 0), 5)
@@ -172,7 +172,7 @@ def test_points_correct_a_hidden_lateral_speed(aside: float) -> None:
         assert float(got[1]) == pytest.approx(aside if speed > MIN_LATERAL_SEARCH_MPS else 0.0, abs=0.15)
 
 
-def test_without_points_boxes_alone_decide() -> None:
+def test_without_points_velocities_follow_from_boxes() -> None:
     now, earlier = cars([(0, 0)]), [replace(e, points=torch.zeros(0, 3)) for e in drive((8, 0), 5)]
     assert torch.equal(
         estimate_velocities(now, earlier, CONFIG, torch.zeros(0, 3)), estimate_velocities(now, earlier, CONFIG)

@@ -39,7 +39,7 @@ def test_attention_of_two_agents_on_one_cell(dense):
     assert dense.attend(maps).flatten().tolist() == pytest.approx(wanted, rel=1e-6)
 
 
-def test_attention_is_per_cell_and_alone_changes_nothing(dense):
+def test_attention_is_per_cell_and_is_the_identity_for_one_agent(dense):
     maps = torch.randn(3, 4, 5, 6, generator=torch.Generator().manual_seed(0))
     cell = dense.attend(maps[:, :, 2:3, 3:4])
     assert torch.allclose(dense.attend(maps)[:, :, 2:3, 3:4], cell, atol=1e-6)

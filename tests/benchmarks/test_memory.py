@@ -26,7 +26,7 @@ def memory():
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory is read from /proc")
-def test_a_peak_is_seen_even_if_all_is_given_back(memory):
+def test_the_peak_includes_released_memory(memory):
     def need(mib: int) -> None:
         torch.ones(mib << 18).sum()
 

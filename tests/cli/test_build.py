@@ -64,7 +64,7 @@ def built():
     return build_map(Crossroads(), CROSS, MapBuildConfig(None, frame_stride=4))
 
 
-def test_what_agents_see_becomes_a_map_that_is_better_than_its_parts(built) -> None:
+def test_the_fused_map_is_better_than_the_union_of_observations(built) -> None:
     n = built.stats
     assert (n.num_messages, n.num_observations, n.num_lost, n.num_rejected) == (20, 20, 0, 0)
     assert 200 < n.bytes_per_message < 2000 and n.bytes_per_frame == 0
@@ -95,7 +95,7 @@ def test_the_same_recording_is_the_same_map_and_pose_noise_moves_priors_only(bui
         assert 0 < np.hypot(*(one.pose - two.pose)[:2]) < 2.0 and one.covariance[0, 0] == pytest.approx(0.1625, rel=0.1)
 
 
-def test_packets_that_are_lost_are_counted() -> None:
+def test_lost_packets_are_counted() -> None:
     calls = []
     lossy = build_map(
         Crossroads(), CROSS, MapBuildConfig(None, frame_stride=4, channel="its-g5", seed=3), lambda: calls.append(1)
@@ -177,7 +177,7 @@ def test_scenarios_are_grouped_by_the_town_that_they_are_named_after() -> None:
         (("--source", "truth"), "scenario"),
     ],
 )
-def test_what_is_wrong_is_one_line(words, named, tmp_path, capsys) -> None:
+def test_invalid_arguments_are_one_line(words, named, tmp_path, capsys) -> None:
     assert cli.main(["map", "build", str(tmp_path), *words, "--out", str(tmp_path / "out")]) == 1
     (output,) = capsys.readouterr().err.splitlines()
     assert output.startswith("manyeyes: ") and named in output

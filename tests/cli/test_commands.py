@@ -213,6 +213,6 @@ def test_train_writes_weights_log_picture_and_json(data, tmp_path, capsys) -> No
     assert len((tmp_path / "run" / "log.jsonl").read_text().splitlines()) == 2
 
 
-def test_the_recording_of_these_tests_is_read_as_it_was_made(data) -> None:
+def test_the_recording_of_the_tests_round_trips(data) -> None:
     recording = Opv2vRecording(data, "test", use_cache=False)
     assert recording.eval_indices("a") == range(1, 3) and recording.agents("a") == (5, -1)

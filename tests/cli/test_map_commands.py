@@ -146,7 +146,7 @@ def spoil_cut(folder: Path) -> Path:
         (("import", "{here}/x.json"), ("--poses",)),
     ],
 )
-def test_what_is_not_there_is_one_line_that_names_it(words, named, tmp_path, capsys, monkeypatch) -> None:
+def test_missing_files_are_one_line_with_their_name(words, named, tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert run("map", *(word.format(here=tmp_path) for word in words)) == 1
     output = capsys.readouterr().err.splitlines()

@@ -277,7 +277,7 @@ def spoil(store: Path, indexed: bool) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("indexed", [True, False], ids=["indexed", "index-lost"])
-def test_a_store_of_an_older_version_recovers_from_what_it_holds(indexed, store, honest, capsys) -> None:
+def test_a_store_of_an_older_version_quarantines_invalid_rows(indexed, store, honest, capsys) -> None:
     bad = spoil(store, indexed)
     capsys.readouterr()
     assert fuse_into(store, honest) == 0
@@ -392,7 +392,7 @@ def test_everything_can_be_retracted(store, honest, capsys) -> None:
         (("--ids", "ab", "--agent", "unknown-agent"), ("--ids", "--agent")),
     ],
 )
-def test_what_cannot_be_retracted_is_one_line_and_changes_nothing(words, named, store, capsys) -> None:
+def test_an_invalid_retraction_is_one_line_and_changes_nothing(words, named, store, capsys) -> None:
     before = sorted((store / "log").iterdir())
     capsys.readouterr()
     assert retract(store, "--reason", "x", *words) == 1

@@ -164,7 +164,7 @@ def test_an_interrupted_run_continues_and_is_known_by_its_seed(
     assert hashes(root) == hashes(made) and {p: p.stat().st_mtime_ns for p in kept} == kept
 
 
-def test_a_run_that_could_not_begin_leaves_no_marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_start_leaves_no_marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing(*_: object) -> None:
         raise ConfigError("no scene")
 
@@ -213,7 +213,7 @@ def test_a_scenario_that_is_not_that_of_the_manifest_is_refused(
     assert "its entry is not that of" in refused(folder, capsys)
 
 
-def test_files_beside_the_recording_change_nothing(folder: Path) -> None:
+def test_other_files_in_the_folder_change_nothing(folder: Path) -> None:
     (folder / "notes.txt").write_text("")
     (folder / "test" / "generated-1_0000" / "notes.txt").write_text("")
     assert simulate(folder) == 0

@@ -55,6 +55,6 @@ def test_the_order_of_senders_changes_a_byte_at_most(total, requested, random):
     "call",
     [lambda: allocate_max_min_fair(-1, []), lambda: allocate_max_min_fair(5, [-1]), lambda: allocate_equal_share(5, 0)],
 )
-def test_what_cannot_be_is_refused(call):
+def test_invalid_values_are_rejected(call):
     with pytest.raises(ConfigError):
         call()

@@ -48,7 +48,7 @@ def test_a_late_sender_takes_its_turn_at_once():
     assert [d.sender_id for d in Channel(SLOW).transmit(sends, 9, HERE)] == [1, 1, 2, 1, 1]
 
 
-def test_what_still_waits_is_withdrawn_for_newer_packets():
+def test_waiting_packets_are_replaced_by_newer_ones():
     bus = LocalBus(Channel(SLOW))
     bus.publish(1, HERE, packets(10), 0)
     bus.publish(1, HERE, packets(1, mark=7), 5 * MS)
@@ -123,7 +123,7 @@ def test_far_receivers_lose_more_and_certain_loss_is_total():
     assert Channel(LOSSY.with_loss(1.0)).transmit(send, 2, HERE) == ()
 
 
-def test_draws_depend_on_who_and_when_and_on_nothing_else():
+def test_draws_depend_on_sender_receiver_and_time_only():
     preset = replace(LOSSY.with_loss(0.4), jitter_s=0.01)
     send = Transmission(1, HERE, packets(100), 0)
     base = Channel(preset, 1).transmit([send], 2, HERE)
@@ -151,7 +151,7 @@ def test_jitter_reorders_within_its_bounds():
     assert min(times) >= 20 * MS and max(times) <= 100 * MS
 
 
-def test_who_publishes_first_at_one_instant_makes_no_difference():
+def test_the_order_of_publishing_at_one_instant_does_not_matter():
     preset = replace(SLOW, jitter_s=0.002).with_loss(0.2)
     results = []
     for order in permutations((1, 2, 3)):

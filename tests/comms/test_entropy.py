@@ -131,7 +131,7 @@ def coded_message(count: int, seed: int, tables: CodeTables) -> Message:
     return Message(1, 2, pose, torch.zeros(3, 3), MODEL, tokens=bev, token_score=score)
 
 
-def test_packets_of_coded_tokens_decode_alone_and_cost_less():
+def test_packets_of_coded_tokens_decode_independently_and_are_smaller():
     tables = skewed(20)
     message = coded_message(300, 1, tables)
     packets = wire.encode(message, token_encoding="codebook", tables=tables)

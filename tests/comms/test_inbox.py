@@ -134,7 +134,7 @@ def test_old_messages_are_neither_taken_nor_given():
     assert inbox.messages(now_ns=1101) == ()
 
 
-def test_a_stamp_from_the_future_does_not_silence_an_agent():
+def test_a_future_time_stamp_does_not_block_an_agent():
     inbox = Inbox()
     inbox.push(packets_of(make_message(1, 10**15))[0], arrival_ns=10**9)
     inbox.push(packets_of(make_message(1, 10**9))[0], arrival_ns=10**9)
@@ -162,6 +162,6 @@ def test_the_bytes_of_one_agent_are_bounded():
 
 
 @pytest.mark.parametrize("junk", [None, 3, "text"])
-def test_what_is_not_bytes_is_a_bug_of_the_caller(junk):
+def test_a_packet_that_is_not_bytes_raises(junk):
     with pytest.raises(TypeError):
         Inbox().push(junk)

@@ -73,7 +73,7 @@ def test_round_trip(seed, count, mtu):
 
 
 @given(st.integers(0, 10**6), st.integers(30, 120))
-def test_each_packet_decodes_alone_to_whole_elements_of_the_one_view(seed, count):
+def test_each_packet_decodes_independently_to_whole_elements(seed, count):
     local_map = random_map(seed, count)
     packets = wire.encode(message(local_map), mtu=700)
     assert len(packets) > 1
@@ -109,7 +109,7 @@ def test_a_map_and_objects_go_as_one_message():
     assert back.local_map is not None and len(back.local_map.elements) == 20
 
 
-def test_what_is_shorter_than_the_unit_is_left_out_and_no_point_stands_twice():
+def test_elements_shorter_than_the_unit_and_repeated_points_are_dropped():
     close = np.array([[1.0, 1.0], [1.004, 1.0], [1.0, 1.004]])
     line = np.array([[0.0, 0.0], [0.001, 0.0], [5.0, 0.0], [5.0, 0.004]])
     closed = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 0.0]])

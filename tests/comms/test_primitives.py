@@ -34,7 +34,7 @@ def test_a_varint_has_a_range(value):
 
 
 @given(keys)
-def test_cells_round_trip_in_the_size_foretold(key):
+def test_cells_round_trip_in_the_predicted_size(key):
     layout, data = primitives.pack_cells(key)
     assert len(data) == primitives.cells_size(key)
     back, used = primitives.unpack_cells(layout, data + b"more", len(key))
@@ -84,7 +84,7 @@ def test_log_codes_by_hand():
     assert primitives.log_values(codes, 0.01, 20.0) == pytest.approx([0, 0.01, 0.01, 20, 20])
 
 
-def test_runs_are_packed_as_if_each_were_alone():
+def test_runs_are_packed_independently():
     dense, sparse, none = np.arange(700, 900), np.array([3, 5000, 2**24 - 1]), np.zeros(0, np.int64)
     runs = [sparse, dense, none, dense + 1]
     packed = primitives.pack_cell_runs(np.concatenate(runs), [len(run) for run in runs])
@@ -99,7 +99,7 @@ def test_runs_are_packed_as_if_each_were_alone():
         primitives.pack_cell_runs(np.array([1, 2**35]), [1, 1])
 
 
-def test_runs_are_quantised_as_if_each_were_alone():
+def test_runs_are_quantised_independently():
     values = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32) * np.array([[0, 1, 1000]], np.float32)
     codes, steps = primitives.quantise_int8_runs(values, [4, 5])
     for run, rows in enumerate((slice(0, 4), slice(4, 9))):

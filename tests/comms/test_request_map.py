@@ -31,7 +31,7 @@ def test_a_window_has_the_lowest_confidence_of_its_objects():
     assert not empty.confidence.any()
 
 
-def test_what_the_receiver_sees_well_weighs_less():
+def test_tokens_at_confident_objects_of_the_receiver_have_less_weight():
     confidence = torch.zeros(WINDOW.shape)
     there = WINDOW.cells(torch.tensor([[12.8, 0.0]]))[0]
     confidence[there[0], there[1]] = 0.8

@@ -443,7 +443,7 @@ def test_contradictions_are_refused():
         ({"tokens": SparseBev(torch.ones(1, 2), Sites(torch.tensor([0]), GRID, 2)), "token_score": None}, "batch of 2"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_the_sender(change, match):
+def test_values_out_of_range_are_rejected_by_the_sender(change, match):
     with pytest.raises(WireError, match=match):
         wire.encode(replace(random_message(9), **change))
 

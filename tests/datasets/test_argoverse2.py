@@ -67,7 +67,9 @@ def test_the_log_as_a_recording(recording: Argoverse2Recording, pair: Snapshot) 
 
 
 @real
-def test_the_truth_is_the_vehicles_and_who_met_them(recording: Argoverse2Recording, pair: Snapshot) -> None:
+def test_ground_truth_lists_vehicles_and_the_agents_with_returns(
+    recording: Argoverse2Recording, pair: Snapshot
+) -> None:
     assert pair.truth is not None
     assert len(pair.truth.boxes) == len(pair.truth.boxes.id.unique()) == 47
     assert torch.bincount(pair.truth.boxes.label, minlength=4).tolist() == [44, 0, 3, 0]

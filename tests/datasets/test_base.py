@@ -29,7 +29,7 @@ class InMemory:
         return Snapshot(scenario, index, ())
 
 
-def test_judged_frames_go_scenario_by_scenario() -> None:
+def test_evaluated_frames_are_ordered_by_scenario() -> None:
     recording: Recording = InMemory()
     assert list(iter_eval_frames(recording)) == [("a", 1), ("a", 2), ("b", 1)]
 
@@ -38,7 +38,7 @@ def test_judged_frames_go_scenario_by_scenario() -> None:
     ("scenario", "index", "message_match"),
     [("c", 0, "No scenario 'c'.*a, b"), ("b", 2, "index from 0 to 1"), ("a", -1, "index from 0 to 2")],
 )
-def test_what_is_not_there_is_refused(scenario: str, index: int, message_match: str) -> None:
+def test_missing_scenarios_are_rejected(scenario: str, index: int, message_match: str) -> None:
     with pytest.raises(RecordingError, match=message_match):
         InMemory().snapshot(scenario, index)
 

@@ -30,7 +30,7 @@ class Apart:
         return Snapshot(scenario, index, tuple(frames))
 
 
-def test_snapshots_are_taken_apart_where_a_recording_knows_nothing_else() -> None:
+def test_frames_are_taken_from_snapshots_by_default() -> None:
     recording: Recording = Apart()
     frames: FrameReader = as_frame_reader(recording)
     assert isinstance(frames, SnapshotFrameReader)

@@ -86,7 +86,7 @@ def test_few_occluded_vehicles_are_no_mismatch(tmp_path: Path, unmet: int, named
     assert found(tmp_path) == named
 
 
-def test_an_agent_that_stands_may_see_the_same_twice(tmp_path: Path) -> None:
+def test_a_stationary_agent_may_repeat_a_cloud(tmp_path: Path) -> None:
     root = write(tmp_path, 2)
     for name in ("000002.pcd", "000002.yaml"):
         for agent in ("0", "1"):

@@ -96,7 +96,9 @@ def test_a_path_counts_once_and_the_list_is_capped() -> None:
     assert str(problems[0]) == "000.pcd: missing (why)"
 
 
-def test_a_verdict_is_kept_until_a_file_changes(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_verification_is_cached_until_a_file_changes(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls: list[str] = []
 
     def check(read: Callable[[int], Snapshot], name: str, clouds: object) -> list[FileProblem]:

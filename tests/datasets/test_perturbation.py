@@ -48,7 +48,7 @@ def test_legacy_noise_is_one_offset_for_all_collaborators_and_frames_in_our_axes
 
 
 @pytest.mark.parametrize("mode", ["collaborators_iid", "all_agents_iid", "all_agents_sequence"])
-def test_who_is_displaced_and_when(mode):
+def test_noise_displaces_the_configured_agents_in_each_frame(mode):
     noise = PoseNoise(mode, 0.4, 0.01, seed=1)
     first, second = (moved(snapshot(f), noise.apply(snapshot(f), ego=0)) for f in (0, 1))
     assert bool((first[0] == 0).all()) == (mode == "collaborators_iid")
@@ -148,7 +148,7 @@ def test_staleness_is_clipped_at_the_start_of_the_scenario_and_of_an_agents_pres
     assert got.frames[1] is drive[0].frames[1] and got.frames[2] is drive[1].frames[2]
 
 
-def test_the_stale_pose_still_places_what_stood_still():
+def test_an_outdated_pose_is_exact_for_stationary_objects():
     """A wall seen by the collaborator two frames ago is where it is, in the ego's current frame: both poses count."""
     wall = torch.tensor([[40.0, 8.0, 1.0]], dtype=torch.float64)
     drive = [snapshot(k) for k in range(3)]

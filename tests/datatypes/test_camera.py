@@ -20,7 +20,7 @@ def test_a_point_projects_as_in_the_drawing() -> None:
     assert depth.tolist() == [10, 5, -5]
 
 
-def test_what_lies_on_a_pixels_ray_is_projected_to_its_centre() -> None:
+def test_points_on_a_pixels_ray_project_to_its_centre() -> None:
     rays = CAMERA.rays()
     points = FACING_LEFT.translation + rays * torch.linspace(0.5, 90, 60 * 80, dtype=torch.float64).reshape(60, 80, 1)
     pixel, depth = CAMERA.project(points)

@@ -132,7 +132,7 @@ def test_a_frame_and_its_truth_are_built_of_numbers(as_given) -> None:
         (lambda: GroundTruth.of(Boxes.of(POINTS, SIZES, [0, 0]), [POSE], [[1]]), "seen needs (1, 2); got (1, 1)"),
     ],
 )
-def test_what_cannot_be_points_or_a_pose_is_refused_by_name(make, message_match) -> None:
+def test_invalid_points_and_poses_are_rejected_by_field(make, message_match) -> None:
     with pytest.raises(ShapeError) as error:
         make()
     assert message_match in str(error.value)

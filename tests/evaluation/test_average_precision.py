@@ -210,7 +210,7 @@ def test_range_by_centre_and_by_corners():
     assert len(filter_detections(cars((71, 20, 0.9), (70, 0, 0.8)), near)) == 1
 
 
-def test_z_is_judged_from_the_lidar_and_only_by_the_legacy_protocols():
+def test_z_is_relative_to_the_lidar_and_used_by_legacy_protocols_only():
     tall = cars((0, 0, 0.9), size=(5.0, 2.5, 3.2), z=1.6)  # 3.2 m over the road, 1.3 m over a roof of 1.9 m
     truth = cars((0, 0, 1), size=(5.0, 2.5, 3.2), z=1.6)
     assert compute_frame_iou(FrameResult("a", 0, tall, truth), GLOBAL_SORT).iou.shape == (1, 1)

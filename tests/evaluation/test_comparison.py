@@ -84,7 +84,7 @@ def test_a_margin_is_compared_with_the_paired_difference(fused, margin, verdict)
     assert (seven.iou, seven.margin, seven.verdict) == (0.7, None, None)
 
 
-def test_one_scenario_resolves_nothing() -> None:
+def test_one_scenario_is_inconclusive() -> None:
     results = [accumulate("none", [0]), accumulate("intermediate", [4])]
     assert compare_methods(results, PROTOCOL)[0].verdict == "inconclusive"
 

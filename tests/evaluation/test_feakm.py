@@ -73,7 +73,7 @@ def make_variant(name="a", min_pairs=99) -> FeakmVariant:
     )
 
 
-def test_where_no_pose_is_found_the_ablation_fuses_what_agents_fuse():
+def test_without_an_estimate_the_ablation_fuses_at_the_prior():
     one, snapshots = make_variant(), [Street().snapshot("street", i) for i in (0, 1)]
     noise = PoseNoise("all_agents_iid", 1.0, 0.02)
     perturbed = [noise.apply(s, 0) for s in snapshots]

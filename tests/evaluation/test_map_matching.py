@@ -126,7 +126,7 @@ def test_equal_scores_go_by_length_then_by_place_whatever_the_order() -> None:
     assert (3 - back).tolist() == [3, 1, 2, 0]
 
 
-def test_lengths_and_bounds_are_per_line_and_nothing_is_nothing() -> None:
+def test_lengths_and_bounds_are_per_line_and_empty_input_is_empty() -> None:
     lines = make_lines([np.array([[0, 0], [3, 4], [3, 5]]), straight(-1, 0, 1, 0)])
     assert lines.lengths().tolist() == [6, 2]
     assert lines.bounds().tolist() == [[0, 0, 3, 5], [-1, 0, 1, 0]]

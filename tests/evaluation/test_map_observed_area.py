@@ -28,7 +28,7 @@ def test_lines_are_cut_and_keep_parts_of_two_metres_and_their_columns() -> None:
     assert got.score.tolist() == [0.1, 0.3] and got.sigma.tolist() == [0.5] * 4
 
 
-def test_a_line_that_leaves_and_comes_back_is_two() -> None:
+def test_a_line_that_leaves_and_reenters_becomes_two() -> None:
     area = compute_observed_area([VIEW], np.zeros((1, 3)))
     got = clip_to_area(MapElements.of([[(2, 0), (2, 9), (7, 9), (7, 0)]], DIVIDER), area)
     assert sorted(got.lengths().tolist()) == [5, 5]

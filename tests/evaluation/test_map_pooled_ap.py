@@ -96,7 +96,7 @@ def test_differences_are_paired_and_equal_maps_do_not_differ() -> None:
     assert gain.low > 0 and gain.high - gain.low < all_of_it.interval().high - less.interval().low
 
 
-def test_a_mean_is_over_what_has_truth() -> None:
+def test_a_mean_is_over_kinds_with_ground_truth() -> None:
     judged = [MapPair(*rough(0), assign_to_scenario("a")), MapPair(*rough(1), assign_to_scenario("b"))]
     both = average_samples(
         [
@@ -121,5 +121,5 @@ def test_a_mean_is_over_what_has_truth() -> None:
         (0.25, 0.25, 1, "inconclusive"),
     ],
 )
-def test_a_margin_is_met_by_the_whole_interval(low, high, blocks, verdict) -> None:
+def test_a_margin_is_met_if_the_whole_interval_is(low, high, blocks, verdict) -> None:
     assert check_map_margin("gain", Interval((low + high) / 2, low, high, 0.95, blocks), 0.2).verdict == verdict

@@ -166,7 +166,7 @@ def test_a_stored_result_is_read_back_and_not_repeated(experiment, tmp_path, mon
     )
 
 
-def test_the_cut_leaves_the_truth_as_it_is_and_knows_no_divider_in_a_junction(experiment) -> None:
+def test_the_cut_keeps_the_ground_truth_and_removes_dividers_in_junctions(experiment) -> None:
     again = experiment.cut_policy(experiment.truth)
     assert len(again) == len(experiment.truth) and again.lengths().sum() == pytest.approx(
         experiment.truth.lengths().sum()

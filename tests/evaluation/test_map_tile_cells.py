@@ -120,7 +120,7 @@ def test_more_frames_change_the_prediction_and_every_frame_is_bytes(map_model, s
     np.testing.assert_array_equal(one.truth.points, many.truth.points)
 
 
-def test_local_maps_are_cut_to_what_lies_ahead(map_model, source):
+def test_local_maps_are_clipped_to_the_window_ahead(map_model, source):
     drawings = LocalPredictor()(map_model, source, "town1_0000", 0)
     assert [d.row_name for d in drawings] == [VEHICLE, VEHICLE, ROADSIDE] and all(
         len(d.frame_bytes) == 1 for d in drawings
@@ -179,7 +179,7 @@ class CountingPredictor:
         ]
 
 
-def test_a_study_that_was_stopped_goes_on(weights, tmp_path):
+def test_an_interrupted_study_resumes(weights, tmp_path):
     world, draw, seen = RecordingSource(Drive, load_truth), CountingPredictor(), []
     first = run_tile_study(
         world, weights, draw, (0, 1), tmp_path, InlineExecutor(), lambda done, total: seen.append((done, total))

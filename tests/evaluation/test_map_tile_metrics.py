@@ -57,7 +57,7 @@ def test_a_margin_test_is_a_paired_difference(table):
     assert table.check_margin("half - all", "half", "all", 0.2, "exact").verdict == "not met"
 
 
-def test_what_has_no_truth_is_no_part_of_the_mean():
+def test_classes_without_ground_truth_are_not_averaged():
     lines = TRUTH.take(np.arange(4))
     table = TileTable([TileStudyResult("a", 0, (TilePrediction("row", lines, lines, ()),))])
     row = table.make_row("row")

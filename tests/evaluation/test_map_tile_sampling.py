@@ -123,7 +123,7 @@ def test_a_local_tile_lies_ahead(source):
     assert float(make_world_from_tile(pole.frames[0]).translation[2]) == 0
 
 
-def test_one_instant_is_one_of_the_judged_and_the_same_again():
+def test_the_single_instant_is_an_evaluated_frame_and_deterministic():
     once = SingleFramePerScenario(Streets(), 5)
     assert (
         once.length("town1_0") == 1 and once.eval_indices("town1_0") == range(1) and once.scenarios == Streets.scenarios

@@ -133,7 +133,7 @@ def test_noise_has_the_size_that_its_prior_states(kind, sigma):
     assert math.sqrt(priors[0].covariance[0, 0]) == pytest.approx(sigma, rel=1e-6)
 
 
-def test_an_error_of_the_egos_yaw_moves_what_is_far():
+def test_a_yaw_error_of_the_ego_displaces_far_objects():
     far = np.array([50.0, 0.0, 0.0])
     priors = [PriorNoise("gaussian_all", 0.0, 1.0).make_prior(far, n).pose for n in range(300)]
     assert np.std([c[1] for c in priors]) == pytest.approx(50 * math.radians(1.0), rel=0.15)

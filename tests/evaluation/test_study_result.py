@@ -27,7 +27,7 @@ SPEED = torch.tensor([0.0, 4.9, 5.0], dtype=torch.float64)
     ("speeds", "rows", "scores"),
     [(STILL, [-1, 0], [0.8, 0.7]), (SLOW, [-1, 1], [0.8, 0.6]), (FAST, [2, -1], [0.9, 0.8])],
 )
-def test_what_matched_another_class_is_left_out_and_what_matched_nothing_stays_false(speeds, rows, scores) -> None:
+def test_detections_matched_to_another_class_are_ignored_and_unmatched_are_false(speeds, rows, scores) -> None:
     got = filter_by_speed(frame(), SPEED, speeds)
     assert got.truth_row.tolist() == rows and got.score.tolist() == scores and got.n_gt == 1
 

@@ -93,7 +93,7 @@ def test_areas_that_touch_are_one_ground(tmp_path):
         ({"right_lane_boundary": points((0, 0), (float("nan"), 1))}, "finite"),
     ],
 )
-def test_what_cannot_be_read_is_named(tmp_path, fields, text):
+def test_unreadable_files_are_named(tmp_path, fields, text):
     path = write(tmp_path, [lane(5, 0.0, **fields)])
     with pytest.raises(Argoverse2MapError, match="element 5") as caught:
         read_argoverse2_map(path)

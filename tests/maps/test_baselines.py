@@ -72,7 +72,7 @@ def test_neither_order_nor_repetition_of_observations_changes_a_map(baseline) ->
 
 
 @pytest.mark.parametrize("baseline", BASELINES, ids=lambda r: r.__name__.split(".")[-1])
-def test_nothing_seen_is_an_empty_map_in_the_frame(baseline) -> None:
+def test_no_observation_gives_an_empty_map(baseline) -> None:
     assert (
         len(baseline.fuse([], frame=MapFrame(49.0, 8.0))) == 0
         and baseline.fuse([], frame=MapFrame(49.0, 8.0)).frame.latitude == 49.0
@@ -133,7 +133,7 @@ def test_occluded_observation_is_no_miss() -> None:
     )
 
 
-def test_what_too_few_saw_is_a_candidate() -> None:
+def test_elements_with_few_observations_are_candidates() -> None:
     rules = BaselineRules(min_observations=2)
     many = [make_observation(0, [line(0.0), line(9.0)]), make_observation(1, [line(0.2)])]
     made = chamfer_nms.fuse(many, chamfer_nms.ChamferNmsConfig(rules=rules))
@@ -228,13 +228,13 @@ def test_polymerge_chains_lines_that_touch_and_keeps_others_apart() -> None:
     assert len(lines_in(polymerge.fuse([*many, bridge]))) == 1
 
 
-def test_polymerge_draws_crossings_and_takes_what_most_agree_on() -> None:
+def test_polymerge_votes_for_crossings_on_a_raster() -> None:
     rings = [np.array(SQUARE) + (dx, 0.0) for dx in (-0.5, 0.0, 0.5)]
     (ring,) = lines_in(polymerge.fuse([make_observation(k, [r], CROSSING) for k, r in enumerate(rings)]), CROSSING)
     assert np.allclose(ring.min(0), [20.0, -4.0], atol=0.15) and np.allclose(ring.max(0), [24.0, 4.0], atol=0.15)
 
 
-def test_frechet_clusters_are_means_of_what_runs_together_from_end_to_end() -> None:
+def test_frechet_clusters_average_lines_that_are_close_along_their_length() -> None:
     many = [
         make_observation(0, [line(0.0)]),
         make_observation(1, [line(0.6)[::-1]]),
@@ -283,14 +283,14 @@ def test_frechet_clusters_of_rings_ignore_start_and_direction() -> None:
     assert np.allclose(ring.mean(0), [22 + 0.5 / 3, 0.0], atol=0.02)
 
 
-def test_the_builder_replaces_what_the_newest_covers() -> None:
+def test_the_builder_replaces_elements_covered_by_the_newest() -> None:
     old, new = np.array(line(0.0, 0, 40, 2)), np.array(line(0.5, 10, 50, 2)[::-1])
     assert global_map_builder.replace_covered(old, new, 0.01).tolist() == [[0, 0], [10, 0.5], [50, 0.5]]
     inner = global_map_builder.replace_covered(old, np.array(line(0.5, 10, 20, 2)), 0.01)
     assert inner.tolist() == [[0, 0], [10, 0.5], [20, 0.5], [40, 0]]
 
 
-def test_the_builder_matches_one_to_one_adds_the_rest_and_suppresses_what_lies_on_others() -> None:
+def test_the_builder_matches_one_to_one_adds_unmatched_and_suppresses_duplicates() -> None:
     many = [
         make_observation(0, [line(0.0), line(3.5)], score=0.6),
         make_observation(1, [line(0.8), line(4.0), line(9.0)]),

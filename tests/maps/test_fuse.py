@@ -126,7 +126,7 @@ def test_b_order_does_not_matter():
 
 
 @pytest.mark.parametrize("pieces", [2, 3, 5])
-def test_c_a_line_seen_in_pieces_is_one_line(pieces):
+def test_c_a_line_observed_in_pieces_is_one_line(pieces):
     cuts = np.linspace(0.0, 50.0, pieces + 1)
     whole = road(50.0)
     world = [(kind, np.array([[a + 0.5, line[0, 1]], [b - 0.5, line[0, 1]]]))
@@ -230,7 +230,7 @@ def test_low_score_needs_more_observations(score, found):
 
 
 @pytest.mark.parametrize(("together", "left"), [(True, 1), (False, 0)])
-def test_a_painted_line_beside_an_edge_stays_where_both_were_seen_at_once(together, left):
+def test_a_line_beside_an_edge_is_kept_if_both_were_observed_together(together, left):
     edge, paint = np.array([[0.0, 0.0], [60.0, 0.0]]), np.array([[0.0, 0.5], [60.0, 0.5]])
     both, only = [(BOUNDARY, edge), (DIVIDER, paint)], [(BOUNDARY, edge)]
     # Three see the divider, beside the edge or instead of it; five more the edge alone, too few to say that it is gone.
@@ -305,7 +305,7 @@ def test_l_the_map_moves_with_the_world(motion):
     assert furthest(expected, there.elements) < 0.01 and furthest(there.elements, expected) < 0.01
 
 
-def test_colluding_agents_displace_no_station_seen_by_honest_agents():
+def test_colluding_agents_displace_no_station_observed_by_honest_agents():
     world = [*road(), (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))]
     honest = crowd(world, 40)
     for offset in (1.0, 2.0, 4.0):
@@ -408,7 +408,7 @@ def test_bends_do_not_shrink():
     assert len(line) == 1 and abs(np.hypot(*line[0].T) - 9.0).max() < 0.1
 
 
-def test_a_trusted_pole_publishes_alone_and_does_not_move():
+def test_one_trusted_roadside_unit_publishes_and_its_pose_is_fixed():
     pole = make_observation(road(), (30.0, 0.0, 0.0), "pole", trusted=True)
     car = make_observation(road(), (35.0, 0.0, 0.0), "car", 1, (0.0, 0.8, 0.0))
     pose = solve_poses([pole, car])

@@ -44,7 +44,7 @@ def make_observations(count=8, sigma=0.3):
     return [make_observation(30.0 + 5.0 * k, k, rng.normal(0.0, sigma)) for k in range(count)]
 
 
-def test_it_comes_out_where_the_fold_does():
+def test_the_incremental_map_equals_the_batch_map():
     observations = make_observations()
     fold = fuse(observations)
     live = IncrementalMap(fuse(observations[:4]))
@@ -57,7 +57,7 @@ def test_it_comes_out_where_the_fold_does():
     assert {row.tobytes().hex() for row in fused.observations} == last
 
 
-def test_it_grows_a_map_from_nothing():
+def test_a_map_is_built_from_an_empty_one():
     live = IncrementalMap(VectorMap.empty())
     for o in make_observations(3, 0.0):
         live.update(o)
@@ -80,7 +80,7 @@ def test_a_pose_is_corrected_against_the_map():
         assert abs(live.update(make_observation(32.0, 10 + round(error * 10), error)).pose[1]) < 0.1
 
 
-def test_what_is_gone_retires_and_what_is_new_is_published():
+def test_removed_elements_retire_and_new_ones_are_published():
     live = IncrementalMap(fuse([make_observation(30.0, k, high=40.0) for k in range(6)]))
     for k in range(9):
         live.update(make_observation(30.0, 10 + k, crossing=False))

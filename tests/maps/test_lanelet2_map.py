@@ -85,7 +85,7 @@ def test_lanelets_that_cross_are_a_junction_and_those_beside_each_other_are_none
         ({1: ([(0, 0), (9, 0)], {}), 3: ([(0, 4), (9, 4)], {})}, "", "lanelet 11"),
     ],
 )
-def test_what_cannot_be_read_is_named(tmp_path, ways, extra, text):
+def test_unreadable_files_are_named(tmp_path, ways, extra, text):
     lanelets = {11: (3, 2, "road")} if not extra else {}
     with pytest.raises(Lanelet2Error, match=text):
         read_lanelet2(osm(tmp_path, ways, lanelets, extra), ORIGIN)

@@ -87,7 +87,7 @@ def test_streammapnet_counts_its_classes(tmp_path, poses):
         (["b"], "no pose"),
     ],
 )
-def test_what_cannot_be_used_is_put_aside_and_the_rest_is_read(tmp_path, poses, bad, reason):
+def test_invalid_samples_are_rejected_and_the_rest_is_read(tmp_path, poses, bad, reason):
     good = {"sample_token": "a", "vectors": [vector([[0, 0], [9, 0]], "divider", 0.5)]}
     path = write(tmp_path / "r.json", {"results": [bad, good]})
     reading = read_model_results(path, poses, RESULT_OPTIONS["maptr-av2"])

@@ -71,7 +71,7 @@ def with_nan(points: np.ndarray) -> np.ndarray:
         ("style", {"elements": MapElements.of([[[0, 0], [1, 1]]], 0, style=np.array([[0.5, 0.4, 0, 0]]))}),
     ],
 )
-def test_what_cannot_be_used_is_refused_by_the_name_of_its_field(field: str, changes: dict) -> None:
+def test_invalid_values_are_rejected_by_field(field: str, changes: dict) -> None:
     with pytest.raises(ObservationError, match=rf"^Observation\.{field}: expected .*; got .*\. Mend it") as caught:
         replace(GOOD, **changes)
     assert "\n" not in str(caught.value)
@@ -187,7 +187,7 @@ def test_equal_content_has_one_id_and_every_field_counts() -> None:
     assert len({o.id for o in [GOOD, *others]}) == len(others) + 1
 
 
-def test_texts_cannot_borrow_from_each_other() -> None:
+def test_adjacent_texts_hash_differently_when_shifted() -> None:
     assert replace(GOOD, agent="ab", pass_id="c").id != replace(GOOD, agent="a", pass_id="bc").id
 
 

@@ -69,7 +69,7 @@ def test_the_documented_example_is_read(tmp_path: Path, monkeypatch: pytest.Monk
     assert np.allclose(seen.elements_in_map().polyline(0)[0], [120.5 - 1.75, -40.25], atol=1e-4)
 
 
-def test_what_was_written_is_read_back_bit_by_bit(tmp_path: Path) -> None:
+def test_files_round_trip_bit_by_bit(tmp_path: Path) -> None:
     many = crowd(7)
     many[3] = replace(many[3], covariance=np.array([[0.5, 0.1, 0.01], [0.1, 0.6, 0.02], [0.01, 0.02, 0.3]]))
     write_observations(tmp_path / "a.parquet", many, FRAME)

@@ -43,7 +43,7 @@ def test_a_hole_is_filled_beside_a_bend():
     assert len(set(source.tolist())) == 1
 
 
-def test_it_goes_over_to_where_the_other_part_lies():
+def test_the_extension_reaches_the_continuation():
     places, _ = extend_rows([row(0.0, 100.0, 0.0), row(0.0, 30.0, 3.5), row(60.0, 100.0, 4.1)])
     order = np.argsort(places[:, 0])
     assert (np.diff(places[order, 1]) > 0).all()
@@ -56,7 +56,7 @@ def test_extension_requires_low_coverage(coverage, found):
     assert bool(len(places)) == bool(found)
 
 
-def test_an_end_that_arrives_nowhere_goes_on_as_far_as_it_may():
+def test_an_end_without_continuation_is_extended_to_the_limit():
     places, source = extend_rows([row(0.0, 150.0, 0.0), row(0.0, 30.0, 3.5)])
     assert set(source.tolist()) == {1}
     assert places[:, 0].max() == pytest.approx(70.0, abs=1.0)  # 40 m

@@ -43,7 +43,7 @@ def _lines(*ys: float, x: float = 0.0) -> VectorMap:
     )
 
 
-def test_the_log_keeps_each_observation_once_and_gives_back_what_was_put_in(tmp_path):
+def test_the_log_stores_each_observation_once_and_round_trips(tmp_path):
     store = MapStore.create(tmp_path / "s", FRAME)
     many = [_observation(k) for k in range(300)]
     with store.open_for_writing() as log:
@@ -133,7 +133,7 @@ def test_other_limits_make_the_index_again_and_rows_outside_are_quarantined(tmp_
     assert len(before) == 300
 
 
-def test_ingest_puts_aside_what_cannot_be_used_with_its_reason_and_keeps_the_rest(tmp_path):
+def test_ingest_rejects_invalid_entries_with_a_reason_and_keeps_the_rest(tmp_path):
     good = [_observation(k) for k in range(4)]
     (tmp_path / "in").mkdir()
     write_observations(tmp_path / "in/a.parquet", good, FRAME)
@@ -218,7 +218,7 @@ def test_ids_go_to_the_largest_overlap_and_only_once():
     assert len(compute_delta(after, after).changed) == 0
 
 
-def test_an_element_lives_in_the_tile_of_its_lesser_end_whichever_way_it_runs(two_lanes):
+def test_an_element_is_stored_in_the_tile_of_its_lesser_end(two_lanes):
     m = _lines(10, x=250.0)
     back = replace(m, elements=m.elements.with_points(m.elements.points[::-1]))
     assert compute_home_tiles(m).tolist() == compute_home_tiles(back).tolist() == [[0, 0]]

@@ -112,7 +112,7 @@ def test_engines_give_the_identical_map(store, whole, tmp_path, name):
     assert got.quantised_hash() == whole.quantised_hash()
 
 
-def test_a_store_fuses_and_publishes_what_it_holds_and_a_retraction_is_a_refold(store, crowd, whole):
+def test_a_store_fuses_and_publishes_and_a_retraction_fuses_again(store, crowd, whole):
     first = store.fuse(executor=InlineExecutor())
     assert first.content == whole.quantised_hash() and first.watermark.observations == COUNT
     taken = [o.id for o in crowd.observations[:6]]
@@ -125,7 +125,7 @@ def test_a_store_fuses_and_publishes_what_it_holds_and_a_retraction_is_a_refold(
     assert set(store.delta(2).modified) & set(to_hex_ids(store.read(1).id))
 
 
-def test_every_block_reads_what_its_home_can_meet_and_nothing_from_far_away(store, tmp_path):
+def test_every_block_reads_overlapping_observations_only(store, tmp_path):
     standing = store.log.active_observations()
     blocks = make_blocks(
         store.log.folder, standing, tmp_path, MapFusionConfig(), TiledFusionConfig(50.0, 1, halo_m=10.0, margin_m=5.0)

@@ -30,7 +30,7 @@ def test_scale_is_one_at_the_origin_in_both_directions():
     np.testing.assert_allclose(moved, [[0.0, north * 1e-6], [east * 1e-6, 0.0]], atol=2e-6)
 
 
-def test_it_is_the_projection_of_proj():
+def test_the_projection_equals_proj():
     pyproj = pytest.importorskip("pyproj", reason="pyproj is not installed: no oracle for the projection")
     text = "+proj=tmerc +lat_0=49 +lon_0=8.4 +k_0=1 +ellps=WGS84"
     oracle = pyproj.Transformer.from_crs("EPSG:4326", text, always_xy=True)

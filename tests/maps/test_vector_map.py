@@ -72,7 +72,7 @@ def test_only_published_elements_remain() -> None:
     assert mixed.select_published().elements.kind.tolist() == [0, 2]
 
 
-def test_the_hash_knows_neither_order_nor_direction_nor_a_rings_start_nor_a_millimetre() -> None:
+def test_the_hash_is_invariant_to_order_direction_ring_start_and_rounding() -> None:
     first = small().quantised_hash()
     turned = [LINES[2][2:] + LINES[2][:2], LINES[0][::-1], LINES[1]]
     assert VectorMap.of(MapElements.of(turned, [2, 0, 0])).quantised_hash() == first
@@ -83,7 +83,7 @@ def test_the_hash_knows_neither_order_nor_direction_nor_a_rings_start_nor_a_mill
 
 
 @pytest.mark.parametrize("change", ["kind", "point", "state", "less"])
-def test_the_hash_knows_what_is_mapped(change: str) -> None:
+def test_the_hash_depends_on_the_content(change: str) -> None:
     first, other = small().quantised_hash(), small()
     if change == "kind":
         other = VectorMap.of(MapElements.of(LINES, [1, 0, 2]))

@@ -152,7 +152,7 @@ def test_an_unknown_name_lists_the_known():
         pretrained.load("somewhere/else.safetensors")
 
 
-def test_a_path_is_loaded_as_it_is(model, path):
+def test_a_path_is_loaded_unchanged(model, path):
     assert pretrained.load(path).fingerprint == fingerprint(model)
 
 

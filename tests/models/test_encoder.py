@@ -82,7 +82,7 @@ def test_dilating_has_more_sites():
     assert counts[0][0] == counts[1][0] and all(a < b for a, b in zip(counts[0][1:], counts[1][1:]))
 
 
-def test_pruned_cells_are_gone_from_all_coarser_strides():
+def test_pruned_cells_are_absent_at_all_coarser_strides():
     model = encoder(CONFIG)
     x = pillars([clumps(0)])
     whole = model(x, 0.0)

@@ -158,7 +158,7 @@ def test_an_empty_past_and_windows_without_one_are_exactly_the_identity(gradient
     assert bool(((out - tokens.features)[met].abs().amax(1) > 1e-3).all())
 
 
-def test_windows_with_more_past_than_cells_lose_none_of_it():
+def test_windows_with_more_history_than_cells_use_all_of_it():
     """A6: 64 cells, 100 remembered tokens on them and as many asked: each still matters."""
     model, random = attention(), torch.Generator().manual_seed(0)
 

@@ -41,7 +41,7 @@ def test_the_raster_holds_moments_where_there_are_returns():
     assert float(raster[0].abs().max()) == 0
 
 
-def test_a_cell_is_seen_where_a_return_lies_in_or_beside_it():
+def test_a_cell_is_observed_where_a_return_lies_in_or_beside_it():
     net = LidarBev(CONFIG)
     features, seen = net([PointCloud.of(torch.tensor([[0.1, 0.1, 0.0]])), PointCloud.of(torch.zeros(0, 3))])
     assert features.shape == (2, 16, 16, 16) and seen.shape == (2, 16, 16)

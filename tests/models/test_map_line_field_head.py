@@ -80,7 +80,7 @@ def test_two_lines_of_a_kind_that_meet_end_to_end_stay_two():
     assert middles == pytest.approx([0.25, 0.75], abs=0.04)
 
 
-def test_tiles_of_a_batch_are_proposed_as_if_alone():
+def test_tiles_of_a_batch_are_independent():
     other = perfect(TRUTH.take(np.array([2, 0])))
     one = perfect()
     both = RawLineField(

@@ -128,7 +128,7 @@ def test_a_certain_depth_puts_the_feature_there_and_nowhere_else():
     assert bool(seen[0, 3, 4:7].all()) and not bool(seen[0, 3, 0])
 
 
-def test_cameras_belong_to_their_agent_and_agents_without_observe_nothing():
+def test_cameras_observe_for_their_agent_only():
     features = torch.stack((torch.full((1, *SIZE), 2.0), torch.full((1, *SIZE), -3.0)))
     bev, seen = lift_ground(features, [camera(), camera()], torch.tensor([2, 0]), 3, GRID, STRIDE)
     assert torch.equal(seen[0], seen[2]) and not bool(seen[1].any())

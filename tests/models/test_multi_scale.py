@@ -61,7 +61,7 @@ def test_a_scale_is_the_maximum_over_its_wider_cells():
     assert len({tuple(p) for p in place}) < len(place)
 
 
-def test_it_starts_as_maximum_fusion():
+def test_initial_weights_equal_maximum_fusion():
     some, model = tokens(), fusion(trained=False)
     plain = MaxFusion(CHANNELS).eval().requires_grad_(False)
     plain.load_state_dict({k: v for k, v in model.state_dict().items() if not k.startswith(("coarse_scales", "out"))})

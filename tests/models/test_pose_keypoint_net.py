@@ -36,7 +36,7 @@ def boxed(**more) -> BoxKeypointNet:
     return BoxKeypointNet(BoxKeypointConfig(CHANNELS, 16, 32, **more)).eval().requires_grad_(False)
 
 
-def test_it_has_as_many_weights_as_the_published_extractor():
+def test_the_number_of_weights_is_that_of_the_published_extractor():
     net = DenseKeypointNet(DenseKeypointConfig(in_channels=128))
     assert sum(p.numel() for p in net.parameters()) == 3_312_640  # parameters of the published code
 

@@ -47,7 +47,7 @@ def last(net: Matcher, a: Keypoints, b: Keypoints) -> torch.Tensor:
         return net(KeypointBatch.of([a]), KeypointBatch.of([b]))[-1].log_p[0]
 
 
-def test_it_has_as_many_weights_as_the_published_matcher():
+def test_the_number_of_weights_is_that_of_the_published_matcher():
     # Parameters of the published code, less the 8 * 257 of the heads that its settings switch off.
     assert sum(p.numel() for p in Matcher(MatcherConfig()).parameters()) == 11_851_601 - 8 * 257
 

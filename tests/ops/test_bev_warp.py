@@ -80,14 +80,14 @@ def test_height_and_tilt_do_not_move_the_ground():
     assert torch.allclose(a, b, atol=1e-5)
 
 
-def test_negative_features_survive_beside_what_is_out_of_view():
+def test_negative_features_are_kept_at_the_border_of_the_view():
     features = torch.tensor([-3.0, -1.0]).view(1, 2, 1, 1, 1).expand(1, 2, 1, 1, 4)
     seen = torch.tensor([[[[True, True, False, False]], [[True, False, True, False]]]])
     fused = masked_max(features, seen, torch.tensor([7.0]))
     assert fused.flatten().tolist() == [-1.0, -3.0, -1.0, 7.0]
 
 
-def test_the_maximum_does_not_know_order_and_ignores_who_sees_nothing():
+def test_the_maximum_is_invariant_to_order_and_to_agents_without_coverage():
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(2, 4, 3, 5, 6, generator=generator)
     seen = torch.rand(2, 4, 5, 6, generator=generator) > 0.4
@@ -115,7 +115,7 @@ def test_the_maximum_is_that_of_the_loop_in_values_and_gradients():
         assert torch.allclose(one, other, atol=1e-12)
 
 
-def test_gradients_go_to_the_largest_seen_feature_else_to_null():
+def test_gradients_go_to_the_largest_observed_feature_else_to_null():
     features = torch.tensor([[1.0, 5.0, 2.0]]).T.view(1, 3, 1, 1, 1).repeat(1, 1, 1, 1, 2).requires_grad_()
     seen = torch.tensor([[True, False], [False, False], [True, False]]).view(1, 3, 1, 2)
     null = torch.zeros(1, requires_grad=True)

@@ -19,7 +19,7 @@ def test_a_line_is_cut_at_the_edge_and_keeps_its_points_inside():
     assert parts([(-5, 9), (15, 9)]) == [] and parts([(-5, -4), (-5, 4)]) == []
 
 
-def test_a_line_that_leaves_and_comes_back_is_two():
+def test_a_line_that_leaves_and_reenters_becomes_two():
     assert parts([(2, 0), (2, 9), (7, 9), (7, 0)]) == [[[2, 0], [2, 5]], [[7, 5], [7, 0]]]
     assert parts([(-5, 0), (15, 0), (15, 2), (-5, 2)]) == [[[0, 0], [10, 0]], [[10, 2], [0, 2]]]
 

@@ -89,7 +89,7 @@ def test_no_sites() -> None:
     assert folded(x.features, same_sites_map(x.sites, kernel=3)).shape == (0, 16)
 
 
-def test_what_the_loops_do_not_know_is_left_to_the_layers() -> None:
+def test_unsupported_layers_are_not_compiled() -> None:
     assert FoldedConvs.of(*zip(layer(16, 24, 3, seed=0))) is None
     assert FoldedConvs.of([], []) is None
     assert NormedConv.of(layer(16, 24, 3, seed=0)[0], nn.LayerNorm(24), is_skipped=False) is None

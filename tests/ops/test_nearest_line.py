@@ -33,7 +33,7 @@ def test_no_lines_and_no_queries() -> None:
 
 
 @given(seed=st.integers(0, 10**6), reach=st.sampled_from([0.2, 1.0, 4.0, 30.0]))
-def test_the_grid_finds_what_the_slow_twin_finds(seed: int, reach: float) -> None:
+def test_the_grid_equals_the_reference(seed: int, reach: float) -> None:
     draw = np.random.default_rng(seed)
     lines = [draw.uniform(-20, 20, 2) + draw.normal(0, 4, (draw.integers(1, 7), 2)).cumsum(0) for _ in range(6)]
     points, first = columns(*lines)

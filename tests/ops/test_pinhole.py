@@ -92,7 +92,7 @@ def test_a_box_covers_the_pixels_of_the_formula() -> None:
     assert (sight.primitive[sight.primitive != 0] == NOTHING).all()
 
 
-def test_a_box_that_reaches_behind_the_camera_is_seen_beside_it() -> None:
+def test_a_box_that_extends_behind_the_camera_is_rendered() -> None:
     wall = solid(BOX, (0, 3, 0), (30.0, 0.5, 5.0))
     sight = cast_pinhole(wall, flat(-100.0), np.zeros(3), AHEAD, INTRINSIC, 80, 60, 50.0)
     assert (sight.primitive[30, :30] == 0).all()
@@ -111,7 +111,7 @@ def test_foliage_transmission_follows_its_density() -> None:
     assert abs((sight.primitive == NOTHING).mean() - np.exp(-density * chord)) < 0.06
 
 
-def test_a_leaf_that_one_camera_sees_stops_the_ray_of_another() -> None:
+def test_leaves_are_equal_for_all_cameras() -> None:
     crown = solid(ELLIPSOID, (12, 0, 0), (2.0, 2.0, 2.0), density=1.0)
     sight = cast_pinhole(crown, flat(-100.0), np.zeros(3), AHEAD, INTRINSIC, 80, 60, 60.0, 5)
     rows, columns = np.nonzero(sight.primitive == 0)

@@ -78,7 +78,7 @@ def test_costs_are_those_of_every_pair_of_points() -> None:
     assert MAX_POINTS in count.tolist()
 
 
-def test_a_body_meets_itself_where_it_was() -> None:
+def test_the_cost_is_zero_at_the_true_motion() -> None:
     """0.6 m farther back than estimated, along its length and not the frame's axis; the road under it does not count."""
     yaw = 0.7
     ahead = torch.tensor([np.cos(yaw), np.sin(yaw)]).float()

@@ -196,7 +196,7 @@ def test_frechet_agrees_with_its_definition_in_both_directions_and_with_shapely(
     assert (np.abs(theirs - one) < 1e-9).sum() >= len(pairs) - 2 and (theirs > one - 1e-9).all()
 
 
-def test_frechet_sees_the_end_that_chamfer_averages_away() -> None:
+def test_frechet_detects_an_end_that_chamfer_averages() -> None:
     whole, half = np.array([[0.0, 0], [50, 0], [100, 0]]), np.array([[0.0, 0], [25, 0], [50, 0]])
     points, first = np.concatenate((whole, half)), np.array([0, 3, 6])
     assert frechet_distance(points, first, points, first, np.array([[0, 1]])).tolist() == [50.0]

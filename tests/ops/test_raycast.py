@@ -108,7 +108,7 @@ def test_flat_ground_is_exact_and_carries_its_class() -> None:
     np.testing.assert_allclose(hits.cosine[ground], np.broadcast_to(np.sin(-BEAMS), x.shape)[ground], atol=1e-6)
 
 
-def test_a_sector_sees_what_the_circle_sees_there() -> None:
+def test_a_sector_equals_that_part_of_the_full_scan() -> None:
     scene, beams = crowd(5), BEAMS
     whole = cast_rays(scene, flat(-20.0), ORIGIN, turn(0.3), beams, circle(360), 360, 60.0, 0)
     part = cast_rays(

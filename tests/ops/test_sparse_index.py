@@ -129,7 +129,7 @@ def test_pairs_are_those_of_the_blocks_tap_by_tap(symmetric):
 
 
 @pytest.mark.parametrize("symmetric", (False, True))
-def test_compiled_loops_find_what_whole_tensors_find(monkeypatch, symmetric):
+def test_compiled_loops_equal_tensor_operations(monkeypatch, symmetric):
     shape, window = (11, 10), Window(3, 1, 1) if symmetric else Window(3, 2, 1)
 
     def found() -> list[torch.Tensor]:

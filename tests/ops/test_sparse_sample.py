@@ -18,7 +18,7 @@ def sparse(stride: int, n: int = 40) -> SparseBev:
 
 
 @pytest.mark.parametrize("stride", [1, 2, 4])
-def test_it_is_a_dense_grid_sample(stride):
+def test_sampling_equals_dense_grid_sample(stride):
     x = sparse(stride)
     grid, rng = x.grid, torch.Generator().manual_seed(7)
     xy = (torch.rand(200, 2, generator=rng) - 0.5) * torch.tensor([20.0, 12.0])
@@ -39,7 +39,7 @@ def test_it_is_a_dense_grid_sample(stride):
     assert float(found.detach().abs().max()) > 0.5
 
 
-def test_at_a_centre_it_is_the_cell_itself_and_nowhere_is_zero():
+def test_sampling_at_a_centre_is_the_cell_and_outside_is_zero():
     x = sparse(4)
     torch.testing.assert_close(bilinear(x, x.sites.xy), x.features, atol=1e-5, rtol=1e-5)
     assert not bilinear(x, torch.tensor([[500.0, 0.0], [-500.0, 3.0]])).any()

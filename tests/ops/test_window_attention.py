@@ -101,7 +101,7 @@ def test_moving_by_whole_windows_changes_neither_offsets_nor_grouping():
         assert_near([window_attention(*qkv, new, new)], [window_attention(*qkv, ids, ids)])
 
 
-def test_a_token_alone_gets_its_own_value():
+def test_a_single_token_gets_its_own_value():
     q, k, v = tokens(5)[2]
     ids = torch.tensor([7, 3, 9, 3, 1])
     out = window_attention(q, k, v, ids, ids)
@@ -109,7 +109,7 @@ def test_a_token_alone_gets_its_own_value():
     assert not torch.allclose(out[[1, 3]], v[[1, 3]])
 
 
-def test_windows_beyond_the_last_bucket_lose_nothing():
+def test_windows_larger_than_the_last_bucket_are_complete():
     _, _, qkv = tokens(700)
     ids = (torch.arange(700) % 100 == 0).long()
     assert int((ids == 0).sum()) > BUCKETS[-1] > SIDE * SIDE

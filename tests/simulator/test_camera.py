@@ -124,7 +124,7 @@ def test_a_vehicle_is_shown_as_far_as_its_solids_reach_and_within_its_box(kind: 
     np.testing.assert_allclose(shown.max(0) + 0.5, pixel.max(0), atol=1.0)
 
 
-def test_camera_and_lidar_of_one_place_meet_the_same() -> None:
+def test_camera_and_lidar_at_one_pose_hit_the_same_objects() -> None:
     wall = block((20.0, 8.0, 1.0), (0.3, 4.0, 1.0))
     scene = make_lit_scene(vehicles((12.0, -3.0, 0.4), (26.0, 5.0, 0.0), (30.0, -6.0, 1.0)), wall)
     spec = replace(FRONT, x_m=0.0, z_m=1.9, width=800, height=600, cx=400.0, cy=300.0, fx=335.6, fy=335.6)
@@ -149,7 +149,7 @@ def brightness(picture: RenderedImage, *points: tuple[float, float, float]) -> l
     return [float(grey[v - 1 : v + 2, u - 1 : u + 2].mean()) for u, v in pixel.long().tolist()]
 
 
-def test_what_stands_before_the_sun_throws_a_shadow_away_from_it() -> None:
+def test_solids_cast_shadows_away_from_the_sun() -> None:
     # The sun stands to the left of the picture's wall, 37 degrees from the zenith: the shadow of its top falls 0.75 of its
     # height to the right.
     wall = block((12.0, 2.0, 2.0), (1.0, 0.1, 2.0))
@@ -160,7 +160,7 @@ def test_what_stands_before_the_sun_throws_a_shadow_away_from_it() -> None:
     assert brightness(to_the_left, (12.0, 0.8, 0.0))[0] == pytest.approx(sunny, rel=0.15)
 
 
-def test_the_carrier_is_not_seen_but_throws_its_shadow() -> None:
+def test_the_own_vehicle_is_invisible_but_casts_a_shadow() -> None:
     scene = make_lit_scene(vehicles((3.0, -2.0, 0.3)), sun=(-0.8, 0.0, 0.6))
     back = replace(RIG[3], samples=1)
     carrier, without_carrier = (
@@ -180,7 +180,7 @@ def test_paint_is_brighter_than_the_road_and_lies_where_the_raster_has_it() -> N
     assert line > 1.4 * max(left, right)
 
 
-def test_the_same_scene_gives_the_same_picture_and_finer_rays_nearly_the_same() -> None:
+def test_rendering_is_deterministic_and_converges_with_finer_rays() -> None:
     scene = make_lit_scene(vehicles((12.0, -3.0, 0.4), (26.0, 5.0, 0.0)))
     one, two = render_image(scene, HERE, FRONT), render_image(scene, HERE, FRONT)
     assert torch.equal(one.image.rgb, two.image.rgb)
@@ -205,7 +205,7 @@ def test_opv2vs_cameras_look_ahead_right_left_and_back() -> None:
         assert float(rotation[2, 0]) == 0  # upright: its right is level
 
 
-def test_a_picture_of_another_size_shows_the_same() -> None:
+def test_images_of_another_size_show_the_same() -> None:
     one, two = FRONT.camera, FRONT.resized(800, 600).camera
     point = torch.tensor([[9.0, 1.0, 0.3]], dtype=torch.float64)
     torch.testing.assert_close(2 * one.project(point)[0], two.project(point)[0])
@@ -220,7 +220,7 @@ def test_rows_cut_off_above_move_nothing_below() -> None:
     assert cut.height == FRONT.height - 30 and cut.width == FRONT.width
 
 
-def test_what_cannot_be_is_named() -> None:
+def test_invalid_values_are_named() -> None:
     with pytest.raises(ConfigError, match="No cameras 'opv'; choose one of none, opv2v"):
         camera_rig("opv")
     with pytest.raises(ConfigError, match="positive focal lengths"):

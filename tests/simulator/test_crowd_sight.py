@@ -77,7 +77,7 @@ def test_a_ring_is_cut_to_the_view_as_shapely_does():
     assert partly > 30
 
 
-def test_an_exact_rectangle_is_seen_as_it_is():
+def test_an_exact_rectangle_is_observed_unchanged():
     """Points of one side lie on one line: they touch, and nothing crosses."""
     corners = np.array([[5.0, -2.0], [9.0, -2.0], [9.0, 2.0], [5.0, 2.0]])
     out = np.empty((20, 2))
@@ -86,7 +86,7 @@ def test_an_exact_rectangle_is_seen_as_it_is():
     assert ring.is_valid and ring.area == pytest.approx(16.0, abs=1.0)
 
 
-def test_points_behind_a_vehicle_are_hidden():
+def test_points_behind_a_vehicle_are_occluded():
     quads = np.array([[[5, 2], [20, 8], [20, 12], [4, 4]], [[-5, -2], [-20, -9], [-20, -12], [-5, -4]]], np.float64)
     ground = shapely.union_all([shapely.Polygon(q) for q in quads])
     assert all(shapely.is_ccw(shapely.LinearRing(q)) for q in quads)

@@ -70,7 +70,7 @@ def unmet(recording: DairRecording) -> int:
     return count
 
 
-def test_the_simulators_own_truth_comes_back(made: Path) -> None:
+def test_the_simulators_ground_truth_round_trips(made: Path) -> None:
     recording = DairRecording(made, strict=True)
     assert recording.scenarios == ("0", "1")
     assert DairRecording(made, "train").scenarios == ("0",) and DairRecording(made, "val").length("1") == 1
@@ -151,7 +151,7 @@ def test_the_manifest_counts_and_hashes_what_is_there(made: Path) -> None:
         assert entry["bytes"] == sum(map(len, inside.values()))
 
 
-def test_finished_drives_are_kept_and_lost_ones_made_again(made: Path) -> None:
+def test_finished_drives_are_kept_and_missing_ones_simulated_again(made: Path) -> None:
     before = files(made)
     kept = (made / "batches/000000.json").stat().st_mtime_ns
     (made / "batches/000001.json").unlink()

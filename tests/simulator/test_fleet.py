@@ -143,7 +143,7 @@ def test_rates_are_met(cross):
     assert wrong.mean() == pytest.approx(0.2 * lines / len(whole.origin), abs=0.04)
 
 
-def test_nothing_is_reported_of_what_a_vehicle_hides(cross):
+def test_occluded_elements_are_not_reported(cross):
     config = dataclasses.replace(PERFECT, occluders=3.0)
     crowd = simulate_crowd(cross, 60, config)
     hidden = 0
@@ -317,7 +317,7 @@ def test_generated_lanes_run_beside_their_paint_and_through_junctions(name):
 
 @pytest.mark.skipif(not (SHARED / "av2").is_dir(), reason="../shared/data is absent")
 @pytest.mark.parametrize("name", ["Town02", "av2-miami", "lanelet2"])
-def test_real_places_can_be_driven_and_seen(name):
+def test_real_places_can_be_simulated(name):
     found = load_place(name, data=SHARED)
     assert name in PLACES
     low, high = np.array(found.area[:2]), np.array(found.area[2:])

@@ -23,7 +23,7 @@ def test_common_rows_are_one_object_and_no_other_pair_is():
     np.testing.assert_allclose(scene.common_xy, ego[scene.common_pairs[:, 0]], atol=1e-6)
 
 
-def test_strangers_share_nothing():
+def test_disjoint_scenes_have_no_common_objects():
     scene = make_landmark_scene(LandmarkSpec(4, 15, 15, EXACT, disjoint=True), 0, 0)
     there = moved(scene.other[0].center[:, :2].numpy(), scene.ego_from_other)
     apart = np.hypot(*(scene.ego[0].center[:, None, :2].numpy() - there[None]).transpose(2, 0, 1))

@@ -18,7 +18,7 @@ TRUTH = MapElements.of(
 POSE = np.array([50.0, 20.0, 0.5])
 
 
-def test_without_errors_it_predicts_what_is_there():
+def test_without_errors_the_prediction_is_the_ground_truth():
     # A little noise: the crowd's test for rings that cross themselves takes edges on one line for ones that meet.
     predicted = SimulatedMapPredictor(TRUTH, replace(crowd_config("perfect"), point_sigma_m=0.002)).predict(
         POSE, AHEAD, "a"
@@ -50,5 +50,5 @@ def test_errors_depend_on_the_key_and_the_seed_alone():
         assert elements.points.shape != first.points.shape or not np.allclose(elements.points, first.points)
 
 
-def test_a_map_of_nothing_is_seen_as_nothing():
+def test_an_empty_map_gives_no_elements():
     assert len(SimulatedMapPredictor(MapElements.empty(), crowd_config("local")).predict(POSE, AHEAD).elements) == 0

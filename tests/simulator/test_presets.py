@@ -24,7 +24,7 @@ def test_no_town_is_on_two_sides() -> None:
         SimulationPreset((SplitPreset("train", ("Town01",), 1), SplitPreset("test", ("Town01",), 1)))
 
 
-def test_the_benchmark_has_the_scenes_it_promises() -> None:
+def test_the_benchmark_has_its_documented_scenes() -> None:
     jobs = make_jobs(simulation_preset("towns-small"), 0)
     counts = {split: sum(job.split == split for job in jobs) for split in ("train", "validate", "test")}
     assert counts == {"train": 150, "validate": 22, "test": 84}
@@ -45,7 +45,7 @@ def test_the_seed_decides() -> None:
     assert make_jobs(preset, 3) != make_jobs(preset, 4)
 
 
-def test_cameras_see_the_same_scenes() -> None:
+def test_presets_with_cameras_have_the_same_scenes() -> None:
     preset = simulation_preset("tiny")
     blind, seeing = make_jobs(preset, 3), make_jobs(with_cameras(preset), 3)
     assert [replace(job.spec, cameras="none", roadside_cameras="none") for job in seeing] == [j.spec for j in blind]

@@ -31,7 +31,7 @@ def test_distances_are_euclidean() -> None:
     np.testing.assert_allclose(distance_transform(blocked), distance_transform_edt(~blocked), atol=1e-9)
 
 
-def test_nothing_stands_on_a_road_and_something_stands_beside() -> None:
+def test_objects_are_placed_beside_roads_only() -> None:
     solids = place_roadside_objects(PlacementGrid.of(crossing()), RoadsideObjectSpec(), MIDDLE, (0,))
     assert (solids.kind == BOX).sum() > 25
     assert (solids.kind == ELLIPSOID).sum() > 10

@@ -45,7 +45,7 @@ def test_points_lie_in_the_boxes_that_agents_list(snapshot: Snapshot) -> None:
     assert int((count_points_in_listed_boxes(replace(snapshot, frames=tuple(mirrored))) == 0).sum()) > 5
 
 
-def test_a_box_is_seen_where_a_return_of_its_own_vehicle_lies_in_it(snapshot: Snapshot) -> None:
+def test_a_box_is_visible_if_a_return_of_its_vehicle_lies_in_it(snapshot: Snapshot) -> None:
     """Against box by box: of returns at random, named after any vehicle, some lie in their own box and some in another's."""
     assert snapshot.truth is not None
     boxes, rng = snapshot.truth.boxes, np.random.default_rng(0)
@@ -104,7 +104,7 @@ def test_the_same_seed_gives_the_same_points(snapshot: Snapshot) -> None:
         assert torch.equal(one.points.intensity, two.points.intensity)
 
 
-def test_a_lead_comes_before_and_changes_nothing_after(scenario: SimulatedScenario) -> None:
+def test_lead_frames_do_not_change_later_frames(scenario: SimulatedScenario) -> None:
     longer = make_scenario(replace(SPEC, lead_frames=3), load_town("generated-1"))
     assert (len(longer), longer.agents, longer.moving_fraction) == (6, scenario.agents, scenario.moving_fraction)
     one, two = scenario.snapshot(1), longer.snapshot(4)
@@ -118,7 +118,7 @@ def test_a_lead_comes_before_and_changes_nothing_after(scenario: SimulatedScenar
     assert float((agent[1] - agent[0]).norm()) == pytest.approx(0.3 * ago, abs=0.3)
 
 
-def test_what_cannot_be_had_is_named() -> None:
+def test_impossible_requests_are_named() -> None:
     with pytest.raises(NoSceneError, match="no crossing in generated-1 has 5000 vehicles"):
         make_scenario(replace(SPEC, min_vehicles=5000), load_town("generated-1"))
     with pytest.raises(ConfigError, match="frames > history_frames"):

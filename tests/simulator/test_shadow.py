@@ -61,7 +61,7 @@ def test_a_crown_shades_by_its_leaves_and_dims_within() -> None:
     assert (dim, bright) == pytest.approx((np.exp(-0.5 * 0.5 * 3.0), np.exp(-0.5 * 0.5 * 0.1)))
 
 
-def test_the_ground_beside_a_wall_sees_less_of_the_sky() -> None:
+def test_the_ground_beside_a_wall_has_less_sky_visibility() -> None:
     wall = Primitives(
         np.array([BOX], np.uint8), np.array([[0.0, 0, 1]]), np.eye(3)[None], np.array([[3.0, 0.5, 1]]), np.zeros(1),
         np.zeros(1, np.int64), np.array([0.5]),

@@ -231,7 +231,7 @@ def test_full_maps_by_map_mode_and_method_against_one_truth(weights, tmp_path, m
     assert len(made) == 2, "what was seen is kept"
 
 
-def test_what_is_missing_or_twice_is_one_line(weights, tmp_path, capsys, monkeypatch):
+def test_missing_or_repeated_options_are_one_line(weights, tmp_path, capsys, monkeypatch):
     def refused(*words):
         assert cli.main([str(word) for word in ("map", "evaluate", "--study", *words)]) == 1
         return capsys.readouterr().err

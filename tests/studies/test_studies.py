@@ -167,7 +167,7 @@ def test_baseline_fusions_are_compared_with_ours_under_each_perturbation(
     assert "methods of the names late" in capsys.readouterr().err and not (tmp_path / "b").exists()
 
 
-def test_a_stopped_study_goes_on_and_a_finished_one_plays_nothing(
+def test_an_interrupted_study_resumes_and_a_finished_one_replays_nothing(
     data, weights, tmp_path, monkeypatch, small_set, panels
 ) -> None:
     monkeypatch.setattr(robustness, "ALL_PERTURBATIONS", small_set[:4])
@@ -204,7 +204,7 @@ def test_budgets_are_respected_and_small_ones_send_less(data, weights, tmp_path)
     assert {r["method"] for r in held["reference_rows"]} == {"none", "late"}
 
 
-def test_agents_are_judged_on_the_scenarios_that_have_them(data, weights, tmp_path, panels) -> None:
+def test_numbers_of_agents_are_evaluated_on_scenarios_that_have_them(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "none", "late", "--frame-stride", 2)
     rows = evaluate(data, weights, tmp_path, "num-agents", *words)["result"]["rows"]
     assert [(r["num_agents"], r["method"], r["num_scenarios"]) for r in rows] == [
@@ -288,7 +288,7 @@ def test_no_fusion_is_the_same_under_every_perturbation(data, weights) -> None:
         (("--study", "num-agents", "--frame-stride", 0), ("at least 1",)),
     ],
 )
-def test_what_is_wrong_is_one_line_before_any_work(data, weights, tmp_path, capsys, words, named) -> None:
+def test_invalid_arguments_are_one_line_before_any_work(data, weights, tmp_path, capsys, words, named) -> None:
     common = ("--data", data, "--split", "test", "--weights", weights, "--out", tmp_path / "out")
     assert cli.main([str(word) for word in ("evaluate", *common, *words)]) == 1
     output = capsys.readouterr().err.splitlines()

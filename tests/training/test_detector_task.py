@@ -45,7 +45,7 @@ def small(toy):
 
 
 @pytest.mark.parametrize("config", (TINY, ROAD), ids=("plain", "road"))
-def test_a_run_that_was_killed_ends_as_if_it_had_not_been(toy, tmp_path, check_resumption, config):
+def test_an_interrupted_run_ends_with_the_same_result(toy, tmp_path, check_resumption, config):
     check_resumption(lambda: DetectorTask(config, dataclasses.replace(small(toy), frames=4), 3), tmp_path)
 
 

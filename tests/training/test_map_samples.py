@@ -133,7 +133,7 @@ def test_line_mask_covers_lines_and_fills_crossings():
     assert [KINDS[CROSSING], KINDS[DIVIDER]] == ["crossing", "divider"]
 
 
-def test_a_mirrored_camera_sees_the_mirrored_point_in_the_mirrored_column():
+def test_a_mirrored_camera_projects_the_mirrored_point_to_the_mirrored_column():
     frame = Drives().snapshot("aton_0", 0).frames[0]
     zero = torch.zeros((), dtype=torch.float64)
     ahead = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)

@@ -100,7 +100,7 @@ def same_state(a, b):
     return all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), b.state_dict().values(), strict=True))
 
 
-def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path, check_resumption):
+def test_an_interrupted_run_ends_with_the_same_result(tmp_path, check_resumption):
     check_resumption(lambda: MapTask(CONFIG, Streets(), 3), tmp_path)
 
 
@@ -115,7 +115,7 @@ def test_run_state_includes_the_initial_weights(tmp_path):
             Trainer(MapTask(CONFIG, Streets(), 3, start), tmp_path / "run")
 
 
-def test_a_batch_in_parts_goes_down_the_mean_of_its_parts(tmp_path):
+def test_a_batch_in_parts_has_the_mean_gradient_of_its_parts(tmp_path):
     config = dataclasses.replace(CONFIG, batch=4, micro_batch=3)
     run = Trainer(MapTask(config, Streets(), 3), tmp_path)
     losses, gradients = [], []

@@ -158,7 +158,7 @@ def test_views_are_cached_once_per_detector_fingerprint(toy, tmp_path, monkeypat
         select_snapshots(toy(agents_n=1))
 
 
-def test_a_run_that_was_killed_ends_as_if_it_had_not_been(cache, tmp_path, check_resumption):
+def test_an_interrupted_run_ends_with_the_same_result(cache, tmp_path, check_resumption):
     check_resumption(lambda: FeakmTask(TINY, cache, 3), tmp_path)
 
 

@@ -166,7 +166,7 @@ def test_the_stream_is_a_function_of_the_number_alone(toy):
     assert not torch.equal(other.draw(3).views[0].cloud.xyz, clouds[3])
 
 
-def test_an_epoch_is_the_judged_frames(toy):
+def test_an_epoch_is_all_evaluated_frames(toy):
     assert epoch_length(toy(frames=3)) == 6
 
 

@@ -62,7 +62,7 @@ def steps_of(folder) -> list[int]:
     return [json.loads(line)["step"] for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
-def test_a_run_that_was_killed_ends_as_if_it_had_not_been(tmp_path, check_resumption):
+def test_an_interrupted_run_ends_with_the_same_result(tmp_path, check_resumption):
     check_resumption(lambda: LineTask(CONFIG, 3), tmp_path)
 
 

@@ -62,7 +62,7 @@ def near(
     return bool((np.abs(pixels.astype(int) - colour).sum(-1) < 60).any())
 
 
-def test_a_true_box_is_drawn_where_it_stands_and_not_mirrored() -> None:
+def test_a_true_box_is_drawn_at_its_position_and_not_mirrored() -> None:
     image = draw_scene(make_scene(snapshot(), Boxes.empty()), GRID)
     for x, y in ((12 + 2.3, 6), (12 - 2.3, 6), (12, 6 + 0.95), (12, 6 - 0.95)):
         assert near(image, x, y, TRUE)
@@ -107,7 +107,7 @@ def test_points_of_agents_without_message_are_pale() -> None:
     assert 255 > np.asarray(image)[int(row), int(column)].min() > AGENT_COLOURS[1][0], "pale, but there"
 
 
-def test_a_box_that_no_agent_met_is_not_drawn_as_seen() -> None:
+def test_a_box_without_returns_is_not_drawn_as_visible() -> None:
     one = snapshot()
     assert one.truth is not None
     hidden = GroundTruth(one.truth.boxes, torch.zeros(2, 1, dtype=torch.bool), one.truth.world_from_agent)
@@ -173,7 +173,7 @@ ROWS = (
 )
 
 
-def test_a_row_reads_as_numbers_and_what_is_absent_reads_not_run() -> None:
+def test_a_row_is_formatted_and_unmeasured_values_read_not_run() -> None:
     assert format_cells(ROWS[0]) == ("none", "0.612 [0.550, 0.660]", "0.400", "0", "-", "-", "-", "41.0")
     assert format_cells(ROWS[1])[3:6] == ("32,768", "15.00", "104")
     assert format_cells(ROWS[2]) == ("early", *["not run"] * 7)

@@ -204,7 +204,7 @@ def faults(recording: DairRecording) -> list[str]:
     return [name for name, good in found.items() if not good]
 
 
-def test_the_scene_comes_out_as_it_was_put_in(dataset: Path) -> None:
+def test_a_scene_round_trips(dataset: Path) -> None:
     recording = DairRecording(dataset)
     assert recording.missing_summary == ()
     assert faults(recording) == []
@@ -291,7 +291,7 @@ def test_clouds_times_and_heights(dataset: Path) -> None:
     assert not pole.points.time_s.any()
 
 
-def test_a_stated_height_goes_before_the_ground(root: Path) -> None:
+def test_a_stated_height_takes_precedence_over_the_ground(root: Path) -> None:
     edit(
         root / "vehicle-side/data_info.json", lambda rows: [row.update(lidar_height_m="2.25") for row in rows] and None
     )
@@ -371,7 +371,7 @@ def test_an_offset_in_text_counts_and_relative_error_stands_in(root: Path) -> No
     assert faults(DairRecording(root)) == []
 
 
-def test_lidar_i2v_stands_in_for_a_lost_calibration(root: Path) -> None:
+def test_lidar_i2v_replaces_a_missing_calibration(root: Path) -> None:
     turn = LIDAR[0].T @ POLE[0]
     i2v = turn, LIDAR[0].T @ (POLE[1] - LIDAR[1])
     dump(root / "cooperative/calib/lidar_i2v/000010.json", motion(i2v))

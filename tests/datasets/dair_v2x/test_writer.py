@@ -48,7 +48,7 @@ def written(root: Path, snapshot: Snapshot, unit: Snapshot | None = None) -> Dai
     return DairRecording(root, "val", strict=True)
 
 
-def test_a_snapshot_comes_back(tmp_path: Path) -> None:
+def test_a_snapshot_round_trips(tmp_path: Path) -> None:
     snapshot = drive()
     found = written(tmp_path, snapshot).snapshot("7", 0)
     assert snapshot.truth is not None and found.truth is not None
@@ -141,7 +141,7 @@ def test_no_vehicle_at_all(tmp_path: Path) -> None:
         (lambda s: replace(s, frames=(s.frames[0], s.frames[0])), "2 frames of the kind vehicle"),
     ],
 )
-def test_what_the_format_cannot_hold_is_refused(tmp_path: Path, change, message_match: str) -> None:
+def test_content_beyond_the_format_is_rejected(tmp_path: Path, change, message_match: str) -> None:
     with pytest.raises(RecordingError, match=message_match):
         DairWriter(tmp_path, "7").write(change(drive()), 0)
     assert list(tmp_path.iterdir()) == []

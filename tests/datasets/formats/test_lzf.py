@@ -13,7 +13,7 @@ from manyeyes.datatypes import RecordingError
 
 
 @given(st.lists(st.tuples(st.binary(max_size=5), st.integers(1, 400)), max_size=12))
-def test_what_is_compressed_unpacks_to_itself(parts: list[tuple[bytes, int]]) -> None:
+def test_compression_round_trips(parts: list[tuple[bytes, int]]) -> None:
     plain = b"".join(part * count for part, count in parts)
     packed = lzf_compress(plain)
     assert lzf_decompress(packed, len(plain)) == plain

@@ -107,7 +107,7 @@ def test_every_ascii_intensity_survives_though_it_is_a_denormal(tmp_path: Path, 
     assert found.intensity.max() == 1 and found.time_s is None
 
 
-def test_what_is_written_reads_back_and_is_the_same_every_time(tmp_path: Path) -> None:
+def test_files_round_trip_and_are_deterministic(tmp_path: Path) -> None:
     xyz, red = cloud(1000)
     for name in ("a.pcd", "b.pcd"):
         write_pcd(tmp_path / name, xyz, red / 255)
@@ -139,7 +139,7 @@ def test_binary_fields_of_any_type_count_and_order(tmp_path: Path) -> None:
     assert read_table(tmp_path / "a.pcd").column("ring").tolist() == [7] * 5
 
 
-def test_float_intensity_stands_for_itself_unless_it_counts_to_255(tmp_path: Path) -> None:
+def test_float_intensity_is_kept_unless_it_reaches_255(tmp_path: Path) -> None:
     for top, wanted in ((1.0, [0, 0.5, 1]), (255.0, [0, 0.5, 1])):
         text = OPV2V_HEADER.format(n=3, data="ascii").replace("rgb", "intensity")
         (tmp_path / "a.pcd").write_text(text + "".join(f"0 0 0 {v * top}\n" for v in (0, 0.5, 1)))
@@ -180,7 +180,7 @@ def test_random_lzf_bytes_are_refused_or_give_the_size_asked_for() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-def test_a_truncated_file_names_itself_what_was_expected_and_what_came(tmp_path: Path, encoding: str) -> None:
+def test_a_truncated_file_is_an_error_with_name_and_sizes(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "000069.pcd"
     xyz, red = cloud(100)
     if encoding == "ascii":

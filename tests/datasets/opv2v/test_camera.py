@@ -51,7 +51,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_pictures_and_cameras_come_back(root: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_images_and_cameras_round_trip(root: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     kept = tmp_path_factory.mktemp("kept")
     for _ in range(2):  # the second time from the cache
         recording = Opv2vRecording(root, images=True, cache_folder=kept)
@@ -106,7 +106,7 @@ def test_a_yaml_as_opv2v_writes_it(tmp_path: Path) -> None:
     assert place.rotation[:, 1].tolist() == pytest.approx([0, 0, -1], abs=1e-12)
 
 
-def test_a_lost_picture_is_a_problem_and_a_damaged_one_an_error(root: Path) -> None:
+def test_a_missing_image_is_a_problem_and_a_damaged_one_an_error(root: Path) -> None:
     folder = root / "one" / "3"
     (folder / "000002_camera1.png").unlink()
     recording = Opv2vRecording(root, images=True, use_cache=False)
@@ -128,7 +128,7 @@ def test_a_camera_without_its_numbers_is_named(tmp_path: Path) -> None:
     assert read_cameras(path) == ()
 
 
-def test_a_picture_comes_back_as_it_was(tmp_path: Path) -> None:
+def test_an_image_round_trips(tmp_path: Path) -> None:
     rgb = torch.arange(3 * 5 * 7, dtype=torch.uint8).reshape(3, 5, 7)
     write_png(tmp_path / "a.png", rgb)
     assert torch.equal(read_image(tmp_path / "a.png"), rgb)

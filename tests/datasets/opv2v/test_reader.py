@@ -243,7 +243,7 @@ def test_scenario_split_and_folder_of_scenarios_are_all_roots(dataset: Path) -> 
     assert recording.snapshot(two[1], 0).frames[0].points.xyz == pytest.approx(ascii_points, abs=2e-6)
 
 
-def test_history_frames_are_not_judged(scenario: Path) -> None:
+def test_history_frames_are_not_evaluated(scenario: Path) -> None:
     edit(scenario / "data_protocol.yaml", lambda c: c.update(history_frames=1))
     assert Opv2vRecording(scenario).eval_indices("drive") == range(1, 2)
     edit(scenario / "data_protocol.yaml", lambda c: c.update(history_frames=9))
@@ -508,7 +508,7 @@ def assert_same(one: Snapshot, other: Snapshot) -> None:
         assert torch.equal(b.points.time_s, torch.zeros(len(b.points)))
 
 
-def test_what_the_writer_wrote_is_what_the_reader_reads(tmp_path: Path) -> None:
+def test_written_recordings_round_trip(tmp_path: Path) -> None:
     snapshots = [drive_frame(i) for i in range(3)]
     writer = Opv2vWriter(tmp_path / "drive")
     for snapshot in snapshots:
@@ -593,7 +593,7 @@ def test_a_frame_without_truth_lists_nothing(tmp_path: Path) -> None:
         (lambda s: replace(s, truth=replace(s.truth, boxes=replace(s.truth.boxes, id=s.truth.boxes.id * 0))), "once"),
     ],
 )
-def test_the_writer_refuses_what_the_format_cannot_hold(
+def test_the_writer_rejects_content_beyond_the_format(
     tmp_path: Path, change: Callable[[Snapshot], Snapshot], message_match: str
 ) -> None:
     with pytest.raises(RecordingError, match=message_match):

@@ -86,7 +86,7 @@ def test_the_bytes_of_a_table_are_those_handed_to_the_bus(detector, monkeypatch,
         assert len(step.perception.received) == sum(1 for s in step.sent if s.num_packets and s.agent_id != 0)
 
 
-def test_codes_arrive_as_what_they_stand_for_in_a_tenth_of_the_bytes(detector):
+def test_codebook_tokens_are_decoded_to_their_values_in_a_tenth_of_the_bytes(detector):
     """All of them: the receiver reads, cell by cell, what the sender's codebook makes of its tokens."""
     frames = Plane().snapshot("plane", 0).frames
     sender = Agent(detector, token_encoding="codebook", budget_bytes=None)
@@ -145,7 +145,7 @@ def test_codes_need_a_codebook_on_both_sides(detector):
     assert Agent(plain).perceive(frames[0], inbox).received[0].message.tokens is None
 
 
-def test_requests_are_counted_and_change_what_is_sent(detector):
+def test_request_maps_are_counted_and_change_the_selection(detector):
     """Where all windows are seen well, all tokens are worth the same less, and the order stays; a window seen well loses cells."""
     frames = Plane().snapshot("plane", 0).frames
     asking = Agent(detector, budget_bytes=4096, send_request_map=True)
