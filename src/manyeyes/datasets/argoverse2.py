@@ -236,7 +236,7 @@ def _rotation(quaternion: Tensor) -> Tensor:
 
 
 def _columns(path: Path, names: tuple[str, ...]) -> tuple[np.ndarray, ...]:
-    """Named columns of a feather file as arrays."""
+    """Read named columns of a feather file as arrays."""
     try:
         from pyarrow import ArrowException, feather
     except ImportError:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbances of a recording: errors of claimed poses, and the literature's whole-frame staleness.
+"""Disturbances of a recording: errors of prior poses, and the literature's whole-frame staleness.
 
-Truth never moves, nor do point clouds: an agent sees what it sees, in its own frame, and is wrong about where it is.
+Ground truth and point clouds stay as they are: clouds are in the frame of their agent, whose prior pose alone is wrong.
 Transport delay and loss are not here; they follow from the bytes sent, in ``comms/channel``.
 
 To disturb in both ways, apply the noise to every snapshot first, then the staleness: a stale message carries the noisy
@@ -27,7 +27,7 @@ NoiseMode = Literal["collaborators_iid", "all_agents_iid", "all_agents_sequence"
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Errors of claimed poses: sigma_xy_m (metres, each axis of the world) and sigma_yaw_rad (radians), Gaussian.
+    """Errors of prior poses: sigma_xy_m (metres, each axis of the world) and sigma_yaw_rad (radians), Gaussian.
 
     mode: ``collaborators_iid`` (the default of this project) moves every agent but the ego, anew in each frame;
     ``all_agents_iid`` (CoAlign) moves the ego too, so that relative errors are sqrt(2) larger;
@@ -55,7 +55,7 @@ class PoseNoise:
             )
 
     def apply(self, snapshot: Snapshot, ego: int) -> Snapshot:
-        """Return the snapshot as agents claim it: poses displaced, their covariance grown by the noise; truth as it was."""
+        """Return the snapshot with prior poses displaced, their covariance grown by the noise; truth as it was."""
         everyone = self.mode.startswith("all_agents")
         frames = tuple(
             self._displace(frame, self.offset(snapshot.scenario, snapshot.index, frame.agent_id))
@@ -66,7 +66,7 @@ class PoseNoise:
         return replace(snapshot, frames=frames)
 
     def offset(self, scenario: str, index: int, agent_id: int) -> Tensor:
-        """x, y, z (m) and yaw (rad) that an agent's claimed pose is off by in the world, (4,) float64."""
+        """Draw the error x, y, z (m) and yaw (rad) of an agent's prior pose in the world, (4,) float64."""
         if self.mode == "legacy_constant":
             x, y, z, yaw = opencood_offset(self.seed, self.sigma_xy_m, self.sigma_yaw_rad)
             # The draw is in CARLA's left-handed world: our y axis and our sense of turning are its opposites.
@@ -88,7 +88,7 @@ class PoseNoise:
 
 
 def opencood_offset(seed: int, sigma_xyz: float, sigma_angle: float) -> tuple[float, float, float, float]:
-    """x, y, z and yaw of OpenCOOD's re-seeded draw, in CARLA's axes; the angle in the unit of its sigma.
+    """Compute x, y, z and yaw of OpenCOOD's re-seeded draw, in CARLA's axes; the angle in the unit of its sigma.
 
     Three normals for the position, then three for angles of which the second is used, from NumPy's legacy generator.
     """

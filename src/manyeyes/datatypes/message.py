@@ -60,7 +60,7 @@ class LocalMap:
 class Message:
     """Header and up to five sections; a section that is not sent is None.
 
-    world_from_agent: the claimed pose at timestamp_ns, the time of capture; pose_covariance: (3, 3), x, y, yaw.
+    world_from_agent: the prior pose at timestamp_ns, the time of capture; pose_covariance: (3, 3), x, y, yaw.
     fingerprint: 8 bytes that name the weights which made the tokens; tokens of other weights are refused.
     tokens: one grid, in the sender's frame; features float, or uint8 rows of the weights' codebook. token_score: (N,), which
     cells matter most. objects and points: sender's frame. descriptors: (objects, DESCRIPTOR) in [-1, 1], of each object, for

@@ -21,9 +21,9 @@ class AgentFrame:
     """One agent at one instant: all inputs of its perception, without labels.
 
     points: in the agent's own frame (x forward, y left, z up; z = 0 is the road under it, under a pole too).
-    world_from_agent: the *claimed* pose; pose_covariance: (3, 3) of x, y (m) and yaw (rad) in the world, the
+    world_from_agent: the *prior* pose; pose_covariance: (3, 3) of x, y (m) and yaw (rad) in the world, the
     agent's estimate of its error. sensor_height_m: height of the LiDAR above the road. speed_mps: own speed. odometry:
-    the pose in a local frame that drifts but never jumps, for motion since earlier frames; by default the claimed pose.
+    the pose in a local frame that drifts but never jumps, for motion since earlier frames; by default the prior pose.
     images: of its cameras, if it has any and they were requested.
     """
 

@@ -104,7 +104,7 @@ def _flat(found: object) -> list[float] | None:
 
 
 def read_calibration(path: Path) -> Transform:
-    """target_from_source of ``{rotation, translation}``, or of such a thing under ``transform``; float64.
+    """Read target_from_source of ``{rotation, translation}``, or of such a thing under ``transform``; float64.
 
     The rotation is replaced by the nearest true one, because published matrices are rounded.
     """
@@ -126,14 +126,14 @@ def _motion(path: Path, content: Any) -> Transform:
 
 
 def read_infrastructure_calibration(path: Path) -> tuple[Transform, tuple[float, float]]:
-    """world_from_virtuallidar, and its ``relative_error``: metres along the world's x and y, 0 where it is blank."""
+    """Read world_from_virtuallidar, and its ``relative_error``: metres along the world's x and y, 0 where it is blank."""
     content = load_json(path)
     error = content.get("relative_error") if isinstance(content, Mapping) else None
     return _motion(path, content), get_offset(path, error or None, "relative_error") or (0.0, 0.0)
 
 
 def get_offset(path: Path, found: Any, json_path: str) -> tuple[float, float] | None:
-    """``{delta_x, delta_y}`` in metres; None where there is none, or where an empty string stands for it."""
+    """Return ``{delta_x, delta_y}`` in metres; None where there is none, or where an empty string stands for it."""
     if found is None or found == "":
         return None
     return get_number(path, found, "delta_x", json_path, 0.0), get_number(path, found, "delta_y", json_path, 0.0)
@@ -215,7 +215,7 @@ def _size(path: Path, entry: Mapping[str, Any], row: int) -> list[float]:
 
 
 def _track(path: Path, entry: Mapping[str, Any], row: int) -> int:
-    """``track_id`` (V2X-Seq), or -1 where there is none."""
+    """Return ``track_id`` (V2X-Seq), or -1 where there is none."""
     if entry.get("track_id") in (None, ""):
         return -1
     value = get_number(path, entry, "track_id", f"[{row}]")

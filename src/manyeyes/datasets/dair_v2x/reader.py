@@ -167,7 +167,7 @@ class DairRecording(RecordingReader):
         return vehicle, Transform(unit.rotation, unit.translation + shift)
 
     def side_boxes(self, scenario: str, index: int) -> tuple[Boxes, Boxes]:
-        """What the vehicle lists and what the infrastructure lists, in the world frame, by the labels of each side."""
+        """Return what the vehicle lists and what the infrastructure lists, in the world frame, by the labels of each side."""
         pair = self.pair(scenario, index)
         return self._listed(pair, self.lidar_poses(pair))
 
@@ -231,7 +231,7 @@ class DairRecording(RecordingReader):
         return Transform(pose.rotation, pose.translation + torch.tensor([x, y, 0.0], dtype=torch.float64))
 
     def _speed(self, side: SideFrame) -> float:
-        """From the sweep before, m/s; 0 where there is none within half a second."""
+        """Return the speed since the sweep before, m/s; 0 where there is none within half a second."""
         before = self._sides.vehicle.before(side, 1)
         if before is None or not all(path.is_file() for path in before.motions):
             return 0.0

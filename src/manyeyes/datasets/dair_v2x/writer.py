@@ -46,7 +46,7 @@ class DairWriter:
     """Writes the pairs of one drive, so that :class:`~manyeyes.datasets.dair_v2x.DairRecording` reads them back.
 
     Exact to rounding: poses, boxes and time stamps (to the microsecond), points as float32, the infrastructure's
-    intensity; the vehicle's intensity in 8 bits. Not in the format, hence not written: claimed poses, boxes that neither
+    intensity; the vehicle's intensity in 8 bits. Not in the format, hence not written: prior poses, boxes that neither
     side lists, the time of an infrastructure's point, the agents' ids (they come back as 0 and -1, and so does the id of
     the vehicle's own body). Beyond the format: ``track_id`` of labels, as in V2X-Seq, and ``lidar_height_m`` in both indices.
     """
@@ -226,7 +226,7 @@ def _motion(target_from_source: Transform) -> dict[str, Any]:
 
 
 def _listed(snapshot: Snapshot, row: int) -> Boxes:
-    """What an agent lists, in the world frame; never its own body."""
+    """Return what an agent lists, in the world frame; never its own body."""
     assert snapshot.truth is not None
     boxes = snapshot.truth.boxes
     return boxes[snapshot.truth.seen[row] & (boxes.id != snapshot.frames[row].agent_id)].to(torch.float64)
@@ -238,7 +238,7 @@ def _side_labels(boxes: Boxes, world_from_lidar: Transform) -> list[dict[str, An
 
 
 def _world_labels(boxes: Boxes, world_from_virtual: Transform) -> list[dict[str, Any]]:
-    """As in the files: everything is the world's but ``rotation``, which is the yaw in the virtual LiDAR's frame."""
+    """Make labels as in the files: everything is the world's but ``rotation``, which is the yaw in the virtual LiDAR's frame."""
     yaw = boxes.transform(world_from_virtual.inverse()).yaw.tolist()
     corners = boxes.corners().tolist()
     return [{**_label(boxes, row, yaw[row]), "world_8_points": corners[row]} for row in range(len(boxes))]

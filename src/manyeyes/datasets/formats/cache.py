@@ -16,7 +16,7 @@ from manyeyes._io import atomic_write
 
 
 def default_cache_folder() -> Path:
-    """``$MANYEYES_CACHE``, else ``manyeyes`` in the user's cache folder."""
+    """Return ``$MANYEYES_CACHE``, else ``manyeyes`` in the user's cache folder."""
     chosen = os.environ.get("MANYEYES_CACHE")
     if chosen:
         return Path(chosen)

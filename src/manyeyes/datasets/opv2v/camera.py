@@ -39,7 +39,7 @@ class CameraRecord:
 
 
 def image_path(folder: Path, stem: str, number: int) -> Path:
-    """Where a camera's picture of one instant lies."""
+    """Return the path of a camera's picture of one instant."""
     return folder / f"{stem}_camera{number}.png"
 
 
@@ -59,7 +59,7 @@ def camera_yaml(
 
 
 def read_images(yaml: Path, world_from_agent: Transform, cache: ArrayCache | None = None) -> tuple[CameraImage, ...]:
-    """What the agent's cameras took at the yaml's instant, in the order of their numbers; those without a file are left out."""
+    """Read the pictures of the yaml's instant in the order of their cameras' numbers; those without a file are left out."""
     images = []
     for record in read_cameras(yaml, cache):
         path = image_path(yaml.parent, yaml.stem, record.number)

@@ -105,19 +105,19 @@ class Opv2vRecording(RecordingReader):
         self._heights: dict[Path, float] = {}
 
     def length(self, scenario: str) -> int:
-        """How many snapshots the scenario has."""
+        """Return how many snapshots the scenario has."""
         return len(self._scenario(scenario).stems)
 
     def eval_indices(self, scenario: str) -> range:
-        """All indices but the first ``history_frames`` of data_protocol.yaml."""
+        """Return all indices but the first ``history_frames`` of data_protocol.yaml."""
         return range(min(self._protocol(scenario).history_frames, self.length(scenario)), self.length(scenario))
 
     def agents(self, scenario: str) -> tuple[int, ...]:
-        """The ids of all agents of the scenario, the ego first and infrastructure last."""
+        """Return the ids of all agents of the scenario, the ego first and infrastructure last."""
         return tuple(agent.id for agent in self._scenario(scenario).agents)
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
-        """All agents that have this frame; the truth is the union of what they list, in the order of ids."""
+        """Read all agents that have this frame; the truth is the union of what they list, in the order of ids."""
         return self._snapshot(scenario, index, self._with_images)
 
     def _snapshot(self, scenario: str, index: int, images: bool) -> Snapshot:
@@ -127,11 +127,11 @@ class Opv2vRecording(RecordingReader):
         return Snapshot(scenario, index, frames, _truth(frames, records))
 
     def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
-        """The ids of the agents that have this frame, in the order of the snapshot's frames."""
+        """Return the ids of the agents that have this frame, in the order of the snapshot's frames."""
         return tuple(agent.id for agent in self._present(scenario, index)[1])
 
     def frame(self, scenario: str, index: int, agent_id: int) -> AgentFrame:
-        """The frame of one agent as it stands in the snapshot; no other agent's files are read."""
+        """Read the frame of one agent as it stands in the snapshot; no other agent's files are read."""
         stem, present = self._present(scenario, index)
         found = [agent for agent in present if agent.id == agent_id]
         if not found:
@@ -166,7 +166,7 @@ class Opv2vRecording(RecordingReader):
         return found
 
     def _clouds(self, name: str) -> list[dict[int, Path]]:
-        """The paths of the clouds of each snapshot, by agent."""
+        """Return the paths of the clouds of each snapshot, by agent."""
         scenario = self._scenarios[name]
         return [
             {agent.id: agent.folder / f"{stem}.pcd" for agent in scenario.agents if stem in agent.stems}
@@ -174,7 +174,7 @@ class Opv2vRecording(RecordingReader):
         ]
 
     def _present(self, scenario: str, index: int) -> tuple[str, list[AgentFiles]]:
-        """The stem of an instant's files, and the agents that have them."""
+        """Return the stem of an instant's files, and the agents that have them."""
         require_index(self, scenario, index)
         stem = self._scenarios[scenario].stems[index]
         return stem, [agent for agent in self._scenarios[scenario].agents if stem in agent.stems]
@@ -220,7 +220,7 @@ class Opv2vRecording(RecordingReader):
         )
 
     def _sensor_height(self, agent: AgentFiles, record: AgentRecord, world_from_lidar: Transform) -> float:
-        """Metres from the road up to the LiDAR along the LiDAR's z axis.
+        """Return the metres from the road up to the LiDAR along the LiDAR's z axis.
 
         By the two poses where they say something plausible. Where a pole's place is its sensor's own, the ground is
         searched in the agent's first cloud, once, so that the height is the same in every frame.
@@ -244,7 +244,7 @@ def _stated_height(record: AgentRecord, world_from_lidar: Transform) -> float | 
 
 
 def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> GroundTruth:
-    """The union of all lists by id, first agent's copy, in the order of ids."""
+    """Return the union of all lists by id, first agent's copy, in the order of ids."""
     listed = [np.where(r.id != f.agent_id)[0] for f, r in zip(frames, records)]
     id = np.concatenate([r.id[rows] for r, rows in zip(records, listed)])
     _, first = np.unique(id, return_index=True)
@@ -262,7 +262,7 @@ def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> Ground
 
 
 def _state(files: Sequence[Path], folder: Path) -> np.ndarray:
-    """(32,) uint8 digest of names, sizes and times of files; replacing any of them changes it."""
+    """Compute a (32,) uint8 digest of names, sizes and times of files; replacing any of them changes it."""
     lines = []
     for path in files:
         stat = path.stat()

@@ -53,7 +53,7 @@ def _is_scenario(folder: Path) -> bool:
 
 
 def contains_scenarios(path: Path) -> bool:
-    """Whether a folder is a scenario, holds some, or holds splits with some, by names alone."""
+    """Return whether a folder is a scenario, holds some, or holds splits with some, by names alone."""
     if not path.is_dir():
         return False
     inside = _subfolders(path)
@@ -65,13 +65,13 @@ def contains_scenarios(path: Path) -> bool:
 
 
 def has_frames(folder: Path) -> bool:
-    """Whether a folder has agents with clouds or metadata, that is, whether it is a scenario with anything in it."""
+    """Return whether a folder has agents with clouds or metadata, that is, whether it is a scenario with anything in it."""
     agents = [p for p in _subfolders(folder) if _AGENT.fullmatch(p.name)]
     return any(p.suffix in (".pcd", ".yaml") and p.stem.isdecimal() for agent in agents for p in agent.iterdir())
 
 
 def find_scenario_folders(root: Path, split: str | None) -> list[Path]:
-    """The folders to scan, after the root was checked; the text of every error lists what is there instead."""
+    """Find the folders to scan, after the root was checked; the text of every error lists what is there instead."""
     if not root.is_dir():
         raise RecordingError(f"{root}: no such folder, expected a recording in OPV2V's layout; check the path.")
     folder = root if split is None else root / split
@@ -94,7 +94,7 @@ def find_scenario_folders(root: Path, split: str | None) -> list[Path]:
 
 
 def scan_scenario(folder: Path, problems: list[str], missing: list[FileProblem], images: bool) -> ScenarioFiles | None:
-    """What a scenario's folder holds, by names alone; what is missing is added to problems and to missing."""
+    """List what a scenario's folder holds, by names alone; what is missing is added to problems and to missing."""
     if folder.name.endswith(PARTIAL):
         reason = "an interrupted run of 'manyeyes simulate' left it unfinished"
         problems.append(f"{folder}: {reason}, the scenario is left out")
@@ -143,7 +143,7 @@ def _scan_agent(folder: Path, problems: list[str], images: bool) -> AgentFiles:
 
 
 def _absent_files(folder: Path, agents: Sequence[AgentFiles]) -> Iterator[FileProblem]:
-    """The files that a scenario lacks: every stem of any agent is expected of all."""
+    """Find the files that a scenario lacks: every stem of any agent is expected of all."""
     stems = frozenset[str]().union(*(agent.clouds | agent.records for agent in agents))
     # A folder of something else may stand beside the scenarios; an empty one was a scenario.
     if not stems and (agents or (folder / "data_protocol.yaml").is_file() or not any(folder.iterdir())):

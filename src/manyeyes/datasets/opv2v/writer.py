@@ -24,8 +24,8 @@ class Opv2vWriter:
     """Writes one scenario's folder, so that :class:`Opv2vRecording` reads the same snapshots back.
 
     Exact to rounding: poses and boxes as float64 text, points as float32, intensity in 8 bits. Not in the format, hence
-    not written: the time of a point, boxes that no agent lists, the covariance of a claim. The true pose goes to
-    ``lidar_pose``, the claimed one to ``predicted_ego_pos``, which the reader does not use. Snapshots come back with
+    not written: the time of a point, boxes that no agent lists, the covariance of a prior pose. The true pose goes to
+    ``lidar_pose``, the prior one to ``predicted_ego_pos``, which the reader does not use. Snapshots come back with
     agents in string order of their ids, infrastructure (negative ids) last, and boxes in the order of ids.
     """
 
