@@ -4,7 +4,7 @@
 Four convolutions predict for each observed cell which kinds of element it holds: average precision over the cells of held-out
 frames, by norm.
 
-python benchmarks/map_norms.py [--data data/streets] [--tiles 60] [--steps 120] [--looks 6] [--rate 3e-3] [--held 20]
+python benchmarks/map_norms.py [--data data/carla-maps] [--tiles 60] [--steps 120] [--looks 6] [--rate 3e-3] [--held 20]
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def average_precision(logit: Tensor, drawn: Tensor) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path("data/streets"))
+    parser.add_argument("--data", type=Path, default=Path("data/carla-maps"))
     parser.add_argument("--tiles", type=int, default=60)
     parser.add_argument("--steps", type=int, default=120)
     parser.add_argument("--looks", type=int, default=6)

@@ -3,7 +3,7 @@
 
 The bar: map-tiny above 0.9 on 16 tiles in five minutes on two cores. One process, or for two cores
 
-torchrun --nproc-per-node 2 benchmarks/map_overfit.py [--data data/streets] [--split train] [--tiles 16] [--steps 800]
+torchrun --nproc-per-node 2 benchmarks/map_overfit.py [--data data/carla-maps] [--split train] [--tiles 16] [--steps 800]
     [--batch 4] [--rate 4e-3] [--threads 1] [--every 200] [--preset map-tiny]
 """
 
@@ -71,7 +71,7 @@ def mean_ap(model: MapModel, samples: tuple[MapSample, ...]) -> dict[str, float]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path("data/streets"))
+    parser.add_argument("--data", type=Path, default=Path("data/carla-maps"))
     parser.add_argument("--split", default="train")
     parser.add_argument("--tiles", type=int, default=16)
     parser.add_argument("--steps", type=int, default=800)

@@ -4,7 +4,7 @@
 For map-paper as it stands, on a processor: eight tiles of ten looks, every picture of each brought to 480 x 640 pixels. The two
 steps must be those of a run that was never interrupted (tests/training/test_map_loop.py holds that bit by bit on a narrow one).
 
-python benchmarks/map_paper_step.py [--data data/streets-pictures] [--split train] [--preset map-paper] [--batch 8] [--threads 2]
+python benchmarks/map_paper_step.py [--data data/carla-maps-camera] [--split train] [--preset map-paper] [--batch 8] [--threads 2]
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ GIB = 1 << 30
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path("data/streets-pictures"))
+    parser.add_argument("--data", type=Path, default=Path("data/carla-maps-camera"))
     parser.add_argument("--split", default="train")
     parser.add_argument("--preset", default="map-paper", choices=MAP_TRAINING_PRESETS)
     parser.add_argument("--batch", type=int, help="tiles a step instead of the preset's")

@@ -3,7 +3,7 @@
 
 Both are given every pair of (NMS IoU, power of the predicted IoU in the score). What the test table uses is chosen here. Every
 frame is processed, so that agents have their sweep before and their past; every third is evaluated.
-Usage: python benchmarks/tuning.py --data data/towns-small --weights costr-small
+Usage: python benchmarks/tuning.py --data data/carla-towns-small --weights costr-small
 """
 
 from __future__ import annotations
@@ -77,15 +77,15 @@ def perceive(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path("data/towns-small"))
-    parser.add_argument("--split", default="validate")
+    parser.add_argument("--data", type=Path, default=Path("data/carla-towns-small"))
+    parser.add_argument("--split", default="val")
     parser.add_argument("--weights", default="costr-small")
     parser.add_argument("--every", type=int, default=3, help="stride of the evaluated frames")
     parser.add_argument("--out", type=Path, default=None)
     options = parser.parse_args()
     torch.set_num_threads(1)
     if not options.data.is_dir():
-        print(f"not run: {options.data} is absent; make it with 'manyeyes simulate --preset towns-small'")
+        print(f"not run: {options.data} is absent; make it with 'manyeyes simulate --preset carla-towns-small'")
         return
     detector, recording = load_detector(options.weights), Opv2vRecording(options.data, options.split)
     grid, base = detector.detection_range, detector.config.decode

@@ -14,7 +14,7 @@ from manyeyes.simulator.presets import simulate
 if __name__ == "__main__":
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(tempfile.mkdtemp()) / "drive"
     if not folder.exists():
-        simulate("tiny", folder, seed=0)
+        simulate("smoke-opv2v", folder, seed=0)
     config = BenchmarkConfig(replay=ReplayConfig(channel="its-g5-27mbps", latency_budget_s=0.1))
     for row in run_benchmark(partial(Opv2vRecording, folder, "test"), config):
         sent = row.communication

@@ -15,7 +15,7 @@ from manyeyes.simulator.presets import simulate
 
 folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(tempfile.mkdtemp())
 if not (folder / "test").is_dir():
-    simulate("tiny", folder)  # on roads that SUMO generates
+    simulate("smoke-opv2v", folder)  # on roads that SUMO generates
 drive = Opv2vRecording(folder, "test")
 detector, scenario = load_detector(), drive.scenarios[0]
 agents = {i: Agent(detector, budget_bytes=4096) for i in drive.agents(scenario)}

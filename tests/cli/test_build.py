@@ -201,7 +201,7 @@ def test_the_command_on_a_simulated_recording(tmp_path, capsys) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
     from manyeyes.simulator.presets import simulate
 
-    simulate("tiny", tmp_path / "tiny")
+    simulate("smoke-opv2v", tmp_path / "tiny")
     words = ["map", "build", str(tmp_path / "tiny"), "--split", "test", "--source", "truth", "--frame-stride", "2"]
     assert cli.main([*words, "--out", str(tmp_path / "out")]) == 0
     assert "against the truth in view" in capsys.readouterr().out

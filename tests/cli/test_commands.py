@@ -159,7 +159,7 @@ def test_a_spoilt_recording_is_one_line_that_names_the_thing(data, weights, tmp_
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (("simulate", "--preset", "moon"), ("moon", "towns-small")),
+        (("simulate", "--preset", "moon"), ("moon", "carla-towns-small")),
         (("train", "--data", ".", "--preset", "moon"), ("moon", "costr-small")),
         (("replay", ".", "--channel", "smoke"), ("smoke", "its-g5")),
         (("replay", ".", "--methods", "guess"), ("guess", "intermediate")),

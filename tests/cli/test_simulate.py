@@ -88,8 +88,8 @@ def test_another_seed_is_refused(folder: Path, capsys: pytest.CaptureFixture[str
     ("preset", "words", "message"),
     [
         ("smaller", (), "preset 'smaller'"),
-        ("tiny", (), "preset 'tiny'"),
-        ("dair-tiny", (), "layout of DAIR-V2X"),
+        ("smoke-opv2v", (), "preset 'smoke-opv2v'"),
+        ("smoke-dair", (), "layout of DAIR-V2X"),
         ("small", ("--cameras",), "cameras 'none' instead of 'opv2v-small'"),
     ],
 )

@@ -21,7 +21,7 @@ from manyeyes.studies.maps import running
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tiny")
-    simulate("tiny", folder)
+    simulate("smoke-opv2v", folder)
     return folder
 
 

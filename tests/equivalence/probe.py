@@ -70,7 +70,7 @@ def content(packets: list[bytes]) -> np.ndarray:
 def strategies(data: Path) -> Arrays:
     """Packets of every strategy and token encoding on one drive, and the boxes of every strategy."""
     if not (data / "tiny" / "manifest.json").is_file():
-        assert cli.main(["simulate", "--preset", "tiny", "--out", str(data / "tiny"), "--workers", "1"]) == 0
+        assert cli.main(["simulate", "--preset", "smoke-opv2v", "--out", str(data / "tiny"), "--workers", "1"]) == 0
     recording, detector = Opv2vRecording(data / "tiny", "test", use_cache=False), pretrained.load()
     scenario = recording.scenarios[0]
     snapshots = [recording.snapshot(scenario, index) for index in range(recording.length(scenario))]

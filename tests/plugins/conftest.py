@@ -22,7 +22,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from manyeyes.simulator.presets import simulate
 
     folder = tmp_path_factory.mktemp("recording") / "drive"
-    simulate("tiny", folder)
+    simulate("smoke-opv2v", folder)
     return folder
 
 

@@ -2,9 +2,11 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.simulator.presets import (
     SIMULATION_PRESETS,
     SimulationPreset,
@@ -25,7 +27,7 @@ def test_no_town_is_on_two_sides() -> None:
 
 
 def test_the_benchmark_has_its_documented_scenes() -> None:
-    jobs = make_jobs(simulation_preset("towns-small"), 0)
+    jobs = make_jobs(simulation_preset("carla-towns-small"), 0)
     counts = {split: sum(job.split == split for job in jobs) for split in ("train", "validate", "test")}
     assert counts == {"train": 150, "validate": 22, "test": 84}
     towns = {job.split: set() for job in jobs}
@@ -39,25 +41,43 @@ def test_the_benchmark_has_its_documented_scenes() -> None:
     assert len({(job.split, job.spec.name) for job in jobs}) == len(jobs)
 
 
+@pytest.mark.parametrize(("preset", "folder"), [("smoke-opv2v", "validate"), ("smoke-dair", "val")])
+def test_scenes_of_val_are_keyed_by_the_name_of_their_folder(preset: str, folder: str) -> None:
+    (job,) = [job for job in make_jobs(simulation_preset(preset), 7) if job.split == folder]
+    random = keyed_generator(7, "preset", folder, 0)
+    vehicles, seed = (
+        random.integers(*(np.array(simulation_preset(preset).vehicles) + [0, 1])),
+        random.integers(1, 2**30),
+    )
+    assert (job.spec.vehicles, job.spec.seed, job.spec.town) == (vehicles, seed, "generated-2")
+
+
+def test_the_number_of_beams_names_the_sensors() -> None:
+    (job,) = make_jobs(simulation_preset("demo"), 0)
+    assert (job.spec.lidar, job.spec.roadside_lidar) == ("opv2v-16", "opv2v-roadside-16")
+    (job, *_) = make_jobs(simulation_preset("carla-maps"), 0)
+    assert (job.spec.lidar, job.spec.roadside_lidar) == ("opv2v", "opv2v-roadside")
+
+
 def test_the_seed_decides() -> None:
-    preset = simulation_preset("towns-small")
+    preset = simulation_preset("carla-towns-small")
     assert make_jobs(preset, 3) == make_jobs(preset, 3)
     assert make_jobs(preset, 3) != make_jobs(preset, 4)
 
 
 def test_presets_with_cameras_have_the_same_scenes() -> None:
-    preset = simulation_preset("tiny")
+    preset = simulation_preset("smoke-opv2v")
     blind, seeing = make_jobs(preset, 3), make_jobs(with_cameras(preset), 3)
     assert [replace(job.spec, cameras="none", roadside_cameras="none") for job in seeing] == [j.spec for j in blind]
     assert {(job.spec.cameras, job.spec.roadside_cameras) for job in seeing} == {
         ("opv2v-small", "dair-infrastructure-small")
     }
     with pytest.raises(ConfigError, match="in OPV2V's layout only"):
-        with_cameras(simulation_preset("dair-tiny"))
+        with_cameras(simulation_preset("smoke-dair"))
 
 
-def test_streets_with_pictures_are_the_same_streets() -> None:
-    blind, seeing = (make_jobs(simulation_preset(name), 0) for name in ("streets", "streets-pictures"))
+def test_scenes_for_maps_with_cameras_are_the_same_scenes() -> None:
+    blind, seeing = (make_jobs(simulation_preset(name), 0) for name in ("carla-maps", "carla-maps-camera"))
     assert [replace(job.spec, cameras="none", roadside_cameras="none") for job in seeing] == [j.spec for j in blind]
     assert all(camera_rig(job.spec.cameras) and camera_rig(job.spec.roadside_cameras) for job in seeing)
 
@@ -75,5 +95,5 @@ def test_the_demo_runs_without_any_town(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_an_unknown_preset_lists_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match="No simulation preset 'town'; choose one of towns-small"):
+    with pytest.raises(ConfigError, match="No simulation preset 'town'; choose one of carla-towns-small"):
         simulation_preset("town")

@@ -14,7 +14,7 @@ from manyeyes._bounds import PositiveInt, Seed
 class Options:
     """What to make, and where."""
 
-    preset: str = "towns-small"
+    preset: str = "carla-towns-small"
     """Which set of scenarios; an unknown name lists the known ones."""
     out: Path | None = None
     """Folder for the splits and the manifest, data/PRESET or data/PRESET-cameras; a run that was stopped goes on there."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from manyeyes.datasets.opv2v.scan import SPLIT_FOLDERS
 from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.simulator.dair import record_dair
@@ -20,13 +21,13 @@ from manyeyes.simulator.scene.towns import GENERATED, TOWN_SPLIT, assert_disjoin
 class SplitPreset:
     """Scenes of one split: count of them, in turn over the towns.
 
-    beams: which of the sensors "<lidar><beams>" all agents of a scene carry, in turn over the scenes; () is the preset's own.
+    lidar_beams: number of LiDAR beams of all agents of a scene, in turn over the scenes; None for the preset's own sensors.
     """
 
     split: str
     towns: tuple[str, ...]
     count: int
-    beams: tuple[str, ...] = ()
+    lidar_beams: tuple[int | None, ...] = (None,)
 
 
 @dataclass(frozen=True)
@@ -64,11 +65,11 @@ class SimulationPreset:
         assert_disjoint_split({part.split: part.towns for part in self.splits})
 
 
-def _towns(train: int, validate: int, test: int) -> tuple[SplitPreset, ...]:
+def _towns(train: int, val: int, test: int) -> tuple[SplitPreset, ...]:
     return (
-        SplitPreset("train", TOWN_SPLIT["train"], train, ("-16", "-16", "-32", "-16", "", "-16", "-16", "-32")),
-        SplitPreset("validate", TOWN_SPLIT["val"], validate, ("-16",)),
-        SplitPreset("test", TOWN_SPLIT["test"], test, ("-16",)),
+        SplitPreset("train", TOWN_SPLIT["train"], train, (16, 16, 32, 16, None, 16, 16, 32)),
+        SplitPreset("val", TOWN_SPLIT["val"], val, (16,)),
+        SplitPreset("test", TOWN_SPLIT["test"], test, (16,)),
     )
 
 
@@ -82,8 +83,8 @@ def _crowded(splits: tuple[SplitPreset, ...]) -> SimulationPreset:
 # For maps: many places rather than many instants, a second apart; mostly OPV2V's own 64 beams, since paint lies between fewer.
 _STREETS = SimulationPreset(
     (
-        SplitPreset("train", TOWN_SPLIT["train"], 240, ("", "", "-32", "", "", "-16")),
-        SplitPreset("validate", TOWN_SPLIT["val"], 24),
+        SplitPreset("train", TOWN_SPLIT["train"], 240, (None, None, 32, None, None, 16)),
+        SplitPreset("val", TOWN_SPLIT["val"], 24),
         SplitPreset("test", TOWN_SPLIT["test"], 84),
     ),
     frames=4,
@@ -95,15 +96,15 @@ _STREETS = SimulationPreset(
 )
 
 SIMULATION_PRESETS: dict[str, SimulationPreset] = {
-    "towns-small": _crowded(_towns(150, 22, 84)),
-    "towns-large": _crowded(_towns(600, 60, 200)),
-    "streets": _STREETS,
+    "carla-towns-small": _crowded(_towns(150, 22, 84)),
+    "carla-towns-large": _crowded(_towns(600, 60, 200)),
+    "carla-maps": _STREETS,
     # The same scenes, to the last point of their clouds, with pictures of what lies on the road.
-    "streets-pictures": replace(_STREETS, cameras="opv2v-road", roadside_cameras="dair-infrastructure-road"),
-    "tiny": SimulationPreset(
+    "carla-maps-camera": replace(_STREETS, cameras="opv2v-road", roadside_cameras="dair-infrastructure-road"),
+    "smoke-opv2v": SimulationPreset(
         (
             SplitPreset("train", ("generated-1",), 2),
-            SplitPreset("validate", ("generated-2",), 1),
+            SplitPreset("val", ("generated-2",), 1),
             SplitPreset("test", ("generated-3",), 1),
         ),
         frames=3,
@@ -111,7 +112,7 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
         min_vehicles=4,
     ),
     "demo": SimulationPreset(
-        (SplitPreset("test", ("Town10HD",), 1, ("-16",)),),
+        (SplitPreset("test", ("Town10HD",), 1, (16,)),),
         frames=56,
         vehicles=(3, 3),
         roadside_chance=1.0,
@@ -133,7 +134,7 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
         min_vehicles=8,
         layout="dair",
     ),
-    "dair-tiny": SimulationPreset(
+    "smoke-dair": SimulationPreset(
         (
             SplitPreset("train", ("generated-1",), 2),
             SplitPreset("val", ("generated-2",), 1),
@@ -174,14 +175,21 @@ def _town_or_fallback(name: str, towns: str | None, fallback_town: str | None) -
     return name
 
 
+def _lidar_of(name: str, beams: int | None) -> str:
+    """Name the sensor of LIDAR_PRESETS with this number of beams."""
+    return name if beams is None else f"{name}-{beams}"
+
+
 def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> list[Job]:
     """The scenarios of a preset; each depends on seed, split and its number alone."""
     jobs = []
     for part in preset.splits:
+        # The folder's name is part of the random key: another name would change every scene.
+        folder = SPLIT_FOLDERS.get(part.split, part.split) if preset.layout == "opv2v" else part.split
         for index in range(part.count):
-            random = keyed_generator(seed, "preset", part.split, index)
+            random = keyed_generator(seed, "preset", folder, index)
             town = _town_or_fallback(part.towns[index % len(part.towns)], towns, preset.fallback_town)
-            beams = part.beams[index % len(part.beams)] if part.beams else ""
+            beams = part.lidar_beams[index % len(part.lidar_beams)]
             vehicles = int(random.integers(preset.vehicles[0], preset.vehicles[1] + 1))
             spec = ScenarioSpec(
                 town=town,
@@ -193,15 +201,15 @@ def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> 
                 lead_frames=preset.lead_frames,
                 rate_hz=preset.rate_hz,
                 roadside_chance=1.0 if vehicles == 1 else preset.roadside_chance,
-                lidar=preset.lidar + beams,
-                roadside_lidar=preset.roadside_lidar + beams,
+                lidar=_lidar_of(preset.lidar, beams),
+                roadside_lidar=_lidar_of(preset.roadside_lidar, beams),
                 density=round(float(random.uniform(*preset.density)), 3),
                 min_vehicles=preset.min_vehicles,
                 clutter=round(float(random.uniform(*preset.clutter)), 3),
                 cameras=preset.cameras,
                 roadside_cameras=preset.roadside_cameras,
             )
-            jobs.append(Job(part.split, spec, None if town.startswith(GENERATED) else towns))
+            jobs.append(Job(folder, spec, None if town.startswith(GENERATED) else towns))
     return sorted(jobs, key=lambda job: (job.split != "train", job.split != "validate", job.spec.town, job.spec.name))
 
 

@@ -54,7 +54,7 @@ JobT = TypeVar("JobT")
 
 @dataclass(frozen=True)
 class Job:
-    """One scenario to write: its split, and the first place to search for the town's roads (None: the default places)."""
+    """One scenario to write: folder of its split, first place to search for the roads of its town (None: the default places)."""
 
     split: str
     spec: ScenarioSpec

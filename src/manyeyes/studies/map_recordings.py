@@ -21,7 +21,7 @@ def open_sensor_recording(data: Path, split: str | None, sensors: Sequence[str])
     if "camera" in sensors and not has_images(recording):
         raise ConfigError(
             f"{data}: no pictures in {recording.scenarios[0]}, and the model has cameras; give a recording of 'manyeyes simulate "
-            "--preset streets-pictures' (or any preset with --cameras), or a model of agents with LiDAR."
+            "--preset carla-maps-camera' (or any preset with --cameras), or a model of agents with LiDAR."
         )
     return recording
 

@@ -306,6 +306,16 @@ def test_a_wrong_root_is_refused_by_kind(dataset: Path, root: str, split: str | 
     assert message_match in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_the_split_val_is_the_folder_validate(dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(dataset / "train", tmp_path / "validate")
+    assert Opv2vRecording(tmp_path, "val").scenarios == Opv2vRecording(dataset, "train").scenarios
+    for split in ("validate", "test"):
+        with pytest.raises(RecordingError, match=f"no split '{split}'; it has val:"):
+            Opv2vRecording(tmp_path, split)
+    (tmp_path / "validate").rename(tmp_path / "val")
+    assert len(Opv2vRecording(tmp_path, "val").scenarios) == 1
+
+
 def test_unknown_scenario_and_index(dataset: Path) -> None:
     recording = Opv2vRecording(dataset, "test")
     with pytest.raises(RecordingError, match=r"No scenario 'x'.*2021_08_18_19_48_05"):

@@ -40,6 +40,7 @@ from manyeyes.datasets.opv2v.scan import (
     compare_with_manifest,
     contains_scenarios,
     find_scenario_folders,
+    get_split_folder,
     scan_scenario,
 )
 from manyeyes.datasets.registry import register_dataset
@@ -91,7 +92,7 @@ class Opv2vRecording(RecordingReader):
         folders = find_scenario_folders(self.root, split)
         found = [scan_scenario(folder, problems, missing, images) for folder in folders]
         self._scenarios = {s.folder.name: s for s in found if s is not None}
-        if folders[0] not in (self.root, self.root / str(split)):  # one scenario may be opened by itself
+        if folders[0] not in (self.root, get_split_folder(self.root, split)):  # one scenario may be opened by itself
             compare_with_manifest(folders, problems, missing)
         self.scenarios = tuple(self._scenarios)
         self.missing_summary = tuple(problems)

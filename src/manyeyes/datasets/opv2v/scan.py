@@ -16,6 +16,8 @@ from manyeyes.datasets.opv2v.camera import describe_missing_images, find_missing
 from manyeyes.datatypes import RecordingError
 
 _AGENT = re.compile(r"-?\d+")
+SPLIT_FOLDERS = {"val": "validate"}
+"""Folders of splits whose name is another one."""
 
 
 @dataclass(frozen=True)
@@ -70,24 +72,38 @@ def has_frames(folder: Path) -> bool:
     return any(p.suffix in (".pcd", ".yaml") and p.stem.isdecimal() for agent in agents for p in agent.iterdir())
 
 
+def get_split_folder(root: Path, split: str | None) -> Path:
+    """Return the folder of a split, the root without one."""
+    folder = root / (split or "")
+    return folder if split not in SPLIT_FOLDERS or folder.is_dir() else root / SPLIT_FOLDERS[split]
+
+
+def _split_names(folders: Sequence[Path]) -> str:
+    names = {folder: split for split, folder in SPLIT_FOLDERS.items()}
+    return ", ".join(names.get(folder.name, folder.name) for folder in folders)
+
+
 def find_scenario_folders(root: Path, split: str | None) -> list[Path]:
     """Find the folders to scan, after the root was checked; the text of every error lists what is there instead."""
     if not root.is_dir():
         raise RecordingError(f"{root}: no such folder, expected a recording in OPV2V's layout; check the path.")
-    folder = root if split is None else root / split
-    if split is not None and not folder.is_dir():
-        there = [p.name for p in _subfolders(root)]
+    folder = get_split_folder(root, split)
+    if split is not None and (not folder.is_dir() or split in SPLIT_FOLDERS.values()):
         if any(_is_scenario(p) for p in _subfolders(root)) or _is_scenario(root):
             raise RecordingError(f"{root}: no split '{split}': the folder holds scenarios itself; name no split.")
-        raise RecordingError(f"{root}: no split '{split}'; it has {', '.join(there) or 'none'}: choose one of them.")
+        raise RecordingError(
+            f"{root}: no split '{split}'; it has {_split_names(_subfolders(root)) or 'none'}: choose one of them."
+        )
     if _is_scenario(folder):
         return [folder]
     inside = _subfolders(folder)
     if any(_is_scenario(p) for p in inside):
         return inside
-    splits = [p.name for p in inside if any(_is_scenario(q) for q in _subfolders(p))]
+    splits = [p for p in inside if any(_is_scenario(q) for q in _subfolders(p))]
     if splits:
-        raise RecordingError(f"{folder}: holds several splits ({', '.join(splits)}), expected scenarios; name a split.")
+        raise RecordingError(
+            f"{folder}: holds several splits ({_split_names(splits)}), expected scenarios; name a split."
+        )
     raise RecordingError(
         f"{folder}: no scenario in it, expected <scenario>/<agent>/<stem>.pcd and .yaml; check the path."
     )

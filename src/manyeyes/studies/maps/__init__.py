@@ -26,6 +26,6 @@ def run_model_study(options: Options, console: Console) -> None:
     from manyeyes.studies.maps.running import find_missing_files
 
     if options.data is None:
-        raise ConfigError(f"The study {options.study!r} needs --data, a dataset of towns such as data/streets.")
+        raise ConfigError(f"The study {options.study!r} needs --data, a dataset of towns such as data/carla-maps.")
     find_missing_files(options, console)
     import_module(f"manyeyes.studies.maps.{MODEL_STUDIES[options.study or '']}").run(options, console)
