@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
 from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, ObservationArrays, compute_visibility, is_line
-from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range, lower_bound
+from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range, line_residual, lower_bound
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -459,7 +459,6 @@ def _collect_offsets(
     keys, start, rxy, rtangent, robservation, relement, rweight = points
     mass, offset, pull, nearest, element, lateral_state, candidates = scratch
     reach, across, wide = params.max_longitudinal_m, params.max_lateral_m, params.max_nearby_m
-    cosine = params.min_cosine
     x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
     ix, iy = int(np.floor(x / _POINT_CELL_M)), int(np.floor(y / _POINT_CELL_M))
     n = 0
@@ -469,13 +468,8 @@ def _collect_offsets(
             ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
             if ex * ex + ey * ey > reach * reach + wide * wide:
                 continue
-            dot = u * rtangent[q, 0] + v * rtangent[q, 1]
-            if abs(dot) < cosine:
-                continue
-            sign = 1.0 if dot > 0.0 else -1.0
-            norm = np.sqrt(2.0 + 2.0 * abs(dot))
-            mx, my = (u + sign * rtangent[q, 0]) / norm, (v + sign * rtangent[q, 1]) / norm
-            along, aside = abs(ex * mx + ey * my), ey * mx - ex * my
+            along, aside = line_residual(ex, ey, u, v, rtangent[q, 0], rtangent[q, 1], params.min_cosine)
+            along = abs(along)
             if along > reach or abs(aside) > wide:
                 continue
             o = robservation[q]

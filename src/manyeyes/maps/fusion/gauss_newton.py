@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x1, F64x2, F64x3, I64x1, njit
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays
-from manyeyes.maps.fusion.point_grid import find_cell_range
+from manyeyes.maps.fusion.point_grid import find_cell_range, line_residual
 
 if TYPE_CHECKING:
     from manyeyes.maps.fusion.pose_config import PoseSolverConfig
@@ -63,13 +63,8 @@ def build_normal_equations(
                     ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
                     if ex * ex + ey * ey > far or robservation[q] == o:
                         continue
-                    dot = u * rtangent[q, 0] + v * rtangent[q, 1]
-                    if abs(dot) < cosine:
-                        continue
-                    sign = 1.0 if dot > 0.0 else -1.0
-                    scale = 1.0 / np.sqrt(2.0 + 2.0 * abs(dot))
-                    mx, my = (u + sign * rtangent[q, 0]) * scale, (v + sign * rtangent[q, 1]) * scale
-                    along, aside = abs(ex * mx + ey * my), ey * mx - ex * my
+                    along, aside = line_residual(ex, ey, u, v, rtangent[q, 0], rtangent[q, 1], cosine, True)
+                    along = abs(along)
                     if along > reach or abs(aside) > gate:
                         continue
                     g = c2 / (c2 + aside * aside)

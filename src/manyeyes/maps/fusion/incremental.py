@@ -40,7 +40,7 @@ from manyeyes.maps.fusion.observation_arrays import (
     is_line,
     to_observation_arrays,
 )
-from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range, line_residual
 from manyeyes.maps.fusion.pose_config import PoseSolverConfig
 from manyeyes.maps.fusion.stations import EvidenceTable, StationTable
 from manyeyes.ops.nearest_line import find_nearest_line
@@ -637,13 +637,10 @@ def _match_stations(
                     a, b = find_cell_range(pkeys, pstart, kind, jx, lowest, highest)
                     for q in range(a, b):
                         ex, ey = pxy[q, 0] - x, pxy[q, 1] - y
-                        dot = u * ptangent[q, 0] + v * ptangent[q, 1]
-                        if abs(dot) < cosine or ex * ex + ey * ey > radius * radius:
+                        if ex * ex + ey * ey > radius * radius:
                             continue
-                        sign = 1.0 if dot > 0.0 else -1.0
-                        norm = np.sqrt(2.0 + 2.0 * abs(dot))
-                        mx, my = (u + sign * ptangent[q, 0]) / norm, (v + sign * ptangent[q, 1]) / norm
-                        along, aside = abs(ex * mx + ey * my), ey * mx - ex * my
+                        along, aside = line_residual(ex, ey, u, v, ptangent[q, 0], ptangent[q, 1], cosine)
+                        along = abs(along)
                         if along > reach or abs(aside) > wide:
                             continue
                         is_near = True

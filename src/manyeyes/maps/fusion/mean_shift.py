@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import F64x1, F64x2, I64x1, njit
-from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range, line_residual
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -111,13 +111,7 @@ def _shift(
                     ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
                     if ex * ex + ey * ey > far:
                         continue
-                    dot = u * rtangent[q, 0] + v * rtangent[q, 1]
-                    if abs(dot) < cosine:
-                        continue
-                    sign = 1.0 if dot > 0.0 else -1.0
-                    norm = np.sqrt(2.0 + 2.0 * abs(dot))
-                    mx, my = (u + sign * rtangent[q, 0]) / norm, (v + sign * rtangent[q, 1]) / norm
-                    along, aside = ex * mx + ey * my, ey * mx - ex * my
+                    along, aside = line_residual(ex, ey, u, v, rtangent[q, 0], rtangent[q, 1], cosine)
                     if abs(along) > reach or abs(aside) > across:
                         continue
                     w = rweight[q] * np.exp(-0.5 * ((along / sigma_along) ** 2 + (aside / sigma_across) ** 2))

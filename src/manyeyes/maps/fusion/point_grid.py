@@ -77,6 +77,28 @@ def lower_bound(keys: I64x1, key: int) -> int:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
+def line_residual(
+    dx: float, dy: float, u: float, v: float, other_u: float, other_v: float, min_cosine: float, by_reciprocal: bool = False
+) -> tuple[float, float]:  # pragma: no cover - compiled
+    """Compute the longitudinal and the lateral offset (dx, dy) of another line's point, along the mean direction of both lines.
+
+    The lines have unit tangents (u, v) and (other_u, other_v) without a sense. Both results are infinite where the cosine of the
+    tangents is below ``min_cosine``. by_reciprocal: multiply by the reciprocal of the norm, which rounds otherwise than a division.
+    """
+    dot = u * other_u + v * other_v
+    if abs(dot) < min_cosine:
+        return np.inf, np.inf
+    sign = 1.0 if dot > 0.0 else -1.0
+    norm = np.sqrt(2.0 + 2.0 * abs(dot))
+    if by_reciprocal:
+        scale = 1.0 / norm
+        mx, my = (u + sign * other_u) * scale, (v + sign * other_v) * scale
+    else:
+        mx, my = (u + sign * other_u) / norm, (v + sign * other_v) / norm
+    return dx * mx + dy * my, dy * mx - dx * my
+
+
+@njit(cache=True, nogil=True)
 def resample_lines(
     offsets: I64x1, points: F64x2, sigma: F64x1, closed: Boolx1, spacing_m: float
 ) -> tuple[I64x1, F64x2, F64x2, F64x1]:  # pragma: no cover - compiled

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx2, F64x1, F64x2, I64x1, I64x2, I64x3, njit
-from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range
+from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range, line_residual
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -190,14 +190,12 @@ def _find_best_partners(
                 turn = np.arccos(min(1.0, abs(dot)))
                 if turn > heading0 + heading1 * gap:
                     continue
-                sign = 1.0 if dot > 0.0 else -1.0
-                norm = np.sqrt(2.0 + 2.0 * abs(dot))
-                mx, my = (u + sign * rtangent[q, 0]) / norm, (v + sign * rtangent[q, 1]) / norm
-                along, aside = ex * mx + ey * my, abs(ey * mx - ex * my)
+                along, aside = line_residual(ex, ey, u, v, rtangent[q, 0], rtangent[q, 1], 0.5)
+                aside = abs(aside)
                 if aside > lateral0 + lateral1 * gap or abs(along) < 0.3 or aside > abs(along):
                     continue
                 side = _FRONT if along > 0.0 else _BEHIND
-                back = 1 - side if sign > 0.0 else side
+                back = 1 - side if dot > 0.0 else side
                 if not free[k, side] or not free[q, back]:
                     continue
                 value = gap + lateral_cost * aside + 2.0 * turn
