@@ -16,6 +16,7 @@ from manyeyes.datasets.formats.cache import ArrayCache
 from manyeyes.datatypes import LABELS, RecordingError
 
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+KMH_PER_MPS = 3.6
 _REMEDY = "copy or download the file again"
 # Columns of a kept array: row 0 is the agent, the rows below are the vehicles that it lists.
 _COLUMNS = 16

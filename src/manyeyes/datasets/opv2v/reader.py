@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OPV2V and V2XSet, read and written: ``<split>/<scenario>/<agent>/<stem>.{pcd,yaml}``, and ``<stem>_camera0.png`` ….
+"""OPV2V and V2XSet, read: ``<split>/<scenario>/<agent>/<stem>.{pcd,yaml}``, and ``<stem>_camera0.png`` ….
 
 On disk everything is left-handed, in degrees and km/h, and points lie in the LiDAR's frame. What comes out is
 right-handed, in radians and m/s, and points lie in the agent's frame, whose z = 0 is the road. The format has neither
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,16 +23,9 @@ from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, estimate_sensor_
 from manyeyes.datasets.manifest import SCENARIO, Digests, list_scenario_files
 from manyeyes.datasets.mismatch import find_mismatched_files
 from manyeyes.datasets.missing import FileProblem
-from manyeyes.datasets.opv2v.camera import (
-    read_images,
-)
+from manyeyes.datasets.opv2v.camera import read_images
 from manyeyes.datasets.opv2v.carla import mirror_points, transform_from_carla
-from manyeyes.datasets.opv2v.metadata import (
-    AgentRecord,
-    DataProtocol,
-    read_protocol,
-    read_record,
-)
+from manyeyes.datasets.opv2v.metadata import KMH_PER_MPS, AgentRecord, DataProtocol, read_protocol, read_record
 from manyeyes.datasets.opv2v.scan import (
     AgentFiles,
     ScenarioFiles,
@@ -46,8 +38,6 @@ from manyeyes.datasets.opv2v.scan import (
 from manyeyes.datasets.registry import register_dataset
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
-_AGENT = re.compile(r"-?\d+")
-_KMH = 3.6
 _MAX_CACHED_RECORDS = 20_000
 
 
@@ -215,7 +205,7 @@ class Opv2vRecording(RecordingReader):
             world_from_agent=world_from_agent,
             pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
             sensor_height_m=height,
-            speed_mps=record.speed_kmh / _KMH,
+            speed_mps=record.speed_kmh / KMH_PER_MPS,
             is_infrastructure=record.is_infrastructure,
             images=read_images(yaml, world_from_agent, self._cache) if images else (),
         )
@@ -257,7 +247,7 @@ def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> Ground
     center = column("location") + column("center")
     center[:, 1] *= -1
     yaw = -column("angle")[:, 1] * (math.pi / 180)
-    velocity = torch.stack((yaw.cos(), yaw.sin()), 1) * (column("speed") / _KMH)[:, None]
+    velocity = torch.stack((yaw.cos(), yaw.sin()), 1) * (column("speed") / KMH_PER_MPS)[:, None]
     boxes = Boxes.of(center, 2 * column("extent"), yaw, None, column("label"), torch.from_numpy(id[first]), velocity)
     return GroundTruth(boxes, torch.from_numpy(seen), Transform.stack([f.world_from_agent for f in frames]))
 

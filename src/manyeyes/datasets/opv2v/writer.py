@@ -14,10 +14,8 @@ from manyeyes.datasets.formats.image_io import write_png
 from manyeyes.datasets.formats.pcd import write_pcd
 from manyeyes.datasets.opv2v.camera import camera_yaml, image_path
 from manyeyes.datasets.opv2v.carla import carla_from_transform, mirror_points, transform_from_carla
-from manyeyes.datasets.opv2v.metadata import AgentRecord, write_protocol, write_record
+from manyeyes.datasets.opv2v.metadata import KMH_PER_MPS, AgentRecord, write_protocol, write_record
 from manyeyes.datatypes import Boxes, RecordingError, Snapshot, Transform
-
-_KMH = 3.6
 
 
 class Opv2vWriter:
@@ -97,7 +95,7 @@ def _record_of(snapshot: Snapshot, row: int, box_speed_mps: torch.Tensor | None)
     return AgentRecord(
         lidar_pose=carla_from_transform(world_from_agent @ Transform.from_xyz_yaw(0, 0, frame.sensor_height_m)),
         ego_pose=carla_from_transform(world_from_agent),
-        speed_kmh=frame.speed_mps * _KMH,
+        speed_kmh=frame.speed_mps * KMH_PER_MPS,
         is_infrastructure=frame.is_infrastructure,
         id=boxes.id.numpy(),
         label=boxes.label.numpy(),
@@ -105,5 +103,5 @@ def _record_of(snapshot: Snapshot, row: int, box_speed_mps: torch.Tensor | None)
         center=above,
         extent=size / 2,
         angle=angle,
-        speed=speed.double().numpy() * _KMH,
+        speed=speed.double().numpy() * KMH_PER_MPS,
     )
