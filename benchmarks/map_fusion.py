@@ -55,7 +55,7 @@ LITERAL_BAR, STREAM_BAR_MS, CITY_BAR_S, CITY_BAR_GB = 50.0, 10.0, 1200.0, 8.0
 class Literal:
     """Seconds of processor time per observation, medians over the rounds, and how many times ours is faster.
 
-    way: "fold", the map of all observations anew; "one more", each of the second half taken into the map of those before it.
+    way: "fold", the map of all observations again; "one more", each of the second half taken into the map of those before it.
     """
 
     way: str

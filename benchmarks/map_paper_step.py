@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map preset of any size takes a step, is saved, is loaded anew and takes the next: loss, seconds and peak memory of each.
+"""A map preset of any size takes a step, is saved, is loaded again and takes the next: loss, seconds and peak memory of each.
 
 For map-paper as it stands, on a processor: eight tiles of ten looks, every picture of each brought to 480 x 640 pixels. The two
 steps must be those of a run that was never interrupted (tests/training/test_map_loop.py holds that bit by bit on a narrow one).

@@ -199,8 +199,8 @@ def test_tokens_have_the_velocity_of_their_box_and_others_are_stationary() -> No
     fast = torch.where(output.boxes.center[:, :1] < 5, torch.tensor([[7.0, -1.0]]), torch.tensor([[0.0, 3.0]]))
     moved = output.with_velocity(fast)
     assert torch.equal(moved.boxes.velocity, fast) and torch.equal(moved.boxes.center, output.boxes.center)
-    anew = decode(moved.raw, moved.config)[0]
-    assert torch.allclose(anew.velocity, fast) and torch.equal(anew.center, moved.boxes.center)
+    again = decode(moved.raw, moved.config)[0]
+    assert torch.allclose(again.velocity, fast) and torch.equal(again.center, moved.boxes.center)
     features, before = moved.shared_tokens.features, output.shared_tokens.features
     want = torch.tensor([[7.0, -1.0], [7.0, -1.0], [0.0, 3.0], [0.0, 0.0]])
     assert torch.allclose(proposed_velocity(features[:, -PROPOSAL_DIM:]), want)

@@ -218,8 +218,8 @@ def test_a_repeated_message_is_counted_once_and_a_new_drive_resets_the_monitor()
     again = PoseCorrection().correct(frame(600_000_000), cache_of(world), [message], first.states)
     assert again.corrections[0].health.num_frames == 1
     earlier = replace(message, timestamp_ns=0)
-    anew = PoseCorrection().correct(frame(), cache_of(world), [earlier], again.states)
-    assert anew.corrections[0].health.num_frames == 1 and anew.states[2].monitor.time_s.tolist() == [0.0]
+    again = PoseCorrection().correct(frame(), cache_of(world), [earlier], again.states)
+    assert again.corrections[0].health.num_frames == 1 and again.states[2].monitor.time_s.tolist() == [0.0]
 
 
 def test_an_agent_fuses_boxes_from_where_their_sender_is() -> None:

@@ -137,7 +137,9 @@ def test_the_demos_map_is_that_of_its_drive_where_a_model_ships(weights, tmp_pat
     monkeypatch.setattr(pretrained, "list_map_models", lambda: (pretrained.DEFAULT_MAP_MODEL,))
     monkeypatch.setattr(pretrained, "load_map_model", lambda load=pretrained.load_map_model: load(weights))
     (chapter,), summary = _make_map_chapters(Crossroads(("elsewhere_0",), frames=11), tmp_path, 0, Console(quiet=True))
-    assert summary.startswith("One map from 8 messages") and summary.endswith("not judged.") and summary in chapter.text
+    assert (
+        summary.startswith("One map from 8 messages") and summary.endswith("not evaluated.") and summary in chapter.text
+    )
     assert [p.path for p in chapter.pictures] == [tmp_path / "map.png"] and (tmp_path / "map.html").is_file()
 
 

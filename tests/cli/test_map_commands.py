@@ -96,7 +96,7 @@ def test_export_writes_a_file_that_others_read(folder, tmp_path) -> None:
 def test_a_store_takes_observations_and_other_commands_read_its_last_release(folder, tmp_path, capsys) -> None:
     store = tmp_path / "city"
     assert run("map", "fuse", folder, "--store", store, "--executor", "inline") == 0
-    assert "release 1 after 24 new observations, 0 known, 0 put aside" in capsys.readouterr().out
+    assert "release 1 after 24 new observations, 0 known, 0 rejected" in capsys.readouterr().out
     assert run("map", "fuse", folder, "--store", store, "--executor", "inline") == 0
     assert "release 2 after 0 new observations, 24 known" in capsys.readouterr().out
     assert read_vector_map(store).quantised_hash() == read_vector_map(folder / "map").quantised_hash()

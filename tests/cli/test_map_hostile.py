@@ -135,7 +135,7 @@ def with_rows(honest: Path, folder: Path, changes: list[Callable[[dict], None]])
 def test_one_hostile_row_is_one_line_and_the_map_is_that_of_the_rest(name, honest, tmp_path, capsys) -> None:
     folder = with_rows(honest, tmp_path / "in", [CASES[name][1]])
     assert run("map", "fuse", folder) == 0
-    output = [text for text in capsys.readouterr().out.splitlines() if text.startswith("put aside")]
+    output = [text for text in capsys.readouterr().out.splitlines() if text.startswith("rejected")]
     assert len(output) == 1 and f"{folder}/all.parquet row 0: Observation.{CASES[name][0]}: expected " in output[0]
     assert "; got " in output[0] and output[0].endswith(".") and len(output[0]) < 400
     assert content(folder / "map") == content(honest / "map")
@@ -144,7 +144,7 @@ def test_one_hostile_row_is_one_line_and_the_map_is_that_of_the_rest(name, hones
 def test_every_hostile_row_of_a_file_is_named_and_the_map_is_that_of_the_rest(honest, tmp_path, capsys) -> None:
     folder = with_rows(honest, tmp_path / "in", [change for _, change in CASES.values()])
     assert run("map", "fuse", folder) == 0
-    output = [text for text in capsys.readouterr().out.splitlines() if text.startswith("put aside")]
+    output = [text for text in capsys.readouterr().out.splitlines() if text.startswith("rejected")]
     assert len(output) == len(CASES) and max(map(len, output)) < 400
     for row, (name, (field, _)) in enumerate(CASES.items()):
         assert f" row {row}: Observation.{field}: expected " in output[row], name
@@ -170,7 +170,7 @@ def test_one_extreme_number_leaves_the_rest_fused(honest, tmp_path, capsys) -> N
     folder = with_rows(honest, tmp_path / "in", changes)
     assert run("map", "fuse", folder) == 0
     output = capsys.readouterr().out
-    refused = output.count("put aside: ")
+    refused = output.count("rejected: ")
     # 1 km is a variance, a sigma and a place; 100 km still is a place and a variance.
     assert len(changes) - 20 <= refused < len(changes)
     assert f"from {NUM_HONEST + len(changes) - refused} observations" in output
@@ -195,7 +195,7 @@ def test_a_file_of_model_results_with_extreme_numbers_is_imported_without_them(t
     words = ("map", "import", tmp_path / "submission_vector.json", "--poses", tmp_path / "poses.csv")
     assert run(*words, "--origin", 49.0, 8.4, "--out", tmp_path / "in") == 0
     output = capsys.readouterr().out
-    assert output.count("put aside: ") == 3 and "1 observations of 2 elements" in output
+    assert output.count("rejected: ") == 3 and "1 observations of 2 elements" in output
 
 
 # Stores.
@@ -226,8 +226,8 @@ def test_a_store_takes_in_the_rest_of_a_folder_with_hostile_rows(honest, tmp_pat
     folder = with_rows(honest, tmp_path / "in", [change for _, change in CASES.values()])
     assert fuse_into(tmp_path / "city", folder) == 0
     output = capsys.readouterr().out
-    assert output.count("put aside: ") == len(CASES)
-    assert f"{NUM_HONEST} new observations, 0 known, {len(CASES)} put aside" in output
+    assert output.count("rejected: ") == len(CASES)
+    assert f"{NUM_HONEST} new observations, 0 known, {len(CASES)} rejected" in output
     assert content(tmp_path / "city") == content(honest / "map")
 
 
@@ -282,8 +282,8 @@ def test_a_store_of_an_older_version_quarantines_invalid_rows(indexed, store, ho
     capsys.readouterr()
     assert fuse_into(store, honest) == 0
     out = capsys.readouterr().out
-    output = [text for text in out.splitlines() if text.startswith("put aside")]
-    assert len(output) == 3 and f"0 new observations, {NUM_HONEST} known, 3 put aside" in out
+    output = [text for text in out.splitlines() if text.startswith("rejected")]
+    assert len(output) == 3 and f"0 new observations, {NUM_HONEST} known, 3 rejected" in out
     for row, (name, field) in enumerate(bad.items()):
         assert f"parquet row {row}: Observation.{field}: expected" in output[row] and name in output[row]
     assert content(store) == content(honest / "map")
@@ -297,7 +297,7 @@ def test_a_store_of_an_older_version_quarantines_invalid_rows(indexed, store, ho
     assert (
         "3 observations retracted now, 0 before; 12 count" in output and "release 2 is already without them" in output
     )
-    assert "put aside" not in output
+    assert "rejected" not in output
 
 
 def test_damage_of_a_segment_is_still_an_error_that_names_it(store, honest, capsys) -> None:

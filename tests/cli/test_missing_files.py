@@ -176,7 +176,7 @@ def test_allowed_files_are_counted_in_json_and_footers(
     assert held["missing"]["count"] == 1
     (file,) = held["missing"]["files"]
     assert (file["path"], file["kind"], file["scenario"]) == (str(path), "missing", "a")
-    # One of four judged frames is absent, and with it a quarter of the true boxes.
+    # One of four evaluated frames is absent, and with it a quarter of the true boxes.
     assert [n["ap_summaries"][0]["n_gt"] for n in held["stats"]] == [18, 18]
     assert FOOTER in capsys.readouterr().out and FOOTER in (tmp_path / "results.md").read_text()
 
@@ -347,7 +347,7 @@ def test_a_drive_is_played_whatever_other_scenarios_lack(whole: Path, weights: P
 
 def test_cells_of_an_incomplete_recording_are_kept_apart(whole: Path, weights: Path, tmp_path: Path) -> None:
     data = shutil.copytree(whole, tmp_path / "data")
-    path = data / "test" / "a" / "7" / "000004.yaml"  # behind the first judged frame, which alone names a cell
+    path = data / "test" / "a" / "7" / "000004.yaml"  # behind the first evaluated frame, which alone names a cell
     text = path.read_text()
     path.unlink()
     words = (*run_study(data, weights, tmp_path / "out"), "--frame-stride", 1)

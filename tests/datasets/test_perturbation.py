@@ -20,7 +20,7 @@ def snapshot(index=0, agents=(7, -1, 30), scenario="town", speed=5.0):
 
 
 def moved(before, after):
-    """(agents, 4): x, y, z, yaw by which claimed poses changed."""
+    """(agents, 4): x, y, z, yaw by which prior poses changed."""
     rows = []
     for a, b in zip(before.frames, after.frames, strict=True):
         shift = b.world_from_agent.translation - a.world_from_agent.translation

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observations as files: the documented example, round trips, and what is put aside with its reason."""
+"""Observations as files: the documented example, round trips, and what is rejected with its reason."""
 
 from __future__ import annotations
 

@@ -80,10 +80,10 @@ def test_observations_and_their_file_give_one_map(tmp_path: Path) -> None:
 def test_rows_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     write_observations(tmp_path / "a.parquet", [observe("a")], MapFrame())
     (tmp_path / "b.parquet").write_bytes(b"no parquet")
-    with pytest.warns(UserWarning, match=r"1 rows were put aside; the first, .*b\.parquet"):
+    with pytest.warns(UserWarning, match=r"1 rows were rejected; the first, .*b\.parquet"):
         assert len(fuse_maps(tmp_path, "union")) == 1
     write_observations(tmp_path / "a.parquet", [], MapFrame())
-    with pytest.warns(UserWarning, match="put aside"), pytest.raises(ConfigError, match="no usable observation"):
+    with pytest.warns(UserWarning, match="rejected"), pytest.raises(ConfigError, match="no usable observation"):
         fuse_maps(tmp_path, "union")
 
 

@@ -76,8 +76,8 @@ def test_a_sound_agent_is_hardly_ever_reported_as_drifting(prior_error_m, max_fr
     """Twenty seconds at 10 Hz, with prior errors that are constant, or independent in each frame."""
     detected = []
     for seed in range(6):
-        anew = np.random.default_rng(500 + seed).standard_normal((200, 3)) * [prior_error_m, prior_error_m, 0.0]
-        detected += [any(r.health is PoseHealth.DRIFTING for r in run(noise(200, seed) + anew))]
+        again = np.random.default_rng(500 + seed).standard_normal((200, 3)) * [prior_error_m, prior_error_m, 0.0]
+        detected += [any(r.health is PoseHealth.DRIFTING for r in run(noise(200, seed) + again))]
     assert np.mean(detected) <= max_fraction
 
 

@@ -75,7 +75,7 @@ def test_fitted_detector_shares_equal_tokens_and_has_another_fingerprint(detecto
     )
     assert (back - features).square().mean() < 0.8 * features.var(0).mean()
     assert with_codebook(detector, tokens, 3, CodebookConfig(2, 32)).fingerprint == fitted.fingerprint
-    # Fitted anew, the old book is gone.
+    # Fitted again, the old book is gone.
     assert with_codebook(fitted, tokens, 3, CodebookConfig(2, 32)).fingerprint == fitted.fingerprint
     for half in (False, True):
         path = tmp_path / f"{half}.safetensors"

@@ -230,7 +230,7 @@ def test_a_run_begins_from_what_it_has_in_common_with_models_of_other_sensors(tm
     random = Trainer(MapTask(config, Streets(), 0), tmp_path / "random").model.state_dict()
     begun = Trainer(MapTask(config, Streets(), 0, [lidar.state_dict(), camera.state_dict()]), tmp_path / "begun")
     state, first, second = (m.state_dict() for m in (begun.model, lidar, camera))
-    # The first model with a tensor takes precedence; calibration starts anew; the average starts as the model.
+    # The first model with a tensor takes precedence; calibration starts again; the average starts as the model.
     assert all(torch.equal(state[k], v) for k, v in first.items() if k not in ("logit_scale", "logit_shift"))
     assert all(torch.equal(state[k], v) for k, v in second.items() if k.startswith("camera."))
     assert torch.equal(state["logit_scale"], torch.ones(3)) and same_state(begun.average, begun.model)

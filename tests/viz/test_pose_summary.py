@@ -40,11 +40,11 @@ def test_the_worst_lasting_health_is_reported_with_its_first_frame() -> None:
     )
     roadside, vehicle = summary.make_rows()
     assert dict(zip(HEADINGS, roadside)) == {
-        "agent": "-1 (roadside unit)", "claimed pose": "drifting", "first seen so at": "7", "corrected": "2",
-        "as claimed": "0", "left out": "1", "drift m/s": "0.10",
+        "agent": "-1 (roadside unit)", "prior pose": "drifting", "first frame": "7", "corrected": "2",
+        "at prior pose": "0", "excluded": "1", "drift [m/s]": "0.10",
     }  # fmt: skip
     assert vehicle == ("7", "sound", "", "2", "1", "0", "")
-    assert summary.make_warnings() == ("agent -1 (roadside unit): its claimed pose is drifting, first in frame 7",)
+    assert summary.make_warnings() == ("agent -1 (roadside unit): its prior pose is drifting, first in frame 7",)
 
 
 def test_an_agent_never_corrected_is_not_reported() -> None:
@@ -58,4 +58,4 @@ def test_the_report_shows_the_table() -> None:
     summary.add(3, [make_outcome(-1, MessageUse.CORRECTED, PoseHealth.OFFSET)])
     chapter = report.Chapter("Who is where", "Text.", table=(HEADINGS, *summary.make_rows()))
     page = report.render(report.HtmlReport("A drive", "Lead.", chapters=(chapter,)))
-    assert "<th>claimed pose</th>" in page and "<td>offset</td>" in page and "-1 (roadside unit)" in page
+    assert "<th>prior pose</th>" in page and "<td>offset</td>" in page and "-1 (roadside unit)" in page

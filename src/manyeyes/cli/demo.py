@@ -36,7 +36,7 @@ class Options:
     towns: Path | None = None
     """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
     frames: PositiveInt | None = None
-    """At most so many judged frames, instead of all."""
+    """At most so many evaluated frames, instead of all."""
     animate: bool = True
     """Draw the animation of the drive."""
     min_score: Fraction = 0.4
@@ -71,7 +71,7 @@ def main(options: Options) -> None:
     drive = make_excerpt(open_recording(folder, "test"), None, options.frames)
     town = drive.scenario.rpartition("_")[0]
     if len(drive.eval_indices(drive.scenario)) == 0:
-        raise ConfigError(f"{folder}: the drive has no judged frame; remove the folder and run the demo again.")
+        raise ConfigError(f"{folder}: the drive has no evaluated frame; remove the folder and run the demo again.")
     spec = ReportSpec(
         out=options.out,
         title="manyeyes demo: one drive, four ways to collaborate",

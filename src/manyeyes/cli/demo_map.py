@@ -59,7 +59,7 @@ def describe_drive_map(stats: MapBuildStats) -> str:
     )
     return (
         f"One map from {stats.num_messages} messages of {stats.bytes_per_message:,.0f} bytes, drawn from "
-        f"sensors:{scores or ' not judged.'}"
+        f"sensors:{scores or ' not evaluated.'}"
     )
 
 

@@ -37,14 +37,14 @@ class Options:
     scenario: str | None = None
     """Which scenario; the first by default."""
     frames: PositiveInt = 60
-    """At most so many judged frames."""
+    """At most so many evaluated frames."""
     correctors: tuple[str, ...] = ("identity", "voting")
     """Any of vote, given, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist, v2x-reg-oiou, mash, feakm, or a .safetensors
     file of FeaKM; of whole clouds register and gicp."""
     noise_xy_m: NonNegativeFloat = 0.0
-    """Standard deviation of errors of collaborators' claimed positions."""
+    """Standard deviation of errors of collaborators' prior positions."""
     noise_yaw_deg: NonNegativeFloat = 0.0
-    """Standard deviation of errors of collaborators' claimed headings, degrees."""
+    """Standard deviation of errors of collaborators' prior headings, degrees."""
     no_prior: bool = False
     """Claim nothing: correctors get no pose to start from."""
     min_score: Fraction = 0.3
@@ -133,7 +133,7 @@ def main(options: Options) -> None:
 def _run_correctors(
     drive: Excerpt, cache: PerceptionCache, options: Options, noise: PoseNoise
 ) -> Iterator[CorrectorResult]:
-    """Yield every corrector's answer about every collaborator in every judged frame."""
+    """Yield every corrector's answer about every collaborator in every evaluated frame."""
     from manyeyes.agents.pose_correction import PoseCorrection
     from manyeyes.pose.registry import find_corrector
     from manyeyes.pose.types import PosePrior

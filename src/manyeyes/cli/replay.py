@@ -23,7 +23,7 @@ class Options:
     scenario: str | None = None
     """Which scenario; the first by default."""
     frames: PositiveInt = 60
-    """At most so many judged frames."""
+    """At most so many evaluated frames."""
     frame: NonNegativeInt | None = None
     """Index of the instant that is pictured; the middle one by default."""
     out: Path = Path("out/replay")

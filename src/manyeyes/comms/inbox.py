@@ -176,7 +176,7 @@ class Inbox:
         return tuple(rejection for _, rejection in sorted(taken.items()))
 
     def discard(self, agent_id: int) -> None:
-        """Let go what is held of one sender; its next message is taken anew."""
+        """Drop the messages of one sender; its next message is accepted again."""
         self._held.pop(agent_id, None)
 
     def messages(self, now_ns: int | None = None) -> tuple[Message, ...]:

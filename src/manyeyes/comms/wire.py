@@ -15,7 +15,7 @@ offset bytes type     meaning
 6      2     u16      packets in the message, all kinds together
 8      4     i32      agent id
 12     8     i64      time of capture, nanoseconds
-20     18    3 x i48  claimed position x, y, z in the world, 2^-20 m, within 100,000 km (error below 0.5 um)
+20     18    3 x i48  stated position x, y, z in the world, 2^-20 m, within 100,000 km (error below 0.5 um)
 38     12    3 x i32  the other three parts of the unit quaternion of world_from_agent, times 2^31 / sqrt(1/2); the
                       part left out is the largest and is made positive (error below 1e-9 rad)
 50     3     3 x u8   standard deviations of x and y, 0 or 1 mm to 10 km, and of yaw, 0 or 1e-5 to 10 rad: 0 is 0,

@@ -29,11 +29,11 @@ NoiseMode = Literal["collaborators_iid", "all_agents_iid", "all_agents_sequence"
 class PoseNoise:
     """Errors of prior poses: sigma_xy_m (metres, each axis of the world) and sigma_yaw_rad (radians), Gaussian.
 
-    mode: ``collaborators_iid`` (the default of this project) moves every agent but the ego, anew in each frame;
+    mode: ``collaborators_iid`` (the default of this project) moves every agent but the ego, again in each frame;
     ``all_agents_iid`` (CoAlign) moves the ego too, so that relative errors are sqrt(2) larger;
     ``all_agents_sequence`` (SparseAlign) moves all, by one error an agent for the whole scenario;
     ``legacy_constant`` (OpenCOOD) moves every agent but the ego by one and the same offset in x, y, z and yaw in all
-    frames, because that code seeds the generator anew in each call. A network can learn that offset, so its curves
+    frames, because that code seeds the generator again in each call. A network can learn that offset, so its curves
     measure no robustness; it is here for parity.
 
     The first three draw three standard normals keyed by (seed, scenario, frame, agent), the frame being 0 for a

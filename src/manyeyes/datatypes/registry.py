@@ -120,7 +120,7 @@ class Registry(Generic[T]):
 
 
 def _is_same(a: object, b: object) -> bool:
-    """Return whether two objects are one definition; a module may be imported anew."""
+    """Return whether two objects are one definition; a module may be imported again."""
     return a is b or (_origin(a) == _origin(b) and getattr(a, "__qualname__", a) == getattr(b, "__qualname__", b))
 
 

@@ -88,7 +88,7 @@ def fuse_maps(
         if loaded.rejected:
             first = loaded.rejected[0]
             warnings.warn(
-                f"{len(loaded.rejected)} rows were put aside; the first, {first.file}: {first.reason}", stacklevel=2
+                f"{len(loaded.rejected)} rows were rejected; the first, {first.file}: {first.reason}", stacklevel=2
             )
         if not loaded.observations:
             raise ConfigError(f"{observations} holds no usable observation; 'manyeyes map simulate' makes some.")

@@ -85,7 +85,7 @@ class FileChecks:
 
 @dataclass(frozen=True)
 class Excerpt:
-    """One scenario of a recording, at most so many judged frames of it, all for None."""
+    """One scenario of a recording, at most so many evaluated frames of it, all for None."""
 
     recording: Recording
     scenario: str

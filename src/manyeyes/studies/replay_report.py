@@ -81,7 +81,7 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
     pictured_index = eval_indices[len(eval_indices) // 2] if spec.frame is None else spec.frame
     if pictured_index not in eval_indices:
         valid_range = f"{eval_indices.start} to {eval_indices[-1]}"
-        raise ConfigError(f"Frame {pictured_index} of {drive.scenario} is not judged; choose one of {valid_range}.")
+        raise ConfigError(f"Frame {pictured_index} of {drive.scenario} is not evaluated; choose one of {valid_range}.")
     grid, protocol = detector.detection_range, make_protocol(detector)
     metrics = {name: MetricAccumulator(name, protocol) for name in spec.methods}
     film = _Film(_select_animated(spec.methods) if spec.animate else ())
@@ -128,7 +128,7 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
 
 
 def _make_pose_chapters(pose_summaries: Mapping[str, PoseCorrectionSummary]) -> tuple[Chapter, ...]:
-    """What was found of senders' claimed poses, for each method that aligns."""
+    """What was found of senders' prior poses, for each method that aligns."""
     text = (
         "Before fusion, the ego matches objects that both agents detect. Prior poses that contradict the match are replaced; "
         "messages without a usable pose are left out; drifting priors are listed."

@@ -250,7 +250,7 @@ class Trainer(Generic[Model, Sample]):
             state = torch.load(self.path, weights_only=True)
         except Exception as error:
             raise CheckpointError(
-                f"{self.path}: not a whole training state ({type(error).__name__}); delete it to start anew."
+                f"{self.path}: not a whole training state ({type(error).__name__}); delete it to start again."
             ) from error
         if {name: state.get(name, "") for name in self._name} != self._name:
             raise CheckpointError(

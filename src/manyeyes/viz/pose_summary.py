@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from manyeyes.agents.pose_correction import CorrectionOutcome, MessageUse
 from manyeyes.pose.pose_monitor import PoseHealth, PoseReport
 
-HEADINGS = ("agent", "claimed pose", "first seen so at", "corrected", "as claimed", "left out", "drift m/s")
+HEADINGS = ("agent", "prior pose", "first frame", "corrected", "at prior pose", "excluded", "drift [m/s]")
 FAULTS = (PoseHealth.DRIFTING, PoseHealth.OFFSET)
 
 
@@ -49,7 +49,7 @@ class PoseCorrectionSummary:
             worst = _worst_health(sender)
             if worst in FAULTS:
                 out.append(
-                    f"agent {sender.name}: its claimed pose is {worst.value}, first in frame {sender.first_frame[worst]}"
+                    f"agent {sender.name}: its prior pose is {worst.value}, first in frame {sender.first_frame[worst]}"
                 )
         return tuple(out)
 

@@ -49,7 +49,7 @@ class Options:
     """Standard deviation of errors added to claimed positions, metres; headings err in proportion, 1 degree a metre."""
     map: Path | None = None
     """The true map of a recording that no town is named after, in its world: an intersection of V2X-Seq (.json), a map of Argoverse
-    2 (log_map_archive_*.json), or Lanelet2's .osm; without it such a map is made, not judged."""
+    2 (log_map_archive_*.json), or Lanelet2's .osm; without it such a map is made, not evaluated."""
     seed: Seed = 0
     """Of errors and losses."""
     out: Path = Path("out/map-build")
@@ -98,7 +98,7 @@ def main(options: Options) -> None:
         _print_summary(console, built.stats, options.out / town_map.name)
         for rejected in built.map_server.rejected:
             sender = f"agent {rejected.agent} at {rejected.time_ns} ns"
-            console.print(f"put aside: {sender}: {rejected.reason}", highlight=False, markup=False, soft_wrap=True)
+            console.print(f"rejected: {sender}: {rejected.reason}", highlight=False, markup=False, soft_wrap=True)
         all_stats.append(built.stats)
     provenance_config = {
         "options": options,
@@ -137,7 +137,7 @@ def _print_summary(console: Console, stats: MapBuildStats, out: Path) -> None:
             make_kinds_table(s.scores.ap_rows, s.scores.kind_rows, f"{s.name}: the map against the truth in view")
         )
     else:
-        console.print(f"{s.name}: no true map is known by this name, so the map is not judged.", highlight=False)
+        console.print(f"{s.name}: no true map is known by this name, so the map is not evaluated.", highlight=False)
     console.print(
         f"{s.num_messages} messages of {s.bytes_per_message:,.0f} bytes, {s.num_lost} lost, {s.num_rejected} put "
         f"aside: {s.num_published} "

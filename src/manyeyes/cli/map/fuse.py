@@ -97,7 +97,7 @@ def _fuse_into_store(options: Options, folder: Path, console: Console) -> None:
     number = publish_release(store, executor, console)
     console.print(
         f"{folder}: release {number} after {ingested.num_added} new observations, {ingested.num_known} known, "
-        f"{len(rejected)} put aside",
+        f"{len(rejected)} rejected",
         highlight=False,
         soft_wrap=True,
     )

@@ -23,7 +23,7 @@ class Options:
     """Observation noise and fleet: local, semi-global, perfect, independent-malicious, colluding-malicious, outdated,
     with-infrastructure."""
     pose_sigma: NonNegativeFloat | None = None
-    """Another standard deviation of claimed positions, metres; headings err in proportion, 1 degree a metre."""
+    """Another standard deviation of prior positions, metres; headings err in proportion, 1 degree a metre."""
     size: PositiveFloat = 300.0
     """Side of the area, metres; generated places and logs are never larger than they are."""
     seed: Seed = 0

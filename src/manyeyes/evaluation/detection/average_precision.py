@@ -2,7 +2,7 @@
 """Average precision of cooperative detection. This text is the definition of the metric.
 
 **Frame.** Detections and truth are in the ego's own, physical frame (x forward, y left, z = 0 on the road). Errors of
-claimed poses displace the content of collaborators' messages; they never move the truth.
+prior poses displace the content of collaborators' messages; they never move the truth.
 
 **Truth of an ego** (:func:`select_ego_truth`): the union of the boxes listed by every agent whose *true* position lies within
 ``com_range_m`` of the ego's (in the plane, the ego included), one box per id, without the ego's own body, moved into the

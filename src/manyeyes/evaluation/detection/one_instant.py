@@ -12,7 +12,7 @@ from manyeyes.ops.keyed_random import keyed_generator
 
 @dataclass(frozen=True)
 class SingleFramePerScenario:
-    """The recording with one of its judged snapshots a scenario, which is the scenario's first and last."""
+    """The recording with one of its evaluated snapshots a scenario, which is the scenario's first and last."""
 
     recording: Recording
     seed: int

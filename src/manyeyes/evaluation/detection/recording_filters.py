@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording seen with less: some of its judged frames, some of its agents, or each snapshot read once. All are recordings."""
+"""Views of a recording: some of its evaluated frames, some of its agents, or cached snapshots. All are recordings."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from manyeyes.datatypes import ConfigError, GroundTruth, Snapshot, Transform
 
 @dataclass(frozen=True)
 class FrameStride:
-    """Every K-th judged frame of each scenario is judged, the first one always; all frames are still there to be played."""
+    """Every K-th evaluated frame of each scenario, the first one always; all frames can still be replayed."""
 
     recording: Recording
     stride: int
 
     def __post_init__(self) -> None:
         if self.stride < 1:
-            raise ConfigError(f"Every K-th frame is judged, K at least 1; got {self.stride}.")
+            raise ConfigError(f"Every K-th frame is evaluated, K at least 1; got {self.stride}.")
 
     @property
     def scenarios(self) -> tuple[str, ...]:
@@ -76,7 +76,7 @@ class CachedRecording:
 
 
 class NearestAgents:
-    """The ego and the agents that are truly nearest to it when a scenario's first judged frame comes, ``num_agents`` in all.
+    """The ego and the agents that are truly nearest to it when a scenario's first evaluated frame comes, ``num_agents`` in all.
 
     Scenarios that have fewer are left out. The choice holds for the whole scenario, so that the set of agents
     is constant. The ground truth stays that of all agents, whatever num_agents is. Its rows of agents that

@@ -30,7 +30,7 @@ MIN_COVERAGE, RASTER_SIZE_M = 0.1, 2.0
 
 @dataclass(frozen=True)
 class ObserverPose:
-    """Where an agent is when its scenario's first judged frame comes: x, y, yaw in the world. row: among the agents."""
+    """Where an agent is when its scenario's first evaluated frame comes: x, y, yaw in the world. row: among the agents."""
 
     scenario: str
     row: int
@@ -59,7 +59,7 @@ class TileSource:
         return crop_to_tile(self.maps[find_town(scenario, tuple(self.maps))], world_from_tile, tile)
 
     def sample_snapshot(self, scenario: str, rng: np.random.Generator) -> Snapshot:
-        """A judged snapshot of a scenario, each as likely as any."""
+        """An evaluated snapshot of a scenario, each as likely as any."""
         return self.recording.snapshot(scenario, int(rng.choice(self.recording.eval_indices(scenario))))
 
 

@@ -108,7 +108,7 @@ def iterate_landmark_pairs(
     frame_stride: int = 1,
     net: FeakmNet | None = None,
 ) -> Iterator[LandmarkPair]:
-    """Yield the first agent and each other, at every so many-th judged instant of every scenario.
+    """Yield the first agent and each other, at every so many-th evaluated instant of every scenario.
 
     Landmarks are boxes of at least min_score. net: computes their descriptors, for correctors that use them.
     """

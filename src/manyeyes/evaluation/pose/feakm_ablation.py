@@ -2,7 +2,7 @@
 """The ablation of FeaKM's Table 3: with and without a confidence map, with one scale and with several.
 
 A row for each branch and noise level: AP@0.5 and AP@0.7 of intermediate fusion by the poses that the branch's net finds,
-under Gaussian errors of every agent's claimed pose, the ego's among them, sigma in metres and degrees alike (the paper's
+under Gaussian errors of every agent's prior pose, the ego's among them, sigma in metres and degrees alike (the paper's
 setting). A branch is a detector, whose fusion has one scale or several (Eq. 7), and a net taught on its views, with or without
 a confidence map (DenseKeypoints.saliency). Frames, draws and truth are the same in all rows.
 """
@@ -77,7 +77,7 @@ def run_ablation(
     seed: int = 0,
     report: Callable[[str, int], None] = lambda scenario, index: None,
 ) -> tuple[FeakmVariantRow, ...]:
-    """Return the rows, branch by branch, over every so many judged frames of the recording; the first agent is the ego."""
+    """Return the rows, branch by branch, over every so many evaluated frames of the recording; the first agent is the ego."""
     accumulators = {(variant.name, sigma): _VariantAccumulator() for variant in variants for sigma in sigmas}
     if len(accumulators) < len(variants) * len(sigmas):
         raise ConfigError(f"Branches have names of their own; got {', '.join(b.name for b in variants)}.")
@@ -113,7 +113,7 @@ class _VariantAccumulator:
 
 
 class _CachedViews:
-    """What does not depend on the claimed poses: every agent's view of the last snapshot, and its keypoints with the ego's.
+    """What does not depend on the prior poses: every agent's view of the last snapshot, and its keypoints with the ego's.
 
     Of the others nothing is remembered: each would stand where another correction put it.
     """

@@ -217,7 +217,7 @@ class PriorNoise:
             raise ConfigError(f"No noise of claims is called {self.kind!r}; known: {', '.join(NOISE_KINDS)}.")
 
     def make_prior(self, truth: Floats, scene: int | str, frame: int = 0) -> PosePrior | None:
-        """ego_from_other as claimed in a frame of a scene, from the true one (3,); None where nothing is claimed."""
+        """ego_from_other of the prior in a frame of a scene, from the true one (3,); None without a prior."""
         if self.kind == "none":
             return None
         sigma = np.array([self.sigma_m, self.sigma_m, math.radians(self.sigma_deg)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one agent saw of the map, once: elements in its own frame, its claimed pose, what it could see; and its file form.
+"""What one agent saw of the map, once: elements in its own frame, its prior pose, what it could see; and its file form.
 
 The file form is documented in docs/maps/observation.md: Parquet, one row an observation.
 """
@@ -110,7 +110,7 @@ class Observation(ObservationContent):
     """One agent's map elements, once; every field is checked, and lies within ``observation_limits.LIMITS``.
 
     agent: a pseudonym. pass_id: one drive of that agent. time_ns: nanoseconds since 1970, UTC.
-    pose: (3,) x, y (m), yaw (rad) of the agent in the map's frame, as claimed. covariance: (3, 3) of that pose, m and rad.
+    pose: (3,) x, y (m), yaw (rad) of the agent in the map's frame, the prior. covariance: (3, 3) of that pose, m and rad.
     view: (K, 2) metres, the polygon that the agent could see, an open ring in the agent's frame; occluders: what hid parts
     of it, same frame. elements: in the agent's frame. model: what made them. trusted: a surveyed pole, whose one word counts.
     """
@@ -120,7 +120,7 @@ class Observation(ObservationContent):
         _check(self)
 
     def elements_in_map(self, pose: Floats | None = None) -> MapElements:
-        """Return the elements in the map's frame, at the claimed pose or at another (3,)."""
+        """Return the elements in the map's frame, at the prior pose or at another (3,)."""
         x, y, yaw = (float(v) for v in (self.pose if pose is None else pose))
         return self.elements.transform(x, y, yaw)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observations as Parquet, one row each (docs/maps/observation.md), and reading that puts aside what cannot be used."""
+"""Observations as Parquet, one row each (docs/maps/observation.md), and reading that rejects what cannot be used."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _REQUIRED = ("agent", "pass_id", "time_ns", "x", "y", "yaw", "covariance", "view
 
 @dataclass(frozen=True)
 class RejectedRows:
-    """What was put aside: the file, its first row (-1: the file as a whole), how many rows, and why, on one line."""
+    """What was rejected: the file, its first row (-1: the file as a whole), how many rows, and why, on one line."""
 
     file: str
     row: int
@@ -66,7 +66,7 @@ class InvalidRow:
 
 @dataclass(frozen=True)
 class LoadedObservations:
-    """What a file or folder held: the frame of its poses, the observations in file and row order, and what was put aside."""
+    """What a file or folder held: the frame of its poses, the observations in file and row order, and what was rejected."""
 
     frame: MapFrame
     observations: tuple[Observation, ...]
@@ -206,7 +206,7 @@ def _open(
 
 
 def _iterate_file_rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[int, str]]]:
-    """Yield row by row; a group of rows that cannot be decoded is put aside as one."""
+    """Yield row by row; a group of rows that cannot be decoded is rejected as one."""
     pa = _pyarrow()
     start = 0
     for group in range(opened.num_row_groups):

@@ -12,7 +12,7 @@ Layouts, as the projects' evaluators write them (both are JSON with ``meta`` and
 Neither file holds poses. They come as a :class:`PoseTable`: out of a CSV (:func:`read_pose_csv`), or of a nuScenes data set's own
 tables (:func:`read_nuscenes_poses`). What neither file holds is filled in so: sigma is 0.3 m a point (the authors publish average
 precision at 0.5 m, no deviation), style is unknown ("none"), the view is the model's range.
-A sample that cannot be used (no pose, a ring that crosses itself, a coordinate that is no number) is put aside with its reason.
+A sample that cannot be used (no pose, a ring that crosses itself, a coordinate that is no number) is rejected with its reason.
 """
 
 from __future__ import annotations

@@ -78,7 +78,14 @@ def lower_bound(keys: I64x1, key: int) -> int:  # pragma: no cover - compiled
 
 @njit(cache=True, nogil=True)
 def line_residual(
-    dx: float, dy: float, u: float, v: float, other_u: float, other_v: float, min_cosine: float, by_reciprocal: bool = False
+    dx: float,
+    dy: float,
+    u: float,
+    v: float,
+    other_u: float,
+    other_v: float,
+    min_cosine: float,
+    by_reciprocal: bool = False,
 ) -> tuple[float, float]:  # pragma: no cover - compiled
     """Compute the longitudinal and the lateral offset (dx, dy) of another line's point, along the mean direction of both lines.
 

@@ -175,14 +175,14 @@ class LogIndex:
             db.execute("INSERT OR REPLACE INTO entries VALUES (?, ?)", (name, len(values)))
 
     def add_rejected(self, name: str, rows: Iterable[tuple[str, int, int, str]]) -> None:
-        """Index what an ingest put aside: file, row, count, reason."""
+        """Index what an ingest rejected: file, row, count, reason."""
         values = [(name, *row) for row in rows]
         with self._open() as db:
             db.executemany("INSERT INTO quarantine VALUES (?, ?, ?, ?, ?)", values)
             db.execute("INSERT OR REPLACE INTO entries VALUES (?, ?)", (name, len(values)))
 
     def list_rejected(self) -> list[tuple[str, int, int, str]]:
-        """Everything that was put aside, in the order of the log."""
+        """Everything that was rejected, in the order of the log."""
         with self._open() as db:
             return list(db.execute("SELECT file, row, count, reason FROM quarantine ORDER BY entry, file, row"))
 

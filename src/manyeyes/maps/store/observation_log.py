@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """An append-only log of observations: Parquet segments that are never changed, and an index beside them.
 
-An entry is one file: a segment of observations (docs/maps/observation.md), a retraction, or what an ingest put aside; its name is
+An entry is one file: a segment of observations (docs/maps/observation.md), a retraction, or what an ingest rejected; its name is
 its number and a hash of its content. An entry is written under another name, flushed and renamed, then indexed: a writer that
 is killed leaves the log without the entry or with it, and one that is there but not indexed is indexed when the log is opened
 to be written.
@@ -52,7 +52,7 @@ class StoreError(ManyeyesError):
 
 @dataclass(frozen=True)
 class IngestResult:
-    """What one ingest did: observations added, those that were there already, and what was put aside."""
+    """What one ingest did: observations added, those that were there already, and what was rejected."""
 
     num_added: int
     num_known: int
@@ -82,7 +82,7 @@ class ObservationLog:
                 self._index(path)
 
     def ingest(self, source: Path | str) -> IngestResult:
-        """Read a file or folder of observations, append the new ones, and keep a record of what was put aside."""
+        """Read a file or folder of observations, append the new ones, and keep a record of what was rejected."""
         reading = read_observations(source, self.frame)
         added, known = self.append(reading.observations)
         if reading.rejected:
@@ -191,7 +191,7 @@ class ObservationLog:
             raise StoreError(f"{path}: no entry of a log of observations; move the file elsewhere.")
 
     def _index_segment(self, path: Path) -> None:
-        """Index the observations of a segment; rows outside the limits are put aside."""
+        """Index the observations of a segment; rows outside the limits are rejected."""
         rows: list[IndexRow] = []
         invalid: list[InvalidEntry] = []
         for group in range(_groups(path)):

@@ -126,7 +126,7 @@ class SimulatedScenario:
         return float(_find_moving(self.states[self.spec.lead_frames :]).mean())
 
     def snapshot(self, index: int) -> Snapshot:
-        """What every agent senses at one instant, and the truth: claimed poses are the true ones."""
+        """What every agent senses at one instant, and the truth: prior poses are the true ones."""
         states, spec = self.states[index], self.spec
         scene, boxes = self.scene(index), true_boxes(states)
         rig = camera_rig(spec.cameras)

@@ -48,7 +48,7 @@ class AugmentConfig:
 
 @dataclass(frozen=True)
 class DegradationConfig:
-    """Degradation of communication and poses, drawn anew for every sample.
+    """Degradation of communication and poses, drawn again for every sample.
 
     Attributes:
         ego_history: number of earlier instants of the ego in its fusion input.

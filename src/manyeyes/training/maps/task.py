@@ -100,7 +100,7 @@ def _begin_from(model: MapModel, start: Sequence[Mapping[str, Tensor]]) -> None:
     """Copy tensors of equal name and shape, such as tile and head of a model of other sensors."""
     own = model.state_dict()
     for state in reversed(start):
-        # Calibration follows training, so its tensors start anew.
+        # Calibration follows training, so its tensors start again.
         fitting = {
             k: v.float()
             for k, v in state.items()
