@@ -2,7 +2,6 @@
 """Numbers of options are refused where they are parsed: one line that names the option, exit code 2."""
 
 import dataclasses
-import importlib
 import typing
 from typing import Any
 
@@ -47,16 +46,17 @@ def required_arguments(options: type, without: str) -> list[str]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_numbers_outside_their_bounds_are_refused(command: str, monkeypatch, capsys) -> None:
-    module = importlib.import_module(cli.module_of(command))
-    monkeypatch.setattr(module, "main", lambda options: pytest.fail(f"accepted {options}"))
-    for name, (bounds, kind) in numeric_options(module.Options).items():
+    options_class = cli.load_command(command).options
+    accepted = cli.Command(options_class, lambda options: pytest.fail(f"accepted {options}"), "")
+    monkeypatch.setattr(cli, "load_command", lambda command: accepted)
+    for name, (bounds, kind) in numeric_options(options_class).items():
         assert bounds is not None, f"--{name} of {command} has no bounds"
         flag = f"--{name.replace('_', '-')}"
         for text, value in BAD.items():
             if value is not None and bounds.contains(value) and (kind is float or value.is_integer()):
                 continue
             for repeats in ([text], [text, text]):
-                code = cli.main([*command.split(), *required_arguments(module.Options, name), flag, *repeats])
+                code = cli.main([*command.split(), *required_arguments(options_class, name), flag, *repeats])
                 assert code == 2, (flag, text)
                 message = capsys.readouterr().err
                 if "needs" in message:

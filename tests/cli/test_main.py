@@ -2,7 +2,6 @@
 """The command as a person meets it: in a process of its own."""
 
 import dataclasses
-import importlib
 import inspect
 import json
 
@@ -23,25 +22,26 @@ ALL_COMMANDS += [f"{group} {command}" for group, commands in cli.COMMAND_GROUPS.
 
 @pytest.mark.parametrize("command", ALL_COMMANDS)
 def test_every_command_has_options_with_help(command, capsys) -> None:
-    module = importlib.import_module(cli.module_of(command))
-    assert module.__doc__ and callable(module.main)
+    options, run, about = cli.load_command(command)
+    assert about and callable(run)
     with pytest.raises(SystemExit) as stop:
         cli.main([*command.split(), "--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
     assert f"manyeyes {command}" in text
-    fields = dataclasses.fields(module.Options)
+    fields = dataclasses.fields(options)
     assert fields and all(f.name.replace("_", "-") in text.lower() for f in fields)
     # tyro prints nothing between a flag and its default where the field has no docstring.
-    source = inspect.getsource(module.Options)
-    assert source.count('\n    """') == len(fields) + 1, "an option is without a line of help"
+    for part in filter(dataclasses.is_dataclass, options.__mro__):
+        texts = inspect.getsource(part).count('\n    """')
+        assert texts == len(inspect.get_annotations(part)) + 1, "an option is without a line of help"
 
 
 def test_an_unknown_command_lists_the_known(capsys) -> None:
     assert cli.main(["demmo"]) == 2
     assert capsys.readouterr().err == (
         "manyeyes: there is no command 'demmo'; did you mean demo? Known commands: "
-        "demo, simulate, train, fit-codebook, evaluate, replay, view, pose, map, doctor.\n"
+        "demo, simulate, train, fit-codebook, evaluate, replay, view, pose, map, study, doctor.\n"
     )
 
 

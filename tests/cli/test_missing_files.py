@@ -262,19 +262,7 @@ def run_fit_codebook(data: Path, weights: Path, out: Path) -> tuple[object, ...]
 
 
 def run_study(data: Path, weights: Path, out: Path) -> tuple[object, ...]:
-    words = (
-        "evaluate",
-        "--data",
-        data,
-        "--split",
-        "test",
-        "--weights",
-        weights,
-        "--study",
-        "num-agents",
-        "--workers",
-        1,
-    )
+    words = ("study", "num-agents", "--data", data, "--split", "test", "--weights", weights, "--workers", 1)
     return (*words, "--methods", "none", "late", "--frame-stride", 2, "--out", out)
 
 
@@ -326,7 +314,7 @@ def test_a_study_of_the_map_model_refuses_before_it_loads_weights(
 ) -> None:
     data = shutil.copytree(whole, tmp_path / "data")
     path = no_record_of_the_ego(data)
-    assert run("map", "evaluate", "--study", "local", "--data", data, "--weights", "none", "--out", tmp_path / "o") == 1
+    assert run("study", "local", "--data", data, "--weights", "none", "--out", tmp_path / "o") == 1
     output = capsys.readouterr().err
     assert str(path) in output and "--allow-missing" in output and not (tmp_path / "o").exists()
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from manyeyes.cli import main as cli, train
-from manyeyes.cli.map import evaluate as map_evaluate
 from manyeyes.datasets.opv2v import Opv2vRecording
 from manyeyes.datatypes import ConfigError
 from manyeyes.models import checkpoint
@@ -15,7 +14,8 @@ from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.simulator.presets import simulate
 from manyeyes.studies.map_recordings import load_true_maps
-from manyeyes.studies.maps import running
+from manyeyes.studies.maps import model_study
+from manyeyes.studies.options import MapModelOptions
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_train_then_judge(recorded, tmp_path, capsys):
     assert model.config.tile.x_max == 60.0 and (out / "loss.png").exists() and (out / "train.json").exists()
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["generated-1"] and card["command"]
-    study = ("map", "evaluate", "--study", "semi-global", "--data", recorded, "--weights", weights, "--workers", 1)
+    study = ("study", "semi-global", "--data", recorded, "--weights", weights, "--workers", 1)
     common = [str(word) for word in (*study, "--seeds", 1, "--scenario-stride", 2, "--out", tmp_path / "study")]
     assert cli.main(common) == 0
     rows = json.loads((tmp_path / "study" / "semi-global.json").read_text())["result"]["rows"]["LiDAR"]
@@ -59,5 +59,5 @@ def test_a_model_with_cameras_needs_pictures(recorded, capsys):
     with pytest.raises(ConfigError, match="no pictures in generated-1_0000"):
         train.main(train.Options(recorded, preset="map-small-camera"))
     # Of the models that ship those are judged whose sensors the recording has.
-    options = map_evaluate.Options(study="local", data=recorded, split="test")
-    assert [model.sensors for model in running.resolve_models(options)] == ["LiDAR"]
+    options = MapModelOptions(data=recorded, split="test")
+    assert [model.sensors for model in model_study.resolve_models(options)] == ["LiDAR"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hand-made steps, counted; and verdicts on hand-made results."""
+"""Hand-made steps, counted, and differences of hand-made results."""
 
 import math
 
@@ -11,7 +11,7 @@ from manyeyes.agents.replay import ReplayStep, SentPackets
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.detection.accumulator import MethodResult, MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS
-from manyeyes.evaluation.statistics.comparison import Margin, compare_methods
+from manyeyes.evaluation.statistics.comparison import compare_methods
 
 PROTOCOL = PROTOCOLS["global-sort"]
 SPOTS = ((10.0, 3.0), (20.0, -3.0), (30.0, 3.0), (40.0, -3.0))
@@ -66,27 +66,13 @@ def test_an_agent_that_sends_nothing_has_no_message_age_or_share_time() -> None:
     assert math.isnan(result.age_ms) and math.isnan(result.share_ms) and result.perceive_ms == pytest.approx(50)
 
 
-@pytest.mark.parametrize(
-    ("fused", "margin", "verdict"),
-    [([3] * 5, 0.25, "met"), ([3] * 5, 0.26, "not met"), ([1, 1, 4, 1, 4], 0.25, "inconclusive")],
-)
-def test_a_margin_is_compared_with_the_paired_difference(fused, margin, verdict) -> None:
+def test_a_method_is_compared_with_every_other_at_both_thresholds() -> None:
+    fused = [1, 1, 4, 1, 4]
     results = [accumulate("none", [2] * 5), accumulate("intermediate", fused)]
-    half, seven = compare_methods(results, PROTOCOL, margins=(Margin("intermediate", "none", margin),))
-    assert (half.method, half.baseline, half.iou, half.margin, half.verdict) == (
-        "intermediate",
-        "none",
-        0.5,
-        margin,
-        verdict,
-    )
-    assert half.interval.value == pytest.approx(sum(fused) / 20 - 0.5)
-    assert (seven.iou, seven.margin, seven.verdict) == (0.7, None, None)
-
-
-def test_one_scenario_is_inconclusive() -> None:
-    results = [accumulate("none", [0]), accumulate("intermediate", [4])]
-    assert compare_methods(results, PROTOCOL)[0].verdict == "inconclusive"
+    half, seven = compare_methods(results, PROTOCOL)
+    assert (half.description, half.metric, seven.metric) == ("intermediate - none", "AP@0.5", "AP@0.7")
+    assert half.interval.value == pytest.approx(sum(fused) / 20 - 0.5) and half.interval.num_scenarios == 5
+    assert half.interval.low < half.interval.value < half.interval.high
 
 
 def test_without_the_method_there_is_nothing_to_compare() -> None:

@@ -15,11 +15,10 @@ from manyeyes.evaluation.maps.pooled_ap import (
     average_samples,
     bootstrap_pooled_ap,
     bootstrap_pooled_mean_ap,
-    check_map_margin,
     collect_blocks,
 )
 from manyeyes.evaluation.maps.tiles import place_side_by_side
-from manyeyes.evaluation.statistics.bootstrap import Interval, draw_resamples
+from manyeyes.evaluation.statistics.bootstrap import draw_resamples
 
 RING = np.array([[0.0, 5.0], [4.0, 5.0], [4.0, 8.0], [0.0, 8.0]])
 
@@ -110,16 +109,3 @@ def test_a_mean_is_over_kinds_with_ground_truth() -> None:
     assert math.isnan(average_samples([bootstrap_pooled_ap(judged, "stop_line", num_resamples=5)]).value)
     nothing = MapPair(MapElements.empty(), judged[0].truth, assign_to_scenario("a"))
     assert bootstrap_pooled_ap([nothing], "divider", num_resamples=5).value == 0.0
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "blocks", "verdict"),
-    [
-        (0.21, 0.3, 9, "met"),
-        (0.1, 0.19, 9, "not met"),
-        (0.1, 0.3, 9, "inconclusive"),
-        (0.25, 0.25, 1, "inconclusive"),
-    ],
-)
-def test_a_margin_is_met_if_the_whole_interval_is(low, high, blocks, verdict) -> None:
-    assert check_map_margin("gain", Interval((low + high) / 2, low, high, 0.95, blocks), 0.2).verdict == verdict

@@ -13,8 +13,7 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 from manyeyes.comms import wire
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
-from manyeyes.evaluation.maps import tile_cells, tile_prediction as tile_drawing
-from manyeyes.evaluation.maps.tile_cells import RecordingSource, TilePrediction, run_tile_study
+from manyeyes.evaluation.maps import tile_prediction as tile_drawing
 from manyeyes.evaluation.maps.tile_prediction import (
     CLEAN,
     CLEAN_CORRECTED,
@@ -26,14 +25,17 @@ from manyeyes.evaluation.maps.tile_prediction import (
     LocalPredictor,
     PoseNoisePredictor,
     SemiGlobalPredictor,
+    TilePrediction,
 )
 from manyeyes.evaluation.maps.tile_sampling import TileSource, collect_observer_poses
-from manyeyes.maps.store.executors import InlineExecutor
 from manyeyes.models import checkpoint
 from manyeyes.models.maps.bev import BevConfig
 from manyeyes.models.maps.head import MapHeadConfig
 from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
+from manyeyes.studies.engine.cells import CellStore
+from manyeyes.studies.maps import tile_cells
+from manyeyes.studies.maps.tile_cells import RecordingSource, make_tile_jobs
 
 CONFIG = MapModelConfig(
     BevConfig(
@@ -92,7 +94,7 @@ def weights(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def map_model(weights):
-    return tile_cells._load_map_model(weights)
+    return tile_cells.load_map_model(weights)
 
 
 @pytest.fixture
@@ -179,21 +181,24 @@ class CountingPredictor:
         ]
 
 
+def run_jobs(weights, predictor, seeds, folder, **options):
+    source = RecordingSource(Drive, load_truth)
+    return [job() for job in make_tile_jobs(source, weights, predictor, seeds, CellStore(folder), **options)]
+
+
 def test_an_interrupted_study_resumes(weights, tmp_path):
-    world, draw, seen = RecordingSource(Drive, load_truth), CountingPredictor(), []
-    first = run_tile_study(
-        world, weights, draw, (0, 1), tmp_path, InlineExecutor(), lambda done, total: seen.append((done, total))
-    )
-    assert draw.num_calls == 4 and seen[-1] == (4, 4)
+    draw = CountingPredictor()
+    first = run_jobs(weights, draw, (0, 1), tmp_path)
+    assert draw.num_calls == 4
     assert [(c.scenario, c.seed) for c in first] == [(s, k) for s in Drive().scenarios for k in (0, 1)]
-    sorted(tmp_path.glob("town1_0001-1-*.npz"))[0].write_bytes(b"spoilt")
-    again = run_tile_study(world, weights, draw, (0, 1), tmp_path, InlineExecutor())
+    sorted(tmp_path.glob("town1_0001-1-*"))[0].write_bytes(b"spoilt")
+    again = run_jobs(weights, draw, (0, 1), tmp_path)
     assert draw.num_calls == 5, "kept ones are read, a spoilt one is made anew"
     for one, other in zip(first, again):
         for a, b in zip(one.predictions, other.predictions, strict=True):
             assert (a.row_name, a.frame_bytes) == (b.row_name, b.frame_bytes) and len(a.predicted) == len(b.predicted)
             np.testing.assert_array_equal(a.truth.points, b.truth.points)
-    run_tile_study(world, weights, draw, (0, 2), tmp_path, InlineExecutor(), scenario_stride=2)
+    run_jobs(weights, draw, (0, 2), tmp_path, scenario_stride=2)
     assert draw.num_calls == 6, "another seed of the first scenario alone"
 
 
@@ -201,7 +206,7 @@ def test_other_weights_are_other_results(weights, tmp_path):
     torch.manual_seed(1)
     other = tmp_path / "other.safetensors"
     checkpoint.save(MapModel(CONFIG), other, {"towns": []}, format=FORMAT)
-    world, draw = RecordingSource(Drive, load_truth), CountingPredictor()
+    draw = CountingPredictor()
     for name in (weights, str(other)):
-        run_tile_study(world, name, draw, (0,), tmp_path / "cells", InlineExecutor(), scenario_stride=2)
+        run_jobs(name, draw, (0,), tmp_path / "cells", scenario_stride=2)
     assert draw.num_calls == 2

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps.tile_cells import TilePrediction, TileStudyResult
 from manyeyes.evaluation.maps.tile_metrics import TileTable
+from manyeyes.evaluation.maps.tile_prediction import ScenarioPredictions, TilePrediction
 
 LINES = [[[0.0, 12.0 * k], [30.0, 12.0 * k]] for k in range(4)]
 RING = [[40.0, 0.0], [44.0, 0.0], [44.0, 3.0], [40.0, 3.0]]
 TRUTH = MapElements.of([*LINES, RING, [[0.0, 90.0], [30.0, 90.0]]], [DIVIDER] * 4 + [CROSSING, BOUNDARY])
 
 
-def cells() -> list[TileStudyResult]:
+def cells() -> list[ScenarioPredictions]:
     """Four scenarios at two seeds: "all" draws everything; "half" two of the lines and, in two scenarios, the crossing."""
     out = []
     for k in range(4):
@@ -23,7 +23,7 @@ def cells() -> list[TileStudyResult]:
                 TilePrediction("half", half, TRUTH, (100,)),
                 TilePrediction("all", TRUTH, TRUTH, (100, 100 + 10 * k)),
             )
-            out.append(TileStudyResult(f"s{k}", seed, drawn))
+            out.append(ScenarioPredictions(f"s{k}", seed, drawn))
     return out
 
 
@@ -48,20 +48,14 @@ def test_a_row_holds_ap_by_kind_mean_and_bytes(table):
     assert half.ap[0][0].low == 0.0 and half.ap[0][0].high == 1.0, "crossings differ among scenarios"
 
 
-def test_a_margin_test_is_a_paired_difference(table):
-    margin_test = table.check_margin("all - half", "all", "half", 0.2)
-    assert margin_test.difference.value == pytest.approx(0.5) and margin_test.difference.low == pytest.approx(0.25)
-    assert (
-        margin_test.verdict == "met" and table.check_margin("all - half", "all", "half", 0.5).verdict == "inconclusive"
-    )
-    assert table.check_margin("half - all", "half", "all", 0.2, "exact").verdict == "not met"
+def test_a_comparison_is_a_paired_difference(table):
+    comparison = table.compare("all - half", "all", "half")
+    assert (comparison.description, comparison.metric) == ("all - half", "mAP")
+    assert comparison.interval.value == pytest.approx(0.5) and comparison.interval.low == pytest.approx(0.25)
 
 
 def test_classes_without_ground_truth_are_not_averaged():
     lines = TRUTH.take(np.arange(4))
-    table = TileTable([TileStudyResult("a", 0, (TilePrediction("row", lines, lines, ()),))])
+    table = TileTable([ScenarioPredictions("a", 0, (TilePrediction("row", lines, lines, ()),))])
     row = table.make_row("row")
     assert row.mean_ap[0].value == 1.0 and np.isnan(row.ap[0][0].value) and row.bytes_per_frame == 0.0
-    assert table.check_margin("row - row", "row", "row", 0.0).verdict == "inconclusive", (
-        "one scenario does not generalise to others"
-    )

@@ -14,11 +14,11 @@ import pytest
 from manyeyes.cli import main as cli
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import DIVIDER, MapElements
-from manyeyes.evaluation.maps.map_cells import hash_map_sources
 from manyeyes.maps.baselines.union import UnionConfig
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.observation_file import write_observations
 from manyeyes.maps.registry import MAP_FUSION_METHODS, OURS, fuse_maps, list_map_fusions
+from manyeyes.studies.maps.fleet_cells import method_source
 
 THEIRS = """
 from dataclasses import dataclass
@@ -96,7 +96,7 @@ def test_a_distribution_that_is_installed_adds_a_method(theirs: Path, tmp_path: 
 
 
 def test_the_source_of_their_method_is_part_of_a_cells_key(theirs: Path) -> None:
-    before = hash_map_sources("first-observations")
+    before = method_source("first-observations")
     theirs.write_text(THEIRS + "MORE = 1\n")
     linecache.checkcache()
-    assert hash_map_sources("first-observations") != before
+    assert method_source("first-observations") != before

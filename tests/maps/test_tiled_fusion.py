@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from manyeyes._records import load_record, save_record
 from manyeyes.datatypes import ConfigError
 from manyeyes.maps.formats.attributes import to_hex_ids
 from manyeyes.maps.fusion.agent_weights import REJECTED_WEIGHT
 from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.pose_optimization import solve_poses
-from manyeyes.maps.store.columns_file import load_columns, save_columns
 from manyeyes.maps.store.executors import InlineExecutor, make_executor
 from manyeyes.maps.store.observation_log import read_active
 from manyeyes.maps.store.store import MapStore
@@ -96,7 +96,7 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
     ]  # fmt: skip
     before = {p.name: p.stat().st_mtime_ns for p in work.iterdir()}
     results = sorted(work.iterdir())
-    assert len(results) == 4 * (steps + 2) and not list(work.glob("*.arrays.npz"))
+    assert len(results) == 4 * (steps + 2) and not list(work.glob("*.arrays.record"))
     results[0].write_bytes(results[0].read_bytes()[:100])
     results[1].unlink()
     assert _tiled(store, work, 256.0).quantised_hash() == whole.quantised_hash()
@@ -143,8 +143,8 @@ def test_every_block_reads_overlapping_observations_only(store, tmp_path):
 def test_observation_arrays_round_trip_through_work_folder(store, tmp_path):
     standing = store.log.active_observations()
     want = to_observation_arrays(read_active(store.log.folder, standing, np.arange(5)), 1.0)
-    save_columns(tmp_path / "a.npz", want)
-    got = load_columns(tmp_path / "a.npz", type(want))
+    save_record(tmp_path / "a.record", want)
+    got = load_record(tmp_path / "a.record", type(want))
     assert got is not None and got.ids == want.ids and got.agents == want.agents
     for name in ("xy", "pose", "time_ns", "priority"):
         a, b = getattr(got, name), getattr(want, name)
@@ -152,9 +152,9 @@ def test_observation_arrays_round_trip_through_work_folder(store, tmp_path):
         assert (a.dtype, a.flags.writeable) == (b.dtype, b.flags.writeable)
     np.testing.assert_array_equal(got.view.xy, want.view.xy)
     np.testing.assert_array_equal(got.elements.points, want.elements.points)
-    (tmp_path / "a.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:-50])
-    assert load_columns(tmp_path / "a.npz", type(want)) is None
-    assert load_columns(tmp_path / "none.npz", type(want)) is None
+    (tmp_path / "a.record").write_bytes((tmp_path / "a.record").read_bytes()[:-50])
+    assert load_record(tmp_path / "a.record", type(want)) is None
+    assert load_record(tmp_path / "none.record", type(want)) is None
 
 
 def test_sizes_that_make_no_sense_are_refused():

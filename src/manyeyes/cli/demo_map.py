@@ -53,8 +53,9 @@ def describe_drive_map(stats: MapBuildStats) -> str:
         ""
         if stats.scores is None or stats.union_scores is None
         else (
-            f" mAP {stats.scores.mean_ap():.2f}, F of dividers at 0.5 m {stats.scores.f1('divider'):.2f}; "
-            f"all that was drawn, unfused, has {stats.union_scores.mean_ap():.2f} and {stats.union_scores.f1('divider'):.2f}."
+            f" mAP {stats.scores.mean_ap('maptr'):.2f}, F1@0.5 m of dividers "
+            f"{stats.scores.get_length_score('divider').f1:.2f}; unfused, "
+            f"{stats.union_scores.mean_ap('maptr'):.2f} and {stats.union_scores.get_length_score('divider').f1:.2f}."
         )
     )
     return (

@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Judges methods on a split: AP with 95 % intervals over scenarios, bytes, age, time, and paired differences with verdicts.
-
---study NAME runs a study instead: robustness (delay, errors of pose, lost packets), budget (AP against bytes), agents (one to
-five), ablation (branches of a training), system (every agent as ego, one budget for the channel), pose and pose-accuracy
-(correctors of claimed poses: AP, and the poses themselves), feakm (branches of that paper's net), picture (one frame).
-"""
+"""Evaluate methods on a split: AP with 95 % intervals over scenarios, bytes, data age, time, and paired differences."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from manyeyes.studies.options import Options
+from manyeyes._bounds import NonNegativeFloat, NonNegativeInt
+from manyeyes.studies.options import EvaluationOptions
 from manyeyes.studies.replay_options import display_name, make_excerpt
 
 if TYPE_CHECKING:
@@ -23,8 +20,24 @@ if TYPE_CHECKING:
     from manyeyes.models.detector.detector import Detector
 
 
+@dataclass(frozen=True, kw_only=True)
+class Options(EvaluationOptions):
+    """Which recording, which methods, by which protocol."""
+
+    out: Path = Path("out/evaluate")
+    """Folder for results.json and results.md."""
+    noise_xy_m: NonNegativeFloat = 0.0
+    """Standard deviation of the position noise of other agents."""
+    noise_yaw_deg: NonNegativeFloat = 0.0
+    """Standard deviation of the heading noise of other agents, degrees."""
+    all_egos: bool = False
+    """Evaluate every agent as ego, not only the first."""
+    timing_frames: NonNegativeInt = 10
+    """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""
+
+
 def main(options: Options) -> None:
-    """Evaluate methods on a split, or run a study."""
+    """Evaluate methods on a split."""
     from rich.console import Console
 
     from manyeyes._io import atomic_write_text
@@ -34,16 +47,11 @@ def main(options: Options) -> None:
     from manyeyes.models import pretrained
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import adapt_to_dataset, check_files
-    from manyeyes.viz.progress import make_progress_bars
+    from manyeyes.viz.progress import track
     from manyeyes.viz.results import print_comparison, summarize_comparison
     from manyeyes.viz.table import DIFFERENCE_HEADINGS, format_difference_cells, format_markdown, format_markdown_lines
 
     console = Console()
-    if options.study is not None:
-        from manyeyes.studies import run_named_study
-
-        run_named_study(options, console)
-        return
     has_pose_noise = options.noise_xy_m > 0 or options.noise_yaw_deg > 0
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
     config = BenchmarkConfig(
@@ -59,11 +67,8 @@ def main(options: Options) -> None:
     recording = opener()
     config = replace(config, replay=adapt_to_dataset(config.replay, options.replay_options, recording))
     missing = check_files(recording, options.checks, console)
-    with make_progress_bars(console) as progress:
-        task = progress.add_task("Judging", total=len(recording.scenarios))
-        results = run_benchmark(
-            opener, config, options.workers, lambda done, total: progress.update(task, completed=done)
-        )
+    with track(console, "Evaluating", len(recording.scenarios)) as report:
+        results = run_benchmark(opener, config, options.workers, report)
     timed_results = [_measure_times(r, recording, detector, config.replay, options.timing_frames) for r in results]
     comparison = summarize_comparison(timed_results, protocol, missing)
     data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"

@@ -6,20 +6,24 @@ from __future__ import annotations
 import difflib
 import importlib
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 from manyeyes import __version__
+from manyeyes.studies.catalog import STUDIES, load_options, run_study
 
 COMMANDS = {
     "demo": "simulate a drive, run every fusion method on it, and write a table, figures, an animation and a report",
     "simulate": "simulate scenes from a seed, in OPV2V's layout",
     "train": "train a detector on a recording",
     "fit-codebook": "fit the codebook that quantises the tokens of trained weights",
-    "evaluate": "evaluate methods on a split: AP with intervals, bytes, paired differences; or run a study",
+    "evaluate": "evaluate methods on a split: AP with intervals, bytes, paired differences",
     "replay": "replay your own recording as demo does",
     "view": "draw a frame of a recording, or animate a drive",
     "pose": "evaluate pose correction from detected objects: prior and corrected poses",
     "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",
+    "study": "reproduce a table or figure: robustness, bandwidth, pose noise, map fusion, ...",
     "doctor": "print what a bug report needs",
 }
 COMMAND_GROUPS = {
@@ -29,11 +33,12 @@ COMMAND_GROUPS = {
         "import": "convert result files of MapTR or StreamMapNet with their poses to observations",
         "fuse": "fuse a folder of observations to one map",
         "retract": "remove observations from a store, and publish the map without them",
-        "evaluate": "evaluate a map against the ground truth, or run a study of methods",
+        "evaluate": "evaluate a map against the ground truth",
         "diff": "list what changed from one map to another",
         "export": "export a map: GeoJSON, GeoPackage, Lanelet2, Argoverse 2, nuScenes, PMTiles",
         "view": "draw a map as a web page (.html) that needs no internet, or as an image (.png)",
     },
+    "study": {name: study.summary for name, study in STUDIES.items()},
 }
 MODULES = {"fit-codebook": "fit_codebook", "map import": "map import_predictions"}
 """Modules of commands whose name differs from the command."""
@@ -44,7 +49,12 @@ def make_help_text(group: str = "") -> str:
     """Make the text of ``manyeyes --help``, or the help of a group of commands."""
     table, prog = (COMMAND_GROUPS[group], f"manyeyes {group}") if group else (COMMANDS, "manyeyes")
     width = max(map(len, table)) + 2
-    command_lines = "\n".join(f"  {command.ljust(width)}{what}" for command, what in table.items())
+    lines: list[str] = []
+    for command, what in table.items():
+        heading = f"{STUDIES[command].group}:" if group == "study" else None
+        lines += [heading] if heading and heading not in lines else []
+        lines.append(f"  {command.ljust(width)}{what}")
+    command_lines = "\n".join(lines)
     about = (
         f"manyeyes {group}: {COMMANDS[group]}."
         if group
@@ -79,6 +89,23 @@ def module_of(command: str) -> str:
     return f"manyeyes.cli.{MODULES.get(command, command).replace(' ', '.')}"
 
 
+class Command(NamedTuple):
+    """A command: its options class, what runs it, and the text above its options."""
+
+    options: type
+    main: Callable[[Any], None]
+    about: str
+
+
+def load_command(command: str) -> Command:
+    """Import what a command needs to parse its arguments."""
+    group, _, name = command.partition(" ")
+    if group == "study":
+        return Command(load_options(name), partial(run_study, name), f"Study {name}: {STUDIES[name].summary}.")
+    module = importlib.import_module(module_of(command))
+    return Command(module.Options, module.main, module.__doc__ or "")
+
+
 def _run_group(group: str, arguments: Sequence[str]) -> int:
     """Run a command of a group; ``map fuse`` lives in the module ``map.fuse``."""
     if not arguments or arguments[0] in ("-h", "--help", "help"):
@@ -103,11 +130,11 @@ def _run_command(command: str, arguments: Sequence[str]) -> int:
         from manyeyes.cli.arguments import UsageError, parse_options
         from manyeyes.datatypes.errors import ManyeyesError
 
-        module = importlib.import_module(module_of(command))
+        options, run, about = load_command(command)
     except KeyboardInterrupt:
         return _fail("stopped.", INTERRUPTED_EXIT_CODE)
     try:
-        module.main(parse_options(module.Options, f"manyeyes {command}", module.__doc__, arguments))
+        run(parse_options(options, f"manyeyes {command}", about, arguments))
     except UsageError as error:
         return _fail(str(error), 2)
     except ManyeyesError as error:

@@ -31,9 +31,10 @@ if TYPE_CHECKING:
         summarize_evaluations as summarize_evaluations,
     )
     from manyeyes.evaluation.statistics.bootstrap import (
+        BootstrapSamples as BootstrapSamples,
         Interval as Interval,
-        paired_difference as paired_difference,
-        scenario_interval as scenario_interval,
+        bootstrap as bootstrap,
     )
+    from manyeyes.evaluation.statistics.comparison import Comparison as Comparison, compare_methods as compare_methods
 
 __getattr__, __dir__ = attach(__name__)

@@ -22,7 +22,7 @@ from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, Transform
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.datatypes.message import LocalMap
-from manyeyes.evaluation.maps.map_cells import ApRow, KindRow, evaluate_map_rows
+from manyeyes.evaluation.maps.metrics import MapMetrics, evaluate_map
 from manyeyes.evaluation.maps.registry import make_tuned_settings
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.incremental import IncrementalConfig, compute_map_fscore
@@ -60,23 +60,6 @@ class MapBuildConfig:
 
 
 @dataclass(frozen=True)
-class MapScores:
-    """What a map is worth against the truth in view."""
-
-    num_true_elements: int
-    ap_rows: tuple[ApRow, ...]
-    kind_rows: tuple[KindRow, ...]
-
-    def mean_ap(self, protocol: str = "maptr", thresholds: str = "narrow") -> float:
-        """mAP over crossings and dividers."""
-        return next(row.mean_ap for row in self.ap_rows if (row.protocol, row.thresholds) == (protocol, thresholds))
-
-    def f1(self, kind: str) -> float:
-        """F by length of one kind at 0.5 m."""
-        return next(row.f1[1] for row in self.kind_rows if row.kind == kind)
-
-
-@dataclass(frozen=True)
 class MapBuildStats:
     """Statistics of one town map. num_messages: with a map; bytes_per_message, bytes_per_frame: of these, and of feature messages.
     num_lost: sent and not completely received.
@@ -98,8 +81,8 @@ class MapBuildStats:
     num_elements: int
     num_published: int
     incremental_fscore: float
-    scores: MapScores | None
-    union_scores: MapScores | None
+    scores: MapMetrics | None
+    union_scores: MapMetrics | None
     missing: MissingFiles = NONE_MISSING
 
 
@@ -229,14 +212,10 @@ def _evaluate(town_map: TownMap, map_server: MapServer, log: _BuildLog) -> Built
         num_elements=len(fused),
         num_published=len(published),
         incremental_fscore=compute_map_fscore(map_server.map(), fused),
-        scores=None if truth is None else _compute_scores(evaluated, truth),
-        union_scores=None if truth is None or cut_policy is None else _compute_scores(cut_policy(observed), truth),
+        scores=None if truth is None else evaluate_map(evaluated, truth),
+        union_scores=None if truth is None or cut_policy is None else evaluate_map(cut_policy(observed), truth),
     )
     return BuiltMap(town_map, map_server, fused, truth, evaluated, observed, stats)
-
-
-def _compute_scores(elements: MapElements, truth: MapElements) -> MapScores:
-    return MapScores(len(truth), *evaluate_map_rows(elements, truth))
 
 
 def write_built_map(built: BuiltMap, out: Path, title: str) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of evaluations and of studies of detection and poses."""
+"""Options of evaluations and studies, made of shared parts; without heavy imports, so that --help is quick."""
 
 from __future__ import annotations
 
@@ -7,58 +7,194 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from manyeyes._bounds import NonNegativeFloat, NonNegativeInt, PositiveInt, Seed
+from manyeyes._bounds import PositiveInt, Seed
 from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 
 
-@dataclass(frozen=True)
-class Options:
-    """Which recording, which methods, whose rules."""
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """Options of every study."""
+
+    out: Path = Path("out/study")
+    """Folder for the results as .json, .md and .png; finished cells are kept there, and a stopped study goes on."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingStudyOptions(StudyOptions):
+    """Options of what is evaluated on a recording."""
 
     data: Path
     """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
     split: str | None = None
     """Which split of a data set, such as test: a folder inside it; with DAIR-V2X one of its split file."""
-    out: Path = Path("out/evaluate")
-    """Folder for results.json and results.md."""
+    frame_stride: PositiveInt = 1
+    """Evaluate every n-th of the frames that the recording evaluates."""
+    seed: Seed = 0
+    """Of losses, jitter and pose errors."""
+    checks: FileChecks = field(default_factory=FileChecks)
+    """What is done about missing files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationOptions(RecordingStudyOptions):
+    """Options of what replays a recording with fusion methods."""
+
     protocol: str = "global-sort"
     """Evaluation protocol: global-sort, opencood, coalign, sparsealign; on DAIR-V2X also dair, heal-dair, costr-dair,
     sparsealign-dair."""
-    noise_xy_m: NonNegativeFloat = 0.0
-    """Standard deviation of errors of collaborators' claimed positions."""
-    noise_yaw_deg: NonNegativeFloat = 0.0
-    """Standard deviation of errors of collaborators' claimed headings, degrees."""
-    all_egos: bool = False
-    """Judge every agent as ego, not only the first."""
-    seed: Seed = 0
-    """Of losses, jitter and pose errors."""
     workers: PositiveInt = os.cpu_count() or 1
     """How many processes share the scenarios; results do not depend on it."""
-    timing_frames: NonNegativeInt = 10
-    """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate."""
-    frame_stride: PositiveInt = 1
-    """Judge each so many-th frame of those that the recording judges."""
-    study: str | None = None
-    """robustness, bandwidth, num-agents, ablation, shared-bandwidth, pose-noise-ap, pose-estimation, feakm or qualitative; finished
-    results are stored under --out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustnessOptions(EvaluationOptions):
+    """Options of the study robustness."""
+
     perturbations: tuple[str, ...] = ()
-    """Those that the studies 'robustness' and 'pose-noise-ap' play, by the names of their tables, such as "0.4 s" "30 % lost"
-    or "2°, 2 m" "0.8 m"; by default all."""
-    budgets: tuple[PositiveInt, ...] = ()
-    """Budgets in bytes: of a message in the study 'bandwidth', of all messages of a snapshot in 'shared-bandwidth'; by default the
-    study's own."""
-    token_selection: tuple[str, ...] = ()
-    """Methods that choose tokens, in the studies 'bandwidth' and 'shared-bandwidth'; by default intermediate,
-    intermediate-confidence, intermediate-random."""
-    token_encodings: tuple[str, ...] = ()
-    """Ways to write tokens, in the study 'bandwidth'; by default all."""
-    correctors: tuple[str, ...] = ()
-    """Pose correctors of the studies 'pose-noise-ap' and 'pose-estimation', among them feakm or a file of its weights; by default
-    the study's own."""
+    """Perturbations by the names of the tables, such as "0.4 s" "30 % lost"; by default all."""
     checkpoints: tuple[str, ...] = ()
-    """Weights that the study 'ablation' compares, and baselines of 'robustness' and 'pose-noise-ap', as name=weights.safetensors;
-    of 'feakm' each as name=detector.safetensors,net.safetensors."""
+    """Baselines beside the methods, as name=weights.safetensors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedBandwidthOptions(EvaluationOptions):
+    """Options of the study shared-bandwidth."""
+
+    budgets: tuple[PositiveInt, ...] = ()
+    """Budgets in bytes, of one message (bandwidth) or of all messages of a snapshot (shared-bandwidth); by default the study's."""
+    token_selection: tuple[str, ...] = ()
+    """Methods that select tokens; by default intermediate, intermediate-confidence, intermediate-random."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BandwidthOptions(SharedBandwidthOptions):
+    """Options of the study bandwidth."""
+
+    token_encodings: tuple[str, ...] = ()
+    """Token encodings; by default all that the weights have."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AblationOptions(EvaluationOptions):
+    """Options of the study ablation."""
+
+    checkpoints: tuple[str, ...] = ()
+    """Weights that are compared, as name=weights.safetensors[@BYTES], in the order of the table."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseNoiseApOptions(RobustnessOptions):
+    """Options of the study pose-noise-ap."""
+
+    correctors: tuple[str, ...] = ()
+    """Pose correctors, among them feakm or a file of its weights; by default identity and voting."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseEstimationOptions(RecordingStudyOptions):
+    """Options of the study pose-estimation."""
+
+    weights: str = "costr-small"
+    """Weights that detect objects: a shipped name or a .safetensors file."""
+    correctors: tuple[str, ...] = ()
+    """Pose correctors, among them feakm or a file of its weights; by default six."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeakmOptions(RecordingStudyOptions):
+    """Options of the study feakm."""
+
+    protocol: str = "global-sort"
+    """Evaluation protocol, as in 'manyeyes evaluate'."""
+    weights: str = "costr-small"
+    """Weights over whose detection range the protocol global-sort evaluates."""
+    checkpoints: tuple[str, ...] = ()
+    """Variants, as name=detector.safetensors,net.safetensors[@8]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetStudyOptions(StudyOptions):
+    """Options of studies of simulated fleets."""
+
+    seeds: PositiveInt = 3
+    """Number of seeds."""
+    workers: PositiveInt = 2
+    """Processes that share the trials; results do not depend on it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapFusionStudyOptions(FleetStudyOptions):
+    """Options of studies that compare map fusion methods."""
+
+    methods: tuple[str, ...] = ()
+    """Map fusion methods; by default all."""
+    oracles: bool = False
+    """Add the oracle rows: truth cut again, true poses, known association."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FleetPoseNoiseOptions(MapFusionStudyOptions):
+    """Options of the study fleet-pose-noise."""
+
+    places: tuple[str, ...] = ()
+    """Places; by default the four test places."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FusionOptions(FleetPoseNoiseOptions):
+    """Options of the study fusion."""
+
+    observation_counts: tuple[PositiveInt, ...] = ()
+    """Counts of observations; by default 20, 60, 200."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdversarialOptions(FleetStudyOptions):
+    """Options of the study adversarial."""
+
+    places: tuple[str, ...] = ()
+    """Places; by default the four test places."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuningOptions(StudyOptions):
+    """Options of the study tuning."""
+
+    methods: tuple[str, ...] = ()
+    """Map fusion methods; by default all."""
+    workers: PositiveInt = 2
+    """Processes that share the trials; results do not depend on it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapModelOptions(FleetStudyOptions):
+    """Options of studies of the map model."""
+
+    data: Path
+    """A dataset of towns, as of 'manyeyes simulate'."""
+    split: str = "test"
+    """Which split of it: towns outside the training set."""
+    weights: tuple[str, ...] = ()
+    """Map models, one a set of sensors: shipped names or .safetensors files; by default all that ship."""
+    scenario_stride: PositiveInt = 1
+    """Only every n-th scenario."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FullMapOptions(MapModelOptions):
+    """Options of the study full-map."""
+
+    methods: tuple[str, ...] = ()
+    """Map fusion methods; by default all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapPoseNoiseOptions(MapModelOptions):
+    """Options of the study map-pose-noise."""
+
+    pose_correction: str = "voting"
+    """Pose corrector, by name."""

@@ -13,7 +13,7 @@ from typing import Any
 
 from manyeyes._io import atomic_write_text
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.statistics.comparison import PairedDifference
+from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.viz.table import (
     DATA_AGE,
     DIFFERENCE_HEADINGS,
@@ -94,7 +94,7 @@ class HtmlReport:
     title: str
     lead: str
     rows: tuple[MethodRow, ...] = ()
-    differences: tuple[PairedDifference, ...] = ()
+    differences: tuple[Comparison, ...] = ()
     pictures: tuple[ReportImage, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
     commands: tuple[str, ...] = ()

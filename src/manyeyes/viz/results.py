@@ -13,7 +13,7 @@ from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResu
 from manyeyes.evaluation.detection.average_precision import DetectionProtocol
 from manyeyes.evaluation.detection.communication import Communication
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.statistics.comparison import PairedDifference, compare_methods
+from manyeyes.evaluation.statistics.comparison import Comparison, compare_methods
 from manyeyes.viz.table import MethodRow, make_differences_table, make_row, make_terminal_table, missing_footer
 
 
@@ -50,7 +50,7 @@ class MethodComparison:
     protocol: DetectionProtocol
     stats: tuple[MethodStats, ...]
     rows: tuple[MethodRow, ...]
-    differences: tuple[PairedDifference, ...]
+    differences: tuple[Comparison, ...]
     missing: MissingFiles = NONE_MISSING
 
     @property

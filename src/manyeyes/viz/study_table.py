@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rich import box
 from rich.table import Table
 
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.viz.table import NOT_RUN, format_markdown_lines
+from manyeyes.evaluation.statistics.comparison import Comparison
+from manyeyes.viz.table import NOT_RUN, format_markdown_lines, make_table
 
 _MAX_NARROW_COLUMNS = 6
 
@@ -25,21 +26,19 @@ class StudyTable:
 
 
 def make_terminal_table(study_table: StudyTable) -> Table:
-    """The sheet for a terminal; a wide one leaves the intervals to the document."""
-    table = Table(
-        title=study_table.title,
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        pad_edge=False,
-        show_edge=False,
-        padding=(0, 1, 0, 0),
-    )
-    for column, heading in enumerate(study_table.headings):
-        table.add_column(heading, justify="left" if column < 2 else "right", no_wrap=column < 2)
+    """Create the table for a terminal; a wide one leaves the intervals to the document."""
+    table = make_table(study_table.title, study_table.headings, num_left=2)
     wide = len(study_table.headings) > _MAX_NARROW_COLUMNS
     for line in study_table.lines:
         table.add_row(*(cell.partition(" [")[0] if wide else cell for cell in line))
     return table
+
+
+def make_comparison_table(comparisons: Sequence[Comparison], resampled_unit: str = "scenarios") -> StudyTable:
+    """Tabulate comparisons; resampled_unit: what is drawn with replacement."""
+    lines = tuple((c.description, c.metric, format_difference(c.interval)) for c in comparisons)
+    title = f"Differences, paired over {resampled_unit}"
+    return StudyTable(title, ("difference", "metric", "value [95 % CI]"), lines)
 
 
 def format_markdown(study_table: StudyTable) -> str:

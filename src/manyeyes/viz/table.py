@@ -13,7 +13,7 @@ from rich.text import Text
 
 from manyeyes.evaluation.detection.accumulator import MethodResult
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.statistics.comparison import PairedDifference
+from manyeyes.evaluation.statistics.comparison import Comparison
 
 NOT_RUN = "not run"
 # Words of columns that several tables have.
@@ -60,7 +60,7 @@ def make_row(result: MethodResult) -> MethodRow:
 HEADINGS = (
     "method", "AP@0.5", "AP@0.7", "bytes/message", LOG2_BYTES, DATA_AGE, "share [ms]", "perceive [ms]",
 )  # fmt: skip
-DIFFERENCE_HEADINGS = ("paired difference", "AP at IoU", AP_DIFFERENCE)
+DIFFERENCE_HEADINGS = ("paired difference", "metric", AP_DIFFERENCE)
 
 
 def format_cells(row: MethodRow) -> tuple[str, ...]:
@@ -108,7 +108,7 @@ def missing_footer(count: int, listed_in: str = "results.json") -> str:
     return f"{files} missing or mismatched: the ground truth and all rows are affected; see {listed_in}."
 
 
-def make_differences_table(differences: Sequence[PairedDifference]) -> Table:
+def make_differences_table(differences: Sequence[Comparison]) -> Table:
     """Create the table of paired differences for the terminal."""
     table = make_table("", DIFFERENCE_HEADINGS)
     for difference in differences:
@@ -116,11 +116,11 @@ def make_differences_table(differences: Sequence[PairedDifference]) -> Table:
     return table
 
 
-def format_difference_cells(difference: PairedDifference) -> tuple[str, ...]:
+def format_difference_cells(difference: Comparison) -> tuple[str, ...]:
     """Format a paired difference in the order of DIFFERENCE_HEADINGS."""
     value = difference.interval
     spread = f" [{value.low:+.3f}, {value.high:+.3f}]" if value.num_scenarios > 1 else ""
-    return f"{difference.method} - {difference.baseline}", f"{difference.iou:g}", f"{value.value:+.3f}{spread}"
+    return difference.description, difference.metric, f"{value.value:+.3f}{spread}"
 
 
 def format_markdown_lines(body: Sequence[Sequence[str]]) -> str:

@@ -133,9 +133,7 @@ def _print_summary(console: Console, stats: MapBuildStats, out: Path) -> None:
 
     s = stats
     if s.scores is not None:
-        console.print(
-            make_kinds_table(s.scores.ap_rows, s.scores.kind_rows, f"{s.name}: the map against the truth in view")
-        )
+        console.print(make_kinds_table(s.scores, f"{s.name}: the map against the truth in view"))
     else:
         console.print(f"{s.name}: no true map is known by this name, so the map is not evaluated.", highlight=False)
     console.print(

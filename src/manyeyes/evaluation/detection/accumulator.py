@@ -22,7 +22,7 @@ from manyeyes.evaluation.detection.average_precision import (
     select_ego_truth,
 )
 from manyeyes.evaluation.detection.communication import Communication, MessageRecord, summarize_messages
-from manyeyes.evaluation.statistics.bootstrap import Interval, paired_difference, scenario_interval
+from manyeyes.evaluation.statistics.bootstrap import Interval, bootstrap
 
 IOU_THRESHOLDS = (0.5, 0.7)
 
@@ -41,7 +41,8 @@ class MethodResult:
 
     def paired_difference(self, other: MethodResult, iou: int, protocol: DetectionProtocol) -> Interval:
         """AP of this method minus that of another, paired over scenarios. iou: index into IOUS."""
-        return paired_difference(self.ap[iou].frames, other.ap[iou].frames, protocol=protocol)
+        samples = (bootstrap(result.ap[iou].frames, protocol=protocol) for result in (self, other))
+        return next(samples).paired_difference(next(samples))
 
 
 @dataclass
@@ -109,7 +110,7 @@ class MetricAccumulator:
         return MethodResult(
             self.method,
             tuple(compute_ap(m, self.protocol) for m in matches),
-            tuple(scenario_interval(m, protocol=self.protocol) for m in matches),
+            tuple(bootstrap(m, protocol=self.protocol).interval() for m in matches),
             self.summarize_communication(),
             self.mean_age_ms(),
             _mean_ms(self.share_s),

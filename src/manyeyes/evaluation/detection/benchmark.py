@@ -52,7 +52,7 @@ class BenchmarkConfig:
 
 def resolve_protocol(config: BenchmarkConfig) -> DetectionProtocol:
     """The named protocol; our own one judges over the range that the detector answers for."""
-    protocol, grid = get_protocol(config.protocol), load_detector(config.weights).config.detection_range
+    protocol, grid = get_protocol(config.protocol), load_detector(config.weights).detection_range
     if config.protocol != "global-sort":
         return protocol
     return protocol.with_range((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))

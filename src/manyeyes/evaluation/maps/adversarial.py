@@ -11,24 +11,19 @@ claims that scatter have their mode: ``num_displaced_without_attack`` counts tha
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
-from manyeyes._io import atomic_write
 from manyeyes.datatypes.map_element import KINDS
 from manyeyes.evaluation.maps.experiment import FleetTrial, run_trial
-from manyeyes.evaluation.maps.map_cells import MapStudyJob, map_result_path, restore_row, to_plain
 from manyeyes.evaluation.maps.metrics import select_lines
 from manyeyes.evaluation.maps.registry import MethodSettings, fuse_observations
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.registry import OURS
-from manyeyes.maps.store.executors import Executor, map_blocks
 from manyeyes.ops.nearest_line import find_nearest_line
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.simulate import MALICIOUS
@@ -60,71 +55,36 @@ class AdversarialResult:
     max_m: float
 
 
-@dataclass(frozen=True)
-class AdversarialJob:
-    """What one process does at a time. results_folder: where trials that are done are kept."""
-
-    trial: FleetTrial
-    settings: MethodSettings
-    results_folder: Path
-
-
-def make_adversarial_jobs(
-    places: Sequence[str],
-    seeds: Sequence[int],
-    settings: MethodSettings,
-    results_folder: Path,
-    offsets_m: Sequence[float] = OFFSETS_M,
-) -> list[AdversarialJob]:
-    """The trials: places, seeds, both manners, and every size of lie."""
-    jobs = []
-    for place in places:
-        for seed in seeds:
-            for attack in ("independent", "colluding"):
-                for offset in offsets_m:
-                    fleet_config = replace(
-                        CROWDS["local"],
-                        malicious_fraction=MALICIOUS_FRACTION,
-                        attack_mode=attack,
-                        malicious_offset_m=(offset, offset),
-                    )
-                    jobs.append(
-                        AdversarialJob(
-                            FleetTrial(place, NUM_OBSERVATIONS, seed, view_label=attack, fleet_config=fleet_config),
-                            settings,
-                            results_folder,
-                        )
-                    )
-    return jobs
+def make_attacks(
+    places: Sequence[str], seeds: Sequence[int], offsets_m: Sequence[float] = OFFSETS_M
+) -> list[FleetTrial]:
+    """Make the trials: places, seeds, both attack modes, and every offset."""
+    return [
+        FleetTrial(
+            place,
+            NUM_OBSERVATIONS,
+            seed,
+            view_label=attack,
+            fleet_config=replace(
+                CROWDS["local"],
+                malicious_fraction=MALICIOUS_FRACTION,
+                attack_mode=attack,
+                malicious_offset_m=(offset, offset),
+            ),
+        )
+        for place in places
+        for seed in seeds
+        for attack in ATTACKS
+        for offset in offsets_m
+    ]
 
 
-def run_adversarial_jobs(
-    jobs: Sequence[AdversarialJob], executor: Executor, progress: Callable[[int, int], None] | None = None
-) -> tuple[AdversarialResult, ...]:
-    """All trials, in order."""
-    with executor.open() as session:
-        return tuple(map_blocks(load_or_run_job, jobs, session, progress))
-
-
-def load_or_run_job(job: AdversarialJob) -> AdversarialResult:
-    """One trial, found where it was done before with the same code and settings, else done and kept."""
-    path = map_result_path(MapStudyJob(job.trial, (OURS,), job.settings, job.results_folder / "malicious"), OURS)
-    try:
-        return AdversarialResult(**restore_row(json.loads(path.read_text(encoding="utf-8"))))
-    except (OSError, ValueError, TypeError):
-        result = run_adversarial_job(job)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write(path, (json.dumps(to_plain(result), indent=1) + "\n").encode())
-    return result
-
-
-def run_adversarial_job(job: AdversarialJob) -> AdversarialResult:
+def run_attack(trial: FleetTrial, settings: MethodSettings) -> AdversarialResult:
     """Run one trial of an attack."""
-    trial, experiment = job.trial, run_trial(job.trial)
-    honest_map, num_displaced_without_attack = _fuse_without_attack(_without_attack(trial), job.settings)
-    displacement_m = measure_displacement(
-        honest_map, fuse_observations(OURS, experiment.observations, job.settings, experiment.place.frame)
-    )
+    experiment = run_trial(trial)
+    honest_map, num_displaced_without_attack = _fuse_without_attack(_without_attack(trial), settings)
+    fused = fuse_observations(OURS, experiment.observations, settings, experiment.place.frame)
+    displacement_m = measure_displacement(honest_map, fused)
     finite = displacement_m[np.isfinite(displacement_m)]
     return AdversarialResult(
         place=trial.place,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Average precision of many maps as one list, its interval over what they are maps of, and claims that compare two such lists.
+"""Average precision of many maps as one list, its interval over what they are maps of.
 
 A block is what is drawn with replacement: a scenario with all its tiles and seeds, or a square of a town. Matching is within each
 map; the ranking is one over all of them, by the rule of ``metrics``. A true positive belongs to the block of the truth it hit, so
@@ -29,10 +29,7 @@ from manyeyes.evaluation.maps.metrics import PAPER_KINDS, THRESHOLDS, Thresholds
 from manyeyes.evaluation.maps.tiles import MAP_SPACING_M
 from manyeyes.evaluation.statistics.bootstrap import (
     BootstrapSamples,
-    Interval,
-    MarginVerdict,
     PooledMatches,
-    compare_to_margin,
     draw_resamples,
     weighted_ap,
 )
@@ -153,23 +150,6 @@ def average_samples(bootstraps: Sequence[BootstrapSamples]) -> BootstrapSamples:
     return BootstrapSamples(
         names, np.zeros(len(names), np.int64), value, samples, bootstraps[0].confidence_level, False
     )
-
-
-@dataclass(frozen=True)
-class MapMarginTest:
-    """A paired difference of mAP and its margin; the verdict compares the whole interval with the margin."""
-
-    description: str
-    difference: Interval
-    margin: float
-    verdict: MarginVerdict
-
-
-def check_map_margin(description: str, difference: Interval, margin: float) -> MapMarginTest:
-    """The claim that a difference is at least the bar; of a single block nothing is resolved."""
-    has_several_blocks = difference.num_scenarios > 1
-    verdict = compare_to_margin(margin, difference.low, difference.high) if has_several_blocks else "inconclusive"
-    return MapMarginTest(description, difference, margin, verdict)
 
 
 def _rank_pooled(lines_of_maps: Sequence[Lines]) -> NDArray[np.int64]:

@@ -10,7 +10,6 @@ covers the choice of the mapped ground, not that of the observations: for that, 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.evaluation.maps.metrics import MAX_LATERAL_M, Thresholds, select_lines, split_into_pieces
 from manyeyes.evaluation.maps.pooled_ap import MapPair, assign_to_squares, bootstrap_pooled_ap
-from manyeyes.evaluation.statistics.bootstrap import Interval, draw_resamples
+from manyeyes.evaluation.statistics.bootstrap import Interval, draw_resamples, make_interval
 from manyeyes.ops.nearest_line import find_nearest_line
 
 Floats = NDArray[np.float64]
@@ -92,7 +91,7 @@ def bootstrap_f1_interval(
             np.where(truth_m > 0, recalled_m / truth_m, np.nan),
         )
         f1 = np.where(precision + recall > 0, 2 * precision * recall / (precision + recall), recall * 0.0)
-    return _make_interval(f1, confidence_level, num_blocks)
+    return make_interval(float(f1[0]), f1[1:], confidence_level, num_blocks)
 
 
 def _assign_blocks(points: Floats) -> tuple[int, Ints]:
@@ -100,12 +99,3 @@ def _assign_blocks(points: Floats) -> tuple[int, Ints]:
     cells = np.floor(points / BLOCK_SIZE_M).astype(np.int64)
     blocks, block = np.unique(cells, axis=0, return_inverse=True)
     return len(blocks), block.reshape(-1)
-
-
-def _make_interval(values: Floats, confidence_level: float, num_blocks: int) -> Interval:
-    """The first value, and quantiles of the others that are numbers."""
-    draws = values[1:][~np.isnan(values[1:])]
-    if not len(draws) or math.isnan(values[0]):
-        return Interval(float(values[0]), math.nan, math.nan, confidence_level, num_blocks)
-    low, high = np.quantile(draws, [(1 - confidence_level) / 2, (1 + confidence_level) / 2])
-    return Interval(float(values[0]), float(low), float(high), confidence_level, num_blocks)

@@ -14,16 +14,15 @@ import numpy as np
 
 from manyeyes.evaluation.maps.metrics import PAPER_KINDS
 from manyeyes.evaluation.maps.pooled_ap import (
-    MapMarginTest,
     MapPair,
     assign_to_scenario,
     average_samples,
     bootstrap_pooled_ap,
-    check_map_margin,
     collect_blocks,
 )
-from manyeyes.evaluation.maps.tile_cells import TilePrediction, TileStudyResult
+from manyeyes.evaluation.maps.tile_prediction import ScenarioPredictions, TilePrediction
 from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval
+from manyeyes.evaluation.statistics.comparison import Comparison
 
 TABLE_KINDS = ("crossing", "divider", "boundary")
 TABLE_PROTOCOLS = ("maptr", "exact")
@@ -49,7 +48,7 @@ class TileRow:
 class TileTable:
     """The cells of a study by row; each number is made once and kept, since differences ask for it again."""
 
-    def __init__(self, results: Sequence[TileStudyResult]) -> None:
+    def __init__(self, results: Sequence[ScenarioPredictions]) -> None:
         self.results = tuple(results)
         self.names = tuple(dict.fromkeys(one.row_name for result in results for one in result.predictions))
         self.blocks = collect_blocks([self._map_pairs(name) for name in self.names])
@@ -84,15 +83,10 @@ class TileTable:
         """mAP of a row, over draws of scenarios."""
         return average_samples([self.bootstrap_ap(name, kind, protocol) for kind in PAPER_KINDS])
 
-    def check_margin(
-        self, description: str, name: str, baseline: str, margin: float, protocol: str = TABLE_PROTOCOLS[0]
-    ) -> MapMarginTest:
-        """mAP of one row less that of another is at least the bar."""
-        return check_map_margin(
-            description,
-            self.bootstrap_mean_ap(name, protocol).paired_difference(self.bootstrap_mean_ap(baseline, protocol)),
-            margin,
-        )
+    def compare(self, description: str, name: str, baseline: str) -> Comparison:
+        """Compare mAP of one row with that of another."""
+        gain = self.bootstrap_mean_ap(name).paired_difference(self.bootstrap_mean_ap(baseline))
+        return Comparison(description, "mAP", gain)
 
     def _mean_ap_of_seed(self, name: str, seed: int) -> float:
         pairs = self._map_pairs(name, seed)

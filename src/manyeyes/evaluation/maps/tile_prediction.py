@@ -20,7 +20,6 @@ from manyeyes.agents.strategies.late import LateFusion
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import AgentFrame, Message, Transform
 from manyeyes.datatypes.map_element import MapElements
-from manyeyes.evaluation.maps.tile_cells import TilePrediction
 from manyeyes.evaluation.maps.tile_sampling import (
     TileSource,
     make_local_tile,
@@ -37,6 +36,27 @@ from manyeyes.models.maps.map_model import MapModel
 VEHICLE, ROADSIDE = "vehicle", "roadside unit"
 CLEAN, NOISY, CORRECTED, CLEAN_CORRECTED = "clean", "noisy", "noisy, corrected", "clean, corrected"
 SINGLE_VEHICLE = "one vehicle"
+
+
+@dataclass(frozen=True, eq=False)
+class TilePrediction:
+    """The prediction of one tile for one row of a table. predicted, truth: in the tile's frame; frame_bytes: bytes of each frame
+    that the tile was predicted from.
+    """
+
+    row_name: str
+    predicted: MapElements
+    truth: MapElements
+    frame_bytes: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioPredictions:
+    """The predicted tiles of one scenario at one seed."""
+
+    scenario: str
+    seed: int
+    predictions: tuple[TilePrediction, ...]
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Confidence intervals by percentile bootstrap over *scenarios*, and the verdict on a margin.
+"""Confidence intervals by percentile bootstrap over *scenarios*.
 
 Frames of one scenario are strongly correlated, so whole scenarios are drawn with replacement, never frames. A scenario
 drawn k times stands k times in the list of detections and in the count of truth; since its copies have equal scores,
@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -31,7 +30,6 @@ from manyeyes.evaluation.detection.average_precision import (
 )
 from manyeyes.ops.keyed_random import keyed_uniform
 
-MarginVerdict = Literal["met", "not met", "inconclusive"]
 _CHUNK_ROWS = 4_000_000
 
 
@@ -103,7 +101,7 @@ class BootstrapSamples:
 
     def interval(self) -> Interval:
         """The value and its interval."""
-        return _make_interval(self.value, self.samples, self.confidence_level, len(self.names))
+        return make_interval(self.value, self.samples, self.confidence_level, len(self.names))
 
     def paired_difference(self, other: BootstrapSamples) -> Interval:
         """This statistic minus the other on the same resamples, of the same scenarios with equal truth."""
@@ -115,7 +113,7 @@ class BootstrapSamples:
         if self.same_truth and not np.array_equal(self.n_gt, other.n_gt):
             unpaired = self.names[int(np.argmax(self.n_gt != other.n_gt))]
             raise ConfigError(f"A paired difference needs the same truth on both sides; scenario {unpaired} differs.")
-        return _make_interval(
+        return make_interval(
             self.value - other.value, self.samples - other.samples, self.confidence_level, len(self.names)
         )
 
@@ -135,34 +133,6 @@ def bootstrap(
     return BootstrapSamples(pool.names, pool.n_gt, value, samples, confidence_level, protocol.count_frames_without_det)
 
 
-def scenario_interval(
-    matches: Sequence[FrameMatch],
-    num_resamples: int = 1000,
-    seed: int = 0,
-    confidence_level: float = 0.95,
-    protocol: DetectionProtocol = PROTOCOLS["global-sort"],
-    statistic: Statistic = weighted_ap,
-) -> Interval:
-    """The AP (or another statistic) of matched frames and its interval over scenarios."""
-    return bootstrap(matches, num_resamples, seed, confidence_level, protocol, statistic).interval()
-
-
-def paired_difference(
-    a: Sequence[FrameMatch],
-    b: Sequence[FrameMatch],
-    num_resamples: int = 1000,
-    seed: int = 0,
-    confidence_level: float = 0.95,
-    protocol: DetectionProtocol = PROTOCOLS["global-sort"],
-    statistic: Statistic = weighted_ap,
-) -> Interval:
-    """Statistic of a minus that of b, both on the same resampled scenarios, which must be the same with equal truth."""
-    ours, theirs = (
-        bootstrap(matches, num_resamples, seed, confidence_level, protocol, statistic) for matches in (a, b)
-    )
-    return ours.paired_difference(theirs)
-
-
 def mean_interval(
     values: Sequence[float], num_resamples: int = 1000, seed: int = 0, confidence_level: float = 0.95
 ) -> Interval:
@@ -171,14 +141,7 @@ def mean_interval(
     if np.isnan(numbers).any():
         raise ConfigError(f"mean_interval needs a number per scenario; {int(np.isnan(numbers).sum())} are NaN.")
     samples = draw_resamples(len(numbers), num_resamples, seed) @ numbers / max(1, len(numbers))
-    return _make_interval(float(numbers.mean()) if len(numbers) else math.nan, samples, confidence_level, len(numbers))
-
-
-def compare_to_margin(margin: float, low: float, high: float) -> MarginVerdict:
-    """Compare an interval with a margin: met when all of it is at or above, not met when all is below, else inconclusive."""
-    if low >= margin:
-        return "met"
-    return "not met" if high < margin else "inconclusive"
+    return make_interval(float(numbers.mean()) if len(numbers) else math.nan, samples, confidence_level, len(numbers))
 
 
 def draw_resamples(num_scenarios: int, num_resamples: int, seed: int) -> np.ndarray:
@@ -208,7 +171,13 @@ def _pool_matches(matches: Sequence[FrameMatch], protocol: DetectionProtocol) ->
     return PooledMatches(names, tp[order], scenario[order], n_gt, protocol.drop_first_segment)
 
 
-def _make_interval(value: float, samples: np.ndarray, confidence_level: float, num_scenarios: int) -> Interval:
+def exact_interval(value: float) -> Interval:
+    """A number without an interval, as of a single scenario."""
+    return Interval(value, value, value, 0.95, 1)
+
+
+def make_interval(value: float, samples: np.ndarray, confidence_level: float, num_scenarios: int) -> Interval:
+    """The percentile interval of samples (R,) about a value; NaN samples are left out, NaN bounds without any sample."""
     if not 0 < confidence_level < 1:
         raise ConfigError(f"The level of an interval lies between 0 and 1; got {confidence_level}.")
     samples = samples[~np.isnan(samples)]

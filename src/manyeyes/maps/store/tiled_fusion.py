@@ -20,6 +20,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._records import load_record, save_record
 from manyeyes._source import source_digest
 from manyeyes.datatypes import ConfigError
 from manyeyes.maps.elements.observation import MapFrame
@@ -28,7 +29,6 @@ from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_map
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
 from manyeyes.maps.fusion.pose_optimization import PoseSolution, merge_solutions, run_step, search_coarse_poses
 from manyeyes.maps.fusion.stations import Area, StationTable, build_stations
-from manyeyes.maps.store.columns_file import load_columns, save_columns
 from manyeyes.maps.store.executors import Executor, ExecutorSession, ProcessExecutor, map_blocks
 from manyeyes.maps.store.log_index import ActiveObservations
 from manyeyes.maps.store.observation_log import TILE_M, StoreError, read_active, tile_indices
@@ -109,7 +109,7 @@ class _BlockStep:
                 value = getattr(self.solution, f.name)
                 if isinstance(value, np.ndarray):
                     digest.update((value + 0.0).tobytes())
-        return self.block.work_folder / f"{digest.hexdigest()}.npz"
+        return self.block.work_folder / f"{digest.hexdigest()}.record"
 
 
 def fuse_tiles(
@@ -129,7 +129,7 @@ def fuse_tiles(
     with (executor or ProcessExecutor()).open() as runner:
         tables = _run_steps(blocks, config, runner, progress, used)
     # Unused results belong to previous maps; observation arrays are large and cheap to recompute.
-    for path in sorted(work_folder.glob("*.npz")):
+    for path in sorted(work_folder.glob("*.record")):
         if path.name not in used:
             path.unlink()
     return assemble_map(StationTable.cat(tables), config, frame) if tables else VectorMap.empty(frame)
@@ -204,11 +204,11 @@ def _select_block(state: PoseSolution, block: TileBlock) -> PoseSolution:
 
 def _load_result(step: _BlockStep, fn: Callable[[_BlockStep], None], kind: type[T]) -> T:
     """Load the result of a step from the work folder; compute it here if the file is missing or damaged."""
-    found = load_columns(step.path, kind)
+    found = load_record(step.path, kind)
     if found is None:
         step.path.unlink(missing_ok=True)
         fn(step)
-        found = load_columns(step.path, kind)
+        found = load_record(step.path, kind)
     if found is None:
         raise StoreError(f"{step.path}: expected a step's result, but it cannot be written or read; check the disk.")
     return found
@@ -225,7 +225,7 @@ def _run_pose_step(step: _BlockStep) -> None:
         found = search_coarse_poses(arrays, home, step.block.config.pose_solver)
     else:
         found = run_step(arrays, step.solution, step.number, home, step.block.config.pose_solver)
-    save_columns(step.path, found)
+    save_record(step.path, found)
 
 
 def _run_station_step(step: _BlockStep) -> None:
@@ -233,19 +233,19 @@ def _run_station_step(step: _BlockStep) -> None:
     if step.solution is None or step.path.exists():
         return
     table = build_stations(_load_arrays(step.block), step.solution, step.block.area, step.block.config.stations)
-    save_columns(step.path, table)
+    save_record(step.path, table)
 
 
 def _load_arrays(block: TileBlock) -> ObservationArrays:
     """Load the block's observations as arrays from the work folder, or make and store them."""
-    path = block.work_folder / f"{block.key}.arrays.npz"
-    found = load_columns(path, ObservationArrays)
+    path = block.work_folder / f"{block.key}.arrays.record"
+    found = load_record(path, ObservationArrays)
     if found is None:
         rows = np.arange(len(block.observations))
         found = to_observation_arrays(
             read_active(block.log_folder, block.observations, rows), block.config.pose_solver.spacing_m
         )
-        save_columns(path, found)
+        save_record(path, found)
     return found
 
 

@@ -11,22 +11,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.study import Condition, ResultGrid
 from manyeyes.models import checkpoint
 from manyeyes.studies.detection.perturbations import CLEAN, Perturbation
-from manyeyes.studies.running import OURS, PAPER_NOTE, prepare_study, run_study, with_replay, write_study_report
+from manyeyes.studies.engine.conditions import Condition, ResultGrid
+from manyeyes.studies.engine.replay_study import OURS, PAPER_NOTE, parse_checkpoints, prepare_study, with_replay
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.options import AblationOptions
 from manyeyes.viz.curves import Curve, CurvePanel
 from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_log2, format_number
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
-    from manyeyes.studies.options import Options
+from manyeyes.viz.table import LOG2_BYTES
 
 LEARNED_MASK = "intermediate-mi"
 PERTURBATIONS = (CLEAN, Perturbation(delay_s=0.2), Perturbation(position_sigma_m=0.4))
@@ -73,48 +71,28 @@ class _AblationVariant:
 
 def _parse_variant(name: str, weights: str, max_bytes: str) -> _AblationVariant:
     if max_bytes and not (max_bytes.isdigit() and int(max_bytes)):
-        raise ConfigError(f"Branch {name!r}: behind @ stands a number of bytes, one or more; got {max_bytes!r}.")
+        raise ConfigError(f"Variant {name!r}: behind @ stands a number of bytes, one or more; got {max_bytes!r}.")
     return _AblationVariant(name, Path(weights), int(max_bytes) if max_bytes else None)
 
 
-def run(options: Options, console: Console) -> None:
+def run(options: AblationOptions, context: StudyContext) -> None:
     """Run the ablation study and write its report."""
     variants = [
         _parse_variant(name, *words.partition("@")[::2])
-        for name, words in parse_checkpoints(options.checkpoints, files="weights.safetensors[@BYTES]").items()
+        for name, words in parse_checkpoints(options.checkpoints, "ablation", "weights.safetensors[@BYTES]").items()
     ]
-    context = prepare_study(options, console)
+    study = prepare_study(options, context)
     conditions = [
-        Condition(_condition_name(variant.name, perturbation), perturbation.apply_to(variant.apply_to(context.base)))
+        Condition(_condition_name(variant.name, perturbation), perturbation.apply_to(variant.apply_to(study.base)))
         for variant in variants
         for perturbation in PERTURBATIONS
     ]
     cards = [checkpoint.read_card(variant.weights) for variant in variants]
-    result_rows = make_rows(run_study(context, conditions), variants, cards)
+    result_rows = make_rows(study.run(conditions), variants, cards)
     tables = [_make_results_table(result_rows), _make_cards_table(result_rows), _make_paper_table()]
     payload: dict[str, object] = {"rows": result_rows, "paper": {"note": PAPER_NOTE, "rows": PAPER_ROWS}}
-    write_study_report(
-        context,
-        payload,
-        tables,
-        make_panels(result_rows),
-        conditions,
-        (PAPER_NOTE.replace('column "paper"', "last table"),),
-    )
-
-
-def parse_checkpoints(
-    words: Sequence[str], study: str = "ablation", files: str = "weights.safetensors"
-) -> dict[str, str]:
-    """Names and files of ``name=weights.safetensors``, or whatever files the study takes."""
-    pairs = [word.partition("=") for word in words]
-    invalid = [word for word, (name, _, path) in zip(words, pairs) if not name or not path]
-    names = [name for name, _, _ in pairs]
-    if invalid or not words or len(set(names)) < len(names):
-        raise ConfigError(
-            f"The study '{study}' takes --checkpoints name={files} ..., each name once; got {' '.join(words) or 'none'}."
-        )
-    return {name: path for name, _, path in pairs}
+    notes = (PAPER_NOTE.replace('column "paper"', "last table"),)
+    study.write_report(payload, tables, make_panels(result_rows), conditions, notes)
 
 
 def _condition_name(variant: str, perturbation: Perturbation) -> str:
@@ -131,7 +109,7 @@ def make_rows(
         out.append(
             AblationRow(
                 variant.name,
-                tuple((results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)) for key in keys),
+                tuple(map(results.ap_pair, keys)),
                 tuple(results.paired_difference(key, other, 0) for key, other in zip(keys, previous)),
                 results.results[keys[0]].bytes_per_message,
                 card,
@@ -144,8 +122,8 @@ def make_rows(
 def _make_results_table(result_rows: Sequence[AblationRow]) -> StudyTable:
     names = [perturbation.name for perturbation in PERTURBATIONS]
     headings = (
-        "branch", *(f"AP@0.5 {n}" for n in names), *(f"AP@0.7 {n}" for n in names),
-        *(f"over the one before {n}" for n in names), "bytes/message", "AB log2",
+        "variant", *(f"AP@0.5 {n}" for n in names), *(f"AP@0.7 {n}" for n in names),
+        *(f"gain over the previous {n}" for n in names), "bytes/message", LOG2_BYTES,
     )  # fmt: skip
     lines = tuple(
         (
@@ -158,19 +136,19 @@ def _make_results_table(result_rows: Sequence[AblationRow]) -> StudyTable:
         )
         for row in result_rows
     )
-    return StudyTable("Branches", headings, lines)
+    return StudyTable("Variants", headings, lines)
 
 
 def _make_cards_table(result_rows: Sequence[AblationRow]) -> StudyTable:
     lines = tuple(
         (row.variant, *(str(row.card.get(key, "")) for key in ("steps", "seed", "command"))) for row in result_rows
     )
-    return StudyTable("How they were trained", ("branch", "steps", "seed", "command"), lines)
+    return StudyTable("How they were trained", ("variant", "steps", "seed", "command"), lines)
 
 
 def _make_paper_table() -> StudyTable:
     lines = tuple((name, *(f"{v:.3f}" for v in ap), f"{ab:.2f}") for name, *ap, ab in PAPER_ROWS)
-    headings = ("parts", *(perturbation.name for perturbation in PERTURBATIONS), "AB log2")
+    headings = ("parts", *(perturbation.name for perturbation in PERTURBATIONS), LOG2_BYTES)
     return StudyTable("The paper's own table, AP@0.5: another data set, unknown protocol", headings, lines)
 
 

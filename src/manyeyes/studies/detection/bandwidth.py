@@ -9,31 +9,32 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from manyeyes.comms.payloads import TOKEN_ENCODINGS
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.benchmark import load_detector
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.statistics.significance import MarginTest, check_margin
-from manyeyes.evaluation.study import Condition, ResultGrid
-from manyeyes.studies.running import (
+from manyeyes.evaluation.statistics.comparison import Comparison
+from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
+from manyeyes.studies.engine.replay_study import (
     NO_FUSION,
     OURS,
-    make_margin_table,
     prepare_study,
     resolve_token_selection,
-    run_study,
     with_replay,
-    write_study_report,
 )
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.options import BandwidthOptions
 from manyeyes.viz.curves import Curve, CurvePanel
-from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_log2, format_number
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from manyeyes.studies.options import Options
+from manyeyes.viz.study_table import (
+    StudyTable,
+    format_difference,
+    format_interval,
+    format_log2,
+    format_number,
+    make_comparison_table,
+)
+from manyeyes.viz.table import LOG2_BYTES
 
 BUDGETS = (1398, 2796, 4096, 8192, 16384, 32768, 65536, 131072)
 UNLIMITED, REFERENCE_ENCODING, CODEBOOK = "references", "float32", "codebook"
@@ -58,45 +59,36 @@ class BandwidthRow:
     compression_ratio: float | None
 
 
-def run(options: Options, console: Console) -> None:
+def run(options: BandwidthOptions, context: StudyContext) -> None:
     """Run the bandwidth study and write its report."""
-    context, methods = prepare_study(options, console), resolve_token_selection(options)
+    study, methods = prepare_study(options, context), resolve_token_selection(options.token_selection)
     encodings = _resolve_encodings(options)
     budgets = (*sorted(options.budgets or BUDGETS), None)
-    others = tuple(m for m in context.base.methods if m not in methods)
-    conditions = [
-        Condition(
-            _condition_name(b, p), with_replay(replace(context.base, methods=methods), token_encoding=p, budget_bytes=b)
-        )
-        for p in encodings
-        for b in budgets
-    ]
+    others = tuple(m for m in study.base.methods if m not in methods)
+    base = replace(study.base, methods=methods)
+    cases = [(b, p) for p in encodings for b in budgets]
     if REFERENCE_ENCODING not in encodings:
-        config = with_replay(
-            replace(context.base, methods=methods), token_encoding=REFERENCE_ENCODING, budget_bytes=None
-        )
-        conditions.append(Condition(_condition_name(None, REFERENCE_ENCODING), config))
+        cases.append((None, REFERENCE_ENCODING))
+    conditions = [
+        Condition(_condition_name(b, p), with_replay(base, token_encoding=p, budget_bytes=b)) for b, p in cases
+    ]
     if others:
-        conditions.append(Condition(UNLIMITED, replace(context.base, methods=others)))
-    results = run_study(context, conditions)
+        conditions.append(Condition(UNLIMITED, replace(study.base, methods=others)))
+    results = study.run(conditions)
     result_rows = make_rows(results, encodings, budgets, methods)
-    reference_rows = tuple(
-        BandwidthRow(None, "", m, (results.bootstrap_ap((UNLIMITED, m), 0), results.bootstrap_ap((UNLIMITED, m), 1)), None,
-            results.results[UNLIMITED, m].bytes_per_message, results.results[UNLIMITED, m].volume.max_message_bytes, None)
-        for m in others
-    )  # fmt: skip
-    margin_tests = check_margins(results, result_rows, encodings, budgets, methods)
+    reference_rows = tuple(_make_row(results, (UNLIMITED, m), None, "", None) for m in others)
+    comparisons = make_comparisons(results, result_rows, encodings, budgets, methods)
     tables = [
         _make_results_table(f"Tokens as {p}", [row for row in result_rows if row.token_encoding == p])
         for p in encodings
     ]
-    tables += [_make_results_table("Beside", reference_rows)] if reference_rows else []
-    tables += [make_margin_table(margin_tests)] if margin_tests else []
-    payload: dict[str, object] = {"rows": result_rows, "reference_rows": reference_rows, "margin_tests": margin_tests}
-    write_study_report(context, payload, tables, make_panels(result_rows, reference_rows), conditions)
+    tables += [_make_results_table("Other methods", reference_rows)] if reference_rows else []
+    tables += [make_comparison_table(comparisons)] if comparisons else []
+    payload: dict[str, object] = {"rows": result_rows, "reference_rows": reference_rows, "comparisons": comparisons}
+    study.write_report(payload, tables, make_panels(result_rows, reference_rows), conditions)
 
 
-def _resolve_encodings(options: Options) -> tuple[str, ...]:
+def _resolve_encodings(options: BandwidthOptions) -> tuple[str, ...]:
     """Those asked for, or all that the weights can write: codes need a codebook."""
     for name in options.token_encodings:
         if name not in TOKEN_ENCODINGS:
@@ -112,94 +104,64 @@ def _condition_name(budget: int | None, encoding: str) -> str:
 def make_rows(
     results: ResultGrid, encodings: Sequence[str], budgets: Sequence[int | None], methods: Sequence[str]
 ) -> tuple[BandwidthRow, ...]:
-    """The table: precisions, budgets, selectors."""
-    out = []
-    for encoding in encodings:
-        for budget in budgets:
-            for method in methods:
-                key, reference_key = (
-                    (_condition_name(budget, encoding), method),
-                    (_condition_name(None, REFERENCE_ENCODING), method),
-                )
-                result, reference = results.results[key], results.results[reference_key]
-                bytes_per_message = result.bytes_per_message
-                out.append(
-                    BandwidthRow(
-                        budget,
-                        encoding,
-                        method,
-                        (results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)),
-                        (
-                            results.paired_difference(reference_key, key, 0),
-                            results.paired_difference(reference_key, key, 1),
-                        ),
-                        bytes_per_message,
-                        result.volume.max_message_bytes,
-                        reference.bytes_per_message / bytes_per_message if bytes_per_message else None,
-                    )
-                )
-    return tuple(out)
+    """Make the table: encodings, budgets, methods of token selection."""
+    return tuple(
+        _make_row(results, (_condition_name(b, p), m), b, p, (_condition_name(None, REFERENCE_ENCODING), m))
+        for p in encodings
+        for b in budgets
+        for m in methods
+    )
 
 
-def check_margins(
+def _make_row(
+    results: ResultGrid, key: ResultKey, budget: int | None, encoding: str, reference: ResultKey | None
+) -> BandwidthRow:
+    result = results.results[key]
+    size = result.bytes_per_message
+    drop = None if reference is None else results.difference_pair(reference, key)
+    ratio = results.results[reference].bytes_per_message / size if reference is not None and size else None
+    max_bytes = result.volume.max_message_bytes
+    return BandwidthRow(budget, encoding, key[1], results.ap_pair(key), drop, size, max_bytes, ratio)
+
+
+def make_comparisons(
     results: ResultGrid,
     result_rows: Sequence[BandwidthRow],
     encodings: Sequence[str],
     budgets: Sequence[int | None],
     methods: Sequence[str],
-) -> tuple[MarginTest, ...]:
-    """Test our token selection: a small AP drop at few bytes, and not below a baseline at equal budgets."""
+) -> tuple[Comparison, ...]:
+    """Compare our token selection: with all tokens at float32, and with the baselines at equal budgets."""
     if OURS not in methods:
         return ()
-    out: list[MarginTest] = []
-    reference_key = (_condition_name(None, REFERENCE_ENCODING), OURS)
+    reference = (_condition_name(None, REFERENCE_ENCODING), OURS)
     compressed = [
         r
         for r in result_rows
-        if r.method == OURS
-        and r.token_encoding == REFERENCE_ENCODING
-        and r.compression_ratio
-        and r.compression_ratio >= MIN_COMPRESSION_RATIO
+        if (r.method, r.token_encoding) == (OURS, REFERENCE_ENCODING)
+        and (r.compression_ratio or 0.0) >= MIN_COMPRESSION_RATIO
     ]
+    cases = []
     if compressed:
-        largest_row = max(compressed, key=lambda row: row.bytes_per_message)
-        description = f"{largest_row.compression_ratio:.1f} times fewer bytes - all, {REFERENCE_ENCODING}"
-        out.append(
-            check_margin(
-                description,
-                results,
-                (_condition_name(largest_row.budget_bytes, REFERENCE_ENCODING), OURS),
-                reference_key,
-                0,
-                -0.005,
-            )
-        )
-    compact_encodings = [p for p in encodings if p not in ("float32", "float16")]
+        row = max(compressed, key=lambda row: row.bytes_per_message)
+        cases.append((row.budget_bytes, REFERENCE_ENCODING, f"{row.compression_ratio:.1f} times fewer bytes"))
     if THREE_PACKETS_BYTES in budgets:
-        for p in compact_encodings:
-            out.append(
-                check_margin(
-                    f"{THREE_PACKETS_BYTES} B as {p} - all, {REFERENCE_ENCODING}",
-                    results,
-                    (_condition_name(THREE_PACKETS_BYTES, p), OURS),
-                    reference_key,
-                    0,
-                    -0.01,
-                )
-            )
-    for encoding in encodings:
-        for budget in (b for b in budgets if b is not None):
-            for baseline in (s for s in methods if s != OURS):
-                name = _condition_name(budget, encoding)
-                out.append(
-                    check_margin(f"{OURS} - {baseline}, {name}", results, (name, OURS), (name, baseline), 0, 0.0)
-                )
+        compact = [p for p in encodings if p not in ("float32", "float16")]
+        cases += [(THREE_PACKETS_BYTES, p, f"{THREE_PACKETS_BYTES} B as {p}") for p in compact]
+    out = [
+        results.compare(f"{what} - all, {REFERENCE_ENCODING}", (_condition_name(b, p), OURS), reference)
+        for b, p, what in cases
+    ]
+    for name in (_condition_name(b, p) for p in encodings for b in budgets if b is not None):
+        for baseline in (m for m in methods if m != OURS):
+            out.append(results.compare(f"{OURS} - {baseline}, {name}", (name, OURS), (name, baseline)))
     return tuple(out)
 
 
 def _make_results_table(title: str, result_rows: Sequence[BandwidthRow]) -> StudyTable:
     headings = (
-        "budget B", "selector", "AP@0.5", "AP@0.7", "lost @0.5", "lost @0.7", "bytes/message", "AB log2", "largest B", "fewer",
+        "budget [bytes]", "token selection", "AP@0.5", "AP@0.7", "AP@0.5 drop", "AP@0.7 drop", "bytes/message", LOG2_BYTES,
+        "max bytes", "compression",
     )  # fmt: skip
     lines = tuple(
         (
@@ -218,7 +180,7 @@ def _make_results_table(title: str, result_rows: Sequence[BandwidthRow]) -> Stud
 
 
 def make_panels(result_rows: Sequence[BandwidthRow], reference_rows: Sequence[BandwidthRow]) -> list[CurvePanel]:
-    """AP@0.5 against the mean bytes of a message, a panel a precision."""
+    """AP@0.5 against the mean bytes of a message, one panel for each encoding."""
     out = []
     for encoding in dict.fromkeys(row.token_encoding for row in result_rows):
         curves = []
@@ -233,5 +195,7 @@ def make_panels(result_rows: Sequence[BandwidthRow], reference_rows: Sequence[Ba
         for row in reference_rows:
             message_bytes = (row.bytes_per_message,) if row.bytes_per_message and row.method != NO_FUSION else ()
             curves.append(Curve(row.method, (row.ap[0],), message_bytes))
-        out.append(CurvePanel(f"Tokens as {encoding}", "bytes a message, mean", "AP@0.5", tuple(curves), in_bytes=True))
+        out.append(
+            CurvePanel(f"Tokens as {encoding}", "bytes per message, mean", "AP@0.5", tuple(curves), in_bytes=True)
+        )
     return out

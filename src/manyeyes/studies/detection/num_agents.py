@@ -9,20 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.average_precision import get_protocol
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.study import Condition, ResultGrid, ResultKey
-from manyeyes.studies.running import NO_FUSION, prepare_study, run_study, write_study_report
+from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
+from manyeyes.studies.engine.replay_study import NO_FUSION, prepare_study
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.options import EvaluationOptions
 from manyeyes.viz.curves import Curve, CurvePanel
 from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_number
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from manyeyes.studies.options import Options
 
 MAX_AGENTS = 5
 
@@ -41,24 +37,23 @@ class NumAgentsRow:
     mean_snapshot_bytes: float
 
 
-def run(options: Options, console: Console) -> None:
+def run(options: EvaluationOptions, context: StudyContext) -> None:
     """Run the study of numbers of agents and write its report."""
     if get_protocol(options.protocol).min_points_in_gt:
-        raise ConfigError(f"The study 'agents' cannot count points in true boxes, as protocol {options.protocol} does.")
-    context = prepare_study(options, console)
-    recording, methods = context.opener(), context.base.methods
+        raise ConfigError(
+            f"The study 'num-agents' cannot count points in true boxes, as protocol {options.protocol} does."
+        )
+    study = prepare_study(options, context)
+    recording, methods = study.opener(), study.base.methods
     max_agents = min(MAX_AGENTS, max(len(recording.agents(name)) for name in recording.scenarios))
     collaborative = tuple(m for m in methods if m != NO_FUSION)
     conditions = [
-        Condition(str(n), replace(context.base, num_agents=n, methods=methods if n == 1 else collaborative))
+        Condition(str(n), replace(study.base, num_agents=n, methods=methods if n == 1 else collaborative))
         for n in range(1, max_agents + 1)
         if n == 1 or collaborative
     ]
-    results = run_study(context, conditions)
-    result_rows = make_rows(results)
-    write_study_report(
-        context, {"rows": result_rows}, [_make_results_table(result_rows)], make_panels(result_rows), conditions
-    )
+    result_rows = make_rows(study.run(conditions))
+    study.write_report({"rows": result_rows}, [_make_results_table(result_rows)], make_panels(result_rows), conditions)
 
 
 def make_rows(results: ResultGrid) -> tuple[NumAgentsRow, ...]:
@@ -79,7 +74,7 @@ def _make_row(results: ResultGrid, num_agents: int, method: str) -> NumAgentsRow
         num_agents,
         method,
         len(scenarios),
-        (results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)),
+        results.ap_pair(key),
         gain_over(fewer_key),
         gain_over(no_fusion_key),
         result.bytes_per_message,
@@ -89,8 +84,8 @@ def _make_row(results: ResultGrid, num_agents: int, method: str) -> NumAgentsRow
 
 def _make_results_table(result_rows: Sequence[NumAgentsRow]) -> StudyTable:
     headings = (
-        "agents", "method", "scenarios", "AP@0.5", "AP@0.7", "over one fewer @0.5", "over no fusion @0.5", "bytes/message",
-        "bytes/instant",
+        "agents", "method", "scenarios", "AP@0.5", "AP@0.7", "gain over one fewer @0.5", "gain over no fusion @0.5",
+        "bytes/message", "bytes/snapshot",
     )  # fmt: skip
     lines = tuple(
         (

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
-from manyeyes.studies.running import with_replay
+from manyeyes.studies.engine.replay_study import with_replay
 
 MAX_DELAY_FRAMES = 4
 """Frames between the capture of a message and its use at the greatest delay, 0.4 s at 10 Hz."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 from manyeyes.agents.replay import ReplayStep, replay
@@ -15,20 +16,18 @@ from manyeyes.datatypes import BevGrid
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import DetectionProtocol
 from manyeyes.evaluation.detection.benchmark import resolve_protocol
-from manyeyes.evaluation.study import Condition
 from manyeyes.models import pretrained
 from manyeyes.studies.detection.perturbations import COMBINED
+from manyeyes.studies.engine.replay_study import prepare_study
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.options import EvaluationOptions
 from manyeyes.studies.replay_options import make_excerpt
-from manyeyes.studies.running import prepare_study, write_study_report
 from manyeyes.viz.birds_eye import draw_scene, make_scene, save_png
 from manyeyes.viz.canvas import import_pillow
 from manyeyes.viz.study_table import StudyTable, format_number
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-    from rich.console import Console
-
-    from manyeyes.studies.options import Options
 
 WIDTH, COLUMNS, MIN_SCORE = 960, 2, 0.4
 
@@ -44,10 +43,10 @@ class QualitativeRow:
     bytes_per_message: float
 
 
-def run(options: Options, console: Console) -> None:
+def run(options: EvaluationOptions, context: StudyContext) -> None:
     """Run the qualitative study and write its image."""
-    context = prepare_study(options, console)
-    config, recording = COMBINED.apply_to(context.base), context.opener()
+    study = prepare_study(options, context)
+    config, recording = COMBINED.apply_to(study.base), study.opener()
     scenario = max(recording.scenarios, key=lambda name: len(recording.agents(name)))
     eval_indices = recording.eval_indices(scenario)
     frame_index = eval_indices[len(eval_indices) // 2]
@@ -68,11 +67,10 @@ def run(options: Options, console: Console) -> None:
     ]
     result_rows = [_make_row(step, protocol) for step in steps]
     images = [_draw_image(step, row, detector.detection_range) for step, row in zip(steps, result_rows)]
-    save_png(_tile_images(images), options.out / "qualitative.png")
     results_table = _make_results_table(f"{scenario}, frame {frame_index}, {COMBINED.name}", result_rows)
-    condition = Condition(COMBINED.name, config)
     payload: dict[str, object] = {"scenario": scenario, "frame": frame_index, "rows": result_rows}
-    write_study_report(context, payload, [results_table], [], [condition])
+    save_picture = partial(save_png, _tile_images(images))
+    study.context.write_report(study.title, payload, [results_table], save_picture, config={"conditions": [config]})
 
 
 def _make_row(step: ReplayStep, protocol: DetectionProtocol) -> QualitativeRow:

@@ -12,14 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from manyeyes.agents.strategies.registry import list_strategies
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.statistics.significance import MarginTest, check_margin
-from manyeyes.evaluation.study import Condition, ResultGrid, ResultKey
-from manyeyes.studies.detection.ablation import parse_checkpoints
+from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.studies.detection.perturbations import (
     CLEAN,
     COMBINED,
@@ -31,23 +28,26 @@ from manyeyes.studies.detection.perturbations import (
     Perturbation,
     select_perturbations,
 )
-from manyeyes.studies.running import (
+from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
+from manyeyes.studies.engine.replay_study import (
     NO_FUSION,
     OURS,
     PAPER_NOTE,
     UPPER_BOUND,
-    make_margin_table,
+    parse_checkpoints,
     prepare_study,
-    run_study,
-    write_study_report,
 )
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.options import RobustnessOptions
 from manyeyes.viz.curves import Curve, CurvePanel
-from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_number
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from manyeyes.studies.options import Options
+from manyeyes.viz.study_table import (
+    StudyTable,
+    format_difference,
+    format_interval,
+    format_number,
+    make_comparison_table,
+)
+from manyeyes.viz.table import DATA_AGE
 
 ORACLES = {
     replace(COMBINED, heading_sigma_deg=0, position_sigma_m=0): "true poses",
@@ -58,7 +58,7 @@ ORACLES = {
 COMBINED_LEVELS = (COMBINED, *list(ORACLES)[:2], COMBINED_SEVERE, *list(ORACLES)[2:])
 ALL_PERTURBATIONS = (CLEAN, *DELAYS, *HEADINGS, *POSITIONS, *LOSSES, *(d for d in COMBINED_LEVELS if d not in DELAYS))
 SPEED_RANGES = {"still": (0.0, 0.1), "below 5 m/s": (0.1, 5.0), "from 5 m/s": (5.0, math.inf)}
-MAX_AP_DROP = {DELAYS[-1]: 0.037, HEADINGS[-1]: 0.054, POSITIONS[-1]: 0.044, LOSSES[-1]: 0.03}
+LARGEST_SINGLE = (DELAYS[-1], HEADINGS[-1], POSITIONS[-1], LOSSES[-1])
 PAPER_AP50 = {
     CLEAN: 0.946,
     **dict(zip(DELAYS, (0.937, 0.928, 0.917, 0.909))),
@@ -78,7 +78,7 @@ class RobustnessRow:
     oracle: str
     method: str
     ap: tuple[Interval, Interval]
-    ap_drop: tuple[Interval, Interval]
+    ap_drop: tuple[Interval, Interval] | None
     gain_over_no_fusion: tuple[Interval, Interval] | None
     bytes_per_message: float
     age_ms: float
@@ -86,49 +86,41 @@ class RobustnessRow:
     paper_ap: float | None
 
 
-def run(options: Options, console: Console) -> None:
+def run(options: RobustnessOptions, context: StudyContext) -> None:
     """Run the robustness study and write its report."""
-    context = prepare_study(options, console)
-    methods = context.base.methods
+    study = prepare_study(options, context)
+    methods = study.base.methods
     collaborative = tuple(m for m in methods if m != NO_FUSION)
+    selected = select_perturbations(options.perturbations, ALL_PERTURBATIONS)
     conditions = [
-        Condition(d.name, d.apply_to(replace(context.base, methods=methods if d == CLEAN else collaborative)))
-        for d in select_perturbations(options.perturbations, ALL_PERTURBATIONS)
+        Condition(d.name, d.apply_to(replace(study.base, methods=methods if d == CLEAN else collaborative)))
+        for d in selected
         if d == CLEAN or collaborative
     ]
     baselines = parse_checkpoints(options.checkpoints, "robustness") if options.checkpoints else {}
     if name_clashes := sorted(set(baselines) & set(list_strategies())):
         raise ConfigError(
-            f"The study 'robustness' has methods of the names {', '.join(name_clashes)}; call these branches otherwise."
+            f"The study 'robustness' has methods of the names {', '.join(name_clashes)}; name these baselines otherwise."
         )
     for baseline, weights in baselines.items():
-        base = replace(context.base, methods=(OURS,), weights=weights)
-        conditions += [
-            Condition(_result_key(d, baseline, (baseline,))[0], d.apply_to(base))
-            for d in select_perturbations(options.perturbations, ALL_PERTURBATIONS)
-        ]
-    results = run_study(context, conditions)
-    result_rows, margin_tests = make_rows(results, tuple(baselines)), check_margins(results, tuple(baselines))
+        base = replace(study.base, methods=(OURS,), weights=weights)
+        conditions += [Condition(_result_key(d, baseline, (baseline,))[0], d.apply_to(base)) for d in selected]
+    results = study.run(conditions)
+    result_rows, comparisons = make_rows(results, tuple(baselines)), make_comparisons(results, tuple(baselines))
     tables = [
         _make_results_table(title, result_rows, group)
         for title, group in (
             ("Delay", DELAYS),
-            ("Heading", HEADINGS),
-            ("Position", POSITIONS),
-            ("Lost packets", LOSSES),
-            ("Together", COMBINED_LEVELS),
+            ("Heading noise", HEADINGS),
+            ("Position noise", POSITIONS),
+            ("Packet loss", LOSSES),
+            ("Combined", COMBINED_LEVELS),
         )
         if any(row.perturbation in group for row in result_rows)
     ]
-    payload: dict[str, object] = {"rows": result_rows, "margin_tests": margin_tests, "paper": PAPER_NOTE}
-    write_study_report(
-        context,
-        payload,
-        [*tables, make_margin_table(margin_tests)],
-        make_panels(result_rows),
-        conditions,
-        (PAPER_NOTE,),
-    )
+    tables.append(make_comparison_table(comparisons))
+    payload: dict[str, object] = {"rows": result_rows, "comparisons": comparisons, "paper": PAPER_NOTE}
+    study.write_report(payload, tables, make_panels(result_rows), conditions, (PAPER_NOTE,))
 
 
 def _result_key(perturbation: Perturbation, method: str, baselines: Sequence[str]) -> ResultKey:
@@ -155,11 +147,9 @@ def _make_row(results: ResultGrid, perturbation: Perturbation, method: str, base
         perturbation,
         ORACLES.get(perturbation, ""),
         method,
-        (results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)),
-        (results.paired_difference(clean_key, key, 0), results.paired_difference(clean_key, key, 1)),
-        (results.paired_difference(key, no_fusion_key, 0), results.paired_difference(key, no_fusion_key, 1))
-        if no_fusion_key in results.results and method != NO_FUSION
-        else None,
+        results.ap_pair(key),
+        results.difference_pair(clean_key, key),
+        results.difference_pair(key, no_fusion_key) if method != NO_FUSION else None,
         result.bytes_per_message,
         result.age_ms,
         tuple(results.bootstrap_ap(key, 0, speed_range) for speed_range in SPEED_RANGES.values()) if has_delay else (),
@@ -167,8 +157,8 @@ def _make_row(results: ResultGrid, perturbation: Perturbation, method: str, base
     )
 
 
-def check_margins(results: ResultGrid, checkpoints: Sequence[str] = ()) -> tuple[MarginTest, ...]:
-    """What is claimed of the project's own method: better than every other but the bound everywhere, and little lost."""
+def make_comparisons(results: ResultGrid, checkpoints: Sequence[str] = ()) -> tuple[Comparison, ...]:
+    """Compare our method with every other but the upper bound at each level, and each single perturbation with none."""
     if (CLEAN.name, OURS) not in results.results:
         return ()
     baselines = [method for name, method in results.results if name == CLEAN.name and method not in (OURS, UPPER_BOUND)]
@@ -179,27 +169,24 @@ def check_margins(results: ResultGrid, checkpoints: Sequence[str] = ()) -> tuple
         for baseline in baselines:
             other = _result_key(CLEAN if baseline == NO_FUSION else perturbation, baseline, checkpoints)
             description = f"{OURS} - {baseline}, {perturbation.name}"
-            out += [check_margin(description, results, (perturbation.name, OURS), other, iou, 0.0) for iou in (0, 1)]
-    for perturbation, max_drop in ((d, MAX_AP_DROP[d]) for d in evaluated if d in MAX_AP_DROP):
-        description = f"{OURS}, {perturbation.name} - {CLEAN.name}"
-        out.append(check_margin(description, results, (perturbation.name, OURS), (CLEAN.name, OURS), 0, -max_drop))
-    return tuple(out)
+            out += [results.compare(description, (perturbation.name, OURS), other, iou) for iou in (0, 1)]
+    return (
+        *out,
+        *(
+            results.compare(f"{OURS}, {d.name} - {CLEAN.name}", (d.name, OURS), (CLEAN.name, OURS))
+            for d in evaluated
+            if d in LARGEST_SINGLE
+        ),
+    )
 
 
 def _make_results_table(title: str, result_rows: Sequence[RobustnessRow], group: Sequence[Perturbation]) -> StudyTable:
     """One kind of disturbance, the perfect setting on top; the word for an oracle row where it is one."""
     result_rows = [row for row in result_rows if row.perturbation in (CLEAN, *group)]
     headings = (
-        "disturbance",
-        "method",
-        "AP@0.5",
-        "AP@0.7",
-        "lost @0.5",
-        "lost @0.7",
-        "over no fusion @0.5",
-        "bytes/message",
-        "age ms",
-    )
+        "perturbation", "method", "AP@0.5", "AP@0.7", "AP@0.5 drop", "AP@0.7 drop", "gain over no fusion @0.5",
+        "bytes/message", DATA_AGE,
+    )  # fmt: skip
     has_speeds = any(row.ap_by_speed for row in result_rows if row.perturbation != CLEAN)
     lines = []
     for row in result_rows:
@@ -209,7 +196,7 @@ def _make_results_table(title: str, result_rows: Sequence[RobustnessRow], group:
             name,
             row.method,
             *map(format_interval, row.ap),
-            *("" if is_clean else format_difference(drop) for drop in row.ap_drop),
+            *("" if is_clean else format_difference(drop) for drop in row.ap_drop or (None, None)),
             format_difference(row.gain_over_no_fusion[0]) if row.gain_over_no_fusion else "",
             format_number(row.bytes_per_message),
             format_number(row.age_ms),
@@ -228,9 +215,9 @@ def make_panels(result_rows: Sequence[RobustnessRow]) -> list[CurvePanel]:
     out = []
     for title, xlabel, group, field_name in (
         ("Delay", "seconds", DELAYS, "delay_s"),
-        ("Heading", "standard deviation, degrees", HEADINGS, "heading_sigma_deg"),
-        ("Position", "standard deviation, m", POSITIONS, "position_sigma_m"),
-        ("Lost packets", "share", LOSSES, "packet_loss"),
+        ("Heading noise", "standard deviation, degrees", HEADINGS, "heading_sigma_deg"),
+        ("Position noise", "standard deviation, m", POSITIONS, "position_sigma_m"),
+        ("Packet loss", "fraction", LOSSES, "packet_loss"),
     ):
         levels = (CLEAN, *group)
         x = tuple(getattr(d, field_name) for d in levels)
@@ -238,7 +225,7 @@ def make_panels(result_rows: Sequence[RobustnessRow]) -> list[CurvePanel]:
         out.append(CurvePanel(title, xlabel, "AP@0.5", tuple(c for c in curves if c)))
     x, levels = tuple(map(float, range(3))), (CLEAN, COMBINED, COMBINED_SEVERE)
     curves = (_make_curve(m, [ap_by_key.get((d, m)) for d in levels], x) for m in methods)
-    out.append(CurvePanel("Together", "", "AP@0.5", tuple(c for c in curves if c), ticks=tuple(d.name for d in levels)))
+    out.append(CurvePanel("Combined", "", "AP@0.5", tuple(c for c in curves if c), ticks=tuple(d.name for d in levels)))
     return out
 
 

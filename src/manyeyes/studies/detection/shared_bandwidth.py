@@ -10,25 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.study import Condition, ResultGrid
-from manyeyes.studies.running import (
-    NO_FUSION,
-    prepare_study,
-    resolve_token_selection,
-    run_study,
-    with_replay,
-    write_study_report,
-)
+from manyeyes.studies.engine.conditions import Condition, ResultGrid
+from manyeyes.studies.engine.replay_study import NO_FUSION, prepare_study, resolve_token_selection, with_replay
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.options import SharedBandwidthOptions
 from manyeyes.viz.curves import Curve, CurvePanel
 from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_number
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from manyeyes.studies.options import Options
 
 BUDGETS = (8192, 16384, 65536, 337_500)
 NO_BUDGET = "no budget"
@@ -49,21 +38,18 @@ class SharedBandwidthRow:
     max_snapshot_bytes: int
 
 
-def run(options: Options, console: Console) -> None:
+def run(options: SharedBandwidthOptions, context: StudyContext) -> None:
     """Run the study of shared bandwidth and write its report."""
-    context, selected = prepare_study(options, console, all_egos=True), resolve_token_selection(options)
-    others = tuple(m for m in context.base.methods if m not in selected)
+    study, selected = prepare_study(options, context, all_egos=True), resolve_token_selection(options.token_selection)
+    others = tuple(m for m in study.base.methods if m not in selected)
     conditions = [
-        Condition(str(b), with_replay(replace(context.base, methods=selected), channel_budget_bytes=b))
+        Condition(str(b), with_replay(replace(study.base, methods=selected), channel_budget_bytes=b))
         for b in sorted(options.budgets or BUDGETS)
     ]
     if others:
-        conditions.append(Condition(NO_BUDGET, replace(context.base, methods=others)))
-    results = run_study(context, conditions)
-    result_rows = make_rows(results)
-    write_study_report(
-        context, {"rows": result_rows}, [_make_results_table(result_rows)], make_panels(result_rows), conditions
-    )
+        conditions.append(Condition(NO_BUDGET, replace(study.base, methods=others)))
+    result_rows = make_rows(study.run(conditions))
+    study.write_report({"rows": result_rows}, [_make_results_table(result_rows)], make_panels(result_rows), conditions)
 
 
 def make_rows(results: ResultGrid) -> tuple[SharedBandwidthRow, ...]:
@@ -77,7 +63,7 @@ def make_rows(results: ResultGrid) -> tuple[SharedBandwidthRow, ...]:
                 None if name == NO_BUDGET else int(name),
                 method,
                 len(result.matches[0]),
-                (results.bootstrap_ap(key, 0), results.bootstrap_ap(key, 1)),
+                results.ap_pair(key),
                 results.paired_difference(key, no_fusion_key, 0)
                 if no_fusion_key in results.results and key != no_fusion_key
                 else None,
@@ -90,15 +76,9 @@ def make_rows(results: ResultGrid) -> tuple[SharedBandwidthRow, ...]:
 
 def _make_results_table(result_rows: Sequence[SharedBandwidthRow]) -> StudyTable:
     headings = (
-        "budget B/instant",
-        "method",
-        "ego frames",
-        "AP@0.5",
-        "AP@0.7",
-        "over no fusion @0.5",
-        "bytes/instant",
-        "most",
-    )
+        "budget [bytes/snapshot]", "method", "ego frames", "AP@0.5", "AP@0.7", "gain over no fusion @0.5", "bytes/snapshot",
+        "max bytes",
+    )  # fmt: skip
     lines = tuple(
         (
             NO_BUDGET if row.budget_bytes is None else f"{row.budget_bytes:,}",
@@ -126,5 +106,7 @@ def make_panels(result_rows: Sequence[SharedBandwidthRow]) -> list[CurvePanel]:
         )
         curves.append(Curve(method, tuple(row.ap[0] for row in method_rows), x))
     return [
-        CurvePanel("Every agent as ego", "bytes an instant, all senders, mean", "AP@0.5", tuple(curves), in_bytes=True)
+        CurvePanel(
+            "Every agent as ego", "bytes per snapshot, all senders, mean", "AP@0.5", tuple(curves), in_bytes=True
+        )
     ]

@@ -8,39 +8,26 @@ Pictures: the paper's Fig. 2, drawings over the truth in pale.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from manyeyes.agents.map_perception import MAP_MODES
-from manyeyes.evaluation.maps.tile_cells import TileStudyResult
-from manyeyes.evaluation.maps.tile_prediction import ROADSIDE, VEHICLE, LocalPredictor
-from manyeyes.studies.maps.running import (
-    make_rows_table,
-    make_tile_panels,
-    make_title,
-    predict_tables,
-    resolve_models,
-    select_for_figure,
-    write_study_report,
-)
+from manyeyes.evaluation.maps.tile_prediction import ROADSIDE, VEHICLE, LocalPredictor, ScenarioPredictions
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.maps.model_study import make_rows_table, make_tile_panels, prepare_map_study, select_for_figure
+from manyeyes.studies.options import MapModelOptions
 from manyeyes.viz.study_table import StudyTable
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from manyeyes.studies.maps.options import Options
 
 WINDOWS = {VEHICLE: MAP_MODES["local"].vehicle_window, ROADSIDE: MAP_MODES["local"].roadside_window}
 PAPER_TABLE = StudyTable(
     "CrowdMap's Table 1: DAIR-V2X, one camera an agent; for reference only",
-    ("range", "agent", "AP ped", "AP div", "mAP"),
+    ("range", "agent", "AP crossing", "AP divider", "mAP"),
     (("30 x 30 m", VEHICLE, "0.745", "0.909", "0.827"), ("50 x 30 m", ROADSIDE, "0.772", "0.785", "0.778")),
 )
 
 
-def run(options: Options, console: Console) -> None:
+def run(options: MapModelOptions, context: StudyContext) -> None:
     """Run the study of local maps and write its report."""
-    models_used = resolve_models(options)
-    tile_tables = predict_tables(options, console, models_used, LocalPredictor())
+    study = prepare_map_study(options, context)
+    tile_tables = study.predict_tables(LocalPredictor())
     names = tuple(WINDOWS)
     rows = {
         sensors: [table.make_row(name) for name in names if name in table.names]
@@ -53,12 +40,10 @@ def run(options: Options, console: Console) -> None:
         row_results = [one for result in results if (one := _keep_first(result, name)) is not None]
         for result in select_for_figure(row_results, lambda c: len(c.predictions[0].truth), 2) if row_results else ():
             panels += make_tile_panels(result, {name: name}, area)
-    write_study_report(
-        options, console, make_title(options, models_used), {"rows": rows}, [results_table, PAPER_TABLE], panels, 4
-    )
+    study.write_report({"rows": rows}, [results_table, PAPER_TABLE], panels, 4)
 
 
-def _keep_first(result: TileStudyResult, row_name: str) -> TileStudyResult | None:
+def _keep_first(result: ScenarioPredictions, row_name: str) -> ScenarioPredictions | None:
     """The cell with the first drawing of a row alone."""
     predictions = [one for one in result.predictions if one.row_name == row_name]
     return replace(result, predictions=(predictions[0],)) if predictions else None

@@ -7,34 +7,27 @@ behind it for the paper's eight pairs; its rows are kept under --out.
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Sequence
-from dataclasses import asdict
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
-from manyeyes._io import atomic_write
-from manyeyes._source import source_digest
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS
-from manyeyes.evaluation.detection.benchmark import load_detector, resolve_protocol
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, resolve_protocol
 from manyeyes.evaluation.pose.feakm_ablation import SIGMAS, FeakmVariant, FeakmVariantRow, run_ablation
-from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.study import COMPUTED_BY, hash_recording
+from manyeyes.evaluation.statistics.bootstrap import exact_interval
 from manyeyes.models.checkpoint import fingerprint
 from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.registry import load_corrector
-from manyeyes.studies.detection.ablation import parse_checkpoints
-from manyeyes.studies.running import StudyContext, prepare_study, write_study_report
+from manyeyes.studies.engine.cells import Cell, hash_recording
+from manyeyes.studies.engine.replay_study import ReplayStudy, open_study, parse_checkpoints
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.options import FeakmOptions
 from manyeyes.viz.curves import Curve, CurvePanel
 from manyeyes.viz.progress import make_progress_bars
 from manyeyes.viz.study_table import StudyTable, format_number
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from manyeyes.studies.options import Options
-
+Report = Callable[[str, int], None]
+COMPUTED_BY = ("manyeyes.evaluation.pose.feakm_ablation", "manyeyes.evaluation.detection.benchmark")
 PAPER_NOTE = "The last table is FeaKM's own: DAIR-V2X, AP@0.5, CoAlign's protocol; it is for reference only."
 PAPER_ROWS = (
     ("neither", 0.741, 0.704, 0.682, 0.678),
@@ -44,52 +37,54 @@ PAPER_ROWS = (
 )
 
 
-def run(options: Options, console: Console) -> None:
+def run(options: FeakmOptions, context: StudyContext) -> None:
     """Run the ablation of FeaKM and write its report."""
     named = parse_checkpoints(options.checkpoints, "feakm", "detector.safetensors,net.safetensors[@8]")
     variants = [(_parse_variant(name, files), files.partition("@")[2]) for name, files in named.items()]
-    context = prepare_study(options, console)
-    result_rows = make_rows(context, variants)
+    study = open_study(options, context, BenchmarkConfig(options.weights, protocol=options.protocol))
+    result_rows = make_rows(study, variants)
     payload: dict[str, object] = {"rows": result_rows, "paper": {"note": PAPER_NOTE, "rows": PAPER_ROWS}}
     tables = [
         *(_make_ap_table(result_rows, k) for k in range(len(IOU_THRESHOLDS))),
         _make_found_table(result_rows),
         _make_paper_table(),
     ]
-    write_study_report(context, payload, tables, make_panels(result_rows), [], (PAPER_NOTE,))
+    study.write_report(payload, tables, make_panels(result_rows), notes=(PAPER_NOTE,))
 
 
 def _parse_variant(name: str, files: str) -> FeakmVariant:
     detector, _, net = files.partition(",")
     if not net.partition("@")[0].endswith(".safetensors"):
-        raise ConfigError(f"Branch {name!r} needs two files, detector.safetensors,net.safetensors[@8]; got {files!r}.")
+        raise ConfigError(f"Variant {name!r} needs two files, detector.safetensors,net.safetensors[@8]; got {files!r}.")
     net_corrector = load_corrector(net)
     assert isinstance(net_corrector, FeakmCorrector)
     return FeakmVariant(name, load_detector(detector), net_corrector)
 
 
-def make_rows(context: StudyContext, variants: Sequence[tuple[FeakmVariant, str]]) -> list[FeakmVariantRow]:
-    """Rows of every branch and its least number of pairs, as it was written; those that are kept are not made again."""
-    recording, seed = context.base.filter_recording(context.opener()), context.options.seed
-    code = source_digest(COMPUTED_BY, "manyeyes.evaluation.pose.feakm_ablation")
-    protocol, data_key = resolve_protocol(context.base), (hash_recording(recording), code, SIGMAS, seed)
+def make_rows(study: ReplayStudy, variants: Sequence[tuple[FeakmVariant, str]]) -> list[FeakmVariantRow]:
+    """Rows of every variant and its minimum number of pairs, as it was written; stored ones are not computed again."""
+    recording, seed = study.base.filter_recording(study.opener()), study.context.seed
+    protocol = resolve_protocol(study.base)
+    data_key = hash_recording(recording), SIGMAS, seed, protocol
     out = list[FeakmVariantRow]()
-    with make_progress_bars(context.console) as progress:
-        task = progress.add_task("Judging", total=len(variants) * len(recording.scenarios))
+    with make_progress_bars(study.context.console) as progress:
+        task = progress.add_task("Evaluating", total=len(variants) * len(recording.scenarios))
         for n, (variant, pairs) in enumerate(variants):
             scenarios_done = {s: n * len(recording.scenarios) + k for k, s in enumerate(recording.scenarios)}
+
+            def report(scenario: str, index: int, done: dict[str, int] = scenarios_done) -> None:
+                progress.update(task, completed=done[scenario])
+
             fingerprints = variant.detector.fingerprint, fingerprint(variant.corrector.net), pairs
-            key = hashlib.blake2b(repr((fingerprints, data_key)).encode(), digest_size=8).hexdigest()
-            path = context.results_folder / f"feakm-{key}.json"
-            if not path.is_file():
+            cell = Cell[tuple[FeakmVariantRow, ...]](
+                "feakm", tuple[FeakmVariantRow, ...], (fingerprints, data_key), COMPUTED_BY
+            )
 
-                def report(scenario: str, index: int, done: dict[str, int] = scenarios_done) -> None:
-                    progress.update(task, completed=done[scenario])
+            def compute(variant: FeakmVariant = variant, report: Report = report) -> tuple[FeakmVariantRow, ...]:
+                return run_ablation(recording, [variant], SIGMAS, protocol=protocol, seed=seed, report=report)
 
-                new_rows = run_ablation(recording, [variant], SIGMAS, protocol=protocol, seed=seed, report=report)
-                atomic_write(path, json.dumps([asdict(row) for row in new_rows]).encode())
-            stored = json.loads(path.read_text(encoding="utf-8"))
-            out += [FeakmVariantRow(**(row | {"variant": variant.name, "ap": tuple(row["ap"])})) for row in stored]
+            rows = study.context.store.load_or_compute(cell, compute)
+            out += [replace(row, variant=variant.name) for row in rows]
     return out
 
 
@@ -104,7 +99,7 @@ def _format_lines(
 
 
 def _make_headings() -> tuple[str, ...]:
-    return ("branch", *(f"{s:g} m, {s:g}°" for s in SIGMAS))
+    return ("variant", *(f"{s:g} m, {s:g}°" for s in SIGMAS))
 
 
 def _make_ap_table(result_rows: Sequence[FeakmVariantRow], iou: int) -> StudyTable:
@@ -113,7 +108,7 @@ def _make_ap_table(result_rows: Sequence[FeakmVariantRow], iou: int) -> StudyTab
 
 def _make_found_table(result_rows: Sequence[FeakmVariantRow]) -> StudyTable:
     return StudyTable(
-        "Share of collaborators whose pose was found", _make_headings(), _format_lines(result_rows, "answered", 2)
+        "Fraction of collaborators whose pose was found", _make_headings(), _format_lines(result_rows, "found", 2)
     )
 
 
@@ -123,16 +118,12 @@ def _make_paper_table() -> StudyTable:
 
 
 def make_panels(result_rows: Sequence[FeakmVariantRow]) -> list[CurvePanel]:
-    """AP against sigma, a line a branch."""
+    """AP against sigma, a line for each variant."""
     names = dict.fromkeys(row.variant for row in result_rows)
     return [
         CurvePanel(
             "FeaKM's parts", "sigma, metres and degrees", f"AP@{threshold:g}",
-            tuple(Curve(n, tuple(_make_interval(r.ap[k]) for r in result_rows if r.variant == n), SIGMAS) for n in names),
+            tuple(Curve(n, tuple(exact_interval(r.ap[k]) for r in result_rows if r.variant == n), SIGMAS) for n in names),
         )
         for k, threshold in enumerate(IOU_THRESHOLDS)
     ]  # fmt: skip
-
-
-def _make_interval(value: float) -> Interval:
-    return Interval(value, value, value, 0.95, 1)

@@ -1,41 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good corrected poses are on agents' own detections, by corrector, error of claims and objects in common (pose.md 3.3)."""
+"""Errors of corrected poses on agents' own detections, by corrector, noise of the prior and common objects."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from manyeyes._source import source_digest
 from manyeyes.agents.pose_correction import PoseCorrection
-from manyeyes.evaluation.detection.benchmark import load_detector
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector
 from manyeyes.evaluation.pose.accuracy import (
     AccuracyRow,
+    CorrectorRun,
     CorrectorTrial,
     LandmarkPair,
     iterate_landmark_pairs,
-    load_or_run,
     run_corrector,
     summarize_run,
 )
 from manyeyes.evaluation.pose.metrics import PriorNoise
-from manyeyes.evaluation.statistics.bootstrap import Interval
-from manyeyes.evaluation.study import hash_recording
+from manyeyes.evaluation.statistics.bootstrap import exact_interval
 from manyeyes.models.checkpoint import fingerprint
 from manyeyes.pose.registry import load_corrector
-from manyeyes.studies.running import StudyContext, prepare_study, write_study_report
+from manyeyes.studies.engine.cells import Cell, hash_recording
+from manyeyes.studies.engine.replay_study import ReplayStudy, open_study
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.options import PoseEstimationOptions
 from manyeyes.viz.curves import Curve, CurvePanel
 from manyeyes.viz.progress import make_progress_bars
 from manyeyes.viz.study_table import StudyTable, format_number
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from manyeyes.studies.options import Options
-
+COMPUTED_BY = ("manyeyes.evaluation.pose.accuracy",)
 CORRECTORS = ("identity", "voting", "coalign", "fpv-rcnn", "feaco", "v2x-reg-odist")
 SIGMAS = (0.0, 0.4, 0.8, 1.2, 2.0)
 NOISE_FAMILIES = (
@@ -43,57 +38,51 @@ NOISE_FAMILIES = (
     ("unknown", 0.0), ("none", 0.0),
 )  # fmt: skip
 LISTED_NOISE = ("gaussian", 0.8)
+_SCORE_HEADINGS = (
+    "frames", "within 1 m, 1° [%]", "2 m, 2° [%]", "3 m, 3° [%]", "coverage [%]", "precision [%]", "false accepts [%]",
+    "conflicts [%]", "RTE median [m]", "RTE p95 [m]", "RRE median [deg]", "object displacement [m]", "NEES", "AURC",
+    "bytes/message", "mean [ms]", "p95 [ms]",
+)  # fmt: skip
 
 
-def run(options: Options, console: Console) -> None:
-    """The study: Gaussian errors for every corrector, every other family for the first two."""
-    context = prepare_study(options, console)
+def run(options: PoseEstimationOptions, context: StudyContext) -> None:
+    """Run the study: Gaussian errors for every corrector, every other family for the first two."""
     names = options.correctors or CORRECTORS
     for name in names:
         load_corrector(name)
+    study = open_study(options, context, BenchmarkConfig(options.weights))
     trials = [CorrectorTrial(n, PriorNoise("gaussian", s, s, options.seed)) for n in names for s in SIGMAS]
     trials += [CorrectorTrial(n, PriorNoise(kind, s, s, options.seed)) for n in names[:2] for kind, s in NOISE_FAMILIES]
-    result_rows = run_trials(context, trials)
-    payload: dict[str, object] = {"rows": [asdict(row) for row in result_rows]}
-    write_study_report(
-        context,
-        payload,
-        [_make_results_table(result_rows), _make_common_objects_table(result_rows)],
-        make_panels(result_rows),
-        [],
-    )
+    result_rows = run_trials(study, trials)
+    tables = [_make_results_table(result_rows), _make_common_objects_table(result_rows)]
+    study.write_report({"rows": result_rows}, tables, make_panels(result_rows))
 
 
-def run_trials(context: StudyContext, trials: Sequence[CorrectorTrial]) -> list[AccuracyRow]:
-    """The rows of every trial; answers that are kept under --out are not made again."""
+def run_trials(study: ReplayStudy, trials: Sequence[CorrectorTrial]) -> list[AccuracyRow]:
+    """The rows of every trial; stored results are not computed again."""
     pairs_by_net: dict[str, list[LandmarkPair]] = {}
-    base, detector = context.base, load_detector(context.base.weights)
-    recording = context.opener()
-    data_key = (
-        hash_recording(recording),
-        detector.fingerprint.hex(),
-        base.frame_stride,
-        source_digest("manyeyes.evaluation.pose.accuracy"),
-    )
+    stride, detector = study.base.frame_stride, load_detector(study.base.weights)
+    recording = study.opener()
+    data_key = hash_recording(recording), detector.fingerprint.hex(), stride
     nets = {name: PoseCorrection(name).net for name in {trial.corrector for trial in trials}}
     net_fingerprints = {name: "" if net is None else fingerprint(net).hex() for name, net in nets.items()}
 
     def get_pairs(name: str) -> list[LandmarkPair]:
         if net_fingerprints[name] not in pairs_by_net:
             pairs_by_net[net_fingerprints[name]] = list(
-                iterate_landmark_pairs(recording, detector, frame_stride=base.frame_stride, net=nets[name])
+                iterate_landmark_pairs(recording, detector, frame_stride=stride, net=nets[name])
             )
         return pairs_by_net[net_fingerprints[name]]
 
+    def run_trial(trial: CorrectorTrial) -> CorrectorRun:
+        return run_corrector(get_pairs(trial.corrector), trial)
+
     out = []
-    with make_progress_bars(context.console) as progress:
-        for trial in progress.track(trials, description="Aligning"):
-            key = hashlib.blake2b(
-                repr((trial, net_fingerprints[trial.corrector], data_key)).encode(), digest_size=8
-            ).hexdigest()
-            path = context.results_folder / f"pose-{Path(trial.corrector).stem}-{key}.json"
-            corrector_run = load_or_run(path, lambda trial=trial: run_corrector(get_pairs(trial.corrector), trial))
-            out += summarize_run(trial, corrector_run)
+    with make_progress_bars(study.context.console) as progress:
+        for trial in progress.track(trials, description="Correcting poses"):
+            key = trial, net_fingerprints[trial.corrector], data_key
+            cell = Cell[CorrectorRun](f"pose-{Path(trial.corrector).stem}", CorrectorRun, key, COMPUTED_BY)
+            out += summarize_run(trial, study.context.store.load_or_compute(cell, partial(run_trial, trial)))
     return out
 
 
@@ -103,13 +92,9 @@ def _noise_name(row: AccuracyRow) -> str:
 
 
 def _make_results_table(result_rows: Sequence[AccuracyRow]) -> StudyTable:
-    headings = (
-        "corrector", "errors", "frames", "within 1 m, 1°", "2", "3", "answered", "right", "wrong", "conflict", "m, median",
-        "m, p95", "°, median", "objects off m", "NEES", "AURC", "bytes", "ms", "ms p95",
-    )  # fmt: skip
     return StudyTable(
-        "All meetings",
-        headings,
+        "All pairs of agents",
+        ("corrector", "noise", *_SCORE_HEADINGS),
         tuple((r.trial.corrector, _noise_name(r), *_format_cells(r)) for r in result_rows if r.common_range is None),
     )
 
@@ -153,11 +138,8 @@ def _make_common_objects_table(result_rows: Sequence[AccuracyRow]) -> StudyTable
         for r in listed
         if r.common_range
     )
-    headings = (
-        "corrector", "errors", "in common", "frames", "within 1 m, 1°", "2", "3", "answered", "right", "wrong", "conflict",
-        "m, median", "m, p95", "°, median", "objects off m", "NEES",
-    )  # fmt: skip
-    return StudyTable("By objects in common", headings, lines)
+    headings = ("corrector", "noise", "common objects", *_SCORE_HEADINGS[:13])
+    return StudyTable("By common objects", headings, lines)
 
 
 def make_panels(result_rows: Sequence[AccuracyRow]) -> list[CurvePanel]:
@@ -165,36 +147,23 @@ def make_panels(result_rows: Sequence[AccuracyRow]) -> list[CurvePanel]:
     overall = [r for r in result_rows if r.common_range is None and r.trial.noise.kind == "gaussian"]
     names = list(dict.fromkeys(r.trial.corrector for r in overall))
     rows_by_corrector = {name: [r for r in overall if r.trial.corrector == name] for name in names}
-    success = [
-        Curve(
-            n,
-            tuple(_make_interval(r.score.success_rate[0]) for r in corrector_rows),
-            tuple(r.trial.noise.sigma_m for r in corrector_rows),
+
+    def make_curves(value: Callable[[AccuracyRow], float]) -> tuple[Curve, ...]:
+        return tuple(
+            Curve(name, tuple(exact_interval(value(r)) for r in rows), tuple(r.trial.noise.sigma_m for r in rows))
+            for name, rows in rows_by_corrector.items()
         )
-        for n, corrector_rows in rows_by_corrector.items()
-    ]
-    displacement = [
-        Curve(
-            n,
-            tuple(_make_interval(r.score.mean_displacement_m) for r in corrector_rows),
-            tuple(r.trial.noise.sigma_m for r in corrector_rows),
-        )
-        for n, corrector_rows in rows_by_corrector.items()
-    ]
+
     coverage = tuple(k / 20 for k in range(1, 21))
     risk = [
-        Curve(n, tuple(map(_make_interval, r.risk_by_coverage)), coverage)
+        Curve(n, tuple(map(exact_interval, r.risk_by_coverage)), coverage)
         for n, corrector_rows in rows_by_corrector.items()
         for r in corrector_rows
         if r.trial.noise.sigma_m == LISTED_NOISE[1]
     ]
-    sigma = "sigma of the claim, metres and degrees"
+    sigma = "sigma of the prior, metres and degrees"
     return [
-        CurvePanel("Success, all meetings", sigma, "within 1 m and 1°", tuple(success)),
-        CurvePanel("Objects in common", sigma, "mean displacement, m", tuple(displacement)),
-        CurvePanel(f"Risk, sigma {LISTED_NOISE[1]:g}", "coverage", "share not within 2 m and 2°", tuple(risk)),
+        CurvePanel("Success, all pairs", sigma, "within 1 m and 1°", make_curves(lambda r: r.score.success_rate[0])),
+        CurvePanel("Common objects", sigma, "mean displacement, m", make_curves(lambda r: r.score.mean_displacement_m)),
+        CurvePanel(f"Risk, sigma {LISTED_NOISE[1]:g}", "coverage", "fraction not within 2 m and 2°", tuple(risk)),
     ]
-
-
-def _make_interval(value: float) -> Interval:
-    return Interval(value, value, value, 0.95, 1)

@@ -16,7 +16,6 @@ from manyeyes.cli import main as cli
 from manyeyes.datasets.missing import NONE_MISSING
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps.tile_cells import TilePrediction, TileStudyResult
 from manyeyes.evaluation.maps.tile_metrics import TileTable
 from manyeyes.evaluation.maps.tile_prediction import (
     CLEAN,
@@ -26,6 +25,8 @@ from manyeyes.evaluation.maps.tile_prediction import (
     ROADSIDE,
     SINGLE_VEHICLE,
     VEHICLE,
+    ScenarioPredictions,
+    TilePrediction,
 )
 from manyeyes.models import checkpoint, pretrained
 from manyeyes.models.maps.bev import BevConfig
@@ -37,8 +38,8 @@ from manyeyes.studies.maps import (
     full_map as whole,
     local,
     map_pose_noise as pose,
+    model_study,
     recorded_fleet as crowd,
-    running,
     semi_global,
 )
 from manyeyes.studies.town_maps import TownMap
@@ -94,16 +95,15 @@ def save(path, sensors=("lidar",), towns=()):
 
 @pytest.fixture
 def weights(tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "open_sensor_recording", lambda data, split, sensors: Crossroads())
-    monkeypatch.setattr(running, "load_true_maps", lambda recording: {"cross": STREETS})
-    monkeypatch.setattr(running, "find_missing_files", lambda options, console: NONE_MISSING)
+    monkeypatch.setattr(model_study, "open_sensor_recording", lambda data, split, sensors: Crossroads())
+    monkeypatch.setattr(model_study, "load_true_maps", lambda recording: {"cross": STREETS})
+    monkeypatch.setattr(model_study, "open_recording", lambda *words, **options: Crossroads())
+    monkeypatch.setattr(model_study, "check_files", lambda recording, checks, console: NONE_MISSING)
     return save(tmp_path / "random.safetensors")
 
 
 def study(name, weights, out, *words, seeds=2):
     common = (
-        "--study",
-        name,
         "--data",
         out,
         "--weights",
@@ -116,7 +116,7 @@ def study(name, weights, out, *words, seeds=2):
         out,
         *words,
     )
-    assert cli.main([str(word) for word in ("map", "evaluate", *common)]) == 0
+    assert cli.main([str(word) for word in ("study", name, *common)]) == 0
     with Image.open(out / f"{name}.png") as picture:
         assert picture.width > 400
     assert f"![{name}]({name}.png)" in (out / f"{name}.md").read_text()
@@ -144,8 +144,8 @@ def make_predictor(parts):
     return FixedPredictor(tuple(parts.items()))
 
 
-def get_verdicts(result):
-    return {margin_test["description"]: margin_test["verdict"] for margin_test in result["margin_tests"]}
+def get_differences(result):
+    return {comparison["description"]: comparison["interval"]["value"] for comparison in result["comparisons"]}
 
 
 def test_more_frames_against_one(weights, tmp_path, monkeypatch):
@@ -160,20 +160,25 @@ def test_more_frames_against_one(weights, tmp_path, monkeypatch):
     assert (
         rows["2"]["bytes_per_tile"] == 2000 and rows["2"]["num_tiles"] == 6 and len(rows["2"]["mean_ap_by_seed"]) == 2
     )
-    assert get_verdicts(result)["LiDAR: 10 frames - one vehicle"] == "met" and " +0.300 |" in text
+    assert get_differences(result)["LiDAR: 10 frames - one vehicle"] == pytest.approx(0.875)
     assert text.count("not run") == 2, "cameras, and both"
 
 
 def table(parts):
     """What a study would judge, of three scenarios."""
     return TileTable(
-        [TileStudyResult(name, 0, tuple(make_predictor(parts)(None, None, name, 0))) for name in Crossroads.scenarios]
+        [
+            ScenarioPredictions(name, 0, tuple(make_predictor(parts)(None, None, name, 0)))
+            for name in Crossroads.scenarios
+        ]
     )
 
 
-def test_margins_that_are_not_met_are_missed():
-    held = semi_global.check_margins("LiDAR", table({"1": 3, "10": 4}), (1, 10))
-    assert [(c.margin, c.verdict) for c in held] == [(0.2, "not met"), (0.3, "not met"), (0.0, "met")]
+def test_each_larger_number_of_frames_is_compared_with_one():
+    held = semi_global.make_comparisons("LiDAR", table({"1": 3, "5": 2, "10": 4}), ("1", "5", "10"))
+    assert [c.description for c in held] == ["LiDAR: 5 frames - one vehicle", "LiDAR: 10 frames - one vehicle"]
+    # Three, two and four of four dividers, and no crossing.
+    assert [c.interval.value for c in held] == pytest.approx([-0.125, 0.125]) and held[0].metric == "mAP"
 
 
 def test_local_maps_have_a_row_for_each_kind_of_agent(weights, tmp_path, monkeypatch):
@@ -191,11 +196,12 @@ def test_the_corrector_is_held_against_half_of_the_loss(weights, tmp_path, monke
     monkeypatch.setattr(pose, "PoseNoisePredictor", lambda pose_correction: make_predictor(rows))
     result, text = study("map-pose-noise", weights, tmp_path)
     half = "LiDAR: corrected - (clean + noisy) / 2"
-    assert get_verdicts(result)[half] == get_verdicts(result)["LiDAR: corrected without errors - clean"] == "met"
-    assert "off by 0.5 m and 1 degrees" in text
+    assert get_differences(result)[half] == pytest.approx(0.375)
+    assert get_differences(result)["LiDAR: corrected without noise - clean"] == 0.0
+    assert "0.5 m and 1 degrees (sigma)" in text
     # Clean 1, noisy .25: half of it won back is .625; four lines have all dividers and no crossing, .5.
-    less = {c.description: c for c in pose.check_margins("LiDAR", table(rows | {CORRECTED: 4}))}[half]
-    assert less.verdict == "not met" and less.difference.value == pytest.approx(-0.125)
+    less = {c.description: c for c in pose.make_comparisons("LiDAR", table(rows | {CORRECTED: 4}))}[half]
+    assert less.interval.value == less.interval.high == pytest.approx(-0.125)
 
 
 def test_full_maps_by_map_mode_and_method_against_one_truth(weights, tmp_path, monkeypatch):
@@ -221,11 +227,11 @@ def test_full_maps_by_map_mode_and_method_against_one_truth(weights, tmp_path, m
         "a local map is held against what tiles see, too"
     )
     assert ours["mean_ap"]["value"] > late["mean_ap"]["value"] + 0.1 and ours["mean_ap"]["num_scenarios"] > 5
-    verdicts_by_name = get_verdicts(result)
-    assert {"the whole - local + union", "the whole - local + chamfer-nms", "the whole - local + manyeyes"} <= set(
-        verdicts_by_name
-    )
-    assert sum("the best of them, goal" in what for what in verdicts_by_name) == 1 and "The map of cross" in text
+    names = {f"semi-global + manyeyes - local + {method}" for method in ("union", "chamfer-nms", "manyeyes")}
+    differences = get_differences(result)
+    assert names <= set(differences) and "The map of cross" in text
+    best = [value for name, value in differences.items() if name.endswith("the best baseline")]
+    assert best == [min(value for name, value in differences.items() if "union" in name or "nms" in name)]
     assert made == ["semi-global", "local"]
     study("full-map", weights, tmp_path, "--methods", "manyeyes", "union", seeds=1)
     assert len(made) == 2, "what was seen is kept"
@@ -233,10 +239,9 @@ def test_full_maps_by_map_mode_and_method_against_one_truth(weights, tmp_path, m
 
 def test_missing_or_repeated_options_are_one_line(weights, tmp_path, capsys, monkeypatch):
     def refused(*words):
-        assert cli.main([str(word) for word in ("map", "evaluate", "--study", *words)]) == 1
+        assert cli.main([str(word) for word in ("study", *words)]) == 1
         return capsys.readouterr().err
 
-    assert "--data" in refused("local")
     monkeypatch.setattr(pretrained, "list_map_models", lambda: ())
     assert "--preset map-small-lidar" in refused("local", "--data", tmp_path)
     again = save(tmp_path / "again.safetensors")

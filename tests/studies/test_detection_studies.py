@@ -18,9 +18,9 @@ from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, run_scenari
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.studies import running
 from manyeyes.studies.detection import robustness
 from manyeyes.studies.detection.perturbations import CLEAN, COMBINED_SEVERE, Perturbation, select_perturbations
+from manyeyes.studies.engine import replay_study
 from manyeyes.viz.curves import CurvePanel
 
 HALF = torch.tensor([2.3, 0.95, 0.8])
@@ -78,14 +78,14 @@ def panels(monkeypatch) -> list[CurvePanel]:
         last[:] = drawn
         Image.new("RGB", (500, 10)).save(path)
 
-    monkeypatch.setattr(running, "save_curves", keep)
+    monkeypatch.setattr(replay_study, "save_curves", keep)
     return last
 
 
 def evaluate(data: Path, weights: Path, out: Path, study: str, *words: object) -> dict:
     """The JSON that a study wrote."""
-    common = ("--data", data, "--split", "test", "--weights", weights, "--workers", 1, "--out", out, "--study", study)
-    assert cli.main([str(word) for word in ("evaluate", *common, *words)]) == 0
+    common = ("--data", data, "--split", "test", "--weights", weights, "--workers", 1, "--out", out)
+    assert cli.main([str(word) for word in ("study", study, *common, *words)]) == 0
     with Image.open(out / f"{study}.png") as picture:
         assert picture.width > 400
     assert (out / f"{study}.md").read_text().startswith(f"# {study}\n")
@@ -118,10 +118,13 @@ def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_pat
     assert [speed["value"] is None for speed in late[0]["ap_by_speed"]] == [False, True, False]
     assert late[0]["ap_drop"][0]["value"] == 0 and late[0]["bytes_per_message"] > 0
     assert [r["paper_ap"] for r in rows if r["method"] == "intermediate"][:3] == [0.946, 0.937, 0.909]
-    margin_tests = held["result"]["margin_tests"]
-    assert sum("intermediate - late" in c["description"] for c in margin_tests) == 2 * len(small_set)
-    assert [c["margin"] for c in margin_tests[-3:]] == [-0.037, -0.044, -0.03]
-    assert [p.title for p in panels] == ["Delay", "Heading", "Position", "Lost packets", "Together"]
+    comparisons = held["result"]["comparisons"]
+    assert sum("intermediate - late" in c["description"] for c in comparisons) == 2 * len(small_set)
+    assert [c["description"] for c in comparisons[-3:]] == [
+        f"intermediate, {level} - perfect" for level in ("0.4 s", "0.8 m", "30 % lost")
+    ]
+    assert all("margin" not in c and "verdict" not in c for c in comparisons), "targets are not the package's"
+    assert [p.title for p in panels] == ["Delay", "Heading noise", "Position noise", "Packet loss", "Combined"]
     assert {c.label: c.x for c in panels[0].curves} == {
         "none": (),
         "late": (0, 0.1, 0.4),
@@ -133,9 +136,9 @@ def test_perturbations_are_selected_by_name(data, weights, tmp_path, panels) -> 
     words = ("--methods", "late", "intermediate", "--frame-stride", 2, "--perturbations", "0.4 s")
     held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
     assert [r["perturbation"]["delay_s"] for r in held["rows"]] == [0, 0, 0.4, 0.4]
-    assert "intermediate, 0.4 s - perfect" in {c["description"] for c in held["margin_tests"]}
+    assert "intermediate, 0.4 s - perfect" in {c["description"] for c in held["comparisons"]}
     text = (tmp_path / "robustness.md").read_text()
-    assert "## Delay" in text and "## Position" not in text
+    assert "## Delay" in text and "## Position noise" not in text
     with pytest.raises(ConfigError, match=r"No disturbance '4 s'; choose from perfect, 0.1 s"):
         select_perturbations(["4 s"], robustness.ALL_PERTURBATIONS)
 
@@ -160,9 +163,9 @@ def test_baseline_fusions_are_compared_with_ours_under_each_perturbation(
     # A baseline of the same weights has the same AP and AP drop.
     for ours, same in (held["rows"][:2], held["rows"][2:]):
         assert ours["ap"] == same["ap"] and ours["ap_drop"] == same["ap_drop"]
-    against = [c for c in held["margin_tests"] if "intermediate - same" in c["description"]]
-    assert len(against) == 4 and all(c["difference"]["value"] == 0 for c in against)
-    common = ("evaluate", "--data", data, "--split", "test", "--weights", weights, "--study", "robustness")
+    against = [c for c in held["comparisons"] if "intermediate - same" in c["description"]]
+    assert len(against) == 4 and all(c["interval"]["value"] == 0 for c in against)
+    common = ("study", "robustness", "--data", data, "--split", "test", "--weights", weights)
     assert cli.main([str(word) for word in (*common, "--out", tmp_path / "b", "--checkpoints", f"late={weights}")]) != 0
     assert "methods of the names late" in capsys.readouterr().err and not (tmp_path / "b").exists()
 
@@ -232,8 +235,8 @@ def test_a_checkpoint_of_the_ablation_may_have_a_budget(data, weights, tmp_path,
     rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
     assert 0 < rows[1]["bytes_per_message"] <= 1398 < rows[0]["bytes_per_message"]
     for wrong in ("0", "many", "-5"):
-        words = ("--data", data, "--split", "test", "--study", "ablation", "--checkpoints", f"masked={weights}@{wrong}")
-        assert cli.main([str(word) for word in ("evaluate", *words)]) == 1
+        words = ("ablation", "--data", data, "--split", "test", "--checkpoints", f"masked={weights}@{wrong}")
+        assert cli.main([str(word) for word in ("study", *words)]) == 1
         assert "behind @ stands a number of bytes" in capsys.readouterr().err
 
 
@@ -279,18 +282,15 @@ def test_no_fusion_is_the_same_under_every_perturbation(data, weights) -> None:
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (("--study", "moon"), ("moon", "robustness")),
-        (("--study", "bandwidth", "--token-encodings", "moon"), ("moon", "float16")),
-        (("--study", "bandwidth", "--token-selection", "moon"), ("moon", "intermediate")),
-        (("--study", "ablation"), ("name=weights.safetensors",)),
-        (("--study", "ablation", "--checkpoints", "a=x", "a=y"), ("each name once",)),
-        (("--study", "robustness", "--noise-xy-m", 0.2), ("--noise-xy-m",)),
-        (("--study", "num-agents", "--frame-stride", 0), ("at least 1",)),
+        (("bandwidth", "--token-encodings", "moon"), ("moon", "float16")),
+        (("bandwidth", "--token-selection", "moon"), ("moon", "intermediate")),
+        (("ablation",), ("name=weights.safetensors",)),
+        (("ablation", "--checkpoints", "a=x", "a=y"), ("each name once",)),
     ],
 )
 def test_invalid_arguments_are_one_line_before_any_work(data, weights, tmp_path, capsys, words, named) -> None:
     common = ("--data", data, "--split", "test", "--weights", weights, "--out", tmp_path / "out")
-    assert cli.main([str(word) for word in ("evaluate", *common, *words)]) == 1
+    assert cli.main([str(word) for word in ("study", *words, *common)]) == 1
     output = capsys.readouterr().err.splitlines()
     assert len(output) == 1 and all(name in output[0] for name in named)
     assert not (tmp_path / "out").exists()

@@ -14,13 +14,12 @@ from manyeyes.datatypes import AgentFrame, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
 from manyeyes.evaluation.detection.communication import summarize_messages
-from manyeyes.evaluation.statistics.bootstrap import paired_difference, scenario_interval
-from manyeyes.evaluation.statistics.significance import check_margin
-from manyeyes.evaluation.study import ResultGrid, hash_recording, result_path
-from manyeyes.evaluation.study_result import BusVolume, StudyResult
+from manyeyes.evaluation.statistics.bootstrap import bootstrap
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.studies.engine.cells import CellStore, hash_recording
+from manyeyes.studies.engine.conditions import BusVolume, MethodMatches, ResultGrid, make_cell
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +33,9 @@ def weights(tmp_path_factory) -> Path:
 
 
 def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_path) -> None:
+    def path(config: BenchmarkConfig, method: str, recording_hash: str) -> Path:
+        return CellStore(tmp_path).path(make_cell(config, method, recording_hash))
+
     base = BenchmarkConfig(str(weights / "0.safetensors"), ("none", "late"))
     late = replace(channel_preset("ideal"), base_latency_s=0.1)
     others = [
@@ -49,13 +51,13 @@ def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_p
             {"seed": 1}, {"all_egos": True}, {"warmup_frames": 3}, {"latency_budget_s": 0.1},
         )),
     ]  # fmt: skip
-    paths = [result_path(tmp_path, config, "late", "data") for config in (base, *others)]
-    paths += [result_path(tmp_path, base, "none", "data"), result_path(tmp_path, base, "late", "other data")]
+    paths = [path(config, "late", "data") for config in (base, *others)]
+    paths += [path(base, "none", "data"), path(base, "late", "other data")]
     assert len(set(paths)) == len(paths) == 18
     # Neither the company of other methods nor where the same weights lie makes a difference.
     (tmp_path / "copy.safetensors").write_bytes((weights / "0.safetensors").read_bytes())
     moved = replace(base, weights=str(tmp_path / "copy.safetensors"), methods=("late", "early"))
-    assert result_path(tmp_path, moved, "late", "data") == paths[0]
+    assert path(moved, "late", "data") == paths[0]
 
 
 class OneFrame:
@@ -84,14 +86,14 @@ def test_another_recording_has_another_digest() -> None:
     assert len(set(digests)) == 4
 
 
-def make_result(method: str, hits: tuple[int, ...]) -> StudyResult:
+def make_result(method: str, hits: tuple[int, ...]) -> MethodMatches:
     """Four true boxes in a frame of each scenario, so many of them found, and one false alarm behind."""
     frames = []
     for number, found in enumerate(hits):
         rows = torch.tensor([*range(found), -1])
         frames.append(FrameMatch(f"s{number}", 0, torch.linspace(0.9, 0.5, found + 1).double(), rows, 4))
     speeds = tuple(torch.tensor([0.0, 0.0, 9.0, 9.0]) for _ in hits)
-    return StudyResult(
+    return MethodMatches(
         method, (tuple(frames), tuple(frames)), speeds, summarize_messages([], len(hits)), BusVolume(0, 0.0, 0), 0.0
     )
 
@@ -101,27 +103,14 @@ def test_differences_are_paired_and_may_be_over_some_scenarios_alone() -> None:
     results = {("x", "a"): make_result("a", (4, 3, 2, 4)), ("x", "b"): make_result("b", (2, 2, 1, 2))}
     grid = ResultGrid(results, protocol)
     a, b = (results[key].matches[0] for key in results)
-    assert grid.paired_difference(("x", "a"), ("x", "b"), 0) == paired_difference(a, b, protocol=protocol)
+    difference = bootstrap(a, protocol=protocol).paired_difference(bootstrap(b, protocol=protocol))
+    assert grid.paired_difference(("x", "a"), ("x", "b"), 0) == difference
+    assert grid.difference_pair(("x", "a"), ("x", "b")) == (difference, difference)
+    assert grid.difference_pair(("x", "a"), ("y", "b")) is None
+    comparison = grid.compare("a - b", ("x", "a"), ("x", "b"), 1)
+    assert (comparison.metric, comparison.interval) == ("AP@0.7", difference)
     assert grid.bootstrap_ap(("x", "a"), 0, (5.0, 99.0)).value < grid.bootstrap_ap(("x", "a"), 0, (0.0, 0.1)).value
     some = {"s0", "s3"}
     kept = [match for match in a if match.scenario in some]
-    assert grid.bootstrap_ap(("x", "a"), 1, scenarios=some) == scenario_interval(kept, protocol=protocol)
+    assert grid.bootstrap_ap(("x", "a"), 1, scenarios=some) == bootstrap(kept, protocol=protocol).interval()
     assert grid.scenarios_of(("x", "a")) == {"s0", "s1", "s2", "s3"}
-
-
-def test_a_margin_is_met_where_the_whole_interval_is() -> None:
-    results = {
-        ("x", "a"): make_result("a", (4, 4, 4)),
-        ("x", "b"): make_result("b", (2, 2, 2)),
-        ("x", "c"): make_result("c", (4, 4, 2)),
-    }
-    grid = ResultGrid(results, PROTOCOLS["global-sort"])
-    verdicts = [
-        check_margin("", grid, ("x", "a"), ("x", other), 0, margin).verdict
-        for other, margin in (("b", 0.4), ("b", 0.6), ("c", 0.1))
-    ]
-    assert verdicts == ["met", "not met", "inconclusive"]
-    single_scenario = ResultGrid(
-        {("x", m): make_result(m, (h,)) for m, h in (("a", 4), ("b", 1))}, PROTOCOLS["global-sort"]
-    )
-    assert check_margin("", single_scenario, ("x", "a"), ("x", "b"), 0, 0.0).verdict == "inconclusive"

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells: classes of speed by hand, and a file that gives back what was written or nothing."""
+"""Cells: classes of speed by hand, and what is selected of a result."""
 
-import dataclasses
 import math
 
 import pytest
@@ -9,7 +8,7 @@ import torch
 
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch, compute_ap
 from manyeyes.evaluation.detection.communication import summarize_messages
-from manyeyes.evaluation.study_result import BusVolume, StudyResult, filter_by_speed, read_result, write_result
+from manyeyes.studies.engine.conditions import BusVolume, MethodMatches, filter_by_speed
 
 STILL, SLOW, FAST = (0.0, 0.1), (0.1, 5.0), (5.0, math.inf)
 
@@ -50,43 +49,14 @@ def test_a_frame_without_boxes_of_a_class_counts_its_false_alarms() -> None:
     assert len(empty.score) == empty.n_gt == 0
 
 
-def make_result() -> StudyResult:
+def make_result() -> MethodMatches:
     half = (frame("a", 6), frame("a", 7, ()), frame("b", 6, (-1, 1)))
     seven = (frame("a", 6, (2, -1, -1, -1)), frame("a", 7, ()), frame("b", 6, (-1, -1)))
-    return StudyResult(
+    return MethodMatches(
         "late", (half, seven), (SPEED, SPEED + 1, SPEED * 2), summarize_messages([], 3), BusVolume(0, 0.0, 0), math.nan
     )
-
-
-def test_a_result_round_trips_through_its_file(tmp_path) -> None:
-    write_result(tmp_path / "x.npz", make_result())
-    got, wanted = read_result(tmp_path / "x.npz"), make_result()
-    assert got is not None and [p.name for p in tmp_path.iterdir()] == ["x.npz"]
-    for one, other in zip(got.matches, wanted.matches, strict=True):
-        for a, b in zip(one, other, strict=True):
-            assert (a.scenario, a.index, a.n_gt) == (b.scenario, b.index, b.n_gt)
-            assert torch.equal(a.score, b.score) and torch.equal(a.truth_row, b.truth_row)
-    assert all(torch.equal(a, b) for a, b in zip(got.speeds, wanted.speeds, strict=True))
-    assert repr(got.communication) == repr(wanted.communication) and got.volume == wanted.volume
-    assert got.method == "late" and math.isnan(got.age_ms) and got.bytes_per_message == 0
 
 
 def test_scenarios_and_speeds_choose_frames() -> None:
     assert [(m.scenario, m.index) for m in make_result().select_matches(0)] == [("a", 6), ("a", 7), ("b", 6)]
     assert [(m.scenario, m.n_gt) for m in make_result().select_matches(1, {"b"}, FAST)] == [("b", 2)]
-
-
-@pytest.mark.parametrize("cut", [0, 10, 200, -1])
-def test_a_damaged_file_is_no_result(tmp_path, cut) -> None:
-    path = tmp_path / "x.npz"
-    assert read_result(path) is None
-    write_result(path, make_result())
-    whole = path.read_bytes()
-    path.write_bytes(whole[:cut])
-    assert read_result(path) is None
-
-
-def test_a_result_of_another_layout_is_none(tmp_path) -> None:
-    one_threshold = dataclasses.replace(make_result(), matches=make_result().matches[:1])
-    write_result(tmp_path / "x.npz", one_threshold)
-    assert read_result(tmp_path / "x.npz") is None

@@ -9,20 +9,21 @@ counts, one seed that no study uses; of equal ones the first stays. Fields that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from manyeyes.evaluation.maps.experiment import FleetTrial
-from manyeyes.evaluation.maps.map_cells import MapStudyJob, run_study_job
-from manyeyes.evaluation.maps.registry import MethodSettings, apply_changes, make_default_config
-from manyeyes.maps.registry import OURS
-from manyeyes.maps.store.executors import Executor, map_blocks
+from manyeyes.evaluation.maps.registry import MethodSettings, apply_changes, check_method, make_default_config
+from manyeyes.maps.registry import OURS, list_map_fusions
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.fleet.config import CROWDS
+from manyeyes.studies.engine.report import StudyContext
+from manyeyes.studies.maps.fleet_cells import FleetJob
+from manyeyes.studies.options import TuningOptions
+from manyeyes.viz.study_table import StudyTable
 
 NUM_CONFIGS, SEED = 8, 1000
 PLACES, OBSERVATION_COUNTS = ("Town07", "cross"), (20, 60)
@@ -81,7 +82,7 @@ SEARCH_SPACE: dict[str, SearchSpace] = {
 
 @dataclass(frozen=True)
 class SearchTrial:
-    """One configuration and its worth; changes: the drawn fields that differ from the defaults."""
+    """One configuration and its mean AP; changes: the drawn fields that differ from the defaults."""
 
     method: str
     config_index: int
@@ -103,26 +104,35 @@ def make_settings(method: str, config: Any) -> MethodSettings:
     return MethodSettings(((method, config),))
 
 
+def run(options: TuningOptions, context: StudyContext) -> None:
+    """Run the search and write its report."""
+    for method in options.methods:
+        check_method(method)
+    trials = run_random_search(context, options.methods or list_map_fusions(), options.workers)
+    defaults = {trial.method: trial.mean_ap for trial in trials if trial.config_index == 0}
+    best = {trial.method: trial for trial in reversed(trials)}
+    lines = tuple(
+        (m, ", ".join(f"{name}={value}" for name, value in best[m].changes), f"{best[m].mean_ap:.3f}", f"{ap:.3f}")
+        for m, ap in defaults.items()
+    )
+    table = StudyTable("Best configurations", ("method", "changes", "mAP", "mAP of the defaults"), lines)
+    payload: dict[str, object] = {"budget": NUM_CONFIGS, "search_trials": trials}
+    context.write_report("Random search with equal budgets", payload, [table], config={"search_space": SEARCH_SPACE})
+
+
 def run_random_search(
-    methods: Sequence[str],
-    results_folder: Path,
-    executor: Executor,
-    progress: Callable[[int, int], None] | None = None,
-    num_configs: int = NUM_CONFIGS,
+    context: StudyContext, methods: Sequence[str], workers: int, num_configs: int = NUM_CONFIGS
 ) -> tuple[SearchTrial, ...]:
-    """Every method's configurations with their worth, the best of each method first."""
+    """Evaluate every method's configurations, the best of each method first."""
     candidates = [(method, config_index) for method in methods for config_index in range(num_configs)]
-    jobs = []
-    for place in PLACES:
-        for num_observations in OBSERVATION_COUNTS:
-            trial = FleetTrial(place, num_observations, SEED, fleet_config=CROWDS["local"])
-            for method, config_index in candidates:
-                config = apply_changes(make_default_config(method), sample_changes(method, config_index))
-                jobs.append(MapStudyJob(trial, (method,), make_settings(method, config), results_folder))
-    with executor.open() as session:
-        results = [
-            result for job_results in map_blocks(run_study_job, jobs, session, progress) for result in job_results
-        ]
+    settings = [make_settings(m, apply_changes(make_default_config(m), sample_changes(m, k))) for m, k in candidates]
+    jobs = [
+        FleetJob(FleetTrial(place, count, SEED, fleet_config=CROWDS["local"]), (method,), one, context.store)
+        for place in PLACES
+        for count in OBSERVATION_COUNTS
+        for (method, _), one in zip(candidates, settings)
+    ]
+    results = [result for part in context.run_jobs(jobs, workers, "Trials") for result in part]
     mean_ap = np.array([result.get_ap() for result in results]).reshape(-1, len(candidates))
     search_trials = [
         SearchTrial(method, config_index, sample_changes(method, config_index), float(np.nanmean(mean_ap[:, k])))

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frozen dataclasses and named tuples as files: numbers and texts as JSON, arrays and tensors as bytes behind it.
+
+Which arrays are read-only is kept, as compiled loops have one version for those and one for others. A checksum covers every part.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import types
+import zlib
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from manyeyes._io import atomic_write
+
+T = TypeVar("T")
+
+
+def save_record(path: Path, value: object) -> None:
+    """Write a value to a file: whole, or not there.
+
+    Fields are numbers, texts, enumerations, None, arrays, tensors, tuples of these, and such dataclasses or named tuples again.
+    """
+    arrays: list[np.ndarray] = []
+    header = json.dumps(_pack(value, arrays)).encode()
+    chunks = (memoryview(_bytes_of(array)) for array in arrays if array.size)
+    atomic_write(path, b"%08x" % zlib.crc32(header), header, b"\n", *chunks, durable=False)
+
+
+def load_record(path: Path, kind: type[T]) -> T | None:
+    """Read the value of a file of :func:`save_record`; None where there is no such file, a damaged one, or one of another type."""
+    try:
+        with path.open("rb") as file:
+            checksum, header = file.read(8), file.readline()[:-1]
+            if int(checksum, 16) != zlib.crc32(header):
+                return None
+            return _unpack(kind, json.loads(header), file)
+    except (OSError, ValueError, TypeError, EOFError, AttributeError):
+        return None
+
+
+def _pack(value: Any, arrays: list[np.ndarray]) -> Any:
+    """A value as JSON can hold it; arrays are appended, each stands as type, shape, order, whether writeable, and checksum."""
+    if names := _field_names(type(value)):
+        return [_pack(getattr(value, name), arrays) for name in names]
+    if isinstance(value, (tuple, list)):
+        return [_pack(item, arrays) for item in value]
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, (np.generic, int, float, str)) or value is None:
+        return value.item() if isinstance(value, np.generic) else value
+    array = value.numpy() if hasattr(value, "numpy") else np.asarray(value)
+    arrays.append(array)
+    is_transposed = array.flags.fnc
+    shape = array.shape[::-1] if is_transposed else array.shape
+    return [array.dtype.str, shape, is_transposed, array.flags.writeable, zlib.crc32(_bytes_of(array))]
+
+
+def _bytes_of(array: np.ndarray) -> np.ndarray:
+    """The bytes (N,) of an array as it lies in memory."""
+    return np.ascontiguousarray(array.T if array.flags.fnc else array).reshape(-1).view(np.uint8)
+
+
+def _unpack(hint: Any, packed: Any, file: io.BufferedIOBase) -> Any:
+    if names := _field_names(hint):
+        if len(packed) != len(names):
+            raise ValueError("another layout")
+        hints = _hints_of(hint)
+        return hint(**{name: _unpack(hints[name], item, file) for name, item in zip(names, packed)})
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is tuple:
+        item_hints = arguments[:1] * len(packed) if arguments[-1] is Ellipsis else arguments
+        return tuple(_unpack(item_hint, item, file) for item_hint, item in zip(item_hints, packed, strict=True))
+    if origin in (Union, types.UnionType):
+        return None if packed is None else _unpack(next(a for a in arguments if a is not type(None)), packed, file)
+    if hint is np.ndarray or origin is np.ndarray:
+        return _read_array(packed, file)
+    if getattr(hint, "__name__", "") == "Tensor":
+        import torch
+
+        return torch.from_numpy(_read_array(packed, file))
+    return hint(packed) if isinstance(hint, type) and issubclass(hint, Enum) else packed
+
+
+def _read_array(packed: Any, file: io.BufferedIOBase) -> np.ndarray:
+    dtype, shape, is_transposed, writeable, checksum = packed
+    array = np.empty(shape, np.dtype(dtype))
+    stored = array.reshape(-1).view(np.uint8)
+    if file.readinto(memoryview(stored)) != array.nbytes or zlib.crc32(stored) != checksum:
+        raise ValueError("damaged")
+    array = array.T if is_transposed else array
+    array.flags.writeable = writeable
+    return array
+
+
+@lru_cache(maxsize=256)
+def _hints_of(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _field_names(kind: Any) -> tuple[str, ...]:
+    """Names of the fields of a dataclass or a named tuple; none of any other type."""
+    if is_dataclass(kind):
+        return tuple(f.name for f in fields(kind))
+    return getattr(kind, "_fields", ()) if isinstance(kind, type) else ()

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Methods replayed under many conditions: one cell for each method and condition, and the paired statistics over them.
+
+Cells are judged over scenarios; differences are paired: all cells are resampled alike, and the unit draws of noise, loss and
+jitter are the same at every level. AP of a speed class counts the true boxes of that class; a detection that was matched to a box
+of another class is left out, neither right nor wrong; one that matched nothing is false in every class.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from manyeyes.agents.strategies.registry import get_strategy
+from manyeyes.datasets.base import Recording
+from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MetricAccumulator
+from manyeyes.evaluation.detection.average_precision import DetectionProtocol, FrameMatch
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, resolve_protocol, run_benchmarks
+from manyeyes.evaluation.detection.communication import Communication
+from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval, bootstrap
+from manyeyes.evaluation.statistics.comparison import Comparison
+from manyeyes.models.checkpoint import fingerprint
+from manyeyes.studies.engine.cells import Cell, CellStore, hash_recording, third_party_source
+
+COMPUTED_BY = ("manyeyes.evaluation.detection.benchmark",)
+"""The modules whose import closure the numbers of a cell follow from."""
+
+SpeedRange = tuple[float, float]
+"""A class of speeds, m/s: from the first, below the second."""
+ResultKey = tuple[str, str]
+"""The names of a condition and of a method."""
+
+
+@dataclass(frozen=True)
+class BusVolume:
+    """Bytes handed to the bus. max_message_bytes: one agent's at one instant; snapshot: of all senders together, mean and maximum.
+
+    Where the first agent alone is judged, its own message is not received by it and is not counted.
+    """
+
+    max_message_bytes: int
+    mean_snapshot_bytes: float
+    max_snapshot_bytes: int
+
+
+@dataclass(frozen=True)
+class MethodMatches:
+    """A method in a condition. matches: every evaluated frame at each of IOU_THRESHOLDS; speeds: (G,) m/s of each frame's true
+    boxes.
+    """
+
+    method: str
+    matches: tuple[tuple[FrameMatch, ...], ...]
+    speeds: tuple[Tensor, ...]
+    communication: Communication
+    volume: BusVolume
+    age_ms: float
+
+    @property
+    def bytes_per_message(self) -> float:
+        """The mean length of another agent's message for an ego's frame; 0 without messages."""
+        return self.communication.bytes_per_message if self.communication.num_messages else 0.0
+
+    def select_matches(
+        self, iou: int, scenarios: Collection[str] | None = None, speed_range: SpeedRange | None = None
+    ) -> list[FrameMatch]:
+        """Select the frames matched at IOU_THRESHOLDS[iou]: of these scenarios alone, of one class of speeds alone."""
+        pairs = zip(self.matches[iou], self.speeds)
+        kept = [(match, v) for match, v in pairs if scenarios is None or match.scenario in scenarios]
+        return [match if speed_range is None else filter_by_speed(match, v, speed_range) for match, v in kept]
+
+
+def filter_by_speed(match: FrameMatch, speed: Tensor, speed_range: SpeedRange) -> FrameMatch:
+    """Restrict a frame to the true boxes of one class of speeds; speed (G,)."""
+    inside = (speed >= speed_range[0]) & (speed < speed_range[1])
+    # Row -1 indexes the last entry, which is kept: a false positive stays one.
+    mask = torch.cat((inside, torch.ones(1, dtype=torch.bool)))[match.truth_row]
+    return FrameMatch(match.scenario, match.index, match.score[mask], match.truth_row[mask], int(inside.sum()))
+
+
+def summarize_metrics(metrics: MetricAccumulator) -> MethodMatches:
+    """Reduce an accumulator to what studies need."""
+    sent = {(m.scenario, m.index, m.sender): m.num_bytes for m in metrics.messages}
+    snapshot_bytes: dict[tuple[str, int], int] = {}
+    for (scenario, index, _), size in sent.items():
+        snapshot_bytes[scenario, index] = snapshot_bytes.get((scenario, index), 0) + size
+    num_snapshots = len({(frame.scenario, frame.index) for frame in metrics.frames})
+    volume = BusVolume(
+        max(sent.values(), default=0),
+        sum(snapshot_bytes.values()) / num_snapshots if num_snapshots else math.nan,
+        max(snapshot_bytes.values(), default=0),
+    )
+    communication, speeds = metrics.summarize_communication(), tuple(metrics.speeds)
+    return MethodMatches(metrics.method, metrics.match_frames(), speeds, communication, volume, metrics.mean_age_ms())
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One setting of the world in which methods are played. name: how tables call it, and how it is found again."""
+
+    name: str
+    config: BenchmarkConfig
+
+
+@dataclass(frozen=True)
+class ResultGrid:
+    """The cells of a study by condition and method, and what follows from them. iou: row of IOU_THRESHOLDS."""
+
+    results: dict[ResultKey, MethodMatches]
+    protocol: DetectionProtocol
+    _bootstraps: dict[object, BootstrapSamples] = field(default_factory=dict, repr=False, compare=False)
+
+    def bootstrap_ap(
+        self, key: ResultKey, iou: int, speeds: SpeedRange | None = None, scenarios: Collection[str] | None = None
+    ) -> Interval:
+        """AP of a cell with its interval, over some scenarios or one class of speeds alone."""
+        return self._bootstrap(key, iou, speeds, scenarios).interval()
+
+    def ap_pair(self, key: ResultKey) -> tuple[Interval, Interval]:
+        """AP of a cell at both IoU thresholds."""
+        return self.bootstrap_ap(key, 0), self.bootstrap_ap(key, 1)
+
+    def paired_difference(
+        self, key: ResultKey, other: ResultKey, iou: int, scenarios: Collection[str] | None = None
+    ) -> Interval:
+        """AP of a cell minus that of another, paired over scenarios."""
+        samples = self._bootstrap(key, iou, None, scenarios)
+        return samples.paired_difference(self._bootstrap(other, iou, None, scenarios))
+
+    def difference_pair(self, key: ResultKey, other: ResultKey) -> tuple[Interval, Interval] | None:
+        """AP of a cell minus that of another at both IoU thresholds; None where the other was not run."""
+        if other not in self.results:
+            return None
+        return self.paired_difference(key, other, 0), self.paired_difference(key, other, 1)
+
+    def compare(self, description: str, key: ResultKey, baseline: ResultKey, iou: int = 0) -> Comparison:
+        """Compare AP of a cell with that of a baseline, paired over scenarios."""
+        return Comparison(description, f"AP@{IOU_THRESHOLDS[iou]:g}", self.paired_difference(key, baseline, iou))
+
+    def scenarios_of(self, key: ResultKey) -> frozenset[str]:
+        """Those that a cell was played on."""
+        return frozenset(match.scenario for match in self.results[key].matches[0])
+
+    def _bootstrap(
+        self, key: ResultKey, iou: int, speeds: SpeedRange | None, scenarios: Collection[str] | None
+    ) -> BootstrapSamples:
+        cache_key = (key, iou, speeds, None if scenarios is None else frozenset(scenarios))
+        if cache_key not in self._bootstraps:
+            frames = self.results[key].select_matches(iou, scenarios, speeds)
+            self._bootstraps[cache_key] = bootstrap(frames, protocol=self.protocol)
+        return self._bootstraps[cache_key]
+
+
+def run_conditions(
+    open_recording: Callable[[], Recording],
+    conditions: Sequence[Condition],
+    store: CellStore,
+    workers: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> ResultGrid:
+    """Load every method of every condition from the store, or play it now and store it.
+
+    progress counts scenarios of conditions that are still to be played. Conditions of one configuration but for its methods
+    should be one: methods of one condition process each cloud once.
+    """
+    recording_hash = hash_recording(open_recording())
+    cells = {(c.name, m): make_cell(c.config, m, recording_hash) for c in conditions for m in c.config.methods}
+    stored = {key: result for key, cell in cells.items() if (result := store.load(cell)) is not None}
+    remaining = [(c, tuple(m for m in c.config.methods if (c.name, m) not in stored)) for c in conditions]
+    pending = [Condition(c.name, replace(c.config, methods=methods)) for c, methods in remaining if methods]
+    with closing(run_benchmarks(open_recording, [c.config for c in pending], workers, progress)) as results:
+        for condition, metrics_by_method in zip(pending, results):
+            for metrics in metrics_by_method:
+                key = condition.name, metrics.method
+                stored[key] = summarize_metrics(metrics)
+                store.save(cells[key], stored[key])
+    return ResultGrid({key: stored[key] for key in cells}, resolve_protocol(conditions[0].config))
+
+
+def make_cell(config: BenchmarkConfig, method: str, recording_hash: str) -> Cell[MethodMatches]:
+    """Describe the cell of one method of a configuration."""
+    method_config = replace(config, methods=(method,), weights=load_detector(config.weights).fingerprint.hex())
+    net = config.replay.pose_correction.net if config.replay.pose_correction is not None else None
+    corrector_fingerprint = "" if net is None else fingerprint(net).hex()
+    source = third_party_source(get_strategy(method), load_detector(config.weights))
+    return Cell(method, MethodMatches, (method_config, corrector_fingerprint, recording_hash, source), COMPUTED_BY)
