@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from manyeyes.agents.exchange import Exchange
 from manyeyes.agents.map_perception import MapPredictor, encode_map_message
 from manyeyes.agents.map_server import MapServer
-from manyeyes.comms.channel import NS_PER_S, Channel, channel_preset
+from manyeyes.comms.channel import NS_PER_S, channel_preset
 from manyeyes.comms.inbox import Inbox
-from manyeyes.comms.local_bus import LocalBus
 from manyeyes.datatypes import AgentFrame
 
 SERVER_ID = -(2**31)
@@ -53,35 +53,29 @@ class MapReplay:
     channel: str = "ideal"
     seed: int = 0
     latency_budget_s: float = 0.05
-    _feature_bus: LocalBus = field(init=False)
-    _map_bus: LocalBus = field(init=False)
-    _inboxes: dict[int, Inbox] = field(default_factory=dict)
+    _features: Exchange = field(init=False)
+    _maps: Exchange = field(init=False)
     _now_ns: int = 0
 
     def __post_init__(self) -> None:
         radio = channel_preset(self.channel)
-        self._feature_bus, self._map_bus = LocalBus(Channel(radio, self.seed)), LocalBus(Channel(radio, self.seed))
+        self._features, self._maps = (Exchange(radio, self.seed, lambda _: Inbox(expire_ns=DRAIN_NS)) for _ in range(2))
 
     def step(self, frames: Sequence[AgentFrame]) -> tuple[SentRecord, ...]:
         """Replay one instant: share features, predict and send local maps, and ingest them at the server."""
-        feature_sizes = [
-            self._send(self._feature_bus, frame, [] if self.encode_features is None else self.encode_features(frame))
-            for frame in frames
-        ]
-        self._now_ns = max((frame.timestamp_ns for frame in frames), default=self._now_ns) + round(
-            self.latency_budget_s * NS_PER_S
-        )
+        features = [[] if self.encode_features is None else self.encode_features(frame) for frame in frames]
+        latest_ns = max((frame.timestamp_ns for frame in frames), default=self._now_ns)
+        self._now_ns = latest_ns + round(self.latency_budget_s * NS_PER_S)
+        positions = {frame.agent_id: _position_xy(frame) for frame in frames}
+        exchanged = self._features.run(frames, features, [self._now_ns] * len(frames), positions)
         records = []
-        for frame, feature_bytes in zip(frames, feature_sizes):
-            received = (
-                ()
-                if self.encode_features is None
-                else self._receive(self._feature_bus, frame.agent_id, _position_xy(frame)).messages()
-            )
-            local_map = self.map_predictor(frame, received)
+        for (frame, inbox, _), sent in zip(exchanged, features):
+            local_map = self.map_predictor(frame, inbox.messages())
             packets = [] if local_map is None else encode_map_message(frame, local_map, self.fingerprint)
-            size, count = self._send(self._map_bus, frame, packets), 0 if local_map is None else len(local_map.elements)
-            records.append(SentRecord(frame.agent_id, frame.timestamp_ns, feature_bytes, size, len(packets), count))
+            self._maps.send(frame, packets, positions)
+            sizes = sum(map(len, sent)), sum(map(len, packets)), len(packets)
+            count = 0 if local_map is None else len(local_map.elements)
+            records.append(SentRecord(frame.agent_id, frame.timestamp_ns, *sizes, count))
         self._ingest(frames)
         return tuple(records)
 
@@ -94,20 +88,8 @@ class MapReplay:
         """Ingest what the server received at the mean position of the agents."""
         if frames:
             x, y = np.mean([_position_xy(frame) for frame in frames], 0).tolist()
-            self.map_server.ingest(self._receive(self._map_bus, SERVER_ID, (x, y)).received_messages(), self.drive)
-
-    def _receive(self, bus: LocalBus, receiver_id: int, position_xy: tuple[float, float]) -> Inbox:
-        """Return the inbox of an agent or of the server, with all packets that have arrived."""
-        inbox = self._inboxes.setdefault(receiver_id, Inbox(expire_ns=DRAIN_NS))
-        for delivery in bus.deliver(receiver_id, position_xy, self._now_ns):
-            inbox.push(delivery.packet, delivery.arrival_ns)
-        return inbox
-
-    @staticmethod
-    def _send(bus: LocalBus, frame: AgentFrame, packets: list[bytes]) -> int:
-        """Publish packets of an agent; returns their number of bytes."""
-        bus.publish(frame.agent_id, _position_xy(frame), packets, frame.timestamp_ns)
-        return sum(map(len, packets))
+            inbox = self._maps.receive(SERVER_ID, self._now_ns, {SERVER_ID: (x, y)})
+            self.map_server.ingest(inbox.received_messages(), self.drive)
 
 
 def _position_xy(frame: AgentFrame) -> tuple[float, float]:

@@ -3,19 +3,18 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from manyeyes.agents.agent import Agent, Perception
+from manyeyes.agents.exchange import Exchange
 from manyeyes.agents.perception_cache import HISTORY_FRAMES, TRACK_FRAMES, AgentOutput, PerceptionCache
 from manyeyes.agents.pose_correction import PoseCorrection
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.comms.bandwidth import allocate_max_min_fair
-from manyeyes.comms.channel import Channel, ChannelPreset, channel_preset
+from manyeyes.comms.channel import ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
-from manyeyes.comms.local_bus import LocalBus
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
@@ -99,7 +98,7 @@ class ReplayStep:
 
 @dataclass
 class DetectionReplay:
-    """All agents of one scenario with one method, their inboxes and the channel between them.
+    """All agents of one scenario with one method.
 
     feature_cache: detector outputs that are read and extended.
     """
@@ -109,79 +108,72 @@ class DetectionReplay:
     config: ReplayConfig
     feature_cache: CachedOutputs | None = None
     _agents: dict[int, Agent] = field(default_factory=dict)
-    _inboxes: dict[int, Inbox] = field(default_factory=dict)
-    _bus: LocalBus = field(init=False)
+    _exchange: Exchange = field(init=False)
 
     def __post_init__(self) -> None:
-        self._bus = LocalBus(Channel(self.config.radio, self.config.seed))
+        config = self.config
+        self._exchange = Exchange(config.radio, config.seed, self._make_inbox, config.comm_range_m)
 
     def step(self, snapshot: Snapshot) -> Iterator[ReplayStep]:
         """Let all agents share; the evaluated egos receive and perceive."""
-        positions = _antenna_positions(snapshot)
-        sent = self._share(snapshot.frames, positions)
-        egos = range(len(snapshot.frames)) if self.config.all_egos else range(1)
-        for ego, frame in enumerate(snapshot.frames):
-            deadline_ns = frame.timestamp_ns + round(self.config.latency_budget_s * 1e9)
-            agent, inbox = self._get_agent_and_inbox(frame)
-            here = positions[frame.agent_id]
-            for delivery in self._bus.deliver(frame.agent_id, here, deadline_ns):
-                if math.dist(here, positions.get(delivery.sender_id, here)) <= self.config.comm_range_m:
-                    inbox.push(delivery.packet, delivery.arrival_ns)
-            if ego in egos:
-                began = time.perf_counter()
-                perception = agent.perceive(frame, inbox, deadline_ns)
-                took = time.perf_counter() - began
-                for rejection in perception.rejected:
-                    # All senders of a replay are agents of this program: an error is a defect of the code.
-                    if rejection.cause is not None:
-                        raise rejection.cause
-                ages = tuple(message.age_ns(deadline_ns) / 1e9 for message in perception.received)
-                yield ReplayStep(self.method, snapshot, ego, perception, sent, ages, took)
-
-    def _share(
-        self, frames: Sequence[AgentFrame], positions: dict[int, tuple[float, float]]
-    ) -> tuple[SentPackets, ...]:
-        """Publish the packets of all agents on the bus and count them."""
-        outgoing = [self._share_one(frame) for frame in frames]
-        if self.config.channel_budget_bytes is not None:
-            requested = [sum(map(len, packets)) for packets, _ in outgoing]
-            shares = allocate_max_min_fair(self.config.channel_budget_bytes, requested)
-            limited = zip(frames, outgoing, requested, shares)
-            outgoing = [
-                message if share == want else self._share_one(frame, share) for frame, message, want, share in limited
-            ]
-        for frame, (packets, _) in zip(frames, outgoing):
-            self._bus.publish(frame.agent_id, positions[frame.agent_id], packets, frame.timestamp_ns)
-        return tuple(
+        frames, latency_ns = snapshot.frames, round(self.config.latency_budget_s * 1e9)
+        outgoing = self._share(frames)
+        sent = tuple(
             SentPackets(frame.agent_id, tuple(map(len, packets)), took)
             for frame, (packets, took) in zip(frames, outgoing)
         )
+        deadlines_ns = [frame.timestamp_ns + latency_ns for frame in frames]
+        packets, positions = [own for own, _ in outgoing], _antenna_positions(snapshot)
+        exchanged = self._exchange.run(frames, packets, deadlines_ns, positions)
+        for ego, (frame, inbox, deadline_ns) in enumerate(exchanged):
+            if ego and not self.config.all_egos:
+                continue
+            began = time.perf_counter()
+            perception = self._agent(frame.agent_id).perceive(frame, inbox, deadline_ns)
+            took = time.perf_counter() - began
+            for rejection in perception.rejected:
+                # All senders of a replay are agents of this program: an error is a defect of the code.
+                if rejection.cause is not None:
+                    raise rejection.cause
+            ages = tuple(message.age_ns(deadline_ns) / 1e9 for message in perception.received)
+            yield ReplayStep(self.method, snapshot, ego, perception, sent, ages, took)
+
+    def _share(self, frames: Sequence[AgentFrame]) -> list[tuple[list[bytes], float]]:
+        """Compose the packets of all agents, within the budget of the channel; with the duration of share in seconds."""
+        outgoing = [self._share_one(frame) for frame in frames]
+        if self.config.channel_budget_bytes is None:
+            return outgoing
+        requested = [sum(map(len, packets)) for packets, _ in outgoing]
+        shares = allocate_max_min_fair(self.config.channel_budget_bytes, requested)
+        return [
+            message if share == want else self._share_one(frame, share)
+            for frame, message, want, share in zip(frames, outgoing, requested, shares)
+        ]
 
     def _share_one(self, frame: AgentFrame, budget_bytes: int | None = None) -> tuple[list[bytes], float]:
         """Return packets of one agent, and the duration of share in seconds."""
-        agent, inbox = self._get_agent_and_inbox(frame)
-        requests = inbox.messages() if self.config.send_request_map else ()
+        agent = self._agent(frame.agent_id)
+        requests = self._exchange.inbox(frame.agent_id).messages() if self.config.send_request_map else ()
         began = time.perf_counter()
         packets = agent.share(frame, budget_bytes, requests)
         return packets, time.perf_counter() - began
 
-    def _get_agent_and_inbox(self, frame: AgentFrame) -> tuple[Agent, Inbox]:
-        agent_id = frame.agent_id
+    def _agent(self, agent_id: int) -> Agent:
         if agent_id not in self._agents:
-            cache = PerceptionCache(self.detector, feature_cache=self.feature_cache)
             config = self.config
-            strategy = get_strategy(self.method)
             self._agents[agent_id] = Agent(
                 self.detector,
-                strategy,
+                get_strategy(self.method),
                 config.token_encoding,
                 config.budget_bytes,
-                cache,
+                PerceptionCache(self.detector, feature_cache=self.feature_cache),
                 config.pose_correction,
                 config.send_request_map,
             )
-            self._inboxes[agent_id] = self._agents[agent_id].inbox(EXPIRE_NS)
-        return self._agents[agent_id], self._inboxes[agent_id]
+        return self._agents[agent_id]
+
+    def _make_inbox(self, agent_id: int) -> Inbox:
+        return self._agent(agent_id).inbox(EXPIRE_NS)
 
 
 def _antenna_positions(snapshot: Snapshot) -> dict[int, tuple[float, float]]:

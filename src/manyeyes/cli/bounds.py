@@ -14,8 +14,10 @@ def find_violation(options: Any) -> str | None:
     """Describe the first option of a dataclass whose number is outside its bounds; None where all fit."""
     for name, hint in get_type_hints(type(options), include_extras=True).items():
         value: Any = getattr(options, name)
-        if is_dataclass(value) and (violation := find_violation(value)):
-            return violation
+        if is_dataclass(value):
+            if violation := find_violation(value):
+                return violation
+            continue
         for bounds in _bounds_of(hint):
             for number in value if isinstance(value, tuple) else (value,):
                 if number is not None and not bounds.contains(number):

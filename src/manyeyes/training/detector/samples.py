@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -18,6 +19,9 @@ from torch import Tensor
 from manyeyes.datasets.base import Recording, iter_eval_frames
 from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_generator
+
+MAX_BUDGET_TOKENS = 1500
+"""Maximum of random budgets, which is about all tokens of a view."""
 
 
 @dataclass(frozen=True)
@@ -139,11 +143,7 @@ def make_sample(
     rng = keyed_generator("augment", *key)
     scene = _AugmentedScene(snapshots, rng, config)
     now = snapshots[-1]
-    others = [i for i in range(len(now.frames)) if i != ego]
-    max_others = min(len(others), config.max_agents - 1)
-    # The larger of two draws: many collaborators are more frequent than few.
-    num_others = int(rng.integers(0, max_others + 1, 2).max()) if config.max_agents < 99 else len(others)
-    chosen = [ego, *(others[i] for i in rng.permutation(len(others))[:num_others])]
+    chosen = _choose_agents(len(now.frames), ego, config.max_agents, rng)
     ids = [now.frames[i].agent_id for i in chosen]
     flip = config.flip and rng.random() < 0.5
     scale = 1 + config.max_scale_change * rng.uniform(-1, 1)
@@ -152,55 +152,68 @@ def make_sample(
     truth = _truth(now)
     mine = truth.boxes.id != ids[0]
     merged_gt_boxes = truth.boxes[truth.seen[chosen].any(0) & mine].transform(ego_pose.inverse())
-    has_pose_noise = rng.random() < degradation.pose_noise_prob
-    sigma_xy_m, sigma_yaw_rad = (
-        has_pose_noise * (rng.random() < 0.5) * top * rng.random()
-        for top in (degradation.max_sigma_xy_m, degradation.max_sigma_yaw_rad)
-    )
-    if not sigma_xy_m and not sigma_yaw_rad and has_pose_noise:
-        sigma_xy_m = degradation.max_sigma_xy_m * rng.random()
+    sigma_xy_m, sigma_yaw_rad = _draw_pose_noise(degradation, rng)
     views, sender_history = [scene.view(0, ids[0], ego_pose)], list[AgentView]()
     if rng.random() < config.early_fusion_prob:
         views = [scene.merge(ids, ego_pose, merged_gt_boxes)]
     else:
         for agent_id in ids[1:]:
-            back = (
-                int(rng.integers(1, degradation.max_delay_frames + 1)) if rng.random() < degradation.delay_prob else 0
-            )
-            off = rng.standard_normal(3) * (sigma_xy_m, sigma_xy_m, sigma_yaw_rad)
-            loss_fraction = degradation.max_loss_fraction * rng.random() * (rng.random() < degradation.packet_loss_prob)
-            budget = (
-                math.exp(rng.uniform(math.log(degradation.min_budget_tokens), math.log(1500)))
-                if rng.random() < degradation.budget_prob
-                else None
-            )
-            back = back if scene.pose(back, agent_id) is not None else 0
-            max_tokens = None if budget is None else int(budget)
-            instants = [
-                k for k in range(back, back + 1 + degradation.sender_history) if scene.pose(k, agent_id) is not None
-            ]
-            raw_views = (scene.view(k, agent_id, ego_pose, off) for k in instants)
-            agent_views = [
-                replace(
-                    v,
-                    sigma_xy_m=sigma_xy_m,
-                    sigma_yaw_rad=sigma_yaw_rad,
-                    loss_fraction=loss_fraction,
-                    max_tokens=max_tokens,
-                )
-                for v in raw_views
-            ]
-            views.append(agent_views[0])
-            sender_history += agent_views[1:]
+            newest, *older = _degraded_views(scene, agent_id, ego_pose, (sigma_xy_m, sigma_yaw_rad), degradation, rng)
+            views.append(newest)
+            sender_history += older
     known = (k for k in range(1, degradation.ego_history + 1) if scene.pose(k, ids[0]) is not None)
-    ego_history = tuple(scene.view(k, ids[0], ego_pose) for k in known) if len(views) > 1 or len(ids) == 1 else ()
+    ego_history = [scene.view(k, ids[0], ego_pose) for k in known] if len(views) > 1 or len(ids) == 1 else []
+    resize = partial(_resize_view, scale=scale, flip=flip, grid=grid)
     return Sample(
-        tuple(_resize_view(view, scale, flip, grid) for view in views),
-        tuple(_resize_view(view, scale, flip, grid) for view in ego_history),
-        tuple(_resize_view(view, scale, flip, grid) for view in sender_history),
+        tuple(map(resize, views)),
+        tuple(map(resize, ego_history)),
+        tuple(map(resize, sender_history)),
         _in_range(_resize_boxes(merged_gt_boxes, scale, flip), grid),
         key,
     )
+
+
+def _choose_agents(count: int, ego: int, max_agents: int, rng: np.random.Generator) -> list[int]:
+    """Choose the rows of the ego, first, and of random collaborators."""
+    others = [i for i in range(count) if i != ego]
+    # The larger of two draws: many collaborators are more frequent than few.
+    max_others = min(len(others), max_agents - 1)
+    num_others = int(rng.integers(0, max_others + 1, 2).max()) if max_agents < 99 else len(others)
+    return [ego, *(others[i] for i in rng.permutation(len(others))[:num_others])]
+
+
+def _draw_pose_noise(degradation: DegradationConfig, rng: np.random.Generator) -> tuple[float, float]:
+    """Draw the standard deviations of positions and headings of a sample; a noisy sample has at least one of them."""
+    is_noisy = rng.random() < degradation.pose_noise_prob
+    sigma_xy_m, sigma_yaw_rad = (
+        is_noisy * (rng.random() < 0.5) * top * rng.random()
+        for top in (degradation.max_sigma_xy_m, degradation.max_sigma_yaw_rad)
+    )
+    if not sigma_xy_m and not sigma_yaw_rad and is_noisy:
+        sigma_xy_m = degradation.max_sigma_xy_m * rng.random()
+    return sigma_xy_m, sigma_yaw_rad
+
+
+def _degraded_views(
+    scene: _AugmentedScene,
+    agent_id: int,
+    ego_pose: Transform,
+    sigmas: tuple[float, float],
+    degradation: DegradationConfig,
+    rng: np.random.Generator,
+) -> list[AgentView]:
+    """Draw the degradation of a collaborator, and return its received views, newest first."""
+    delay = int(rng.integers(1, degradation.max_delay_frames + 1)) if rng.random() < degradation.delay_prob else 0
+    off = rng.standard_normal(3) * (sigmas[0], sigmas[0], sigmas[1])
+    loss_fraction = degradation.max_loss_fraction * rng.random() * (rng.random() < degradation.packet_loss_prob)
+    max_tokens = None
+    if rng.random() < degradation.budget_prob:
+        max_tokens = int(math.exp(rng.uniform(math.log(degradation.min_budget_tokens), math.log(MAX_BUDGET_TOKENS))))
+    first = delay if scene.pose(delay, agent_id) is not None else 0
+    received = range(first, first + 1 + degradation.sender_history)
+    views = [scene.view(k, agent_id, ego_pose, off) for k in received if scene.pose(k, agent_id) is not None]
+    link = dict(zip(("sigma_xy_m", "sigma_yaw_rad"), sigmas), loss_fraction=loss_fraction, max_tokens=max_tokens)
+    return [replace(view, **link) for view in views]
 
 
 class _AugmentedScene:

@@ -72,8 +72,8 @@ def assign_targets(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Ta
     return Targets(heat, box, weight, Boxes.cat(truth), positive)
 
 
-def _unique_pairs(distance: Tensor, reach_m: float) -> list[tuple[int, int]]:
-    site, target = (distance < reach_m).nonzero(as_tuple=True)
+def _unique_pairs(distance: Tensor, max_distance_m: float) -> list[tuple[int, int]]:
+    site, target = (distance < max_distance_m).nonzero(as_tuple=True)
     order = distance[site, target].sort(stable=True).indices
     taken_sites: set[int] = set()
     taken_boxes: set[int] = set()
