@@ -18,12 +18,12 @@ PACKAGES = [
     if module.ispkg and hasattr(import_module(module.name), "attach")
 ]
 NAMES = """
-Agent AgentFrame Argoverse2Recording BenchmarkConfig BevGrid BoxDetector Boxes DairRecording Inbox
-ManyeyesError MapElements Message Observation Opv2vRecording Perception PointCloud PoseEstimate PosePrior
-Recording RecordingReader Snapshot SparseBev TokenDetector Transform VectorMap correct_pose fuse_maps
-get_strategy list_correctors list_detectors list_fusion_modules list_map_fusions list_strategies load_detector
-open_recording read_observations register_dataset register_fusion register_map_fusion register_pose_corrector
-register_strategy run_benchmark
+Agent AgentFrame Argoverse2Recording BenchmarkConfig BenchmarkResult BevGrid BoxDetector Boxes DairRecording
+FusionStrategy Inbox ManyeyesError MapElements Message Observation Opv2vRecording Perception PointCloud
+PoseEstimate PosePrior Recording RecordingReader Snapshot SparseBev TokenDetector Transform VectorMap
+benchmark correct_pose fuse_maps get_strategy list_correctors list_detectors list_fusion_modules
+list_map_fusions list_strategies load_detector open_recording read_observations register_dataset
+register_detector register_fusion register_map_fusion register_pose_corrector register_strategy run_benchmark
 """
 
 

@@ -12,6 +12,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from manyeyes.agents.agent import Agent as Agent, Perception as Perception
     from manyeyes.agents.strategies.registry import (
+        FusionStrategy as FusionStrategy,
         get_strategy as get_strategy,
         list_strategies as list_strategies,
         register_strategy as register_strategy,
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from manyeyes.datatypes.transform import Transform as Transform
     from manyeyes.evaluation.detection.benchmark import (
         BenchmarkConfig as BenchmarkConfig,
+        BenchmarkResult as BenchmarkResult,
+        benchmark as benchmark,
         run_benchmark as run_benchmark,
     )
     from manyeyes.maps.elements.observation import Observation as Observation
@@ -48,7 +51,11 @@ if TYPE_CHECKING:
         list_fusion_modules as list_fusion_modules,
         register_fusion as register_fusion,
     )
-    from manyeyes.models.pretrained import list_detectors as list_detectors, load as load_detector  # noqa: F401
+    from manyeyes.models.pretrained import (  # noqa: F401
+        list_detectors as list_detectors,
+        load as load_detector,
+        register_detector as register_detector,
+    )
     from manyeyes.pose.registry import (
         correct_pose as correct_pose,
         list_correctors as list_correctors,

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -90,3 +91,40 @@ def test_07_map_model(tmp_path: Path) -> None:
     # The AP of dividers is higher from five frames than from one.
     assert float(several.split("divider ")[1].split(",")[0]) > float(single.split("divider ")[1].split(",")[0])
     assert picture.stat().st_size > 10_000
+
+
+def read_code_blocks(guide: Path) -> list[str]:
+    """The blocks of Python in a page."""
+    return [block.split("```")[0] for block in guide.read_text().split("```python\n")[1:]]
+
+
+@pytest.mark.parametrize(
+    ("guide", "example", "package"),
+    [
+        ("own-detector.md", "08_own_detector.py", "own_detector"),
+        ("own-method.md", "09_own_method.py", "own_method"),
+    ],
+)
+def test_the_code_of_a_guide_is_that_of_its_example_and_package(guide: str, example: str, package: str) -> None:
+    text, code = (REPOSITORY / "docs" / "guides" / guide).read_text(), (REPOSITORY / "examples" / example).read_text()
+    blocks = read_code_blocks(REPOSITORY / "docs" / "guides" / guide)
+    absent = [block for block in blocks if block not in code and textwrap.indent(block, "    ") not in code]
+    assert len(blocks) >= 2 and absent == []
+    assert (REPOSITORY / "tests" / "plugins" / package / "pyproject.toml").read_text() in text
+
+
+@pytest.mark.slow
+def test_08_own_detector(tmp_path: Path) -> None:
+    pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
+    heading, *rows = run("08_own_detector.py", str(tmp_path / "drive")).strip().splitlines()[-4:]
+    assert heading.split()[0] == "method" and [row.split()[0] for row in rows] == ["none", "late", "early"]
+    ap = [float(row.split()[1]) for row in rows]
+    assert 0.1 < ap[0] < ap[1] < ap[2]
+
+
+@pytest.mark.slow
+def test_09_own_method(tmp_path: Path) -> None:
+    pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
+    *_, first, second = run("09_own_method.py", str(tmp_path / "drive")).strip().splitlines()
+    assert [row.split()[0] for row in (first, second)] == ["intermediate", "moving-first"]
+    assert all(0 < int(row.split()[-1]) <= 1000 for row in (first, second)) and first.split()[1:] != second.split()[1:]

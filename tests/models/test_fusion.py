@@ -23,7 +23,7 @@ from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_velocity
 from manyeyes.models.detector.transformer import AttentionConfig
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
-from manyeyes.models.fusion.registry import build_fusion, list_fusion_modules, register_fusion
+from manyeyes.models.fusion.registry import get_fusion, list_fusion_modules, register_fusion
 from manyeyes.models.fusion.token_merge import MIN_VOTE_LOGIT, assign_cells
 from manyeyes.models.fusion.transform_tokens import POSE_CONTEXT_DIM, AgentTokens, Tokens, rotate_vectors, to_ego_frame
 
@@ -34,7 +34,7 @@ FUSIONS = ("max", "self-attention", "fast", "v2x-vit")
 
 def fusion(name: str, random_placement: bool = True) -> torch.nn.Module:
     torch.manual_seed(0)
-    model = build_fusion(name, CHANNELS, AttentionConfig(heads=2))
+    model = get_fusion(name)(CHANNELS, AttentionConfig(heads=2))
     if random_placement:
         torch.nn.init.normal_(model.encoding.outer.weight, std=0.3)
         torch.nn.init.normal_(model.encoding.temporal.weight, std=0.3)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from manyeyes.datasets.base import Recording
     from manyeyes.datasets.missing import MissingFiles
-    from manyeyes.models.detector.detector import Detector
+    from manyeyes.models.detector.protocols import BoxDetector
     from manyeyes.training.maps.task import MapTask, MapTrainConfig
     from manyeyes.training.pose.feakm import FeakmTask, FeakmTrainConfig
     from manyeyes.training.pose.feakm_cache import FeatureCache
@@ -48,6 +48,8 @@ class Options:
     """Samples a step over all processes, instead of the preset's."""
     learning_rate: NonNegativeFloat | None = None
     """Instead of the preset's."""
+    fusion: str | None = None
+    """Fusion module of a detector by name, one of your own too, instead of the preset's; an unknown name lists the known ones."""
     weights: tuple[Path, ...] = ()
     """Weights to begin from instead of random ones, such as those of the stage before. Of a map model several, each what it has in
     common with the preset, the first before the others. For feakm and feakm-paper the detector whose view they match, a shipped
@@ -80,7 +82,7 @@ def make_config(options: Options) -> TrainConfig:
     """Make the configuration of the preset with what the options replace.
 
     Raises:
-        ConfigError: the preset is unknown, or takes only one file of weights.
+        ConfigError: the preset is unknown, takes only one file of weights, or has no fusion module.
     """
     from manyeyes.datatypes import ConfigError
     from manyeyes.training.maps.task import MapTrainConfig
@@ -91,8 +93,21 @@ def make_config(options: Options) -> TrainConfig:
     config = TRAINING_PRESETS[options.preset]
     if len(options.weights) > 1 and not isinstance(config, MapTrainConfig):
         raise ConfigError(f"--weights takes one file for {options.preset}; got {len(options.weights)}.")
+    if options.fusion is not None:
+        config = _with_fusion(config, options.fusion)
     given = {name: getattr(options, name) for name in ("steps", "batch", "learning_rate")}
     return replace(config, **{name: value for name, value in given.items() if value is not None})
+
+
+def _with_fusion(config: TrainConfig, fusion: str) -> TrainConfig:
+    from manyeyes.datatypes import ConfigError
+    from manyeyes.models.fusion.registry import get_fusion
+    from manyeyes.training.detector.task import DetectorTrainConfig
+
+    if not isinstance(config, DetectorTrainConfig):
+        raise ConfigError("--fusion is for presets of a detector; this one has no fusion module by name.")
+    get_fusion(fusion)
+    return replace(config, detector=replace(config.detector, fusion=fusion))
 
 
 def _train(options: Options, config: TrainConfig, console: Console) -> None:
@@ -168,17 +183,19 @@ def _make_feakm_task(
     options: Options, config: FeakmTrainConfig, recording: Recording, missing: MissingFiles, bars: ProgressBars
 ) -> FeakmTask:
     from manyeyes.models import pretrained
+    from manyeyes.models.detector.proposal import PROPOSAL_DIM
+    from manyeyes.models.detector.protocols import require_tokens
     from manyeyes.training.pose.feakm import FeakmTask
 
-    detector = pretrained.load(options.weights[0] if options.weights else pretrained.DEFAULT_DETECTOR)
-    keypoints = replace(config.net.keypoints, in_channels=detector.encoder.out_channels)
+    detector = require_tokens(pretrained.load(*options.weights[:1]))
+    keypoints = replace(config.net.keypoints, in_channels=detector.token_channels - PROPOSAL_DIM)
     net = replace(config.net, keypoints=keypoints, detector=detector.fingerprint.hex())
     cache = _load_or_cache_features(options, recording, missing, detector, bars)
     return FeakmTask(replace(config, net=net), cache, options.seed)
 
 
 def _load_or_cache_features(
-    options: Options, recording: Recording, missing: MissingFiles, detector: Detector, bars: ProgressBars
+    options: Options, recording: Recording, missing: MissingFiles, detector: BoxDetector, bars: ProgressBars
 ) -> FeatureCache:
     """Cache the detector's views under runs/views, by detector, data, split and missing files, for both FeaKM presets."""
     from manyeyes.training.pose.feakm_cache import build_cache, select_snapshots

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     )
     from manyeyes.evaluation.detection.benchmark import (
         BenchmarkConfig as BenchmarkConfig,
+        BenchmarkResult as BenchmarkResult,
+        benchmark as benchmark,
         run_benchmark as run_benchmark,
     )
     from manyeyes.evaluation.maps.matching import (

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         list_map_models as list_map_models,
         load_feakm as load_feakm,
         load_map_model as load_map_model,
+        register_detector as register_detector,
     )
 
 __getattr__, __dir__ = attach(__name__)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Load the weights that ship with the package by name, or other weights by path."""
+"""Load the weights that ship with the package by name, other weights by path, and detectors of third parties by name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -11,9 +11,10 @@ from pathlib import Path
 from torch import Tensor
 
 from manyeyes.datatypes import CheckpointError
+from manyeyes.datatypes.registry import Registry
 from manyeyes.models import checkpoint
-from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.fold_norms import fold_norms
+from manyeyes.models.detector.protocols import BoxDetector, check_detector
 from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.models.pose import feakm
@@ -25,15 +26,24 @@ DEFAULT_MAP_MODEL = "map-small-lidar"
 """The map model for LiDAR; map-small-camera and map-small-fusion take images, or both."""
 _MAP_PREFIX = "map-"
 
+_DETECTORS: Registry[Callable[[], BoxDetector]] = Registry("detector", "manyeyes.detector")
+
+register_detector = _DETECTORS.register
+"""Return a decorator that registers a detector, a class or function without arguments, under a name."""
+
 
 def list_detectors() -> tuple[str, ...]:
-    """List the names of the shipped detectors."""
-    return tuple(name for name in _shipped() if name != DEFAULT_FEAKM and not name.startswith(_MAP_PREFIX))
+    """List the names of the shipped detectors, then of those of third parties (entry points of manyeyes.detector)."""
+    return (*_shipped_detectors(), *_DETECTORS.names())
 
 
 def list_map_models() -> tuple[str, ...]:
     """List the names of the shipped map models."""
     return tuple(name for name in _shipped() if name.startswith(_MAP_PREFIX))
+
+
+def _shipped_detectors() -> tuple[str, ...]:
+    return tuple(name for name in _shipped() if name != DEFAULT_FEAKM and not name.startswith(_MAP_PREFIX))
 
 
 def _shipped() -> tuple[str, ...]:
@@ -42,23 +52,29 @@ def _shipped() -> tuple[str, ...]:
     return tuple(sorted(Path(f.name).stem for f in found if f.name.endswith(".safetensors")))
 
 
-def load(name_or_path: str | Path = DEFAULT_DETECTOR) -> Detector:
-    """Load a detector for inference, with its norms folded into the convolutions.
+def load(name_or_path: str | Path = DEFAULT_DETECTOR) -> BoxDetector:
+    """Load a detector for inference; norms of shipped and trained weights are folded into the convolutions.
 
-    name_or_path: a shipped name, or a .safetensors file written by 'manyeyes train'. To continue training, or to
-    inspect the stored
-    weights, use checkpoint.load.
+    To continue training, or to inspect the stored weights, use checkpoint.load.
+
+    Args:
+        name_or_path: a shipped name, a registered name, or a .safetensors file written by 'manyeyes train'.
+
+    Raises:
+        CheckpointError: there are no such weights. ConfigError: a registered detector lacks something.
     """
-    if str(name_or_path) in list_detectors():
-        with as_file(files("manyeyes.models") / "weights" / f"{name_or_path}.safetensors") as path:
+    name = str(name_or_path)
+    if name in _shipped_detectors():
+        with as_file(files("manyeyes.models") / "weights" / f"{name}.safetensors") as path:
             return fold_norms(checkpoint.load(path))
-    path = Path(name_or_path)
-    if path.suffix != ".safetensors":
-        raise CheckpointError(
-            f"No weights are named {name_or_path!r}; shipped are {', '.join(list_detectors()) or 'none'}, or give "
-            "a .safetensors file."
-        )
-    return fold_norms(checkpoint.load(path))
+    if name.endswith(".safetensors"):
+        return fold_norms(checkpoint.load(Path(name)))
+    if name not in _DETECTORS:
+        known = ", ".join(list_detectors()) or "none"
+        raise CheckpointError(f"No weights are named {name!r}; known are {known}, or give a .safetensors file.")
+    detector = _DETECTORS.get(name)()
+    check_detector(detector)
+    return detector
 
 
 def load_feakm(name_or_path: str | Path = DEFAULT_FEAKM) -> feakm.FeakmNet:

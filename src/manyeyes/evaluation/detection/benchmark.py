@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import pickle
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -14,15 +15,15 @@ from pathlib import Path
 
 import torch
 
-from manyeyes.agents.replay import CachedOutputs, ReplayConfig, ReplayStep, replay
+from manyeyes.agents.replay import WARMUP_FRAMES, CachedOutputs, ReplayConfig, ReplayStep, replay
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import Snapshot
-from manyeyes.evaluation.detection.accumulator import MethodResult, MetricAccumulator
+from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult, MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import DetectionProtocol, get_protocol
 from manyeyes.evaluation.detection.recording_filters import CachedRecording, FrameStride, NearestAgents
 from manyeyes.models import pretrained
-from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.protocols import BoxDetector, check_detector
 
 CONDITIONS_PER_GROUP = 8
 """Conditions that are played side by side: more of them see each sweep once, fewer of them are lost when a study is stopped."""
@@ -30,13 +31,13 @@ CONDITIONS_PER_GROUP = 8
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
-    """What is compared, and how it is judged. weights: a name or a path. protocol: by name, over the detector's own range.
+    """What is compared, and how it is judged. weights: a name, a path or a detector. protocol: by name, over the detector's range.
 
     frame_stride: judge each so many-th frame. num_agents: the nearest so many, in scenarios that have them; None: all of all
     scenarios.
     """
 
-    weights: str = pretrained.DEFAULT_DETECTOR
+    weights: str | BoxDetector = pretrained.DEFAULT_DETECTOR
     methods: tuple[str, ...] = ("none", "late", "intermediate", "early")
     protocol: str = "global-sort"
     replay: ReplayConfig = field(default_factory=ReplayConfig)
@@ -58,14 +59,17 @@ def resolve_protocol(config: BenchmarkConfig) -> DetectionProtocol:
     return protocol.with_range((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
 
 
-def load_detector(weights: str) -> Detector:
-    """The weights of that name or path, read once by each process for as long as the file stays as it is."""
+def load_detector(weights: str | BoxDetector) -> BoxDetector:
+    """The weights of that name or path, read once by each process for as long as the file stays as it is; or the detector given."""
+    if not isinstance(weights, str):
+        check_detector(weights)
+        return weights
     path = Path(weights)
     return _load_cached(weights, path.stat().st_mtime_ns if path.is_file() else 0)
 
 
 @lru_cache(maxsize=2)
-def _load_cached(weights: str, modified_ns: int) -> Detector:
+def _load_cached(weights: str, modified_ns: int) -> BoxDetector:
     return pretrained.load(weights)
 
 
@@ -93,7 +97,7 @@ def run_scenario(
 
 
 def _iterate_snapshots(
-    recording: Recording, scenario: str, detector: Detector, config: BenchmarkConfig, feature_cache: CachedOutputs
+    recording: Recording, scenario: str, detector: BoxDetector, config: BenchmarkConfig, feature_cache: CachedOutputs
 ) -> Iterator[tuple[int, Iterator[ReplayStep]]]:
     """The steps of one configuration, judged snapshot by judged snapshot."""
     perturb = partial(_perturb, config.pose_noise)
@@ -169,3 +173,59 @@ def run_benchmark(
     """Every method on every scenario. open_recording must be picklable when workers > 1; results do not depend on workers."""
     with closing(run_benchmarks(open_recording, [config], workers, progress)) as accumulators:
         return tuple(accumulator.compute_result() for accumulator in next(accumulators))
+
+
+@dataclass(frozen=True)
+class BenchmarkResult:
+    """Results of methods on a recording, in their order; ``result["late"]`` is one of them, and ``print(result)`` a table."""
+
+    protocol: DetectionProtocol
+    methods: tuple[MethodResult, ...]
+
+    def __getitem__(self, method: str) -> MethodResult:
+        return {result.method: result for result in self.methods}[method]
+
+    def __str__(self) -> str:
+        names = ("method", *(f"AP@{iou}" for iou in IOU_THRESHOLDS), "bytes/message")
+        rows = [
+            (result.method, *(f"{interval.value:.3f}" for interval in result.intervals), _format_bytes(result))
+            for result in self.methods
+        ]
+        widths = [max(map(len, column)) for column in zip(names, *rows)]
+        return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in (names, *rows))
+
+
+def _format_bytes(result: MethodResult) -> str:
+    mean = result.communication.bytes_per_message
+    return "-" if math.isnan(mean) else f"{mean:,.0f}"
+
+
+def benchmark(
+    recording: Recording,
+    detector: str | Path | BoxDetector = pretrained.DEFAULT_DETECTOR,
+    methods: Sequence[str] = ("none", "late", "intermediate", "early"),
+    protocol: str = "global-sort",
+    replay: ReplayConfig | None = None,
+    workers: int = 1,
+) -> BenchmarkResult:
+    """Evaluate methods on all scenarios of a recording.
+
+    Args:
+        recording: what a reader opened.
+        detector: weights by name or path, a registered detector by name, or any object that is a BoxDetector.
+        methods: names of strategies, registered ones of your own too.
+        protocol: name of the evaluation protocol; the default one evaluates over the range of the detector.
+        replay: channel, budget and more; by default an ideal channel between agents within 70 m, with full histories.
+        workers: number of processes that share the scenarios; with several, recording and detector must be picklable.
+
+    Raises:
+        ConfigError: a name is not known, or a method needs tokens that the detector does not have.
+    """
+    weights = str(detector) if isinstance(detector, Path) else detector
+    replay = replay or ReplayConfig(warmup_frames=WARMUP_FRAMES)
+    config = BenchmarkConfig(weights, tuple(methods), protocol, replay)
+    return BenchmarkResult(resolve_protocol(config), run_benchmark(partial(_return, recording), config, workers))
+
+
+def _return(recording: Recording) -> Recording:
+    return recording

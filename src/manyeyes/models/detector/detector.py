@@ -18,7 +18,7 @@ from manyeyes.models.detector.proposal import PROPOSAL_DIM, make_proposals
 from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.models.detector.selector import Selector
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
-from manyeyes.models.fusion.registry import build_fusion
+from manyeyes.models.fusion.registry import get_fusion
 from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import Tokens
 
@@ -75,7 +75,7 @@ class Detector(nn.Module):
         self.dast = WindowTransformer(channels, config.dast)
         self.token_prune = FocalPrune(channels)
         self.selector = Selector(channels)
-        self.fusion = build_fusion(config.fusion, channels, config.fusion_attention)
+        self.fusion = get_fusion(config.fusion)(channels, config.fusion_attention)
         self.head = BoxHead(channels, config.head_channels)
         self.refine = RefineHead(channels, config.head_channels)
         self.codebook = None if config.codebook is None else Codebook(channels, config.codebook)

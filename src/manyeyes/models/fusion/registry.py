@@ -18,12 +18,4 @@ _FUSION_MODULES: Registry[FusionBuilder] = Registry("fusion module", "manyeyes.f
 register_fusion = _FUSION_MODULES.register
 """Return a decorator that registers a fusion module, a class or function of (channels, attention), under a name."""
 list_fusion_modules = _FUSION_MODULES.names
-
-
-def build_fusion(name: str, channels: int, attention: AttentionConfig) -> nn.Module:
-    """Build the fusion module of a name.
-
-    Raises:
-        ConfigError: no fusion module has the name.
-    """
-    return _FUSION_MODULES.get(name)(channels, attention)
+get_fusion = _FUSION_MODULES.get
