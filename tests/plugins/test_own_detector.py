@@ -17,6 +17,21 @@ def test_an_own_detector_is_evaluated_by_name(drive: Path, install, manyeyes, tm
     assert [row["method"] for row in rows] == ["none", "late", "late-temporal", "early"]
     assert max(row["ap50"]["value"] for row in rows) > 0.02
 
+    replay = (
+        "replay",
+        str(drive),
+        "--split",
+        "test",
+        "--weights",
+        "clusters",
+        "--methods",
+        "none",
+        "late",
+        "--no-animate",
+    )
+    done = manyeyes(site, *replay, "--frames", "3", "--out", str(tmp_path / "replay"))
+    assert done.returncode == 0 and (tmp_path / "replay" / "report.html").is_file(), done.stderr
+
     refused = manyeyes(site, *words, "--methods", "intermediate")
     assert refused.returncode == 1 and "ClusterDetector is a BoxDetector: it has no tokens" in refused.stderr
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.base import Recording
     from manyeyes.evaluation.detection.accumulator import MethodResult
-    from manyeyes.models.detector.detector import Detector
+    from manyeyes.models.detector.protocols import BoxDetector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,8 +43,7 @@ def main(options: Options) -> None:
     from manyeyes._io import atomic_write_text
     from manyeyes.datasets.perturbation import PoseNoise
     from manyeyes.datasets.registry import open_recording
-    from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, resolve_protocol, run_benchmark
-    from manyeyes.models import pretrained
+    from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, resolve_protocol, run_benchmark
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import adapt_to_dataset, check_files
     from manyeyes.viz.progress import track
@@ -62,7 +61,7 @@ def main(options: Options) -> None:
         pose_noise=noise if has_pose_noise else None,
         frame_stride=options.frame_stride,
     )
-    protocol, detector = resolve_protocol(config), pretrained.load(config.weights)
+    protocol, detector = resolve_protocol(config), load_detector(config.weights)
     opener = partial(open_recording, options.data, options.split)
     recording = opener()
     config = replace(config, replay=adapt_to_dataset(config.replay, options.replay_options, recording))
@@ -72,7 +71,7 @@ def main(options: Options) -> None:
     timed_results = [_measure_times(r, recording, detector, config.replay, options.timing_frames) for r in results]
     comparison = summarize_comparison(timed_results, protocol, missing)
     data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
-    title = f"{display_name(config.weights)} on {data_name}: {len(recording.scenarios)} scenarios, {protocol.name}"
+    title = f"{display_name(options.replay_options.weights)} on {data_name}: {len(recording.scenarios)} scenarios, {protocol.name}"
     print_comparison(console, comparison, title)
     provenance.write_json(
         options.out / "results.json", comparison, {"options": options, "benchmark": config}, options.seed
@@ -91,7 +90,7 @@ def main(options: Options) -> None:
 
 
 def _measure_times(
-    result: MethodResult, recording: Recording, detector: Detector, config: ReplayConfig, num_frames: int
+    result: MethodResult, recording: Recording, detector: BoxDetector, config: ReplayConfig, num_frames: int
 ) -> MethodResult:
     """Measure times of one method by itself: in an evaluation, methods share the processing of each cloud."""
     from manyeyes.agents.replay import replay

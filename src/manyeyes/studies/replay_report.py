@@ -16,6 +16,7 @@ from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import DetectionProtocol, get_protocol
+from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.studies import provenance
 from manyeyes.studies.replay_options import Excerpt
@@ -106,7 +107,10 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
         for warning in summary.make_warnings():
             console.print(f"{chapter.title}: {warning}", highlight=False, soft_wrap=True)
     pictures = _save_animation(film, spec.out) + _save_pictures(pictured_steps, comparison, grid, spec)
-    config = {"spec": spec, "detector": detector.config}
+    config = {
+        "spec": spec,
+        "detector": detector.config if isinstance(detector, Detector) else type(detector).__qualname__,
+    }
     origin = provenance.write_json(spec.out / "results.json", comparison, config, spec.replay.seed)
     atomic_write_text(
         spec.out / "results.md",

@@ -129,7 +129,7 @@ class PoseNoisePredictor:
         """The errors, the corrector and its weights, and the detector's."""
         net = self.pose_correction.net
         return repr(
-            (self, fingerprint(_load_detector(self.detector_weights)), None if net is None else fingerprint(net))
+            (self, _load_detector(self.detector_weights).fingerprint, None if net is None else fingerprint(net))
         )
 
     def __call__(self, map_model: MapModel, source: TileSource, scenario: str, seed: int) -> Sequence[TilePrediction]:

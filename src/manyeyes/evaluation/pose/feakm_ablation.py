@@ -31,7 +31,7 @@ from manyeyes.evaluation.detection.average_precision import (
     match_frame,
     select_ego_truth,
 )
-from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
 from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.pose.feakm import FeakmCorrector
@@ -47,7 +47,7 @@ class FeakmVariant:
     """A line of the ablation: who sees and fuses, and who corrects."""
 
     name: str
-    detector: Detector
+    detector: BoxDetector
     corrector: FeakmCorrector
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from manyeyes.agents.token_codec import default_token_encoding
 from manyeyes.comms.payloads import TOKEN_ENCODINGS
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.benchmark import load_detector
@@ -93,7 +94,7 @@ def _resolve_encodings(options: BandwidthOptions) -> tuple[str, ...]:
     for name in options.token_encodings:
         if name not in TOKEN_ENCODINGS:
             raise ConfigError(f"Tokens are not written as {name!r}; known: {', '.join(TOKEN_ENCODINGS)}.")
-    has_codes = load_detector(options.replay_options.weights).codebook is not None
+    has_codes = default_token_encoding(load_detector(options.replay_options.weights)) == CODEBOOK
     return options.token_encodings or tuple(name for name in TOKEN_ENCODINGS if name != CODEBOOK or has_codes)
 
 

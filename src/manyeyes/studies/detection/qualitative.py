@@ -15,8 +15,7 @@ from manyeyes.agents.replay import ReplayStep, replay
 from manyeyes.datatypes import BevGrid
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import DetectionProtocol
-from manyeyes.evaluation.detection.benchmark import resolve_protocol
-from manyeyes.models import pretrained
+from manyeyes.evaluation.detection.benchmark import load_detector, resolve_protocol
 from manyeyes.studies.detection.perturbations import COMBINED
 from manyeyes.studies.engine.replay_study import prepare_study
 from manyeyes.studies.engine.report import StudyContext
@@ -51,7 +50,7 @@ def run(options: EvaluationOptions, context: StudyContext) -> None:
     eval_indices = recording.eval_indices(scenario)
     frame_index = eval_indices[len(eval_indices) // 2]
     drive = make_excerpt(recording, scenario, eval_indices.index(frame_index) + 1)
-    detector, protocol = pretrained.load(config.weights), resolve_protocol(config)
+    detector, protocol = load_detector(config.weights), resolve_protocol(config)
     steps = [
         step
         for step in replay(

@@ -45,9 +45,7 @@ class ReplayStudy:
         assert isinstance(options, RecordingStudyOptions)
         frames = sum(len(recording.eval_indices(name)) for name in recording.scenarios)
         data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
-        return (
-            f"{display_name(self.base.weights)} on {data_name}: {len(recording.scenarios)} scenarios, {frames} frames"
-        )
+        return f"{display_name(str(self.base.weights))} on {data_name}: {len(recording.scenarios)} scenarios, {frames} frames"
 
     def run(self, conditions: Sequence[Condition]) -> ResultGrid:
         """Run all conditions; stored results are not computed again."""
