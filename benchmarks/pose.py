@@ -8,9 +8,9 @@ five, and on agents without common objects. ``baselines``: success at 1 m and 1 
 the prior. ``displacement``: of common objects after fusion with a good prior, over that of the prior alone. ``monitor``:
 fraction of frames that conflict with the prior, for priors off by five of their stated sigma and for priors with the stated
 error; in single frames, and by the pose monitor over drives of 20 frames at 10 Hz. ``speed``: processor time of one call.
-The acceptance bars follow the tables.
+The targets follow the tables.
 
-python benchmarks/pose.py [--tables success answers ...] [--scenes 300] [--nulls 1000] [--out benchmarks/results/pose.json]
+python -m benchmarks.pose [--tables success answers ...] [--scenes 300] [--nulls 1000] [--out benchmarks/results/pose.json]
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-
-from manyeyes.evaluation.pose.metrics import PoseEvaluation, PoseScore, PriorNoise, evaluate_pose, summarize_evaluations
-from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_by_voting
-from manyeyes.pose.landmarks import Landmarks
-from manyeyes.pose.multi_frame import TimedLandmarks, accumulate
-from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorState, update_monitor
-from manyeyes.pose.registry import list_correctors, load_corrector
-from manyeyes.pose.types import PoseCorrector, PoseStatus
-from manyeyes.simulator.fleet.landmark_scenes import (
+from benchmarks.landmark_scenes import (
     BoxNoise,
     LandmarkScene,
     LandmarkSpec,
     make_landmark_scene,
     relative_pose,
 )
+from benchmarks.multi_frame import TimedLandmarks, accumulate
+
+from manyeyes.evaluation.pose.metrics import PoseEvaluation, PoseScore, PriorNoise, evaluate_pose, summarize_evaluations
+from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_by_voting
+from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorState, update_monitor
+from manyeyes.pose.registry import list_correctors, load_corrector
+from manyeyes.pose.types import PoseCorrector, PoseStatus
 from manyeyes.studies.provenance import write_json
 
 NOISY = BoxNoise(0.45, np.radians(4.0), 0.10, 0.3)
@@ -206,39 +206,39 @@ def speed(scenes: int, nulls: int) -> Iterator[Row]:
 
 
 @dataclass(frozen=True)
-class Bar:
-    """One bar: the value of the row that is worst by it, and whether all rows reach it. An interval (two standard errors)
-    that holds the bar is not resolved.
+class Target:
+    """One target: the value of the worst row, and whether all rows meet it; inconclusive where an interval of two standard
+    errors contains the target.
     """
 
     what: str
     value: float
-    bar: str
+    target: str
     verdict: str
 
 
-def bars(rows: Sequence[Row]) -> Iterator[Bar]:
-    """Bars of the rows that were run: consistency of the covariance, and detection rates of the monitor."""
+def check_targets(rows: Sequence[Row]) -> Iterator[Target]:
+    """Check the rows that were run: consistency of the covariance, and detection rates of the monitor."""
     for row in rows:
         s, shown = row.score, row.claim == "none" and (row.table == "answers" or row.table == "success")
         if not shown or not s.nees_standard_error > 0:
             continue
         low, high = s.nees - 2 * s.nees_standard_error, s.nees + 2 * s.nees_standard_error
-        verdict = "reached" if low >= 2.5 and high <= 3.6 else "missed" if high < 2.5 or low > 3.6 else "not resolved"
+        verdict = "met" if low >= 2.5 and high <= 3.6 else "not met" if high < 2.5 or low > 3.6 else "inconclusive"
         noise = ", noisy" if row.noisy else ""
         what = f"mean NEES, {row.table}, K={row.common or 'DAIR'}, {row.instants} frames{noise} (+-{2 * s.nees_standard_error:.2f})"
-        yield Bar(what, s.nees, "2.5 to 3.6", verdict)
+        yield Target(what, s.nees, "2.5 to 3.6", verdict)
     for table, name in (("monitored", "over drives"), ("monitor", "in single frames")):
         for sigma in sorted({row.sigma for row in rows if row.table == table}):
             some = [row for row in rows if (row.table, row.sigma) == (table, sigma)]
             flagged = min(row.score.conflict_rate for row in some if row.claim == "offset")
             false_alarms = max(row.score.conflict_rate for row in some if row.claim != "offset")
             what = f"monitor {name}, sigma {sigma:g} m"
-            yield Bar(
-                f"{what}: five sigma off, flagged", flagged, "at least 0.98", "reached" if flagged >= 0.98 else "missed"
+            yield Target(
+                f"{what}: five sigma off, flagged", flagged, "at least 0.98", "met" if flagged >= 0.98 else "not met"
             )
-            verdict = "reached" if false_alarms <= 0.005 else "missed"
-            yield Bar(f"{what}: stated error, flagged", false_alarms, "at most 0.005", verdict)
+            verdict = "met" if false_alarms <= 0.005 else "not met"
+            yield Target(f"{what}: stated error, flagged", false_alarms, "at most 0.005", verdict)
 
 
 TABLES = {f.__name__: f for f in (success, answers, displacement, baselines, monitor, speed)}
@@ -272,12 +272,15 @@ def main() -> None:
             sys.stdout.write(line(row) + "\n")
             sys.stdout.flush()
             done.append(row)
-    held = list(bars(done))
-    for bar in held:
-        sys.stdout.write(f"{bar.what}: {bar.value:.3f} (bar {bar.bar}): {bar.verdict}\n")
-    command = f"python benchmarks/pose.py {shlex.join(sys.argv[1:])}".strip()
+    targets = list(check_targets(done))
+    for target in targets:
+        sys.stdout.write(f"{target.what}: {target.value:.3f} (target {target.target}): {target.verdict}\n")
+    command = f"python -m benchmarks.pose {shlex.join(sys.argv[1:])}".strip()
     write_json(
-        options.out, {"rows": [asdict(r) for r in done], "bars": [asdict(bar) for bar in held]}, {"command": command}, 0
+        options.out,
+        {"rows": [asdict(r) for r in done], "targets": [asdict(target) for target in targets]},
+        {"command": command},
+        0,
     )
 
 

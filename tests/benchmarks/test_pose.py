@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bars that the pose benchmark prints behind its tables."""
+"""The targets that the pose benchmark prints behind its tables."""
 
 from dataclasses import replace
 
-from benchmarks.pose import Row, bars
+from benchmarks.pose import Row, check_targets
 
 from manyeyes.evaluation.pose.metrics import PoseEvaluation, summarize_evaluations
 from manyeyes.pose.types import PoseStatus
@@ -24,13 +24,13 @@ def test_the_monitor_is_held_to_its_worst_row():
         row("monitored", "bias", 1.0, 0),
     ]
     rows += [row("monitor", "offset", 1.0, 90), row("monitor", "gaussian", 1.0, 0)]
-    assert [(bar.value, bar.verdict) for bar in bars(rows)] == [
-        (0.97, "missed"), (0.0, "reached"), (0.98, "reached"), (0.01, "missed"), (0.9, "missed"), (0.0, "reached"),
+    assert [(target.value, target.verdict) for target in check_targets(rows)] == [
+        (0.97, "not met"), (0.0, "met"), (0.98, "met"), (0.01, "not met"), (0.9, "not met"), (0.0, "met"),
     ]  # fmt: skip
-    assert "over drives" in next(bars(rows)).what
+    assert "over drives" in next(check_targets(rows)).what
 
 
-def test_a_mean_nees_whose_interval_holds_a_bar_is_not_resolved():
+def test_a_mean_nees_whose_interval_contains_the_target_is_inconclusive():
     wide = tuple(2.5 + (-1) ** n for n in range(100))
     apart = {"high": tuple(4.0 + 0.01 * (n % 2) for n in range(100)), "low": tuple(n % 3 for n in range(100))}
     rows = {
@@ -38,7 +38,9 @@ def test_a_mean_nees_whose_interval_holds_a_bar_is_not_resolved():
         "sure": row("success", "none", 0.0, 0, tuple(3.0 + 0.01 * (n % 2) for n in range(100))),
         **{name: row("answers", "none", 0.0, 0, nees) for name, nees in apart.items()},
     }
-    verdicts = {name: [bar.verdict for bar in bars([one])] for name, one in rows.items()}
-    assert verdicts == {"wide": ["not resolved"], "sure": ["reached"], "high": ["missed"], "low": ["missed"]}
+    verdicts = {name: [bar.verdict for bar in check_targets([one])] for name, one in rows.items()}
+    assert verdicts == {"wide": ["inconclusive"], "sure": ["met"], "high": ["not met"], "low": ["not met"]}
     # There is no bar with a prior, nor without a standard error of the NEES.
-    assert not list(bars([row("success", "gaussian", 1.0, 0), replace(rows["sure"], score=summarize_evaluations([]))]))
+    assert not list(
+        check_targets([row("success", "gaussian", 1.0, 0), replace(rows["sure"], score=summarize_evaluations([]))])
+    )

@@ -36,7 +36,7 @@ RENAMED = {
 
 def run(code: Path, place: Path, name: str, probes: list[str]) -> dict[str, np.ndarray]:
     """The arrays that the probes of one checkout compute."""
-    environment = {**os.environ, "PYTHONPATH": str(code / "src"), "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "PYTHONPATH": f"{code / 'src'}:{code}", "OMP_NUM_THREADS": "1"}
     maps = REPOSITORY.parent / "shared" / "data"
     environment.setdefault("MANYEYES_TOWNS", str(maps / "carla_opendrive"))
     environment.setdefault("MANYEYES_MAPS", str(maps))

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """FeaKM judged: the ablation fuses what agents fuse, and correctors are judged on the same keypoints and claims."""
 
-import math
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -12,20 +11,13 @@ from manyeyes.agents.agent import Agent
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
-from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.evaluation.pose.feakm_ablation import FeakmVariant, _CachedViews, run_ablation
-from manyeyes.evaluation.pose.feakm_pose import describe_pairs, evaluate_correctors
-from manyeyes.evaluation.pose.metrics import PriorNoise, summarize_evaluations
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.models.pose.box_descriptors import BoxKeypointConfig
 from manyeyes.models.pose.feakm import FeakmConfig, FeakmNet
-from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.models.pose.matcher import MatcherConfig
-from manyeyes.pose.corrector import correct_by_voting
 from manyeyes.pose.feakm import FeakmCorrector, RansacConfig, solve_with_ransac
-from manyeyes.pose.types import no_estimate
-from manyeyes.simulator.fleet.landmark_scenes import LandmarkSpec, make_landmark_scene
 
 CHANNELS = COSTR_TINY.encoder.channels[2]
 
@@ -119,35 +111,3 @@ def test_a_net_of_another_detector_is_refused():
     net = FeakmNet(replace(one.corrector.net.config, detector="ab" * 8))
     with pytest.raises(ConfigError, match="trained on views of the weights abab"):
         FeakmVariant("a", one.detector, FeakmCorrector(net, solve_with_ransac))
-
-
-def test_correctors_are_evaluated_on_the_same_pairs_and_priors():
-    pairs = []
-    for scene in range(4):
-        made = make_landmark_scene(LandmarkSpec(8, 6, 6), 5, scene)
-        x, y, yaw = made.ego_from_other.tolist()
-        points = [Keypoints(boxes, torch.zeros(len(boxes), 1)) for boxes in (made.ego[0], made.other[0])]
-        pairs.append((*points, Transform.from_xyz_yaw(x, y, 0.0, yaw)))
-    finders = {"voting": correct_by_voting, "claim": lambda ego, other, prior: no_estimate(prior)}
-    found = evaluate_correctors(pairs, finders, PriorNoise("gaussian", 1.0, 1.0))
-    assert all(len(frames) == 4 for frames in found.values())
-    assert [f.num_common for f in found["voting"]] == [f.num_common for f in found["claim"]] and found["voting"][
-        0
-    ].num_common >= 6
-    assert (
-        summarize_evaluations(found["voting"]).success_rate[0] == 1.0
-        and summarize_evaluations(found["claim"]).success_rate[0] == 0.0
-    )
-    assert 0.2 < found["claim"][0].translation_error_m < 5
-    nothing = evaluate_correctors([(pairs[0][0][:0], pairs[0][1], pairs[0][2])], finders, PriorNoise("none"))
-    assert nothing["voting"][0].num_common == 0 and math.isinf(nothing["claim"][0].translation_error_m)
-
-
-def test_views_are_described_in_pairs():
-    one, snapshot = make_variant(), Street().snapshot("street", 1)
-    outputs = [Agent(one.detector).perception_cache.process(f) for f in snapshot.frames]
-    views = [DetectorView.of(output.shared_tokens, output.boxes) for output in outputs]
-    truth = snapshot.frames[0].world_from_agent.inverse() @ snapshot.frames[1].world_from_agent
-    ((ego, other, same),) = describe_pairs(one.corrector.net, [(views[0], views[1], truth)])
-    assert torch.equal(ego.descriptor, one.corrector.net.describe([views[0]])[0].descriptor)
-    assert same is truth and len(other) <= 64 and not ego.descriptor.requires_grad

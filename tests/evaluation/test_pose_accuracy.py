@@ -1,24 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Answers about a few hand-made meetings: what is expected, counted and kept."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
 
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.pose.accuracy import (
-    CorrectorRun,
     CorrectorTrial,
     LandmarkPair,
     count_common_objects,
     get_expected_status,
-    load_or_run,
     run_corrector,
     summarize_run,
 )
-from manyeyes.evaluation.pose.metrics import PoseEvaluation, PriorNoise
+from manyeyes.evaluation.pose.metrics import PriorNoise
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PoseStatus
 
@@ -67,20 +63,6 @@ def test_evaluations_follow_priors_and_objects() -> None:
 )
 def test_expected_status_of_an_ideal_corrector(kind: str, common: int, status: str) -> None:
     assert get_expected_status(kind, common) is PoseStatus[status]
-
-
-def test_runs_are_stored_and_not_repeated(tmp_path) -> None:
-    nothing = PoseEvaluation(PoseStatus.NO_MATCH, 0, math.inf, math.inf, math.nan, math.nan, -math.inf)
-    made = CorrectorRun((nothing,), (PoseStatus.OK,), (1.5,), (99,))
-    path = tmp_path / "cells" / "pose.json"
-    assert load_or_run(path, lambda: made) is made
-    again = load_or_run(path, lambda: pytest.fail("made again"))
-    assert (
-        again.expected_status == made.expected_status
-        and again.times_ms == made.times_ms
-        and again.message_bytes == made.message_bytes
-    )
-    assert again.evaluations[0].translation_error_m == math.inf and math.isnan(again.evaluations[0].nees)
 
 
 def test_common_objects_are_the_minimum_over_agents_in_range() -> None:

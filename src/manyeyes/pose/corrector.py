@@ -2,7 +2,7 @@
 """The default corrector: accept or reject the best candidate pose, and fuse it with the prior.
 
 A candidate is accepted by its log-likelihood ratio against chance and by its margin over the best distinct other candidate.
-The limits are calibrated on pairs of agents without common objects (threshold_calibration). A prior raises the score of
+The limits are calibrated on pairs of agents without common objects (benchmarks, threshold_calibration). A prior raises the score of
 candidates near it by the logarithm of its density over that of a uniform pose, and never lowers a score. The accepted
 candidate is compared with the prior by the squared Mahalanobis distance, a chi^2 test with 3 degrees of freedom. Below
 p = 0.05 the two are fused by their information. Below p = 0.001 the prior is not used. In between its covariance is

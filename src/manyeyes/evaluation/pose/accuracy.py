@@ -7,18 +7,15 @@ of the truth reaches a corrector: it is kept beside the landmarks, for the claim
 
 from __future__ import annotations
 
-import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from manyeyes._io import atomic_write
 from manyeyes.agents.descriptors import extract_own_keypoints
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.comms import wire
@@ -232,22 +229,3 @@ def summarize_run(trial: CorrectorTrial, run: CorrectorRun) -> list[AccuracyRow]
             )
         )
     return out
-
-
-def load_or_run(path: Path, make: Callable[[], CorrectorRun]) -> CorrectorRun:
-    """Return the answers in a file, or made now and kept there, whole or not at all."""
-    if path.is_file():
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        evaluations = tuple(PoseEvaluation(**(f | {"status": PoseStatus(f["status"])})) for f in stored["frames"])
-        return CorrectorRun(
-            evaluations, tuple(map(PoseStatus, stored["expected"])), tuple(stored["ms"]), tuple(stored["bytes"])
-        )
-    run = make()
-    content = {
-        "frames": [asdict(f) | {"status": f.status.value} for f in run.evaluations],
-        "expected": [status.value for status in run.expected_status],
-        "ms": run.times_ms,
-        "bytes": run.message_bytes,
-    }
-    atomic_write(path, json.dumps(content).encode())
-    return run
