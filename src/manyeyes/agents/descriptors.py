@@ -28,7 +28,7 @@ def extract_own_keypoints(
         raise ConfigError(
             f"A message carries objects with {DESCRIPTOR_DIM} numbers each; this net has {keypoint_config.descriptor_dim} "
             f"of {type(keypoint_config).__name__}. Use a net of 'manyeyes train --preset feakm-small'; "
-            "--study feakm takes any net."
+            "study feakm takes any net."
         )
     net.check_views(cache.detector.fingerprint)
     output = cache.process_tokens(frame)

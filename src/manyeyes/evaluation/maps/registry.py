@@ -32,7 +32,7 @@ class MethodSettings:
 
 
 ConfigChanges = tuple[tuple[str, Any], ...]
-# What ``manyeyes map evaluate --study tuning`` found, as changes of the defaults; a method that is not here stays with its own.
+# What ``manyeyes study tuning`` found, as changes of the defaults; a method that is not here stays with its own.
 # Ours: one agent suffices to publish, as in every baseline. Average precision ranks by score, so a line of one agent with a low
 # score costs nothing behind lines of many agents.
 TUNED_CHANGES: dict[str, ConfigChanges] = {
