@@ -26,6 +26,7 @@ from manyeyes.evaluation.maps.metrics import MapMetrics, evaluate_map
 from manyeyes.evaluation.maps.registry import make_tuned_settings
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.incremental import IncrementalConfig, compute_map_fscore
+from manyeyes.maps.registry import OURS
 from manyeyes.studies.map_folder import MapFolder, write_vector_map
 from manyeyes.studies.town_maps import TownMap
 from manyeyes.viz.map_figures import MapPanel, save_figure
@@ -112,7 +113,7 @@ def build_map(
 ) -> BuiltMap:
     """Build the map of one town; on_snapshot is called after each snapshot."""
     map_server = MapServer(
-        town_map.frame, town_map.origin_xy, config=IncrementalConfig(fusion=make_tuned_settings().ours)
+        town_map.frame, town_map.origin_xy, config=IncrementalConfig(fusion=make_tuned_settings().config_of(OURS))
     )
     log = _BuildLog()
     for scenario in town_map.scenarios:
