@@ -34,12 +34,15 @@ def find_unknown(words: list[str]) -> list[str]:
     """The first unknown word of a command, or its options that its help does not list."""
     if words[0] not in COMMANDS:
         return words[:1]
+    options = {name for word in words for name in re.findall(r"^\[?(--[a-z][a-z0-9-]*)", word)}
+    if words[:2] == ["study", "NAME"]:
+        helps = [read_help("study", name) for name in COMMAND_GROUPS["study"]]
+        return sorted(name for name in options if not any(re.search(rf"{name}\b(?!-)", text) for text in helps))
     command = words[:1]
     if words[0] in COMMAND_GROUPS and len(words) > 1 and re.fullmatch(r"[a-z][a-z0-9-]+", words[1]):
         if words[1] not in COMMAND_GROUPS[words[0]]:
             return words[:2]
         command = words[:2]
-    options = {name for word in words for name in re.findall(r"^\[?(--[a-z][a-z0-9-]*)", word)}
     return sorted(name for name in options if not re.search(rf"{name}\b(?!-)", read_help(*command)))
 
 

@@ -121,7 +121,7 @@ def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_pat
     comparisons = held["result"]["comparisons"]
     assert sum("intermediate - late" in c["description"] for c in comparisons) == 2 * len(small_set)
     assert [c["description"] for c in comparisons[-3:]] == [
-        f"intermediate, {level} - perfect" for level in ("0.4 s", "0.8 m", "30 % lost")
+        f"intermediate, {level} - clean" for level in ("0.4 s", "0.8 m", "30 % loss")
     ]
     assert all("margin" not in c and "verdict" not in c for c in comparisons), "targets are not the package's"
     assert [p.title for p in panels] == ["Delay", "Heading noise", "Position noise", "Packet loss", "Combined"]
@@ -136,10 +136,10 @@ def test_perturbations_are_selected_by_name(data, weights, tmp_path, panels) -> 
     words = ("--methods", "late", "intermediate", "--frame-stride", 2, "--perturbations", "0.4 s")
     held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
     assert [r["perturbation"]["delay_s"] for r in held["rows"]] == [0, 0, 0.4, 0.4]
-    assert "intermediate, 0.4 s - perfect" in {c["description"] for c in held["comparisons"]}
+    assert "intermediate, 0.4 s - clean" in {c["description"] for c in held["comparisons"]}
     text = (tmp_path / "robustness.md").read_text()
     assert "## Delay" in text and "## Position noise" not in text
-    with pytest.raises(ConfigError, match=r"No disturbance '4 s'; choose from perfect, 0.1 s"):
+    with pytest.raises(ConfigError, match=r"No perturbation '4 s'; choose from clean, 0.1 s"):
         select_perturbations(["4 s"], robustness.ALL_PERTURBATIONS)
 
 

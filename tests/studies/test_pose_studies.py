@@ -90,7 +90,7 @@ def test_every_corrector_with_every_fusion_under_the_requested_levels(data, tmp_
     assert all(len(r["ap_by_common_objects"]) == 3 and r["gain_over_no_fusion"] for r in held["rows"])
     descriptions = [c["description"] for c in held["comparisons"]]
     assert descriptions[:3] == [
-        "voting, perfect: corrected - true poses",
+        "voting, clean: corrected - true poses",
         "voting, 0.8 m: corrected - true poses",
         "voting, 2°, 2 m, 8 and more in common: corrected - true poses",
     ]
@@ -155,7 +155,7 @@ def test_the_ablation_of_feakm_has_a_row_per_variant_and_level_and_stores_it(dat
 
 def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path) -> None:
     net = write_net(data, "few.safetensors", max_keypoints=5)
-    options = ("--frame-stride", 2, "--perturbations", "perfect", "--correctors", "identity", net, f"{net}@8")
+    options = ("--frame-stride", 2, "--perturbations", "clean", "--correctors", "identity", net, f"{net}@8")
     words = ("--methods", "intermediate", *options)
     held = evaluate(data, tmp_path, "pose-noise-ap", *words)
     plain, four, eight = (r["bytes_per_message"] for r in held["rows"])

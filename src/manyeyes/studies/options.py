@@ -53,7 +53,7 @@ class RobustnessOptions(EvaluationOptions):
     """Options of the study robustness."""
 
     perturbations: tuple[str, ...] = ()
-    """Perturbations by the names of the tables, such as "0.4 s" "30 % lost"; by default all."""
+    """Perturbations by the names of the tables, such as "0.4 s" "30 % loss"; by default all."""
     checkpoints: tuple[str, ...] = ()
     """Baselines beside the methods, as name=weights.safetensors."""
 

@@ -33,7 +33,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class CurvePanel:
-    """Curves on common axes. in_bytes: x is logarithmic, with its base-2 logarithm, the papers' "AB", on top.
+    """Curves on common axes. in_bytes: x is logarithmic, with its base-2 logarithm on top.
 
     ticks: names of the places 0, 1, 2, … on the x axis, for what is no number.
     """
@@ -104,4 +104,4 @@ def _draw(axes: Axes, panel: CurvePanel, labels: Sequence[str]) -> None:
         axes.set_xticks(_BYTES_TICKS, [f"{t / 1024:g} KiB" for t in _BYTES_TICKS])
         top = axes.secondary_xaxis("top")
         top.set_xticks(_BYTES_TICKS, [f"{math.log2(t):g}" for t in _BYTES_TICKS])
-        top.set_xlabel("AB: log2 of bytes a message", fontsize=8)
+        top.set_xlabel("log2(bytes)", fontsize=8)

@@ -42,27 +42,27 @@ def make_comparison_table(comparisons: Sequence[Comparison], resampled_unit: str
 
 
 def format_markdown(study_table: StudyTable) -> str:
-    """The sheet for a document."""
+    """Format a table as Markdown."""
     return f"## {study_table.title}\n\n{format_markdown_lines([study_table.headings, *study_table.lines])}"
 
 
 def format_interval(interval: Interval | None) -> str:
-    """A number with its interval: ``0.912 [0.900, 0.923]``."""
+    """Format a number with its interval: ``0.912 [0.900, 0.923]``."""
     return _format_text(interval, ".3f")
 
 
 def format_difference(interval: Interval | None) -> str:
-    """A difference with its interval, signs shown."""
+    """Format a difference with its interval and signs."""
     return _format_text(interval, "+.3f")
 
 
 def format_number(number: float | None, digits: int = 0) -> str:
-    """A plain number; nothing for none."""
+    """Format a number; nothing for none."""
     return "" if number is None or math.isnan(number) else f"{number:,.{digits}f}"
 
 
 def format_log2(num_bytes: float) -> str:
-    """The papers' "AB" of so many bytes; nothing for silence."""
+    """Format the base-2 logarithm of a number of bytes; nothing for 0."""
     return f"{math.log2(num_bytes):.2f}" if num_bytes > 0 else ""
 
 

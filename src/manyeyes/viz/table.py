@@ -17,7 +17,7 @@ from manyeyes.evaluation.statistics.comparison import Comparison
 
 NOT_RUN = "not run"
 # Words of columns that several tables have.
-LOG2_BYTES, DATA_AGE, AP_DIFFERENCE, AP_DROP = "log2(bytes)", "data age [ms]", "ΔAP [95 % CI]", "ΔAP vs. clean"
+LOG2_BYTES, DATA_AGE, AP_DIFFERENCE = "log2(bytes)", "data age [ms]", "ΔAP [95 % CI]"
 AP_CROSSING, AP_DIVIDER, AP_BOUNDARY = "AP crossing", "AP divider", "AP boundary"
 
 

@@ -43,6 +43,9 @@ class Interval:
     confidence_level: float
     num_scenarios: int
 
+    def __neg__(self) -> Interval:
+        return Interval(-self.value, -self.high, -self.low, self.confidence_level, self.num_scenarios)
+
 
 @dataclass(frozen=True)
 class PooledMatches:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Branches of a training side by side, perfect, late and displaced: CoSTr, Table III. Each part is to earn its place.
+"""Variants of a training, clean, with delay and with pose noise: CoSTr, Table III.
 
 The order is that of the command line; a branch is held against the one before it. What was trained, how long and from which
 seed stands in the model card of each file and is shown beside. ``@BYTES`` behind a file: a message has so many bytes at most,

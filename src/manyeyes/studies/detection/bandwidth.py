@@ -161,7 +161,7 @@ def make_comparisons(
 
 def _make_results_table(title: str, result_rows: Sequence[BandwidthRow]) -> StudyTable:
     headings = (
-        "budget [bytes]", "token selection", "AP@0.5", "AP@0.7", "AP@0.5 drop", "AP@0.7 drop", "bytes/message", LOG2_BYTES,
+        "budget [bytes]", "token selection", "AP@0.5", "AP@0.7", "ΔAP@0.5 vs. all", "ΔAP@0.7 vs. all", "bytes/message", LOG2_BYTES,
         "max bytes", "compression",
     )  # fmt: skip
     lines = tuple(
@@ -169,7 +169,7 @@ def _make_results_table(title: str, result_rows: Sequence[BandwidthRow]) -> Stud
             "" if not row.token_encoding else "all" if row.budget_bytes is None else f"{row.budget_bytes:,}",
             row.method,
             *map(format_interval, row.ap),
-            *(map(format_difference, row.ap_drop) if row.ap_drop else ("", "")),
+            *((format_difference(-drop) for drop in row.ap_drop) if row.ap_drop else ("", "")),
             format_number(row.bytes_per_message),
             format_log2(row.bytes_per_message),
             format_number(row.max_message_bytes),

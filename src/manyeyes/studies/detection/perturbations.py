@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbances that studies play methods under. Levels are those of CoSTr, Table II and Fig. 4; loss and the hard one are ours."""
+"""Perturbations of the detection studies, at the levels of CoSTr, Table II and Fig. 4; packet loss and COMBINED_SEVERE are ours."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ MAX_DELAY_FRAMES = 4
 
 @dataclass(frozen=True)
 class Perturbation:
-    """delay_s: how much later every packet comes, while the ego waits for none. heading_sigma_deg, position_sigma_m: standard
-    deviations of collaborators' claimed poses, anew in each frame. packet_loss: share of packets lost.
+    """delay_s: delay of every packet, while the ego does not wait. heading_sigma_deg, position_sigma_m: standard deviations of
+    collaborators' prior poses, resampled in each frame. packet_loss: fraction of packets that are lost.
     """
 
     delay_s: float = 0.0
@@ -29,20 +29,19 @@ class Perturbation:
 
     @property
     def name(self) -> str:
-        """How tables call it."""
+        """Its name in tables and on the command line."""
         parts = (
             (self.delay_s, f"{self.delay_s:g} s"),
             (self.heading_sigma_deg, f"{self.heading_sigma_deg:g}°"),
             (self.position_sigma_m, f"{self.position_sigma_m:g} m"),
-            (self.packet_loss, f"{100 * self.packet_loss:g} % lost"),
+            (self.packet_loss, f"{100 * self.packet_loss:g} % loss"),
         )
-        return ", ".join(text for level, text in parts if level) or "perfect"
+        return ", ".join(text for level, text in parts if level) or "clean"
 
     def apply_to(self, config: BenchmarkConfig) -> BenchmarkConfig:
-        """The configuration under it.
+        """Apply it to a configuration.
 
-        Under any, as many more frames are played before the first judged one as the latest message is late: conditions of one
-        history share what their agents see.
+        With any of them, the warm-up is longer by the largest delay, so that conditions share the features of their agents.
         """
         radio, replay = config.replay.radio, config.replay
         channel = replace(radio, base_latency_s=radio.base_latency_s + self.delay_s)
@@ -61,10 +60,10 @@ CLEAN = Perturbation()
 
 
 def select_perturbations(names: Sequence[str], candidates: Sequence[Perturbation]) -> tuple[Perturbation, ...]:
-    """The perfect setting and those of a study's disturbances that have these names; all of them for none."""
+    """Return CLEAN and the perturbations of a study with these names; all of them without names."""
     unknown = sorted(set(names) - {d.name for d in candidates})
     if unknown:
-        raise ConfigError(f"No disturbance {unknown[0]!r}; choose from {', '.join(d.name for d in candidates)}.")
+        raise ConfigError(f"No perturbation {unknown[0]!r}; choose from {', '.join(d.name for d in candidates)}.")
     return tuple(d for d in candidates if not names or d == CLEAN or d.name in names)
 
 

@@ -181,10 +181,10 @@ def make_comparisons(results: ResultGrid, checkpoints: Sequence[str] = ()) -> tu
 
 
 def _make_results_table(title: str, result_rows: Sequence[RobustnessRow], group: Sequence[Perturbation]) -> StudyTable:
-    """One kind of disturbance, the perfect setting on top; the word for an oracle row where it is one."""
+    """Tabulate one kind of perturbation, the clean row on top, oracle rows marked."""
     result_rows = [row for row in result_rows if row.perturbation in (CLEAN, *group)]
     headings = (
-        "perturbation", "method", "AP@0.5", "AP@0.7", "AP@0.5 drop", "AP@0.7 drop", "gain over no fusion @0.5",
+        "perturbation", "method", "AP@0.5", "AP@0.7", "ΔAP@0.5 vs. clean", "ΔAP@0.7 vs. clean", "gain over no fusion @0.5",
         "bytes/message", DATA_AGE,
     )  # fmt: skip
     has_speeds = any(row.ap_by_speed for row in result_rows if row.perturbation != CLEAN)
@@ -196,7 +196,7 @@ def _make_results_table(title: str, result_rows: Sequence[RobustnessRow], group:
             name,
             row.method,
             *map(format_interval, row.ap),
-            *("" if is_clean else format_difference(drop) for drop in row.ap_drop or (None, None)),
+            *("" if is_clean else format_difference(drop and -drop) for drop in row.ap_drop or (None, None)),
             format_difference(row.gain_over_no_fusion[0]) if row.gain_over_no_fusion else "",
             format_number(row.bytes_per_message),
             format_number(row.age_ms),

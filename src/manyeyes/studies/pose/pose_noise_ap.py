@@ -246,14 +246,16 @@ def _make_common_objects_table(result_rows: Sequence[PoseNoiseRow]) -> StudyTabl
             row.method,
             row.level.name,
             *map(format_interval, row.ap_by_common_objects),
-            format_difference(row.ap_drop[0]) if row.ap_drop else "",
+            format_difference(-row.ap_drop[0]) if row.ap_drop else "",
             format_difference(row.gain_over_no_fusion[0]) if row.gain_over_no_fusion else "",
         )
         for row in listed
     )
     buckets = tuple(f"{_format_range(b)} in common" for b in COMMON_OBJECT_RANGES)
     return StudyTable(
-        "AP@0.5 by common objects", ("corrector", "fusion", "noise", *buckets, "AP drop", "gain over no fusion"), lines
+        "AP@0.5 by common objects",
+        ("corrector", "fusion", "noise", *buckets, "ΔAP vs. clean", "gain over no fusion"),
+        lines,
     )
 
 
