@@ -19,9 +19,9 @@ from manyeyes.training.maps.samples import (
     MapAugmentConfig,
     TileStream,
     mirror_frame,
-    mirror_transform,
     rasterise_elements,
 )
+from manyeyes.training.mirroring import resize_transform
 
 CONFIG = MapModelConfig(
     BevConfig(BevGrid(-12.0, -12.0, -2.0, 12.0, 12.0, 4.0, pillar=0.5)),
@@ -157,6 +157,6 @@ def test_a_mirrored_camera_projects_the_mirrored_point_to_the_mirrored_column():
 
 
 def test_a_mirrored_turn_is_a_turn_the_other_way():
-    back = mirror_transform(Transform.from_xyz_yaw(1.0, 2.0, 3.0, 0.4))
+    back = resize_transform(Transform.from_xyz_yaw(1.0, 2.0, 3.0, 0.4), 1.0, flip=True)
     assert float(back.yaw) == pytest.approx(-0.4) and back.translation.tolist() == [1.0, -2.0, 3.0]
     assert math.isclose(float(torch.det(back.rotation)), 1.0)

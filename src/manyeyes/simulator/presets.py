@@ -95,22 +95,36 @@ _STREETS = SimulationPreset(
     density=(3.5, 8.0),
 )
 
+_SMOKE_SPLITS = (
+    SplitPreset("train", ("generated-1",), 2),
+    SplitPreset("val", ("generated-2",), 1),
+    SplitPreset("test", ("generated-3",), 1),
+)
+
+# Generated roads: it needs no file.
+_CROSSING = SimulationPreset(
+    (
+        SplitPreset("train", ("generated-1", "generated-4", "generated-6", "generated-7"), 24),
+        SplitPreset("val", ("generated-2", "generated-8"), 8),
+        SplitPreset("test", ("generated-3", "generated-9"), 8),
+    ),
+    frames=10,
+    history_frames=0,
+    vehicles=(1, 1),
+    roadside_chance=1.0,
+    lidar="dair-vehicle",
+    roadside_lidar="dair-infrastructure",
+    min_vehicles=8,
+    layout="dair",
+)
+
 SIMULATION_PRESETS: dict[str, SimulationPreset] = {
     "carla-towns-small": _crowded(_towns(150, 22, 84)),
     "carla-towns-large": _crowded(_towns(600, 60, 200)),
     "carla-maps": _STREETS,
     # The same scenes, to the last point of their clouds, with pictures of what lies on the road.
     "carla-maps-camera": replace(_STREETS, cameras="opv2v-road", roadside_cameras="dair-infrastructure-road"),
-    "smoke-opv2v": SimulationPreset(
-        (
-            SplitPreset("train", ("generated-1",), 2),
-            SplitPreset("val", ("generated-2",), 1),
-            SplitPreset("test", ("generated-3",), 1),
-        ),
-        frames=3,
-        history_frames=1,
-        min_vehicles=4,
-    ),
+    "smoke-opv2v": SimulationPreset(_SMOKE_SPLITS, frames=3, history_frames=1, min_vehicles=4),
     "demo": SimulationPreset(
         (SplitPreset("test", ("Town10HD",), 1, (16,)),),
         frames=56,
@@ -118,37 +132,8 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
         roadside_chance=1.0,
         fallback_town="generated-5",
     ),
-    # The split's names are DAIR-V2X's own. Generated roads: it needs no file.
-    "dair-crossing": SimulationPreset(
-        (
-            SplitPreset("train", ("generated-1", "generated-4", "generated-6", "generated-7"), 24),
-            SplitPreset("val", ("generated-2", "generated-8"), 8),
-            SplitPreset("test", ("generated-3", "generated-9"), 8),
-        ),
-        frames=10,
-        history_frames=0,
-        vehicles=(1, 1),
-        roadside_chance=1.0,
-        lidar="dair-vehicle",
-        roadside_lidar="dair-infrastructure",
-        min_vehicles=8,
-        layout="dair",
-    ),
-    "smoke-dair": SimulationPreset(
-        (
-            SplitPreset("train", ("generated-1",), 2),
-            SplitPreset("val", ("generated-2",), 1),
-            SplitPreset("test", ("generated-3",), 1),
-        ),
-        frames=3,
-        history_frames=0,
-        vehicles=(1, 1),
-        roadside_chance=1.0,
-        lidar="dair-vehicle",
-        roadside_lidar="dair-infrastructure",
-        min_vehicles=4,
-        layout="dair",
-    ),
+    "dair-crossing": _CROSSING,
+    "smoke-dair": replace(_CROSSING, splits=_SMOKE_SPLITS, frames=3, min_vehicles=4),
 }
 
 

@@ -14,11 +14,11 @@ from functools import partial
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from manyeyes.datasets.base import Recording, iter_eval_frames
 from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.training.mirroring import mirror_factors, resize_cloud, resize_transform
 
 MAX_BUDGET_TOKENS = 1500
 """Maximum of random budgets, which is about all tokens of a view."""
@@ -306,31 +306,18 @@ def _in_range(boxes: Boxes, grid: BevGrid) -> Boxes:
     return boxes[grid.contains(boxes.center[:, :2])]
 
 
-def _mirror(flip: bool, dtype: torch.dtype) -> Tensor:
-    return torch.tensor([1.0, -1.0 if flip else 1.0, 1.0], dtype=dtype)
-
-
 def _resize_view(view: AgentView, scale: float, flip: bool, grid: BevGrid) -> AgentView:
     return replace(
         view,
-        cloud=_resize_cloud(view.cloud, scale, flip),
-        previous_cloud=_resize_cloud(view.previous_cloud, scale, flip),
-        ego_from_view=_resize_motion(view.ego_from_view, scale, flip),
+        cloud=resize_cloud(view.cloud, scale, flip),
+        previous_cloud=resize_cloud(view.previous_cloud, scale, flip),
+        ego_from_view=resize_transform(view.ego_from_view, scale, flip),
         visible_boxes=_in_range(_resize_boxes(view.visible_boxes, scale, flip), grid),
     )
 
 
-def _resize_cloud(cloud: PointCloud, scale: float, flip: bool) -> PointCloud:
-    return replace(cloud, xyz=cloud.xyz * (_mirror(flip, cloud.xyz.dtype) * scale))
-
-
-def _resize_motion(motion: Transform, scale: float, flip: bool) -> Transform:
-    mirror = _mirror(flip, motion.rotation.dtype)
-    return Transform(mirror[:, None] * motion.rotation * mirror, motion.translation * mirror * scale)
-
-
 def _resize_boxes(boxes: Boxes, scale: float, flip: bool) -> Boxes:
-    mirror = _mirror(flip, boxes.center.dtype) * scale
+    mirror = mirror_factors(flip, boxes.center.dtype) * scale
     yaw = -boxes.yaw if flip else boxes.yaw
     return replace(
         boxes, center=boxes.center * mirror, size=boxes.size * scale, yaw=yaw, velocity=boxes.velocity * mirror[:2]

@@ -27,6 +27,7 @@ from manyeyes.evaluation.maps.tiles import check_town_split, crop_to_tile, find_
 from manyeyes.models.maps.map_model import FRAMES_PER_TILE, MapModelConfig
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.polyline import resample_spaced
+from manyeyes.training.mirroring import mirror_factors, resize_cloud, resize_transform
 
 Floats = NDArray[np.float64]
 
@@ -174,7 +175,7 @@ class TileStream:
         if augment.flip and rng.random() < 0.5:
             frames, reported = (
                 [mirror_frame(frame) for frame in frames],
-                [mirror_transform(motion) for motion in reported],
+                [resize_transform(motion, 1.0, flip=True) for motion in reported],
             )
             truth, *local_elements = (_mirrored_elements(elements) for elements in (truth, *local_elements))
         line_mask = torch.stack(
@@ -212,12 +213,12 @@ def _filled(ring: Floats, step_m: float) -> Floats:
     return np.concatenate((points[inside], ring))
 
 
-_MIRROR = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+_MIRROR = mirror_factors(True, torch.float64)
 
 
 def mirror_frame(frame: AgentFrame) -> AgentFrame:
     """Mirror a frame left to right: its cloud, its cameras and their images."""
-    cloud = replace(frame.points, xyz=frame.points.xyz * _MIRROR.to(frame.points.xyz.dtype))
+    cloud = resize_cloud(frame.points, 1.0, flip=True)
     return replace(frame, points=cloud, images=tuple(_mirrored_image(image) for image in frame.images))
 
 
@@ -230,11 +231,6 @@ def _mirrored_image(image: CameraImage) -> CameraImage:
     intrinsic[0, 2] = camera.width - intrinsic[0, 2]
     placed = Camera(intrinsic, Transform(rotation, pose.translation * _MIRROR), camera.width, camera.height)
     return CameraImage(placed, image.rgb.flip(-1))
-
-
-def mirror_transform(motion: Transform) -> Transform:
-    """Return the transform between two mirrored frames."""
-    return Transform(_MIRROR[:, None] * motion.rotation * _MIRROR, motion.translation * _MIRROR)
 
 
 def _mirrored_elements(elements: MapElements) -> MapElements:

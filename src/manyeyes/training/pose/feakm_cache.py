@@ -20,16 +20,7 @@ from torch import Tensor
 from manyeyes._io import atomic_write
 from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.datasets.base import Recording
-from manyeyes.datatypes import (
-    BevGrid,
-    Boxes,
-    ConfigError,
-    RecordingError,
-    Sites,
-    Snapshot,
-    SparseBev,
-    Transform,
-)
+from manyeyes.datatypes import BevGrid, Boxes, ConfigError, RecordingError, Sites, Snapshot, SparseBev, Transform
 from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.ops.keyed_random import keyed_generator
