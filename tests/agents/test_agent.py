@@ -5,14 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import ClassVar
 
 import pytest
 import torch
 
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.perception_cache import PerceptionCache
+from manyeyes.agents.strategies.intermediate import IntermediateFusion
 from manyeyes.agents.strategies.registry import get_strategy, list_strategies
+from manyeyes.comms import payloads
 from manyeyes.comms.inbox import Inbox
+from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, PointCloud, Transform
 from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.detector import Detector
@@ -198,3 +202,61 @@ def test_an_unknown_strategy_lists_the_known_ones() -> None:
         ConfigError, match="No strategy is called 'telepathy'; known: .*" + ", ".join(list_strategies())
     ):
         get_strategy("telepathy")
+
+
+class Objects(IntermediateFusion):
+    """Intermediate fusion that sends its boxes too, and keeps what was recorded as sent."""
+
+    sent: ClassVar[list[Message]] = []
+
+    def compose_message(self, cache, frame, requests=()):
+        message = super().compose_message(cache, frame, requests)
+        return replace(message, objects=cache.process(frame).boxes[:20])
+
+    def record_sent(self, cache, frame, message):
+        self.sent.append(message)
+
+
+@pytest.mark.parametrize("encoding", ["float16", "int8"])
+def test_share_encodes_each_section_once_and_records_the_selected_tokens(
+    drive, detector: Detector, encoding: TokenEncoding, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = {"pack_object_bodies": 0, "pack_token_bodies": 0}
+
+    def count(name: str) -> None:
+        packed = getattr(payloads, name)
+
+        def counted(*arguments):
+            calls[name] += 1
+            return packed(*arguments)
+
+        monkeypatch.setattr(payloads, name, counted)
+
+    for name in calls:
+        count(name)
+    Objects.sent.clear()
+    packets = Agent(detector, Objects(), encoding, budget_bytes=2500).share(drive(1).frame(0, 3))
+    assert calls == {"pack_object_bodies": 1, "pack_token_bodies": 1} and sum(map(len, packets)) <= 2500
+    inbox = Inbox(detector.fingerprint)
+    for packet in packets:
+        inbox.push(packet)
+    assert packets
+    (message,), (sent,) = inbox.messages(), Objects.sent
+    assert message.tokens is not None and sent.tokens is not None and message.objects is not None
+    assert len(message.tokens.sites) > 0 and torch.equal(message.tokens.sites.key, sent.tokens.sites.key)
+
+
+def test_tokens_without_a_score_are_selected_in_the_order_of_their_cells(drive, detector: Detector) -> None:
+    class Unscored(IntermediateFusion):
+        def compose_message(self, cache, frame, requests=()):
+            return replace(super().compose_message(cache, frame, requests), token_score=None)
+
+    frame = drive(1).frame(0, 3)
+    cache = PerceptionCache(detector)
+    packets = Agent(detector, Unscored(), "float16", 1000, cache).share(frame)
+    inbox = Inbox(detector.fingerprint)
+    for packet in packets:
+        inbox.push(packet)
+    keys = inbox.messages()[0].tokens.sites.key
+    own = cache.process_tokens(frame).shared_tokens.sites.key
+    assert 0 < len(keys) < len(own) and torch.equal(keys, own[: len(keys)])

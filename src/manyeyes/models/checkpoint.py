@@ -103,7 +103,7 @@ def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config
     except (ConfigError, TypeError) as error:
         raise CheckpointError(
             f"{path}: its configuration is not one of this version of manyeyes: {error} "
-            "Use the version that wrote it, or train again."
+            "Use the version that wrote it, install the package that registers what is missing, or train again."
         ) from error
     expected = _tensors(model)
     for name in sorted(set(expected) | set(state)):
