@@ -103,6 +103,7 @@ def read_code_blocks(guide: Path) -> list[str]:
     [
         ("own-detector.md", "08_own_detector.py", "own_detector"),
         ("own-method.md", "09_own_method.py", "own_method"),
+        ("own-data.md", "10_own_data.py", "own_reader"),
     ],
 )
 def test_the_code_of_a_guide_is_that_of_its_example_and_package(guide: str, example: str, package: str) -> None:
@@ -128,3 +129,12 @@ def test_09_own_method(tmp_path: Path) -> None:
     *_, first, second = run("09_own_method.py", str(tmp_path / "drive")).strip().splitlines()
     assert [row.split()[0] for row in (first, second)] == ["intermediate", "moving-first"]
     assert all(0 < int(row.split()[-1]) <= 1000 for row in (first, second)) and first.split()[1:] != second.split()[1:]
+
+
+@pytest.mark.slow
+def test_10_own_data(tmp_path: Path) -> None:
+    pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
+    opened, heading, *rows = run("10_own_data.py", str(tmp_path / "drive")).strip().splitlines()[-5:]
+    assert opened.split()[0] == "NpzRecording" and heading.split()[0] == "method"
+    assert [row.split()[0] for row in rows] == ["none", "late", "early"]
+    assert all(float(row.split()[1]) > 0.5 for row in rows)

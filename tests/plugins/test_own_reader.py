@@ -15,6 +15,8 @@ from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
 
 PACKAGE = Path(__file__).parent / "own_reader"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SIZE = np.array([[4.6, 1.9, 1.6]])
 
 
@@ -31,7 +33,8 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
             rows.append(f"{index},{agent},{index * 0.1},{x},0,0,0")
             ground = rng.uniform(-25, 25, (1500, 3)) * (1, 1, 0)
             body = (rng.random((200, 3)) - 0.5) * SIZE + (8 - x, 5, 0.8)
-            np.savez(folder / f"{index}-{agent}.npz", points=np.concatenate((ground, body)).astype(np.float32))
+            points = np.concatenate((ground, body)).astype(np.float32)
+            np.savez(folder / f"{index}-{agent}.npz", points=points, intensity=np.full(len(points), 0.2))
     (folder / "poses.csv").write_text("\n".join(rows))
     return root
 
@@ -61,6 +64,9 @@ def test_without_its_entry_point_it_is_not_found(clouds: Path, manyeyes, tmp_pat
     assert "no recording in a known layout (argoverse2: logs" in viewed.stderr and "Traceback" not in viewed.stderr
 
 
-def test_it_is_one_short_module() -> None:
+def test_it_is_one_short_module_with_the_reader_of_the_example() -> None:
     (module,) = PACKAGE.glob("*.py")
-    assert len(module.read_text().splitlines()) <= 40
+    text = module.read_text()
+    assert len(text.splitlines()) <= 40
+    reader = text[text.index("def has_poses") :]
+    assert "def snapshot" in reader and reader in (EXAMPLES / "10_own_data.py").read_text()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from manyeyes import AgentFrame, Boxes, RecordingReader, Snapshot, Transform, register_dataset
+from manyeyes import AgentFrame, Boxes, PointCloud, RecordingReader, Snapshot, Transform, register_dataset
 from manyeyes.datatypes import GroundTruth
 
 
@@ -29,7 +29,8 @@ class NpzRecording(RecordingReader):
         frames, table, folder = [], self.poses[scenario], self.folders[scenario]
         for row in table[table["index"] == index]:
             agent, pose = int(row["agent"]), Transform.from_xyz_yaw(*(float(row[k]) for k in ("x", "y", "z", "yaw")))
-            points = np.load(folder / f"{index}-{agent}.npz")["points"]
+            cloud = np.load(folder / f"{index}-{agent}.npz")
+            points = PointCloud.of(cloud["points"], cloud["intensity"])
             frames.append(AgentFrame.of(points, pose, agent, round(row["time_s"] * 1e9)))
         truth = np.load(folder / f"{index}.npz")
         boxes = Boxes.of(truth["center"], truth["size"], truth["yaw"], id=truth["id"])
