@@ -24,6 +24,7 @@ from manyeyes.maps.fusion.existence import (
     ElementStyles,
     EvidenceConfig,
     EvidenceParameters,
+    EvidenceTable,
     MatchedObservations,
     ObservationScene,
     build_visibility_index,
@@ -60,24 +61,11 @@ class CrossingConfig:
 
 @dataclass(frozen=True, eq=False)
 class FusedCrossings:
-    """K fused crossings: ring k is ``xy[ring_offsets[k]:ring_offsets[k + 1]]``; sigma: (K,) metres of its sides.
-
-    The other columns are those of :class:`~manyeyes.maps.fusion.existence.StationEvidence`.
-    """
+    """K fused crossings: ring k is ``xy[ring_offsets[k]:ring_offsets[k + 1]]``; and their evidence."""
 
     ring_offsets: Ints
     xy: Floats
-    sigma: Floats
-    log_odds: Floats
-    coverage: Floats
-    support: Ints
-    agents: Ints
-    state: Ints
-    t_first: Ints
-    t_last: Ints
-    style: Floats
-    source_offsets: Ints
-    sources: Ints
+    evidence: EvidenceTable
 
 
 def fuse_crossings(
@@ -86,7 +74,7 @@ def fuse_crossings(
     weight: Floats,
     rank: Ints,
     config: CrossingConfig,
-    evidence: EvidenceConfig,
+    evidence_config: EvidenceConfig,
 ) -> FusedCrossings:
     """Fuse the crossings of all observations with agents at pose (O, 3).
 
@@ -109,19 +97,21 @@ def fuse_crossings(
     ]
     start = np.concatenate(([0], np.cumsum([len(r) for r in rings], dtype=np.int64))).astype(np.int64)
     xy = np.concatenate(rings) if rings else np.zeros((0, 2))
-    out = _accumulate_evidence(
+    styles = ElementStyles(np.asarray(arrays.elements.style), evidence_config.score_weight(arrays.elements.score))
+    evidence = EvidenceTable.zeros(np.full(count, CROSSING, np.int64), styles.style.shape[1])
+    sources = _accumulate_evidence(
         _OpenRings(start, xy),
         _CrossingHulls(*hulls, area, owner, rows),
         ObservationScene(
             build_visibility_index(arrays, pose), gather_observers(arrays, pose), gather_visibility_rings(arrays)
         ),
-        ElementStyles(np.asarray(arrays.elements.style), evidence.score_weight(arrays.elements.score)),
-        replace(evidence, publish_log_odds=evidence.publish_crossing_log_odds).kernel_params,
-        evidence.decay_time_s[CROSSING],
-        config.min_overlap,
+        styles,
+        replace(evidence_config, publish_log_odds=evidence_config.publish_crossing_log_odds).kernel_params,
+        (evidence_config.decay_time_s[CROSSING], config.min_overlap),
+        evidence,
     )
-    sigma = np.sqrt(0.2**2 / np.maximum(1, out.agents) + evidence.bias_sigma_m**2)
-    return FusedCrossings(start, xy, sigma, *out)
+    sigma = np.sqrt(0.2**2 / np.maximum(1, evidence.agents) + evidence_config.bias_sigma_m**2)
+    return FusedCrossings(start, xy, evidence._replace(sigma=sigma).with_sources(sources, arrays.digests))
 
 
 class _OpenRings(NamedTuple):
@@ -139,21 +129,6 @@ class _CrossingHulls(NamedTuple):
     area: F64x1
     observation: I64x1
     element: I64x1
-
-
-class _CrossingEvidence(NamedTuple):
-    """The columns of :class:`FusedCrossings` from log_odds on."""
-
-    log_odds: F64x1
-    coverage: F64x1
-    support: I64x1
-    agents: I64x1
-    state: I64x1
-    t_first: I64x1
-    t_last: I64x1
-    style: F64x2
-    source_offsets: I64x1
-    sources: I64x1
 
 
 def _transform_rings(arrays: ObservationArrays, rows: Ints, owner: Ints, pose: Floats) -> tuple[Ints, Floats]:
@@ -456,19 +431,17 @@ def _accumulate_evidence(
     scene: ObservationScene,
     element_columns: ElementStyles,
     params: EvidenceParameters,
-    decay_time_s: float,
-    min_overlap: float,
-) -> _CrossingEvidence:  # pragma: no cover - compiled
-    """Accumulate the evidence of each fused ring from the hulls whose overlap with it is at least ``min_overlap``."""
+    decay_time_s_and_min_overlap: tuple[float, float],
+    out: EvidenceTable,
+) -> I64x1:  # pragma: no cover - compiled
+    """Write the evidence of each fused ring, from the hulls that overlap it enough, to ``out``; returns the sources."""
+    decay_time_s, min_overlap = decay_time_s_and_min_overlap
     start, xy = fused
     style, score_weight = element_columns
     hull_first, hulls, area, owner, rows = rings
     time_ns = scene.observers.time_ns
     count, observations = len(start) - 1, len(time_ns)
-    odds, coverage = np.zeros(count), np.zeros(count)
-    support, agents, state = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
-    t_first, t_last, votes = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros((count, style.shape[1]))
-    first, found, filled = np.zeros(count + 1, np.int64), np.empty(max(16, len(area)), np.int64), 0
+    found, filled = np.empty(max(16, len(area)), np.int64), 0
     overlap_state, gain = np.full(observations, UNMATCHED, np.int64), np.zeros(observations)
     by_agent = new_agent_scratch(scene.observers.num_agents)
     for k in range(count):
@@ -486,7 +459,7 @@ def _accumulate_evidence(
             share = _common(hulls[hull_first[r] : hull_first[r + 1]], ring) / min(area[r], size)
             if share >= min_overlap:
                 if overlap_state[owner[r]] != MATCHED:
-                    votes[k] += style[rows[r]]
+                    out.style[k] += style[rows[r]]
                     gain[owner[r]] = 0.0
                 gain[owner[r]] = max(gain[owner[r]], score_weight[rows[r]])
                 overlap_state[owner[r]] = MATCHED
@@ -500,14 +473,12 @@ def _accumulate_evidence(
                 found[filled] = o
                 filled += 1
         hits = found[begin:filled]
-        odds[k], coverage[k], agents[k], state[k] = update_existence(
+        out.log_odds[k], out.coverage[k], out.agents[k], out.state[k] = update_existence(
             places, k, MatchedObservations(hits, overlap_state, gain), scene, params, decay_time_s, by_agent
         )
-        support[k] = len(hits)
+        out.support[k] = len(hits)
         if len(hits) > 0:
-            t_first[k], t_last[k] = time_ns[hits[0]], time_ns[hits[-1]]
-        first[k + 1] = filled
+            out.t_first[k], out.t_last[k] = time_ns[hits[0]], time_ns[hits[-1]]
+        out.source_offsets[k + 1] = filled
         overlap_state[:] = UNMATCHED
-    return _CrossingEvidence(
-        odds, coverage, support, agents, state, t_first, t_last, votes, first, found[:filled].copy()
-    )
+    return found[:filled].copy()

@@ -10,13 +10,15 @@ misses is more likely false than new, while a few detections that agree still su
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, U8x2, njit
+from manyeyes.datatypes.map_element import take_rows
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
 from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, ObservationArrays, compute_visibility, is_line
 from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range, line_residual, lower_bound
@@ -210,15 +212,16 @@ class ExistenceEstimate(NamedTuple):
     state: int
 
 
-class StationEvidence(NamedTuple):
-    """Evidence of K stations.
+class EvidenceTable(NamedTuple):
+    """The evidence of K elements: stations of lines, or crossings.
 
-    lateral_shift: (K,) metres along the normal to the position that the observations agree on; sigma: (K,) of it. log_odds,
-    coverage: (K,), coverage being the sum of visibilities. support, agents, state: (K,). t_first, t_last: (K,) ns. style: (K,
-    S) votes. Station k was detected by observations ``sources[source_offsets[k]:source_offsets[k + 1]]``, rows of the arrays.
+    kind: (K,) index into KINDS. sigma: (K,) metres, of the lateral position. log_odds, coverage: (K,), coverage being the sum of
+    visibilities. support, agents: (K,) observations and distinct agents that detected it. state: (K,). t_first, t_last: (K,) ns.
+    style: (K, S) votes. Element k was detected by observations ``sources[source_offsets[k]:source_offsets[k + 1]]``, ascending
+    rows of observations, which are ids (U, 16), ascending.
     """
 
-    lateral_shift: F64x1
+    kind: I64x1
     sigma: F64x1
     log_odds: F64x1
     coverage: F64x1
@@ -230,6 +233,42 @@ class StationEvidence(NamedTuple):
     style: F64x2
     source_offsets: I64x1
     sources: I64x1
+    observations: U8x2
+
+    @classmethod
+    def zeros(cls, kind: Ints, num_styles: int) -> EvidenceTable:
+        """Make rows of these kinds without evidence."""
+        count = len(kind)
+        sigma, log_odds, coverage = (np.zeros(count) for _ in range(3))
+        support, agents, state, t_first, t_last = (np.zeros(count, np.int64) for _ in range(5))
+        style, offsets, none = np.zeros((count, num_styles)), np.zeros(count + 1, np.int64), np.zeros(0, np.int64)
+        ids = np.zeros((0, 16), np.uint8)
+        return cls(kind, sigma, log_odds, coverage, support, agents, state, t_first, t_last, style, offsets, none, ids)
+
+    def with_sources(self, sources: Ints, ids: NDArray[np.uint8]) -> EvidenceTable:
+        """Return the same with sources, rows of ids (O, 16) in any order, in the order of source_offsets."""
+        observations, place = np.unique(ids, axis=0, return_inverse=True)
+        sources = place.reshape(-1)[sources]
+        owner = np.repeat(np.arange(len(self.kind)), np.diff(self.source_offsets))
+        return self._replace(sources=sources[np.lexsort((sources, owner))], observations=observations)
+
+    def take(self, rows: Ints) -> EvidenceTable:
+        """Return the chosen rows, in the order given."""
+        first, places = take_rows(self.source_offsets, rows)
+        return EvidenceTable(*(column[rows] for column in self[:-3]), first, self.sources[places], self.observations)
+
+    @classmethod
+    def cat(cls, tables: Sequence[EvidenceTable]) -> EvidenceTable:
+        """Concatenate tables, in order, and merge their observations."""
+        observations, place = np.unique(np.concatenate([e.observations for e in tables]), axis=0, return_inverse=True)
+        seen = np.cumsum([0, *(len(e.observations) for e in tables)])
+        counts = np.concatenate([np.diff(e.source_offsets) for e in tables])
+        return cls(
+            *(np.concatenate(columns) for columns in zip(*(e[:-3] for e in tables))),
+            np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+            np.concatenate([place.reshape(-1)[start + e.sources] for e, start in zip(tables, seen)]),
+            observations,
+        )
 
 
 def build_visibility_index(
@@ -299,9 +338,9 @@ def accumulate_evidence(
     weight: Floats,
     is_inlier: NDArray[np.bool_],
     config: EvidenceConfig = EvidenceConfig(),
-) -> StationEvidence:
+) -> tuple[Floats, EvidenceTable]:
     """Accumulate the evidence for line stations (K,) at xy with unit tangents from all observations, with agents at pose (O,
-    3).
+    3): metres (K,) along the normal to the position that the observations agree on, and the evidence.
 
     weight: (P,) weight of each point in the lateral position; points of weight 0 are no detections. A detection counts once per
     observation. is_inlier: (O,) observations whose misses count.
@@ -320,14 +359,18 @@ def accumulate_evidence(
         arrays.element_of_point[order],
         weight[order],
     )
-    return _accumulate_evidence(
+    styles = ElementStyles(np.asarray(arrays.elements.style), config.score_weight(arrays.elements.score))
+    evidence = EvidenceTable.zeros(kind, styles.style.shape[1])
+    shift, sources = _accumulate_evidence(
         _EvidenceStations(xy, tangent, kind),
         others,
         ObservationScene(index, gather_observers(arrays, pose), gather_visibility_rings(arrays)),
-        ElementStyles(np.asarray(arrays.elements.style), config.score_weight(arrays.elements.score)),
+        styles,
         config.kernel_params,
         np.array(config.decay_time_s),
+        evidence,
     )
+    return shift, evidence.with_sources(sources, arrays.digests)
 
 
 class _EvidenceStations(NamedTuple):
@@ -397,17 +440,15 @@ def _accumulate_evidence(
     element_columns: ElementStyles,
     params: EvidenceParameters,
     decay_time_s: F64x1,
-) -> StationEvidence:  # pragma: no cover - compiled
-    """Accumulate the evidence of each station; decay_time_s: (4,) by kind."""
+    out: EvidenceTable,
+) -> tuple[F64x1, I64x1]:  # pragma: no cover - compiled
+    """Write the evidence of each station to ``out``; returns the lateral shifts and the sources. decay_time_s: (4,) by kind."""
     xy, tangent, kind = stations
     style, score_weight = element_columns
     time_ns = scene.observers.time_ns
     count, observations = len(xy), len(time_ns)
-    shift, sigma, odds, coverage = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
-    support, agents, state = np.zeros(count, np.int64), np.zeros(count, np.int64), np.zeros(count, np.int64)
-    t_first, t_last = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    votes = np.zeros((count, style.shape[1]))
-    first, sources, filled = np.zeros(count + 1, np.int64), np.empty(max(16, 8 * count), np.int64), 0
+    shift, first = np.zeros(count), out.source_offsets
+    sources, filled = np.empty(max(16, 8 * count), np.int64), 0
     mass, offset, pull = np.zeros(observations), np.zeros(observations), np.zeros(observations)
     nearest, element, gain = np.zeros(observations), np.zeros(observations, np.int64), np.zeros(observations)
     lateral_state = np.full(observations, UNMATCHED, np.int64)
@@ -418,7 +459,7 @@ def _accumulate_evidence(
         n = _collect_offsets(k, stations, points, params, scratch)
         # Sums over observations go in their order, whatever order the grid gave.
         candidates[:n].sort()
-        shift[k], sigma[k] = _estimate_shift(n, scratch, params)
+        shift[k], out.sigma[k] = _estimate_shift(n, scratch, params)
         for t in range(n):
             o = candidates[t]
             if lateral_state[o] == MATCHED and abs(offset[o] / mass[o] - shift[k]) > params.max_lateral_m:
@@ -431,23 +472,21 @@ def _accumulate_evidence(
                     sources = doubled(sources)
                 sources[filled] = o
                 filled += 1
-                votes[k] += style[element[o]]
+                out.style[k] += style[element[o]]
                 gain[o] = score_weight[element[o]]
         first[k + 1] = filled
         place[0, 0], place[0, 1] = xy[k, 0] - shift[k] * tangent[k, 1], xy[k, 1] + shift[k] * tangent[k, 0]
         hits = MatchedObservations(sources[first[k] : filled], lateral_state, gain)
-        odds[k], coverage[k], agents[k], state[k] = update_existence(
+        out.log_odds[k], out.coverage[k], out.agents[k], out.state[k] = update_existence(
             place, k, hits, scene, params, float(decay_time_s[kind[k]]), by_agent
         )
-        support[k] = filled - first[k]
-        if support[k] > 0:
-            t_first[k], t_last[k] = time_ns[sources[first[k]]], time_ns[sources[filled - 1]]
+        out.support[k] = filled - first[k]
+        if out.support[k] > 0:
+            out.t_first[k], out.t_last[k] = time_ns[sources[first[k]]], time_ns[sources[filled - 1]]
         for t in range(n):
             o = candidates[t]
             mass[o], offset[o], pull[o], lateral_state[o] = 0.0, 0.0, 0.0, UNMATCHED
-    return StationEvidence(
-        shift, sigma, odds, coverage, support, agents, state, t_first, t_last, votes, first, sources[:filled].copy()
-    )
+    return shift, sources[:filled].copy()
 
 
 @njit(cache=True, nogil=True)

@@ -28,6 +28,7 @@ from manyeyes.maps.elements.vector_map import (
     compute_content_ids,
 )
 from manyeyes.maps.fusion.coverage import cut_unobserved
+from manyeyes.maps.fusion.existence import EvidenceTable
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.parallel_extension import ParallelExtensionConfig, extend_parallel
 from manyeyes.maps.fusion.polyline_linking import LinkConfig, link_stations, smooth_chains
@@ -35,7 +36,6 @@ from manyeyes.maps.fusion.pose_config import PoseSolverConfig
 from manyeyes.maps.fusion.pose_optimization import PoseSolution, solve_poses
 from manyeyes.maps.fusion.stations import (
     Area,
-    EvidenceTable,
     StationConfig,
     StationTable,
     build_stations,

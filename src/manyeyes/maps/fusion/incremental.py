@@ -10,7 +10,7 @@ again, the daily bound keeps only the last agent's sum per station, and crossing
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ from manyeyes.maps.fusion.crossings import compute_convex_hull, compute_overlap
 from manyeyes.maps.fusion.existence import (
     EvidenceConfig,
     EvidenceParameters,
+    EvidenceTable,
     compute_mean_visibility,
     doubled,
     gather_visibility_rings,
@@ -42,7 +43,7 @@ from manyeyes.maps.fusion.observation_arrays import (
 )
 from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range, line_residual
 from manyeyes.maps.fusion.pose_config import PoseSolverConfig
-from manyeyes.maps.fusion.stations import EvidenceTable, StationTable
+from manyeyes.maps.fusion.stations import StationTable
 from manyeyes.ops.nearest_line import find_nearest_line
 
 Floats = NDArray[np.float64]
@@ -89,7 +90,7 @@ class IncrementalMap:
         self._ring_centers = np.array([ring.mean(0) for ring in self._ring_points]).reshape(-1, 2)
         rows = _EvidenceRows.of_points(start, lines)
         xy, tangent = _points_and_tangents(start.elements.take(lines))
-        order = _order(xy, rows.kind)
+        order = _order(xy, rows.evidence.kind)
         self._merged_stations = _StationGrid.of(xy[order], tangent[order], rows.take(order))
         self._candidate_stations = _StationGrid.of(np.zeros((0, 2)), np.zeros((0, 2)), rows.take(order[:0]))
         self._observation_ids = [row.tobytes() for row in start.observations]
@@ -245,7 +246,7 @@ class IncrementalMap:
             np.concatenate((self._candidate_stations.xy, xy)),
             np.concatenate((self._candidate_stations.tangent, tangent)),
         )
-        order = _order(xy, rows.kind)
+        order = _order(xy, rows.evidence.kind)
         self._candidate_order = np.concatenate((self._candidate_order, np.arange(count, len(xy))))[order]
         self._candidate_stations = _StationGrid.of(xy[order], tangent[order], rows.take(order))
         self._support_log.append((np.arange(count, len(xy)), False, len(self._observation_ids) - 1))
@@ -258,7 +259,7 @@ class IncrementalMap:
         both = _EvidenceRows.cat(self._merged_stations.rows, self._candidate_stations.rows)
         xy = np.concatenate((self._merged_stations.xy, self._candidate_stations.xy))
         tangent = np.concatenate((self._merged_stations.tangent, self._candidate_stations.tangent))
-        order = _order(xy, both.kind)
+        order = _order(xy, both.evidence.kind)
         place = np.empty(len(order), np.int64)
         place[order] = np.arange(len(order))
         candidate_place = np.empty(len(self._candidate_stations), np.int64)
@@ -272,68 +273,55 @@ class IncrementalMap:
         self._candidate_stations = _StationGrid.of(np.zeros((0, 2)), np.zeros((0, 2)), both.take(order[:0]))
 
 
-@dataclass(eq=False)
-class _EvidenceRows:
-    """Mutable evidence columns, row by row with stations or rings."""
+class _EvidenceRows(NamedTuple):
+    """Evidence of stations or rings that observations change in place, without its sources; and the agent that changed each row
+    last, the day, and the sum of that agent's changes on that day.
+    """
 
-    kind: Ints
-    sigma: Floats
-    log_odds: Floats
-    support: Ints
-    agents: Ints
-    state: Ints
-    t_first: Ints
-    t_last: Ints
-    style: Floats
-    last_agent: Ints
-    day: Ints
-    day_sum: Floats
+    evidence: EvidenceTable
+    last_agent: I64x1
+    day: I64x1
+    day_sum: F64x1
 
     @classmethod
     def of(cls, m: VectorMap, rows: Ints) -> _EvidenceRows:
         """Make one row for each of the elements ``rows``."""
-        columns = (m.log_odds, m.supporters, m.agents, m.state, m.t_first, m.t_last)
-        sigma = np.array([m.elements.sigma[m.elements.offsets[k]] for k in rows.tolist()])
-        return cls._of(m.elements.kind[rows], sigma, tuple(c[rows] for c in columns), m.elements.style[rows])
+        return cls._of(
+            m.elements.kind[rows],
+            sigma=m.elements.sigma[m.elements.offsets[:-1][rows]],
+            log_odds=m.log_odds[rows],
+            support=m.supporters[rows],
+            agents=m.agents[rows],
+            state=m.state[rows],
+            t_first=m.t_first[rows],
+            t_last=m.t_last[rows],
+            style=m.elements.style[rows],
+        )
 
     @classmethod
     def of_points(cls, m: VectorMap, rows: Ints) -> _EvidenceRows:
         """Make one row for each point of the elements ``rows``."""
         _, points = take_rows(m.elements.offsets, rows)
-        owner = m.elements.element_of_point[points]
-        t = m.point_evidence
-        columns = (t.log_odds, t.support, t.agents, m.state[m.elements.element_of_point], t.t_first, t.t_last)
-        return cls._of(
-            m.elements.kind[owner], t.sigma[points], tuple(c[points] for c in columns), m.elements.style[owner]
-        )
+        owner, at_points = m.elements.element_of_point[points], m.point_evidence.take(points)
+        columns = {f.name: np.array(getattr(at_points, f.name)) for f in fields(at_points)}
+        return cls._of(m.elements.kind[owner], state=m.state[owner], style=m.elements.style[owner], **columns)
 
     @classmethod
-    def _of(cls, kind: Ints, sigma: Floats, columns: tuple[NDArray, ...], style: Floats) -> _EvidenceRows:
+    def _of(cls, kind: Ints, last_agent: int = -1, day: int = 0, **columns: NDArray) -> _EvidenceRows:
+        """Make rows of these kinds (N,) and columns; the rest is zero."""
         count = len(kind)
-        log_odds, support, agents, state, first, last = (np.array(c) for c in columns)
-        return cls(
-            kind=np.array(kind),
-            sigma=np.array(sigma),
-            log_odds=log_odds,
-            support=support,
-            agents=agents,
-            state=state,
-            t_first=first,
-            t_last=last,
-            style=np.array(style),
-            last_agent=np.full(count, -1, np.int64),
-            day=np.zeros(count, np.int64),
-            day_sum=np.zeros(count),
-        )
+        evidence = EvidenceTable.zeros(np.array(kind, np.int64), len(STYLES))._replace(**columns)
+        return cls(evidence, np.full(count, last_agent), np.full(count, day), np.zeros(count))
 
     @classmethod
     def cat(cls, one: _EvidenceRows, two: _EvidenceRows) -> _EvidenceRows:
         """Concatenate two tables, in order."""
-        return cls(*(np.concatenate((getattr(one, n), getattr(two, n))) for n in cls.__dataclass_fields__))
+        evidence = EvidenceTable.cat([one.evidence, two.evidence])
+        return cls(evidence, *(np.concatenate(both) for both in zip(one[1:], two[1:])))
 
     def take(self, order: Ints) -> _EvidenceRows:
         """Return the chosen rows, in the order given."""
-        return _EvidenceRows(*(getattr(self, n)[order] for n in self.__dataclass_fields__))
+        return _EvidenceRows(self.evidence.take(order), *(column[order] for column in self[1:]))
 
     def append_created(
         self, kind: Ints, score_weight: Floats, s: ObservationArrays, config: IncrementalConfig
@@ -343,20 +331,20 @@ class _EvidenceRows:
         odds = np.minimum(evidence.log_odds_hit * score_weight, evidence.max_daily_change)
         state = np.where(bool(s.trusted[0]) & (odds >= evidence.publish_threshold(kind)), PUBLISHED, 0)
         one = np.ones(count, np.int64)
-        created = _EvidenceRows(
-            np.asarray(kind, np.int64),
-            np.full(count, 0.3),
-            odds,
-            one,
-            one.copy(),
-            state,
-            one * time,
-            one * time,
-            np.full((count, len(STYLES)), 1.0 / len(STYLES)),
-            np.full(count, _hash_agent(s)),
-            one * (time // DAY_NS),
-            odds.copy(),
+        created = _EvidenceRows._of(
+            kind,
+            _hash_agent(s),
+            time // DAY_NS,
+            sigma=np.full(count, 0.3),
+            log_odds=odds,
+            support=one,
+            agents=one.copy(),
+            state=state,
+            t_first=one * time,
+            t_last=one * time,
+            style=np.full((count, len(STYLES)), 1.0 / len(STYLES)),
         )
+        created.day_sum[:] = odds
         return _EvidenceRows.cat(self, created)
 
     def add_log_odds(
@@ -368,7 +356,7 @@ class _EvidenceRows:
         _add_log_odds(
             rows,
             np.broadcast_to(np.asarray(log_odds_change, np.float64), len(rows)),
-            self._columns,
+            self,
             _Update(time, time // DAY_NS, _hash_agent(s), hit, bool(s.trusted[0])),
             _UpdateLimits(
                 evidence.max_daily_change,
@@ -380,53 +368,14 @@ class _EvidenceRows:
             ),
         )
 
-    @property
-    def _columns(self) -> _UpdatedColumns:
-        return _UpdatedColumns(
-            kind=self.kind,
-            log_odds=self.log_odds,
-            support=self.support,
-            agents=self.agents,
-            state=self.state,
-            t_last=self.t_last,
-            last_agent=self.last_agent,
-            day=self.day,
-            day_sum=self.day_sum,
-        )
-
     def to_table(self, sources_of_row: Sequence[Sequence[int]], ids: NDArray[np.uint8]) -> EvidenceTable:
         """Convert to the table of the batch fusion; sources_of_row: observations (rows of ids) of each row."""
-        digests, place = np.unique(ids, axis=0, return_inverse=True)
-        sources = [np.unique(place.reshape(-1)[np.array(one, np.int64)]) for one in sources_of_row]
-        return EvidenceTable(
-            kind=self.kind,
-            sigma=self.sigma,
-            log_odds=self.log_odds,
-            coverage=self.support.astype(np.float64),
-            support=self.support,
-            agents=self.agents,
-            state=self.state,
-            t_first=self.t_first,
-            t_last=self.t_last,
-            style=self.style,
+        sources = [np.unique(np.array(one, np.int64)) for one in sources_of_row]
+        table = self.evidence._replace(
+            coverage=self.evidence.support.astype(np.float64),
             source_offsets=np.concatenate(([0], np.cumsum([len(one) for one in sources]))).astype(np.int64),
-            sources=np.concatenate(sources) if sources else np.zeros(0, np.int64),
-            observations=digests,
         )
-
-
-class _UpdatedColumns(NamedTuple):
-    """The columns of :class:`_EvidenceRows` that an observation changes, and the kind."""
-
-    kind: I64x1
-    log_odds: F64x1
-    support: I64x1
-    agents: I64x1
-    state: I64x1
-    t_last: I64x1
-    last_agent: I64x1
-    day: I64x1
-    day_sum: F64x1
+        return table.with_sources(np.concatenate(sources) if sources else np.zeros(0, np.int64), ids)
 
 
 class _Update(NamedTuple):
@@ -452,10 +401,12 @@ class _UpdateLimits(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _add_log_odds(
-    rows: I64x1, amount: F64x1, columns: _UpdatedColumns, now: _Update, params: _UpdateLimits
+    rows: I64x1, amount: F64x1, columns: _EvidenceRows, now: _Update, params: _UpdateLimits
 ) -> None:  # pragma: no cover - compiled
     """Add amount (N,) to the log-odds of rows (N,), decayed, capped by agent and day and clamped; then set their state."""
-    kind, log_odds, support, agents, state, t_last, last_agent, day, day_sum = columns
+    evidence, last_agent, day, day_sum = columns
+    kind, log_odds, support, agents = evidence.kind, evidence.log_odds, evidence.support, evidence.agents
+    state, t_last = evidence.state, evidence.t_last
     time, today, agent, hit, trusted = now
     max_daily_change, max_log_odds, min_agents, retire, decay_time_s, publish = params
     for k, added in zip(rows, amount):
@@ -522,15 +473,15 @@ class _StationGrid:
     def of(cls, xy: Floats, tangent: Floats, rows: _EvidenceRows) -> _StationGrid:
         """Sort stations into a grid; rows: their evidence."""
         xy, tangent = np.ascontiguousarray(xy), np.ascontiguousarray(tangent)
-        grid = build_grid(xy[:, 0], xy[:, 1], rows.kind, _CELL_M)
+        grid = build_grid(xy[:, 0], xy[:, 1], rows.evidence.kind, _CELL_M)
         no_observation = np.full(len(xy), _NO_OBSERVATION, np.int64)
-        weight = np.minimum(4.0, rows.support.astype(np.float64))
+        weight = np.minimum(4.0, rows.evidence.support.astype(np.float64))
         return cls(xy, tangent, rows, grid, no_observation, weight)
 
     @cached_property
     def coarse_grid(self) -> tuple[Ints, Ints, Floats, Floats, Ints]:
         """The stations for the coarse search, at their positions when this was first read."""
-        grid = build_grid(self.xy[:, 0], self.xy[:, 1], self.rows.kind, 8.0)
+        grid = build_grid(self.xy[:, 0], self.xy[:, 1], self.rows.evidence.kind, 8.0)
         return grid.keys, grid.offsets, self.xy[grid.order], self.tangent[grid.order], self.observation_of_point
 
     def __len__(self) -> int:
@@ -552,11 +503,13 @@ class _StationGrid:
         )
         hit = mass > 0.0
         rows = near[hit]
-        gain = mass[hit] / (mass[hit] + 1.0 / np.maximum(self.rows.sigma[rows], 0.02) ** 2 * 0.04)
+        gain = mass[hit] / (mass[hit] + 1.0 / np.maximum(self.rows.evidence.sigma[rows], 0.02) ** 2 * 0.04)
         self.rows.add_log_odds(rows, evidence.log_odds_hit * score_weight[hit], s, True, config)
         normal = np.stack((-self.tangent[rows, 1], self.tangent[rows, 0]), 1)
         self.xy[rows] += (gain * place[hit])[:, None] * normal
-        self.rows.sigma[rows] = np.maximum(evidence.bias_sigma_m, self.rows.sigma[rows] * np.sqrt(1.0 - gain))
+        self.rows.evidence.sigma[rows] = np.maximum(
+            evidence.bias_sigma_m, self.rows.evidence.sigma[rows] * np.sqrt(1.0 - gain)
+        )
         missed = (mass < 0.0) & (seen > 0.0)
         self.rows.add_log_odds(near[missed], evidence.log_odds_miss * seen[missed], s, False, config)
         explained_points[placed.order] = explained

@@ -80,6 +80,11 @@ class ObservationArrays:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def digests(self) -> NDArray[np.uint8]:
+        """The ids as bytes (O, 16)."""
+        return np.frombuffer(bytes.fromhex("".join(self.ids)), np.uint8).reshape(-1, 16)
+
     def to_world(self, pose: Floats) -> tuple[Floats, Floats]:
         """Transform points and tangents (P, 2) to the map's frame with agents at pose (O, 3)."""
         return _to_world(self.xy, self.tangent, self.observation_offsets, np.ascontiguousarray(pose))

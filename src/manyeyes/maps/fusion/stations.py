@@ -7,19 +7,19 @@ A station depends only on observations within a few tens of metres. So the stati
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
-from manyeyes.datatypes.map_element import CROSSING, STYLES, take_rows
+from manyeyes._jit import Boolx1, F64x2, I64x1, njit
+from manyeyes.datatypes.map_element import STYLES, take_rows
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
 from manyeyes.maps.fusion.agent_weights import REJECTED_WEIGHT, compute_observation_weights
 from manyeyes.maps.fusion.coverage import find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import CrossingConfig, FusedCrossings, fuse_crossings
-from manyeyes.maps.fusion.existence import EvidenceConfig, StationEvidence, accumulate_evidence, find_covered_by_inliers
+from manyeyes.maps.fusion.existence import EvidenceConfig, EvidenceTable, accumulate_evidence, find_covered_by_inliers
 from manyeyes.maps.fusion.mean_shift import RidgeConfig, mean_shift_to_ridges, thin_ridges
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, is_line
 from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
@@ -27,7 +27,6 @@ from manyeyes.maps.fusion.pose_optimization import PoseSolution, limit_per_cell
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Digests = NDArray[np.uint8]
 
 _CONFLICT_CELL_M = 2.5
 
@@ -61,52 +60,6 @@ class StationConfig:
     ridge: RidgeConfig = field(default_factory=RidgeConfig)
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     polygon: CrossingConfig = field(default_factory=CrossingConfig)
-
-
-@dataclass(frozen=True, eq=False)
-class EvidenceTable:
-    """The columns that K stations or crossings share, as in :class:`~manyeyes.maps.fusion.existence.StationEvidence`.
-
-    sources: rows of observations (U, 16), ascending for each station; observations: ids, ascending.
-    """
-
-    kind: Ints
-    sigma: Floats
-    log_odds: Floats
-    coverage: Floats
-    support: Ints
-    agents: Ints
-    state: Ints
-    t_first: Ints
-    t_last: Ints
-    style: Floats
-    source_offsets: Ints
-    sources: Ints
-    observations: Digests
-
-    def take(self, rows: Ints) -> EvidenceTable:
-        """Return the chosen rows, in the order given."""
-        first, places = take_rows(self.source_offsets, rows)
-        columns = {name: getattr(self, name)[rows] for name in _PER_ROW}
-        return EvidenceTable(
-            source_offsets=first, sources=self.sources[places], observations=self.observations, **columns
-        )
-
-    @classmethod
-    def cat(cls, tables: Sequence[EvidenceTable]) -> EvidenceTable:
-        """Concatenate tables, in order, and merge their observations."""
-        digests, place = np.unique(np.concatenate([e.observations for e in tables]), axis=0, return_inverse=True)
-        seen = np.cumsum([0, *(len(e.observations) for e in tables)])
-        counts = np.concatenate([np.diff(e.source_offsets) for e in tables])
-        return cls(
-            source_offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-            sources=np.concatenate([place.reshape(-1)[start + e.sources] for e, start in zip(tables, seen)]),
-            observations=digests,
-            **{name: np.concatenate([getattr(e, name) for e in tables]) for name in _PER_ROW},
-        )
-
-
-_PER_ROW = tuple(f.name for f in fields(EvidenceTable) if f.name not in ("source_offsets", "sources", "observations"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +119,7 @@ def build_stations(
     lines = _build_line_stations(arrays, pose, covariance, (weight, is_inlier), area, config)
     rank = np.argsort(np.argsort(np.array(arrays.ids)))
     crossings = fuse_crossings(arrays, pose, weight, rank, config.polygon, config.evidence)
-    ring, ring_offsets, ring_xy = _rings_inside(crossings, arrays, area, config)
+    ring, ring_offsets, ring_xy = _rings_inside(crossings, area, config)
     observed_cells = find_observed_cells(arrays, pose, area)
     return StationTable.cat([StationTable(*lines, ring_offsets, ring_xy, ring, observed_cells)])
 
@@ -207,42 +160,25 @@ def _build_line_stations(
     kept = thin_ridges(places, turned, arrays.kind_of_point[seeds], arrays.priority[seeds], config.ridge)
     seeds, places, turned = seeds[kept], places[kept], turned[kept]
     kind = arrays.kind_of_point[seeds]
-    found = accumulate_evidence(places, turned, kind, arrays, pose, point_weight, is_inlier, config.evidence)
+    shift, found = accumulate_evidence(places, turned, kind, arrays, pose, point_weight, is_inlier, config.evidence)
     normal = np.stack((-turned[:, 1], turned[:, 0]), 1)
-    places = places + found.lateral_shift[:, None] * normal
+    places = places + shift[:, None] * normal
     has_support = (found.support >= config.min_support) | (found.coverage < config.min_support_coverage)
     stays = np.flatnonzero((found.support > 0) & (has_support | (found.state == RETIRED)))
     thinned = thin_ridges(places[stays], turned[stays], kind[stays], arrays.priority[seeds[stays]], config.ridge)
     stays = stays[thinned]
-    table = _publish_low_coverage(_to_table(found, kind, arrays).take(stays), config.evidence)
+    table = _publish_low_coverage(found.take(stays), config.evidence)
     places, turned = places[stays], turned[stays]
     loses = _find_conflicts(places, turned, table, config)
     chosen = np.flatnonzero(_within(places, area, 0.0) & ~loses & ((table.log_odds > 0.0) | (table.state != 0)))
     return places[chosen], turned[chosen], table.take(chosen)
 
 
-def _to_table(found: StationEvidence | FusedCrossings, kind: Ints, arrays: ObservationArrays) -> EvidenceTable:
-    """Convert evidence to a table whose sources are rows of the sorted ids."""
-    names = [name for name in _PER_ROW if name != "kind"]
-    ids = np.frombuffer(bytes.fromhex("".join(arrays.ids)), np.uint8).reshape(-1, 16)
-    digests, place = np.unique(ids, axis=0, return_inverse=True)
-    columns = {name: getattr(found, name) for name in names}
-    sources = place.reshape(-1)[found.sources]
-    owner = np.repeat(np.arange(len(kind)), np.diff(found.source_offsets))
-    return EvidenceTable(
-        kind=kind,
-        source_offsets=found.source_offsets,
-        sources=sources[np.lexsort((sources, owner))],
-        observations=digests,
-        **columns,
-    )
-
-
 def _publish_low_coverage(table: EvidenceTable, config: EvidenceConfig) -> EvidenceTable:
     """Publish candidates of low coverage whose log-odds reach their own threshold."""
     low_coverage = (table.coverage <= config.low_coverage) & (table.log_odds >= config.publish_low_coverage_log_odds)
     low_coverage &= (table.state == CANDIDATE) & (table.agents >= config.min_publish_agents)
-    return replace(table, state=np.where(low_coverage, PUBLISHED, table.state))
+    return table._replace(state=np.where(low_coverage, PUBLISHED, table.state))
 
 
 def _compute_point_weights(
@@ -273,21 +209,7 @@ def _find_conflicts(xy: Floats, tangent: Floats, table: EvidenceTable, config: S
         config.conflict_support_ratio,
         config.conflict_log_odds,
     )
-    columns = _ConflictColumns(
-        table.kind, table.log_odds, table.support, table.state, table.source_offsets, table.sources
-    )
-    return _find_losers(xy, tangent, columns, grid, params)
-
-
-class _ConflictColumns(NamedTuple):
-    """The columns of :class:`EvidenceTable` that decide which of two stations remains."""
-
-    kind: I64x1
-    log_odds: F64x1
-    support: I64x1
-    state: I64x1
-    first: I64x1
-    sources: I64x1
+    return _find_losers(xy, tangent, table, grid, params)
 
 
 class _ConflictLimits(NamedTuple):
@@ -303,10 +225,10 @@ class _ConflictLimits(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _find_losers(
-    xy: F64x2, tangent: F64x2, columns: _ConflictColumns, grid: PointGrid, params: _ConflictLimits
+    xy: F64x2, tangent: F64x2, table: EvidenceTable, grid: PointGrid, params: _ConflictLimits
 ) -> Boolx1:  # pragma: no cover - compiled
     """Find the stations (K,), at xy (K, 2) with unit tangents (K, 2), that lose against another one."""
-    kind, odds, support, state, first, sources = columns
+    kind, odds, support, state = table.kind, table.log_odds, table.support, table.state
     keys, start, order = grid.keys, grid.offsets, grid.order
     near, far, ratio, difference = params
     loses = np.zeros(len(xy), np.bool_)
@@ -328,7 +250,7 @@ def _find_losers(
                 else:
                     wins = odds[q] > odds[k] + difference and support[q] >= 3
                 # Two lines that the same observations detected are two lines; else they are two estimates of one.
-                if wins and 4 * _count_shared(sources, first, k, q) < min(support[k], support[q]):
+                if wins and 4 * _count_shared(table.sources, table.source_offsets, k, q) < min(support[k], support[q]):
                     loses[k] = True
     return loses
 
@@ -350,11 +272,10 @@ def _count_shared(sources: I64x1, first: I64x1, k: int, q: int) -> int:  # pragm
 
 
 def _rings_inside(
-    crossings: FusedCrossings, arrays: ObservationArrays, area: Area | None, config: StationConfig
+    crossings: FusedCrossings, area: Area | None, config: StationConfig
 ) -> tuple[EvidenceTable, Ints, Floats]:
     """Evidence, offsets and rings of the crossings whose centre lies in the area."""
-    count = len(crossings.support)
-    table = _to_table(crossings, np.full(count, CROSSING, np.int64), arrays)
+    table, count = crossings.evidence, len(crossings.evidence.kind)
     counts = np.diff(crossings.ring_offsets)
     owner = np.repeat(np.arange(count), counts)
     centre = np.stack([np.bincount(owner, crossings.xy[:, axis], count) / np.maximum(1, counts) for axis in (0, 1)], 1)
@@ -368,4 +289,4 @@ def _rings_inside(
 def normalize_style(table: EvidenceTable) -> EvidenceTable:
     """Return the same with style votes as probabilities (K, S); without votes all alike."""
     total = table.style.sum(1, keepdims=True)
-    return replace(table, style=np.where(total > 0, table.style / np.maximum(total, 1e-12), 1.0 / len(STYLES)))
+    return table._replace(style=np.where(total > 0, table.style / np.maximum(total, 1e-12), 1.0 / len(STYLES)))
