@@ -9,6 +9,7 @@ that detected a line there. So dense lines do not dominate, and support by more 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,54 @@ from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+class SearchParameters(NamedTuple):
+    """The values of CoarseSearchConfig as compiled loops read them."""
+
+    max_shift_m: float
+    cell_m: float
+    min_score_gain: float
+    min_shift_m: float
+    cost_per_m: float
+    yaw_steps_rad: F64x1
+    point_stride: int
+
+
+class SearchedObservations(NamedTuple):
+    """O observations: prior poses (O, 3), whether they are surveyed and their agents (O,); offsets (O + 1,), positions and unit
+    tangents (P, 2) in their own frames and kinds (P,) of their points.
+    """
+
+    pose: F64x2
+    trusted: Boolx1
+    agent: I64x1
+    offsets: I64x1
+    xy: F64x2
+    tangent: F64x2
+    kind: I64x1
+
+
+class DrawnPoints(NamedTuple):
+    """Points in the order of their grid of 8 m: its keys and offsets, positions and unit tangents (P, 2) in the map's frame, and
+    agents (P,).
+    """
+
+    keys: I64x1
+    start: I64x1
+    xy: F64x2
+    tangent: F64x2
+    agent: I64x1
+
+
+class _RasterFrame(NamedTuple):
+    """A raster in an observation's frame: its lower corner (m), numbers of cells along x and y, and their edge (m)."""
+
+    x0: float
+    y0: float
+    nx: int
+    ny: int
+    cell: float
 
 
 @dataclass(frozen=True)
@@ -39,6 +88,19 @@ class CoarseSearchConfig:
     yaw_steps_rad: tuple[float, ...] = (0.0,)
     point_stride: int = 2
 
+    @property
+    def kernel_params(self) -> SearchParameters:
+        """The configuration as compiled loops read it."""
+        return SearchParameters(
+            self.max_shift_m,
+            self.cell_m,
+            self.min_score_gain,
+            self.min_shift_m,
+            self.cost_per_m,
+            np.array(self.yaw_steps_rad),
+            self.point_stride,
+        )
+
 
 def search_coarse(arrays: ObservationArrays, keep: NDArray[np.bool_], home: Ints, config: CoarseSearchConfig) -> Floats:
     """Search the poses (H, 3) of the home observations; ``keep`` (P,) are the points of the raster.
@@ -49,24 +111,24 @@ def search_coarse(arrays: ObservationArrays, keep: NDArray[np.bool_], home: Ints
     chosen = np.flatnonzero(keep)
     grid = build_grid(xy[chosen, 0], xy[chosen, 1], arrays.kind_of_point[chosen], 8.0)
     rows = chosen[grid.order]
-    shifts = find_best_shifts(
-        home,
+    drawn = DrawnPoints(
+        grid.keys, grid.offsets, xy[rows], tangent[rows], arrays.agent[arrays.observation_of_point[rows]]
+    )
+    shifts = find_best_shifts(home, to_searched_observations(arrays), drawn, config.kernel_params)
+    return apply_shifts(arrays, home, shifts)
+
+
+def to_searched_observations(arrays: ObservationArrays) -> SearchedObservations:
+    """Gather the observations for the compiled search."""
+    return SearchedObservations(
         np.asarray(arrays.pose),
         np.asarray(arrays.trusted),
-        (arrays.observation_offsets, arrays.xy, arrays.tangent, arrays.kind_of_point),
-        (
-            grid.keys,
-            grid.offsets,
-            xy[rows],
-            tangent[rows],
-            arrays.agent[arrays.observation_of_point[rows]],
-        ),
         np.asarray(arrays.agent),
-        np.array(config.yaw_steps_rad),
-        (config.max_shift_m, config.cell_m, config.min_score_gain, config.min_shift_m, config.cost_per_m),
-        config.point_stride,
+        arrays.observation_offsets,
+        arrays.xy,
+        arrays.tangent,
+        arrays.kind_of_point,
     )
-    return apply_shifts(arrays, home, shifts)
 
 
 def apply_shifts(arrays: ObservationArrays, home: Ints, shifts: Floats) -> Floats:
@@ -79,19 +141,11 @@ def apply_shifts(arrays: ObservationArrays, home: Ints, shifts: Floats) -> Float
 
 @njit(cache=True, nogil=True)
 def find_best_shifts(
-    home: I64x1,
-    pose: F64x2,
-    trusted: Boolx1,
-    own_points: tuple[I64x1, F64x2, F64x2, I64x1],
-    other_points: tuple[I64x1, I64x1, F64x2, F64x2, I64x1],
-    agent: I64x1,
-    yaw_steps: F64x1,
-    params: tuple[float, float, float, float, float],
-    stride: int,
+    home: I64x1, observations: SearchedObservations, others: DrawnPoints, params: SearchParameters
 ) -> F64x2:  # pragma: no cover - compiled
     """Find the shift (H, 3) of each home observation, in its own frame, with the best score; zero for none."""
-    first, xy, tangent, kind = own_points
-    max_shift, cell, min_gain, min_shift, cost_per_m = params
+    pose, trusted, agent, first, xy, tangent, kind = observations
+    max_shift, cell, min_gain, min_shift, cost_per_m, yaw_steps, stride = params
     shifts = np.zeros((len(home), 3))
     radius = int(np.floor(max_shift / cell))
     for h in range(len(home)):
@@ -102,11 +156,12 @@ def find_best_shifts(
         x0, y0 = xy[a:b, 0].min() - max_shift - 2.0, xy[a:b, 1].min() - max_shift - 2.0
         nx = int((xy[a:b, 0].max() + max_shift + 2.0 - x0) / cell) + 1
         ny = int((xy[a:b, 1].max() + max_shift + 2.0 - y0) / cell) + 1
-        picture = _draw_layers(pose[o], int(agent[o]), other_points, x0, y0, nx, ny, cell)
+        frame = _RasterFrame(x0, y0, nx, ny, cell)
+        picture = _draw_layers(pose[o], int(agent[o]), others, frame)
         best, bx, by, bt = 0.0, 0, 0, 0.0
         at_rest = 0.0
         for turn in yaw_steps:
-            score = _correlate(picture, xy[a:b], tangent[a:b], kind[a:b], turn, x0, y0, cell, radius, stride)
+            score = _correlate(picture, frame, xy[a:b], tangent[a:b], kind[a:b], turn, radius, stride)
             if turn == 0.0:
                 at_rest = score[radius, radius]
                 best = max(best, at_rest)
@@ -127,17 +182,11 @@ def find_best_shifts(
 
 @njit(cache=True, nogil=True)
 def _draw_layers(
-    pose: F64x1,
-    agent: int,
-    other_points: tuple[I64x1, I64x1, F64x2, F64x2, I64x1],
-    x0: float,
-    y0: float,
-    nx: int,
-    ny: int,
-    cell: float,
+    pose: F64x1, agent: int, others: DrawnPoints, frame: _RasterFrame
 ) -> F32x3:  # pragma: no cover - compiled
     """Draw the points of other agents in the frame of a pose: (layers, nx, ny) of s."""
-    keys, start, rxy, rtangent, ragent = other_points
+    keys, start, rxy, rtangent, ragent = others
+    x0, y0, nx, ny, cell = frame
     picture = np.zeros((24, nx, ny), np.float32)
     stamp = np.empty((5, 5), np.float32)
     for i in range(5):
@@ -176,20 +225,18 @@ def _draw_layers(
 @njit(cache=True, nogil=True)
 def _correlate(
     picture: F32x3,
+    frame: _RasterFrame,
     xy: F64x2,
     tangent: F64x2,
     kind: I64x1,
     turn: float,
-    x0: float,
-    y0: float,
-    cell: float,
     radius: int,
     stride: int,
 ) -> F64x2:  # pragma: no cover - compiled
     """Compute the mean of s / (s + 1) under the points for each shift (2 radius + 1, 2 radius + 1), after a turn about their
     mean.
     """
-    _, nx, ny = picture.shape
+    x0, y0, nx, ny, cell = frame
     score = np.zeros((2 * radius + 1, 2 * radius + 1))
     c, s = np.cos(turn), np.sin(turn)
     mx, my = xy[:, 0].mean(), xy[:, 1].mean()

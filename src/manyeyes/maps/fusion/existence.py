@@ -585,7 +585,7 @@ def update_existence(
     pose, agent, time_ns, trusted, _ = scene.observers
     hits, lateral_state, score_weight = found
     of = scene.cells.observations
-    hit, miss, max_log_odds, max_daily_change = params.hit, params.miss, params.max_log_odds, params.max_daily_change
+    max_log_odds = params.max_log_odds
     low, high = _cell_of(places, scene.cells)
     odds, coverage, state, then, surveyed, started = 0.0, 0.0, CANDIDATE, 0, False, False
     seen_by, all_by, missed_by, next_hit, q, floor = 0, 0, 0, 0, low, -params.max_initial_log_odds
@@ -600,11 +600,9 @@ def update_existence(
         else:
             o = of[q]
             q += 1
-            seen = (
-                0.0
-                if lateral_state[o] == NEARBY
-                else compute_mean_visibility(places, o, pose, scene.fields, params.margin_m)
-            )
+            seen = 0.0
+            if lateral_state[o] != NEARBY:
+                seen = compute_mean_visibility(places, o, pose, scene.fields, params.margin_m)
         coverage += seen
         if seen <= 0.0:
             continue
@@ -613,18 +611,16 @@ def update_existence(
         started, then = True, time_ns[o]
         a = int(agent[o])
         _open_day(scratch, a, k, int(time_ns[o] // DAY_NS))
-        change = hit * score_weight[o] if is_hit else miss * seen
+        change = params.hit * score_weight[o] if is_hit else params.miss * seen
         if not trusted[o]:
-            allowed = min(max_daily_change, max(-max_daily_change, scratch.day_sum[a] + change))
-            change, scratch.day_sum[a] = allowed - scratch.day_sum[a], allowed
+            change = _bound_daily_change(scratch, a, change, params.max_daily_change)
         if is_hit:
             floor = -max_log_odds
         odds = min(max_log_odds, max(floor, odds + change))
         if is_hit:
             seen_by += _count_once(scratch.seen_era, a, era_seen)
-            if not scratch.has_seen[a]:
-                scratch.has_seen[a] = True
-                all_by += 1
+            all_by += not scratch.has_seen[a]
+            scratch.has_seen[a] = True
             surveyed = surveyed or trusted[o]
         elif all_by > 0:
             missed_by += _count_once(scratch.missed_era, a, era_missed)
@@ -646,6 +642,16 @@ def _count_once(eras: I64x1, a: int, era: int) -> int:  # pragma: no cover - com
         return 0
     eras[a] = era
     return 1
+
+
+@njit(cache=True, nogil=True)
+def _bound_daily_change(
+    scratch: AgentScratch, a: int, change: float, max_daily_change: float
+) -> float:  # pragma: no cover - compiled
+    """Return the part of a change by which the sum of agent a's changes of the day stays within its bound; counts it."""
+    allowed = min(max_daily_change, max(-max_daily_change, scratch.day_sum[a] + change))
+    change, scratch.day_sum[a] = allowed - scratch.day_sum[a], allowed
+    return change
 
 
 @njit(cache=True, nogil=True)

@@ -21,7 +21,7 @@ from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, take_rows
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, VectorMap
-from manyeyes.maps.fusion.coarse_search import apply_shifts, find_best_shifts
+from manyeyes.maps.fusion.coarse_search import DrawnPoints, apply_shifts, find_best_shifts, to_searched_observations
 from manyeyes.maps.fusion.coverage import find_cells_under_lines, find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import compute_convex_hull, compute_overlap
 from manyeyes.maps.fusion.existence import (
@@ -42,7 +42,6 @@ from manyeyes.maps.fusion.observation_arrays import (
     to_observation_arrays,
 )
 from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range, line_residual
-from manyeyes.maps.fusion.pose_config import PoseSolverConfig
 from manyeyes.maps.fusion.stations import StationTable
 from manyeyes.ops.nearest_line import find_nearest_line
 
@@ -173,7 +172,13 @@ class IncrementalMap:
         pose, covariance = np.array(s.pose), np.array(s.covariance)
         if not len(station_grid) or not len(s.xy):
             return pose, covariance
-        pose = apply_shifts(s, home, find_best_shifts(*_to_search_arguments(s, home, station_grid.coarse_grid, config)))
+        pose = apply_shifts(
+            s,
+            home,
+            find_best_shifts(
+                home, to_searched_observations(s), station_grid.coarse_grid, config.coarse_search.kernel_params
+            ),
+        )
         begin = pose
         for gate, kernel in zip(one.gates_m, one.kernels_m):
             xy, tangent = s.to_world(pose)
@@ -479,10 +484,12 @@ class _StationGrid:
         return cls(xy, tangent, rows, grid, no_observation, weight)
 
     @cached_property
-    def coarse_grid(self) -> tuple[Ints, Ints, Floats, Floats, Ints]:
+    def coarse_grid(self) -> DrawnPoints:
         """The stations for the coarse search, at their positions when this was first read."""
         grid = build_grid(self.xy[:, 0], self.xy[:, 1], self.rows.evidence.kind, 8.0)
-        return grid.keys, grid.offsets, self.xy[grid.order], self.tangent[grid.order], self.observation_of_point
+        return DrawnPoints(
+            grid.keys, grid.offsets, self.xy[grid.order], self.tangent[grid.order], self.observation_of_point
+        )
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -558,6 +565,54 @@ class _Comparison(NamedTuple):
     explained: Boolx1
 
 
+class _StationMatch(NamedTuple):
+    """Sums over the points that match a station, each with its weight: of weights; of lateral offset (m), point weight and
+    detection weight times weight. is_near: whether any line is within the wider gate.
+    """
+
+    weight: float
+    offset: float
+    mass: float
+    score_weight: float
+    is_near: bool
+
+
+@njit(cache=True, nogil=True)
+def _match_station(
+    k: int,
+    kind: int,
+    stations: _GridStations,
+    points: _ObservationPoints,
+    params: EvidenceParameters,
+    explained: Boolx1,
+) -> _StationMatch:  # pragma: no cover - compiled
+    """Match station k with the points of its kind; marks those that match in ``explained``."""
+    reach, across, wide = params.max_longitudinal_m, params.max_lateral_m, params.max_nearby_m
+    radius = np.hypot(reach, wide)
+    x, y, u, v = stations.xy[k, 0], stations.xy[k, 1], stations.tangent[k, 0], stations.tangent[k, 1]
+    total, offset, heavy, certain, is_near = 0.0, 0.0, 0.0, 0.0, False
+    lowest, highest = int(np.floor((y - radius) / _CELL_M)), int(np.floor((y + radius) / _CELL_M))
+    for ix in range(int(np.floor((x - radius) / _CELL_M)), int(np.floor((x + radius) / _CELL_M)) + 1):
+        low, high = find_cell_range(points.keys, points.start, kind, ix, lowest, highest)
+        for q in range(low, high):
+            ex, ey = points.xy[q, 0] - x, points.xy[q, 1] - y
+            if ex * ex + ey * ey > radius * radius:
+                continue
+            along, aside = line_residual(ex, ey, u, v, points.tangent[q, 0], points.tangent[q, 1], params.min_cosine)
+            along = abs(along)
+            if along > reach or abs(aside) > wide:
+                continue
+            is_near = True
+            if abs(aside) <= across:
+                explained[q] = True
+                w = (1.0 - along / reach) ** 2 + 1e-9
+                total += w
+                offset += w * aside
+                heavy += w * points.weight[q]
+                certain += w * points.score_weight[q]
+    return _StationMatch(total, offset, heavy, certain, is_near)
+
+
 @njit(cache=True, nogil=True)
 def _match_stations(
     stations: _GridStations, placed: _PlacedObservation, kinds: int
@@ -565,12 +620,8 @@ def _match_stations(
     """Match the stations in the box of a view with the observed points; those with a line only at a small lateral offset are
     left out.
     """
-    keys, start, xy, tangent = stations
-    pkeys, pstart, pxy, ptangent, pweight, pscore_weight = placed.points
     params, (low, high) = placed.kernel_params, placed.box
-    reach, across, wide = params.max_longitudinal_m, params.max_lateral_m, params.max_nearby_m
-    cosine, radius = params.min_cosine, np.hypot(reach, wide)
-    explained = np.zeros(len(pxy), np.bool_)
+    explained = np.zeros(len(placed.points.xy), np.bool_)
     size, n = 1024, 0
     rows, place, mass = np.empty(size, np.int64), np.empty(size), np.empty(size)
     seen, score_weight = np.empty(size), np.empty(size)
@@ -580,31 +631,17 @@ def _match_stations(
             continue
         for ix in range(int(np.floor((low[0] - 2.0) / _CELL_M)), int(np.floor((high[0] + 2.0) / _CELL_M)) + 1):
             first, last = find_cell_range(
-                keys, start, kind, ix, int(np.floor((low[1] - 2.0) / _CELL_M)), int(np.floor((high[1] + 2.0) / _CELL_M))
+                stations.keys,
+                stations.start,
+                kind,
+                ix,
+                int(np.floor((low[1] - 2.0) / _CELL_M)),
+                int(np.floor((high[1] + 2.0) / _CELL_M)),
             )
             for k in range(first, last):
-                x, y, u, v = xy[k, 0], xy[k, 1], tangent[k, 0], tangent[k, 1]
-                total, offset, heavy, certain, is_near = 0.0, 0.0, 0.0, 0.0, False
-                lowest, highest = int(np.floor((y - radius) / _CELL_M)), int(np.floor((y + radius) / _CELL_M))
-                for jx in range(int(np.floor((x - radius) / _CELL_M)), int(np.floor((x + radius) / _CELL_M)) + 1):
-                    a, b = find_cell_range(pkeys, pstart, kind, jx, lowest, highest)
-                    for q in range(a, b):
-                        ex, ey = pxy[q, 0] - x, pxy[q, 1] - y
-                        if ex * ex + ey * ey > radius * radius:
-                            continue
-                        along, aside = line_residual(ex, ey, u, v, ptangent[q, 0], ptangent[q, 1], cosine)
-                        along = abs(along)
-                        if along > reach or abs(aside) > wide:
-                            continue
-                        is_near = True
-                        explained[q] = explained[q] or abs(aside) <= across
-                        if abs(aside) <= across:
-                            w = (1.0 - along / reach) ** 2 + 1e-9
-                            total += w
-                            offset += w * aside
-                            heavy += w * pweight[q]
-                            certain += w * pscore_weight[q]
-                spot[0, 0], spot[0, 1] = x, y
+                match = _match_station(k, kind, stations, placed.points, params, explained)
+                total, is_near = match.weight, match.is_near
+                spot[0, 0], spot[0, 1] = stations.xy[k]
                 visible = (
                     compute_mean_visibility(spot, 0, placed.pose, placed.visibility_rings, params.margin_m)
                     if not is_near
@@ -616,8 +653,8 @@ def _match_stations(
                     size *= 2
                     rows, place = doubled(rows), _resize(place, size)
                     mass, seen, score_weight = _resize(mass, size), _resize(seen, size), _resize(score_weight, size)
-                rows[n], seen[n], score_weight[n] = k, visible, certain / total if total > 0.0 else 0.0
-                place[n], mass[n] = (offset / total, heavy / total) if total > 0.0 else (0.0, -1.0)
+                rows[n], seen[n], score_weight[n] = k, visible, match.score_weight / total if total > 0.0 else 0.0
+                place[n], mass[n] = (match.offset / total, match.mass / total) if total > 0.0 else (0.0, -1.0)
                 n += 1
     return _Comparison(
         rows[:n].copy(), place[:n].copy(), mass[:n].copy(), seen[:n].copy(), score_weight[:n].copy(), explained
@@ -647,28 +684,6 @@ def compute_map_fscore(one: VectorMap, two: VectorMap, threshold_m: float = 0.5)
             close, total = close + int((away <= threshold_m).sum()), total + len(points)
         fractions.append(close / total if total else 1.0)
     return 2 * fractions[0] * fractions[1] / (fractions[0] + fractions[1]) if sum(fractions) > 0 else 0.0
-
-
-def _to_search_arguments(s: ObservationArrays, home: Ints, other_points: tuple, config: PoseSolverConfig) -> tuple:
-    """Convert one observation and the stations to arguments of the compiled coarse search."""
-    search_config = config.coarse_search
-    return (
-        home,
-        np.asarray(s.pose),
-        np.asarray(s.trusted),
-        (s.observation_offsets, s.xy, s.tangent, s.kind_of_point),
-        other_points,
-        np.asarray(s.agent),
-        np.array(search_config.yaw_steps_rad),
-        (
-            search_config.max_shift_m,
-            search_config.cell_m,
-            search_config.min_score_gain,
-            search_config.min_shift_m,
-            search_config.cost_per_m,
-        ),
-        search_config.point_stride,
-    )
 
 
 def _points_and_tangents(elements: MapElements) -> tuple[Floats, Floats]:

@@ -70,71 +70,48 @@ def link_stations(
 
     Every station is in exactly one chain. coverage: (K,) summed visibility. A closed loop is opened at its weakest station.
     """
-    pair = _find_links(xy, tangent, kind, config.max_gap_m, config)
+    gates = _LinkGates(
+        config.max_lateral_m,
+        config.lateral_slope,
+        config.max_heading_rad,
+        config.heading_slope,
+        config.lateral_cost,
+    )
+    pair = _find_links(xy, tangent, kind, np.ones((len(xy), 2), np.bool_), config.max_gap_m, gates)
     offsets, members = _trace_chains(pair, log_odds)
-    near, far = (config.max_heading_rad, config.heading_slope), (config.max_low_coverage_heading_rad, 0.0)
+    lateral = (config.max_end_lateral_m, config.end_lateral_slope)
+    near = _LinkGates(*lateral, config.max_heading_rad, config.heading_slope, config.lateral_cost)
+    far = _LinkGates(*lateral, config.max_low_coverage_heading_rad, 0.0, config.lateral_cost)
     rounds = (
         (config.max_join_gap_m, near, np.ones(len(xy), bool)),
         (config.max_dashed_gap_m, near, dashed),
         (config.max_low_coverage_gap_m, far, coverage <= config.max_coverage),
     )
-    for max_gap, turn, allowed in rounds:
+    for max_gap, gates, allowed in rounds:
         ends = np.unique(np.concatenate((members[offsets[:-1]], members[offsets[1:] - 1])))
         ends = ends[allowed[ends]]
-        pair = _join_ends(pair, ends, xy, tangent, kind, max_gap, turn, config, (offsets, members))
+        direction = _end_tangents(xy, tangent, offsets, members)
+        pair = _join_ends(pair, ends, xy, direction, kind, max_gap, gates)
         offsets, members = _trace_chains(pair, log_odds)
     return offsets, members
 
 
-def _find_links(xy: Floats, tangent: Floats, kind: Ints, max_gap: float, config: LinkConfig) -> Ints:
-    """Return (K, 2): the station linked in front of and behind each one's own tangent, or -1."""
+def _find_links(
+    xy: Floats, tangent: Floats, kind: Ints, free: NDArray[np.bool_], max_gap: float, gates: _LinkGates
+) -> Ints:
+    """Return (K, 2): the station linked in front of and behind each one's own tangent, or -1; free: (K, 2) sides to link."""
     grid = build_grid(xy[:, 0], xy[:, 1], kind, max_gap)
-    best = _find_best_partners(
-        xy,
-        tangent,
-        kind,
-        np.ones((len(xy), 2), np.bool_),
-        _LinkCandidates(grid.keys, grid.offsets, grid.order, xy, tangent),
-        max_gap,
-        _LinkGates(
-            config.max_lateral_m,
-            config.lateral_slope,
-            config.max_heading_rad,
-            config.heading_slope,
-            config.lateral_cost,
-        ),
-    )
-    return _select_mutual(best)
+    candidates = _LinkCandidates(grid.keys, grid.offsets, grid.order, xy, tangent)
+    return _select_mutual(_find_best_partners(xy, tangent, kind, free, candidates, max_gap, gates))
 
 
 def _join_ends(
-    pair: Ints,
-    ends: Ints,
-    xy: Floats,
-    tangent: Floats,
-    kind: Ints,
-    max_gap: float,
-    turn: tuple[float, float],
-    config: LinkConfig,
-    chains: tuple[Ints, Ints],
+    pair: Ints, ends: Ints, xy: Floats, direction: Floats, kind: Ints, max_gap: float, gates: _LinkGates
 ) -> Ints:
-    """Links with those of a second round added: free ends only, by the direction that the line has over its last
-    stations.
-    """
-    direction = _end_tangents(xy, tangent, *chains)
-    grid = build_grid(xy[ends, 0], xy[ends, 1], kind[ends], max_gap)
+    """Links with those of a second round added: free ends only; direction: (K, 2) of the line over its last stations."""
     free = (pair < 0)[ends]
-    best = _find_best_partners(
-        xy[ends],
-        direction[ends],
-        kind[ends],
-        free,
-        _LinkCandidates(grid.keys, grid.offsets, grid.order, xy[ends], direction[ends]),
-        max_gap,
-        _LinkGates(config.max_end_lateral_m, config.end_lateral_slope, *turn, config.lateral_cost),
-    )
     # A tangent that was turned round for the fit turns front and back round with it.
-    more = _select_mutual(best)
+    more = _find_links(xy[ends], direction[ends], kind[ends], free, max_gap, gates)
     added = pair.copy()
     for side in range(2):
         rows = np.flatnonzero((more[:, side] >= 0) & free[:, side])
