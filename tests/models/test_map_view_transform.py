@@ -8,7 +8,7 @@ import torch
 
 from manyeyes.datatypes import BevGrid, ShapeError, Transform
 from manyeyes.datatypes.camera import Camera
-from manyeyes.models.maps.view_transform import DepthBins, lift_depth, lift_ground
+from manyeyes.models.maps.view_transform import AgentCameras, DepthBins, lift_depth, lift_ground
 
 GRID = BevGrid(0.0, -6.0, -1.0, 16.0, 6.0, 3.0, pillar=1.0, stride=2)
 STRIDE, SIZE = 8, (6, 8)
@@ -74,11 +74,11 @@ def test_values_and_gradients_are_those_of_the_loop(way):
     depth = torch.rand(3, BINS.num_bins, *SIZE, generator=generator).softmax(1).requires_grad_()
     owner, heights = torch.zeros(3, dtype=torch.int64), (-0.3, 0.0, 0.8)
     if way == "ground":
-        fast, seen = lift_ground(features, cameras, owner, 1, GRID, STRIDE)
+        fast, seen = lift_ground(features, AgentCameras(cameras, owner, 1), GRID, STRIDE)
         slow, expected = slowly(features, None, cameras, (0.0,))
         inputs = (features,)
     else:
-        fast, seen = lift_depth(features, depth, cameras, owner, 1, GRID, STRIDE, BINS, heights)
+        fast, seen = lift_depth(features, depth, AgentCameras(cameras, owner, 1), GRID, STRIDE, BINS, heights)
         slow, expected = slowly(features, depth, cameras, heights)
         inputs = (features, depth)
     assert torch.equal(seen[0], expected) and 8 < int(expected.sum()) < expected.numel()
@@ -97,7 +97,7 @@ def test_pixel_is_lifted_to_its_position_on_the_road():
     row, column = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
     picture = torch.stack((row + 0.5, column + 0.5))[None]
     grid = BevGrid(7.5, -2.5, -1.0, 8.5, 2.5, 1.0, pillar=1.0)
-    bev, seen = lift_ground(picture, [cam], torch.zeros(1, dtype=torch.int64), 1, grid, 1)
+    bev, seen = lift_ground(picture, AgentCameras([cam], torch.zeros(1, dtype=torch.int64), 1), grid, 1)
     assert bool(seen.all())
     assert bev[0, 0, :, 0].tolist() == pytest.approx([32.0] * 5, abs=1e-3)
     # y is to the left, columns count to the right: 1 m is 4 columns at 8 m.
@@ -108,8 +108,10 @@ def test_ground_beyond_the_maximum_pixel_footprint_is_not_observed():
     # Two metres up, 32 pixels a unit of slope: a pixel d metres ahead covers (d^2 + 4) / 64 m of a level road.
     cam, owner = camera(pitch=0.0), torch.zeros(1, dtype=torch.int64)
     grid = BevGrid(0.0, -0.5, -1.0, 16.0, 0.5, 1.0, pillar=1.0)
-    _, all_seen = lift_ground(torch.ones(1, 1, *SIZE), [cam], owner, 1, grid, STRIDE)
-    bev, seen = lift_ground(torch.ones(1, 1, *SIZE), [cam], owner, 1, grid, STRIDE, max_pixel_footprint_m=1.0)
+    _, all_seen = lift_ground(torch.ones(1, 1, *SIZE), AgentCameras([cam], owner, 1), grid, STRIDE)
+    bev, seen = lift_ground(
+        torch.ones(1, 1, *SIZE), AgentCameras([cam], owner, 1), grid, STRIDE, max_pixel_footprint_m=1.0
+    )
     # 2 m of height at 45 degrees down at most: nothing nearer than 8 / 3 m; cells are centred on halves.
     assert all_seen[0, 0].nonzero()[:, 0].tolist() == list(range(3, 16))
     assert seen[0, 0].nonzero()[:, 0].tolist() == [3, 4, 5, 6, 7]  # 7.5 m: .94 m; 8.5 m: 1.19 m
@@ -120,7 +122,13 @@ def test_a_certain_depth_puts_the_feature_there_and_nowhere_else():
     features, depth = torch.ones(1, 1, *SIZE), torch.zeros(1, BINS.num_bins, *SIZE)
     depth[:, 3] = 1.0
     bev, seen = lift_depth(
-        features, depth, [camera(pitch=0.0)], torch.zeros(1, dtype=torch.int64), 1, GRID, STRIDE, BINS, (0.0,)
+        features,
+        depth,
+        AgentCameras([camera(pitch=0.0)], torch.zeros(1, dtype=torch.int64), 1),
+        GRID,
+        STRIDE,
+        BINS,
+        (0.0,),
     )
     ahead = bev[0, 0, 3]
     # Bin 3 of 2, 4, …, 14 m is 8 m; cells lie at 0.5, 2.5, 4.5, … m: 6.5 and 8.5 m are 0.75 of a bin and a quarter of one away.
@@ -130,7 +138,7 @@ def test_a_certain_depth_puts_the_feature_there_and_nowhere_else():
 
 def test_cameras_observe_for_their_agent_only():
     features = torch.stack((torch.full((1, *SIZE), 2.0), torch.full((1, *SIZE), -3.0)))
-    bev, seen = lift_ground(features, [camera(), camera()], torch.tensor([2, 0]), 3, GRID, STRIDE)
+    bev, seen = lift_ground(features, AgentCameras([camera(), camera()], torch.tensor([2, 0]), 3), GRID, STRIDE)
     assert torch.equal(seen[0], seen[2]) and not bool(seen[1].any())
     assert torch.allclose(bev[2, 0][seen[2]], torch.tensor(2.0)) and torch.allclose(
         bev[0, 0][seen[0]], torch.tensor(-3.0)
@@ -140,4 +148,6 @@ def test_cameras_observe_for_their_agent_only():
 
 def test_missing_camera_is_refused():
     with pytest.raises(ShapeError, match="for 1 cameras"):
-        lift_ground(torch.zeros(2, 1, *SIZE), [camera()], torch.zeros(1, dtype=torch.int64), 1, GRID, STRIDE)
+        lift_ground(
+            torch.zeros(2, 1, *SIZE), AgentCameras([camera()], torch.zeros(1, dtype=torch.int64), 1), GRID, STRIDE
+        )

@@ -4,8 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from manyeyes.ops.pinhole import LEAF_M, cast_pinhole, cast_pinhole_reference
-from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, GROUND, NOTHING, HeightField, Primitives
+from manyeyes.ops.pinhole import LEAF_M, PinholeCamera, cast_pinhole, cast_pinhole_reference
+from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, GROUND, NOTHING, HeightField, Primitives, SensorPose
 
 # world_from_camera of a level camera that looks along +x: its right is -y, its down is -z.
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -63,7 +63,7 @@ def crowd(seed: int) -> Primitives:
 @pytest.mark.parametrize("seed", [2, 9])
 def test_equals_every_ray_against_every_primitive(seed: int, ground: HeightField) -> None:
     small = np.diag([0.5, 0.5, 1.0]) @ INTRINSIC
-    args = (crowd(seed), ground, EYE, turn(0.1, 0.05) @ AHEAD, small, 40, 30, 50.0, 11, 4)
+    args = (crowd(seed), ground, SensorPose(EYE, turn(0.1, 0.05) @ AHEAD), PinholeCamera(small, 40, 30), 50.0, 11, 4)
     fast, slow = cast_pinhole(*args), cast_pinhole_reference(*args)
     same = fast.primitive == slow.primitive
     assert same.mean() > 0.998
@@ -84,7 +84,7 @@ def test_equals_every_ray_against_every_primitive(seed: int, ground: HeightField
 def test_a_box_covers_the_pixels_of_the_formula() -> None:
     #   a wall 2 m wide and 1 m high, its face 10 m ahead, seen through f = 33.5 px: 6.7 x 3.35 px about the middle
     wall = solid(BOX, (10.5, 0, 0), (0.5, 1.0, 0.5))
-    sight = cast_pinhole(wall, flat(-100.0), np.zeros(3), AHEAD, INTRINSIC, 80, 60, 50.0)
+    sight = cast_pinhole(wall, flat(-100.0), SensorPose(np.zeros(3), AHEAD), PinholeCamera(INTRINSIC, 80, 60), 50.0)
     rows, columns = np.nonzero(sight.primitive == 0)
     assert (columns.min(), columns.max()) == (37, 42)
     assert (rows.min(), rows.max()) == (28, 31)
@@ -94,11 +94,16 @@ def test_a_box_covers_the_pixels_of_the_formula() -> None:
 
 def test_a_box_that_extends_behind_the_camera_is_rendered() -> None:
     wall = solid(BOX, (0, 3, 0), (30.0, 0.5, 5.0))
-    sight = cast_pinhole(wall, flat(-100.0), np.zeros(3), AHEAD, INTRINSIC, 80, 60, 50.0)
+    sight = cast_pinhole(wall, flat(-100.0), SensorPose(np.zeros(3), AHEAD), PinholeCamera(INTRINSIC, 80, 60), 50.0)
     assert (sight.primitive[30, :30] == 0).all()
     assert (sight.primitive[30, 44:] == NOTHING).all()
     behind = replace(wall, center=np.array([[-40.0, 0, 0]]))
-    assert (cast_pinhole(behind, flat(-100.0), np.zeros(3), AHEAD, INTRINSIC, 80, 60, 50.0).primitive == NOTHING).all()
+    assert (
+        cast_pinhole(
+            behind, flat(-100.0), SensorPose(np.zeros(3), AHEAD), PinholeCamera(INTRINSIC, 80, 60), 50.0
+        ).primitive
+        == NOTHING
+    ).all()
 
 
 def test_foliage_transmission_follows_its_density() -> None:
@@ -106,14 +111,21 @@ def test_foliage_transmission_follows_its_density() -> None:
     slab = turn(0.5, 0.3)
     crown = solid(ELLIPSOID, 20 * slab[:, 0], (thick / 2, 60.0, 60.0), slab, density)
     fine = np.array([[400.0, 0, 100], [0, 400.0, 100], [0, 0, 1]])
-    sight = cast_pinhole(crown, flat(-100.0), np.zeros(3), slab @ turn(0.6, 0.5) @ AHEAD, fine, 200, 200, 90.0, 5)
+    sight = cast_pinhole(
+        crown,
+        flat(-100.0),
+        SensorPose(np.zeros(3), slab @ turn(0.6, 0.5) @ AHEAD),
+        PinholeCamera(fine, 200, 200),
+        90.0,
+        5,
+    )
     chord = thick / turn(0.6, 0.5)[0, 0]
     assert abs((sight.primitive == NOTHING).mean() - np.exp(-density * chord)) < 0.06
 
 
 def test_leaves_are_equal_for_all_cameras() -> None:
     crown = solid(ELLIPSOID, (12, 0, 0), (2.0, 2.0, 2.0), density=1.0)
-    sight = cast_pinhole(crown, flat(-100.0), np.zeros(3), AHEAD, INTRINSIC, 80, 60, 60.0, 5)
+    sight = cast_pinhole(crown, flat(-100.0), SensorPose(np.zeros(3), AHEAD), PinholeCamera(INTRINSIC, 80, 60), 60.0, 5)
     rows, columns = np.nonzero(sight.primitive == 0)
     assert len(rows) > 50
     one_pixel = np.array([[100.0, 0, 0.5], [0, 100.0, 0.5], [0, 0, 1]])
@@ -124,5 +136,7 @@ def test_leaves_are_equal_for_all_cameras() -> None:
         ahead = (leaf - eye) / np.linalg.norm(leaf - eye)
         right = np.cross(ahead, (0.0, 0, 1)) / np.hypot(*ahead[:2])
         world_from_camera = np.stack([right, np.cross(ahead, right), ahead], 1)
-        met = cast_pinhole(crown, flat(-100.0), eye, world_from_camera, one_pixel, 1, 1, 60.0, 5)
+        met = cast_pinhole(
+            crown, flat(-100.0), SensorPose(eye, world_from_camera), PinholeCamera(one_pixel, 1, 1), 60.0, 5
+        )
         assert met.depth_m[0, 0] <= np.linalg.norm(leaf - eye) + LEAF_M

@@ -11,6 +11,7 @@ from manyeyes.ops.raycast import (
     NOTHING,
     HeightField,
     Primitives,
+    SensorPose,
     cast_rays,
     cast_rays_reference,
 )
@@ -72,7 +73,7 @@ def circle(n: int) -> np.ndarray:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("tilt", [0.0, 0.12])
 def test_equals_every_ray_against_every_primitive(seed: int, tilt: float) -> None:
-    args = (crowd(seed), flat(-20.0), ORIGIN, turn(0.4, tilt), BEAMS, circle(360), 360, 60.0, 7)
+    args = (crowd(seed), flat(-20.0), SensorPose(ORIGIN, turn(0.4, tilt)), BEAMS, circle(360), 360, 60.0, 7)
     fast, slow = cast_rays(*args), cast_rays_reference(*args)
     assert (fast.primitive == slow.primitive).mean() > 0.9999
     same = (fast.primitive == slow.primitive) & (slow.primitive >= 0)
@@ -83,7 +84,7 @@ def test_equals_every_ray_against_every_primitive(seed: int, tilt: float) -> Non
 
 @pytest.mark.parametrize("tilt", [0.0, 0.08])
 def test_ground_equals_small_steps(tilt: float) -> None:
-    args = (crowd(3, 6), hills(), np.array([0.0, 0.0, 2.1]), turn(1.0, tilt), BEAMS, circle(90), 90, 55.0)
+    args = (crowd(3, 6), hills(), SensorPose(np.array([0.0, 0.0, 2.1]), turn(1.0, tilt)), BEAMS, circle(90), 90, 55.0)
     fast, slow = cast_rays(*args), cast_rays_reference(*args)
     both = (fast.primitive == GROUND) & (slow.primitive == GROUND)
     assert both.sum() > 800
@@ -93,7 +94,9 @@ def test_ground_equals_small_steps(tilt: float) -> None:
 
 
 def test_flat_ground_is_exact_and_carries_its_class() -> None:
-    hits = cast_rays(Primitives.empty(), flat(), np.array([0.0, 0.0, 2.0]), np.eye(3), BEAMS, circle(360), 360, 40.0)
+    hits = cast_rays(
+        Primitives.empty(), flat(), SensorPose(np.array([0.0, 0.0, 2.0]), np.eye(3)), BEAMS, circle(360), 360, 40.0
+    )
     reach = 2.0 / np.sin(-BEAMS, where=BEAMS < 0, out=np.full_like(BEAMS, 1e-9))
     expected = (reach > 0) & (reach < 39.9) & (BEAMS < 0)
     assert (hits.primitive[:, expected] == GROUND).all()
@@ -110,21 +113,29 @@ def test_flat_ground_is_exact_and_carries_its_class() -> None:
 
 def test_a_sector_equals_that_part_of_the_full_scan() -> None:
     scene, beams = crowd(5), BEAMS
-    whole = cast_rays(scene, flat(-20.0), ORIGIN, turn(0.3), beams, circle(360), 360, 60.0, 0)
+    whole = cast_rays(scene, flat(-20.0), SensorPose(ORIGIN, turn(0.3)), beams, circle(360), 360, 60.0, 0)
     part = cast_rays(
-        scene[scene.density == 0], flat(-20.0), ORIGIN, turn(0.3), beams, circle(360)[130:230], 360, 60.0, 0
+        scene[scene.density == 0], flat(-20.0), SensorPose(ORIGIN, turn(0.3)), beams, circle(360)[130:230], 360, 60.0, 0
     )
-    again = cast_rays(scene[scene.density == 0], flat(-20.0), ORIGIN, turn(0.3), beams, circle(360), 360, 60.0, 0)
+    again = cast_rays(
+        scene[scene.density == 0], flat(-20.0), SensorPose(ORIGIN, turn(0.3)), beams, circle(360), 360, 60.0, 0
+    )
     np.testing.assert_array_equal(part.range_m, again.range_m[130:230])
     assert whole.range_m.shape == (360, 24)
 
 
 def test_foliage_lets_some_rays_through_and_the_seed_decides_which() -> None:
     tree = solid(ELLIPSOID, (8, 0, 2), (2, 2, 2), density=0.5)
-    one = cast_rays(tree, flat(-20.0), ORIGIN, np.eye(3), BEAMS, circle(720), 720, 60.0, 1)
-    two = cast_rays(tree, flat(-20.0), ORIGIN, np.eye(3), BEAMS, circle(720), 720, 60.0, 2)
+    one = cast_rays(tree, flat(-20.0), SensorPose(ORIGIN, np.eye(3)), BEAMS, circle(720), 720, 60.0, 1)
+    two = cast_rays(tree, flat(-20.0), SensorPose(ORIGIN, np.eye(3)), BEAMS, circle(720), 720, 60.0, 2)
     opaque = cast_rays(
-        solid(ELLIPSOID, (8, 0, 2), (2, 2, 2)), flat(-20.0), ORIGIN, np.eye(3), BEAMS, circle(720), 720, 60.0
+        solid(ELLIPSOID, (8, 0, 2), (2, 2, 2)),
+        flat(-20.0),
+        SensorPose(ORIGIN, np.eye(3)),
+        BEAMS,
+        circle(720),
+        720,
+        60.0,
     )
     share = (one.primitive == 0).sum() / (opaque.primitive == 0).sum()
     assert 0.4 < share < 0.9

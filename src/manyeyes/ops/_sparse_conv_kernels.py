@@ -148,6 +148,7 @@ def _panel(vectors: int) -> Any:
     return add
 
 
+# One function with so many parameters: an intrinsic takes them one by one, and its code is one piece.
 def _tile(
     _: Any,
     rows: Any,

@@ -8,11 +8,12 @@ given closed, its first point repeated. The slow twin compares every point with 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import njit
+from manyeyes._jit import F64x1, F64x2, I64x1, njit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -44,9 +45,8 @@ def find_nearest_line(queries: Floats, points: Floats, offsets: Ints, max_distan
     # A cell of the reach keeps the lists short; a segment is entered in every cell that its box, grown by the reach, meets.
     size = max(max_distance_m, 1.0)
     shape = np.floor((points.max(0) + max_distance_m - origin) / size).astype(np.int64) + 1
-    place = np.array([origin[0], origin[1], size])
-    offset, held = _enter(points, start, place, shape, max_distance_m)
-    return NearestLines(*_look_up(queries, points, start, line, place, shape, offset, held, max_distance_m))
+    grid = _enter(points, start, np.array([origin[0], origin[1], size]), shape, max_distance_m)
+    return NearestLines(*_find_nearest(queries, points, start, line, grid, max_distance_m))
 
 
 def find_nearest_line_slow(queries: Floats, points: Floats, offsets: Ints, max_distance_m: float) -> NearestLines:
@@ -80,9 +80,20 @@ def segments_of(offsets: Ints) -> tuple[Ints, Ints]:
     return line, offsets[line] + within
 
 
+class _SegmentGrid(NamedTuple):
+    """Cells over segments: place: origin x, y and cell size (m); shape: columns, rows. Cell c has the segments
+    ``held[offset[c]:offset[c + 1]]``, ascending.
+    """
+
+    place: F64x1
+    shape: I64x1
+    offset: I64x1
+    held: I64x1
+
+
 @njit(cache=True)
-def _enter(points: Floats, start: Ints, place: Floats, shape: Ints, reach: float) -> tuple[Ints, Ints]:
-    """CSR over cells: offset (cells + 1,), held: rows of start, ascending in every cell. place: origin x, y and cell size."""
+def _enter(points: F64x2, start: I64x1, place: F64x1, shape: I64x1, reach: float) -> _SegmentGrid:
+    """Enter each segment, which begins at a row of start, in the cells that its box, grown by the reach, meets."""
     size, columns, rows = place[2], shape[0], shape[1]
     count = np.zeros(columns * rows + 1, dtype=np.int64)
     offset, held, fill = count, count, count
@@ -105,15 +116,15 @@ def _enter(points: Floats, start: Ints, place: Floats, shape: Ints, reach: float
                     else:
                         held[fill[cell]] = k
                         fill[cell] += 1
-    return offset, held
+    return _SegmentGrid(place, shape, offset, held)
 
 
 @njit(cache=True)
-def _look_up(
-    queries: Floats, points: Floats, start: Ints, line: Ints, place: Floats, shape: Ints, offset: Ints, held: Ints,
-    reach: float,
-) -> tuple[Floats, Ints, Floats, Floats]:  # fmt: skip
+def _find_nearest(
+    queries: F64x2, points: F64x2, start: I64x1, line: I64x1, grid: _SegmentGrid, reach: float
+) -> tuple[F64x1, I64x1, F64x1, F64x1]:
     """Return the distance, line, heading and offset across of each query's nearest segment in its own cell."""
+    place, shape, offset, held = grid
     size, columns, rows = place[2], shape[0], shape[1]
     distance = np.full(len(queries), np.inf)
     owner = np.full(len(queries), -1, dtype=np.int64)

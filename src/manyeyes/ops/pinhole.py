@@ -58,6 +58,14 @@ class _Lens(NamedTuple):
     cy: float
 
 
+class PinholeCamera(NamedTuple):
+    """intrinsic: (3, 3) pixels, and the size of the picture in pixels."""
+
+    intrinsic: Array
+    width: int
+    height: int
+
+
 @dataclass(frozen=True)
 class PinholeHits:
     """What each pixel meets, all (height, width).
@@ -279,24 +287,20 @@ def _ground(
 def cast_pinhole(
     primitives: Primitives,
     ground: HeightField,
-    origin: Array,
-    rotation: Array,
-    intrinsic: Array,
-    width: int,
-    height: int,
+    pose: SensorPose,
+    camera: PinholeCamera,
     max_depth: float,
     seed: int = 0,
     own: int = 0,
 ) -> PinholeHits:
-    """Return one picture's depths.
-
-    origin: (3,) and rotation: (3, 3) world_from_camera (x right, y down, z ahead); intrinsic: (3, 3) pixels.
+    """Return one picture's depths. pose: of the camera (x right, y down, z ahead).
 
     own: the instance that is not met, 0 for none. seed decides where leaves are.
     """
+    intrinsic, width, height = camera
     depth, owner = np.full((height, width), np.inf), np.full((height, width), NOTHING, np.int32)
     lens = _Lens(float(intrinsic[0, 0]), float(intrinsic[1, 1]), float(intrinsic[0, 2]), float(intrinsic[1, 2]))
-    pose = SensorPose(np.ascontiguousarray(origin, np.float64), np.ascontiguousarray(rotation, np.float64))
+    pose = SensorPose(*(np.ascontiguousarray(part, np.float64) for part in pose))
     _cast(primitives.arrays, _own(primitives, own), pose, lens, float(max_depth), seed, depth, owner)
     _ground(ground.raster, float(ground.height.max()), pose, lens, float(max_depth), depth, owner)
     return PinholeHits(depth, owner)
@@ -309,16 +313,14 @@ def _own(primitives: Primitives, own: int) -> NDArray[np.bool_]:
 def cast_pinhole_reference(
     primitives: Primitives,
     ground: HeightField,
-    origin: Array,
-    rotation: Array,
-    intrinsic: Array,
-    width: int,
-    height: int,
+    pose: SensorPose,
+    camera: PinholeCamera,
     max_depth: float,
     seed: int = 0,
     own: int = 0,
 ) -> PinholeHits:
     """Return the slow twin of :func:`cast_pinhole`: slabs and quadrics for every pixel, leaves and ground in small steps."""
+    (origin, rotation), (intrinsic, width, height) = pose, camera
     v, u = np.mgrid[0:height, 0:width] + 0.5
     ray = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(intrinsic).T @ rotation.T
     depth, owner = np.full((height, width), np.inf), np.full((height, width), NOTHING, np.int32)

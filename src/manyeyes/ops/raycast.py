@@ -226,7 +226,7 @@ def _interval(o: F64x1, q: F64x2, half: F64x1, bounds: F64x1) -> None:
 
 @njit(cache=True)
 def hit_box(o: F64x1, half: F64x1, d0: float, d1: float, d2: float) -> tuple[float, float]:
-    """Return the entry distance and cosine into a box from outside; (inf, 0) when missed. At most three faces face the sensor."""
+    """Return the entry distance and cosine into a box from outside; (inf, 0) when missed. At most three faces count."""
     if abs(o[0]) > half[0] and o[0] * d0 < 0:
         t = ((half[0] if o[0] > 0 else -half[0]) - o[0]) / d0
         if abs(o[1] + t * d1) <= half[1] and abs(o[2] + t * d2) <= half[2]:
@@ -446,15 +446,14 @@ def _finish(
 def cast_rays(
     primitives: Primitives,
     ground: HeightField,
-    origin: Array,
-    rotation: Array,
+    pose: SensorPose,
     elevation: Array,
     azimuth: Array,
     per_turn: int,
     max_range: float,
     seed: int = 0,
 ) -> Hits:
-    """Return one scan. origin: (3,) and rotation: (3, 3) world_from_sensor; elevation: (B,) ascending, radians.
+    """Return one scan. elevation: (B,) ascending, radians.
 
     azimuth: (A,) radians, counter-clockwise, equally spaced by 2 pi / per_turn. seed decides where rays end in foliage.
     """
@@ -462,7 +461,7 @@ def cast_rays(
     depth, owner = np.full(shape, np.inf), np.full(shape, NOTHING, np.int32)
     cosine, surface = np.zeros(shape), np.zeros(shape, np.uint8)
     rays = _Rays(np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth))
-    pose, image = SensorPose(origin, rotation), _ScanImage(depth, owner, cosine)
+    image = _ScanImage(depth, owner, cosine)
     scan = _ScanPattern(elevation, azimuth, rays, per_turn, max_range)
     _cast(primitives.arrays, pose, scan, np.uint64(seed % 2**64), image)
     _walk_ground(ground.raster, pose, rays, max_range, image)
@@ -474,8 +473,7 @@ def cast_rays(
 def cast_rays_reference(
     primitives: Primitives,
     ground: HeightField,
-    origin: Array,
-    rotation: Array,
+    pose: SensorPose,
     elevation: Array,
     azimuth: Array,
     per_turn: int,
@@ -486,6 +484,7 @@ def cast_rays_reference(
     steps.
     """
     del per_turn
+    origin, rotation = pose
     ce, se = np.cos(elevation)[None], np.sin(elevation)[None]
     sensor = np.stack([ce * np.cos(azimuth)[:, None], ce * np.sin(azimuth)[:, None], se + 0 * azimuth[:, None]], -1)
     ray = sensor @ rotation.T

@@ -85,6 +85,61 @@ def _initial_variance(x: F64x2, y: F64x2) -> float:  # pragma: no cover - compil
     return variance / (2.0 * n * m)
 
 
+class _Moments(NamedTuple):
+    """Sums over the posterior p(j | i): of itself, of x, of y, of their squares, and of their products across and along."""
+
+    total: float
+    sx: float
+    sy: float
+    tx: float
+    ty: float
+    xx: float
+    yy: float
+    cross_c: float
+    cross_s: float
+
+
+@njit(cache=True)
+def _sum_posterior(
+    x: F64x2, y: F64x2, motion: tuple[float, float, float, float, float], variance: float, uniform: float
+) -> _Moments:  # pragma: no cover - compiled
+    """Sum the posterior of all pairs under a motion: scale, cosine and sine of the rotation, shift."""
+    scale, c, s, u, v = motion
+    n, m = len(x), len(y)
+    weight = np.empty(m)
+    total, sx, sy, tx, ty = 0.0, 0.0, 0.0, 0.0, 0.0
+    xx, yy, cross_c, cross_s = 0.0, 0.0, 0.0, 0.0
+    for i in range(n):
+        min_cost = np.inf
+        for j in range(m):
+            dx = x[i, 0] - scale * (c * y[j, 0] - s * y[j, 1]) - u
+            dy = x[i, 1] - scale * (s * y[j, 0] + c * y[j, 1]) - v
+            weight[j] = (dx * dx + dy * dy) / (2.0 * variance)
+            min_cost = min(min_cost, weight[j])
+        # Relative to the nearest, so that nothing underflows; what is e^40 times less likely is nothing.
+        denominator = uniform * np.exp(min(min_cost, 700.0)) if uniform > 0.0 else 0.0
+        mass, mx, my, mm = 0.0, 0.0, 0.0, 0.0
+        for j in range(m):
+            if weight[j] - min_cost < 40.0:
+                w = np.exp(min_cost - weight[j])
+                mass += w
+                mx += w * y[j, 0]
+                my += w * y[j, 1]
+                mm += w * (y[j, 0] ** 2 + y[j, 1] ** 2)
+        denominator += mass
+        p, mx, my = mass / denominator, mx / denominator, my / denominator
+        total += p
+        sx += p * x[i, 0]
+        sy += p * x[i, 1]
+        tx += mx
+        ty += my
+        xx += p * (x[i, 0] ** 2 + x[i, 1] ** 2)
+        yy += mm / denominator
+        cross_c += x[i, 0] * mx + x[i, 1] * my
+        cross_s += x[i, 1] * mx - x[i, 0] * my
+    return _Moments(total, sx, sy, tx, ty, xx, yy, cross_c, cross_s)
+
+
 @njit(cache=True)
 def _run_cpd(
     x: F64x2,
@@ -101,41 +156,11 @@ def _run_cpd(
     variance = initial_variance
     if variance < 0.0:
         variance = _initial_variance(x, y)
-    weight, count = np.empty(m), 0
+    count = 0
     while count < max_iterations and variance > 1e-12:
         count += 1
         uniform = 2.0 * np.pi * variance * outlier_fraction / (1.0 - outlier_fraction) * m / n
-        # Sums over the posterior p(j | i): of itself, of x, of y, of their products.
-        total, sx, sy, tx, ty = 0.0, 0.0, 0.0, 0.0, 0.0
-        xx, yy, cross_c, cross_s = 0.0, 0.0, 0.0, 0.0
-        for i in range(n):
-            min_cost = np.inf
-            for j in range(m):
-                dx = x[i, 0] - scale * (c * y[j, 0] - s * y[j, 1]) - u
-                dy = x[i, 1] - scale * (s * y[j, 0] + c * y[j, 1]) - v
-                weight[j] = (dx * dx + dy * dy) / (2.0 * variance)
-                min_cost = min(min_cost, weight[j])
-            # Relative to the nearest, so that nothing underflows; what is e^40 times less likely is nothing.
-            denominator = uniform * np.exp(min(min_cost, 700.0)) if uniform > 0.0 else 0.0
-            mass, mx, my, mm = 0.0, 0.0, 0.0, 0.0
-            for j in range(m):
-                if weight[j] - min_cost < 40.0:
-                    w = np.exp(min_cost - weight[j])
-                    mass += w
-                    mx += w * y[j, 0]
-                    my += w * y[j, 1]
-                    mm += w * (y[j, 0] ** 2 + y[j, 1] ** 2)
-            denominator += mass
-            p, mx, my = mass / denominator, mx / denominator, my / denominator
-            total += p
-            sx += p * x[i, 0]
-            sy += p * x[i, 1]
-            tx += mx
-            ty += my
-            xx += p * (x[i, 0] ** 2 + x[i, 1] ** 2)
-            yy += mm / denominator
-            cross_c += x[i, 0] * mx + x[i, 1] * my
-            cross_s += x[i, 1] * mx - x[i, 0] * my
+        total, sx, sy, tx, ty, xx, yy, cross_c, cross_s = _sum_posterior(x, y, (scale, c, s, u, v), variance, uniform)
         if total <= 1e-12:
             break
         sx, sy, tx, ty = sx / total, sy / total, tx / total, ty / total

@@ -315,7 +315,13 @@ def _average_linkage(
                 )
         size[bj] += size[bi]
         into[bi] = bj
-    for i in range(n):
+    return _label_groups(chosen, into, label, groups)
+
+
+@njit(cache=True, nogil=True)
+def _label_groups(chosen: I64x1, into: I64x1, label: I64x1, groups: int) -> int:  # pragma: no cover - compiled
+    """Write the group of each chosen ring, the root of ``into``, to label, numbered from ``groups`` on; the number after."""
+    for i in range(len(chosen)):
         root = i
         while into[root] != root:
             root = into[root]

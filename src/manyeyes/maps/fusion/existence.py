@@ -614,8 +614,7 @@ def update_existence(
         change = params.hit * score_weight[o] if is_hit else params.miss * seen
         if not trusted[o]:
             change = _bound_daily_change(scratch, a, change, params.max_daily_change)
-        if is_hit:
-            floor = -max_log_odds
+        floor = -max_log_odds if is_hit else floor
         odds = min(max_log_odds, max(floor, odds + change))
         if is_hit:
             seen_by += _count_once(scratch.seen_era, a, era_seen)

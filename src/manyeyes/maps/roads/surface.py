@@ -166,6 +166,7 @@ def _edge_nearest(corner: F64x2, x: float, y: float) -> tuple[float, float]:  # 
     return best, z
 
 
+# One function: split in two, it takes a tenth longer.
 @njit(cache=True)
 def _query(xy: F64x2, near_z: F64x1, buckets: _Buckets) -> _SurfacePoints:  # pragma: no cover - compiled
     """Return height, distance and triangle at each point: the own bucket first, then rings of buckets until none can be

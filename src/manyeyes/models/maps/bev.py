@@ -26,7 +26,7 @@ from manyeyes.models.maps.image_encoder import (
     ResidualBlock,
     conv_norm,
 )
-from manyeyes.models.maps.view_transform import DepthBins, lift_depth, lift_ground
+from manyeyes.models.maps.view_transform import AgentCameras, DepthBins, lift_depth, lift_ground
 from manyeyes.ops.voxelize import MOMENTS, pillar_moments, pillar_sites
 
 Sensor = Literal["lidar", "camera"]
@@ -157,29 +157,18 @@ class CameraBev(_RasterEncoder):
         if not flat:
             shape = config.token_grid.shape
             return torch.zeros(len(images), config.channels, *shape), torch.zeros(len(images), *shape, dtype=torch.bool)
-        agent_of_camera = torch.repeat_interleave(torch.arange(len(images)), torch.tensor([len(one) for one in images]))
+        owner = torch.repeat_interleave(torch.arange(len(images)), torch.tensor([len(one) for one in images]))
         height, width = config.image_size
         cameras = [image.camera.resize(width, height) for image in flat]
+        rig = AgentCameras(cameras, owner, len(images))
         rgb = torch.cat([_resize(image.rgb, config.image_size) for image in flat])
         outputs = self.project(self.encoder(rgb.contiguous(memory_format=torch.channels_last)))
         features, stride = outputs[:, : config.raster_channels], config.image_encoder.stride
         if config.view_transform == "ground":
-            raster, seen = lift_ground(
-                features, cameras, agent_of_camera, len(images), grid, stride, config.max_pixel_footprint_m
-            )
+            raster, seen = lift_ground(features, rig, grid, stride, config.max_pixel_footprint_m)
         else:
             depth = outputs[:, config.raster_channels :].softmax(1)
-            raster, seen = lift_depth(
-                features,
-                depth,
-                cameras,
-                agent_of_camera,
-                len(images),
-                grid,
-                stride,
-                config.depth_bins,
-                config.heights_m,
-            )
+            raster, seen = lift_depth(features, depth, rig, grid, stride, config.depth_bins, config.heights_m)
         # The image resolution of a cell depends on its position.
         rows, columns = grid.shape
         y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")

@@ -16,6 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -40,6 +41,14 @@ class DepthBins:
     def __post_init__(self) -> None:
         if not (0 < self.near_m < self.far_m and self.num_bins >= 2):
             raise ConfigError(f"DepthBins needs 0 < near_m < far_m and two bins or more; got {self}.")
+
+
+class AgentCameras(NamedTuple):
+    """V cameras of several agents, and the agent of each camera (V,) int64."""
+
+    cameras: Sequence[Camera]
+    agent_of_camera: Tensor
+    num_agents: int
 
 
 @dataclass(frozen=True)
@@ -114,9 +123,7 @@ def _pixel_footprint(camera: Camera, points: Tensor) -> Tensor:
 
 def lift_ground(
     features: Tensor,
-    cameras: Sequence[Camera],
-    agent_of_camera: Tensor,
-    num_agents: int,
+    rig: AgentCameras,
     grid: BevGrid,
     stride: int,
     max_pixel_footprint_m: float = math.inf,
@@ -125,9 +132,7 @@ def lift_ground(
 
     Args:
         features: of the images.
-        cameras: V cameras.
-        agent_of_camera: (V,) int64.
-        num_agents: number of agents.
+        rig: the V cameras.
         grid: ground cells in the agent's frame.
         stride: pixels per feature; the first feature is centred on the first pixel.
         max_pixel_footprint_m: cells of which one pixel covers more along its ray are not observed.
@@ -135,19 +140,15 @@ def lift_ground(
     Returns:
         Features (agents, C, rows, columns), zero where not observed, and the observed mask.
     """
-    _check(features, cameras, agent_of_camera)
-    projected = _project_cells(cameras, _LiftGeometry(grid, 0.0, max_pixel_footprint_m, _size(features), stride))
-    return _average_cameras(
-        [(projected, projected.valid, _sample(features, projected.place))], agent_of_camera, num_agents, grid
-    )
+    _check(features, rig)
+    projected = _project_cells(rig.cameras, _LiftGeometry(grid, 0.0, max_pixel_footprint_m, _size(features), stride))
+    return _average_cameras([(projected, projected.valid, _sample(features, projected.place))], rig, grid)
 
 
 def lift_depth(
     features: Tensor,
     depth: Tensor,
-    cameras: Sequence[Camera],
-    agent_of_camera: Tensor,
-    num_agents: int,
+    rig: AgentCameras,
     grid: BevGrid,
     stride: int,
     bins: DepthBins,
@@ -160,20 +161,20 @@ def lift_depth(
     heights. Points outside
     the depth range are not observed.
     """
-    _check(features, cameras, agent_of_camera)
+    _check(features, rig)
     if depth.shape != (features.shape[0], bins.num_bins, *features.shape[-2:]):
         raise ShapeError(
             f"lift_depth needs depth (V, {bins.num_bins}, h, w) beside {tuple(features.shape)}; got {tuple(depth.shape)}."
         )
     found = []
     for height_m in heights_m:
-        projected = _project_cells(cameras, _LiftGeometry(grid, height_m, math.inf, _size(features), stride))
+        projected = _project_cells(rig.cameras, _LiftGeometry(grid, height_m, math.inf, _size(features), stride))
         bin_at = (projected.depth_m - bins.near_m) / (bins.far_m - bins.near_m) * (bins.num_bins - 1)
         deep = torch.cat((projected.place, (2 * bin_at[..., None] + 1) / bins.num_bins - 1), -1)
         likelihood = _sample(depth[:, None], deep[:, None])
         within = projected.valid & (projected.depth_m >= bins.near_m) & (projected.depth_m <= bins.far_m)
         found.append((projected, within, _sample(features, projected.place) * likelihood))
-    return _average_cameras(found, agent_of_camera, num_agents, grid)
+    return _average_cameras(found, rig, grid)
 
 
 def _size(features: Tensor) -> tuple[int, int]:
@@ -187,9 +188,10 @@ def _sample(values: Tensor, place: Tensor) -> Tensor:
 
 
 def _average_cameras(
-    found: Sequence[tuple[_ProjectedCells, Tensor, Tensor]], agent_of_camera: Tensor, num_agents: int, grid: BevGrid
+    found: Sequence[tuple[_ProjectedCells, Tensor, Tensor]], rig: AgentCameras, grid: BevGrid
 ) -> tuple[Tensor, Tensor]:
     """Average found features (V, M, C), where within (V, M), over the cameras that observe a cell of an agent."""
+    _, agent_of_camera, num_agents = rig
     rows, columns = grid.shape
     cells, channels = rows * columns, found[0][2].shape[2]
     total = found[0][2].new_zeros(num_agents * cells, channels)
@@ -208,7 +210,8 @@ def _average_cameras(
     return mean.permute(0, 3, 1, 2), count > 0
 
 
-def _check(features: Tensor, cameras: Sequence[Camera], agent_of_camera: Tensor) -> None:
+def _check(features: Tensor, rig: AgentCameras) -> None:
+    cameras, agent_of_camera, _ = rig
     if features.dim() != 4 or len(cameras) != features.shape[0] or agent_of_camera.shape != (len(cameras),):
         raise ShapeError(
             f"Lifting needs features (V, C, h, w) and agent_of_camera (V,) for {len(cameras)} cameras; got "

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import Camera, CameraImage, ConfigError, Transform
-from manyeyes.ops.pinhole import cast_pinhole
-from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, GROUND, NOTHING
+from manyeyes.ops.pinhole import PinholeCamera, cast_pinhole
+from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, GROUND, NOTHING, SensorPose
 from manyeyes.simulator.sensors.lidar import RaycastScene
 from manyeyes.simulator.sensors.lighting import Light, dot, tone_map
 from manyeyes.simulator.sensors.materials import PAINTWORK, Materials
@@ -153,9 +153,14 @@ def render_image(lit_scene: LitScene, world_from_agent: Transform, spec: CameraS
     origin, rotation = world_from_camera.translation.numpy(), np.ascontiguousarray(world_from_camera.rotation.numpy())
     solids = lit_scene.scene.solids
     hits = cast_pinhole(
-        solids, lit_scene.scene.ground, origin, rotation, dense.intrinsic.numpy(), dense.width, dense.height,
-        spec.max_depth_m, lit_scene.light.seed, own,
-    )  # fmt: skip
+        solids,
+        lit_scene.scene.ground,
+        SensorPose(origin, rotation),
+        PinholeCamera(dense.intrinsic.numpy(), dense.width, dense.height),
+        spec.max_depth_m,
+        lit_scene.light.seed,
+        own,
+    )
     # (pixels, n n): where all rays of a pixel meet the same thing, one through its middle has the colour of all.
     owner, depth = (_by_pixel(grid, n) for grid in (hits.primitive, hits.depth_m))
     one = (owner == owner[:, :1]).all(1)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from manyeyes._jit import F32x2, F64x1, F64x2, I32x2, I64x1, U8x2, njit
 from manyeyes.datatypes import ConfigError, PointCloud, Transform
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.ops.raycast import GROUND, NOTHING, HeightField, Primitives, cast_rays
+from manyeyes.ops.raycast import GROUND, NOTHING, HeightField, Primitives, SensorPose, cast_rays
 
 OFF_ROAD, ASPHALT, PAINT, SIDEWALK, CROSSING = range(5)
 
@@ -212,7 +212,14 @@ def scan(
     solids = scene.solids[(scene.solids.instance != own) | (scene.solids.instance == 0)] if own else scene.solids
     foliage = int(random.integers(2**63))
     hits = cast_rays(
-        solids, scene.ground, origin, rotation, spec.elevation, spec.azimuth, spec.per_turn, spec.max_range_m, foliage
+        solids,
+        scene.ground,
+        SensorPose(origin, rotation),
+        spec.elevation,
+        spec.azimuth,
+        spec.per_turn,
+        spec.max_range_m,
+        foliage,
     )
     shape = hits.range_m.shape
     azimuth, elevation = spec.azimuth, spec.elevation
