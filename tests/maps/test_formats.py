@@ -10,6 +10,7 @@ import pytest
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.maps.elements.observation import MapFrame
+from manyeyes.maps.elements.simplify import simplify_map
 from manyeyes.maps.elements.vector_map import PointEvidence, VectorMap
 from manyeyes.maps.formats.argoverse2_map import read_argoverse2_map
 from manyeyes.maps.formats.attributes import orient_counter_clockwise, to_hex_ids
@@ -17,7 +18,6 @@ from manyeyes.maps.formats.export import FORMATS, export_map
 from manyeyes.maps.formats.geoparquet import MapFileError, projjson, read_map, write_map
 from manyeyes.maps.formats.lanes import find_lane_pairs
 from manyeyes.maps.formats.rings import split_long_sides
-from manyeyes.maps.fusion.simplify import simplify_map
 from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.maps.elements.simplify import simplify_map
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.argoverse2_writer import write_argoverse2
 from manyeyes.maps.formats.element_graph import write_element_graph
@@ -16,7 +17,6 @@ from manyeyes.maps.formats.geoparquet import write_geoparquet
 from manyeyes.maps.formats.lanelet2_writer import write_lanelet2
 from manyeyes.maps.formats.nuscenes_writer import write_nuscenes
 from manyeyes.maps.formats.pmtiles import write_pmtiles
-from manyeyes.maps.fusion.simplify import simplify_map
 
 Writer = Callable[[VectorMap, Path], None]
 
