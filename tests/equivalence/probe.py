@@ -131,10 +131,9 @@ def trained_weights(data: Path) -> Arrays:
 
 STUDIES: dict[str, tuple[str, ...]] = {
     "evaluate": ("evaluate", "--methods", "none", "late", "intermediate"),
-    "robustness": ("evaluate", "--study", "robustness", "--methods", "late", "--perturbations", "0.8 m"),
+    "robustness": ("study", "robustness", "--methods", "late", "--perturbations", "0.8 m"),
     "budget": (
-        "evaluate",
-        "--study",
+        "study",
         "bandwidth",
         "--methods",
         "late",
@@ -143,8 +142,8 @@ STUDIES: dict[str, tuple[str, ...]] = {
         "--budgets",
         "4096",
     ),
-    "agents": ("evaluate", "--study", "num-agents", "--methods", "intermediate"),
-    "pose": ("evaluate", "--study", "pose-noise-ap", "--correctors", "voting", "--perturbations", "0.8 m"),
+    "agents": ("study", "num-agents", "--methods", "intermediate"),
+    "pose": ("study", "pose-noise-ap", "--correctors", "voting", "--perturbations", "0.8 m"),
 }
 UNTIMED = ("evaluate",)
 
@@ -155,7 +154,7 @@ def studies(data: Path) -> Arrays:
         out = fresh(data / f"study-{key}")
         timing = ("--timing-frames", "0") if key in UNTIMED else ()
         common = ("--data", str(data / "tiny"), "--split", "test", "--workers", "1", *timing, "--out", str(out))
-        assert cli.main([words[0], *common, *words[1:]]) == 0, key
+        assert cli.main([*words, *common]) == 0, key
         for path in sorted(out.glob("*.json")):
             yield f"study/{key}", np.array([*flat(without_times(json.loads(path.read_text())["result"]))])
 

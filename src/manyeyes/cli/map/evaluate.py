@@ -22,7 +22,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Evaluate a map."""
+    """Evaluate a map against the ground truth."""
     from rich.console import Console
 
     from manyeyes.evaluation.maps.metrics import evaluate_map
