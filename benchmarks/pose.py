@@ -3,14 +3,14 @@
 density.
 
 Tables: ``success``: fraction of frames whose best candidate is within 1 m and 1 degree, by common objects and by prior
-(sparse traffic). ``answers``: acceptance on DAIR-V2X's counts of common objects in dense traffic, with one frame and with
+(sparse traffic). ``acceptance``: acceptance on DAIR-V2X's counts of common objects in dense traffic, with one frame and with
 five, and on agents without common objects. ``baselines``: success at 1 m and 1 degree, all frames, against the noise of
 the prior. ``displacement``: of common objects after fusion with a good prior, over that of the prior alone. ``monitor``:
 fraction of frames that conflict with the prior, for priors off by five of their stated sigma and for priors with the stated
 error; in single frames, and by the pose monitor over drives of 20 frames at 10 Hz. ``speed``: processor time of one call.
 The targets follow the tables.
 
-python -m benchmarks.pose [--tables success answers ...] [--scenes 300] [--nulls 1000] [--out benchmarks/results/pose.json]
+python -m benchmarks.pose [--tables success acceptance ...] [--scenes 300] [--nulls 1000] [--out benchmarks/results/pose.json]
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def success(scenes: int, nulls: int) -> Iterator[Row]:
             yield run("success", "voting", guess, spec, PriorNoise(kind, sigma, sigma), scenes, 0)
 
 
-def answers(scenes: int, nulls: int) -> Iterator[Row]:
+def acceptance(scenes: int, nulls: int) -> Iterator[Row]:
     """Acceptance; agents without common objects stand at one crossing or at two."""
     none = PriorNoise("none")
     for error in (BoxNoise(), NOISY):
@@ -130,7 +130,7 @@ def answers(scenes: int, nulls: int) -> Iterator[Row]:
             (LandmarkSpec(0, 22, 28, error, disjoint=True, num_instants=5), 5),
             (LandmarkSpec(noise=error, num_instants=5), 5),
         ):
-            yield run("answers", "voting", correct_by_voting, spec, none, nulls // divisor, 1)
+            yield run("acceptance", "voting", correct_by_voting, spec, none, nulls // divisor, 1)
 
 
 def displacement(scenes: int, nulls: int) -> Iterator[Row]:
@@ -220,7 +220,7 @@ class Target:
 def check_targets(rows: Sequence[Row]) -> Iterator[Target]:
     """Check the rows that were run: consistency of the covariance, and detection rates of the monitor."""
     for row in rows:
-        s, shown = row.score, row.claim == "none" and (row.table == "answers" or row.table == "success")
+        s, shown = row.score, row.claim == "none" and (row.table == "acceptance" or row.table == "success")
         if not shown or not s.nees_standard_error > 0:
             continue
         low, high = s.nees - 2 * s.nees_standard_error, s.nees + 2 * s.nees_standard_error
@@ -241,7 +241,7 @@ def check_targets(rows: Sequence[Row]) -> Iterator[Target]:
             yield Target(f"{what}: stated error, flagged", false_alarms, "at most 0.005", verdict)
 
 
-TABLES = {f.__name__: f for f in (success, answers, displacement, baselines, monitor, speed)}
+TABLES = {f.__name__: f for f in (success, acceptance, displacement, baselines, monitor, speed)}
 
 
 def line(row: Row) -> str:

@@ -10,7 +10,7 @@ from manyeyes.pose.types import PoseStatus
 
 
 def row(table: str, prior_noise: str, sigma: float, flagged: int, nees: tuple[float, ...] = (3.0,) * 100) -> Row:
-    """A row of a hundred answers, so many of which contradict the claim."""
+    """A row of a hundred estimates, of which so many contradict the prior."""
     statuses = [PoseStatus.CONFLICT] * flagged + [PoseStatus.OK] * (100 - flagged)
     frames = [PoseEvaluation(s, 5, 0.1, 0.1, 0.1, n, 1.0) for s, n in zip(statuses, nees)]
     return Row(table, "voting", 5, 8, 10, 1, False, False, prior_noise, sigma, summarize_evaluations(frames), 1.0, 1.0)
@@ -36,7 +36,7 @@ def test_a_mean_nees_whose_interval_contains_the_target_is_inconclusive():
     rows = {
         "wide": row("success", "none", 0.0, 0, wide),
         "sure": row("success", "none", 0.0, 0, tuple(3.0 + 0.01 * (n % 2) for n in range(100))),
-        **{name: row("answers", "none", 0.0, 0, nees) for name, nees in apart.items()},
+        **{name: row("acceptance", "none", 0.0, 0, nees) for name, nees in apart.items()},
     }
     verdicts = {name: [bar.verdict for bar in check_targets([one])] for name, one in rows.items()}
     assert verdicts == {"wide": ["inconclusive"], "sure": ["met"], "high": ["not met"], "low": ["not met"]}
