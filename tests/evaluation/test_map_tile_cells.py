@@ -193,7 +193,7 @@ def test_an_interrupted_study_resumes(weights, tmp_path):
     assert [(c.scenario, c.seed) for c in first] == [(s, k) for s in Drive().scenarios for k in (0, 1)]
     sorted(tmp_path.glob("town1_0001-1-*"))[0].write_bytes(b"spoilt")
     again = run_jobs(weights, draw, (0, 1), tmp_path)
-    assert draw.num_calls == 5, "kept ones are read, a spoilt one is made anew"
+    assert draw.num_calls == 5, "kept ones are read, a spoilt one is made again"
     for one, other in zip(first, again):
         for a, b in zip(one.predictions, other.predictions, strict=True):
             assert (a.row_name, a.frame_bytes) == (b.row_name, b.frame_bytes) and len(a.predicted) == len(b.predicted)

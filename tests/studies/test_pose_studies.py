@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The studies of claimed poses on a small recording: AP before and after correction, and the poses themselves."""
+"""The studies of prior poses on a small recording: AP before and after correction, and the poses themselves."""
 
 import json
 import math

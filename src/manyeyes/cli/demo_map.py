@@ -33,7 +33,9 @@ FRAME_STRIDE = 10
 
 
 def map_drive(recording: Recording, map_model: MapModel, out: Path, seed: int = 0) -> tuple[str, Chapter]:
-    """The map of a drive of one scenario, from its agents' sensors by a map model, under out: in one line, and as a chapter."""
+    """Return the map of a drive of one scenario, from its agents' sensors by a map model, under out: in one line, and as a
+    chapter.
+    """
     (town_map,) = group_by_town(recording, recording.scenarios[:1], "drive")
     built = build_map(recording, town_map, MapBuildConfig(map_model, "semi-global", FRAME_STRIDE, seed=seed))
     write_built_map(built, out, "One drive, one map")
@@ -48,7 +50,7 @@ def map_drive(recording: Recording, map_model: MapModel, out: Path, seed: int = 
 
 
 def describe_drive_map(stats: MapBuildStats) -> str:
-    """The map of a drive in one line."""
+    """Return the map of a drive in one line."""
     scores = (
         ""
         if stats.scores is None or stats.union_scores is None
@@ -110,7 +112,7 @@ def map_crossing(out: Path, seed: int = 0) -> tuple[DemoMapStats, Chapter]:
 
 
 def describe_crossing_map(stats: DemoMapStats) -> str:
-    """The map in one line."""
+    """Return the map in one line."""
     ours, union = stats.fused, stats.union
     return (
         f"One map from {stats.num_observations} local maps of a crossroads: mAP {ours.mean_ap():.2f}, "
@@ -130,7 +132,7 @@ def _make_chapter(stats: DemoMapStats, out: Path) -> Chapter:
             ReportImage(out / "map.png", "All observations, and what is fused of them", wide=True),
             ReportImage(
                 out / "misalignment.png",
-                "Two observations as claimed, and after correction; arrows: misalignment",
+                "Two observations at the prior pose, and after correction; arrows: misalignment",
                 wide=True,
             ),
         ),
@@ -138,12 +140,12 @@ def _make_chapter(stats: DemoMapStats, out: Path) -> Chapter:
 
 
 def _make_pair_panels(experiment: FleetExperiment, solution: PoseSolution) -> list[MapPanel]:
-    """The two neighbouring observations that disagree most, before and after."""
+    """Return the two neighbouring observations that disagree most, before and after."""
     before, after = _find_largest_difference(experiment.observations)
     rows = solution.row_indices([before.id, after.id])
     panels = []
     for title, poses in (
-        ("As claimed", (before.pose, after.pose)),
+        ("At prior poses", (before.pose, after.pose)),
         ("After one correction an observation", solution.pose[rows]),
     ):
         one, two = before.elements_in_map(poses[0]), after.elements_in_map(poses[1])

@@ -138,19 +138,19 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
 
 
 def simulation_preset(name: str) -> SimulationPreset:
-    """A preset by its name in SIMULATION_PRESETS."""
+    """Return a preset by its name in SIMULATION_PRESETS."""
     if name not in SIMULATION_PRESETS:
         raise ConfigError(f"No simulation preset '{name}'; choose one of {', '.join(SIMULATION_PRESETS)}.")
     return SIMULATION_PRESETS[name]
 
 
 def with_cameras(preset: SimulationPreset) -> SimulationPreset:
-    """The same scenes seen by four cameras a vehicle and one a pole too, on a quarter of their pixels or less."""
+    """Return the same scenes with four cameras per vehicle and one per roadside unit, on a quarter of their pixels or less."""
     return replace(preset, cameras="opv2v-small", roadside_cameras="dair-infrastructure-small")
 
 
 def _town_or_fallback(name: str, towns: str | None, fallback_town: str | None) -> str:
-    """The town, or its stand-in where its roads are not found."""
+    """Return the town, or its stand-in where its roads are not found."""
     if fallback_town is None:
         return name
     try:
@@ -166,7 +166,7 @@ def _lidar_of(name: str, beams: int | None) -> str:
 
 
 def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> list[Job]:
-    """The scenarios of a preset; each depends on seed, split and its number alone."""
+    """Return the scenarios of a preset; each depends on seed, split and its number alone."""
     jobs = []
     for part in preset.splits:
         # The folder's name is part of the random key: another name would change every scene.

@@ -109,7 +109,7 @@ class RecordingPlan:
     names: Sequence[tuple[str, str]]
 
     def manifest(self) -> dict[str, Any]:
-        """The manifest of the run while it is unfinished."""
+        """Return the manifest of the run while it is unfinished."""
         digest = hashlib.sha256(json.dumps(self.requested_specs, sort_keys=True).encode()).hexdigest()
         scenarios = [{"split": split, "name": name} for split, name in self.names]
         return {"format": self.layout, "settings": dict(self.settings), "asked": digest, "scenarios": scenarios}
@@ -279,7 +279,7 @@ def _format_scenario(place: str) -> str:
 
 
 def _flat(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """A specification without its nesting."""
+    """Return a specification without its nesting."""
     flat: dict[str, Any] = {}
     for name, value in asked.items():
         flat.update(value if isinstance(value, dict) else {name: value})
@@ -388,7 +388,7 @@ def record_scenario(job: Job, root: Path) -> ManifestEntry:
 
 
 def make_first_scenario(spec: ScenarioSpec, towns: str | None, roadside: bool = False) -> SimulatedScenario:
-    """The scenario of the first of the seeds s, s + 1, … whose traffic offers one; roadside: with a unit on a pole."""
+    """Return the scenario of the first of the seeds s, s + 1, … whose traffic offers one; roadside: with a unit on a pole."""
     network = _network(spec.town, towns)
     reason = ""
     for attempt in range(_ATTEMPTS):
@@ -404,7 +404,7 @@ def make_first_scenario(spec: ScenarioSpec, towns: str | None, roadside: bool = 
 
 
 def _write(scenario: SimulatedScenario, folder: Path) -> int:
-    """All frames and the protocol; the number of points."""
+    """Return all frames and the protocol; the number of points."""
     spec, points = scenario.spec, 0
     writer = Opv2vWriter(folder, _STEP_S)
     for index in range(len(scenario)):
@@ -426,7 +426,7 @@ def _write(scenario: SimulatedScenario, folder: Path) -> int:
 
 
 def read_finished(path: Path) -> dict[str, Any]:
-    """The content of scenario.json, its specification with the defaults of fields that an older version did not have."""
+    """Return the content of scenario.json, its specification with the defaults of fields that an older version did not have."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         parse_entry(content)
@@ -436,7 +436,7 @@ def read_finished(path: Path) -> dict[str, Any]:
 
 
 def parse_entry(content: Mapping[str, Any]) -> ManifestEntry:
-    """The entry of a finished scenario."""
+    """Return the entry of a finished scenario."""
     return ManifestEntry(**{**content["entry"], "agents": tuple(content["entry"]["agents"])})
 
 
@@ -449,7 +449,7 @@ def _check(path: Path) -> list[FileProblem]:
 
 
 def _plain(content: Any) -> Any:
-    """Values as JSON gives them back."""
+    """Return values as JSON gives them back."""
     return json.loads(json.dumps(content))
 
 

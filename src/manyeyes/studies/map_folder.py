@@ -58,7 +58,7 @@ class MapFolder:
             write_observations(folder / f"part-{part:05d}.parquet", observations[start : start + ROWS_PER_FILE], frame)
 
     def read_cut_policy(self) -> CutPolicy | None:
-        """The cut policy for maps before evaluation; None where the folder holds none."""
+        """Return the cut policy for maps before evaluation; None where the folder holds none."""
         import shapely
 
         from manyeyes.evaluation.maps.experiment import CutPolicy
@@ -77,7 +77,7 @@ class MapFolder:
 
 
 def load_observations(path: Path, console: Console) -> LoadedObservations:
-    """The observations of a file, a folder of files, or a simulated folder; rejected ones are printed, one line each."""
+    """Return the observations of a file, a folder of files, or a simulated folder; rejected ones are printed, one line each."""
     from manyeyes.maps.elements.observation_file import find_observation_files, read_observations
 
     loaded = read_observations(find_observation_files(path))
@@ -104,7 +104,7 @@ def write_vector_map(vector_map: VectorMap, folder: Path) -> None:
 
 
 def read_vector_map(folder: Path) -> VectorMap:
-    """The map of a folder that 'map fuse' wrote: a map's own, or a store, whose last release is meant."""
+    """Return the map of a folder that 'map fuse' wrote: a map's own, or a store, whose last release is meant."""
     from manyeyes.maps.formats.geoparquet import read_map
 
     if (folder / "store.json").is_file():

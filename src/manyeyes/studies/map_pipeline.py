@@ -136,7 +136,7 @@ def count_snapshots(recording: Recording, town_map: TownMap, frame_stride: int) 
 def _iterate_snapshots(
     recording: Recording, scenario: str, config: MapBuildConfig
 ) -> Iterator[tuple[tuple[AgentFrame, ...], Floats]]:
-    """Frames with the poses that are claimed, and where they truly are: (N, 3) world, as far as the recording knows."""
+    """Yield frames with their prior poses, and the true poses: (N, 3) world, as far as the recording knows."""
     sigma = config.pose_sigma_m
     noise = PoseNoise("all_agents_iid", sigma, float(np.radians(sigma)), config.seed)
     for index in range(0, recording.length(scenario), config.frame_stride):

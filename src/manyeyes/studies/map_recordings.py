@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def open_sensor_recording(data: Path, split: str | None, sensors: Sequence[str]) -> RecordingReader:
-    """The recording with what these sensors took: pictures are read where a model has cameras, and must then be there."""
+    """Return the recording with what these sensors took: pictures are read where a model has cameras, and must then be there."""
     from manyeyes.datasets.registry import open_recording
     from manyeyes.datatypes import ConfigError
 
@@ -27,12 +27,14 @@ def open_sensor_recording(data: Path, split: str | None, sensors: Sequence[str])
 
 
 def has_images(recording: Recording) -> bool:
-    """Whether any agent of the first snapshot has; the recording reads them."""
+    """Return whether any agent of the first snapshot has; the recording reads them."""
     return any(frame.images for frame in recording.snapshot(recording.scenarios[0], 0).frames)
 
 
 def load_true_maps(recording: Recording) -> dict[str, MapElements]:
-    """The true map of every town that the recording's scenarios are named after, in its world frame; edges are the pavement's."""
+    """Return the true map of every town that the recording's scenarios are named after, in its world frame; edges are the
+    pavement's.
+    """
     from manyeyes.maps.roads.ground_truth import GroundTruthPolicy, build_ground_truth_map
     from manyeyes.simulator.scene.towns import GENERATED, TOWNS, load_town
 

@@ -38,7 +38,7 @@ def installed_versions() -> dict[str, str | None]:
 
 
 def git_commit() -> str | None:
-    """The commit of the sources that run, with ``+changes`` if tracked files differ; None outside a checkout."""
+    """Return the commit of the sources that run, with ``+changes`` if tracked files differ; None outside a checkout."""
     package = Path(__file__).resolve().parents[1]
 
     def git(*words: str) -> str | None:
@@ -57,7 +57,7 @@ def git_commit() -> str | None:
 
 
 def cpu_name() -> str:
-    """The processor's name as the system reports it."""
+    """Return the processor's name as the system reports it."""
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -81,7 +81,7 @@ def collect_provenance(config: object, seed: int | None) -> dict[str, Any]:
 
 
 def to_plain(value: object) -> Any:
-    """A value as JSON can hold it: dataclasses become objects, paths text, NaN and infinity null."""
+    """Return a value as JSON can hold it: dataclasses become objects, paths text, NaN and infinity null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, dict):

@@ -64,7 +64,7 @@ def print_notes(recording: RecordingReader, console: Console) -> None:
 
 
 def choose_results_folder(out: Path, missing: MissingFiles) -> Path:
-    """The folder under out for the kept results of a study, another one for each set of missing files."""
+    """Return the folder under out for the kept results of a study, another one for each set of missing files."""
     if not missing.count:
         return out / "cells"
     digest = hashlib.blake2b(repr(missing).encode(), digest_size=4).hexdigest()
@@ -72,7 +72,7 @@ def choose_results_folder(out: Path, missing: MissingFiles) -> Path:
 
 
 def select_checked_scenarios(recording: RecordingReader, replayed: str, chosen_name: str | None) -> frozenset[str]:
-    """The scenarios whose files count where one is played; those that are left out count if it was not chosen by name."""
+    """Return the scenarios whose files count where one is played; those that are left out count if it was not chosen by name."""
     return frozenset({replayed}) | (recording.unreadable_scenarios if chosen_name is None else frozenset())
 
 

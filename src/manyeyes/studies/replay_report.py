@@ -145,7 +145,7 @@ def _make_pose_chapters(pose_summaries: Mapping[str, PoseCorrectionSummary]) -> 
 
 
 def make_protocol(detector: BoxDetector) -> DetectionProtocol:
-    """The project's own protocol over the range that the detector sees."""
+    """Return the project's own protocol over the range that the detector sees."""
     grid = detector.detection_range
     return get_protocol("global-sort").with_range(
         (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
@@ -153,7 +153,7 @@ def make_protocol(detector: BoxDetector) -> DetectionProtocol:
 
 
 def _select_animated(methods: Sequence[str]) -> tuple[str, ...]:
-    """The two methods whose difference is the point, or as many of them as were run."""
+    """Return the two methods whose difference is the point, or as many of them as were run."""
     preferred = tuple(name for name in ("none", "intermediate") if name in methods)
     return preferred or tuple(methods[:1])
 
@@ -188,7 +188,7 @@ def _save_animation(film: _Film, out: Path) -> tuple[ReportImage, ...]:
 def _save_pictures(
     steps: Sequence[ReplayStep], comparison: MethodComparison, grid: BevGrid, spec: ReportSpec
 ) -> tuple[ReportImage, ...]:
-    """One bird's-eye picture a method, of the same instant."""
+    """Return one bird's-eye picture a method, of the same instant."""
     rows = {row.method: row for row in comparison.rows}
     out = []
     for step in steps:

@@ -64,7 +64,7 @@ class TownMap:
         return None if self.place is None else CutPolicy(self.place.junctions, self.place.area)
 
     def observed_truth(self, observations: Sequence[Observation], true_poses: Floats) -> MapElements | None:
-        """The true elements that were in view of any agent, at true poses (N, 3) in the map's frame; cut."""
+        """Return the true elements that were in view of any agent, at true poses (N, 3) in the map's frame; cut."""
         from manyeyes.evaluation.maps.observed_area import MIN_PART_LENGTH_M, clip_to_area, compute_observed_area
 
         if self.place is None or self.cut_policy is None:
@@ -78,7 +78,9 @@ class TownMap:
 def group_by_town(
     recording: Recording, scenarios: Sequence[str], default_name: str, map_file: Path | None = None
 ) -> list[TownMap]:
-    """The grounds of the scenarios: one a town, and one, called otherwise, of all whose names are no town's; map_file: its map."""
+    """Return the grounds of the scenarios: one a town, and one, called otherwise, of all whose names are no town's; map_file:
+    its map.
+    """
     groups: dict[str | None, list[str]] = {}
     for scenario in scenarios:
         groups.setdefault(find_named_town(scenario), []).append(scenario)
@@ -93,7 +95,7 @@ def group_by_town(
 
 
 def find_named_town(scenario: str) -> str | None:
-    """The town that a scenario is named after, ``town05_0066`` after Town05; None where it is no town's name."""
+    """Return the town that a scenario is named after, ``town05_0066`` after Town05; None where it is no town's name."""
     from manyeyes.simulator.scene.towns import GENERATED, TOWNS
 
     name = scenario.rpartition("_")[0]

@@ -46,7 +46,7 @@ class Options:
     channel: str = "ideal"
     """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
     pose_sigma: NonNegativeFloat = 0.0
-    """Standard deviation of errors added to claimed positions, metres; headings err in proportion, 1 degree a metre."""
+    """Standard deviation of errors added to prior positions, metres; headings err in proportion, 1 degree a metre."""
     map: Path | None = None
     """The true map of a recording that no town is named after, in its world: an intersection of V2X-Seq (.json), a map of Argoverse
     2 (log_map_archive_*.json), or Lanelet2's .osm; without it such a map is made, not evaluated."""
@@ -113,7 +113,7 @@ def main(options: Options) -> None:
 
 
 def _load_map_model(options: Options) -> MapModel | None:
-    """The map model; None where the truth draws."""
+    """Return the map model; None where the truth draws."""
     from manyeyes.models import pretrained
 
     if options.source == "truth":

@@ -40,7 +40,7 @@ class MethodResult:
     perceive_ms: float
 
     def paired_difference(self, other: MethodResult, iou: int, protocol: DetectionProtocol) -> Interval:
-        """AP of this method minus that of another, paired over scenarios. iou: index into IOUS."""
+        """Return the AP of this method minus that of another, paired over scenarios. iou: index into IOUS."""
         samples = (bootstrap(result.ap[iou].frames, protocol=protocol) for result in (self, other))
         return next(samples).paired_difference(next(samples))
 
@@ -93,7 +93,7 @@ class MetricAccumulator:
         self.perceive_s += other.perceive_s
 
     def match_frames(self) -> tuple[tuple[FrameMatch, ...], ...]:
-        """The frames matched at each of IOUS, in the order they came in."""
+        """Return the frames matched at each of IOUS, in the order they came in."""
         return tuple(tuple(match_frame(frame, iou, self.protocol) for frame in self.frames) for iou in IOU_THRESHOLDS)
 
     def summarize_communication(self) -> Communication:
@@ -101,11 +101,11 @@ class MetricAccumulator:
         return summarize_messages(self.messages, len(self.frames))
 
     def mean_age_ms(self) -> float:
-        """The mean age of what took part, when it was used; NaN where nothing did."""
+        """Return the mean age of what took part, when it was used; NaN where nothing did."""
         return _mean_ms(self.ages_s)
 
     def compute_result(self) -> MethodResult:
-        """The numbers of everything counted so far."""
+        """Return the numbers of everything counted so far."""
         matches = self.match_frames()
         return MethodResult(
             self.method,

@@ -52,7 +52,7 @@ class BenchmarkConfig:
 
 
 def resolve_protocol(config: BenchmarkConfig) -> DetectionProtocol:
-    """The named protocol; our own one judges over the range that the detector answers for."""
+    """Return the named protocol; our own one uses the output range of the detector."""
     protocol, grid = get_protocol(config.protocol), load_detector(config.weights).detection_range
     if config.protocol != "global-sort":
         return protocol
@@ -60,7 +60,9 @@ def resolve_protocol(config: BenchmarkConfig) -> DetectionProtocol:
 
 
 def load_detector(weights: str | BoxDetector) -> BoxDetector:
-    """The weights of that name or path, read once by each process for as long as the file stays as it is; or the detector given."""
+    """Return the weights of that name or path, read once by each process for as long as the file stays as it is; or the
+    detector given.
+    """
     if not isinstance(weights, str):
         check_detector(weights)
         return weights
@@ -76,7 +78,7 @@ def _load_cached(weights: str, modified_ns: int) -> BoxDetector:
 def run_scenario(
     open_recording: Callable[[], Recording], configs: Sequence[BenchmarkConfig], scenario: str
 ) -> list[list[MetricAccumulator]]:
-    """All methods of each configuration on one scenario; a function of its arguments alone.
+    """Return all methods of each configuration on one scenario; a function of its arguments alone.
 
     The configurations have the same weights, view and history: each sweep is read and processed once for all of them.
     """
@@ -99,7 +101,7 @@ def run_scenario(
 def _iterate_snapshots(
     recording: Recording, scenario: str, detector: BoxDetector, config: BenchmarkConfig, feature_cache: CachedOutputs
 ) -> Iterator[tuple[int, Iterator[ReplayStep]]]:
-    """The steps of one configuration, judged snapshot by judged snapshot."""
+    """Return the steps of one configuration, evaluated snapshot by evaluated snapshot."""
     perturb = partial(_perturb, config.pose_noise)
     steps = replay(recording, scenario, detector, config.methods, config.replay, perturb, feature_cache)
     return groupby(steps, lambda step: step.snapshot.index)
@@ -115,7 +117,7 @@ def run_benchmarks(
     workers: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Generator[tuple[MetricAccumulator, ...]]:
-    """The tallies of each configuration in turn, as soon as they are there.
+    """Yield the tallies of each configuration in turn, as soon as they are there.
 
     open_recording must be picklable when workers > 1; results do not depend on workers. progress counts scenarios played by
     a configuration.
@@ -135,7 +137,7 @@ def run_benchmarks(
 
 
 def _group_configs(configs: Sequence[BenchmarkConfig]) -> list[tuple[BenchmarkConfig, ...]]:
-    """Neighbours that can be played together, at most TOGETHER of them: what is finished is handed out group by group."""
+    """Return neighbours that can be replayed together, at most TOGETHER of them: what is finished is handed out group by group."""
     comparable = groupby(configs, lambda c: (c.weights, c.frame_stride, c.num_agents, c.replay.warmup_frames))
     runs = [tuple(run) for _, run in comparable]
     return [run[k : k + CONDITIONS_PER_GROUP] for run in runs for k in range(0, len(run), CONDITIONS_PER_GROUP)]
@@ -152,7 +154,7 @@ def _gather(
     jobs: Sequence[tuple[tuple[BenchmarkConfig, ...], str]],
     progress: Callable[[int], None],
 ) -> Generator[tuple[MetricAccumulator, ...]]:
-    """The tallies of jobs, added up over the scenarios of each group."""
+    """Yield the tallies of jobs, added up over the scenarios of each group."""
     results, done = iter(found), 0
     for group in groups:
         totals = [[MetricAccumulator(name, resolve_protocol(config)) for name in config.methods] for config in group]
@@ -170,7 +172,9 @@ def run_benchmark(
     workers: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[MethodResult, ...]:
-    """Every method on every scenario. open_recording must be picklable when workers > 1; results do not depend on workers."""
+    """Return every method on every scenario. open_recording must be picklable when workers > 1; results do not depend on
+    workers.
+    """
     with closing(run_benchmarks(open_recording, [config], workers, progress)) as accumulators:
         return tuple(accumulator.compute_result() for accumulator in next(accumulators))
 

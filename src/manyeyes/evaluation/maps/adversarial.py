@@ -103,14 +103,14 @@ def run_attack(trial: FleetTrial, settings: MethodSettings) -> AdversarialResult
 
 
 def _without_attack(trial: FleetTrial) -> FleetTrial:
-    """The trial without displacement of elements; the same for every kind and size of attack."""
+    """Return the trial without displacement of elements; the same for every kind and size of attack."""
     fleet_config = replace(trial.fleet_config, attack_mode="independent", malicious_offset_m=(0.0, 0.0))
     return replace(trial, view_label="truthful", fleet_config=fleet_config)
 
 
 @lru_cache(maxsize=1)
 def _fuse_without_attack(trial: FleetTrial, settings: MethodSettings) -> tuple[VectorMap, int]:
-    """The map of the honest agents alone, and how many of its stations the other agents displace without an attack."""
+    """Return the map of the honest agents alone, and how many of its stations the other agents displace without an attack."""
     experiment = run_trial(trial)
     honest_observations = [o for o, role in zip(experiment.observations, experiment.fleet.roles) if role != MALICIOUS]
     honest_map, full_map = (
@@ -121,7 +121,9 @@ def _fuse_without_attack(trial: FleetTrial, settings: MethodSettings) -> tuple[V
 
 
 def measure_displacement(reference: VectorMap, other: VectorMap, min_agents: int = MIN_AGENTS) -> np.ndarray:
-    """(S,) metres across the nearest line of its kind in another map, of each well-seen station; inf where there is none near."""
+    """Return (S,) metres across the nearest line of its kind in another map, of each well-seen station; inf where there is
+    none near.
+    """
     before, after = reference.select_published(), other.select_published()
     kind = before.elements.kind[before.elements.element_of_point]
     out = []

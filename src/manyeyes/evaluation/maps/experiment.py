@@ -39,7 +39,7 @@ class FleetTrial:
     fleet_config: CrowdConfig = field(default_factory=CrowdConfig)
 
     def with_pose_noise(self, pose_sigma_m: float) -> FleetTrial:
-        """The same trial with other pose errors, the heading's in proportion (1° a metre)."""
+        """Return the same trial with other pose errors, the heading's in proportion (1° a metre)."""
         fleet_config = replace(
             self.fleet_config, pose_sigma_m=pose_sigma_m, yaw_sigma_rad=float(np.radians(pose_sigma_m))
         )
@@ -92,7 +92,7 @@ class FleetExperiment:
 
 @lru_cache(maxsize=2)
 def run_trial(trial: FleetTrial) -> FleetExperiment:
-    """The trial's crowd, driven; the last two are kept, as a study asks for one trial with many settings in turn."""
+    """Return the trial's crowd, driven; the last two are kept, as a study asks for one trial with many settings in turn."""
     return FleetExperiment(
         trial,
         simulate_crowd(load_place(trial.place, trial.size_m), trial.num_observations, trial.fleet_config, trial.seed),
@@ -100,13 +100,13 @@ def run_trial(trial: FleetTrial) -> FleetExperiment:
 
 
 def replace_poses(observations: Sequence[Observation], poses: np.ndarray, sigma_m: float = 0.02) -> list[Observation]:
-    """The same observations with other poses (N, 3), claimed with a small sigma (m, and rad): an oracle's."""
+    """Return the same observations with other poses (N, 3), claimed with a small sigma (m, and rad): an oracle's."""
     covariance = np.diag([sigma_m**2, sigma_m**2, (sigma_m / 10) ** 2])
     return [replace(o, pose=pose, covariance=covariance) for o, pose in zip(observations, poses)]
 
 
 def _inside(elements: MapElements, ground: BaseGeometry) -> np.ndarray:
-    """(N,) whether the middle of each element lies on a ground."""
+    """Return (N,) whether the middle of each element lies on a ground."""
     import shapely
 
     middles = [_middle(elements.polyline(row)) for row in range(len(elements))]
@@ -117,6 +117,6 @@ def _inside(elements: MapElements, ground: BaseGeometry) -> np.ndarray:
 
 
 def _middle(line: np.ndarray) -> np.ndarray:
-    """The point halfway along."""
+    """Return the point halfway along."""
     arc_length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
     return np.array([np.interp(arc_length[-1] / 2, arc_length, line[:, axis]) for axis in (0, 1)])

@@ -48,7 +48,7 @@ def find_discrepancies(
 
 
 def find_unmatched_segments(elements: MapElements, others: MapElements, max_distance_m: float) -> list[Floats]:
-    """The pieces of elements that have no line of their kind among others within the distance."""
+    """Return the pieces of elements that have no line of their kind among others within the distance."""
     out = []
     for kind in KINDS:
         lines, other_lines = select_lines(elements, kind), select_lines(others, kind)

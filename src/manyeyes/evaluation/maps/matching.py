@@ -46,7 +46,7 @@ MATCHING_PROTOCOLS = {
 
 
 def get_matching_protocol(name: str) -> MatchingProtocol:
-    """The way of that name."""
+    """Return the matching protocol of that name."""
     if name not in MATCHING_PROTOCOLS:
         raise ConfigError(
             f"No way to measure a Chamfer distance is called {name!r}; known: {', '.join(MATCHING_PROTOCOLS)}."
@@ -66,17 +66,17 @@ class Lines:
         return len(self.offsets) - 1
 
     def line(self, row: int) -> Floats:
-        """(n, 2) points of one line."""
+        """Return (n, 2) points of one line."""
         return self.points[self.offsets[row] : self.offsets[row + 1]]
 
     def lengths(self) -> Floats:
-        """Length of each line, (N,) metres."""
+        """Return the length of each line, (N,) metres."""
         step = np.hypot(*np.diff(self.points, axis=0).T) if len(self.points) > 1 else np.zeros(0)
         line, start = segments_of(self.offsets)
         return np.bincount(line, weights=step[start], minlength=len(self)).astype(np.float64)
 
     def bounds(self) -> Floats:
-        """(N, 4) x_min, y_min, x_max, y_max."""
+        """Return (N, 4) x_min, y_min, x_max, y_max."""
         if len(self) == 0:
             return np.zeros((0, 4))
         low = np.minimum.reduceat(self.points, self.offsets[:-1], axis=0)
@@ -84,14 +84,14 @@ class Lines:
 
 
 def make_lines(parts: list[Floats], score: Floats | None = None) -> Lines:
-    """Lines of a list of (n, 2) arrays; scores are 1 where none are given."""
+    """Return lines of a list of (n, 2) arrays; scores are 1 where none are given."""
     offsets = np.concatenate(([0], np.cumsum([len(p) for p in parts], dtype=np.int64))).astype(np.int64)
     points = np.concatenate(parts).astype(np.float64) if parts else np.zeros((0, 2))
     return Lines(points, offsets, np.ones(len(parts)) if score is None else np.asarray(score, dtype=np.float64))
 
 
 def resample_lines(lines: Lines, protocol: MatchingProtocol) -> Lines:
-    """The samples of each line: equal arc length, both ends included."""
+    """Return the samples of each line: equal arc length, both ends included."""
     lengths = lines.lengths()
     if protocol.num_samples is not None:
         num_samples = np.full(len(lines), protocol.num_samples, dtype=np.int64)
@@ -102,7 +102,8 @@ def resample_lines(lines: Lines, protocol: MatchingProtocol) -> Lines:
 
 
 def compute_chamfer(predicted: Lines, truth: Lines, protocol: MatchingProtocol, max_distance_m: float) -> Floats:
-    """(N, M) Chamfer distances; inf where the boxes are farther apart than max_distance_m, or the protocol leaves the pair out.
+    """Return (N, M) Chamfer distances; inf where the boxes are farther apart than max_distance_m, or the protocol leaves the
+    pair out.
 
     No Chamfer distance is below the gap between the boxes, so that thresholds up to max_distance_m are judged exactly.
     """
@@ -133,14 +134,14 @@ def compute_chamfer(predicted: Lines, truth: Lines, protocol: MatchingProtocol, 
 
 
 def rank_lines(lines: Lines) -> Ints:
-    """Rows by descending score; ties by descending length, then by the smallest x, then y, of the element."""
+    """Return rows by descending score; ties by descending length, then by the smallest x, then y, of the element."""
     low = lines.bounds()[:, :2].reshape(-1, 2)
     # Lengths that differ by rounding alone must not decide before the place does.
     return np.lexsort((low[:, 1], low[:, 0], -np.round(lines.lengths(), 6), -lines.score)).astype(np.int64)
 
 
 def match_lines(table: Floats, order: Ints, threshold_m: float) -> Ints:
-    """(N,) the truth row that each prediction takes, -1 for a false positive.
+    """Return (N,) the truth row that each prediction takes, -1 for a false positive.
 
     Predictions in their order consider only their nearest truth (of equally near ones the first), and take it when it is
     free and within the threshold; there is no second choice.
@@ -169,14 +170,14 @@ def compute_all_point_ap(ranked: NDArray[np.bool_], n_truth: int) -> float:
 
 
 def _find_nearby_pairs(a: Floats, b: Floats, max_distance_m: float) -> Ints:
-    """(K, 2) pairs of rows whose boxes are at most max_distance_m apart."""
+    """Return (K, 2) pairs of rows whose boxes are at most max_distance_m apart."""
     gap_x = np.maximum(np.maximum(a[:, None, 0] - b[None, :, 2], b[None, :, 0] - a[:, None, 2]), 0.0)
     gap_y = np.maximum(np.maximum(a[:, None, 1] - b[None, :, 3], b[None, :, 1] - a[:, None, 3]), 0.0)
     return np.argwhere(np.hypot(gap_x, gap_y) <= max_distance_m).astype(np.int64)
 
 
 def _buffers_intersect(predicted: Lines, truth: Lines, pairs: Ints) -> NDArray[np.bool_]:
-    """(K,) whether the buffers of each pair meet."""
+    """Return (K,) whether the buffers of each pair meet."""
     try:
         import shapely
     except ImportError as error:
@@ -192,7 +193,7 @@ def _buffers_intersect(predicted: Lines, truth: Lines, pairs: Ints) -> NDArray[n
 
 @njit(cache=True)
 def _resample(points: Floats, offsets: Ints, target_offsets: Ints) -> Floats:
-    """Each line at target[i + 1] - target[i] points of equal arc length."""
+    """Return each line at target[i + 1] - target[i] points of equal arc length."""
     out = np.empty((target_offsets[-1], 2))
     for row in range(len(offsets) - 1):
         begin, end = offsets[row], offsets[row + 1]
@@ -217,7 +218,7 @@ def _resample(points: Floats, offsets: Ints, target_offsets: Ints) -> Floats:
 
 @njit(cache=True)
 def _point_chamfer(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> Floats:
-    """Half the sum of both mean distances from samples to the nearest samples, for pairs (K, 2)."""
+    """Return half the sum of both mean distances from samples to the nearest samples, for pairs (K, 2)."""
     out = np.empty(len(pairs))
     for p in range(len(pairs)):
         i0, i1 = a_offsets[pairs[p, 0]], a_offsets[pairs[p, 0] + 1]
@@ -237,7 +238,7 @@ def _point_chamfer(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs
 
 @njit(cache=True)
 def _directed_to_segments(a: Floats, a_offsets: Ints, b: Floats, b_offsets: Ints, pairs: Ints) -> Floats:
-    """The mean distance from the samples of a to the line b itself, for pairs (K, 2)."""
+    """Return the mean distance from the samples of a to the line b itself, for pairs (K, 2)."""
     out = np.empty(len(pairs))
     for p in range(len(pairs)):
         i0, i1 = a_offsets[pairs[p, 0]], a_offsets[pairs[p, 0] + 1]

@@ -117,11 +117,11 @@ class MapMetrics:
     kinds: tuple[KindMetrics, ...]
 
     def get_kind(self, kind: str) -> KindMetrics:
-        """The numbers of one kind."""
+        """Return the numbers of one kind."""
         return next(k for k in self.kinds if k.kind == kind)
 
     def get_ap(self, kind: str, protocol: str = "exact", thresholds: Thresholds = "narrow") -> float:
-        """The AP of one kind, mean over the thresholds."""
+        """Return the AP of one kind, mean over the thresholds."""
         distances_m = THRESHOLDS[thresholds]
         return next(
             p.ap for p in self.get_kind(kind).ap_scores if p.protocol == protocol and p.thresholds == distances_m
@@ -135,7 +135,7 @@ class MapMetrics:
         return sum(ap_values) / len(ap_values) if ap_values else math.nan
 
     def get_length_score(self, kind: str, max_distance_m: float = 0.5) -> LengthScore:
-        """The length score of one kind."""
+        """Return the length score of one kind."""
         return next(s for s in self.get_kind(kind).length_scores if s.max_distance_m == max_distance_m)
 
 
@@ -145,7 +145,7 @@ def evaluate_map(
     protocols: Sequence[str] = tuple(MATCHING_PROTOCOLS),
     kinds: Sequence[str] = KINDS,
 ) -> MapMetrics:
-    """All numbers of a map (elements with scores) against the truth, both in one metric frame."""
+    """Return all numbers of a map (elements with scores) against the truth, both in one metric frame."""
     for name in protocols:
         get_matching_protocol(name)
     return MapMetrics(
@@ -203,7 +203,7 @@ def _evaluate_kind(kind: str, predicted: Lines, truth: Lines, protocols: Sequenc
 
 
 def select_lines(elements: MapElements, kind: str) -> Lines:
-    """The elements of one kind that have length, rings closed."""
+    """Return the elements of one kind that have length, rings closed."""
     parts, scores = [], []
     for row in np.flatnonzero(elements.kind == KINDS.index(kind)):
         points = elements.polyline(int(row))
@@ -223,7 +223,7 @@ class Pieces:
 
 
 def split_into_pieces(lines: Lines) -> Pieces:
-    """Every segment in equal pieces of at most PIECE_M."""
+    """Return every segment in equal pieces of at most PIECE_M."""
     start = (
         np.delete(np.arange(len(lines.points)), lines.offsets[1:] - 1) if len(lines) else np.zeros(0, dtype=np.int64)
     )
@@ -268,7 +268,7 @@ def _quantiles(distance: Floats, weight: Floats, levels: Sequence[float]) -> lis
 
 
 def _fragmentation(pieces: Pieces, nearest: NDArray[np.int64], n_truth: int) -> float:
-    """The mean number of predicted elements on those true ones that have any."""
+    """Return the mean number of predicted elements on those true ones that have any."""
     near = nearest >= 0
     if n_truth == 0 or not near.any():
         return math.nan
@@ -280,7 +280,7 @@ def _fragmentation(pieces: Pieces, nearest: NDArray[np.int64], n_truth: int) -> 
 
 
 def _median_frechet(predicted: Lines, truth: Lines, matched_row: NDArray[np.int64]) -> float:
-    """The median discrete Frechet distance of matched lines."""
+    """Return the median discrete Frechet distance of matched lines."""
     a, b = resample_lines(predicted, MATCHING_PROTOCOLS["exact"]), resample_lines(truth, MATCHING_PROTOCOLS["exact"])
     distances = [
         min(
@@ -294,7 +294,7 @@ def _median_frechet(predicted: Lines, truth: Lines, matched_row: NDArray[np.int6
 
 @njit(cache=True)
 def frechet(a: Floats, b: Floats) -> float:
-    """Discrete Frechet distance of two sampled lines (n, 2), (m, 2), row by row (Eiter and Mannila, 1994)."""
+    """Return the discrete Frechet distance of two sampled lines (n, 2), (m, 2), row by row (Eiter and Mannila, 1994)."""
     row = np.empty(len(b))
     for i in range(len(a)):
         diagonal = 0.0
@@ -312,7 +312,7 @@ def frechet(a: Floats, b: Floats) -> float:
 
 
 def compute_topology(predicted: Lines, truth: Lines) -> tuple[float, float]:
-    """The endpoint error, and F1 of branches."""
+    """Return the endpoint error, and F1 of branches."""
     predicted_ends, truth_ends = _line_ends(predicted), _line_ends(truth)
     end_error = math.nan
     if len(truth_ends):
@@ -330,7 +330,7 @@ def compute_topology(predicted: Lines, truth: Lines) -> tuple[float, float]:
 
 
 def _line_ends(lines: Lines) -> Floats:
-    """(2 N, 2): both ends of every line."""
+    """Return (2 N, 2): both ends of every line."""
     return (
         np.vstack((lines.points[lines.offsets[:-1]], lines.points[lines.offsets[1:] - 1]))
         if len(lines)
@@ -339,7 +339,7 @@ def _line_ends(lines: Lines) -> Floats:
 
 
 def find_branches(ends: Floats) -> Floats:
-    """(B, 2) centres of groups of three or more ends, joined within 1 m; by x, then y."""
+    """Return (B, 2) centres of groups of three or more ends, joined within 1 m; by x, then y."""
     ordered = ends[np.lexsort((ends[:, 1], ends[:, 0]))] if len(ends) else ends
     names, label, count = np.unique(
         _group_points(ordered, MAX_BRANCH_SPREAD_M), return_inverse=True, return_counts=True
@@ -352,7 +352,7 @@ def find_branches(ends: Floats) -> Floats:
 
 @njit(cache=True)
 def _group_points(ordered: Floats, max_gap_m: float) -> NDArray[np.int64]:
-    """(N,) single-linkage groups of points (N, 2) sorted by x: each is named after one of its members."""
+    """Return (N,) single-linkage groups of points (N, 2) sorted by x: each is named after one of its members."""
     parent = np.arange(len(ordered))
     for i in range(len(ordered)):
         for j in range(i + 1, len(ordered)):
@@ -374,7 +374,7 @@ def _group_points(ordered: Floats, max_gap_m: float) -> NDArray[np.int64]:
 
 
 def _count_matches(a: Floats, b: Floats, max_distance_m: float) -> int:
-    """How many pairs match one to one, nearest first."""
+    """Return how many pairs match one to one, nearest first."""
     gap = np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1])
     hits = 0
     while gap.size and gap.min() <= max_distance_m:

@@ -28,7 +28,7 @@ MIN_PART_LENGTH_M, MIN_CROSSING_FRACTION = 2.0, 0.5
 
 
 def compute_observed_area(views: Sequence[Floats], poses: Floats) -> BaseGeometry:
-    """The union of field-of-view polygons (K, 2), agents' frames, at true poses (N, 3) of x, y, yaw."""
+    """Return the union of field-of-view polygons (K, 2), agents' frames, at true poses (N, 3) of x, y, yaw."""
     shapely = _shapely()
     polygons = []
     for view, (x, y, yaw) in zip(views, np.asarray(poses, dtype=np.float64)):
@@ -38,7 +38,7 @@ def compute_observed_area(views: Sequence[Floats], poses: Floats) -> BaseGeometr
 
 
 def clip_to_area(elements: MapElements, area: BaseGeometry) -> MapElements:
-    """The elements inside an area; scores and styles are kept."""
+    """Return the elements inside an area; scores and styles are kept."""
     shapely = _shapely()
     shapely.prepare(area)
     rows: list[int] = []
@@ -67,7 +67,7 @@ def clip_to_area(elements: MapElements, area: BaseGeometry) -> MapElements:
 
 
 def replace_geometry(elements: MapElements, rows: Sequence[int], parts: Sequence[Floats]) -> MapElements:
-    """Elements like those at the rows, each with another geometry (n, 2); sigma is the mean of the old points'."""
+    """Return elements like those at the rows, each with another geometry (n, 2); sigma is the mean of the old points'."""
     index = np.asarray(rows, dtype=np.int64)
     mean = np.add.reduceat(elements.sigma, elements.offsets[:-1]) / elements.counts if len(elements) else np.zeros(0)
     sigma = np.repeat(mean[index], [len(part) for part in parts]) if len(parts) else np.zeros(0)

@@ -24,7 +24,7 @@ _MAX_GAP_M = 6.0
 
 
 def run_oracle(name: str, experiment: FleetExperiment, config: MapFusionConfig) -> MapElements:
-    """The elements of an oracle's map, before the common cut."""
+    """Return the elements of an oracle's map, before the common cut."""
     if name == "oracle-cuts":
         return split_in_half(experiment.truth)
     if name == "oracle-pose":
@@ -34,7 +34,7 @@ def run_oracle(name: str, experiment: FleetExperiment, config: MapFusionConfig) 
 
 
 def split_in_half(elements: MapElements) -> MapElements:
-    """Every line as two of half its length; crossings as they are."""
+    """Return every line as two of half its length; crossings as they are."""
     rows, parts = [], []
     for row in range(len(elements)):
         line = elements.polyline(row)
@@ -51,7 +51,7 @@ def split_in_half(elements: MapElements) -> MapElements:
 
 
 def fuse_with_true_association(experiment: FleetExperiment) -> MapElements:
-    """Every observed true element, moved by the mean offset of its observations at the prior poses."""
+    """Return every observed true element, moved by the mean offset of its observations at the prior poses."""
     truth = experiment.place.truth
     points_by_element: dict[int, list[Floats]] = {}
     for k, (observation, pose) in enumerate(zip(experiment.observations, experiment.fleet.true_poses)):
@@ -76,7 +76,7 @@ def fuse_with_true_association(experiment: FleetExperiment) -> MapElements:
 
 
 def _shift_line(line: Floats, point_pairs: Floats) -> list[Floats]:
-    """The seen parts of a line, at 1 m, across it at the mean of the claimed points (K, 4): true x, y, claimed x, y."""
+    """Return the seen parts of a line, at 1 m, across it at the mean of the claimed points (K, 4): true x, y, claimed x, y."""
     stations = resample_lines(make_lines([line]), MatchingProtocol("stations", spacing_m=1.0)).points
     step = np.gradient(stations, axis=0)
     normal = np.stack((-step[:, 1], step[:, 0]), 1) / np.maximum(np.hypot(*step.T), 1e-9)[:, None]

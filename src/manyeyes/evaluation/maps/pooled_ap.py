@@ -55,7 +55,7 @@ def assign_to_scenario(name: str) -> BlockAssignment:
 
 
 def assign_to_squares(name: str, square_size_m: float) -> BlockAssignment:
-    """Lines belong to the square, of so many metres a side, in which their middles lie."""
+    """Assign lines to the square, of so many metres a side, in which their middles lie."""
 
     def assign(middles: Floats) -> list[Block]:
         return [(name, *cell) for cell in np.floor(middles / square_size_m).astype(np.int64).tolist()]
@@ -73,7 +73,7 @@ def bootstrap_pooled_ap(
     seed: int = 0,
     confidence_level: float = 0.95,
 ) -> BootstrapSamples:
-    """AP of one kind, mean over the thresholds, of all maps as one list, and on n draws of the blocks.
+    """Return the AP of one kind, mean over the thresholds, of all maps as one list, and on n draws of the blocks.
 
     all_blocks: all blocks, where other lists are to be compared that may have some more; otherwise those that have a line.
     """
@@ -129,7 +129,7 @@ def bootstrap_pooled_mean_ap(
 
 
 def collect_blocks(pair_lists: Sequence[Sequence[MapPair]]) -> list[Block]:
-    """All blocks that have an element on any side of several lists."""
+    """Return all blocks that have an element on any side of several lists."""
     found: set[Block] = set()
     for pairs in pair_lists:
         for one in pairs:
@@ -141,7 +141,7 @@ def collect_blocks(pair_lists: Sequence[Sequence[MapPair]]) -> list[Block]:
 
 
 def average_samples(bootstraps: Sequence[BootstrapSamples]) -> BootstrapSamples:
-    """The mean of those that have truth, draw by draw; of lists over other blocks each is drawn by itself."""
+    """Return the mean of those that have truth, draw by draw; of lists over other blocks each is drawn by itself."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a draw in which nothing has truth stays NaN
         value = float(np.nanmean([one.value for one in bootstraps]))
@@ -153,7 +153,7 @@ def average_samples(bootstraps: Sequence[BootstrapSamples]) -> BootstrapSamples:
 
 
 def _rank_pooled(lines_of_maps: Sequence[Lines]) -> NDArray[np.int64]:
-    """The ranking of the lines of all maps as one list, ties as if the maps lay side by side."""
+    """Return the ranking of the lines of all maps as one list, ties as if the maps lay side by side."""
     parts = [
         lines.line(row) + [MAP_SPACING_M * k, 0.0] for k, lines in enumerate(lines_of_maps) for row in range(len(lines))
     ]
@@ -161,7 +161,7 @@ def _rank_pooled(lines_of_maps: Sequence[Lines]) -> NDArray[np.int64]:
 
 
 def _line_centers(lines: Lines) -> Floats:
-    """(N, 2) the middle of each line's bounding box."""
+    """Return (N, 2) the middle of each line's bounding box."""
     bounds = lines.bounds()
     return (bounds[:, :2] + bounds[:, 2:]) / 2
 

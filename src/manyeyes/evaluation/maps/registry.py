@@ -26,7 +26,7 @@ class MethodSettings:
     configs: tuple[tuple[str, Any], ...] = ()
 
     def config_of(self, method: str) -> Any:
-        """The configuration of a method."""
+        """Return the configuration of a method."""
         method = OURS if method in ORACLES else method
         return dict(self.configs).get(method) or make_default_config(method)
 
@@ -54,18 +54,18 @@ TUNED_CHANGES: dict[str, ConfigChanges] = {
 
 
 def make_tuned_settings() -> MethodSettings:
-    """The settings that studies use."""
+    """Return the settings that studies use."""
     configs = {method: apply_changes(make_default_config(method), changes) for method, changes in TUNED_CHANGES.items()}
     return MethodSettings(tuple(sorted(configs.items())))
 
 
 def make_default_config(method: str) -> Any:
-    """A method's configuration as it comes."""
+    """Return a method's configuration as it comes."""
     return MAP_FUSION_METHODS.get(method).config_class()
 
 
 def apply_changes(config: Any, changes: ConfigChanges) -> Any:
-    """A configuration with fields replaced; a dotted name goes into the part of that name."""
+    """Return a configuration with fields replaced; a dotted name goes into the part of that name."""
     for name, value in changes:
         head, _, rest = name.partition(".")
         config = replace(config, **{head: apply_changes(getattr(config, head), ((rest, value),)) if rest else value})
@@ -81,14 +81,14 @@ def check_method(method: str) -> None:
 def fuse_observations(
     method: str, observations: Sequence[Observation], settings: MethodSettings, frame: MapFrame | None = None
 ) -> VectorMap:
-    """The map that a method makes of observations."""
+    """Return the map that a method makes of observations."""
     if method in ORACLES:
         raise ConfigError(f"{method!r} needs more than observations; known: {', '.join(list_map_fusions())}.")
     return MAP_FUSION_METHODS.get(method).fuse(observations, settings.config_of(method), frame)
 
 
 def fuse_experiment(method: str, experiment: FleetExperiment, settings: MethodSettings) -> MapElements:
-    """The published elements of a method's map of a scene."""
+    """Return the published elements of a method's map of a scene."""
     if method in ORACLES:
         return run_oracle(method, experiment, settings.config_of(method))
     return (

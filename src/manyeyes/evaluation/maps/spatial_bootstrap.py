@@ -45,7 +45,7 @@ def bootstrap_ap_interval(
     seed: int = 0,
     confidence_level: float = 0.95,
 ) -> Interval:
-    """The AP of one kind, mean over the thresholds, with its interval."""
+    """Return the AP of one kind, mean over the thresholds, with its interval."""
     pair = MapPair(predicted, truth, assign_to_squares("", BLOCK_SIZE_M))
     return bootstrap_pooled_ap(
         [pair], kind, protocol, thresholds, num_resamples=num_resamples, seed=seed, confidence_level=confidence_level
@@ -95,7 +95,7 @@ def bootstrap_f1_interval(
 
 
 def _assign_blocks(points: Floats) -> tuple[int, Ints]:
-    """How many squares hold any of the places (N, 2), and which of them each is in (N,)."""
+    """Return how many squares hold any of the places (N, 2), and which of them each is in (N,)."""
     cells = np.floor(points / BLOCK_SIZE_M).astype(np.int64)
     blocks, block = np.unique(cells, axis=0, return_inverse=True)
     return len(blocks), block.reshape(-1)

@@ -55,7 +55,7 @@ class TileTable:
         self._bootstraps: dict[tuple[str, str, str], BootstrapSamples] = {}
 
     def make_row(self, name: str) -> TileRow:
-        """All numbers of one row."""
+        """Return all numbers of one row."""
         predictions = [one for result in self.results for one in result.predictions if one.row_name == name]
         frame_bytes = [size for one in predictions for size in one.frame_bytes]
         return TileRow(
@@ -73,7 +73,7 @@ class TileTable:
         )
 
     def bootstrap_ap(self, name: str, kind: str, protocol: str) -> BootstrapSamples:
-        """AP of one kind of a row, over draws of scenarios."""
+        """Return the AP of one kind of a row, over draws of scenarios."""
         key = name, kind, protocol
         if key not in self._bootstraps:
             self._bootstraps[key] = bootstrap_pooled_ap(self._map_pairs(name), kind, protocol, all_blocks=self.blocks)

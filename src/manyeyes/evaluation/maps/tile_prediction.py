@@ -72,7 +72,7 @@ class LocalPredictor:
         return repr(self)
 
     def __call__(self, map_model: MapModel, source: TileSource, scenario: str, seed: int) -> Sequence[TilePrediction]:
-        """One drawing an agent."""
+        """Return one drawing an agent."""
         snapshot, out = sample_meeting(source, scenario, seed), []
         for row, frame in enumerate(snapshot.frames):
             tile, window = make_local_tile(source, snapshot, row)
@@ -100,7 +100,7 @@ class SemiGlobalPredictor:
         return repr(self)
 
     def __call__(self, map_model: MapModel, source: TileSource, scenario: str, seed: int) -> Sequence[TilePrediction]:
-        """One prediction for each number of frames; all share the frames of the tile."""
+        """Return one prediction for each number of frames; all share the frames of the tile."""
         config = map_model.config
         tile = sample_fleet_tile(source, scenario, seed, max(self.frame_counts), config.tile, config.bev.grid)
         received = [_ReceivedFeatures.of(map_model, frame) for frame in tile.frames]
@@ -112,7 +112,7 @@ class SemiGlobalPredictor:
 
 @dataclass(frozen=True)
 class PoseNoisePredictor:
-    """The tile about a scenario's first agent from all agents that meet there at one instant, others' claimed poses in error.
+    """The tile about a scenario's first agent from all agents that meet there at one instant, others' prior poses in error.
 
     sigma_m: of each axis; headings err by as many degrees times deg_per_m. The first agent knows its own pose, in whose frame the
     tile lies. pose_correction: corrects others' poses by objects that both detect; what it leaves out is not drawn from.
@@ -133,7 +133,7 @@ class PoseNoisePredictor:
         )
 
     def __call__(self, map_model: MapModel, source: TileSource, scenario: str, seed: int) -> Sequence[TilePrediction]:
-        """Rows: one vehicle; clean; noisy; noisy, corrected; clean, corrected."""
+        """Return rows: one vehicle; clean; noisy; noisy, corrected; clean, corrected."""
         snapshot = sample_meeting(source, scenario, seed)
         ego_frame = snapshot.frames[0]
         world_from_tile = make_world_from_tile(ego_frame)
@@ -183,7 +183,7 @@ def _predict(
 
 
 def _make_cache(detector: str, frame: AgentFrame, previous_frames: Sequence[AgentFrame]) -> PerceptionCache:
-    """A perception cache that has processed the agent's previous sweeps."""
+    """Return a perception cache that has processed the agent's previous sweeps."""
     cache = PerceptionCache(_load_detector(detector))
     for earlier in previous_frames:
         if earlier.agent_id == frame.agent_id:

@@ -38,7 +38,7 @@ class ObserverPose:
 
 
 def collect_observer_poses(recording: Recording) -> tuple[ObserverPose, ...]:
-    """Every agent of every scenario."""
+    """Return every agent of every scenario."""
     return tuple(
         ObserverPose(scenario, row, to_xy_yaw(frame.world_from_agent))
         for scenario in recording.scenarios
@@ -59,14 +59,14 @@ class TileSource:
         return crop_to_tile(self.maps[find_town(scenario, tuple(self.maps))], world_from_tile, tile)
 
     def sample_snapshot(self, scenario: str, rng: np.random.Generator) -> Snapshot:
-        """An evaluated snapshot of a scenario, each as likely as any."""
+        """Return an evaluated snapshot of a scenario, each as likely as any."""
         return self.recording.snapshot(scenario, int(rng.choice(self.recording.eval_indices(scenario))))
 
 
 def sample_fleet_tile(
     source: TileSource, scenario: str, seed: int, max_frames: int, tile: BevGrid, view_area: BevGrid
 ) -> Tile:
-    """The tile about a scenario's first agent at an index drawn from the seed, with at most max_frames frames.
+    """Return the tile about a scenario's first agent at an index drawn from the seed, with at most max_frames frames.
 
     view_area: the ground that a frame covers, in its agent's frame.
     """
@@ -94,7 +94,7 @@ def sample_fleet_tile(
 
 
 def sample_meeting(source: TileSource, scenario: str, seed: int) -> Snapshot:
-    """The instant of a seed at which the agents of one scenario meet."""
+    """Return the instant of a seed at which the agents of one scenario meet."""
     return source.sample_snapshot(scenario, keyed_generator("meeting", seed, scenario))
 
 
@@ -109,7 +109,7 @@ def make_local_tile(source: TileSource, snapshot: Snapshot, row: int) -> tuple[T
 
 
 def make_world_from_tile(frame: AgentFrame) -> Transform:
-    """The tile's frame about an agent: where it claims to be, on the ground, along its heading."""
+    """Return the tile's frame about an agent: at its prior pose, on the ground, along its heading."""
     x, y, yaw = to_xy_yaw(frame.world_from_agent)
     return Transform.from_xyz_yaw(x, y, 0.0, yaw)
 
@@ -117,7 +117,7 @@ def make_world_from_tile(frame: AgentFrame) -> Transform:
 def compute_coverage(
     poses: Sequence[tuple[float, float, float]], center_frame: AgentFrame, tile: BevGrid, view_area: BevGrid
 ) -> np.ndarray:
-    """(N, raster) bool: which places of the tile about an agent lie in the view from each pose."""
+    """Return (N, raster) bool: which places of the tile about an agent lie in the view from each pose."""
     axes = [
         np.arange(a + RASTER_SIZE_M / 2, b, RASTER_SIZE_M)
         for a, b in ((tile.x_min, tile.x_max), (tile.y_min, tile.y_max))
@@ -132,7 +132,7 @@ def compute_coverage(
 
 
 def select_by_coverage(coverage: np.ndarray, max_frames: int, rng: np.random.Generator) -> list[int]:
-    """Which others join the first row of views (1 + N, raster), in order: the more likely the more they newly cover.
+    """Return which others join the first row of views (1 + N, raster), in order: the more likely the more they newly cover.
 
     When nothing is left to cover, each is as likely as any. Those that cover less than LEAST_COVER never come.
     """

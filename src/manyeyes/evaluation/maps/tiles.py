@@ -47,7 +47,7 @@ class Tile:
 
 
 def find_town(scenario: str, towns: Sequence[str]) -> str:
-    """The town that a scenario is named after: ``town05_0066`` was driven in Town05."""
+    """Return the town that a scenario is named after: ``town05_0066`` was driven in Town05."""
     for town in sorted(towns, key=len, reverse=True):
         if scenario.lower().startswith(town.lower()):
             return town
@@ -82,7 +82,7 @@ def crop_to_tile(truth: MapElements, world_from_tile: Transform, tile: BevGrid) 
 
 
 def place_side_by_side(maps: Sequence[MapElements]) -> MapElements:
-    """Maps of many tiles in one frame, so far apart that none is near another: so one list is ranked over all of them."""
+    """Return maps of many tiles in one frame, so far apart that none is near another: so one list is ranked over all of them."""
     return MapElements.cat([elements.transform(MAP_SPACING_M * i, 0.0, 0.0) for i, elements in enumerate(maps)])
 
 

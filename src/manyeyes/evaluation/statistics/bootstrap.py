@@ -66,7 +66,7 @@ Statistic = Callable[[PooledMatches, np.ndarray], np.ndarray]
 
 
 def weighted_ap(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
-    """AP (R,) of each resample (R, S); NaN where it holds no truth. Weights of one give the plain AP."""
+    """Return AP (R,) of each resample (R, S); NaN where it holds no truth. Weights of one give the plain AP."""
     ap = np.full(len(weights), np.nan)
     n_gt = weights @ pool.n_gt
     step = max(1, _CHUNK_ROWS // max(1, len(pool.tp)))
@@ -85,7 +85,7 @@ def weighted_ap(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
 
 
 def weighted_recall(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
-    """Recall (R,) of each resample (R, S) at the protocol's score threshold."""
+    """Return recall (R,) of each resample (R, S) at the protocol's score threshold."""
     hits = np.bincount(pool.scenario_row, weights=pool.tp, minlength=len(pool.names))
     with np.errstate(invalid="ignore", divide="ignore"):
         return (weights @ hits) / (weights @ pool.n_gt)
@@ -103,7 +103,7 @@ class BootstrapSamples:
     same_truth: bool
 
     def interval(self) -> Interval:
-        """The value and its interval."""
+        """Return the value and its interval."""
         return make_interval(self.value, self.samples, self.confidence_level, len(self.names))
 
     def paired_difference(self, other: BootstrapSamples) -> Interval:
@@ -129,7 +129,7 @@ def bootstrap(
     protocol: DetectionProtocol = PROTOCOLS["global-sort"],
     statistic: Statistic = weighted_ap,
 ) -> BootstrapSamples:
-    """The AP (or another statistic) of matched frames on n resamples, made once for any number of differences."""
+    """Return the AP (or another statistic) of matched frames on n resamples, made once for any number of differences."""
     pool = _pool_matches(matches, protocol)
     value = float(statistic(pool, np.ones((1, len(pool.names)), dtype=np.int64))[0])
     samples = statistic(pool, draw_resamples(len(pool.names), num_resamples, seed))
@@ -139,7 +139,7 @@ def bootstrap(
 def mean_interval(
     values: Sequence[float], num_resamples: int = 1000, seed: int = 0, confidence_level: float = 0.95
 ) -> Interval:
-    """The mean of one number per scenario (bytes, milliseconds, a difference) and its interval; NaN values are refused."""
+    """Return the mean of one number per scenario (bytes, milliseconds, a difference) and its interval; NaN values are refused."""
     numbers = np.asarray(values, dtype=np.float64)
     if np.isnan(numbers).any():
         raise ConfigError(f"mean_interval needs a number per scenario; {int(np.isnan(numbers).sum())} are NaN.")
@@ -148,7 +148,7 @@ def mean_interval(
 
 
 def draw_resamples(num_scenarios: int, num_resamples: int, seed: int) -> np.ndarray:
-    """(n, scenarios) int64: how often each scenario is drawn in each resample; a function of its arguments alone."""
+    """Return (n, scenarios) int64: how often each scenario is drawn in each resample; a function of its arguments alone."""
     if num_scenarios == 0:
         return np.zeros((num_resamples, 0), dtype=np.int64)
     chosen = (keyed_uniform((num_resamples, num_scenarios), seed, "bootstrap").numpy() * num_scenarios).astype(np.int64)
@@ -175,12 +175,12 @@ def _pool_matches(matches: Sequence[FrameMatch], protocol: DetectionProtocol) ->
 
 
 def exact_interval(value: float) -> Interval:
-    """A number without an interval, as of a single scenario."""
+    """Return a number without an interval, as of a single scenario."""
     return Interval(value, value, value, 0.95, 1)
 
 
 def make_interval(value: float, samples: np.ndarray, confidence_level: float, num_scenarios: int) -> Interval:
-    """The percentile interval of samples (R,) about a value; NaN samples are left out, NaN bounds without any sample."""
+    """Return the percentile interval of samples (R,) about a value; NaN samples are left out, NaN bounds without any sample."""
     if not 0 < confidence_level < 1:
         raise ConfigError(f"The level of an interval lies between 0 and 1; got {confidence_level}.")
     samples = samples[~np.isnan(samples)]

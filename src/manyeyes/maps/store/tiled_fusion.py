@@ -174,7 +174,9 @@ def _run_steps(
     progress: StepProgress | None,
     used: set[str],
 ) -> list[StationTable]:
-    """Stations of all blocks: search, sweeps with a barrier after each, stations; ``used`` gets the names of all results."""
+    """Return stations of all blocks: search, sweeps with a barrier after each, stations; ``used`` gets the names of all
+    results.
+    """
 
     def run_all(steps: Sequence[_BlockStep], name: str, fn: Callable[[_BlockStep], None], kind: type[T]) -> list[T]:
         report = None if progress is None else partial(progress, name)
@@ -198,7 +200,7 @@ def _run_steps(
 
 
 def _select_block(state: PoseSolution, block: TileBlock) -> PoseSolution:
-    """The rows of a state that a block reads."""
+    """Return the rows of a state that a block reads."""
     return state.take(state.row_indices(block.observations.ids))
 
 

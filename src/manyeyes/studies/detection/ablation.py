@@ -64,7 +64,7 @@ class _AblationVariant:
         return OURS if self.budget_bytes is None else LEARNED_MASK
 
     def apply_to(self, base: BenchmarkConfig) -> BenchmarkConfig:
-        """The configuration of a benchmark of this branch."""
+        """Return the configuration of a benchmark of this branch."""
         config = replace(base, methods=(self.method,), weights=str(self.weights))
         return config if self.budget_bytes is None else with_replay(config, budget_bytes=self.budget_bytes)
 
@@ -102,7 +102,7 @@ def _condition_name(variant: str, perturbation: Perturbation) -> str:
 def make_rows(
     results: ResultGrid, variants: Sequence[_AblationVariant], cards: Sequence[dict[str, Any]]
 ) -> tuple[AblationRow, ...]:
-    """The table, in the order of the branches."""
+    """Return the table, in the order of the branches."""
     out, previous = [], []
     for variant, card in zip(variants, cards):
         keys = [(_condition_name(variant.name, perturbation), variant.method) for perturbation in PERTURBATIONS]
@@ -153,7 +153,7 @@ def _make_paper_table() -> StudyTable:
 
 
 def make_panels(result_rows: Sequence[AblationRow]) -> list[CurvePanel]:
-    """AP@0.5 and AP@0.7 of the branches, a line a disturbance."""
+    """Return AP@0.5 and AP@0.7 of the branches, a line per perturbation."""
     x, ticks = tuple(map(float, range(len(result_rows)))), tuple(row.variant for row in result_rows)
     return [
         CurvePanel(

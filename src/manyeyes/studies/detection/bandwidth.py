@@ -90,7 +90,7 @@ def run(options: BandwidthOptions, context: StudyContext) -> None:
 
 
 def _resolve_encodings(options: BandwidthOptions) -> tuple[str, ...]:
-    """Those asked for, or all that the weights can write: codes need a codebook."""
+    """Return those asked for, or all that the weights can write: codes need a codebook."""
     for name in options.token_encodings:
         if name not in TOKEN_ENCODINGS:
             raise ConfigError(f"Tokens are not written as {name!r}; known: {', '.join(TOKEN_ENCODINGS)}.")
@@ -181,7 +181,7 @@ def _make_results_table(title: str, result_rows: Sequence[BandwidthRow]) -> Stud
 
 
 def make_panels(result_rows: Sequence[BandwidthRow], reference_rows: Sequence[BandwidthRow]) -> list[CurvePanel]:
-    """AP@0.5 against the mean bytes of a message, one panel for each encoding."""
+    """Return AP@0.5 against the mean bytes of a message, one panel for each encoding."""
     out = []
     for encoding in dict.fromkeys(row.token_encoding for row in result_rows):
         curves = []

@@ -57,7 +57,7 @@ def run(options: EvaluationOptions, context: StudyContext) -> None:
 
 
 def make_rows(results: ResultGrid) -> tuple[NumAgentsRow, ...]:
-    """The table, by number of agents."""
+    """Return the table, by number of agents."""
     return tuple(_make_row(results, int(name), method) for name, method in results.results)
 
 
@@ -104,7 +104,7 @@ def _make_results_table(result_rows: Sequence[NumAgentsRow]) -> StudyTable:
 
 
 def make_panels(result_rows: Sequence[NumAgentsRow]) -> list[CurvePanel]:
-    """AP by number of agents on all scenarios that have them, and what that is over no fusion on the same scenarios."""
+    """Return AP by number of agents on all scenarios that have them, and what that is over no fusion on the same scenarios."""
     methods = [m for m in dict.fromkeys(row.method for row in result_rows) if m != NO_FUSION]
     ap_curves, gain_curves = [], []
     for method in methods:

@@ -124,12 +124,12 @@ def run(options: RobustnessOptions, context: StudyContext) -> None:
 
 
 def _result_key(perturbation: Perturbation, method: str, baselines: Sequence[str]) -> ResultKey:
-    """The result key of a method, or of a baseline's weights."""
+    """Return the result key of a method, or of a baseline's weights."""
     return (f"{method}: {perturbation.name}", OURS) if method in baselines else (perturbation.name, method)
 
 
 def make_rows(results: ResultGrid, baselines: Sequence[str] = ()) -> tuple[RobustnessRow, ...]:
-    """The table, a disturbance after the other."""
+    """Return the table, ordered by perturbation."""
     return tuple(
         _make_row(results, d, method, baselines)
         for d in ALL_PERTURBATIONS
@@ -209,7 +209,7 @@ def _make_results_table(title: str, result_rows: Sequence[RobustnessRow], group:
 
 
 def make_panels(result_rows: Sequence[RobustnessRow]) -> list[CurvePanel]:
-    """AP@0.5 against each disturbance by itself, and a panel of the joint ones."""
+    """Return AP@0.5 against each perturbation, and a panel of the combined ones."""
     ap_by_key = {(row.perturbation, row.method): row.ap[0] for row in result_rows}
     methods = list(dict.fromkeys(row.method for row in result_rows))
     out = []
@@ -230,7 +230,7 @@ def make_panels(result_rows: Sequence[RobustnessRow]) -> list[CurvePanel]:
 
 
 def _make_curve(method: str, y: Sequence[Interval | None], x: tuple[float, ...]) -> Curve | None:
-    """A line through the evaluated levels, a constant where there is one level: no fusion."""
+    """Return a line through the evaluated levels, a constant where there is one level: no fusion."""
     known = [(v, x_value) for v, x_value in zip(y, x) if v is not None]
     values = tuple(v for v, _ in known)
     if len(known) > 1:

@@ -53,7 +53,7 @@ def run(options: SharedBandwidthOptions, context: StudyContext) -> None:
 
 
 def make_rows(results: ResultGrid) -> tuple[SharedBandwidthRow, ...]:
-    """The table, by budget."""
+    """Return the table, by budget."""
     no_fusion_key = (NO_BUDGET, NO_FUSION)
     out = []
     for key, result in results.results.items():
@@ -95,7 +95,7 @@ def _make_results_table(result_rows: Sequence[SharedBandwidthRow]) -> StudyTable
 
 
 def make_panels(result_rows: Sequence[SharedBandwidthRow]) -> list[CurvePanel]:
-    """AP@0.5 of all egos against the mean bytes of an instant."""
+    """Return AP@0.5 of all egos against the mean bytes of an instant."""
     curves = []
     for method in dict.fromkeys(row.method for row in result_rows):
         method_rows = [row for row in result_rows if row.method == method]

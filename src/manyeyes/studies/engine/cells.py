@@ -2,7 +2,7 @@
 """Cells: results of a study, each stored in a file, so that a study that was stopped goes on where it was.
 
 A file's name holds a digest of all that the result depends on: its key, and the import closure of the code that computes it. A
-change of any of them computes the cell anew, and so does a damaged file.
+change of any of them computes the cell again, and so does a damaged file.
 """
 
 from __future__ import annotations

@@ -118,22 +118,22 @@ class ResultGrid:
     def bootstrap_ap(
         self, key: ResultKey, iou: int, speeds: SpeedRange | None = None, scenarios: Collection[str] | None = None
     ) -> Interval:
-        """AP of a cell with its interval, over some scenarios or one class of speeds alone."""
+        """Return the AP of a cell with its interval, over some scenarios or one class of speeds alone."""
         return self._bootstrap(key, iou, speeds, scenarios).interval()
 
     def ap_pair(self, key: ResultKey) -> tuple[Interval, Interval]:
-        """AP of a cell at both IoU thresholds."""
+        """Return the AP of a cell at both IoU thresholds."""
         return self.bootstrap_ap(key, 0), self.bootstrap_ap(key, 1)
 
     def paired_difference(
         self, key: ResultKey, other: ResultKey, iou: int, scenarios: Collection[str] | None = None
     ) -> Interval:
-        """AP of a cell minus that of another, paired over scenarios."""
+        """Return the AP of a cell minus that of another, paired over scenarios."""
         samples = self._bootstrap(key, iou, None, scenarios)
         return samples.paired_difference(self._bootstrap(other, iou, None, scenarios))
 
     def difference_pair(self, key: ResultKey, other: ResultKey) -> tuple[Interval, Interval] | None:
-        """AP of a cell minus that of another at both IoU thresholds; None where the other was not run."""
+        """Return the AP of a cell minus that of another at both IoU thresholds; None where the other was not run."""
         if other not in self.results:
             return None
         return self.paired_difference(key, other, 0), self.paired_difference(key, other, 1)
@@ -143,7 +143,7 @@ class ResultGrid:
         return Comparison(description, f"AP@{IOU_THRESHOLDS[iou]:g}", self.paired_difference(key, baseline, iou))
 
     def scenarios_of(self, key: ResultKey) -> frozenset[str]:
-        """Those that a cell was played on."""
+        """Return the scenarios of a cell."""
         return frozenset(match.scenario for match in self.results[key].matches[0])
 
     def _bootstrap(

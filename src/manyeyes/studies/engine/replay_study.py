@@ -84,14 +84,16 @@ def prepare_study(options: EvaluationOptions, context: StudyContext, all_egos: b
 
 
 def resolve_token_selection(names: Sequence[str]) -> tuple[str, ...]:
-    """The methods of token selection that are compared: those asked for, or those of TOKEN_SELECTION_METHODS that there are."""
+    """Return the methods of token selection that are compared: those asked for, or those of TOKEN_SELECTION_METHODS that there
+    are.
+    """
     for name in names:
         get_strategy(name)
     return tuple(names) or tuple(name for name in TOKEN_SELECTION_METHODS if name in list_strategies())
 
 
 def parse_checkpoints(words: Sequence[str], study: str, files: str = "weights.safetensors") -> dict[str, str]:
-    """Names and files of ``name=weights.safetensors``, or whatever files the study takes."""
+    """Return names and files of ``name=weights.safetensors``, or whatever files the study takes."""
     pairs = [word.partition("=") for word in words]
     invalid = [word for word, (name, _, path) in zip(words, pairs) if not name or not path]
     names = [name for name, _, _ in pairs]
@@ -103,5 +105,5 @@ def parse_checkpoints(words: Sequence[str], study: str, files: str = "weights.sa
 
 
 def with_replay(config: BenchmarkConfig, **changes: object) -> BenchmarkConfig:
-    """The configuration with some fields of its replay changed."""
+    """Return the configuration with some fields of its replay changed."""
     return replace(config, replay=replace(config.replay, **changes))  # pyright: ignore[reportArgumentType]

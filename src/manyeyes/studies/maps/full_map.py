@@ -82,7 +82,7 @@ class TownResults:
         return collect_blocks([self.map_pairs(key, in_own_view) for key in self.maps for in_own_view in (False, True)])
 
     def map_pairs(self, key: MapKey, in_own_view: bool = False) -> list[MapPair]:
-        """A row's maps against the truth, seed by seed."""
+        """Return a row's maps against the truth, seed by seed."""
         truths = self.maps[key] if in_own_view else self.maps[SEMI_GLOBAL, key[1]]
         assign_blocks = assign_to_squares(self.name, BLOCK_SIZE_M)
         return [MapPair(one.fused, other.truth, assign_blocks) for one, other in zip(self.maps[key], truths)]

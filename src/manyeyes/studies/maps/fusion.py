@@ -176,7 +176,7 @@ def find_best_baseline(
 def compute_paired_difference(
     results: Sequence[FleetResult], method: str, baseline: str, kind: str, protocol: str, thresholds: Thresholds
 ) -> Interval:
-    """AP of one method minus that of another, paired over the cells that both have."""
+    """Return the AP of one method minus that of another, paired over the cells that both have."""
 
     def ap_by_key(method: str) -> dict[tuple[object, ...], float]:
         return {
@@ -208,6 +208,6 @@ def _make_table(group: str, summaries: Sequence[MethodSummary]) -> StudyTable:
 
 
 def _mean(values: Sequence[float]) -> float:
-    """The mean of those that are numbers; NaN where none is."""
+    """Return the mean of those that are numbers; NaN where none is."""
     known = [v for v in values if not math.isnan(v)]
     return float(np.mean(known)) if known else math.nan

@@ -44,6 +44,6 @@ def run(options: MapModelOptions, context: StudyContext) -> None:
 
 
 def _keep_first(result: ScenarioPredictions, row_name: str) -> ScenarioPredictions | None:
-    """The cell with the first drawing of a row alone."""
+    """Return the cell with the first drawing of a row alone."""
     predictions = [one for one in result.predictions if one.row_name == row_name]
     return replace(result, predictions=(predictions[0],)) if predictions else None

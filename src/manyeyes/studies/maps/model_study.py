@@ -43,7 +43,7 @@ class OpenRecording:
     sensors: tuple[str, ...]
 
     def __call__(self) -> Recording:
-        """The recording."""
+        """Return the recording."""
         return open_sensor_recording(self.data, self.split, self.sensors)
 
 
@@ -95,7 +95,9 @@ def prepare_map_study(options: MapModelOptions, context: StudyContext) -> MapMod
 
 
 def resolve_models(options: MapModelOptions) -> tuple[StudyModel, ...]:
-    """The models that are judged: those given, or those that ship; refused where one was taught by a town that would judge it."""
+    """Return the models to evaluate: those given, or those that ship; rejected where one was trained on a town of the
+    evaluation.
+    """
     names = options.weights or _select_shipped(options)
     if not names:
         raise ConfigError(
@@ -116,7 +118,7 @@ def resolve_models(options: MapModelOptions) -> tuple[StudyModel, ...]:
 
 
 def _select_shipped(options: MapModelOptions) -> tuple[str, ...]:
-    """The shipped models whose sensors the recording has."""
+    """Return the shipped models whose sensors the recording has."""
     if not pretrained.list_map_models():
         return ()
     recording = open_recording(options.data, options.split)
@@ -129,7 +131,7 @@ def _select_shipped(options: MapModelOptions) -> tuple[str, ...]:
 
 
 def make_rows_table(title: str, rows: Mapping[str, Sequence[TileRow]]) -> StudyTable:
-    """A line for each row of each set of sensors; sets without weights read "not run"."""
+    """Return a line for each row of each set of sensors; sets without weights read "not run"."""
     lines: list[tuple[str, ...]] = []
     for sensors in SENSORS.values():
         lines += [(sensors, row.name, *_format_cells(row)) for row in rows.get(sensors, ())]
@@ -167,7 +169,7 @@ def select_for_figure(
 def make_tile_panels(
     result: ScenarioPredictions, rows: Mapping[str, str], area: tuple[float, float, float, float]
 ) -> list[MapPanel]:
-    """The truth of a cell's tile, and the drawings of some rows on it; rows: their titles by name."""
+    """Return the truth of a cell's tile, and the drawings of some rows on it; rows: their titles by name."""
     by_name = {one.row_name: one for one in result.predictions}
     truth = by_name[next(iter(rows))].truth
     confident = {name: by_name[name].predicted.take(by_name[name].predicted.score >= 0.3) for name in rows}

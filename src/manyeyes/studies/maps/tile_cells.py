@@ -39,7 +39,7 @@ class TilePredictor(Protocol):
         ...
 
     def __call__(self, map_model: MapModel, source: TileSource, scenario: str, seed: int) -> Sequence[TilePrediction]:
-        """The predictions, row by row."""
+        """Return the predictions, row by row."""
         ...
 
 

@@ -91,7 +91,7 @@ class SearchTrial:
 
 
 def sample_changes(method: str, config_index: int) -> tuple[tuple[str, Any], ...]:
-    """The fields of one configuration; number 0 is the defaults."""
+    """Return the fields of one configuration; number 0 is the defaults."""
     if config_index == 0:
         return ()
     applicable = [item for item in SEARCH_SPACE[method].items() if _has_field(make_default_config(method), item[0])]

@@ -62,7 +62,7 @@ def _parse_variant(name: str, files: str) -> FeakmVariant:
 
 
 def make_rows(study: ReplayStudy, variants: Sequence[tuple[FeakmVariant, str]]) -> list[FeakmVariantRow]:
-    """Rows of every variant and its minimum number of pairs, as it was written; stored ones are not computed again."""
+    """Return rows of every variant and its minimum number of pairs, as it was written; stored ones are not computed again."""
     recording, seed = study.base.filter_recording(study.opener()), study.context.seed
     protocol = resolve_protocol(study.base)
     data_key = hash_recording(recording), SIGMAS, seed, protocol
@@ -118,7 +118,7 @@ def _make_paper_table() -> StudyTable:
 
 
 def make_panels(result_rows: Sequence[FeakmVariantRow]) -> list[CurvePanel]:
-    """AP against sigma, a line for each variant."""
+    """Return AP against sigma, a line for each variant."""
     names = dict.fromkeys(row.variant for row in result_rows)
     return [
         CurvePanel(

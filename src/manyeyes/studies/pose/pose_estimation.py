@@ -59,7 +59,7 @@ def run(options: PoseEstimationOptions, context: StudyContext) -> None:
 
 
 def run_trials(study: ReplayStudy, trials: Sequence[CorrectorTrial]) -> list[AccuracyRow]:
-    """The rows of every trial; stored results are not computed again."""
+    """Return the rows of every trial; stored results are not computed again."""
     pairs_by_net: dict[str, list[LandmarkPair]] = {}
     stride, detector = study.base.frame_stride, load_detector(study.base.weights)
     recording = study.opener()

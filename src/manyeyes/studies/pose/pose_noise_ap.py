@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AP against errors of claimed poses, for each way to fuse and each corrector before it: FeaKM, Tables 1 and 2.
+"""AP against errors of prior poses, for each way to fuse and each corrector before it: FeaKM, Tables 1 and 2.
 
 --checkpoints name=weights.safetensors adds baseline fusions without pose correction: the paper's rows F-Cooper (preset
 ablation/se-dast, the maximum) and V2X-ViT (ablation/v2x-vit). Buckets are of evaluated frames, by the minimum number of objects
@@ -125,12 +125,12 @@ def apply_level(config: BenchmarkConfig, level: Perturbation, corrector: str) ->
 
 
 def condition_name(name: str, level: Perturbation) -> str:
-    """The name of a condition."""
+    """Return the name of a condition."""
     return f"{name}: {level.name}"
 
 
 def count_common_objects_by_frame(recording: Recording, max_range_m: float) -> CommonObjects:
-    """How many objects the ego has in common with others, by scenario and index."""
+    """Return how many objects the ego has in common with others, by scenario and index."""
     return {
         (scenario, index): count_common_objects(recording.snapshot(scenario, index), max_range_m)
         for scenario in recording.scenarios
@@ -144,7 +144,7 @@ def make_rows(
     common: CommonObjects,
     baselines: Sequence[str] = (),
 ) -> tuple[PoseNoiseRow, ...]:
-    """The table, corrector by corrector, method by method, level by level; then baseline fusions without correction."""
+    """Return the table, corrector by corrector, method by method, level by level; then baseline fusions without correction."""
     out = []
     for name in names:
         methods = [method for condition, method in results.results if condition == condition_name(name, CLEAN)]
@@ -186,7 +186,7 @@ def _make_row(
 
 
 def _bootstrap(results: ResultGrid, key: ResultKey, bucket: tuple[int, int], common: CommonObjects) -> BootstrapSamples:
-    """AP@0.5 of a cell over the frames with so many common objects."""
+    """Return AP@0.5 of a cell over the frames with so many common objects."""
     matches = results.results[key].matches[0]
     selected = [m for m in matches if bucket[0] <= common[m.scenario, m.index] <= bucket[1]]
     return bootstrap(selected, protocol=results.protocol)
@@ -266,7 +266,7 @@ def _make_paper_table(iou: int) -> StudyTable:
 
 
 def make_panels(result_rows: Sequence[PoseNoiseRow]) -> list[CurvePanel]:
-    """AP against sigma at both IoUs, a line for each corrector and fusion."""
+    """Return AP against sigma at both IoUs, a line for each corrector and fusion."""
     row_by_key = {(row.corrector, row.method, row.level): row for row in result_rows}
     evaluated = {row.level for row in result_rows}
     levels = [level for level in LEVELS if level.position_sigma_m == level.heading_sigma_deg and level in evaluated]
