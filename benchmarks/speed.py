@@ -280,7 +280,7 @@ def staged(model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -
     messages_received = inbox.messages()
     stopwatch.lap("from bytes")
     together, _ = gather_ego_tokens(frames[0], own, (), messages_received)
-    fused = model.fuse_tokens(together)
+    fused = model.fusion(together)
     stopwatch.lap("gather, FAST")
     raw = model.refine(fused.bev, fused.merged_proposals)
     stopwatch.lap("refine")

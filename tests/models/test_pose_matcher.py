@@ -168,7 +168,7 @@ def test_weights_are_saved_with_their_settings_and_loaded_strictly(tmp_path):
 
 def test_the_shipped_net_has_a_name_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setattr(pretrained, "files", lambda package: tmp_path)
-    with pytest.raises(checkpoint.CheckpointError, match="No weights of FeaKM are shipped; train them"):
+    with pytest.raises(checkpoint.CheckpointError, match="No weights are named 'feakm-small'; known are none"):
         pretrained.load_feakm()
     checkpoint.save(
         FeakmNet(FeakmConfig(BoxKeypointConfig(8, 8, 16), SMALL)),

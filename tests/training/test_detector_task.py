@@ -106,8 +106,7 @@ def test_added_modules_start_without_effect(toy, tmp_path):
             [AgentTokens(0, new.make_tokens(past, new.predict(past)).features, past.sites.xy)], old.token_grid, 1
         )
         tokens = to_ego_frame([AgentTokens(0, mine.features, mine.sites.xy)], old.token_grid, 1)
-        fused = old.fuse_tokens(tokens), new.fuse_tokens(tokens, ego_past)
-        boxes = old.fuse(tokens), new.fuse(tokens, ego_past)
+        fused, boxes = zip(old.fuse(tokens), new.fuse(tokens, ego_past))
     assert torch.equal(mine.sites.key, theirs.sites.key)
     assert torch.allclose(mine.features, theirs.features, atol=1e-5)
     assert len(ego_past.features) > 20 and torch.equal(boxes[0].sites.key, boxes[1].sites.key)

@@ -208,8 +208,7 @@ class PerceptionCache:
     def fuse(self, tokens: Tokens, past: Tokens | None = None) -> tuple[FusedBev, RawBoxes]:
         """Fused tokens around one ego, and raw boxes from them."""
         with torch.inference_mode():
-            fused = self.token_detector.fuse_tokens(tokens, past)
-            return fused, self.token_detector.refine(fused.bev, fused.merged_proposals)
+            return self.token_detector.fuse(tokens, past)
 
     def decode(self, raw: RawBoxes) -> Boxes:
         """Decoded boxes around one ego, in its frame, by falling score."""

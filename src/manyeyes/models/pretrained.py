@@ -63,30 +63,18 @@ def load(name_or_path: str | Path = DEFAULT_DETECTOR) -> BoxDetector:
     Raises:
         CheckpointError: there are no such weights. ConfigError: a registered detector lacks something.
     """
-    name = str(name_or_path)
-    if name in _shipped_detectors():
-        with as_file(files("manyeyes.models") / "weights" / f"{name}.safetensors") as path:
-            return fold_norms(checkpoint.load(path))
-    if name.endswith(".safetensors"):
-        return fold_norms(checkpoint.load(Path(name)))
-    if name not in _DETECTORS:
-        known = ", ".join(list_detectors()) or "none"
-        raise CheckpointError(f"No weights are named {name!r}; known are {known}, or give a .safetensors file.")
-    detector = _DETECTORS.get(name)()
-    check_detector(detector)
-    return detector
+    name, shipped = str(name_or_path), _shipped_detectors()
+    if name in _DETECTORS and name not in shipped:
+        detector = _DETECTORS.get(name)()
+        check_detector(detector)
+        return detector
+    with _weights_file(name, list_detectors()) as path:
+        return fold_norms(checkpoint.load(path))
 
 
 def load_feakm(name_or_path: str | Path = DEFAULT_FEAKM) -> feakm.FeakmNet:
     """Load FeaKM's network: the shipped one by name, or a .safetensors file of 'manyeyes train --preset feakm-small'."""
-    if str(name_or_path) != DEFAULT_FEAKM:
-        return feakm.load(Path(name_or_path))
-    shipped = files("manyeyes.models") / "weights" / f"{DEFAULT_FEAKM}.safetensors"
-    if not shipped.is_file():
-        raise CheckpointError(
-            "No weights of FeaKM are shipped; train them (manyeyes train --preset feakm-small) and give the .safetensors file."
-        )
-    with as_file(shipped) as path:
+    with _weights_file(name_or_path, tuple(name for name in _shipped() if name == DEFAULT_FEAKM)) as path:
         return feakm.load(path)
 
 
@@ -94,7 +82,7 @@ def load_map_model(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> MapModel:
     """Load a map model for inference: a shipped name, or a .safetensors file of 'manyeyes train --preset
     map-small-lidar'.
     """
-    with _map_model_file(name_or_path) as path:
+    with _weights_file(name_or_path, list_map_models()) as path:
         model = checkpoint.load_as(path, FORMAT, MapModelConfig, MapModel)
     model.fingerprint = checkpoint.fingerprint(model)
     return model
@@ -102,26 +90,27 @@ def load_map_model(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> MapModel:
 
 def read_training_towns(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> tuple[str, ...]:
     """Read the names of the training towns of a map model from its card."""
-    with _map_model_file(name_or_path) as path:
+    with _weights_file(name_or_path, list_map_models()) as path:
         return tuple(checkpoint.read_card(path, FORMAT)["towns"])
 
 
 def load_map_model_state(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> dict[str, Tensor]:
     """Read the tensors of a map model by name, to initialise training."""
-    with _map_model_file(name_or_path) as path:
+    with _weights_file(name_or_path, list_map_models()) as path:
         return checkpoint.read_state(path, FORMAT)
 
 
 @contextmanager
-def _map_model_file(name_or_path: str | Path) -> Iterator[Path]:
-    if str(name_or_path) in list_map_models():
-        with as_file(files("manyeyes.models") / "weights" / f"{name_or_path}.safetensors") as path:
+def _weights_file(name_or_path: str | Path, names: tuple[str, ...]) -> Iterator[Path]:
+    """Open the file of shipped weights of one of these names, or of a path."""
+    name = str(name_or_path)
+    if name in names:
+        with as_file(files("manyeyes.models") / "weights" / f"{name}.safetensors") as path:
             yield path
-        return
-    path = Path(name_or_path)
-    if path.suffix != ".safetensors":
+    elif name.endswith(".safetensors"):
+        yield Path(name)
+    else:
         raise CheckpointError(
-            f"No map weights are named {name_or_path!r}; shipped are {', '.join(list_map_models()) or 'none'}: train some "
-            "(manyeyes train --preset map-small-lidar) and give the .safetensors file."
+            f"No weights are named {name!r}; known are {', '.join(names) or 'none'}, or give a .safetensors file of "
+            "'manyeyes train'."
         )
-    yield path

@@ -25,9 +25,9 @@ class ReplayOptions:
     """How agents collaborate while a recording is played."""
 
     weights: str = "costr-small"
-    """Shipped weights by name, or a .safetensors file of 'manyeyes train'."""
+    """Shipped weights or a registered detector by name, or a .safetensors file of 'manyeyes train'."""
     methods: tuple[str, ...] = ALL_METHODS
-    """What is compared: any of none, late, intermediate, early."""
+    """What is compared: strategies by name, those of your own too; an unknown name lists the known ones."""
     channel: str = "ideal"
     """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
     latency_budget_ms: NonNegativeFloat | None = None

@@ -137,14 +137,10 @@ class Detector(nn.Module):
         """Return importance logits (N,) of the tokens; under a budget the highest are sent."""
         return self.selector(tokens)
 
-    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> RawBoxes:
-        """Fuse the tokens of all agents around each ego, its own included, to raw boxes in the ego's frame.
+    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> tuple[FusedBev, RawBoxes]:
+        """Fuse the tokens of all agents around each ego, its own included; and raw boxes in the ego's frame.
 
         past: the ego's tokens of earlier instants, transformed to its current frame.
         """
-        fused = self.fuse_tokens(tokens, past)
-        return self.refine(fused.bev, fused.merged_proposals)
-
-    def fuse_tokens(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
-        """First half of fuse: one feature and one merged proposal per cell."""
-        return self.fusion(tokens, past)
+        fused = self.fusion(tokens, past)
+        return fused, self.refine(fused.bev, fused.merged_proposals)

@@ -86,12 +86,8 @@ class TokenDetector(BoxDetector, Protocol):
         """Importance logits (N,) of tokens; under a budget the highest are sent."""
         ...
 
-    def fuse_tokens(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
-        """Fuse the tokens of all agents around each ego; past: the ego's own tokens of earlier instants."""
-        ...
-
-    def refine(self, features: SparseBev, proposals: Tensor) -> RawBoxes:
-        """Raw boxes from fused features and their merged proposals."""
+    def fuse(self, tokens: Tokens, past: Tokens | None = None) -> tuple[FusedBev, RawBoxes]:
+        """Fuse the tokens of all agents around each ego, to raw boxes too; past: the ego's tokens of earlier frames."""
         ...
 
 

@@ -78,7 +78,7 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
     )
     tokens = to_ego_frame([*parts, *ego_history, *sender_history], shared.grid, len(samples))
     ego_past = to_ego_frame(ego_history, shared.grid, len(samples)) if ego_history else None
-    return ForwardOutput(seen, alone, model.fuse(tokens, ego_past), shared, mask)
+    return ForwardOutput(seen, alone, model.fuse(tokens, ego_past)[1], shared, mask)
 
 
 def _agent_tokens(ego: int, view: AgentView, features: Tensor, xy: Tensor) -> AgentTokens:
