@@ -30,7 +30,7 @@ def save_record(path: Path, value: object) -> None:
     """
     arrays: list[np.ndarray] = []
     header = json.dumps(_pack(value, arrays)).encode()
-    chunks = (memoryview(_bytes_of(array)) for array in arrays if array.size)
+    chunks = (_bytes_of(array) for array in arrays if array.size)
     atomic_write(path, b"%08x" % zlib.crc32(header), header, b"\n", *chunks, durable=False)
 
 
@@ -63,9 +63,9 @@ def _pack(value: Any, arrays: list[np.ndarray]) -> Any:
     return [array.dtype.str, shape, is_transposed, array.flags.writeable, zlib.crc32(_bytes_of(array))]
 
 
-def _bytes_of(array: np.ndarray) -> np.ndarray:
+def _bytes_of(array: np.ndarray) -> memoryview:
     """The bytes (N,) of an array as it lies in memory."""
-    return np.ascontiguousarray(array.T if array.flags.fnc else array).reshape(-1).view(np.uint8)
+    return np.ascontiguousarray(array.T if array.flags.fnc else array).reshape(-1).view(np.uint8).data
 
 
 def _unpack(hint: Any, packed: Any, file: io.BufferedIOBase) -> Any:
@@ -92,8 +92,8 @@ def _unpack(hint: Any, packed: Any, file: io.BufferedIOBase) -> Any:
 def _read_array(packed: Any, file: io.BufferedIOBase) -> np.ndarray:
     dtype, shape, is_transposed, writeable, checksum = packed
     array = np.empty(shape, np.dtype(dtype))
-    stored = array.reshape(-1).view(np.uint8)
-    if file.readinto(memoryview(stored)) != array.nbytes or zlib.crc32(stored) != checksum:
+    stored = array.reshape(-1).view(np.uint8).data
+    if file.readinto(stored) != array.nbytes or zlib.crc32(stored) != checksum:
         raise ValueError("damaged")
     array = array.T if is_transposed else array
     array.flags.writeable = writeable
