@@ -68,7 +68,7 @@ def main(options: Options) -> None:
     first = drive.eval_indices(drive.scenario).start if options.frame is None else options.frame
     last = min(drive.length(drive.scenario), first + (1 if single else options.frames))
     console = Console()
-    print_notes(recording, console)
+    print_notes(recording, console, {drive.scenario})
     config: ReplayConfig | None = None
     if options.detect is not None:
         replay_options = replace(options.replay_options, methods=(options.detect,))

@@ -48,16 +48,17 @@ def check_files(
             "go on and have them counted."
         )
     mismatched = [str(problem) for problem in missing.files if problem.kind == "mismatched"]
-    print_notes(recording, console)
+    print_notes(recording, console, scenarios)
     for line in mismatched[:_MAX_NOTES]:
         console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
     return missing
 
 
-def print_notes(recording: RecordingReader, console: Console) -> None:
-    """Print what a user should know of a recording: what it lacks."""
+def print_notes(recording: RecordingReader, console: Console, scenarios: Collection[str] | None = None) -> None:
+    """Print what a user should know of the played scenarios of a recording, all for None: what it lacks."""
     lines = list(recording.missing_summary)
-    if all(len(recording.agents(name)) < 2 for name in recording.scenarios):
+    played = [name for name in recording.scenarios if scenarios is None or name in scenarios]
+    if all(len(recording.agents(name)) < 2 for name in played):
         lines.append("no scenario has a second agent: nothing is shared, and all methods find what 'none' finds")
     for line in lines:
         console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
