@@ -70,12 +70,6 @@ def test_several_thresholds_at_once():
     assert together[0].ap_global > together[2].ap_global
 
 
-def test_frames_may_come_in_any_order():
-    frames = three_frames()
-    forward, back = average_precision(frames, 0.5, GLOBAL_SORT), average_precision(frames[::-1], 0.5, GLOBAL_SORT)
-    assert (forward.ap_global, forward.ap_legacy) == (back.ap_global, back.ap_legacy)
-
-
 def slow_ap(frames, thr, global_sort):
     """The slow twin, in plain loops, with the padded VOC area."""
     rows, n_gt = [], 0

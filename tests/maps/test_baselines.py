@@ -58,20 +58,6 @@ BASELINES = [
 
 
 @pytest.mark.parametrize("baseline", BASELINES, ids=lambda r: r.__name__.split(".")[-1])
-def test_neither_order_nor_repetition_of_observations_changes_a_map(baseline) -> None:
-    many = [
-        make_observation(
-            k, [line(0.1 * k), line(3.5 - 0.05 * k), SQUARE], [DIVIDER, BOUNDARY, CROSSING], 0.5 + 0.05 * k
-        )
-        for k in range(5)
-    ]
-    first = baseline.fuse(many)
-    again = baseline.fuse([*many[::-1], many[2]])
-    assert first.quantised_hash() == again.quantised_hash() and len(first)
-    assert np.array_equal(first.elements.score, again.elements.score)
-
-
-@pytest.mark.parametrize("baseline", BASELINES, ids=lambda r: r.__name__.split(".")[-1])
 def test_no_observation_gives_an_empty_map(baseline) -> None:
     assert (
         len(baseline.fuse([], frame=MapFrame(49.0, 8.0))) == 0

@@ -52,10 +52,8 @@ def test_the_number_of_weights_is_that_of_the_published_matcher():
     assert sum(p.numel() for p in Matcher(MatcherConfig()).parameters()) == 11_851_601 - 8 * 257
 
 
-def test_the_shipped_net_is_small_and_both_presets_survive_json():
+def test_the_shipped_net_is_small():
     assert sum(p.numel() for p in FeakmNet(FEAKM["feakm-small"]).parameters()) <= 2_000_000
-    for config in FEAKM.values():
-        assert checkpoint.config_from_json(FeakmConfig, checkpoint.config_to_json(config)) == config
 
 
 def test_eq_4_and_5_in_a_plain_loop():
