@@ -146,6 +146,7 @@ STUDIES: dict[str, tuple[str, ...]] = {
     "pose": ("study", "pose-noise-ap", "--correctors", "voting", "--perturbations", "0.8 m"),
 }
 UNTIMED = ("evaluate",)
+LEFT_OUT = ("_ms", "_s", "seconds", "iou", "bar")
 
 
 def studies(data: Path) -> Arrays:
@@ -160,9 +161,9 @@ def studies(data: Path) -> Arrays:
 
 
 def without_times(value: Any) -> Any:
-    """The same without fields of measured time, whose names end in a unit of time."""
+    """The same without fields of measured time, whose names end in a unit of time, and without thresholds and targets."""
     if isinstance(value, dict):
-        return {k: without_times(v) for k, v in value.items() if not k.endswith(("_ms", "_s", "seconds"))}
+        return {k: without_times(v) for k, v in value.items() if not k.endswith(LEFT_OUT)}
     return [without_times(item) for item in value] if isinstance(value, list) else value
 
 
