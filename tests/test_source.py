@@ -23,6 +23,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return to
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roots", ROOTS.values(), ids=ROOTS)
 def test_a_statement_in_any_file_of_the_closure_changes_the_key_and_a_docstring_does_not(copy: Path, roots) -> None:
     before, closure = source_digest(*roots, package=copy), import_closure(*roots, package=copy)

@@ -102,6 +102,7 @@ ROADS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROADS)
 def test_training_forward_equals_share_bytes_perceive(drive, detector: Detector, name: str) -> None:
     """With float32 features, what training computes and what the bytes give agree within 1e-5, site by site.

@@ -99,6 +99,7 @@ def drive_through(
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own_inbox", [False, True], ids=["packets", "an inbox of the caller"])
 @pytest.mark.parametrize("what", WRONG)
 def test_one_whole_packet_of_wrong_tokens_changes_nothing(drive, detector, what: str, own_inbox: bool) -> None:

@@ -121,6 +121,7 @@ def predict_one_line(own: AgentFrame, received=()) -> LocalMap:
     return LocalMap(MapElements.of([[[0.0, 1.0], [30.0, 1.0]]], DIVIDER), rectangle((0.0, -15.0, 30.0, 15.0)))
 
 
+@pytest.mark.slow
 def test_a_map_replay_counts_sent_bytes_and_the_server_ingests_them():
     service = MapServer(origin_xy=(1000.0, -200.0))
     team = MapReplay(predict_one_line, service, "drive")
@@ -133,6 +134,7 @@ def test_a_map_replay_counts_sent_bytes_and_the_server_ingests_them():
     assert {o.agent for o in service.observations} == {"drive/1", "drive/2"}
 
 
+@pytest.mark.slow
 def test_agents_predict_jointly_from_sent_tokens(mapper):
     senders_of = {}
 

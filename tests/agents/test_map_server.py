@@ -74,6 +74,7 @@ def test_poses_without_covariance_get_the_minimum_covariance():
     assert made.observations[0].covariance[0, 0] == pytest.approx(MIN_SIGMA_M**2)
 
 
+@pytest.mark.slow
 def test_a_street_from_several_agents_is_one_street_and_the_stream_is_near_the_fold():
     made, rng = service(), np.random.default_rng(4)
     for k in range(12):

@@ -87,6 +87,7 @@ def pose_error(message: Message, pose: Transform) -> tuple[float, float]:
     return float((message.world_from_agent.translation - pose.translation).norm()), math.degrees(abs(turn))
 
 
+@pytest.mark.slow
 def test_a_wrong_prior_pose_is_corrected_and_its_covariance_updated() -> None:
     world = cars(12, 0)
     message = message_of(world, OTHERS[0], off=(1.2, -0.8, 0.02))

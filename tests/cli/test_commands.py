@@ -62,6 +62,7 @@ def run(*words: object) -> int:
     return cli.main([str(word) for word in words])
 
 
+@pytest.mark.slow
 def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_path, capsys) -> None:
     assert run("replay", data, "--split", "test", "--weights", weights, "--out", tmp_path, "--min-score", 0.9) == 0
     output = capsys.readouterr()

@@ -28,6 +28,7 @@ def folder(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_simulate_and_fuse_leave_observations_truth_and_a_map(folder) -> None:
     assert {p.name for p in folder.iterdir()} == {"observations", "truth", "cut.json", "simulate.json", "map"}
     made, truth = read_vector_map(folder / "map"), read_vector_map(folder / "truth")
@@ -43,6 +44,7 @@ def test_the_same_seed_is_the_same_map(folder, tmp_path) -> None:
     assert read_vector_map(tmp_path / "again").quantised_hash() == read_vector_map(folder / "map").quantised_hash()
 
 
+@pytest.mark.slow
 def test_evaluate_prints_and_writes_the_metrics(folder, capsys) -> None:
     assert run("map", "evaluate", folder / "map") == 0
     output = capsys.readouterr().out
@@ -55,6 +57,7 @@ def test_evaluate_prints_and_writes_the_metrics(folder, capsys) -> None:
     assert {score["ap"] for kind in perfect["kinds"] if kind["n_truth"] for score in kind["ap_scores"]} == {1.0}
 
 
+@pytest.mark.slow
 def test_a_baseline_map_is_written_and_diff_lists_the_differences(folder, capsys) -> None:
     assert run("map", "fuse", folder, "--method", "union") == 0
     page, numbers = folder / "change.html", folder / "change.json"
@@ -93,6 +96,7 @@ def test_export_writes_a_file_that_others_read(folder, tmp_path) -> None:
     assert len(json.loads((tmp_path / "all.geojson").read_text())["features"]) >= len(held["features"])
 
 
+@pytest.mark.slow
 def test_a_store_takes_observations_and_other_commands_read_its_last_release(folder, tmp_path, capsys) -> None:
     store = tmp_path / "city"
     assert run("map", "fuse", folder, "--store", store, "--executor", "inline") == 0

@@ -336,6 +336,7 @@ def map_without(honest: Path, folder: Path, left_out: set[str]) -> str:
     return content(folder / "map")
 
 
+@pytest.mark.slow
 def test_a_retracted_observation_is_not_in_the_next_release_and_stays_out(store, honest, tmp_path, capsys) -> None:
     name = read_observations(honest / "observations").observations[3].id
     want = map_without(honest, tmp_path / "rest", {name})

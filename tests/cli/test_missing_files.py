@@ -279,6 +279,7 @@ def missing_in_card(out: Path) -> dict:
     return checkpoint.read_card(out / "coded.safetensors")["codebook"]["missing"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "held"),
     [

@@ -71,6 +71,7 @@ def refused(root: Path, capsys: pytest.CaptureFixture[str], *words: object, pres
     return line
 
 
+@pytest.mark.slow
 def test_the_same_settings_keep_a_finished_folder(folder: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file() and p.name != "simulate.json"}
     assert simulate(folder) == 0
@@ -137,6 +138,7 @@ def test_a_manifest_of_another_tool_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert hashes(tmp_path).keys() == {"manifest.json"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finished", [0, 1])
 def test_an_interrupted_run_continues_and_is_known_by_its_seed(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], finished: int
@@ -179,6 +181,7 @@ def change_a_byte(path: Path) -> None:
     path.write_bytes(bytes(content))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [Path.unlink, change_a_byte])
 @pytest.mark.parametrize("older", [False, True])
 def test_a_damaged_file_of_a_finished_scenario_is_named_and_made_again(
@@ -219,6 +222,7 @@ def test_other_files_in_the_folder_change_nothing(folder: Path) -> None:
     assert simulate(folder) == 0
 
 
+@pytest.mark.slow
 def test_roads_that_are_found_later_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

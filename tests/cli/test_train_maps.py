@@ -17,6 +17,8 @@ from manyeyes.studies.map_recordings import load_true_maps
 from manyeyes.studies.maps import model_study
 from manyeyes.studies.options import MapModelOptions
 
+pytestmark = pytest.mark.training
+
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):

@@ -15,6 +15,8 @@ from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.models.pose import feakm
 
+pytestmark = pytest.mark.training
+
 
 def snapshot(index: int) -> Snapshot:
     """Two agents 10 m apart among 100 points each."""

@@ -72,7 +72,9 @@ def main() -> int:
         subprocess.run(["git", "worktree", "add", "--detach", str(place / "code"), commit], check=True, cwd=REPOSITORY)
         probe = place / "code" / PROBE
         # Targets left the package, and with them the thresholds beside them.
-        probe.write_text(probe.read_text().replace('("_ms", "_s", "seconds")', '("_ms", "_s", "seconds", "iou", "bar")'))
+        probe.write_text(
+            probe.read_text().replace('("_ms", "_s", "seconds")', '("_ms", "_s", "seconds", "iou", "bar")')
+        )
         try:
             old = rename_keys(run(place / "code", place, "old", probes))
             new = run(REPOSITORY, place, "new", probes)

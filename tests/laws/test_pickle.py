@@ -41,6 +41,7 @@ def test_data_types(assert_same, kind, data) -> None:
     assert_same(pickle.loads(pickle.dumps(item)), item)
 
 
+@pytest.mark.slow
 def test_configurations(assert_same) -> None:
     instances = find_default_instances()
     assert len(instances) > 50

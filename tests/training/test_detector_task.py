@@ -21,6 +21,8 @@ from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig, _grow, prune_threshold
 from manyeyes.training.trainer import Trainer
 
+pytestmark = pytest.mark.training
+
 TINY = DetectorTrainConfig(
     COSTR_TINY, steps=6, batch=2, warmup_steps=2, save_every=2, augment=AugmentConfig(max_agents=2)
 )

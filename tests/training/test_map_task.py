@@ -36,6 +36,8 @@ from manyeyes.training.maps.step import extract_features, loss_terms, subsample_
 from manyeyes.training.maps.task import MapTask, MapTrainConfig
 from manyeyes.training.trainer import Trainer
 
+pytestmark = pytest.mark.training
+
 TINY = MapModelConfig(
     BevConfig(
         BevGrid(-12.0, -12.0, -2.0, 12.0, 12.0, 4.0, pillar=0.5), channels=24, raster_channels=12, raster_blocks=(1, 1)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """H7: the smallest preset learns one frame of two agents by heart."""
 
+import pytest
 import torch
 
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameResult, average_precision
@@ -10,6 +11,8 @@ from manyeyes.training.detector.samples import AugmentConfig
 from manyeyes.training.detector.step import forward
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
 from manyeyes.training.trainer import Trainer
+
+pytestmark = pytest.mark.training
 
 
 def test_one_frame_can_be_overfitted(toy, tmp_path):

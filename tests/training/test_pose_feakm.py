@@ -40,6 +40,8 @@ from manyeyes.training.pose.feakm_cache import (
 )
 from manyeyes.training.trainer import Trainer
 
+pytestmark = pytest.mark.training
+
 CHANNELS = 8
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=4)
 TINY = FeakmTrainConfig(

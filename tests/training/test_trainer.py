@@ -16,6 +16,8 @@ from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.training.presets import TRAINING_PRESETS
 from manyeyes.training.trainer import Task, TrainConfig, Trainer, parameter_groups, warmup_cosine
 
+pytestmark = pytest.mark.training
+
 CONFIG = TrainConfig(steps=6, batch=4, learning_rate=0.1, warmup_steps=2, save_every=2)
 
 
