@@ -259,3 +259,16 @@ def test_drawing_without_pillow_names_the_extra(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'manyeyes\[view\]'"):
         import_pillow()
+
+
+def test_a_wide_table_folds_headings_and_never_numbers() -> None:
+    from rich.console import Console
+
+    from manyeyes.viz.table import make_table
+
+    headings = ("method", "AP crossing", "AP divider", "fragmentation", "endpoint error [m]", *["duplication"] * 5)
+    lines = [("global-map-builder", *(f"0.{n}23" for n in range(1, 10)))]
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
+    console.print(make_table("", headings, lines))
+    text = console.export_text()
+    assert "…" not in text and " ".join(lines[0]) in text

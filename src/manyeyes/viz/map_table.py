@@ -12,37 +12,37 @@ from manyeyes.evaluation.maps.change_summary import KindChange
 from manyeyes.evaluation.maps.metrics import MapMetrics
 from manyeyes.viz.table import make_table
 
-PROTOCOLS = ("exact", "maptr", "streammapnet")
+PROTOCOLS = {"exact": "Chamfer-exact", "maptr": "MapTR", "streammapnet": "StreamMapNet"}
 
 
 def make_kinds_table(metrics: MapMetrics, title: str) -> Table:
-    """Tabulate one map: a row for each kind that is predicted or true."""
-    headings = (
-        "kind", "AP exact", "AP MapTR", "AP StreamMapNet", "F1@0.3 m", "F1@0.5 m", "F1@1 m", "duplication", "fragmentation",
-        "lateral error [m]", "predicted/true",
-    )  # fmt: skip
-    table = make_table(title, headings, wraps=True)
-    for k in metrics.kinds:
-        if k.n_predicted or k.n_truth:
-            table.add_row(
-                k.kind,
-                *(_format_number(metrics.get_ap(k.kind, protocol)) for protocol in PROTOCOLS),
-                *(_format_number(score.f1) for score in k.length_scores),
-                *(_format_number(value, 2) for value in (k.duplication, k.fragmentation, k.lateral_median_m)),
-                f"{k.n_predicted}/{k.n_truth}",
-            )
-    table.add_row("mAP", *(_format_number(metrics.mean_ap(protocol)) for protocol in PROTOCOLS), *[""] * 7)
-    return table
+    """Tabulate one map: a column for each kind that is predicted or true, and one for the mean over kinds."""
+    kinds = [k for k in metrics.kinds if k.n_predicted or k.n_truth]
+    lines = [
+        (f"AP {name}", *(_format_number(metrics.get_ap(k.kind, protocol)) for k in kinds), _format_number(mean))
+        for protocol, name in PROTOCOLS.items()
+        for mean in (metrics.mean_ap(protocol),)
+    ]
+    for heading, values in (
+        *((f"F1@{limit} m", [k.length_scores[n].f1 for k in kinds]) for n, limit in enumerate(("0.3", "0.5", "1"))),
+        ("duplication", [k.duplication for k in kinds]),
+        ("fragmentation", [k.fragmentation for k in kinds]),
+        ("lateral error [m]", [k.lateral_median_m for k in kinds]),
+    ):
+        lines.append((heading, *(_format_number(value, 3 if heading.startswith("F1") else 2) for value in values), ""))
+    lines.append(("predicted/true elements", *(f"{k.n_predicted}/{k.n_truth}" for k in kinds), ""))
+    return make_table(title, ("metric", *(k.kind for k in kinds), "mean"), lines)
 
 
 def make_change_table(changes: Sequence[KindChange], title: str) -> Table:
     """Tabulate changes: a row for each kind that has elements."""
-    table = make_table(title, ("kind", "kept", "changed", "added", "removed", "added [m]", "removed [m]"), wraps=True)
-    for c in changes:
-        counts = (c.num_unchanged, c.num_changed, c.num_added, c.num_removed)
-        if any(counts):
-            table.add_row(c.kind, *map(str, counts), f"{c.added_length_m:.0f}", f"{c.removed_length_m:.0f}")
-    return table
+    lines = [
+        (c.kind, *map(str, counts), f"{c.added_length_m:.0f}", f"{c.removed_length_m:.0f}")
+        for c in changes
+        for counts in ((c.num_unchanged, c.num_changed, c.num_added, c.num_removed),)
+        if any(counts)
+    ]
+    return make_table(title, ("kind", "kept", "changed", "added", "removed", "added [m]", "removed [m]"), lines)
 
 
 def _format_number(value: float, digits: int = 3) -> str:

@@ -27,11 +27,9 @@ class StudyTable:
 
 def make_terminal_table(study_table: StudyTable) -> Table:
     """Create the table for a terminal; a wide one leaves the intervals to the document."""
-    table = make_table(study_table.title, study_table.headings, num_left=2)
     wide = len(study_table.headings) > _MAX_NARROW_COLUMNS
-    for line in study_table.lines:
-        table.add_row(*(cell.partition(" [")[0] if wide else cell for cell in line))
-    return table
+    lines = [[cell.partition(" [")[0] if wide else cell for cell in line] for line in study_table.lines]
+    return make_table(study_table.title, study_table.headings, lines, num_left=2)
 
 
 def make_comparison_table(comparisons: Sequence[Comparison], resampled_unit: str = "scenarios") -> StudyTable:

@@ -15,7 +15,7 @@ from manyeyes.evaluation.detection.accumulator import MethodResult
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
 
-NOT_RUN = "not run"
+NOT_RUN, TERMINAL_WIDTH = "not run", 80
 # Words of columns that several tables have.
 LOG2_BYTES, DATA_AGE, AP_DIFFERENCE = "log2(bytes)", "data age [ms]", "ΔAP [95 % CI]"
 AP_CROSSING, AP_DIVIDER, AP_BOUNDARY = "AP crossing", "AP divider", "AP boundary"
@@ -77,22 +77,43 @@ def format_cells(row: MethodRow) -> tuple[str, ...]:
     )
 
 
-def make_table(title: str, headings: Sequence[str], num_left: int = 1, wraps: bool = False) -> Table:
-    """Create a table for the terminal; the first num_left columns are aligned left, headings wrap at spaces where asked."""
+def make_table(title: str, headings: Sequence[str], lines: Sequence[Sequence[str]], num_left: int = 1) -> Table:
+    """Create a table for the terminal: headings are folded where space is short, numbers never.
+
+    Args:
+        title: above the table; empty for none.
+        headings: of the columns.
+        lines: cells as text.
+        num_left: number of columns of text, aligned left, whose cells wrap at spaces.
+    """
     table = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    table.padding = (0, 1, 0, 0)
-    for column, heading in enumerate(headings):
-        text = Text(heading.replace(" ", "\n") if wraps else heading)
-        table.add_column(text, justify="left" if column < num_left else "right", no_wrap=wraps or column < num_left)
+    table.padding = 0
+    widths = _find_widths(headings, lines, num_left)
+    for column, (heading, width) in enumerate(zip(headings, widths)):
+        justify = "left" if column < num_left else "right"
+        table.add_column(Text(heading), justify=justify, overflow="fold", width=width)
+    for line in lines:
+        table.add_row(*map(Text, line))
     return table
+
+
+def _find_widths(headings: Sequence[str], lines: Sequence[Sequence[str]], num_left: int) -> list[int]:
+    """Find the widths of columns that hold their cells, and of the words of headings as many as fit into 80 columns."""
+    columns = [
+        [part for line in lines for part in line[column].split(None if column < num_left else "\n")]
+        for column in range(len(headings))
+    ]
+    widths = [max(map(len, parts), default=1) for parts in columns]
+    words = [max(map(len, heading.split())) for heading in headings]
+    while sum(widths) + len(widths) < TERMINAL_WIDTH and any(word > width for word, width in zip(words, widths)):
+        widths[max(range(len(widths)), key=lambda column: words[column] - widths[column])] += 1
+    return widths
 
 
 def make_terminal_table(rows: Sequence[MethodRow], title: str = "") -> Table:
     """Create the table of methods for 80 columns: units and intervals are on a second line."""
-    table = make_table(title, [heading.replace("/", "/ ").replace("(", " (") for heading in HEADINGS], wraps=True)
-    for row in rows:
-        table.add_row(*(_two_lines(cell) for cell in format_cells(row)))
-    return table
+    headings = [heading.replace("/", "/\n").replace("(", "\n(").replace(" [", "\n[") for heading in HEADINGS]
+    return make_table(title, headings, [[_two_lines(cell) for cell in format_cells(row)] for row in rows])
 
 
 def format_markdown(rows: Sequence[MethodRow]) -> str:
@@ -110,10 +131,7 @@ def missing_footer(count: int, listed_in: str = "results.json") -> str:
 
 def make_differences_table(differences: Sequence[Comparison]) -> Table:
     """Create the table of paired differences for the terminal."""
-    table = make_table("", DIFFERENCE_HEADINGS)
-    for difference in differences:
-        table.add_row(*format_difference_cells(difference))
-    return table
+    return make_table("", DIFFERENCE_HEADINGS, [format_difference_cells(difference) for difference in differences])
 
 
 def format_difference_cells(difference: Comparison) -> tuple[str, ...]:

@@ -133,8 +133,8 @@ class ResultGrid:
         return samples.paired_difference(self._bootstrap(other, iou, None, scenarios))
 
     def difference_pair(self, key: ResultKey, other: ResultKey) -> tuple[Interval, Interval] | None:
-        """Return the AP of a cell minus that of another at both IoU thresholds; None where the other was not run."""
-        if other not in self.results:
+        """Return the AP of a cell minus that of another at both IoU thresholds; None where one was not run."""
+        if not {key, other} <= self.results.keys():
             return None
         return self.paired_difference(key, other, 0), self.paired_difference(key, other, 1)
 
