@@ -271,4 +271,4 @@ def test_a_wide_table_folds_headings_and_never_numbers() -> None:
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
     console.print(make_table("", headings, lines))
     text = console.export_text()
-    assert "…" not in text and " ".join(lines[0]) in text
+    assert "…" not in text and list(lines[0]) == text.splitlines()[-1].split()
