@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes a drive that the shipped weights never saw, lets every agent share bytes and perceive, and judges the result.
+"""Simulate a drive in a town outside the training data, replay it with every fusion method, and evaluate the result.
 
-Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. What is found is
-compared for no fusion, late, intermediate and early fusion on the same channel. Beside it a map is made: of the drive, where a map
-model ships; else of a crossroads by a simulated crowd.
+Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. Detections of no fusion,
+late, intermediate and early fusion are compared on the same channel. A map is built too: of the drive, where a map model ships;
+else of a crossroads by a simulated fleet.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prints what a bug report needs: versions, machine, extras, shipped weights, towns."""
+"""Print what a bug report needs: versions, machine, extras, shipped weights, towns."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds where the agents of a recording are relative to the first, from what each detects; judges claims and corrections."""
+"""Estimate the poses of agents relative to the first from what each detects; evaluate prior and corrected poses."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes scenes from a seed, in OPV2V's or DAIR-V2X's layout, with counts and hashes; the same bytes at any worker count."""
+"""Simulate scenes from a seed, in OPV2V's or DAIR-V2X's layout, with counts and hashes; the same bytes at any worker count."""
 
 from __future__ import annotations
 
