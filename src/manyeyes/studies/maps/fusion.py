@@ -39,8 +39,9 @@ TITLES = {
     "crowdmap-table3": "Two intersections, stage-1 input local and semi-global (after CrowdMap, Table 3)",
 }
 HEADINGS = (
-    "method", "AP crossing", "AP divider", "mAP exact [95 % CI]", "mAP MapTR", "mAP StreamMapNet (wide)", "F1@0.5 m divider",
-    "duplication", "fragmentation", "lateral error [m]", "endpoint error [m]", "time [s]",
+    "method", "AP crossing", "AP divider", "mAP Chamfer-exact [95 % CI]", "mAP MapTR",
+    "mAP StreamMapNet (1.0/1.5/2.0 m)", "F1@0.5 m divider", "duplication", "fragmentation",
+    "lateral error [m]", "endpoint error [m]", "time [s]",
 )  # fmt: skip
 
 
