@@ -115,7 +115,7 @@ def correct_pose(
         ConfigError: the corrector is not known. ShapeError: an array has another shape.
     """
     found = find_corrector(corrector)
-    convert = _as_cloud if found.kind == "clouds" else Landmarks.of
+    convert: Callable[[Any], Any] = _as_cloud if found.kind == "clouds" else Landmarks.of
     return found.function(convert(ego), convert(other), prior)
 
 

@@ -110,7 +110,7 @@ def merge_nodes(
 def _fits(overlaps: ElementGraph, edge: int, config: CrowdMapGraphConfig) -> bool:
     """Return whether registration brings the common interval of the second node onto that of the first."""
     target, source = (
-        _sample_interval(overlaps.nodes, int(node), *overlaps.interval[edge, k : k + 2].tolist(), config.num_samples)
+        _sample_interval(overlaps.nodes, int(node), overlaps.interval[edge, k : k + 2], config.num_samples)
         for node, k in zip(overlaps.edge[edge], (0, 2))
     )
     moved = register(target, source, config.cpd).apply(source)
@@ -119,8 +119,10 @@ def _fits(overlaps: ElementGraph, edge: int, config: CrowdMapGraphConfig) -> boo
     return bool(distance[0] <= config.max_registered_chamfer_m)
 
 
-def _sample_interval(elements: MapElements, row: int, start_m: float, end_m: float, num_samples: int) -> Floats:
+def _sample_interval(elements: MapElements, row: int, interval: Floats, num_samples: int) -> Floats:
     """Return (num_samples, 2) points of an element between two stations; of the whole of a ring."""
     line = elements.polyline(row)
-    line = np.vstack((line, line[:1])) if elements.closed[row] else cut_line(line, start_m, end_m)
+    line = (
+        np.vstack((line, line[:1])) if elements.closed[row] else cut_line(line, float(interval[0]), float(interval[1]))
+    )
     return resample(line, np.array([0, len(line)]), num_samples)[0]

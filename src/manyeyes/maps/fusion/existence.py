@@ -255,7 +255,8 @@ class EvidenceTable(NamedTuple):
     def take(self, rows: Ints) -> EvidenceTable:
         """Return the chosen rows, in the order given."""
         first, places = take_rows(self.source_offsets, rows)
-        return EvidenceTable(*(column[rows] for column in self[:-3]), first, self.sources[places], self.observations)
+        columns = {name: getattr(self, name)[rows] for name in self._fields[:-3]}
+        return self._replace(source_offsets=first, sources=self.sources[places], **columns)
 
     @classmethod
     def cat(cls, tables: Sequence[EvidenceTable]) -> EvidenceTable:
@@ -263,11 +264,11 @@ class EvidenceTable(NamedTuple):
         observations, place = np.unique(np.concatenate([e.observations for e in tables]), axis=0, return_inverse=True)
         seen = np.cumsum([0, *(len(e.observations) for e in tables)])
         counts = np.concatenate([np.diff(e.source_offsets) for e in tables])
-        return cls(
-            *(np.concatenate(columns) for columns in zip(*(e[:-3] for e in tables))),
-            np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-            np.concatenate([place.reshape(-1)[start + e.sources] for e, start in zip(tables, seen)]),
-            observations,
+        return tables[0]._replace(
+            source_offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+            sources=np.concatenate([place.reshape(-1)[start + e.sources] for e, start in zip(tables, seen)]),
+            observations=observations,
+            **{name: np.concatenate([getattr(e, name) for e in tables]) for name in cls._fields[:-3]},
         )
 
 

@@ -291,17 +291,17 @@ class _EvidenceRows(NamedTuple):
     @classmethod
     def of(cls, m: VectorMap, rows: Ints) -> _EvidenceRows:
         """Make one row for each of the elements ``rows``."""
-        return cls._of(
-            m.elements.kind[rows],
-            sigma=m.elements.sigma[m.elements.offsets[:-1][rows]],
-            log_odds=m.log_odds[rows],
-            support=m.supporters[rows],
-            agents=m.agents[rows],
-            state=m.state[rows],
-            t_first=m.t_first[rows],
-            t_last=m.t_last[rows],
-            style=m.elements.style[rows],
-        )
+        columns = {
+            "sigma": m.elements.sigma[m.elements.offsets[:-1][rows]],
+            "log_odds": m.log_odds[rows],
+            "support": m.supporters[rows],
+            "agents": m.agents[rows],
+            "state": m.state[rows],
+            "t_first": m.t_first[rows],
+            "t_last": m.t_last[rows],
+            "style": m.elements.style[rows],
+        }
+        return cls._of(m.elements.kind[rows], -1, 0, columns)
 
     @classmethod
     def of_points(cls, m: VectorMap, rows: Ints) -> _EvidenceRows:
@@ -309,10 +309,11 @@ class _EvidenceRows(NamedTuple):
         _, points = take_rows(m.elements.offsets, rows)
         owner, at_points = m.elements.element_of_point[points], m.point_evidence.take(points)
         columns = {f.name: np.array(getattr(at_points, f.name)) for f in fields(at_points)}
-        return cls._of(m.elements.kind[owner], state=m.state[owner], style=m.elements.style[owner], **columns)
+        columns |= {"state": m.state[owner], "style": m.elements.style[owner]}
+        return cls._of(m.elements.kind[owner], -1, 0, columns)
 
     @classmethod
-    def _of(cls, kind: Ints, last_agent: int = -1, day: int = 0, **columns: NDArray) -> _EvidenceRows:
+    def _of(cls, kind: Ints, last_agent: int, day: int, columns: dict[str, NDArray]) -> _EvidenceRows:
         """Make rows of these kinds (N,) and columns; the rest is zero."""
         count = len(kind)
         evidence = EvidenceTable.zeros(np.array(kind, np.int64), len(STYLES))._replace(**columns)
@@ -321,12 +322,16 @@ class _EvidenceRows(NamedTuple):
     @classmethod
     def cat(cls, one: _EvidenceRows, two: _EvidenceRows) -> _EvidenceRows:
         """Concatenate two tables, in order."""
-        evidence = EvidenceTable.cat([one.evidence, two.evidence])
-        return cls(evidence, *(np.concatenate(both) for both in zip(one[1:], two[1:])))
+        return cls(
+            EvidenceTable.cat([one.evidence, two.evidence]),
+            np.concatenate((one.last_agent, two.last_agent)),
+            np.concatenate((one.day, two.day)),
+            np.concatenate((one.day_sum, two.day_sum)),
+        )
 
     def take(self, order: Ints) -> _EvidenceRows:
         """Return the chosen rows, in the order given."""
-        return _EvidenceRows(self.evidence.take(order), *(column[order] for column in self[1:]))
+        return _EvidenceRows(self.evidence.take(order), self.last_agent[order], self.day[order], self.day_sum[order])
 
     def append_created(
         self, kind: Ints, score_weight: Floats, s: ObservationArrays, config: IncrementalConfig
@@ -336,19 +341,17 @@ class _EvidenceRows(NamedTuple):
         odds = np.minimum(evidence.log_odds_hit * score_weight, evidence.max_daily_change)
         state = np.where(bool(s.trusted[0]) & (odds >= evidence.publish_threshold(kind)), PUBLISHED, 0)
         one = np.ones(count, np.int64)
-        created = _EvidenceRows._of(
-            kind,
-            _hash_agent(s),
-            time // DAY_NS,
-            sigma=np.full(count, 0.3),
-            log_odds=odds,
-            support=one,
-            agents=one.copy(),
-            state=state,
-            t_first=one * time,
-            t_last=one * time,
-            style=np.full((count, len(STYLES)), 1.0 / len(STYLES)),
-        )
+        columns = {
+            "sigma": np.full(count, 0.3),
+            "log_odds": odds,
+            "support": one,
+            "agents": one.copy(),
+            "state": state,
+            "t_first": one * time,
+            "t_last": one * time,
+            "style": np.full((count, len(STYLES)), 1.0 / len(STYLES)),
+        }
+        created = _EvidenceRows._of(kind, _hash_agent(s), time // DAY_NS, columns)
         created.day_sum[:] = odds
         return _EvidenceRows.cat(self, created)
 
