@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from manyeyes.agents.replay import ReplayConfig
 from manyeyes.cli import main as cli
 from manyeyes.datasets.dair_v2x import DairRecording
 from manyeyes.datasets.dair_v2x.writer import DairWriter, write_dair_index
@@ -86,6 +87,13 @@ def test_an_ego_waits_for_the_later_sweep_of_a_pair(data: Path, tmp_path: Path) 
     Opv2vWriter(tmp_path / "drive").write(street(0))
     config = ReplayOptions().make_replay_config(0)
     assert adapt_to_dataset(config, ReplayOptions(), open_recording(tmp_path)) == config
+
+
+def test_a_replay_takes_the_range_and_budget_of_a_reader(data: Path, tmp_path: Path) -> None:
+    adapted = ReplayConfig(comm_range_m=1.0).adapt_to(open_recording(data, "test"))
+    assert (adapted.comm_range_m, adapted.latency_budget_s) == (math.inf, 0.05)
+    Opv2vWriter(tmp_path / "drive").write(street(0))
+    assert ReplayConfig(comm_range_m=1.0).adapt_to(open_recording(tmp_path)).comm_range_m == 1.0
 
 
 def test_evaluate_scores_pairs_with_infrastructure_messages(data: Path, weights: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.exchange import Exchange
@@ -16,7 +16,7 @@ from manyeyes.comms.bandwidth import allocate_max_min_fair
 from manyeyes.comms.channel import ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
 from manyeyes.comms.wire import TokenEncoding
-from manyeyes.datasets.base import Recording
+from manyeyes.datasets.base import Recording, RecordingReader
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
 from manyeyes.models.detector.protocols import BoxDetector
 
@@ -57,6 +57,17 @@ class ReplayConfig:
     def radio(self) -> ChannelPreset:
         """The preset of the channel."""
         return self.channel if isinstance(self.channel, ChannelPreset) else channel_preset(self.channel)
+
+    def adapt_to(self, recording: Recording) -> ReplayConfig:
+        """Return the configuration with the range and the latency budget that the reader of a recording sets, if any."""
+        if not isinstance(recording, RecordingReader):
+            return self
+        range_m, budget_s = recording.comm_range_m, recording.latency_budget_s
+        return replace(
+            self,
+            comm_range_m=self.comm_range_m if range_m is None else range_m,
+            latency_budget_s=self.latency_budget_s if budget_s is None else budget_s,
+        )
 
 
 @dataclass(frozen=True)

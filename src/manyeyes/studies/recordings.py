@@ -78,10 +78,6 @@ def select_checked_scenarios(recording: RecordingReader, replayed: str, chosen_n
 
 
 def adapt_to_dataset(config: ReplayConfig, options: ReplayOptions, recording: RecordingReader) -> ReplayConfig:
-    """Return the configuration with the latency budget and range that suit the recording; a budget that the user chose stays."""
-    latency_budget_s = recording.latency_budget_s if options.latency_budget_ms is None else None
-    return replace(
-        config,
-        comm_range_m=config.comm_range_m if recording.comm_range_m is None else recording.comm_range_m,
-        latency_budget_s=config.latency_budget_s if latency_budget_s is None else latency_budget_s,
-    )
+    """Return the configuration that suits the recording; a latency budget that the user chose stays."""
+    adapted = config.adapt_to(recording)
+    return adapted if options.latency_budget_ms is None else replace(adapted, latency_budget_s=config.latency_budget_s)

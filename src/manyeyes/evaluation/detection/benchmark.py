@@ -219,14 +219,15 @@ def benchmark(
         detector: weights by name or path, a registered detector by name, or any object that is a BoxDetector.
         methods: names of strategies, registered ones of your own too.
         protocol: name of the evaluation protocol; the default one evaluates over the range of the detector.
-        replay: channel, budget and more; by default an ideal channel between agents within 70 m, with full histories.
+        replay: channel, budget and more; by default an ideal channel with full histories, between agents within 70 m or
+            the range that the reader sets.
         workers: number of processes that share the scenarios; with several, recording and detector must be picklable.
 
     Raises:
         ConfigError: a name is not known, or a method needs tokens that the detector does not have.
     """
     weights = str(detector) if isinstance(detector, Path) else detector
-    replay = replay or ReplayConfig(warmup_frames=WARMUP_FRAMES)
+    replay = replay or ReplayConfig(warmup_frames=WARMUP_FRAMES).adapt_to(recording)
     config = BenchmarkConfig(weights, tuple(methods), protocol, replay)
     return BenchmarkResult(resolve_protocol(config), run_benchmark(partial(_return, recording), config, workers))
 
