@@ -115,8 +115,12 @@ def correct_pose(
         ConfigError: the corrector is not known. ShapeError: an array has another shape.
     """
     found = find_corrector(corrector)
-    convert: Callable[[Any], Any] = _as_cloud if found.kind == "clouds" else Landmarks.of
+    convert = _as_cloud if found.kind == "clouds" else _as_landmarks
     return found.function(convert(ego), convert(other), prior)
+
+
+def _as_landmarks(objects: Any) -> Landmarks:
+    return Landmarks.of(objects)
 
 
 def _as_cloud(points: Any) -> PointCloud:
