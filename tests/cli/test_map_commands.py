@@ -48,7 +48,7 @@ def test_the_same_seed_is_the_same_map(folder, tmp_path) -> None:
 def test_evaluate_prints_and_writes_the_metrics(folder, capsys) -> None:
     assert run("map", "evaluate", folder / "map") == 0
     output = capsys.readouterr().out
-    assert "divider" in output and "mAP" in output
+    assert "divider" in output and "AP MapTR" in output
     held = json.loads((folder / "map" / "quality.json").read_text())["result"]
     assert 0.3 < held["mean_ap"]["exact"] <= 1.0
     assert run("map", "evaluate", folder / "truth", "--truth", folder / "truth") == 0

@@ -98,16 +98,24 @@ def make_table(title: str, headings: Sequence[str], lines: Sequence[Sequence[str
 
 
 def _find_widths(headings: Sequence[str], lines: Sequence[Sequence[str]], num_left: int) -> list[int]:
-    """Find the widths of columns that hold their cells, and of the words of headings as many as fit into 80 columns."""
-    columns = [
-        [part for line in lines for part in line[column].split(None if column < num_left else "\n")]
-        for column in range(len(headings))
-    ]
-    widths = [max(map(len, parts), default=1) for parts in columns]
-    words = [max(map(len, heading.split())) for heading in headings]
-    while sum(widths) + len(widths) < TERMINAL_WIDTH and any(word > width for word, width in zip(words, widths)):
-        widths[max(range(len(widths)), key=lambda column: words[column] - widths[column])] += 1
+    """Find the widths of columns: words of cells and all numbers fit; as far as 80 columns allow words of headings, cells of text
+    and headings fit, too.
+    """
+    columns = [[line[column] for line in lines] for column in range(len(headings))]
+    widths = [_max_length(cells, None if column < num_left else "\n") for column, cells in enumerate(columns)]
+    for wanted in (
+        [_max_length([heading], None) for heading in headings],
+        [_max_length(cells, "\n") for cells in columns],
+        [_max_length([heading], "\n") for heading in headings],
+    ):
+        while sum(widths) + len(widths) < TERMINAL_WIDTH and any(want > width for want, width in zip(wanted, widths)):
+            widths[max(range(len(widths)), key=lambda column: wanted[column] - widths[column])] += 1
     return widths
+
+
+def _max_length(texts: Sequence[str], separator: str | None) -> int:
+    """Return the length of the longest part of texts; separator None: any white space."""
+    return max((len(part) for text in texts for part in text.split(separator)), default=1)
 
 
 def make_terminal_table(rows: Sequence[MethodRow], title: str = "") -> Table:
