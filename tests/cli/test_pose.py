@@ -78,12 +78,16 @@ def test_an_unknown_pose_is_found_and_a_noisy_prior_improved(drive, capsys) -> N
         "voting" in output
         and "identity" in output
         and "pose.json" in output
-        and "agent -1: sound over 2 frames" in output
+        and "agent -1: prior pose sound over 2 frames" in output
     )
     free, noisy = (json.loads((p / "pose.json").read_text())["result"] for p in (out, out / "noisy"))
-    for answer in free["answers"]:
-        assert answer["status"] == "corrected" and answer["inliers"] == len(PLACES) and answer["common"] == len(PLACES)
-        assert answer["error_m"] < 1e-3
+    for estimate in free["estimates"]:
+        assert (
+            estimate["status"] == "corrected"
+            and estimate["inliers"] == len(PLACES)
+            and estimate["common"] == len(PLACES)
+        )
+        assert estimate["error_m"] < 1e-3
     scores = noisy["scores"]
     assert scores["voting"]["mean_displacement_m"] < scores["identity"]["mean_displacement_m"] and math.isfinite(
         scores["voting"]["nees"]
@@ -102,9 +106,9 @@ def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
     monkeypatch.setitem(POSE_CORRECTORS._items, "scan-registration", RegisteredCorrector(cloud, "clouds"))
     words = ("--split", "test", "--weights", weights, "--out", out, "--correctors", "scan-registration", "voting")
     assert run("pose", data, *words) == 0
-    answers = json.loads((out / "pose.json").read_text())["result"]["answers"]
-    assert [a["corrector"] for a in answers] == ["scan-registration", "voting"] * len(sizes) and len(sizes) > 0
-    assert [tuple(a["landmarks"]) for a in answers[::2]] == sizes and answers[0]["status"] == "no match"
+    estimates = json.loads((out / "pose.json").read_text())["result"]["estimates"]
+    assert [a["corrector"] for a in estimates] == ["scan-registration", "voting"] * len(sizes) and len(sizes) > 0
+    assert [tuple(a["landmarks"]) for a in estimates[::2]] == sizes and estimates[0]["status"] == "no match"
 
 
 def test_an_unknown_corrector_lists_the_known(drive, capsys) -> None:

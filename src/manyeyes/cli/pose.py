@@ -15,8 +15,6 @@ from manyeyes._bounds import Fraction, NonNegativeFloat, PositiveInt, Seed
 from manyeyes.studies.replay_options import FileChecks, display_name, make_excerpt
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from manyeyes.agents.perception_cache import PerceptionCache
     from manyeyes.datasets.perturbation import PoseNoise
     from manyeyes.datatypes import Snapshot
@@ -26,9 +24,23 @@ if TYPE_CHECKING:
     from manyeyes.studies.replay_options import Excerpt
 
 
+HEADINGS = (
+    "corrector",
+    "within 1 m, 1° [%]",
+    "within 2 m, 2° [%]",
+    "coverage [%]",
+    "precision [%]",
+    "false accepts [%]",
+    "error [m]",
+    "error [°]",
+    "object error [m]",
+)
+"""Rates and errors of ``evaluation.pose.metrics``; errors are medians, that of objects a mean."""
+
+
 @dataclass(frozen=True)
 class Options:
-    """Which drive, which correctors, how wrong the claims."""
+    """Which drive, which correctors, and the noise of prior poses."""
 
     recording: tyro.conf.Positional[Path]
     """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
@@ -46,13 +58,13 @@ class Options:
     noise_yaw_deg: NonNegativeFloat = 0.0
     """Standard deviation of errors of collaborators' prior headings, degrees."""
     no_prior: bool = False
-    """Claim nothing: correctors get no pose to start from."""
+    """Correctors get no prior pose."""
     min_score: Fraction = 0.3
     """Detections below this score are no landmarks."""
     weights: str = "costr-small"
     """Shipped weights by name, or a .safetensors file of 'manyeyes train'."""
     seed: Seed = 0
-    """Of pose errors."""
+    """Of the noise."""
     out: Path = Path("out/pose")
     """Folder for pose.json."""
     checks: FileChecks = field(default_factory=FileChecks)
@@ -61,8 +73,8 @@ class Options:
 
 @dataclass(frozen=True)
 class CorrectorResult:
-    """One corrector's answer about one agent in one frame; num_landmarks: how many each has, or points where clouds are compared;
-    judged is None where the recording has no truth.
+    """One corrector's estimate for one agent in one frame; num_landmarks: of ego and agent, or of points where clouds are compared;
+    evaluation is None where the recording has no ground truth.
     """
 
     frame: int
@@ -88,7 +100,7 @@ def main(options: Options) -> None:
     from manyeyes.pose.registry import find_corrector
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import check_files, select_checked_scenarios
-    from manyeyes.viz.table import missing_footer
+    from manyeyes.viz.table import make_table, missing_footer
 
     console = Console()
     for name in options.correctors:
@@ -110,30 +122,32 @@ def main(options: Options) -> None:
     scores = {name: summarize_evaluations(frames) for name, frames in evaluations.items() if frames}
     if scores:
         title = f"{display_name(options.weights)} on {drive.scenario}: {len(results) // len(options.correctors)} pairs of agents"
-        console.print(_make_table(scores, title))
+        console.print(make_table(title, HEADINGS, [_format_scores(name, score) for name, score in scores.items()]))
     if missing.count:
         console.print(missing_footer(missing.count, "pose.json"), highlight=False, soft_wrap=True)
     health = run_pose_monitor([f for f in results if f.corrector == "voting"])
     for agent, report in health.items():
-        console.print(f"agent {agent}: {report.health.value} over {report.num_frames} frames", highlight=False)
+        console.print(
+            f"agent {agent}: prior pose {report.health.value} over {report.num_frames} frames", highlight=False
+        )
     provenance.write_json(
         options.out / "pose.json",
         {
             "scores": {name: asdict(s) for name, s in scores.items()},
             "health": {str(agent): report.health.value for agent, report in health.items()},
-            "answers": [_to_json(f) for f in results],
+            "estimates": [_to_json(f) for f in results],
             "missing": missing,
         },
         {"options": options},
         options.seed,
     )
-    console.print(f"\nEvery answer is in {options.out / 'pose.json'}", highlight=False, soft_wrap=True)
+    console.print(f"\nAll estimates are in {options.out / 'pose.json'}", highlight=False, soft_wrap=True)
 
 
 def _run_correctors(
     drive: Excerpt, cache: PerceptionCache, options: Options, noise: PoseNoise
 ) -> Iterator[CorrectorResult]:
-    """Yield every corrector's answer about every collaborator in every evaluated frame."""
+    """Yield every corrector's estimate of the pose of every collaborator in every evaluated frame."""
     from manyeyes.agents.pose_correction import PoseCorrection
     from manyeyes.pose.registry import find_corrector
     from manyeyes.pose.types import PosePrior
@@ -187,17 +201,11 @@ def run_pose_monitor(results: list[CorrectorResult]) -> dict[int, PoseReport]:
     return reports
 
 
-def _make_table(scores: dict[str, PoseScore], title: str) -> Table:
-    from rich.table import Table
-
-    table = Table(title=title)
-    for head in ("", "within 1 m, 1°", "2 m, 2°", "answered", "right", "wrong", "error m", "error °", "objects off m"):
-        table.add_column(head, justify="right" if head else "left", no_wrap=not head)
-    for name, s in scores.items():
-        shares = (*s.success_rate[:2], s.coverage, s.precision, s.false_accept_rate)
-        lengths = (s.median_translation_error_m, s.median_rotation_error_deg, s.mean_displacement_m)
-        table.add_row(name, *(f"{100 * x:.1f} %" for x in shares), *(f"{x:.2f}" for x in lengths))
-    return table
+def _format_scores(name: str, s: PoseScore) -> tuple[str, ...]:
+    """Format the cells of a corrector under HEADINGS."""
+    rates = (*s.success_rate[:2], s.coverage, s.precision, s.false_accept_rate)
+    errors = (s.median_translation_error_m, s.median_rotation_error_deg, s.mean_displacement_m)
+    return (name, *(f"{100 * rate:.1f}" for rate in rates), *(f"{error:.2f}" for error in errors))
 
 
 def _to_json(result: CorrectorResult) -> dict[str, object]:
