@@ -60,11 +60,13 @@ def named_extras(tree: ast.Module) -> set[str]:
     return {call.args[0].value for call in calls if isinstance(call.args[0], ast.Constant)}
 
 
+@pytest.mark.slow
 def test_every_import_is_of_a_core_dependency_or_of_an_extra() -> None:
     known = CORE.union(*EXTRAS.values())
     assert [(package, place) for package, place, _ in third_party() if package.lower() not in known] == []
 
 
+@pytest.mark.slow
 def test_a_file_that_names_an_extra_imports_nothing_that_this_extra_lacks() -> None:
     lacking = []
     for package, place, tree in third_party():
@@ -98,6 +100,7 @@ def test_doctor_looks_for_what_the_extras_install(capsys: pytest.CaptureFixture[
     assert {entry["name"] for entry in report["extras"]} == set(EXTRAS)
 
 
+@pytest.mark.slow
 def test_the_package_imports_no_extra_before_it_is_needed() -> None:
     code = (
         "import sys, manyeyes.cli.main, manyeyes.agents.agent; "

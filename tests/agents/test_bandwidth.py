@@ -62,6 +62,7 @@ def detector() -> Detector:
     return with_codebook(plain, torch.cat(features), 0, CodebookConfig(3, 64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float16", "codebook"])
 @pytest.mark.parametrize("channel_bytes", [None, 2500])
 def test_the_bytes_of_a_table_are_those_handed_to_the_bus(detector, monkeypatch, precision, channel_bytes):

@@ -51,6 +51,7 @@ def decode_message(detector, packets) -> Message:
     return reception.message
 
 
+@pytest.mark.slow
 def test_tokens_gain_45_bytes_an_object_that_the_net_describes(drive, detector, weights):
     frame, aligner = drive().frame(1, 3), PoseCorrection(weights)
     plain, describing = (Agent(detector, budget_bytes=None, pose_correction=a) for a in (None, aligner))

@@ -197,6 +197,7 @@ def test_a_received_box_at_the_side_of_an_own_box_does_not_replace_it(drive, det
     assert float(torch.cdist(alone.center[:, :2], found.center[:, :2]).min(1).values.max()) <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list_strategies())
 def test_no_bytes_make_perceive_raise(drive, detector, name: str) -> None:
     """Bytes of honest packets at random places, with checksums made right: everything decodable is fused or rejected."""

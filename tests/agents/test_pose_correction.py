@@ -101,6 +101,7 @@ def test_a_wrong_prior_pose_is_corrected_and_its_covariance_updated() -> None:
     assert kept.objects is message.objects
 
 
+@pytest.mark.slow
 def test_a_conflicting_prior_pose_is_replaced_and_its_sender_reported() -> None:
     world = cars(12, 0)
     found = PoseCorrection().correct(

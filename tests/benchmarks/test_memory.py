@@ -25,6 +25,7 @@ def memory():
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="peak memory is read from /proc")
 def test_the_peak_includes_released_memory(memory):
     def need(mib: int) -> None:

@@ -78,6 +78,7 @@ def test_the_fused_map_is_better_than_the_union_of_observations(built) -> None:
     assert {o.agent for o in built.map_server.observations} == {f"cross_0/{k}" for k in (1, 2, 3, 4)}
 
 
+@pytest.mark.slow
 def test_the_folder_is_read_by_the_other_commands(built, tmp_path) -> None:
     write_built_map(built, tmp_path, "A crossroads")
     assert {p.name for p in tmp_path.iterdir()} == {"observations", "truth", "cut.json", "map", "map.html", "map.png"}

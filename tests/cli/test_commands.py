@@ -81,6 +81,7 @@ def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_
     assert (tmp_path / "report.html").read_text().count("data:image/") == 5
 
 
+@pytest.mark.slow
 def test_two_runs_agree_except_for_times(data, weights, tmp_path) -> None:
     results = []
     for name, workers in (("one", 1), ("two", 2)):
@@ -203,6 +204,7 @@ def test_weights_of_another_shape_are_one_line(data, weights, tmp_path, capsys) 
     assert len(output) == 1 and name in output[0] and "other.safetensors" in output[0]
 
 
+@pytest.mark.slow
 def test_train_writes_weights_log_picture_and_json(data, tmp_path, capsys) -> None:
     words = ("--preset", "costr-tiny", "--steps", 2, "--batch", 1, "--out", tmp_path / "run")
     assert run("train", "--data", data, "--split", "test", *words) == 0

@@ -222,6 +222,7 @@ def store(honest_store, tmp_path) -> Path:
     return Path(shutil.copytree(honest_store, tmp_path / "city"))
 
 
+@pytest.mark.slow
 def test_a_store_takes_in_the_rest_of_a_folder_with_hostile_rows(honest, tmp_path, capsys) -> None:
     folder = with_rows(honest, tmp_path / "in", [change for _, change in CASES.values()])
     assert fuse_into(tmp_path / "city", folder) == 0
@@ -356,6 +357,7 @@ def test_a_retracted_observation_is_not_in_the_next_release_and_stays_out(store,
     assert content(store) == want
 
 
+@pytest.mark.slow
 def test_an_agent_and_a_pass_can_be_retracted_and_published_later(store, honest, tmp_path, capsys) -> None:
     many = read_observations(honest / "observations").observations
     agent, pass_id = many[0].agent, many[-1].pass_id

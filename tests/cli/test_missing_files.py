@@ -206,6 +206,7 @@ def test_a_replaced_file_is_noticed_after_a_sound_verdict_was_kept(data: Path, w
     assert evaluate(data, weights, tmp_path) == 1
 
 
+@pytest.mark.slow
 def test_many_files_are_counted_and_the_list_is_capped(
     whole: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -334,6 +335,7 @@ def test_a_drive_is_played_whatever_other_scenarios_lack(whole: Path, weights: P
     assert run(*run_replay(data, weights, tmp_path), "--scenario", "a") == 1
 
 
+@pytest.mark.slow
 def test_cells_of_an_incomplete_recording_are_kept_apart(whole: Path, weights: Path, tmp_path: Path) -> None:
     data = shutil.copytree(whole, tmp_path / "data")
     path = data / "test" / "a" / "7" / "000004.yaml"  # behind the first evaluated frame, which alone names a cell

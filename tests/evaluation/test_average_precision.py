@@ -119,6 +119,7 @@ def random_frames(n, per=8, seed=0, miss=0.25, clutter=3):
         yield FrameResult(f"s{f // 10}", f % 10, Boxes.cat([found, wrong]), truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thr", [0.3, 0.5, 0.7])
 def test_agrees_with_its_slow_twin(thr):
     frames = list(random_frames(12))

@@ -34,6 +34,7 @@ def test_every_example_is_run_here() -> None:
     assert [name for name in examples if f'run("{name}"' not in tested] == []
 
 
+@pytest.mark.slow
 def test_01_two_agents() -> None:
     sent, no_fusion, fused = run("01_two_agents.py").strip().splitlines()
     assert "from 1 agent" in sent and int(sent.split()[0]) > 80
@@ -49,6 +50,7 @@ def test_02_evaluate_recording(tmp_path: Path) -> None:
     assert [line.split()[0] for line in out.strip().splitlines()] == ["none", "late", "intermediate", "early"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (SHARED / "av2").is_dir(), reason="../shared/data/av2 is not beside this repository")
 def test_03_argoverse2(tmp_path: Path) -> None:
     picture = tmp_path / "pair.png"
@@ -57,6 +59,7 @@ def test_03_argoverse2(tmp_path: Path) -> None:
     assert picture.stat().st_size > 50_000
 
 
+@pytest.mark.slow
 def test_04_map_fusion(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="the 'map' extra is not installed")
     pytest.importorskip("shapely", reason="the 'map' extra is not installed")
@@ -75,6 +78,7 @@ def test_05_delay_and_bandwidth(tmp_path: Path) -> None:
     assert "with 0 bytes" in lines[0] and "with 0 bytes" not in lines[1]
 
 
+@pytest.mark.slow
 def test_06_map_server() -> None:
     *lines, last = run("06_map_server.py").strip().splitlines()
     score = [float(line.rsplit("mAP ", 1)[1]) for line in (*lines, last)]

@@ -146,6 +146,7 @@ def observe_map(seed: int, count: int = 5) -> list[Observation]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", list_map_fusions())
 @settings(max_examples=5)  # an example takes up to 0.3 s
 @given(seed=SEEDS, random=RANDOMS)

@@ -84,6 +84,7 @@ def test_geopandas_reads_the_lossless_form_with_its_own_metric_crs_and_bounding_
     assert len(geopandas.read_parquet(tmp_path / "crossings.parquet", bbox=(0, 0, 10, 10))) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format", ["geojson", "geopackage", "geoparquet"])
 def test_geopandas_reads_all_elements_in_their_place_on_earth(two_lanes, tmp_path, format):
     geopandas = pytest.importorskip("geopandas", reason="the map extra is not installed")

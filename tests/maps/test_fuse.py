@@ -305,6 +305,7 @@ def test_l_the_map_moves_with_the_world(motion):
     assert furthest(expected, there.elements) < 0.01 and furthest(there.elements, expected) < 0.01
 
 
+@pytest.mark.slow
 def test_colluding_agents_displace_no_station_observed_by_honest_agents():
     world = [*road(), (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))]
     honest = crowd(world, 40)
@@ -335,6 +336,7 @@ def test_rejected_agents_leave_poses_unchanged():
     assert np.abs(together.pose[rows] - alone.pose).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_wrongly_rejected_agents_are_reinstated():
     """Of a crossroads' crowd every fifth lies by 3 m as the others do: honest agents stand where they stand alone."""
     crowd_config = replace(

@@ -265,6 +265,7 @@ def test_missing_file_is_named(tmp_path: Path):
         read_opendrive(tmp_path / "absent.xodr")
 
 
+@pytest.mark.slow
 @needs_towns
 @pytest.mark.parametrize(
     ("town", "rise", "crossings"),

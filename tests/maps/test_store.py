@@ -255,6 +255,7 @@ def test_two_writers_do_not_meet(tmp_path):
         pass
 
 
+@pytest.mark.slow
 def test_a_writer_killed_at_any_moment_leaves_a_whole_release_and_a_whole_log():
     step, timed = 11, 2
     script = Path(__file__).with_name("killed_writer.py")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from manyeyes.maps.roads.surface import RoadSurface
 
@@ -43,6 +44,7 @@ def slow(surface: RoadSurface, point: np.ndarray, near_z: float | None) -> tuple
     return best[1], best[0]
 
 
+@pytest.mark.slow
 def test_height_and_distance_equal_the_slow_twin():
     random = np.random.default_rng(5)
     surface = RoadSurface.of_strips(*strips(random, 14))

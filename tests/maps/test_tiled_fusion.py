@@ -67,12 +67,14 @@ def test_four_tiles_that_meet_in_the_crossroads_give_the_map_of_one_piece(store,
     assert _tiled(store, tmp_path / "work", 256.0).quantised_hash() == whole.quantised_hash()
 
 
+@pytest.mark.slow
 def test_small_tiles_give_the_map_of_one_piece_and_no_line_is_cut_at_a_border(store, whole, tmp_path):
     got = _tiled(store, tmp_path / "work", 90.0)
     assert got.quantised_hash() == whole.quantised_hash()
     assert got.elements.lengths().max() > 90.0
 
 
+@pytest.mark.slow
 def test_rejected_agents_are_rejected_alike_in_tiles_and_in_one_piece(tmp_path):
     crowd_config = replace(
         CROWDS["local"], malicious_fraction=0.2, attack_mode="colluding", malicious_offset_m=(3.0, 3.0)
@@ -104,6 +106,7 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
     assert {name for name in before if after[name] != before[name]} == {results[0].name, results[1].name}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["process", "dask", "ray"])
 def test_engines_give_the_identical_map(store, whole, tmp_path, name):
     module = {"process": "concurrent.futures", "dask": "dask.distributed", "ray": "ray"}[name]
@@ -112,6 +115,7 @@ def test_engines_give_the_identical_map(store, whole, tmp_path, name):
     assert got.quantised_hash() == whole.quantised_hash()
 
 
+@pytest.mark.slow
 def test_a_store_fuses_and_publishes_and_a_retraction_fuses_again(store, crowd, whole):
     first = store.fuse(executor=InlineExecutor())
     assert first.content == whole.quantised_hash() and first.watermark.observations == COUNT

@@ -29,6 +29,7 @@ def net(kind) -> PillarEncoder:
     return model.eval()
 
 
+@pytest.mark.slow
 def test_inference_by_one_pass_equals_the_formula_with_a_row_for_every_point():
     model = net("points")
     wanted = model([cloud()])

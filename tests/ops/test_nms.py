@@ -16,6 +16,7 @@ def slow_nms(boxes, score, threshold, pre=1000):
     return kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("threshold", [0.0, 0.15, 0.6])
 def test_equals_its_slow_twin(seed, threshold):
@@ -51,6 +52,7 @@ def test_empty_and_misshapen_input():
         rotated_nms(torch.zeros(2, 5), torch.zeros(3), 0.15)
 
 
+@pytest.mark.slow
 def test_rectangles_that_share_sides_and_corners():
     g = torch.Generator().manual_seed(1)
     place = torch.randint(0, 4, (200, 2), generator=g).double() * torch.tensor([2.0, 1.0]).double()

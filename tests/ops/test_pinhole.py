@@ -59,6 +59,7 @@ def crowd(seed: int) -> Primitives:
     return Primitives.cat(many)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ground", [flat(-1.0), hills()], ids=["flat", "hills"])
 @pytest.mark.parametrize("seed", [2, 9])
 def test_equals_every_ray_against_every_primitive(seed: int, ground: HeightField) -> None:

@@ -70,6 +70,7 @@ def circle(n: int) -> np.ndarray:
     return -np.pi + 2 * np.pi * np.arange(n) / n
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("tilt", [0.0, 0.12])
 def test_equals_every_ray_against_every_primitive(seed: int, tilt: float) -> None:

@@ -153,6 +153,7 @@ def test_a_noisy_graph_reaches_the_minimum_that_scipy_finds():
     assert (got.covariance[:3] == 0).all() and (got.covariance[:, :3] == 0).all()
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_repeated_measurements():
     truth, edges = graph(n=4, extra=3, seed=4)
     g = torch.Generator().manual_seed(0)

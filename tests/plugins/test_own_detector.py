@@ -6,7 +6,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 
+
+@pytest.mark.slow
 def test_an_own_detector_is_evaluated_by_name(drive: Path, install, manyeyes, tmp_path: Path) -> None:
     site = install("own_detector")
     words = ("evaluate", "--data", str(drive), "--split", "test", "--weights", "clusters")

@@ -6,9 +6,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from safetensors import safe_open
 
 
+@pytest.mark.slow
 def test_an_own_fusion_module_is_trained_and_evaluated_with_an_own_strategy(
     drive: Path, install, manyeyes, tmp_path: Path
 ) -> None:

@@ -39,6 +39,7 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_view_replay_and_evaluate_open_its_recordings(clouds: Path, install, manyeyes, tmp_path: Path) -> None:
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -58,6 +59,7 @@ def test_view_replay_and_evaluate_open_its_recordings(clouds: Path, install, man
     assert early["communication"]["bytes_per_message"] > 1000
 
 
+@pytest.mark.slow
 def test_without_its_entry_point_it_is_not_found(clouds: Path, manyeyes, tmp_path: Path) -> None:
     viewed = manyeyes(PACKAGE, "view", str(clouds), "--split", "test", "--out", str(tmp_path / "frame.png"))
     assert viewed.returncode == 1

@@ -109,6 +109,7 @@ def start(number: int) -> Transform:
     return Transform.from_xyz_yaw(20 * far * math.cos(angle), 20 * far * math.sin(angle), 0.0, 2 * math.pi * turn)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHARED.is_dir(), reason=f"{SHARED} is absent: the real scans are not in this project")
 @pytest.mark.parametrize("starts", [5, pytest.param(100, marks=pytest.mark.slow)])
 def test_two_real_scans_from_random_starts(starts):

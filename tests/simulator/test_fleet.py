@@ -315,6 +315,7 @@ def test_generated_lanes_run_beside_their_paint_and_through_junctions(name):
     assert len(gaps) > 30 and max(gaps) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (SHARED / "av2").is_dir(), reason="../shared/data is absent")
 @pytest.mark.parametrize("name", ["Town02", "av2-miami", "lanelet2"])
 def test_real_places_can_be_simulated(name):

@@ -97,6 +97,7 @@ def test_half_of_the_vehicles_move_and_positions_change(scenario: SimulatedScena
     assert max(moved) > 1.0
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_points(snapshot: Snapshot) -> None:
     again = make_scenario(SPEC, load_town("generated-1")).snapshot(1)
     for one, two in zip(snapshot.frames, again.frames):
@@ -104,6 +105,7 @@ def test_the_same_seed_gives_the_same_points(snapshot: Snapshot) -> None:
         assert torch.equal(one.points.intensity, two.points.intensity)
 
 
+@pytest.mark.slow
 def test_lead_frames_do_not_change_later_frames(scenario: SimulatedScenario) -> None:
     longer = make_scenario(replace(SPEC, lead_frames=3), load_town("generated-1"))
     assert (len(longer), longer.agents, longer.moving_fraction) == (6, scenario.agents, scenario.moving_fraction)

@@ -182,6 +182,7 @@ def test_parked_cars_stand_beside_the_road_and_apart(town):
     assert 0 < len(parked_cars(town, 2, center, 150.0)) != len(cars)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHARED.is_dir(), reason=f"the CARLA towns are not at {SHARED}")
 def test_traffic_follows_the_hills_of_town03(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     pytest.importorskip("libsumo")

@@ -102,6 +102,7 @@ def small_set(monkeypatch) -> tuple:
     return kept
 
 
+@pytest.mark.slow
 def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_path, small_set, panels) -> None:
     held = evaluate(
         data, weights, tmp_path, "robustness", "--methods", "none", "late", "intermediate", "--frame-stride", 2
@@ -170,6 +171,7 @@ def test_baseline_fusions_are_compared_with_ours_under_each_perturbation(
     assert "methods of the names late" in capsys.readouterr().err and not (tmp_path / "b").exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_resumes_and_a_finished_one_replays_nothing(
     data, weights, tmp_path, monkeypatch, small_set, panels
 ) -> None:
@@ -191,6 +193,7 @@ def test_an_interrupted_study_resumes_and_a_finished_one_replays_nothing(
     assert played == []
 
 
+@pytest.mark.slow
 def test_budgets_are_respected_and_small_ones_send_less(data, weights, tmp_path) -> None:
     words = ("--methods", "none", "late", "--token-selection", "intermediate", "--token-encodings", "float16", "int8")
     held = evaluate(data, weights, tmp_path, "bandwidth", *words, "--budgets", 1398, 4096, "--frame-stride", 2)[
@@ -221,6 +224,7 @@ def test_numbers_of_agents_are_evaluated_on_scenarios_that_have_them(data, weigh
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_ablation_shows_each_checkpoint_with_its_card(data, weights, tmp_path, panels) -> None:
     words = ("--frame-stride", 2, "--checkpoints", f"first={weights}", f"again={weights}")
     rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
@@ -262,6 +266,7 @@ def scores(tallies: list[MetricAccumulator]) -> list[list[float]]:
     return [[x for frame in tally.frames for x in frame.score.tolist()] for tally in tallies]
 
 
+@pytest.mark.slow
 def test_conditions_side_by_side_are_as_each_by_itself(data, weights) -> None:
     opener = partial(Opv2vRecording, data, "test")
     base = BenchmarkConfig(str(weights), ("late", "early"))

@@ -204,6 +204,7 @@ def test_the_corrector_is_held_against_half_of_the_loss(weights, tmp_path, monke
     assert less.interval.value == less.interval.high == pytest.approx(-0.125)
 
 
+@pytest.mark.slow
 def test_full_maps_by_map_mode_and_method_against_one_truth(weights, tmp_path, monkeypatch):
     """The oracle predicts elements; their bytes are fused and evaluated."""
     town_map = TownMap("cross", Crossroads.scenarios, "cross", (0.0, 0.0))
