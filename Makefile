@@ -47,7 +47,7 @@ test: $(STAMP)
 	@$(BIN)/python -m pytest
 
 test-fast: $(STAMP)
-	@HYPOTHESIS_PROFILE=fast $(BIN)/python -m pytest -m "not slow and not training"
+	@HYPOTHESIS_PROFILE=fast $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not training"
 
 test-nightly: $(STAMP)
 	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest

@@ -131,12 +131,12 @@ def test_gicp_names_the_extra_to_install(monkeypatch):
         raise ImportError(name)
 
     monkeypatch.setattr(gicp.importlib, "import_module", absent)
-    with pytest.raises(MissingExtraError, match=r"manyeyes\[register\]"):
+    with pytest.raises(MissingExtraError, match=r"manyeyes\[icp\]"):
         gicp.correct(street(0), street(0), PosePrior.of(Transform.identity(), 1.0, 0.1))
 
 
 def test_gicp_corrects_a_near_prior_and_needs_one():
-    pytest.importorskip("small_gicp", reason="small_gicp is absent: pip install 'manyeyes[register]'")
+    pytest.importorskip("small_gicp", reason="small_gicp is absent: pip install 'manyeyes[icp]'")
     truth = Transform.from_xyz_yaw(3.0, -2.0, 0.0, 0.3)
     world = street(0)
     ego, other = some(world, 0.7, 1), some(world, 0.7, 2).transform(truth.inverse())

@@ -25,7 +25,7 @@ EXTRAS = {
     "av2": ("pyarrow", "shapely"),
     "dask": ("dask", "distributed"),
     "ray": ("ray",),
-    "register": ("small_gicp",),
+    "icp": ("small_gicp",),
 }
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generalised ICP of whole clouds from the prior pose, by small-gicp (extra 'register').
+"""Generalised ICP of whole clouds from the prior pose, by small-gicp (extra 'icp').
 
 Koide, JOSS 9(100), 2024; Segal et al., RSS 2009.
 """
@@ -66,4 +66,4 @@ def _small_gicp() -> Any:
     try:
         return importlib.import_module("small_gicp")
     except ImportError as error:
-        raise MissingExtraError("register", "ICP on clouds") from error
+        raise MissingExtraError("icp", "ICP on clouds") from error
