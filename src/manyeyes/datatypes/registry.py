@@ -16,7 +16,6 @@ import importlib
 import pkgutil
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
-from types import ModuleType
 from typing import Generic, TypeVar, cast
 
 from manyeyes.datatypes.errors import ConfigError
@@ -102,20 +101,18 @@ class Registry(Generic[T]):
         return self._entry_points
 
     def _load(self, point: EntryPoint) -> None:
-        """Import what an entry point names: a module, whose decorators register its items, or an item."""
+        """Import the module that an entry point names; its decorators register its items."""
         try:
-            loaded = point.load()
+            point.load()
         except Exception as error:
             text = " ".join(f"{type(error).__name__}: {error}".split())
             raise ConfigError(
                 f"The {self.kind} {point.name!r} of {_distribution(point)} cannot be imported: {text}"
             ) from error
-        if not isinstance(loaded, ModuleType):
-            self._items.setdefault(point.name, loaded)
-        elif point.name not in self._items:
+        if point.name not in self._items:
             raise ConfigError(
-                f"The entry point {point.name!r} of {_distribution(point)} names the module {point.value}, which registers no "
-                f"{self.kind} of that name."
+                f"The entry point {point.name!r} of {_distribution(point)} names {point.value}, which registers no {self.kind} of "
+                "that name; register it there with the decorator."
             )
 
 
