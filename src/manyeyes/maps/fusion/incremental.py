@@ -555,7 +555,7 @@ class _ViewBounds(NamedTuple):
     high: F64x1
 
 
-class _Comparison(NamedTuple):
+class _ComparedStations(NamedTuple):
     """N stations that one observation covers or detects: rows; lateral offset (m) of its line; weight of that, -1: no line;
     visibility; detection weight. explained: (P,) which of its points, in the order of their grid, match a station.
     """
@@ -619,7 +619,7 @@ def _match_station(
 @njit(cache=True, nogil=True)
 def _match_stations(
     stations: _GridStations, placed: _PlacedObservation, kinds: int
-) -> _Comparison:  # pragma: no cover - compiled
+) -> _ComparedStations:  # pragma: no cover - compiled
     """Match the stations in the box of a view with the observed points; those with a line only at a small lateral offset are
     left out.
     """
@@ -659,7 +659,7 @@ def _match_stations(
                 rows[n], seen[n], score_weight[n] = k, visible, match.score_weight / total if total > 0.0 else 0.0
                 place[n], mass[n] = (match.offset / total, match.mass / total) if total > 0.0 else (0.0, -1.0)
                 n += 1
-    return _Comparison(
+    return _ComparedStations(
         rows[:n].copy(), place[:n].copy(), mass[:n].copy(), seen[:n].copy(), score_weight[:n].copy(), explained
     )
 
