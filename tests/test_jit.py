@@ -10,6 +10,8 @@ from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 import manyeyes
 from manyeyes._jit import _LockedIndexFile, njit
 
@@ -29,6 +31,7 @@ def _keep(folder: Path, key: str, start: Barrier) -> None:
     index.save(key, f"the code of {key}")
 
 
+@pytest.mark.slow
 def test_two_processes_keep_both_variants(tmp_path: Path) -> None:
     context = multiprocessing.get_context("spawn")
     start = context.Barrier(2)

@@ -77,6 +77,7 @@ def test_messages_with_descriptors_are_within_the_budget(drive, detector, weight
     assert Agent(detector, budget_bytes=200, pose_correction=PoseCorrection(weights)).share(frame) == []
 
 
+@pytest.mark.slow
 def test_boxes_that_are_sent_anyway_are_described_and_stay(drive, detector, weights):
     frame, net = drive().frame(1, 3), PoseCorrection(weights).net
     plain, describing = (

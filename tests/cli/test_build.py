@@ -90,6 +90,7 @@ def test_the_folder_is_read_by_the_other_commands(built, tmp_path) -> None:
     assert held["maptr"] == pytest.approx(built.stats.scores.mean_ap("maptr"), abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_same_recording_is_the_same_map_and_pose_noise_moves_priors_only(built) -> None:
     again = build_map(Crossroads(), CROSS, MapBuildConfig(None, frame_stride=4))
     assert again.fused.quantised_hash() == built.fused.quantised_hash()
@@ -121,6 +122,7 @@ def weights(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_model_predicts_where_no_truth_is_known(weights, tmp_path) -> None:
     map_model = pretrained.load_map_model(weights)
     made = build_map(Crossroads(frames=9), NOWHERE, MapBuildConfig(map_model, "semi-global", frame_stride=8))
@@ -133,6 +135,7 @@ def test_a_model_predicts_where_no_truth_is_known(weights, tmp_path) -> None:
     assert not (tmp_path / "truth").exists() and (tmp_path / "map.png").exists()
 
 
+@pytest.mark.slow
 def test_the_demos_map_is_that_of_its_drive_where_a_model_ships(weights, tmp_path, monkeypatch) -> None:
     from rich.console import Console
 

@@ -186,6 +186,7 @@ def run_jobs(weights, predictor, seeds, folder, **options):
     return [job() for job in make_tile_jobs(source, weights, predictor, seeds, CellStore(folder), **options)]
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_resumes(weights, tmp_path):
     draw = CountingPredictor()
     first = run_jobs(weights, draw, (0, 1), tmp_path)

@@ -58,6 +58,7 @@ def _tiled(store, work, tile_m, executor=None, progress=None):
     )
 
 
+@pytest.mark.slow
 def test_four_tiles_that_meet_in_the_crossroads_give_the_map_of_one_piece(store, whole, tmp_path):
     assert len(whole) > 10
     blocks = make_blocks(
@@ -88,6 +89,7 @@ def test_rejected_agents_are_rejected_alike_in_tiles_and_in_one_piece(tmp_path):
     assert _tiled(made, tmp_path / "work", 90.0).quantised_hash() == one_piece.quantised_hash()
 
 
+@pytest.mark.slow
 def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, whole, tmp_path):
     work = tmp_path / "work"
     seen = []

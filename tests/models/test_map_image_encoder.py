@@ -67,6 +67,7 @@ def test_one_stage_is_refused():
         ImageEncoderConfig((2,))
 
 
+@pytest.mark.slow
 def test_recomputation_is_bitwise_equal_and_updates_running_statistics_once():
     config = ImageEncoderConfig((2, 1), 8, True, 16)
     kept, again = ImageEncoder(config), ImageEncoder(dataclasses.replace(config, gradient_checkpointing=True))

@@ -43,6 +43,7 @@ def disturbed(marks, *key):
     return shift
 
 
+@pytest.mark.slow
 def test_a_hundred_starts_of_any_yaw_and_up_to_twenty_metres():
     ego, other, ego_from_other = views()
     assert len(ego) > 15

@@ -124,6 +124,7 @@ def test_a_vehicle_is_shown_as_far_as_its_solids_reach_and_within_its_box(kind: 
     np.testing.assert_allclose(shown.max(0) + 0.5, pixel.max(0), atol=1.0)
 
 
+@pytest.mark.slow
 def test_camera_and_lidar_at_one_pose_hit_the_same_objects() -> None:
     wall = block((20.0, 8.0, 1.0), (0.3, 4.0, 1.0))
     scene = make_lit_scene(vehicles((12.0, -3.0, 0.4), (26.0, 5.0, 0.0), (30.0, -6.0, 1.0)), wall)

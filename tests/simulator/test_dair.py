@@ -24,6 +24,9 @@ from manyeyes.simulator.presets import make_jobs, simulation_preset
 from manyeyes.simulator.record import Job, RecordingProgress, make_first_scenario
 from manyeyes.simulator.scene.scenario import ScenarioSpec, SimulatedScenario
 
+pytestmark = pytest.mark.slow
+
+
 SPEC = ScenarioSpec(
     town="generated-1",
     seed=7,
@@ -198,7 +201,6 @@ def test_damaged_files_of_finished_drives_are_named(made: Path, tmp_path: Path, 
     assert DairRecording(root).verify().count == 0
 
 
-@pytest.mark.slow
 def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
     record_dair(JOBS, tmp_path, workers=2)
     assert files(tmp_path) == files(made)

@@ -16,6 +16,9 @@ from manyeyes.simulator.record import Job, RecordingProgress, record
 from manyeyes.simulator.scene.scenario import ScenarioSpec, make_scenario
 from manyeyes.simulator.scene.towns import load_town
 
+pytestmark = pytest.mark.slow
+
+
 SPEC = ScenarioSpec(
     "generated-1", 7, "one", vehicles=1, frames=2, history_frames=1, roadside_chance=1.0, min_vehicles=6
 )
@@ -34,7 +37,6 @@ def files(root: Path) -> dict[str, bytes]:
     return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
-@pytest.mark.slow
 def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
     seen: list[RecordingProgress] = []
     record(JOBS, tmp_path, workers=2, progress=seen.append)
@@ -42,7 +44,6 @@ def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
     assert [p.done for p in seen] == [1, 2]
 
 
-@pytest.mark.slow
 def test_the_reader_returns_the_simulators_own_truth(made: Path) -> None:
     recording = Opv2vRecording(made, "train", strict=True, use_cache=False)
     assert recording.scenarios == ("one", "two")
@@ -61,7 +62,6 @@ def test_the_reader_returns_the_simulators_own_truth(made: Path) -> None:
     assert int((count_points_in_listed_boxes(read) == 0).sum()) == 0
 
 
-@pytest.mark.slow
 def test_pictures_lie_beside_the_clouds_as_they_were_taken(made: Path) -> None:
     assert len(list((made / "train" / "two" / "-1").glob("*_camera0.png"))) == 2
     assert not list((made / "train" / "one").rglob("*.png"))
@@ -92,7 +92,6 @@ def test_the_manifest_counts_and_hashes_what_is_there(made: Path) -> None:
         assert entry["moving"] >= 0.5
 
 
-@pytest.mark.slow
 def test_finished_scenarios_are_kept_and_half_written_ones_redone(made: Path) -> None:
     before = files(made)
     kept = (made / "train" / "one" / "scenario.json").stat().st_mtime_ns

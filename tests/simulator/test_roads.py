@@ -57,6 +57,7 @@ def test_arms_are_groups_of_directions():
     assert _count_arms(np.zeros(0)) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHARED.is_dir(), reason=f"the CARLA towns are not at {SHARED}")
 def test_crossings_of_town05_avoid_its_bridges():
     network = read_opendrive(SHARED / "Town05.xodr.gz")

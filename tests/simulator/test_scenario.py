@@ -120,6 +120,7 @@ def test_lead_frames_do_not_change_later_frames(scenario: SimulatedScenario) -> 
     assert float((agent[1] - agent[0]).norm()) == pytest.approx(0.3 * ago, abs=0.3)
 
 
+@pytest.mark.slow
 def test_impossible_requests_are_named() -> None:
     with pytest.raises(NoSceneError, match="no crossing in generated-1 has 5000 vehicles"):
         make_scenario(replace(SPEC, min_vehicles=5000), load_town("generated-1"))

@@ -80,6 +80,7 @@ def test_errors_list_towns_places_and_remedy(nowhere: Path):
         find_town("Town05", nowhere / "torn.whl")
 
 
+@pytest.mark.slow
 def test_generated_town_is_the_same_for_the_same_seed():
     pytest.importorskip("sumo")
     one, again, other = find_town("generated-1"), find_town("generated-1"), find_town("generated-3")

@@ -81,6 +81,7 @@ def test_no_vehicle_appears_vanishes_or_touches(drive):
             assert not overlaps(corners[n], corners[:n]).any()
 
 
+@pytest.mark.slow
 def test_same_seed_same_traffic_other_seed_other_traffic(town, drive):
     again = simulate_traffic(town, 4, STEPS, vehicles_per_lane_km=12.0, warmup_s=20.0)
     for one, two in zip(drive, again, strict=True):

@@ -133,6 +133,7 @@ def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_pat
     }
 
 
+@pytest.mark.slow
 def test_perturbations_are_selected_by_name(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "late", "intermediate", "--frame-stride", 2, "--perturbations", "0.4 s")
     held = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
@@ -144,6 +145,7 @@ def test_perturbations_are_selected_by_name(data, weights, tmp_path, panels) -> 
         select_perturbations(["4 s"], robustness.ALL_PERTURBATIONS)
 
 
+@pytest.mark.slow
 def test_baseline_fusions_are_compared_with_ours_under_each_perturbation(
     data, weights, tmp_path, panels, capsys
 ) -> None:
@@ -210,6 +212,7 @@ def test_budgets_are_respected_and_small_ones_send_less(data, weights, tmp_path)
     assert {r["method"] for r in held["reference_rows"]} == {"none", "late"}
 
 
+@pytest.mark.slow
 def test_numbers_of_agents_are_evaluated_on_scenarios_that_have_them(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "none", "late", "--frame-stride", 2)
     rows = evaluate(data, weights, tmp_path, "num-agents", *words)["result"]["rows"]
@@ -234,6 +237,7 @@ def test_ablation_shows_each_checkpoint_with_its_card(data, weights, tmp_path, p
     assert [p.ticks for p in panels] == 2 * [("first", "again")] and len(panels[0].curves) == 3
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_the_ablation_may_have_a_budget(data, weights, tmp_path, panels, capsys) -> None:
     words = ("--frame-stride", 2, "--checkpoints", f"all={weights}", f"masked={weights}@1398")
     rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]
@@ -244,6 +248,7 @@ def test_a_checkpoint_of_the_ablation_may_have_a_budget(data, weights, tmp_path,
         assert "behind @ stands a number of bytes" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_with_shared_bandwidth_every_agent_is_ego_under_one_budget(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "none", "--token-selection", "intermediate", "--budgets", 6000, "--frame-stride", 2)
     rows = evaluate(data, weights, tmp_path, "shared-bandwidth", *words)["result"]["rows"]
@@ -254,6 +259,7 @@ def test_with_shared_bandwidth_every_agent_is_ego_under_one_budget(data, weights
     assert {c.label: len(c.x) for c in panels[0].curves} == {"intermediate": 1, "none": 0}
 
 
+@pytest.mark.slow
 def test_the_qualitative_study_shows_the_frame_with_max_agents(data, weights, tmp_path) -> None:
     held = evaluate(data, weights, tmp_path, "qualitative")["result"]
     assert (held["scenario"], held["frame"]) == ("b", 5)

@@ -191,6 +191,7 @@ def test_local_maps_have_a_row_for_each_kind_of_agent(weights, tmp_path, monkeyp
     assert "CrowdMap's Table 1" in text
 
 
+@pytest.mark.slow
 def test_the_corrector_is_held_against_half_of_the_loss(weights, tmp_path, monkeypatch):
     rows = {SINGLE_VEHICLE: 1, CLEAN: 5, NOISY: 2, CORRECTED: 5, CLEAN_CORRECTED: 5}
     monkeypatch.setattr(pose, "PoseNoisePredictor", lambda pose_correction: make_predictor(rows))

@@ -79,6 +79,7 @@ def evaluate(data, out, study, *words):
     return json.loads((out / f"{study}.json").read_text())["result"]
 
 
+@pytest.mark.slow
 def test_every_corrector_with_every_fusion_under_the_requested_levels(data, tmp_path) -> None:
     words = ("--methods", "none", "intermediate", "--frame-stride", 2, "--perturbations", "2°, 2 m", "0.8 m")
     held = evaluate(data, tmp_path, "pose-noise-ap", *words)
@@ -139,6 +140,7 @@ def write_net(data, name: str, detector: str = "", max_keypoints: int = 64) -> s
     return str(data / name)
 
 
+@pytest.mark.slow
 def test_the_ablation_of_feakm_has_a_row_per_variant_and_level_and_stores_it(data, tmp_path, monkeypatch) -> None:
     one, two = write_net(data, "one.safetensors"), write_net(data, "two.safetensors", max_keypoints=3)
     detector = data / "untrained.safetensors"
@@ -167,6 +169,7 @@ def test_feakm_corrects_before_fusion_by_the_file_of_its_weights(data, tmp_path)
     assert cli.main([str(w) for w in ("evaluate", *common, "--out", tmp_path, "--pose-correction", wrong)]) == 1
 
 
+@pytest.mark.slow
 def test_poses_are_evaluated_by_error_and_common_objects_and_stored(data, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(pose_accuracy, "SIGMAS", (0.0, 0.8))
     monkeypatch.setattr(pose_accuracy, "NOISE_FAMILIES", (("offset", 0.5), ("none", 0.0)))

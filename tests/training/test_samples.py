@@ -295,6 +295,7 @@ def test_pose_errors_match_their_reported_sigmas(toy):
     assert float((yaw > 0).float().mean()) == pytest.approx(0.75 * 0.5, abs=0.07)
 
 
+@pytest.mark.slow
 def test_frequencies_of_delay_loss_and_budget(toy):
     recording = toy(cars=1, points_per_car=1, ground_points=1)
     moments = [recording.snapshot("toy_0", i) for i in range(5)]

@@ -36,6 +36,7 @@ def test_a_wider_interval_and_another_level_are_other_pictures(tmp_path) -> None
     assert np.abs(first - wider).any() and np.abs(first - other).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("values", [(0.5, 0.9), (math.nan, 0.9)])
 def test_bytes_have_their_logarithm_on_top_and_ticks_their_names(tmp_path, values) -> None:
     panels = [
