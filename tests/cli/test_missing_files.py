@@ -426,6 +426,6 @@ def test_pairs_of_dair_v2x_are_checked_alike(
     assert evaluate(pairs, weights, tmp_path / "out") == 1
     output = capsys.readouterr().err
     assert str(path) in output and "--allow-missing" in output
-    if damage is not no_label:  # without its truth no pair is judged, allowed or not
+    if damage is not no_label:  # without its truth no pair is evaluated, allowed or not
         assert evaluate(pairs, weights, tmp_path / "out", "--allow-missing") == 0
         assert json.loads((tmp_path / "out" / "results.json").read_text())["result"]["missing"]["count"] == 1

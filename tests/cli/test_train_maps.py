@@ -60,6 +60,6 @@ def test_an_unknown_preset_names_the_map_presets():
 def test_a_model_with_cameras_needs_pictures(recorded, capsys):
     with pytest.raises(ConfigError, match="no pictures in generated-1_0000"):
         train.main(train.Options(recorded, preset="map-small-camera"))
-    # Of the models that ship those are judged whose sensors the recording has.
+    # Of the models that ship those are evaluated whose sensors the recording has.
     options = MapModelOptions(data=recorded, split="test")
     assert [model.sensors for model in model_study.resolve_models(options)] == ["LiDAR"]

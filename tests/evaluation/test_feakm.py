@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""FeaKM judged: the ablation fuses what agents fuse, and correctors are judged on the same keypoints and claims."""
+"""FeaKM evaluated: the ablation fuses what agents fuse, and correctors are evaluated on the same keypoints and claims."""
 
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps drawn by hand, judged; every number is worked out beside the drawing."""
+"""Maps drawn by hand, evaluated; every number is worked out beside the drawing."""
 
 import math
 

@@ -41,8 +41,8 @@ class Street:
     ("every", "left"), [(1, [*range(6, 16)]), (3, [6, 9, 12, 15]), (5, [6, 11]), (10, [6]), (99, [6])]
 )
 def test_every_kth_frame_is_evaluated_and_none_after_the_last(every, left) -> None:
-    judged = FrameStride(Street(), every).eval_indices("many")
-    assert list(judged) == left and judged.stop == left[-1] + 1
+    evaluated = FrameStride(Street(), every).eval_indices("many")
+    assert list(evaluated) == left and evaluated.stop == left[-1] + 1
 
 
 def test_every_zeroth_is_refused() -> None:

@@ -112,7 +112,7 @@ def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_pat
     assert len(rows) == 1 + 2 * len(small_set)
     late = [r for r in rows if r["method"] == "late"]
     assert [r["oracle"] for r in late] == ["", "true poses", "", "", "", "no delay"]
-    # A message that is d old when it comes is d old when it is used; frame 4 alone is judged.
+    # A message that is d old when it comes is d old when it is used; frame 4 alone is evaluated.
     assert [late[k]["age_ms"] for k in (0, 1, 2, 3)] == pytest.approx([0, 100, 400, 0])
     assert [len(r["ap_by_speed"]) for r in late] == [3, 3, 3, 0, 0, 0]
     # One car stands, one drives at 10 m/s, none is slower: that class has no AP.

@@ -68,7 +68,7 @@ def describe_drive_map(stats: MapBuildStats) -> str:
 
 @dataclass(frozen=True)
 class DemoMapStats:
-    """What the demo's map is worth: judged against the truth, beside the union of all observations."""
+    """What the demo's map is worth: evaluated against the truth, beside the union of all observations."""
 
     num_observations: int
     num_elements: int

@@ -34,7 +34,7 @@ class Options:
     scenario: str | None = None
     """Which scenario; the first by default."""
     frame: NonNegativeInt | None = None
-    """Index of the frame; the first judged one by default. An animation starts there."""
+    """Index of the frame; the first evaluated one by default. An animation starts there."""
     frames: PositiveInt = 60
     """At most so many frames of an animation."""
     out: Path = Path("out/view.png")

@@ -187,7 +187,7 @@ class Inbox:
         return self._expire_ns is not None and now_ns - timestamp_ns > self._expire_ns
 
     def _refusal(self, fragment: Fragment, arrival_ns: int | None) -> DropReason | None:
-        """Why a proper packet is not wanted, judged by itself."""
+        """Why a proper packet is not wanted, evaluated by itself."""
         stamp = fragment.header.timestamp_ns
         if arrival_ns is not None:
             if self._is_old(stamp, arrival_ns):

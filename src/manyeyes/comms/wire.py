@@ -293,7 +293,7 @@ def _encode_covariance(covariance: NDArray[np.float64]) -> list[int]:
     if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
         raise WireError(f"Message.pose_covariance is a finite (3, 3); got {covariance.tolist()}.")
     sigma = np.sqrt(np.maximum(covariance.diagonal(), 0))
-    # Metres and radians differ by orders of magnitude: what counts as zero is judged on the correlations.
+    # Metres and radians differ by orders of magnitude: what counts as zero is evaluated on the correlations.
     scale = np.outer(sigma, sigma)
     correlation = np.divide(covariance, scale, out=np.zeros((3, 3)), where=scale > 0)
     back = correlation * scale

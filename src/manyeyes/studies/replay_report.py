@@ -204,7 +204,7 @@ def _make_facts(drive: Excerpt, detector: BoxDetector, spec: ReportSpec) -> tupl
     return (
         *spec.facts,
         ("Scenario", drive.scenario),
-        ("Judged frames", str(len(drive.eval_indices(drive.scenario)))),
+        ("Evaluated frames", str(len(drive.eval_indices(drive.scenario)))),
         ("Agents", str(len(drive.agents(drive.scenario)))),
         ("Channel", spec.replay.radio.name),
         ("The ego waits", f"{1e3 * spec.replay.latency_budget_s:.0f} ms"),
@@ -216,7 +216,7 @@ def _make_notes(protocol: DetectionProtocol) -> tuple[str, ...]:
     x0, y0, _, x1, y1, _ = protocol.gt_range
     place = f"x from {x0:g} to {x1:g} m, y from {y0:g} to {y1:g} m around the ego"
     text = (
-        f"Judged are the vehicles that any agent's LiDAR met, {place}. This is one drive: its numbers show what "
+        f"The vehicles that the LiDAR of any agent hit are evaluated, {place}. This is one drive: its numbers show what "
         "happened here, and resolve no difference between methods; 'manyeyes evaluate' does, over many."
     )
     return (text,)

@@ -58,7 +58,7 @@ class TownMap:
 
     @property
     def cut_policy(self) -> CutPolicy | None:
-        """The cut that maps get before they are judged, as in the studies."""
+        """The cut that maps get before they are evaluated, as in the studies."""
         from manyeyes.evaluation.maps.experiment import CutPolicy
 
         return None if self.place is None else CutPolicy(self.place.junctions, self.place.area)

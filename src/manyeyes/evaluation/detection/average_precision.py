@@ -206,11 +206,11 @@ class ApResult:
 
 
 def select_ego_truth(snapshot: Snapshot, ego: int, protocol: DetectionProtocol) -> Boxes:
-    """Return the truth that frames[ego] is judged by, in its true frame, float64; the rule is in the module's text."""
+    """Return the truth that frames[ego] is evaluated by, in its true frame, float64; the rule is in the module's text."""
     truth = snapshot.truth
     if truth is None:
         raise RecordingError(
-            f"{snapshot.scenario} #{snapshot.index} has no truth; only recordings with labels are judged."
+            f"{snapshot.scenario} #{snapshot.index} has no truth; only recordings with labels are evaluated."
         )
     position = truth.world_from_agent.translation[:, :2]
     near = (position - position[ego]).norm(dim=-1) <= protocol.com_range_m

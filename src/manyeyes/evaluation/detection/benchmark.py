@@ -31,7 +31,7 @@ CONDITIONS_PER_GROUP = 8
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
-    """What is compared, and how it is judged. weights: a name, a path or a detector. protocol: by name, over the detector's range.
+    """What is compared, and how it is evaluated. weights: a name, a path or a detector. protocol: by name, over its range.
 
     frame_stride: judge each so many-th frame. num_agents: the nearest so many, in scenarios that have them; None: all of all
     scenarios.
@@ -46,7 +46,7 @@ class BenchmarkConfig:
     num_agents: int | None = None
 
     def filter_recording(self, recording: Recording) -> Recording:
-        """What is judged of a recording."""
+        """What is evaluated of a recording."""
         filtered = recording if self.num_agents is None else NearestAgents(recording, self.num_agents)
         return filtered if self.frame_stride == 1 else FrameStride(filtered, self.frame_stride)
 

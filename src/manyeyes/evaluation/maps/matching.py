@@ -105,7 +105,7 @@ def compute_chamfer(predicted: Lines, truth: Lines, protocol: MatchingProtocol, 
     """Return (N, M) Chamfer distances; inf where the boxes are farther apart than max_distance_m, or the protocol leaves the
     pair out.
 
-    No Chamfer distance is below the gap between the boxes, so that thresholds up to max_distance_m are judged exactly.
+    No Chamfer distance is below the gap between the boxes, so that thresholds up to max_distance_m are evaluated exactly.
     """
     table = np.full((len(predicted), len(truth)), np.inf)
     if table.size == 0:

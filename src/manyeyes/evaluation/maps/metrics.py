@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How good a map is. This text is the definition of the metrics.
 
-**What is judged.** Two tables of map elements in one metric frame, kind by kind (divider, boundary, crossing, stop_line);
+**What is evaluated.** Two tables of map elements in one metric frame, kind by kind (divider, boundary, crossing, stop_line);
 kinds never mix. A crossing enters as its closed ring. Elements with fewer than two points or without length are left out.
 Nothing is clipped here: the caller clips the truth to the observed area (evaluation.maps.observed_area).
 
@@ -112,7 +112,7 @@ class KindMetrics:
 
 @dataclass(frozen=True)
 class MapMetrics:
-    """A map judged against the truth, one entry a kind in the order of KINDS."""
+    """A map evaluated against the truth, one entry a kind in the order of KINDS."""
 
     kinds: tuple[KindMetrics, ...]
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Correctors of poses on a recording: what agents detect at each instant, answers under each error of claims, their numbers.
 
-Detections are made once and serve every corrector and every error. What is judged is defined in evaluation/pose/metrics.py. Nothing
+Detections are made once and serve every corrector and every error. What is evaluated: evaluation/pose/metrics.py. Nothing
 of the truth reaches a corrector: it is kept beside the landmarks, for the claims' errors and for judging.
 """
 

@@ -56,7 +56,7 @@ class FeakmVariant:
 
 @dataclass(frozen=True)
 class FeakmVariantRow:
-    """One branch at one level. ap: at each of IOUS. num_frames: judged; num_collaborators: collaborators in them; found_fraction:
+    """One branch at one level. ap: at each of IOUS. num_frames: evaluated; num_collaborators: in them; found_fraction:
     the share of these whose pose was found.
     """
 

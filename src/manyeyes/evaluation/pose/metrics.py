@@ -35,7 +35,7 @@ CHI2_3DOF_95 = 7.815
 
 @dataclass(frozen=True)
 class PoseEvaluation:
-    """One frame judged. num_common: objects in common. translation_error_m, rotation_error_deg: error of the pose used, infinite
+    """One frame evaluated. num_common: objects in common. translation_error_m, rotation_error_deg: error of the pose used, infinite
     where there is none.
 
     displacement_m: of the objects in common (m), NaN without any. nees: NaN where objects gave no pose. confidence: by
@@ -84,7 +84,7 @@ def evaluate_pose(estimate: PoseEstimate, truth: Floats, common_xy: Floats) -> P
     frame.
     """
     if truth.shape != (3,) or common_xy.ndim != 2 or common_xy.shape[1] != 2:
-        raise ConfigError(f"judged needs a pose (3,) and places (K, 2); got {truth.shape} and {common_xy.shape}.")
+        raise ConfigError(f"evaluated needs a pose (3,) and places (K, 2); got {truth.shape} and {common_xy.shape}.")
     pose = estimate.pose
     if pose is None:
         return PoseEvaluation(estimate.status, len(common_xy), math.inf, math.inf, math.nan, math.nan, -math.inf)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each further agent brings: the ego with the nearest so many others, one to five in all.
 
-A row of n agents is judged on the scenarios that have as many, against the truth of everybody that is there; what it gains over
-one agent fewer and over no fusion is judged on those same scenarios.
+A row of n agents is evaluated on the scenarios that have as many, against the truth of everybody that is there; what it gains over
+one agent fewer and over no fusion is evaluated on those same scenarios.
 """
 
 from __future__ import annotations

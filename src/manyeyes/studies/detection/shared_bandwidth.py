@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The system as a whole: every agent judged as ego in turn, all senders within one budget of the channel (CoSTr, Eq. 2).
+"""The system as a whole: every agent evaluated as ego in turn, all senders within one budget of the channel (CoSTr, Eq. 2).
 
 What is maximised is the AP of all egos together, their detections in one list. What one sender does not need of its part goes
 to the others (comms/bandwidth.py). A broadcast is received by all agents and counted once. The largest budget is what 27 Mbit/s

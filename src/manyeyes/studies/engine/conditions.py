@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Methods replayed under many conditions: one cell for each method and condition, and the paired statistics over them.
 
-Cells are judged over scenarios; differences are paired: all cells are resampled alike, and the unit draws of noise, loss and
+Cells are evaluated over scenarios; differences are paired: all cells are resampled alike, and the unit draws of noise, loss and
 jitter are the same at every level. AP of a speed class counts the true boxes of that class; a detection that was matched to a box
 of another class is left out, neither right nor wrong; one that matched nothing is false in every class.
 """
@@ -40,7 +40,7 @@ ResultKey = tuple[str, str]
 class BusVolume:
     """Bytes handed to the bus. max_message_bytes: one agent's at one instant; snapshot: of all senders together, mean and maximum.
 
-    Where the first agent alone is judged, its own message is not received by it and is not counted.
+    Where the first agent alone is evaluated, its own message is not received by it and is not counted.
     """
 
     max_message_bytes: int

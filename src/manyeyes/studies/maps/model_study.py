@@ -49,7 +49,7 @@ class OpenRecording:
 
 @dataclass(frozen=True)
 class StudyModel:
-    """Weights by name, the sensors that they are for, and where they are judged."""
+    """Weights by name, the sensors that they are for, and where they are evaluated."""
 
     weights: str
     sensors: str
