@@ -272,3 +272,15 @@ def test_a_wide_table_folds_headings_and_never_numbers() -> None:
     console.print(make_table("", headings, lines))
     text = console.export_text()
     assert "…" not in text and list(lines[0]) == text.splitlines()[-1].split()
+
+
+def test_a_table_wider_than_the_terminal_continues_below() -> None:
+    from rich.console import Console
+
+    from manyeyes.viz.table import make_table
+
+    headings, numbers = ("method", *["duplication"] * 14), [f"0.{n:02}345" for n in range(14)]
+    console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: PTH123, SIM115
+    console.print(make_table("", headings, [("global-map-builder", *numbers)]))
+    rows = [line.split() for line in console.export_text().splitlines() if "global-map-builder" in line]
+    assert len(rows) > 1 and [number for row in rows for number in row[1:]] == numbers

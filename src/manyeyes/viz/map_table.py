@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from rich.table import Table
+from rich.console import RenderableType
 
 from manyeyes.evaluation.maps.change_summary import KindChange
 from manyeyes.evaluation.maps.metrics import MapMetrics
@@ -15,7 +15,7 @@ from manyeyes.viz.table import make_table
 PROTOCOLS = {"exact": "Chamfer-exact", "maptr": "MapTR", "streammapnet": "StreamMapNet"}
 
 
-def make_kinds_table(metrics: MapMetrics, title: str) -> Table:
+def make_kinds_table(metrics: MapMetrics, title: str) -> RenderableType:
     """Tabulate one map: a column for each kind that is predicted or true, and one for the mean over kinds."""
     kinds = [k for k in metrics.kinds if k.n_predicted or k.n_truth]
     lines = [
@@ -34,7 +34,7 @@ def make_kinds_table(metrics: MapMetrics, title: str) -> Table:
     return make_table(title, ("metric", *(k.kind for k in kinds), "mean"), lines)
 
 
-def make_change_table(changes: Sequence[KindChange], title: str) -> Table:
+def make_change_table(changes: Sequence[KindChange], title: str) -> RenderableType:
     """Tabulate changes: a row for each kind that has elements."""
     lines = [
         (c.kind, *map(str, counts), f"{c.added_length_m:.0f}", f"{c.removed_length_m:.0f}")

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rich.table import Table
+from rich.console import RenderableType
 
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
@@ -25,7 +25,7 @@ class StudyTable:
     lines: tuple[tuple[str, ...], ...]
 
 
-def make_terminal_table(study_table: StudyTable) -> Table:
+def make_terminal_table(study_table: StudyTable) -> RenderableType:
     """Create the table for a terminal; a wide one leaves the intervals to the document."""
     wide = len(study_table.headings) > _MAX_NARROW_COLUMNS
     lines = [[cell.partition(" [")[0] if wide else cell for cell in line] for line in study_table.lines]

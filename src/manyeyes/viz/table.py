@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rich import box
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -77,8 +78,11 @@ def format_cells(row: MethodRow) -> tuple[str, ...]:
     )
 
 
-def make_table(title: str, headings: Sequence[str], lines: Sequence[Sequence[str]], num_left: int = 1) -> Table:
-    """Create a table for the terminal: headings are folded where space is short, numbers never.
+def make_table(
+    title: str, headings: Sequence[str], lines: Sequence[Sequence[str]], num_left: int = 1
+) -> RenderableType:
+    """Create a table for the terminal: headings are folded where space is short, numbers never; a table that is wider than 80
+    columns continues below, with its columns of text again.
 
     Args:
         title: above the table; empty for none.
@@ -86,15 +90,25 @@ def make_table(title: str, headings: Sequence[str], lines: Sequence[Sequence[str
         lines: cells as text.
         num_left: number of columns of text, aligned left, whose cells wrap at spaces.
     """
-    table = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    table.padding = 0
     widths = _find_widths(headings, lines, num_left)
-    for column, (heading, width) in enumerate(zip(headings, widths)):
-        justify = "left" if column < num_left else "right"
-        table.add_column(Text(heading), justify=justify, overflow="fold", width=width)
-    for line in lines:
-        table.add_row(*map(Text, line))
-    return table
+    blocks = [list(range(num_left))]
+    for column in range(num_left, len(widths)):
+        if sum(widths[c] + 1 for c in blocks[-1]) + widths[column] > TERMINAL_WIDTH:
+            blocks.append(list(range(num_left)))
+        blocks[-1].append(column)
+    parts: list[RenderableType] = []
+    for block in blocks:
+        heading = title if title and not parts else None
+        table = Table(
+            title=heading, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, padding=0
+        )
+        for column in block:
+            justify = "left" if column < num_left else "right"
+            table.add_column(Text(headings[column]), justify=justify, overflow="fold", width=widths[column])
+        for line in lines:
+            table.add_row(*(Text(line[column]) for column in block))
+        parts += ["", table] if parts else [table]
+    return Group(*parts)
 
 
 def _find_widths(headings: Sequence[str], lines: Sequence[Sequence[str]], num_left: int) -> list[int]:
@@ -103,8 +117,11 @@ def _find_widths(headings: Sequence[str], lines: Sequence[Sequence[str]], num_le
     """
     columns = [[line[column] for line in lines] for column in range(len(headings))]
     widths = [_max_length(cells, None if column < num_left else "\n") for column, cells in enumerate(columns)]
+    words = [_max_length([heading], None) for heading in headings]
+    if sum(widths) + len(widths) > TERMINAL_WIDTH:
+        return list(map(max, widths, words))
     for wanted in (
-        [_max_length([heading], None) for heading in headings],
+        words,
         [_max_length(cells, "\n") for cells in columns],
         [_max_length([heading], "\n") for heading in headings],
     ):
@@ -118,7 +135,7 @@ def _max_length(texts: Sequence[str], separator: str | None) -> int:
     return max((len(part) for text in texts for part in text.split(separator)), default=1)
 
 
-def make_terminal_table(rows: Sequence[MethodRow], title: str = "") -> Table:
+def make_terminal_table(rows: Sequence[MethodRow], title: str = "") -> RenderableType:
     """Create the table of methods for 80 columns: units and intervals are on a second line."""
     headings = [heading.replace("/", "/\n").replace("(", "\n(").replace(" [", "\n[") for heading in HEADINGS]
     return make_table(title, headings, [[_two_lines(cell) for cell in format_cells(row)] for row in rows])
@@ -137,7 +154,7 @@ def missing_footer(count: int, listed_in: str = "results.json") -> str:
     return f"{files} missing or mismatched: the ground truth and all rows are affected; see {listed_in}."
 
 
-def make_differences_table(differences: Sequence[Comparison]) -> Table:
+def make_differences_table(differences: Sequence[Comparison]) -> RenderableType:
     """Create the table of paired differences for the terminal."""
     return make_table("", DIFFERENCE_HEADINGS, [format_difference_cells(difference) for difference in differences])
 
