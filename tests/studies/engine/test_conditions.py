@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of cells hold all that their numbers depend on; differences of cells are paired."""
 
+import importlib
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from manyeyes.agents.pose_correction import PoseCorrection
 from manyeyes.agents.replay import ReplayConfig
 from manyeyes.comms.channel import channel_preset
 from manyeyes.datasets.perturbation import PoseNoise
@@ -18,6 +21,7 @@ from manyeyes.evaluation.statistics.bootstrap import bootstrap
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.pose.registry import POSE_CORRECTORS
 from manyeyes.studies.engine.cells import CellStore, hash_recording
 from manyeyes.studies.engine.conditions import BusVolume, MethodMatches, ResultGrid, make_cell
 
@@ -58,6 +62,29 @@ def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_p
     (tmp_path / "copy.safetensors").write_bytes((weights / "0.safetensors").read_bytes())
     moved = replace(base, weights=str(tmp_path / "copy.safetensors"), methods=("late", "early"))
     assert path(moved, "late", "data") == paths[0]
+
+
+CORRECTOR = """
+from manyeyes.pose.registry import load_corrector, register_pose_corrector
+
+@register_pose_corrector("their-corrector")
+def correct(ego, other, prior):
+    return load_corrector("identity")(ego, other, prior)
+"""
+
+
+def test_the_source_of_a_third_party_corrector_counts(weights, tmp_path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(POSE_CORRECTORS, "_items", POSE_CORRECTORS.load_all())
+    (tmp_path / "their_corrector.py").write_text(CORRECTOR)
+    importlib.import_module("their_corrector")
+    replay = ReplayConfig(pose_correction=PoseCorrection("their-corrector"))
+    config = BenchmarkConfig(str(weights / "0.safetensors"), ("late",), replay=replay)
+    before = make_cell(config, "late", "data")
+    assert make_cell(config, "late", "data") == before
+    (tmp_path / "their_corrector.py").write_text(CORRECTOR + "LATER = True\n")
+    assert make_cell(config, "late", "data").key != before.key
+    sys.modules.pop("their_corrector")
 
 
 class OneFrame:

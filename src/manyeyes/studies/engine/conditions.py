@@ -25,6 +25,7 @@ from manyeyes.evaluation.detection.communication import Communication
 from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval, bootstrap
 from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.models.checkpoint import fingerprint
+from manyeyes.pose.registry import load_corrector
 from manyeyes.studies.engine.cells import Cell, CellStore, hash_recording, third_party_source
 
 COMPUTED_BY = ("manyeyes.evaluation.detection.benchmark",)
@@ -184,8 +185,10 @@ def run_conditions(
 
 def make_cell(config: BenchmarkConfig, method: str, recording_hash: str) -> Cell[MethodMatches]:
     """Describe the cell of one method of a configuration."""
-    method_config = replace(config, methods=(method,), weights=load_detector(config.weights).fingerprint.hex())
-    net = config.replay.pose_correction.net if config.replay.pose_correction is not None else None
+    detector, correction = load_detector(config.weights), config.replay.pose_correction
+    method_config = replace(config, methods=(method,), weights=detector.fingerprint.hex())
+    net = None if correction is None else correction.net
     corrector_fingerprint = "" if net is None else fingerprint(net).hex()
-    source = third_party_source(get_strategy(method), load_detector(config.weights))
+    corrector = None if correction is None else load_corrector(correction.corrector)
+    source = third_party_source(get_strategy(method), detector, getattr(detector, "fusion", None), corrector)
     return Cell(method, MethodMatches, (method_config, corrector_fingerprint, recording_hash, source), COMPUTED_BY)
