@@ -23,15 +23,15 @@ from manyeyes._io import atomic_write
 T = TypeVar("T")
 
 
-def save_record(path: Path, value: object) -> None:
-    """Write a value to a file: whole, or not there.
+def save_record(path: Path, value: object, durable: bool = False) -> None:
+    """Write a value to a file: whole, or not there; durable: also after a loss of power.
 
     Fields are numbers, texts, enumerations, None, arrays, tensors, tuples of these, and such dataclasses or named tuples again.
     """
     arrays: list[np.ndarray] = []
     header = json.dumps(_pack(value, arrays)).encode()
     chunks = (_bytes_of(array) for array in arrays if array.size)
-    atomic_write(path, b"%08x" % zlib.crc32(header), header, b"\n", *chunks, durable=False)
+    atomic_write(path, b"%08x" % zlib.crc32(header), header, b"\n", *chunks, durable=durable)
 
 
 def load_record(path: Path, kind: type[T]) -> T | None:

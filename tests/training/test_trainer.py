@@ -4,6 +4,7 @@
 import itertools
 import json
 import os
+import resource
 import signal
 from dataclasses import dataclass, replace
 
@@ -169,3 +170,41 @@ def test_only_matrices_have_weight_decay():
 def test_presets_of_all_tasks_have_names_of_their_own():
     assert {"costr-small/stage1", "feakm-small", "map-small-lidar"} <= set(TRAINING_PRESETS)
     assert all(config.batch >= 1 and config.learning_rate > 0 for config in TRAINING_PRESETS.values())
+
+
+def test_a_full_disk_keeps_the_last_state_and_the_run_goes_on_from_it(tmp_path):
+    whole = Trainer(LineTask(CONFIG), tmp_path / "whole")
+    whole.run()
+
+    def fill(progress):
+        if progress.step == 3:
+            used = (tmp_path / "full" / "log.jsonl").stat().st_size
+            resource.setrlimit(resource.RLIMIT_FSIZE, (used + 20, limit[1]))
+
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        with pytest.raises(OSError, match="free some space and run again") as error:
+            Trainer(LineTask(CONFIG), tmp_path / "full").run(report=fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert error.value.filename == str(tmp_path / "full" / "log.jsonl")
+    resumed = Trainer(LineTask(CONFIG), tmp_path / "full")
+    assert resumed.step == 2
+    resumed.run()
+    assert (tmp_path / "full" / "log.jsonl").read_bytes() == (tmp_path / "whole" / "log.jsonl").read_bytes()
+    assert torch.equal(resumed.model.weight, whole.model.weight)
+
+
+def test_a_full_disk_at_a_save_names_the_state_and_keeps_the_last_one(tmp_path):
+    run = Trainer(LineTask(CONFIG), tmp_path)
+    run.save()
+    before, limit = run.path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    run.advance()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limit[1]))
+    try:
+        with pytest.raises(OSError, match="free some space") as error:
+            run.save()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert error.value.filename == str(run.path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"last.pt": before}

@@ -47,6 +47,13 @@ class Options:
 
 def main(options: Options) -> None:
     """Simulate a drive, evaluate the methods on it, and write a report."""
+    from manyeyes._lock import hold_folder
+
+    with hold_folder(options.out):
+        _run_demo(options)
+
+
+def _run_demo(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.datasets.registry import open_recording

@@ -38,6 +38,13 @@ class Options(EvaluationOptions):
 
 def main(options: Options) -> None:
     """Evaluate methods on a split."""
+    from manyeyes._lock import hold_folder
+
+    with hold_folder(options.out):
+        _evaluate(options)
+
+
+def _evaluate(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes._io import atomic_write_text

@@ -89,6 +89,13 @@ class CorrectorResult:
 
 def main(options: Options) -> None:
     """Evaluate pose correction on a recording."""
+    from manyeyes._lock import hold_folder
+
+    with hold_folder(options.out):
+        _evaluate_poses(options)
+
+
+def _evaluate_poses(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.agents.perception_cache import PerceptionCache

@@ -42,6 +42,13 @@ class Options:
 
 def main(options: Options) -> None:
     """Replay a drive and write a report."""
+    from manyeyes._lock import hold_folder
+
+    with hold_folder(options.out):
+        _replay(options)
+
+
+def _replay(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.datasets.registry import open_recording

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,13 +67,17 @@ def main(options: Options) -> None:
     import torch.distributed as dist
     from rich.console import Console
 
-    config = make_config(options)
+    from manyeyes._lock import hold_folder
+
+    config, out = make_config(options), options.out or Path("runs") / options.preset
     torch.set_num_threads(options.threads)
     is_distributed = int(os.environ.get("WORLD_SIZE", "1")) > 1
     if is_distributed:
         dist.init_process_group("gloo")
+    is_first = not is_distributed or dist.get_rank() == 0
     try:
-        _train(options, config, Console(quiet=is_distributed and dist.get_rank() > 0))
+        with hold_folder(out) if is_first else nullcontext():
+            _train(options, config, out, Console(quiet=not is_first))
     finally:
         if is_distributed:
             dist.destroy_process_group()
@@ -110,7 +115,8 @@ def _with_fusion(config: TrainConfig, fusion: str) -> TrainConfig:
     return replace(config, detector=replace(config.detector, fusion=fusion))
 
 
-def _train(options: Options, config: TrainConfig, console: Console) -> None:
+def _train(options: Options, config: TrainConfig, out: Path, console: Console) -> None:
+    from manyeyes._io import remove_unfinished
     from manyeyes.studies import provenance
     from manyeyes.studies.map_recordings import open_sensor_recording
     from manyeyes.studies.recordings import check_files
@@ -123,7 +129,8 @@ def _train(options: Options, config: TrainConfig, console: Console) -> None:
     sensors = config.map_model.bev.sensors if isinstance(config, MapTrainConfig) else ("lidar",)
     recording = open_sensor_recording(options.data, options.split, sensors)
     missing = check_files(recording, options.checks, console)
-    out = options.out or Path("runs") / options.preset
+    if not console.quiet:
+        remove_unfinished(out, below=False)
     last: Progress | None = None
     with make_progress_bars(console) as bars:
         task = _make_task(options, config, recording, missing, bars)

@@ -13,10 +13,10 @@ from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save as serialize
 from torch import nn
 
-from manyeyes._io import atomic_replace
+from manyeyes._io import atomic_write
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models.detector.detector import Detector, DetectorConfig
 
@@ -80,10 +80,8 @@ def _tensors(model: nn.Module) -> dict[str, torch.Tensor]:
 def save(model: nn.Module, path: Path, card: dict[str, Any], half: bool = False, format: str = FORMAT) -> None:
     """Write weights, configuration and model card (command, seed, time, result) to one file, atomically."""
     state = {k: (v.half() if half and v.is_floating_point() else v).contiguous() for k, v in _tensors(model).items()}
-    with atomic_replace(path, durable=False) as temporary:
-        save_file(
-            state, temporary, {"format": format, "config": config_to_json(model.config), "card": json.dumps(card)}
-        )
+    metadata = {"format": format, "config": config_to_json(model.config), "card": json.dumps(card)}
+    atomic_write(path, serialize(state, metadata))
 
 
 def load(path: Path) -> Detector:

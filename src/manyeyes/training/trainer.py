@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import json
 import math
 import signal
@@ -20,7 +21,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from manyeyes._io import atomic_replace, atomic_write_text
+from manyeyes._io import atomic_write, atomic_write_text, flush_files, name_errors
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
 
@@ -118,7 +119,8 @@ class Progress:
 class Trainer(Generic[Model, Sample]):
     """A resumable training run in a folder, of one process or of one of several that share every batch.
 
-    The folder holds last.pt (training state), log.jsonl (one object per step) and weights.safetensors (float16).
+    The folder holds last.pt (training state), log.jsonl (one object per step) and weights.safetensors (float16). Two runs must not
+    write to one folder at once: hold its lock (:func:`manyeyes._lock.hold_folder`), as ``manyeyes train`` does.
 
     Raises:
         CheckpointError: the folder holds a run of another configuration, seed or initial weights, or a damaged state.
@@ -139,7 +141,12 @@ class Trainer(Generic[Model, Sample]):
         if self.path.exists():
             self._resume()
         if not self.rank:
-            _trim_log(self.folder / "log.jsonl", self.step)
+            _trim_log(self.log_path, self.step)
+
+    @property
+    def log_path(self) -> Path:
+        """The file of the log, one line per step."""
+        return self.folder / "log.jsonl"
 
     @property
     def path(self) -> Path:
@@ -158,9 +165,7 @@ class Trainer(Generic[Model, Sample]):
             while self.step < self.task.steps:
                 progress = self.advance()
                 if not self.rank:
-                    self.folder.mkdir(parents=True, exist_ok=True)
-                    with (self.folder / "log.jsonl").open("a") as log:
-                        log.write(json.dumps(progress.to_record()) + "\n")
+                    self._log(progress)
                     report(progress)
                 if not self.step % self.task.config.save_every or self.step == self.task.steps or interrupted.is_set():
                     self.save()
@@ -196,8 +201,17 @@ class Trainer(Generic[Model, Sample]):
         if self.rank:
             return
         parts = {name: getattr(self, name).state_dict() for name in ("model", "average", "optimiser")}
-        with atomic_replace(self.path) as temporary:
-            torch.save({**self._name, **parts, "step": self.step, "seconds": self.seconds}, temporary)
+        # In memory first: torch reports a full disk as a RuntimeError without the file's name.
+        content = io.BytesIO()
+        torch.save({**self._name, **parts, "step": self.step, "seconds": self.seconds}, content)
+        if self.log_path.exists():
+            flush_files([self.log_path])  # a resumed run keeps the lines up to this state
+        atomic_write(self.path, content.getbuffer())
+
+    def _log(self, progress: Progress) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with name_errors(self.log_path), self.log_path.open("a", encoding="utf-8") as log:
+            log.write(json.dumps(progress.to_record()) + "\n")
 
     def _sample_numbers(self, batch: int) -> range:
         """Return the sample numbers of this process for the next step."""
@@ -315,7 +329,7 @@ def _mean_in_place(tensors: Sequence[Tensor], world: int) -> None:
 def _trim_log(path: Path, step: int) -> None:
     """Drop log lines written after the last save, which may be truncated; they will be written again."""
     if path.exists():
-        kept = [line for line in path.read_text().splitlines() if 0 < _step_of(line) <= step]
+        kept = [line for line in path.read_text(encoding="utf-8").splitlines() if 0 < _step_of(line) <= step]
         atomic_write_text(path, "".join(line + "\n" for line in kept))
 
 

@@ -123,7 +123,7 @@ class DairWriter:
         self.files.append(path)
 
     def _json(self, path: Path, content: object) -> None:
-        _write_json(path, content)
+        _write_json(path, content, durable=False)
         self.files.append(path)
 
     def _add_rows(self, stem: str, car: AgentFrame, pole: AgentFrame, offset: tuple[float, float]) -> None:
@@ -213,9 +213,8 @@ def _lidar_points(frame: AgentFrame) -> np.ndarray:
     return xyz
 
 
-def _write_json(path: Path, content: object) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    atomic_write_text(path, json.dumps(content, indent=1) + "\n")
+def _write_json(path: Path, content: object, durable: bool = True) -> None:
+    atomic_write_text(path, json.dumps(content, indent=1) + "\n", durable)
 
 
 def _motion(target_from_source: Transform) -> dict[str, Any]:

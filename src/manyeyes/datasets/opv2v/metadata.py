@@ -202,7 +202,7 @@ def write_record(
             lines += _list(name, getattr(record, name)[i].tolist(), "    ")
         lines.append(f"    obj_type: {LABELS[int(record.label[i])]}")
         lines.append(f"    speed: {_number(float(record.speed[i]))}")
-    atomic_write_text(path, "\n".join(lines) + "\n")
+    atomic_write_text(path, "\n".join(lines) + "\n", durable=False)
 
 
 def _list(key: str, values: Sequence[float], indent: str) -> list[str]:
@@ -230,7 +230,7 @@ def write_protocol(folder: Path, protocol: Mapping[str, Any], fixed_delta_s: flo
             f"{folder / 'data_protocol.yaml'}: world.fixed_delta_seconds is {world['fixed_delta_seconds']}, but the "
             f"frames were written with {fixed_delta_s}: give both the same value."
         )
-    atomic_write_text(folder / "data_protocol.yaml", yaml.safe_dump(content, sort_keys=False, width=120))
+    atomic_write_text(folder / "data_protocol.yaml", yaml.safe_dump(content, sort_keys=False, width=120), durable=False)
 
 
 def _plain(value: Any) -> Any:

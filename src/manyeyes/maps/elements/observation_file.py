@@ -77,7 +77,7 @@ def write_observations(path: Path | str, observations: Sequence[Observation], fr
     """Write observations as one Parquet file: whole under that name, or not there."""
     pq = _parquet()
     path = Path(path)
-    with atomic_replace(path, durable=False) as temporary:
+    with atomic_replace(path) as temporary:
         pq.write_table(
             observation_table(observations, frame),
             temporary,

@@ -50,8 +50,8 @@ class CellStore:
         return load_record(self.path(cell), cell.kind)
 
     def save(self, cell: Cell[T], result: T) -> None:
-        """Store a result, whole or not at all."""
-        save_record(self.path(cell), result)
+        """Store a result, whole or not at all; several processes may store into one folder."""
+        save_record(self.path(cell), result, durable=True)
 
     def load_or_compute(self, cell: Cell[T], compute: Callable[[], T]) -> T:
         """Load a result, or compute and store it."""
