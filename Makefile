@@ -16,7 +16,7 @@ endif
 export PYTHONWARNINGS := ignore:::pip
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help venv demo test test-fast test-nightly coverage check wheel format bench clean
+.PHONY: help venv demo test test-fast test-nightly coverage check wheel wheels format bench clean
 .DEFAULT_GOAL := help
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo "make coverage      every test, and the fraction of statements that they run, by module"
 	@echo "make check         formatting, lint, types, layers"
 	@echo "make wheel         build the wheel and run demo, pose and map fuse from it in an empty environment"
+	@echo "make wheels        the same for every set of extras and Python version, and the README's install lines; half an hour"
 	@echo "make format        rewrite the sources in the house format"
 	@echo "make bench         the speed benchmarks, each with its stored result"
 	@echo "make clean         remove the environment, outputs and caches"
@@ -63,6 +64,9 @@ check: $(STAMP)
 
 wheel:
 	@PYTHON=$(PYTHON) bash .ci/wheel
+
+wheels:
+	@nice -n 10 $(PYTHON) scripts/wheels.py
 
 format: $(STAMP)
 	@$(BIN)/ruff format .

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -17,11 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from manyeyes.evaluation.statistics.bootstrap import Interval
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 TARGETS = Path(__file__).with_name("targets.toml")
 

@@ -8,12 +8,12 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-tomllib = pytest.importorskip("tomllib", reason="Python 3.11 reads pyproject.toml")
 REPOSITORY = Path(__file__).resolve().parents[1]
 SOURCE = REPOSITORY / "src" / "manyeyes"
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
@@ -26,7 +26,8 @@ def packages(requirements: list[str]) -> set[str]:
 
 
 CORE = packages(PROJECT["dependencies"])
-EXTRAS = {name: packages(lines) for name, lines in PROJECT["optional-dependencies"].items() if name != "dev"}
+GROUPS = ("all", "dev")
+EXTRAS = {name: packages(lines) for name, lines in PROJECT["optional-dependencies"].items() if name not in GROUPS}
 
 
 def imported(tree: ast.AST) -> Iterator[tuple[str, int]]:
@@ -77,6 +78,12 @@ def test_a_file_that_names_an_extra_imports_nothing_that_this_extra_lacks() -> N
     assert lacking == []
 
 
+def test_the_extra_all_holds_every_extra() -> None:
+    (line,) = PROJECT["optional-dependencies"]["all"]
+    held = re.fullmatch(r"manyeyes\[([a-z0-9,]+)\]", line)
+    assert held is not None and set(held[1].split(",")) == set(EXTRAS)
+
+
 def test_the_compiled_linear_algebra_finds_its_library() -> None:
     assert "scipy" in CORE
 
@@ -91,7 +98,7 @@ def test_the_install_line_of_the_readme_holds_what_the_demo_imports() -> None:
 
 def test_doctor_looks_for_what_the_extras_install(capsys: pytest.CaptureFixture[str]) -> None:
     from manyeyes.cli import main as cli
-    from manyeyes.cli.doctor import EXTRAS as LOOKED_FOR
+    from manyeyes.cli.requirements import EXTRAS as LOOKED_FOR
 
     wanted = {name: {MODULES.get(m, m).lower() for m in modules} for name, modules in LOOKED_FOR.items()}
     assert wanted == EXTRAS

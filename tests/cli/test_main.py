@@ -102,9 +102,34 @@ def test_doctor_prints_json_for_a_bug_report(capsys) -> None:
     assert {"cpu", "cores", "system", "git_commit", "weights", "towns", "towns_from", "package"} <= set(output)
 
 
-def test_doctor_names_the_pip_line_of_a_missing_extra(monkeypatch, capsys) -> None:
-    from manyeyes.cli import doctor
+def test_doctor_names_the_pip_line_of_a_missing_extra_and_the_commands_that_need_it(monkeypatch, capsys) -> None:
+    from manyeyes.cli import doctor, requirements
 
-    monkeypatch.setattr(doctor, "_installed", lambda module: module != "pyogrio")
+    for module in (doctor, requirements):
+        monkeypatch.setattr(module, "is_installed", lambda name: name != "pyogrio")
     assert cli.main(["doctor"]) == 0
-    assert "pip install 'manyeyes[map]'" in capsys.readouterr().out
+    output = " ".join(capsys.readouterr().out.split())
+    assert "missing pyogrio: pip install 'manyeyes[map]'; needed by map export (format geopackage, pmtiles)" in output
+    assert "needed by demo" not in output
+
+
+def test_doctor_names_damaged_weights_and_exits_with_1(monkeypatch, capsys, tmp_path) -> None:
+    from pathlib import Path
+
+    from manyeyes.models import pretrained, shipped
+
+    source, folder = Path(shipped.__file__).with_name("weights"), tmp_path / "weights"
+    folder.mkdir()
+    (folder / shipped.MANIFEST).write_text((source / shipped.MANIFEST).read_text())
+    whole = (source / "costr-small.safetensors").read_bytes()
+    (folder / "costr-small.safetensors").write_bytes(whole[:1000])
+    monkeypatch.setattr(shipped, "files", lambda package: tmp_path)
+    monkeypatch.setattr(pretrained, "list_detectors", lambda: ("costr-small",))
+    assert cli.main(["doctor", "--json"]) == 1
+    output = capsys.readouterr()
+    statuses = {status["name"]: status for status in json.loads(output.out)["weights"]}
+    assert set(statuses) == {"costr-small", "feakm-small", "map-small-camera", "map-small-fusion", "map-small-lidar"}
+    assert "1,000 bytes instead of 1,794,208" in statuses["costr-small"]["problem"]
+    assert "No such file" in statuses["feakm-small"]["problem"]
+    assert output.err.startswith(f"manyeyes: {folder}") and output.err.count("\n") == 1
+    assert "pip install --force-reinstall manyeyes" in output.err

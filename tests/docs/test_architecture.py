@@ -2,16 +2,14 @@
 """The page on the architecture lists the layers of the import contract and the extension points of the code."""
 
 import re
+import tomllib
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = (ROOT / "docs" / "development" / "architecture.md").read_text(encoding="utf-8")
 
 
 def test_layers_are_those_of_the_import_contract() -> None:
-    tomllib = pytest.importorskip("tomllib", reason="Python 3.11 reads pyproject.toml")
     (contract,) = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     listed = re.findall(r"^\| -?\d+ \| (.*?) \|", TEXT, re.MULTILINE)
     assert [set(re.findall(r"`(\w+)`", row)) for row in listed] == [

@@ -107,19 +107,14 @@ def _run_demo(options: Options) -> None:
 
 
 def _make_map_chapters(drive: Recording, out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
-    """Return the map part, or why there is none: it needs an extra of its own."""
-    from manyeyes.datatypes import MissingExtraError
+    """Return the map part of the report, and its summary in one line."""
+    from manyeyes.cli.demo_map import describe_crossing_map, map_crossing, map_drive
     from manyeyes.models import pretrained
 
-    try:
-        from manyeyes.cli.demo_map import describe_crossing_map, map_crossing, map_drive
-
-        if pretrained.DEFAULT_MAP_MODEL in pretrained.list_map_models():
-            with console.status("Mapping the drive"):
-                summary, chapter = map_drive(drive, pretrained.load_map_model(), out, seed)
-            return (chapter,), summary
-        with console.status("Mapping a crossroads"):
-            stats, chapter = map_crossing(out, seed)
-    except MissingExtraError as error:
-        return (), f"No map: {error}"
+    if pretrained.DEFAULT_MAP_MODEL in pretrained.list_map_models():
+        with console.status("Mapping the drive"):
+            summary, chapter = map_drive(drive, pretrained.load_map_model(), out, seed)
+        return (chapter,), summary
+    with console.status("Mapping a crossroads"):
+        stats, chapter = map_crossing(out, seed)
     return (chapter,), describe_crossing_map(stats)

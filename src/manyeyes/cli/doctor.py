@@ -1,32 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Print what a bug report needs: versions, machine, extras, shipped weights, towns."""
+"""Print what a bug report needs: versions, machine, extras and the commands that lack them, shipped weights, towns.
+
+The exit code is 1 where shipped weights are missing or damaged.
+"""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import platform
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
-from manyeyes.datatypes import ConfigError
+from manyeyes.cli.requirements import EXTRAS, REQUIREMENTS, is_installed
+from manyeyes.datatypes import CheckpointError, ConfigError, ManyeyesError
 from manyeyes.studies import provenance
 
-EXTRAS = {
-    "sim": ("libsumo", "sumo", "shapely", "pyarrow"),
-    "map": ("shapely", "pyarrow", "pyogrio"),
-    "view": ("matplotlib", "PIL"),
-    "av2": ("pyarrow", "shapely"),
-    "dask": ("dask", "distributed"),
-    "ray": ("ray",),
-    "icp": ("small_gicp",),
-}
+if TYPE_CHECKING:
+    from manyeyes.models.shipped import WeightsStatus
 
 
 @dataclass(frozen=True)
@@ -41,18 +37,11 @@ class Options:
 
 @dataclass(frozen=True)
 class Extra:
-    """An optional group of packages; missing: what is not there."""
+    """An optional group of packages. missing: modules that are not installed. commands: those that cannot run without them."""
 
     name: str
     missing: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Shipped weights, and the 8 bytes that name them on the wire."""
-
-    name: str
-    fingerprint: str
+    commands: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -67,7 +56,7 @@ class Diagnosis:
     torch_threads: int
     cuda: str
     extras: tuple[Extra, ...]
-    weights: tuple[Weights, ...]
+    weights: tuple[WeightsStatus, ...]
     towns: tuple[str, ...]
     towns_from: str
     package: str
@@ -86,19 +75,45 @@ def diagnose(towns: Path | None = None) -> Diagnosis:
         os.cpu_count() or 1,
         torch.get_num_threads(),
         f"{torch.cuda.get_device_name(0)}, CUDA {torch.version.cuda}" if torch.cuda.is_available() else "none",
-        tuple(Extra(name, tuple(m for m in modules if not _installed(m))) for name, modules in EXTRAS.items()),
-        shipped_weights(),
+        tuple(_inspect_extra(name) for name in EXTRAS),
+        inspect_weights(),
         found[0],
         found[1],
         str(Path(provenance.__file__).resolve().parents[1]),
     )
 
 
-def shipped_weights() -> tuple[Weights, ...]:
-    """Return the weights inside the package, each loaded strictly."""
+def inspect_weights() -> tuple[WeightsStatus, ...]:
+    """Check the shipped weights against their manifest, then load the detectors of third parties."""
     from manyeyes.models import pretrained
+    from manyeyes.models.shipped import WeightsStatus, check_shipped_weights
 
-    return tuple(Weights(name, pretrained.load(name).fingerprint.hex()) for name in pretrained.list_detectors())
+    try:
+        shipped = check_shipped_weights()
+    except CheckpointError as error:
+        shipped = (WeightsStatus("manifest", "", str(error)),)
+    known = {status.name for status in shipped}
+    return (*shipped, *(_inspect_detector(name) for name in pretrained.list_detectors() if name not in known))
+
+
+def _inspect_detector(name: str) -> WeightsStatus:
+    from manyeyes.models import pretrained
+    from manyeyes.models.shipped import WeightsStatus
+
+    try:
+        return WeightsStatus(name, pretrained.load(name).fingerprint.hex())
+    except ManyeyesError as error:
+        return WeightsStatus(name, "", str(error))
+
+
+def _inspect_extra(name: str) -> Extra:
+    commands: list[str] = []
+    for command, requirements in REQUIREMENTS.items():
+        conditions = [r.condition for r in requirements if r.extra == name and r.missing]
+        always = "" in conditions
+        commands += [command] if always else [f"{command} ({condition})" for condition in conditions]
+    missing = tuple(module for module in EXTRAS[name] if not is_installed(module))
+    return Extra(name, missing, tuple(commands))
 
 
 def find_towns(folder: Path | None = None) -> tuple[tuple[str, ...], str]:
@@ -120,16 +135,19 @@ def find_towns(folder: Path | None = None) -> tuple[tuple[str, ...], str]:
 
 
 def main(options: Options) -> None:
-    """Print the diagnosis of this installation."""
+    """Print the diagnosis of this installation.
+
+    Raises:
+        CheckpointError: shipped weights are missing or damaged; the diagnosis is printed before.
+    """
     diagnosis = diagnose(options.towns)
     if options.json:
         sys.stdout.write(json.dumps(provenance.to_plain(diagnosis), indent=2) + "\n")
-        return
-    Console().print(_table(diagnosis))
-
-
-def _installed(module: str) -> bool:
-    return importlib.util.find_spec(module) is not None
+    else:
+        Console().print(_table(diagnosis))
+    if problems := [status.problem for status in diagnosis.weights if status.problem]:
+        sys.stdout.flush()
+        raise CheckpointError(f"{'; '.join(problems)}. Install manyeyes again: pip install --force-reinstall manyeyes")
 
 
 def _table(diagnosis: Diagnosis) -> Table:
@@ -145,12 +163,17 @@ def _table(diagnosis: Diagnosis) -> Table:
         ("processor", f"{diagnosis.cpu}, {diagnosis.cores} cores; torch uses {diagnosis.torch_threads} threads"),
         ("CUDA", diagnosis.cuda),
     ]
-    for extra in diagnosis.extras:
-        remedy = f"missing {', '.join(extra.missing)}: pip install 'manyeyes[{extra.name}]'"
-        lines.append((f"extra {extra.name}", remedy if extra.missing else "present"))
-    weights = ", ".join(f"{w.name} ({w.fingerprint})" for w in diagnosis.weights) or "none"
+    lines += [(f"extra {extra.name}", _describe_extra(extra)) for extra in diagnosis.extras]
+    lines += [(f"weights {w.name}", w.problem or f"{w.fingerprint}, intact") for w in diagnosis.weights]
     towns = f"{', '.join(diagnosis.towns)} from {diagnosis.towns_from}" if diagnosis.towns else diagnosis.towns_from
-    for name, value in (*lines, ("weights", weights), ("towns", towns)):
+    for name, value in (*lines, ("towns", towns)):
         # Text, not markup: the brackets of 'manyeyes[sim]' are to be seen.
         table.add_row(name, str(value).replace("[", r"\["))
     return table
+
+
+def _describe_extra(extra: Extra) -> str:
+    if not extra.missing:
+        return "present"
+    needed = f"; needed by {', '.join(extra.commands)}" if extra.commands else ""
+    return f"missing {', '.join(extra.missing)}: pip install 'manyeyes[{extra.name}]'{needed}"

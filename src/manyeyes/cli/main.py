@@ -128,13 +128,16 @@ def _report_unknown(word: str, known: Iterable[str]) -> int:
 def _run_command(command: str, arguments: Sequence[str]) -> int:
     try:
         from manyeyes.cli.arguments import UsageError, parse_options
+        from manyeyes.cli.requirements import check_requirements
         from manyeyes.datatypes.errors import ManyeyesError
 
         options, run, about = load_command(command)
     except KeyboardInterrupt:
         return _fail("stopped.", INTERRUPTED_EXIT_CODE)
     try:
-        run(parse_options(options, f"manyeyes {command}", about, arguments))
+        parsed = parse_options(options, f"manyeyes {command}", about, arguments)
+        check_requirements(command, parsed)
+        run(parsed)
     except UsageError as error:
         return _fail(str(error), 2)
     except ManyeyesError as error:

@@ -27,7 +27,12 @@ class CheckpointError(ManyeyesError):
 
 
 class MissingExtraError(ManyeyesError, ImportError):
-    """An optional dependency is not installed; the text is the pip line that installs it."""
+    """An optional dependency is not installed; the text is the pip line that installs it.
+
+    extra: its name, or several joined by commas. purpose: what needs it, the subject of the sentence.
+    """
 
     def __init__(self, extra: str, purpose: str) -> None:
-        super().__init__(f"{purpose} needs the '{extra}' extra: pip install 'manyeyes[{extra}]'")
+        names = " and ".join(f"'{name}'" for name in extra.split(","))
+        noun = "extras" if "," in extra else "extra"
+        super().__init__(f"{purpose} needs the {names} {noun}: pip install 'manyeyes[{extra}]'")

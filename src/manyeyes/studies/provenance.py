@@ -12,7 +12,7 @@ import platform
 import shlex
 import subprocess
 import sys
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,7 @@ def collect_provenance(config: object, seed: int | None) -> dict[str, Any]:
         "versions": installed_versions(),
         "git_commit": git_commit(),
         "machine": {"system": platform.platform(), "cpu": cpu_name(), "cores": os.cpu_count()},
-        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
 

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Optional packages that each command imports: one literal table, checked before it begins."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from typing import Any
+
+from manyeyes.datatypes.errors import MissingExtraError
+
+EXTRAS = {
+    "sim": ("libsumo", "sumo", "shapely", "pyarrow"),
+    "map": ("shapely", "pyarrow", "pyogrio"),
+    "view": ("matplotlib", "PIL"),
+    "av2": ("pyarrow", "shapely"),
+    "dask": ("dask", "distributed"),
+    "ray": ("ray",),
+    "icp": ("small_gicp",),
+}
+"""Modules that each extra installs."""
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """Modules that a command imports, and the extra that installs them.
+
+    option: the field of the command's Options that decides whether it imports them; without one it always does.
+    patterns: the values of that option for which it does, as of fnmatch; an option that is None matches none.
+    """
+
+    extra: str
+    modules: tuple[str, ...]
+    option: str = ""
+    patterns: tuple[str, ...] = ()
+
+    def when(self, option: str, *patterns: str) -> Requirement:
+        """Return the same requirement for some values of an option only."""
+        return replace(self, option=option, patterns=patterns)
+
+    def applies(self, options: Any) -> bool:
+        """Return whether a command with these options imports the modules."""
+        if not self.option:
+            return True
+        value = getattr(options, self.option)
+        values = value if isinstance(value, tuple) else (value,)
+        return any(fnmatchcase(str(v), pattern) for v in values if v is not None for pattern in self.patterns)
+
+    @property
+    def condition(self) -> str:
+        """The option and its values, for messages; empty where the modules are always imported."""
+        values = ", ".join(pattern for pattern in self.patterns if pattern not in ("*", "True"))
+        return f"{self.option} {values}".strip()
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Those of the modules that are not installed."""
+        return tuple(module for module in self.modules if not is_installed(module))
+
+
+_SUMO = Requirement("sim", ("sumo", "libsumo"))
+_ARROW = Requirement("map", ("pyarrow",))
+_SHAPELY = Requirement("map", ("shapely",))
+_GEOPACKAGE = Requirement("map", ("pyogrio", "shapely"))
+_PILLOW = Requirement("view", ("PIL",))
+_MATPLOTLIB = Requirement("view", ("matplotlib",))
+_EXECUTORS = (
+    Requirement("dask", EXTRAS["dask"]).when("executor", "dask"),
+    Requirement("ray", EXTRAS["ray"]).when("executor", "ray"),
+)
+_GICP = Requirement("icp", EXTRAS["icp"]).when("correctors", "gicp")
+
+REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
+    "demo": (Requirement("sim", EXTRAS["sim"]), Requirement("view", EXTRAS["view"])),
+    "simulate": (_SUMO, _PILLOW.when("cameras", "True"), _PILLOW.when("preset", "*-camera")),
+    "train": (_MATPLOTLIB, _SHAPELY.when("preset", "map-*")),
+    "fit-codebook": (),
+    "evaluate": (),
+    "replay": (_PILLOW,),
+    "view": (_PILLOW,),
+    "pose": (_GICP,),
+    "doctor": (),
+    "map build": (_ARROW, _SHAPELY, _MATPLOTLIB),
+    "map simulate": (_ARROW, _SHAPELY),
+    "map import": (_ARROW,),
+    "map fuse": (
+        _ARROW,
+        _SHAPELY.when("method", "polymerge", "global-map-builder", "heatmap-buffer"),
+        _SHAPELY.when("store", "*"),
+        *_EXECUTORS,
+    ),
+    "map retract": (_ARROW, _SHAPELY, *_EXECUTORS),
+    "map evaluate": (_ARROW, _SHAPELY),
+    "map diff": (_ARROW,),
+    "map export": (
+        _ARROW,
+        _SHAPELY.when("format", "geoparquet"),
+        _SHAPELY.when("file", "*.parquet"),
+        _GEOPACKAGE.when("format", "geopackage", "pmtiles"),
+        _GEOPACKAGE.when("file", "*.gpkg", "*.pmtiles"),
+    ),
+    "map view": (_ARROW, _MATPLOTLIB.when("out", "*.png")),
+    "study robustness": (_MATPLOTLIB,),
+    "study bandwidth": (_MATPLOTLIB,),
+    "study shared-bandwidth": (_MATPLOTLIB,),
+    "study num-agents": (_MATPLOTLIB,),
+    "study ablation": (_MATPLOTLIB,),
+    "study qualitative": (_PILLOW,),
+    "study pose-noise-ap": (_MATPLOTLIB,),
+    "study pose-estimation": (_MATPLOTLIB, _GICP),
+    "study feakm": (_MATPLOTLIB,),
+    "study local": (_SHAPELY, _MATPLOTLIB),
+    "study semi-global": (_SHAPELY, _MATPLOTLIB),
+    "study full-map": (_SHAPELY, _MATPLOTLIB),
+    "study map-pose-noise": (_SHAPELY, _MATPLOTLIB),
+    "study fusion": (_SHAPELY,),
+    "study fleet-pose-noise": (_SHAPELY,),
+    "study crowdmap-table3": (_SHAPELY,),
+    "study adversarial": (_SHAPELY,),
+    "study tuning": (_SHAPELY,),
+}
+"""Requirements of every command, studies included."""
+
+
+def is_installed(module: str) -> bool:
+    """Return whether a module is found, without importing it."""
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):  # a finder that refuses it, or None in sys.modules
+        return False
+
+
+def check_requirements(command: str, options: Any) -> None:
+    """Check that what a command imports with these options is installed.
+
+    Raises:
+        MissingExtraError: something is not installed; the text names the extras that install it.
+    """
+    unmet = [r for r in REQUIREMENTS[command] if r.applies(options) and r.missing]
+    if unmet:
+        conditions = [f"with {r.condition}" for r in unmet if r.condition]
+        extras = ",".join(dict.fromkeys(r.extra for r in unmet))
+        raise MissingExtraError(extras, " ".join((command, *dict.fromkeys(conditions))))

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A command whose optional packages are not installed is refused by one line before it begins, and needs no others."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from manyeyes.cli import main as cli
+from manyeyes.cli.requirements import EXTRAS, REQUIREMENTS, check_requirements
+from manyeyes.datatypes import MissingExtraError
+
+ALL_COMMANDS = {command for command in cli.COMMANDS if command not in cli.COMMAND_GROUPS}
+ALL_COMMANDS |= {f"{group} {command}" for group, commands in cli.COMMAND_GROUPS.items() for command in commands}
+OPTIONAL = sorted({module for modules in EXTRAS.values() for module in modules})
+
+
+class Finder:
+    """A finder that hides packages, installed or not."""
+
+    def __init__(self, hidden: Sequence[str]) -> None:
+        self.hidden = set(hidden)
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        """Refuse a hidden package, and leave others to the finders behind this one."""
+        if name.partition(".")[0] in self.hidden:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+
+@pytest.fixture
+def hide(monkeypatch: pytest.MonkeyPatch) -> Iterator[Finder]:
+    finder = Finder(())
+    for name in [name for name in sys.modules if name.partition(".")[0] in OPTIONAL]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "meta_path", [finder, *sys.meta_path])
+    yield finder
+
+
+def test_every_command_declares_what_it_needs() -> None:
+    assert set(REQUIREMENTS) == ALL_COMMANDS
+    for requirement in (r for requirements in REQUIREMENTS.values() for r in requirements):
+        assert set(requirement.modules) <= set(EXTRAS[requirement.extra])
+
+
+@pytest.mark.parametrize("command", sorted(ALL_COMMANDS))
+def test_declared_options_are_options_of_the_command(command: str) -> None:
+    fields = {f for part in cli.load_command(command).options.__mro__ for f in getattr(part, "__annotations__", {})}
+    assert {r.option for r in REQUIREMENTS[command] if r.option} <= fields
+
+
+CASES = [
+    ("demo", "libsumo", "demo needs the 'sim' extra: pip install 'manyeyes[sim]'"),
+    ("demo", "sumo", "demo needs the 'sim' extra"),
+    ("demo", "pyarrow", "demo needs the 'sim' extra"),
+    ("demo", "matplotlib", "demo needs the 'view' extra: pip install 'manyeyes[view]'"),
+    ("demo", "PIL libsumo", "demo needs the 'sim' and 'view' extras: pip install 'manyeyes[sim,view]'"),
+    ("simulate", "libsumo", "simulate needs the 'sim' extra"),
+    ("simulate --cameras", "PIL", "simulate with cameras needs the 'view' extra"),
+    ("simulate --preset carla-maps-camera", "PIL", "simulate with preset *-camera needs the 'view' extra"),
+    ("train --data d", "matplotlib", "train needs the 'view' extra"),
+    ("train --data d --preset map-small-lidar", "shapely", "train with preset map-* needs the 'map' extra"),
+    ("replay d", "PIL", "replay needs the 'view' extra"),
+    ("view d", "PIL", "view needs the 'view' extra"),
+    ("pose d --correctors voting gicp", "small_gicp", "pose with correctors gicp needs the 'icp' extra"),
+    ("map build d", "matplotlib", "map build needs the 'view' extra"),
+    ("map build d", "shapely", "map build needs the 'map' extra"),
+    ("map simulate", "pyarrow", "map simulate needs the 'map' extra"),
+    ("map import d", "pyarrow", "map import needs the 'map' extra"),
+    ("map fuse d", "pyarrow", "map fuse needs the 'map' extra"),
+    ("map fuse d --method polymerge", "shapely", "map fuse with method polymerge, "),
+    ("map fuse d --store s", "shapely", "map fuse with store needs the 'map' extra"),
+    ("map fuse d --store s --executor dask", "distributed", "map fuse with executor dask needs the 'dask' extra"),
+    ("map retract s --reason r --agent a --executor ray", "ray", "map retract with executor ray needs the 'ray' extra"),
+    ("map evaluate m", "shapely", "map evaluate needs the 'map' extra"),
+    ("map diff m n", "pyarrow", "map diff needs the 'map' extra"),
+    ("map export m a.gpkg", "pyogrio", "map export with file *.gpkg, *.pmtiles needs the 'map' extra"),
+    (
+        "map export m a.zip --format pmtiles",
+        "pyogrio",
+        "map export with format geopackage, pmtiles needs the 'map' extra",
+    ),
+    ("map export m a.parquet", "shapely", "map export with file *.parquet needs the 'map' extra"),
+    ("map view m --out m.png", "matplotlib", "map view with out *.png needs the 'view' extra"),
+    ("study robustness --data d", "matplotlib", "study robustness needs the 'view' extra"),
+    ("study qualitative --data d", "PIL", "study qualitative needs the 'view' extra"),
+    (
+        "study pose-estimation --data d --correctors gicp",
+        "small_gicp",
+        "study pose-estimation with correctors gicp needs",
+    ),
+    ("study semi-global --data d", "shapely", "study semi-global needs the 'map' extra"),
+    ("study fusion", "shapely", "study fusion needs the 'map' extra"),
+]
+
+
+@pytest.mark.parametrize(("words", "hidden", "error"), CASES)
+def test_a_command_is_refused_before_it_reads_or_writes(
+    words: str,
+    hidden: str,
+    error: str,
+    hide: Finder,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    hide.hidden = set(hidden.split())
+    assert cli.main(words.split()) == 1
+    output = capsys.readouterr()
+    assert output.err.startswith(f"manyeyes: {error}") and output.err.count("\n") == 1
+    assert output.out == "" and not any(tmp_path.iterdir())
+
+
+def test_every_unconditional_requirement_is_refused_by_some_case() -> None:
+    commands = {command for command in ALL_COMMANDS if any(not r.option for r in REQUIREMENTS[command])}
+    groups = {command.partition(" ")[0] if command.startswith("study") else command for command in commands}
+    cases = [words for words, _, _ in CASES]
+    assert [command for command in sorted(groups) if not any(words.startswith(command) for words in cases)] == []
+
+
+def test_an_option_that_is_not_given_requires_nothing(hide: Finder) -> None:
+    from manyeyes.cli.map.fuse import Options
+
+    hide.hidden = {"shapely", "dask", "distributed", "ray"}
+    check_requirements("map fuse", Options(Path("observations")))
+    with pytest.raises(MissingExtraError, match="with store"):
+        check_requirements("map fuse", Options(Path("observations"), store=Path("city")))
+
+
+RUN_WITHOUT = """
+import sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in hidden:
+            raise ModuleNotFoundError(name)
+from manyeyes.cli.main import main
+from manyeyes.cli.requirements import EXTRAS
+for line in sys.stdin.read().splitlines():
+    allowed, _, words = line.partition(" | ")
+    hidden = {m for modules in EXTRAS.values() for m in modules} - set(allowed.split())
+    sys.meta_path.insert(0, Finder())
+    for name in [n for n in sys.modules if n.partition(".")[0] in hidden]:
+        del sys.modules[name]
+    if main(words.split()):
+        sys.exit(f"{words} needs more than {allowed}")
+"""
+SEQUENCE = """\
+pyarrow shapely | map simulate cross --observations 6 --size 100 --out m
+pyarrow shapely | map evaluate m/truth --truth m/truth
+pyarrow | map fuse m --method union
+pyarrow | map diff m/union m/union --out m/change.html
+pyarrow | map export m/union m/a.geojson
+pyarrow | map export m/union m/a.osm
+pyarrow | map export m/union m/a.npz
+pyarrow | map export m/union m/a.json --format nuscenes
+pyarrow | map export m/union m/a.json --format argoverse2
+pyarrow shapely | map export m/union m/a.parquet
+pyarrow shapely pyogrio | map export m/union m/a.gpkg
+pyarrow shapely pyogrio | map export m/union m/a.pmtiles
+pyarrow | map view m/union"""
+
+
+@pytest.mark.slow
+def test_map_commands_need_no_more_than_they_declare(tmp_path: Path) -> None:
+    for module in ("pyarrow", "shapely", "pyogrio"):
+        pytest.importorskip(module, reason="the 'map' extra is not installed")
+    # Modules cannot be unloaded safely, so each set of packages has a process of its own.
+    lines = SEQUENCE.splitlines()
+    for allowed in dict.fromkeys(line.partition(" | ")[0] for line in lines):
+        part = "\n".join(line for line in lines if line.startswith(f"{allowed} | "))
+        words = [sys.executable, "-c", RUN_WITHOUT]
+        done = subprocess.run(words, input=part, cwd=tmp_path, env=dict(os.environ), capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
