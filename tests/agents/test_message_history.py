@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 from manyeyes.agents.message_history import MAX_AGE_NS, MessageHistory
@@ -82,7 +85,8 @@ def test_absent_senders_are_dropped_although_a_delayed_message_arrives():
     memory = MessageHistory()
     update(memory, *(message_of(0, agent) for agent in range(100)))
     assert times(update(memory, message_of(9, 7), message_of(2, 8))) == [(7, 9), (8, 2), (8, 0)]
-    assert list(memory._messages) == [7]
+    assert times(update(memory, message_of(13, 7))) == [(7, 13), (7, 9)]
+    assert memory.senders == {7}
 
 
 def test_messages_of_an_absent_sender_are_kept_for_half_a_second():
@@ -114,3 +118,36 @@ def test_messages_of_absent_senders_are_not_kept_over_drives():
     memory = MessageHistory()
     update(memory, message_of(50))
     assert update(memory, at=49) == []
+
+
+@pytest.mark.parametrize("lead", [2, 9, 10**11])
+def test_a_message_of_the_future_removes_no_other_sender(lead: int) -> None:
+    """The newest received stamp counted as the time: one sender stamped 0.9 s ahead cleared the history of all others."""
+    memory = MessageHistory()
+    for at in range(3):
+        update(memory, message_of(at, 1), message_of(at, 2), at=at)
+    clean = times(update(memory, message_of(3, 1), at=3))
+    memory = MessageHistory()
+    for at in range(3):
+        update(memory, message_of(at, 1), message_of(at, 2), message_of(at + lead, 9), at=at)
+    found = times(update(memory, message_of(3, 1), at=3))
+    assert [entry for entry in found if entry[0] != 9] == clean == [(1, 3), (1, 2), (1, 1), (2, 2), (2, 1)]
+
+
+@pytest.mark.parametrize("stamp_ns", [-(2**63), 2**63 - 1, -3600 * 10**9, 2 * 10**9])
+def test_messages_far_from_the_receivers_time_are_neither_returned_nor_stored(stamp_ns: int) -> None:
+    memory = MessageHistory()
+    strange = replace(message_of(0, 9), timestamp_ns=stamp_ns)
+    assert times(memory.update_and_get([message_of(0), strange], 0)) == [(1, 0)]
+    assert memory.senders == {1}
+
+
+def test_the_history_of_a_sender_does_not_depend_on_other_senders() -> None:
+    """A message that is delayed by 0.4 s finds its predecessor, whatever came in between."""
+    alone, among = MessageHistory(), MessageHistory()
+    for memory, others in ((alone, ()), (among, (6, 7, 8))):
+        update(memory, message_of(0), at=0)
+        for at in others:
+            update(memory, message_of(at, 2), at=at)
+        found = [entry for entry in times(update(memory, message_of(4), at=8)) if entry[0] == 1]
+        assert found == [(1, 4), (1, 0)]

@@ -3,16 +3,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 
+from manyeyes.agents.fusion_selection import select_for_fusion
+from manyeyes.agents.isolation import Quarantine, content_error, isolate_failing
 from manyeyes.agents.message_history import MessageHistory
+from manyeyes.agents.own_detections import restore_own_boxes
 from manyeyes.agents.perception_cache import History, PerceptionCache
 from manyeyes.agents.pose_correction import CorrectionOutcome, PoseCorrection, SenderState
+from manyeyes.agents.pose_plausibility import (
+    AcceptedPoses,
+    accept_poses,
+    find_pose_fault,
+    with_unknown_pose,
+)
 from manyeyes.agents.strategies.intermediate import IntermediateFusion
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.registry import FusionStrategy
@@ -26,6 +35,7 @@ from manyeyes.agents.token_codec import (
 )
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox, ReceivedMessage, Rejection
+from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.comms.token_format import clamp_features
 from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import TokenEncoding
@@ -55,11 +65,20 @@ class Perception:
 
 @dataclass(frozen=True)
 class _State:
-    """State after a perception; it is stored only if the whole perception succeeded."""
+    """State of an agent; a new one is stored only if the whole perception succeeded."""
 
     message_history: MessageHistory
-    sender_states: dict[int, SenderState]
+    sender_states: Mapping[int, SenderState]
+    accepted_poses: AcceptedPoses
     history: History
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """One successful fusion, and the state after it."""
+
+    perception: Perception
+    state: _State
 
 
 class Agent:
@@ -85,7 +104,10 @@ class Agent:
     ) -> None:
         check_detector(detector)
         self.perception_cache, self.message_history = perception_cache or PerceptionCache(detector), MessageHistory()
-        self.pose_correction, self._sender_states = pose_correction, dict[int, SenderState]()
+        self.pose_correction = pose_correction
+        self._sender_states: Mapping[int, SenderState] = {}
+        self._accepted_poses: AcceptedPoses = {}
+        self._quarantine, self.limits = Quarantine(), ReceiverLimits()
         self.strategy = strategy or IntermediateFusion()
         if self.strategy.needs_tokens:
             require_tokens(detector)
@@ -150,88 +172,112 @@ class Agent:
     def perceive(self, frame: AgentFrame, inbox: Inbox | Iterable[bytes] = (), now_ns: int | None = None) -> Perception:
         """Return boxes around the agent from its own frame and from the messages received so far.
 
-        Received content never raises: tokens of another format are excluded, and a sender whose content makes fusion fail is
-        excluded as a whole; both are listed in ``Perception.rejected``. A failed perception changes no state.
+        Received content never raises: what cannot be fused is excluded and listed in ``Perception.rejected``. A failed perception
+        changes no state.
 
-        inbox: an Inbox that packets were pushed into, preferably the agent's own (``inbox``), or plain packets. now_ns: end of the
-        latency budget; messages that have expired by then are excluded.
+        inbox: an Inbox that packets were pushed into, preferably the agent's own (``inbox``), or plain packets, which arrive at
+        now_ns. now_ns: end of the latency budget, by default the time of the frame; ages of messages are relative to it.
         """
+        now_ns = frame.timestamp_ns if now_ns is None else now_ns
         if not isinstance(inbox, Inbox):
-            packets, inbox = inbox, self.inbox()
+            packets, inbox = inbox, self.inbox(self.limits.max_age_ns)
             for packet in packets:
-                inbox.push(packet)
+                inbox.push(packet, now_ns)
         rejected, received = list(inbox.take_rejections()), list[ReceivedMessage]()
         for reception in inbox.received_messages(now_ns):
             if reception.message.agent_id != frame.agent_id:
-                decoded, rejection = decode_tokens(reception, self.perception_cache.detector, self.token_format)
-                received.append(decoded)
-                rejected += [] if rejection is None else [rejection]
-        perception, failed = self._perceive(frame, received)
+                checked, rejections = self._check(frame, reception, now_ns)
+                received += [] if checked is None else [checked]
+                rejected += rejections
+        selected, left_out = select_for_fusion(frame, received, self.message_history.senders, self.limits)
+        perception, failed = self._perceive(frame, selected)
         for rejection in failed:
             inbox.discard(rejection.agent_id)
-        return replace(perception, rejected=(*rejected, *failed))
+        fused = {reception.message.agent_id for reception in perception.received}
+        # The pose of a fused sender was estimated.
+        rejected = [
+            rejection for rejection in rejected if rejection.reason != "pose" or rejection.agent_id not in fused
+        ]
+        return replace(perception, rejected=(*rejected, *left_out, *failed))
 
-    def _perceive(self, frame: AgentFrame, received: list[ReceivedMessage]) -> tuple[Perception, list[Rejection]]:
-        """Fuse the messages that can be fused, and reject the others."""
-        failed: list[Rejection] = []
+    def _check(
+        self, frame: AgentFrame, reception: ReceivedMessage, now_ns: int
+    ) -> tuple[ReceivedMessage | None, list[Rejection]]:
+        """Return a message with decoded tokens and a plausible or an unknown pose, or None; and what is rejected of it."""
+        message, limits = reception.message, self.limits
+        if self._quarantine.contains(message.agent_id, now_ns):
+            return None, [Rejection(message.agent_id, "quarantined", "its content made fusion fail before")]
+        if not -limits.max_skew_ns <= now_ns - message.timestamp_ns <= limits.max_age_ns:
+            text = f"captured {(now_ns - message.timestamp_ns) / 1e9:.4g} s before the receiver's time"
+            return None, [Rejection(message.agent_id, "time", text)]
         try:
-            perception, state = self._try_perceive(frame, received)
+            decoded, rejection = decode_tokens(reception, self.perception_cache.detector, self.token_format)
+            fault = find_pose_fault(frame, message, self._accepted_poses.get(message.agent_id), limits)
         except Exception as error:
-            failed = self._find_failing(frame, received, error)
-            agent_ids = {rejection.agent_id for rejection in failed}
-            left = [reception for reception in received if reception.message.agent_id not in agent_ids]
-            try:
-                perception, state = self._try_perceive(frame, left)
-            except Exception as joint_error:
-                # Each message can be fused alone, but not all together: reject all of them and clear the history.
-                failed += [_content_error(reception, joint_error) for reception in left]
-                self.message_history, self._sender_states = MessageHistory(), {}
-                perception, state = self._try_perceive(frame, [])
-        self.message_history, self._sender_states, self.perception_cache.history = (
-            state.message_history,
-            state.sender_states,
-            state.history,
-        )
-        return perception, failed
+            return None, [content_error(message.agent_id, error)]
+        rejections = [] if rejection is None else [rejection]
+        if fault is None:
+            return decoded, rejections
+        rejections.append(Rejection(message.agent_id, "pose", fault))
+        if self.pose_correction is None:
+            return None, rejections
+        return replace(decoded, message=with_unknown_pose(decoded.message)), rejections
 
-    def _find_failing(
-        self, frame: AgentFrame, received: Sequence[ReceivedMessage], error: Exception
-    ) -> list[Rejection]:
-        """Find messages whose content alone makes fusion fail, by bisection of a group that fails."""
-        if len(received) <= 1:
-            return [_content_error(reception, error) for reception in received]
-        failed = []
-        for half in (received[: len(received) // 2], received[len(received) // 2 :]):
-            try:
-                self._try_perceive(frame, half)
-            except Exception as half_error:
-                failed += self._find_failing(frame, half, half_error)
-        return failed
+    def _perceive(self, frame: AgentFrame, received: Sequence[ReceivedMessage]) -> tuple[Perception, list[Rejection]]:
+        """Fuse the messages that can be fused together, and reject the others; the state is stored."""
+        known, now_ns = self.message_history.senders, frame.timestamp_ns
+        current = {reception.message.agent_id: reception for reception in received}
+        failed: list[Rejection] = []
 
-    def _try_perceive(self, frame: AgentFrame, received: Sequence[ReceivedMessage]) -> tuple[Perception, _State]:
-        """Return one perception and the state after it; the agent's own state is restored, also after an error."""
-        before = _State(copy(self.message_history), self._sender_states, self.perception_cache.history)
+        def attempt(senders: Sequence[int]) -> _Attempt:
+            usable = [reception for sender, reception in sorted(current.items()) if sender in senders]
+            return self._try_perceive(frame, usable, (known | current.keys()) - set(senders))
+
+        # Senders that were fused before come first: of two that cannot be fused together, the newer one is excluded.
+        senders = sorted(known | current.keys(), key=lambda sender: (sender not in known, sender))
         try:
+            done = attempt(senders)
+        except Exception as error:
+            isolated = isolate_failing(attempt, senders, error)
+            done = isolated.result
+            failed = [content_error(sender, cause) for sender, cause in sorted(isolated.errors.items())]
+            for sender in sorted(isolated.errors.keys() - isolated.untested):
+                self._quarantine = self._quarantine.add(sender, now_ns)
+        self._restore(done.state)
+        return done.perception, failed
+
+    def _try_perceive(
+        self, frame: AgentFrame, received: Sequence[ReceivedMessage], excluded: Collection[int]
+    ) -> _Attempt:
+        """Return one perception without excluded senders and the state after it; the agent's own state is restored."""
+        before = replace(self._state, message_history=copy(self.message_history))
+        try:
+            stated = [reception.message for reception in received]
+            self._accepted_poses = accept_poses(self._accepted_poses, stated, frame.timestamp_ns)
             usable, corrections = self._correct_poses(frame, tuple(received))
             messages = [reception.message for reception in usable]
             if self.strategy.uses_history:
-                untrusted = [correction.agent_id for correction in corrections if correction.untrusted]
-                messages = self.message_history.update_and_get(messages, frame.timestamp_ns, untrusted)
+                untrusted = {correction.agent_id for correction in corrections if correction.untrusted}
+                messages = self.message_history.update_and_get(messages, frame.timestamp_ns, untrusted.union(excluded))
             boxes = self.strategy.fuse(self.perception_cache, frame, messages)
-            return Perception(_remove_own_body(boxes, frame), usable, corrections), _State(
-                self.message_history, self._sender_states, self.perception_cache.history
-            )
+            if messages:
+                boxes = restore_own_boxes(boxes, self.perception_cache.process(frame).boxes)
+            return _Attempt(Perception(_remove_own_body(boxes, frame), usable, corrections), self._state)
         finally:
-            self.message_history, self._sender_states, self.perception_cache.history = (
-                before.message_history,
-                before.sender_states,
-                before.history,
-            )
+            self._restore(before)
+
+    @property
+    def _state(self) -> _State:
+        return _State(self.message_history, self._sender_states, self._accepted_poses, self.perception_cache.history)
+
+    def _restore(self, state: _State) -> None:
+        self.message_history, self._sender_states = state.message_history, state.sender_states
+        self._accepted_poses, self.perception_cache.history = state.accepted_poses, state.history
 
     def _correct_poses(
         self, frame: AgentFrame, received: tuple[ReceivedMessage, ...]
     ) -> tuple[tuple[ReceivedMessage, ...], tuple[CorrectionOutcome, ...]]:
-        """Return messages with corrected poses, without those whose pose is uncertain or inconsistent."""
+        """Return messages with corrected poses, without those whose pose is unknown, uncertain or inconsistent."""
         if self.pose_correction is None:
             return received, ()
         corrected = self.pose_correction.correct(
@@ -245,11 +291,6 @@ class Agent:
             if r.message.agent_id in message_of_agent
         )
         return tuple(kept), corrected.corrections
-
-
-def _content_error(reception: ReceivedMessage, error: Exception) -> Rejection:
-    text = " ".join(f"fusing its content failed: {type(error).__name__}: {error}".split())
-    return Rejection(reception.message.agent_id, "content_error", text, error)
 
 
 def _remove_own_body(boxes: Boxes, frame: AgentFrame) -> Boxes:

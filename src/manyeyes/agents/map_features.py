@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import torch
 
 from manyeyes.comms import wire
-from manyeyes.comms.token_format import TokenFormat, clamp_features
+from manyeyes.comms.token_format import TokenFormat, TokenRefusal, clamp_features
 from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import AgentFrame, Boxes, Message, Sites, SparseBev, Transform
@@ -67,10 +67,17 @@ def decode_map_features(packets: Iterable[bytes], model: MapModel) -> Message | 
 
 def is_compatible(message: Message, model: MapModel) -> bool:
     """Return whether a message has tokens of these weights, on their grid, of their width and within their range."""
+    return message.tokens is not None and find_token_refusal(message, model) is None
+
+
+def find_token_refusal(message: Message, model: MapModel) -> TokenRefusal | None:
+    """Return why the tokens of a message are not of these weights; None where they are, or where it has none."""
+    if message.tokens is None:
+        return None
+    if message.fingerprint != model.fingerprint:
+        return "wrong_model"
     token_format = TokenFormat(model.fingerprint, model.token_grid, model.config.token_channels)
-    if message.tokens is None or message.fingerprint != token_format.fingerprint:
-        return False
-    return token_format.check_tokens(message.tokens) is None
+    return token_format.check_tokens(message.tokens)
 
 
 def predict_tile(model: MapModel, messages: Sequence[Message], world_from_tile: Transform) -> MapElements:

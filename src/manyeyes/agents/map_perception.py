@@ -13,9 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.agents.map_features import decode_map_features, encode_map_features, is_compatible, predict_tile
+from manyeyes.agents.fusion_selection import busy_rejection
+from manyeyes.agents.isolation import content_error, isolate_failing
+from manyeyes.agents.map_features import decode_map_features, encode_map_features, find_token_refusal, predict_tile
+from manyeyes.agents.pose_plausibility import find_pose_fault
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.comms import wire
+from manyeyes.comms.inbox import Rejection, token_rejection
+from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, Transform
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.datatypes.message import LocalMap
@@ -65,6 +70,14 @@ def get_map_share_config(name: str) -> MapShareConfig:
 
 
 @dataclass(frozen=True)
+class MapPrediction:
+    """A local map, None without any features, and the senders whose features are excluded, with the reason."""
+
+    local_map: LocalMap | None
+    rejected: tuple[Rejection, ...] = ()
+
+
+@dataclass(frozen=True)
 class MapModelPredictor:
     """A map model applied to frames; predictions are clipped to the covered area and filtered."""
 
@@ -73,18 +86,52 @@ class MapModelPredictor:
 
     def __call__(self, frame: AgentFrame, received: Sequence[Message] = ()) -> LocalMap | None:
         """Return the elements in the agent's frame; None without own or received features."""
+        return self.predict(frame, received).local_map
+
+    def predict(self, frame: AgentFrame, received: Sequence[Message] = ()) -> MapPrediction:
+        """Return the local map, and the rejected senders: those of another token format, of an implausible pose, or with features
+        that make the prediction fail.
+        """
         own = decode_map_features(encode_map_features(self.model, frame), self.model)
-        others = [m for m in received if is_compatible(m, self.model)]
-        messages = [
-            message for message in (own, *(others if self.config.use_neighbours else ())) if message is not None
-        ]
-        if not messages:
-            return None
+        usable, rejected = self._select(frame, received) if self.config.use_neighbours else ({}, [])
+        if own is None and not usable:
+            return MapPrediction(None, tuple(rejected))
         x, y, _ = frame.world_from_agent.translation.tolist()
         world_from_tile = Transform.from_xyz_yaw(x, y, 0.0, float(frame.world_from_agent.yaw))
-        view = self._view(frame, [world_from_tile.inverse() @ message.world_from_agent for message in messages])
-        predicted = predict_tile(self.model, messages, world_from_tile)
-        return LocalMap(clip_to_view(predicted.take(predicted.score >= self.config.min_score), view, self.config), view)
+
+        def predict(senders: Sequence[int]) -> LocalMap:
+            messages = [*([] if own is None else [own]), *(usable[sender] for sender in senders)]
+            view = self._view(frame, [world_from_tile.inverse() @ message.world_from_agent for message in messages])
+            predicted = predict_tile(self.model, messages, world_from_tile)
+            kept = predicted.take(predicted.score >= self.config.min_score)
+            return LocalMap(clip_to_view(kept, view, self.config), view)
+
+        try:
+            return MapPrediction(predict([*usable]), tuple(rejected))
+        except Exception as error:
+            if not usable:
+                raise
+            isolated = isolate_failing(predict, [*usable], error)
+            errors = [content_error(sender, cause) for sender, cause in sorted(isolated.errors.items())]
+            return MapPrediction(isolated.result, (*rejected, *errors))
+
+    def _select(self, frame: AgentFrame, received: Sequence[Message]) -> tuple[dict[int, Message], list[Rejection]]:
+        """Return the messages that can be fused, by sender, and the rejections of the others that have tokens."""
+        limits, usable, rejected = ReceiverLimits(), dict[int, Message](), list[Rejection]()
+        for message in received:
+            if message.tokens is None:
+                continue
+            refusal = find_token_refusal(message, self.model)
+            fault = find_pose_fault(frame, message, None, limits)
+            if refusal is not None:
+                rejected.append(token_rejection(message.agent_id, refusal))
+            elif fault is not None:
+                rejected.append(Rejection(message.agent_id, "pose", fault))
+            elif len(usable) == limits.max_fused_senders:
+                rejected.append(busy_rejection(message.agent_id, limits))
+            else:
+                usable[message.agent_id] = message
+        return usable, rejected
 
     def _view(self, frame: AgentFrame, tile_from_sender: Sequence[Transform]) -> Floats:
         """Return the convex hull of the covered ground, clipped to the agent's window: an open ring, anticlockwise."""

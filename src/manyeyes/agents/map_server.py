@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.comms.inbox import ReceivedMessage
-from manyeyes.datatypes import Message
+from manyeyes.datatypes import ManyeyesError, Message
 from manyeyes.datatypes.map_element import MapElements
 from manyeyes.datatypes.message import LocalMap
 from manyeyes.maps.elements.observation import MapFrame, Observation, ObservationError, is_simple_ring
@@ -29,6 +30,8 @@ MIN_SIGMA_M, MIN_SIGMA_RAD = 0.05, float(np.radians(0.05))
 """Lower bounds of the standard deviations of a sender's pose; formats without covariance read as zero."""
 NEW_PASS_NS = 60_000_000_000
 """A longer gap between messages of an agent starts a new pass."""
+MAX_REMEMBERED = 1000
+"""Number of rejected and of incomplete messages that are kept, the last ones: agent ids are not authenticated."""
 FIRST_REBUILD_COUNT = 8
 """Number of observations at the first rebuild of the map in memory; it is rebuilt whenever their number has doubled."""
 
@@ -43,7 +46,7 @@ class RejectedMessage:
 
 
 class MapServer:
-    """The map server: ingests messages and maintains observations and the map.
+    """The map server: ingests messages and maintains observations and the map. Received content never raises.
 
     frame: of the map, whose origin is the world's point origin_xy (m). trusted: pseudonyms of surveyed roadside units, of which a
     single observation suffices; a flag in a message does not make its sender trusted. initial_map: a map to extend.
@@ -64,13 +67,13 @@ class MapServer:
         self.frame = initial_map.frame if initial_map is not None else frame or MapFrame()
         self._origin, self._trusted = np.array([*origin_xy, 0.0]), frozenset(trusted)
         self._config = config or IncrementalConfig()
-        self._incremental_map = IncrementalMap(
-            VectorMap.empty(self.frame) if initial_map is None else initial_map, self._config
-        )
+        self._base_map = VectorMap.empty(self.frame) if initial_map is None else initial_map
+        self._since_base: list[Observation] = []
+        self._incremental_map = IncrementalMap(self._base_map, self._config)
         self._next_rebuild = None if initial_map is not None else FIRST_REBUILD_COUNT
         self._accepted: dict[tuple[str, int], Observation] = {}
         self._rejected: dict[tuple[str, int], RejectedMessage] = {}
-        self._partial: set[tuple[str, int]] = set()
+        self._partial: dict[tuple[str, int], None] = {}
         self._passes: dict[str, tuple[int, int]] = {}
 
     @property
@@ -80,7 +83,7 @@ class MapServer:
 
     @property
     def rejected(self) -> tuple[RejectedMessage, ...]:
-        """Messages whose map could not be used."""
+        """Messages whose map could not be used, the last MAX_REMEMBERED."""
         return tuple(self._rejected.values())
 
     @property
@@ -103,23 +106,45 @@ class MapServer:
         if message.local_map is None or key in self._accepted or key in self._rejected:
             return None
         if not received.complete:
-            self._partial.add(key)
+            self._partial[key] = None
+            _drop_first(self._partial)
             return None
-        self._partial.discard(key)
+        self._partial.pop(key, None)
+        number = self._find_pass_number(*key)
         try:
-            pass_id = f"{agent}-p{self._assign_pass_number(*key)}"
-            observation = make_observation(message, agent, pass_id, self._origin, agent in self._trusted)
-        except ObservationError as error:
-            self._rejected[key] = RejectedMessage(*key, str(error))
+            observation = make_observation(message, agent, f"{agent}-p{number}", self._origin, agent in self._trusted)
+            result = self._update(observation)
+        except Exception as error:
+            text = str(error) if isinstance(error, ObservationError) else f"{type(error).__name__}: {error}"
+            self._rejected[key] = RejectedMessage(*key, text)
+            _drop_first(self._rejected)
             return None
-        self._accepted[key] = observation
-        result = self._incremental_map.update(observation)
+        self._accepted[key], self._passes[agent] = observation, (message.timestamp_ns, number)
         if len(self._accepted) == self._next_rebuild:
-            self._incremental_map, self._next_rebuild = (
-                IncrementalMap(self.rebuild(), self._config),
-                2 * len(self._accepted),
-            )
+            self._rebuild_in_memory()
         return result
+
+    def _update(self, observation: Observation) -> UpdateResult:
+        """Add an observation to the map in memory; after an error the map is as before."""
+        try:
+            result = self._incremental_map.update(observation)
+        except Exception:
+            self._incremental_map = IncrementalMap(self._base_map, self._config)
+            for earlier in self._since_base:
+                self._incremental_map.update(earlier)
+            raise
+        self._since_base.append(observation)
+        return result
+
+    def _rebuild_in_memory(self) -> None:
+        """Replace the map in memory by the batch fusion; if that fails, the incremental map is kept until the next one."""
+        self._next_rebuild = 2 * len(self._accepted)
+        try:
+            rebuilt = self.rebuild()
+        except (ManyeyesError, ArithmeticError, ValueError):
+            return
+        self._base_map, self._since_base = rebuilt, []
+        self._incremental_map = IncrementalMap(rebuilt, self._config)
 
     def map(self) -> VectorMap:
         """Return the current map, updated with each observation in the order of arrival."""
@@ -129,12 +154,16 @@ class MapServer:
         """Batch fusion of all observations, independent of their order; an initial map is not included."""
         return fuse(self.observations, self._config.fusion, self.frame)
 
-    def _assign_pass_number(self, agent: str, time_ns: int) -> int:
+    def _find_pass_number(self, agent: str, time_ns: int) -> int:
         """Return the number of the pass that this observation belongs to."""
         last, number = self._passes.get(agent, (time_ns, 0))
-        number += abs(time_ns - last) > NEW_PASS_NS
-        self._passes[agent] = time_ns, number
-        return number
+        return number + (abs(time_ns - last) > NEW_PASS_NS)
+
+
+def _drop_first(entries: dict[tuple[str, int], Any]) -> None:
+    """Drop the first entry of more than MAX_REMEMBERED."""
+    if len(entries) > MAX_REMEMBERED:
+        del entries[next(iter(entries))]
 
 
 def make_observation(

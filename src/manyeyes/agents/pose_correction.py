@@ -23,6 +23,7 @@ from torch import Tensor
 
 from manyeyes.agents.descriptors import attach_descriptors, extract_message_keypoints, extract_own_keypoints
 from manyeyes.agents.perception_cache import PerceptionCache
+from manyeyes.agents.pose_plausibility import has_known_pose
 from manyeyes.agents.strategies.message_header import age_s
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message, Transform
 from manyeyes.datatypes.keypoints import Keypoints
@@ -41,6 +42,8 @@ Floats = NDArray[np.float64]
 
 MAX_SILENCE_S = 60.0
 """The monitor of a sender restarts after a longer gap."""
+MAX_SENDER_STATES = 256
+"""Number of senders whose state is kept, the last received ones."""
 _FAULTY = (PoseHealth.OFFSET, PoseHealth.DRIFTING)
 EGO_NODE = 0
 """The ego's node in the pose graph; senders are 1, 2, ... in the order of their messages."""
@@ -130,7 +133,10 @@ class PoseCorrection:
     def correct(
         self, frame: AgentFrame, cache: PerceptionCache, messages: Sequence[Message], states: Mapping[int, SenderState]
     ) -> CorrectedMessages:
-        """Correct the poses of the messages received for a frame. states: of the previous frame, by sender."""
+        """Correct the poses of the messages received for a frame. states: of the previous frame, by sender.
+
+        A message with infinite pose covariance has no prior: it is used only if its pose is measured from objects.
+        """
         now_s = frame.timestamp_ns * 1e-9
         new_states = {
             a: s
@@ -141,7 +147,7 @@ class PoseCorrection:
             return CorrectedMessages((), (), new_states)
         own = self.extract_own_landmarks(frame, cache)
         landmarks = [self._message_landmarks(cache, message, age_s(frame, message)) for message in messages]
-        priors = [PosePrior.between(frame, message) for message in messages]
+        priors = [_make_prior(frame, message) for message in messages]
         pairwise_estimates = [
             load_corrector(self.corrector)(own, theirs, prior) for theirs, prior in zip(landmarks, priors)
         ]
@@ -149,6 +155,8 @@ class PoseCorrection:
         for message, prior, pairwise in zip(messages, priors, pairwise_estimates):
             before = new_states.get(message.agent_id)
             state, report = self._update_monitor(before.monitor if before else None, message, prior, pairwise)
+            # The last entries are those of the last received senders.
+            new_states.pop(message.agent_id, None)
             new_states[message.agent_id] = SenderState(state)
             health.append(report)
         propagated = set[int]()
@@ -183,7 +191,7 @@ class PoseCorrection:
             refuted = use is MessageUse.INCONSISTENT or estimate.status is PoseStatus.CONFLICT
             put = kept[-1] if use is MessageUse.CORRECTED else last_corrected.get(message.agent_id)
             new_states[message.agent_id] = SenderState(new_states[message.agent_id].monitor, None if refuted else put)
-        return CorrectedMessages(tuple(kept), tuple(corrections), new_states)
+        return CorrectedMessages(tuple(kept), tuple(corrections), dict([*new_states.items()][-MAX_SENDER_STATES:]))
 
     @property
     def net(self) -> FeakmNet | None:
@@ -251,7 +259,7 @@ class PoseCorrection:
         return PosePrior(previous.ego_from_other @ motion.ego_from_other, (covariance + covariance.T) / 2)
 
     def _update_monitor(
-        self, state: PoseMonitorState | None, message: Message, prior: PosePrior, estimate: PoseEstimate
+        self, state: PoseMonitorState | None, message: Message, prior: PosePrior | None, estimate: PoseEstimate
     ) -> tuple[PoseMonitorState, PoseReport]:
         """State and report of the monitor after this message; a repeated message does not change them."""
         state, time_s = state or PoseMonitorState.new(), message.timestamp_ns * 1e-9
@@ -264,23 +272,21 @@ class PoseCorrection:
         self,
         messages: Sequence[Message],
         landmarks: Sequence[Landmarks],
-        priors: Sequence[PosePrior],
+        priors: Sequence[PosePrior | None],
         pairwise_estimates: Sequence[PoseEstimate],
     ) -> tuple[dict[int, PoseEstimate], set[int]]:
         """Joint estimates of the senders' poses where pairs of senders match too; and the isolated senders."""
         ego_edges = [_make_edge(EGO_NODE, n + 1, pairwise) for n, pairwise in enumerate(pairwise_estimates)]
         sender_edges = []
         for i, j in itertools.combinations(range(len(messages)), 2):
-            estimate = load_corrector(self.corrector)(
-                landmarks[i], landmarks[j], PosePrior.between(messages[i], messages[j])
-            )
+            estimate = load_corrector(self.corrector)(landmarks[i], landmarks[j], _make_prior(messages[i], messages[j]))
             sender_edges.append(_make_edge(i + 1, j + 1, estimate))
         if not any(sender_edges):
             return {}, set()
         prior_by_node = {
             n + 1: inflate_covariance(prior, pairwise.mahalanobis_squared)
             for n, (prior, pairwise) in enumerate(zip(priors, pairwise_estimates))
-            if pairwise.status is not PoseStatus.CONFLICT
+            if prior is not None and pairwise.status is not PoseStatus.CONFLICT
         }
         joint = optimize_poses(
             EGO_NODE, [edge for edge in (*ego_edges, *sender_edges) if edge is not None], prior_by_node
@@ -335,6 +341,11 @@ def apply_correction(message: Message, frame: AgentFrame, estimate: PoseEstimate
         world_from_agent=world_from_ego @ estimate.ego_from_other,
         pose_covariance=(covariance + covariance.mT) / 2,
     )
+
+
+def _make_prior(one: AgentFrame | Message, other: Message) -> PosePrior | None:
+    """Return the prior of two agents' reported poses; None if a pose is unknown."""
+    return PosePrior.between(one, other) if has_known_pose(one) and has_known_pose(other) else None
 
 
 def _make_edge(i: int, j: int, estimate: PoseEstimate) -> RelativePoseEdge | None:

@@ -15,6 +15,8 @@ from manyeyes.datatypes import Message
 
 DropReason = Reason | TokenRefusal | Literal["duplicate", "expired", "full"]
 
+RejectionReason = TokenRefusal | Literal["content_error", "quarantined", "time", "pose", "busy"]
+
 _CLOCK_SLACK_NS = 1_000_000_000
 
 
@@ -56,11 +58,13 @@ class DropCounts:
 class Rejection:
     """Content of one sender that takes no part in a perception.
 
-    reason: as in DropCounts, or content_error: fusing it raised an error, which is the cause. text: what was expected, what came.
+    reason: as in DropCounts, or content_error: fusing it raised an error, which is the cause; quarantined: its content did so
+    shortly before; time: captured too long before or after the receiver's time; pose: its pose is implausible and could not be
+    estimated; busy: beyond the number of senders that are fused at one instant. text: what was expected, what came.
     """
 
     agent_id: int
-    reason: TokenRefusal | Literal["content_error"]
+    reason: RejectionReason
     text: str
     cause: Exception | None = field(default=None, compare=False)
 

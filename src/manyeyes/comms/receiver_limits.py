@@ -42,11 +42,15 @@ class ReceiverLimits:
     max_map_points: int = 8_192
     # Distance of objects, map elements and the edges of a grid from their sender
     max_range_m: float = 300.0
-    # Pose of a sender: roll and pitch; distance and height relative to the receiver; speed between messages; stated sigma
+    # Fused at one instant: senders, and tokens of all of them together
+    max_fused_senders: int = 16
+    max_fused_tokens: int = 8_192
+    # Pose of a sender relative to the receiver; displacement between its messages by speed and a jump; stated sigma
     max_tilt_rad: float = math.radians(25.0)
     max_distance_m: float = 1_000.0
     max_height_difference_m: float = 50.0
     max_speed_mps: float = 70.0
+    max_pose_jump_m: float = 10.0
     max_sigma_xy_m: float = 5.0
     max_sigma_yaw_rad: float = 0.5
 

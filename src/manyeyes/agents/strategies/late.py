@@ -11,18 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import torch
-
+from manyeyes.agents.own_detections import restore_own_boxes
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import age_s, ego_from_sender, lag_behind_newest_s, make_header
 from manyeyes.agents.strategies.registry import FusionStrategy, register_strategy
 from manyeyes.agents.strategies.temporal_boxes import DUPLICATE_IOU, decay_scores, merge_boxes_nms, propagate_boxes
 from manyeyes.datatypes import AgentFrame, Boxes, Message
-
-DUPLICATE_DISTANCE_M = 1.0
-"""Maximum distance between the centres of an own box and the box that replaces it."""
-DISPLACED_SCORE_FACTOR = 0.5
-"""Factor on the score of an own box that was suppressed by a box farther away."""
 
 
 @register_strategy("late")
@@ -60,15 +54,7 @@ class LateFusion(FusionStrategy):
                 others.append(decay_scores(best.to(own.center.dtype), lag_s))
         earlier = propagate_boxes(frame, cache.previous_outputs(frame)) if self.uses_history else []
         ranked = merge_boxes_nms([own, *earlier, *others], self.nms_iou)
-        return _restore_own_boxes(ranked, own)
+        return restore_own_boxes(ranked, own, min_score=0.0)
 
 
 register_strategy("late-temporal")(partial(LateFusion, uses_history=True))
-
-
-def _restore_own_boxes(ranked: Boxes, own: Boxes) -> Boxes:
-    """Return all ranked boxes, and the own boxes without one of them within DUPLICATE_DISTANCE_M, at a reduced score."""
-    replaced = (torch.cdist(own.center[:, :2], ranked.center[:, :2]) <= DUPLICATE_DISTANCE_M).any(1)
-    displaced = own[~replaced]
-    found = Boxes.cat([ranked, replace(displaced, score=displaced.score * DISPLACED_SCORE_FACTOR)])
-    return found[found.score.argsort(descending=True, stable=True)] if len(displaced) else ranked

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Selection of the received content that is fused at one instant, which bounds the time of a fusion."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+import torch
+
+from manyeyes.agents.strategies.message_header import ego_from_sender
+from manyeyes.comms.bandwidth import allocate_max_min_fair
+from manyeyes.comms.inbox import ReceivedMessage, Rejection
+from manyeyes.comms.receiver_limits import ReceiverLimits
+from manyeyes.datatypes import AgentFrame, SparseBev
+from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
+
+
+def select_for_fusion(
+    frame: AgentFrame, received: Sequence[ReceivedMessage], known: Collection[int], limits: ReceiverLimits
+) -> tuple[list[ReceivedMessage], list[Rejection]]:
+    """Return at most limits.max_fused_senders messages, with at most limits.max_fused_tokens tokens; and the senders left out.
+
+    Senders that were fused before come first, then the nearest. The tokens of one message that exceed its share are left out in
+    the order of their proposed confidence. known: senders that were fused before.
+    """
+    if len(received) > limits.max_fused_senders:
+        order = sorted(received, key=lambda r: (r.message.agent_id not in known, _distance_m(frame, r)))
+        selected = {r.message.agent_id for r in order[: limits.max_fused_senders]}
+    else:
+        selected = {r.message.agent_id for r in received}
+    kept = [r for r in received if r.message.agent_id in selected]
+    left_out = [busy_rejection(r.message.agent_id, limits) for r in received if r.message.agent_id not in selected]
+    counts = [0 if r.message.tokens is None else len(r.message.tokens.sites) for r in kept]
+    shares = allocate_max_min_fair(limits.max_fused_tokens, counts)
+    return [_keep_tokens(r, share) if share < n else r for r, n, share in zip(kept, counts, shares)], left_out
+
+
+def busy_rejection(agent_id: int, limits: ReceiverLimits) -> Rejection:
+    """Return the rejection of a sender beyond the number of senders that are fused."""
+    return Rejection(agent_id, "busy", f"more than {limits.max_fused_senders} senders at one instant")
+
+
+def _distance_m(frame: AgentFrame, reception: ReceivedMessage) -> float:
+    distance = float(ego_from_sender(frame, reception.message).translation.norm())
+    return distance if distance == distance else float("inf")
+
+
+def _keep_tokens(reception: ReceivedMessage, count: int) -> ReceivedMessage:
+    """Return a message with its most confident tokens."""
+    message = reception.message
+    assert message.tokens is not None
+    tokens: SparseBev = message.tokens
+    heat = proposed_heat(tokens.features[:, -PROPOSAL_DIM:])
+    rows = heat.argsort(descending=True, stable=True)[:count]
+    kept = torch.zeros(len(heat), dtype=torch.bool).index_fill(0, rows, True)
+    score = None if message.token_score is None else message.token_score[kept]
+    return replace(reception, message=replace(message, tokens=tokens.keep(kept), token_score=score))
