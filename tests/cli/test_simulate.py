@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+import resource
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +14,7 @@ import torch
 
 pytest.importorskip("libsumo", reason="scenarios need the sim extra")
 
+from manyeyes._io import atomic_write
 from manyeyes.cli import main as cli
 from manyeyes.datatypes import ConfigError
 from manyeyes.models import checkpoint
@@ -120,8 +122,13 @@ def add_pairs(folder: Path) -> None:
     (folder / "vehicle-side").mkdir()
 
 
-@pytest.mark.parametrize("add", [forget_specification, add_scenario, add_pairs])
-@pytest.mark.parametrize("manifest", [True, False])
+@pytest.mark.parametrize(
+    ("add", "manifest"),
+    [
+        (forget_specification, False),
+        *((add, manifest) for add in (add_scenario, add_pairs) for manifest in (True, False)),
+    ],
+)
 def test_recordings_of_others_are_refused(
     folder: Path, capsys: pytest.CaptureFixture[str], add: Callable[[Path], None], manifest: bool
 ) -> None:
@@ -181,39 +188,126 @@ def change_a_byte(path: Path) -> None:
     path.write_bytes(bytes(content))
 
 
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:100])
+
+
+def times(root: Path) -> dict[str, int]:
+    return {p.relative_to(root).as_posix(): p.stat().st_mtime_ns for p in root.rglob("*") if p.is_file()}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("damage", [Path.unlink, change_a_byte])
-@pytest.mark.parametrize("older", [False, True])
-def test_a_damaged_file_of_a_finished_scenario_is_named_and_made_again(
-    made: Path,
-    folder: Path,
-    capsys: pytest.CaptureFixture[str],
-    damage: Callable[[Path], None],
-    older: bool,
+def test_missing_truncated_and_altered_files_alone_are_repaired(
+    made: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scenario = folder / "test" / "generated-1_0001"
-    if older:  # a version that noted the digest of all files together
-        content = json.loads((scenario / "scenario.json").read_text())
-        content.pop("files", None)
-        (scenario / "scenario.json").write_text(json.dumps(content))
-    path = sorted(scenario.glob("*/*.pcd"))[0]
-    damage(path)
+    clouds = sorted(scenario.glob("*/*.pcd"))
+    damaged = (clouds[0], clouds[1], clouds[2].with_suffix(".yaml"), scenario / "data_protocol.yaml")
+    for path, damage in zip(damaged, (Path.unlink, truncate, change_a_byte, Path.unlink)):
+        damage(path)
     line = refused(folder, capsys)
-    assert str(scenario if older else path) in line and "finished scenario test/generated-1_0001" in line
-    assert f"remove {scenario} and run again" in line
-    shutil.rmtree(scenario)
+    assert all(str(path) in line for path in damaged) and "finished scenario test/generated-1_0001" in line
+    assert "add --repair to simulate these files again" in line
+    before = times(folder)
+    assert simulate(folder, "--repair") == 0
+    assert hashes(folder) == hashes(made)
+    names = {path.relative_to(folder).as_posix() for path in damaged}
+    assert {name for name, time in times(folder).items() if before.get(name) != time} == names | {"simulate.json"}
+    printed = capsys.readouterr().out
+    assert all(f"simulated again: {path}: " in printed for path in damaged)
     assert simulate(folder) == 0
+
+
+def forget_digests(scenario: Path) -> None:
+    """As a version wrote it that noted the digest of all files together."""
+    content = json.loads((scenario / "scenario.json").read_text())
+    del content["files"]
+    (scenario / "scenario.json").write_text(json.dumps(content))
+    change_a_byte(min(scenario.glob("*/*.pcd")))
+
+
+def lose_specification(scenario: Path) -> None:
+    (scenario / "scenario.json").unlink()
+    min(scenario.glob("*/*.pcd")).unlink()
+
+
+def truncate_specification(scenario: Path) -> None:
+    truncate(scenario / "scenario.json")
+
+
+def alter_entry(scenario: Path) -> None:
+    path = scenario / "scenario.json"
+    path.write_text(path.read_text().replace('"sha256": "', '"sha256": "0'))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        (forget_digests, "generated-1_0001: mismatched"),
+        (truncate_specification, "generated-1_0001/scenario.json: mismatched"),
+        (shutil.rmtree, "generated-1_0001: missing"),
+    ],
+)
+def test_a_scenario_without_sound_digests_is_repaired_by_the_manifest(
+    made: Path, folder: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None], named: str
+) -> None:
+    damage(folder / "test" / "generated-1_0001")
+    line = refused(folder, capsys)
+    assert named in line and "add --repair to simulate this file again" in line
+    assert simulate(folder, "--repair") == 0
     assert hashes(folder) == hashes(made)
 
 
-def test_a_scenario_that_is_not_that_of_the_manifest_is_refused(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        (lose_specification, "generated-1_0001/scenario.json: missing (manifest.json lists it)"),
+        (alter_entry, "generated-1_0001/scenario.json: mismatched (its entry is not that of manifest.json)"),
+    ],
+)
+def test_a_finished_folder_is_compared_with_its_manifest(
+    folder: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None], named: str
 ) -> None:
+    damage(folder / "test" / "generated-1_0001")
+    reason = named.replace(" (", " in the finished scenario test/generated-1_0001 (")
+    assert reason in refused(folder, capsys)
+
+
+@pytest.mark.slow
+def test_a_repair_with_other_bytes_changes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = folder / "manifest.json"
     content = json.loads(path.read_text())
     content["scenarios"][0]["sha256"] = "0" * 64
     path.write_text(json.dumps(content))
-    assert "its entry is not that of" in refused(folder, capsys)
+    assert "its entry is not that of manifest.json" in refused(folder, capsys)
+    assert "its files are not those of the first run" in refused(folder, capsys, "--repair")
+
+
+def test_a_file_that_no_run_wrote_is_not_repaired(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stray = min(folder.glob("test/generated-1_0000/*/*.pcd")).with_name("000099.pcd")
+    stray.write_bytes(b"")
+    line = refused(folder, capsys, "--repair")
+    assert str(stray) in line and "remove this file yourself" in line
+
+
+def test_a_full_disk_leaves_no_half_written_scenario(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fill(scenario: object, draft: Path) -> int:
+        limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit[1]))
+        try:
+            atomic_write(draft / "641" / "000000.pcd", bytes(100), durable=False)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        raise AssertionError
+
+    monkeypatch.setattr(record, "_write", fill)
+    assert simulate(tmp_path) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "641/000000.pcd: " in line and "free some space and run again" in line
+    assert hashes(tmp_path).keys() == {"manifest.partial.json"}
 
 
 def test_other_files_in_the_folder_change_nothing(folder: Path) -> None:

@@ -158,6 +158,7 @@ def test_finished_drives_are_kept_and_missing_ones_simulated_again(made: Path) -
     before = files(made)
     kept = (made / "batches/000000.json").stat().st_mtime_ns
     (made / "batches/000001.json").unlink()
+    (made / "manifest.json").rename(made / "manifest.partial.json")
     (made / "vehicle-side/velodyne/000002.pcd").unlink()
     seen: list[RecordingProgress] = []
     record_dair(JOBS, made, workers=1, progress=seen.append)
@@ -193,12 +194,29 @@ def test_damaged_files_of_finished_drives_are_named(made: Path, tmp_path: Path, 
         del content["files"]
         batch.write_text(json.dumps(content))
     assert [problem.kind for problem in DairRecording(root).verify().files] == ["mismatched"]
-    with pytest.raises(RecordingError, match=r"mismatched in the finished scenario train/one .* remove .*000000.json"):
+    with pytest.raises(RecordingError, match=r"mismatched in the finished scenario train/one .* add --repair"):
         record_dair(JOBS, root)
-    (root / "batches" / "000000.json").unlink()
-    record_dair(JOBS, root)
+    record_dair(JOBS, root, on_repair=lambda problem: None)
     assert files(root) == files(made)
     assert DairRecording(root).verify().count == 0
+
+
+def test_lost_drives_and_index_files_are_repaired_by_the_manifest(made: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(made, tmp_path / "copy"))
+    damaged = ("batches/000001.json", "vehicle-side/data_info.json", "cooperative/data_info.json")
+    (root / damaged[0]).unlink()
+    with pytest.raises(RecordingError, match=r"000001.json: missing in the finished scenario val/two .* add --repair"):
+        record_dair(JOBS, root)
+    repaired: list[str] = []
+    record_dair(JOBS, root, on_repair=lambda problem: repaired.append(problem.path.relative_to(root).as_posix()))
+    (root / damaged[1]).unlink()
+    (root / damaged[2]).write_text("[]")
+    with pytest.raises(
+        RecordingError, match=r"vehicle-side.data_info.json: missing .*; also .*cooperative.* add --repair"
+    ):
+        record_dair(JOBS, root)
+    record_dair(JOBS, root, on_repair=lambda problem: repaired.append(problem.path.relative_to(root).as_posix()))
+    assert files(root) == files(made) and repaired == list(damaged)
 
 
 def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:

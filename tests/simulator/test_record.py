@@ -97,6 +97,7 @@ def test_finished_scenarios_are_kept_and_half_written_ones_redone(made: Path) ->
     kept = (made / "train" / "one" / "scenario.json").stat().st_mtime_ns
     (made / "train" / "two").rename(made / "train" / "two.partial")
     (made / "train" / "two.partial" / "scenario.json").unlink()
+    (made / "manifest.json").unlink()
     record(JOBS, made, workers=1)
     assert files(made) == before
     assert (made / "train" / "one" / "scenario.json").stat().st_mtime_ns == kept

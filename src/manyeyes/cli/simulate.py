@@ -26,6 +26,8 @@ class Options:
     """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
     cameras: bool = False
     """Pictures too: four cameras a vehicle and one a pole, beside the clouds."""
+    repair: bool = False
+    """Simulate again the files of finished scenarios that are missing or altered; without it they are named and nothing is done."""
 
 
 def main(options: Options) -> None:
@@ -34,6 +36,7 @@ def main(options: Options) -> None:
 
     from rich.console import Console
 
+    from manyeyes.datasets.missing import FileProblem
     from manyeyes.simulator.presets import simulate, simulation_preset
     from manyeyes.simulator.record import RecordingProgress
     from manyeyes.studies import provenance
@@ -49,7 +52,13 @@ def main(options: Options) -> None:
         def report(at: RecordingProgress) -> None:
             progress.update(task, completed=at.done)
 
-        manifest = simulate(options.preset, out, options.seed, options.workers, report, options.towns, options.cameras)
+        def report_repair(problem: FileProblem) -> None:
+            console.print(f"simulated again: {problem}", highlight=False, markup=False, soft_wrap=True)
+
+        on_repair = report_repair if options.repair else None
+        manifest = simulate(
+            options.preset, out, options.seed, options.workers, report, options.towns, options.cameras, on_repair
+        )
     held = json.loads(manifest.read_text(encoding="utf-8"))["scenarios"]
     provenance.write_json(
         out / "simulate.json",

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from manyeyes.datasets.dair_v2x.writer import DairRows, DairWriter, list_index_files, list_pair_files, write_dair_index
+from manyeyes._io import atomic_write_text, flush_files
+from manyeyes._lock import hold_folder
+from manyeyes.datasets.dair_v2x.writer import DairRows, DairWriter, list_pair_files, make_dair_index
 from manyeyes.datasets.manifest import (
     BATCHES,
     MANIFEST,
@@ -21,16 +23,23 @@ from manyeyes.datasets.manifest import (
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datatypes import ConfigError, RecordingError
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.simulator.record import (
-    Job,
+from manyeyes.simulator.folder_state import (
+    Damage,
+    FolderState,
     ManifestEntry,
     RecordingPlan,
-    RecordingProgress,
-    make_first_scenario,
+    clean_draft,
+    draft_of,
+    install_draft,
     parse_entry,
-    require_listed,
     require_own_folder,
     require_sound,
+)
+from manyeyes.simulator.record import (
+    Job,
+    RecordingProgress,
+    keep_finished,
+    make_first_scenario,
     run_unfinished,
     write_json,
     write_manifest,
@@ -60,15 +69,17 @@ def record_dair(
     workers: int = 1,
     progress: Callable[[RecordingProgress], None] | None = None,
     settings: dict[str, str | int] | None = None,
+    on_repair: Callable[[FileProblem], None] | None = None,
 ) -> Path:
     """Write all drives into one root in DAIR-V2X's layout, with its split file and a manifest; the manifest's path.
 
-    What a former run finished under the same settings is checked and kept. Drives are numbered in the order of jobs, frames
-    throughout.
+    What a former run finished under the same settings is checked and kept, or repaired as in
+    :func:`~manyeyes.simulator.record.record`. Drives are numbered in the order of jobs, frames throughout.
 
     Raises:
         ConfigError: the folder holds another recording; nothing in it was changed.
-        RecordingError: a file of a finished drive is missing or damaged; nothing was changed.
+        RecordingError: a file of a finished drive is missing or altered; nothing was changed.
+        FolderInUseError: another process writes to the folder.
     """
     root = Path(out)
     if workers < 1:
@@ -81,35 +92,80 @@ def record_dair(
     starts = [sum(job.spec.frames for job in jobs[:i]) for i in range(len(jobs))]
     work = [DairJob(job, i, start) for i, (job, start) in enumerate(zip(jobs, starts))]
     plan = RecordingPlan("DAIR-V2X", settings or {}, {_place(one): _make_request(one) for one in work}, names)
-    finished = {p.relative_to(root).as_posix(): _content(p) for p in sorted((root / BATCHES).glob("*.json"))}
-    require_own_folder(root, plan, {place: content["asked"] for place, content in finished.items()})
-    require_sound(root, {place: _check(root, place, content) for place, content in finished.items()})
-    require_listed(root, {place: content["entry"] for place, content in finished.items()})
-    kept = {name: parse_entry(finished[_place(one)]) for name, one in zip(names, work) if _place(one) in finished}
-    todo = {name: one for name, one in zip(names, work) if name not in kept}
-    entries = kept | run_unfinished(record_drive, todo, root, workers, plan, progress)
-    if todo or not all(path.is_file() for path in (root / MANIFEST, *list_index_files(root))):
-        drives = [_rows(root, one) for one in work]
-        splits: dict[str, list[str]] = {}
-        for one, rows in zip(work, drives):
-            splits.setdefault(one.job.split, []).extend(rows.frames)
-        write_dair_index(root, drives, splits)
-        scenarios = [{"batch": one.batch_id, **asdict(entries[name])} for name, one in zip(names, work)]
-        write_manifest(root, plan, scenarios)
-    (root / UNFINISHED_MANIFEST).unlink(missing_ok=True)
+    with hold_folder(root):
+        state = FolderState.read(root, plan, sorted((root / BATCHES).glob("*.json")), _content)
+        require_own_folder(state, {place: content["asked"] for place, content in state.contents.items()})
+        kept = keep_finished(state, repair_drive, {_place(one): one for one in work}, workers, _check, on_repair)
+        todo = {name: one for name, one in zip(names, work) if name not in kept}
+        if not todo and (root / MANIFEST).is_file():
+            _keep_index(root, work, on_repair)
+        else:
+            entries = kept | run_unfinished(record_drive, todo, root, workers, plan, progress)
+            for path, text in _make_index(root, work).items():
+                atomic_write_text(path, text)
+            scenarios = [{"batch": one.batch_id, **asdict(entries[name])} for name, one in zip(names, work)]
+            write_manifest(root, plan, scenarios)
+        (root / UNFINISHED_MANIFEST).unlink(missing_ok=True)
     return root / MANIFEST
+
+
+def _make_index(root: Path, work: Sequence[DairJob]) -> dict[Path, str]:
+    """Make the texts of the index files of all drives from their rows."""
+    drives = [_rows(root, one) for one in work]
+    splits: dict[str, list[str]] = {}
+    for one, rows in zip(work, drives):
+        splits.setdefault(one.job.split, []).extend(rows.frames)
+    return make_dair_index(root, drives, splits)
+
+
+def _keep_index(root: Path, work: Sequence[DairJob], on_repair: Callable[[FileProblem], None] | None) -> None:
+    """Compare the index files of a finished folder with the rows of its drives, and write them again where on_repair is given."""
+    texts = _make_index(root, work)
+    problems = []
+    for path, text in texts.items():
+        if not path.is_file():
+            problems.append(FileProblem(path, "missing", "of all drives", "every reader needs it"))
+        elif path.read_bytes() != text.encode():
+            problems.append(FileProblem(path, "mismatched", "of all drives", f"it is not that of {BATCHES}"))
+    if on_repair is None:
+        require_sound(problems)
+    for problem in problems:
+        assert on_repair is not None
+        on_repair(problem)
+        atomic_write_text(problem.path, texts[problem.path])
 
 
 def record_drive(one: DairJob, root: Path) -> ManifestEntry:
     """Write one drive's files, its rows of the indices last."""
+    scenario = _make_scenario(one)
+    writer = DairWriter(root, str(one.batch_id), one.job.spec.town)
+    return _finish(one, scenario, writer, _write(scenario, writer, one.first_frame))
+
+
+def repair_drive(damaged: tuple[DairJob, Damage], root: Path) -> ManifestEntry:
+    """Simulate again the files that a finished drive lacks."""
+    one, damage = damaged
+    with clean_draft(draft_of(root, damage.place)) as draft:
+        scenario = _make_scenario(one)
+        writer = DairWriter(draft, str(one.batch_id), one.job.spec.town)
+        if damage.names is None:
+            _finish(one, scenario, writer, _write(scenario, writer, one.first_frame))
+        else:
+            _write(scenario, writer, one.first_frame, {int(Path(name).stem) for name in damage.names})
+        install_draft(root, damage)
+    return damage.entry
+
+
+def _make_scenario(one: DairJob) -> SimulatedScenario:
     spec = one.job.spec
     fast = replace(spec, frames=_STEPS * spec.frames, rate_hz=_STEPS * spec.rate_hz, history_frames=0)
-    scenario = make_first_scenario(fast, one.job.towns, roadside=True)
-    writer = DairWriter(root, str(one.batch_id), spec.town)
-    points = _write(scenario, writer, one.first_frame)
-    rows = writer.rows
-    files = sorted(writer.files)
-    digests = digest_files(files, root)
+    return make_first_scenario(fast, one.job.towns, roadside=True)
+
+
+def _finish(one: DairJob, scenario: SimulatedScenario, writer: DairWriter, points: int) -> ManifestEntry:
+    """Flush the files of a drive, and write the one that marks it as finished."""
+    spec, files = one.job.spec, sorted(writer.files)
+    digests = digest_files(files, writer.root)
     agents = (*scenario.agents, RSU_ID)
     entry = ManifestEntry(
         split=one.job.split,
@@ -127,19 +183,23 @@ def record_drive(one: DairJob, root: Path) -> ManifestEntry:
         bytes=sum(p.stat().st_size for p in files),
         sha256=compute_total_digest(digests),
     )
-    content = {"asked": _make_request(one), "entry": asdict(entry), "rows": asdict(rows), "files": digests}
-    (root / BATCHES).mkdir(exist_ok=True)
-    write_json(root / _place(one), content)
+    flush_files(files)
+    content = {"asked": _make_request(one), "entry": asdict(entry), "rows": asdict(writer.rows), "files": digests}
+    write_json(writer.root / _place(one), content)
     return entry
 
 
-def _write(scenario: SimulatedScenario, writer: DairWriter, first_frame: int) -> int:
-    """Return all pairs of a drive; the number of points."""
+def _write(
+    scenario: SimulatedScenario, writer: DairWriter, first_frame: int, ids: Collection[int] | None = None
+) -> int:
+    """Write the pairs with these ids, all of a drive for None; returns the number of points."""
     spec, points = scenario.spec, 0
     random = keyed_generator(spec.seed, "dair", spec.town)
     lag = int(random.integers(_MAX_LAG_STEPS + 1))
     offset = tuple(round(float(v), 4) for v in random.normal(0, _OFFSET_SIGMA_M, 2))
     for number, index in enumerate(range(_STEPS - 1, len(scenario), _STEPS)):
+        if ids is not None and first_frame + number not in ids:
+            continue
         snapshot = scenario.snapshot(index)
         unit = scenario.snapshot(index - lag) if lag else snapshot
         writer.write(snapshot, first_frame + number, unit, (offset[0], offset[1]))
@@ -161,9 +221,10 @@ def _rows(root: Path, one: DairJob) -> DairRows:
     return DairRows(**_content(root / _place(one))["rows"])
 
 
-def _check(root: Path, place: str, content: Mapping[str, Any]) -> list[FileProblem]:
+def _check(root: Path, place: str) -> list[FileProblem]:
     """Compare a finished drive with its digests."""
-    entry, digests = content["entry"], Digests.read(root / place)
+    content, digests = _content(root / place), Digests.read(root / place)
+    entry = content["entry"]
     if digests is None:
         return [FileProblem(root / place, "mismatched", entry["name"], "it has no digests")]
     files = sorted(p for stem in DairRows(**content["rows"]).frames for p in list_pair_files(root, stem) if p.is_file())

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from manyeyes.datasets.missing import FileProblem
 from manyeyes.datasets.opv2v.scan import SPLIT_FOLDERS
 from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_generator
@@ -206,10 +207,14 @@ def simulate(
     progress: Callable[[RecordingProgress], None] | None = None,
     towns: Path | str | None = None,
     cameras: bool = False,
+    on_repair: Callable[[FileProblem], None] | None = None,
 ) -> Path:
-    """Simulate a preset's recording into a folder; returns the path of its manifest. towns: the first place to search for roads."""
+    """Simulate a preset's recording into a folder; returns the path of its manifest.
+
+    towns: the first place to search for roads. on_repair: as in :func:`~manyeyes.simulator.record.record`.
+    """
     place = None if towns is None else str(towns)
     wanted = with_cameras(simulation_preset(preset)) if cameras else simulation_preset(preset)
     jobs = make_jobs(wanted, seed, place)
     write = record_dair if wanted.layout == "dair" else record
-    return write(jobs, out, workers, progress, {"preset": preset, "seed": seed})
+    return write(jobs, out, workers, progress, {"preset": preset, "seed": seed}, on_repair)

@@ -7,26 +7,24 @@ that are finished after a check of their digests, and refuses every other folder
 
 from __future__ import annotations
 
-import hashlib
 import json
 import multiprocessing
 import os
 import platform
-import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from threading import Thread
 from typing import Any, TypeVar
 
 import torch
 
-from manyeyes._io import atomic_write_text
-from manyeyes.datasets.dair_v2x.index import find_dair_root
+from manyeyes._io import atomic_rename, atomic_write_text, flush_files, remove_unfinished
+from manyeyes._lock import hold_folder
 from manyeyes.datasets.manifest import (
-    BATCHES,
     MANIFEST,
     PARTIAL,
     SCENARIO,
@@ -35,19 +33,29 @@ from manyeyes.datasets.manifest import (
     compute_total_digest,
     digest_files,
     list_scenario_files,
-    read_manifest,
 )
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datasets.opv2v import Opv2vWriter
-from manyeyes.datasets.opv2v.scan import has_frames
 from manyeyes.datatypes import ConfigError, ManyeyesError, RecordingError
 from manyeyes.maps.roads.road_network import RoadNetwork
+from manyeyes.simulator.folder_state import (
+    Damage,
+    FolderState,
+    ManifestEntry,
+    RecordingPlan,
+    clean_draft,
+    draft_of,
+    install_draft,
+    parse_entry,
+    require_own_folder,
+    require_repairable,
+    require_sound,
+)
 from manyeyes.simulator.scene.scenario import NoSceneError, ScenarioSpec, SimulatedScenario, make_scenario
 from manyeyes.simulator.scene.towns import load_town
 from manyeyes.simulator.sensors.lidar import lidar_spec
 
 _STEP_S = 0.05
-_UNCHANGED = "Nothing was changed: choose another --out, or remove the folder yourself."
 _ATTEMPTS = 40
 JobT = TypeVar("JobT")
 
@@ -62,31 +70,6 @@ class Job:
 
 
 @dataclass(frozen=True)
-class ManifestEntry:
-    """The manifest's entry of one scenario.
-
-    seed: the one that gave a scene: the requested one plus the number of failed ones. moving: fraction of the vehicles near it
-    that move. returns: mean points of a sweep. sha256: of the lines ``<sha256 of a file>  <path in the scenario>``, sorted by
-    path.
-    """
-
-    split: str
-    name: str
-    town: str
-    seed: int
-    agents: tuple[int, ...]
-    frames: int
-    history_frames: int
-    vehicles: int
-    moving: float
-    points: int
-    returns: int
-    files: int
-    bytes: int
-    sha256: str
-
-
-@dataclass(frozen=True)
 class RecordingProgress:
     """How far a recording is: scenarios done of all, and the one that was just finished."""
 
@@ -95,41 +78,24 @@ class RecordingProgress:
     name: str
 
 
-@dataclass(frozen=True)
-class RecordingPlan:
-    """What a run writes.
-
-    layout: OPV2V or DAIR-V2X. settings: what names the run (preset, seed). requested_specs: the specification of each scenario as
-    plain JSON, by the place of the file that marks it as finished, relative to the root. names: split and name of each scenario.
-    """
-
-    layout: str
-    settings: Mapping[str, str | int]
-    requested_specs: Mapping[str, Mapping[str, Any]]
-    names: Sequence[tuple[str, str]]
-
-    def manifest(self) -> dict[str, Any]:
-        """Return the manifest of the run while it is unfinished."""
-        digest = hashlib.sha256(json.dumps(self.requested_specs, sort_keys=True).encode()).hexdigest()
-        scenarios = [{"split": split, "name": name} for split, name in self.names]
-        return {"format": self.layout, "settings": dict(self.settings), "asked": digest, "scenarios": scenarios}
-
-
 def record(
     jobs: list[Job],
     out: Path | str,
     workers: int = 1,
     progress: Callable[[RecordingProgress], None] | None = None,
     settings: dict[str, str | int] | None = None,
+    on_repair: Callable[[FileProblem], None] | None = None,
 ) -> Path:
     """Write all jobs under ``out/<split>/<name>`` and ``out/manifest.json``; the manifest's path.
 
     What a former run finished under the same settings is checked and kept; what it left half-written is made again. Each
-    process works with one thread. settings: what names this recording (preset, seed), for the manifest.
+    process works with one thread. settings: what names this recording (preset, seed), for the manifest. on_repair: receives every
+    missing or altered file of a finished scenario before it is simulated again; None makes these files an error.
 
     Raises:
         ConfigError: the folder holds another recording; nothing in it was changed.
-        RecordingError: a file of a finished scenario is missing or damaged; nothing was changed.
+        RecordingError: a file of a finished scenario is missing or altered; nothing was changed.
+        FolderInUseError: another process writes to the folder.
     """
     root = Path(out)
     if workers < 1:
@@ -139,24 +105,55 @@ def record(
         raise ConfigError("Two scenarios of one split have one name; give each its own.")
     asked = {f"{job.split}/{job.spec.name}/{SCENARIO}": _plain(asdict(job.spec)) for job in jobs}
     plan = RecordingPlan("OPV2V", settings or {}, asked, names)
-    found = sorted(p for p in root.glob(f"*/*/{SCENARIO}") if p.parent.suffix != PARTIAL)
-    finished = {path.relative_to(root).as_posix(): read_finished(path) for path in found}
-    require_own_folder(root, plan, {place: content["spec"] for place, content in finished.items()})
-    require_sound(root, {place: _check(root / place) for place in finished})
-    kept = {name: parse_entry(finished[place]) for name, place in zip(names, asked) if place in finished}
-    require_listed(root, {place: content["entry"] for place, content in finished.items()})
-    entries = kept | run_unfinished(
-        record_scenario,
-        {name: job for name, job in zip(names, jobs) if name not in kept},
-        root,
-        workers,
-        plan,
-        progress,
-    )
-    if len(kept) < len(names) or not (root / MANIFEST).is_file():
-        write_manifest(root, plan, [asdict(entries[name]) for name in names])
-    (root / UNFINISHED_MANIFEST).unlink(missing_ok=True)
+    with hold_folder(root):
+        found = sorted(p for p in root.glob(f"*/*/{SCENARIO}") if p.parent.suffix != PARTIAL)
+        state = FolderState.read(root, plan, found, read_finished)
+        require_own_folder(state, {place: content["spec"] for place, content in state.contents.items()})
+        kept = keep_finished(state, repair_scenario, dict(zip(asked, jobs)), workers, _check, on_repair)
+        todo = {name: job for name, job in zip(names, jobs) if name not in kept}
+        entries = kept | run_unfinished(record_scenario, todo, root, workers, plan, progress)
+        if todo or not (root / MANIFEST).is_file():
+            write_manifest(root, plan, [asdict(entries[name]) for name in names])
+        (root / UNFINISHED_MANIFEST).unlink(missing_ok=True)
     return root / MANIFEST
+
+
+def keep_finished(
+    state: FolderState,
+    work: Callable[[tuple[JobT, Damage], Path], ManifestEntry],
+    jobs: Mapping[str, JobT],
+    workers: int,
+    check: Callable[[Path, str], Sequence[FileProblem]],
+    on_repair: Callable[[FileProblem], None] | None,
+) -> dict[tuple[str, str], ManifestEntry]:
+    """Check the finished scenarios of a folder, and repair them where on_repair is given; their entries by split and name.
+
+    Args:
+        state: of the folder, which is this run's.
+        work: simulates again what a job's scenario lacks.
+        jobs: by place.
+        workers: number of processes.
+        check: compares the files of a place with their digests.
+        on_repair: as in :func:`record`.
+    """
+    root, names = state.root, dict(zip(state.plan.requested_specs, state.plan.names))
+    damages = state.find_damage(partial(check, root))
+    if on_repair is None:
+        require_sound([problem for damage in damages for problem in damage.problems])
+    require_repairable(root, damages)
+    remove_unfinished(root)
+    for place in names:
+        with clean_draft(draft_of(root, place)):  # of a repair that was stopped
+            pass
+    for damage in damages:
+        for problem in damage.problems:
+            assert on_repair is not None
+            on_repair(problem)
+    for _ in run_jobs(work, [(jobs[damage.place], damage) for damage in damages], root, workers):
+        pass
+    require_sound([problem for damage in damages for problem in check(root, damage.place)])
+    kept = {names[place]: parse_entry(content) for place, content in state.contents.items()}
+    return kept | {names[damage.place]: damage.entry for damage in damages}
 
 
 def run_unfinished(
@@ -200,131 +197,6 @@ def write_manifest(root: Path, plan: RecordingPlan, scenarios: Sequence[Mapping[
     write_json(root / MANIFEST, content)
 
 
-def require_own_folder(root: Path, plan: RecordingPlan, finished: Mapping[str, Mapping[str, Any]]) -> None:
-    """Refuse a folder that holds another recording than that of the plan.
-
-    Args:
-        root: the folder; it need not exist.
-        plan: what is to be written.
-        finished: specifications of the finished scenarios in the folder, by their places.
-
-    Raises:
-        ConfigError: what is there, what is wanted, and the remedy.
-    """
-    if not root.is_dir():
-        return
-    content, wanted = read_manifest(root), plan.manifest()
-    same_run = content is None or (content["format"], content["settings"]) == (wanted["format"], wanted["settings"])
-    foreign = _foreign_scenarios(root, plan, finished) if same_run else []
-    if foreign:
-        raise ConfigError(
-            f"{root} holds {_count(len(foreign), 'scenario folder')} that no run of 'manyeyes simulate' for this layout "
-            f"wrote, the first is {foreign[0]}. {_UNCHANGED}"
-        )
-    other = [place for place, asked in finished.items() if plan.requested_specs.get(place) != asked]
-    there = "of a run without a manifest" if content is None else _describe(content)
-    if same_run and not other:
-        if content is None or content.get("asked", wanted["asked"]) == wanted["asked"]:
-            return
-        there += " with other specifications (cameras, towns or version)"
-    why = f" ({_difference(other[0], finished, plan)})" if same_run and other else ""
-    count = len(list(root.glob(f"*/*/{SCENARIO}"))) + len(list(root.glob(f"{BATCHES}/*.json")))
-    raise ConfigError(
-        f"{root} holds {_count(count, 'finished scenario')} {there}; this run makes {len(plan.names)} "
-        f"{_describe(wanted)}{why}. {_UNCHANGED}"
-    )
-
-
-def _foreign_scenarios(root: Path, plan: RecordingPlan, finished: Mapping[str, Any]) -> list[Path]:
-    """Folders with frames that no finished scenario of the layout accounts for; unfinished ones end in PARTIAL."""
-    folders = [root, *_folders(root), *(inner for folder in _folders(root) for inner in _folders(folder))]
-    own = {(root / place).parent for place in finished} if plan.layout == "OPV2V" else set()
-    foreign = [f for f in folders if f not in own and (has_frames(f) or (f / SCENARIO).is_file())]
-    if plan.layout == "OPV2V":
-        taken = [(root / place).parent for place in plan.requested_specs]
-        foreign += [f for f in taken if f not in own and f not in foreign and f.is_dir() and any(f.iterdir())]
-    begun = finished or (root / UNFINISHED_MANIFEST).is_file() or (root / MANIFEST).is_file()
-    dair = find_dair_root(root)
-    if dair is not None and not (plan.layout == "DAIR-V2X" and dair == root and begun):
-        foreign.append(dair)
-    return foreign
-
-
-def _folders(folder: Path) -> list[Path]:
-    """Folders in a folder that may hold a recording."""
-    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".") and p.suffix != PARTIAL)
-
-
-def _describe(content: Mapping[str, Any]) -> str:
-    """Settings and layout of a manifest as text."""
-    settings = ", ".join(f"{name} {value!r}" for name, value in content["settings"].items()) or "no named settings"
-    return f"of {settings} in the layout of {content['format']}"
-
-
-def _difference(place: str, finished: Mapping[str, Mapping[str, Any]], plan: RecordingPlan) -> str:
-    """What of a finished scenario is not that of the plan."""
-    if place not in plan.requested_specs:
-        only = next((other for other in plan.requested_specs if other not in finished), "")
-        instead = f", which has {_format_scenario(only)}" if only else ""
-        return (
-            f"{_format_scenario(place)} is not one of this run{instead}; do both runs find the roads of the same towns?"
-        )
-    there, wanted = _flat(finished[place]), _flat(plan.requested_specs[place])
-    name = next(name for name in {**there, **wanted} if there.get(name) != wanted.get(name))
-    return f"{_format_scenario(place)} has {name} {there.get(name)!r} instead of {wanted.get(name)!r}"
-
-
-def _format_scenario(place: str) -> str:
-    return place.removesuffix(f"/{SCENARIO}")
-
-
-def _flat(asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a specification without its nesting."""
-    flat: dict[str, Any] = {}
-    for name, value in asked.items():
-        flat.update(value if isinstance(value, dict) else {name: value})
-    return flat
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def require_sound(root: Path, problems: Mapping[str, Sequence[FileProblem]]) -> None:
-    """Refuse finished scenarios with missing or damaged files; problems: by the place that marks each as finished."""
-    found = [(place, problem) for place, some in problems.items() for problem in some]
-    if not found:
-        return
-    _, first = found[0]
-    more = f", and {len(found) - 1} more" if len(found) > 1 else ""
-    damaged = [str(_removable(root, place)) for place in dict.fromkeys(place for place, _ in found)]
-    others = f" and {len(damaged) - 4} more" if len(damaged) > 4 else ""
-    raise RecordingError(
-        f"{first.path}: {first.kind} in the finished scenario {first.scenario} ({first.reason}){more}. Nothing was changed: "
-        f"remove {', '.join(damaged[:4])}{others} and run again."
-    )
-
-
-def require_listed(root: Path, entries: Mapping[str, Mapping[str, Any]]) -> None:
-    """Refuse finished scenarios that are not those of the manifest; entries: by the place that marks each as finished."""
-    content = read_manifest(root) if (root / MANIFEST).is_file() else None
-    if content is None:
-        return
-    listed = {(entry["split"], entry["name"]): entry for entry in content["scenarios"]}
-    for place, entry in entries.items():
-        noted = listed.get((entry["split"], entry["name"]), entry)
-        if any(noted.get(name) != value for name, value in entry.items()):
-            raise RecordingError(
-                f"{root / place}: its entry is not that of {root / MANIFEST}. Nothing was changed: remove "
-                f"{_removable(root, place)} and run again."
-            )
-
-
-def _removable(root: Path, place: str) -> Path:
-    """What a user removes to have a scenario made again."""
-    return root / place if place.startswith(f"{BATCHES}/") else (root / place).parent
-
-
 def run_jobs(
     work: Callable[[JobT, Path], ManifestEntry], jobs: Sequence[JobT], root: Path, workers: int
 ) -> Iterator[tuple[JobT, ManifestEntry]]:
@@ -348,6 +220,15 @@ def run_jobs(
 def _start_worker() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it was killed: it must not write to a folder that another run may continue."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @lru_cache(maxsize=2)
@@ -358,13 +239,31 @@ def _network(town: str, towns: str | None) -> RoadNetwork:
 def record_scenario(job: Job, root: Path) -> ManifestEntry:
     """Write one scenario; a folder without the suffix .partial is whole."""
     folder = root / job.split / job.spec.name
-    partial = folder.with_name(f"{folder.name}{PARTIAL}")
-    if partial.exists():
-        shutil.rmtree(partial)
-    scenario = make_first_scenario(job.spec, job.towns)
-    points = _write(scenario, partial)
-    files = list_scenario_files(partial)
-    digests = digest_files(files, partial)
+    with clean_draft(folder.with_name(f"{folder.name}{PARTIAL}")) as draft:
+        scenario = make_first_scenario(job.spec, job.towns)
+        entry = _finish(job, scenario, draft, _write(scenario, draft))
+        atomic_rename(draft, folder)
+    return entry
+
+
+def repair_scenario(damaged: tuple[Job, Damage], root: Path) -> ManifestEntry:
+    """Simulate again the files that a finished scenario lacks."""
+    job, damage = damaged
+    with clean_draft(draft_of(root, damage.place)) as draft:
+        scenario = make_first_scenario(job.spec, job.towns)
+        if damage.names is None:
+            _finish(job, scenario, draft, _write(scenario, draft))
+        else:
+            stems = {Path(name).name.partition(".")[0].partition("_")[0] for name in damage.names}
+            _write(scenario, draft, {round(int(s) * _STEP_S * job.spec.rate_hz) for s in stems if s.isdigit()})
+        install_draft(root, damage)
+    return damage.entry
+
+
+def _finish(job: Job, scenario: SimulatedScenario, draft: Path, points: int) -> ManifestEntry:
+    """Flush the files of a scenario, and write the one that marks it as finished."""
+    files = list_scenario_files(draft)
+    digests = digest_files(files, draft)
     agents = (*scenario.agents, *((-1,) if scenario.roadside is not None else ()))
     entry = ManifestEntry(
         split=job.split,
@@ -382,8 +281,8 @@ def record_scenario(job: Job, root: Path) -> ManifestEntry:
         bytes=sum(p.stat().st_size for p in files),
         sha256=compute_total_digest(digests),
     )
-    write_json(partial / SCENARIO, {"spec": asdict(job.spec), "entry": asdict(entry), "files": digests})
-    partial.rename(folder)
+    flush_files(files)
+    write_json(draft / SCENARIO, {"spec": asdict(job.spec), "entry": asdict(entry), "files": digests})
     return entry
 
 
@@ -403,11 +302,11 @@ def make_first_scenario(spec: ScenarioSpec, towns: str | None, roadside: bool = 
     raise NoSceneError(f"{spec.name}: none of {_ATTEMPTS} seeds gives a scene in {spec.town}; last: {reason}")
 
 
-def _write(scenario: SimulatedScenario, folder: Path) -> int:
-    """Return all frames and the protocol; the number of points."""
+def _write(scenario: SimulatedScenario, folder: Path, frames: Collection[int] | None = None) -> int:
+    """Write the protocol and these frames, all for None; returns the number of points."""
     spec, points = scenario.spec, 0
     writer = Opv2vWriter(folder, _STEP_S)
-    for index in range(len(scenario)):
+    for index in range(len(scenario)) if frames is None else sorted(frames):
         snapshot = scenario.snapshot(index)
         writer.write(snapshot, torch.from_numpy(scenario.states[index].speed))
         points += sum(len(frame.points) for frame in snapshot.frames)
@@ -435,13 +334,9 @@ def read_finished(path: Path) -> dict[str, Any]:
         raise RecordingError(f"{path}: expected what a recording run writes; {error}: remove the folder.") from error
 
 
-def parse_entry(content: Mapping[str, Any]) -> ManifestEntry:
-    """Return the entry of a finished scenario."""
-    return ManifestEntry(**{**content["entry"], "agents": tuple(content["entry"]["agents"])})
-
-
-def _check(path: Path) -> list[FileProblem]:
+def _check(root: Path, place: str) -> list[FileProblem]:
     """Compare a finished scenario with its digests."""
+    path = root / place
     digests, folder = Digests.read(path), path.parent
     if digests is None:
         return [FileProblem(path, "mismatched", folder.name, "it has no digests")]

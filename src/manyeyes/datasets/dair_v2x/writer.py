@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from manyeyes._io import atomic_write_text
-from manyeyes.datasets.dair_v2x.index import SIDES, SPLIT_FILE
+from manyeyes.datasets.dair_v2x.index import SPLIT_FILE
 from manyeyes.datasets.formats.pcd import PcdTable, write_table
 from manyeyes.datatypes import LABELS, AgentFrame, Boxes, RecordingError, Snapshot, Transform
 
@@ -123,7 +123,7 @@ class DairWriter:
         self.files.append(path)
 
     def _json(self, path: Path, content: object) -> None:
-        _write_json(path, content, durable=False)
+        atomic_write_text(path, _format_json(content), durable=False)
         self.files.append(path)
 
     def _add_rows(self, stem: str, car: AgentFrame, pole: AgentFrame, offset: tuple[float, float]) -> None:
@@ -175,19 +175,24 @@ def list_pair_files(root: Path, stem: str) -> list[Path]:
     ]
 
 
-def list_index_files(root: Path) -> list[Path]:
-    """Return the files that write_dair_index writes."""
-    return [root / SPLIT_FILE, *(root / f"{name}/data_info.json" for name in (*SIDES, "cooperative"))]
-
-
 def write_dair_index(root: Path, drives: Sequence[DairRows], splits: Mapping[str, Sequence[str]]) -> None:
-    """Write the three data_info.json of all drives, and the split file: ids of the vehicle's frames by split."""
-    _write_json(root / "vehicle-side" / "data_info.json", [row for d in drives for row in d.vehicle])
-    _write_json(root / "infrastructure-side" / "data_info.json", [row for d in drives for row in d.infrastructure])
-    content = {"cooperative_split": {name: list(ids) for name, ids in splits.items()}}
-    _write_json(root / SPLIT_FILE, content)
-    # Last: the reader knows a root by it.
-    _write_json(root / "cooperative" / "data_info.json", [row for d in drives for row in d.pairs])
+    """Write the split file and the three data_info.json of all drives."""
+    for path, text in make_dair_index(root, drives, splits).items():
+        atomic_write_text(path, text)
+
+
+def make_dair_index(root: Path, drives: Sequence[DairRows], splits: Mapping[str, Sequence[str]]) -> dict[Path, str]:
+    """Make the texts of the split file (ids of the vehicle's frames by split) and of the three data_info.json of all drives.
+
+    They are to be written in this order: the reader recognises a root by the last one.
+    """
+    contents = {
+        "vehicle-side/data_info.json": [row for d in drives for row in d.vehicle],
+        "infrastructure-side/data_info.json": [row for d in drives for row in d.infrastructure],
+        SPLIT_FILE: {"cooperative_split": {name: list(ids) for name, ids in splits.items()}},
+        "cooperative/data_info.json": [row for d in drives for row in d.pairs],
+    }
+    return {root / name: _format_json(content) for name, content in contents.items()}
 
 
 def _row_of(snapshot: Snapshot, infrastructure: bool) -> int:
@@ -213,8 +218,8 @@ def _lidar_points(frame: AgentFrame) -> np.ndarray:
     return xyz
 
 
-def _write_json(path: Path, content: object, durable: bool = True) -> None:
-    atomic_write_text(path, json.dumps(content, indent=1) + "\n", durable)
+def _format_json(content: object) -> str:
+    return json.dumps(content, indent=1) + "\n"
 
 
 def _motion(target_from_source: Transform) -> dict[str, Any]:
