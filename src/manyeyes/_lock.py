@@ -11,7 +11,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 
 from manyeyes._io import name_errors
@@ -86,6 +86,6 @@ def _is_file_of(handle: int, path: Path) -> bool:
 
 def _describe_process() -> str:
     """Id, host, time and command; the command's path is left out."""
-    time = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    time = datetime.now(UTC).isoformat(timespec="seconds")
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     return f"process {os.getpid()} on {socket.gethostname()} (since {time}: {command})\n"
