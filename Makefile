@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 OUT ?= out/demo
+SEED ?= 2026
+COUNT ?= 40
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
@@ -16,7 +18,7 @@ endif
 export PYTHONWARNINGS := ignore:::pip
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help venv demo test test-fast test-nightly coverage check wheel wheels format bench clean
+.PHONY: help venv demo test test-fast test-nightly coverage mutants check wheel wheels format bench clean
 .DEFAULT_GOAL := help
 
 help:
@@ -25,6 +27,7 @@ help:
 	@echo "make test          every test; 200 hypothesis examples each"
 	@echo "make test-nightly  every test; 2,000 hypothesis examples each, other ones in every run"
 	@echo "make coverage      every test, and the fraction of statements that they run, by module"
+	@echo "make mutants       40 mutations of the source, drawn by SEED, each against the tests of its module; lists the survivors"
 	@echo "make check         formatting, lint, types, layers"
 	@echo "make wheel         build the wheel and run demo, pose and map fuse from it in an empty environment"
 	@echo "make wheels        the same for every set of extras and Python version, and the README's install lines; half an hour"
@@ -55,6 +58,9 @@ test-nightly: $(STAMP)
 
 coverage: $(STAMP)
 	@$(BIN)/python -m pytest --cov=manyeyes --cov-report=term:skip-covered
+
+mutants: $(STAMP)
+	@$(BIN)/python tests/probes/mutants.py --seed $(SEED) --count $(COUNT)
 
 check: $(STAMP)
 	@$(BIN)/ruff format --check --quiet .

@@ -200,7 +200,7 @@ def _first(log: Path) -> Path:
 
 def _nan(path: Path) -> None:
     table = feather.read_table(path)
-    column = pyarrow.array(np.array([1, np.nan, 2], np.float16))
+    column = pyarrow.array(np.array([np.nan, 1, np.nan], np.float16))
     feather.write_feather(table.set_column(0, "x", column), path)
 
 
@@ -219,7 +219,7 @@ def _shift_poses(log: Path) -> None:
         (lambda log: _first(log).write_bytes(_first(log).read_bytes()[:90]), "1000000000.feather: expected a feather"),
         (lambda log: _first(log).write_bytes(b""), "1000000000.feather: expected a feather"),
         (lambda log: _drop_column(_first(log), "offset_ns"), "expected the columns offset_ns, found x, y, z"),
-        (lambda log: _nan(_first(log)), "1000000000.feather: 1 of 3 points are NaN"),
+        (lambda log: _nan(_first(log)), "1000000000.feather: 2 of 3 points are NaN"),
         (_shift_poses, "no pose at the sweep's time 1000000000"),
     ],
 )

@@ -6,7 +6,7 @@ import torch
 
 from manyeyes.datatypes import BevGrid, PointCloud
 from manyeyes.models.detector.layers import ActiveNorm
-from manyeyes.models.detector.pillars import PillarEncoder
+from manyeyes.models.detector.pillars import PillarEncoder, PointPillars
 
 GRID = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0)
 
@@ -82,3 +82,12 @@ def test_no_points_no_pillars(kind):
     for training in (False, True):
         out = model.train(training)([PointCloud.of(torch.zeros(0, 3)), PointCloud.of(torch.tensor([[99.0, 0, 0]]))])
         assert out.features.shape == (0, 16) and out.sites.batch_size == 2
+
+
+def test_one_pass_serves_inference_alone(monkeypatch):
+    model, taken = net("points"), []
+    monkeypatch.setattr(PointPillars, "infer", lambda *arguments: taken.append(arguments) or "one pass")
+    with torch.no_grad():
+        assert model([cloud(20)]) == "one pass" and len(taken) == 1
+        assert model.train()([cloud(20)]) != "one pass"
+    assert model.eval()([cloud(20)]) != "one pass" and len(taken) == 1

@@ -96,3 +96,19 @@ def test_memory_is_bounded_and_time_must_grow():
     assert report.num_frames == 30 and state.time_s[0] == 20.0
     with pytest.raises(ConfigError, match="growing times"):
         update_monitor(state, measured(np.zeros(3)), PRIOR, 49.0)
+
+
+@pytest.mark.parametrize("field", ["offset_gate", "suspect_gate", "drift_gate_sigmas"])
+def test_gates_are_above_zero(field):
+    assert getattr(PoseMonitorConfig(**{field: 1e-9}), field) == 1e-9
+    for value in (0.0, -1.0):
+        with pytest.raises(ConfigError, match="gates above 0"):
+            PoseMonitorConfig(**{field: value})
+
+
+def test_windows_fit_into_the_memory():
+    assert PoseMonitorConfig(max_frames=3, offset_window=3, min_drift_frames=3).max_frames == 3
+    assert PoseMonitorConfig(offset_window=1).offset_window == 1
+    for sizes in ((2, 1, 2), (5, 6, 3), (5, 0, 3), (5, 1, 6)):
+        with pytest.raises(ConfigError, match="offset_window <= max_frames"):
+            PoseMonitorConfig(*sizes)

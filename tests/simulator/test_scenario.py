@@ -14,10 +14,12 @@ from manyeyes.simulator.scene.scenario import (
     NoSceneError,
     ScenarioSpec,
     SimulatedScenario,
+    _choose_agents,
     find_visible_boxes,
     make_scenario,
 )
 from manyeyes.simulator.scene.towns import load_town
+from manyeyes.simulator.scene.vehicles import VehicleStates
 
 SPEC = ScenarioSpec(
     "generated-1", 7, "one", vehicles=2, frames=3, history_frames=1, roadside_chance=1.0, min_vehicles=6
@@ -130,3 +132,26 @@ def test_impossible_requests_are_named() -> None:
         replace(SPEC, lead_frames=-1)
     with pytest.raises(ConfigError, match="low_m < high_m"):
         replace(SPEC, low_m=45.0, high_m=8.0)
+
+
+def make_states(kinds: dict[int, int], x: dict[int, float]) -> VehicleStates:
+    """Vehicles on the x axis, by id."""
+    id, zero = np.array(list(x)), np.zeros(len(x))
+    position = np.stack((np.array(list(x.values())), zero, zero), 1)
+    return VehicleStates(id, np.array([kinds[i] for i in x]), position, zero, zero, zero, np.ones((len(x), 3)))
+
+
+def test_agents_are_cars_in_range_at_the_first_frame_that_stay_and_keep_the_gap() -> None:
+    """8 and 45 m are the limits; 3 leaves the scene, 4 is a bus, 5 is too near the crossing, 6 too far, 7 too near 2."""
+    spec = replace(SPEC, vehicles=6)
+    assert (spec.low_m, spec.high_m, spec.min_gap_m) == (8.0, 45.0, 9.0)
+    start = {1: -44.0, 2: 20.0, 3: -20.0, 4: -30.0, 5: 7.0, 6: 46.0, 7: 28.0}
+    kinds = {id: int(id == 4) for id in start}
+    # Every vehicle drives 5 m: 1 comes nearer, 5 into the range, 2 and 7 keep their distance.
+    end = {id: x + 5.0 for id, x in start.items() if id != 3}
+    traffic = (make_states(kinds, start), make_states(kinds, end))
+    chosen = {_choose_agents(traffic, np.zeros(2), spec, np.random.default_rng(seed)) for seed in range(20)}
+    assert chosen == {(1, 2), (1, 7)}
+    near = (make_states(kinds, {1: -9.0, 2: 9.0}), make_states(kinds, {1: -1.0, 2: 1.0}))
+    assert _choose_agents(near, np.zeros(2), spec, np.random.default_rng(0)) == (1, 2)
+    assert len(_choose_agents(near, np.zeros(2), replace(spec, vehicles=1), np.random.default_rng(0))) == 1

@@ -114,3 +114,25 @@ def test_noise_is_centred_smooth_and_shifted_by_its_seed() -> None:
 
 def test_smooth_goes_from_nought_to_one() -> None:
     assert smoothstep(1.0, 3.0, np.array([0.0, 1.0, 2.0, 3.0, 9.0])).tolist() == [0, 0, 0.5, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("size", "height", "low", "high"), [((8.0, 2.4, 3.2), 1.3, 0.46, 0.68), ((5.4, 2.0, 2.4), 1.9, 0.52, 0.86)]
+)
+def test_windscreens_of_lorries_and_vans_lie_between_two_heights(size, height, low, high) -> None:
+    """A column of points in the middle of a lorry's front, and one through the side window of a van."""
+    count = 500
+    z, one = np.linspace(0.5, 0.98 * size[2], count).astype(np.float32), np.ones(count, np.float32)
+    lorry = size[0] > 6
+    local = np.stack(
+        (0.5 * size[0] * one, 0.5 * one, z) if lorry else (0.2 * size[0] * one, 0.5 * size[1] * one, z), -1
+    )
+    spots = SolidPoints(
+        local, np.full(count, int(not lorry)), one, np.tile(np.float32([size[0] / 2, size[1] / 2, height]), (count, 1)),
+        0.005 * one, np.tile(np.float32([0.6, 0.6, 0.6]), (count, 1)), 0.3 * one, np.zeros((count, 3), np.float32),
+        np.tile(np.float32(size), (count, 1)), np.tile(np.float32([9.0, 9.0, np.inf, 0.3]), (count, 1)),
+    )  # fmt: skip
+    albedo, gloss = solid_rgb(PAINTWORK, spots, 7)
+    glass = z[(albedo.max(1) < 0.1) & (gloss > 0.95) & (z > 0.4 * size[2])]
+    assert glass.min() == pytest.approx(low * size[2], abs=0.03)
+    assert glass.max() == pytest.approx(high * size[2], abs=0.03)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.simulator.scene import towns
 from manyeyes.simulator.scene.towns import TOWN_SPLIT, TOWNS, assert_disjoint_split, find_town, load_town
 
 ROAD = b"""<OpenDRIVE><road id="1" length="9" junction="-1"><planView><geometry s="0" x="0" y="0" hdg="0" length="9"><line/>
@@ -91,3 +92,17 @@ def test_generated_town_is_the_same_for_the_same_seed():
     assert {"driving", "sidewalk"} <= {lane.kind for lane in network.lanes}
     junctions = {road.id for road in network.roads if road.junction_id is not None}
     assert not [mark for mark in network.marks if mark.road_id in junctions]
+
+
+def test_seeds_draw_grids_webs_and_random_nets_alike(monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+
+    def record(program: str, kind: str, *options: str) -> None:
+        drawn.append(kind)
+        raise ConfigError(program)
+
+    monkeypatch.setattr(towns, "run_sumo_tool", record)
+    for seed in range(60):
+        with pytest.raises(ConfigError, match="netgenerate"):
+            towns.generate_town(seed)
+    assert {kind: drawn.count(kind) > 10 for kind in drawn} == {"--grid": True, "--spider": True, "--rand": True}
