@@ -205,13 +205,13 @@ class Copy:
 def _run_pytest(folder: Path, words: list[str], cache: Path) -> None:
     os.setsid()
     os.chdir(folder)
-    output = os.open(".output", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-    os.dup2(output, 1)
-    os.dup2(output, 2)
+    sys.stdout = sys.stderr = output = Path(".output").open("w", encoding="utf-8")  # noqa: SIM115
+    os.dup2(output.fileno(), 1)
+    os.dup2(output.fileno(), 2)
     sys.path[:0] = [str(folder), str(folder / "src")]
     os.environ["PYTHONPATH"] = os.pathsep.join([str(folder / "src"), os.environ.get("PYTHONPATH", "")])
     os.environ["NUMBA_CACHE_DIR"] = str(cache)
-    vars(numba_config).update(CACHE_DIR=str(cache))
+    numba_config.reload_config()
     for name in [name for name in sys.modules if name.partition(".")[0] == "manyeyes"]:
         del sys.modules[name]
     sys.exit(pytest.main(["--tb=no", "-rfE", "--no-header", *words]))
