@@ -18,7 +18,7 @@ endif
 export PYTHONWARNINGS := ignore:::pip
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help venv demo test test-fast test-nightly coverage mutants check wheel wheels format bench clean
+.PHONY: help venv demo test test-fast test-nightly probes coverage mutants check wheel wheels format bench clean
 .DEFAULT_GOAL := help
 
 help:
@@ -26,6 +26,7 @@ help:
 	@echo "make test-fast     tests without training and without slow ones, in two minutes; 20 hypothesis examples each"
 	@echo "make test          every test; 200 hypothesis examples each"
 	@echo "make test-nightly  every test; 2,000 hypothesis examples each, other ones in every run"
+	@echo "make probes        hostile packets, kills, races and the like at full length, in hours"
 	@echo "make coverage      every test, and the fraction of statements that they run, by module"
 	@echo "make mutants       40 mutations of the source, drawn by SEED, each against the tests of its module; lists the survivors"
 	@echo "make check         formatting, lint, types, layers"
@@ -55,6 +56,9 @@ test-fast: $(STAMP)
 
 test-nightly: $(STAMP)
 	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest
+
+probes: $(STAMP)
+	@MANYEYES_PROBES=long nice -n 10 $(BIN)/python -m pytest tests/probes
 
 coverage: $(STAMP)
 	@$(BIN)/python -m pytest --cov=manyeyes --cov-report=term:skip-covered
